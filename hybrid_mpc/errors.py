@@ -1,0 +1,16 @@
+"""Errors that speak to the user: what was given, what is needed, how to fix it."""
+
+from __future__ import annotations
+
+
+class InputError(ValueError):
+    """Bad input of the user: a file, a field, a setting. The command line answers it with exit code 2.
+
+    Its message names what was given (file, row, field), what is needed, and a remedy.
+
+    Example:
+        >>> raise InputError("run.csv: no column 'pos_rad'; it has 'time_s', 'angle'. Rename one.")
+        Traceback (most recent call last):
+        ...
+        hybrid_mpc.errors.InputError: run.csv: no column 'pos_rad'; it has 'time_s', 'angle'. Rename one.
+    """

@@ -1,0 +1,113 @@
+"""HybridModel: the deployed model of a machine as CasADi functions. No torch in here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.signals import Signal
+
+
+@dataclass(frozen=True)
+class HybridModel:
+    """A discrete-time model over the state ``x`` and the hidden state ``h``, all in SI units.
+
+    ``h`` is the hidden state before ``(x_k, u_k)``; it is empty (``n_h = 0``, 0 x 1) for a prior. The
+    fitted prior, the hybrid and an oracle share this interface.
+
+    Args:
+        name: e.g. ``"mopgrnn"``.
+        dt: Model period [s].
+        states: Signals of ``x``, ``[q, v]``.
+        inputs: Signals of ``u``.
+        outputs: Signals of ``y``.
+        step: ``(x, h, u) -> (x_next, h_next)``, columns n_x, n_h, n_u.
+        xdot: ``(x, h, u) -> xdot`` at the instant, with the correction that ``(x, h, u)`` gives.
+        output: ``(x, u) -> y``.
+        energy_balance: ``(x, xdot, u) -> dE`` [W] of the prior; zero along the prior's own flow.
+        with_jacobian: ``(x, h, u) -> (x_next, h_next, A, B)`` with ``A`` of ``(x_next, h_next)`` by
+            ``(x, h)`` and ``B`` by ``u``. Default: made from ``step`` by CasADi's own derivatives.
+
+    Raises:
+        InputError: If the functions' shapes do not fit the signals.
+
+    Example:
+        >>> x, h, u = ca.MX.sym("x", 2), ca.MX.sym("h", 0), ca.MX.sym("u")
+        >>> rhs, y, w = ca.vertcat(x[1], u), x[0], ca.MX.sym("w", 2)
+        >>> model = HybridModel(
+        ...     "double_integrator", 0.1,
+        ...     (Signal("q", "m"), Signal("v", "m/s")), (Signal("F", "N"),), (Signal("q", "m"),),
+        ...     step=ca.Function("step", [x, h, u], [x + 0.1 * rhs, h]),
+        ...     xdot=ca.Function("xdot", [x, h, u], [rhs]),
+        ...     output=ca.Function("output", [x, u], [y]),
+        ...     energy_balance=ca.Function("energy_balance", [x, w, u], [(w[1] - u) * x[1]]))
+        >>> model.n_x, model.n_h, model.n_u
+        (2, 0, 1)
+    """
+
+    name: str
+    dt: float
+    states: tuple[Signal, ...]
+    inputs: tuple[Signal, ...]
+    outputs: tuple[Signal, ...]
+    step: ca.Function
+    xdot: ca.Function
+    output: ca.Function
+    energy_balance: ca.Function
+    with_jacobian: ca.Function | None = None
+
+    def __post_init__(self) -> None:
+        if not self.dt > 0:
+            raise InputError(f"model {self.name}: dt must be positive, got {self.dt}")
+        x, u, y = (self.n_x, 1), (self.n_u, 1), (len(self.outputs), 1)
+        h = (self.n_h, 1)
+        _check(self.name, "step", self.step, [x, h, u], [x, h])
+        _check(self.name, "xdot", self.xdot, [x, h, u], [x])
+        _check(self.name, "output", self.output, [x, u], [y])
+        _check(self.name, "energy_balance", self.energy_balance, [x, x, u], [(1, 1)])
+        if self.with_jacobian is None:
+            object.__setattr__(self, "with_jacobian", _with_jacobian(self.step))
+        n_z = self.n_x + self.n_h
+        _check(self.name, "with_jacobian", self.with_jacobian, [x, h, u], [x, h, (n_z, n_z), (n_z, self.n_u)])
+
+    @property
+    def n_x(self) -> int:
+        """Number of states."""
+        return len(self.states)
+
+    @property
+    def n_u(self) -> int:
+        """Number of inputs."""
+        return len(self.inputs)
+
+    @property
+    def n_y(self) -> int:
+        """Number of outputs."""
+        return len(self.outputs)
+
+    @property
+    def n_h(self) -> int:
+        """Number of hidden states."""
+        return int(self.step.size1_in(1))
+
+
+def _with_jacobian(step: ca.Function) -> ca.Function:
+    x, h, u = (ca.MX.sym(name, step.size1_in(i)) for i, name in enumerate(("x", "h", "u")))
+    z = ca.vertcat(*step(x, h, u))
+    a = ca.densify(ca.horzcat(ca.jacobian(z, x), ca.jacobian(z, h)))
+    b = ca.densify(ca.jacobian(z, u))
+    names = ["x", "h", "u"], ["x_next", "h_next", "A", "B"]
+    return ca.Function("with_jacobian", [x, h, u], [*step(x, h, u), a, b], *names)
+
+
+def _check(
+    model: str, name: str, f: ca.Function, ins: list[tuple[int, int]], outs: list[tuple[int, int]]
+) -> None:
+    given = [f.size_in(i) for i in range(f.n_in())], [f.size_out(i) for i in range(f.n_out())]
+    if given != (ins, outs):
+        raise InputError(
+            f"model {model}: {name} takes {given[0]} and returns {given[1]}, "
+            f"its signals need {ins} and {outs}"
+        )

@@ -1,0 +1,89 @@
+"""The prior: the ODE that explains most of a machine, written once (torch).
+
+The same code trains on any batch and is exported for one sample, because it indexes the last axis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.signals import Parameter, Signal
+
+
+class Prior(nn.Module):
+    """A mechanical ODE prior with its output equation and its energy balance.
+
+    The state is ``x = [q, v]``: positions first, then their velocities, so that ``q_dot = v`` is exact.
+    A subclass names its signals and parameters as class attributes and writes three methods. Every
+    parameter becomes a float64 ``nn.Parameter`` of shape ``()`` under its name.
+
+    Args:
+        values: Parameter values [SI] by name that replace the nominal ones, e.g. fitted ones.
+
+    Raises:
+        InputError: If a name in ``values`` is no parameter, or the signals do not form ``[q, v]``.
+
+    Example:
+        >>> class Pendulum(Prior):
+        ...     states = (Signal("phi", "rad"), Signal("phi_dot", "rad/s"))
+        ...     inputs = (Signal("torque", "N m"),)
+        ...     outputs = (Signal("phi", "rad"),)
+        ...     parameters_spec = (Parameter("J", 0.1, "kg m^2", 0.01, 1.0),)
+        ...     def acceleration(self, x, u):
+        ...         return u / self.J
+        ...     def energy_balance(self, x, xdot, u):
+        ...         return (self.J * xdot[..., 1] - u[..., 0]) * x[..., 1]
+        >>> Pendulum()(torch.tensor([0.0, 1.0]), torch.tensor([0.2])).tolist()
+        [1.0, 2.0]
+    """
+
+    states: ClassVar[tuple[Signal, ...]]
+    inputs: ClassVar[tuple[Signal, ...]]
+    outputs: ClassVar[tuple[Signal, ...]]
+    parameters_spec: ClassVar[tuple[Parameter, ...]]
+
+    def __init__(self, values: Mapping[str, float] | None = None) -> None:
+        super().__init__()
+        if len(self.states) % 2:
+            raise InputError(f"{type(self).__name__}: states must be [q, v] in pairs, got {len(self.states)}")
+        values = dict(values or {})
+        for spec in self.parameters_spec:
+            value = torch.tensor(values.pop(spec.name, spec.value), dtype=torch.float64)
+            self.register_parameter(spec.name, nn.Parameter(value, requires_grad=False))
+        if values:
+            names = ", ".join(spec.name for spec in self.parameters_spec)
+            raise InputError(f"{type(self).__name__} has no parameter {', '.join(values)}; it has: {names}")
+
+    @property
+    def n_q(self) -> int:
+        """Number of degrees of freedom."""
+        return len(self.states) // 2
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Current parameter values [SI] by name."""
+        return {spec.name: float(getattr(self, spec.name)) for spec in self.parameters_spec}
+
+    def acceleration(self, x: Tensor, u: Tensor) -> Tensor:
+        """Accelerations ``v_dot``, shape ``(..., n_q)``, at ``x`` ``(..., 2 n_q)`` and ``u`` ``(..., n_u)``."""
+        raise NotImplementedError(f"{type(self).__name__} must define acceleration(x, u)")
+
+    def forward(self, x: Tensor, u: Tensor) -> Tensor:
+        """Derivative ``xdot`` ``(..., n_x)`` of the state: exact kinematics and :meth:`acceleration`."""
+        return torch.cat([x[..., self.n_q :], self.acceleration(x, u)], dim=-1)
+
+    def output(self, x: Tensor, u: Tensor) -> Tensor:
+        """Measured outputs ``(..., n_y)``. Default: the positions."""
+        return x[..., : len(self.outputs)]
+
+    def energy_balance(self, x: Tensor, xdot: Tensor, u: Tensor) -> Tensor:
+        """Energy balance ΔE [W], shape ``(...)``: zero along the prior's own flow.
+
+        The velocity comes from the state ``x``, the acceleration from ``xdot``.
+        """
+        raise NotImplementedError(f"{type(self).__name__} must define energy_balance(x, xdot, u)")

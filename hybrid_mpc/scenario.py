@@ -1,0 +1,263 @@
+"""A scenario: everything the main job needs to know about one machine. No torch in here."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.errors import InputError
+
+if TYPE_CHECKING:
+    from hybrid_mpc.model import HybridModel
+    from hybrid_mpc.physics import Prior
+
+Array = NDArray[np.float64]
+Role = Literal["train", "valid", "test"]
+
+
+class Plant(Protocol):
+    """The machine in simulation. Its state is its own affair; ``truth`` gives the model's states.
+
+    It uses numpy, scipy and casadi only, and its own integrator with its own tolerance.
+    """
+
+    def reset(self, x0: Array, seed: int) -> Any:
+        """Plant state at rest within itself at the model state ``x0`` ``(n_x,)`` [SI]."""
+
+    def step(self, state: Any, u: Array, dt: float) -> Any:
+        """Plant state after ``dt`` [s] with the input ``u`` ``(n_u,)`` held."""
+
+    def measure(self, state: Any, rng: np.random.Generator) -> Array:
+        """Measured outputs ``(n_y,)`` with sensor noise drawn from ``rng``."""
+
+    def truth(self, state: Any) -> Array:
+        """True model states ``(n_x,)``."""
+
+    def hidden(self, state: Any) -> Array:
+        """True internal states ``(n_h,)`` in the order of the scenario's oracle model (may be empty)."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """A part of a recording and what it is used for.
+
+    Args:
+        start: First time [s] in the recording's own time.
+        end: Last time [s].
+        role: ``"train"``, ``"valid"`` or ``"test"``.
+    """
+
+    start: float
+    end: float
+    role: Role
+
+
+@dataclass(frozen=True)
+class DataSpec:
+    """How a machine's recordings are read.
+
+    Args:
+        time: CSV column of the time stamps [s].
+        inputs: CSV columns of the inputs, in the order of the prior's inputs (zero-order hold).
+        outputs: CSV columns of the measured positions, in the order of the prior's outputs.
+        dt: Model period [s]; declaring it is the request to resample to it.
+        max_gap: Longest distance [s] between two samples; a run is cut where it is exceeded.
+        smoothing: Length [s] of the local polynomial that smooths and differentiates the positions.
+        warm_up: Measured past [s] that starts every free run: x(0) is smoothed from it, h warmed up on
+            it, and none of it is scored.
+        windows: Known windows by file stem. A recording that is not named here is split by ``fractions``.
+        fractions: Shares of training, validation and test samples, in this order of time.
+
+    Raises:
+        InputError: If a length is not positive or the fractions do not sum to one.
+    """
+
+    time: str
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    dt: float
+    max_gap: float
+    smoothing: float
+    warm_up: float
+    windows: Mapping[str, tuple[Window, ...]] = field(default_factory=dict)
+    fractions: tuple[float, float, float] = (0.6, 0.2, 0.2)
+
+    def __post_init__(self) -> None:
+        for name in ("dt", "max_gap", "smoothing", "warm_up"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"data specification: {name} must be positive, got {getattr(self, name)}")
+        if abs(sum(self.fractions) - 1.0) > 1e-9 or min(self.fractions) < 0:
+            raise InputError(f"data specification: fractions must sum to 1, got {self.fractions}")
+
+
+@dataclass(frozen=True)
+class ControlSpec:
+    """The optimal control problem that all controllers of a scenario share.
+
+    Args:
+        horizon: Number of model periods in the horizon.
+        q: Weight of each state's deviation from its reference, ``(n_x,)`` [1/unit^2].
+        r: Weight of each input, ``(n_u,)`` [1/unit^2].
+        r_delta: Weight of each input change per period, ``(n_u,)`` [1/unit^2].
+        u_min: Lower input bounds ``(n_u,)``.
+        u_max: Upper input bounds ``(n_u,)``.
+        du_max: Largest input change per period ``(n_u,)``; default: none.
+        estimator_sigma: Standard deviations that the estimator is to assume, ``(n_y,)`` [output units].
+    """
+
+    horizon: int
+    q: tuple[float, ...]
+    r: tuple[float, ...]
+    r_delta: tuple[float, ...]
+    u_min: tuple[float, ...]
+    u_max: tuple[float, ...]
+    du_max: tuple[float, ...] | None = None
+    estimator_sigma: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Task:
+    """A closed-loop task.
+
+    Args:
+        name: Short name, e.g. ``"track_sine"``.
+        title: One line for plots and the report.
+        duration: Length [s].
+        x0: Initial state ``(n_x,)`` [SI], at rest.
+        reference: ``t (n,) [s] -> x_ref (n, n_x)`` [SI]; the controller previews it.
+    """
+
+    name: str
+    title: str
+    duration: float
+    x0: tuple[float, ...]
+    reference: Callable[[Array], Array]
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Effort of one run of the main job.
+
+    Args:
+        hidden: Hidden units z of the networks.
+        networks: Networks trained per model; the best on validation free runs is deployed.
+        teacher_steps: Optimiser steps with teacher forcing.
+        free_run_steps: Optimiser steps on free runs.
+        seeds: Closed loops per task and controller.
+    """
+
+    hidden: int
+    networks: int
+    teacher_steps: int
+    free_run_steps: int
+    seeds: int
+
+
+DEFAULT_BUDGETS: Mapping[str, Budget] = {
+    "quick": Budget(hidden=16, networks=2, teacher_steps=300, free_run_steps=200, seeds=2),
+    "full": Budget(hidden=32, networks=4, teacher_steps=1500, free_run_steps=1500, seeds=10),
+}
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One machine: prior, data, and what there is to control.
+
+    Args:
+        name: Registered name.
+        title: One line for the report.
+        description: A paragraph for the report: the machine, its traps, the source of its data.
+        prior: Prior class or factory ``(values=None) -> Prior``; imported lazily, since it needs torch.
+        data: How recordings are read.
+        make_data: ``(folder, seed, budget name) -> CSV paths`` for a simulated machine; default: none.
+        plant: ``() -> Plant``; default: none (then there is no closed loop, only timing).
+        oracle: ``(dt) -> HybridModel`` with the plant's own equations, its hidden states as ``h``.
+        control: The optimal control problem; default: none.
+        tasks: Closed-loop tasks.
+        budgets: Effort by name.
+
+    Example:
+        >>> import numpy as np
+        >>> spec = DataSpec("time_s", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.5)
+        >>> Scenario("mine", "My machine", "", prior=lambda values=None: None, data=spec).tasks
+        ()
+    """
+
+    name: str
+    title: str
+    description: str
+    prior: Callable[..., Prior]
+    data: DataSpec
+    make_data: Callable[[Path, int, str], list[Path]] | None = None
+    plant: Callable[[], Plant] | None = None
+    oracle: Callable[[float], HybridModel] | None = None
+    control: ControlSpec | None = None
+    tasks: tuple[Task, ...] = ()
+    budgets: Mapping[str, Budget] = field(default_factory=lambda: DEFAULT_BUDGETS)
+
+
+def registered_scenarios() -> dict[str, str]:
+    """Registered scenario names with the place they come from."""
+    return {e.name: e.value for e in sorted(entry_points(group="hybrid_mpc.scenarios"), key=lambda e: e.name)}
+
+
+def load_scenario(name_or_path: str) -> Scenario:
+    """The scenario of a registered name or of a user's Python file (which defines ``scenario``).
+
+    A scenario file is the user's own program: loading it runs it.
+
+    Raises:
+        InputError: If there is no such name or file, the file fails, or defines no ``scenario``.
+
+    Example:
+        >>> load_scenario("golf_robot").name
+        'golf_robot'
+    """
+    for entry in entry_points(group="hybrid_mpc.scenarios"):
+        if entry.name == name_or_path:
+            return _checked(entry.load(), name_or_path)
+    path = Path(name_or_path)
+    if path.suffix != ".py":
+        names = ", ".join(registered_scenarios()) or "none is registered"
+        raise InputError(f"no scenario {name_or_path!r}; registered: {names}. Or give the path of a .py file.")
+    if not path.is_file():
+        raise InputError(f"no scenario file {path}")
+    spec = importlib.util.spec_from_file_location(f"hybrid_mpc_user_{path.stem}", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses and worker processes look their module up by name
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        line = _line_in(error, path)
+        raise InputError(f"{path}{line}: {type(error).__name__}: {error}") from error
+    if not hasattr(module, "scenario"):
+        raise InputError(f"{path} defines no variable 'scenario'; add: scenario = Scenario(name=..., ...)")
+    return _checked(module.scenario, str(path))
+
+
+def _checked(scenario: object, where: str) -> Scenario:
+    if not isinstance(scenario, Scenario):
+        raise InputError(f"{where}: 'scenario' is a {type(scenario).__name__}, it must be a hybrid_mpc Scenario")
+    if not callable(scenario.prior):
+        raise InputError(f"{where}: scenario {scenario.name!r} has no prior; give prior=YourPriorClass")
+    return scenario
+
+
+def _line_in(error: BaseException, path: Path) -> str:
+    if isinstance(error, SyntaxError):
+        return f":{error.lineno}"
+    line, trace = "", error.__traceback__
+    while trace is not None:
+        if trace.tb_frame.f_code.co_filename == str(path):
+            line = f":{trace.tb_lineno}"
+        trace = trace.tb_next
+    return line
