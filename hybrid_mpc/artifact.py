@@ -1,0 +1,142 @@
+"""The artifact: a folder that holds the deployed models as data. Loading it needs no torch and runs nothing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import nn_export
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import read_json, write_json
+from hybrid_mpc.model import HybridModel
+from hybrid_mpc.signals import Signal
+
+SCHEMA_VERSION = 1
+FILE = "model.json"
+FUNCTIONS = ("step", "xdot", "output", "energy_balance")
+INPUTS = {
+    "step": ("x", "h", "u"),
+    "xdot": ("x", "h", "u"),
+    "output": ("x", "u"),
+    "energy_balance": ("x", "xdot", "u"),
+}
+OUTPUTS = {
+    "step": ("x_next", "h_next"),
+    "xdot": ("xdot",),
+    "output": ("y",),
+    "energy_balance": ("dE",),
+}
+
+
+@dataclass(frozen=True)
+class ModelInfo:
+    """What a model's programs do not say themselves.
+
+    Args:
+        dt: Model period [s].
+        states: Signals of x.
+        inputs: Signals of u.
+        outputs: Signals of y.
+    """
+
+    dt: float
+    states: tuple[Signal, ...]
+    inputs: tuple[Signal, ...]
+    outputs: tuple[Signal, ...]
+
+
+@dataclass(frozen=True)
+class Artifact:
+    """Models by name (``"hybrid"``, ``"prior"``), the monitor's calibration and the provenance.
+
+    Args:
+        models: Deployed models.
+        calibration: Calibration of the energy monitor in plain form, or None.
+        provenance: Data hash, versions, seed, metrics.
+    """
+
+    models: Mapping[str, HybridModel]
+    calibration: Mapping[str, Any] | None
+    provenance: Mapping[str, Any]
+
+
+def save_artifact(
+    folder: Path,
+    programs: Mapping[str, Mapping[str, nn_export.Program]],
+    info: ModelInfo,
+    *,
+    calibration: Mapping[str, Any] | None = None,
+    provenance: Mapping[str, Any] | None = None,
+) -> None:
+    """Write models to ``folder``: ``programs.json``, ``weights.safetensors`` and, last, ``model.json``.
+
+    Args:
+        folder: Made if missing.
+        programs: Program of each function of each model, e.g. ``programs["hybrid"]["step"]``.
+        info: Period and signals, the same for all models.
+        calibration: Calibration of the monitor.
+        provenance: What the models were made from.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    flat = {f"{model}/{name}": p for model, functions in programs.items() for name, p in functions.items()}
+    nn_export.save_programs(folder, flat)
+    description = {
+        "schema_version": SCHEMA_VERSION,
+        "models": list(programs),
+        "dt_s": info.dt,
+        **{role: [_signal_out(s) for s in getattr(info, role)] for role in ("states", "inputs", "outputs")},
+        "calibration": calibration,
+        "provenance": provenance or {},
+    }
+    write_json(folder / FILE, description)
+
+
+def set_calibration(folder: Path, calibration: Mapping[str, Any]) -> None:
+    """Put the monitor's calibration into an artifact."""
+    write_json(folder / FILE, {**read_json(folder / FILE), "calibration": calibration})
+
+
+def load_artifact(folder: Path) -> Artifact:
+    """Models of an artifact folder, built as CasADi functions.
+
+    Raises:
+        InputError: If a file is missing, damaged, of another schema, or does not fit the others.
+    """
+    description = read_json(folder / FILE)
+    if not isinstance(description, dict) or description.get("schema_version") != SCHEMA_VERSION:
+        raise InputError(f"{folder / FILE} is no artifact of schema version {SCHEMA_VERSION}")
+    try:
+        signals = {r: tuple(_signal_in(s) for s in description[r]) for r in ("states", "inputs", "outputs")}
+        info = ModelInfo(float(description["dt_s"]), **signals)
+        names = [str(name) for name in description["models"]]
+        calibration, provenance = description["calibration"], description["provenance"]
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{folder / FILE} is damaged: {type(error).__name__} {error}") from error
+    try:
+        programs = nn_export.load_programs(folder)
+        models = {name: build_model(name, programs, info) for name in names}
+    except KeyError as error:
+        raise InputError(f"{folder}: programs.json lacks {error}, which {FILE} names") from error
+    except nn_export.ProgramError as error:
+        raise InputError(f"{folder}: {error}") from error
+    return Artifact(models, calibration, provenance)
+
+
+def build_model(name: str, programs: Mapping[str, nn_export.Program], info: ModelInfo) -> HybridModel:
+    """The :class:`HybridModel` of ``programs["<name>/step"]`` and its siblings."""
+    functions = {f: nn_export.build(programs[f"{name}/{f}"], f) for f in FUNCTIONS}
+    return HybridModel(name, info.dt, info.states, info.inputs, info.outputs, **functions)
+
+
+def _signal_out(s: Signal) -> dict[str, Any]:
+    bounds = [None if math.isinf(b) else b for b in (s.lower, s.upper)]
+    return {"name": s.name, "unit": s.unit, "lower": bounds[0], "upper": bounds[1], "periodic": s.periodic}
+
+
+def _signal_in(s: Mapping[str, Any]) -> Signal:
+    lower = -math.inf if s["lower"] is None else float(s["lower"])
+    upper = math.inf if s["upper"] is None else float(s["upper"])
+    return Signal(str(s["name"]), str(s["unit"]), lower, upper, bool(s["periodic"]))

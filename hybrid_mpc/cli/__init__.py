@@ -1,0 +1,5 @@
+"""The command line ``hybrid-mpc``: one thin module a command."""
+
+from hybrid_mpc.cli.main import main
+
+__all__ = ["main"]

@@ -1,0 +1,60 @@
+"""Entry point of ``hybrid-mpc``: commands, version, and errors that end with exit code 2."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+try:
+    import typer
+    from rich.console import Console
+except ImportError as missing:  # the online half installs without the command line's libraries
+    raise SystemExit(f"hybrid-mpc: {missing}. Install the command line with: pip install 'hybrid-mpc[all]'") from None
+
+from hybrid_mpc import __version__
+from hybrid_mpc.cli import run as run_command
+from hybrid_mpc.cli import scenarios as scenarios_command
+from hybrid_mpc.errors import InputError
+
+app = typer.Typer(
+    name="hybrid-mpc",
+    help="Measurements and an ODE in, a guarded real-time nonlinear MPC out.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+app.command("run", epilog=run_command.EXAMPLES)(run_command.run)
+app.command("scenarios")(scenarios_command.scenarios)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        print(f"hybrid-mpc {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Measurements and an ODE in, a guarded real-time nonlinear MPC out."""
+
+
+def main() -> None:
+    """Run the command line; bad input ends with a message and exit code 2, Ctrl-C with 130."""
+    errors = Console(stderr=True, soft_wrap=True, highlight=False)
+    try:
+        app()
+    except InputError as error:
+        errors.print(f"[bold red]error:[/] {_escape(str(error))}")
+        sys.exit(2)
+    except KeyboardInterrupt:
+        errors.print("interrupted; finished stages are kept: the same command with --resume goes on")
+        sys.exit(130)
+
+
+def _escape(text: str) -> str:
+    return text.replace("[", r"\[")

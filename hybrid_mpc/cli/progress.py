@@ -1,0 +1,91 @@
+"""Progress on the terminal: rich bars; plain lines where the output is no terminal."""
+
+from __future__ import annotations
+
+import time
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+LINE_EVERY_S = 5.0
+"""Plain output says something at most this often within a stage."""
+
+
+class Bars:
+    """Rich progress bars, one a part of the stage."""
+
+    def __init__(self, console: Console) -> None:
+        self._bars = Progress(
+            TextColumn("{task.description:28}"),
+            BarColumn(),
+            TextColumn("{task.percentage:>3.0f} %"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[text]}"),
+            console=console,
+        )
+        self._parts: dict[str, TaskID] = {}
+        self._stage: TaskID | None = None
+
+    def __enter__(self) -> Self:
+        self._bars.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, t: TracebackType | None) -> None:
+        self._bars.stop()
+
+    def start(self, title: str) -> None:
+        """A line for the stage, which its parts' bars join."""
+        self._stage = self._bars.add_task(title, total=1, text="")
+
+    def update(self, key: str, done: int, total: int, text: str) -> None:
+        """Move the bar of one part."""
+        if key not in self._parts:
+            self._parts[key] = self._bars.add_task(f"  {key}", total=total, text="")
+        self._bars.update(self._parts[key], completed=done, total=total, text=text)
+
+    def finish(self, text: str) -> None:
+        """Complete the stage and its parts."""
+        for task in self._parts.values():
+            self._bars.remove_task(task)
+        self._parts.clear()
+        if self._stage is not None:
+            self._bars.update(self._stage, completed=1, text=text)
+
+
+class Lines:
+    """Plain lines for logs and pipes."""
+
+    def __init__(self) -> None:
+        self._begin = self._stage = self._last = time.monotonic()
+        self._title = ""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, t: TracebackType | None) -> None:
+        return None
+
+    def start(self, title: str) -> None:
+        """Note the stage."""
+        self._title, self._stage = title, time.monotonic()
+        print(f"{title} ...", flush=True)
+
+    def update(self, key: str, done: int, total: int, text: str) -> None:
+        """A line now and then."""
+        now = time.monotonic()
+        if now - self._last >= LINE_EVERY_S:
+            self._last = now
+            print(f"  {key}: {done}/{total} {text}", flush=True)
+
+    def finish(self, text: str) -> None:
+        """How long the stage took."""
+        print(f"  {text or 'done'} after {time.monotonic() - self._stage:.1f} s", flush=True)
+
+
+def make_progress() -> Bars | Lines:
+    """Bars on a terminal, lines elsewhere."""
+    console = Console()
+    return Bars(console) if console.is_terminal else Lines()

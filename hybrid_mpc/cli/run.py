@@ -1,0 +1,73 @@
+"""``hybrid-mpc run``: the main job."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+EXAMPLES = (
+    "Examples:\n\n"
+    "  hybrid-mpc run golf_robot --out runs/golf\n\n"
+    "  hybrid-mpc run torque_pendulum --data swing1.csv --data swing2.csv --out runs/pendulum\n\n"
+    "  hybrid-mpc run my_machine.py --data mine.csv --budget full --out runs/mine\n\n"
+    "  hybrid-mpc run my_machine.py --data mine.csv --budget full --out runs/mine --resume"
+)
+
+
+def run(
+    scenario: Annotated[str, typer.Argument(help="A registered name (see: hybrid-mpc scenarios) or a .py file.")],
+    data: Annotated[list[Path] | None, typer.Option(help="A recording; give it once for each file.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder to make. Default: runs/SCENARIO.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of data, training and closed loops.", min=0)] = 0,
+    budget: Annotated[str, typer.Option(help="Effort: quick or full.")] = "quick",
+    resume: Annotated[bool, typer.Option("--resume", help="Finish the run that the folder holds.")] = False,
+    time_column: Annotated[str, typer.Option(help="CSV column of the time [s]. Default: the scenario's.")] = "",
+    input_column: Annotated[
+        list[str] | None, typer.Option(help="CSV column of an input, in the prior's order.")
+    ] = None,
+    output_column: Annotated[
+        list[str] | None, typer.Option(help="CSV column of a measured position, in the prior's order.")
+    ] = None,
+) -> None:
+    """Fit the prior, train, export, close the loop, monitor, analyse, and write a report."""
+    from hybrid_mpc.cli.progress import make_progress
+    from hybrid_mpc.pipeline.run import run as run_job
+    from hybrid_mpc.pipeline.settings import RunSettings
+
+    folder = out or Path("runs") / Path(scenario).stem
+    settings = RunSettings(
+        scenario,
+        tuple(data or ()),
+        seed,
+        budget,
+        tuple(input_column or ()),
+        tuple(output_column or ()),
+        time_column,
+    )
+    with make_progress() as progress:
+        results = run_job(settings, folder, resume=resume, progress=progress)
+    for line in summary(results):
+        print(line)
+    print(f"report: {(folder / 'report.html').resolve()}")
+
+
+def summary(results: dict[str, object]) -> list[str]:
+    """The figures of a run that are worth a line on the terminal."""
+    identification, control = results["identification"], results["control"]
+    assert isinstance(identification, dict)
+    assert isinstance(control, dict)
+    lines = ["free runs on unseen data:    E_sim      RMSE [rad]   energy violation [W]"]
+    for name, e_sim in identification["e_sim_s"].items():
+        rmse, energy = identification["rmse_rad"][name], identification["energy_violation_w"][name]
+        lines.append(f"  {name:22} {_number(e_sim)} {_number(rmse)} {_number(energy)}")
+    for name in ("prior", "hybrid", "oracle"):
+        loop = control[name]
+        if loop["cost"] is not None:
+            lines.append(f"closed loop, {name:8} cost {loop['cost']:.4g}, tracking {loop['tracking_rmse_rad']:.4g} rad")
+    return lines
+
+
+def _number(value: object) -> str:
+    return f"{value:12.4g}" if isinstance(value, float) else f"{value!s:>12}"

@@ -1,0 +1,165 @@
+"""Free runs of a model over whole trajectories and the figures that judge them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.identification.step import PriorStep
+from hybrid_mpc.physics import Prior
+
+Array = NDArray[np.float64]
+START_S = 0.3
+"""Length [s] of the end of the warm-up from which x(0) of a free run is smoothed."""
+
+
+@dataclass(frozen=True)
+class FreeRun:
+    """A free run over one trajectory after its warm-up, beside the measurement; n scored periods.
+
+    Args:
+        name: The trajectory's name.
+        t: Times [s] ``(n,)``.
+        u: Inputs ``(n, n_u)``.
+        x: Measured (smoothed) states ``(n, n_x)``; x_hat: the model's.
+        x_hat: States of the model ``(n, n_x)``.
+        y: Measured outputs ``(n, n_y)``, not smoothed.
+        y_hat: Outputs of the model ``(n, n_y)``.
+        xdot: Measured mean rates over each period ``(n, n_x)``.
+        xdot_hat: Mean rates of the model ``(n, n_x)``.
+        energy_measured_w: ΔE_S [W] ``(n,)``, the prior's balance on the measurement.
+        energy_model_w: ΔE_M [W] ``(n,)`` on the model's own run.
+    """
+
+    name: str
+    t: Array
+    u: Array
+    x: Array
+    x_hat: Array
+    y: Array
+    y_hat: Array
+    xdot: Array
+    xdot_hat: Array
+    energy_measured_w: Array
+    energy_model_w: Array
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Figures of one model over several free runs; a diverging run makes them infinite.
+
+    Args:
+        e_sim_s: Simulation error in duration form, λ = 0: mean over runs of the time mean of
+            ``|xdot - xdot_hat|_1``.
+        e_sim_lambda1_s: The same discounted by ``1 / (1 + λ t)`` with λ = 1 1/s.
+        e_sim_literal_s: The paper's literal form: integral over the run divided by its number of samples.
+        rmse_rad: Root mean square of the first output's error (rad for an angle).
+        energy_violation_w: Time mean of ``|ΔE_M - ΔE_S|`` [W].
+        amplitude_ratio: Largest ``|y_hat|`` over largest ``|y|``, the largest over runs.
+    """
+
+    e_sim_s: float
+    e_sim_lambda1_s: float
+    e_sim_literal_s: float
+    rmse_rad: float
+    energy_violation_w: float
+    amplitude_ratio: float
+
+
+def smoothed_start(prior: Prior, trajectory: Trajectory, warm: int) -> Array:
+    """State at the end of the warm-up ``(n_x,)``, smoothed from the warm-up's measurements alone.
+
+    The fitted prior with a constant unknown acceleration is fitted to the last ``START_S`` of the warm-up
+    (Gauss-Newton); every model starts there, so none gains by it.
+    """
+    n, n_q = min(warm, max(4, round(START_S / trajectory.dt))), prior.n_q
+    y, u = (torch.tensor(a[warm - n : warm + 1]) for a in (trajectory.y, trajectory.u))
+    step = PriorStep(prior, trajectory.dt)
+
+    def outputs(p: Tensor) -> tuple[Tensor, Tensor]:
+        x, offset = p[: 2 * n_q], p[2 * n_q :]
+        ys = [prior.output(x, u[0])]
+        kick = torch.cat([0.5 * trajectory.dt**2 * offset, trajectory.dt * offset])
+        for k in range(n):
+            x = step(x, x.new_zeros(0), u[k])[0] + kick
+            ys.append(prior.output(x, u[k + 1]))
+        return torch.stack(ys), x
+
+    p = torch.cat([torch.tensor(trajectory.x[warm - n]), torch.zeros(n_q, dtype=torch.float64)])
+    for _ in range(4):
+        jacobian, _ = torch.func.jacfwd(outputs)(p)
+        residual = (outputs(p)[0] - y).reshape(-1, 1)
+        p = p - torch.linalg.lstsq(jacobian.reshape(-1, p.numel()), residual).solution.reshape(-1)
+    x = outputs(p)[1].numpy()
+    return x if np.isfinite(x).all() else trajectory.x[warm]
+
+
+def free_runs(
+    step: nn.Module, prior: Prior, trajectories: Sequence[Trajectory], starts: Sequence[Array], warm: int, h0: Tensor
+) -> list[FreeRun]:
+    """Free runs of one step over trajectories, h warmed up on their first ``warm`` samples.
+
+    Args:
+        step: ``(x, h, u) -> (x_next, h_next)``, one network, any batch.
+        prior: The prior whose energy balance judges (the fitted one).
+        trajectories: The runs; they may differ in length.
+        starts: x at the end of each warm-up, ``(n_x,)``.
+        warm: Samples of the warm-up.
+        h0: Hidden state before the warm-up ``(n_h,)``.
+    """
+    longest = max(len(t.t) for t in trajectories)
+    x_all, u_all = (torch.tensor(np.stack([_pad(a, longest) for a in arrays])) for arrays in (
+        [t.x for t in trajectories], [t.u for t in trajectories]))
+    with torch.no_grad():
+        h = h0.expand(len(trajectories), -1)
+        for k in range(warm):
+            _, h = step(x_all[:, k], h, u_all[:, k])
+        x, states = torch.tensor(np.stack(starts)), []
+        for k in range(warm, longest):
+            states.append(x)
+            x, h = step(x, h, u_all[:, k])
+        states.append(x)
+    x_hat = torch.stack(states, 1).numpy()
+    return [_free_run(prior, t, x_hat[i], warm) for i, t in enumerate(trajectories)]
+
+
+def score(runs: Sequence[FreeRun]) -> Scores:
+    """Figures over free runs (paper: E_sim, energy violation)."""
+    e0, e1, literal, square, energy, amplitude = [], [], [], [], [], []
+    for run in runs:
+        error = np.abs(run.xdot_hat - run.xdot).sum(1)
+        t, dt = run.t - run.t[0], float(np.mean(np.diff(run.t)))
+        e0.append(error.mean())
+        e1.append((error / (1.0 + t)).mean())
+        literal.append(error.mean() * dt)
+        square.append(((run.y_hat[:, 0] - run.y[:, 0]) ** 2).mean())
+        energy.append(np.abs(run.energy_model_w - run.energy_measured_w).mean())
+        amplitude.append(np.abs(run.y_hat).max() / np.abs(run.y).max())
+    figures = (np.mean(e0), np.mean(e1), np.mean(literal), np.sqrt(np.mean(square)), np.mean(energy), np.max(amplitude))
+    return Scores(*(float(v) if np.isfinite(v) else float("inf") for v in figures))
+
+
+def _free_run(prior: Prior, trajectory: Trajectory, x_hat: Array, warm: int) -> FreeRun:
+    n, dt = len(trajectory.t) - warm - 1, trajectory.dt
+    part = slice(warm, warm + n)
+    u, x = trajectory.u[part], trajectory.x[part]
+    xdot, xdot_hat = np.diff(trajectory.x[warm:], axis=0) / dt, np.diff(x_hat[: n + 1], axis=0) / dt
+    tensors = (torch.tensor(a) for a in (x, xdot, u, x_hat[:n], xdot_hat))
+    with torch.no_grad():
+        x_t, xdot_t, u_t, x_hat_t, xdot_hat_t = tensors
+        measured = prior.energy_balance(x_t, xdot_t, u_t).numpy()
+        model = prior.energy_balance(x_hat_t, xdot_hat_t, u_t).numpy()
+        y_hat = prior.output(x_hat_t, u_t).numpy()
+    return FreeRun(
+        trajectory.name, trajectory.t[part], u, x, x_hat[:n], trajectory.y[part], y_hat, xdot, xdot_hat, measured, model
+    )
+
+
+def _pad(values: Array, length: int) -> Array:
+    return np.concatenate([values, np.repeat(values[-1:], length - len(values), axis=0)])

@@ -1,0 +1,91 @@
+"""From a torch step to programs: the bridge between the offline and the online half."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+import nn_export
+from hybrid_mpc.artifact import INPUTS, OUTPUTS, ModelInfo, build_model
+from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.identification.step import HybridStep, PriorStep
+from hybrid_mpc.physics import Prior
+
+
+@dataclass(frozen=True)
+class Parity:
+    """Largest differences between the exported step and torch in float64, relative to the outputs' scale.
+
+    Args:
+        max_abs_error: Of the values.
+        jacobian_max_abs_error: Of the Jacobians.
+    """
+
+    max_abs_error: float
+    jacobian_max_abs_error: float
+
+
+class _Method(nn.Module):
+    """One method of a module as a module of its own, which is what gets traced."""
+
+    def __init__(self, owner: nn.Module, method: str) -> None:
+        super().__init__()
+        self.owner, self.method = owner, method
+
+    def forward(self, *args: Tensor) -> Tensor:
+        result: Tensor = getattr(self.owner, self.method)(*args)
+        return result
+
+
+def trace_model(step: HybridStep | PriorStep) -> dict[str, nn_export.Program]:
+    """Programs ``step, xdot, output, energy_balance`` of one model."""
+    prior = step.prior
+    modules: dict[str, nn.Module] = {
+        "step": step,
+        "xdot": _Method(step, "xdot"),
+        "output": _Method(prior, "output"),
+        "energy_balance": _Method(prior, "energy_balance"),
+    }
+    examples = _examples(step)
+    return {
+        name: nn_export.trace(
+            module,
+            tuple(examples[i] for i in INPUTS[name]),
+            input_names=list(INPUTS[name]),
+            output_names=list(OUTPUTS[name]),
+        )
+        for name, module in modules.items()
+    }
+
+
+def model_info(prior: Prior, dt: float) -> ModelInfo:
+    """Period and signals of the models built on ``prior``."""
+    return ModelInfo(dt, prior.states, prior.inputs, prior.outputs)
+
+
+def check_parity(
+    step: HybridStep | PriorStep,
+    programs: dict[str, nn_export.Program],
+    info: ModelInfo,
+    trajectories: Sequence[Trajectory],
+    *,
+    seed: int,
+) -> Parity:
+    """Measure the exported step against torch on random and extreme inputs of the trajectories' magnitude."""
+    model = build_model("m", {f"m/{name}": program for name, program in programs.items()}, info)
+    examples = _examples(step)
+    x, u = (np.concatenate([getattr(t, name) for t in trajectories]) for name in ("x", "u"))
+    scale = (np.abs(x).max(0), np.ones(examples["h"].numel()), np.abs(u).max(0))
+    report = nn_export.parity(step, model.step, tuple(examples[i] for i in INPUTS["step"]), seed=seed, scale=scale)
+    return Parity(report.max_rel_error, report.jacobian_max_rel_error)
+
+
+def _examples(step: HybridStep | PriorStep) -> dict[str, Tensor]:
+    n_h = step.network.hidden if isinstance(step, HybridStep) else 0
+    n_x, n_u = len(step.prior.states), len(step.prior.inputs)
+    shapes = {"x": n_x, "h": int(n_h), "u": n_u, "xdot": n_x}
+    return {name: torch.zeros(n, dtype=torch.float64) for name, n in shapes.items()}

@@ -1,0 +1,114 @@
+"""What the stages of a run share: settings, folder, data, and the results of the stages before."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Protocol
+
+from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import read_arrays, read_json, write_arrays, write_json
+from hybrid_mpc.pipeline.settings import RunSettings
+from hybrid_mpc.scenario import Budget, DataSpec, Scenario
+
+
+class Progress(Protocol):
+    """Where a run reports to: bars on a terminal, lines elsewhere, nothing in tests."""
+
+    def start(self, title: str) -> None:
+        """A stage begins."""
+
+    def update(self, key: str, done: int, total: int, text: str) -> None:
+        """Part ``key`` of the stage has done ``done`` of ``total``."""
+
+    def finish(self, text: str) -> None:
+        """The stage is done."""
+
+
+class Silent:
+    """A :class:`Progress` that says nothing."""
+
+    def start(self, title: str) -> None:
+        """Ignored."""
+
+    def update(self, key: str, done: int, total: int, text: str) -> None:
+        """Ignored."""
+
+    def finish(self, text: str) -> None:
+        """Ignored."""
+
+
+@dataclass(frozen=True)
+class Context:
+    """A run in its folder.
+
+    Args:
+        settings: What the run computes.
+        scenario: The machine.
+        out: The run's folder.
+        progress: Where to report.
+    """
+
+    settings: RunSettings
+    scenario: Scenario
+    out: Path
+    progress: Progress = field(default_factory=Silent)
+
+    @property
+    def budget(self) -> Budget:
+        """The scenario's budget of the run's name."""
+        budgets = self.scenario.budgets
+        if self.settings.budget not in budgets:
+            raise InputError(
+                f"scenario {self.scenario.name} has no budget {self.settings.budget!r}; "
+                f"it has: {', '.join(budgets)}"
+            )
+        return budgets[self.settings.budget]
+
+    @property
+    def spec(self) -> DataSpec:
+        """The scenario's data specification with the user's columns."""
+        s, spec = self.settings, self.scenario.data
+        return replace(
+            spec, time=s.time or spec.time, inputs=s.inputs or spec.inputs, outputs=s.outputs or spec.outputs
+        )
+
+    @property
+    def warm(self) -> int:
+        """Samples of the warm-up."""
+        return round(self.spec.warm_up / self.spec.dt)
+
+    @cached_property
+    def dataset(self) -> Dataset:
+        """All trajectories of the user's CSV files, or of those that the simulated machine recorded."""
+        files = list(self.settings.data) or sorted((self.out / "data").glob("*.csv"))
+        prior = self.scenario.prior()
+        return load_trajectories(files, self.spec, outputs=prior.outputs, inputs=prior.inputs)
+
+    def trajectories(self, role: str) -> list[Trajectory]:
+        """Trajectories of one role."""
+        return [t for t in self.dataset.trajectories if t.role == role]
+
+    def save(self, stage: str, result: Mapping[str, Any], arrays: Mapping[str, Any] | None = None) -> None:
+        """Keep a stage's result; its JSON is written last and means that the stage is done."""
+        if arrays is not None:
+            write_arrays(self._path(stage, "npz"), arrays)
+        write_json(self._path(stage, "json"), result)
+
+    def done(self, stage: str) -> bool:
+        """Whether a stage's result is there."""
+        return self._path(stage, "json").is_file()
+
+    def result(self, stage: str) -> Any:
+        """Result of a stage that is done."""
+        return read_json(self._path(stage, "json"))
+
+    def arrays(self, stage: str) -> dict[str, Any]:
+        """Arrays of a stage that is done."""
+        return read_arrays(self._path(stage, "npz"))
+
+    def _path(self, stage: str, ending: str) -> Path:
+        return self.out / "checkpoints" / f"{stage}.{ending}"

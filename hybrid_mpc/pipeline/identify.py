@@ -1,0 +1,190 @@
+"""Stages data, prior, training and evaluation: from CSV files to judged models."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import read_arrays, read_json, write_arrays, write_json
+from hybrid_mpc.pipeline.context import Context
+from hybrid_mpc.pipeline.parallel import run_jobs
+from hybrid_mpc.scenario import load_scenario
+
+if TYPE_CHECKING:
+    from hybrid_mpc.data.trajectories import Trajectory
+    from hybrid_mpc.identification.training import Trained, TrainingSettings
+    from hybrid_mpc.physics import Prior
+
+MODELS = ("phy_nominal", "phy", "rnn", "pgrnn", "mopgrnn")
+WORKERS = 2
+"""Trainings side by side: the machine this is made for has two cores."""
+
+
+def data_stage(context: Context) -> None:
+    """Make the data of a simulated machine, or take the user's files; read and check them all."""
+    scenario, settings = context.scenario, context.settings
+    if not settings.data:
+        if scenario.make_data is None:
+            raise InputError(
+                f"scenario {scenario.name} is a real machine: give its recordings with --data FILE.csv "
+                f"(once for each file)"
+            )
+        context.progress.update("files", 0, 1, "recording the simulated machine")
+        scenario.make_data(context.out / "data", settings.seed, settings.budget)
+    dataset = context.dataset
+    roles = ("train", "valid", "test")
+    context.save(
+        "data",
+        {
+            "files": dataset.files,
+            "hash": dataset.hash,
+            "cuts": [{"file": c.file, "from_s": c.start, "to_s": c.end, "why": c.why} for c in dataset.cuts],
+            "pieces": {role: len(context.trajectories(role)) for role in roles},
+            "seconds": {role: sum(len(t.t) * t.dt for t in context.trajectories(role)) for role in roles},
+        },
+    )
+
+
+def prior_stage(context: Context) -> None:
+    """Fit the prior's parameters."""
+    from hybrid_mpc.identification.prior_fit import fit_prior
+
+    fit = fit_prior(
+        context.scenario.prior,
+        context.trajectories("train"),
+        context.trajectories("valid"),
+        dt=context.spec.dt,
+        on_progress=lambda done, total, text: context.progress.update("prior", done, total, text),
+    )
+    nominal = context.scenario.prior().values
+    units = {p.name: p.unit for p in context.scenario.prior().parameters_spec}
+    context.save("prior", {**asdict(fit), "nominal": nominal, "units": units})
+
+
+def training_stage(context: Context) -> None:
+    """Train the networks of every kind, two kinds side by side."""
+    from hybrid_mpc.identification.training import KINDS
+
+    folder = context.out / "checkpoints" / "training"
+    values = context.result("prior")["values"]
+    todo = [kind for kind in reversed(KINDS) if not (folder / f"{kind}.json").is_file()]
+    jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
+        kind: (
+            _train_kind,
+            (context.settings.scenario, values, context.trajectories("train"), context.trajectories("valid"),
+             _settings(context, kind), folder),
+        )
+        for kind in todo
+    }  # fmt: skip
+    run_jobs(jobs, context.progress.update, min(WORKERS, os.cpu_count() or 1))
+    trained = {kind: load_trained(context, kind) for kind in KINDS}
+    best = {k: float(t.validation.min()) for k, t in trained.items()}
+    skipped = {k: int(t.skipped.sum()) for k, t in trained.items()}
+    context.save("training", {"validation_e_sim_s": best, "skipped_updates": skipped})
+
+
+def load_trained(context: Context, kind: str) -> Trained:
+    """A finished training from the run's folder."""
+    from hybrid_mpc.identification.step import Scaling
+    from hybrid_mpc.identification.training import Trained, TrainingSettings
+
+    folder = context.out / "checkpoints" / "training"
+    note, arrays = read_json(folder / f"{kind}.json"), read_arrays(folder / f"{kind}.npz")
+    part: dict[str, dict[str, Any]] = {"weights": {}, "curve": {}, "own": {}}
+    for name, value in arrays.items():
+        group, _, key = name.partition(".")
+        part[group][key] = value
+    note["settings"]["learning_rates"] = tuple(note["settings"]["learning_rates"])
+    scaling = Scaling(**{name: tuple(v) for name, v in note["scaling"].items()})
+    own = part["own"]
+    return Trained(
+        TrainingSettings(**note["settings"]), scaling, part["weights"], own["validation"], part["curve"], own["skipped"]
+    )
+
+
+def evaluation_stage(context: Context) -> None:
+    """Free runs of every model over the test trajectories."""
+    from hybrid_mpc.identification.evaluation import free_runs, score, smoothed_start
+
+    test = context.trajectories("test")
+    phy = context.scenario.prior(context.result("prior")["values"])
+    starts = [smoothed_start(phy, t, context.warm) for t in test]
+    scores: dict[str, Any] = {}
+    arrays: dict[str, Any] = {}
+    for i, name in enumerate(MODELS):
+        context.progress.update("models", i, len(MODELS), name)
+        members = _members(context, name, phy)
+        all_scores = []
+        for k, (step, h0) in enumerate(members):
+            runs = free_runs(step, phy, test, starts, context.warm, h0)
+            all_scores.append(asdict(score(runs)))
+            if k == 0:
+                for run in runs:
+                    for key in ("t", "u", "x", "x_hat", "y", "energy_measured_w", "energy_model_w"):
+                        arrays[f"{name}/{run.name}/{key}"] = getattr(run, key)
+        scores[name] = {"best": all_scores[0], "networks": all_scores}
+    context.save("evaluation", {"scores": scores, "runs": [t.name for t in test]}, arrays)
+
+
+def _members(context: Context, name: str, phy: Prior) -> list[tuple[Any, Any]]:
+    """Steps of one model with their initial hidden states, the deployed one first."""
+    import torch
+
+    from hybrid_mpc.identification.step import PriorStep
+
+    dt, double = context.spec.dt, torch.float64
+    if name in ("phy_nominal", "phy"):
+        prior = phy if name == "phy" else context.scenario.prior()
+        return [(PriorStep(prior, dt), torch.zeros(0, dtype=double))]
+    trained = load_trained(context, name)
+    order = np.argsort(trained.validation, kind="stable")
+    return [(trained.step(phy, dt, int(i)), torch.zeros(trained.settings.hidden, dtype=double)) for i in order]
+
+
+def _settings(context: Context, kind: str) -> TrainingSettings:
+    from hybrid_mpc.identification.training import TrainingSettings
+
+    b = context.budget
+    return TrainingSettings(
+        kind=kind,  # type: ignore[arg-type]
+        hidden=b.hidden,
+        networks=b.networks,
+        teacher_steps=b.teacher_steps,
+        free_run_steps=b.free_run_steps,
+        seed=context.settings.seed,
+        warm=context.warm,
+    )
+
+
+def _train_kind(
+    scenario: str,
+    values: dict[str, float],
+    training: Sequence[Trajectory],
+    validation: Sequence[Trajectory],
+    settings: TrainingSettings,
+    folder: Path,
+    report: Callable[[int, int, str], None],
+) -> None:
+    """Job of one process: train one kind and leave its files."""
+    from hybrid_mpc.identification.training import train
+
+    prior = load_scenario(scenario).prior(values)
+    trained = train(
+        prior,
+        training,
+        validation,
+        settings,
+        checkpoint=folder / f"{settings.kind}.safetensors",
+        on_progress=lambda done, total, error: report(done, total, f"validation E_sim {error:.4g}"),
+    )
+    arrays = {f"weights.{n}": v for n, v in trained.weights.items()}
+    arrays |= {f"curve.{n}": v for n, v in trained.curve.items()}
+    arrays |= {"own.validation": trained.validation, "own.skipped": trained.skipped}
+    write_arrays(folder / f"{settings.kind}.npz", arrays)
+    write_json(folder / f"{settings.kind}.json", {"settings": asdict(settings), "scaling": asdict(trained.scaling)})

@@ -1,0 +1,132 @@
+"""Estimators and controllers of a scenario, the same for the main job's every closed loop."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimation.kalman import ExtendedKalmanFilter
+from hybrid_mpc.model import HybridModel
+from hybrid_mpc.monitor.calibration import Calibration
+from hybrid_mpc.monitor.energy import EnergyMonitor
+from hybrid_mpc.mpc.condensed import CondensedController
+from hybrid_mpc.mpc.ocp import OCP
+from hybrid_mpc.mpc.safeguard import SafeController
+from hybrid_mpc.scenario import ControlSpec
+
+if TYPE_CHECKING:
+    from hybrid_mpc.data.trajectories import Trajectory
+
+Array = NDArray[np.float64]
+DISTURBANCE_SHARE = 0.01
+"""Step of the estimated input disturbance per period, as a share of the input's range: a disturbance as
+large as the range is followed within some hundred periods, and noise does not pass for one."""
+
+MONITOR_WINDOW_S = 0.3
+"""Window [s] of the monitor's derivative and of the average that makes its level."""
+
+
+def process_noise(model: HybridModel, trajectories: Sequence[Trajectory], most: int = 4000) -> Array:
+    """Standard deviations ``(n_x,)`` of the model's one-period errors on measured trajectories [SI].
+
+    Args:
+        model: The model.
+        trajectories: Measured trajectories (the training ones).
+        most: Largest number of periods to look at.
+    """
+    errors: list[Array] = []
+    for trajectory in trajectories:
+        h = np.zeros(model.n_h)
+        for k in range(len(trajectory.t) - 1):
+            x_next, h = (m.full().ravel() for m in model.step(trajectory.x[k], h, trajectory.u[k]))
+            errors.append(x_next - trajectory.x[k + 1])
+        if len(errors) >= most:
+            break
+    return np.maximum(np.sqrt(np.mean(np.square(errors), axis=0)), 1e-9)
+
+
+def make_estimator(
+    model: HybridModel, control: ControlSpec, sigma_x: Array, *, disturbance: bool = True
+) -> ExtendedKalmanFilter:
+    """The extended Kalman filter that all controllers share, tuned by the model's own one-period errors.
+
+    Args:
+        model: The model to estimate with.
+        control: Input range and sensor noise.
+        sigma_x: Process noise ``(n_x,)`` per period, see :func:`process_noise`.
+        disturbance: False leaves the input disturbance at zero: the monitor's filter, which must not
+            explain a fault away.
+    """
+    if len(control.estimator_sigma) != model.n_y:
+        raise InputError(
+            f"control: estimator_sigma needs {model.n_y} standard deviations of the outputs, "
+            f"got {control.estimator_sigma}"
+        )
+    span = np.subtract(control.u_max, control.u_min)
+    share = DISTURBANCE_SHARE * span if disturbance else 0.0 * span
+    first = np.concatenate([control.estimator_sigma, np.full(model.n_x - model.n_y, 0.1)])
+    return ExtendedKalmanFilter(
+        model,
+        sigma_y=np.array(control.estimator_sigma),
+        sigma_x=sigma_x,
+        sigma_d=share,
+        sigma_x0=first,
+        sigma_d0=5.0 * share,
+    )
+
+
+def make_controller(
+    model: HybridModel, prior: HybridModel, control: ControlSpec, *, iterations: int = 1
+) -> SafeController:
+    """The condensed real-time iteration of a model behind the safeguards that stand on the prior.
+
+    Terminal weight and fallback linearise at a working speed: at rest the slope of dry friction would
+    pass for strong damping.
+    """
+    point = working_point(prior, control)
+    ocp = OCP.from_spec(control, working_point=point)
+    return SafeController(CondensedController(model, ocp, iterations=iterations), prior)
+
+
+def working_point(model: HybridModel, control: ControlSpec) -> tuple[Array, Array]:
+    """``(x, u)`` in motion at the position zero: speeds of the tolerated size ``1 / sqrt(q)``."""
+    x = np.zeros(model.n_x)
+    half = model.n_x // 2
+    weights = np.asarray(control.q[half:], dtype=float)
+    x[half:] = 1.0 / np.sqrt(np.where(weights > 0, weights, 1.0))
+    return x, np.zeros(model.n_u)
+
+
+def make_monitor(model: HybridModel, calibration: Calibration | None) -> EnergyMonitor:
+    """The energy monitor with its default window: about 0.3 s for the derivative and for the level."""
+    half = max(2, round(0.5 * MONITOR_WINDOW_S / model.dt))
+    return EnergyMonitor(
+        model, window=2 * half + 1, average=max(1, round(MONITOR_WINDOW_S / model.dt)), calibration=calibration
+    )
+
+
+def time_on_recording(
+    controller: SafeController, estimator: ExtendedKalmanFilter, monitor: EnergyMonitor, trajectory: Trajectory
+) -> Array:
+    """Durations [ms] of estimate, solve and monitor on recorded states, for a machine without a plant.
+
+    The controller is asked to hold the rest position from wherever the recording is; the estimator is told
+    the recorded input, not the controller's.
+    """
+    ocp = controller.controller.ocp
+    target = np.zeros((ocp.horizon + 1, ocp.n_x))
+    estimate = estimator.start(trajectory.y[0])
+    decision, state = controller.initial(estimate), monitor.initial()
+    durations = []
+    for k in range(1, len(trajectory.t)):
+        begin = perf_counter()
+        estimate = estimator.update(estimate, trajectory.y[k], trajectory.u[k - 1])
+        decision = controller.decide(decision, estimate, target)
+        state, _ = monitor.update(state, trajectory.y[k], trajectory.u[k - 1], estimate)
+        durations.append(1e3 * (perf_counter() - begin))
+    return np.array(durations)

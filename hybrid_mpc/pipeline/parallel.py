@@ -1,0 +1,74 @@
+"""Jobs in processes of their own that report their progress while they work."""
+
+from __future__ import annotations
+
+import multiprocessing
+import traceback
+from collections.abc import Callable, Mapping
+from multiprocessing.connection import Connection, wait
+from typing import Any
+
+
+def run_jobs(
+    jobs: Mapping[str, tuple[Callable[..., Any], tuple[Any, ...]]],
+    on_progress: Callable[[str, int, int, str], None],
+    workers: int,
+) -> dict[str, Any]:
+    """Run ``function(*args, report)`` for each job and return the results by name.
+
+    A job calls ``report(done, total, text)`` as it goes. Jobs start in the order given, ``workers`` at a
+    time, each in a fresh process, so results do not depend on how many run side by side.
+
+    Raises:
+        RuntimeError: If a job fails; the message holds its traceback. The other jobs are ended.
+    """
+    context = multiprocessing.get_context("spawn")
+    waiting, results = list(jobs), {}
+    running: dict[Connection, tuple[str, Any]] = {}
+    try:
+        while waiting or running:
+            while waiting and len(running) < workers:
+                name = waiting.pop(0)
+                ours, theirs = context.Pipe(duplex=False)
+                process = context.Process(target=_work, args=(theirs, *jobs[name]), daemon=True)
+                process.start()
+                theirs.close()
+                running[ours] = (name, process)
+            for connection in wait(list(running)):
+                name, process = running[connection]  # type: ignore[index]
+                kind, value = _receive(connection, process)  # type: ignore[arg-type]
+                if kind == "progress":
+                    on_progress(name, *value)
+                    continue
+                if kind == "error":
+                    raise RuntimeError(f"{name} failed:\n{value}")
+                results[name] = value
+                process.join()
+                del running[connection]  # type: ignore[arg-type]
+    finally:
+        for _, process in running.values():
+            process.terminate()
+    return results
+
+
+def _receive(connection: Connection, process: Any) -> tuple[str, Any]:
+    try:
+        message: tuple[str, Any] = connection.recv()
+    except EOFError:
+        process.join()
+        return "error", f"its process ended with exit code {process.exitcode}"
+    return message
+
+
+def _work(connection: Connection, function: Callable[..., Any], args: tuple[Any, ...]) -> None:
+    def report(done: int, total: int, text: str) -> None:
+        connection.send(("progress", (done, total, text)))
+
+    try:
+        result = function(*args, report)
+    except Exception:  # every failure travels to the parent, which raises it
+        connection.send(("error", traceback.format_exc()))
+    else:
+        connection.send(("result", result))
+    finally:
+        connection.close()

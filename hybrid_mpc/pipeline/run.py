@@ -1,0 +1,63 @@
+"""The main job: data, prior, training, evaluation, export, control, monitor, analysis, report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from hybrid_mpc.pipeline import deploy, identify, judge
+from hybrid_mpc.pipeline.context import Context, Progress, Silent
+from hybrid_mpc.pipeline.reporting import report_stage
+from hybrid_mpc.pipeline.settings import RunSettings, open_folder
+from hybrid_mpc.scenario import load_scenario
+
+STAGES: tuple[tuple[str, str, Callable[[Context], None]], ...] = (
+    ("data", "reading the measurements", identify.data_stage),
+    ("prior", "fitting the prior", identify.prior_stage),
+    ("training", "training the networks", identify.training_stage),
+    ("evaluation", "free runs on unseen data", identify.evaluation_stage),
+    ("export", "exporting to CasADi", deploy.export_stage),
+    ("control", "closing the loop", deploy.control_stage),
+    ("monitor", "calibrating the energy monitor", judge.monitor_stage),
+    ("analysis", "linear analysis", judge.analysis_stage),
+    ("report", "writing the report", report_stage),
+)
+
+
+def run(
+    settings: RunSettings, out: Path, *, resume: bool = False, progress: Progress | None = None
+) -> dict[str, Any]:
+    """Run the main job into the folder ``out`` and return what stands in its ``results.json``.
+
+    Every stage leaves a checkpoint in ``out/checkpoints``; a run that was interrupted, at any point, is
+    finished by ``resume=True`` and then equals one that was not.
+
+    Args:
+        settings: What to compute.
+        out: Folder to make; it must be new or empty unless ``resume``.
+        resume: Finish the run that ``out`` holds.
+        progress: Where to report; default: nowhere.
+
+    Returns:
+        The results (docs/results-schema.md).
+
+    Raises:
+        InputError: For any bad input; nothing half-written is left behind that a later run would trip over.
+
+    Example:
+        >>> results = run(RunSettings("golf_robot"), Path("out"))  # doctest: +SKIP
+    """
+    scenario = load_scenario(settings.scenario)
+    context = Context(settings, scenario, out, progress or Silent())
+    context.budget  # noqa: B018  an unknown budget is refused before a folder is made
+    open_folder(out, settings, resume=resume)
+    for name, title, stage in STAGES:
+        context.progress.start(title)
+        if context.done(name):
+            context.progress.finish("done before")
+            continue
+        stage(context)
+        context.progress.finish("")
+    result: dict[str, Any] = context.result("report")
+    return result
