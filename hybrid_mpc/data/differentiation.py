@@ -101,7 +101,7 @@ def noise_gain(dt: float, length: float, order: int = 4, derivative: int = 0) ->
 
     Example:
         >>> round(noise_gain(0.005, 0.2, derivative=2))
-        344
+        351
     """
     n = window_samples(length, dt, order)
     return float(np.linalg.norm(savgol_coeffs(n, order, deriv=derivative, delta=dt)))

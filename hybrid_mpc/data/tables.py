@@ -86,8 +86,8 @@ def read_csv(
     path = Path(path)
     if len(spec.outputs) != len(outputs) or len(spec.inputs) != len(inputs):
         raise InputError(
-            f"data specification: {len(spec.inputs)} input and {len(spec.outputs)} output columns for a prior "
-            f"with {len(inputs)} inputs and {len(outputs)} outputs; name one column for each, in its order"
+            f"data specification: {len(spec.inputs)} input and {len(spec.outputs)} output columns for a "
+            f"prior with {len(inputs)} inputs and {len(outputs)} outputs; name one column for each, in its order"
         )
     content = _content(path)
     header, rows = _rows(path, content)
@@ -105,7 +105,7 @@ def read_csv(
 
 
 def write_csv(path: Path | str, columns: Mapping[str, Array]) -> Path:
-    """Write columns of equal length as CSV: all of it or nothing, the same data as the same bytes.
+    r"""Write columns of equal length as CSV: all of it or nothing, the same data as the same bytes.
 
     Numbers are written with ten significant digits. The file appears under its name only when complete.
 
@@ -123,7 +123,7 @@ def write_csv(path: Path | str, columns: Mapping[str, Array]) -> Path:
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     write_csv(Path(folder) / "a.csv", {"t": np.array([0.0, 0.1])}).read_text()
-        't\\n0\\n0.1\\n'
+        't\n0\n0.1\n'
     """
     path = Path(path)
     arrays = {name: np.asarray(column, dtype=float) for name, column in columns.items()}
@@ -168,10 +168,10 @@ def _rows(path: Path, content: bytes) -> tuple[list[str], list[tuple[int, list[s
     except csv.Error as error:
         raise InputError(f"{path}: row {reader.line_num}: {error}. Export the table as plain CSV.") from error
     header = [name.strip() for name in rows[0][1]] if rows else []
-    for line, row in rows[1:]:
-        if len(row) != len(header):
+    for line, cells in rows[1:]:
+        if len(cells) != len(header):
             raise InputError(
-                f"{path}: row {line} has {len(row)} cells, the header (row {rows[0][0]}) has {len(header)}. "
+                f"{path}: row {line} has {len(cells)} cells, the header (row {rows[0][0]}) has {len(header)}. "
                 "Separate cells by commas, write decimals with a point, and complete or delete the row."
             )
     return header, rows[1:]
@@ -215,8 +215,8 @@ def _check_time(path: Path, t: Array, lines: list[int], spec: DataSpec) -> None:
         k = int(np.argmax(steps <= 0))
         what = "repeats" if steps[k] == 0 else "decreases"
         raise InputError(
-            f"{path}: row {lines[k + 1]}, column {spec.time!r}: time {what} ({t[k]:g} s, then {t[k + 1]:g} s). "
-            "Time stamps must increase: delete the repeated rows or split the file into recordings."
+            f"{path}: row {lines[k + 1]}, column {spec.time!r}: time {what} ({t[k]:g} s, then "
+            f"{t[k + 1]:g} s). Time stamps must increase: delete the repeated rows or split the file into recordings."
         )
     if steps.min() > spec.max_gap * (1 + 1e-6):
         raise InputError(
@@ -245,12 +245,11 @@ def _check_range(path: Path, signal: Signal, name: str, column: Array, lines: li
         return
     k = int(np.argmax(bad))
     hint = ""
-    if signal.unit in ("rad", "rad/s") and np.abs(column).max() > 4 * max(
-        abs(signal.lower), abs(signal.upper)
-    ):
+    limit = max(abs(signal.lower), abs(signal.upper))
+    if signal.unit in ("rad", "rad/s") and np.abs(column).max() > 4 * limit:
         hint = " It looks like degrees: multiply by pi/180."
     raise InputError(
         f"{path}: row {lines[k]}, column {name!r}: {column[k]:g} is outside the plausible range "
-        f"{signal.lower:g} to {signal.upper:g} {signal.unit} of {signal.name} ({int(bad.sum())} such rows).{hint} "
-        "Check unit and sign, or widen the range of the signal in the scenario's prior."
+        f"{signal.lower:g} to {signal.upper:g} {signal.unit} of {signal.name} ({int(bad.sum())} such rows)."
+        f"{hint} Check unit and sign, or widen the range of the signal in the scenario's prior."
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -125,7 +126,7 @@ def load_trajectories(
         ...     data = load_trajectories([file], spec, outputs=(Signal("phi", "rad"),),
         ...                              inputs=(Signal("tau", "N m"),))
         >>> [(piece.name, piece.role, len(piece.t)) for piece in data.trajectories]
-        [('run', 'train', 300), ('run#2', 'valid', 95), ('run#3', 'test', 95)]
+        [('run', 'train', 299), ('run#2', 'valid', 94), ('run#3', 'test', 94)]
     """
     if not paths:
         raise InputError("no recordings given; name at least one CSV file with --data")
@@ -259,11 +260,11 @@ def _check_windows(spec: DataSpec) -> None:
                 raise InputError(
                     f"data specification: window {window} of {stem} needs start < end and one of {ROLES}"
                 )
-        for one, two in zip(ordered, ordered[1:], strict=False):
+        for one, two in pairwise(ordered):
             if two.start < one.end:
                 raise InputError(
-                    f"data specification: windows of {stem} overlap: {one.role} {one.start:g} to {one.end:g} s "
-                    f"and {two.role} {two.start:g} to {two.end:g} s. A sample can have one role only."
+                    f"data specification: windows of {stem} overlap: {one.role} {one.start:g} to {one.end:g} s"
+                    f" and {two.role} {two.start:g} to {two.end:g} s. A sample can have one role only."
                 )
 
 
@@ -272,8 +273,8 @@ def _check_roles(trajectories: list[Trajectory], cuts: list[Cut], spec: DataSpec
     if missing:
         dropped = "".join(f"\n  {cut.file} {cut.start:g} to {cut.end:g} s: {cut.why}" for cut in cuts)
         raise InputError(
-            f"no piece of {_fewest(spec) * spec.dt:g} s or more is left for {' and '.join(missing)}. Give more or "
-            "longer recordings, or change windows, fractions or max_gap in the DataSpec."
+            f"no piece of {_fewest(spec) * spec.dt:g} s or more is left for {' and '.join(missing)}. Give more "
+            "or longer recordings, or change windows, fractions or max_gap in the DataSpec."
             + (f" Cut out:{dropped}" if dropped else "")
         )
 
