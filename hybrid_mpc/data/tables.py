@@ -87,7 +87,8 @@ def read_csv(
     if len(spec.outputs) != len(outputs) or len(spec.inputs) != len(inputs):
         raise InputError(
             f"data specification: {len(spec.inputs)} input and {len(spec.outputs)} output columns for a "
-            f"prior with {len(inputs)} inputs and {len(outputs)} outputs; name one column for each, in its order"
+            f"prior with {len(inputs)} inputs and {len(outputs)} outputs; "
+            "name one column for each, in its order"
         )
     content = _content(path)
     header, rows = _rows(path, content)
@@ -171,7 +172,8 @@ def _rows(path: Path, content: bytes) -> tuple[list[str], list[tuple[int, list[s
     for line, cells in rows[1:]:
         if len(cells) != len(header):
             raise InputError(
-                f"{path}: row {line} has {len(cells)} cells, the header (row {rows[0][0]}) has {len(header)}. "
+                f"{path}: row {line} has {len(cells)} cells, the header (row {rows[0][0]}) has "
+                f"{len(header)}. "
                 "Separate cells by commas, write decimals with a point, and complete or delete the row."
             )
     return header, rows[1:]
@@ -216,7 +218,8 @@ def _check_time(path: Path, t: Array, lines: list[int], spec: DataSpec) -> None:
         what = "repeats" if steps[k] == 0 else "decreases"
         raise InputError(
             f"{path}: row {lines[k + 1]}, column {spec.time!r}: time {what} ({t[k]:g} s, then "
-            f"{t[k + 1]:g} s). Time stamps must increase: delete the repeated rows or split the file into recordings."
+            f"{t[k + 1]:g} s). Time stamps must increase: delete the repeated rows or split "
+            "the file into recordings."
         )
     if steps.min() > spec.max_gap * (1 + 1e-6):
         raise InputError(

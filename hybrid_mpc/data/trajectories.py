@@ -263,8 +263,8 @@ def _check_windows(spec: DataSpec) -> None:
         for one, two in pairwise(ordered):
             if two.start < one.end:
                 raise InputError(
-                    f"data specification: windows of {stem} overlap: {one.role} {one.start:g} to {one.end:g} s"
-                    f" and {two.role} {two.start:g} to {two.end:g} s. A sample can have one role only."
+                    f"data specification: windows of {stem} overlap: {one.role} {one.start:g} to "
+                    f"{one.end:g} s and {two.role} {two.start:g} to {two.end:g} s. A sample can have one role only."
                 )
 
 
@@ -273,8 +273,8 @@ def _check_roles(trajectories: list[Trajectory], cuts: list[Cut], spec: DataSpec
     if missing:
         dropped = "".join(f"\n  {cut.file} {cut.start:g} to {cut.end:g} s: {cut.why}" for cut in cuts)
         raise InputError(
-            f"no piece of {_fewest(spec) * spec.dt:g} s or more is left for {' and '.join(missing)}. Give more "
-            "or longer recordings, or change windows, fractions or max_gap in the DataSpec."
+            f"no piece of {_fewest(spec) * spec.dt:g} s or more is left for {' and '.join(missing)}. "
+            "Give more or longer recordings, or change windows, fractions or max_gap in the DataSpec."
             + (f" Cut out:{dropped}" if dropped else "")
         )
 

@@ -42,6 +42,12 @@ class TorquePendulumPrior(Prior):
         Parameter("k_u", 1.0, "-", 0.5, 1.2, "true over commanded torque"),
     )
 
+    mgl: Tensor
+    d: Tensor
+    J: Tensor
+    F_c: Tensor
+    k_u: Tensor
+
     def _losses(self, v: Tensor) -> Tensor:
         return self.d * v + self.F_c * torch.tanh(v / FRICTION_SPEED)
 
