@@ -263,8 +263,8 @@ def _check_windows(spec: DataSpec) -> None:
         for one, two in pairwise(ordered):
             if two.start < one.end:
                 raise InputError(
-                    f"data specification: windows of {stem} overlap: {one.role} {one.start:g} to "
-                    f"{one.end:g} s and {two.role} {two.start:g} to {two.end:g} s. A sample can have one role only."
+                    f"windows overlap in {stem}: {one.role} {one.start:g} to {one.end:g} s, "
+                    f"{two.role} {two.start:g} to {two.end:g} s. A sample can have one role only."
                 )
 
 
