@@ -1,0 +1,297 @@
+"""From recordings to trajectories on the model's uniform grid, with states, derivatives and roles."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from hybrid_mpc.data.differentiation import local_polynomial, window_samples
+from hybrid_mpc.data.tables import MIN_SCORED, Table, read_csv
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.scenario import DataSpec, Role, Window
+from hybrid_mpc.signals import Signal
+
+Array = NDArray[np.float64]
+ROLES: tuple[Role, ...] = ("train", "valid", "test")
+TINY = 1e-6
+"""Tolerance [s] of comparisons between time stamps; far below any sampling time, above rounding."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """One contiguous piece of a recording on the uniform grid ``dt``.
+
+    Args:
+        name: ``"<file stem>"``, or ``"<file stem>#2"`` for the second piece of that file.
+        role: ``"train"``, ``"valid"``, ``"test"``; ``""`` for a whole recording.
+        dt: Period [s].
+        t: Times ``(n,)`` [s] in the recording's own time.
+        u: Inputs ``(n, n_u)`` held over ``[t_k, t_k + dt)``: the mean of the recorded zero-order hold.
+        y: Measured outputs ``(n, n_y)``, interpolated to the grid and not smoothed.
+        x: States ``(n, n_x)``, ``[q, v]`` smoothed.
+        xdot: Derivatives of the states ``(n, n_x)``, ``[v, v_dot]`` smoothed.
+    """
+
+    name: str
+    role: str
+    dt: float
+    t: Array
+    u: Array
+    y: Array
+    x: Array
+    xdot: Array
+
+    def part(self, keep: NDArray[np.bool_], name: str, role: str) -> Trajectory:
+        """The samples where ``keep`` ``(n,)`` holds (one contiguous run), under a new name and role."""
+        arrays = {key: getattr(self, key)[keep] for key in ("t", "u", "y", "x", "xdot")}
+        return replace(self, name=name, role=role, **arrays)
+
+
+class Cut(NamedTuple):
+    """A part of a recording that is not used as it was recorded: file name, from and to [s], and why."""
+
+    file: str
+    start: float
+    end: float
+    why: str
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """All recordings of a run.
+
+    Args:
+        trajectories: Pieces for training, validation and test; no sample has two roles.
+        whole: The recordings from first to last sample (one for each side of a gap), role ``""``.
+        cuts: What was left out, and why.
+        files: File names, in the order given.
+        sha256: SHA-256 of each file, in the same order.
+        hash: One hash of all files' names and contents; it does not depend on their order or folder.
+    """
+
+    trajectories: tuple[Trajectory, ...]
+    whole: tuple[Trajectory, ...]
+    cuts: tuple[Cut, ...]
+    files: tuple[str, ...]
+    sha256: tuple[str, ...]
+    hash: str
+
+    def by_role(self, role: Role) -> tuple[Trajectory, ...]:
+        """The trajectories of one role, in order."""
+        return tuple(piece for piece in self.trajectories if piece.role == role)
+
+
+def load_trajectories(
+    paths: Sequence[Path | str],
+    spec: DataSpec,
+    *,
+    outputs: tuple[Signal, ...],
+    inputs: tuple[Signal, ...],
+) -> Dataset:
+    """Read recordings, cut them at gaps, smooth and differentiate, resample to ``spec.dt``, give roles.
+
+    The outputs are the positions ``q``; velocities and accelerations are their derivatives. Smoothing
+    comes before resampling and before the split, never across a gap: a sample's ``x`` and ``xdot`` know at
+    most half of ``spec.smoothing`` of the time before and after it. Parts by ``fractions`` keep that much
+    distance from each other; whoever writes ``windows`` should too.
+
+    Args:
+        paths: CSV files with different stems.
+        spec: Columns, ``dt``, ``max_gap``, ``smoothing``, ``warm_up`` [s] and the split.
+        outputs: Signals of the prior's outputs (positions).
+        inputs: Signals of the prior's inputs.
+
+    Returns:
+        The data set; it has at least one trajectory of each role.
+
+    Raises:
+        InputError: If a recording is bad (see :func:`read_csv`), windows of different roles overlap, a
+            role gets no trajectory, or the sampling is too coarse for ``smoothing``.
+
+    Example:
+        >>> import tempfile
+        >>> from hybrid_mpc.data import write_csv
+        >>> spec = DataSpec("t", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.5)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     t = 0.01 * np.arange(1000)
+        ...     file = write_csv(Path(folder) / "run.csv", {"t": t, "tau": 0 * t, "phi": np.sin(t)})
+        ...     data = load_trajectories([file], spec, outputs=(Signal("phi", "rad"),),
+        ...                              inputs=(Signal("tau", "N m"),))
+        >>> [(piece.name, piece.role, len(piece.t)) for piece in data.trajectories]
+        [('run', 'train', 299), ('run#2', 'valid', 94), ('run#3', 'test', 94)]
+    """
+    if not paths:
+        raise InputError("no recordings given; name at least one CSV file with --data")
+    _check_windows(spec)
+    tables = [read_csv(path, spec, outputs=outputs, inputs=inputs) for path in paths]
+    stems = [table.name for table in tables]
+    if len(set(stems)) < len(stems):
+        raise InputError(
+            f"two recordings have the same file stem: {', '.join(sorted(stems))}. Give each file once, or "
+            "rename one: pieces and windows are named by the stem."
+        )
+    trajectories: list[Trajectory] = []
+    whole: list[Trajectory] = []
+    cuts: list[Cut] = []
+    for table in tables:
+        segments = list(_segments(table, spec, cuts))
+        whole += segments
+        trajectories += _pieces(table, segments, spec, cuts)
+    _check_roles(trajectories, cuts, spec)
+    return Dataset(
+        trajectories=tuple(trajectories),
+        whole=tuple(whole),
+        cuts=tuple(cuts),
+        files=tuple(table.path.name for table in tables),
+        sha256=tuple(table.sha256 for table in tables),
+        hash=_hash(tables),
+    )
+
+
+def _segments(table: Table, spec: DataSpec, cuts: list[Cut]) -> Iterator[Trajectory]:
+    """Smoothed and resampled parts between gaps, numbered; too short ones become cuts."""
+    gaps = np.flatnonzero(np.diff(table.t) > spec.max_gap * (1 + 1e-6))
+    for k in gaps:
+        why = f"gap of {table.t[k + 1] - table.t[k]:.4g} s is longer than max_gap {spec.max_gap:g} s"
+        cuts.append(Cut(table.path.name, float(table.t[k]), float(table.t[k + 1]), why))
+    samples = window_samples(spec.smoothing, table.dt)
+    shortest = max((samples - 1) * table.dt, (_fewest(spec) - 1) * spec.dt) + spec.dt
+    number = 0
+    for rows in np.split(np.arange(len(table.t)), gaps + 1):
+        t = table.t[rows]
+        if t[-1] - t[0] < shortest - TINY:
+            cuts.append(Cut(table.path.name, float(t[0]), float(t[-1]), _too_short(shortest, spec)))
+            continue
+        number += 1
+        yield _resample(table, rows, spec, _numbered(table.name, number))
+
+
+def _resample(table: Table, rows: NDArray[np.intp], spec: DataSpec, name: str) -> Trajectory:
+    t, y, u = table.t[rows], table.y[rows], table.u[rows]
+    n = int(np.floor((t[-1] - t[0]) / spec.dt + TINY))
+    grid = t[0] + spec.dt * np.arange(n)
+    fine = t[0] + table.dt * np.arange(int(np.floor((t[-1] - t[0]) / table.dt + TINY)) + 1)
+    smooth = local_polynomial(_interpolate(t, y, fine), table.dt, spec.smoothing)
+    q, v, a = (CubicSpline(fine, z)(grid) for z in (smooth.value, smooth.first, smooth.second))
+    return Trajectory(
+        name=name,
+        role="",
+        dt=spec.dt,
+        t=grid,
+        u=hold_mean(t, u, grid, spec.dt),
+        y=_interpolate(t, y, grid),
+        x=np.hstack([q, v]),
+        xdot=np.hstack([v, a]),
+    )
+
+
+def hold_mean(t: Array, u: Array, grid: Array, dt: float) -> Array:
+    """Mean over ``[T_k, T_k + dt)`` of an input recorded as a zero-order hold: exact, whatever the stamps.
+
+    Args:
+        t: Recorded time stamps ``(m,)`` [s].
+        u: Recorded inputs ``(m, n_u)``, each held until the next time stamp.
+        grid: Times ``T_k`` ``(n,)`` [s] within the recording; before its start or after its end the
+            integral is constant, that is, the input counts as zero.
+        dt: Period [s].
+
+    Returns:
+        Means ``(n, n_u)``; their integral over the grid is the recording's.
+
+    Example:
+        >>> hold_mean(np.array([0.0, 0.1, 0.2]), np.array([[1.0], [3.0], [9.0]]), np.array([0.0]), 0.2)
+        array([[2.]])
+    """
+    integral = np.vstack([np.zeros((1, u.shape[1])), np.cumsum(u[:-1] * np.diff(t)[:, None], axis=0)])
+    return (_interpolate(t, integral, grid + dt) - _interpolate(t, integral, grid)) / dt
+
+
+def _interpolate(t: Array, z: Array, grid: Array) -> Array:
+    """Linear interpolation of each column of ``z`` ``(m, n_z)``."""
+    return np.column_stack([np.interp(grid, t, column) for column in z.T])
+
+
+def _pieces(table: Table, segments: list[Trajectory], spec: DataSpec, cuts: list[Cut]) -> list[Trajectory]:
+    """Intersections of windows and segments, in order of time; too short ones become cuts."""
+    pieces: list[Trajectory] = []
+    for window in sorted(_windows(table, spec), key=lambda window: window.start):
+        for segment in segments:
+            keep = (segment.t >= window.start - TINY) & (segment.t + spec.dt <= window.end + TINY)
+            if not keep.any():
+                continue
+            piece = segment.part(keep, _numbered(table.name, len(pieces) + 1), window.role)
+            if len(piece.t) >= _fewest(spec):
+                pieces.append(piece)
+            else:
+                why = f"{window.role}: " + _too_short(_fewest(spec) * spec.dt, spec)
+                cuts.append(Cut(table.path.name, float(piece.t[0]), float(piece.t[-1]), why))
+    return pieces
+
+
+def _windows(table: Table, spec: DataSpec) -> tuple[Window, ...]:
+    """The file's named windows, or its parts by fractions with the smoothing length between them."""
+    if table.name in spec.windows:
+        return tuple(spec.windows[table.name])
+    start, length = float(table.t[0]), float(table.t[-1] - table.t[0])
+    windows: list[Window] = []
+    for role, fraction in zip(ROLES, spec.fractions, strict=True):
+        if fraction > 0:
+            distance = spec.smoothing if windows else 0.0
+            windows.append(Window(start + distance, start + fraction * length, role))
+            start += fraction * length
+    last = windows[-1]
+    windows[-1] = replace(last, end=last.end + spec.dt)
+    return tuple(windows)
+
+
+def _check_windows(spec: DataSpec) -> None:
+    for stem, windows in spec.windows.items():
+        ordered = sorted(windows, key=lambda window: window.start)
+        for window in ordered:
+            if not window.start < window.end or window.role not in ROLES:
+                raise InputError(
+                    f"data specification: window {window} of {stem} needs start < end and one of {ROLES}"
+                )
+        for one, two in pairwise(ordered):
+            if two.start < one.end:
+                raise InputError(
+                    f"windows overlap in {stem}: {one.role} {one.start:g} to {one.end:g} s, "
+                    f"{two.role} {two.start:g} to {two.end:g} s. A sample can have one role only."
+                )
+
+
+def _check_roles(trajectories: list[Trajectory], cuts: list[Cut], spec: DataSpec) -> None:
+    missing = [role for role in ROLES if all(piece.role != role for piece in trajectories)]
+    if missing:
+        dropped = "".join(f"\n  {cut.file} {cut.start:g} to {cut.end:g} s: {cut.why}" for cut in cuts)
+        raise InputError(
+            f"no piece of {_fewest(spec) * spec.dt:g} s or more is left for {' and '.join(missing)}. "
+            "Give more or longer recordings, or change windows, fractions or max_gap in the DataSpec."
+            + (f" Cut out:{dropped}" if dropped else "")
+        )
+
+
+def _fewest(spec: DataSpec) -> int:
+    """Fewest samples of a piece: the warm-up and a handful to score."""
+    return int(np.ceil(spec.warm_up / spec.dt - TINY)) + MIN_SCORED
+
+
+def _too_short(need: float, spec: DataSpec) -> str:
+    return f"shorter than the {need:.4g} s that warm-up ({spec.warm_up:g} s) and smoothing need"
+
+
+def _numbered(stem: str, number: int) -> str:
+    return stem if number == 1 else f"{stem}#{number}"
+
+
+def _hash(tables: list[Table]) -> str:
+    lines = sorted(f"{table.name} {table.sha256}\n" for table in tables)
+    return hashlib.sha256("".join(lines).encode()).hexdigest()

@@ -1,0 +1,77 @@
+"""The torque-driven simple pendulum, a real rig: swing-ups recorded under several controllers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from hybrid_mpc.scenario import ControlSpec, DataSpec, Scenario, Window
+
+if TYPE_CHECKING:
+    from hybrid_mpc.physics import Prior
+
+DESCRIPTION = """\
+A point mass of 0.546 kg on a rod of 0.5 m, driven through a 6:1 gear; phi = 0 hangs down. Recordings:
+DFKI Robotics Innovation Center, torque_limited_simple_pendulum (BSD-3-Clause, 2021). Input is the
+commanded torque: it explains the motion as well as the measured current does, is free of its noise, and
+the measured torque lags it by 7 to 20 ms. In most runs a person pushes the pendulum outside the windows
+used here: never trained on, and just what the online monitor should notice. Recordings named
+*_closed_loop have a drive with an inner controller and no column of commanded torque; they are refused.
+To use them, name tau_meas_Nm as input in a scenario of your own."""
+
+WINDOWS: Mapping[str, tuple[Window, ...]] = {
+    "energy_shaping_0p9Nm": (
+        Window(0.0, 5.0, "train"),  # swing-up and first catch
+        Window(8.0, 10.0, "test"),  # fall through the bottom and catch on the other side
+        Window(13.0, 15.0, "valid"),  # the same in the other direction
+    ),
+    "energy_shaping_1p5Nm": (
+        Window(0.0, 1.3, "train"),  # first swing at the larger torque: tells k_u and friction apart
+        Window(1.5, 3.5, "test"),  # last swing to the top
+        Window(3.7, 4.9, "valid"),  # standing at the top; later nothing new happens
+    ),
+    "sac_0p9Nm": (Window(0.1, 6.0, "train"),),
+    "ilqr_0p9Nm": (
+        Window(0.0, 2.0, "train"),
+        Window(4.0, 6.0, "valid"),
+        Window(11.0, 14.0, "train"),
+        Window(14.2, 17.5, "test"),
+    ),
+}
+"""Windows without a hand on the pendulum; roles are at least one smoothing length apart."""
+
+
+def make_prior(values: Mapping[str, float] | None = None) -> Prior:
+    """The prior with the given parameter values; torch is imported here and not before."""
+    from scenarios.torque_pendulum.prior import TorquePendulumPrior
+
+    return TorquePendulumPrior(values)
+
+
+scenario = Scenario(
+    name="torque_pendulum",
+    title="Torque-driven pendulum (real recordings)",
+    description=DESCRIPTION,
+    prior=make_prior,
+    data=DataSpec(
+        time="time_s",
+        inputs=("tau_cmd_Nm",),
+        outputs=("pos_rad",),
+        dt=0.02,
+        max_gap=0.05,
+        smoothing=0.2,
+        warm_up=0.5,
+        windows=WINDOWS,
+    ),
+    control=ControlSpec(
+        horizon=50,
+        # Bryson: 1 / (largest acceptable deviation)^2: 0.2 rad, 2 rad/s, 0.9 N m, 0.5 N m a period
+        q=(25.0, 0.25),
+        r=(1.23,),
+        r_delta=(4.0,),
+        u_min=(-0.9,),
+        u_max=(0.9,),
+        # encoder step 0.0029 rad / sqrt(12), doubled for backlash and vibration
+        estimator_sigma=(0.0017,),
+    ),
+)

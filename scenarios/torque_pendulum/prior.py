@@ -1,0 +1,63 @@
+"""Prior of the torque-driven pendulum: rigid rod, viscous and dry friction."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from hybrid_mpc.physics import Prior
+from hybrid_mpc.signals import Parameter, Signal
+
+FRICTION_SPEED = 0.1
+"""Speed [rad/s] over which dry friction changes its sign, about the noise of the measured speed."""
+
+
+class TorquePendulumPrior(Prior):
+    r"""``J phi_ddot = k_u u - mgl sin(phi) - d phi_dot - F_c tanh(phi_dot / v_c)``; phi = 0 hangs down.
+
+    Motion alone fixes only the ratios of ``J, mgl, d, F_c, k_u``, so ``J`` keeps its data-sheet value and
+    the others are fitted relative to it. A fitted ``k_u`` below 1 holds the drive's losses and torque
+    constant and the error of ``J``. Energy shaping commands ``u`` with the sign of the speed, which makes
+    ``k_u`` and ``F_c`` hard to tell apart in one recording; fit runs of different torque together.
+
+    Example:
+        >>> prior = TorquePendulumPrior()
+        >>> prior(torch.zeros(2), torch.tensor([0.15])).tolist()
+        [0.0, 1.0]
+    """
+
+    states: ClassVar[tuple[Signal, ...]] = (
+        Signal("phi", "rad", -40.0, 40.0, periodic=True),
+        Signal("phi_dot", "rad/s", -40.0, 40.0),
+    )
+    inputs: ClassVar[tuple[Signal, ...]] = (Signal("torque", "N m", -5.0, 5.0),)
+    outputs: ClassVar[tuple[Signal, ...]] = (states[0],)
+    parameters_spec: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("J", 0.15, "kg m^2", 0.15, 0.15, "inertia about the axis (fixed: only ratios show)"),
+        Parameter("mgl", 2.98, "N m", 2.0, 4.0, "largest gravity torque"),
+        Parameter("d", 0.005, "N m s/rad", 0.0, 0.1, "viscous friction"),
+        Parameter("F_c", 0.19, "N m", 0.0, 0.5, "dry friction"),
+        Parameter("k_u", 1.0, "-", 0.5, 1.2, "true over commanded torque"),
+    )
+
+    mgl: Tensor
+    d: Tensor
+    J: Tensor
+    F_c: Tensor
+    k_u: Tensor
+
+    def _losses(self, v: Tensor) -> Tensor:
+        return self.d * v + self.F_c * torch.tanh(v / FRICTION_SPEED)
+
+    def acceleration(self, x: Tensor, u: Tensor) -> Tensor:
+        """Angular acceleration ``(..., 1)`` [rad/s^2]."""
+        phi, v = x[..., 0:1], x[..., 1:2]
+        return (self.k_u * u - self.mgl * torch.sin(phi) - self._losses(v)) / self.J
+
+    def energy_balance(self, x: Tensor, xdot: Tensor, u: Tensor) -> Tensor:
+        """Power [W] that no term of the prior explains, shape ``(...)``."""
+        phi, v, a = x[..., 0], x[..., 1], xdot[..., 1]
+        torque = self.J * a + self.mgl * torch.sin(phi) + self._losses(v) - self.k_u * u[..., 0]
+        return torque * v

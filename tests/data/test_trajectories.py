@@ -1,0 +1,84 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hybrid_mpc.data import load_trajectories, write_csv
+from hybrid_mpc.data.trajectories import hold_mean
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.scenario import DataSpec, Window
+from hybrid_mpc.signals import Signal
+
+SPEC = DataSpec("t", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.2)
+SIGNALS = {"outputs": (Signal("phi", "rad"),), "inputs": (Signal("torque", "N m"),)}
+
+
+def record(path, t, phi=np.sin):
+    return write_csv(path, {"t": t, "tau": np.sign(np.cos(7 * t)), "phi": phi(t)})
+
+
+def test_states_and_derivatives_of_a_known_motion(tmp_path):
+    t = np.arange(0, 5, 0.005) + np.random.default_rng(0).uniform(0, 1e-4, 1000)  # jittered stamps
+    data = load_trajectories([record(tmp_path / "run.csv", t)], SPEC, **SIGNALS)
+    whole = data.whole[0]
+    # linear interpolation of the jitter: h j / 2 = 0.005 * 1e-4 / 2 = 2.5e-7, times filter gains (<= 1e3)
+    np.testing.assert_allclose(whole.x, np.c_[np.sin(whole.t), np.cos(whole.t)], atol=2e-5)
+    inner = slice(5, -5)
+    np.testing.assert_allclose(whole.xdot[inner, 1], -np.sin(whole.t)[inner], atol=2.5e-3)
+    np.testing.assert_allclose(np.diff(whole.t), SPEC.dt, atol=1e-12)
+    assert [piece.role for piece in data.trajectories] == ["train", "valid", "test"]
+
+
+def test_hold_mean_keeps_the_impulse():
+    rng = np.random.default_rng(2)
+    t = np.cumsum(rng.uniform(0.001, 0.009, 400))
+    u = rng.standard_normal((400, 2))
+    dt = 0.02
+    grid = t[0] + dt * np.arange(int((t[-1] - t[0]) / dt) + 1)  # the last period ends after the record
+    impulse = (u[:-1] * np.diff(t)[:, None]).sum(axis=0)
+    np.testing.assert_allclose(hold_mean(t, u, grid, dt).sum(axis=0) * dt, impulse, atol=1e-12)
+
+
+def test_gap_cuts_and_nothing_leaks_across_it(tmp_path):
+    t = np.r_[np.arange(0, 3, 0.01), np.arange(3.2, 6, 0.01)]
+    before = load_trajectories([record(tmp_path / "a.csv", t)], SPEC, **SIGNALS)
+    after = load_trajectories(
+        [record(tmp_path / "a.csv", t, lambda t: np.where(t > 3.1, 5.0, np.sin(t)))], SPEC, **SIGNALS
+    )
+    assert [(piece.name, piece.role) for piece in before.whole] == [("a", ""), ("a#2", "")]
+    np.testing.assert_array_equal(before.whole[0].x, after.whole[0].x)
+    assert before.hash != after.hash
+    (cut,) = [cut for cut in before.cuts if "gap" in cut.why]
+    assert (cut.file, cut.start, cut.end) == ("a.csv", 2.99, 3.2)
+
+
+def test_windows_give_disjoint_roles_and_short_ones_are_reported(tmp_path):
+    windows = (
+        Window(0, 2, "train"),
+        Window(2.2, 2.4, "train"),
+        Window(3, 4, "valid"),
+        Window(4.2, 6, "test"),
+    )
+    spec = replace(SPEC, windows={"a": windows})
+    data = load_trajectories([record(tmp_path / "a.csv", np.arange(0, 6.01, 0.01))], spec, **SIGNALS)
+    times = np.concatenate([piece.t for piece in data.trajectories])
+    assert len(np.unique(times)) == len(times)
+    assert [cut.start for cut in data.cuts] == pytest.approx([2.2])
+    for piece, window in zip(data.trajectories, (windows[0], *windows[2:]), strict=True):
+        assert piece.role == window.role
+        assert piece.t[0] >= window.start - 1e-6
+        assert piece.t[-1] + piece.dt <= window.end + 1e-6
+
+
+def test_what_cannot_be_split_is_refused(tmp_path):
+    file = record(tmp_path / "a.csv", np.arange(0, 6, 0.01))
+    only = replace(SPEC, windows={"a": (Window(0, 5, "train"),)})
+    with pytest.raises(InputError, match="left for valid and test"):
+        load_trajectories([file], only, **SIGNALS)
+    double = replace(SPEC, windows={"a": (Window(0, 5, "train"), Window(4, 6, "test"))})
+    with pytest.raises(InputError, match="overlap"):
+        load_trajectories([file], double, **SIGNALS)
+    with pytest.raises(InputError, match="same file stem"):
+        load_trajectories([file, file], SPEC, **SIGNALS)
+    with pytest.raises(InputError, match="no recordings"):
+        load_trajectories([], SPEC, **SIGNALS)
