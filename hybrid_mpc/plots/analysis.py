@@ -9,11 +9,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import MultipleLocator
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.plots.style import (
     FAINT,
     Array,
+    axis_label,
     checked,
     colour,
     line_style,
@@ -47,10 +49,10 @@ def pole_map(poles: Mapping[str, Any], dt: float) -> Figure:
     figure, axes = new_figure(1, 2, size=(10, 5.4))
     extent = max(1.08, *(1.05 * float(np.abs(p).max()) for p in values.values() if len(p)))
     near = np.concatenate([p[np.abs(p - 1.0) < 0.35] for p in values.values()])
-    half = max(0.02, 1.3 * float(np.abs(near - 1.0).max())) if len(near) else 0.3
+    half = _half_width(near)
     whole, zoom = axes[0]
-    for ax in (whole, zoom):
-        _z_grid(ax, dt)
+    for ax, spacing in ((whole, 0.1 * np.pi / dt), (zoom, _round(half / dt / 5))):
+        _z_grid(ax, dt, spacing)
         for model, p in values.items():
             open_marker = _MARKERS.get(model, "D") != "x"
             ax.scatter(
@@ -73,13 +75,29 @@ def pole_map(poles: Mapping[str, Any], dt: float) -> Figure:
     zoom.set_ylim(-0.675 * half, 0.675 * half)
     box = (1.0 - half, -0.675 * half), 1.35 * half, 1.35 * half
     whole.add_patch(Rectangle(*box, fill=False, edgecolor="black", linewidth=0.8, zorder=5))
-    title_axes(whole, "z-plane (stable inside the circle)")
-    title_axes(zoom, "enlarged: slow poles near z = 1")
+    grid = "grid: damping ratio, natural frequency every {:.3g} rad/s"
+    title_axes(whole, "z-plane, stable inside the circle\n" + grid.format(0.1 * np.pi / dt))
+    title_axes(zoom, "the frame enlarged: slow poles near z = 1\n" + grid.format(_round(half / dt / 5)))
     shared_legend(figure)
     return figure
 
 
-def _z_grid(ax: Axes, dt: float) -> None:
+def _half_width(near: Any) -> float:
+    """Size of the enlarged frame [1 - h, 1 + 0.35 h] x [-0.675 h, 0.675 h] that holds all these poles."""
+    if not len(near):
+        return 0.3
+    d = near - 1.0
+    reach = np.maximum.reduce([-d.real, d.real / 0.35, np.abs(d.imag) / 0.675])
+    return max(0.02, 1.2 * float(reach.max()))
+
+
+def _round(value: float) -> float:
+    """The nearest of 1, 2, 5 times a power of ten below ``value``."""
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(max(step for step in (1.0, 2.0, 5.0) if step <= value / power + 1e-9) * power)
+
+
+def _z_grid(ax: Axes, dt: float, spacing: float) -> None:
     ax.grid(False)
     angle = np.linspace(0.0, 2.0 * np.pi, 721)
     ax.plot(np.cos(angle), np.sin(angle), color="black", linewidth=1.2)
@@ -99,21 +117,12 @@ def _z_grid(ax: Axes, dt: float) -> None:
             clip_on=True,
             annotation_clip=True,
         )
-    for share in np.arange(0.1, 1.01, 0.1):
+    turns = np.arange(spacing * dt, np.pi * 1.001, spacing * dt)
+    for turn in turns[:40]:
         damping_angle = np.linspace(np.pi / 2, np.pi, 120)
-        z = np.exp(share * np.pi * np.exp(1j * damping_angle))
+        z = np.exp(turn * np.exp(1j * damping_angle))
         for side in (z, z.conj()):
             ax.plot(side.real, side.imag, color="#dedede", linewidth=0.7, zorder=1)
-    ax.text(
-        0.02,
-        0.02,
-        f"grid: damping ratio [-] and every\n{0.1 * np.pi / dt:.3g} rad/s of natural frequency",
-        transform=ax.transAxes,
-        fontsize=7.5,
-        color="#555555",
-        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.5},
-        zorder=6,
-    )
 
 
 def bode(
@@ -152,11 +161,12 @@ def bode(
             ax.axvline(nyquist, color=FAINT, linestyle=":", label="Nyquist frequency")
         ax.grid(True, which="minor", color="#eeeeee", linewidth=0.4)
         ax.margins(x=0)
-    unit = f"({output_signal.unit})/({input_signal.unit})"
+    unit = "/".join(f"({s.unit})" if " " in s.unit else s.unit for s in (output_signal, input_signal))
     magnitude_ax.set_ylabel(f"magnitude\n[{unit}]")
     phase_ax.set_ylabel("phase [°]")
     phase_ax.set_xlabel("angular frequency [rad/s]")
-    title_axes(magnitude_ax, f"from {input_signal.label} to {output_signal.label}".replace("_", " "))
+    title_axes(magnitude_ax, f"from {axis_label(input_signal)} to {axis_label(output_signal)}")
+    phase_ax.yaxis.set_major_locator(MultipleLocator(45))
     figure.align_ylabels([magnitude_ax, phase_ax])
     shared_legend(figure)
     return figure

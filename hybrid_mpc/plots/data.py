@@ -114,10 +114,10 @@ def coverage(trajectories: Sequence[Recording], states: Sequence[Signal]) -> Fig
     n_q = len(states) // 2
     figure, axes = new_figure(1, n_q, size=(6.8 if n_q == 1 else 5.0 * n_q, 4.6))
     for q, ax in enumerate(axes[0]):
-        for role in ROLES:
+        for role in ("train", "test"):
             for piece in (p for p in trajectories if p.role == role):
                 x = checked(f"x of {piece.name}", piece.x, len(piece.t), len(states))
-                width = 2.2 if role == "train" else 0.9
+                width = 2.4 if role == "train" else 1.0
                 ax.plot(x[:, q], x[:, n_q + q], color=colour(role), linewidth=width, label=name_of(role))
         ax.set_xlabel(axis_label(states[q]))
         ax.set_ylabel(axis_label(states[n_q + q]))

@@ -84,12 +84,12 @@ def free_run(
         values = checked("u", u, len(t), len(inputs))[:, i]
         ax.plot(t, values, color=INK, linewidth=1.0, drawstyle="steps-post")
         ax.set_ylabel(axis_label(signal))
-    column[-2].plot(t, balances[0], **line_style("measured"))
+    column[-2].plot(t, balances[0], **(line_style("measured") | {"linewidth": 1.0}))
     column[-2].plot(t, balances[1], **line_style(energy_name))
-    column[-2].set_ylabel(r"$\Delta E$ [W]")
+    column[-2].set_ylabel("balance\n" r"$\Delta E$ [W]")
     column[-1].fill_between(t, gap, color=colour(energy_name), alpha=0.35, linewidth=0)
     column[-1].plot(t, gap, color=colour(energy_name), linewidth=0.8)
-    column[-1].set_ylabel(r"violation $\Delta$ [W]")
+    column[-1].set_ylabel("violation\n" r"$\Delta$ [W]")
     for ax in column:
         if warm_up > 0:
             ax.axvspan(t[0], t[0] + warm_up, color="#dddddd", lw=0, zorder=0, label="warm-up, not scored")
@@ -146,16 +146,19 @@ def errors_bar(
     if not shown:
         raise InputError(f"plot of the errors: no model has any of {', '.join(metrics)}")
     figure, axes = new_figure(1, len(shown), size=(max(5.0, 3.4 * len(shown)), 4.2))
+    line = f"{name_of(reference)}: the line to beat"
     for ax, metric in zip(axes[0], shown, strict=True):
         values = {model: v[metric] for model, v in errors.items() if metric in v}
         bars = {model: (spread or {}).get(model, {}).get(metric, 0.0) for model in values}
         _bars(ax, values, bars)
         if reference in values:
-            ax.axhline(values[reference], color=colour(reference), linestyle="--", linewidth=1.1, zorder=4)
+            ax.axhline(
+                values[reference], color=colour(reference), linestyle="--", lw=1.1, zorder=4, label=line
+            )
         ax.set_ylabel(metrics[metric])
         ax.set_xticks([])
         ax.grid(False, axis="x")
-    shared_legend(figure, columns=5)
+    shared_legend(figure, columns=6)
     return figure
 
 
@@ -174,8 +177,10 @@ def _bars(ax: Axes, values: Mapping[str, float], spread: Mapping[str, float]) ->
             xytext=(0, 3),
             textcoords="offset points",
             ha="center",
-            fontsize=9,
+            fontsize=8.5,
             color=INK,
+            zorder=5,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 0.6},
         )
     ax.set_ylim(0, top if top > 0 else 1.0)
 

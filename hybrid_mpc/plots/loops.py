@@ -20,6 +20,7 @@ from hybrid_mpc.plots.style import (
     name_of,
     new_figure,
     number,
+    plain_log,
     shared_legend,
     title_axes,
 )
@@ -147,8 +148,11 @@ def solve_times(times_ms: Mapping[str, Array], period_ms: float) -> Figure:
         ax.set_xscale("log")
         ax.set_xlim(bins[0], bins[-1])
         ax.set_xlabel("duration of a controller step [ms]")
+    for ax in (left, right):
+        plain_log(ax.xaxis, bins[0], bins[-1])
     left.set_ylabel("share of steps [%]")
     right.set_yscale("log")
+    plain_log(right.yaxis, *right.get_ylim())
     right.axhline(1.0, color=FAINT, linestyle=":", label="1 % of the steps (p99)")
     right.set_ylabel("share of longer steps [%]")
     title_axes(left, "distribution")

@@ -12,8 +12,11 @@ from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
@@ -157,7 +160,8 @@ def new_figure(
         >>> axes.shape
         (2, 1)
     """
-    figure = Figure(figsize=size or (10.0, max(3.6, 2.2 * rows)), dpi=DPI, layout="constrained")
+    layout = ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.06)
+    figure = Figure(figsize=size or (10.0, max(3.6, 2.2 * rows)), dpi=DPI, layout=layout)
     FigureCanvasAgg(figure)
     ratios = None if heights is None else list(heights)
     axes = figure.subplots(rows, cols, squeeze=False, sharex=sharex, sharey=sharey, height_ratios=ratios)
@@ -200,6 +204,14 @@ def shared_legend(figure: Figure, *, columns: int = 7) -> None:
         frameon=False,
         fontsize=9,
     )
+
+
+def plain_log(axis: Axis, lowest: float, highest: float) -> None:
+    """Plain numbers (0.1, 1, 10) on a logarithmic axis; 2 and 5 as well where it spans little."""
+    narrow = highest < 100 * lowest
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if narrow else (1.0,)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def number(value: float) -> str:

@@ -16,6 +16,7 @@ from hybrid_mpc.plots.style import (
     colour,
     name_of,
     new_figure,
+    plain_log,
     shared_legend,
     title_axes,
 )
@@ -69,17 +70,20 @@ def curves(
         column[-1].set_xlabel("optimiser step [-]")
     for row, (_, _, label), unit in zip(axes, _ROWS, units, strict=True):
         row[0].set_ylabel(label.replace("[-]", f"[{unit}]"))
+        if any(ax.get_yscale() == "log" for ax in row):
+            plain_log(row[0].yaxis, *row[0].get_ylim())
+    figure.align_ylabels(list(axes[:, 0]))
     shared_legend(figure)
     return figure
 
 
 def _curve(ax: Axes, model: str, step: Any, values: Any, name: str) -> None:
     if values is None:
-        ax.text(0.5, 0.5, "not used", transform=ax.transAxes, ha="center", color=FAINT, fontsize=9)
+        ax.text(0.25, 0.5, "not used", transform=ax.transAxes, ha="center", color=FAINT, fontsize=9)
         return
     array = checked(f"{name} of {model}", values, len(step))
     taken = np.isfinite(array) & (array > 0)
     marker = "o" if name == "validation" else ""
-    ax.plot(step[taken], array[taken], color=colour(model), lw=1.1, marker=marker, ms=3, label=name_of(model))
+    ax.plot(step[taken], array[taken], color=colour(model), lw=1.1, marker=marker, ms=3)
     if taken.any():
         ax.set_yscale("log")

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_mpc.plots import analysis, data, fit, loops, monitor, save, training
+from hybrid_mpc.plots.style import name_of
 from hybrid_mpc.report import KeyFigure, Report, Section, Table, write_report
 from hybrid_mpc.report.texts import TITLES, paragraphs
 from hybrid_mpc.signals import Signal
@@ -191,7 +192,7 @@ def report(folder: Path) -> Report:
     )
     results = Table(
         ("model", "E_sim [s]", "RMSE [rad]", "violation [W]"),
-        tuple((m, *ERRORS[m].values()) for m in MODELS),
+        tuple((name_of(m), *ERRORS[m].values()) for m in MODELS),
         "Errors on test data.",
     )
     tables = {"models": (table,), "free_run": (results,)}
