@@ -51,8 +51,9 @@ def pole_map(poles: Mapping[str, Any], dt: float) -> Figure:
     near = np.concatenate([p[np.abs(p - 1.0) < 0.35] for p in values.values()])
     half = _half_width(near)
     whole, zoom = axes[0]
-    for ax, spacing in ((whole, 0.1 * np.pi / dt), (zoom, _round(half / dt / 5))):
-        _z_grid(ax, dt, spacing)
+    grids = (whole, 0.1 * np.pi / dt, 0.6), (zoom, _round(half / dt / 5), 0.5 * half)
+    for ax, spacing, reach in grids:
+        _z_grid(ax, dt, spacing, reach)
         for model, p in values.items():
             open_marker = _MARKERS.get(model, "D") != "x"
             ax.scatter(
@@ -97,16 +98,16 @@ def _round(value: float) -> float:
     return float(max(step for step in (1.0, 2.0, 5.0) if step <= value / power + 1e-9) * power)
 
 
-def _z_grid(ax: Axes, dt: float, spacing: float) -> None:
+def _z_grid(ax: Axes, dt: float, spacing: float, reach: float) -> None:
     ax.grid(False)
     angle = np.linspace(0.0, 2.0 * np.pi, 721)
     ax.plot(np.cos(angle), np.sin(angle), color="black", linewidth=1.2)
     for damping in _DAMPING:
-        omega = np.linspace(0.0, np.pi / np.sqrt(1.0 - damping**2), 300)
+        omega = np.linspace(0.0, np.pi / np.sqrt(1.0 - damping**2), 2000)
         z = np.exp(omega * (-damping + 1j * np.sqrt(1.0 - damping**2)))
         for side in (z, z.conj()):
             ax.plot(side.real, side.imag, color="#c9c9c9", linewidth=0.7, zorder=1)
-        at = 60
+        at = int(np.argmin(np.abs(np.abs(z - 1.0) - reach)))
         ax.annotate(
             f"{damping:g}",
             (z[at].real, z[at].imag),

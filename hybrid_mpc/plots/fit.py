@@ -118,7 +118,7 @@ def _states(
 
 
 def errors_bar(
-    errors: Mapping[str, Mapping[str, float]],
+    errors: Mapping[str, Mapping[str, float | None]],
     *,
     spread: Mapping[str, Mapping[str, float]] | None = None,
     metrics: Mapping[str, str] = METRICS,
@@ -127,7 +127,7 @@ def errors_bar(
     """Errors of the models, one panel a metric, with the fitted prior as the line to beat.
 
     Args:
-        errors: ``{model: {metric: value}}``; a missing value leaves a gap.
+        errors: ``{model: {metric: value}}``; a missing value or None leaves a gap.
         spread: Standard deviation over the trained networks in the same form. Default: none drawn.
         metrics: Axis label with unit by metric name. Default: the three of ``results.json``.
         reference: Model whose value is drawn as a line. Default: ``"phy"``.
@@ -142,13 +142,14 @@ def errors_bar(
         >>> len(errors_bar({"phy": {"e_sim_s": 0.2}, "mopgrnn": {"e_sim_s": 0.1}}).axes)
         1
     """
-    shown = [m for m in metrics if any(m in values for values in errors.values())]
+    shown = [m for m in metrics if any(values.get(m) is not None for values in errors.values())]
     if not shown:
         raise InputError(f"plot of the errors: no model has any of {', '.join(metrics)}")
     figure, axes = new_figure(1, len(shown), size=(max(5.0, 3.4 * len(shown)), 4.2))
     line = f"{name_of(reference)}: the line to beat"
     for ax, metric in zip(axes[0], shown, strict=True):
-        values = {model: v[metric] for model, v in errors.items() if metric in v}
+        found = {model: v.get(metric) for model, v in errors.items()}
+        values = {model: value for model, value in found.items() if value is not None}
         bars = {model: (spread or {}).get(model, {}).get(metric, 0.0) for model in values}
         _bars(ax, values, bars)
         if reference in values:

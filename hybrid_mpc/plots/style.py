@@ -99,7 +99,7 @@ def plain(text: str) -> str:
 
     Example:
         >>> plain("run $1")
-        'run \\\\$1'
+        'run \\$1'
     """
     return text.replace("$", r"\$")
 

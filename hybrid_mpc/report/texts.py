@@ -177,13 +177,13 @@ TEXTS: Mapping[str, tuple[Markup, ...]] = {
             "minus the power put in. For a pendulum of inertia <i>J</i>, mass <i>m</i>, distance <i>l</i> "
             "of the centre of mass and damping <i>d</i>:"
             '<span class="formula">Δ<i>E</i> = <i>J</i> <i>φ̈</i> <i>φ̇</i> + <i>m g l</i> <i>φ̇</i> '
-            "sin <i>φ</i> + <i>d</i> <i>φ̇</i><sup>2</sup> − <i>u</i> <i>φ̇</i> &nbsp; [W]</span>"
+            "sin <i>φ</i> + <i>d</i> <i>φ̇</i><sup>2</sup> − <i>u</i> <i>φ̇</i>&nbsp;&nbsp;[W]</span>"
             "It is zero along the prior's own motion. Δ<i>E</i><sub>S</sub> puts the measured motion "
             "in, Δ<i>E</i><sub>M</sub> the model's. It is a power, although the source calls it an energy."
         ),
         _M(
             "<b>Violation.</b> The distance of the two balances:"
-            '<span class="formula">Δ = |Δ<i>E</i><sub>M</sub> − Δ<i>E</i><sub>S</sub>| &nbsp; [W]</span>'
+            '<span class="formula">Δ = |Δ<i>E</i><sub>M</sub> − Δ<i>E</i><sub>S</sub>|&nbsp;&nbsp;[W]</span>'
             "What both leave out cancels; what only one of them shows remains."
         ),
     ),
