@@ -42,6 +42,10 @@ def pole_map(poles: Mapping[str, Any], dt: float) -> Figure:
 
     Raises:
         InputError: If there is no pole or ``dt`` is not positive.
+
+    Example:
+        >>> len(pole_map({"phy": [0.9 + 0.1j, 0.9 - 0.1j]}, 0.02).axes)
+        2
     """
     values = {m: np.ravel(np.asarray(p, dtype=complex)) for m, p in poles.items()}
     if not dt > 0 or not any(len(p) for p in values.values()):
@@ -147,6 +151,13 @@ def bode(
 
     Raises:
         InputError: If there is no model or lengths differ.
+
+    Example:
+        >>> omega = np.array([0.1, 1.0, 10.0])
+        >>> response = (omega, 1 / omega, np.full(3, -np.pi / 2))
+        >>> u, y = Signal("v", "m/s"), Signal("q", "m")
+        >>> len(bode({"phy": response}, input_signal=u, output_signal=y).axes)
+        2
     """
     if not responses:
         raise InputError("Bode plot: there is no model to draw")

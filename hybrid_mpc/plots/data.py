@@ -72,6 +72,14 @@ def recordings(
 
     Raises:
         InputError: If there is no trajectory, or its shapes do not fit the signals.
+
+    Example:
+        >>> import numpy as np
+        >>> from types import SimpleNamespace as Piece
+        >>> t, y = np.array([0.0, 0.1]), np.zeros((2, 1))
+        >>> piece = Piece(name="a", role="train", t=t, y=y, u=y, x=np.zeros((2, 2)))
+        >>> len(recordings([piece], [Signal("q", "m")], [Signal("F", "N")]).axes)
+        2
     """
     chosen = _chosen(trajectories, limit)
     signals = (*outputs, *inputs)
@@ -108,6 +116,13 @@ def coverage(trajectories: Sequence[Recording], states: Sequence[Signal]) -> Fig
 
     Raises:
         InputError: If there is no trajectory, or its shapes do not fit the signals.
+
+    Example:
+        >>> import numpy as np
+        >>> from types import SimpleNamespace as Piece
+        >>> piece = Piece(name="a", role="train", t=np.zeros(2), x=np.zeros((2, 2)))
+        >>> len(coverage([piece], [Signal("q", "m"), Signal("v", "m/s")]).axes)
+        1
     """
     if not trajectories:
         raise InputError("plot of the coverage: there is no recording to draw")

@@ -69,6 +69,14 @@ def free_run(
 
     Raises:
         InputError: If shapes do not fit.
+
+    Example:
+        >>> t, x, u, power = np.array([0.0, 0.1]), np.zeros((2, 2)), np.zeros((2, 1)), np.zeros(2)
+        >>> states, inputs = (Signal("q", "m"), Signal("v", "m/s")), (Signal("F", "N"),)
+        >>> figure = free_run(t, x, {"mopgrnn": x}, u, states=states, inputs=inputs,
+        ...                   energy_measured=power, energy_model=power)
+        >>> len(figure.axes)
+        5
     """
     t = np.asarray(t, dtype=float)
     balances = [checked("energy balance", e, len(t)) for e in (energy_measured, energy_model)]
@@ -198,6 +206,10 @@ def parity(errors: Mapping[str, Array], tolerances: Mapping[str, float]) -> Figu
 
     Raises:
         InputError: If there is nothing to draw.
+
+    Example:
+        >>> len(parity({"values": np.array([0.0, 1e-16])}, {"values": 1e-12}).axes)
+        1
     """
     if not errors:
         raise InputError("plot of the parity: there is no difference to draw")

@@ -72,6 +72,13 @@ def closed_loops(
 
     Raises:
         InputError: If there is no loop or shapes do not fit.
+
+    Example:
+        >>> t, x, u = np.array([0.0, 0.1]), np.zeros((2, 2)), np.zeros((2, 1))
+        >>> states, inputs = (Signal("q", "m"), Signal("v", "m/s")), (Signal("F", "N"),)
+        >>> figure = closed_loops("Rest", t, x, {"prior": Loop(t, x, u)}, states=states, inputs=inputs)
+        >>> len(figure.axes)
+        4
     """
     if not results:
         raise InputError(f"plot of the closed loops {title!r}: there is no controller to draw")
@@ -124,6 +131,10 @@ def solve_times(times_ms: Mapping[str, Array], period_ms: float) -> Figure:
 
     Raises:
         InputError: If a controller has no positive durations, or the period is not positive.
+
+    Example:
+        >>> len(solve_times({"hybrid": np.array([2.0, 2.5, 4.0])}, 20.0).axes)
+        2
     """
     if not times_ms or not period_ms > 0:
         raise InputError("plot of the solve times: needs at least one controller and a positive period")

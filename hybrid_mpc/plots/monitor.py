@@ -56,6 +56,12 @@ def trace(
 
     Raises:
         InputError: If lengths differ.
+
+    Example:
+        >>> t, zero = np.array([0.0, 0.1]), np.zeros(2)
+        >>> figure = trace(t, zero, zero, 0.1, [False, False], zero, output=Signal("phi", "rad"))
+        >>> len(figure.axes)
+        2
     """
     t = np.asarray(t, dtype=float)
     raw, averaged = checked("violation", violation, len(t)), checked("level", level, len(t))
