@@ -1,0 +1,155 @@
+"""Figures of the recordings: what was measured, what each part is used for, what it covers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from matplotlib.figure import Figure
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.plots.style import (
+    Array,
+    axis_label,
+    checked,
+    colour,
+    name_of,
+    new_figure,
+    plain,
+    shared_legend,
+    title_axes,
+)
+from hybrid_mpc.signals import Signal
+
+ROLES = ("train", "valid", "test")
+
+
+class Recording(Protocol):
+    """What a figure needs of a contiguous piece of a recording (``data.Trajectory`` has it)."""
+
+    @property
+    def name(self) -> str:
+        """``"<file stem>"`` or ``"<file stem>#2"`` for a later piece."""
+
+    @property
+    def role(self) -> str:
+        """``"train"``, ``"valid"`` or ``"test"``."""
+
+    @property
+    def t(self) -> Array:
+        """Times ``(n,)`` [s]."""
+
+    @property
+    def u(self) -> Array:
+        """Inputs ``(n, n_u)``."""
+
+    @property
+    def y(self) -> Array:
+        """Measured outputs ``(n, n_y)``."""
+
+    @property
+    def x(self) -> Array:
+        """Smoothed states ``(n, n_x)``."""
+
+
+def recordings(
+    trajectories: Sequence[Recording],
+    outputs: Sequence[Signal],
+    inputs: Sequence[Signal],
+    *,
+    limit: int = 4,
+) -> Figure:
+    """A few recordings over time, each part shaded by what it is used for.
+
+    Args:
+        trajectories: Pieces of recordings; pieces of one file (same stem) share a row.
+        outputs: Signals of ``y``.
+        inputs: Signals of ``u``.
+        limit: Most files drawn; files are chosen so that every role is seen. Default: 4.
+
+    Returns:
+        The figure: one row a file, one column a signal.
+
+    Raises:
+        InputError: If there is no trajectory, or its shapes do not fit the signals.
+
+    Example:
+        >>> import numpy as np
+        >>> from types import SimpleNamespace as Piece
+        >>> t, y = np.array([0.0, 0.1]), np.zeros((2, 1))
+        >>> piece = Piece(name="a", role="train", t=t, y=y, u=y, x=np.zeros((2, 2)))
+        >>> len(recordings([piece], [Signal("q", "m")], [Signal("F", "N")]).axes)
+        2
+    """
+    chosen = _chosen(trajectories, limit)
+    signals = (*outputs, *inputs)
+    figure, axes = new_figure(len(chosen), len(signals), sharey="col", size=(10, 0.9 + 1.75 * len(chosen)))
+    for row, (stem, pieces) in zip(axes, chosen.items(), strict=True):
+        for piece in pieces:
+            y = checked(f"y of {piece.name}", piece.y, len(piece.t), len(outputs))
+            u = checked(f"u of {piece.name}", piece.u, len(piece.t), len(inputs))
+            columns = [*y.T, *u.T]
+            for i, (ax, values) in enumerate(zip(row, columns, strict=True)):
+                shade = name_of(piece.role)
+                ax.axvspan(piece.t[0], piece.t[-1], color=colour(piece.role), alpha=0.22, lw=0, label=shade)
+                step = "steps-post" if i >= len(outputs) else "default"
+                ax.plot(piece.t, values, color="black", linewidth=0.9, drawstyle=step)
+        title_axes(row[0], plain(stem))
+    for ax, signal in zip(axes.T, signals, strict=True):
+        for one in ax:
+            one.set_ylabel(axis_label(signal))
+            one.margins(x=0)
+        ax[-1].set_xlabel("time [s]")
+    shared_legend(figure)
+    return figure
+
+
+def coverage(trajectories: Sequence[Recording], states: Sequence[Signal]) -> Figure:
+    """Phase portrait: where the training data have been, and where the models are tested.
+
+    Args:
+        trajectories: Pieces of recordings.
+        states: Signals of ``x = [q, v]``.
+
+    Returns:
+        The figure: one panel a degree of freedom, position across, velocity up.
+
+    Raises:
+        InputError: If there is no trajectory, or its shapes do not fit the signals.
+
+    Example:
+        >>> import numpy as np
+        >>> from types import SimpleNamespace as Piece
+        >>> piece = Piece(name="a", role="train", t=np.zeros(2), x=np.zeros((2, 2)))
+        >>> len(coverage([piece], [Signal("q", "m"), Signal("v", "m/s")]).axes)
+        1
+    """
+    if not trajectories:
+        raise InputError("plot of the coverage: there is no recording to draw")
+    n_q = len(states) // 2
+    figure, axes = new_figure(1, n_q, size=(6.8 if n_q == 1 else 5.0 * n_q, 4.6))
+    for q, ax in enumerate(axes[0]):
+        for role in ("train", "test"):
+            for piece in (p for p in trajectories if p.role == role):
+                x = checked(f"x of {piece.name}", piece.x, len(piece.t), len(states))
+                width = 2.4 if role == "train" else 1.0
+                ax.plot(x[:, q], x[:, n_q + q], color=colour(role), linewidth=width, label=name_of(role))
+        ax.set_xlabel(axis_label(states[q]))
+        ax.set_ylabel(axis_label(states[n_q + q]))
+    shared_legend(figure)
+    return figure
+
+
+def _chosen(trajectories: Sequence[Recording], limit: int) -> dict[str, list[Recording]]:
+    if not trajectories:
+        raise InputError("plot of the recordings: there is no recording to draw")
+    files: dict[str, list[Recording]] = {}
+    for piece in trajectories:
+        files.setdefault(piece.name.split("#")[0], []).append(piece)
+    picked: list[str] = []
+    for role in ROLES:
+        first = [stem for stem, pieces in files.items() if any(p.role == role for p in pieces)]
+        picked += [stem for stem in first[:1] if stem not in picked]
+    picked = picked[:limit]
+    picked += [stem for stem in files if stem not in picked][: limit - len(picked)]
+    return {stem: pieces for stem, pieces in files.items() if stem in picked}

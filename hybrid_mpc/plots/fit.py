@@ -1,0 +1,232 @@
+"""Figures of the identified models: free runs, errors by model, parity of the export."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.plots.style import (
+    FAINT,
+    INK,
+    Array,
+    axis_label,
+    checked,
+    colour,
+    line_style,
+    name_of,
+    new_figure,
+    number,
+    shared_legend,
+    title_axes,
+)
+from hybrid_mpc.signals import Signal
+
+METRICS: Mapping[str, str] = {
+    "e_sim_s": "simulation error $E_{sim}$ [s]",
+    "rmse_rad": "free-run RMSE [rad]",
+    "energy_violation_w": "mean violation [W]",
+}
+
+
+def free_run(
+    t: Array,
+    x: Array,
+    predictions: Mapping[str, Array],
+    u: Array,
+    *,
+    states: Sequence[Signal],
+    inputs: Sequence[Signal],
+    energy_measured: Array,
+    energy_model: Array,
+    energy_name: str = "mopgrnn",
+    violation: Array | None = None,
+    warm_up: float = 0.0,
+    title: str = "",
+) -> Figure:
+    """A free run beside the measurement, with the energy balances (the paper's Fig. 6).
+
+    Args:
+        t: Times ``(n,)`` [s].
+        x: Measured (smoothed) states ``(n, n_x)``.
+        predictions: States ``(n, n_x)`` of each model's free run; NaN during the warm-up.
+        u: Inputs ``(n, n_u)``, held between samples.
+        states: Signals of ``x``.
+        inputs: Signals of ``u``.
+        energy_measured: Energy balance of the measured system, ``(n,)`` [W].
+        energy_model: Energy balance of the model ``energy_name``, ``(n,)`` [W].
+        energy_name: Whose balance it is. Default: ``"mopgrnn"``.
+        violation: ``|energy_model - energy_measured|`` if computed elsewhere, ``(n,)`` [W].
+        warm_up: Length [s] of the measured past at the start that is not scored; shaded.
+        title: Title. Default: none.
+
+    Returns:
+        The figure: a row for each state and input, the balances, and the violation.
+
+    Raises:
+        InputError: If shapes do not fit.
+
+    Example:
+        >>> t, x, u, power = np.array([0.0, 0.1]), np.zeros((2, 2)), np.zeros((2, 1)), np.zeros(2)
+        >>> states, inputs = (Signal("q", "m"), Signal("v", "m/s")), (Signal("F", "N"),)
+        >>> figure = free_run(t, x, {"mopgrnn": x}, u, states=states, inputs=inputs,
+        ...                   energy_measured=power, energy_model=power)
+        >>> len(figure.axes)
+        5
+    """
+    t = np.asarray(t, dtype=float)
+    balances = [checked("energy balance", e, len(t)) for e in (energy_measured, energy_model)]
+    gap = np.abs(balances[1] - balances[0]) if violation is None else checked("violation", violation, len(t))
+    rows = len(states) + len(inputs) + 2
+    heights = [1.6] * len(states) + [0.9] * len(inputs) + [1.2, 0.9]
+    figure, axes = new_figure(
+        rows, 1, sharex=True, heights=heights, title=title, size=(10, 0.8 + 1.2 * sum(heights))
+    )
+    column = axes[:, 0]
+    _states(column, t, x, predictions, states)
+    for i, (ax, signal) in enumerate(zip(column[len(states) :], inputs, strict=False)):
+        values = checked("u", u, len(t), len(inputs))[:, i]
+        ax.plot(t, values, color=INK, linewidth=1.0, drawstyle="steps-post")
+        ax.set_ylabel(axis_label(signal))
+    column[-2].plot(t, balances[0], **(line_style("measured") | {"linewidth": 1.0}))
+    column[-2].plot(t, balances[1], **line_style(energy_name))
+    column[-2].set_ylabel("balance\n" r"$\Delta E$ [W]")
+    column[-1].fill_between(t, gap, color=colour(energy_name), alpha=0.35, linewidth=0)
+    column[-1].plot(t, gap, color=colour(energy_name), linewidth=0.8)
+    column[-1].set_ylabel("violation\n" r"$\Delta$ [W]")
+    for ax in column:
+        if warm_up > 0:
+            ax.axvspan(t[0], t[0] + warm_up, color="#dddddd", lw=0, zorder=0, label="warm-up, not scored")
+        ax.margins(x=0)
+    column[-1].set_xlabel("time [s]")
+    figure.align_ylabels(list(column))
+    shared_legend(figure, columns=6)
+    return figure
+
+
+def _states(
+    column: Any, t: Array, x: Array, predictions: Mapping[str, Array], states: Sequence[Signal]
+) -> None:
+    measured = checked("x", x, len(t), len(states))
+    runs = {m: checked(f"free run of {m}", values, len(t), len(states)) for m, values in predictions.items()}
+    for i, signal in enumerate(states):
+        ax = column[i]
+        ax.plot(t, measured[:, i], **(line_style("measured") | {"linewidth": 2.2, "alpha": 0.85}))
+        for model, run in runs.items():
+            ax.plot(t, run[:, i], **line_style(model))
+        low, high = measured[:, i].min(), measured[:, i].max()
+        room = 0.6 * max(high - low, 1e-9)  # a model that runs away must not flatten the others
+        bottom, top = ax.get_ylim()
+        ax.set_ylim(max(bottom, low - room), min(top, high + room))
+        ax.set_ylabel(axis_label(signal))
+
+
+def errors_bar(
+    errors: Mapping[str, Mapping[str, float | None]],
+    *,
+    spread: Mapping[str, Mapping[str, float]] | None = None,
+    metrics: Mapping[str, str] = METRICS,
+    reference: str = "phy",
+) -> Figure:
+    """Errors of the models, one panel a metric, with the fitted prior as the line to beat.
+
+    Args:
+        errors: ``{model: {metric: value}}``; a missing value or None leaves a gap.
+        spread: Standard deviation over the trained networks in the same form. Default: none drawn.
+        metrics: Axis label with unit by metric name. Default: the three of ``results.json``.
+        reference: Model whose value is drawn as a line. Default: ``"phy"``.
+
+    Returns:
+        The figure. A bar far above all others is cut and marked; its number stays.
+
+    Raises:
+        InputError: If no model has any of the metrics.
+
+    Example:
+        >>> len(errors_bar({"phy": {"e_sim_s": 0.2}, "mopgrnn": {"e_sim_s": 0.1}}).axes)
+        1
+    """
+    shown = [m for m in metrics if any(values.get(m) is not None for values in errors.values())]
+    if not shown:
+        raise InputError(f"plot of the errors: no model has any of {', '.join(metrics)}")
+    figure, axes = new_figure(1, len(shown), size=(max(5.0, 3.4 * len(shown)), 4.2))
+    line = f"{name_of(reference)}: the line to beat"
+    for ax, metric in zip(axes[0], shown, strict=True):
+        found = {model: v.get(metric) for model, v in errors.items()}
+        values = {model: value for model, value in found.items() if value is not None}
+        bars = {model: (spread or {}).get(model, {}).get(metric, 0.0) for model in values}
+        _bars(ax, values, bars)
+        if reference in values:
+            ax.axhline(
+                values[reference], color=colour(reference), linestyle="--", lw=1.1, zorder=4, label=line
+            )
+        ax.set_ylabel(metrics[metric])
+        ax.set_xticks([])
+        ax.grid(False, axis="x")
+    shared_legend(figure, columns=6)
+    return figure
+
+
+def _bars(ax: Axes, values: Mapping[str, float], spread: Mapping[str, float]) -> None:
+    ordered = sorted(values.values())
+    second = ordered[-2] if len(ordered) > 1 else ordered[-1]
+    cut = ordered[-1] > 3.0 * second > 0
+    top = 1.25 * (1.6 * second if cut else max(v + spread[m] for m, v in values.items()))
+    for i, (model, value) in enumerate(values.items()):
+        height = min(value, 0.93 * top)
+        error = spread[model] if spread[model] > 0 and value < top else None
+        ax.bar(i, height, 0.72, color=colour(model), label=name_of(model), yerr=error, capsize=3)
+        ax.annotate(
+            number(value) + (" ▲" if height < value else ""),
+            (i, height + (error or 0.0)),
+            xytext=(0, 3),
+            textcoords="offset points",
+            ha="center",
+            fontsize=8.5,
+            color=INK,
+            zorder=5,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 0.6},
+        )
+    ax.set_ylim(0, top if top > 0 else 1.0)
+
+
+def parity(errors: Mapping[str, Array], tolerances: Mapping[str, float]) -> Figure:
+    """Differences between the trained and the exported model, as shares of all compared numbers.
+
+    Args:
+        errors: Absolute differences by what is compared, e.g. ``{"values": (m,), "Jacobians": (k,)}``.
+        tolerances: Allowed difference by the same names; drawn as vertical lines.
+
+    Returns:
+        The figure. Exact agreement (0) is drawn at 1e-18, left of every float64 rounding error.
+
+    Raises:
+        InputError: If there is nothing to draw.
+
+    Example:
+        >>> len(parity({"values": np.array([0.0, 1e-16])}, {"values": 1e-12}).axes)
+        1
+    """
+    if not errors:
+        raise InputError("plot of the parity: there is no difference to draw")
+    figure, axes = new_figure(1, 1, size=(8, 3.6))
+    ax = axes[0, 0]
+    palette = ("#0072B2", "#D55E00", "#009E73", "#E69F00")
+    for (name, values), ink in zip(errors.items(), palette, strict=False):
+        ordered = np.sort(np.maximum(np.abs(np.ravel(values)), 1e-18))
+        share = 100.0 * np.arange(1, len(ordered) + 1) / len(ordered)
+        ax.step(ordered, share, where="post", color=ink, linewidth=1.8, label=name)
+        if name in tolerances:
+            ax.axvline(tolerances[name], color=ink, linestyle="--", label=f"{name}, allowed")
+    ax.set_xscale("log")
+    ax.set_ylim(0, 103)
+    ax.set_xlabel("absolute difference, trained against exported [SI]")
+    ax.set_ylabel("share of numbers below [%]")
+    title_axes(ax, "left of its dashed line: passed")
+    ax.title.set_color(FAINT)
+    shared_legend(figure)
+    return figure

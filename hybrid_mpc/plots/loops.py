@@ -1,0 +1,172 @@
+"""Figures of the closed loops: tracking of each controller, and the time a step takes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.plots.style import (
+    FAINT,
+    INK,
+    Array,
+    axis_label,
+    checked,
+    colour,
+    line_style,
+    name_of,
+    new_figure,
+    number,
+    plain_log,
+    shared_legend,
+    title_axes,
+)
+from hybrid_mpc.signals import Signal
+
+
+@dataclass(frozen=True)
+class Loop:
+    """One closed loop as a figure needs it.
+
+    Args:
+        t: Times ``(n,)`` [s].
+        x: True states ``(n, n_x)``.
+        u: Inputs ``(n, n_u)``, held between samples.
+
+    Example:
+        >>> Loop(np.zeros(1), np.zeros((1, 2)), np.zeros((1, 1))).x.shape
+        (1, 2)
+    """
+
+    t: Array
+    x: Array
+    u: Array
+
+
+def closed_loops(
+    title: str,
+    t: Array,
+    reference: Array,
+    results: Mapping[str, Loop],
+    *,
+    states: Sequence[Signal],
+    inputs: Sequence[Signal],
+    limits: tuple[Sequence[float], Sequence[float]] | None = None,
+) -> Figure:
+    """The same task under each controller: states with their reference, tracking error, inputs.
+
+    Args:
+        title: The task in one line.
+        t: Times ``(m,)`` [s] of the reference.
+        reference: Reference states ``(m, n_x)``.
+        results: Closed loop by controller (``"prior"``, ``"hybrid"``, ``"oracle"``).
+        states: Signals of ``x``.
+        inputs: Signals of ``u``.
+        limits: Lower and upper bounds of the inputs. Default: none drawn.
+
+    Returns:
+        The figure; the error row shows the positions only.
+
+    Raises:
+        InputError: If there is no loop or shapes do not fit.
+
+    Example:
+        >>> t, x, u = np.array([0.0, 0.1]), np.zeros((2, 2)), np.zeros((2, 1))
+        >>> states, inputs = (Signal("q", "m"), Signal("v", "m/s")), (Signal("F", "N"),)
+        >>> figure = closed_loops("Rest", t, x, {"prior": Loop(t, x, u)}, states=states, inputs=inputs)
+        >>> len(figure.axes)
+        4
+    """
+    if not results:
+        raise InputError(f"plot of the closed loops {title!r}: there is no controller to draw")
+    t = np.asarray(t, dtype=float)
+    target = checked("reference", reference, len(t), len(states))
+    n_x, n_q = len(states), max(1, len(states) // 2)
+    heights = [1.6] * n_x + [1.1] * (n_q + len(inputs))
+    figure, axes = new_figure(
+        len(heights), 1, sharex=True, heights=heights, title=title, size=(10, 0.8 + 1.15 * sum(heights))
+    )
+    column = axes[:, 0]
+    for controller, loop in results.items():
+        x = checked(f"x of {controller}", loop.x, len(loop.t), n_x)
+        u = checked(f"u of {controller}", loop.u, len(loop.t), len(inputs))
+        line = line_style(controller)
+        for i in range(n_x):
+            column[i].plot(loop.t, x[:, i], **line)
+        for i in range(n_q):
+            column[n_x + i].plot(loop.t, x[:, i] - np.interp(loop.t, t, target[:, i]), **line)
+        for i in range(len(inputs)):
+            column[n_x + n_q + i].plot(loop.t, u[:, i], drawstyle="steps-post", **line)
+    for i, signal in enumerate(states):
+        column[i].plot(t, target[:, i], **(line_style("reference") | {"zorder": 4}))
+        column[i].set_ylabel(axis_label(signal))
+    for i, signal in enumerate(states[:n_q]):
+        column[n_x + i].axhline(0.0, color=FAINT, linewidth=0.8)
+        column[n_x + i].set_ylabel(f"error of\n{axis_label(signal)}")
+    for i, signal in enumerate(inputs):
+        ax = column[n_x + n_q + i]
+        ax.set_ylabel(axis_label(signal))
+        for bound in (limits[0][i], limits[1][i]) if limits is not None else ():
+            ax.axhline(bound, color=INK, linestyle=":", linewidth=1.1, label="input limits")
+    column[-1].set_xlabel("time [s]")
+    for ax in column:
+        ax.margins(x=0)
+    figure.align_ylabels(list(column))
+    shared_legend(figure)
+    return figure
+
+
+def solve_times(times_ms: Mapping[str, Array], period_ms: float) -> Figure:
+    """How long a controller step takes, against the period that it must fit into.
+
+    Args:
+        times_ms: Durations of all steps by controller, ``(n,)`` [ms].
+        period_ms: Control period [ms], the deadline.
+
+    Returns:
+        The figure: left the distribution, right the share of steps that took longer.
+
+    Raises:
+        InputError: If a controller has no positive durations, or the period is not positive.
+
+    Example:
+        >>> len(solve_times({"hybrid": np.array([2.0, 2.5, 4.0])}, 20.0).axes)
+        2
+    """
+    if not times_ms or not period_ms > 0:
+        raise InputError("plot of the solve times: needs at least one controller and a positive period")
+    data = {name: np.sort(np.ravel(np.asarray(v, dtype=float))) for name, v in times_ms.items()}
+    for name, values in data.items():
+        if len(values) == 0 or not values[0] > 0:
+            raise InputError(f"plot of the solve times of {name}: needs positive durations [ms]")
+    figure, axes = new_figure(1, 2, size=(10, 4.0))
+    left, right = axes[0]
+    low = min(v[0] for v in data.values())
+    high = max(period_ms, *(v[-1] for v in data.values()))
+    bins = np.geomspace(0.9 * low, 1.15 * high, 60)
+    for name, v in data.items():
+        note = f"{name_of(name)}: median {number(np.median(v))} ms, p99 {number(np.quantile(v, 0.99))} ms"
+        weights = np.full(len(v), 100.0 / len(v))
+        left.hist(v, bins, weights=weights, color=colour(name), alpha=0.3)
+        left.hist(v, bins, weights=weights, color=colour(name), histtype="step", linewidth=1.3)
+        longer = 100.0 * np.arange(len(v), 0, -1) / len(v)
+        right.step(v, longer, where="post", color=colour(name), linewidth=1.6, label=note)
+    for ax in (left, right):
+        ax.axvline(period_ms, color="black", linewidth=1.6, label=f"deadline {number(period_ms)} ms")
+        ax.set_xscale("log")
+        ax.set_xlim(bins[0], bins[-1])
+        ax.set_xlabel("duration of a controller step [ms]")
+    for ax in (left, right):
+        plain_log(ax.xaxis, bins[0], bins[-1])
+    left.set_ylabel("share of steps [%]")
+    right.set_yscale("log")
+    plain_log(right.yaxis, *right.get_ylim())
+    right.axhline(1.0, color=FAINT, linestyle=":", label="1 % of the steps (p99)")
+    right.set_ylabel("share of longer steps [%]")
+    title_axes(left, "distribution")
+    title_axes(right, "share of steps that took longer")
+    shared_legend(figure, columns=2)
+    return figure

@@ -1,0 +1,289 @@
+"""One look for all figures: colours (Okabe-Ito, safe for colour-blind readers), names, saving."""
+
+from __future__ import annotations
+
+import math
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from numpy.typing import NDArray
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.signals import Signal
+
+Array = NDArray[np.float64]
+Share = bool | Literal["none", "all", "row", "col"]
+
+DPI = 110
+INK = "#222222"
+FAINT = "#8a8a8a"
+ALARM = "#CC79A7"
+
+COLOURS: Mapping[str, str] = MappingProxyType(
+    {
+        "measured": "#000000",
+        "reference": "#000000",
+        "phy_nominal": "#7f7f7f",
+        "phy": "#0072B2",
+        "prior": "#0072B2",
+        "rnn": "#E69F00",
+        "pgrnn": "#009E73",
+        "mopgrnn": "#D55E00",
+        "hybrid": "#D55E00",
+        "oracle": "#CC79A7",
+        "train": "#56B4E9",
+        "valid": "#F0E442",
+        "test": "#555555",
+    }
+)
+NAMES: Mapping[str, str] = MappingProxyType(
+    {
+        "measured": "measured",
+        "reference": "reference",
+        "phy_nominal": "prior, nominal",
+        "phy": "prior, fitted",
+        "prior": "prior, fitted",
+        "rnn": "RNN",
+        "pgrnn": "PGRNN",
+        "mopgrnn": "MOPGRNN (hybrid)",
+        "hybrid": "MOPGRNN (hybrid)",
+        "oracle": "oracle",
+        "train": "training",
+        "valid": "validation",
+        "test": "test",
+    }
+)
+_DASHED = frozenset({"phy_nominal", "reference"})
+_SYMBOLS = {
+    "phi": r"$\varphi$",
+    "phi_dot": r"$\dot{\varphi}$",
+    "theta": r"$\theta$",
+    "theta_dot": r"$\dot{\theta}$",
+    "tau": r"$\tau$",
+}
+
+
+def colour(role: str) -> str:
+    """Colour of a role or model; an unknown name gets a middle grey.
+
+    Example:
+        >>> colour("phy"), colour("someone's own")
+        ('#0072B2', '#8a8a8a')
+    """
+    return COLOURS.get(role, FAINT)
+
+
+def name_of(role: str) -> str:
+    """Human name of a role or model; an unknown name stays as it is.
+
+    Example:
+        >>> name_of("mopgrnn")
+        'MOPGRNN (hybrid)'
+    """
+    return NAMES.get(role, plain(role))
+
+
+def plain(text: str) -> str:
+    r"""Text of a user as matplotlib prints it literally (a dollar sign starts no formula).
+
+    Example:
+        >>> plain("run $1")
+        'run \\$1'
+    """
+    return text.replace("$", r"\$")
+
+
+def line_style(role: str) -> dict[str, Any]:
+    """Keyword arguments of a line of a role: colour, dashes, width, order of drawing and legend name.
+
+    Example:
+        >>> line_style("phy_nominal")["linestyle"]
+        '--'
+    """
+    measured = role in ("measured", "reference")
+    return {
+        "color": colour(role),
+        "linestyle": "--" if role in _DASHED else "-",
+        "linewidth": 1.5 if measured else 1.3,
+        "zorder": 2.5 if measured else 3,
+        "label": name_of(role),
+    }
+
+
+def axis_label(signal: Signal) -> str:
+    """Label of an axis: symbol or name, and unit.
+
+    Example:
+        >>> axis_label(Signal("torque", "N m"))
+        'torque [N m]'
+    """
+    return f"{_SYMBOLS.get(signal.name, plain(signal.name.replace('_', ' ')))} [{signal.unit}]"
+
+
+def new_figure(
+    rows: int,
+    cols: int,
+    *,
+    title: str = "",
+    size: tuple[float, float] | None = None,
+    sharex: Share = False,
+    sharey: Share = False,
+    heights: Sequence[float] | None = None,
+) -> tuple[Figure, NDArray[np.object_]]:
+    """An empty figure in the project's look, and its axes.
+
+    Args:
+        rows: Rows of axes.
+        cols: Columns of axes.
+        title: Title over all axes. Default: none.
+        size: Width and height [inch]. Default: 10 wide, 2.2 a row and at least 3.6 high.
+        sharex: As in ``matplotlib.figure.Figure.subplots``.
+        sharey: As in ``matplotlib.figure.Figure.subplots``.
+        heights: Relative heights of the rows. Default: equal.
+
+    Returns:
+        The figure, on its own Agg canvas (nothing global is touched), and the axes ``(rows, cols)``.
+
+    Example:
+        >>> figure, axes = new_figure(2, 1)
+        >>> axes.shape
+        (2, 1)
+    """
+    layout = ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.06)
+    figure = Figure(figsize=size or (10.0, max(3.6, 2.2 * rows)), dpi=DPI, layout=layout)
+    FigureCanvasAgg(figure)
+    ratios = None if heights is None else list(heights)
+    axes = figure.subplots(rows, cols, squeeze=False, sharex=sharex, sharey=sharey, height_ratios=ratios)
+    for ax in axes.flat:
+        dress(ax)
+    if title:
+        figure.suptitle(title, fontsize=12, fontweight="bold", color=INK)
+    return figure, axes
+
+
+def dress(ax: Axes) -> None:
+    """Give axes the project's look: two spines, a faint grid, small ticks."""
+    for side in ("top", "right"):
+        ax.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        ax.spines[side].set_color(FAINT)
+    ax.grid(True, color="#dddddd", linewidth=0.6)
+    ax.set_axisbelow(True)
+    ax.tick_params(labelsize=9, colors=INK)
+    ax.xaxis.label.set_fontsize(10)
+    ax.yaxis.label.set_fontsize(10)
+
+
+def title_axes(ax: Axes, text: str) -> None:
+    """Small title at the left edge of axes."""
+    ax.set_title(text, loc="left", fontsize=10, color=INK)
+
+
+def shared_legend(figure: Figure, *, columns: int = 7) -> None:
+    """One legend beneath all axes of a figure, each name once, in order of first appearance."""
+    seen: dict[str, Any] = {}
+    for ax in figure.axes:
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+            seen.setdefault(label, handle)
+    figure.legend(
+        list(seen.values()),
+        list(seen),
+        loc="outside lower center",
+        ncols=max(1, min(columns, len(seen))),
+        frameon=False,
+        fontsize=9,
+    )
+
+
+def plain_log(axis: Axis, lowest: float, highest: float) -> None:
+    """Plain numbers (0.1, 1, 10) on a logarithmic axis; 2 and 5 as well where it spans little."""
+    narrow = highest < 100 * lowest
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if narrow else (1.0,)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def number(value: float) -> str:
+    """A number as figures and tables print it: three significant digits.
+
+    Example:
+        >>> number(0.012345), number(1234.5), number(2.5e-13), number(0.0)
+        ('0.0123', '1234', '2.5e-13', '0')
+    """
+    if value == 0 or not math.isfinite(value):
+        return f"{value:g}"
+    size = abs(value)
+    if size < 1e-3 or size >= 1e5:
+        return f"{value:.2g}"
+    return f"{value:.{max(0, 2 - math.floor(math.log10(size)))}f}"
+
+
+def checked(name: str, values: Any, length: int, columns: int | None = None) -> Array:
+    """An array of a figure with its length (and number of columns) checked.
+
+    Args:
+        name: What it is, for the message.
+        values: Numbers, ``(length,)``, or ``(length, columns)`` where ``columns`` is given.
+        length: Samples it must have.
+        columns: Columns it must have; a 1-D array counts as one column. Default: a 1-D array is needed.
+
+    Raises:
+        InputError: If the shape is another.
+
+    Example:
+        >>> checked("u", [1.0, 2.0], 2, 1).shape
+        (2, 1)
+    """
+    array = np.asarray(values, dtype=float)
+    if columns is not None and array.ndim == 1:
+        array = array[:, None]
+    needed = (length,) if columns is None else (length, columns)
+    if array.shape != needed:
+        raise InputError(f"plot: {name} has shape {array.shape}, its time axis and signals need {needed}")
+    return array
+
+
+def save(figure: Figure, path: str | Path) -> Path:
+    """Write a figure as PNG: all of it or nothing, and the same bytes for the same data.
+
+    Args:
+        figure: The figure.
+        path: Target file, ``.png``; its folder is made if missing.
+
+    Returns:
+        The path.
+
+    Raises:
+        InputError: If the name does not end in ``.png``.
+
+    Example:
+        >>> import tempfile
+        >>> figure, _ = new_figure(1, 1)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save(figure, Path(folder) / "a.png").name
+        'a.png'
+    """
+    path = Path(path)
+    if path.suffix != ".png":
+        raise InputError(f"figure {path}: figures are written as PNG; end the name in .png")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=".png")
+    os.close(handle)
+    try:
+        figure.savefig(temporary, format="png", dpi=DPI, facecolor="white", metadata={"Software": None})
+        Path(temporary).chmod(0o644)
+        Path(temporary).replace(path)
+    finally:
+        Path(temporary).unlink(missing_ok=True)
+    return path

@@ -1,0 +1,228 @@
+"""The report: one HTML file that needs nothing beside it."""
+
+from __future__ import annotations
+
+import base64
+import os
+import re
+import struct
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.plots.style import number
+
+Cell = str | float | int | bool | None
+_PNG = b"\x89PNG\r\n\x1a\n"
+
+
+@dataclass(frozen=True)
+class KeyFigure:
+    """A number at the head of the report.
+
+    Args:
+        label: What it is, e.g. ``"Free-run error, hybrid against fitted prior"``.
+        value: The number (or a word); None shows a dash, say why in ``comment``.
+        unit: Its unit. Default: none.
+        comment: A few words of judgement, e.g. ``"target: at most 0.8"``.
+        verdict: ``"good"``, ``"bad"`` or ``"plain"`` (no judgement).
+
+    Example:
+        >>> KeyFigure("Period", 20.0, "ms").text
+        '20.0'
+    """
+
+    label: str
+    value: Cell
+    unit: str = ""
+    comment: str = ""
+    verdict: Literal["good", "bad", "plain"] = "plain"
+
+    @property
+    def text(self) -> str:
+        """The value as printed."""
+        return cell(self.value)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table.
+
+    Args:
+        columns: Heads, with units.
+        rows: Cells; numbers get three significant digits, None a dash.
+        caption: One sentence.
+
+    Raises:
+        InputError: If a row has another length than ``columns``.
+
+    Example:
+        >>> Table(("model", "RMSE [rad]"), (("prior", 0.0255),)).rows[0]
+        ('prior', 0.0255)
+    """
+
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+    caption: str = ""
+
+    def __post_init__(self) -> None:
+        for i, row in enumerate(self.rows):
+            if len(row) != len(self.columns):
+                raise InputError(
+                    f"table {self.caption!r}: row {i} has {len(row)} cells, "
+                    f"its {len(self.columns)} columns need one each"
+                )
+
+
+@dataclass(frozen=True)
+class Section:
+    """A section of the report.
+
+    Args:
+        title: Its title.
+        paragraphs: Text. A plain ``str`` is escaped; ``markupsafe.Markup`` is taken as HTML.
+        figures: PNG files with their captions.
+        tables: Tables.
+        notes: Text after figures and tables.
+
+    Example:
+        >>> Section("Data", ("Two recordings.",)).anchor
+        'data'
+    """
+
+    title: str
+    paragraphs: Sequence[str] = ()
+    figures: Sequence[tuple[str | Path, str]] = ()
+    tables: Sequence[Table] = ()
+    notes: Sequence[str] = ()
+
+    @property
+    def anchor(self) -> str:
+        """Name of the section within the page."""
+        return re.sub(r"[^a-z0-9]+", "-", self.title.lower()).strip("-") or "section"
+
+
+@dataclass(frozen=True)
+class Report:
+    """Everything the report shows.
+
+    Args:
+        title: Title of the page.
+        scenario: Title of the scenario.
+        description: A paragraph about the machine.
+        command: The command that made it.
+        summary: Key figures.
+        sections: Sections, in order.
+        remark: A line under the title, e.g. seed, budget, versions.
+
+    Example:
+        >>> Report("Report", "A pendulum", "It swings.", "hybrid-mpc run pendulum").sections
+        ()
+    """
+
+    title: str
+    scenario: str
+    description: str
+    command: str
+    summary: Sequence[KeyFigure] = ()
+    sections: Sequence[Section] = ()
+    remark: str = ""
+
+
+def write_report(path: str | Path, report: Report) -> Path:
+    """Write a report as one self-contained HTML file: all of it or nothing.
+
+    Args:
+        path: Target file; its folder is made if missing.
+        report: What it shows.
+
+    Returns:
+        The path.
+
+    Raises:
+        InputError: If a figure is missing or is no PNG.
+
+    Example:
+        >>> page = Report("Report", "A pendulum", "It swings.", "hybrid-mpc run pendulum")
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_report(Path(folder) / "report.html", page).name
+        'report.html'
+    """
+    path = Path(path)
+    text = render(report)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=".html")
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(text)
+        Path(temporary).chmod(0o644)
+        Path(temporary).replace(path)
+    finally:
+        Path(temporary).unlink(missing_ok=True)
+    return path
+
+
+def render(report: Report) -> str:
+    """The report as HTML text.
+
+    Raises:
+        InputError: If a figure is missing or is no PNG.
+
+    Example:
+        >>> "<title>Report &amp; more</title>" in render(Report("Report & more", "", "", ""))
+        True
+    """
+    environment = Environment(
+        loader=PackageLoader("hybrid_mpc.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["cell"] = cell
+    environment.filters["is_number"] = is_number
+    sections = [
+        {"section": s, "id": f"s{i}-{s.anchor}", "figures": [_figure(s, *f) for f in s.figures]}
+        for i, s in enumerate(report.sections, 1)
+    ]
+    style = Markup((Path(__file__).parent / "templates" / "report.css").read_text(encoding="utf-8"))
+    return environment.get_template("report.html").render(report=report, sections=sections, style=style)
+
+
+def cell(value: Cell) -> str:
+    """A table's cell as text.
+
+    Example:
+        >>> cell(None), cell(True), cell(3), cell(0.0255), cell("RNN")
+        ('–', 'yes', '3', '0.0255', 'RNN')
+    """
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return number(value) if isinstance(value, float) else str(value)
+
+
+def is_number(value: Cell) -> bool:
+    """True for a cell that is set to the right."""
+    return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
+
+
+def _figure(section: Section, path: str | Path, caption: str) -> dict[str, Any]:
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(
+            f"report, section {section.title!r}: no figure {path}; draw it first, or leave it out"
+        )
+    content = path.read_bytes()
+    if not content.startswith(_PNG) or len(content) < 24:
+        raise InputError(f"report, section {section.title!r}: figure {path} is no PNG file")
+    width, height = struct.unpack(">II", content[16:24])
+    data = base64.b64encode(content).decode("ascii")
+    return {"uri": f"data:image/png;base64,{data}", "caption": caption, "width": width, "height": height}
