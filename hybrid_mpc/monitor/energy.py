@@ -127,11 +127,13 @@ class EnergyMonitor:
         sizes_out = [self._function.size1_out(i) for i in range(2)]
         self._ins = [np.zeros(n) for n in sizes_in]
         self._outs = [np.zeros(n) for n in sizes_out]
-        self._buffer, self._evaluate = self._function.buffer()
+        buffer: Any
+        buffer, self._evaluate = self._function.buffer()
         for i, array in enumerate(self._ins):
-            self._buffer.set_arg(i, memoryview(array))
+            buffer.set_arg(i, memoryview(array.data))
         for i, array in enumerate(self._outs):
-            self._buffer.set_res(i, memoryview(array))
+            buffer.set_res(i, memoryview(array.data))
+        self._buffer = buffer
 
     @property
     def delay(self) -> float:

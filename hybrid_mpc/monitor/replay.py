@@ -88,7 +88,7 @@ def replay(monitor: EnergyMonitor, estimator: EstimatorLike, trajectory: Traject
         state, r = monitor.update(state, y[k], u_prev, estimate)
         readings.append((r.dE_model_w, r.dE_measured_w, r.violation_w, r.level_w, r.alarm))
     columns = np.array(readings, dtype=np.float64).T
-    return MonitorTrace(t, *columns[:4], columns[4].astype(bool))
+    return MonitorTrace(t, columns[0], columns[1], columns[2], columns[3], columns[4].astype(bool))
 
 
 def _check(t: Array, y: Array, u: Array, dt: float) -> None:
