@@ -1,0 +1,17 @@
+"""Online plausibility: the energy violation, its calibrated alarm, and replay on recordings."""
+
+from hybrid_mpc.monitor.calibration import Calibration, alarm_intervals, calibrate, count_alarms
+from hybrid_mpc.monitor.energy import EnergyMonitor, MonitorReading, MonitorState
+from hybrid_mpc.monitor.replay import MonitorTrace, replay
+
+__all__ = [
+    "EnergyMonitor",
+    "MonitorState",
+    "MonitorReading",
+    "Calibration",
+    "calibrate",
+    "count_alarms",
+    "alarm_intervals",
+    "MonitorTrace",
+    "replay",
+]

@@ -1,0 +1,104 @@
+"""Run a monitor over a recording, as it would have run online."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.monitor.calibration import alarm_intervals
+from hybrid_mpc.monitor.energy import EnergyMonitor
+
+Array = NDArray[np.float64]
+
+
+class EstimatorLike(Protocol):
+    """The estimator as the replay uses it; estimates have ``x`` (n_x,) and ``h`` (n_h,)."""
+
+    def start(self, y: Array, t: float) -> Any:
+        """Estimate at the first sample."""
+
+    def update(self, estimate: Any, y: Array, u_prev: Array) -> Any:
+        """Estimate at the next sample, one period later."""
+
+
+class TrajectoryLike(Protocol):
+    """A recording on the uniform grid: ``t`` (n,), ``y`` (n, n_y), ``u`` (n, n_u) held over [t_k, t_k+dt)."""
+
+    @property
+    def t(self) -> Array:
+        """Time [s]."""
+
+    @property
+    def y(self) -> Array:
+        """Measurements."""
+
+    @property
+    def u(self) -> Array:
+        """Inputs."""
+
+
+@dataclass(frozen=True)
+class MonitorTrace:
+    """Readings over time, all ``(n,)``; see :class:`~hybrid_mpc.monitor.energy.MonitorReading`.
+
+    Example:
+        >>> z = np.zeros(3)
+        >>> MonitorTrace(np.arange(3.0), z, z, z, z, np.array([False, True, True])).intervals()
+        [(1.0, 2.0)]
+    """
+
+    t: Array
+    dE_model_w: Array
+    dE_measured_w: Array
+    violation_w: Array
+    level_w: Array
+    alarm: NDArray[np.bool_]
+
+    def intervals(self) -> list[tuple[float, float]]:
+        """Alarms as ``(first, last)`` [s] in the recording's own time."""
+        return [(float(self.t[int(a)]), float(self.t[int(b)])) for a, b in alarm_intervals(self.alarm, 1.0)]
+
+
+def replay(monitor: EnergyMonitor, estimator: EstimatorLike, trajectory: TrajectoryLike) -> MonitorTrace:
+    """Feed a recording to the estimator and the monitor, sample by sample.
+
+    Args:
+        monitor: The monitor.
+        estimator: With ``start(y, t)`` and ``update(estimate, y, u_prev)``.
+        trajectory: With ``t`` (n,), ``y`` (n, n_y), ``u`` (n, n_u) on the model's grid.
+
+    Raises:
+        InputError: If the recording is empty, its lengths differ, or its period is not the model's.
+
+    Example:
+        ``trace = replay(monitor, estimator, trajectory); trace.intervals()``
+    """
+    t, y, u = (np.asarray(a, dtype=np.float64) for a in (trajectory.t, trajectory.y, trajectory.u))
+    _check(t, y, u, monitor.model.dt)
+    state, estimate = monitor.initial(), estimator.start(y[0], float(t[0]))
+    readings = []
+    for k in range(t.size):
+        u_prev = u[k - 1] if k else np.full(monitor.model.n_u, np.nan)
+        if k:
+            estimate = estimator.update(estimate, y[k], u_prev)
+        state, r = monitor.update(state, y[k], u_prev, estimate)
+        readings.append((r.dE_model_w, r.dE_measured_w, r.violation_w, r.level_w, r.alarm))
+    columns = np.array(readings, dtype=np.float64).T
+    return MonitorTrace(t, columns[0], columns[1], columns[2], columns[3], columns[4].astype(bool))
+
+
+def _check(t: Array, y: Array, u: Array, dt: float) -> None:
+    if not t.size or not t.size == len(y) == len(u):
+        raise InputError(
+            f"replay: t, y, u have {t.size}, {len(y)}, {len(u)} samples; need equally many, not 0"
+        )
+    off = float(np.max(np.abs(np.diff(t) - dt))) if t.size > 1 else 0.0
+    if off > 1e-3 * dt:
+        raise InputError(
+            f"replay: the sampling period is off the model's {dt} s by up to {off:.3g} s; "
+            "resample, or cut the recording at its gaps"
+        )

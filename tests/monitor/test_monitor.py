@@ -1,0 +1,234 @@
+"""The energy monitor against a machine whose faults are known."""
+
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.model import HybridModel
+from hybrid_mpc.monitor import Calibration, EnergyMonitor, calibrate, count_alarms, replay
+from hybrid_mpc.signals import Signal
+
+DT, J, MGL, GAMMA = 0.02, 0.1, 1.5, 0.15
+
+
+def pendulum(friction: float = GAMMA, push: float = 0.0) -> HybridModel:
+    x, h, u, w = ca.MX.sym("x", 2), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w", 2)
+
+    def balance(x, w, u, friction=friction):
+        return (J * w[1] + MGL * ca.sin(x[0]) + friction * x[1] - u - push) * x[1]
+
+    def rhs(x):
+        return ca.vertcat(x[1], (u + push - MGL * ca.sin(x[0]) - friction * x[1]) / J)
+
+    z = x
+    for _ in range(4):
+        d = DT / 4
+        k1 = rhs(z)
+        k2 = rhs(z + d / 2 * k1)
+        k3 = rhs(z + d / 2 * k2)
+        z = z + d / 6 * (k1 + 2 * k2 + 2 * k3 + rhs(z + d * k3))
+    return HybridModel(
+        "pendulum", DT, (Signal("phi", "rad"), Signal("phi_dot", "rad/s")), (Signal("tau", "N m"),),
+        (Signal("phi", "rad"),),
+        step=ca.Function("step", [x, h, u], [z, h]),
+        xdot=ca.Function("xdot", [x, h, u], [rhs(x)]),
+        output=ca.Function("output", [x, u], [x[0]]),
+        energy_balance=ca.Function("energy", [x, w, u], [balance(x, w, u)]),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Estimate:
+    x: np.ndarray
+    h: np.ndarray
+    d: np.ndarray
+
+
+@dataclass(frozen=True)
+class Run:
+    t: np.ndarray
+    y: np.ndarray
+    u: np.ndarray
+    x: np.ndarray
+
+
+class Exact:
+    """Knows the true states of a run."""
+
+    def __init__(self, run):
+        self.run, self.k = run, 0
+
+    def start(self, y, t):
+        self.k = 0
+        return Estimate(self.run.x[0], np.zeros(0), np.zeros(1))
+
+    def update(self, estimate, y, u_prev):
+        self.k += 1
+        return Estimate(self.run.x[self.k], np.zeros(0), np.zeros(1))
+
+
+class Observer:
+    """A Luenberger observer with disturbance: exact model prediction, fixed gains (poles near 0.7)."""
+
+    def __init__(self, model):
+        self.step = model.step
+
+    def start(self, y, t):
+        return Estimate(np.array([y[0], 0.0]), np.zeros(0), np.zeros(1))
+
+    def update(self, estimate, y, u_prev):
+        x = self.step(estimate.x, estimate.h, u_prev + estimate.d)[0].full().ravel()
+        e = y[0] - x[0]
+        return Estimate(x + np.array([0.6, 5.0]) * e, np.zeros(0), estimate.d + 3.0 * e)
+
+
+def simulate(n, seed=0, fault=None, at=10**9, noise=0.0, kind="sine"):
+    rng = np.random.default_rng(seed)
+    t = np.arange(n) * DT
+    u = 0.8 * np.sin(2 * np.pi * 0.5 * t) + 0.5 * np.sin(2 * np.pi * 0.37 * t + seed)
+    if kind == "steps":
+        u = rng.choice([-1.2, 1.2], n // 7 + 1).repeat(7)[:n]
+    if kind == "rest":
+        u = np.zeros(n)
+    model, broken = pendulum(), fault or pendulum()
+    x = np.zeros((n, 2))
+    for k in range(n - 1):
+        x[k + 1] = (broken if k >= at else model).step(x[k], [], u[k])[0].full().ravel()
+    return Run(t, x[:, :1] + noise * rng.standard_normal((n, 1)), u[:, None], x)
+
+
+@pytest.mark.parametrize("kind", ["sine", "steps"])
+@pytest.mark.parametrize("window", [5, 11, 21])
+def test_perfect_model_has_no_violation_even_under_torque_steps(kind, window):
+    run = simulate(400, kind=kind)
+    monitor = EnergyMonitor(pendulum(), window=window, average=5)
+    trace = replay(monitor, Exact(run), run)
+    # The identity is exact; what remains is the fourth-order integrator's dp against dv, h^5 per
+    # sub-step of 5 ms (1e-11) over dt^2 (4e-4), with power ~ 10 W: below 1e-5 W. The power itself is ~ 1 W.
+    assert np.nanmax(trace.violation_w) < 1e-5
+    assert np.isfinite(trace.violation_w[window - 1 :]).all()
+    assert np.isnan(trace.violation_w[: window - 1]).all()
+
+
+def test_violation_is_J_v_times_the_acceleration_error_under_a_constant_push():
+    run = simulate(400, kind="sine")
+    trace = replay(EnergyMonitor(pendulum(push=0.3), window=5, average=1), Exact(run), run)
+    # The model's one step feels its own friction: gamma dt / (2 J) = 1.5 % less than 0.3 |v|, plus the
+    # cubic's velocity error, of order dt^2 at the kinks of the held input: below 2e-3 W.
+    expected = 0.3 * np.abs(run.x[2:-2, 1])
+    assert np.all(np.abs(trace.violation_w[4:] - expected) < 0.02 * expected + 2e-3)
+    assert expected.max() > 0.5
+
+
+NOISE = 1e-4  # rad: an encoder of about 14 bits
+
+
+def test_alarm_rate_on_fresh_nominal_data_is_near_the_wanted_rate():
+    model = pendulum()
+    monitor = EnergyMonitor(model, window=11, average=10)
+    levels = [
+        replay(monitor, Observer(model), simulate(5000, s, noise=NOISE)).level_w[100:] for s in range(4)
+    ]
+    calibration = calibrate(levels, DT, false_alarms_per_hour=60.0)
+    armed = EnergyMonitor(model, window=11, average=10, calibration=calibration)
+    runs = [replay(armed, Observer(model), simulate(5000, s, noise=NOISE)) for s in range(10, 16)]
+    n = sum(count_alarms(r.alarm[100:], DT)[0] for r in runs)
+    # 10 min at 60/h: 10 expected. Factor 3 for the threshold's own error (80 blocks, |scale| error 10 %
+    # at -log(1/12) = 2.5 scales) and Poisson spread: P(n > 30 | 10) < 1e-6; no alarm at all has 5e-5.
+    assert 1 <= n <= 30
+
+
+@pytest.mark.parametrize(("fault", "limit"), [(pendulum(friction=3 * GAMMA), 1.0), (pendulum(push=0.5), 0.5)])
+def test_faults_raise_the_alarm_in_time(fault, limit):
+    model = pendulum()
+    monitor = EnergyMonitor(model, window=11, average=10)
+    levels = [
+        replay(monitor, Observer(model), simulate(5000, s, noise=NOISE)).level_w[100:] for s in range(2)
+    ]
+    calibration = calibrate(levels, DT, false_alarms_per_hour=20.0)
+    armed = EnergyMonitor(model, window=11, average=10, calibration=calibration)
+    run = simulate(700, seed=20, fault=fault, at=500, noise=NOISE)
+    trace = replay(armed, Observer(model), run)
+    # Limits [s]: window 0.2 + average 0.2 + one passage through rest (0.6 s).
+    assert not trace.alarm[100:500].any()
+    starts = [a for a, _ in trace.intervals() if a >= run.t[500]]
+    assert starts
+    assert starts[0] - run.t[500] <= limit
+
+
+def test_at_rest_there_is_no_power_whatever_the_torque_error():
+    run = simulate(100, kind="rest")
+    trace = replay(EnergyMonitor(pendulum(push=1.0), window=11, average=10), Exact(run), run)
+    assert np.nanmax(trace.violation_w) == 0.0  # v = 0 exactly: the documented blind spot
+
+
+def test_update_is_pure():
+    run = simulate(40)
+    monitor = EnergyMonitor(pendulum(push=0.2), window=5, average=4)
+    state = monitor.initial()
+    for k in range(1, 20):
+        estimate = Estimate(run.x[k], np.zeros(0), np.zeros(1))
+        state, _ = monitor.update(state, run.y[k], run.u[k - 1], estimate)
+    before = state.memory.copy()
+    estimate = Estimate(run.x[20], np.zeros(0), np.zeros(1))
+    first = monitor.update(state, run.y[20], run.u[19], estimate)
+    monitor.update(first[0], run.y[21], run.u[20], estimate)
+    second = monitor.update(state, run.y[20], run.u[19], estimate)
+    assert first[1] == second[1]
+    assert np.array_equal(first[0].memory, second[0].memory)
+    assert np.array_equal(before, state.memory)
+
+
+def test_a_missing_measurement_blinds_one_window_and_raises_nothing():
+    run = simulate(200)
+    y = run.y.copy()
+    y[100] = np.nan
+    calibration = Calibration(1e-3, 5e-4, 1.0, 1, 1.0, "by hand")
+    monitor = EnergyMonitor(pendulum(), window=5, average=10, calibration=calibration)
+    trace = replay(monitor, Exact(run), replace(run, y=y))
+    assert np.flatnonzero(np.isnan(trace.violation_w[4:])).tolist() == list(range(96, 101))
+    assert np.isfinite(trace.level_w[20:]).all()  # 5 of 10 remain
+    assert not trace.alarm.any()
+
+
+def test_hysteresis_holds_between_release_and_threshold():
+    monitor = EnergyMonitor(
+        pendulum(), window=5, average=1, calibration=Calibration(1.0, 0.5, 1.0, 1, 1.0, "by hand")
+    )
+    sequence, on, seen = [0.7, 1.1, 0.7, 0.4, 0.7], False, []
+    for level in sequence:
+        on = monitor._alarm(level, on)
+        seen.append(on)
+    assert seen == [False, True, True, False, False]
+
+
+def test_calibration_recovers_a_gumbel_quantile():
+    rng = np.random.default_rng(3)
+    levels = rng.gumbel(2.0, 0.3, 4000).clip(1e-3)
+    calibration = calibrate([levels], 5.0, false_alarms_per_hour=7.2)  # one sample a block, 1 % a block
+    # L-moment estimates from 4000 samples: standard error of the 1 % quantile about 0.02.
+    assert abs(calibration.threshold_w - (2.0 - 0.3 * np.log(0.01))) < 0.08
+
+
+def test_bad_input_speaks():
+    with pytest.raises(InputError, match=r"need 3\.0 min"):
+        calibrate([np.ones(100)], 0.02)
+    with pytest.raises(InputError, match="odd"):
+        EnergyMonitor(pendulum(), window=10, average=1)
+    model = pendulum()
+    x, u = ca.MX.sym("x", 2), ca.MX.sym("u")
+    with pytest.raises(InputError, match="positions"):
+        EnergyMonitor(replace(model, output=ca.Function("o", [x, u], [x[1]])), window=5, average=1)
+    run = simulate(10)
+    monitor = EnergyMonitor(model, window=5, average=1)
+    with pytest.raises(InputError, match="resample"):
+        replay(monitor, Exact(run), replace(run, t=2 * run.t))
+    with pytest.raises(InputError, match="entries"):
+        monitor.update(
+            monitor.initial(), np.zeros(2), np.zeros(1), Estimate(np.zeros(2), np.zeros(0), np.zeros(1))
+        )
+    with pytest.raises(InputError, match="release_w"):
+        Calibration(1.0, 2.0, 1.0, 1, 1.0, "by hand")
