@@ -67,10 +67,10 @@ class HybridModel:
         _check(self.name, "xdot", self.xdot, [x, h, u], [x])
         _check(self.name, "output", self.output, [x, u], [y])
         _check(self.name, "energy_balance", self.energy_balance, [x, x, u], [(1, 1)])
-        if self.with_jacobian is None:
-            object.__setattr__(self, "with_jacobian", _with_jacobian(self.step))
+        with_jacobian = self.with_jacobian or _with_jacobian(self.step)
+        object.__setattr__(self, "with_jacobian", with_jacobian)
         n_z = self.n_x + self.n_h
-        _check(self.name, "with_jacobian", self.with_jacobian, [x, h, u], [x, h, (n_z, n_z), (n_z, self.n_u)])
+        _check(self.name, "with_jacobian", with_jacobian, [x, h, u], [x, h, (n_z, n_z), (n_z, self.n_u)])
 
     @property
     def n_x(self) -> int:

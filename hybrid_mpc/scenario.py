@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from hybrid_mpc.physics import Prior
 
 Array = NDArray[np.float64]
-Role = Literal["train", "valid", "test"]
+Role = Literal["train", "valid", "test", "nominal"]
 
 
 class Plant(Protocol):
@@ -52,7 +52,8 @@ class Window:
     Args:
         start: First time [s] in the recording's own time.
         end: Last time [s].
-        role: ``"train"``, ``"valid"`` or ``"test"``.
+        role: ``"train"``, ``"valid"``, ``"test"``, or ``"nominal"``: known to be free of disturbances but used
+            for no free run (standing at an unstable point, say); the monitor must stay quiet there.
     """
 
     start: float
@@ -227,11 +228,14 @@ def load_scenario(name_or_path: str) -> Scenario:
     path = Path(name_or_path)
     if path.suffix != ".py":
         names = ", ".join(registered_scenarios()) or "none is registered"
-        raise InputError(f"no scenario {name_or_path!r}; registered: {names}. Or give the path of a .py file.")
+        raise InputError(
+            f"no scenario {name_or_path!r}; registered: {names}. Or give the path of a .py file."
+        )
     if not path.is_file():
         raise InputError(f"no scenario file {path}")
     spec = importlib.util.spec_from_file_location(f"hybrid_mpc_user_{path.stem}", path)
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # dataclasses and worker processes look their module up by name
     try:
@@ -246,7 +250,8 @@ def load_scenario(name_or_path: str) -> Scenario:
 
 def _checked(scenario: object, where: str) -> Scenario:
     if not isinstance(scenario, Scenario):
-        raise InputError(f"{where}: 'scenario' is a {type(scenario).__name__}, it must be a hybrid_mpc Scenario")
+        kind = type(scenario).__name__
+        raise InputError(f"{where}: 'scenario' is a {kind}, it must be a hybrid_mpc Scenario")
     if not callable(scenario.prior):
         raise InputError(f"{where}: scenario {scenario.name!r} has no prior; give prior=YourPriorClass")
     return scenario

@@ -256,9 +256,10 @@ def _check_windows(spec: DataSpec) -> None:
     for stem, windows in spec.windows.items():
         ordered = sorted(windows, key=lambda window: window.start)
         for window in ordered:
-            if not window.start < window.end or window.role not in ROLES:
+            if not window.start < window.end or window.role not in (*ROLES, "nominal"):
                 raise InputError(
-                    f"data specification: window {window} of {stem} needs start < end and one of {ROLES}"
+                    f"data specification: window {window} of {stem} needs start < end and one of "
+                    f"{(*ROLES, 'nominal')}"
                 )
         for one, two in pairwise(ordered):
             if two.start < one.end:
