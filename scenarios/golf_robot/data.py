@@ -52,8 +52,8 @@ def excitation(kind: str, rng: np.random.Generator, n: int) -> Array:
     """Motor torque ``(n,)`` [N m] on the grid of 20 ms.
 
     Args:
-        kind: ``"sine"`` (0.08 to 0.22 N m, 0.15 to 0.9 Hz), ``"step"`` (up to 0.35 N m, held 1 to 3 s) or
-            ``"chirp"`` (0.08 to 0.22 N m, 0.1 to 1.2 Hz, up or down).
+        kind: ``"sine"`` (0.08 to 0.16 N m, 0.15 to 0.9 Hz), ``"step"`` (up to 0.25 N m, held 1 to 3 s) or
+            ``"chirp"`` (0.08 to 0.16 N m, 0.1 to 1.2 Hz, up or down).
         rng: Source of amplitudes and frequencies.
         n: Number of samples.
 
@@ -64,8 +64,8 @@ def excitation(kind: str, rng: np.random.Generator, n: int) -> Array:
     t = GRID * np.arange(n)
     if kind == "step":
         starts = np.cumsum(rng.uniform(1.0, 3.0, size=n))
-        return rng.uniform(-0.35, 0.35, size=n + 1)[np.searchsorted(starts, t, side="right")]
-    amplitude, phase = rng.uniform(0.08, 0.22), rng.uniform(0.0, 2 * np.pi)
+        return rng.uniform(-0.25, 0.25, size=n + 1)[np.searchsorted(starts, t, side="right")]
+    amplitude, phase = rng.uniform(0.08, 0.16), rng.uniform(0.0, 2 * np.pi)
     if kind == "sine":
         return amplitude * np.sin(2 * np.pi * rng.uniform(0.15, 0.9) * t + phase)
     f0, f1 = rng.permutation([rng.uniform(0.1, 0.3), rng.uniform(0.8, 1.2)])
@@ -99,7 +99,7 @@ def _advance(rig: Rig, state: Array, u: Array, now: float, until: float) -> tupl
 
 
 def record(rig: Rig, kind: str, seed: tuple[int, ...]) -> tuple[Array, Array]:
-    """One recording: table ``(n, 3)`` of time [s], measured angle [rad], torque [N m]; true states ``(n, 4)``.
+    """One recording: table ``(n, 3)`` of time [s], measured angle [rad], torque [N m]; true states.
 
     The angle is sampled at the jittered times that are recorded; the torque is the one held after them.
     """

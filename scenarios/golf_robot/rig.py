@@ -33,7 +33,7 @@ class RigParameters:
         mu_c: Coulomb coefficient: -5 % against the paper's 1.5136, which averages over static friction.
         mu_s: Static coefficient: 1.4 x Coulomb (dry or starved plain bearing: 1.2 to 1.6).
         v_s: Stribeck speed [rad/s]: 0.3 (7 mm/s at 24.5 mm; boundary lubrication ends at 1 to 10 mm/s).
-        sigma0: Bristle stiffness [1/rad]: break-away after about 1.4 mrad (35 um at 24.5 mm, seal and belt creep).
+        sigma0: Bristle stiffness [1/rad]: break-away after about 1.4 mrad (35 um at 24.5 mm).
         sigma1: Bristle damping [s/rad]: half of critical at the stuck club's own frequency (36 rad/s).
         v_d: Speed [rad/s] above which bristle damping fades (keeps LuGre passive).
         asymmetry: Friction is this share larger forwards, smaller backwards: 8 % (axial play, seal lip).

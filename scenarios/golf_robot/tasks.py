@@ -14,7 +14,7 @@ STEP_TIME = 1.6  # [s]
 
 
 def sine_reference(t: Array) -> Array:
-    """``(n, 2)``: 0.8 rad at 0.4 Hz, faded in over 2 s, and its exact derivative.
+    """``(n, 2)``: 0.8 rad at 0.4 Hz, faded in over 2 s (smooth acceleration), and its exact derivative.
 
     The prior needs at most 0.31 N m for it; the friction reverses every 1.25 s.
 
@@ -23,7 +23,7 @@ def sine_reference(t: Array) -> Array:
         [[0.0, 0.0]]
     """
     w, s = 2 * np.pi * 0.4, np.clip(t / 2.0, 0.0, 1.0)
-    fade, slope = s**2 * (3 - 2 * s), 6 * s * (1 - s) / 2.0
+    fade, slope = s**3 * (10 - 15 * s + 6 * s**2), 30 * s**2 * (1 - s) ** 2 / 2.0
     return 0.8 * np.column_stack([fade * np.sin(w * t), slope * np.sin(w * t) + fade * w * np.cos(w * t)])
 
 
