@@ -26,14 +26,14 @@ class RigParameters:
     Args:
         m: Club mass [kg]: +2 % (grip tape, screws) against the paper's 0.5241.
         a: Centre of mass [m]: -2 % (9 mm: a clamp's tolerance) against 0.4702.
-        J: Inertia [kg m^2]: +4 % (rotor inertia times 4^2 is missing in the paper's club) against 0.1445.
+        J: Inertia [kg m^2]: +4 % (pulley, rotor, clamp: a swing test misses some per cent) against 0.1445.
         g: Gravity [m/s^2].
         d: Viscous damping [N m s/rad]: +10 % (grease over 10 K) against 0.0132.
         r: Friction radius [m], as the paper.
         mu_c: Coulomb coefficient: -5 % against the paper's 1.5136, which averages over static friction.
         mu_s: Static coefficient: 1.4 x Coulomb (dry or starved plain bearing: 1.2 to 1.6).
         v_s: Stribeck speed [rad/s]: 0.3 (7 mm/s at 24.5 mm; boundary lubrication ends at 1 to 10 mm/s).
-        sigma0: Bristle stiffness [1/rad]: break-away after about 1.4 mrad (35 um at 24.5 mm).
+        sigma0: Bristle stiffness [1/rad]: break-away after about 1.3 mrad (33 um at 24.5 mm).
         sigma1: Bristle damping [s/rad]: half of critical at the stuck club's own frequency (36 rad/s).
         v_d: Speed [rad/s] above which bristle damping fades (keeps LuGre passive).
         asymmetry: Friction is this share larger forwards, smaller backwards: 8 % (axial play, seal lip).
@@ -41,7 +41,7 @@ class RigParameters:
         motor_gain: Torque constant against its data sheet: -2 % (magnets at temperature; +-5 % is usual).
         cogging: Cogging amplitude at the motor [N m]: 1 % of the 0.5 N m peak torque.
         cogging_order: Cogging periods per motor turn: least common multiple of 12 slots and 8 poles.
-        drag: Aerodynamic drag [N m s^2/rad^2]: shaft rho c_w D L^4/8 = 0.5e-3, head rho c_w A L^3/2 = 0.9e-3.
+        drag: Aerodynamic drag [N m s^2/rad^2]: shaft rho c_w D L^4/8 = 0.5e-3 (12 mm, 0.7 m), head 0.9e-3.
         counts: Encoder counts per turn.
         noise: Sensor noise [rad], one standard deviation.
     """
