@@ -1,0 +1,1 @@
+"""Machines that the main job can run: one package each."""

@@ -1,0 +1,52 @@
+"""The golf robot of Schön, Götte and Timmermann (2022), in simulation: a rig with dry friction."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from hybrid_mpc.scenario import DataSpec, Scenario
+from scenarios.golf_robot.data import make_data, windows
+from scenarios.golf_robot.oracle import oracle
+from scenarios.golf_robot.rig import Rig
+from scenarios.golf_robot.tasks import CONTROL, TASKS
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from hybrid_mpc.physics import Prior
+
+__all__ = ["scenario"]
+
+
+def _prior(values: Mapping[str, float] | None = None) -> Prior:
+    from scenarios.golf_robot.prior import GolfRobotPrior
+
+    return GolfRobotPrior(values)
+
+
+scenario = Scenario(
+    name="golf_robot",
+    title="Golf robot: a club on a belt drive with load-dependent dry friction",
+    description=(
+        "A motor swings a golf club through a belt (ratio 4). The prior is the paper's equation; the rig "
+        "has dynamic friction with stiction and Stribeck effect, another friction forwards than backwards, "
+        "torque lag, cogging, drag and parameters some per cent off. Only the angle is measured. The data "
+        "are simulated, since the paper's are not public."
+    ),
+    prior=_prior,
+    data=DataSpec(
+        time="time_s",
+        inputs=("u_nm",),
+        outputs=("phi_rad",),
+        dt=0.02,
+        max_gap=0.05,
+        smoothing=0.15,
+        warm_up=0.5,
+        windows=windows(),
+    ),
+    make_data=make_data,
+    plant=Rig,
+    oracle=oracle,
+    control=CONTROL,
+    tasks=TASKS,
+)

@@ -1,0 +1,52 @@
+"""The oracle: the rig's own equations as a model of the controller's form. No torch in here."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from hybrid_mpc.model import HybridModel
+from scenarios.golf_robot.nominal import GEAR, INPUTS, OUTPUTS, PARAMETERS, STATES
+from scenarios.golf_robot.rig import RigParameters, chain, rhs
+
+
+def oracle(dt: float, parameters: RigParameters | None = None, sub_steps: int = 50) -> HybridModel:
+    """The rig as a :class:`HybridModel` whose ``h`` is (bristle [-], motor torque [N m]).
+
+    Args:
+        dt: Model period [s].
+        parameters: The rig's parameters. Default: those of the default rig.
+        sub_steps: RK4 steps per period. Default 50 (0.4 ms at 20 ms: stable to about 6 rad/s).
+
+    Returns:
+        The model; its energy balance is the prior's, with the published parameters.
+
+    Example:
+        >>> oracle(0.02).n_h
+        2
+    """
+    p = parameters or RigParameters()
+    run = chain(p, sub_steps)
+    x, h, u, w = ca.MX.sym("x", 2), ca.MX.sym("h", 2), ca.MX.sym("u"), ca.MX.sym("xdot", 2)
+    after = run(ca.vertcat(x, h), u, dt / sub_steps)
+    s, v = ca.SX.sym("s", 4), ca.SX.sym("v")
+    f = ca.Function("f", [s, v], [rhs(s, v, p)[0][:2]])
+    return HybridModel(
+        "oracle",
+        dt,
+        STATES,
+        INPUTS,
+        OUTPUTS,
+        step=ca.Function("step", [x, h, u], [after[:2], after[2:]]),
+        xdot=ca.Function("xdot", [x, h, u], [f(ca.vertcat(x, h), u)]),
+        output=ca.Function("output", [x, u], [x[0]]),
+        energy_balance=ca.Function("energy_balance", [x, w, u], [_energy_balance(x, w, u)]),
+    )
+
+
+def _energy_balance(x: ca.MX, xdot: ca.MX, u: ca.MX) -> ca.MX:
+    p = {spec.name: spec.value for spec in PARAMETERS}
+    phi, v = x[0], x[1]
+    load = ca.fabs(p["m"] * v**2 * p["a"] + p["m"] * p["g"] * ca.cos(phi))
+    friction = p["r"] * p["mu"] * ca.tanh(p["gamma"] * v) * load
+    gravity = p["m"] * p["g"] * p["a"] * ca.sin(phi)
+    return v * (p["J"] * xdot[1] + gravity + p["d"] * v + friction - GEAR * u)
