@@ -1,0 +1,87 @@
+"""The record of a closed loop."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ClosedLoopResult:
+    """A closed loop of n periods; row k belongs to ``t_k = k dt``.
+
+    Args:
+        dt: Period [s].
+        t: ``(n,)`` [s].
+        x: True states ``(n, n_x)`` at ``t_k``.
+        y: Measurements ``(n, n_y)`` as they arrived, faults and noise included; NaN for a dropout.
+        u: Commanded inputs ``(n, n_u)``, held from ``t_k`` on.
+        x_hat: Estimated states ``(n, n_x)``.
+        h: Estimated hidden states ``(n, n_h)``.
+        d: Estimated input disturbance ``(n, n_u)``.
+        reference: Reference ``(n, n_x)`` at ``t_k``.
+        source: Name of the :class:`~hybrid_mpc.mpc.Source` of each input.
+        status: Name of the :class:`~hybrid_mpc.mpc.Status` of each solve.
+        stage_cost: Stage cost ``(n,)`` per second on the true state; NaN if no cost was given.
+        timing_ms: Durations ``(n,)`` [ms] of ``estimate``, ``solve``, ``monitor`` and ``total``. The only
+            field in which two runs may differ.
+        violation: Energy violation ``(n,)`` [W]; NaN without a monitor.
+        level: Alarm level ``(n,)`` [W]; NaN without a monitor.
+        alarm: ``(n,)``, True while the monitor alarms.
+
+    Example:
+        >>> one = np.ones((2, 1))
+        >>> result = ClosedLoopResult(0.1, np.array([0.0, 0.1]), one, one, one, one, one, one, 0 * one,
+        ...     ("MPC",) * 2, ("SOLVED",) * 2, np.array([2.0, 4.0]), {}, one[:, 0], one[:, 0], np.zeros(2, bool))
+        >>> round(result.cost, 6), result.tracking_rmse
+        (0.6, 1.0)
+    """
+
+    dt: float
+    t: Array
+    x: Array
+    y: Array
+    u: Array
+    x_hat: Array
+    h: Array
+    d: Array
+    reference: Array
+    source: tuple[str, ...]
+    status: tuple[str, ...]
+    stage_cost: Array
+    timing_ms: Mapping[str, Array]
+    violation: Array
+    level: Array
+    alarm: NDArray[np.bool_]
+
+    @property
+    def cost(self) -> float:
+        """Closed-loop cost ``J = sum_k stage_cost_k dt`` on the true state."""
+        return float(np.sum(self.stage_cost) * self.dt)
+
+    @property
+    def tracking_rmse(self) -> float:
+        """Root mean square of the true first state's deviation from its reference [its unit]."""
+        return float(np.sqrt(np.mean((self.x[:, 0] - self.reference[:, 0]) ** 2)))
+
+    def to_pandas(self) -> pd.DataFrame:
+        """One row a period; vectors become columns ``x_0, x_1, ...``. Needs pandas."""
+        import pandas as pd
+
+        columns: dict[str, object] = {"t": self.t}
+        for name in ("x", "y", "u", "x_hat", "h", "d", "reference"):
+            values = getattr(self, name)
+            columns.update({f"{name}_{i}": values[:, i] for i in range(values.shape[1])})
+        for name in ("source", "status", "stage_cost", "violation", "level", "alarm"):
+            columns[name] = getattr(self, name)
+        columns.update({f"{name}_ms": values for name, values in self.timing_ms.items()})
+        return pd.DataFrame(columns)

@@ -1,0 +1,199 @@
+"""The closed loop: measure, estimate, solve, monitor, hold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybrid_mpc.closed_loop.faults import Fault, check_channels, corrupt_input, corrupt_measurement
+from hybrid_mpc.closed_loop.result import ClosedLoopResult
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimation.kalman import Estimate, Estimator, TrueState
+from hybrid_mpc.mpc.condensed import CondensedController
+from hybrid_mpc.mpc.ocp import OCP
+from hybrid_mpc.mpc.safeguard import Decision, SafeController
+from hybrid_mpc.riccati import vector
+from hybrid_mpc.scenario import Plant
+
+Array = NDArray[np.float64]
+
+
+class Reading(Protocol):
+    """What a monitor says of one period."""
+
+    @property
+    def violation_w(self) -> float:
+        """Energy violation [W]."""
+
+    @property
+    def level_w(self) -> float:
+        """Level above which it counts [W]."""
+
+    @property
+    def alarm(self) -> bool:
+        """True while the monitor alarms."""
+
+
+class Monitor(Protocol):
+    """Watches a loop; pure, its memory is the state it returns."""
+
+    def initial(self) -> Any:
+        """State before the first period."""
+
+    def update(self, state: Any, y: Array, u_prev: Array, estimate: Estimate) -> tuple[Any, Reading]:
+        """State and reading after the measurement ``y``, with ``u_prev`` held before it."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One period as ``on_step`` sees it: number, time [s], truth, measurement, estimate, decision."""
+
+    k: int
+    t: float
+    x: Array
+    y: Array
+    estimate: Estimate
+    decision: Decision
+    reading: Reading | None
+
+
+def simulate(
+    plant: Plant,
+    estimator: Estimator,
+    controller: SafeController | CondensedController,
+    reference: Callable[[Array], Array],
+    *,
+    dt: float,
+    duration: float,
+    x0: ArrayLike,
+    seed: int,
+    horizon: int | None = None,
+    monitor: Monitor | None = None,
+    faults: Sequence[Fault] = (),
+    stage_cost: OCP | None = None,
+    on_step: Callable[[Step], None] | None = None,
+) -> ClosedLoopResult:
+    """Run a plant under control; deterministic except for the recorded durations.
+
+    At ``t_k``: measure ``y_k``; estimate with ``y_k`` and ``u_{k-1}``; solve ``u_k``; monitor; hold ``u_k``.
+    No time passes between measuring and holding. Input faults act behind the controller, which is not
+    told.
+
+    Args:
+        plant: The machine.
+        estimator: Filter, or :class:`~hybrid_mpc.estimation.TrueState`, which is handed the truth.
+        controller: A :class:`~hybrid_mpc.mpc.SafeController`; a bare controller is guarded without fallback.
+        reference: ``t (n,) -> x_ref (n, n_x)``, previewed over the horizon.
+        dt: Period [s]; must be the models' own.
+        duration: Length [s], rounded to whole periods.
+        x0: Initial state ``(n_x,)``.
+        seed: Seed of the plant and of the measurement noise.
+        horizon: Periods of preview. Default: the controller's horizon.
+        monitor: Default: none.
+        faults: Default: none.
+        stage_cost: Problem whose stage cost is recorded. Default: the controller's.
+        on_step: Called after every period, e.g. to show progress.
+
+    Returns:
+        The record of ``round(duration / dt)`` periods.
+
+    Raises:
+        InputError: If a period, shape or channel does not fit.
+
+    Example: see ``tests/closed_loop``; with a scenario::
+
+        result = simulate(plant, ekf, controller, task.reference, dt=0.02, duration=10.0, x0=task.x0, seed=0)
+    """
+    safe = controller if isinstance(controller, SafeController) else SafeController(controller)
+    ocp, model = safe.controller.ocp, estimator.model
+    n = _periods(dt, duration, model.dt, safe.controller.model.dt)
+    check_channels(faults, model.n_y, ocp.n_u)
+    x0 = vector(x0, ocp.n_x, "x0")
+    ahead = np.arange((ocp.horizon if horizon is None else horizon) + 1) * dt
+    cost = ocp if stage_cost is None else stage_cost
+    rng = np.random.default_rng(seed)
+    state = plant.reset(x0, seed)
+    estimate: Estimate | None = None
+    decision: Decision | None = None
+    memory = monitor.initial() if monitor is not None else None
+    record = _Record(dt)
+    y = np.full(model.n_y, np.nan)
+    for k in range(n):
+        t = k * dt
+        x = plant.truth(state)
+        y = corrupt_measurement(faults, t, plant.measure(state, rng), y)
+        seen = np.concatenate([x, plant.hidden(state)]) if isinstance(estimator, TrueState) else y
+        preview = np.asarray(reference(t + ahead), dtype=float)
+        if preview.shape != (ahead.size, ocp.n_x):
+            raise InputError(f"reference returns {preview.shape}, needed: {(ahead.size, ocp.n_x)}")
+        clock = [perf_counter()]
+        if estimate is None or decision is None:
+            estimate = estimator.start(seen, t)
+            decision = safe.initial(estimate)
+        else:
+            estimate = estimator.update(estimate, seen, decision.u)
+        clock.append(perf_counter())
+        u_prev = decision.u
+        decision = safe.decide(decision, estimate, preview)
+        clock.append(perf_counter())
+        reading = None
+        if monitor is not None:
+            memory, reading = monitor.update(memory, y, u_prev, estimate)
+        clock.append(perf_counter())
+        stage = float(cost.stage_cost(x, decision.u, preview[0], decision.u - u_prev))
+        step = Step(k, t, x, y, estimate, decision, reading)
+        record.add(step, preview[0], stage, np.diff(clock) * 1e3)
+        if on_step is not None:
+            on_step(step)
+        state = plant.step(state, corrupt_input(faults, t, decision.u), dt)
+    return record.result()
+
+
+def _periods(dt: float, duration: float, *periods: float) -> int:
+    for period in periods:
+        if not abs(dt - period) <= 1e-9 * period:
+            raise InputError(f"dt = {dt} s given, a model's period is {period} s; they must agree")
+    n = round(duration / dt)
+    if n < 1:
+        raise InputError(f"duration {duration} s is shorter than one period of {dt} s")
+    return n
+
+
+class _Record:
+    """Collects the rows of one simulation."""
+
+    def __init__(self, dt: float) -> None:
+        self._dt = dt
+        self._rows: list[tuple[Step, Array, float, Array]] = []
+
+    def add(self, step: Step, reference: Array, stage: float, spent: Array) -> None:
+        self._rows.append((step, reference, stage, spent))
+
+    def result(self) -> ClosedLoopResult:
+        steps = [row[0] for row in self._rows]
+        readings = [step.reading for step in steps]
+        spent = np.array([row[3] for row in self._rows])
+        timing = {name: spent[:, i] for i, name in enumerate(("estimate", "solve", "monitor"))}
+        return ClosedLoopResult(
+            dt=self._dt,
+            t=np.array([step.t for step in steps]),
+            x=np.array([step.x for step in steps]),
+            y=np.array([step.y for step in steps]),
+            u=np.array([step.decision.u for step in steps]),
+            x_hat=np.array([step.estimate.x for step in steps]),
+            h=np.array([step.estimate.h for step in steps]),
+            d=np.array([step.estimate.d for step in steps]),
+            reference=np.array([row[1] for row in self._rows]),
+            source=tuple(step.decision.source.name for step in steps),
+            status=tuple(step.decision.status.name for step in steps),
+            stage_cost=np.array([row[2] for row in self._rows]),
+            timing_ms={**timing, "total": spent.sum(axis=1)},
+            violation=np.array([np.nan if r is None else r.violation_w for r in readings]),
+            level=np.array([np.nan if r is None else r.level_w for r in readings]),
+            alarm=np.array([r is not None and bool(r.alarm) for r in readings]),
+        )

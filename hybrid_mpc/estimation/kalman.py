@@ -1,0 +1,270 @@
+"""Extended Kalman filter over the state, the hidden state and an input disturbance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.model import HybridModel
+from hybrid_mpc.riccati import hidden_fixed_point, vector
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What is believed of a machine at one instant.
+
+    Args:
+        t: Time [s].
+        x: State ``(n_x,)`` [SI].
+        h: Hidden state ``(n_h,)`` before ``(x, u)`` at ``t``.
+        d: Input disturbance ``(n_u,)`` [input units]: the machine acts as if its input were ``u + d``.
+        P: Covariance of ``(x, h, d)``, ``(n_x + n_h + n_u,) * 2``.
+        innovation: Measured minus predicted outputs ``(n_y,)``; NaN where nothing was measured.
+        nis: Normalised innovation squared [-]; chi-square with n_y degrees of freedom if the filter's
+            assumptions hold; NaN without a measurement.
+    """
+
+    t: float
+    x: Array
+    h: Array
+    d: Array
+    P: Array
+    innovation: Array
+    nis: float
+
+
+class Estimator(Protocol):
+    """What a closed loop needs of an estimator. Both methods are pure."""
+
+    @property
+    def model(self) -> HybridModel:
+        """The model whose ``(x, h)`` is estimated."""
+
+    def start(self, y: Array, t: float = 0.0) -> Estimate:
+        """First estimate from the first measurement."""
+
+    def update(self, estimate: Estimate, y: Array, u_prev: Array) -> Estimate:
+        """Estimate one period later, from ``y`` and the input held since."""
+
+
+class ExtendedKalmanFilter:
+    """Extended Kalman filter over ``(x, h, d)`` with the model's exact Jacobian.
+
+    The input disturbance ``d`` is a random walk; the hidden state carries no noise of its own, it
+    follows the state. On a linear model this is the Kalman filter. No method changes the object.
+
+    Args:
+        model: The deployed model.
+        sigma_y: Standard deviations of the measurement noise ``(n_y,)``, positive [output units].
+        sigma_x: Standard deviations of the process noise per period ``(n_x,)`` [state units].
+        sigma_d: Standard deviations of the step of ``d`` per period ``(n_u,)`` [input units]; 0 turns the
+            disturbance off.
+        sigma_x0: Standard deviations of the first state ``(n_x,)``.
+        sigma_d0: Standard deviations of the first disturbance ``(n_u,)``.
+
+    Raises:
+        InputError: If a shape does not fit, a deviation is negative or not finite, or ``sigma_y`` is 0.
+
+    Source: Simon, *Optimal State Estimation*, 2006, section 13.2; Joseph form of the correction.
+
+    Example:
+        >>> from hybrid_mpc.signals import Signal
+        >>> x, h, u, w = ca.MX.sym("x"), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w")
+        >>> model = HybridModel("sum", 1.0, (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),),
+        ...     ca.Function("f", [x, h, u], [x + u, h]), ca.Function("g", [x, h, u], [u]),
+        ...     ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]))
+        >>> ekf = ExtendedKalmanFilter(model, sigma_y=[0.1], sigma_x=[0.1], sigma_d=[0.0],
+        ...                            sigma_x0=[0.1], sigma_d0=[0.0])
+        >>> estimate = ekf.update(ekf.start(np.array([1.0])), y=np.array([1.3]), u_prev=np.zeros(1))
+        >>> estimate.x.round(3)
+        array([1.2])
+    """
+
+    def __init__(
+        self,
+        model: HybridModel,
+        *,
+        sigma_y: ArrayLike,
+        sigma_x: ArrayLike,
+        sigma_d: ArrayLike,
+        sigma_x0: ArrayLike,
+        sigma_d0: ArrayLike,
+    ) -> None:
+        n_x, n_u, n_y = model.n_x, model.n_u, model.n_y
+        variance_y = _variance(sigma_y, n_y, "sigma_y")
+        if not np.all(variance_y > 0):
+            raise InputError(f"sigma_y must be positive, got {np.asarray(sigma_y)}")
+        hidden = np.zeros(model.n_h)
+        self._model = model
+        self._noise_y = variance_y
+        self._noise = np.concatenate(
+            [_variance(sigma_x, n_x, "sigma_x"), hidden, _variance(sigma_d, n_u, "sigma_d")]
+        )
+        self._first = np.concatenate(
+            [_variance(sigma_x0, n_x, "sigma_x0"), hidden, _variance(sigma_d0, n_u, "sigma_d0")]
+        )
+        self._output = _output_with_jacobian(model)
+
+    @property
+    def model(self) -> HybridModel:
+        """The model of this filter."""
+        return self._model
+
+    def start(self, y: ArrayLike, t: float = 0.0) -> Estimate:
+        """Estimate at rest at ``y`` ``(n_y,)``: the smallest state with this output, ``d`` zero.
+
+        Elements of ``y`` that are not finite count as the output at the state zero.
+        """
+        model = self._model
+        x, u = np.zeros(model.n_x), np.zeros(model.n_u)
+        target = np.asarray(y, dtype=float).ravel()
+        for _ in range(20):  # Newton; one step if the outputs are linear in the state
+            y_hat, c_x, _ = (m.full() for m in self._output(x, u))
+            error = np.where(np.isfinite(target), target - y_hat.ravel(), 0.0)
+            x = x + np.linalg.pinv(c_x) @ error
+            if np.max(np.abs(error)) < 1e-12:
+                break
+        h = hidden_fixed_point(model, x, u)
+        empty = np.full(model.n_y, np.nan)
+        return Estimate(float(t), x, h, np.zeros(model.n_u), np.diag(self._first), empty, float("nan"))
+
+    def predict(self, estimate: Estimate, u: ArrayLike) -> Estimate:
+        """Estimate one period later with the input ``u`` ``(n_u,)`` held."""
+        model = self._model
+        n_z = model.n_x + model.n_h
+        assert model.with_jacobian is not None
+        held = np.asarray(u, dtype=float).ravel() + estimate.d
+        x, h, a, b = (m.full() for m in model.with_jacobian(estimate.x, estimate.h, held))
+        f = np.eye(n_z + model.n_u)
+        f[:n_z, :n_z], f[:n_z, n_z:] = a, b
+        p = f @ estimate.P @ f.T
+        p.flat[:: p.shape[0] + 1] += self._noise
+        empty = np.full(model.n_y, np.nan)
+        return Estimate(estimate.t + model.dt, x.ravel(), h.ravel(), estimate.d, p, empty, float("nan"))
+
+    def correct(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> Estimate:
+        """Estimate after the measurement ``y`` ``(n_y,)``, in Joseph form.
+
+        Elements of ``y`` that are not finite are left out; if all are, the estimate comes back as it is.
+
+        Args:
+            estimate: The predicted estimate.
+            y: Measurement ``(n_y,)``.
+            u: Input ``(n_u,)`` of the output equation. Default: zero.
+        """
+        model = self._model
+        y = np.asarray(y, dtype=float).ravel()
+        seen = np.isfinite(y)
+        if not seen.any():
+            return estimate
+        held = estimate.d if u is None else np.asarray(u, dtype=float).ravel() + estimate.d
+        y_hat, c_x, c_u = (m.full() for m in self._output(estimate.x, held))
+        c = np.hstack([c_x, np.zeros((model.n_y, model.n_h)), c_u])[seen]
+        p, r = estimate.P, self._noise_y[seen]
+        innovation = y - y_hat.ravel()
+        pct = p @ c.T
+        s = c @ pct + np.diag(r)
+        if not np.all(np.isfinite(s)):  # a diverged prediction: nothing to weigh the measurement with
+            return replace(estimate, innovation=innovation)
+        gain = np.linalg.solve(s, pct.T).T
+        i_kc = np.eye(p.shape[0]) - gain @ c
+        p_new = i_kc @ p @ i_kc.T + (gain * r) @ gain.T
+        step = gain @ innovation[seen]
+        nis = float(innovation[seen] @ np.linalg.solve(s, innovation[seen]))
+        n_x, n_z = model.n_x, model.n_x + model.n_h
+        x, h, d = estimate.x + step[:n_x], estimate.h + step[n_x:n_z], estimate.d + step[n_z:]
+        innovation = np.where(seen, innovation, np.nan)
+        return Estimate(estimate.t, x, h, d, 0.5 * (p_new + p_new.T), innovation, nis)
+
+    def update(self, estimate: Estimate, y: ArrayLike, u_prev: ArrayLike) -> Estimate:
+        """:meth:`predict` with the input ``u_prev`` held since, then :meth:`correct` with ``y``."""
+        return self.correct(self.predict(estimate, u_prev), y, u_prev)
+
+    def run(self, y: ArrayLike, u: ArrayLike, t: float = 0.0) -> list[Estimate]:
+        """Estimates along a measured past, e.g. to warm up.
+
+        Args:
+            y: Outputs ``(n, n_y)`` on the model's grid.
+            u: Inputs ``(n, n_u)``; ``u[k]`` is held from sample k to k + 1 (the last is not used).
+            t: Time of the first sample [s].
+
+        Returns:
+            ``n`` estimates; number k has seen ``y[:k + 1]``.
+
+        Raises:
+            InputError: If the shapes do not fit.
+        """
+        ys, us = np.asarray(y, dtype=float), np.asarray(u, dtype=float)
+        n = len(ys)
+        if n == 0 or ys.shape != (n, self._model.n_y) or us.shape != (n, self._model.n_u):
+            raise InputError(
+                f"y {ys.shape} and u {us.shape} given; "
+                f"needed: (n, {self._model.n_y}) and (n, {self._model.n_u}) with n > 0"
+            )
+        estimates = [self.start(ys[0], t)]
+        for y_k, u_k in zip(ys[1:], us[:-1], strict=True):
+            estimates.append(self.update(estimates[-1], y_k, u_k))
+        return estimates
+
+
+class TrueState:
+    """The estimator of an oracle: its "measurement" is the plant's truth ``(x, hidden)``.
+
+    ``closed_loop.simulate`` hands it the true states instead of the sensors' outputs.
+
+    Args:
+        model: The oracle model, whose hidden states are the plant's own (a prior has none).
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> TrueState(SimpleNamespace(n_x=2, n_h=0, n_u=1, n_y=1)).start(np.array([0.1, 0.2])).x
+        array([0.1, 0.2])
+    """
+
+    def __init__(self, model: HybridModel) -> None:
+        self._model = model
+
+    @property
+    def model(self) -> HybridModel:
+        """The oracle model."""
+        return self._model
+
+    def start(self, y: ArrayLike, t: float = 0.0) -> Estimate:
+        """Estimate that is the truth ``y = (x, hidden)``, ``(n_x + n_h,)`` or longer; ``d`` zero.
+
+        Raises:
+            InputError: If the plant has fewer hidden states than the model.
+        """
+        m, z = self._model, np.asarray(y, dtype=float).ravel()
+        n_z = m.n_x + m.n_h
+        if z.size < n_z:
+            raise InputError(f"true state: the plant gives {z.size} states, the oracle model needs {n_z}")
+        p, empty = np.zeros((n_z + m.n_u, n_z + m.n_u)), np.full(m.n_y, np.nan)
+        return Estimate(float(t), z[: m.n_x], z[m.n_x : n_z], np.zeros(m.n_u), p, empty, float("nan"))
+
+    def update(self, estimate: Estimate, y: ArrayLike, u_prev: ArrayLike) -> Estimate:
+        """The truth one period later; ``u_prev`` is not used."""
+        return self.start(y, estimate.t + self._model.dt)
+
+
+def _variance(sigma: ArrayLike | Sequence[float], size: int, name: str) -> Array:
+    values = vector(sigma, size, name)
+    if np.any(values < 0):
+        raise InputError(f"{name} must not be negative, got {values}")
+    return values**2
+
+
+def _output_with_jacobian(model: HybridModel) -> ca.Function:
+    x, u = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
+    y = model.output(x, u)
+    return ca.Function(
+        "output_with_jacobian", [x, u], [y, ca.densify(ca.jacobian(y, x)), ca.densify(ca.jacobian(y, u))]
+    )

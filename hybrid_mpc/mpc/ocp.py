@@ -1,0 +1,175 @@
+"""The optimal control problem as plain data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.model import HybridModel
+from hybrid_mpc.riccati import dare, linearisation, vector
+from hybrid_mpc.scenario import ControlSpec
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class OCP:
+    """A quadratic tracking problem with bounded inputs.
+
+    The cost of a plan is ``sum_k stage_k dt + (x_N - x_ref_N)' P (x_N - x_ref_N)`` with
+    ``stage_k = (x_k - x_ref_k)' diag(q) (x_k - x_ref_k) + u_k' diag(r) u_k + du_k' diag(r_delta) du_k``,
+    ``du_k = u_k - u_{k-1}`` and ``k = 0 .. N-1``. Only the stages are multiplied by ``dt``.
+
+    Args:
+        horizon: N, number of model periods.
+        q: Weights of the states ``(n_x,)``, not negative.
+        r: Weights of the inputs ``(n_u,)``, not negative.
+        r_delta: Weights of the input changes ``(n_u,)``; ``r + r_delta`` must be positive.
+        u_min: Lower bounds ``(n_u,)``; ``-inf`` for none.
+        u_max: Upper bounds ``(n_u,)``; ``inf`` for none.
+        du_max: Largest change per period ``(n_u,)``, positive. Default: none.
+        terminal: ``"riccati"``, or a symmetric positive semi-definite ``(n_x, n_x)`` matrix ``P``.
+        working_point: ``(x, u)`` at which ``"riccati"`` linearises the model. Default: zero. With a steep
+            friction law take a moving point (see :func:`hybrid_mpc.riccati.lqr`).
+
+    Raises:
+        InputError: If shapes do not fit, bounds cross, or a weight is negative or not finite.
+
+    Example:
+        >>> OCP(20, (1.0, 0.1), (0.1,), (0.0,), (-1.0,), (1.0,)).q
+        array([1. , 0.1])
+    """
+
+    horizon: int
+    q: Array
+    r: Array
+    r_delta: Array
+    u_min: Array
+    u_max: Array
+    du_max: Array | None = None
+    terminal: Array | Literal["riccati"] = "riccati"
+    working_point: tuple[ArrayLike, ArrayLike] | None = None
+
+    def __init__(
+        self,
+        horizon: int,
+        q: ArrayLike,
+        r: ArrayLike,
+        r_delta: ArrayLike,
+        u_min: ArrayLike,
+        u_max: ArrayLike,
+        du_max: ArrayLike | None = None,
+        terminal: ArrayLike | Literal["riccati"] = "riccati",
+        working_point: tuple[ArrayLike, ArrayLike] | None = None,
+    ) -> None:
+        if int(horizon) != horizon or horizon < 1:
+            raise InputError(f"horizon must be a whole number of periods, at least 1; got {horizon}")
+        q_v, r_v = np.asarray(q, dtype=float).ravel(), np.asarray(r, dtype=float).ravel()
+        n_x, n_u = q_v.size, r_v.size
+        weights = {"q": q_v, "r": r_v, "r_delta": vector(r_delta, n_u, "r_delta")}
+        _check_weights(weights)
+        lower, upper = _bounds(u_min, u_max, n_u)
+        if du_max is not None:
+            du_max = vector(du_max, n_u, "du_max")
+            if not np.all(du_max > 0):
+                raise InputError(f"du_max must be positive, got {du_max}; leave it out for no limit")
+        if not (isinstance(terminal, str) and terminal == "riccati"):
+            terminal = _terminal(terminal, n_x)
+        fields = {"horizon": int(horizon), **weights, "u_min": lower, "u_max": upper, "du_max": du_max}
+        for name, value in {**fields, "terminal": terminal, "working_point": working_point}.items():
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def from_spec(
+        cls,
+        spec: ControlSpec,
+        terminal: ArrayLike | Literal["riccati"] = "riccati",
+        working_point: tuple[ArrayLike, ArrayLike] | None = None,
+    ) -> OCP:
+        """The problem of a scenario's :class:`~hybrid_mpc.scenario.ControlSpec`."""
+        return cls(
+            spec.horizon, spec.q, spec.r, spec.r_delta, spec.u_min, spec.u_max, spec.du_max, terminal,
+            working_point,
+        )  # fmt: skip
+
+    @property
+    def n_x(self) -> int:
+        """Number of states."""
+        return int(self.q.size)
+
+    @property
+    def n_u(self) -> int:
+        """Number of inputs."""
+        return int(self.r.size)
+
+    def stage_cost(self, x: Array, u: Array, x_ref: Array, du: Array) -> Array:
+        """Stage cost ``(...)`` per second of states ``(..., n_x)`` and inputs ``(..., n_u)``."""
+        error = np.asarray(x) - np.asarray(x_ref)
+        return np.asarray(error**2 @ self.q + np.asarray(u) ** 2 @ self.r + np.asarray(du) ** 2 @ self.r_delta)
+
+    def saturate(self, u: Array, u_prev: Array) -> Array:
+        """``u`` ``(n_u,)`` moved into the bounds and, around ``u_prev``, into the limit of its change.
+
+        Example:
+            >>> OCP(5, [1.0], [1.0], [0.0], [-1.0], [1.0], du_max=[0.2]).saturate([3.0], [0.5])
+            array([0.7])
+        """
+        u = np.asarray(u, dtype=float)
+        if self.du_max is not None:
+            u = np.clip(u, u_prev - self.du_max, u_prev + self.du_max)
+        return np.clip(u, self.u_min, self.u_max)
+
+    def terminal_weight(self, model: HybridModel) -> Array:
+        """Terminal matrix ``(n_x, n_x)`` for a model.
+
+        ``"riccati"``: the cost-to-go of the LQR at the working point. With hidden states it is the
+        cost-to-go minimised over them (Schur complement), so that it needs no target for them. An input
+        change weight is counted as an input weight there: exact for ``r_delta = 0``.
+
+        Raises:
+            InputError: If the linearised model is not stabilisable.
+        """
+        if not isinstance(self.terminal, str):
+            return self.terminal
+        n_x = self.n_x
+        x, u = self.working_point if self.working_point is not None else (np.zeros(n_x), np.zeros(self.n_u))
+        a, b, _ = linearisation(model, vector(x, n_x, "working_point x"), vector(u, self.n_u, "working_point u"))
+        q = np.diag(np.concatenate([self.q, np.zeros(model.n_h)]) * model.dt)
+        p, _ = dare(a, b, q, np.diag(self.r + self.r_delta) * model.dt)
+        if not model.n_h:
+            return p
+        reduced = p[:n_x, :n_x] - p[:n_x, n_x:] @ np.linalg.pinv(p[n_x:, n_x:], hermitian=True) @ p[n_x:, :n_x]
+        values, vectors = np.linalg.eigh(0.5 * (reduced + reduced.T))
+        return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+
+
+def _check_weights(weights: dict[str, Array]) -> None:
+    for name, value in weights.items():
+        if value.size == 0 or not np.all(np.isfinite(value)) or np.any(value < 0):
+            raise InputError(f"{name}: weights must be finite and not negative, got {value}")
+    if not np.all(weights["r"] + weights["r_delta"] > 0):
+        raise InputError("every input needs a positive weight in r or r_delta, otherwise it is not determined")
+
+
+def _bounds(u_min: ArrayLike, u_max: ArrayLike, n_u: int) -> tuple[Array, Array]:
+    lower, upper = np.asarray(u_min, dtype=float).ravel(), np.asarray(u_max, dtype=float).ravel()
+    if lower.shape != (n_u,) or upper.shape != (n_u,):
+        raise InputError(f"u_min has {lower.size} and u_max {upper.size} values, {n_u} needed")
+    if not np.all(lower < upper):
+        raise InputError(f"input bounds cross: u_min {lower}, u_max {upper}; every u_min must be below its u_max")
+    return lower, upper
+
+
+def _terminal(value: ArrayLike, n_x: int) -> Array:
+    if isinstance(value, str):
+        raise InputError(f"terminal: {value!r} given; needed: 'riccati' or an ({n_x}, {n_x}) matrix")
+    matrix = np.asarray(value, dtype=float)
+    if matrix.shape != (n_x, n_x) or not np.all(np.isfinite(matrix)) or not np.allclose(matrix, matrix.T):
+        raise InputError(f"terminal: shape {matrix.shape} given; needed: a finite symmetric ({n_x}, {n_x}) matrix")
+    if np.min(np.linalg.eigvalsh(matrix)) < -1e-9 * max(1.0, float(np.max(np.abs(matrix)))):
+        raise InputError("terminal: the matrix has a negative eigenvalue; needed: positive semi-definite")
+    return matrix

@@ -1,0 +1,160 @@
+"""A controller that always returns an admissible input and says where it came from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimation.kalman import Estimate
+from hybrid_mpc.model import HybridModel
+from hybrid_mpc.mpc.condensed import CondensedController
+from hybrid_mpc.mpc.solution import Solution, Status
+from hybrid_mpc.riccati import lqr
+
+Array = NDArray[np.float64]
+
+
+class Source(Enum):
+    """Where an applied input came from; the value is the message."""
+
+    MPC = "the checked solution of the MPC"
+    PLAN = "the previous plan, shifted: the solve failed"
+    FALLBACK = "the stabilising feedback on the prior: the solve failed and the plan is used up"
+    ZERO = "zero within the limits: nothing else was finite"
+
+
+@dataclass(frozen=True)
+class Decision:
+    """The input of one period.
+
+    Args:
+        u: Input ``(n_u,)``, always within the bounds and the limit of its change.
+        source: Where it came from.
+        solution: The plan to go on from; its ``u[0]`` is ``u``.
+        status: How this period's solve ended.
+        age: Periods since the last successful solve.
+    """
+
+    u: Array
+    source: Source
+    solution: Solution
+    status: Status
+    age: int
+
+
+class SafeController:
+    """Guards a controller: checked solution, else the shifted plan, else a fallback, else zero.
+
+    Every input is within ``[u_min, u_max]`` and within ``du_max`` of the last one, whatever the solver,
+    the model or the estimate do. The object keeps nothing between calls: what must be remembered
+    (the held input, the plan, its age) is in the :class:`Decision`.
+
+    Args:
+        controller: The controller to guard.
+        fallback: Model, usually the fitted prior, whose LQR takes over. Default: none, then zero follows.
+        max_age: Periods a plan may be followed without a successful solve.
+        working_point: ``(x, u)`` at which the fallback is linearised; see :func:`hybrid_mpc.riccati.lqr`.
+            Default: the problem's own, else zero.
+
+    Raises:
+        InputError: If the fallback does not fit the problem or cannot be stabilised.
+
+    Example:
+        >>> from hybrid_mpc.estimation import TrueState
+        >>> from hybrid_mpc.mpc.ocp import OCP
+        >>> from hybrid_mpc.signals import Signal
+        >>> x, h, u, w = ca.MX.sym("x"), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w")
+        >>> model = HybridModel("sum", 1.0, (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),),
+        ...     ca.Function("f", [x, h, u], [x + u, h]), ca.Function("g", [x, h, u], [u]),
+        ...     ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]))
+        >>> ocp = OCP(5, [1.0], [1.0], [0.0], [-9.0], [9.0], du_max=[0.5])
+        >>> safe = SafeController(CondensedController(model, ocp), fallback=model)
+        >>> estimate = TrueState(model).start([2.0])
+        >>> decision = safe.decide(safe.initial(estimate), estimate, np.full((6, 1), np.nan))
+        >>> decision.source.name, decision.status.name
+        ('PLAN', 'NOT_FINITE')
+    """
+
+    def __init__(
+        self,
+        controller: CondensedController,
+        fallback: HybridModel | None = None,
+        *,
+        max_age: int = 5,
+        working_point: tuple[Array, Array] | None = None,
+    ) -> None:
+        if max_age < 0:
+            raise InputError(f"max_age must not be negative, got {max_age}")
+        ocp = controller.ocp
+        self._controller, self._max_age = controller, max_age
+        self._fallback = None
+        if fallback is not None:
+            if (fallback.n_x, fallback.n_u) != (ocp.n_x, ocp.n_u):
+                raise InputError(
+                    f"fallback {fallback.name} has {fallback.n_x} states and {fallback.n_u} inputs, "
+                    f"the problem {ocp.n_x} and {ocp.n_u}"
+                )
+            point = working_point if working_point is not None else ocp.working_point
+            zero = np.zeros(ocp.n_x), np.zeros(ocp.n_u)
+            feedback = lqr(fallback, *zero, ocp.q, ocp.r + ocp.r_delta, working_point=point)
+            self._gain = feedback.gain[:, : ocp.n_x]
+            self._fallback = _equilibrium_input(fallback)
+
+    @property
+    def controller(self) -> CondensedController:
+        """The guarded controller."""
+        return self._controller
+
+    def initial(self, estimate: Estimate, u: Array | None = None) -> Decision:
+        """Decision before the first: ``u`` ``(n_u,)`` is held (default: zero, or the bound next to it)."""
+        ocp = self._controller.ocp
+        held = np.clip(np.zeros(ocp.n_u) if u is None else u, ocp.u_min, ocp.u_max)
+        plan = self._controller.initial(estimate, np.tile(held, (ocp.horizon, 1)))
+        return Decision(held, Source.ZERO, plan, Status.INITIAL, 0)
+
+    def decide(self, previous: Decision, estimate: Estimate, reference: Array) -> Decision:
+        """The input to hold from now on.
+
+        Args:
+            previous: The last decision; its ``u`` is being held.
+            estimate: The state now.
+            reference: ``(m, n_x)`` from now on in steps of ``dt``.
+        """
+        ocp, held = self._controller.ocp, previous.u
+        solution = self._controller.solve(previous.solution, estimate, reference)
+        if solution.status.ok:
+            u = ocp.saturate(solution.u[0], held)
+            plan = replace(solution, u=np.vstack([u[None], solution.u[1:]]))
+            return Decision(u, Source.MPC, plan, solution.status, 0)
+        u, source = self._instead(solution, estimate, np.asarray(reference, dtype=float), previous.age + 1)
+        u = ocp.saturate(u, held)
+        inputs = np.vstack([u[None], solution.u[1:]])
+        inputs = np.where(np.isfinite(inputs), inputs, u)
+        known = bool(np.all(np.isfinite(np.concatenate([estimate.x, estimate.h, estimate.d]))))
+        plan = self._controller.initial(estimate, inputs) if known else replace(solution, u=inputs)
+        return Decision(u, source, plan, solution.status, previous.age + 1)
+
+    def _instead(self, failed: Solution, estimate: Estimate, reference: Array, age: int) -> tuple[Array, Source]:
+        if age <= self._max_age and np.all(np.isfinite(failed.u[0])):
+            return failed.u[0], Source.PLAN
+        if self._fallback is not None:
+            goal = reference[0] if np.all(np.isfinite(reference[0])) else np.zeros(self._controller.ocp.n_x)
+            u = self._fallback(goal).full().ravel() - self._gain @ (estimate.x - goal) - estimate.d
+            if np.all(np.isfinite(u)):
+                return u, Source.FALLBACK
+        return np.zeros(self._controller.ocp.n_u), Source.ZERO
+
+
+def _equilibrium_input(model: HybridModel) -> ca.Function:
+    """``x -> u`` that holds a state best: one least-squares Newton step of ``xdot(x, h = 0, u)`` from zero."""
+    x, u = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
+    v_dot = model.xdot(x, ca.DM.zeros(model.n_h, 1), u)[model.n_x // 2 :]
+    slope = ca.jacobian(v_dot, u)
+    damping = 1e-12 * ca.DM.eye(model.n_u)
+    best = -ca.solve(slope.T @ slope + damping, slope.T @ v_dot)
+    return ca.Function("equilibrium_input", [x], [ca.substitute(best, u, ca.DM.zeros(model.n_u, 1))])

@@ -1,0 +1,60 @@
+"""What a solve returns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class Status(Enum):
+    """How a solve ended; the value is the message.
+
+    Example:
+        >>> Status.QP_FAILED.ok, Status.SOLVED.ok
+        (False, True)
+    """
+
+    INITIAL = "a first plan, not optimised"
+    SOLVED = "the QP was solved and its solution checked"
+    NOT_FINITE = "the estimate, the reference, the model or the plan holds a value that is not finite"
+    QP_FAILED = "the QP solver reported a failure"
+    INFEASIBLE = "the QP's solution violates an input bound or the limit of its change"
+    INACCURATE = "the QP's solution fails the KKT check"
+
+    @property
+    def ok(self) -> bool:
+        """True if the plan may be applied."""
+        return self is Status.SOLVED
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A plan from ``t_k`` on, and how it was found.
+
+    Args:
+        u: Inputs ``(N, n_u)``; ``u[0]`` is the one to hold now.
+        x: Predicted states ``(N + 1, n_x)``.
+        h: Predicted hidden states ``(N + 1, n_h)``.
+        d: Input disturbance ``(n_u,)`` that the prediction assumes: the model runs on ``u + d``.
+        cost: Cost of the plan (see :class:`~hybrid_mpc.mpc.OCP`); NaN if it was not solved.
+        status: How the solve ended.
+        kkt: KKT residual of the QP, relative to its gradient [-].
+        defect: Largest defect ``|x_{k+1} - f(x_k, h_k, u_k)|`` at the last linearisation, over (x, h).
+        timing: Durations [ms] by name (``prepare``, ``feedback``); recorded, never used to decide.
+    """
+
+    u: Array
+    x: Array
+    h: Array
+    d: Array
+    cost: float
+    status: Status
+    kkt: float
+    defect: float
+    timing: Mapping[str, float]
