@@ -1,0 +1,44 @@
+"""Torch modules as CasADi functions: exact, without a compiler, readable on disk.
+
+``trace``, ``to_casadi`` and ``parity`` need torch and import it when first used; ``build`` and
+``load_programs`` need casadi and numpy only.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from nn_export.build import build
+from nn_export.errors import ExportError, ProgramError
+from nn_export.program import Node, Port, Program
+from nn_export.storage import load_programs, save_programs
+
+if TYPE_CHECKING:
+    from nn_export.parity import ParityReport, parity
+    from nn_export.trace import to_casadi, trace
+
+__all__ = [
+    "to_casadi",
+    "trace",
+    "build",
+    "parity",
+    "ParityReport",
+    "Program",
+    "Node",
+    "Port",
+    "save_programs",
+    "load_programs",
+    "ExportError",
+    "ProgramError",
+]
+_LAZY = {"trace": "trace", "to_casadi": "trace", "parity": "parity", "ParityReport": "parity"}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LAZY:
+        raise AttributeError(f"module 'nn_export' has no attribute {name!r}")
+    import importlib
+
+    module = importlib.import_module(f"nn_export.{_LAZY[name]}")
+    for public, home in _LAZY.items():  # a submodule of the same name must not hide the function
+        if home == _LAZY[name]:
+            globals()[public] = getattr(module, public)
+    return globals()[name]

@@ -1,0 +1,112 @@
+"""Program to CasADi: no torch in here."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from nn_export.errors import ProgramError, ShapeError
+from nn_export.operators import OPERATORS
+from nn_export.operators.value import Value, constant, matrix_shape
+from nn_export.program import Node, Program
+
+_IDENTIFIER = re.compile(r"[A-Za-z](_?[A-Za-z0-9])*_?")
+
+
+def valid_name(name: str) -> bool:
+    """True if CasADi takes the name.
+
+    Example:
+        >>> valid_name("x_next"), valid_name("x next"), valid_name("a__b")
+        (True, False, False)
+    """
+    return _IDENTIFIER.fullmatch(name) is not None and name not in ("null", "jac", "hess")
+
+
+def build(program: Program, name: str | None = None) -> ca.Function:
+    """The program as a CasADi function of MX with the program's names.
+
+    A tensor of shape (n,) becomes n x 1, (r, c) becomes r x c; axes of size 1 are dropped.
+
+    Args:
+        program: What :func:`nn_export.trace` made or :func:`nn_export.load_programs` read.
+        name: Name of the function. Default: ``"program"``.
+
+    Returns:
+        Function with dense inputs and outputs.
+
+    Raises:
+        ProgramError: If an operator gets arguments it does not know, or a result has another shape than
+            the program says: the message names the node and the line of the module.
+
+    Example:
+        >>> from nn_export import Node, Port
+        >>> node = Node("tanh", "aten.tanh.default", [{"input": "x"}], {}, ((2,),))
+        >>> build(Program((Port("x", (2,)),), (Port("y", (2,), {"node": "tanh"}),), (node,)))
+        Function(program:(x[2])->(y[2]) MXFunction)
+    """
+    name = "program" if name is None else name
+    for text in (name, *(p.name for p in (*program.inputs, *program.outputs))):
+        if not valid_name(text):
+            raise ProgramError(f"{text!r} is no name for CasADi: use letters, digits and single underscores")
+    values: dict[tuple[str, str], Any] = {}
+    symbols = []
+    for port in program.inputs:
+        symbols.append(ca.MX.sym(port.name, *_size(f"input {port.name}", port.shape)))
+        values["input", port.name] = Value(port.shape, symbols[-1])
+    for weight, array in program.weights.items():
+        _size(f"weight {weight}", np.shape(array))
+        values["weight", weight] = constant(array)
+    for node in program.nodes:
+        values["node", node.name] = _evaluate(node, values)
+    results = []
+    for port in program.outputs:
+        value = _resolve(port.source, values)
+        if not isinstance(value, Value) or value.shape != port.shape:
+            raise ProgramError(f"output {port.name}: {port.source} has not its shape {port.shape}; export again")
+        results.append(value.mx)
+    names = [p.name for p in program.inputs], [p.name for p in program.outputs]
+    try:
+        return ca.Function(name, symbols, results, *names, {"allow_duplicate_io_names": True})
+    except RuntimeError as error:
+        raise ProgramError(f"CasADi refuses the function: {error}") from error
+
+
+def _size(what: str, shape: tuple[int, ...]) -> tuple[int, int]:
+    try:
+        return matrix_shape(shape)
+    except ShapeError as error:
+        raise ShapeError(f"{what}: {error}") from error
+
+
+def _evaluate(node: Node, values: dict[tuple[str, str], Any]) -> Any:
+    where = f"node {node.name} ({node.op})" + (f" from {node.line}" if node.line else "")
+    try:
+        for shape in node.shapes:
+            matrix_shape(shape)
+        args, kwargs = _resolve(node.args, values), _resolve(node.kwargs, values)
+        result = OPERATORS[node.op](*args, **kwargs)
+        given = tuple(v.shape for v in (result if isinstance(result, tuple) else (result,)))
+    except ShapeError as error:
+        raise ShapeError(f"{where}: {error}") from error
+    except (TypeError, ValueError, LookupError, AttributeError, ArithmeticError, RuntimeError) as error:
+        raise ProgramError(f"{where}: arguments that nn_export does not know: {error}") from error
+    except (NotImplementedError, MemoryError) as error:
+        raise ProgramError(f"{where}: cannot be built: {error}") from error
+    if given != node.shapes:
+        raise ProgramError(f"{where}: gives shapes {given}, the program says {node.shapes}; export again")
+    return result
+
+
+def _resolve(data: Any, values: dict[tuple[str, str], Any]) -> Any:
+    if isinstance(data, dict):
+        if len(data) != 1:
+            return {key: _resolve(value, values) for key, value in data.items()}
+        key, value = next(iter(data.items()))
+        if key == "float":
+            return float(value)
+        return values[key, value] if (key, value) in values else {key: _resolve(value, values)}
+    return [_resolve(item, values) for item in data] if isinstance(data, list) else data

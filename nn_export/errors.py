@@ -1,0 +1,43 @@
+"""Named errors of the exporter; every message says what was given and what to do."""
+
+from __future__ import annotations
+
+
+class ExportError(ValueError):
+    """Base of all errors of this package."""
+
+
+class UnsupportedOperatorError(ExportError):
+    """The module uses operators the exporter does not know; all of them are listed at once."""
+
+
+class ControlFlowError(ExportError):
+    """The module decides by the values of its inputs (``if x > 0``, ``float(x)``)."""
+
+
+class TrainingModeError(ExportError):
+    """A layer draws random numbers or uses batch statistics, even in evaluation mode."""
+
+
+class HiddenStateError(ExportError):
+    """The module writes into a buffer or into one of its inputs."""
+
+
+class DtypeError(ExportError):
+    """A value is complex, integer where a real one is needed, or computed in less than float64."""
+
+
+class ShapeError(ExportError):
+    """A value has more than two axes longer than one."""
+
+
+class SignatureError(ExportError):
+    """Example inputs or names do not fit the module."""
+
+
+class TraceError(ExportError):
+    """torch could not trace the module for another reason; its own message is included."""
+
+
+class ProgramError(ExportError):
+    """A program or its file is damaged, foreign, too large, or not understood."""

@@ -1,0 +1,26 @@
+"""The table of operators: ATen overload name to a small function on :class:`Value`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from nn_export.operators import elementwise, linear, recurrent, reduce, shape
+from nn_export.operators.value import Value
+
+
+def getitem(values: Sequence[Value], index: int) -> Value:
+    """One of the results of an operator that has several."""
+    return values[index]
+
+
+OPERATORS: dict[str, Callable[..., Any]] = {
+    "getitem": getitem,
+    **elementwise.OPERATORS,
+    **shape.OPERATORS,
+    **linear.OPERATORS,
+    **reduce.OPERATORS,
+    **recurrent.OPERATORS,
+}
+
+__all__ = ["OPERATORS"]

@@ -1,0 +1,143 @@
+"""Tensors of any rank held as dense CasADi matrices.
+
+A tensor is stored without its axes of size 1, so at most two axes remain: none is a 1 x 1 matrix, one
+of n a column n x 1, two a matrix r x c. Every movement of data (slicing, reshaping, broadcasting ...)
+is one selection of elements, found by doing the movement on an array of positions.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from nn_export.errors import ShapeError
+
+Shape = tuple[int, ...]
+MAX_ELEMENTS = 2**24  # of one value: 128 MiB
+
+
+def matrix_shape(shape: Shape) -> tuple[int, int]:
+    """Rows and columns of the matrix that holds a tensor of this shape.
+
+    Raises:
+        ShapeError: If more than two axes are longer than one, or there are more than 2**24 elements.
+
+    Example:
+        >>> matrix_shape((1, 3)), matrix_shape((4, 1, 2)), matrix_shape(()), matrix_shape((0,))
+        ((3, 1), (4, 2), (1, 1), (0, 1))
+    """
+    if math.prod(shape) > MAX_ELEMENTS:
+        raise ShapeError(f"a value of shape {shape} is too large: at most {MAX_ELEMENTS} elements")
+    kept = [n for n in shape if n != 1]
+    if len(kept) > 2:
+        raise ShapeError(f"shape {shape} has more than two axes longer than 1; export one sample, not a batch")
+    rows, columns = (*kept, 1, 1)[:2]
+    return rows, columns
+
+
+@dataclass(frozen=True)
+class Value:
+    """A tensor: its torch shape and the dense matrix that holds it.
+
+    Args:
+        shape: Shape in torch.
+        mx: Matrix of ``matrix_shape(shape)``.
+
+    Raises:
+        ShapeError: If the two do not fit.
+
+    Example:
+        >>> Value((1, 3), ca.MX.sym("x", 3)).mx.shape
+        (3, 1)
+    """
+
+    shape: Shape
+    mx: ca.MX
+
+    def __post_init__(self) -> None:
+        if self.mx.shape != matrix_shape(self.shape):
+            raise ShapeError(f"shape {self.shape} does not fit a {self.mx.shape} matrix")
+        if not self.mx.is_dense():
+            object.__setattr__(self, "mx", ca.densify(self.mx))
+
+    @property
+    def positions(self) -> np.ndarray:
+        """Column-major position of every element in ``mx``, in the tensor's shape."""
+        rows, columns = self.mx.shape
+        return np.arange(rows * columns).reshape((rows, columns), order="F").reshape(self.shape)
+
+
+def constant(array: Any) -> Value:
+    """The array as a constant value."""
+    data = np.asarray(array, dtype=np.float64)
+    rows, columns = matrix_shape(data.shape)
+    return Value(data.shape, ca.MX(ca.DM(data.reshape(rows, columns))))
+
+
+def lift(value: Value | float) -> Value:
+    """A number becomes a constant, a value stays."""
+    if isinstance(value, Value):
+        return value
+    if not isinstance(value, bool | int | float):
+        raise TypeError(f"expected a tensor or a number, got {value!r}")
+    return constant(float(value))
+
+
+def arrange(mx: ca.MX, positions: np.ndarray) -> ca.MX:
+    """Matrix (R, C) of the elements of ``mx`` at column-major ``positions`` (R, C)."""
+    rows, columns = positions.shape
+    flat = positions.flatten(order="F")
+    if flat.size == 0:
+        return ca.MX.zeros(rows, columns)
+    if flat.size == mx.numel():
+        if np.array_equal(flat, np.arange(flat.size)):
+            return mx if mx.shape == (rows, columns) else ca.reshape(mx, rows, columns)
+        if mx.shape == (columns, rows) and np.array_equal(positions.flatten(), np.arange(flat.size)):
+            return mx.T
+    return ca.reshape(mx.nz[flat.tolist()], rows, columns)
+
+
+def move(value: Value, positions: np.ndarray) -> Value:
+    """The tensor of ``value``'s elements at ``positions``, which have the new shape."""
+    return Value(positions.shape, arrange(value.mx, positions.reshape(matrix_shape(positions.shape))))
+
+
+def matrix(value: Value, rows: int, columns: int) -> ca.MX:
+    """The elements, in row-major order, as a matrix of exactly this size."""
+    return arrange(value.mx, value.positions.reshape(rows, columns))
+
+
+def from_matrix(mx: ca.MX, shape: Shape) -> Value:
+    """A tensor of this shape from a matrix whose row-major order it has. Inverse of :func:`matrix`."""
+    mx = mx if mx.is_dense() else ca.densify(mx)
+    positions = np.arange(mx.numel()).reshape(mx.shape, order="F")
+    return Value(shape, arrange(mx, positions.reshape(shape).reshape(matrix_shape(shape))))
+
+
+def broadcast(value: Value, shape: Shape) -> Value:
+    """The value repeated to a shape by the rules of torch."""
+    return value if value.shape == shape else move(value, np.broadcast_to(value.positions, shape))
+
+
+def concatenate(values: list[Value], axis: int) -> Value:
+    """Values joined along an axis; empty 1-D ones are skipped, as torch does."""
+    kept = [v for v in values if v.shape != (0,)] or values[:1]
+    offsets = np.cumsum([0] + [v.mx.numel() for v in kept])
+    joined = np.concatenate([v.positions + o for v, o in zip(kept, offsets, strict=False)], axis=axis)
+    column = ca.vertcat(*[ca.vec(v.mx) for v in kept])
+    return Value(joined.shape, arrange(column, joined.reshape(matrix_shape(joined.shape))))
+
+
+def numbers(value: Value) -> np.ndarray:
+    """The numbers of a constant value, in its shape.
+
+    Raises:
+        ValueError: If it depends on an input.
+    """
+    if ca.symvar(value.mx):
+        raise ValueError("an index or size depends on an input; only constant ones can be exported")
+    return np.array(ca.evalf(value.mx)).flatten(order="F")[value.positions]
