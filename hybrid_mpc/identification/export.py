@@ -81,7 +81,7 @@ def check_parity(
     x, u = (np.concatenate([getattr(t, name) for t in trajectories]) for name in ("x", "u"))
     scale = (np.abs(x).max(0), np.ones(examples["h"].numel()), np.abs(u).max(0))
     report = nn_export.parity(step, model.step, tuple(examples[i] for i in INPUTS["step"]), seed=seed, scale=scale)
-    return Parity(report.max_rel_error, report.jacobian_max_rel_error)
+    return Parity(report.value_rel, report.jacobian_rel)
 
 
 def _examples(step: HybridStep | PriorStep) -> dict[str, Tensor]:

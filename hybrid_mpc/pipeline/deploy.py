@@ -108,14 +108,14 @@ def _closed_loops(context: Context, artifact: Artifact, control: ControlSpec, no
                 context.progress.update("loops", done, total, f"{task.name}, {name}, seed {seed}")
                 result = _loop(context, artifact, control, noise, task, name, seed)
                 done += 1
-                sources = [getattr(s, "name", str(s)) for s in result.source]
+                solved = result.source.count("MPC") / len(result.source)
                 rows.append(
                     {"task": task.name, "controller": name, "seed": seed, "cost": result.cost,
-                     "tracking_rmse_rad": result.tracking_rmse, "solved": sources.count("MPC") / len(sources),
+                     "tracking_rmse_rad": result.tracking_rmse, "solved": solved,
                      "finite": bool(np.isfinite(result.x).all())}
                 )  # fmt: skip
                 arrays[f"{task.name}/{name}/{seed}/step_ms"] = result.timing_ms["total"]
-                arrays[f"{task.name}/{name}/{seed}/level_w"] = result.level_w
+                arrays[f"{task.name}/{name}/{seed}/level_w"] = result.level
                 if seed == 0:
                     for key in ("t", "x", "u", "reference"):
                         arrays[f"{task.name}/{name}/{key}"] = getattr(result, key)
@@ -149,6 +149,7 @@ def _loop(
         estimator,
         controller,
         task.reference,
+        dt=context.spec.dt,
         duration=task.duration,
         x0=np.array(task.x0),
         seed=context.settings.seed * 1000 + seed,

@@ -1,0 +1,179 @@
+"""The main job's pictures, drawn from the stages' checkpoints."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hybrid_mpc.identification.training import KINDS
+from hybrid_mpc.pipeline.context import Context
+from hybrid_mpc.pipeline.identify import MODELS, load_trained
+from hybrid_mpc.pipeline.judge import clean_windows
+from hybrid_mpc.pipeline.results import step_times
+from hybrid_mpc.plots import analysis, data, fit, loops, monitor, save, training
+
+Figures = dict[str, list[tuple[Path, str]]]
+"""Figure files with their captions by section of the report."""
+SHOWN_RUNS = 2
+SHOWN_RECORDINGS = 4
+
+
+def draw_all(context: Context) -> Figures:
+    """Draw every figure that the run's stages allow into ``figures/``."""
+    parts = (_data, _training, _free_runs, _loops, _timing, _monitor, _analysis)
+    figures: Figures = {}
+    for i, part in enumerate(parts):
+        context.progress.update("figures", i, len(parts), part.__name__.strip("_"))
+        for section, name, figure, caption in part(context):
+            path = save(figure, context.out / "figures" / f"{name}.png")
+            figures.setdefault(section, []).append((path, caption))
+    return figures
+
+
+def _data(context: Context) -> Any:
+    prior = context.scenario.prior()
+    pieces = [t for t in context.dataset.trajectories if t.role != "nominal"]
+    yield (
+        "data", "recordings", data.recordings(pieces, prior.outputs, prior.inputs),
+        "Recordings with what each part is used for.",
+    )  # fmt: skip
+    yield "data", "coverage", data.coverage(pieces, prior.states), "Where training and test data lie."
+
+
+def _training(context: Context) -> Any:
+    curves, starts = {}, {}
+    for kind in reversed(KINDS):
+        trained = load_trained(context, kind)
+        names = ["loss_error", "validation"]
+        if kind == "mopgrnn":
+            names += ["loss_energy", "bound_error", "bound_energy"]
+        best = trained.best
+        curves[kind] = {"step": trained.curve["step"][:, best]}
+        curves[kind] |= {name: trained.curve[name][:, best] for name in names}
+        starts[kind] = float(trained.settings.teacher_steps)
+    figure = training.curves(curves, free_run_start=starts, units=("mixed SI", "W", "mixed SI"))
+    caption = "Objectives and bounds of the deployed network of each kind, on a fixed set of training windows."
+    yield "training", "training", figure, caption
+
+
+def _free_runs(context: Context) -> Any:
+    arrays, prior = context.arrays("evaluation"), context.scenario.prior()
+    for run in context.result("evaluation")["runs"][:SHOWN_RUNS]:
+        own = {m: {k: arrays[f"{m}/{run}/{k}"] for k in ("x_hat", "energy_model_w")} for m in MODELS}
+        shared = {k: arrays[f"mopgrnn/{run}/{k}"] for k in ("t", "x", "u", "energy_measured_w")}
+        shown = [m for m in ("phy_nominal", "phy", "rnn", "mopgrnn")]
+        figure = fit.free_run(
+            shared["t"],
+            shared["x"],
+            {m: own[m]["x_hat"] for m in shown},
+            shared["u"],
+            states=prior.states,
+            inputs=prior.inputs,
+            energy_measured=shared["energy_measured_w"],
+            energy_model=own["mopgrnn"]["energy_model_w"],
+            title=f"Free run on {run}",
+        )
+        name = run.replace("#", "-")
+        yield "free_run", f"free_run_{name}", figure, f"Free run over the unseen piece {run}; the warm-up before it is left out."
+    scores = context.result("evaluation")["scores"]
+    keys = ("e_sim_s", "rmse_rad", "energy_violation_w")
+    finite = {m: {k: _finite(scores[m]["best"][k]) for k in keys} for m in MODELS}
+    spread = {
+        m: {k: float(np.std([float(n[k]) for n in scores[m]["networks"]])) for k in keys}
+        for m in KINDS
+        if all(np.isfinite(float(n[k])) for n in scores[m]["networks"] for k in keys)
+    }
+    yield (
+        "free_run", "errors", fit.errors_bar(finite, spread=spread),
+        "Errors over all unseen pieces; whiskers: standard deviation over the networks of a kind.",
+    )  # fmt: skip
+
+
+def _finite(value: Any) -> float | None:
+    return float(value) if np.isfinite(float(value)) else None
+
+
+def _loops(context: Context) -> Any:
+    arrays, scenario = context.arrays("control"), context.scenario
+    if "reason" in context.result("control") or scenario.control is None:
+        return
+    prior = scenario.prior()
+    for task in scenario.tasks:
+        names = [n for n in ("prior", "hybrid", "oracle") if f"{task.name}/{n}/t" in arrays]
+        results = {
+            n: loops.Loop(*(arrays[f"{task.name}/{n}/{key}"] for key in ("t", "x", "u"))) for n in names
+        }
+        figure = loops.closed_loops(
+            task.title,
+            arrays[f"{task.name}/{names[0]}/t"],
+            arrays[f"{task.name}/{names[0]}/reference"],
+            results,
+            states=prior.states,
+            inputs=prior.inputs,
+            limits=(scenario.control.u_min, scenario.control.u_max),
+        )
+        yield "control", f"loop_{task.name}", figure, f"{task.title}, first seed."
+
+
+def _timing(context: Context) -> Any:
+    times = step_times(context)
+    if times:
+        caption = "Whole controller steps: estimation, optimisation and monitoring, the Python calls included."
+        yield "timing", "step_times", loops.solve_times(times, 1e3 * context.spec.dt), caption
+
+
+def _monitor(context: Context) -> Any:
+    result = context.result("monitor")
+    if "reason" in result:
+        return
+    arrays, output = context.arrays("monitor"), context.scenario.prior().outputs[0]
+    for recording in _worth_showing(context):
+        own = {k: arrays[f"{recording.name}/{k}"] for k in ("t", "violation_w", "level_w", "alarm", "y")}
+        figure = monitor.trace(
+            own["t"],
+            own["violation_w"],
+            own["level_w"],
+            result["calibration"]["threshold_w"],
+            own["alarm"],
+            own["y"],
+            output=output,
+            windows=clean_windows(context, recording, ("train", "valid", "test", "nominal")),
+            title=recording.name,
+        )
+        name = recording.name.replace("#", "-")
+        yield "monitor", f"monitor_{name}", figure, f"The monitor over the whole recording {recording.name}."
+
+
+def _worth_showing(context: Context) -> list[Any]:
+    """Recordings with alarms first, then test recordings, a few in all."""
+    alarmed = {alarm["file"] for alarm in context.result("monitor")["alarms"]}
+    tested = {t.name.split("#")[0] for t in context.trajectories("test")}
+    ranked = sorted(
+        context.dataset.whole, key=lambda r: (r.name not in alarmed, r.name.split("#")[0] not in tested)
+    )
+    return ranked[:SHOWN_RECORDINGS]
+
+
+def _analysis(context: Context) -> Any:
+    result, arrays = context.result("analysis"), context.arrays("analysis")
+    colours = {"prior": "phy", "hybrid": "mopgrnn"}
+    poles = {c: np.array([complex(*z) for z in result[n]["rest"]["poles"]]) for n, c in colours.items()}
+    yield "analysis", "poles", analysis.pole_map(poles, context.spec.dt), "Poles of the one-step maps at rest."
+    prior = context.scenario.prior()
+    titles = {"rest": "at rest, where the slope of dry friction dominates", "moving": "at working speed"}
+    for point in ("rest", "moving"):
+        if point not in result["prior"]:
+            continue
+        responses = {
+            c: tuple(arrays[f"{n}/{point}/{key}"] for key in ("omega", "magnitude", "phase"))
+            for n, c in colours.items()
+        }
+        figure = analysis.bode(
+            responses,  # type: ignore[arg-type]
+            input_signal=prior.inputs[0],
+            output_signal=prior.outputs[0],
+            nyquist=np.pi / context.spec.dt,
+        )
+        yield "analysis", f"bode_{point}", figure, f"Bode plot of prior and hybrid {titles[point]}."

@@ -1,0 +1,130 @@
+"""Stages monitor and analysis: online plausibility on recordings, and the linearised models."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.artifact import load_artifact, set_calibration
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.model import HybridModel
+from hybrid_mpc.monitor.calibration import Calibration, alarm_intervals, calibrate
+from hybrid_mpc.monitor.replay import MonitorTrace, replay
+from hybrid_mpc.pipeline.context import Context
+from hybrid_mpc.pipeline.loops import make_estimator, make_monitor, working_point
+from hybrid_mpc.scenario import ControlSpec
+
+if TYPE_CHECKING:
+    from hybrid_mpc.data.trajectories import Trajectory
+
+Array = NDArray[np.float64]
+WANTED_RATE = 1.0
+"""Wanted false alarms an hour on nominal data."""
+MARGIN = 1.5
+"""Where nominal data are too short for a rate: threshold over the highest nominal level."""
+
+
+def monitor_stage(context: Context) -> None:
+    """Calibrate on training and validation stretches, then replay the monitor over whole recordings."""
+    control = context.scenario.control
+    if control is None:
+        reason = "the monitor's estimator needs the scenario's control problem (input range, sensor noise)"
+        context.save("monitor", {"reason": reason}, {})
+        return
+    model = load_artifact(context.out / "model").models["hybrid"]
+    sigma_x = np.array(context.result("control")["sigma_x"]["hybrid"])
+    whole = context.dataset.whole
+    levels = []
+    for i, recording in enumerate(whole):
+        context.progress.update("recordings", i, 2 * len(whole), f"levels of {recording.name}")
+        levels.append(_trace(model, None, control, sigma_x, recording).level_w)
+    nominal = [
+        np.where(_inside(context, recording, ("train", "valid", "nominal")), level, np.nan)
+        for recording, level in zip(whole, levels, strict=True)
+    ]
+    calibration = _calibrate(nominal, model.dt, context.dataset.hash)
+    set_calibration(context.out / "model", calibration.to_dict())
+    alarms, arrays, clean = [], {}, {"seconds": 0.0, "alarms": 0, "test_seconds": 0.0, "test_alarms": 0}
+    for i, recording in enumerate(whole):
+        context.progress.update("recordings", len(whole) + i, 2 * len(whole), f"replay of {recording.name}")
+        trace = _trace(model, calibration, control, sigma_x, recording)
+        alarms += [{"file": recording.name, "start_s": a, "end_s": b} for a, b in trace.intervals()]
+        for key in ("t", "violation_w", "level_w", "alarm"):
+            arrays[f"{recording.name}/{key}"] = getattr(trace, key)
+        arrays[f"{recording.name}/y"] = recording.y[:, 0]
+        for prefix, roles in (("", ("train", "valid", "nominal", "test")), ("test_", ("test",))):
+            inside = _inside(context, recording, roles)
+            clean[f"{prefix}seconds"] += float(inside.sum() * model.dt)
+            clean[f"{prefix}alarms"] += len(alarm_intervals(trace.alarm & inside, model.dt))
+    context.save("monitor", {"calibration": calibration.to_dict(), "alarms": alarms, "clean": clean}, arrays)
+
+
+def clean_windows(context: Context, recording: Trajectory, roles: tuple[str, ...]) -> list[tuple[float, float]]:
+    """Stretches of a recording whose role says that nothing disturbs the machine there, ``(start, end)`` [s]."""
+    stem = recording.name.split("#")[0]
+    if stem in context.spec.windows:
+        return [(w.start, w.end) for w in context.spec.windows[stem] if w.role in roles]
+    pieces = [t for t in context.dataset.trajectories if t.name.split("#")[0] == stem and t.role in roles]
+    return [(float(t.t[0]), float(t.t[-1])) for t in pieces]
+
+
+def _inside(context: Context, recording: Trajectory, roles: tuple[str, ...]) -> NDArray[np.bool_]:
+    inside = np.zeros(len(recording.t), dtype=bool)
+    for start, end in clean_windows(context, recording, roles):
+        inside |= (recording.t >= start) & (recording.t <= end)
+    return inside
+
+
+def _trace(
+    model: HybridModel, calibration: Calibration | None, control: ControlSpec, sigma_x: Array, recording: Trajectory
+) -> MonitorTrace:
+    """Replay with an estimator that has no disturbance state: it must not explain a fault away."""
+    estimator = make_estimator(model, control, sigma_x, disturbance=False)
+    return replay(make_monitor(model, calibration), estimator, recording)
+
+
+def _calibrate(levels: list[Array], dt: float, data_hash: str) -> Calibration:
+    """By extreme values for the wanted rate; where the data are too short for any rate, by a margin."""
+    try:
+        return calibrate(levels, dt, false_alarms_per_hour=WANTED_RATE, data_hash=data_hash)
+    except InputError as too_short:
+        finite = np.concatenate(levels)
+        finite = finite[np.isfinite(finite)]
+        if finite.size == 0:
+            raise
+        threshold = MARGIN * float(finite.max())
+        method = f"{MARGIN} x the highest nominal level ({too_short})"
+        release = max(0.5 * threshold, float(np.quantile(finite, 0.95)))
+        return Calibration(
+            threshold, min(release, threshold), WANTED_RATE, finite.size, finite.size * dt / 3600, method, data_hash
+        )
+
+
+def analysis_stage(context: Context) -> None:
+    """Linearise prior and hybrid at rest and at working speed; poles, PBH tests, frequency responses."""
+    from hybrid_mpc.analysis import analyze, fixed_point, frequency_response, linearize, linearize_at_speed
+
+    artifact = load_artifact(context.out / "model")
+    result: dict[str, Any] = {}
+    arrays: dict[str, Any] = {}
+    for i, (name, model) in enumerate(artifact.models.items()):
+        context.progress.update("models", i, len(artifact.models), name)
+        u = np.zeros(model.n_u)
+        x, h = fixed_point(model, u, np.zeros(model.n_x))
+        at_rest = linearize(model, x, u, h)
+        systems = {"rest": at_rest}
+        if context.scenario.control is not None:
+            speed = working_point(model, context.scenario.control)[0][model.n_x // 2 :]
+            systems["moving"] = linearize_at_speed(model, x[: model.n_x // 2], speed, u)
+            result["working_speed"] = speed.tolist()
+        result[name] = {"fixed_point": x.tolist()}
+        for point, system in systems.items():
+            omega = np.geomspace(0.1, np.pi / model.dt, 300)
+            response = frequency_response(system, omega)
+            arrays[f"{name}/{point}/omega"] = omega
+            arrays[f"{name}/{point}/magnitude"] = response.magnitude[0, 0]
+            arrays[f"{name}/{point}/phase"] = response.phase[0, 0]
+            result[name][point] = analyze(system).to_dict()
+    context.save("analysis", result, arrays)

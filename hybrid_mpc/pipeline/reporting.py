@@ -1,0 +1,220 @@
+"""Stage report: figures, ``report.html`` and ``results.json``."""
+
+from __future__ import annotations
+
+import shlex
+from typing import Any
+
+from hybrid_mpc.files import write_json
+from hybrid_mpc.pipeline.context import Context
+from hybrid_mpc.pipeline.figures import Figures, draw_all
+from hybrid_mpc.pipeline.results import collect
+from hybrid_mpc.plots.style import name_of
+from hybrid_mpc.report import KeyFigure, Report, Section, Table, write_report
+from hybrid_mpc.report.schema import CONTROLLERS, MODELS
+from hybrid_mpc.report.texts import TITLES, paragraphs
+
+
+def report_stage(context: Context) -> None:
+    """Draw, write the report, and last the results."""
+    results = collect(context)
+    figures = draw_all(context)
+    write_report(context.out / "report.html", _report(context, results, figures))
+    write_json(context.out / "results.json", results)
+    context.save("report", results)
+
+
+def command(context: Context) -> str:
+    """The command line that makes this run."""
+    s = context.settings
+    words = ["hybrid-mpc", "run", s.scenario, *(w for f in s.data for w in ("--data", f.name))]
+    for option, values in (("--input-column", s.inputs), ("--output-column", s.outputs)):
+        words += [w for v in values for w in (option, v)]
+    words += ["--time-column", s.time] if s.time else []
+    return shlex.join([*words, "--seed", str(s.seed), "--budget", s.budget])
+
+
+def _report(context: Context, results: dict[str, Any], figures: Figures) -> Report:
+    tables = {
+        "data": _data_table(results),
+        "models": _prior_table(context),
+        "free_run": _score_table(results),
+        "export": _export_table(results),
+        "control": _control_table(results),
+        "timing": _timing_table(results),
+        "monitor": _alarm_table(results),
+        "analysis": _pole_table(results),
+    }
+    notes = _notes(context, results)
+    sections = tuple(
+        Section(
+            TITLES[key],
+            notes["instead"].get(key, paragraphs(key)),
+            figures.get(key, ()),
+            (tables[key],) if tables.get(key) is not None else (),
+            notes["after"].get(key, ()),
+        )  # type: ignore[arg-type]
+        for key in TITLES
+    )
+    versions = ", ".join(f"{name} {v}" for name, v in results["versions"].items())
+    return Report(
+        f"hybrid-mpc: {context.scenario.name}",
+        context.scenario.title,
+        context.scenario.description,
+        command(context),
+        _summary(context, results),
+        sections,
+        f"seed {results['seed']}, budget {results['budget']}; {versions}",
+    )
+
+
+def _summary(context: Context, results: dict[str, Any]) -> list[KeyFigure]:
+    identification, timing = results["identification"], results["timing"]
+    rmse = identification["rmse_rad"]
+    ratio = identification["details"]["hybrid_over_phy"]
+    e_sim = identification["e_sim_s"]
+    summary = [
+        KeyFigure(
+            "Free-run error (RMSE) of the hybrid on unseen data", rmse["mopgrnn"], "rad",
+            f"fitted prior: {_text(rmse['phy'])} rad", _verdict(ratio["rmse_rad"], 1.0),
+        ),
+        KeyFigure(
+            "Simulation error E_sim of the hybrid", e_sim["mopgrnn"], "s",
+            f"fitted prior: {_text(e_sim['phy'])}, RNN: {_text(e_sim['rnn'])}", _verdict(ratio["e_sim_s"], 1.0),
+        ),
+    ]  # fmt: skip
+    control = results["control"]
+    if control["gap_closed"] is not None:
+        costs = ", ".join(f"{n} {_text(control[n]['cost'])}" for n in CONTROLLERS)
+        gap = control["gap_closed"]
+        summary.append(
+            KeyFigure("Gap from prior to oracle closed by the hybrid", gap, "", f"costs: {costs}", "good" if gap > 0 else "bad")
+        )
+    if timing["misses"] is not None:
+        p99 = timing["controller_step_ms"]["p99"]
+        summary.append(
+            KeyFigure("Controller step, 99th percentile", p99, "ms", f"period: {timing['period_ms']:g} ms",
+                      _verdict(p99 / timing["period_ms"], 1.0))
+        )  # fmt: skip
+    if results["monitor"]["alarms"] is not None:
+        clean = results["monitor"]["details"]["clean"]
+        summary.append(
+            KeyFigure("Alarms of the energy monitor", len(results["monitor"]["alarms"]), "",
+                      f"{clean['alarms']} of them in {clean['seconds']:.0f} s known to be undisturbed",
+                      "good" if clean["alarms"] == 0 else "bad")
+        )  # fmt: skip
+    return summary
+
+
+def _verdict(ratio: float | None, most: float) -> Any:
+    return "plain" if ratio is None else "good" if ratio < most else "bad"
+
+
+def _text(value: float | None) -> str:
+    return "diverged" if value is None else f"{value:.3g}"
+
+
+def _notes(context: Context, results: dict[str, Any]) -> dict[str, dict[str, tuple[str, ...]]]:
+    instead: dict[str, tuple[str, ...]] = {}
+    after: dict[str, tuple[str, ...]] = {}
+    if results["control"]["gap_closed"] is None:
+        reason = results["control"]["gap_closed_reason"]
+        if results["control"]["hybrid"]["cost"] is None:
+            instead["control"] = (f"There is no closed loop here: {reason}. The controller was built and timed "
+                                  "on recorded states instead.",)  # fmt: skip
+        else:
+            after["control"] = (f"The gap closed is not defined: {reason}.",)
+    warnings = context.result("prior")["warnings"]
+    if warnings:
+        after["models"] = ("Warnings of the fit: " + "; ".join(warnings) + ".",)
+    if results["monitor"]["alarms"] is not None:
+        method = results["monitor"]["details"]["calibration"]["method"]
+        after["monitor"] = (f"Calibration: {method}.",)
+    return {"instead": instead, "after": after}
+
+
+def _data_table(results: dict[str, Any]) -> Table:
+    data = results["data"]
+    rows: list[tuple[Any, ...]] = [(role, seconds) for role, seconds in data["details"]["seconds"].items()]
+    rows += [
+        (f"cut: {c['file']}, {c['start_s']:.2f} to {c['end_s']:.2f} s: {why}", c["end_s"] - c["start_s"])
+        for c, why in zip(data["cuts"], data["details"]["why_cut"], strict=True)
+    ]
+    return Table(("part", "length [s]"), rows, f"{len(data['files'])} files; content hash {data['hash'][:16]}.")
+
+
+def _prior_table(context: Context) -> Table:
+    prior = context.result("prior")
+    rows = [
+        (p.label, p.description, prior["nominal"][p.name], prior["values"][p.name],
+         prior["standard_errors"].get(p.name, "fixed"))
+        for p in context.scenario.prior().parameters_spec
+    ]  # fmt: skip
+    caption = "Parameters of the prior. Standard errors suppose that the prior's structure is right."
+    return Table(("parameter", "meaning", "nominal", "fitted", "standard error"), rows, caption)
+
+
+def _score_table(results: dict[str, Any]) -> Table:
+    groups = [results["identification"][key] for key in ("e_sim_s", "rmse_rad", "energy_violation_w")]
+    base = [group["phy"] for group in groups]
+    rows = [
+        (name_of(m), *(g[m] for g in groups), *(_percent(g[m], b) for g, b in zip(groups, base, strict=True)))
+        for m in MODELS
+    ]
+    columns = ("model", "E_sim [s]", "RMSE [rad]", "violation [W]", "E_sim", "RMSE", "violation")
+    return Table(columns, rows, "Free runs on unseen data; the last columns against the fitted prior.")
+
+
+def _percent(value: float | None, base: float | None) -> str:
+    return "–" if value is None or not base else f"{100 * (value / base - 1):+.0f} %"
+
+
+def _export_table(results: dict[str, Any]) -> Table:
+    e = results["export"]
+    rows = [("values", e["parity_max_abs_error"], "1e-12"), ("Jacobians", e["jacobian_max_abs_error"], "1e-10")]
+    caption = "Largest difference between the exported models and PyTorch, relative to the outputs' scale."
+    return Table(("compared", "largest difference", "allowed"), [(a, f"{b:.1e}", c) for a, b, c in rows], caption)
+
+
+def _control_table(results: dict[str, Any]) -> Table | None:
+    if results["control"]["hybrid"]["cost"] is None:
+        return None
+    rows = [
+        (task, name, cell["cost"], f"± {cell['cost_ci95']:.2g}", cell["tracking_rmse_rad"])
+        for task, cells in results["control"]["details"]["tasks"].items()
+        for name, cell in cells.items()
+    ]
+    caption = "Closed-loop cost J on the true state: mean over seeds with its 95 % interval."
+    return Table(("task", "controller", "cost J", "95 %", "tracking RMSE [rad]"), rows, caption)
+
+
+def _timing_table(results: dict[str, Any]) -> Table | None:
+    timing = results["timing"]
+    if timing["misses"] is None:
+        return None
+    ms = timing["controller_step_ms"]
+    row = (ms["median"], ms["p95"], ms["p99"], ms["max"], timing["period_ms"], timing["misses"])
+    return Table(("median [ms]", "p95 [ms]", "p99 [ms]", "max [ms]", "period [ms]", "misses"), (row,))
+
+
+def _alarm_table(results: dict[str, Any]) -> Table | None:
+    if results["monitor"]["alarms"] is None:
+        return None
+    rows = [(a["file"], a["start_s"], a["end_s"]) for a in results["monitor"]["alarms"]]
+    caption = f"Alarms over the whole recordings; threshold {results['monitor']['threshold_w']:.3g} W."
+    return Table(("recording", "from [s]", "to [s]"), rows, caption)
+
+
+def _pole_table(results: dict[str, Any]) -> Table:
+    rows = []
+    for model, points in results["analysis"]["details"].items():
+        if not isinstance(points, dict):
+            continue
+        for point, a in points.items():
+            if point == "fixed_point":
+                continue
+            slow = [f"{w:.2f} ({z:.2f})" for w, z in
+                    list(zip(a["frequency_rad_s"], a["damping"], strict=True))[:2] if w is not None]  # fmt: skip
+            rows.append((model, point, ", ".join(slow), a["stable"], a["stabilisable"], a["detectable"]))
+    columns = ("model", "point", "slowest poles: rad/s (damping)", "stable", "stabilisable", "detectable")
+    return Table(columns, rows, "Linearisations at rest and at working speed.")

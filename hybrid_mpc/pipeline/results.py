@@ -1,0 +1,180 @@
+"""What a run found, as ``results.json`` holds it (docs/results-schema.md)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from hybrid_mpc.pipeline.context import Context
+from hybrid_mpc.pipeline.deploy import versions
+from hybrid_mpc.report.schema import CONTROLLERS, MODELS, SCHEMA_VERSION, validate_results
+
+LOOP_FIGURES = ("cost", "tracking_rmse_rad")
+
+
+def collect(context: Context) -> dict[str, Any]:
+    """Results of all stages in the schema's form; checked before they are returned."""
+    data = context.result("data")
+    results = {
+        "schema_version": SCHEMA_VERSION,
+        "scenario": context.scenario.name,
+        "seed": context.settings.seed,
+        "budget": context.settings.budget,
+        "versions": versions(),
+        "data": {
+            "files": data["files"],
+            "hash": data["hash"],
+            "cuts": [{"file": c["file"], "start_s": c["from_s"], "end_s": c["to_s"]} for c in data["cuts"]],
+            "details": {"seconds": data["seconds"], "why_cut": [c["why"] for c in data["cuts"]]},
+        },
+        "identification": _identification(context),
+        "export": context.result("export"),
+        "control": _control(context),
+        "timing": _timing(context),
+        "monitor": _monitor(context),
+        "analysis": _analysis(context),
+    }
+    validate_results(results)
+    return results
+
+
+def _identification(context: Context) -> dict[str, Any]:
+    scores, prior = context.result("evaluation")["scores"], context.result("prior")
+    figures: dict[str, Any] = {}
+    for key in ("e_sim_s", "rmse_rad", "energy_violation_w"):
+        group: dict[str, Any] = {}
+        for name in MODELS:
+            value = float(scores[name]["best"][key])
+            group[name] = value if math.isfinite(value) else None
+            if not math.isfinite(value):
+                group[f"{name}_reason"] = "a free run diverged"
+        figures[key] = group
+    details = {
+        "prior_parameters": {k: prior[k] for k in ("values", "standard_errors", "nominal", "warnings", "stages")},
+        "scores_of_all_networks": {name: scores[name]["networks"] for name in MODELS},
+        "hybrid_over_phy": {
+            key: _ratio(figures[key]["mopgrnn"], figures[key]["phy"]) for key in ("e_sim_s", "rmse_rad")
+        },
+    }
+    return {**figures, "details": details}
+
+
+def _ratio(value: float | None, baseline: float | None) -> float | None:
+    return None if value is None or not baseline else value / baseline
+
+
+def _control(context: Context) -> dict[str, Any]:
+    control = context.result("control")
+    if "reason" in control:
+        groups: dict[str, Any] = {
+            name: dict.fromkeys(LOOP_FIGURES) | {"reason": control["reason"]} for name in CONTROLLERS
+        }
+        return {**groups, "gap_closed": None, "gap_closed_reason": control["reason"]}
+    table = loop_table(control["loops"])
+    out: dict[str, Any] = {}
+    for name in CONTROLLERS:
+        rows = [row[name] for row in table.values() if name in row]
+        if rows:
+            out[name] = {
+                "cost": float(sum(np.mean(r["cost"]) for r in rows)),
+                "tracking_rmse_rad": float(np.sqrt(np.mean([np.mean(np.square(r["rmse"])) for r in rows]))),
+            }
+        else:
+            out[name] = dict.fromkeys(LOOP_FIGURES) | {"reason": "the scenario has no oracle"}
+    gap, why = gap_closed(table)
+    out["gap_closed"] = gap
+    if gap is None:
+        out["gap_closed_reason"] = why
+    tasks = {task: {name: summary(r) for name, r in row.items()} for task, row in table.items()}
+    solved = {n: float(np.mean([r["solved"] for r in control["loops"] if r["controller"] == n])) for n in CONTROLLERS
+              if any(r["controller"] == n for r in control["loops"])}  # fmt: skip
+    return {**out, "details": {"tasks": tasks, "share_of_solved_steps": solved}}
+
+
+def loop_table(loops: list[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, list[float]]]]:
+    """Costs and tracking errors ``table[task][controller]``, one entry a seed."""
+    table: dict[str, dict[str, dict[str, list[float]]]] = {}
+    for row in loops:
+        cell = table.setdefault(row["task"], {}).setdefault(row["controller"], {"cost": [], "rmse": []})
+        cell["cost"].append(float(row["cost"]))
+        cell["rmse"].append(float(row["tracking_rmse_rad"]))
+    return table
+
+
+def summary(cell: Mapping[str, list[float]]) -> dict[str, float]:
+    """Mean and half width of the 95 % interval over seeds (Student's t; 0 for one seed)."""
+    from scipy.stats import t as student
+
+    cost, n = np.array(cell["cost"]), len(cell["cost"])
+    half = float(student.ppf(0.975, n - 1) * cost.std(ddof=1) / np.sqrt(n)) if n > 1 else 0.0
+    return {"cost": float(cost.mean()), "cost_ci95": half, "tracking_rmse_rad": float(np.mean(cell["rmse"]))}
+
+
+def gap_closed(table: Mapping[str, Mapping[str, Mapping[str, list[float]]]]) -> tuple[float | None, str]:
+    """Share of the distance prior to oracle that the hybrid covers, on the tasks' summed costs.
+
+    None with a reason where that distance is below twice its standard error over the seeds.
+    """
+    if any("oracle" not in row for row in table.values()):
+        return None, "the scenario has no oracle"
+    sums = {name: np.sum([row[name]["cost"] for row in table.values()], axis=0) for name in CONTROLLERS}
+    gap = sums["prior"] - sums["oracle"]
+    error = gap.std(ddof=1) / np.sqrt(len(gap)) if len(gap) > 1 else 0.0
+    if gap.mean() <= 2.0 * error or gap.mean() <= 0.0:
+        return None, "prior and oracle differ by less than twice the standard error over the seeds"
+    return float((sums["prior"] - sums["hybrid"]).mean() / gap.mean()), ""
+
+
+def step_times(context: Context) -> dict[str, Any]:
+    """Durations [ms] of whole controller steps by controller."""
+    arrays, times = context.arrays("control"), {}
+    if "step_ms" in arrays:
+        return {"hybrid": arrays["step_ms"]}
+    for name in ("prior", "hybrid"):
+        own = [v for key, v in arrays.items() if key.split("/")[1] == name and key.endswith("/step_ms")]
+        if own:
+            times[name] = np.concatenate(own)
+    return times
+
+
+def _timing(context: Context) -> dict[str, Any]:
+    period = 1e3 * context.spec.dt
+    ms = step_times(context).get("hybrid")
+    if ms is None:
+        reason = context.result("control")["reason"]
+        none = dict.fromkeys(("median", "p95", "p99", "max"))
+        return {"controller_step_ms": {**none, "reason": reason}, "period_ms": period, "misses": None,
+                "misses_reason": reason}  # fmt: skip
+    quantiles = {name: float(np.quantile(ms, q)) for name, q in (("median", 0.5), ("p95", 0.95), ("p99", 0.99))}
+    return {
+        "controller_step_ms": {**quantiles, "max": float(ms.max())},
+        "period_ms": period,
+        "misses": int((ms > period).sum()),
+    }
+
+
+def _monitor(context: Context) -> dict[str, Any]:
+    monitor = context.result("monitor")
+    if "reason" in monitor:
+        return {**dict.fromkeys(("threshold_w", "false_alarms_per_hour", "alarms")), "reason": monitor["reason"]}
+    clean = monitor["clean"]
+    return {
+        "threshold_w": monitor["calibration"]["threshold_w"],
+        "false_alarms_per_hour": clean["alarms"] / (clean["seconds"] / 3600.0),
+        "alarms": monitor["alarms"],
+        "details": {"calibration": monitor["calibration"], "clean": clean},
+    }
+
+
+def _analysis(context: Context) -> dict[str, Any]:
+    analysis = context.result("analysis")
+    hybrid = analysis["hybrid"]["rest"]
+    return {
+        "eigenvalues": hybrid["poles"],
+        "stabilisable": hybrid["stabilisable"],
+        "detectable": hybrid["detectable"],
+        "details": analysis,
+    }
