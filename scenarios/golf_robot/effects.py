@@ -80,12 +80,14 @@ def measure_effects(seed: int = 0, budget: str = "quick") -> Effects:
     sizes["torque lag, 10 ms after a change"] = GEAR * _rms(rig.parameters.motor_gain * u - states[:, 3])
     residuals, fitted = _fit(states, acceleration[0], u)
     return Effects(
-        sizes,
-        *residuals,
-        noise_floor(rig.parameters),
-        fitted,
-        float(np.abs(states[:, 0]).max()),
-        float(np.abs(states[:, 1]).max()),
+        torques=sizes,
+        residual=residuals[0],
+        residual_moving=residuals[1],
+        residual_published=residuals[2],
+        noise_floor=noise_floor(rig.parameters),
+        fitted=fitted,
+        largest_angle=float(np.abs(states[:, 0]).max()),
+        largest_speed=float(np.abs(states[:, 1]).max()),
     )
 
 
