@@ -15,15 +15,23 @@ Operator = Callable[..., Value]
 
 
 def apply(f: Callable[..., ca.MX], *args: Number) -> Value:
-    """``f`` on broadcast values; a 1 x 1 operand is left to CasADi's own broadcasting."""
+    """``f`` on broadcast values.
+
+    Only constants are left to CasADi's own broadcasting of scalars: CasADi 3.8.2 differentiates
+    ``vector + sum(vector)`` wrongly unless the sum is repeated explicitly (a test shows it).
+    """
     values = [lift(a) for a in args]
     shape = tuple(int(n) for n in np.broadcast_shapes(*(v.shape for v in values)))
     if 0 in shape:
         return Value(shape, ca.MX.zeros(*matrix_shape(shape)))
     size = matrix_shape(shape)
-    parts = [v.mx if v.mx.numel() == 1 else broadcast(v, shape).mx for v in values]
+    parts = [v.mx if _number(v.mx) else broadcast(v, shape).mx for v in values]
     mx = f(*parts)
     return Value(shape, mx if mx.shape == size else ca.repmat(mx, *size))
+
+
+def _number(mx: ca.MX) -> bool:
+    return mx.numel() == 1 and mx.is_constant()
 
 
 def unary(f: Callable[[ca.MX], ca.MX]) -> Operator:

@@ -120,7 +120,11 @@ def from_matrix(mx: ca.MX, shape: Shape) -> Value:
 
 def broadcast(value: Value, shape: Shape) -> Value:
     """The value repeated to a shape by the rules of torch."""
-    return value if value.shape == shape else move(value, np.broadcast_to(value.positions, shape))
+    if value.shape == shape:
+        return value
+    if value.mx.numel() == 1:
+        return Value(shape, ca.repmat(value.mx, *matrix_shape(shape)))
+    return move(value, np.broadcast_to(value.positions, shape))
 
 
 def concatenate(values: list[Value], axis: int) -> Value:
