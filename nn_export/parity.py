@@ -91,7 +91,10 @@ def parity(
     for k in range(n):
         factor = {1: 0.0, 2: 1e3}.get(k % 10, 1.0)
         kind = k % 10 if k % 10 in (1, 2) else 0
-        draws = [factor * s * rng.standard_normal(tuple(x.shape)) for x, s in zip(example_inputs, scales, strict=True)]
+        draws = [
+            factor * s * rng.standard_normal(tuple(x.shape))
+            for x, s in zip(example_inputs, scales, strict=True)
+        ]
         tensors = [torch.tensor(d, dtype=torch.float64) for d in draws]
         held = [constant(d) for d in draws]
         ours = [ca.evalf(v.mx) for v in held]
@@ -105,7 +108,9 @@ def parity(
             for j, x in enumerate(held):
                 block = np.asarray(blocks[i * len(held) + j].full())
                 rows = _order(shapes[i])
-                jacobians.add((i, kind), block[rows][:, x.positions.reshape(-1)], exact[i][j].detach().numpy())
+                jacobians.add(
+                    (i, kind), block[rows][:, x.positions.reshape(-1)], exact[i][j].detach().numpy()
+                )
     return ParityReport(n, *values.largest, *jacobians.largest)
 
 

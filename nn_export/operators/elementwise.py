@@ -100,8 +100,8 @@ def leaky_relu(self: Value, negative_slope: float = 0.01) -> Value:
 
 
 def hardtanh(self: Value, min_val: float = -1.0, max_val: float = 1.0) -> Value:
-    """``x`` kept within two numbers."""
-    return clamp(self, min_val, max_val)
+    """``x`` kept within two numbers, with slope 0 at both, as in torch."""
+    return apply(lambda x: ca.if_else(x >= max_val, max_val, ca.if_else(x <= min_val, min_val, x)), self)
 
 
 def elu(self: Value, alpha: float = 1.0, scale: float = 1.0, input_scale: float = 1.0) -> Value:

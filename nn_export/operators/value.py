@@ -34,7 +34,9 @@ def matrix_shape(shape: Shape) -> tuple[int, int]:
         raise ShapeError(f"a value of shape {shape} is too large: at most {MAX_ELEMENTS} elements")
     kept = [n for n in shape if n != 1]
     if len(kept) > 2:
-        raise ShapeError(f"shape {shape} has more than two axes longer than 1; export one sample, not a batch")
+        raise ShapeError(
+            f"shape {shape} has more than two axes longer than 1; export one sample, not a batch"
+        )
     rows, columns = (*kept, 1, 1)[:2]
     return rows, columns
 
