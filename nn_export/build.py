@@ -66,7 +66,9 @@ def build(program: Program, name: str | None = None) -> ca.Function:
     for port in program.outputs:
         value = _resolve(port.source, values)
         if not isinstance(value, Value) or value.shape != port.shape:
-            raise ProgramError(f"output {port.name}: {port.source} has not its shape {port.shape}; export again")
+            raise ProgramError(
+                f"output {port.name}: {port.source} has not its shape {port.shape}; export again"
+            )
         results.append(value.mx)
     names = [p.name for p in program.inputs], [p.name for p in program.outputs]
     try:

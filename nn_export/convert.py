@@ -24,8 +24,16 @@ from nn_export.operators.shape import OPERATORS as MOVEMENTS
 from nn_export.program import Node, Port
 
 _SKIPPED = {"aten._assert_tensor_metadata.default", "aten.sym_constrain_range_for_size.default"}
-_RANDOM = re.compile(r"aten\.(native_dropout|dropout|bernoulli|rand|randn|normal|uniform|.*batch_norm_legit)\w*\.")
-_LIKE_NOTHING = {"layout", "device", "pin_memory", "memory_format", "non_blocking"}  # where data lie, not what
+_RANDOM = re.compile(
+    r"aten\.(native_dropout|dropout|bernoulli|rand|randn|normal|uniform|.*batch_norm_legit)\w*\."
+)
+_LIKE_NOTHING = {
+    "layout",
+    "device",
+    "pin_memory",
+    "memory_format",
+    "non_blocking",
+}  # where data lie, not what
 _TORCH = str(Path(torch.__file__).parent)
 
 
@@ -191,7 +199,9 @@ def _plain(value: Any, refs: dict[str, Reference]) -> Any:
         return {"float": str(value)}
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    raise UnsupportedOperatorError(f"an argument of type {type(value).__name__} ({value!r:.60}); use a number")
+    raise UnsupportedOperatorError(
+        f"an argument of type {type(value).__name__} ({value!r:.60}); use a number"
+    )
 
 
 def _output(index: int, value: Any, refs: dict[str, Reference]) -> tuple[Reference, tuple[int, ...]]:
@@ -199,5 +209,7 @@ def _output(index: int, value: Any, refs: dict[str, Reference]) -> tuple[Referen
         raise SignatureError(f"output {index} of the module is {value!r}, not a tensor; do not return it")
     tensor = value.meta["val"]
     if not tensor.is_floating_point():
-        raise DtypeError(f"output {index} of the module is {tensor.dtype}; return real numbers, e.g. x.double()")
+        raise DtypeError(
+            f"output {index} of the module is {tensor.dtype}; return real numbers, e.g. x.double()"
+        )
     return refs[value.name], tuple(int(n) for n in tensor.shape)

@@ -190,7 +190,9 @@ def _fields(data: Any, types: dict[str, type], where: str) -> dict[str, Any]:
         raise ProgramError(f"{where}: expected the fields {sorted(types)}, got {given}; export again")
     for name, kind in types.items():
         if not isinstance(data[name], kind):
-            raise ProgramError(f"{where}.{name}: expected {kind.__name__}, got {data[name]!r:.60}; export again")
+            raise ProgramError(
+                f"{where}.{name}: expected {kind.__name__}, got {data[name]!r:.60}; export again"
+            )
     return data
 
 

@@ -71,7 +71,9 @@ def trace(
         raise SignatureError(f"names must differ: inputs {names}, outputs {outputs}")
     for name in (*names, *outputs):
         if not valid_name(name):
-            raise SignatureError(f"{name!r} is no name for CasADi: use letters, digits and single underscores")
+            raise SignatureError(
+                f"{name!r} is no name for CasADi: use letters, digits and single underscores"
+            )
     metadata = {"module": type(module).__name__, "torch": str(torch.__version__), "casadi": ca.__version__}
     metadata["nn_export"] = _version()
     ports = tuple(Port(n, s, ref) for n, (ref, s) in zip(outputs, sources, strict=True))

@@ -15,15 +15,23 @@ Operator = Callable[..., Value]
 
 
 def apply(f: Callable[..., ca.MX], *args: Number) -> Value:
-    """``f`` on broadcast values; a 1 x 1 operand is left to CasADi's own broadcasting."""
+    """``f`` on broadcast values.
+
+    Only constants are left to CasADi's own broadcasting of scalars: CasADi 3.8.2 differentiates
+    ``vector + sum(vector)`` wrongly unless the sum is repeated explicitly (a test shows it).
+    """
     values = [lift(a) for a in args]
     shape = tuple(int(n) for n in np.broadcast_shapes(*(v.shape for v in values)))
     if 0 in shape:
         return Value(shape, ca.MX.zeros(*matrix_shape(shape)))
     size = matrix_shape(shape)
-    parts = [v.mx if v.mx.numel() == 1 else broadcast(v, shape).mx for v in values]
+    parts = [v.mx if _number(v.mx) else broadcast(v, shape).mx for v in values]
     mx = f(*parts)
     return Value(shape, mx if mx.shape == size else ca.repmat(mx, *size))
+
+
+def _number(mx: ca.MX) -> bool:
+    return mx.numel() == 1 and mx.is_constant()
 
 
 def unary(f: Callable[[ca.MX], ca.MX]) -> Operator:
@@ -92,8 +100,8 @@ def leaky_relu(self: Value, negative_slope: float = 0.01) -> Value:
 
 
 def hardtanh(self: Value, min_val: float = -1.0, max_val: float = 1.0) -> Value:
-    """``x`` kept within two numbers."""
-    return clamp(self, min_val, max_val)
+    """``x`` kept within two numbers, with slope 0 at both, as in torch."""
+    return apply(lambda x: ca.if_else(x >= max_val, max_val, ca.if_else(x <= min_val, min_val, x)), self)
 
 
 def elu(self: Value, alpha: float = 1.0, scale: float = 1.0, input_scale: float = 1.0) -> Value:

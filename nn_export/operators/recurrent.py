@@ -56,7 +56,12 @@ def _columns(value: Value) -> ca.MX:  # (batch, n) or (n,) as n x batch
 
 def _cell(cell: Cell) -> Callable[..., Value]:
     def operator(
-        input: Value, hx: Value, w_ih: Value, w_hh: Value, b_ih: Value | None = None, b_hh: Value | None = None
+        input: Value,
+        hx: Value,
+        w_ih: Value,
+        w_hh: Value,
+        b_ih: Value | None = None,
+        b_hh: Value | None = None,
     ) -> Value:
         result = cell(_columns(input), (_columns(hx),), (w_ih, w_hh, b_ih, b_hh))
         return from_matrix(result[0].T, hx.shape)
@@ -77,7 +82,9 @@ def lstm_cell(
     return tuple(from_matrix(mx.T, v.shape) for mx, v in zip(new, hx, strict=True))
 
 
-def _run(cell: Cell, x: Value, states: Sequence[Value], w: Weights, reverse: bool) -> tuple[Value, list[Value]]:
+def _run(
+    cell: Cell, x: Value, states: Sequence[Value], w: Weights, reverse: bool
+) -> tuple[Value, list[Value]]:
     """One direction of one layer over ``x`` (T, B, F); states (B, H)."""
     x = flip(x, [0]) if reverse else x
     state = tuple(_columns(v) for v in states)

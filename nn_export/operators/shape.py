@@ -16,7 +16,9 @@ def same(self: Value) -> Value:
     return self
 
 
-def slice_(self: Value, dim: int = 0, start: int | None = None, end: int | None = None, step: int = 1) -> Value:
+def slice_(
+    self: Value, dim: int = 0, start: int | None = None, end: int | None = None, step: int = 1
+) -> Value:
     """Part of an axis."""
     index: list[slice] = [slice(None)] * len(self.shape)
     index[dim] = slice(start, None if end is not None and end > LONGEST else end, step)

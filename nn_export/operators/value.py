@@ -34,7 +34,9 @@ def matrix_shape(shape: Shape) -> tuple[int, int]:
         raise ShapeError(f"a value of shape {shape} is too large: at most {MAX_ELEMENTS} elements")
     kept = [n for n in shape if n != 1]
     if len(kept) > 2:
-        raise ShapeError(f"shape {shape} has more than two axes longer than 1; export one sample, not a batch")
+        raise ShapeError(
+            f"shape {shape} has more than two axes longer than 1; export one sample, not a batch"
+        )
     rows, columns = (*kept, 1, 1)[:2]
     return rows, columns
 
@@ -120,7 +122,11 @@ def from_matrix(mx: ca.MX, shape: Shape) -> Value:
 
 def broadcast(value: Value, shape: Shape) -> Value:
     """The value repeated to a shape by the rules of torch."""
-    return value if value.shape == shape else move(value, np.broadcast_to(value.positions, shape))
+    if value.shape == shape:
+        return value
+    if value.mx.numel() == 1:
+        return Value(shape, ca.repmat(value.mx, *matrix_shape(shape)))
+    return move(value, np.broadcast_to(value.positions, shape))
 
 
 def concatenate(values: list[Value], axis: int) -> Value:
