@@ -9,7 +9,9 @@ try:
     import typer
     from rich.console import Console
 except ImportError as missing:  # the online half installs without the command line's libraries
-    raise SystemExit(f"hybrid-mpc: {missing}. Install the command line with: pip install 'hybrid-mpc[all]'") from None
+    raise SystemExit(
+        f"hybrid-mpc: {missing}. Install the command line with: pip install 'hybrid-mpc[all]'"
+    ) from None
 
 from hybrid_mpc import __version__
 from hybrid_mpc.cli import run as run_command

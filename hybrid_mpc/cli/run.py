@@ -17,13 +17,17 @@ EXAMPLES = (
 
 
 def run(
-    scenario: Annotated[str, typer.Argument(help="A registered name (see: hybrid-mpc scenarios) or a .py file.")],
+    scenario: Annotated[
+        str, typer.Argument(help="A registered name (see: hybrid-mpc scenarios) or a .py file.")
+    ],
     data: Annotated[list[Path] | None, typer.Option(help="A recording; give it once for each file.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder to make. Default: runs/SCENARIO.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of data, training and closed loops.", min=0)] = 0,
     budget: Annotated[str, typer.Option(help="Effort: quick or full.")] = "quick",
     resume: Annotated[bool, typer.Option("--resume", help="Finish the run that the folder holds.")] = False,
-    time_column: Annotated[str, typer.Option(help="CSV column of the time [s]. Default: the scenario's.")] = "",
+    time_column: Annotated[
+        str, typer.Option(help="CSV column of the time [s]. Default: the scenario's.")
+    ] = "",
     input_column: Annotated[
         list[str] | None, typer.Option(help="CSV column of an input, in the prior's order.")
     ] = None,
@@ -65,7 +69,9 @@ def summary(results: dict[str, object]) -> list[str]:
     for name in ("prior", "hybrid", "oracle"):
         loop = control[name]
         if loop["cost"] is not None:
-            lines.append(f"closed loop, {name:8} cost {loop['cost']:.4g}, tracking {loop['tracking_rmse_rad']:.4g} rad")
+            lines.append(
+                f"closed loop, {name:8} cost {loop['cost']:.4g}, tracking {loop['tracking_rmse_rad']:.4g} rad"
+            )
     return lines
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import platform
+from collections.abc import Callable
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +16,6 @@ from hybrid_mpc.artifact import Artifact, load_artifact, save_artifact
 from hybrid_mpc.closed_loop.result import ClosedLoopResult
 from hybrid_mpc.closed_loop.simulate import simulate
 from hybrid_mpc.estimation.kalman import TrueState
-from hybrid_mpc.model import HybridModel
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.loops import (
     make_controller,
@@ -23,12 +24,13 @@ from hybrid_mpc.pipeline.loops import (
     process_noise,
     time_on_recording,
 )
-from hybrid_mpc.scenario import ControlSpec, Task
+from hybrid_mpc.pipeline.parallel import WORKERS, run_jobs
+from hybrid_mpc.scenario import ControlSpec, load_scenario
 
 Array = NDArray[np.float64]
 DEPLOYED = "mopgrnn"
-ORACLE_ITERATIONS = 3
-"""Linearisations a period of the oracle, which need not be fast."""
+ORACLE_ITERATIONS = 1
+"""Linearisations a period of the oracle."""
 
 
 def versions() -> dict[str, str]:
@@ -52,7 +54,9 @@ def export_stage(context: Context) -> None:
     for i, (name, step) in enumerate(steps.items()):
         context.progress.update("models", i, len(steps), name)
         programs[name] = trace_model(step)
-        parities.append(check_parity(step, programs[name], info, context.trajectories("train"), seed=settings.seed))
+        parities.append(
+            check_parity(step, programs[name], info, context.trajectories("train"), seed=settings.seed)
+        )
     provenance = {
         "scenario": context.scenario.name,
         "seed": settings.seed,
@@ -96,62 +100,82 @@ def _only_timing(context: Context, artifact: Artifact, control: ControlSpec, noi
     context.save("control", {"reason": reason, "sigma_x": noise}, {"step_ms": np.concatenate(durations)})
 
 
-def _closed_loops(context: Context, artifact: Artifact, control: ControlSpec, noise: dict[str, Array]) -> None:
+def _closed_loops(
+    context: Context, artifact: Artifact, control: ControlSpec, noise: dict[str, Array]
+) -> None:
+    """All loops; those that are timed run alone, the oracle's side by side in processes."""
     scenario, seeds = context.scenario, context.budget.seeds
-    names = ["prior", "hybrid", *(["oracle"] if scenario.oracle else [])]
-    total, done = len(scenario.tasks) * len(names) * seeds, 0
-    rows: list[dict[str, Any]] = []
+    names = ("prior", "hybrid", *(("oracle",) if scenario.oracle else ()))
+    keys = [(t.name, n, s) for t in scenario.tasks for n in names for s in range(seeds)]
+    timed = [key for key in keys if key[1] != "oracle"]
+    results: dict[tuple[str, str, int], ClosedLoopResult] = {}
+    common = context.settings.scenario, context.out / "model", noise, context.settings.seed
+    for i, key in enumerate(timed):
+        context.progress.update("timed loops", i, len(timed), ", ".join(map(str, key)))
+        results[key] = closed_loop(*common, *key)
+    jobs: dict[str, Any] = {
+        f"{key[0]}, oracle, seed {key[2]}": (closed_loop, (*common, *key)) for key in keys if key not in timed
+    }
+    oracle = run_jobs(jobs, context.progress.update, WORKERS)
+    results |= {key: oracle[f"{key[0]}, oracle, seed {key[2]}"] for key in keys if key not in timed}
     arrays: dict[str, Any] = {}
-    for task in scenario.tasks:
-        for name in names:
-            for seed in range(seeds):
-                context.progress.update("loops", done, total, f"{task.name}, {name}, seed {seed}")
-                result = _loop(context, artifact, control, noise, task, name, seed)
-                done += 1
-                solved = result.source.count("MPC") / len(result.source)
-                rows.append(
-                    {"task": task.name, "controller": name, "seed": seed, "cost": result.cost,
-                     "tracking_rmse_rad": result.tracking_rmse, "solved": solved,
-                     "finite": bool(np.isfinite(result.x).all())}
-                )  # fmt: skip
-                arrays[f"{task.name}/{name}/{seed}/step_ms"] = result.timing_ms["total"]
-                arrays[f"{task.name}/{name}/{seed}/level_w"] = result.level
-                if seed == 0:
-                    for key in ("t", "x", "u", "reference"):
-                        arrays[f"{task.name}/{name}/{key}"] = getattr(result, key)
+    for (task, name, seed), result in results.items():
+        arrays[f"{task}/{name}/{seed}/step_ms"] = result.timing_ms["total"]
+        if seed == 0:
+            arrays |= {f"{task}/{name}/{key}": getattr(result, key) for key in ("t", "x", "u", "reference")}
+    rows = [
+        {"task": task, "controller": name, "seed": seed, "cost": r.cost, "tracking_rmse_rad": r.tracking_rmse,
+         "solved": r.source.count("MPC") / len(r.source)}
+        for (task, name, seed), r in results.items()
+    ]  # fmt: skip
     context.save("control", {"loops": rows, "sigma_x": noise}, arrays)
 
 
-def _loop(
-    context: Context,
-    artifact: Artifact,
-    control: ControlSpec,
+def closed_loop(
+    scenario_name: str,
+    folder: Path,
     noise: dict[str, Array],
-    task: Task,
+    run_seed: int,
+    task_name: str,
     name: str,
     seed: int,
+    report: Callable[[int, int, str], None] = lambda done, total, text: None,
 ) -> ClosedLoopResult:
-    """One closed loop on the plant; all controllers share problem, period, horizon and safeguards."""
-    scenario, prior = context.scenario, artifact.models["prior"]
+    """One closed loop on the plant; all controllers share problem, period, horizon and safeguards.
+
+    Args:
+        scenario_name: Name or path of the scenario.
+        folder: The artifact.
+        noise: Process noise by model, see :func:`~hybrid_mpc.pipeline.loops.process_noise`.
+        run_seed: Seed of the run.
+        task_name: Task.
+        name: ``"prior"``, ``"hybrid"`` or ``"oracle"``.
+        seed: Number of the loop; same seed, same sensor noise for every controller.
+        report: Called with ``(done, total, text)`` as the loop goes on.
+    """
+    scenario, artifact = load_scenario(scenario_name), load_artifact(folder)
+    control, prior = scenario.control, artifact.models["prior"]
+    task = next(t for t in scenario.tasks if t.name == task_name)
     assert scenario.plant is not None
-    model: HybridModel
+    assert control is not None
+    estimator: Any
     if name == "oracle":
         assert scenario.oracle is not None
-        model = scenario.oracle(context.spec.dt)
-        estimator: Any = TrueState(model)
-        controller = make_controller(model, prior, control, iterations=ORACLE_ITERATIONS)
+        model = scenario.oracle(prior.dt)
+        estimator, iterations = TrueState(model), ORACLE_ITERATIONS
     else:
         model = artifact.models[name]
-        estimator = make_estimator(model, control, noise[name])
-        controller = make_controller(model, prior, control)
+        estimator, iterations = make_estimator(model, control, noise[name]), 1
+    periods = round(task.duration / prior.dt)
     return simulate(
         scenario.plant(),
         estimator,
-        controller,
+        make_controller(model, prior, control, iterations=iterations),
         task.reference,
-        dt=context.spec.dt,
+        dt=prior.dt,
         duration=task.duration,
         x0=np.array(task.x0),
-        seed=context.settings.seed * 1000 + seed,
+        seed=run_seed * 1000 + seed,
         monitor=make_monitor(model, None),
+        on_step=lambda step: report(step.k, periods, "periods") if step.k % 50 == 0 else None,
     )

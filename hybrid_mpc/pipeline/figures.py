@@ -54,7 +54,9 @@ def _training(context: Context) -> Any:
         curves[kind] |= {name: trained.curve[name][:, best] for name in names}
         starts[kind] = float(trained.settings.teacher_steps)
     figure = training.curves(curves, free_run_start=starts, units=("mixed SI", "W", "mixed SI"))
-    caption = "Objectives and bounds of the deployed network of each kind, on a fixed set of training windows."
+    caption = (
+        "Objectives and bounds of the deployed network of each kind, on a fixed set of training windows."
+    )
     yield "training", "training", figure, caption
 
 
@@ -76,7 +78,12 @@ def _free_runs(context: Context) -> Any:
             title=f"Free run on {run}",
         )
         name = run.replace("#", "-")
-        yield "free_run", f"free_run_{name}", figure, f"Free run over the unseen piece {run}; the warm-up before it is left out."
+        yield (
+            "free_run",
+            f"free_run_{name}",
+            figure,
+            f"Free run over the unseen piece {run}; the warm-up before it is left out.",
+        )
     scores = context.result("evaluation")["scores"]
     keys = ("e_sim_s", "rmse_rad", "energy_violation_w")
     finite = {m: {k: _finite(scores[m]["best"][k]) for k in keys} for m in MODELS}
@@ -120,7 +127,9 @@ def _loops(context: Context) -> Any:
 def _timing(context: Context) -> Any:
     times = step_times(context)
     if times:
-        caption = "Whole controller steps: estimation, optimisation and monitoring, the Python calls included."
+        caption = (
+            "Whole controller steps: estimation, optimisation and monitoring, the Python calls included."
+        )
         yield "timing", "step_times", loops.solve_times(times, 1e3 * context.spec.dt), caption
 
 
@@ -160,7 +169,12 @@ def _analysis(context: Context) -> Any:
     result, arrays = context.result("analysis"), context.arrays("analysis")
     colours = {"prior": "phy", "hybrid": "mopgrnn"}
     poles = {c: np.array([complex(*z) for z in result[n]["rest"]["poles"]]) for n, c in colours.items()}
-    yield "analysis", "poles", analysis.pole_map(poles, context.spec.dt), "Poles of the one-step maps at rest."
+    yield (
+        "analysis",
+        "poles",
+        analysis.pole_map(poles, context.spec.dt),
+        "Poles of the one-step maps at rest.",
+    )
     prior = context.scenario.prior()
     titles = {"rest": "at rest, where the slope of dry friction dominates", "moving": "at working speed"}
     for point in ("rest", "moving"):

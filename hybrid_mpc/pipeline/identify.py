@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_arrays, read_json, write_arrays, write_json
 from hybrid_mpc.pipeline.context import Context
-from hybrid_mpc.pipeline.parallel import run_jobs
+from hybrid_mpc.pipeline.parallel import WORKERS, run_jobs
 from hybrid_mpc.scenario import load_scenario
 
 if TYPE_CHECKING:
@@ -22,8 +21,6 @@ if TYPE_CHECKING:
     from hybrid_mpc.physics import Prior
 
 MODELS = ("phy_nominal", "phy", "rnn", "pgrnn", "mopgrnn")
-WORKERS = 2
-"""Trainings side by side: the machine this is made for has two cores."""
 
 
 def data_stage(context: Context) -> None:
@@ -82,7 +79,7 @@ def training_stage(context: Context) -> None:
         )
         for kind in todo
     }  # fmt: skip
-    run_jobs(jobs, context.progress.update, min(WORKERS, os.cpu_count() or 1))
+    run_jobs(jobs, context.progress.update, WORKERS)
     trained = {kind: load_trained(context, kind) for kind in KINDS}
     best = {k: float(t.validation.min()) for k, t in trained.items()}
     skipped = {k: int(t.skipped.sum()) for k, t in trained.items()}
@@ -104,7 +101,12 @@ def load_trained(context: Context, kind: str) -> Trained:
     scaling = Scaling(**{name: tuple(v) for name, v in note["scaling"].items()})
     own = part["own"]
     return Trained(
-        TrainingSettings(**note["settings"]), scaling, part["weights"], own["validation"], part["curve"], own["skipped"]
+        TrainingSettings(**note["settings"]),
+        scaling,
+        part["weights"],
+        own["validation"],
+        part["curve"],
+        own["skipped"],
     )
 
 
@@ -144,7 +146,9 @@ def _members(context: Context, name: str, phy: Prior) -> list[tuple[Any, Any]]:
         return [(PriorStep(prior, dt), torch.zeros(0, dtype=double))]
     trained = load_trained(context, name)
     order = np.argsort(trained.validation, kind="stable")
-    return [(trained.step(phy, dt, int(i)), torch.zeros(trained.settings.hidden, dtype=double)) for i in order]
+    return [
+        (trained.step(phy, dt, int(i)), torch.zeros(trained.settings.hidden, dtype=double)) for i in order
+    ]
 
 
 def _settings(context: Context, kind: str) -> TrainingSettings:
@@ -187,4 +191,6 @@ def _train_kind(
     arrays |= {f"curve.{n}": v for n, v in trained.curve.items()}
     arrays |= {"own.validation": trained.validation, "own.skipped": trained.skipped}
     write_arrays(folder / f"{settings.kind}.npz", arrays)
-    write_json(folder / f"{settings.kind}.json", {"settings": asdict(settings), "scaling": asdict(trained.scaling)})
+    write_json(
+        folder / f"{settings.kind}.json", {"settings": asdict(settings), "scaling": asdict(trained.scaling)}
+    )

@@ -8,12 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.artifact import load_artifact, set_calibration
+from hybrid_mpc.closed_loop.faults import Fault
+from hybrid_mpc.closed_loop.result import ClosedLoopResult
+from hybrid_mpc.closed_loop.simulate import simulate
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.monitor.calibration import Calibration, alarm_intervals, calibrate
 from hybrid_mpc.monitor.replay import MonitorTrace, replay
 from hybrid_mpc.pipeline.context import Context
-from hybrid_mpc.pipeline.loops import make_estimator, make_monitor, working_point
+from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_monitor, working_point
 from hybrid_mpc.scenario import ControlSpec
 
 if TYPE_CHECKING:
@@ -22,6 +25,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 WANTED_RATE = 1.0
 """Wanted false alarms an hour on nominal data."""
+LOAD_SHARE = 0.2
+"""Unknown load of the demonstration, as a share of the largest input."""
 MARGIN = 1.5
 """Where nominal data are too short for a rate: threshold over the highest nominal level."""
 
@@ -58,10 +63,45 @@ def monitor_stage(context: Context) -> None:
             inside = _inside(context, recording, roles)
             clean[f"{prefix}seconds"] += float(inside.sum() * model.dt)
             clean[f"{prefix}alarms"] += len(alarm_intervals(trace.alarm & inside, model.dt))
-    context.save("monitor", {"calibration": calibration.to_dict(), "alarms": alarms, "clean": clean}, arrays)
+    result = {"calibration": calibration.to_dict(), "alarms": alarms, "clean": clean}
+    if context.scenario.plant is not None and context.scenario.tasks:
+        result["load"], loop = _load_loop(context, model, calibration, control, sigma_x)
+        arrays |= {
+            f"load/{key}": getattr(loop, key) for key in ("t", "violation", "level", "alarm", "x", "u")
+        }
+    context.save("monitor", result, arrays)
 
 
-def clean_windows(context: Context, recording: Trajectory, roles: tuple[str, ...]) -> list[tuple[float, float]]:
+def _load_loop(
+    context: Context, model: HybridModel, calibration: Calibration, control: ControlSpec, sigma_x: Array
+) -> tuple[dict[str, Any], ClosedLoopResult]:
+    """The first task with an unknown constant load from its middle on: does the monitor see it?"""
+    task, prior = context.scenario.tasks[0], load_artifact(context.out / "model").models["prior"]
+    assert context.scenario.plant is not None
+    start, load = 0.5 * task.duration, LOAD_SHARE * control.u_max[0]
+    result = simulate(
+        context.scenario.plant(),
+        make_estimator(model, control, sigma_x),
+        make_controller(model, prior, control),
+        task.reference,
+        dt=model.dt,
+        duration=task.duration,
+        x0=np.array(task.x0),
+        seed=context.settings.seed,
+        monitor=make_monitor(model, calibration),
+        faults=(Fault(start, task.duration, "input_offset", load),),
+    )
+    before, after = result.alarm[result.t < start], np.flatnonzero(result.alarm & (result.t >= start))
+    delay = float(result.t[after[0]] - start) if after.size else None
+    return {
+        "task": task.name, "load": load, "start_s": start, "delay_s": delay,
+        "false_alarms": len(alarm_intervals(before, model.dt)),
+    }, result  # fmt: skip
+
+
+def clean_windows(
+    context: Context, recording: Trajectory, roles: tuple[str, ...]
+) -> list[tuple[float, float]]:
     """Stretches of a recording whose role says that nothing disturbs the machine there, ``(start, end)`` [s]."""
     stem = recording.name.split("#")[0]
     if stem in context.spec.windows:
@@ -78,11 +118,14 @@ def _inside(context: Context, recording: Trajectory, roles: tuple[str, ...]) -> 
 
 
 def _trace(
-    model: HybridModel, calibration: Calibration | None, control: ControlSpec, sigma_x: Array, recording: Trajectory
+    model: HybridModel,
+    calibration: Calibration | None,
+    control: ControlSpec,
+    sigma_x: Array,
+    recording: Trajectory,
 ) -> MonitorTrace:
-    """Replay with an estimator that has no disturbance state: it must not explain a fault away."""
-    estimator = make_estimator(model, control, sigma_x, disturbance=False)
-    return replay(make_monitor(model, calibration), estimator, recording)
+    """Replay with the estimator of the closed loops; the monitor ignores its disturbance estimate."""
+    return replay(make_monitor(model, calibration), make_estimator(model, control, sigma_x), recording)
 
 
 def _calibrate(levels: list[Array], dt: float, data_hash: str) -> Calibration:
@@ -98,7 +141,13 @@ def _calibrate(levels: list[Array], dt: float, data_hash: str) -> Calibration:
         method = f"{MARGIN} x the highest nominal level ({too_short})"
         release = max(0.5 * threshold, float(np.quantile(finite, 0.95)))
         return Calibration(
-            threshold, min(release, threshold), WANTED_RATE, finite.size, finite.size * dt / 3600, method, data_hash
+            threshold,
+            min(release, threshold),
+            WANTED_RATE,
+            finite.size,
+            finite.size * dt / 3600,
+            method,
+            data_hash,
         )
 
 

@@ -50,17 +50,13 @@ def process_noise(model: HybridModel, trajectories: Sequence[Trajectory], most: 
     return np.maximum(np.sqrt(np.mean(np.square(errors), axis=0)), 1e-9)
 
 
-def make_estimator(
-    model: HybridModel, control: ControlSpec, sigma_x: Array, *, disturbance: bool = True
-) -> ExtendedKalmanFilter:
+def make_estimator(model: HybridModel, control: ControlSpec, sigma_x: Array) -> ExtendedKalmanFilter:
     """The extended Kalman filter that all controllers share, tuned by the model's own one-period errors.
 
     Args:
         model: The model to estimate with.
         control: Input range and sensor noise.
         sigma_x: Process noise ``(n_x,)`` per period, see :func:`process_noise`.
-        disturbance: False leaves the input disturbance at zero: the monitor's filter, which must not
-            explain a fault away.
     """
     if len(control.estimator_sigma) != model.n_y:
         raise InputError(
@@ -68,7 +64,7 @@ def make_estimator(
             f"got {control.estimator_sigma}"
         )
     span = np.subtract(control.u_max, control.u_min)
-    share = DISTURBANCE_SHARE * span if disturbance else 0.0 * span
+    share = DISTURBANCE_SHARE * span
     first = np.concatenate([control.estimator_sigma, np.full(model.n_x - model.n_y, 0.1)])
     return ExtendedKalmanFilter(
         model,
@@ -106,12 +102,18 @@ def make_monitor(model: HybridModel, calibration: Calibration | None) -> EnergyM
     """The energy monitor with its default window: about 0.3 s for the derivative and for the level."""
     half = max(2, round(0.5 * MONITOR_WINDOW_S / model.dt))
     return EnergyMonitor(
-        model, window=2 * half + 1, average=max(1, round(MONITOR_WINDOW_S / model.dt)), calibration=calibration
+        model,
+        window=2 * half + 1,
+        average=max(1, round(MONITOR_WINDOW_S / model.dt)),
+        calibration=calibration,
     )
 
 
 def time_on_recording(
-    controller: SafeController, estimator: ExtendedKalmanFilter, monitor: EnergyMonitor, trajectory: Trajectory
+    controller: SafeController,
+    estimator: ExtendedKalmanFilter,
+    monitor: EnergyMonitor,
+    trajectory: Trajectory,
 ) -> Array:
     """Durations [ms] of estimate, solve and monitor on recorded states, for a machine without a plant.
 

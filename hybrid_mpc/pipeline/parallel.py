@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import traceback
 from collections.abc import Callable, Mapping
 from multiprocessing.connection import Connection, wait
 from typing import Any
+
+WORKERS = min(2, os.cpu_count() or 1)
+"""Processes side by side: the machine this is made for has two cores."""
 
 
 def run_jobs(

@@ -88,7 +88,13 @@ def _summary(context: Context, results: dict[str, Any]) -> list[KeyFigure]:
         costs = ", ".join(f"{n} {_text(control[n]['cost'])}" for n in CONTROLLERS)
         gap = control["gap_closed"]
         summary.append(
-            KeyFigure("Gap from prior to oracle closed by the hybrid", gap, "", f"costs: {costs}", "good" if gap > 0 else "bad")
+            KeyFigure(
+                "Gap from prior to oracle closed by the hybrid",
+                gap,
+                "",
+                f"costs: {costs}",
+                "good" if gap > 0 else "bad",
+            )
         )
     if timing["misses"] is not None:
         p99 = timing["controller_step_ms"]["p99"]
@@ -140,7 +146,9 @@ def _data_table(results: dict[str, Any]) -> Table:
         (f"cut: {c['file']}, {c['start_s']:.2f} to {c['end_s']:.2f} s: {why}", c["end_s"] - c["start_s"])
         for c, why in zip(data["cuts"], data["details"]["why_cut"], strict=True)
     ]
-    return Table(("part", "length [s]"), rows, f"{len(data['files'])} files; content hash {data['hash'][:16]}.")
+    return Table(
+        ("part", "length [s]"), rows, f"{len(data['files'])} files; content hash {data['hash'][:16]}."
+    )
 
 
 def _prior_table(context: Context) -> Table:
@@ -171,9 +179,14 @@ def _percent(value: float | None, base: float | None) -> str:
 
 def _export_table(results: dict[str, Any]) -> Table:
     e = results["export"]
-    rows = [("values", e["parity_max_abs_error"], "1e-12"), ("Jacobians", e["jacobian_max_abs_error"], "1e-10")]
+    rows = [
+        ("values", e["parity_max_abs_error"], "1e-12"),
+        ("Jacobians", e["jacobian_max_abs_error"], "1e-10"),
+    ]
     caption = "Largest difference between the exported models and PyTorch, relative to the outputs' scale."
-    return Table(("compared", "largest difference", "allowed"), [(a, f"{b:.1e}", c) for a, b, c in rows], caption)
+    return Table(
+        ("compared", "largest difference", "allowed"), [(a, f"{b:.1e}", c) for a, b, c in rows], caption
+    )
 
 
 def _control_table(results: dict[str, Any]) -> Table | None:

@@ -53,7 +53,9 @@ def _identification(context: Context) -> dict[str, Any]:
                 group[f"{name}_reason"] = "a free run diverged"
         figures[key] = group
     details = {
-        "prior_parameters": {k: prior[k] for k in ("values", "standard_errors", "nominal", "warnings", "stages")},
+        "prior_parameters": {
+            k: prior[k] for k in ("values", "standard_errors", "nominal", "warnings", "stages")
+        },
         "scores_of_all_networks": {name: scores[name]["networks"] for name in MODELS},
         "hybrid_over_phy": {
             key: _ratio(figures[key]["mopgrnn"], figures[key]["phy"]) for key in ("e_sim_s", "rmse_rad")
@@ -148,7 +150,9 @@ def _timing(context: Context) -> dict[str, Any]:
         none = dict.fromkeys(("median", "p95", "p99", "max"))
         return {"controller_step_ms": {**none, "reason": reason}, "period_ms": period, "misses": None,
                 "misses_reason": reason}  # fmt: skip
-    quantiles = {name: float(np.quantile(ms, q)) for name, q in (("median", 0.5), ("p95", 0.95), ("p99", 0.99))}
+    quantiles = {
+        name: float(np.quantile(ms, q)) for name, q in (("median", 0.5), ("p95", 0.95), ("p99", 0.99))
+    }
     return {
         "controller_step_ms": {**quantiles, "max": float(ms.max())},
         "period_ms": period,
@@ -159,7 +163,10 @@ def _timing(context: Context) -> dict[str, Any]:
 def _monitor(context: Context) -> dict[str, Any]:
     monitor = context.result("monitor")
     if "reason" in monitor:
-        return {**dict.fromkeys(("threshold_w", "false_alarms_per_hour", "alarms")), "reason": monitor["reason"]}
+        return {
+            **dict.fromkeys(("threshold_w", "false_alarms_per_hour", "alarms")),
+            "reason": monitor["reason"],
+        }
     clean = monitor["clean"]
     return {
         "threshold_w": monitor["calibration"]["threshold_w"],
