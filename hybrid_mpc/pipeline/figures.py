@@ -43,7 +43,8 @@ def _data(context: Context) -> Any:
 
 
 def _training(context: Context) -> Any:
-    curves, starts = {}, {}
+    curves: dict[str, dict[str, Any]] = {}
+    starts: dict[str, float] = {}
     for kind in reversed(KINDS):
         trained = load_trained(context, kind)
         names = ["loss_error", "validation"]
@@ -65,7 +66,7 @@ def _free_runs(context: Context) -> Any:
     for run in context.result("evaluation")["runs"][:SHOWN_RUNS]:
         own = {m: {k: arrays[f"{m}/{run}/{k}"] for k in ("x_hat", "energy_model_w")} for m in MODELS}
         shared = {k: arrays[f"mopgrnn/{run}/{k}"] for k in ("t", "x", "u", "energy_measured_w")}
-        shown = [m for m in ("phy_nominal", "phy", "rnn", "mopgrnn")]
+        shown = ("phy_nominal", "phy", "rnn", "mopgrnn")
         figure = fit.free_run(
             shared["t"],
             shared["x"],
@@ -87,7 +88,7 @@ def _free_runs(context: Context) -> Any:
     scores = context.result("evaluation")["scores"]
     keys = ("e_sim_s", "rmse_rad", "energy_violation_w")
     finite = {m: {k: _finite(scores[m]["best"][k]) for k in keys} for m in MODELS}
-    spread = {
+    spread: dict[str, dict[str, float]] = {
         m: {k: float(np.std([float(n[k]) for n in scores[m]["networks"]])) for k in keys}
         for m in KINDS
         if all(np.isfinite(float(n[k])) for n in scores[m]["networks"] for k in keys)
@@ -153,6 +154,23 @@ def _monitor(context: Context) -> Any:
         )
         name = recording.name.replace("#", "-")
         yield "monitor", f"monitor_{name}", figure, f"The monitor over the whole recording {recording.name}."
+    if "load" in result:
+        load = result["load"]
+        own = {k: arrays[f"load/{k}"] for k in ("t", "violation", "level", "alarm", "x")}
+        figure = monitor.trace(
+            own["t"],
+            own["violation"],
+            own["level"],
+            result["calibration"]["threshold_w"],
+            own["alarm"],
+            own["x"][:, 0],
+            output=output,
+            windows=((0.0, load["start_s"]),),
+            title=f"closed loop, {load['task']}: an unknown load from {load['start_s']:g} s on",
+        )
+        unit = context.scenario.prior().inputs[0].unit
+        caption = f"The monitor inside the loop: a constant load of {load['load']:g} {unit} at the input sets in."
+        yield "monitor", "monitor_load", figure, caption
 
 
 def _worth_showing(context: Context) -> list[Any]:
@@ -185,7 +203,7 @@ def _analysis(context: Context) -> Any:
             for n, c in colours.items()
         }
         figure = analysis.bode(
-            responses,  # type: ignore[arg-type]
+            responses,
             input_signal=prior.inputs[0],
             output_signal=prior.outputs[0],
             nyquist=np.pi / context.spec.dt,

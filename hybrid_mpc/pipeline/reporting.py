@@ -35,7 +35,7 @@ def command(context: Context) -> str:
 
 
 def _report(context: Context, results: dict[str, Any], figures: Figures) -> Report:
-    tables = {
+    tables: dict[str, Table | None] = {
         "data": _data_table(results),
         "models": _prior_table(context),
         "free_run": _score_table(results),
@@ -51,9 +51,9 @@ def _report(context: Context, results: dict[str, Any], figures: Figures) -> Repo
             TITLES[key],
             notes["instead"].get(key, paragraphs(key)),
             figures.get(key, ()),
-            (tables[key],) if tables.get(key) is not None else (),
+            [t for t in (tables.get(key),) if t is not None and t.rows],
             notes["after"].get(key, ()),
-        )  # type: ignore[arg-type]
+        )
         for key in TITLES
     )
     versions = ", ".join(f"{name} {v}" for name, v in results["versions"].items())
@@ -135,8 +135,21 @@ def _notes(context: Context, results: dict[str, Any]) -> dict[str, dict[str, tup
         after["models"] = ("Warnings of the fit: " + "; ".join(warnings) + ".",)
     if results["monitor"]["alarms"] is not None:
         method = results["monitor"]["details"]["calibration"]["method"]
-        after["monitor"] = (f"Calibration: {method}.",)
+        after["monitor"] = (_monitor_words(context, results), f"Calibration: {method}.")
     return {"instead": instead, "after": after}
+
+
+def _monitor_words(context: Context, results: dict[str, Any]) -> str:
+    clean = results["monitor"]["details"]["clean"]
+    words = (
+        f"In {clean['seconds']:.0f} s known to be undisturbed there were {clean['alarms']} alarms, "
+        f"in the {clean['test_seconds']:.0f} s of test data among them {clean['test_alarms']}."
+    )
+    load = context.result("monitor").get("load")
+    if load is None:
+        return words
+    seen = "never" if load["delay_s"] is None else f"after {load['delay_s']:.2f} s"
+    return f"{words} The unknown load in the closed loop was reported {seen}."
 
 
 def _data_table(results: dict[str, Any]) -> Table:

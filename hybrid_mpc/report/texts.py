@@ -71,8 +71,8 @@ TEXTS: Mapping[str, tuple[Markup, ...]] = {
         _M(
             "In a free run a model gets the measured input and an initial state, and nothing else: from "
             "then on it lives on its own predictions. Errors accumulate, which makes this a much harder "
-            "test than predicting one step. The initial state comes from a short measured past (shaded "
-            "grey), the same for every model; it is not scored."
+            "test than predicting one step. The initial state comes from a short measured past, the "
+            "same for every model; that past also warms the networks' memory up, and is not scored."
         ),
         _M(
             "Read from top to bottom: the states, the input, the energy balances of the measurement and of "
@@ -88,9 +88,9 @@ TEXTS: Mapping[str, tuple[Markup, ...]] = {
             "then evaluated at the same points in double precision."
         ),
         _M(
-            "The curve shows which share of all compared numbers differs by less than the value on the "
-            "horizontal axis. Everything must lie left of the dashed line of its colour. Differences around "
-            "10<sup>−16</sup> are the rounding of double precision itself."
+            "The table gives the largest difference at random points of the data's magnitude, at zero, and far "
+            "outside (a thousand times). Differences around 10<sup>−16</sup> are the rounding of double "
+            "precision itself."
         ),
     ),
     "control": (
@@ -107,6 +107,7 @@ TEXTS: Mapping[str, tuple[Markup, ...]] = {
             "the distance between prior and oracle that the hybrid covers:"
             '<span class="formula">gap closed = (<i>J</i><sub>prior</sub> − <i>J</i><sub>hybrid</sub>) / '
             "(<i>J</i><sub>prior</sub> − <i>J</i><sub>oracle</sub>)</span>"
+            "It is summed over the tasks in which prior and oracle differ by more than twice the standard error."
         ),
     ),
     "timing": (
