@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from typing import Annotated
+
+# Before numpy or torch are loaded: arrays here are small, threads inside them only cost time.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 try:
     import typer

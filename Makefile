@@ -1,0 +1,35 @@
+# Two commands for a newcomer: make demo, make test. Both make .venv and install into it first.
+PYTHON ?= python3
+BIN := .venv/bin
+INSTALLED := .venv/.installed
+# Arrays here are small: threads inside numpy and torch only cost time.
+export OMP_NUM_THREADS ?= 1
+
+.PHONY: install demo test test-full lint types clean
+
+install: $(INSTALLED)
+
+$(INSTALLED): pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+# An interrupted demo goes on where it stopped.
+demo: $(INSTALLED)
+	$(BIN)/hybrid-mpc run golf_robot --budget quick --out runs/demo $(if $(wildcard runs/demo/run.json),--resume)
+
+lint: $(INSTALLED)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(INSTALLED)
+	$(BIN)/mypy
+
+test: lint types
+	$(BIN)/python -m pytest -m 'not full' -n 2 -q --durations=8
+
+test-full: lint types
+	$(BIN)/python -m pytest -n 2 -q --durations=20
+
+clean:
+	rm -rf .venv build runs/demo

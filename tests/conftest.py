@@ -1,0 +1,31 @@
+"""Shared material of the tests."""
+
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def golf_artifact(tmp_path_factory) -> Path:
+    """An artifact of the golf robot: the nominal prior, and a small network with random weights.
+
+    Its output layer is scaled down so that the hybrid stays near the prior.
+    """
+    import torch
+
+    from hybrid_mpc.artifact import save_artifact
+    from hybrid_mpc.identification.export import model_info, trace_model
+    from hybrid_mpc.identification.networks import StackedGRU
+    from hybrid_mpc.identification.step import HybridStep, PriorStep, Scaling, n_features
+    from scenarios.golf_robot.prior import GolfRobotPrior
+
+    prior = GolfRobotPrior()
+    stack = StackedGRU(1, n_features(prior, True), 8, 1, seed=3)
+    with torch.no_grad():
+        stack.w_out.mul_(0.3)
+    scaling = Scaling(x=(0.5, 1.5), u=(0.2,), acceleration=(5.0,), correction=(0.5,))
+    steps = {"hybrid": HybridStep(prior, stack.member(0), scaling, 0.02), "prior": PriorStep(prior, 0.02)}
+    folder = tmp_path_factory.mktemp("artifact") / "model"
+    programs = {name: trace_model(step.requires_grad_(False)) for name, step in steps.items()}
+    save_artifact(folder, programs, model_info(prior, 0.02), provenance={"made": "for tests"})
+    return folder

@@ -1,0 +1,112 @@
+"""Who may import whom, read off the source; and the online half without torch, in a process of its own."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+OWN = ("nn_export", "hybrid_mpc", "scenarios")
+ALLOWED = {
+    "nn_export": {"nn_export"},
+    "hybrid_mpc": {"nn_export", "hybrid_mpc"},
+    "scenarios": {"nn_export", "hybrid_mpc", "scenarios"},
+}
+# the offline half: the only places where torch may be imported when a module is loaded
+TORCH = (
+    "nn_export/trace.py",
+    "nn_export/convert.py",
+    "nn_export/parity.py",
+    "hybrid_mpc/physics.py",
+    "hybrid_mpc/identification/",
+)
+# rooms that run beside a machine and so must not even import torch lazily
+ONLINE = ("model", "artifact", "riccati", "estimation", "mpc", "monitor", "closed_loop", "analysis", "plots", "report")
+
+
+def imports(path, *, at_load):
+    """Top-level names that a file imports; ``at_load`` leaves out functions and TYPE_CHECKING blocks."""
+    names = set()
+
+    def visit(node):
+        for child in ast.iter_child_nodes(node):
+            if at_load and isinstance(child, ast.FunctionDef | ast.Lambda):
+                continue
+            if at_load and isinstance(child, ast.If) and "TYPE_CHECKING" in ast.dump(child.test):
+                continue
+            if isinstance(child, ast.Import):
+                names.update(alias.name for alias in child.names)
+            elif isinstance(child, ast.ImportFrom):
+                assert child.level == 0, f"{path}: relative import"
+                names.add(child.module)
+            visit(child)
+
+    visit(ast.parse(path.read_text()))
+    return names
+
+
+FILES = [p for package in OWN for p in sorted((ROOT / package).rglob("*.py"))]
+
+
+def test_there_are_files():
+    assert len(FILES) > 60
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_imports_go_one_way(path):
+    package = path.relative_to(ROOT).parts[0]
+    tops = {name.split(".")[0] for name in imports(path, at_load=False)}
+    assert tops & set(OWN) <= ALLOWED[package]
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_torch_stays_offline(path):
+    where = str(path.relative_to(ROOT))
+    if where.startswith(TORCH) or (where.startswith("scenarios/") and path.name == "prior.py"):
+        return
+    assert "torch" not in {name.split(".")[0] for name in imports(path, at_load=True)}
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    if parts[0] == "hybrid_mpc" and parts[1] in ONLINE:
+        assert "torch" not in {name.split(".")[0] for name in imports(path, at_load=False)}
+
+
+def test_only_the_command_line_knows_typer():
+    for path in FILES:
+        if "cli" not in path.parts:
+            assert not {"typer", "rich"} & {name.split(".")[0] for name in imports(path, at_load=False)}, path
+
+
+CLOSED_LOOP = """
+import sys
+class Refuse:
+    def find_spec(self, name, *rest):
+        if name.split(".")[0] == "torch":
+            raise ImportError("torch is refused here")
+sys.meta_path.insert(0, Refuse())
+import numpy as np
+from pathlib import Path
+from hybrid_mpc.artifact import load_artifact
+from hybrid_mpc.closed_loop.simulate import simulate
+from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_monitor
+from hybrid_mpc.scenario import load_scenario
+artifact, scenario = load_artifact(Path(sys.argv[1])), load_scenario("golf_robot")
+model, prior, task = artifact.models["hybrid"], artifact.models["prior"], scenario.tasks[0]
+result = simulate(
+    scenario.plant(), make_estimator(model, scenario.control, np.array([1e-4, 1e-2])),
+    make_controller(model, prior, scenario.control), task.reference,
+    dt=model.dt, duration=2.0, x0=np.array(task.x0), seed=0, monitor=make_monitor(model, None))
+assert "torch" not in sys.modules
+print(result.source.count("MPC"), float(np.abs(result.x[:, 0] - result.reference[:, 0]).max()))
+"""
+
+
+def test_closed_loop_runs_where_torch_cannot_be_imported(tmp_path, golf_artifact):
+    done = subprocess.run(
+        [sys.executable, "-c", CLOSED_LOOP, str(golf_artifact)], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    solved, error = done.stdout.split()
+    assert int(solved) == 100  # every one of the 2 s / 20 ms steps
+    assert float(error) < 0.1  # rad; an untrained network is the prior: it follows, roughly
