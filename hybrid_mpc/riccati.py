@@ -61,20 +61,20 @@ def dare(a: ArrayLike, b: ArrayLike, q: ArrayLike, r: ArrayLike) -> tuple[Array,
         raise InputError("Riccati equation: A, B, Q or R holds a NaN or an infinite value")
     try:
         p = solve_discrete_are(a, b, q, r)
+        p = 0.5 * (p + p.T)
+        k = np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a)
     except (LinAlgError, ValueError) as error:
         raise InputError(f"the Riccati equation has no stabilising solution ({error}); {hint}") from error
-    p = 0.5 * (p + p.T)
-    k = np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a)
     radius = float(np.max(np.abs(np.linalg.eigvals(a - b @ k))))
     if not radius < 1.0:
-        raise InputError(f"the system is not stabilisable: spectral radius {radius:.6f} in closed loop; {hint}")
+        raise InputError(f"not stabilisable: spectral radius {radius:.6f} in closed loop; {hint}")
     return p, k
 
 
 def hidden_fixed_point(
     model: HybridModel, x: Array, u: Array, *, tol: float = 1e-10, limit: int = 2000
 ) -> Array:
-    """Hidden state ``(n_h,)`` that iterating the step with ``x`` ``(n_x,)`` and ``u`` ``(n_u,)`` held reaches.
+    """Hidden state ``(n_h,)`` that the step reaches with ``x`` ``(n_x,)`` and ``u`` ``(n_u,)`` held.
 
     The iteration starts at zero and ends when no element moves by more than ``tol``, or after
     ``limit`` steps with the last value.

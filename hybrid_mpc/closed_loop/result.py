@@ -41,7 +41,8 @@ class ClosedLoopResult:
     Example:
         >>> one = np.ones((2, 1))
         >>> result = ClosedLoopResult(0.1, np.array([0.0, 0.1]), one, one, one, one, one, one, 0 * one,
-        ...     ("MPC",) * 2, ("SOLVED",) * 2, np.array([2.0, 4.0]), {}, one[:, 0], one[:, 0], np.zeros(2, bool))
+        ...     ("MPC",) * 2, ("SOLVED",) * 2, np.array([2.0, 4.0]), {},
+        ...     one[:, 0], one[:, 0], np.zeros(2, bool))
         >>> round(result.cost, 6), result.tracking_rmse
         (0.6, 1.0)
     """

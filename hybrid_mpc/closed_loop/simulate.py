@@ -114,7 +114,7 @@ def simulate(
     n = _periods(dt, duration, model.dt, safe.controller.model.dt)
     check_channels(faults, model.n_y, ocp.n_u)
     x0 = vector(x0, ocp.n_x, "x0")
-    ahead = np.arange((ocp.horizon if horizon is None else horizon) + 1) * dt
+    ahead: Array = np.arange((ocp.horizon if horizon is None else horizon) + 1, dtype=np.float64) * dt
     cost = ocp if stage_cost is None else stage_cost
     rng = np.random.default_rng(seed)
     state = plant.reset(x0, seed)
@@ -128,7 +128,7 @@ def simulate(
         x = plant.truth(state)
         y = corrupt_measurement(faults, t, plant.measure(state, rng), y)
         seen = np.concatenate([x, plant.hidden(state)]) if isinstance(estimator, TrueState) else y
-        preview = np.asarray(reference(t + ahead), dtype=float)
+        preview: Array = np.asarray(reference(t + ahead), dtype=np.float64)
         if preview.shape != (ahead.size, ocp.n_x):
             raise InputError(f"reference returns {preview.shape}, needed: {(ahead.size, ocp.n_x)}")
         clock = [perf_counter()]

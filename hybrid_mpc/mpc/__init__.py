@@ -5,4 +5,13 @@ from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.safeguard import Decision, SafeController, Source
 from hybrid_mpc.mpc.solution import Solution, Status
 
-__all__ = ["OCP", "CondensedController", "Decision", "Prepared", "SafeController", "Solution", "Source", "Status"]
+__all__ = [
+    "OCP",
+    "CondensedController",
+    "Decision",
+    "Prepared",
+    "SafeController",
+    "Solution",
+    "Source",
+    "Status",
+]

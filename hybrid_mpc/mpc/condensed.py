@@ -239,7 +239,9 @@ class CondensedController:
         stages = self._ocp.stage_cost(x[:-1], u, x_ref[:-1], du)
         return float(np.sum(stages) * self._model.dt + last @ self._terminal @ last)
 
-    def _failed(self, prepared: Prepared, status: Status, start: float, kkt: float = float("nan")) -> Solution:
+    def _failed(
+        self, prepared: Prepared, status: Status, start: float, kkt: float = float("nan")
+    ) -> Solution:
         x, h = prepared.z[:, : self._n_x], prepared.z[:, self._n_x :]
         return Solution(prepared.u, x, h, prepared.d, float("nan"), status, kkt, prepared.defect,
                         self._timing(prepared, start))  # fmt: skip

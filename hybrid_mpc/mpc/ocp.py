@@ -109,7 +109,9 @@ class OCP:
     def stage_cost(self, x: Array, u: Array, x_ref: Array, du: Array) -> Array:
         """Stage cost ``(...)`` per second of states ``(..., n_x)`` and inputs ``(..., n_u)``."""
         error = np.asarray(x) - np.asarray(x_ref)
-        return np.asarray(error**2 @ self.q + np.asarray(u) ** 2 @ self.r + np.asarray(du) ** 2 @ self.r_delta)
+        return np.asarray(
+            error**2 @ self.q + np.asarray(u) ** 2 @ self.r + np.asarray(du) ** 2 @ self.r_delta
+        )
 
     def saturate(self, u: Array, u_prev: Array) -> Array:
         """``u`` ``(n_u,)`` moved into the bounds and, around ``u_prev``, into the limit of its change.
@@ -137,12 +139,16 @@ class OCP:
             return self.terminal
         n_x = self.n_x
         x, u = self.working_point if self.working_point is not None else (np.zeros(n_x), np.zeros(self.n_u))
-        a, b, _ = linearisation(model, vector(x, n_x, "working_point x"), vector(u, self.n_u, "working_point u"))
+        a, b, _ = linearisation(
+            model, vector(x, n_x, "working_point x"), vector(u, self.n_u, "working_point u")
+        )
         q = np.diag(np.concatenate([self.q, np.zeros(model.n_h)]) * model.dt)
         p, _ = dare(a, b, q, np.diag(self.r + self.r_delta) * model.dt)
         if not model.n_h:
             return p
-        reduced = p[:n_x, :n_x] - p[:n_x, n_x:] @ np.linalg.pinv(p[n_x:, n_x:], hermitian=True) @ p[n_x:, :n_x]
+        reduced = (
+            p[:n_x, :n_x] - p[:n_x, n_x:] @ np.linalg.pinv(p[n_x:, n_x:], hermitian=True) @ p[n_x:, :n_x]
+        )
         values, vectors = np.linalg.eigh(0.5 * (reduced + reduced.T))
         return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
@@ -152,7 +158,9 @@ def _check_weights(weights: dict[str, Array]) -> None:
         if value.size == 0 or not np.all(np.isfinite(value)) or np.any(value < 0):
             raise InputError(f"{name}: weights must be finite and not negative, got {value}")
     if not np.all(weights["r"] + weights["r_delta"] > 0):
-        raise InputError("every input needs a positive weight in r or r_delta, otherwise it is not determined")
+        raise InputError(
+            "every input needs a positive weight in r or r_delta, otherwise it is not determined"
+        )
 
 
 def _bounds(u_min: ArrayLike, u_max: ArrayLike, n_u: int) -> tuple[Array, Array]:
@@ -160,7 +168,9 @@ def _bounds(u_min: ArrayLike, u_max: ArrayLike, n_u: int) -> tuple[Array, Array]
     if lower.shape != (n_u,) or upper.shape != (n_u,):
         raise InputError(f"u_min has {lower.size} and u_max {upper.size} values, {n_u} needed")
     if not np.all(lower < upper):
-        raise InputError(f"input bounds cross: u_min {lower}, u_max {upper}; every u_min must be below its u_max")
+        raise InputError(
+            f"input bounds cross: u_min {lower}, u_max {upper}; every u_min must be below its u_max"
+        )
     return lower, upper
 
 
@@ -169,7 +179,9 @@ def _terminal(value: ArrayLike, n_x: int) -> Array:
         raise InputError(f"terminal: {value!r} given; needed: 'riccati' or an ({n_x}, {n_x}) matrix")
     matrix = np.asarray(value, dtype=float)
     if matrix.shape != (n_x, n_x) or not np.all(np.isfinite(matrix)) or not np.allclose(matrix, matrix.T):
-        raise InputError(f"terminal: shape {matrix.shape} given; needed: a finite symmetric ({n_x}, {n_x}) matrix")
+        raise InputError(
+            f"terminal: shape {matrix.shape} given; needed: a finite symmetric ({n_x}, {n_x}) matrix"
+        )
     if np.min(np.linalg.eigvalsh(matrix)) < -1e-9 * max(1.0, float(np.max(np.abs(matrix)))):
         raise InputError("terminal: the matrix has a negative eigenvalue; needed: positive semi-definite")
     return matrix

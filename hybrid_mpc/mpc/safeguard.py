@@ -139,7 +139,9 @@ class SafeController:
         plan = self._controller.initial(estimate, inputs) if known else replace(solution, u=inputs)
         return Decision(u, source, plan, solution.status, previous.age + 1)
 
-    def _instead(self, failed: Solution, estimate: Estimate, reference: Array, age: int) -> tuple[Array, Source]:
+    def _instead(
+        self, failed: Solution, estimate: Estimate, reference: Array, age: int
+    ) -> tuple[Array, Source]:
         if age <= self._max_age and np.all(np.isfinite(failed.u[0])):
             return failed.u[0], Source.PLAN
         if self._fallback is not None:
@@ -151,7 +153,7 @@ class SafeController:
 
 
 def _equilibrium_input(model: HybridModel) -> ca.Function:
-    """``x -> u`` that holds a state best: one least-squares Newton step of ``xdot(x, h = 0, u)`` from zero."""
+    """``x -> u`` that holds a state best: one least-squares Newton step of ``xdot(x, 0, u)`` from zero."""
     x, u = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
     v_dot = model.xdot(x, ca.DM.zeros(model.n_h, 1), u)[model.n_x // 2 :]
     slope = ca.jacobian(v_dot, u)
