@@ -17,6 +17,7 @@ from hybrid_mpc.monitor.calibration import Calibration, alarm_intervals, calibra
 from hybrid_mpc.monitor.replay import MonitorTrace, replay
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_monitor, working_point
+from hybrid_mpc.riccati import hidden_fixed_point
 from hybrid_mpc.scenario import ControlSpec
 
 if TYPE_CHECKING:
@@ -153,22 +154,26 @@ def _calibrate(levels: list[Array], dt: float, data_hash: str) -> Calibration:
 
 def analysis_stage(context: Context) -> None:
     """Linearise prior and hybrid at rest and at working speed; poles, PBH tests, frequency responses."""
-    from hybrid_mpc.analysis import analyze, fixed_point, frequency_response, linearize, linearize_at_speed
+    from hybrid_mpc.analysis import analyze, fixed_point, frequency_response, linearize
 
     artifact = load_artifact(context.out / "model")
     result: dict[str, Any] = {}
     arrays: dict[str, Any] = {}
     for i, (name, model) in enumerate(artifact.models.items()):
         context.progress.update("models", i, len(artifact.models), name)
-        u = np.zeros(model.n_u)
-        x, h = fixed_point(model, u, np.zeros(model.n_x))
-        at_rest = linearize(model, x, u, h)
-        systems = {"rest": at_rest}
+        u, x = np.zeros(model.n_u), np.zeros(model.n_x)
+        result[name] = {}
+        try:
+            x, h = fixed_point(model, u, x)
+            result[name]["fixed_point"] = x.tolist()
+        except InputError as none:  # a learned correction may leave no point of rest near zero
+            h = hidden_fixed_point(model, x, u)
+            result[name]["fixed_point_reason"] = f"linearised at x = 0 instead: {none}"
+        systems = {"rest": linearize(model, x, u, h)}
         if context.scenario.control is not None:
-            speed = working_point(model, context.scenario.control)[0][model.n_x // 2 :]
-            systems["moving"] = linearize_at_speed(model, x[: model.n_x // 2], speed, u)
-            result["working_speed"] = speed.tolist()
-        result[name] = {"fixed_point": x.tolist()}
+            moving = x + working_point(model, context.scenario.control)[0]
+            systems["moving"] = linearize(model, moving, u, hidden_fixed_point(model, moving, u))
+            result["working_speed"] = moving[model.n_x // 2 :].tolist()
         for point, system in systems.items():
             omega = np.geomspace(0.1, np.pi / model.dt, 300)
             response = frequency_response(system, omega)

@@ -70,6 +70,8 @@ def _work(connection: Connection, function: Callable[..., Any], args: tuple[Any,
 
     try:
         result = function(*args, report)
+    except BrokenPipeError:  # the parent is gone, and with it whoever wanted the result
+        return
     except Exception:  # every failure travels to the parent, which raises it
         connection.send(("error", traceback.format_exc()))
     else:

@@ -136,7 +136,15 @@ def _notes(context: Context, results: dict[str, Any]) -> dict[str, dict[str, tup
     if results["monitor"]["alarms"] is not None:
         method = results["monitor"]["details"]["calibration"]["method"]
         after["monitor"] = (_monitor_words(context, results), f"Calibration: {method}.")
+    points = results["analysis"]["details"]
+    reasons = [f"{m}: {points[m]['fixed_point_reason']}" for m in points if "fixed_point_reason" in _dict(points[m])]
+    if reasons:
+        after["analysis"] = tuple(reasons)
     return {"instead": instead, "after": after}
+
+
+def _dict(value: Any) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
 
 
 def _monitor_words(context: Context, results: dict[str, Any]) -> str:
@@ -237,7 +245,7 @@ def _pole_table(results: dict[str, Any]) -> Table:
         if not isinstance(points, dict):
             continue
         for point, a in points.items():
-            if point == "fixed_point":
+            if point.startswith("fixed_point"):
                 continue
             slow = [f"{w:.2f} ({z:.2f})" for w, z in
                     list(zip(a["frequency_rad_s"], a["damping"], strict=True))[:2] if w is not None]  # fmt: skip
