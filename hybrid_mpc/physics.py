@@ -19,7 +19,7 @@ class Prior(nn.Module):
     """A mechanical ODE prior with its output equation and its energy balance.
 
     The state is ``x = [q, v]``: positions first, then their velocities, so that ``q_dot = v`` is exact.
-    A subclass names its signals and parameters as class attributes and writes three methods. Every
+    A subclass names its signals and parameters as class attributes and writes two methods. Every
     parameter becomes a float64 ``nn.Parameter`` of shape ``()`` under its name.
 
     Args:
@@ -36,8 +36,8 @@ class Prior(nn.Module):
         ...     parameters_spec = (Parameter("J", 0.1, "kg m^2", 0.01, 1.0),)
         ...     def acceleration(self, x, u):
         ...         return u / self.J
-        ...     def energy_balance(self, x, xdot, u):
-        ...         return (self.J * xdot[..., 1] - u[..., 0]) * x[..., 1]
+        ...     def inertia(self, x):
+        ...         return self.J
         >>> Pendulum()(torch.tensor([0.0, 1.0]), torch.tensor([0.2])).tolist()
         [1.0, 2.0]
     """
@@ -81,9 +81,16 @@ class Prior(nn.Module):
         """Measured outputs ``(..., n_y)``. Default: the positions."""
         return x[..., : len(self.outputs)]
 
+    def inertia(self, x: Tensor) -> Tensor | float:
+        """Generalised inertia of each velocity [SI], a number or ``(..., n_q)``, for :meth:`energy_balance`."""
+        raise NotImplementedError(f"{type(self).__name__} must define inertia(x), or energy_balance(x, xdot, u)")
+
     def energy_balance(self, x: Tensor, xdot: Tensor, u: Tensor) -> Tensor:
         """Energy balance ΔE [W], shape ``(...)``: zero along the prior's own flow.
 
-        The velocity comes from the state ``x``, the acceleration from ``xdot``.
+        The velocity comes from the state ``x``, the acceleration from ``xdot``. By default it is the equation
+        of motion times the velocity, ``inertia * (v_dot - acceleration(x, u)) * v``: the same number as the
+        balance written out term by term, and no equation is written twice.
         """
-        raise NotImplementedError(f"{type(self).__name__} must define energy_balance(x, xdot, u)")
+        v, v_dot = x[..., self.n_q :], xdot[..., self.n_q :]
+        return (self.inertia(x) * (v_dot - self.acceleration(x, u)) * v).sum(-1)

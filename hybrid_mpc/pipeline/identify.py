@@ -23,17 +23,23 @@ if TYPE_CHECKING:
 MODELS = ("phy_nominal", "phy", "rnn", "pgrnn", "mopgrnn")
 
 
+def check_data(context: Context) -> None:
+    """Read the user's recordings before anything is written: bad ones leave no folder behind."""
+    if context.settings.data:
+        context.dataset  # noqa: B018  read, checked and kept
+    elif context.scenario.make_data is None:
+        raise InputError(
+            f"scenario {context.scenario.name} is a real machine: give its recordings with --data FILE.csv "
+            f"(once for each file)"
+        )
+
+
 def data_stage(context: Context) -> None:
-    """Make the data of a simulated machine, or take the user's files; read and check them all."""
-    scenario, settings = context.scenario, context.settings
-    if not settings.data:
-        if scenario.make_data is None:
-            raise InputError(
-                f"scenario {scenario.name} is a real machine: give its recordings with --data FILE.csv "
-                f"(once for each file)"
-            )
+    """Take the user's recordings, or let a simulated machine make its own, and note what is in them."""
+    if not context.settings.data:
+        assert context.scenario.make_data is not None
         context.progress.update("files", 0, 1, "recording the simulated machine")
-        scenario.make_data(context.out / "data", settings.seed, settings.budget)
+        context.scenario.make_data(context.out / "data", context.settings.seed, context.settings.budget)
     dataset = context.dataset
     roles = ("train", "valid", "test")
     context.save(
@@ -187,7 +193,7 @@ def _train_kind(
         checkpoint=folder / f"{settings.kind}.safetensors",
         on_progress=lambda done, total, error: report(done, total, f"validation E_sim {error:.4g}"),
     )
-    arrays = {f"weights.{n}": v for n, v in trained.weights.items()}
+    arrays: dict[str, Any] = {f"weights.{n}": v for n, v in trained.weights.items()}
     arrays |= {f"curve.{n}": v for n, v in trained.curve.items()}
     arrays |= {"own.validation": trained.validation, "own.skipped": trained.skipped}
     write_arrays(folder / f"{settings.kind}.npz", arrays)

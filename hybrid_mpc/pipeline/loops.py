@@ -114,8 +114,9 @@ def time_on_recording(
     estimator: ExtendedKalmanFilter,
     monitor: EnergyMonitor,
     trajectory: Trajectory,
+    most: int,
 ) -> Array:
-    """Durations [ms] of estimate, solve and monitor on recorded states, for a machine without a plant.
+    """Durations [ms] of estimate, solve and monitor on at most ``most`` recorded samples, without a plant.
 
     The controller is asked to hold the rest position from wherever the recording is; the estimator is told
     the recorded input, not the controller's.
@@ -125,7 +126,7 @@ def time_on_recording(
     estimate = estimator.start(trajectory.y[0])
     decision, state = controller.initial(estimate), monitor.initial()
     durations = []
-    for k in range(1, len(trajectory.t)):
+    for k in range(1, min(most, len(trajectory.t))):
         begin = perf_counter()
         estimate = estimator.update(estimate, trajectory.y[k], trajectory.u[k - 1])
         decision = controller.decide(decision, estimate, target)

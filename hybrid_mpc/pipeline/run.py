@@ -51,6 +51,7 @@ def run(
     scenario = load_scenario(settings.scenario)
     context = Context(settings, scenario, out, progress or Silent())
     context.budget  # noqa: B018  an unknown budget is refused before a folder is made
+    identify.check_data(context)
     open_folder(out, settings, resume=resume)
     for name, title, stage in STAGES:
         context.progress.start(title)

@@ -1,0 +1,68 @@
+"""A small machine of a user's own: the README's lines, and recordings of a pendulum that differs from them."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+README = Path(__file__).parents[2] / "README.md"
+TINY = """
+import dataclasses
+from hybrid_mpc import Budget
+tiny = {"quick": Budget(hidden=4, networks=2, teacher_steps=50, free_run_steps=25, seeds=1)}
+scenario = dataclasses.replace(scenario, budgets=tiny)
+"""
+
+
+def recording(seed: int, seconds: float = 20.0, dt: float = 0.01) -> dict[str, np.ndarray]:
+    """A pendulum with dry friction (the README's prior has none), by semi-implicit Euler at 1 ms."""
+    rng = np.random.default_rng(seed)
+    n, fine = round(seconds / dt), round(dt / 1e-3)
+    t = dt * np.arange(n)
+    u = 0.4 * np.sin(2 * np.pi * rng.uniform(0.2, 0.4) * t) + 0.3 * np.sign(np.sin(2 * np.pi * 0.13 * t + seed))
+    phi, v, out = 0.2, 0.0, np.zeros(n)
+    for k in range(n):
+        out[k] = phi
+        for _ in range(fine):
+            v += 1e-3 * (u[k] - 1.1 * np.sin(phi) - 0.06 * v - 0.08 * np.tanh(v / 0.05)) / 0.1
+            phi += 1e-3 * v
+    return {"time_s": t, "tau_nm": u, "phi_rad": out + 2e-4 * rng.standard_normal(n)}
+
+
+def write(path: Path, columns: dict[str, np.ndarray]) -> Path:
+    table = np.column_stack(list(columns.values()))
+    np.savetxt(path, table, delimiter=",", header=",".join(columns), comments="", fmt="%.8g")
+    return path
+
+
+@pytest.fixture(scope="session")
+def machine(tmp_path_factory) -> Path:
+    """Folder with ``my_machine.py`` (the README's lines) and two recordings."""
+    folder = tmp_path_factory.mktemp("machine")
+    blocks = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    (folder / "my_machine.py").write_text(blocks[0] + TINY)
+    for i, name in enumerate(("monday", "tuesday")):
+        write(folder / f"{name}.csv", recording(i))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def arguments(machine) -> list[str]:
+    """Command line of a run without its --out."""
+    data = [w for name in ("monday", "tuesday") for w in ("--data", str(machine / f"{name}.csv"))]
+    return ["run", str(machine / "my_machine.py"), *data]
+
+
+@pytest.fixture(scope="session")
+def finished(arguments, tmp_path_factory) -> Path:
+    """Folder of a finished run."""
+    import subprocess
+    import sys
+
+    out = tmp_path_factory.mktemp("finished") / "run"
+    command = [sys.executable, "-m", "hybrid_mpc.cli", *arguments, "--out", str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "report.html" in done.stdout
+    return out

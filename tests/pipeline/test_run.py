@@ -1,0 +1,113 @@
+"""The main job as a user runs it: its folder, its determinism, its resumption."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from hybrid_mpc.artifact import load_artifact
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.report.schema import validate_results
+
+
+def results(folder):
+    return json.loads((folder / "results.json").read_text())
+
+
+def without_timing(folder):
+    return {key: value for key, value in results(folder).items() if key != "timing"}
+
+
+def test_folder_holds_what_the_readme_says(finished):
+    found = results(finished)
+    validate_results(found)
+    assert found["scenario"] == "my_machine"
+    assert found["export"]["parity_max_abs_error"] <= 1e-12  # the project's bound for values
+    assert found["export"]["jacobian_max_abs_error"] <= 1e-10  # and for Jacobians
+    page = (finished / "report.html").read_text()
+    assert not re.search(r"(src|href)=[\"']?https?:", page)
+    names = {path.name for path in (finished / "figures").glob("*.png")}
+    assert {"recordings.png", "training.png", "errors.png", "step_times.png", "poles.png"} <= names
+
+
+def test_the_fitted_prior_beats_the_nominal_one(finished):
+    # the machine's parameters are 10 to 20 % off the README's nominal ones, and it has dry friction
+    rmse = results(finished)["identification"]["rmse_rad"]
+    assert rmse["phy"] < 0.7 * rmse["phy_nominal"]
+    fitted = results(finished)["identification"]["details"]["prior_parameters"]["values"]
+    assert fitted["mgl"] == pytest.approx(1.1, rel=0.05)  # dry friction that the prior lacks biases it a little
+
+
+def test_a_machine_without_plant_says_why_it_has_no_closed_loop(finished):
+    control = results(finished)["control"]
+    assert control["gap_closed"] is None
+    assert "no plant" in control["gap_closed_reason"]
+    assert results(finished)["timing"]["controller_step_ms"]["median"] > 0
+
+
+def test_bounds_never_rise(finished):
+    curve = np.load(finished / "checkpoints" / "training" / "mopgrnn.npz")
+    for name in ("bound_error", "bound_energy"):
+        for stage in (0.0, 1.0):
+            bound = curve[f"curve.{name}"][curve["curve.free_run"][:, 0] == stage]
+            assert len(bound) >= 2
+            assert (np.diff(bound, axis=0) <= 0).all()
+
+
+def test_killed_and_resumed_run_equals_the_finished_one(finished, arguments, tmp_path):
+    """Also the test of determinism: everything but timing is the same, bit for bit."""
+    out = tmp_path / "run"
+    command = [sys.executable, "-m", "hybrid_mpc.cli", *arguments, "--out", str(out)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
+    deadline = time.monotonic() + 120
+    while not list(out.glob("checkpoints/training/*.safetensors")):  # in the middle of the training
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not (out / "results.json").exists()
+    done = subprocess.run([*command, "--resume"], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert without_timing(out) == without_timing(finished)
+    assert (out / "model" / "weights.safetensors").read_bytes() == (
+        finished / "model" / "weights.safetensors"
+    ).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("file", "damage", "words"),
+    [
+        ("model.json", lambda b: b[: len(b) // 2], "damaged"),
+        ("model.json", lambda b: b.replace(b'"schema_version": 1', b'"schema_version": 99'), "schema version"),
+        ("programs.json", lambda b: b[: len(b) // 2], "programs.json"),
+        ("weights.safetensors", lambda b: b[:-8], "weights.safetensors"),
+        ("weights.safetensors", lambda b: b[:-8] + bytes(8), "weights.safetensors"),
+        ("programs.json", None, "programs.json"),
+    ],
+)
+def test_damaged_artifact_is_refused(golf_artifact, tmp_path, file, damage, words):
+    for path in golf_artifact.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    if damage is None:
+        (tmp_path / file).unlink()
+    else:
+        (tmp_path / file).write_bytes(damage((tmp_path / file).read_bytes()))
+    with pytest.raises(InputError, match=re.escape(words)):
+        load_artifact(tmp_path)
+
+
+def test_artifact_holds_data_only(finished):
+    names = {path.name for path in (finished / "model").iterdir()}
+    assert names == {"model.json", "programs.json", "weights.safetensors"}
+    artifact = load_artifact(finished / "model")
+    assert set(artifact.models) == {"hybrid", "prior"}
+    assert artifact.models["prior"].n_h == 0
+    assert artifact.calibration is not None
+    assert artifact.provenance["data_hash"] == results(finished)["data"]["hash"]
