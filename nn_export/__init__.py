@@ -12,8 +12,8 @@ from nn_export.program import Node, Port, Program
 from nn_export.storage import load_programs, save_programs
 
 if TYPE_CHECKING:
-    from nn_export.parity import ParityReport, parity
-    from nn_export.trace import to_casadi, trace
+    from nn_export.comparison import ParityReport, parity
+    from nn_export.tracing import to_casadi, trace
 
 __all__ = [
     "to_casadi",
@@ -29,7 +29,7 @@ __all__ = [
     "ExportError",
     "ProgramError",
 ]
-_LAZY = {"trace": "trace", "to_casadi": "trace", "parity": "parity", "ParityReport": "parity"}
+_LAZY = {"trace": "tracing", "to_casadi": "tracing", "parity": "comparison", "ParityReport": "comparison"}
 
 
 def __getattr__(name: str) -> Any:
@@ -37,8 +37,4 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module 'nn_export' has no attribute {name!r}")
     import importlib
 
-    module = importlib.import_module(f"nn_export.{_LAZY[name]}")
-    for public, home in _LAZY.items():  # a submodule of the same name must not hide the function
-        if home == _LAZY[name]:
-            globals()[public] = getattr(module, public)
-    return globals()[name]
+    return getattr(importlib.import_module(f"nn_export.{_LAZY[name]}"), name)
