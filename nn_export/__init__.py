@@ -1,13 +1,14 @@
 """Torch modules as CasADi functions: exact, without a compiler, readable on disk.
 
-``trace``, ``to_casadi`` and ``parity`` need torch and import it when first used; ``build`` and
-``load_programs`` need casadi and numpy only.
+``trace``, ``to_casadi`` and ``parity`` need torch and import it when first used; ``build``,
+``with_jacobian`` and ``load_programs`` need casadi and numpy only.
 """
 
 from typing import TYPE_CHECKING, Any
 
 from nn_export.build import build
 from nn_export.errors import ExportError, ProgramError
+from nn_export.jacobian import with_jacobian
 from nn_export.program import Node, Port, Program
 from nn_export.storage import load_programs, save_programs
 
@@ -19,6 +20,7 @@ __all__ = [
     "to_casadi",
     "trace",
     "build",
+    "with_jacobian",
     "parity",
     "ParityReport",
     "Program",
