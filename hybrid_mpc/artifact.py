@@ -29,6 +29,7 @@ OUTPUTS = {
     "output": ("y",),
     "energy_balance": ("dE",),
 }
+JACOBIANS = {"A": ("x", "h"), "B": ("u",)}
 
 
 @dataclass(frozen=True)
@@ -128,6 +129,7 @@ def load_artifact(folder: Path) -> Artifact:
 def build_model(name: str, programs: Mapping[str, nn_export.Program], info: ModelInfo) -> HybridModel:
     """The :class:`HybridModel` of ``programs["<name>/step"]`` and its siblings."""
     functions = {f: nn_export.build(programs[f"{name}/{f}"], f) for f in FUNCTIONS}
+    functions["with_jacobian"] = nn_export.with_jacobian(programs[f"{name}/step"], JACOBIANS)
     return HybridModel(name, info.dt, info.states, info.inputs, info.outputs, **functions)
 
 

@@ -95,11 +95,12 @@ class HybridModel:
 
 def _with_jacobian(step: ca.Function) -> ca.Function:
     x, h, u = (ca.MX.sym(name, step.size1_in(i)) for i, name in enumerate(("x", "h", "u")))
-    z = ca.vertcat(*step(x, h, u))
+    x_next, h_next = step(x, h, u)
+    z = ca.vertcat(x_next, h_next)
     a = ca.densify(ca.horzcat(ca.jacobian(z, x), ca.jacobian(z, h)))
     b = ca.densify(ca.jacobian(z, u))
     names = ["x", "h", "u"], ["x_next", "h_next", "A", "B"]
-    return ca.Function("with_jacobian", [x, h, u], [*step(x, h, u), a, b], *names)
+    return ca.Function("with_jacobian", [x, h, u], [x_next, h_next, a, b], *names)
 
 
 def _check(

@@ -1,24 +1,26 @@
 """Torch modules as CasADi functions: exact, without a compiler, readable on disk.
 
-``trace``, ``to_casadi`` and ``parity`` need torch and import it when first used; ``build`` and
-``load_programs`` need casadi and numpy only.
+``trace``, ``to_casadi`` and ``parity`` need torch and import it when first used; ``build``,
+``with_jacobian`` and ``load_programs`` need casadi and numpy only.
 """
 
 from typing import TYPE_CHECKING, Any
 
 from nn_export.build import build
 from nn_export.errors import ExportError, ProgramError
+from nn_export.jacobian import with_jacobian
 from nn_export.program import Node, Port, Program
 from nn_export.storage import load_programs, save_programs
 
 if TYPE_CHECKING:
-    from nn_export.parity import ParityReport, parity
-    from nn_export.trace import to_casadi, trace
+    from nn_export.comparison import ParityReport, parity
+    from nn_export.tracing import to_casadi, trace
 
 __all__ = [
     "to_casadi",
     "trace",
     "build",
+    "with_jacobian",
     "parity",
     "ParityReport",
     "Program",
@@ -29,7 +31,7 @@ __all__ = [
     "ExportError",
     "ProgramError",
 ]
-_LAZY = {"trace": "trace", "to_casadi": "trace", "parity": "parity", "ParityReport": "parity"}
+_LAZY = {"trace": "tracing", "to_casadi": "tracing", "parity": "comparison", "ParityReport": "comparison"}
 
 
 def __getattr__(name: str) -> Any:
@@ -37,8 +39,4 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module 'nn_export' has no attribute {name!r}")
     import importlib
 
-    module = importlib.import_module(f"nn_export.{_LAZY[name]}")
-    for public, home in _LAZY.items():  # a submodule of the same name must not hide the function
-        if home == _LAZY[name]:
-            globals()[public] = getattr(module, public)
-    return globals()[name]
+    return getattr(importlib.import_module(f"nn_export.{_LAZY[name]}"), name)

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from nn_export.errors import ProgramError, ShapeError
-from nn_export.operators import OPERATORS
+from nn_export.operators import OPERATORS, PLAIN
 from nn_export.operators.value import Value, constant, matrix_shape
 from nn_export.program import Node, Program
 
 _IDENTIFIER = re.compile(r"[A-Za-z](_?[A-Za-z0-9])*_?")
+_BAD_NAME = "{!r} is no name for CasADi: use letters, digits and single underscores"
 
 
 def valid_name(name: str) -> bool:
@@ -26,7 +28,7 @@ def valid_name(name: str) -> bool:
     return _IDENTIFIER.fullmatch(name) is not None and name not in ("null", "jac", "hess")
 
 
-def build(program: Program, name: str | None = None) -> ca.Function:
+def build(program: Program, name: str | None = None, *, plain: bool = False) -> ca.Function:
     """The program as a CasADi function of MX with the program's names.
 
     A tensor of shape (n,) becomes n x 1, (r, c) becomes r x c; axes of size 1 are dropped.
@@ -34,6 +36,8 @@ def build(program: Program, name: str | None = None) -> ca.Function:
     Args:
         program: What :func:`nn_export.trace` made or :func:`nn_export.load_programs` read.
         name: Name of the function. Default: ``"program"``.
+        plain: Leave the derivatives of GRU cells to CasADi as well. Default: each cell is a call of a
+            function that brings its exact Jacobian, which makes derivatives several times faster.
 
     Returns:
         Function with dense inputs and outputs.
@@ -49,19 +53,28 @@ def build(program: Program, name: str | None = None) -> ca.Function:
         Function(program:(x[2])->(y[2]) MXFunction)
     """
     name = "program" if name is None else name
-    for text in (name, *(p.name for p in (*program.inputs, *program.outputs))):
-        if not valid_name(text):
-            raise ProgramError(f"{text!r} is no name for CasADi: use letters, digits and single underscores")
+    symbols, values = graph(program, PLAIN if plain else OPERATORS)
+    return function(name, symbols, [v.mx for v in values], program, [p.name for p in program.outputs])
+
+
+def graph(program: Program, table: Mapping[str, Callable[..., Any]]) -> tuple[list[ca.MX], list[Value]]:
+    """Symbols of the inputs and values of the outputs, with the operators of a table.
+
+    Raises:
+        ProgramError: As :func:`build`.
+    """
     values: dict[tuple[str, str], Any] = {}
     symbols = []
     for port in program.inputs:
+        if not valid_name(port.name):
+            raise ProgramError(_BAD_NAME.format(port.name))
         symbols.append(ca.MX.sym(port.name, *_size(f"input {port.name}", port.shape)))
         values["input", port.name] = Value(port.shape, symbols[-1])
     for weight, array in program.weights.items():
         _size(f"weight {weight}", np.shape(array))
         values["weight", weight] = constant(array)
     for node in program.nodes:
-        values["node", node.name] = _evaluate(node, values)
+        values["node", node.name] = _evaluate(node, values, table)
     results = []
     for port in program.outputs:
         value = _resolve(port.source, values)
@@ -69,8 +82,22 @@ def build(program: Program, name: str | None = None) -> ca.Function:
             raise ProgramError(
                 f"output {port.name}: {port.source} has not its shape {port.shape}; export again"
             )
-        results.append(value.mx)
-    names = [p.name for p in program.inputs], [p.name for p in program.outputs]
+        results.append(value)
+    return symbols, results
+
+
+def function(
+    name: str, symbols: list[ca.MX], results: list[ca.MX], program: Program, outputs: list[str]
+) -> ca.Function:
+    """A function of the program's inputs.
+
+    Raises:
+        ProgramError: If CasADi refuses a name or the function.
+    """
+    for text in (name, *outputs):
+        if not valid_name(text):
+            raise ProgramError(_BAD_NAME.format(text))
+    names = [p.name for p in program.inputs], outputs
     try:
         return ca.Function(name, symbols, results, *names, {"allow_duplicate_io_names": True})
     except RuntimeError as error:
@@ -84,13 +111,13 @@ def _size(what: str, shape: tuple[int, ...]) -> tuple[int, int]:
         raise ShapeError(f"{what}: {error}") from error
 
 
-def _evaluate(node: Node, values: dict[tuple[str, str], Any]) -> Any:
+def _evaluate(node: Node, values: dict[tuple[str, str], Any], table: Mapping[str, Callable[..., Any]]) -> Any:
     where = f"node {node.name} ({node.op})" + (f" from {node.line}" if node.line else "")
     try:
         for shape in node.shapes:
             matrix_shape(shape)
         args, kwargs = _resolve(node.args, values), _resolve(node.kwargs, values)
-        result = OPERATORS[node.op](*args, **kwargs)
+        result = table[node.op](*args, **kwargs)
         given = tuple(v.shape for v in (result if isinstance(result, tuple) else (result,)))
     except ShapeError as error:
         raise ShapeError(f"{where}: {error}") from error

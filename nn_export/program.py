@@ -184,7 +184,7 @@ def from_json(data: Any, weights: dict[str, np.ndarray], where: str) -> Program:
         raise ProgramError(f"{where}: {error}") from error
 
 
-def _fields(data: Any, types: dict[str, type], where: str) -> dict[str, Any]:
+def _fields(data: Any, types: Mapping[str, type], where: str) -> dict[str, Any]:
     if not isinstance(data, dict) or set(data) != set(types):
         given = sorted(data) if isinstance(data, dict) else type(data).__name__
         raise ProgramError(f"{where}: expected the fields {sorted(types)}, got {given}; export again")

@@ -22,5 +22,7 @@ OPERATORS: dict[str, Callable[..., Any]] = {
     **reduce.OPERATORS,
     **recurrent.OPERATORS,
 }
+PLAIN: dict[str, Callable[..., Any]] = {**OPERATORS, **recurrent.PLAIN}
+"""The table without functions that bring their own Jacobians."""
 
-__all__ = ["OPERATORS"]
+__all__ = ["OPERATORS", "PLAIN"]

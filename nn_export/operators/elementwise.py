@@ -54,7 +54,11 @@ def binary(f: Callable[[ca.MX, ca.MX], ca.MX]) -> Operator:
 
 def where(condition: Value, self: Number, other: Number) -> Value:
     """Choice by element; the branch not taken cannot spoil the value."""
-    return apply(lambda c, a, b: ca.if_else(c, a, b), condition, self, other)
+
+    def choose(c: ca.MX, a: ca.MX, b: ca.MX) -> ca.MX:
+        return ca.if_else(c, a, b)
+
+    return apply(choose, condition, self, other)
 
 
 def add(self: Number, other: Number, *, alpha: float = 1) -> Value:

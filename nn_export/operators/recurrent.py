@@ -11,41 +11,26 @@ from collections.abc import Callable, Sequence
 import casadi as ca
 
 from nn_export.operators.elementwise import sigmoid
+from nn_export.operators.gru import State, Weights, affine, gru, gru_call
 from nn_export.operators.shape import flip, stack
-from nn_export.operators.value import Value, arrange, concatenate, from_matrix, matrix, move
+from nn_export.operators.value import Value, arrange, concatenate, from_matrix, move
 
-State = tuple[ca.MX, ...]
-Weights = tuple[Value, Value, Value | None, Value | None]
 Cell = Callable[[ca.MX, State, Weights], State]
-
-
-def _affine(w: Value, x: ca.MX, b: Value | None) -> ca.MX:
-    y = ca.mtimes(matrix(w, *w.shape), x)
-    return y if b is None else y + ca.repmat(matrix(b, b.shape[0], 1), 1, x.shape[1])
-
-
-def _gru(x: ca.MX, state: State, w: Weights) -> State:
-    h = state[0]
-    xr, xz, xn = ca.vertsplit(_affine(w[0], x, w[2]), h.shape[0])
-    hr, hz, hn = ca.vertsplit(_affine(w[1], h, w[3]), h.shape[0])
-    z = sigmoid(xz + hz)
-    n = ca.tanh(xn + sigmoid(xr + hr) * hn)
-    return (n + z * (h - n),)
 
 
 def _lstm(x: ca.MX, state: State, w: Weights) -> State:
     h, c = state
-    i, f, g, o = ca.vertsplit(_affine(w[0], x, w[2]) + _affine(w[1], h, w[3]), c.shape[0])
+    i, f, g, o = ca.vertsplit(affine(w[0], x, w[2]) + affine(w[1], h, w[3]), c.shape[0])
     c = sigmoid(f) * c + sigmoid(i) * ca.tanh(g)
     return sigmoid(o) * ca.tanh(c), c
 
 
 def _tanh(x: ca.MX, state: State, w: Weights) -> State:
-    return (ca.tanh(_affine(w[0], x, w[2]) + _affine(w[1], state[0], w[3])),)
+    return (ca.tanh(affine(w[0], x, w[2]) + affine(w[1], state[0], w[3])),)
 
 
 def _relu(x: ca.MX, state: State, w: Weights) -> State:
-    y = _affine(w[0], x, w[2]) + _affine(w[1], state[0], w[3])
+    y = affine(w[0], x, w[2]) + affine(w[1], state[0], w[3])
     return (ca.if_else(y > 0, y, 0.0),)
 
 
@@ -167,9 +152,16 @@ def lstm(
     return _sequence(_lstm, input, hx, params, *flags)
 
 
-OPERATORS: dict[str, Callable[..., Value | tuple[Value, ...]]] = {
-    "aten.gru.input": _layer(_gru), "aten.rnn_tanh.input": _layer(_tanh),
-    "aten.rnn_relu.input": _layer(_relu), "aten.lstm.input": lstm, "aten.gru_cell.default": _cell(_gru),
-    "aten.rnn_tanh_cell.default": _cell(_tanh), "aten.rnn_relu_cell.default": _cell(_relu),
-    "aten.lstm_cell.default": lstm_cell,
-}  # fmt: skip
+def table(gru: Cell) -> dict[str, Callable[..., Value | tuple[Value, ...]]]:
+    """The operators with a form of the GRU cell: ``gru(x, (h,), weights) -> (h_next,)`` on columns."""
+    return {
+        "aten.gru.input": _layer(gru), "aten.rnn_tanh.input": _layer(_tanh),
+        "aten.rnn_relu.input": _layer(_relu), "aten.lstm.input": lstm, "aten.gru_cell.default": _cell(gru),
+        "aten.rnn_tanh_cell.default": _cell(_tanh), "aten.rnn_relu_cell.default": _cell(_relu),
+        "aten.lstm_cell.default": lstm_cell,
+    }  # fmt: skip
+
+
+OPERATORS = table(gru_call)
+PLAIN = table(gru)
+"""The same without the cell's own Jacobian."""

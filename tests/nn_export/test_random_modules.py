@@ -1,5 +1,7 @@
 """Random stacks of layers: values and Jacobians agree with torch."""
 
+from itertools import pairwise
+
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -17,7 +19,7 @@ class Stack(nn.Module):
     def __init__(self, n, sizes, activations, recurrent, norm):
         super().__init__()
         widths = [n, *sizes]
-        pairs = list(zip(widths[:-1], widths[1:], strict=True))
+        pairs = list(pairwise(widths))
         layers = [m for (a, b), f in zip(pairs, activations, strict=False) for m in (nn.Linear(a, b), f())]
         self.body = nn.Sequential(*layers, *([nn.LayerNorm(sizes[-1])] if norm else []))
         self.recurrent = recurrent(sizes[-1], sizes[-1]) if recurrent else None

@@ -74,7 +74,7 @@ def trace(
             raise SignatureError(
                 f"{name!r} is no name for CasADi: use letters, digits and single underscores"
             )
-    metadata = {"module": type(module).__name__, "torch": str(torch.__version__), "casadi": ca.__version__}
+    metadata = {"module": type(module).__name__, "torch": version("torch"), "casadi": version("casadi")}
     metadata["nn_export"] = _version()
     ports = tuple(Port(n, s, ref) for n, (ref, s) in zip(outputs, sources, strict=True))
     return Program(inputs, ports, nodes, weights, metadata)

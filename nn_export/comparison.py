@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -11,7 +11,7 @@ import torch
 
 from nn_export.errors import SignatureError
 from nn_export.operators.value import constant
-from nn_export.trace import float64_copy
+from nn_export.tracing import float64_copy
 
 
 @dataclass(frozen=True)
@@ -25,10 +25,14 @@ class ParityReport:
             (normal, zeros, extreme); never less than 1e-3 of the magnitude in normal samples.
         jacobian_abs: Largest absolute error of an entry of a Jacobian.
         jacobian_rel: The same for the Jacobian of one output by all inputs.
+        left_out: Number of entries of values and Jacobians that were not compared, because torch itself
+            gave infinity or NaN there.
 
     Example:
         >>> print(ParityReport(3, 0.0, 0.0, 1e-17, 1e-16))
         parity over 3 samples: values 0.0e+00 abs, 0.0e+00 rel; Jacobians 1.0e-17 abs, 1.0e-16 rel
+        >>> print(str(ParityReport(3, 0.0, 0.0, 0.0, 0.0, left_out=6)).split("; ")[2])
+        6 entries left out, not finite in torch
     """
 
     n: int
@@ -36,11 +40,13 @@ class ParityReport:
     value_rel: float
     jacobian_abs: float
     jacobian_rel: float
+    left_out: int = 0
 
     def __str__(self) -> str:
+        left_out = f"; {self.left_out} entries left out, not finite in torch" if self.left_out else ""
         return (
             f"parity over {self.n} samples: values {self.value_abs:.1e} abs, {self.value_rel:.1e} rel; "
-            f"Jacobians {self.jacobian_abs:.1e} abs, {self.jacobian_rel:.1e} rel"
+            f"Jacobians {self.jacobian_abs:.1e} abs, {self.jacobian_rel:.1e} rel{left_out}"
         )
 
 
@@ -67,7 +73,10 @@ def parity(
         scale: Magnitude of each input's normal distribution. Default: 1 for all.
 
     Returns:
-        The largest differences; NaN on one side only, or infinities that differ, count as infinite.
+        The largest differences. A value that is not finite on both sides is left out and counted; so is
+        the Jacobian of an output whose value or Jacobian is not finite in torch (a model that diverges
+        from an extreme sample). What is not finite in CasADi alone counts as an infinite error, and so
+        does a value that is not finite in torch alone.
 
     Raises:
         SignatureError: If the numbers of inputs or scales differ.
@@ -99,19 +108,16 @@ def parity(
         held = [constant(d) for d in draws]
         ours = [ca.evalf(v.mx) for v in held]
         results = function.call(ours)
-        shapes = [tuple(t.shape) for t in _leaves(copy(*tensors))]
-        for i, expected in enumerate(_flat(copy)(*tensors)):
-            values.add((i, kind), _row_major(results[i], shapes[i]), expected.detach().numpy())
-        exact = jacobian(*tensors)
         blocks = derivative.call([*ours, *results])
-        for i in range(len(shapes)):
-            for j, x in enumerate(held):
-                block = np.asarray(blocks[i * len(held) + j].full())
-                rows = _order(shapes[i])
-                jacobians.add(
-                    (i, kind), block[rows][:, x.positions.reshape(-1)], exact[i][j].detach().numpy()
-                )
-    return ParityReport(n, *values.largest, *jacobians.largest)
+        exact = jacobian(*tensors)
+        for i, output in enumerate(_leaves(copy(*tensors))):
+            expected, shape = output.detach().numpy().reshape(-1), tuple(output.shape)
+            values.add((i, kind), _row_major(results[i], shape), expected)
+            given = [blocks[i * len(held) + j].full()[_order(shape)] for j in range(len(held))]
+            given = [g[:, x.positions.reshape(-1)] for g, x in zip(given, held, strict=True)]
+            slopes = [e.detach().numpy().reshape(g.shape) for e, g in zip(exact[i], given, strict=True)]
+            jacobians.add((i, kind), np.hstack(given), np.hstack(slopes), np.isfinite(expected).all())
+    return ParityReport(n, *values.largest, *jacobians.largest, values.left_out + jacobians.left_out)
 
 
 class _Errors:
@@ -120,16 +126,22 @@ class _Errors:
     def __init__(self) -> None:
         self.error: dict[tuple[int, int], float] = {}
         self.size: dict[tuple[int, int], float] = {}
+        self.left_out = 0
 
-    def add(self, key: tuple[int, int], given: np.ndarray, expected: np.ndarray) -> None:
-        expected = expected.reshape(given.shape)
-        same = (given == expected) | (np.isnan(given) & np.isnan(expected))
+    def add(
+        self, key: tuple[int, int], given: np.ndarray, expected: np.ndarray, whole: bool | None = None
+    ) -> None:
+        # Entries not finite on both sides are left out; with ``whole`` given, all entries unless it and
+        # every expected one are finite.
+        finite = np.isfinite(expected)
+        kept = finite | np.isfinite(given) if whole is None else np.full(given.shape, whole and finite.all())
+        self.left_out += int(np.sum(~kept))
         with np.errstate(invalid="ignore"):
-            difference = np.where(same, 0.0, np.abs(given - expected))
-        worst = float(np.max(np.where(np.isnan(difference), np.inf, difference), initial=0.0))
-        finite = np.abs(expected[np.isfinite(expected)])
+            difference = np.abs(given - expected)[kept]
+        worst = float(np.max(np.where(np.isfinite(difference), difference, np.inf), initial=0.0))
+        size = float(np.max(np.abs(expected[kept & finite]), initial=0.0))
         self.error[key] = max(self.error.get(key, 0.0), worst)
-        self.size[key] = max(self.size.get(key, 0.0), float(np.max(finite, initial=0.0)))
+        self.size[key] = max(self.size.get(key, 0.0), size)
 
     @property
     def largest(self) -> tuple[float, float]:
@@ -144,10 +156,9 @@ def _leaves(output: object) -> list[torch.Tensor]:
     return list(torch.utils._pytree.tree_leaves(output))
 
 
-def _flat(module: torch.nn.Module):  # type: ignore[no-untyped-def]
+def _flat(module: torch.nn.Module) -> Callable[..., tuple[torch.Tensor, ...]]:
     def f(*args: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        shaped = _leaves(module(*args))
-        return tuple(t.reshape(-1) for t in shaped)
+        return tuple(t.reshape(-1) for t in _leaves(module(*args)))
 
     return f
 

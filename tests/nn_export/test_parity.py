@@ -1,0 +1,56 @@
+"""What parity reports where torch itself is not finite, and where the two sides disagree."""
+
+import casadi as ca
+import numpy as np
+import torch
+from torch import nn
+
+from nn_export import parity, to_casadi
+
+EXAMPLE = (torch.zeros(2),)
+
+
+class Naive(nn.Module):
+    """A logistic function that gives inf / inf at samples that are 1000 times as large, nowhere else."""
+
+    def forward(self, x):
+        return torch.exp(x) / (1 + torch.exp(x)), torch.tanh(x)
+
+
+class Root(nn.Module):
+    def forward(self, x):
+        return torch.sqrt(torch.clamp(x, min=0.0)), torch.tanh(x)
+
+
+def test_samples_that_overflow_in_torch_are_left_out_and_counted():
+    report = parity(Naive(), to_casadi(Naive(), EXAMPLE), EXAMPLE, n=10, scale=(5.0,))
+    # The one extreme sample: two values and both 2 x 2 Jacobians (reverse mode spreads NaN to all outputs).
+    assert 0 < report.left_out <= 2 + 8
+    # The package's promise for functions of a few operations.
+    assert report.value_rel < 1e-12
+    assert report.jacobian_rel < 1e-10
+    assert f"{report.left_out} entries left out" in str(report)
+
+
+def test_what_is_not_finite_on_one_side_only_is_an_infinite_error():
+    x = ca.MX.sym("x", 2)
+    ours_only = ca.Function("f", [x], [ca.sqrt(x), ca.tanh(x)])
+    assert parity(Root(), ours_only, EXAMPLE, n=4).value_abs == np.inf
+    theirs_only = ca.Function("f", [x], [0.5 + 0.5 * ca.tanh(x / 2), ca.tanh(x)])
+    assert parity(Naive(), theirs_only, EXAMPLE, n=10, scale=(5.0,)).value_abs == np.inf
+    slope_only = ca.Function("f", [x], [ca.tanh(x), ca.sqrt(x**4)])
+    report = parity(Squares(), slope_only, EXAMPLE, n=4)
+    assert report.value_abs < 1e-15 * 1e8  # rounding of squares of 1000 times a few
+    assert report.jacobian_abs == np.inf
+
+
+class Squares(nn.Module):
+    def forward(self, x):
+        return torch.tanh(x), x * x
+
+
+def test_a_wrong_derivative_is_seen():
+    x = ca.MX.sym("x", 2)
+    wrong = ca.Function("f", [x], [ca.tanh(x) + 1e-6 * ca.sin(x), x * x])
+    # The slope of the error is 1e-6 at the zero sample; tanh and its slope round to 1e-16.
+    assert abs(parity(Squares(), wrong, EXAMPLE, n=2).jacobian_abs - 1e-6) < 1e-15
