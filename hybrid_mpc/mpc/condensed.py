@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
+from hybrid_mpc.mpc.buffered import BufferedFunction
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.qp import InputQP
 from hybrid_mpc.mpc.solution import Solution, Status
@@ -56,7 +57,8 @@ class CondensedController:
     one mapped call and condenses states and hidden states away (their multiple-shooting trajectory and
     its defects are kept); :meth:`feedback` embeds the new estimate and solves the QP of ``N n_u``
     unknowns. The QP's answer is checked, whatever status its solver reports. Everything is built here;
-    no method changes the object or raises on numbers.
+    no method changes the object (apart from scratch buffers: not for several threads at once) or raises on
+    the numbers of an estimate, a reference or a plan.
 
     Args:
         model: The deployed model; ``n_h`` may be 0.
@@ -95,7 +97,7 @@ class CondensedController:
         assert model.with_jacobian is not None
         self._model, self._ocp, self._iterations = model, ocp, iterations
         n, n_x, n_u = ocp.horizon, ocp.n_x, ocp.n_u
-        self._stages = model.with_jacobian.map(n)
+        self._stages = BufferedFunction(model.with_jacobian.map(n))
         self._rollout = _rollout(model, n)
         self._terminal = ocp.terminal_weight(model)
         self._difference = np.eye(n * n_u) - np.eye(n * n_u, k=-n_u)
@@ -103,6 +105,7 @@ class CondensedController:
         self._input_hessian = 2 * (np.diag(r) + (self._difference.T * r_delta) @ self._difference)
         self._qp = InputQP(ocp)
         self._n_x = n_x
+        self._evaluate_once()
 
     @property
     def model(self) -> HybridModel:
@@ -124,9 +127,15 @@ class CondensedController:
 
         Returns:
             A plan of status INITIAL. Where the free run diverges, the state is held at the estimate.
+
+        Raises:
+            InputError: If ``u`` has another shape or is not finite.
         """
         n, ocp = self._ocp.horizon, self._ocp
-        plan = np.clip(np.zeros((n, ocp.n_u)) if u is None else u, ocp.u_min, ocp.u_max)
+        start = np.zeros((n, ocp.n_u)) if u is None else np.asarray(u, dtype=float)
+        if start.shape != (n, ocp.n_u) or not np.all(np.isfinite(start)):
+            raise InputError(f"u: finite values of shape {(n, ocp.n_u)} needed, got {start}")
+        plan = np.clip(start, ocp.u_min, ocp.u_max)
         z0 = np.concatenate([estimate.x, estimate.h])
         z = np.vstack([z0, self._rollout(z0, (plan + estimate.d).T).full().T])
         if not np.all(np.isfinite(z)):
@@ -154,8 +163,14 @@ class CondensedController:
 
         Returns:
             The plan. If its status is not ``ok`` the inputs are the shifted previous plan.
+
+        Raises:
+            InputError: If the reference has another shape.
         """
         start = perf_counter()
+        reference = np.asarray(reference, dtype=float)
+        if reference.ndim != 2 or len(reference) < 1 or reference.shape[1] != self._n_x:
+            raise InputError(f"reference: shape {reference.shape} given, (m, {self._n_x}) with m > 0 needed")
         if not np.all(np.isfinite(reference)):
             return self._failed(prepared, Status.NOT_FINITE, start)
         x_ref = self._reference(reference)
@@ -199,21 +214,19 @@ class CondensedController:
     def _condense(self, u: Array, z: Array, d: Array, u_prev: Array, *, shifted: bool) -> Prepared:
         start = perf_counter()
         n, n_x, n_u, n_z = self._ocp.horizon, self._n_x, self._ocp.n_u, z.shape[1]
-        x_next, h_next, a, b = self._stages(z[:-1, :n_x].T, z[:-1, n_x:].T, (u + d).T)
-        z_next = np.vstack([x_next.full(), h_next.full()]).T
+        z_next, a, b = self._linearise(z[:-1], u + d)
         if shifted:  # the appended period has no trajectory yet: start it without a defect
             z = np.vstack([z[:-1], z_next[-1:]])
         defect = z_next - z[1:]
-        a, b = a.full().reshape(n_z, n, n_z), b.full().reshape(n_z, n, n_u)
         first = n_z + n_u + 1
         maps = np.zeros((n + 1, n_z, first + n * n_u))
         maps[0, :, :n_z] = np.eye(n_z)
         for k in range(n):
             end = first + k * n_u
-            maps[k + 1, :, :end] = a[:, k] @ maps[k, :, :end]
-            maps[k + 1, :, n_z : n_z + n_u] += b[:, k]
+            maps[k + 1, :, :end] = a[k] @ maps[k, :, :end]
+            maps[k + 1, :, n_z : n_z + n_u] += b[k]
             maps[k + 1, :, first - 1] += defect[k]
-            maps[k + 1, :, end : end + n_u] = b[:, k]
+            maps[k + 1, :, end : end + n_u] = b[k]
         from_u = maps[:, :n_x, first:]
         weighted = from_u * (self._ocp.q * self._model.dt)[None, :, None]
         weighted[-1] = self._terminal @ from_u[-1]
@@ -223,6 +236,26 @@ class CondensedController:
         largest = float(np.max(np.abs(defect)))
         return Prepared(u, z, d, u_prev, maps, weighted, hessian, largest, spent)
 
+    def _linearise(self, z: Array, u: Array) -> tuple[Array, Array, Array]:
+        """Successors ``(N, n_z)``, and views of ``A`` ``(N, n_z, n_z)`` and ``B`` ``(N, n_z, n_u)``."""
+        n, n_z, n_x = *z.shape, self._n_x
+        into_x, into_h, into_u = self._stages.inputs
+        into_x[:], into_h[:], into_u[:] = z[:, :n_x].ravel(), z[:, n_x:].ravel(), u.ravel()
+        self._stages()
+        x, h, a, b = (out.reshape(n, -1) for out in self._stages.outputs)
+        return (
+            np.hstack([x, h]),
+            a.reshape(n, n_z, n_z).transpose(0, 2, 1),
+            b.reshape(n, -1, n_z).transpose(0, 2, 1),
+        )
+
+    def _evaluate_once(self) -> None:
+        """Solve once at zero, so that no later call is the first of a CasADi function, which is slow."""
+        m = self._model
+        x, h, d, p = np.zeros(m.n_x), np.zeros(m.n_h), np.zeros(m.n_u), np.zeros((0, 0))
+        zero = Estimate(0.0, x, h, d, p, np.zeros(0), float("nan"))
+        self.solve(self.initial(zero), zero, np.zeros((1, m.n_x)))
+
     def _input_gradient(self, u: Array, u_prev: Array) -> Array:
         """Gradient of the input costs at the plan ``u`` ``(N n_u,)``."""
         gradient: Array = self._input_hessian @ u
@@ -231,7 +264,7 @@ class CondensedController:
 
     def _reference(self, reference: Array) -> Array:
         rows = np.minimum(np.arange(self._ocp.horizon + 1), len(reference) - 1)
-        return np.asarray(np.asarray(reference, dtype=float)[rows])
+        return np.asarray(reference[rows])
 
     def _cost(self, x: Array, u: Array, x_ref: Array, u_prev: Array) -> float:
         du = np.diff(u, axis=0, prepend=u_prev[None])

@@ -14,7 +14,7 @@ from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.mpc.condensed import CondensedController
 from hybrid_mpc.mpc.solution import Solution, Status
-from hybrid_mpc.riccati import lqr
+from hybrid_mpc.riccati import lqr, vector
 
 Array = NDArray[np.float64]
 
@@ -104,6 +104,7 @@ class SafeController:
             feedback = lqr(fallback, *zero, ocp.q, ocp.r + ocp.r_delta, working_point=point)
             self._gain = feedback.gain[:, : ocp.n_x]
             self._fallback = _equilibrium_input(fallback)
+            self._fallback(np.zeros(ocp.n_x))  # a CasADi function's first call is slow
 
     @property
     def controller(self) -> CondensedController:
@@ -111,9 +112,13 @@ class SafeController:
         return self._controller
 
     def initial(self, estimate: Estimate, u: Array | None = None) -> Decision:
-        """Decision before the first: ``u`` ``(n_u,)`` is held (default: zero, or the bound next to it)."""
+        """Decision before the first: ``u`` ``(n_u,)`` is held (default: zero, or the bound next to it).
+
+        Raises:
+            InputError: If ``u`` has another size or is not finite.
+        """
         ocp = self._controller.ocp
-        held = np.clip(np.zeros(ocp.n_u) if u is None else u, ocp.u_min, ocp.u_max)
+        held = np.clip(np.zeros(ocp.n_u) if u is None else vector(u, ocp.n_u, "u"), ocp.u_min, ocp.u_max)
         plan = self._controller.initial(estimate, np.tile(held, (ocp.horizon, 1)))
         return Decision(held, Source.ZERO, plan, Status.INITIAL, 0)
 

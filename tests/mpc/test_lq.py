@@ -1,0 +1,138 @@
+"""On linear models one iteration must give the exact answer of the linear-quadratic problem."""
+
+import numpy as np
+import pytest
+from lq_oracle import constraints, lq_plan, residuals
+from online_models import random_linear
+from scipy.linalg import block_diag
+from scipy.optimize import minimize
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimation.kalman import Estimate
+from hybrid_mpc.mpc import OCP, CondensedController, Status
+from hybrid_mpc.riccati import dare
+
+INF = np.inf
+
+
+def estimate_of(model, z, d=None):
+    d = np.zeros(model.n_u) if d is None else np.asarray(d, dtype=float)
+    return Estimate(0.0, z[: model.n_x], z[model.n_x :], d, np.eye(z.size + d.size), np.zeros(1), 0.0)
+
+
+def problem(n_u, horizon, *, bound=INF, du_max=None, r_delta=0.0):
+    r = np.linspace(0.4, 0.7, n_u)
+    return OCP(horizon, [1.0, 0.5, 2.0], r, [r_delta] * n_u, [-bound] * n_u, [0.7 * bound] * n_u, du_max)
+
+
+@pytest.mark.parametrize(("n_u", "radius"), [(1, 0.98), (2, 0.98), (1, 1.3), (2, 1.3)])
+def test_first_input_is_the_lqr(n_u, radius):
+    model, a, b, _ = random_linear(7, n_u=n_u, radius=radius)
+    controller = CondensedController(model, problem(n_u, 12))
+    _, k = dare(a, b, np.diag(controller.ocp.q), np.diag(controller.ocp.r))  # dt scales q and r alike
+    z = np.array([0.8, -0.5, 0.3])
+    e = estimate_of(model, z)
+    solution = controller.solve(controller.initial(e), e, np.zeros((1, 3)))
+    assert solution.status is Status.SOLVED
+    for j in range(12):  # the whole plan is the LQR's closed loop, not only its first input
+        np.testing.assert_allclose(solution.u[j], -k @ z, atol=1e-8)  # rounding, cond(H) about 1e4
+        np.testing.assert_allclose(solution.x[j], z, atol=1e-8)
+        z = (a - b @ k) @ z
+
+
+@pytest.mark.parametrize("n_u", [1, 2])
+def test_first_input_with_a_linear_hidden_state_is_the_lqr(n_u):
+    model, a, b, _ = random_linear(1, n_u=n_u, n_h=3, radius=0.8)
+    controller = CondensedController(model, problem(n_u, 60))
+    q = block_diag(np.diag(controller.ocp.q), np.zeros((3, 3)))
+    _, k = dare(a, b, q, np.diag(controller.ocp.r))
+    # The terminal weight leaves h out, which the first input feels with the square of the closed loop's decay.
+    assert np.max(np.abs(np.linalg.eigvals(a - b @ k))) ** (2 * 60) < 1e-9
+    z = np.random.default_rng(0).normal(size=6)
+    e = estimate_of(model, z)
+    solution = controller.solve(controller.initial(e), e, np.zeros((1, 3)))
+    np.testing.assert_allclose(solution.u[0], -k @ z, atol=1e-8)
+
+
+@pytest.mark.parametrize("n_h", [0, 2])
+@pytest.mark.parametrize("r_delta", [0.0, 0.3])
+def test_reference_disturbance_and_change_weight_without_bounds(n_h, r_delta):
+    model, a, b, _ = random_linear(3, n_u=2, n_h=n_h)
+    controller = CondensedController(model, problem(2, 15, r_delta=r_delta))
+    rng = np.random.default_rng(5)
+    z, d, u_prev, reference = rng.normal(size=3 + n_h), rng.normal(size=2), rng.normal(size=2), rng.normal(size=(16, 3))
+    e = estimate_of(model, z, d)
+    solution = controller.solve(controller.initial(e, np.tile(u_prev, (15, 1))), e, reference)
+    terminal = controller.ocp.terminal_weight(model)
+    args = a, b, controller.ocp, model.dt, terminal, z, d, reference, u_prev
+    np.testing.assert_allclose(solution.u, lq_plan(*args), atol=1e-8)  # rounding, as above
+    assert solution.cost == pytest.approx(np.sum(residuals(solution.u, *args) ** 2), rel=1e-10)
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("du_max", [None, 0.15])
+@pytest.mark.parametrize("n_u", [1, 2])
+def test_bounds_and_limits_of_the_change(n_u, du_max, seed):
+    n_h = 2 * (seed % 2)
+    model, a, b, _ = random_linear(seed, n_u=n_u, n_h=n_h, radius=1.05)
+    limit = None if du_max is None else [du_max] * n_u
+    controller = CondensedController(model, problem(n_u, 10, bound=0.5, du_max=limit, r_delta=0.1))
+    rng = np.random.default_rng(seed)
+    z, d, reference = rng.normal(size=3 + n_h), 0.1 * rng.normal(size=n_u), rng.normal(size=(11, 3))
+    u_prev = rng.uniform(-0.5, 0.35, size=n_u)
+    e = estimate_of(model, z, d)
+    solution = controller.solve(controller.initial(e, np.tile(u_prev, (10, 1))), e, reference)
+    want = lq_plan(a, b, controller.ocp, model.dt, controller.ocp.terminal_weight(model), z, d, reference, u_prev)
+    assert solution.status is Status.SOLVED
+    g, h = constraints(controller.ocp, u_prev)
+    assert np.min(h - g @ want.ravel()) < 1e-9  # bounds are active: the case is not a free one
+    # DAQP takes constraints into its active set from 1e-6 (of half the range) on; ten times that.
+    np.testing.assert_allclose(solution.u, want, atol=5e-6)
+
+
+def test_the_oracle_agrees_with_slsqp():
+    model, a, b, _ = random_linear(2, n_u=1, radius=1.05)
+    ocp = problem(1, 6, bound=0.5, du_max=[0.15])
+    rng = np.random.default_rng(2)
+    args = (a, b, ocp, model.dt, ocp.terminal_weight(model), rng.normal(size=3), np.zeros(1),
+            rng.normal(size=(7, 3)), np.array([0.2]))  # fmt: skip
+    g, h = constraints(ocp, args[-1])
+    cost = lambda u: np.sum(residuals(u.reshape(6, 1), *args) ** 2)  # noqa: E731
+    rows = {"type": "ineq", "fun": lambda u: h - g @ u}
+    got = minimize(cost, np.full(6, 0.2), method="SLSQP", constraints=rows, options={"ftol": 1e-14, "maxiter": 300})
+    np.testing.assert_allclose(lq_plan(*args).ravel(), got.x, atol=1e-5)  # SLSQP's numerical gradients
+
+
+@pytest.mark.parametrize("guess", [0.0, 0.3])
+def test_on_a_linear_model_the_first_guess_does_not_matter(guess):
+    model, *_ = random_linear(4, n_u=1, n_h=2)
+    controller = CondensedController(model, problem(1, 10, bound=0.5))
+    e = estimate_of(model, np.array([1.0, -1.0, 0.5, 0.2, 0.1]))
+    start = np.full((10, 1), guess)
+    start[0] = 0.1  # the held input, which the cost does not see: no weight on changes
+    u = controller.solve(controller.initial(e, start), e, np.zeros((1, 3))).u
+    same = controller.solve(controller.initial(e), e, np.zeros((1, 3))).u
+    np.testing.assert_allclose(u, same, atol=5e-6)  # DAQP's tolerance, see above
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"reference": np.zeros((0, 3))}, "reference"),
+        ({"reference": np.zeros((4, 2))}, r"\(m, 3\)"),
+        ({"reference": np.zeros(3)}, "reference"),
+        ({"u": np.zeros((3, 1))}, r"\(10, 1\)"),
+        ({"u": np.full((10, 1), np.nan)}, "finite"),
+        ({"iterations": 0}, "iterations"),
+        ({"n_u": 2}, "3 states and 2 inputs"),
+    ],
+)
+def test_bad_input_is_refused(change, words):
+    model, *_ = random_linear(0, n_u=1)
+    e = estimate_of(model, np.zeros(3))
+    with pytest.raises(InputError, match=words):
+        controller = CondensedController(
+            model, problem(change.get("n_u", 1), 10), iterations=change.get("iterations", 1)
+        )
+        plan = controller.initial(e, change.get("u"))
+        controller.solve(plan, e, change.get("reference", np.zeros((1, 3))))
