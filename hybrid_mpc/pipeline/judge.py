@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from hybrid_mpc.data.trajectories import Trajectory
 
 Array = NDArray[np.float64]
-WANTED_RATE = 1.0
-"""Wanted false alarms an hour on nominal data."""
+RATES = (1.0, 2.0, 5.0, 10.0)
+"""False alarms an hour on nominal data: the first that the data are long enough for."""
 LOAD_SHARE = 0.2
 """Unknown load of the demonstration, as a share of the largest input."""
 MARGIN = 1.5
@@ -130,26 +130,21 @@ def _trace(
 
 
 def _calibrate(levels: list[Array], dt: float, data_hash: str) -> Calibration:
-    """By extreme values for the wanted rate; where the data are too short for any rate, by a margin."""
-    try:
-        return calibrate(levels, dt, false_alarms_per_hour=WANTED_RATE, data_hash=data_hash)
-    except InputError as too_short:
-        finite = np.concatenate(levels)
-        finite = finite[np.isfinite(finite)]
-        if finite.size == 0:
-            raise
-        threshold = MARGIN * float(finite.max())
-        method = f"{MARGIN} x the highest nominal level ({too_short})"
-        release = max(0.5 * threshold, float(np.quantile(finite, 0.95)))
-        return Calibration(
-            threshold,
-            min(release, threshold),
-            WANTED_RATE,
-            finite.size,
-            finite.size * dt / 3600,
-            method,
-            data_hash,
-        )
+    """By extreme values for the lowest of ``RATES`` that the data can carry; for none of them, by a margin."""
+    for rate in RATES:
+        try:
+            return calibrate(levels, dt, false_alarms_per_hour=rate, data_hash=data_hash)
+        except InputError as too_short:
+            why = str(too_short)
+    finite = np.concatenate(levels)
+    finite = finite[np.isfinite(finite)]
+    if finite.size == 0:
+        raise InputError(f"the monitor has no nominal level to be calibrated on; {why}")
+    threshold = MARGIN * float(finite.max())
+    release = min(max(0.5 * threshold, float(np.quantile(finite, 0.95))), threshold)
+    method = f"{MARGIN} x the highest nominal level, for no rate can be told from so little data ({why})"
+    hours = finite.size * dt / 3600.0
+    return Calibration(threshold, release, RATES[-1], finite.size, hours, method, data_hash)
 
 
 def analysis_stage(context: Context) -> None:
