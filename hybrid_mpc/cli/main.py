@@ -28,7 +28,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    rich_markup_mode="rich",
+    rich_markup_mode=None,
 )
 app.command("run", epilog=run_command.EXAMPLES)(run_command.run)
 app.command("scenarios")(scenarios_command.scenarios)
