@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import casadi as ca
@@ -15,6 +15,11 @@ from hybrid_mpc.model import HybridModel
 from hybrid_mpc.riccati import hidden_fixed_point, vector
 
 Array = NDArray[np.float64]
+
+# A variance that has grown this much leaves few digits of a covariance: nothing is known any more.
+LOST = 1e12
+# Values that overflow are looked at where they matter; they are no news for the user's screen.
+QUIET = {"over": "ignore", "invalid": "ignore", "divide": "ignore"}
 
 
 @dataclass(frozen=True)
@@ -60,6 +65,9 @@ class ExtendedKalmanFilter:
 
     The input disturbance ``d`` is a random walk; the hidden state carries no noise of its own, it
     follows the state. On a linear model this is the Kalman filter. No method changes the object.
+
+    A prediction that is not finite, or whose deviation is a million times the largest one given here, is
+    lost (an unstable model without measurements for long, an absurd one): the next measurement starts anew.
 
     Args:
         model: The deployed model.
@@ -111,6 +119,7 @@ class ExtendedKalmanFilter:
         self._first = np.concatenate(
             [_variance(sigma_x0, n_x, "sigma_x0"), hidden, _variance(sigma_d0, n_u, "sigma_d0")]
         )
+        self._lost = LOST * max(np.max(v) for v in (self._noise, self._first, self._noise_y))
         self._output = _output_with_jacobian(model)
 
     @property
@@ -129,13 +138,14 @@ class ExtendedKalmanFilter:
         for _ in range(20):  # Newton; one step if the outputs are linear in the state
             y_hat, c_x, _ = (m.full() for m in self._output(x, u))
             error = np.where(np.isfinite(target), target - y_hat.ravel(), 0.0)
-            x = x + np.linalg.pinv(c_x) @ error
-            if np.max(np.abs(error)) < 1e-12:
+            if not np.all(np.isfinite(c_x)) or np.max(np.abs(error)) < 1e-12:
                 break
+            x = x + np.linalg.pinv(c_x) @ error
         h = hidden_fixed_point(model, x, u)
         empty = np.full(model.n_y, np.nan)
         return Estimate(float(t), x, h, np.zeros(model.n_u), np.diag(self._first), empty, float("nan"))
 
+    @np.errstate(**QUIET)
     def predict(self, estimate: Estimate, u: ArrayLike) -> Estimate:
         """Estimate one period later with the input ``u`` ``(n_u,)`` held."""
         model = self._model
@@ -150,6 +160,7 @@ class ExtendedKalmanFilter:
         empty = np.full(model.n_y, np.nan)
         return Estimate(estimate.t + model.dt, x.ravel(), h.ravel(), estimate.d, p, empty, float("nan"))
 
+    @np.errstate(**QUIET)
     def correct(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> Estimate:
         """Estimate after the measurement ``y`` ``(n_y,)``, in Joseph form.
 
@@ -167,26 +178,31 @@ class ExtendedKalmanFilter:
             return estimate
         held = estimate.d if u is None else np.asarray(u, dtype=float).ravel() + estimate.d
         y_hat, c_x, c_u = (m.full() for m in self._output(estimate.x, held))
-        c = np.hstack([c_x, np.zeros((model.n_y, model.n_h)), c_u])[seen]
-        p, r = estimate.P, self._noise_y[seen]
-        innovation = y - y_hat.ravel()
-        pct = p @ c.T
-        s = c @ pct + np.diag(r)
-        if not np.all(np.isfinite(s)):  # a diverged prediction: nothing to weigh the measurement with
-            return replace(estimate, innovation=innovation)
-        gain = np.linalg.solve(s, pct.T).T
-        i_kc = np.eye(p.shape[0]) - gain @ c
-        p_new = i_kc @ p @ i_kc.T + (gain * r) @ gain.T
-        step = gain @ innovation[seen]
-        nis = float(innovation[seen] @ np.linalg.solve(s, innovation[seen]))
+        c = np.hstack([c_x, np.zeros((model.n_y, model.n_h)), c_u])
+        innovation = np.where(seen, y - y_hat.ravel(), np.nan)
+        p, step, nis = estimate.P, np.zeros(c.shape[1]), 0.0
+        for i in np.flatnonzero(seen):  # one by one is exact, since the noises are independent
+            pc = p @ c[i]
+            s = float(c[i] @ pc) + self._noise_y[i]
+            gain, error = pc / s, innovation[i] - c[i] @ step
+            i_kc = np.eye(step.size) - np.outer(gain, c[i])
+            p = i_kc @ p @ i_kc.T + self._noise_y[i] * np.outer(gain, gain)
+            step, nis = step + gain * error, nis + float(error / s * error)
         n_x, n_z = model.n_x, model.n_x + model.n_h
         x, h, d = estimate.x + step[:n_x], estimate.h + step[n_x:n_z], estimate.d + step[n_z:]
-        innovation = np.where(seen, innovation, np.nan)
-        return Estimate(estimate.t, x, h, d, 0.5 * (p_new + p_new.T), innovation, nis)
+        return Estimate(estimate.t, x, h, d, 0.5 * (p + p.T), innovation, nis)
 
     def update(self, estimate: Estimate, y: ArrayLike, u_prev: ArrayLike) -> Estimate:
-        """:meth:`predict` with the input ``u_prev`` held since, then :meth:`correct` with ``y``."""
-        return self.correct(self.predict(estimate, u_prev), y, u_prev)
+        """:meth:`predict` with the input ``u_prev`` held since, then :meth:`correct` with ``y``.
+
+        A lost prediction is dropped: the estimate starts anew from ``y`` if any of it is finite.
+        """
+        predicted = self.predict(estimate, u_prev)
+        mean = np.concatenate([predicted.x, predicted.h, predicted.d])
+        known = np.all(np.isfinite(mean)) and np.max(np.diag(predicted.P)) <= self._lost
+        if not known and np.any(np.isfinite(np.asarray(y, dtype=float))):
+            return self.start(y, predicted.t)
+        return self.correct(predicted, y, u_prev)
 
     def run(self, y: ArrayLike, u: ArrayLike, t: float = 0.0) -> list[Estimate]:
         """Estimates along a measured past, e.g. to warm up.

@@ -153,6 +153,7 @@ class CondensedController:
         z = np.vstack([z[1:], z[-1:]])
         return self._condense(u, z, previous.d, previous.u[0], shifted=True)
 
+    @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def feedback(self, prepared: Prepared, estimate: Estimate, reference: Array) -> Solution:
         """Embed the estimate and the reference, solve the QP and check its answer.
 
@@ -211,6 +212,7 @@ class CondensedController:
             solution = replace(solution, timing=total)
         return solution
 
+    @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def _condense(self, u: Array, z: Array, d: Array, u_prev: Array, *, shifted: bool) -> Prepared:
         start = perf_counter()
         n, n_x, n_u, n_z = self._ocp.horizon, self._n_x, self._ocp.n_u, z.shape[1]

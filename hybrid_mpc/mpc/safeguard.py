@@ -144,6 +144,7 @@ class SafeController:
         plan = self._controller.initial(estimate, inputs) if known else replace(solution, u=inputs)
         return Decision(u, source, plan, solution.status, previous.age + 1)
 
+    @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def _instead(
         self, failed: Solution, estimate: Estimate, reference: Array, age: int
     ) -> tuple[Array, Source]:

@@ -132,3 +132,40 @@ def test_bad_deviations_are_refused(change, words):
 def test_run_refuses_shapes_that_do_not_fit():
     with pytest.raises(InputError, match="needed"):
         make_filter(pendulum_model()).run(np.zeros((5, 1)), np.zeros((4, 1)))
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("n", [50, 100, 400, 3000])
+def test_an_unstable_model_without_measurements_for_long(n, seed):
+    # growth 1.3 per period: the covariance reaches 1e22 (singular to rounding), 1e91, and infinity
+    model, *_ = random_linear(seed, n_x=2, n_u=1, n_y=2, radius=1.3)
+    ekf = make_filter(model)
+    e = ekf.start([0.5, -0.5])
+    for _ in range(n):
+        e = ekf.update(e, [np.nan, np.nan], [0.0])
+    for _ in range(10):  # the machine rests at zero
+        e = ekf.update(e, [0.0, 0.0], [0.0])
+    deviation = np.sqrt(np.diag(e.P))
+    assert np.all(np.abs(np.concatenate([e.x, e.d])) < 3 * deviation)  # as the filter itself believes
+    assert np.max(deviation[:2]) < 0.3  # it is back at its ordinary size, sigma_x0
+    assert np.min(np.linalg.eigvalsh(e.P)) > 0
+
+
+def test_an_absurd_measurement_is_got_over():
+    ekf = make_filter(pendulum_model(z=3))
+    e = ekf.start([0.1])
+    for y in (1e308, 1e308, 0.1):
+        e = ekf.update(e, [y], [0.0])
+    assert not np.all(np.isfinite(ekf.predict(e, [0.0]).x))  # else this test shows nothing
+    for _ in range(3):
+        e = ekf.update(e, [0.1], [0.0])
+    assert abs(e.x[0] - 0.1) < 0.3  # sigma_x0
+
+
+@pytest.mark.filterwarnings("error")
+def test_overflow_prints_no_warning():
+    ekf = make_filter(pendulum_model(z=3))
+    e = ekf.start([0.1])
+    for y in (1e308, -1e308, 1e308, np.inf, 0.1):
+        e = ekf.update(e, [y], [1e300])
+    assert np.all(np.isfinite(e.x))
