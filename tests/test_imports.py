@@ -16,9 +16,9 @@ ALLOWED = {
 }
 # the offline half: the only places where torch may be imported when a module is loaded
 TORCH = (
-    "nn_export/trace.py",
+    "nn_export/tracing.py",
     "nn_export/convert.py",
-    "nn_export/parity.py",
+    "nn_export/comparison.py",
     "hybrid_mpc/physics.py",
     "hybrid_mpc/identification/",
 )

@@ -9,6 +9,8 @@ from hybrid_mpc.cli import main
 
 from .conftest import recording, write
 
+pytestmark = pytest.mark.xdist_group("run")  # these share one finished run
+
 
 @pytest.fixture
 def call(monkeypatch, capsys):

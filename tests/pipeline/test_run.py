@@ -15,6 +15,8 @@ from hybrid_mpc.artifact import load_artifact
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.report.schema import validate_results
 
+pytestmark = pytest.mark.xdist_group("run")  # these share one finished run
+
 
 def results(folder):
     return json.loads((folder / "results.json").read_text())
