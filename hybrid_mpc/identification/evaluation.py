@@ -15,8 +15,8 @@ from hybrid_mpc.identification.step import PriorStep
 from hybrid_mpc.physics import Prior
 
 Array = NDArray[np.float64]
-START_S = 0.3
-"""Length [s] of the end of the warm-up from which x(0) of a free run is smoothed."""
+START_S = 0.5
+"""Longest end [s] of the warm-up from which x(0) of a free run is smoothed."""
 
 
 @dataclass(frozen=True)
