@@ -49,10 +49,11 @@ def cut_windows(trajectories: Sequence[Trajectory], warm: int, horizon: int, str
     """Windows of ``warm + horizon`` periods, every ``stride`` samples, from every trajectory long enough.
 
     Raises:
-        InputError: If no trajectory is long enough.
+        InputError: If no trajectory is long enough, or one holds a value that is not finite.
     """
     x, u, length = [], [], warm + horizon
     for trajectory in trajectories:
+        _check_finite(trajectory)
         for start in range(0, len(trajectory.t) - length, stride):
             x.append(trajectory.x[start : start + length + 1])
             u.append(trajectory.u[start : start + length])
@@ -106,3 +107,13 @@ def scaling_of(prior: Prior, windows: Windows, dt: float, *, use_prior: bool) ->
         return tuple(float(v) for v in values.square().mean(0).sqrt().clamp_min(1e-9))
 
     return Scaling(x=rms(x), u=rms(u), acceleration=rms(predicted), correction=rms(averaged))
+
+
+def _check_finite(trajectory: Trajectory) -> None:
+    for name in ("x", "u"):
+        bad = np.flatnonzero(~np.isfinite(getattr(trajectory, name)).all(axis=1))
+        if len(bad):
+            raise InputError(
+                f"{trajectory.name}: {name} is not finite at {trajectory.t[bad[0]]:g} s ({len(bad)} samples in "
+                f"all); remove these samples or mark them as a gap"
+            )

@@ -33,7 +33,7 @@ def test_standard_errors_shrink_with_the_noise(fit):
 
 
 def test_a_parameter_without_effect_is_named(fit):
-    at_rest = record(0, seconds=3.0)
+    at_rest = record(0, seconds=1.0)
     for array in (at_rest.u, at_rest.x, at_rest.y, at_rest.xdot):
         array[:] = 0.0
     at_rest.u[::2] = 1e-12  # nothing moves: no parameter can be told
