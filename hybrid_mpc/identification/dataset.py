@@ -61,7 +61,8 @@ def cut_windows(trajectories: Sequence[Trajectory], warm: int, horizon: int, str
         longest = max((len(t.t) for t in trajectories), default=0)
         raise InputError(
             f"no training trajectory is long enough: the longest has {longest} samples, a window of "
-            f"{warm} warm-up and {horizon} scored periods needs {length + 1}. Record longer runs or lower warm_up."
+            f"{warm} warm-up and {horizon} scored periods needs {length + 1}. Record longer runs or lower "
+            "warm_up."
         )
     return Windows(torch.tensor(np.stack(x)), torch.tensor(np.stack(u)), warm)
 
@@ -114,6 +115,6 @@ def _check_finite(trajectory: Trajectory) -> None:
         bad = np.flatnonzero(~np.isfinite(getattr(trajectory, name)).all(axis=1))
         if len(bad):
             raise InputError(
-                f"{trajectory.name}: {name} is not finite at {trajectory.t[bad[0]]:g} s ({len(bad)} samples in "
-                f"all); remove these samples or mark them as a gap"
+                f"{trajectory.name}: {name} is not finite at {trajectory.t[bad[0]]:g} s ({len(bad)} samples "
+                "in all); leave these samples out of the file"
             )

@@ -155,7 +155,11 @@ class _Run:
     """State of one training. Batches are drawn from (seed, step), so a resumed run is the same run."""
 
     def __init__(
-        self, prior: Prior, training: Sequence[Trajectory], validation: Sequence[Trajectory], s: TrainingSettings
+        self,
+        prior: Prior,
+        training: Sequence[Trajectory],
+        validation: Sequence[Trajectory],
+        s: TrainingSettings,
     ) -> None:
         self.settings, use_prior, dt = s, s.kind != "rnn", training[0].dt
         horizon = fitting_horizon(training, s.warm, s.horizon)
@@ -189,7 +193,9 @@ class _Run:
         self.optimizer = self._fresh_optimizer()
         with torch.no_grad():
             losses = self._losses(self._predict(self.fixed))
-            self.index = VectorPerformanceIndex(torch.where(torch.isfinite(losses), losses, 1e6).clamp_min(1e-12))
+            self.index = VectorPerformanceIndex(
+                torch.where(torch.isfinite(losses), losses, 1e6).clamp_min(1e-12)
+            )
         self.evaluate()
 
     def update(self) -> None:

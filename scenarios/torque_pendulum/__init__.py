@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from hybrid_mpc.scenario import ControlSpec, DataSpec, Scenario, Window
+from hybrid_mpc.scenario import Budget, ControlSpec, DataSpec, Scenario, Window
 
 if TYPE_CHECKING:
     from hybrid_mpc.physics import Prior
@@ -83,4 +83,9 @@ scenario = Scenario(
         # encoder step 0.0029 rad / sqrt(12), doubled for backlash and vibration
         estimator_sigma=(0.0017,),
     ),
+    # six seconds of training: more networks to choose from, few steps (best after 300 to 500 on validation)
+    budgets={
+        "quick": Budget(hidden=16, networks=4, teacher_steps=300, free_run_steps=400, seeds=2),
+        "full": Budget(hidden=16, networks=16, teacher_steps=300, free_run_steps=800, seeds=10),
+    },
 )

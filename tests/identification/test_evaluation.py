@@ -12,7 +12,7 @@ from hybrid_mpc.identification.step import PriorStep
 def hand_made(n, dt, error):
     """A run of n samples: rates off by ``error`` in the second state, output off by 0.5, power by 0.25 W."""
     zeros, t = np.zeros((n, 2)), dt * np.arange(n)
-    xdot_hat = zeros + [0.0, error]
+    xdot_hat = zeros + np.array([0.0, error])
     y, power = np.ones((n, 1)), np.zeros(n)
     return FreeRun(
         "r", t, zeros[:, :1], zeros, zeros, y, y + 0.5, zeros, xdot_hat, power, power - 0.25
@@ -22,7 +22,9 @@ def hand_made(n, dt, error):
 def test_scores_of_a_run_made_by_hand():
     figures = score([hand_made(100, 0.02, -3.0)])
     assert figures.e_sim_s == pytest.approx(3.0, rel=1e-12)  # 1/T integral of 3 over T
-    assert figures.e_sim_literal_s == pytest.approx(3.0 * 2.0 / 100, rel=1e-12)  # integral over 2 s / 100 samples
+    assert figures.e_sim_literal_s == pytest.approx(
+        3.0 * 2.0 / 100, rel=1e-12
+    )  # integral over 2 s / 100 samples
     # 1/T integral of 3 / (1 + t) over T = 2 s; the sum over left ends errs by dt / 2 (f(0) - f(T)) / T
     assert figures.e_sim_lambda1_s == pytest.approx(3.0 * np.log(3.0) / 2.0, abs=0.02 / 2 * 2.0 / 2.0 * 1.05)
     assert figures.rmse_rad == pytest.approx(0.5)

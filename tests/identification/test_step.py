@@ -1,4 +1,5 @@
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -34,7 +35,7 @@ def test_rk4_is_of_order_four():
 
     exact = end(2000)
     errors = [float((end(n) - exact).norm()) for n in (20, 40, 80)]
-    orders = [math.log2(a / b) for a, b in zip(errors, errors[1:], strict=False)]
+    orders = [math.log2(a / b) for a, b in pairwise(errors)]
     assert orders == pytest.approx([4.0, 4.0], abs=0.3)  # the next term of the error is of order 5
 
 
@@ -54,7 +55,8 @@ def test_a_hybrid_with_a_zero_head_is_its_prior():
     x, u = torch.tensor([[0.5, -1.0]]).double(), torch.tensor([[0.2]]).double()
     hybrid, _ = HybridStep(prior, network, UNIT, DT)(x.expand(2, 1, 2), network.initial(1), u.expand(2, 1, 1))
     own, _ = PriorStep(prior, DT)(x, x.new_zeros(0), u)
-    assert torch.equal(hybrid[0], own) and torch.equal(hybrid[1], own)
+    assert torch.equal(hybrid[0], own)
+    assert torch.equal(hybrid[1], own)
 
 
 def test_a_correction_acts_as_acceleration_and_kinematics_stay_exact():

@@ -28,7 +28,8 @@ PRIOR = Pendulum(TRUTH)
 
 
 def same(one, two):
-    assert one.settings == two.settings and one.scaling == two.scaling
+    assert one.settings == two.settings
+    assert one.scaling == two.scaling
     for name, weight in one.weights.items():
         np.testing.assert_array_equal(weight, two.weights[name])
     for name, column in one.curve.items():
@@ -81,7 +82,8 @@ def test_a_checkpoint_gives_back_what_it_got(tmp_path):
     tensors = {"a": torch.rand(3, 2).double(), "b": torch.arange(3)}
     save_checkpoint(tmp_path / "c", "key", tensors, {"done": 3})
     again, numbers = load_checkpoint(tmp_path / "c", "key")
-    assert numbers == {"done": 3} and all(torch.equal(again[n], tensors[n]) for n in tensors)
+    assert numbers == {"done": 3}
+    assert all(torch.equal(again[n], tensors[n]) for n in tensors)
     assert [f.name for f in tmp_path.iterdir()] == ["c"]
 
 
@@ -137,7 +139,8 @@ def test_a_short_run_shortens_the_windows_and_too_short_ones_are_refused(data):
     for n in (warm + 20, warm + 31):
         horizon = fitting_horizon([long, cut(long, n)], warm, 20)
         alone = cut_windows([cut(long, n)], warm, horizon, 1)
-        assert 10 <= horizon <= 20 and len(alone) > 1  # it gives windows at several starts
+        assert 10 <= horizon <= 20
+        assert len(alone) > 1  # it gives windows at several starts
     assert fitting_horizon([long, cut(long, warm + 2)], warm, 20) == 10  # it does not drag the others down
     with pytest.raises(InputError, match="long enough"):
         train(PRIOR, [cut(long, warm + 1)], data[1], SMALL)
