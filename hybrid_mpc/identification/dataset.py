@@ -14,6 +14,9 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.identification.step import Scaling
 from hybrid_mpc.physics import Prior
 
+SPAN = 10
+"""Periods over which the correction is averaged to find its scale."""
+
 
 @dataclass(frozen=True)
 class Windows:
@@ -46,10 +49,11 @@ def cut_windows(trajectories: Sequence[Trajectory], warm: int, horizon: int, str
     """Windows of ``warm + horizon`` periods, every ``stride`` samples, from every trajectory long enough.
 
     Raises:
-        InputError: If no trajectory is long enough.
+        InputError: If no trajectory is long enough, or one holds a value that is not finite.
     """
     x, u, length = [], [], warm + horizon
     for trajectory in trajectories:
+        _check_finite(trajectory)
         for start in range(0, len(trajectory.t) - length, stride):
             x.append(trajectory.x[start : start + length + 1])
             u.append(trajectory.u[start : start + length])
@@ -57,20 +61,60 @@ def cut_windows(trajectories: Sequence[Trajectory], warm: int, horizon: int, str
         longest = max((len(t.t) for t in trajectories), default=0)
         raise InputError(
             f"no training trajectory is long enough: the longest has {longest} samples, a window of "
-            f"{warm} warm-up and {horizon} scored periods needs {length + 1}. Record longer runs or lower warm_up."
+            f"{warm} warm-up and {horizon} scored periods needs {length + 1}. Record longer runs or lower "
+            "warm_up."
         )
     return Windows(torch.tensor(np.stack(x)), torch.tensor(np.stack(u)), warm)
 
 
+def fitting_horizon(trajectories: Sequence[Trajectory], warm: int, most: int) -> int:
+    """Scored periods of a window that let the shortest trajectory give windows at several starts.
+
+    That is two thirds of what the warm-up leaves of it, at most ``most``. Where that is less than half of
+    ``most``, the longest trajectory decides up to that half: one too short then gives no window, which is
+    better than short windows for all.
+
+    Args:
+        trajectories: The trajectories to cut.
+        warm: Samples of the warm-up.
+        most: Most scored periods.
+
+    Example:
+        >>> import numpy as np
+        >>> z = np.zeros((65, 1))
+        >>> short = Trajectory("run", "train", 0.02, 0.02 * np.arange(65), z, z, z, z)
+        >>> fitting_horizon([short], warm=10, most=50)
+        36
+    """
+    lengths = [2 * (len(t.t) - warm - 1) // 3 for t in trajectories]
+    return max(1, min(most, max(min(lengths), min(most // 2, max(lengths)))))
+
+
 def scaling_of(prior: Prior, windows: Windows, dt: float, *, use_prior: bool) -> Scaling:
-    """Scaling from training windows: root mean squares of signals and of what the network must give."""
+    """Scaling from training windows: root mean squares of signals and of what the network must give.
+
+    What it must give is averaged over ``SPAN`` periods first: the noise of a twice differentiated position
+    would set the scale otherwise, and networks on so large a scale learn noise.
+    """
     x, u = windows.x[:, :-1].reshape(-1, windows.x.shape[-1]), windows.u.reshape(-1, windows.u.shape[-1])
     n_q = prior.n_q
-    measured = (windows.x[:, 1:, n_q:] - windows.x[:, :-1, n_q:]).reshape(-1, n_q) / dt
+    measured = (windows.x[:, 1:, n_q:] - windows.x[:, :-1, n_q:]) / dt
     predicted = prior.acceleration(x, u)
-    residual = measured - predicted if use_prior else measured
+    residual = measured - predicted.reshape(measured.shape) if use_prior else measured
+    whole = residual[:, : residual.shape[1] // SPAN * SPAN] if residual.shape[1] >= SPAN else residual
+    averaged = whole.unflatten(1, (-1, min(SPAN, whole.shape[1]))).mean(2).reshape(-1, n_q)
 
     def rms(values: Tensor) -> tuple[float, ...]:
         return tuple(float(v) for v in values.square().mean(0).sqrt().clamp_min(1e-9))
 
-    return Scaling(x=rms(x), u=rms(u), acceleration=rms(predicted), correction=rms(residual))
+    return Scaling(x=rms(x), u=rms(u), acceleration=rms(predicted), correction=rms(averaged))
+
+
+def _check_finite(trajectory: Trajectory) -> None:
+    for name in ("x", "u"):
+        bad = np.flatnonzero(~np.isfinite(getattr(trajectory, name)).all(axis=1))
+        if len(bad):
+            raise InputError(
+                f"{trajectory.name}: {name} is not finite at {trajectory.t[bad[0]]:g} s ({len(bad)} samples "
+                "in all); leave these samples out of the file"
+            )

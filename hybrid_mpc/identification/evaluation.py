@@ -15,8 +15,8 @@ from hybrid_mpc.identification.step import PriorStep
 from hybrid_mpc.physics import Prior
 
 Array = NDArray[np.float64]
-START_S = 0.3
-"""Length [s] of the end of the warm-up from which x(0) of a free run is smoothed."""
+START_S = 0.5
+"""Longest end [s] of the warm-up from which x(0) of a free run is smoothed."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,12 @@ def smoothed_start(prior: Prior, trajectory: Trajectory, warm: int) -> Array:
 
 
 def free_runs(
-    step: nn.Module, prior: Prior, trajectories: Sequence[Trajectory], starts: Sequence[Array], warm: int, h0: Tensor
+    step: nn.Module,
+    prior: Prior,
+    trajectories: Sequence[Trajectory],
+    starts: Sequence[Array],
+    warm: int,
+    h0: Tensor,
 ) -> list[FreeRun]:
     """Free runs of one step over trajectories, h warmed up on their first ``warm`` samples.
 
@@ -114,8 +119,10 @@ def free_runs(
         h0: Hidden state before the warm-up ``(n_h,)``.
     """
     longest = max(len(t.t) for t in trajectories)
-    x_all, u_all = (torch.tensor(np.stack([_pad(a, longest) for a in arrays])) for arrays in (
-        [t.x for t in trajectories], [t.u for t in trajectories]))
+    x_all, u_all = (
+        torch.tensor(np.stack([_pad(a, longest) for a in arrays]))
+        for arrays in ([t.x for t in trajectories], [t.u for t in trajectories])
+    )
     with torch.no_grad():
         h = h0.expand(len(trajectories), -1)
         for k in range(warm):
@@ -141,7 +148,14 @@ def score(runs: Sequence[FreeRun]) -> Scores:
         square.append(((run.y_hat[:, 0] - run.y[:, 0]) ** 2).mean())
         energy.append(np.abs(run.energy_model_w - run.energy_measured_w).mean())
         amplitude.append(np.abs(run.y_hat).max() / np.abs(run.y).max())
-    figures = (np.mean(e0), np.mean(e1), np.mean(literal), np.sqrt(np.mean(square)), np.mean(energy), np.max(amplitude))
+    figures = (
+        np.mean(e0),
+        np.mean(e1),
+        np.mean(literal),
+        np.sqrt(np.mean(square)),
+        np.mean(energy),
+        np.max(amplitude),
+    )
     return Scores(*(float(v) if np.isfinite(v) else float("inf") for v in figures))
 
 
@@ -157,7 +171,17 @@ def _free_run(prior: Prior, trajectory: Trajectory, x_hat: Array, warm: int) -> 
         model = prior.energy_balance(x_hat_t, xdot_hat_t, u_t).numpy()
         y_hat = prior.output(x_hat_t, u_t).numpy()
     return FreeRun(
-        trajectory.name, trajectory.t[part], u, x, x_hat[:n], trajectory.y[part], y_hat, xdot, xdot_hat, measured, model
+        trajectory.name,
+        trajectory.t[part],
+        u,
+        x,
+        x_hat[:n],
+        trajectory.y[part],
+        y_hat,
+        xdot,
+        xdot_hat,
+        measured,
+        model,
     )
 
 

@@ -19,7 +19,8 @@ class GRUNetwork(nn.Module):
         n_out: Number of outputs.
 
     Example:
-        >>> out, h = GRUNetwork(3, 4, 1)(torch.zeros(3, dtype=torch.float64), torch.zeros(4, dtype=torch.float64))
+        >>> s, h = torch.zeros(3, dtype=torch.float64), torch.zeros(4, dtype=torch.float64)
+        >>> out, h = GRUNetwork(3, 4, 1)(s, h)
         >>> tuple(out.shape), tuple(h.shape)
         ((1,), (4,))
     """
@@ -88,7 +89,7 @@ class StackedGRU(nn.Module):
         return torch.baddbmm(self.b_out, h_next, self.w_out), h_next
 
     def sequence(self, s: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
-        """Outputs ``(T, networks, batch, n_out)`` and last h along given features ``(T, networks, batch, n_in)``."""
+        """Outputs ``(T, networks, batch, n_out)`` and last h; features ``(T, networks, batch, n_in)``."""
         gates = torch.matmul(s, self.w_ih) + self.b_ih
         states = []
         for gate in gates:

@@ -124,10 +124,12 @@ class VectorPerformanceIndex:
         self.bounds, self.rho = bounds, rho
 
     def value(self, losses: Tensor) -> Tensor:
-        """Smooth maximum of ``losses / bounds``, shape ``(networks,)``, for losses ``(networks, objectives)``."""
+        """Smooth maximum of ``losses / bounds`` ``(networks,)`` for losses ``(networks, objectives)``."""
         return torch.logsumexp(self.rho * losses / self.bounds, dim=-1) / self.rho
 
     def lower(self, losses: Tensor) -> VectorPerformanceIndex:
         """The index with bounds lowered where all objectives of a network keep theirs."""
         keeps = (losses <= self.bounds).all(dim=-1, keepdim=True)
-        return VectorPerformanceIndex(torch.where(keeps, torch.minimum(losses, self.bounds), self.bounds), self.rho)
+        return VectorPerformanceIndex(
+            torch.where(keeps, torch.minimum(losses, self.bounds), self.bounds), self.rho
+        )

@@ -69,7 +69,9 @@ def fit_prior(
     fit = _Fit(make, dt)
     stages = [s for s in STAGES if _fits(train, s[0], dt)] or [(_shortest(train, dt), 20)]
     lengths = [s for s, _ in stages]
-    judge = _sample(cut_windows(valid or train, 0, round(_longest(valid or train, lengths) / dt), round(0.5 / dt)))
+    judge = _sample(
+        cut_windows(valid or train, 0, round(_longest(valid or train, lengths) / dt), round(0.5 / dt))
+    )
     candidates = [("nominal", fit.nominal, None)]
     theta, jacobian = fit.equation_error(_sample(cut_windows(train, 0, 1, 3), 4000))
     candidates.append(("equation error", theta, jacobian))
@@ -111,13 +113,20 @@ class _Fit:
         self, start: NDArray[np.float64], windows: Windows, evaluations: int
     ) -> tuple[NDArray[np.float64], Any]:
         run = self._residual_function(windows, start)
-        jacobian = torch.func.jacfwd(run)
+        derivative = torch.func.jacfwd(run)
+
+        def residual(theta: NDArray[np.float64]) -> NDArray[np.float64]:
+            return run(torch.tensor(theta)).numpy()
+
+        def jacobian(theta: NDArray[np.float64]) -> NDArray[np.float64]:
+            return derivative(torch.tensor(theta)).numpy()
+
         # a start exactly on a bound would stall a trust-region reflective search
         inside = np.clip(start, self.lower + 1e-6, self.upper - 1e-6)
         result = least_squares(
-            lambda th: run(torch.tensor(th)).numpy(),
+            residual,
             inside,
-            jac=lambda th: jacobian(torch.tensor(th)).numpy(),
+            jac=jacobian,
             bounds=(self.lower, self.upper),
             loss="soft_l1",
             max_nfev=evaluations,

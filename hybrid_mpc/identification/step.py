@@ -75,6 +75,11 @@ class HybridStep(nn.Module):
         substeps: Runge-Kutta steps a period.
     """
 
+    scale_x: Tensor
+    scale_u: Tensor
+    scale_acceleration: Tensor
+    scale_correction: Tensor
+
     def __init__(
         self,
         prior: Prior,

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.identification.checkpoint import load_checkpoint, save_checkpoint
-from hybrid_mpc.identification.dataset import Windows, cut_windows, scaling_of
+from hybrid_mpc.identification.dataset import Windows, cut_windows, fitting_horizon, scaling_of
 from hybrid_mpc.identification.networks import GRUNetwork, StackedGRU
 from hybrid_mpc.identification.objectives import (
     OBJECTIVES,
@@ -47,8 +47,11 @@ class TrainingSettings:
         free_run_steps: Optimiser steps on free runs.
         seed: Seed of weights and batches.
         warm: Warm-up samples of a window.
-        horizon: Scored periods of a free-run window.
+        horizon: Most scored periods of a free-run window; fewer where a trajectory is short
+            (:func:`~hybrid_mpc.identification.dataset.fitting_horizon`).
         batch: Windows a step.
+        decay: Weight decay of AdamW times the number of training samples: the weights' prior counts the
+            less, the more data there are. Small recordings need it, large ones do not notice.
         learning_rates: Start and end of the cosine schedule, teacher forcing then free runs.
         every: Steps between evaluations (bounds, validation, checkpoint).
     """
@@ -62,6 +65,7 @@ class TrainingSettings:
     warm: int
     horizon: int = 50
     batch: int = 32
+    decay: float = 1500.0
     learning_rates: tuple[float, float, float, float] = (1e-2, 1e-3, 5e-3, 1e-4)
     every: int = 25
 
@@ -151,18 +155,24 @@ class _Run:
     """State of one training. Batches are drawn from (seed, step), so a resumed run is the same run."""
 
     def __init__(
-        self, prior: Prior, training: Sequence[Trajectory], validation: Sequence[Trajectory], s: TrainingSettings
+        self,
+        prior: Prior,
+        training: Sequence[Trajectory],
+        validation: Sequence[Trajectory],
+        s: TrainingSettings,
     ) -> None:
         self.settings, use_prior, dt = s, s.kind != "rnn", training[0].dt
-        self.windows = cut_windows(training, s.warm, s.horizon, max(1, s.horizon // 5))
+        horizon = fitting_horizon(training, s.warm, s.horizon)
+        self.windows = cut_windows(training, s.warm, horizon, max(1, horizon // 10))
         self.fixed = self.windows.take(torch.linspace(0, len(self.windows) - 1, 64).round().long().unique())
-        horizon = min(5 * s.horizon, max(len(t.t) for t in validation) - s.warm - 1)
-        self.valid = cut_windows(validation, s.warm, horizon, max(1, horizon // 2))
+        horizon = fitting_horizon(validation, s.warm, 5 * s.horizon)
+        self.valid = cut_windows(validation, s.warm, horizon, max(1, horizon // 5))
         self.scaling = scaling_of(prior, self.windows, dt, use_prior=use_prior)
         self.stack = _stack(prior, s)
         self.step = HybridStep(prior, self.stack, self.scaling, dt, use_prior=use_prior)
         self.weights = dict(self.stack.named_parameters())
-        self.optimizer = torch.optim.Adam(list(self.weights.values()))
+        self.decay = s.decay / sum(len(t.t) for t in training)
+        self.optimizer = self._fresh_optimizer()
         self.done, self.free = 0, False
         self.best = torch.full((s.networks,), math.inf, dtype=torch.float64)
         self.best_weights = {name: w.detach().clone() for name, w in self.weights.items()}
@@ -180,14 +190,16 @@ class _Run:
         self.free = self.done >= self.settings.teacher_steps
         if self.done:
             self._load(self.best_weights)
-        self.optimizer = torch.optim.Adam(list(self.weights.values()))
+        self.optimizer = self._fresh_optimizer()
         with torch.no_grad():
             losses = self._losses(self._predict(self.fixed))
-            self.index = VectorPerformanceIndex(torch.where(torch.isfinite(losses), losses, 1e6).clamp_min(1e-12))
+            self.index = VectorPerformanceIndex(
+                torch.where(torch.isfinite(losses), losses, 1e6).clamp_min(1e-12)
+            )
         self.evaluate()
 
     def update(self) -> None:
-        """One step of Adam on a batch, each network's gradient clipped for itself."""
+        """One step of AdamW on a batch, each network's gradient clipped for itself."""
         s = self.settings
         rng = np.random.default_rng([s.seed, self.done])
         batch = self.windows.take(torch.tensor(rng.integers(len(self.windows), size=s.batch)))
@@ -216,6 +228,9 @@ class _Run:
         head = torch.full((2, len(valid)), float(self.done), dtype=torch.float64)
         head[1] = float(self.free)
         self.rows.append(torch.cat([head, losses.T, self.index.bounds.T, valid[None]]))
+
+    def _fresh_optimizer(self) -> torch.optim.Optimizer:
+        return torch.optim.AdamW(list(self.weights.values()), weight_decay=self.decay)
 
     def _predict(self, windows: Windows) -> Prediction:
         return (free_run if self.free else teacher_forced)(self.step, windows)

@@ -1,0 +1,49 @@
+"""A pendulum with known parameters, simulated by an integrator of its own: data for these tests."""
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from hybrid_mpc.data import Trajectory
+from hybrid_mpc.physics import Prior
+from hybrid_mpc.signals import Parameter, Signal
+
+DT = 0.02
+TRUTH = {"J": 0.1, "mgl": 1.2, "d": 0.05}
+
+
+class Pendulum(Prior):
+    states = (Signal("phi", "rad", periodic=True), Signal("phi_dot", "rad/s"))
+    inputs = (Signal("torque", "N m"),)
+    outputs = (states[0],)
+    parameters_spec = (
+        Parameter("J", 0.15, "kg m^2", 0.02, 0.5),
+        Parameter("mgl", 1.0, "N m", 0.2, 5.0),
+        Parameter("d", 0.01, "N m s/rad", 0.0, 0.5),
+    )
+
+    def acceleration(self, x, u):
+        phi, v = x[..., 0:1], x[..., 1:2]
+        return (u - self.mgl * phi.sin() - self.d * v) / self.J
+
+    def energy_balance(self, x, xdot, u):
+        phi, v = x[..., 0], x[..., 1]
+        return (self.J * xdot[..., 1] + self.mgl * phi.sin() + self.d * v - u[..., 0]) * v
+
+
+def record(seed, seconds=4.0, role="train", extra=lambda phi, v: 0.0, noise=0.0):
+    """A run under random steps of torque; ``extra`` [N m] is a torque that the prior lacks."""
+    rng, n = np.random.default_rng(seed), round(seconds / DT)
+    u = np.repeat(rng.uniform(-0.6, 0.6, n // 20 + 1), 20)[:n, None]
+    x = np.empty((n, 2))
+    x[0] = rng.uniform(-1, 1, 2)
+
+    def f(_, x, u):
+        phi, v = x
+        torque = u - TRUTH["mgl"] * np.sin(phi) - TRUTH["d"] * v + extra(phi, v)
+        return [v, torque / TRUTH["J"]]
+
+    for k in range(n - 1):  # a new start at every step of u keeps the integrator's tolerance
+        x[k + 1] = solve_ivp(f, (0, DT), x[k], args=(u[k, 0],), rtol=1e-10, atol=1e-12).y[:, -1]
+    xdot = np.array([f(0, *pair) for pair in zip(x, u[:, 0], strict=True)])
+    x = x + noise * rng.standard_normal(x.shape)
+    return Trajectory(f"run{seed}", role, DT, DT * np.arange(n), u, x[:, :1], x, xdot)
