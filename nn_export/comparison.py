@@ -101,7 +101,7 @@ def parity(
         factor = {1: 0.0, 2: 1e3}.get(k % 10, 1.0)
         kind = k % 10 if k % 10 in (1, 2) else 0
         draws = [
-            factor * s * rng.standard_normal(tuple(x.shape))
+            factor * s * rng.standard_normal(tuple(x.shape)) + 0.0  # no negative zeros
             for x, s in zip(example_inputs, scales, strict=True)
         ]
         tensors = [torch.tensor(d, dtype=torch.float64) for d in draws]

@@ -88,9 +88,13 @@ def div_mode(self: Number, other: Number, *, rounding_mode: str | None = None) -
 
 
 def clamp(self: Value, min: Number | None = None, max: Number | None = None) -> Value:
-    """Limits, each of which may be missing."""
-    result = self if min is None else apply(ca.fmax, self, min)
-    return result if max is None else apply(ca.fmin, result, max)
+    """Limits, each of which may be missing; slope 1 at a limit and NaN stays NaN, as in torch."""
+    result = self
+    if min is not None:
+        result = apply(lambda x, low: ca.if_else(x < low, low, x), result, min)
+    if max is not None:
+        result = apply(lambda x, high: ca.if_else(x > high, high, x), result, max)
+    return result
 
 
 def relu(self: Value) -> Value:
@@ -133,9 +137,14 @@ def gelu(self: Value, *, approximate: str = "none") -> Value:
     return apply(lambda x: 0.5 * x * (1 + ca.tanh(k * (x + 0.044715 * x * x * x))), self)
 
 
-def sigmoid(x: ca.MX) -> ca.MX:
-    """Logistic function through tanh: it cannot overflow, nor can its derivatives."""
+def gate(x: ca.MX) -> ca.MX:
+    """Logistic function through tanh: right to 1e-16 of 1, for factors. Nothing can overflow."""
     return 0.5 + 0.5 * ca.tanh(0.5 * x)
+
+
+def sigmoid(x: ca.MX) -> ca.MX:
+    """Logistic function, right to 1e-16 of itself down to exp(-350); neither it nor its slope overflows."""
+    return 1 / (1 + ca.exp(-ca.if_else(x < -350, -350.0, x)))
 
 
 def softplus_mx(x: ca.MX, beta: float = 1, threshold: float = 20) -> ca.MX:

@@ -16,7 +16,7 @@ from typing import Any
 
 import casadi as ca
 
-from nn_export.operators.elementwise import sigmoid
+from nn_export.operators.elementwise import gate
 from nn_export.operators.value import Value, matrix
 
 State = tuple[ca.MX, ...]
@@ -51,7 +51,7 @@ def cell(x: ca.MX, h: ca.MX, w: Weights) -> Cell:
     """The cell at columns ``x`` (F, batch) and ``h`` (H, batch)."""
     xr, xz, xn = ca.vertsplit(affine(w[0], x, w[2]), h.shape[0])
     hr, hz, q = ca.vertsplit(affine(w[1], h, w[3]), h.shape[0])
-    r, z = sigmoid(xr + hr), sigmoid(xz + hz)
+    r, z = gate(xr + hr), gate(xz + hz)
     n = ca.tanh(xn + r * q)
     a, b = (h - n) * z * (1 - z), (1 - n * n) * (1 - z)
     c = b * q * r * (1 - r)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 import casadi as ca
 
-from nn_export.operators.elementwise import sigmoid
+from nn_export.operators.elementwise import gate
 from nn_export.operators.gru import State, Weights, affine, gru, gru_call
 from nn_export.operators.shape import flip, stack
 from nn_export.operators.value import Value, arrange, concatenate, from_matrix, move
@@ -21,8 +21,8 @@ Cell = Callable[[ca.MX, State, Weights], State]
 def _lstm(x: ca.MX, state: State, w: Weights) -> State:
     h, c = state
     i, f, g, o = ca.vertsplit(affine(w[0], x, w[2]) + affine(w[1], h, w[3]), c.shape[0])
-    c = sigmoid(f) * c + sigmoid(i) * ca.tanh(g)
-    return sigmoid(o) * ca.tanh(c), c
+    c = gate(f) * c + gate(i) * ca.tanh(g)
+    return gate(o) * ca.tanh(c), c
 
 
 def _tanh(x: ca.MX, state: State, w: Weights) -> State:

@@ -73,6 +73,13 @@ def var(
     return reduced(f, self, dim, keepdim)
 
 
+def std(
+    self: Value, dim: Sequence[int] | None = None, *, correction: float = 1, keepdim: bool = False
+) -> Value:
+    """Standard deviation over axes, with slope 0 where it is 0, as in torch."""
+    return apply(_root, var(self, dim, correction=correction, keepdim=keepdim))
+
+
 def amax(self: Value, dim: Sequence[int] = (), keepdim: bool = False) -> Value:
     """Largest over axes."""
     return reduced(_largest, self, dim, keepdim)
@@ -157,7 +164,8 @@ def _back(value: Value, dim: int, size: tuple[int, int]) -> np.ndarray:
 
 OPERATORS: dict[str, Callable[..., Value]] = {
     "aten.sum.default": sum_all, "aten.sum.dim_IntList": sum_, "aten.mean.dim": mean,
-    "aten.mean.default": mean, "aten.var.correction": var, "aten.amax.default": amax,
+    "aten.mean.default": mean, "aten.var.correction": var, "aten.std.correction": std,
+    "aten.amax.default": amax,
     "aten.amin.default": amin, "aten.max.default": max_all, "aten.min.default": min_all,
     "aten.prod.default": prod, "aten.prod.dim_int": prod_dim, "aten.linalg_vector_norm.default": norm,
     "aten.logsumexp.default": logsumexp, "aten._softmax.default": softmax,

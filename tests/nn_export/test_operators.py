@@ -1,10 +1,12 @@
 """Every operator of the table against torch."""
 
+import casadi as ca
 import numpy as np
 import pytest
 import torch
+from torch.nn import functional as F
 
-from nn_export import Node, Port, Program, build
+from nn_export import Node, Port, Program, build, to_casadi
 from nn_export.operators import OPERATORS
 from nn_export.operators.elementwise import OPERATORS as ELEMENTWISE
 from nn_export.operators.value import constant, matrix_shape
@@ -56,7 +58,9 @@ CASES = {
     "addmv.default": ((V3, A34, V4), {"beta": 0.5, "alpha": 2.0}), "linear.default": (A34, B34, V3),
     "layer_norm.default": (A34, [4], V4, V4), "sum.dim_IntList": (A34, [1], True),
     "_native_batch_norm_legit_no_training.default": (A34, V4, V4, V4, V4, 0.1, 1e-5),
-    "mean.dim": (A34, [0]), "var.correction": ((A34, [1]), {"correction": 0.0}), "amax.default": (A34, [0]),
+    "mean.dim": (A34, [0]), "var.correction": ((A34, [1]), {"correction": 0.0}),
+    "std.correction": ((A34, [0]), {"correction": 1.0}),
+    "amax.default": (A34, [0]),
     "amin.default": (A34, [1], True), "prod.dim_int": (A34, 0), "linalg_vector_norm.default": (A34, 2.0, [1]),
     "logsumexp.default": (A34, [1]), "_softmax.default": (A34, 0, False),
     "_log_softmax.default": (A34, 1, False),
@@ -84,46 +88,171 @@ def _case(name):
     return (A34,), {}  # operators of one tensor
 
 
-@pytest.mark.parametrize("name", [name for name in OPERATORS if name != "getitem"])
-def test_operator_against_torch(name):
-    args, kwargs = _case(name)
-    base, overload = name.removeprefix("aten.").split(".")
-    boolean, integer = base.startswith("bitwise"), base.startswith("index")
+NAMES = [name for name in OPERATORS if name != "getitem"]
+RECURRENT = ("gru", "lstm", "rnn")
+OWN_SLOPES = {"aten.celu.default", "aten.detach.default"}  # tested below
 
-    def torch_side(a):
-        if isinstance(a, list):
-            return [torch_side(v) for v in a]
-        is_index = integer and a is I2
-        if isinstance(a, torch.Tensor):
-            bool_where = base == "where" and a is args[0]
-            return a.long() if is_index else (a > 0.5) if boolean or bool_where else a
-        return a
 
-    op = getattr(getattr(A, base), overload)
-    extra = {"dtype": torch.float64} if base in ("full", "scalar_tensor", "arange") else {}
-    expected = op(*[torch_side(a) for a in args], **kwargs, **extra)
-    expected = list(expected) if isinstance(expected, tuple | list) else [expected]
-    weights = {}
+class Setup:
+    """One operator as torch calls it, and as a program whose first tensors are inputs."""
 
-    def reference(a):
+    def __init__(self, name, inputs):
+        self.name = name
+        self.args, self.kwargs = _case(name)
+        self.base, overload = name.removeprefix("aten.").split(".")
+        self.op = getattr(getattr(A, self.base), overload)
+        self.extra = {"dtype": torch.float64} if self.base in ("full", "scalar_tensor", "arange") else {}
+        self.tensors, self.free, self.weights = [], [], {}
+        self.data = [self.reference(a, inputs and self.may_be_input(k)) for k, a in enumerate(self.args)]
+        self.expected = self.torch(*self.tensors)
+        shapes = tuple(tuple(e.shape) for e in self.expected)
+        nodes, ports = (
+            [Node("n", name, self.data, self.kwargs, shapes)],
+            [Port("y", shapes[0], {"node": "n"})],
+        )
+        if len(shapes) > 1:
+            nodes += [Node(f"g{i}", "getitem", [{"node": "n"}, i], {}, (s,)) for i, s in enumerate(shapes)]
+            ports = [Port(f"y{i}", s, {"node": f"g{i}"}) for i, s in enumerate(shapes)]
+        symbols = [Port(f"x{i}", tuple(t.shape)) for i, t in enumerate(self.tensors)]
+        self.program = Program(tuple(symbols), tuple(ports), tuple(nodes), self.weights)
+
+    def may_be_input(self, k):
+        return not (
+            self.base.startswith(("bitwise", "logical"))
+            or (self.base == "where" and k == 0)
+            or (self.base.startswith("index") and k > 0)
+            or (self.base.startswith(RECURRENT) and k > 1)  # weights are constant
+            or (
+                self.base == "_native_batch_norm_legit_no_training" and k > 2
+            )  # statistics: no slope in torch
+        )
+
+    def torch_side(self, a, k):
+        if self.base.startswith("index") and k > 0 and a is I2:
+            return a.long()
+        if isinstance(a, torch.Tensor) and (
+            self.base.startswith("bitwise") or (self.base == "where" and k == 0)
+        ):
+            return a > 0.5
+        return [self.torch_side(v, k) for v in a] if isinstance(a, list) else a
+
+    def reference(self, a, free):
         if isinstance(a, list | tuple):
-            return [reference(v) for v in a]
-        if isinstance(a, torch.Tensor):
-            key = f"w{len(weights)}"
-            value = (a > 0.5) if boolean else a
-            weights[key] = value.double().numpy()
-            return {"weight": key}
-        return a
+            return [self.reference(v, free) for v in a]
+        if not isinstance(a, torch.Tensor):
+            return a
+        if free:
+            self.tensors.append(a)
+            return {"input": f"x{len(self.tensors) - 1}"}
+        key = f"w{len(self.weights)}"
+        value = (a > 0.5) if self.base.startswith("bitwise") else a
+        self.weights[key] = value.double().numpy()
+        return {"weight": key}
 
-    shapes = tuple(tuple(e.shape) for e in expected)
-    nodes = [Node("n", name, reference(args), kwargs, shapes)]
-    ports = [Port("y", shapes[0], {"node": "n"})]
-    if len(expected) > 1:
-        nodes += [Node(f"g{i}", "getitem", [{"node": "n"}, i], {}, (s,)) for i, s in enumerate(shapes)]
-        ports = [Port(f"y{i}", s, {"node": f"g{i}"}) for i, s in enumerate(shapes)]
-    results = build(Program((), tuple(ports), tuple(nodes), weights)).call([])
-    for result, e in zip(results, expected, strict=True):
+    def torch(self, *tensors):
+        left = list(tensors)
+
+        def fill(a, data):
+            if isinstance(a, list):
+                return [fill(v, d) for v, d in zip(a, data, strict=True)]
+            return left.pop(0) if isinstance(data, dict) and "input" in data else a
+
+        sides = [self.torch_side(a, k) for k, a in enumerate(self.args)]
+        filled = [fill(a, d) for a, d in zip(sides, self.data, strict=True)]
+        result = self.op(*filled, **self.kwargs, **self.extra)
+        return tuple(result) if isinstance(result, tuple | list) else (result,)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_operator_against_torch(name):
+    setup = Setup(name, inputs=False)
+    results = build(setup.program).call([])
+    for result, e in zip(results, setup.expected, strict=True):
         assert result.shape == matrix_shape(tuple(e.shape))
         ours = result.full().flatten(order="F")[constant(e.double().numpy()).positions]
         # Both sides round a few operations on numbers of order 1.
         np.testing.assert_allclose(ours, e.double().numpy(), rtol=1e-13, atol=1e-14)
+
+
+def _differentiable(name):
+    setup = Setup(name, inputs=True)
+    return bool(setup.tensors) and setup.expected[0].is_floating_point()
+
+
+@pytest.mark.parametrize("plain", [False, True])
+@pytest.mark.parametrize("name", [n for n in NAMES if _differentiable(n) and n not in OWN_SLOPES])
+def test_derivative_against_torch(name, plain):
+    setup = Setup(name, inputs=True)
+    kept = [i for i, e in enumerate(setup.expected) if e.numel()]
+    exact = torch.autograd.functional.jacobian(
+        lambda *t: tuple(setup.torch(*t)[i] for i in kept), tuple(setup.tensors)
+    )
+    held = [constant(t.numpy()) for t in setup.tensors]
+    function = build(setup.program, plain=plain)
+    symbols = [ca.MX.sym("x", *v.mx.shape) for v in held]
+    outputs = function.call(symbols)
+    blocks = [ca.densify(ca.jacobian(outputs[i], x)) for i in kept for x in symbols]
+    values = ca.Function("slopes", symbols, blocks).call([ca.evalf(v.mx) for v in held])
+    for k, i in enumerate(kept):
+        rows = constant(setup.expected[i].numpy()).positions.reshape(-1)
+        for j, x in enumerate(held):
+            ours = values[k * len(held) + j].full()[rows][:, x.positions.reshape(-1)]
+            # Derivatives round some more operations than values; slopes of this set are below 100.
+            np.testing.assert_allclose(ours, exact[k][j].reshape(ours.shape), rtol=1e-12, atol=1e-13)
+
+
+class Call(torch.nn.Module):
+    def __init__(self, f):
+        super().__init__()
+        self.f = f
+
+    def forward(self, x):
+        return self.f(x)
+
+
+def slopes(f, point):
+    """Diagonal of the exported function's Jacobian."""
+    x = torch.tensor(point, dtype=torch.float64)
+    symbol = ca.MX.sym("x", len(point))
+    jacobian = ca.jacobian(to_casadi(Call(f), (x,))(symbol), symbol)
+    return ca.Function("slopes", [symbol], [ca.diag(jacobian)])(point).full().ravel()
+
+
+def test_slopes_that_torch_rounds_to_float32_are_exact():
+    # torch 2.13 keeps 1/6 and 1/alpha of these derivatives in float32: off by 3e-8.
+    assert slopes(F.hardsigmoid, [0.5]) == 1 / 6
+    expected = np.exp(np.array([-0.4, -2.0]) / 1.3)
+    np.testing.assert_allclose(slopes(lambda x: F.celu(x, 1.3), [-0.4, -2.0]), expected, rtol=1e-15)
+
+
+def test_detach_is_no_barrier_to_derivatives():
+    assert slopes(lambda x: x.detach() * 2 + x, [0.7]) == 3.0
+
+
+@pytest.mark.parametrize(
+    ("f", "point", "expected"),
+    [
+        (lambda x: x.clamp(min=0.0), [0.0, -1.0, 1.0], [1, 0, 1]),
+        (lambda x: x.clamp(-1, 1), [-1.0, 1.0, 2.0], [1, 1, 0]),
+        (F.relu, [0.0], [0]),
+        (F.relu6, [0.0, 6.0, 3.0], [0, 0, 1]),
+        (torch.abs, [0.0], [0]),
+        (F.hardtanh, [-1.0, 1.0], [0, 0]),
+        (lambda x: torch.std(x).expand(2), [0.3, 0.3], [0, 0]),
+        (lambda x: torch.linalg.vector_norm(x).expand(2), [0.0, 0.0], [0, 0]),
+    ],
+)
+def test_slopes_at_kinks_follow_torch(f, point, expected):
+    x = torch.tensor(point, dtype=torch.float64)
+    assert torch.autograd.functional.jacobian(f, x).diagonal().tolist() == expected
+    assert slopes(f, point).tolist() == expected
+
+
+def test_the_logistic_function_far_out():
+    point = torch.tensor([-800.0, -300.0, -40.0, 0.0, 40.0, 800.0], dtype=torch.float64)
+    ours = to_casadi(Call(torch.sigmoid), (point,))(point.numpy()).full().ravel()
+    # Relative to itself where it is above exp(-350), absolute below; three roundings.
+    np.testing.assert_allclose(ours, torch.sigmoid(point).numpy(), rtol=1e-15, atol=1e-150)
+    assert np.isfinite(slopes(torch.sigmoid, point.numpy())).all()
+    assert slopes(torch.sigmoid, [0.0]) == 0.25
+    assert np.isnan(to_casadi(Call(torch.sigmoid), (point[:1],))(np.nan).full()).all()
