@@ -7,9 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from online_models import PendulumPlant, pendulum_model
 
+from hybrid_mpc.closed_loop import simulate
 from hybrid_mpc.estimation import ExtendedKalmanFilter
 from hybrid_mpc.mpc import OCP, CondensedController, SafeController
 
+DT = 0.02
 POINT = [0.0, 1.0], [0.0]
 
 
@@ -46,3 +48,14 @@ class Recorder:
 
     def __getattr__(self, name):
         return getattr(self.plant, name)
+
+
+def run(model, safe, **changes):
+    """A short closed loop of the mismatched pendulum; ``changes`` are arguments of ``simulate``."""
+    arguments = {
+        "plant": PendulumPlant(), "estimator": make_ekf(model), "controller": safe, "reference": sine,
+        "dt": DT, "duration": 0.6, "x0": [0.1, 0.0], "seed": 0,
+    }  # fmt: skip
+    arguments |= changes
+    head = [arguments.pop(name) for name in ("plant", "estimator", "controller", "reference")]
+    return simulate(*head, **arguments)

@@ -88,6 +88,7 @@ class PendulumPlant:
 
     noise: float = 1e-3
     disturbance: float = 0.0
+    inertia: float = 0.16
     gravity: float = 2.9
     damping: float = 0.05
     friction: float = 0.09
@@ -95,7 +96,7 @@ class PendulumPlant:
     def _integrator(self, dt):
         x, u = ca.MX.sym("x", 2), ca.MX.sym("u")
         rhs = pendulum_rhs(
-            x, u + self.disturbance, inertia=0.16, gravity=self.gravity, damping=self.damping,
+            x, u + self.disturbance, inertia=self.inertia, gravity=self.gravity, damping=self.damping,
             friction=self.friction, slope=60.0,
         )  # fmt: skip
         options = {"abstol": 1e-9, "reltol": 1e-9}

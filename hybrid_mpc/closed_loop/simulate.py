@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from time import perf_counter
@@ -14,6 +15,7 @@ from hybrid_mpc.closed_loop.faults import Fault, check_channels, corrupt_input, 
 from hybrid_mpc.closed_loop.result import ClosedLoopResult
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate, Estimator, TrueState
+from hybrid_mpc.model import HybridModel
 from hybrid_mpc.mpc.condensed import CondensedController
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.safeguard import Decision, SafeController
@@ -111,11 +113,19 @@ def simulate(
     """
     safe = controller if isinstance(controller, SafeController) else SafeController(controller)
     ocp, model = safe.controller.ocp, estimator.model
+    _check_models(model, safe.controller.model)
     n = _periods(dt, duration, model.dt, safe.controller.model.dt)
     check_channels(faults, model.n_y, ocp.n_u)
     x0 = vector(x0, ocp.n_x, "x0")
-    ahead: Array = np.arange((ocp.horizon if horizon is None else horizon) + 1, dtype=np.float64) * dt
+    preview_steps = ocp.horizon if horizon is None else horizon
+    if preview_steps < 0:
+        raise InputError(f"horizon must not be negative, got {horizon}")
+    ahead: Array = np.arange(preview_steps + 1, dtype=np.float64) * dt
     cost = ocp if stage_cost is None else stage_cost
+    if (cost.n_x, cost.n_u) != (ocp.n_x, ocp.n_u):
+        raise InputError(
+            f"stage_cost has {cost.n_x} states and {cost.n_u} inputs, needed: {ocp.n_x} and {ocp.n_u}"
+        )
     rng = np.random.default_rng(seed)
     state = plant.reset(x0, seed)
     estimate: Estimate | None = None
@@ -125,8 +135,10 @@ def simulate(
     y = np.full(model.n_y, np.nan)
     for k in range(n):
         t = k * dt
-        x = plant.truth(state)
-        y = corrupt_measurement(faults, t, plant.measure(state, rng), y)
+        x = _fitting(plant.truth(state), ocp.n_x, "the plant's truth")
+        y = corrupt_measurement(
+            faults, t, _fitting(plant.measure(state, rng), model.n_y, "the plant's measurement"), y
+        )
         seen = np.concatenate([x, plant.hidden(state)]) if isinstance(estimator, TrueState) else y
         preview: Array = np.asarray(reference(t + ahead), dtype=np.float64)
         if preview.shape != (ahead.size, ocp.n_x):
@@ -145,7 +157,8 @@ def simulate(
         if monitor is not None:
             memory, reading = monitor.update(memory, y, u_prev, estimate)
         clock.append(perf_counter())
-        stage = float(cost.stage_cost(x, decision.u, preview[0], decision.u - u_prev))
+        with np.errstate(over="ignore"):  # an absurd reference costs infinitely much
+            stage = float(cost.stage_cost(x, decision.u, preview[0], decision.u - u_prev))
         step = Step(k, t, x, y, estimate, decision, reading)
         record.add(step, preview[0], stage, np.diff(clock) * 1e3)
         if on_step is not None:
@@ -154,7 +167,25 @@ def simulate(
     return record.result()
 
 
+def _check_models(estimated: HybridModel, controlled: HybridModel) -> None:
+    sizes = [(m.n_x, m.n_h, m.n_u) for m in (estimated, controlled)]
+    if sizes[0] != sizes[1]:
+        raise InputError(
+            f"the estimator's model {estimated.name} has (n_x, n_h, n_u) = {sizes[0]}, "
+            f"the controller's model {controlled.name} {sizes[1]}; give both the same model"
+        )
+
+
+def _fitting(values: ArrayLike, size: int, name: str) -> Array:
+    array: Array = np.array(values, dtype=np.float64)
+    if array.shape != (size,):
+        raise InputError(f"{name} has shape {array.shape}, the model needs {(size,)}")
+    return array
+
+
 def _periods(dt: float, duration: float, *periods: float) -> int:
+    if not (math.isfinite(duration) and math.isfinite(dt) and dt > 0):
+        raise InputError(f"dt and duration must be finite and dt positive; got {dt} s and {duration} s")
     for period in periods:
         if not abs(dt - period) <= 1e-9 * period:
             raise InputError(f"dt = {dt} s given, a model's period is {period} s; they must agree")

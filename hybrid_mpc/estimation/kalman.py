@@ -18,8 +18,6 @@ Array = NDArray[np.float64]
 
 # A variance that has grown this much leaves few digits of a covariance: nothing is known any more.
 LOST = 1e12
-# Values that overflow are looked at where they matter; they are no news for the user's screen.
-QUIET = {"over": "ignore", "invalid": "ignore", "divide": "ignore"}
 
 
 @dataclass(frozen=True)
@@ -145,7 +143,7 @@ class ExtendedKalmanFilter:
         empty = np.full(model.n_y, np.nan)
         return Estimate(float(t), x, h, np.zeros(model.n_u), np.diag(self._first), empty, float("nan"))
 
-    @np.errstate(**QUIET)
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
     def predict(self, estimate: Estimate, u: ArrayLike) -> Estimate:
         """Estimate one period later with the input ``u`` ``(n_u,)`` held."""
         model = self._model
@@ -160,7 +158,7 @@ class ExtendedKalmanFilter:
         empty = np.full(model.n_y, np.nan)
         return Estimate(estimate.t + model.dt, x.ravel(), h.ravel(), estimate.d, p, empty, float("nan"))
 
-    @np.errstate(**QUIET)
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
     def correct(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> Estimate:
         """Estimate after the measurement ``y`` ``(n_y,)``, in Joseph form.
 

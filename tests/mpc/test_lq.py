@@ -60,7 +60,12 @@ def test_reference_disturbance_and_change_weight_without_bounds(n_h, r_delta):
     model, a, b, _ = random_linear(3, n_u=2, n_h=n_h)
     controller = CondensedController(model, problem(2, 15, r_delta=r_delta))
     rng = np.random.default_rng(5)
-    z, d, u_prev, reference = rng.normal(size=3 + n_h), rng.normal(size=2), rng.normal(size=2), rng.normal(size=(16, 3))
+    z, d, u_prev, reference = (
+        rng.normal(size=3 + n_h),
+        rng.normal(size=2),
+        rng.normal(size=2),
+        rng.normal(size=(16, 3)),
+    )
     e = estimate_of(model, z, d)
     solution = controller.solve(controller.initial(e, np.tile(u_prev, (15, 1))), e, reference)
     terminal = controller.ocp.terminal_weight(model)
@@ -82,7 +87,9 @@ def test_bounds_and_limits_of_the_change(n_u, du_max, seed):
     u_prev = rng.uniform(-0.5, 0.35, size=n_u)
     e = estimate_of(model, z, d)
     solution = controller.solve(controller.initial(e, np.tile(u_prev, (10, 1))), e, reference)
-    want = lq_plan(a, b, controller.ocp, model.dt, controller.ocp.terminal_weight(model), z, d, reference, u_prev)
+    want = lq_plan(
+        a, b, controller.ocp, model.dt, controller.ocp.terminal_weight(model), z, d, reference, u_prev
+    )
     assert solution.status is Status.SOLVED
     g, h = constraints(controller.ocp, u_prev)
     assert np.min(h - g @ want.ravel()) < 1e-9  # bounds are active: the case is not a free one
@@ -99,7 +106,9 @@ def test_the_oracle_agrees_with_slsqp():
     g, h = constraints(ocp, args[-1])
     cost = lambda u: np.sum(residuals(u.reshape(6, 1), *args) ** 2)  # noqa: E731
     rows = {"type": "ineq", "fun": lambda u: h - g @ u}
-    got = minimize(cost, np.full(6, 0.2), method="SLSQP", constraints=rows, options={"ftol": 1e-14, "maxiter": 300})
+    got = minimize(
+        cost, np.full(6, 0.2), method="SLSQP", constraints=rows, options={"ftol": 1e-14, "maxiter": 300}
+    )
     np.testing.assert_allclose(lq_plan(*args).ravel(), got.x, atol=1e-5)  # SLSQP's numerical gradients
 
 
@@ -130,9 +139,12 @@ def test_on_a_linear_model_the_first_guess_does_not_matter(guess):
 def test_bad_input_is_refused(change, words):
     model, *_ = random_linear(0, n_u=1)
     e = estimate_of(model, np.zeros(3))
-    with pytest.raises(InputError, match=words):
-        controller = CondensedController(
-            model, problem(change.get("n_u", 1), 10), iterations=change.get("iterations", 1)
-        )
+    n_u, iterations = change.get("n_u", 1), change.get("iterations", 1)
+
+    def use():
+        controller = CondensedController(model, problem(n_u, 10), iterations=iterations)
         plan = controller.initial(e, change.get("u"))
         controller.solve(plan, e, change.get("reference", np.zeros((1, 3))))
+
+    with pytest.raises(InputError, match=words):
+        use()

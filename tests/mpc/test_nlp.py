@@ -20,7 +20,9 @@ def ipopt_plan(model, ocp, terminal, z0, d, reference, u_prev):
         x_next, h_next = model.step(z[:n_x, k], z[n_x:, k], u[:, k] + d)
         opti.subject_to(z[:, k + 1] == ca.vertcat(x_next, h_next))
         error, du = z[:n_x, k] - reference[k], u[:, k] - before
-        cost += model.dt * (ca.dot(ocp.q, error**2) + ca.dot(ocp.r, u[:, k] ** 2) + ca.dot(ocp.r_delta, du**2))
+        cost += model.dt * (
+            ca.dot(ocp.q, error**2) + ca.dot(ocp.r, u[:, k] ** 2) + ca.dot(ocp.r_delta, du**2)
+        )
         opti.subject_to(opti.bounded(ocp.u_min, u[:, k], ocp.u_max))
         if ocp.du_max is not None:
             opti.subject_to(opti.bounded(-ocp.du_max, du, ocp.du_max))
@@ -34,12 +36,19 @@ def ipopt_plan(model, ocp, terminal, z0, d, reference, u_prev):
 
 
 def start(model, x):
-    return Estimate(0.0, np.array(x), np.zeros(model.n_h), np.array([0.1]), np.eye(3 + model.n_h), np.zeros(1), 0.0)
+    return Estimate(
+        0.0, np.array(x), np.zeros(model.n_h), np.array([0.1]), np.eye(3 + model.n_h), np.zeros(1), 0.0
+    )
 
 
 @pytest.mark.parametrize(
     ("z", "bound", "du_max", "x0"),
-    [(0, 20.0, None, [0.9, 0.0]), (0, 2.0, None, [0.9, -1.0]), (0, 2.0, [0.3], [0.9, 1.0]), (4, 2.0, [0.3], [-0.7, 0.0])],
+    [
+        (0, 20.0, None, [0.9, 0.0]),
+        (0, 2.0, None, [0.9, -1.0]),
+        (0, 2.0, [0.3], [0.9, 1.0]),
+        (4, 2.0, [0.3], [-0.7, 0.0]),
+    ],
 )
 def test_converged_iterations_are_ipopts_answer(z, bound, du_max, x0):
     model = pendulum_model(z=z)
@@ -96,7 +105,15 @@ def test_sparse_jacobians_of_a_users_model_are_read_rightly():
     jacobians = ca.sparsify(ca.DM(a)), ca.sparsify(ca.DM(b))
     assert not jacobians[0].is_dense()
     by_hand = ca.Function("j", [x, h, u], [*dense.step(x, h, u), *jacobians])
-    fields = (dense.states, dense.inputs, dense.outputs, dense.step, dense.xdot, dense.output, dense.energy_balance)
+    fields = (
+        dense.states,
+        dense.inputs,
+        dense.outputs,
+        dense.step,
+        dense.xdot,
+        dense.output,
+        dense.energy_balance,
+    )
     sparse = HybridModel("sparse", dense.dt, *fields, with_jacobian=by_hand)
     ocp = OCP(8, [1.0, 1.0], [0.1], [0.0], [-1.0], [1.0])
     e = Estimate(0.0, np.array([1.0, -2.0]), np.zeros(0), np.zeros(1), np.eye(3), np.zeros(1), 0.0)

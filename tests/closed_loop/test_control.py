@@ -1,0 +1,136 @@
+"""Closed loops on a machine that is not the model: other parameters, other friction, another integrator."""
+
+import numpy as np
+import pytest
+from closed_loop_parts import hold, make_ekf, make_safe, sine
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from online_models import PendulumPlant, pendulum_model
+
+from hybrid_mpc.closed_loop import Fault, simulate
+from hybrid_mpc.estimation import TrueState
+
+
+def loop(model, plant, reference, duration=6.0, **options):
+    safe = options.pop("safe", None) or make_safe(model)
+    estimator = options.pop("estimator", None) or make_ekf(model)
+    return simulate(
+        plant,
+        estimator,
+        safe,
+        reference,
+        dt=0.02,
+        duration=duration,
+        **{"x0": [0.0, 0.0], "seed": 0, **options},
+    )
+
+
+@pytest.mark.parametrize("z", [0, 4])
+def test_tracks_on_a_mismatched_plant(z):
+    result = loop(pendulum_model(z=z), PendulumPlant(), sine, duration=8.0)
+    assert set(result.source) == {"MPC"}
+    late = result.t > 4.0
+    error = result.x[late, 0] - result.reference[late, 0]
+    # Model errors of 15 to 20 % in inertia and gravity act as a torque of up to 0.3 N m, of which d takes off the
+    # slow part: what stays is below 3 % of the amplitude; without control the pendulum would miss it by 100 %.
+    assert np.sqrt(np.mean(error**2)) < 0.03 * 0.5
+
+
+def viscous(**changes):
+    """The model's own parameters and viscous friction only: the plant differs by its integrator alone."""
+    same = {"gravity": 2.4, "damping": 0.2, "friction": 0.0, "inertia": 0.14}
+    return pendulum_model(**same), PendulumPlant(**{**same, "noise": 0.0, **changes})
+
+
+@pytest.mark.parametrize("disturbance", [0.3, -0.5])
+@pytest.mark.parametrize("other", [{}, {"gravity": 2.9, "inertia": 0.16, "damping": 0.3}])
+def test_a_constant_input_disturbance_is_found_and_taken_off(disturbance, other):
+    model, plant = viscous(disturbance=disturbance, **other)
+    # Any weight on u pulls the rest away from the reference (next test): here it is next to none.
+    safe = make_safe(model, r=1e-6)
+    result = loop(model, plant, hold, duration=8.0, safe=safe)
+    # At rest u + disturbance = gravity sin(phi) on the plant, u + d = 2.4 sin(phi) in the model: the difference of
+    # the two is what d must be, also of a wrong gravity. The loop has settled for many time constants by then.
+    phi = result.x[-1, 0]
+    assert abs(result.d[-1, 0] - (disturbance + (2.4 - plant.gravity) * np.sin(phi))) < 1e-4
+    # q e^2 is traded against r u^2 through du/dphi = 2.4 cos(phi) = 2.2: e = r u du/dphi / q < 1e-6 * 2 * 2.2 / 300,
+    # so what is left is the settling and the solver's tolerance.
+    assert np.max(np.abs(result.x[-50:, 0] - 0.4)) < 2e-5
+    assert np.max(np.abs(result.x[-50:, 1])) < 1e-4
+
+
+def test_the_steady_error_is_the_one_that_the_weights_ask_for():
+    model, plant = viscous(disturbance=0.3)
+    safe = make_safe(model, r=0.5, horizon=100)
+    result = loop(model, plant, hold, duration=12.0, safe=safe)
+    # The cheapest rest: minimise q (phi - 0.4)^2 + r u^2 with u = 2.4 sin(phi) - 0.3, by a fine grid.
+    phi = np.linspace(0.3, 0.45, 300001)
+    best = phi[np.argmin(300.0 * (phi - 0.4) ** 2 + 0.5 * (2.4 * np.sin(phi) - 0.3) ** 2)]
+    assert abs(best - 0.4) > 1e-3
+    # A finite horizon with a terminal weight at the reference differs from it a little.
+    assert abs(result.x[-1, 0] - best) < 0.15 * abs(best - 0.4)
+
+
+def test_a_step_of_the_disturbance_is_followed():
+    model, plant = viscous()
+    fault = Fault(4.0, np.inf, "input_offset", 0.4)
+    result = loop(model, plant, hold, duration=9.0, faults=[fault], safe=make_safe(model, r=1e-6))
+    assert abs(result.d[199, 0]) < 1e-3
+    assert abs(result.d[-1, 0] - 0.4) < 1e-3
+    assert np.max(np.abs(result.x[200:230, 0] - 0.4)) > 3e-3  # the fault is felt ...
+    assert np.abs(result.x[-1, 0] - 0.4) < 1e-4  # ... and taken off
+
+
+def test_true_state_controls_as_well_as_the_model_is():
+    model, plant = viscous()
+    exact = loop(model, plant, sine, safe=make_safe(model, r=1e-6), estimator=TrueState(model))
+    late = exact.t > 2.0
+    # The plant is the model to 1e-8; what stays comes from the small weights on u, its change and on speed.
+    assert np.max(np.abs(exact.x[late, 0] - exact.reference[late, 0])) < 5e-3
+    np.testing.assert_array_equal(exact.x, exact.x_hat)
+
+
+def test_unstable_upright_position_is_held_and_the_angle_counts_on():
+    plant = PendulumPlant()
+    up = lambda t: hold(t, np.pi)  # noqa: E731
+    result = loop(pendulum_model(), plant, up, duration=5.0, x0=[np.pi - 0.2, 0.0])
+    assert (
+        np.max(np.abs(result.x[-50:, 0] - np.pi)) < 0.03
+    )  # 0.09 N m of dry friction over a gain of several N m/rad
+
+
+FAULTS = st.builds(
+    Fault,
+    st.floats(0, 0.5), st.floats(0.6, 2.0),
+    st.sampled_from(["measurement_offset", "measurement_freeze", "measurement_dropout", "input_gain", "input_offset"]),
+    st.floats(-1e3, 1e3),
+)  # fmt: skip
+
+
+class Rough(PendulumPlant):
+    """A plant whose sensor now and then returns anything."""
+
+    def measure(self, state, rng):
+        odd = rng.choice([0.0, np.nan, np.inf, 1e200, -1e308, 30.0], p=[0.7, 0.1, 0.05, 0.05, 0.05, 0.05])
+        return super().measure(state, rng) + odd
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    faults=st.lists(FAULTS, max_size=3),
+    x0=st.tuples(st.floats(-4, 4), st.floats(-20, 20)),
+    points=st.lists(st.one_of(st.floats(-1e3, 1e3), st.just(np.nan), st.just(1e200)), min_size=4, max_size=4),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_limits_hold_in_any_closed_loop(faults, x0, points, seed):
+    model = pendulum_model(z=2)
+    safe = make_safe(model, bound=1.5, du_max=0.4, horizon=10)
+    reference = lambda t: np.column_stack([np.interp(t, [0, 0.2, 0.4, 0.6], points), 0 * t])  # noqa: E731
+    result = loop(model, Rough(), reference, duration=0.8, safe=safe, faults=faults, x0=x0, seed=seed)
+    assert len(result.u) == 40
+    assert np.all(np.isfinite(result.u))
+    assert np.max(np.abs(result.u)) <= 1.5
+    # one rounding of held +- du_max and one of the difference, at most 4 ulp of the bound
+    assert np.max(np.abs(np.diff(result.u, axis=0, prepend=0.0))) <= 0.4 + 4 * 1.5 * np.finfo(float).eps
+    for source, status in zip(result.source, result.status, strict=True):
+        assert (source == "MPC") == (status == "SOLVED")
