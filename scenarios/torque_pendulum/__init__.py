@@ -22,9 +22,8 @@ To use them, name tau_meas_Nm as input in a scenario of your own."""
 WINDOWS: Mapping[str, tuple[Window, ...]] = {
     "energy_shaping_0p9Nm": (
         Window(0.0, 4.4, "train"),  # swing-up
-        Window(4.6, 5.0, "nominal"),  # standing at the top
         Window(8.0, 9.8, "test"),  # fall through the bottom and catch on the other side
-        Window(10.0, 11.0, "nominal"),
+        Window(10.0, 11.0, "nominal"),  # standing at the top
         Window(13.0, 14.6, "valid"),  # the same in the other direction
         Window(14.8, 16.0, "nominal"),
     ),
