@@ -68,7 +68,7 @@ def test_recordings_of_that_name_load_with_swings_in_both_test_parts(tmp_path):
         files.append(write_csv(tmp_path / f"{stem}.csv", columns))
     prior = TorquePendulumPrior
     data = load_trajectories(files, scenario.data, outputs=prior.outputs, inputs=prior.inputs)
-    assert {piece.role for piece in data.trajectories} == {"train", "valid", "test"}
+    assert {piece.role for piece in data.trajectories} == {"train", "valid", "test", "nominal"}
     assert {piece.name.split("#")[0] for piece in data.by_role("test")} == set(WINDOWS) - {
         "sac_0p9Nm",
         "ilqr_0p9Nm",
