@@ -3,9 +3,9 @@
 ``python benchmarks/export_step.py [--out times.json]``. Routes are timed in turn in one run, the best of
 several rounds counts: other work on the machine only ever adds time.
 
-- step: the value alone;
-- plain: Jacobian by CasADi's differentiation of the plain graph;
-- cell: the same, where the GRU cell brings its exact Jacobian;
+- value_plain, value: the step alone as a plain graph and as ``nn_export.build`` makes it;
+- plain: Jacobian by CasADi, of a call of the plain graph;
+- casadi: Jacobian by CasADi, of the graph that ``nn_export.build`` makes (cells with exact Jacobians);
 - composed: ``nn_export.with_jacobian``.
 """
 
@@ -28,10 +28,10 @@ from scenarios.golf_robot import scenario
 ROUNDS, CALLS = 9, 60
 
 
-def by_casadi(step: ca.Function) -> ca.Function:
+def by_casadi(step: ca.Function, *, inline: bool) -> ca.Function:
     """Values and the two Jacobians as :func:`nn_export.with_jacobian` gives them."""
     x, h, u = (ca.MX.sym(name, step.size1_in(i)) for i, name in enumerate(("x", "h", "u")))
-    values = step(x, h, u)
+    values = step.call([x, h, u], inline, False)
     z = ca.vertcat(*values)
     a = ca.densify(ca.horzcat(ca.jacobian(z, x), ca.jacobian(z, h)))
     return ca.Function("by_casadi", [x, h, u], [*values, a, ca.densify(ca.jacobian(z, u))])
@@ -67,9 +67,10 @@ def measure(z: int) -> dict[str, float]:
     examples = tuple(torch.zeros(n, dtype=torch.float64) for n in (len(prior.states), z, len(prior.inputs)))
     program = nn_export.trace(module, examples, output_names=["x_next", "h_next"])
     routes = {
-        "step": nn_export.build(program),
-        "plain": by_casadi(nn_export.build(program, plain=True)),
-        "cell": by_casadi(nn_export.build(program)),
+        "value_plain": nn_export.build(program, plain=True),
+        "value": nn_export.build(program),
+        "plain": by_casadi(nn_export.build(program, plain=True), inline=False),
+        "casadi": by_casadi(nn_export.build(program), inline=True),
         "composed": nn_export.with_jacobian(program, {"A": ("x", "h"), "B": ("u",)}),
     }
     rng = np.random.default_rng(z)
@@ -91,12 +92,16 @@ def main() -> None:
     parser.add_argument("--z", type=int, nargs="+", default=[8, 16, 32, 64], help="hidden units")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    print("   z   step  plain   cell  composed [us]  plain/composed  difference")
+    print("   z  value_plain  value  plain  casadi  composed [us]  plain/composed  difference")
     rows = []
     for z in given.z:
         row = measure(z)
         rows.append(row)
-        times = "{step_us:7.1f}{plain_us:7.0f}{cell_us:7.0f}{composed_us:10.1f}".format(**row)
+        times = (
+            "{value_plain_us:13.1f}{value_us:7.1f}{plain_us:7.0f}{casadi_us:8.0f}{composed_us:10.1f}".format(
+                **row
+            )
+        )
         ratio = row["plain_us"] / row["composed_us"]
         print(f"{z:4d}{times}{ratio:20.1f}{row['difference']:12.1e}")
     if given.out is not None:

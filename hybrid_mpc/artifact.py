@@ -1,4 +1,4 @@
-"""The artifact: a folder that holds the deployed models as data. Loading it needs no torch and runs nothing."""
+"""The artifact: a folder of the deployed models as data. Loading needs no torch and runs nothing."""
 
 from __future__ import annotations
 

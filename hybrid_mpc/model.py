@@ -95,7 +95,8 @@ class HybridModel:
 
 def _with_jacobian(step: ca.Function) -> ca.Function:
     x, h, u = (ca.MX.sym(name, step.size1_in(i)) for i, name in enumerate(("x", "h", "u")))
-    x_next, h_next = step(x, h, u)
+    # Differentiated inside the caller's graph where it is a graph of matrices: twice as fast as a call.
+    x_next, h_next = step.call([x, h, u], step.is_a("MXFunction"), False)
     z = ca.vertcat(x_next, h_next)
     a = ca.densify(ca.horzcat(ca.jacobian(z, x), ca.jacobian(z, h)))
     b = ca.densify(ca.jacobian(z, u))

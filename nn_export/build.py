@@ -10,8 +10,9 @@ import casadi as ca
 import numpy as np
 
 from nn_export.errors import ProgramError, ShapeError
-from nn_export.operators import OPERATORS, PLAIN
+from nn_export.operators import OPERATORS, PLAIN, recurrent
 from nn_export.operators.value import Value, constant, matrix_shape
+from nn_export.pieces import Pieces
 from nn_export.program import Node, Program
 
 _IDENTIFIER = re.compile(r"[A-Za-z](_?[A-Za-z0-9])*_?")
@@ -36,8 +37,9 @@ def build(program: Program, name: str | None = None, *, plain: bool = False) -> 
     Args:
         program: What :func:`nn_export.trace` made or :func:`nn_export.load_programs` read.
         name: Name of the function. Default: ``"program"``.
-        plain: Leave the derivatives of GRU cells to CasADi as well. Default: each cell is a call of a
-            function that brings its exact Jacobian, which makes derivatives several times faster.
+        plain: One graph of matrices, all derivatives by CasADi. Default: each GRU cell is a call of a
+            function that brings its exact Jacobian, and small parts between are scalar code: both values
+            and derivatives are faster.
 
     Returns:
         Function with dense inputs and outputs.
@@ -53,12 +55,21 @@ def build(program: Program, name: str | None = None, *, plain: bool = False) -> 
         Function(program:(x[2])->(y[2]) MXFunction)
     """
     name = "program" if name is None else name
-    symbols, values = graph(program, PLAIN if plain else OPERATORS)
-    return function(name, symbols, [v.mx for v in values], program, [p.name for p in program.outputs])
+    outputs = [p.name for p in program.outputs]
+    if plain:
+        symbols, values = graph(program, PLAIN)
+        return function(name, symbols, [v.mx for v in values], program, outputs)
+    pieces = Pieces()
+    symbols, values = graph(program, {**OPERATORS, **recurrent.table(pieces.gru)}, pieces)
+    return function(name, symbols, pieces.evaluate([v.mx for v in values]), program, outputs)
 
 
-def graph(program: Program, table: Mapping[str, Callable[..., Any]]) -> tuple[list[ca.MX], list[Value]]:
+def graph(
+    program: Program, table: Mapping[str, Callable[..., Any]], pieces: Pieces | None = None
+) -> tuple[list[ca.MX], list[Value]]:
     """Symbols of the inputs and values of the outputs, with the operators of a table.
+
+    The pieces, if given, are told the inputs before the first operator.
 
     Raises:
         ProgramError: As :func:`build`.
@@ -70,6 +81,8 @@ def graph(program: Program, table: Mapping[str, Callable[..., Any]]) -> tuple[li
             raise ProgramError(_BAD_NAME.format(port.name))
         symbols.append(ca.MX.sym(port.name, *_size(f"input {port.name}", port.shape)))
         values["input", port.name] = Value(port.shape, symbols[-1])
+        if pieces is not None and symbols[-1].numel():
+            pieces.add(symbols[-1], symbols[-1])
     for weight, array in program.weights.items():
         _size(f"weight {weight}", np.shape(array))
         values["weight", weight] = constant(array)

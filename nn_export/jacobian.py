@@ -7,7 +7,6 @@ small Jacobian; pieces too large for that keep CasADi's derivatives of the matri
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
@@ -18,6 +17,7 @@ import casadi as ca
 from nn_export.build import function, graph
 from nn_export.errors import ProgramError
 from nn_export.operators import OPERATORS, gru, recurrent
+from nn_export.pieces import operations
 from nn_export.program import Program
 
 SCALAR_LIMIT = 50_000
@@ -137,7 +137,7 @@ def _differentiate(
     """Targets and their Jacobians by each symbol, at the arguments."""
     piece = ca.Function("piece", symbols, targets)
     n, rows, columns = len(targets), _edges(targets), _edges(symbols)
-    scalar = _operations(piece) * min(rows[-1], columns[-1]) <= SCALAR_LIMIT
+    scalar = operations(piece) * min(rows[-1], columns[-1]) <= SCALAR_LIMIT
     inner: list[Any] = [(ca.SX if scalar else ca.MX).sym("v", *s.shape) for s in symbols]
     values = piece.call(inner, True, False)
     whole = ca.jacobian(ca.veccat(*values), ca.veccat(*inner))
@@ -150,19 +150,6 @@ def _differentiate(
 
 def _edges(parts: list[ca.MX]) -> list[int]:
     return list(accumulate((p.numel() for p in parts), initial=0))
-
-
-def _operations(f: ca.Function) -> float:
-    """Scalar operations of a matrix graph, about; infinite if it calls other functions."""
-    total = 0
-    for k in range(f.n_instructions()):
-        kind = f.instruction_id(k)
-        if kind == ca.OP_CALL:
-            return math.inf
-        if kind not in (ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST):
-            node = f.instruction_MX(k)
-            total += node.numel() * (2 * node.dep(1).size2() if kind == ca.OP_MTIMES else 1)
-    return total
 
 
 def _cell(x: _Known, h: _Known, w: gru.Weights) -> _Known:
