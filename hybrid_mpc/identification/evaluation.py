@@ -11,12 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hybrid_mpc.data.trajectories import Trajectory
-from hybrid_mpc.identification.step import PriorStep
 from hybrid_mpc.physics import Prior
 
 Array = NDArray[np.float64]
-START_S = 0.5
-"""Longest end [s] of the warm-up from which x(0) of a free run is smoothed."""
 
 
 @dataclass(frozen=True)
@@ -72,50 +69,21 @@ class Scores:
     amplitude_ratio: float
 
 
-def smoothed_start(prior: Prior, trajectory: Trajectory, warm: int) -> Array:
-    """State at the end of the warm-up ``(n_x,)``, smoothed from the warm-up's measurements alone.
-
-    The fitted prior with a constant unknown acceleration is fitted to the last ``START_S`` of the warm-up
-    (Gauss-Newton); every model starts there, so none gains by it.
-    """
-    n, n_q = min(warm, max(4, round(START_S / trajectory.dt))), prior.n_q
-    y, u = (torch.tensor(a[warm - n : warm + 1]) for a in (trajectory.y, trajectory.u))
-    step = PriorStep(prior, trajectory.dt)
-
-    def outputs(p: Tensor) -> tuple[Tensor, Tensor]:
-        x, offset = p[: 2 * n_q], p[2 * n_q :]
-        ys = [prior.output(x, u[0])]
-        kick = torch.cat([0.5 * trajectory.dt**2 * offset, trajectory.dt * offset])
-        for k in range(n):
-            x = step(x, x.new_zeros(0), u[k])[0] + kick
-            ys.append(prior.output(x, u[k + 1]))
-        return torch.stack(ys), x
-
-    p = torch.cat([torch.tensor(trajectory.x[warm - n]), torch.zeros(n_q, dtype=torch.float64)])
-    for _ in range(4):
-        jacobian, _ = torch.func.jacfwd(outputs)(p)
-        residual = (outputs(p)[0] - y).reshape(-1, 1)
-        p = p - torch.linalg.lstsq(jacobian.reshape(-1, p.numel()), residual).solution.reshape(-1)
-    x = outputs(p)[1].numpy()
-    return x if np.isfinite(x).all() else trajectory.x[warm]
-
-
 def free_runs(
-    step: nn.Module,
-    prior: Prior,
-    trajectories: Sequence[Trajectory],
-    starts: Sequence[Array],
-    warm: int,
-    h0: Tensor,
+    step: nn.Module, prior: Prior, trajectories: Sequence[Trajectory], start: int, warm: int, h0: Tensor
 ) -> list[FreeRun]:
-    """Free runs of one step over trajectories, h warmed up on their first ``warm`` samples.
+    """Free runs of one step over trajectories; the warm-up is measured and not scored.
+
+    The run leaves the measurement at sample ``start``, half a smoothing length before the warm-up ends:
+    there the smoothed state knows the warm-up on both sides and nothing after it. It is the same for every
+    model. h is warmed up on the samples before it; scores begin at sample ``warm``.
 
     Args:
         step: ``(x, h, u) -> (x_next, h_next)``, one network, any batch.
         prior: The prior whose energy balance judges (the fitted one).
         trajectories: The runs; they may differ in length.
-        starts: x at the end of each warm-up, ``(n_x,)``.
-        warm: Samples of the warm-up.
+        start: Sample at which the free run starts.
+        warm: Samples of the warm-up, at least ``start``.
         h0: Hidden state before the warm-up ``(n_h,)``.
     """
     longest = max(len(t.t) for t in trajectories)
@@ -125,14 +93,14 @@ def free_runs(
     )
     with torch.no_grad():
         h = h0.expand(len(trajectories), -1)
-        for k in range(warm):
+        for k in range(start):
             _, h = step(x_all[:, k], h, u_all[:, k])
-        x, states = torch.tensor(np.stack(starts)), []
-        for k in range(warm, longest):
+        x, states = x_all[:, start], []
+        for k in range(start, longest):
             states.append(x)
             x, h = step(x, h, u_all[:, k])
         states.append(x)
-    x_hat = torch.stack(states, 1).numpy()
+    x_hat = torch.stack(states, 1).numpy()[:, warm - start :]
     return [_free_run(prior, t, x_hat[i], warm) for i, t in enumerate(trajectories)]
 
 

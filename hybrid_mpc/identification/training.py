@@ -65,7 +65,7 @@ class TrainingSettings:
     warm: int
     horizon: int = 50
     batch: int = 32
-    decay: float = 1500.0
+    decay: float = 300.0
     learning_rates: tuple[float, float, float, float] = (1e-2, 1e-3, 5e-3, 1e-4)
     every: int = 25
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -118,11 +119,11 @@ def load_trained(context: Context, kind: str) -> Trained:
 
 def evaluation_stage(context: Context) -> None:
     """Free runs of every model over the test trajectories."""
-    from hybrid_mpc.identification.evaluation import free_runs, score, smoothed_start
+    from hybrid_mpc.identification.evaluation import free_runs, score
 
     test = context.trajectories("test")
     phy = context.scenario.prior(context.result("prior")["values"])
-    starts = [smoothed_start(phy, t, context.warm) for t in test]
+    start = max(0, context.warm - math.ceil(0.5 * context.spec.smoothing / context.spec.dt))
     scores: dict[str, Any] = {}
     arrays: dict[str, Any] = {}
     for i, name in enumerate(MODELS):
@@ -130,7 +131,7 @@ def evaluation_stage(context: Context) -> None:
         members = _members(context, name, phy)
         all_scores = []
         for k, (step, h0) in enumerate(members):
-            runs = free_runs(step, phy, test, starts, context.warm, h0)
+            runs = free_runs(step, phy, test, start, context.warm, h0)
             all_scores.append(asdict(score(runs)))
             if k == 0:
                 for run in runs:

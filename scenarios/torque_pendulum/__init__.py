@@ -17,9 +17,7 @@ commanded torque: it explains the motion as well as the measured current does, i
 the measured torque lags it by 7 to 20 ms. In most runs a person pushes the pendulum outside the windows
 used here: never trained on, and just what the online monitor should notice. Recordings named
 *_closed_loop have a drive with an inner controller and no column of commanded torque; they are refused.
-To use them, name tau_meas_Nm as input in a scenario of your own. What the prior lacks most is an offset of
-the angle: a torque of about -0.03 N m cos(phi) (the zero lies some 0.01 rad from hanging rest) shows in the
-training windows and in the two recordings not trained on alike."""
+To use them, name tau_meas_Nm as input in a scenario of your own."""
 
 WINDOWS: Mapping[str, tuple[Window, ...]] = {
     "energy_shaping_0p9Nm": (

@@ -15,7 +15,7 @@ FRICTION_SPEED = 0.1
 
 
 class TorquePendulumPrior(Prior):
-    r"""``J phi_ddot = k_u u - mgl sin(phi) - d phi_dot - F_c tanh(phi_dot / v_c)``; phi = 0 hangs down.
+    r"""``J phi_ddot = k_u u - mgl sin(phi + phi_0) - d phi_dot - F_c tanh(phi_dot / v_c)``; phi = 0 hangs down.
 
     Motion alone fixes only the ratios of ``J, mgl, d, F_c, k_u``, so ``J`` keeps its data-sheet value and
     the others are fitted relative to it. A fitted ``k_u`` below 1 holds the drive's losses and torque
@@ -39,6 +39,7 @@ class TorquePendulumPrior(Prior):
         Parameter("mgl", 2.98, "N m", 2.0, 4.0, "largest gravity torque"),
         Parameter("d", 0.005, "N m s/rad", 0.0, 0.1, "viscous friction"),
         Parameter("F_c", 0.19, "N m", 0.0, 0.5, "dry friction"),
+        Parameter("phi_0", 0.0, "rad", -0.1, 0.1, "angle of the encoder's zero from hanging down"),
         Parameter("k_u", 1.0, "-", 0.5, 1.2, "true over commanded torque"),
     )
 
@@ -47,6 +48,7 @@ class TorquePendulumPrior(Prior):
     J: Tensor
     F_c: Tensor
     k_u: Tensor
+    phi_0: Tensor
 
     def _losses(self, v: Tensor) -> Tensor:
         return self.d * v + self.F_c * torch.tanh(v / FRICTION_SPEED)
@@ -54,10 +56,10 @@ class TorquePendulumPrior(Prior):
     def acceleration(self, x: Tensor, u: Tensor) -> Tensor:
         """Angular acceleration ``(..., 1)`` [rad/s^2]."""
         phi, v = x[..., 0:1], x[..., 1:2]
-        return (self.k_u * u - self.mgl * torch.sin(phi) - self._losses(v)) / self.J
+        return (self.k_u * u - self.mgl * torch.sin(phi + self.phi_0) - self._losses(v)) / self.J
 
     def energy_balance(self, x: Tensor, xdot: Tensor, u: Tensor) -> Tensor:
         """Power [W] that no term of the prior explains, shape ``(...)``."""
         phi, v, a = x[..., 0], x[..., 1], xdot[..., 1]
-        torque = self.J * a + self.mgl * torch.sin(phi) + self._losses(v) - self.k_u * u[..., 0]
+        torque = self.J * a + self.mgl * torch.sin(phi + self.phi_0) + self._losses(v) - self.k_u * u[..., 0]
         return torque * v

@@ -5,7 +5,7 @@ import pytest
 import torch
 from simulated_pendulum import DT, TRUTH, Pendulum, record
 
-from hybrid_mpc.identification.evaluation import FreeRun, free_runs, score, smoothed_start
+from hybrid_mpc.identification.evaluation import FreeRun, free_runs, score
 from hybrid_mpc.identification.step import PriorStep
 
 
@@ -50,36 +50,19 @@ def test_a_diverging_run_makes_its_figures_infinite():
 
 def test_the_true_model_runs_along_the_measurement():
     prior, run = Pendulum(TRUTH), record(3, seconds=2.0)
-    warm = 25
-    start = smoothed_start(prior, run, warm)
-    # y is exact and the prior true: only the integrator's error (1e-8 a period) is left
-    np.testing.assert_allclose(start, run.x[warm], atol=1e-5)
-    (free,) = free_runs(PriorStep(prior, DT), prior, [run], [start], warm, torch.zeros(0).double())
+    start, warm = 20, 25
+    # x is exact and the prior true: only the integrator's error (1e-8 a period) is left
+    (free,) = free_runs(PriorStep(prior, DT), prior, [run], start, warm, torch.zeros(0).double())
     assert len(free.t) == len(run.t) - warm - 1
+    assert free.t[0] == run.t[warm]
     np.testing.assert_allclose(free.y_hat, free.y, atol=1e-4)
     assert score([free]).energy_violation_w < 1e-3
 
 
-def test_a_start_knows_the_warm_up_alone_and_averages_its_noise():
-    prior, run, warm = Pendulum(TRUTH), record(3, seconds=2.0), 25
-    noise = 1e-3 * np.random.default_rng(0).standard_normal(run.y.shape)
-    noisy = replace(run, y=run.y + noise)
-    start = smoothed_start(prior, noisy, warm)
-    later = replace(noisy, y=noisy.y.copy(), x=noisy.x.copy())
-    later.y[warm + 1 :], later.x[warm + 1 :] = 9.0, 9.0
-    # rounding of the least squares may depend on where in memory its arrays lie
-    np.testing.assert_allclose(smoothed_start(prior, later, warm), start, rtol=0, atol=1e-12)
-    # position, speed and acceleration from 26 samples in 0.5 s: sigma_v = sqrt(192 / 26) / 0.5 = 5.4 sigma
-    assert abs(start[1] - run.x[warm, 1]) < 3 * 5.4 * 1e-3
-
-
-def test_runs_of_different_length_are_each_their_own():
-    prior, warm = Pendulum(), 25
-    runs = [record(1, seconds=1.5), record(2, seconds=2.5)]
-    starts = [run.x[warm] for run in runs]
-    none = torch.zeros(0).double()
-    together = free_runs(PriorStep(prior, DT), prior, runs, starts, warm, none)
-    for run, start, one in zip(runs, starts, together, strict=True):
-        (alone,) = free_runs(PriorStep(prior, DT), prior, [run], [start], warm, none)
-        np.testing.assert_allclose(one.x_hat, alone.x_hat, rtol=0, atol=1e-12)  # rounding of another batch
-        assert len(one.t) == len(run.t) - warm - 1
+def test_a_free_run_knows_nothing_of_the_measurement_after_its_start():
+    prior, run = Pendulum(TRUTH), record(3, seconds=2.0)
+    later = replace(run, x=run.x.copy(), y=run.y.copy())
+    later.x[21:], later.y[21:] = 9.0, 9.0
+    step, h = PriorStep(prior, DT), torch.zeros(0).double()
+    ours, theirs = (free_runs(step, prior, [r], 20, 25, h)[0] for r in (run, later))
+    np.testing.assert_array_equal(ours.x_hat, theirs.x_hat)
