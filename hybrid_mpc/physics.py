@@ -83,7 +83,9 @@ class Prior(nn.Module):
 
     def inertia(self, x: Tensor) -> Tensor | float:
         """Generalised inertia of each velocity [SI], a number or ``(..., n_q)``, for :meth:`energy_balance`."""
-        raise NotImplementedError(f"{type(self).__name__} must define inertia(x), or energy_balance(x, xdot, u)")
+        raise NotImplementedError(
+            f"{type(self).__name__} must define inertia(x), or energy_balance(x, xdot, u)"
+        )
 
     def energy_balance(self, x: Tensor, xdot: Tensor, u: Tensor) -> Tensor:
         """Energy balance ΔE [W], shape ``(...)``: zero along the prior's own flow.

@@ -23,7 +23,18 @@ TORCH = (
     "hybrid_mpc/identification/",
 )
 # rooms that run beside a machine and so must not even import torch lazily
-ONLINE = ("model", "artifact", "riccati", "estimation", "mpc", "monitor", "closed_loop", "analysis", "plots", "report")
+ONLINE = (
+    "model",
+    "artifact",
+    "riccati",
+    "estimation",
+    "mpc",
+    "monitor",
+    "closed_loop",
+    "analysis",
+    "plots",
+    "report",
+)
 
 
 def imports(path, *, at_load):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor, nn
 import nn_export
 from hybrid_mpc.artifact import INPUTS, OUTPUTS, ModelInfo, build_model
 from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.identification.networks import GRUNetwork
 from hybrid_mpc.identification.step import HybridStep, PriorStep
 from hybrid_mpc.physics import Prior
 
@@ -80,12 +82,14 @@ def check_parity(
     examples = _examples(step)
     x, u = (np.concatenate([getattr(t, name) for t in trajectories]) for name in ("x", "u"))
     scale = (np.abs(x).max(0), np.ones(examples["h"].numel()), np.abs(u).max(0))
-    report = nn_export.parity(step, model.step, tuple(examples[i] for i in INPUTS["step"]), seed=seed, scale=scale)
+    report = nn_export.parity(
+        step, model.step, tuple(examples[i] for i in INPUTS["step"]), seed=seed, scale=scale
+    )
     return Parity(report.value_rel, report.jacobian_rel)
 
 
 def _examples(step: HybridStep | PriorStep) -> dict[str, Tensor]:
-    n_h = step.network.hidden if isinstance(step, HybridStep) else 0
+    n_h = 0 if isinstance(step, PriorStep) else cast(GRUNetwork, step.network).hidden
     n_x, n_u = len(step.prior.states), len(step.prior.inputs)
-    shapes = {"x": n_x, "h": int(n_h), "u": n_u, "xdot": n_x}
+    shapes = {"x": n_x, "h": n_h, "u": n_u, "xdot": n_x}
     return {name: torch.zeros(n, dtype=torch.float64) for name, n in shapes.items()}

@@ -46,12 +46,15 @@ def versions() -> dict[str, str]:
 def export_stage(context: Context) -> None:
     """Write the hybrid and the fitted prior as one artifact; measure both against torch."""
     from hybrid_mpc.identification.export import check_parity, model_info, trace_model
-    from hybrid_mpc.identification.step import PriorStep
+    from hybrid_mpc.identification.step import HybridStep, PriorStep
     from hybrid_mpc.pipeline.identify import load_trained
 
     dt, settings = context.spec.dt, context.settings
     phy = context.scenario.prior(context.result("prior")["values"])
-    steps = {"hybrid": load_trained(context, DEPLOYED).step(phy, dt), "prior": PriorStep(phy, dt)}
+    steps: dict[str, HybridStep | PriorStep] = {
+        "hybrid": load_trained(context, DEPLOYED).step(phy, dt),
+        "prior": PriorStep(phy, dt),
+    }
     info = model_info(phy, dt)
     programs, parities = {}, []
     for i, (name, step) in enumerate(steps.items()):

@@ -169,7 +169,9 @@ def _monitor(context: Context) -> Any:
             title=f"closed loop, {load['task']}: an unknown load from {load['start_s']:g} s on",
         )
         unit = context.scenario.prior().inputs[0].unit
-        caption = f"The monitor inside the loop: a constant load of {load['load']:g} {unit} at the input sets in."
+        caption = (
+            f"The monitor inside the loop: a constant load of {load['load']:g} {unit} at the input sets in."
+        )
         yield "monitor", "monitor_load", figure, caption
 
 

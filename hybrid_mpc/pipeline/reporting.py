@@ -137,7 +137,9 @@ def _notes(context: Context, results: dict[str, Any]) -> dict[str, dict[str, tup
         method = results["monitor"]["details"]["calibration"]["method"]
         after["monitor"] = (_monitor_words(context, results), f"Calibration: {method}.")
     points = results["analysis"]["details"]
-    reasons = [f"{m}: {points[m]['fixed_point_reason']}" for m in points if "fixed_point_reason" in _dict(points[m])]
+    reasons = [
+        f"{m}: {points[m]['fixed_point_reason']}" for m in points if "fixed_point_reason" in _dict(points[m])
+    ]
     if reasons:
         after["analysis"] = tuple(reasons)
     return {"instead": instead, "after": after}

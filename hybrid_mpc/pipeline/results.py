@@ -131,7 +131,10 @@ def gap_closed(table: Mapping[str, Mapping[str, Mapping[str, list[float]]]]) -> 
         if gap.mean() > max(2.0 * error, 0.01 * prior.mean()):
             covered, distance = covered + float((prior - hybrid).mean()), distance + float(gap.mean())
     if distance == 0.0:
-        return None, "in no task do prior and oracle differ by more than twice the standard error over the seeds"
+        return (
+            None,
+            "in no task do prior and oracle differ by more than twice the standard error over the seeds",
+        )
     return covered / distance, ""
 
 

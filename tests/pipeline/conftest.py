@@ -20,7 +20,9 @@ def recording(seed: int, seconds: float = 20.0, dt: float = 0.01) -> dict[str, n
     rng = np.random.default_rng(seed)
     n, fine = round(seconds / dt), round(dt / 1e-3)
     t = dt * np.arange(n)
-    u = 0.4 * np.sin(2 * np.pi * rng.uniform(0.2, 0.4) * t) + 0.3 * np.sign(np.sin(2 * np.pi * 0.13 * t + seed))
+    u = 0.4 * np.sin(2 * np.pi * rng.uniform(0.2, 0.4) * t) + 0.3 * np.sign(
+        np.sin(2 * np.pi * 0.13 * t + seed)
+    )
     phi, v, out = 0.2, 0.0, np.zeros(n)
     for k in range(n):
         out[k] = phi

@@ -28,7 +28,10 @@ def call(monkeypatch, capsys):
 def rows(columns):
     """CSV lines of columns."""
     names = list(columns)
-    return [",".join(names), *(",".join(f"{columns[n][k]:.8g}" for n in names) for k in range(len(columns["time_s"])))]
+    return [
+        ",".join(names),
+        *(",".join(f"{columns[n][k]:.8g}" for n in names) for k in range(len(columns["time_s"]))),
+    ]
 
 
 def nan(lines):
@@ -96,7 +99,9 @@ def test_bad_recordings(call, machine, tmp_path, damage, words):
 
 
 def test_missing_file_and_missing_data(call, machine, tmp_path):
-    code, message = call("run", machine / "my_machine.py", "--data", tmp_path / "none.csv", "--out", tmp_path / "o")
+    code, message = call(
+        "run", machine / "my_machine.py", "--data", tmp_path / "none.csv", "--out", tmp_path / "o"
+    )
     assert code == 2
     assert "none.csv" in message
     code, message = call("run", machine / "my_machine.py", "--out", tmp_path / "o")

@@ -43,7 +43,9 @@ def test_the_fitted_prior_beats_the_nominal_one(finished):
     rmse = results(finished)["identification"]["rmse_rad"]
     assert rmse["phy"] < 0.7 * rmse["phy_nominal"]
     fitted = results(finished)["identification"]["details"]["prior_parameters"]["values"]
-    assert fitted["mgl"] == pytest.approx(1.1, rel=0.05)  # dry friction that the prior lacks biases it a little
+    assert fitted["mgl"] == pytest.approx(
+        1.1, rel=0.05
+    )  # dry friction that the prior lacks biases it a little
 
 
 def test_a_machine_without_plant_says_why_it_has_no_closed_loop(finished):
@@ -87,7 +89,11 @@ def test_killed_and_resumed_run_equals_the_finished_one(finished, arguments, tmp
     ("file", "damage", "words"),
     [
         ("model.json", lambda b: b[: len(b) // 2], "damaged"),
-        ("model.json", lambda b: b.replace(b'"schema_version": 1', b'"schema_version": 99'), "schema version"),
+        (
+            "model.json",
+            lambda b: b.replace(b'"schema_version": 1', b'"schema_version": 99'),
+            "schema version",
+        ),
         ("programs.json", lambda b: b[: len(b) // 2], "programs.json"),
         ("weights.safetensors", lambda b: b[:-8], "weights.safetensors"),
         ("weights.safetensors", lambda b: b[:-8] + bytes(8), "weights.safetensors"),
