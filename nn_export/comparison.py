@@ -70,7 +70,7 @@ def parity(
         example_inputs: Tensors that give the shapes.
         n: Number of samples.
         seed: Seed of the samples.
-        scale: Magnitude of each input's normal distribution, a number or an array of the input's shape. Default: 1 for all.
+        scale: Magnitude of each input's normal distribution, a number or an array of its shape. Default: 1 for all.
 
     Returns:
         The largest differences. A value that is not finite on both sides is left out and counted; so is
