@@ -15,6 +15,8 @@ from hybrid_mpc.model import HybridModel
 from hybrid_mpc.riccati import hidden_fixed_point, vector
 
 Array = NDArray[np.float64]
+START_LIMIT = 200
+"""Most periods at rest that the first estimate runs the hidden state through: a loop's first step must not be late."""
 
 # A variance that has grown this much leaves few digits of a covariance: nothing is known any more.
 LOST = 1e12
@@ -139,7 +141,7 @@ class ExtendedKalmanFilter:
             if not np.all(np.isfinite(c_x)) or np.max(np.abs(error)) < 1e-12:
                 break
             x = x + np.linalg.pinv(c_x) @ error
-        h = hidden_fixed_point(model, x, u)
+        h = hidden_fixed_point(model, x, u, limit=START_LIMIT)
         empty = np.full(model.n_y, np.nan)
         return Estimate(float(t), x, h, np.zeros(model.n_u), np.diag(self._first), empty, float("nan"))
 
