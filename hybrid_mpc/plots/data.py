@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from hybrid_mpc.errors import InputError
@@ -133,11 +134,19 @@ def coverage(trajectories: Sequence[Recording], states: Sequence[Signal]) -> Fig
             for piece in (p for p in trajectories if p.role == role):
                 x = checked(f"x of {piece.name}", piece.x, len(piece.t), len(states))
                 width = 2.4 if role == "train" else 1.0
-                ax.plot(x[:, q], x[:, n_q + q], color=colour(role), linewidth=width, label=name_of(role))
+                position = _wrapped(x[:, q]) if states[q].periodic else x[:, q]
+                ax.plot(position, x[:, n_q + q], color=colour(role), linewidth=width, label=name_of(role))
         ax.set_xlabel(axis_label(states[q]))
         ax.set_ylabel(axis_label(states[n_q + q]))
     shared_legend(figure)
     return figure
+
+
+def _wrapped(angle: Array) -> Array:
+    """The angle within half a turn of zero; NaN where it passes from one side to the other, so no line is drawn."""
+    within = (angle + np.pi) % (2.0 * np.pi) - np.pi
+    jumps = np.abs(np.diff(within, append=within[-1:])) > np.pi
+    return np.where(jumps, np.nan, within)
 
 
 def _chosen(trajectories: Sequence[Recording], limit: int) -> dict[str, list[Recording]]:

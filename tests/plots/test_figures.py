@@ -171,3 +171,15 @@ def test_numbers_have_three_digits():
 def test_bad_input_is_refused(draw):
     with pytest.raises(InputError):
         draw()
+
+
+def test_coverage_draws_a_turning_angle_within_half_a_turn_of_zero():
+    t = np.linspace(0.0, 1.0, 200)
+    turning = example.Piece(
+        "a", "train", t, t[:, None], t[:, None], np.column_stack([-12.0 * t, 0 * t - 12.0])
+    )
+    states = (Signal("phi", "rad", periodic=True), Signal("phi_dot", "rad/s"))
+    (line,) = data.coverage([turning], states).axes[0].get_lines()
+    drawn = line.get_xdata()
+    assert np.nanmax(np.abs(drawn)) <= np.pi
+    assert np.isnan(drawn).sum() == 2  # 12 rad pass -pi twice: at 3.1 and at 9.4 rad
