@@ -38,12 +38,13 @@ def control(results: dict[str, Any]) -> list[str]:
 def rest(results: dict[str, Any]) -> list[str]:
     """Export, timing and monitor in a line each."""
     export, timing, monitor = results["export"], results["timing"], results["monitor"]
+    gap = results["control"]["gap_closed"]
     ms, clean = timing["controller_step_ms"], monitor["details"]["clean"]
     return [
         f"Export parity {export['parity_max_abs_error']:.1e}, Jacobians {export['jacobian_max_abs_error']:.1e}. "
         f"Controller step: median {ms['median']:.2f} ms, p99 {ms['p99']:.2f} ms of {timing['period_ms']:g} ms, "
         f"{timing['misses']} misses. Monitor: {len(monitor['alarms'])} alarms in all, {clean['alarms']} in "
-        f"{clean['seconds']:.0f} s of clean data. Gap closed: {results['control']['gap_closed']}."
+        f"{clean['seconds']:.0f} s of clean data. Gap closed: {'undefined' if gap is None else f'{gap:.3f}'}."
     ]
 
 
