@@ -17,7 +17,7 @@ from hybrid_mpc.riccati import hidden_fixed_point, vector
 Array = NDArray[np.float64]
 START_LIMIT = 25
 """Most periods at rest that the first estimate runs the hidden state through: as many as training warms it up on.
-Longer leads a network where it was never trained, and makes a loop's first step late."""
+Longer makes a loop's first step late. Closed loops with a network depend on it (docs/results/README.md)."""
 
 # A variance that has grown this much leaves few digits of a covariance: nothing is known any more.
 LOST = 1e12
