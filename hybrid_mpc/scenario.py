@@ -71,11 +71,16 @@ class DataSpec:
         outputs: CSV columns of the measured positions, in the order of the prior's outputs.
         dt: Model period [s]; declaring it is the request to resample to it.
         max_gap: Longest distance [s] between two samples; a run is cut where it is exceeded.
-        smoothing: Length [s] of the local polynomial that smooths and differentiates the positions.
+        smoothing: Length [s] of the local polynomial that first smooths and differentiates the positions; the
+            prior is fitted to that, then smooths them once more by its own equations.
         warm_up: Measured past [s] that starts every free run: x(0) is smoothed from it, h warmed up on
             it, and none of it is scored.
         windows: Known windows by file stem. A recording that is not named here is split by ``fractions``.
         fractions: Shares of training, validation and test samples, in this order of time.
+        free_run: Length [s] of the free runs that judge a model, started every fifth of it. Default: each
+            test trajectory as a whole. Where an unstable point multiplies every error, short runs from many
+            starts say more than one long one.
+        inputs_of: Input columns of single recordings, by file stem, where they differ from ``inputs``.
 
     Raises:
         InputError: If a length is not positive or the fractions do not sum to one.
@@ -90,11 +95,17 @@ class DataSpec:
     warm_up: float
     windows: Mapping[str, tuple[Window, ...]] = field(default_factory=dict)
     fractions: tuple[float, float, float] = (0.6, 0.2, 0.2)
+    free_run: float | None = None
+    inputs_of: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in ("dt", "max_gap", "smoothing", "warm_up"):
             if not getattr(self, name) > 0:
                 raise InputError(f"data specification: {name} must be positive, got {getattr(self, name)}")
+        if self.free_run is not None and not self.free_run > 0:
+            raise InputError(
+                f"data specification: free_run must be positive or left out, got {self.free_run}"
+            )
         if abs(sum(self.fractions) - 1.0) > 1e-9 or min(self.fractions) < 0:
             raise InputError(f"data specification: fractions must sum to 1, got {self.fractions}")
 
@@ -153,6 +164,8 @@ class Budget:
         teacher_steps: Optimiser steps with teacher forcing.
         free_run_steps: Optimiser steps on free runs.
         seeds: Closed loops per task and controller.
+        decay: Weight decay times the number of training samples. The less data, the more of it is needed to
+            keep a network from learning their noise; large recordings do not notice the default.
     """
 
     hidden: int
@@ -160,6 +173,7 @@ class Budget:
     teacher_steps: int
     free_run_steps: int
     seeds: int
+    decay: float = 300.0
 
 
 DEFAULT_BUDGETS: Mapping[str, Budget] = {

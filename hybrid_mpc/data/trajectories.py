@@ -131,7 +131,11 @@ def load_trajectories(
     if not paths:
         raise InputError("no recordings given; name at least one CSV file with --data")
     _check_windows(spec)
-    tables = [read_csv(path, spec, outputs=outputs, inputs=inputs) for path in paths]
+    tables = [
+        read_csv(path, replace(spec, inputs=spec.inputs_of.get(Path(path).stem, spec.inputs)),
+                 outputs=outputs, inputs=inputs)
+        for path in paths
+    ]  # fmt: skip
     stems = [table.name for table in tables]
     if len(set(stems)) < len(stems):
         raise InputError(

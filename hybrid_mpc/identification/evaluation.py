@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -11,9 +11,12 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.identification.smoothing import Smoother
 from hybrid_mpc.physics import Prior
 
 Array = NDArray[np.float64]
+STARTS = 5
+"""Starts of short free runs within the length of one."""
 
 
 @dataclass(frozen=True)
@@ -69,21 +72,45 @@ class Scores:
     amplitude_ratio: float
 
 
+def judged(
+    trajectories: Sequence[Trajectory], smoother: Smoother, warm: int, length: float | None = None
+) -> list[Trajectory]:
+    """The runs that judge a model: what is known at their start was smoothed from their warm-up alone.
+
+    Args:
+        trajectories: Test trajectories, smoothed as a whole (what the models' rates are compared with).
+        smoother: Smoother of the warm-ups; the same for every model.
+        warm: Samples of the warm-up.
+        length: Length [s] of a run after its warm-up; one starts every fifth of it. A trajectory that is
+            shorter is one run. Default: every trajectory is one run.
+
+    Returns:
+        Runs whose first ``warm + 1`` states know the measurements up to sample ``warm`` and none after it.
+    """
+    pieces = []
+    for t in trajectories:
+        n = len(t.t) if length is None else min(len(t.t), warm + round(length / t.dt) + 1)
+        stride = len(t.t) if length is None else max(1, round(length / t.dt / STARTS))
+        pieces += [_samples(t, slice(a, a + n)) for a in range(0, len(t.t) - n + 1, stride)]
+    starts = smoother.smooth([_samples(t, slice(0, warm + 1)) for t in pieces])
+    return [
+        replace(t, x=np.vstack([s.x, t.x[warm + 1 :]]), xdot=np.vstack([s.xdot, t.xdot[warm + 1 :]]))
+        for t, s in zip(pieces, starts, strict=True)
+    ]
+
+
 def free_runs(
-    step: nn.Module, prior: Prior, trajectories: Sequence[Trajectory], start: int, warm: int, h0: Tensor
+    step: nn.Module, prior: Prior, trajectories: Sequence[Trajectory], warm: int, h0: Tensor
 ) -> list[FreeRun]:
     """Free runs of one step over trajectories; the warm-up is measured and not scored.
 
-    The run leaves the measurement at sample ``start``, half a smoothing length before the warm-up ends:
-    there the smoothed state knows the warm-up on both sides and nothing after it. It is the same for every
-    model. h is warmed up on the samples before it; scores begin at sample ``warm``.
+    h is warmed up on the samples before ``warm``; there the run leaves the measurement.
 
     Args:
         step: ``(x, h, u) -> (x_next, h_next)``, one network, any batch.
         prior: The prior whose energy balance judges (the fitted one).
-        trajectories: The runs; they may differ in length.
-        start: Sample at which the free run starts.
-        warm: Samples of the warm-up, at least ``start``.
+        trajectories: The runs (see :func:`judged`); they may differ in length.
+        warm: Samples of the warm-up.
         h0: Hidden state before the warm-up ``(n_h,)``.
     """
     longest = max(len(t.t) for t in trajectories)
@@ -93,14 +120,14 @@ def free_runs(
     )
     with torch.no_grad():
         h = h0.expand(len(trajectories), -1)
-        for k in range(start):
+        for k in range(warm):
             _, h = step(x_all[:, k], h, u_all[:, k])
-        x, states = x_all[:, start], []
-        for k in range(start, longest):
+        x, states = x_all[:, warm], []
+        for k in range(warm, longest):
             states.append(x)
             x, h = step(x, h, u_all[:, k])
         states.append(x)
-    x_hat = torch.stack(states, 1).numpy()[:, warm - start :]
+    x_hat = torch.stack(states, 1).numpy()
     return [_free_run(prior, t, x_hat[i], warm) for i, t in enumerate(trajectories)]
 
 
@@ -151,6 +178,11 @@ def _free_run(prior: Prior, trajectory: Trajectory, x_hat: Array, warm: int) -> 
         measured,
         model,
     )
+
+
+def _samples(trajectory: Trajectory, keep: slice) -> Trajectory:
+    arrays = {key: getattr(trajectory, key)[keep] for key in ("t", "u", "y", "x", "xdot")}
+    return replace(trajectory, **arrays)
 
 
 def _pad(values: Array, length: int) -> Array:

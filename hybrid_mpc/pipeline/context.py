@@ -70,11 +70,11 @@ class Context:
 
     @property
     def spec(self) -> DataSpec:
-        """The scenario's data specification with the user's columns."""
+        """The scenario's data specification with the user's columns, which hold for every file."""
         s, spec = self.settings, self.scenario.data
-        return replace(
-            spec, time=s.time or spec.time, inputs=s.inputs or spec.inputs, outputs=s.outputs or spec.outputs
-        )
+        if s.inputs:
+            spec = replace(spec, inputs=s.inputs, inputs_of={})
+        return replace(spec, time=s.time or spec.time, outputs=s.outputs or spec.outputs)
 
     @property
     def warm(self) -> int:
@@ -91,6 +91,14 @@ class Context:
     def trajectories(self, role: str) -> list[Trajectory]:
         """Trajectories of one role."""
         return [t for t in self.dataset.trajectories if t.role == role]
+
+    def smoothed(self, role: str) -> list[Trajectory]:
+        """Trajectories of one role with the states that the fitted prior's equations smooth them to."""
+        arrays = self.arrays("prior")
+        return [
+            replace(t, x=arrays[f"{t.name}/x"], xdot=arrays[f"{t.name}/xdot"])
+            for t in self.trajectories(role)
+        ]
 
     def save(self, stage: str, result: Mapping[str, Any], arrays: Mapping[str, Any] | None = None) -> None:
         """Keep a stage's result; its JSON is written last and means that the stage is done."""

@@ -61,7 +61,7 @@ def export_stage(context: Context) -> None:
         context.progress.update("models", i, len(steps), name)
         programs[name] = trace_model(step)
         parities.append(
-            check_parity(step, programs[name], info, context.trajectories("train"), seed=settings.seed)
+            check_parity(step, programs[name], info, context.smoothed("train"), seed=settings.seed)
         )
     provenance = {
         "scenario": context.scenario.name,
@@ -85,7 +85,7 @@ def export_stage(context: Context) -> None:
 def control_stage(context: Context) -> None:
     """Closed loops of every task with prior, hybrid and oracle; or only timing where there is no plant."""
     artifact, control = load_artifact(context.out / "model"), context.scenario.control
-    noise = {name: process_noise(m, context.trajectories("train")) for name, m in artifact.models.items()}
+    noise = {name: process_noise(m, context.smoothed("train")) for name, m in artifact.models.items()}
     if control is None:
         reason = f"scenario {context.scenario.name} defines no control problem"
         context.save("control", {"reason": reason, "sigma_x": noise}, {})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -18,9 +17,12 @@ from hybrid_mpc.scenario import load_scenario
 
 if TYPE_CHECKING:
     from hybrid_mpc.data.trajectories import Trajectory
+    from hybrid_mpc.identification.evaluation import FreeRun
     from hybrid_mpc.identification.training import Trained, TrainingSettings
     from hybrid_mpc.physics import Prior
 
+ROUNDS = 2
+"""Fits of the prior: to polynomially smoothed states, then to those that it smoothed itself."""
 MODELS = ("phy_nominal", "phy", "rnn", "pgrnn", "mopgrnn")
 
 
@@ -56,19 +58,32 @@ def data_stage(context: Context) -> None:
 
 
 def prior_stage(context: Context) -> None:
-    """Fit the prior's parameters."""
+    """Fit the prior's parameters, let it smooth the measurements, fit it to these, smooth once more."""
     from hybrid_mpc.identification.prior_fit import fit_prior
+    from hybrid_mpc.identification.smoothing import fit_smoother
 
-    fit = fit_prior(
-        context.scenario.prior,
-        context.trajectories("train"),
-        context.trajectories("valid"),
-        dt=context.spec.dt,
-        on_progress=lambda done, total, text: context.progress.update("prior", done, total, text),
-    )
-    nominal = context.scenario.prior().values
-    units = {p.name: p.unit for p in context.scenario.prior().parameters_spec}
-    context.save("prior", {**asdict(fit), "nominal": nominal, "units": units})
+    make, dt = context.scenario.prior, context.spec.dt
+    train, valid = context.trajectories("train"), context.trajectories("valid")
+    for i in range(ROUNDS):
+        fit = fit_prior(
+            make, train, valid, dt=dt,
+            on_progress=lambda done, total, text, i=i: context.progress.update(  # type: ignore[misc]
+                "prior", done + i * total, ROUNDS * total, text
+            ),
+        )  # fmt: skip
+        smoother = fit_smoother(make(fit.values), [*train, *valid], dt)
+        train, valid = smoother.smooth(train), smoother.smooth(valid)
+    arrays = {
+        f"{t.name}/{key}": getattr(t, key)
+        for t in (*train, *valid, *smoother.smooth(context.trajectories("test")))
+        for key in ("x", "xdot")
+    }
+    notes = {
+        "nominal": make().values,
+        "units": {p.name: p.unit for p in make().parameters_spec},
+        "smoother": {"sigma": smoother.sigma, "walk": smoother.walk},
+    }
+    context.save("prior", {**asdict(fit), **notes}, arrays)
 
 
 def training_stage(context: Context) -> None:
@@ -81,7 +96,7 @@ def training_stage(context: Context) -> None:
     jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
         kind: (
             _train_kind,
-            (context.settings.scenario, values, context.trajectories("train"), context.trajectories("valid"),
+            (context.settings.scenario, values, context.smoothed("train"), context.smoothed("valid"),
              _settings(context, kind), folder),
         )
         for kind in todo
@@ -118,27 +133,40 @@ def load_trained(context: Context, kind: str) -> Trained:
 
 
 def evaluation_stage(context: Context) -> None:
-    """Free runs of every model over the test trajectories."""
-    from hybrid_mpc.identification.evaluation import free_runs, score
+    """Free runs of every model over the test trajectories; the figures show them whole."""
+    from hybrid_mpc.identification.evaluation import free_runs, judged, score
+    from hybrid_mpc.identification.smoothing import Smoother
 
-    test = context.trajectories("test")
-    phy = context.scenario.prior(context.result("prior")["values"])
-    start = max(0, context.warm - math.ceil(0.5 * context.spec.smoothing / context.spec.dt))
+    prior, spec = context.result("prior"), context.spec
+    phy = context.scenario.prior(prior["values"])
+    smoother = Smoother(phy, spec.dt, tuple(prior["smoother"]["sigma"]), tuple(prior["smoother"]["walk"]))
+    whole = context.smoothed("test")
+    shown, test = (judged(whole, smoother, context.warm, length) for length in (None, spec.free_run))
     scores: dict[str, Any] = {}
+    files: dict[str, Any] = {}
     arrays: dict[str, Any] = {}
     for i, name in enumerate(MODELS):
         context.progress.update("models", i, len(MODELS), name)
         members = _members(context, name, phy)
         all_scores = []
         for k, (step, h0) in enumerate(members):
-            runs = free_runs(step, phy, test, start, context.warm, h0)
+            runs = free_runs(step, phy, test, context.warm, h0)
             all_scores.append(asdict(score(runs)))
             if k == 0:
-                for run in runs:
+                files[name] = {f: asdict(score(part)) for f, part in _by_file(runs).items()}
+                for run in free_runs(step, phy, shown, context.warm, h0):
                     for key in ("t", "u", "x", "x_hat", "y", "energy_measured_w", "energy_model_w"):
                         arrays[f"{name}/{run.name}/{key}"] = getattr(run, key)
         scores[name] = {"best": all_scores[0], "networks": all_scores}
-    context.save("evaluation", {"scores": scores, "runs": [t.name for t in test]}, arrays)
+    context.save("evaluation", {"scores": scores, "by_file": files, "runs": [t.name for t in whole]}, arrays)
+
+
+def _by_file(runs: Sequence[FreeRun]) -> dict[str, list[FreeRun]]:
+    """Free runs by the stem of the recording they come from."""
+    files: dict[str, list[FreeRun]] = {}
+    for run in runs:
+        files.setdefault(run.name.split("#")[0], []).append(run)
+    return files
 
 
 def _members(context: Context, name: str, phy: Prior) -> list[tuple[Any, Any]]:
@@ -170,6 +198,7 @@ def _settings(context: Context, kind: str) -> TrainingSettings:
         free_run_steps=b.free_run_steps,
         seed=context.settings.seed,
         warm=context.warm,
+        decay=b.decay,
     )
 
 

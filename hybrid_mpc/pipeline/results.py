@@ -57,11 +57,20 @@ def _identification(context: Context) -> dict[str, Any]:
             k: prior[k] for k in ("values", "standard_errors", "nominal", "warnings", "stages")
         },
         "scores_of_all_networks": {name: scores[name]["networks"] for name in MODELS},
+        "by_file": {
+            stem: {m: _finite(context.result("evaluation")["by_file"][m][stem]["rmse_rad"]) for m in MODELS}
+            for stem in context.result("evaluation")["by_file"]["phy"]
+        },
+        "smoother": prior["smoother"],
         "hybrid_over_phy": {
             key: _ratio(figures[key]["mopgrnn"], figures[key]["phy"]) for key in ("e_sim_s", "rmse_rad")
         },
     }
     return {**figures, "details": details}
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(float(value)) else None
 
 
 def _ratio(value: float | None, baseline: float | None) -> float | None:

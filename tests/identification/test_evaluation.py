@@ -5,7 +5,8 @@ import pytest
 import torch
 from simulated_pendulum import DT, TRUTH, Pendulum, record
 
-from hybrid_mpc.identification.evaluation import FreeRun, free_runs, score
+from hybrid_mpc.identification.evaluation import FreeRun, free_runs, judged, score
+from hybrid_mpc.identification.smoothing import Smoother
 from hybrid_mpc.identification.step import PriorStep
 
 
@@ -49,20 +50,31 @@ def test_a_diverging_run_makes_its_figures_infinite():
 
 
 def test_the_true_model_runs_along_the_measurement():
-    prior, run = Pendulum(TRUTH), record(3, seconds=2.0)
-    start, warm = 20, 25
+    prior, run, warm = Pendulum(TRUTH), record(3, seconds=2.0), 25
     # x is exact and the prior true: only the integrator's error (1e-8 a period) is left
-    (free,) = free_runs(PriorStep(prior, DT), prior, [run], start, warm, torch.zeros(0).double())
+    (free,) = free_runs(PriorStep(prior, DT), prior, [run], warm, torch.zeros(0).double())
     assert len(free.t) == len(run.t) - warm - 1
     assert free.t[0] == run.t[warm]
     np.testing.assert_allclose(free.y_hat, free.y, atol=1e-4)
     assert score([free]).energy_violation_w < 1e-3
 
 
+def test_short_runs_start_every_fifth_of_their_length():
+    run, warm = record(3, seconds=2.0), 25
+    smoother = Smoother(Pendulum(TRUTH), DT, (1e-3,), (0.1,))
+    pieces = judged([run], smoother, warm, 0.5)
+    # 100 samples; 25 of warm-up, 25 periods of the run; a start every 5 samples
+    assert [p.t[0] for p in pieces] == pytest.approx(run.t[0 : 100 - 50 : 5])
+    assert {len(p.t) for p in pieces} == {51}
+    assert len(judged([run], smoother, warm)) == 1
+
+
 def test_a_free_run_knows_nothing_of_the_measurement_after_its_start():
-    prior, run = Pendulum(TRUTH), record(3, seconds=2.0)
+    prior, run, warm = Pendulum(TRUTH), record(3, seconds=2.0), 25
     later = replace(run, x=run.x.copy(), y=run.y.copy())
-    later.x[21:], later.y[21:] = 9.0, 9.0
+    later.x[warm + 1 :], later.y[warm + 1 :] = 9.0, 9.0
     step, h = PriorStep(prior, DT), torch.zeros(0).double()
-    ours, theirs = (free_runs(step, prior, [r], 20, 25, h)[0] for r in (run, later))
+    smoother = Smoother(prior, DT, (1e-3,), (0.1,))
+    ours, theirs = (free_runs(step, prior, judged([r], smoother, warm), warm, h)[0] for r in (run, later))
     np.testing.assert_array_equal(ours.x_hat, theirs.x_hat)
+    assert not np.array_equal(ours.x, theirs.x)  # what it is compared with does know
