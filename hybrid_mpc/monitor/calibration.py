@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -29,9 +29,11 @@ class Calibration:
         hours: Their duration [h].
         method: How the threshold was found.
         data_hash: Hash of the nominal data.
+        residual_threshold: Residual level [N m or N] above which the alarm starts too. Default: never.
+        residual_release: Residual level [N m or N] below which that ends.
 
     Raises:
-        InputError: If ``0 < release_w <= threshold_w`` does not hold.
+        InputError: If ``0 < release_w <= threshold_w`` does not hold, or not so for the residual.
 
     Example:
         >>> c = Calibration(0.2, 0.1, 1.0, 1000, 0.1, "by hand")
@@ -46,8 +48,16 @@ class Calibration:
     hours: float
     method: str
     data_hash: str = ""
+    residual_threshold: float | None = None
+    residual_release: float | None = None
 
     def __post_init__(self) -> None:
+        residual = self.residual_release, self.residual_threshold
+        if residual != (None, None) and not (None not in residual and 0 < residual[0] <= residual[1]):  # type: ignore[operator]
+            raise InputError(
+                "calibration: need 0 < residual_release <= residual_threshold, or neither; got "
+                f"{residual[0]} and {residual[1]}"
+            )
         if not 0 < self.release_w <= self.threshold_w:
             raise InputError(
                 "calibration: need 0 < release_w <= threshold_w [W], "
@@ -128,6 +138,26 @@ def calibrate(
     hours = finite.size * dt / 3600.0
     method = f"Gumbel tail of maxima in blocks of {BLOCK_S:g} s (L-moments), {maxima.size} blocks"
     return Calibration(threshold, release, false_alarms_per_hour, finite.size, hours, method, data_hash)
+
+
+def with_residual(power: Calibration, residual: Calibration) -> Calibration:
+    """One calibration of both alarms; either may raise a false one, so their wanted rates add up.
+
+    Args:
+        power: Calibration on the levels of the violation.
+        residual: Calibration on the levels of the residual force; its thresholds are in N m or N.
+
+    Example:
+        >>> c = with_residual(Calibration(0.2, 0.1, 0.5, 9, 0.1, ""), Calibration(3.0, 2.0, 0.5, 9, 0.1, ""))
+        >>> c.threshold_w, c.residual_threshold, c.false_alarms_per_hour
+        (0.2, 3.0, 1.0)
+    """
+    return replace(
+        power,
+        false_alarms_per_hour=power.false_alarms_per_hour + residual.false_alarms_per_hour,
+        residual_threshold=residual.threshold_w,
+        residual_release=residual.release_w,
+    )
 
 
 def count_alarms(alarm: Array | NDArray[np.bool_], dt: float) -> tuple[int, float]:

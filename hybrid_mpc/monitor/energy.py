@@ -37,14 +37,16 @@ class MonitorState:
         x: Estimated state ``(n_x,)`` at the latest sample.
         h: Hidden state ``(n_h,)`` at the latest sample.
         violations: The latest ``average`` violations [W]; NaN where there was none.
-        alarm: True while the alarm is on.
+        residuals: The latest ``average`` residual forces ``(average, n_q)``; NaN where there was none.
+        alarms: True while the alarm on the violation, and the one on the residual force, is on.
     """
 
     memory: Array
     x: Array
     h: Array
     violations: Array
-    alarm: bool
+    residuals: Array
+    alarms: tuple[bool, bool]
 
 
 @dataclass(frozen=True)
@@ -56,13 +58,18 @@ class MonitorReading:
         dE_measured_w: Energy balance [W] with the measured acceleration, at the same state.
         violation_w: ``|dE_model_w - dE_measured_w|`` [W].
         level_w: Mean violation [W] over the last ``average`` samples.
-        alarm: True while the alarm is on; always False without a calibration.
+        residual: Force that the model does not explain ``(n_q,)`` [N m for an angle, N for a length]; what
+            sticking friction may hold is taken off near rest.
+        residual_level: Length of the mean residual over the last ``average`` samples.
+        alarm: True while either alarm is on; always False without a calibration.
     """
 
     dE_model_w: float
     dE_measured_w: float
     violation_w: float
     level_w: float
+    residual: Array
+    residual_level: float
     alarm: bool
 
 
@@ -81,8 +88,13 @@ class EnergyMonitor:
     Both balances take the state ``[q, v]`` of the cubic and the input averaged with ``K``. At equal state
     the other terms cancel: the violation is ``J |v| |a_model - a_measured|`` (one degree of freedom), where
     ``a_model`` is a mean over each period's own step, so a model error acts as it would in a prediction.
-    Blind spot: at rest it is zero, whatever the torques do. The other terms of each single balance are
-    taken at the centre, not averaged.
+    The other terms of each single balance are taken at the centre, not averaged.
+
+    At rest the violation is zero, whatever the forces do. Beside it stands the residual force
+    ``M (a_measured - a_model)`` with the inertia ``M`` that the energy balance holds. Near rest friction may
+    be anything up to ``F``, half the jump of the model's acceleration times ``M`` between ``-rest_speed``
+    and ``rest_speed``: only what exceeds this dead band counts there; it closes linearly up to twice the
+    speed. So a hand that holds the machine still shows, and sticking friction does not.
 
     A missing (NaN) measurement gives NaN readings until it has left the window. The level is the mean of
     the finite ones of the last ``average`` violations, NaN (and no alarm) while fewer than half are finite.
@@ -93,6 +105,7 @@ class EnergyMonitor:
         window: Samples in the local polynomial, odd, at least 5.
         average: Samples in the moving average of the level.
         calibration: Thresholds of the alarm. Default: none, then there is no alarm.
+        rest_speed: Speed [unit of v] below which friction may stick. Default 0.2.
 
     Raises:
         InputError: If the window or average is unfit, or the outputs are not the positions.
@@ -115,16 +128,22 @@ class EnergyMonitor:
     """
 
     def __init__(
-        self, model: HybridModel, *, window: int, average: int, calibration: Calibration | None = None
+        self,
+        model: HybridModel,
+        *,
+        window: int,
+        average: int,
+        calibration: Calibration | None = None,
+        rest_speed: float = 0.2,
     ) -> None:
-        _check(model, window, average)
+        _check(model, window, average, rest_speed)
         self.model = model
         self.window = window
         self.average = average
         self.calibration = calibration
-        self._function = _reading_function(model, window)
+        self._function = _reading_function(model, window, rest_speed)
         sizes_in = [self._function.size1_in(i) for i in range(5)]
-        sizes_out = [self._function.size1_out(i) for i in range(2)]
+        sizes_out = [self._function.size1_out(i) for i in range(3)]
         self._ins = [np.zeros(n) for n in sizes_in]
         self._outs = [np.zeros(n) for n in sizes_out]
         buffer: Any
@@ -148,7 +167,8 @@ class EnergyMonitor:
             np.full(model.n_x, np.nan),
             np.full(model.n_h, np.nan),
             np.full(self.average, np.nan),
-            False,
+            np.full((self.average, model.n_x // 2), np.nan),
+            (False, False),
         )
 
     def update(
@@ -181,27 +201,40 @@ class EnergyMonitor:
         for target, value in zip(ins, (state.memory, state.x, state.h, u_prev, y), strict=True):
             target[:] = value.reshape(-1)
         self._evaluate()
-        memory, (de_model, de_measured) = self._outs[0].copy(), self._outs[1].tolist()
-        violation = abs(de_model - de_measured)
-        violations = np.empty_like(state.violations)
-        violations[:-1], violations[-1] = state.violations[1:], violation
-        level = _mean_of_finite(violations)
-        alarm = self._alarm(level, state.alarm)
-        following = MonitorState(memory, x.reshape(-1), h.reshape(-1), violations, alarm)
-        return following, MonitorReading(de_model, de_measured, violation, level, alarm)
+        memory, (de_model, de_measured), residual = (out.copy() for out in self._outs)
+        violation = abs(float(de_model - de_measured))
+        violations, residuals = _push(state.violations, violation), _push(state.residuals, residual)
+        level = float(_mean_of_finite(violations))
+        residual_level = float(np.linalg.norm(_mean_of_finite(residuals)))
+        alarms = self._alarms(level, residual_level, state.alarms)
+        following = MonitorState(memory, x.reshape(-1), h.reshape(-1), violations, residuals, alarms)
+        return following, MonitorReading(
+            float(de_model), float(de_measured), violation, level, residual, residual_level, any(alarms)
+        )
 
-    def _alarm(self, level: float, was_on: bool) -> bool:
-        if self.calibration is None:
-            return False
-        return bool(level > (self.calibration.release_w if was_on else self.calibration.threshold_w))
+    def _alarms(self, level: float, residual_level: float, were_on: tuple[bool, bool]) -> tuple[bool, bool]:
+        c = self.calibration
+        if c is None:
+            return False, False
+        power = level > (c.release_w if were_on[0] else c.threshold_w)
+        if c.residual_threshold is None or c.residual_release is None:
+            return power, False
+        return power, residual_level > (c.residual_release if were_on[1] else c.residual_threshold)
 
 
-def _mean_of_finite(values: Array) -> float:
-    total = float(values.sum())
-    if np.isfinite(total):
-        return total / values.size
-    finite = values[np.isfinite(values)]
-    return float(finite.mean()) if finite.size and 2 * finite.size >= values.size else float("nan")
+def _push(values: Array, latest: Any) -> Array:
+    following = np.empty_like(values)
+    following[:-1], following[-1] = values[1:], latest
+    return following
+
+
+def _mean_of_finite(values: Array) -> Any:
+    """Mean along the first axis of the rows without NaN; NaN where fewer than half are."""
+    total = values.sum(axis=0)
+    if np.isfinite(total).all():
+        return total / len(values)
+    finite = values[np.isfinite(values.reshape(len(values), -1)).all(axis=1)]
+    return finite.mean(axis=0) if len(finite) and 2 * len(finite) >= len(values) else total * np.nan
 
 
 def _weights(window: int, dt: float) -> tuple[Array, Array, Array, Array, Array]:
@@ -214,8 +247,34 @@ def _weights(window: int, dt: float) -> tuple[Array, Array, Array, Array, Array]
     return position, velocity, acceleration, kernel, np.diff(kernel) / dt
 
 
-def _reading_function(model: HybridModel, window: int) -> ca.Function:
-    """``(memory, x_prev, h_prev, u_prev, y) -> (memory_next, [dE_model, dE_measured])``."""
+def _inertia(model: HybridModel, x: ca.MX, u: ca.MX) -> ca.MX:
+    """Inertia matrix ``M(q)`` of the energy balance, which is ``v' M a`` plus terms without ``a``."""
+    n_q = model.n_x // 2
+    a, rows = ca.MX.sym("a", n_q), []
+    for i in range(n_q):
+        v = ca.DM.zeros(n_q)
+        v[i] = 1.0
+        state, rate = ca.vertcat(x[:n_q], v), ca.vertcat(v, a)
+        rows.append(ca.jacobian(model.energy_balance(state, rate, u), a))
+    return ca.graph_substitute(ca.vertcat(*rows), [a], [ca.MX.zeros(n_q)])
+
+
+def _residual(
+    model: HybridModel, a_measured: ca.MX, a_model: ca.MX, x: ca.MX, h: ca.MX, u: ca.MX, rest_speed: float
+) -> ca.MX:
+    """Force ``(n_q,)`` that the model does not explain; near rest, what friction could not hold either."""
+    n_q = model.n_x // 2
+    inertia, speed = _inertia(model, x, u), rest_speed * ca.DM.ones(n_q)
+    back, forth = (model.xdot(ca.vertcat(x[:n_q], s), h, u)[n_q:] for s in (-speed, speed))
+    friction = ca.fmax(0, 0.5 * inertia @ (back - forth))
+    held = inertia @ (a_measured - 0.5 * (back + forth))  # friction of either direction taken out
+    held = ca.sign(held) * ca.fmax(0, ca.fabs(held) - friction)
+    near = ca.fmax(0, ca.fmin(1, 2 - ca.fabs(x[n_q:]) / rest_speed))
+    return near * held + (1 - near) * (inertia @ (a_measured - a_model))
+
+
+def _reading_function(model: HybridModel, window: int, rest_speed: float) -> ca.Function:
+    """``(memory, x_prev, h_prev, u_prev, y) -> (memory_next, [dE_model, dE_measured], residual)``."""
     n_q, n_u, dt = model.n_x // 2, model.n_u, model.dt
     position, velocity, acceleration, kernel, slope = _weights(window, dt)
     row = 2 * n_q + n_u
@@ -235,11 +294,14 @@ def _reading_function(model: HybridModel, window: int) -> ca.Function:
     u_mean = row_grid[2 * n_q :, :] @ ca.DM(0.5 * dt * (kernel[:-1] + kernel[1:]))
     state = ca.vertcat(q + y, v)
     balances = [model.energy_balance(state, ca.vertcat(v, a), u_mean) for a in (a_model, a_measured)]
-    outs = [ca.vertcat(ys, rows), ca.vertcat(*balances)]
+    residual = _residual(model, a_measured, a_model, state, h, u_mean, rest_speed)
+    outs = [ca.vertcat(ys, rows), ca.vertcat(*balances), residual]
     return ca.Function("monitor", [memory, x, h, u, y], [ca.densify(out) for out in outs])
 
 
-def _check(model: HybridModel, window: int, average: int) -> None:
+def _check(model: HybridModel, window: int, average: int, rest_speed: float) -> None:
+    if not rest_speed > 0:
+        raise InputError(f"energy monitor: rest_speed must be positive, got {rest_speed}")
     if window < 5 or window % 2 == 0:
         raise InputError(f"energy monitor: window must be an odd number of at least 5 samples, got {window}")
     if average < 1:

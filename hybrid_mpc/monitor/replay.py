@@ -47,7 +47,7 @@ class MonitorTrace:
 
     Example:
         >>> z = np.zeros(3)
-        >>> MonitorTrace(np.arange(3.0), z, z, z, z, np.array([False, True, True])).intervals()
+        >>> MonitorTrace(np.arange(3.0), z, z, z, z, z, np.array([False, True, True])).intervals()
         [(1.0, 2.0)]
     """
 
@@ -56,6 +56,7 @@ class MonitorTrace:
     dE_measured_w: Array
     violation_w: Array
     level_w: Array
+    residual_level: Array
     alarm: NDArray[np.bool_]
 
     def intervals(self) -> list[tuple[float, float]]:
@@ -86,9 +87,10 @@ def replay(monitor: EnergyMonitor, estimator: EstimatorLike, trajectory: Traject
         if k:
             estimate = estimator.update(estimate, y[k], u_prev)
         state, r = monitor.update(state, y[k], u_prev, estimate)
-        readings.append((r.dE_model_w, r.dE_measured_w, r.violation_w, r.level_w, r.alarm))
+        readings.append((r.dE_model_w, r.dE_measured_w, r.violation_w, r.level_w, r.residual_level, r.alarm))
     columns = np.array(readings, dtype=np.float64).T
-    return MonitorTrace(t, columns[0], columns[1], columns[2], columns[3], columns[4].astype(bool))
+    balances, levels = (columns[0], columns[1]), (columns[2], columns[3], columns[4])
+    return MonitorTrace(t, *balances, *levels, columns[5].astype(bool))
 
 
 def _check(t: Array, y: Array, u: Array, dt: float) -> None:

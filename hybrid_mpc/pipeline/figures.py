@@ -139,8 +139,10 @@ def _monitor(context: Context) -> Any:
     if "reason" in result:
         return
     arrays, output = context.arrays("monitor"), context.scenario.prior().outputs[0]
+    unit = "N m" if output.unit == "rad" else "N"
     for recording in _worth_showing(context):
-        own = {k: arrays[f"{recording.name}/{k}"] for k in ("t", "violation_w", "level_w", "alarm", "y")}
+        keys = ("t", "violation_w", "level_w", "residual_level", "alarm", "y")
+        own = {k: arrays[f"{recording.name}/{k}"] for k in keys}
         figure = monitor.trace(
             own["t"],
             own["violation_w"],
@@ -150,6 +152,7 @@ def _monitor(context: Context) -> Any:
             own["y"],
             output=output,
             windows=clean_windows(context, recording, ("train", "valid", "test", "nominal")),
+            residual=(own["residual_level"], result["calibration"]["residual_threshold"], unit),
             title=recording.name,
         )
         name = recording.name.replace("#", "-")

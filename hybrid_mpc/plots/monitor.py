@@ -35,9 +35,10 @@ def trace(
     *,
     output: Signal,
     windows: Sequence[tuple[float, float]] = (),
+    residual: tuple[Array, float, str] | None = None,
     title: str = "",
 ) -> Figure:
-    """The monitor over a whole recording: violation, alarm level, alarms, and the position beneath.
+    """The monitor over a whole recording: violation, residual force, alarms, and the position beneath.
 
     Args:
         t: Times ``(n,)`` [s].
@@ -49,6 +50,7 @@ def trace(
         y: Measured position, ``(n,)``.
         output: Signal of ``y``.
         windows: Start and end [s] of the stretches known to be clean. Default: none.
+        residual: Level of the residual force ``(n,)``, its threshold and its unit. Default: no such row.
         title: Title. Default: none.
 
     Returns:
@@ -66,8 +68,9 @@ def trace(
     t = np.asarray(t, dtype=float)
     raw, averaged = checked("violation", violation, len(t)), checked("level", level, len(t))
     position, active = checked("y", y, len(t)), checked("alarm", alarm, len(t)) > 0.5
-    figure, axes = new_figure(2, 1, sharex=True, heights=(1.5, 1.0), size=(10, 5.2))
-    top, bottom = axes[:, 0]
+    heights = (1.5, 1.0) if residual is None else (1.5, 1.0, 1.0)
+    figure, axes = new_figure(len(heights), 1, sharex=True, heights=heights, size=(10, 2.6 * len(heights)))
+    top, bottom = axes[0, 0], axes[-1, 0]
     top.plot(t, raw, color="#9a9a9a", linewidth=0.7, label="violation")
     top.plot(t, averaged, color=COLOURS["hybrid"], linewidth=1.4, label="level (averaged)")
     top.axhline(threshold, color="black", linestyle="--", linewidth=1.2, label="threshold")
@@ -76,10 +79,15 @@ def trace(
     if len(positive) and positive.max() > 30 * threshold:
         top.set_yscale("log")
         top.set_ylim(bottom=max(positive.min(), 1e-3 * threshold))
+    if residual is not None:
+        force, limit, unit = residual
+        axes[1, 0].plot(t, checked("residual", force, len(t)), color=COLOURS["hybrid"], linewidth=1.4)
+        axes[1, 0].axhline(limit, color="black", linestyle="--", linewidth=1.2)
+        axes[1, 0].set_ylabel(f"residual\n[{unit}]")
     bottom.plot(t, position, color=INK, linewidth=1.0, label="measured")
     bottom.set_ylabel(axis_label(output))
     bottom.set_xlabel("time [s]")
-    for ax in (top, bottom):
+    for ax in axes[:, 0]:
         for start, end in intervals(t, active):
             ax.axvspan(start, end, color=ALARM, alpha=0.35, linewidth=0, label="alarm")
         for start, end in windows:

@@ -73,7 +73,8 @@ def test_equals_the_least_squares_solution_of_a_linear_system():
     for k in range(n):
         response[k], known[k] = state[0], forced[0]
         state = step @ state
-        forced = step @ (forced + [0, 0, run.u[k, 0] / TRUTH["J"]]) - [0, 0, run.u[k, 0] / TRUTH["J"]]
+        push = np.array([0.0, 0.0, run.u[k, 0] / TRUTH["J"]])
+        forced = step @ (forced + push) - push
         if k + 3 < n + 2:
             state[2, k + 3] = 1.0
     rows = np.vstack([response / sigma, np.eye(n + 2)[3:] / walk])

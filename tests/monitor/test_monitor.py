@@ -8,20 +8,22 @@ import pytest
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model import HybridModel
-from hybrid_mpc.monitor import Calibration, EnergyMonitor, calibrate, count_alarms, replay
+from hybrid_mpc.monitor import Calibration, EnergyMonitor, calibrate, count_alarms, replay, with_residual
 from hybrid_mpc.signals import Signal
 
 DT, J, MGL, GAMMA = 0.02, 0.1, 1.5, 0.15
 
 
-def pendulum(friction: float = GAMMA, push: float = 0.0) -> HybridModel:
+def pendulum(friction: float = GAMMA, push: float = 0.0, dry: float = 0.0) -> HybridModel:
     x, h, u, w = ca.MX.sym("x", 2), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w", 2)
 
     def balance(x, w, u, friction=friction):
-        return (J * w[1] + MGL * ca.sin(x[0]) + friction * x[1] - u - push) * x[1]
+        losses = friction * x[1] + dry * ca.tanh(x[1] / 0.02)
+        return (J * w[1] + MGL * ca.sin(x[0]) + losses - u - push) * x[1]
 
     def rhs(x):
-        return ca.vertcat(x[1], (u + push - MGL * ca.sin(x[0]) - friction * x[1]) / J)
+        losses = friction * x[1] + dry * ca.tanh(x[1] / 0.02)
+        return ca.vertcat(x[1], (u + push - MGL * ca.sin(x[0]) - losses) / J)
 
     z = x
     for _ in range(4):
@@ -198,11 +200,46 @@ def test_hysteresis_holds_between_release_and_threshold():
     monitor = EnergyMonitor(
         pendulum(), window=5, average=1, calibration=Calibration(1.0, 0.5, 1.0, 1, 1.0, "by hand")
     )
-    sequence, on, seen = [0.7, 1.1, 0.7, 0.4, 0.7], False, []
+    sequence, on, seen = [0.7, 1.1, 0.7, 0.4, 0.7], (False, False), []
     for level in sequence:
-        on = monitor._alarm(level, on)
-        seen.append(on)
+        on = monitor._alarms(level, 0.0, on)
+        seen.append(on[0])
     assert seen == [False, True, True, False, False]
+
+
+def test_residual_force_is_the_unknown_torque_while_the_machine_moves():
+    run = simulate(300, fault=pendulum(push=0.1), at=100)
+    trace = replay(EnergyMonitor(pendulum(), window=5, average=1), Exact(run), run)
+    fast = np.abs(np.roll(run.x[:, 1], 2)) > 0.42  # at the window's centre; the dead band ends at 0.4 rad/s
+    before, after = np.arange(300) < 100, np.arange(300) > 106
+    # exact but for the fourth-order integrator's dp against dv, 1e-11 over dt^2 (see above), times J
+    np.testing.assert_allclose(trace.residual_level[10:][(fast & before)[10:]], 0.0, atol=1e-6)
+    # within its own step the model lacks the push and thus push dt / 2J of speed on average, which viscous
+    # friction GAMMA feels: 0.1 * 0.01 / 0.1 * 0.15 = 1.5e-3 less
+    np.testing.assert_allclose(trace.residual_level[fast & after], 0.1, atol=2e-3)
+
+
+@pytest.mark.parametrize(("torque", "excess"), [(0.15, 0.0), (-0.15, 0.0), (0.35, 0.13), (-0.35, 0.13)])
+def test_at_rest_only_what_friction_cannot_hold_counts(torque, excess):
+    n = 60
+    run = Run(np.arange(n) * DT, np.zeros((n, 1)), np.full((n, 1), torque), np.zeros((n, 2)))
+    monitor = EnergyMonitor(pendulum(friction=0.1, dry=0.2), window=5, average=5)
+    trace = replay(monitor, Exact(run), run)
+    # friction at the rest speed of 0.2 rad/s: 0.2 dry (tanh(10) = 1 - 4e-9) and 0.02 viscous
+    np.testing.assert_allclose(trace.residual_level[20:], excess, atol=1e-6)
+    np.testing.assert_allclose(trace.level_w[20:], 0.0, atol=1e-12)  # no power at rest
+
+
+def test_either_alarm_is_an_alarm():
+    run = simulate(300, fault=pendulum(push=0.3), at=150)
+    nothing = Calibration(1e9, 1e9, 1.0, 1, 1.0, "by hand")
+    assert not replay(
+        EnergyMonitor(pendulum(), window=5, average=5, calibration=nothing), Exact(run), run
+    ).alarm.any()
+    both = with_residual(nothing, Calibration(0.2, 0.1, 1.0, 1, 1.0, "by hand"))
+    alarm = replay(EnergyMonitor(pendulum(), window=5, average=5, calibration=both), Exact(run), run).alarm
+    assert not alarm[:150].any()
+    assert alarm[165:].any()
 
 
 def test_calibration_recovers_a_gumbel_quantile():
@@ -230,5 +267,9 @@ def test_bad_input_speaks():
         monitor.update(
             monitor.initial(), np.zeros(2), np.zeros(1), Estimate(np.zeros(2), np.zeros(0), np.zeros(1))
         )
+    with pytest.raises(InputError, match="residual_release"):
+        Calibration(1.0, 0.5, 1.0, 1, 1.0, "by hand", residual_threshold=1.0)
+    with pytest.raises(InputError, match="rest_speed"):
+        EnergyMonitor(model, window=5, average=1, rest_speed=0.0)
     with pytest.raises(InputError, match="release_w"):
         Calibration(1.0, 2.0, 1.0, 1, 1.0, "by hand")
