@@ -237,7 +237,11 @@ def _alarm_table(results: dict[str, Any]) -> Table | None:
     if results["monitor"]["alarms"] is None:
         return None
     rows = [(a["file"], a["start_s"], a["end_s"]) for a in results["monitor"]["alarms"]]
-    caption = f"Alarms over the whole recordings; threshold {results['monitor']['threshold_w']:.3g} W."
+    calibration = results["monitor"]["details"]["calibration"]
+    caption = (
+        f"Alarms over the whole recordings; thresholds {calibration['threshold_w']:.3g} W and "
+        f"{calibration['residual_threshold']:.3g} N m (N for a slider)."
+    )
     return Table(("recording", "from [s]", "to [s]"), rows, caption)
 
 

@@ -30,7 +30,9 @@ TEXTS: Mapping[str, tuple[Markup, ...]] = {
         _M(
             "The recordings were brought to one uniform time grid, and cut wherever the distance between "
             "two samples was too large to interpolate. Positions were measured; velocities and "
-            "accelerations come from a short polynomial that is fitted around every sample."
+            "accelerations come first from a short polynomial around every sample, to which the prior is "
+            "fitted, and then from the prior's own equations, which know where the input jumped and leave a "
+            "slowly changing force to be explained."
         ),
         _M(
             "The shading tells what a part is used for: <b>training</b> data fit the parameters, "
@@ -128,13 +130,14 @@ TEXTS: Mapping[str, tuple[Markup, ...]] = {
             "The prior's energy balance says how much power enters, leaves and is stored. As long as "
             "nothing unknown acts on the machine, the balance of the measurement and that of the model "
             "agree. A push by hand, a collision or a jammed bearing moves energy that the model knows "
-            "nothing about, and the violation rises."
+            "nothing about, and the violation rises. At rest no power flows, whatever pushes: there the "
+            "residual force is judged, less what sticking friction may hold."
         ),
         _M(
             "Grey is the violation at each sample, red-orange the averaged level that is compared with the "
             "threshold (dashed). Pink shading marks alarms. The green bar at the bottom marks "
-            "stretches known to be undisturbed: alarms there are false alarms. The threshold was calibrated "
-            "on undisturbed data."
+            "stretches known to be undisturbed: an alarm that starts there is a false one. Both thresholds "
+            "were calibrated on undisturbed data."
         ),
     ),
     "analysis": (
