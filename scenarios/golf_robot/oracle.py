@@ -5,12 +5,16 @@ from __future__ import annotations
 import casadi as ca
 
 from hybrid_mpc.model import HybridModel
+from scenarios.golf_robot.dynamics import N_STATES, RigParameters, rhs, steps
 from scenarios.golf_robot.nominal import GEAR, INPUTS, OUTPUTS, PARAMETERS, STATES
-from scenarios.golf_robot.rig import RigParameters, chain, rhs
 
 
 def oracle(dt: float, parameters: RigParameters | None = None, sub_steps: int = 50) -> HybridModel:
-    """The rig as a :class:`HybridModel` whose ``h`` is (bristle [-], motor torque [N m]).
+    """The rig as a :class:`HybridModel`.
+
+    Its ``h`` is (bristle [-], motor torque [N m], belt twist [rad], motor speed / 4 [rad/s]). All of it is
+    smooth but for ``|phi_dot|`` in the bristle's equation and the drag, so its Jacobian exists through stiction
+    and backlash.
 
     Args:
         dt: Model period [s].
@@ -22,13 +26,13 @@ def oracle(dt: float, parameters: RigParameters | None = None, sub_steps: int = 
 
     Example:
         >>> oracle(0.02).n_h
-        2
+        4
     """
     p = parameters or RigParameters()
-    run = chain(p, sub_steps)
-    x, h, u, w = ca.MX.sym("x", 2), ca.MX.sym("h", 2), ca.MX.sym("u"), ca.MX.sym("xdot", 2)
+    run = steps(p, sub_steps)
+    x, h, u, w = ca.MX.sym("x", 2), ca.MX.sym("h", N_STATES - 2), ca.MX.sym("u"), ca.MX.sym("xdot", 2)
     after = run(ca.vertcat(x, h), u, dt / sub_steps)
-    s, v = ca.SX.sym("s", 4), ca.SX.sym("v")
+    s, v = ca.SX.sym("s", N_STATES), ca.SX.sym("v")
     f = ca.Function("f", [s, v], [rhs(s, v, p)[0][:2]])
     return HybridModel(
         "oracle",
