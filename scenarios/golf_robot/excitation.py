@@ -13,6 +13,7 @@ from hybrid_mpc.errors import InputError
 Array = NDArray[np.float64]
 
 PEAK = 0.5  # [N m] the motor's
+ROUNDED = 0.2  # [s]
 
 
 def excitation(kind: str, rng: np.random.Generator, t: Array) -> Array:
@@ -28,9 +29,9 @@ def excitation(kind: str, rng: np.random.Generator, t: Array) -> Array:
     ``step``       levels up to 0.25 N m, held 1 to 3 s
     ``chirp``      0.08 to 0.16 N m, 0.1 to 1.2 Hz, up or down
     ``stair``      levels up to 0.5 N m, each at most 0.2 N m from the last, held 0.4 to 1.6 s
-    ``pulse``      0.2 to 0.5 N m of alternating sign, 0.1 to 0.35 s each
+    ``pulse``      0.25 to 0.5 N m of alternating sign, 0.2 to 0.4 s each
     ``fastsine``   0.3 to 0.5 N m, 1 to 2 Hz
-    ``fastchirp``  0.3 to 0.5 N m, 1 to 2.5 Hz, up or down
+    ``fastchirp``  0.3 to 0.5 N m, 1 to 2 Hz, up or down
     =============  ==========================================================================
 
     Args:
@@ -70,13 +71,19 @@ def _stair(rng: np.random.Generator, t: Array) -> Array:
     for _ in starts:
         level = rng.uniform(max(-PEAK, level - 0.2), min(PEAK, level + 0.2))
         levels.append(level)
-    return np.array(levels)[np.searchsorted(starts, t - t[0], side="right")]
+    return _rounded(np.array(levels)[np.searchsorted(starts, t - t[0], side="right")], t)
 
 
 def _pulse(rng: np.random.Generator, t: Array) -> Array:
-    starts = np.cumsum(rng.uniform(0.1, 0.35, len(t)))
-    sizes = rng.uniform(0.2, PEAK, len(t) + 1) * np.where(np.arange(len(t) + 1) % 2, -1.0, 1.0)
-    return sizes[np.searchsorted(starts, t - t[0], side="right")]
+    starts = np.cumsum(rng.uniform(0.2, 0.4, len(t)))
+    sizes = rng.uniform(0.25, PEAK, len(t) + 1) * np.where(np.arange(len(t) + 1) % 2, -1.0, 1.0)
+    return _rounded(sizes[np.searchsorted(starts, t - t[0], side="right")], t)
+
+
+def _rounded(levels: Array, t: Array) -> Array:
+    """Levels with each jump turned into half a cosine that ends ``ROUNDED`` after it."""
+    taps = np.sin(np.pi * np.arange(0.5, round(ROUNDED / (t[1] - t[0]))) / round(ROUNDED / (t[1] - t[0])))
+    return np.convolve(levels, taps / taps.sum())[: len(levels)]
 
 
 def _fastsine(rng: np.random.Generator, t: Array) -> Array:
@@ -86,7 +93,7 @@ def _fastsine(rng: np.random.Generator, t: Array) -> Array:
 
 def _fastchirp(rng: np.random.Generator, t: Array) -> Array:
     amplitude = rng.uniform(0.3, PEAK)
-    f0, f1 = rng.permutation([rng.uniform(1.0, 1.3), rng.uniform(2.0, 2.5)])
+    f0, f1 = rng.permutation([rng.uniform(1.0, 1.3), rng.uniform(1.6, 2.0)])
     return chirp(t, amplitude, f0, f1)
 
 
