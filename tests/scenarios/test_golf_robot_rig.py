@@ -130,7 +130,7 @@ def test_without_losses_and_gap_it_is_the_pendulum_of_both_inertias():
     none = {"mu_c": 1e-9, "mu_s": 1e-9, "d": 0.0, "drag": 0.0, "motor_friction": 0.0, "cogging": 0.0}
     rigid = replace(P, **none, gap=0.0, belt_stiffness=4000.0)
     # mu of 1e-9 makes the bristle infinitely fast: take it out by a stiffness that is as small
-    states = drive(Rig(replace(rigid, sigma0=1e-6)), np.zeros(300), x0=(0.05, 0.0))
+    states = drive(Rig(replace(rigid, sigma0=1e-6, sigma1=0.0)), np.zeros(300), x0=(0.05, 0.0))
     t = DT * np.arange(len(states))
     omega = np.sqrt(P.m * P.g * P.a / P.J) * (1 - 0.05**2 / 16)  # pendulum at a small amplitude
     # belt: J_rotor / stiffness changes the frequency by (omega / 2500)^2; rest: amplitude^4 and 6 s of phase
@@ -148,9 +148,9 @@ def test_ball_takes_momentum_once_and_only_forwards():
     # from the impact to the end of the period the club gains what it gains without a ball: to 2nd order
     assert with_ball[hit, 1] - without[hit, 1] == pytest.approx(after - before, abs=0.02 * before)
     back = Rig(ball=True)
-    swing = drive(back, np.zeros(40), x0=(0.4, 0.0))
-    np.testing.assert_array_equal(swing[:20], drive(Rig(), np.zeros(40), x0=(0.4, 0.0))[:20])
-    assert swing[19, 0] < 0  # it went through, backwards
+    swing = drive(back, np.zeros(40), x0=(0.9, 0.0))
+    np.testing.assert_array_equal(swing, drive(Rig(), np.zeros(40), x0=(0.9, 0.0)))
+    assert swing[-1, 0] < -0.1  # it went through, backwards
     state = back.reset(np.array([-0.4, 0.0]), 0)
     assert state.ball
     for u in push:
