@@ -24,10 +24,12 @@ MOTIONS = ((0.1, 0.3), (0.14, 0.6), (0.15, 0.6), (0.5, 1.5))  # N m, Hz: with st
 
 
 def torques(amplitude, frequency):
+    """A sine of torques [N m], one for each period."""
     return amplitude * np.sin(2 * np.pi * frequency * DT * np.arange(round(SECONDS / DT)))
 
 
 def rk4(sub_step):
+    """The rig itself."""
     rig = Rig(sub_step=sub_step)
 
     def run(u):
@@ -41,6 +43,7 @@ def rk4(sub_step):
 
 
 def casadi_integrator(name, options):
+    """One of CasADi's integrators, restarted each period."""
     s, u = ca.SX.sym("s", N_STATES), ca.SX.sym("u")
     dae = {"x": s, "p": u, "ode": rhs(s, u, RigParameters())[0]}
     step = ca.integrator("step", name, dae, 0.0, DT, options)
@@ -56,6 +59,7 @@ def casadi_integrator(name, options):
 
 
 def scipy_integrator(method, seconds):
+    """One of scipy's, with CasADi's right-hand side and Jacobian."""
     s, u = ca.SX.sym("s", N_STATES), ca.SX.sym("u")
     ds = rhs(s, u, RigParameters())[0]
     f, jac = ca.Function("f", [s, u], [ds]), ca.Function("j", [s, u], [ca.densify(ca.jacobian(ds, s))])
@@ -74,6 +78,7 @@ def scipy_integrator(method, seconds):
 
 
 def main():
+    """Print the table."""
     tolerances = {"reltol": 1e-6, "abstol": 1e-8}
     rivals = {
         "RK4 in CasADi's VM, 1 ms": (rk4(1e-3), SECONDS),

@@ -53,10 +53,10 @@ def write_data(scenario: Scenario, out: Path, seed: int, budget: str, data_set: 
         InputError: If the scenario makes no data, has no such budget or data set, or the folder is not empty.
 
     Example:
-        >>> write_data(load_scenario("torque_pendulum"), Path("out"), 0, "quick")
-        Traceback (most recent call last):
-        ...
-        hybrid_mpc.errors.InputError: torque_pendulum makes no data of its own; give its recordings to 'hybrid-mpc run' with --data
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     len(write_data(load_scenario("golf_robot"), Path(folder), 0, "quick"))
+        15
     """
     make = scenario.make_data
     if make is None:

@@ -100,7 +100,7 @@ def record(rig: Rig, kind: str, seed: tuple[int, ...]) -> tuple[Array, Array]:
     """
     rng = np.random.default_rng(seed)
     n = round(DURATION / RECORD) + 1
-    u = excitation(kind, rng, GRID * np.arange(round(DURATION / GRID) + 1))
+    u = excitation(kind, rng, GRID * np.arange(round(DURATION / GRID) + 1, dtype=np.float64))
     x0 = np.array([rng.uniform(-0.6, 0.6), 0.0])
     offsets = np.clip(JITTER * rng.standard_normal(n), -4 * JITTER, 4 * JITTER)
     times = np.clip(RECORD * np.arange(n) + offsets, 0.0, DURATION)
@@ -120,10 +120,10 @@ def recordings(seed: int, budget: str, data_set: str = "b") -> Iterator[tuple[st
     Raises:
         InputError: If there is no such budget or data set.
     """
-    rig = Rig()
+    rig, roles = Rig(), [str(role) for role in ROLES]
     for stem in stems(budget, data_set):
         role, number, kind = stem.split("_")
-        table, states = record(rig, kind, (seed, [*ROLES].index(role), int(number)))
+        table, states = record(rig, kind, (seed, roles.index(role), int(number)))
         yield stem, table, states
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf, pi
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -279,10 +281,12 @@ class Stepper:
     def __init__(self, f: ca.Function) -> None:
         self._ins = [np.zeros(f.size1_in(i)) for i in range(3)]
         self._out = np.zeros(f.size1_out(0))
+        self._evaluate: Callable[[], None]
+        self._buffer: Any
         self._buffer, self._evaluate = f.buffer()
         for i, values in enumerate(self._ins):
-            self._buffer.set_arg(i, memoryview(values))
-        self._buffer.set_res(0, memoryview(self._out))
+            self._buffer.set_arg(i, values.data)
+        self._buffer.set_res(0, self._out.data)
 
     def __call__(self, s: Array, q: Array, h: float) -> Array:
         """The state ``(6,)`` after the steps."""

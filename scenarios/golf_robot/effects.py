@@ -149,7 +149,11 @@ def fit(motions: list[Motion], kernel: Array | None = None) -> tuple[dict[str, f
 
     start = np.array([spec.value for spec in FREE])
     bounds = [spec.lower for spec in FREE], [spec.upper for spec in FREE]
-    best = least_squares(lambda x: np.concatenate(residuals(x)), start, bounds=bounds, x_scale=start).x
+
+    def joined(values: Array) -> Array:
+        return np.concatenate(residuals(values))
+
+    best = least_squares(joined, start, bounds=bounds, x_scale=start).x
     return PUBLISHED | dict(zip([s.name for s in FREE], best.tolist(), strict=True)), residuals(best)
 
 
@@ -215,7 +219,8 @@ def table(effects: Effects) -> str:
         ("left by the fitted prior, as the differentiation shows it", effects.residual_seen),
     ):
         rows.append(f"| {name} ({value / floor:.2f} x floor) | {1e3 * value:.1f} |")
-    rows.append(f"| noise floor ({SMOOTHING:g} s, {bandwidth(RECORD, SMOOTHING):.1f} Hz) | {1e3 * floor:.1f} |")
+    band = bandwidth(RECORD, SMOOTHING)
+    rows.append(f"| noise floor ({SMOOTHING:g} s, {band:.1f} Hz) | {1e3 * floor:.1f} |")
     fitted = ", ".join(f"{name} {value:.4g}" for name, value in effects.fitted.items())
     reach = f"largest angle {effects.largest_angle:.2f} rad, speed {effects.largest_speed:.2f} rad/s"
     return "\n".join(

@@ -55,7 +55,9 @@ def catalogue(start: float = 2.0, end: float = inf, drift_time: float = 60.0) ->
         return FaultCase(name, title, (Fault(start, end, target, value, ramp=ramp),), nominal)
 
     last = min(end, start + 4.0)
-    gaps = tuple(Fault(t, min(t + 0.1, end), "measurement_dropout") for t in np.arange(start, last, 0.5).tolist())
+    gaps = tuple(
+        Fault(t, min(t + 0.1, end), "measurement_dropout") for t in np.arange(start, last, 0.5).tolist()
+    )
     push = Fault(start, min(start + 0.2, end), "plant_push", 1.0)
     return (
         *(one(f"friction_x{f:g}", f"Bearing friction x {f:g}", "plant_friction", f) for f in (1.5, 2.0, 4.0)),

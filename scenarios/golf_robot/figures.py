@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -20,7 +21,7 @@ from scenarios.golf_robot.rig import Rig
 Array = NDArray[np.float64]
 
 PAPER = ("sine", "step", "chirp")
-RECORDING = "train_03_chirp"  # the one whose residual is drawn; both data sets have a chirp of the paper's size
+RECORDING = "train_03_chirp"  # the one whose residual is drawn, if there is one of that name
 SPEED, ANGLE, TORQUE = "club speed [rad/s]", "angle [rad]", "motor torque [N m]"
 RED, BLUE, GREY = colour("hybrid"), colour("prior"), colour("")
 
@@ -49,11 +50,11 @@ def draw(folder: Path, seed: int = 0, budget: str = "quick", data_set: str = "b"
 
 def friction(p: RigParameters) -> Figure:
     """Friction of the hanging club over speed: steady, in a slow reversal, and the prior's."""
-    figure, axes = new_figure(1, 2, title="Friction of the hanging club", size=(10, 4))
+    figure, axes = _panels(1, 2, title="Friction of the hanging club", size=(10, 4))
     s, u = ca.SX.sym("s", N_STATES), ca.SX.sym("u")
     f = ca.Function("friction", [s, u], [rhs(s, u, p)[1]["friction"]])
     load = p.r * p.m * p.g
-    for ax, reach in zip(axes.flat, (4.0, 0.3), strict=True):
+    for ax, reach in zip(axes, (4.0, 0.3), strict=True):
         v = np.linspace(-reach, reach, 801)
         side = 1 + p.asymmetry * np.tanh(v / p.v_d)
         level = side * (p.mu_c + (p.mu_s - p.mu_c) * np.exp(-((v / p.v_s) ** 2))) * np.sign(v)
@@ -65,12 +66,19 @@ def friction(p: RigParameters) -> Figure:
         ax.plot(v, prior, color=BLUE, label="prior, published parameters")
         ax.plot(v, steady, color=RED, label="rig, steady sliding")
         ax.set(xlabel=SPEED, ylabel="friction torque [N m]")
-    axes.flat[1].plot(*_slow_loop(p), color=GREY, linewidth=0.9, label="rig, slow oscillation")
-    axes.flat[1].set(xlim=(-0.3, 0.3), ylim=(-1.4 * p.mu_s * load, 1.4 * p.mu_s * load))
-    title_axes(axes.flat[0], "whole range: the load grows with the speed")
-    title_axes(axes.flat[1], "near rest: Stribeck, presliding, direction")
+    axes[1].plot(*_slow_loop(p), color=GREY, linewidth=0.9, label="rig, slow oscillation")
+    axes[1].set(xlim=(-0.3, 0.3), ylim=(-1.4 * p.mu_s * load, 1.4 * p.mu_s * load))
+    title_axes(axes[0], "whole range: the load grows with the speed")
+    title_axes(axes[1], "near rest: Stribeck, presliding, direction")
     shared_legend(figure)
     return figure
+
+
+def _panels(
+    rows: int, cols: int, *, title: str, size: tuple[float, float], share: bool = False
+) -> tuple[Figure, list[Any]]:
+    figure, axes = new_figure(rows, cols, title=title, size=size, sharex=share, sharey=share)
+    return figure, list(axes.flat)
 
 
 def _slow_loop(p: RigParameters) -> tuple[Array, Array]:
@@ -90,11 +98,11 @@ def _slow_loop(p: RigParameters) -> tuple[Array, Array]:
 
 def residual(runs: list[tuple[str, Array, Array]]) -> Figure:
     """What the fitted prior leaves of the torque: along one recording, and over the speed in all."""
-    figure, axes = new_figure(1, 2, title="Torque that the fitted prior leaves", size=(10, 4))
+    figure, axes = _panels(1, 2, title="Torque that the fitted prior leaves", size=(10, 4))
     motions = {stem: motion(table, states) for stem, table, states in runs}
     fitted, _ = fit(list(motions.values()))
     stem = RECORDING if RECORDING in motions else next(iter(motions))
-    left, right = axes.flat
+    left, right = axes
     one, floor = motions[stem], noise_floor(RigParameters())
     t = 0.01 * np.arange(1, len(one.v) + 1)
     part = (t > 5.0) & (t < 15.0)
@@ -114,19 +122,19 @@ def residual(runs: list[tuple[str, Array, Array]]) -> Figure:
 
 def coverage(runs: list[tuple[str, Array, Array]]) -> Figure:
     """Where the training data are: angle and speed, speed and torque."""
-    figure, axes = new_figure(1, 2, title="What the training data cover", size=(10, 4.4))
+    figure, axes = _panels(1, 2, title="What the training data cover", size=(10, 4.4))
     groups = (("of the paper's size", BLUE, True), ("up to 0.5 N m", RED, False))
     for name, ink, wanted in groups:
         chosen = [run for run in runs if (run[0].split("_")[2] in PAPER) is wanted]
         for k, (_, table, states) in enumerate(chosen):
-            style = {"color": ink, "linewidth": 0.5, "label": name if k == 0 else None}
-            axes.flat[0].plot(states[::2, 0], states[::2, 1], **style)
-            axes.flat[1].plot(states[::2, 1], table[::2, 2], ".", color=ink, markersize=1.0)
+            label = name if k == 0 else None
+            axes[0].plot(states[::2, 0], states[::2, 1], color=ink, linewidth=0.5, label=label)
+            axes[1].plot(states[::2, 1], table[::2, 2], ".", color=ink, markersize=1.0)
     box = [-0.9, 0.9, 0.9, -0.9, -0.9], [-4, -4, 4, 4, -4]
-    axes.flat[0].plot(*box, color="#222222", linestyle="--", label="range of the tasks")
-    axes.flat[1].plot([-4, 4, 4, -4, -4], [-0.5, -0.5, 0.5, 0.5, -0.5], color="#222222", linestyle="--")
-    axes.flat[0].set(xlabel=ANGLE, ylabel=SPEED)
-    axes.flat[1].set(xlabel=SPEED, ylabel=TORQUE)
+    axes[0].plot(*box, color="#222222", linestyle="--", label="range of the tasks")
+    axes[1].plot([-4, 4, 4, -4, -4], [-0.5, -0.5, 0.5, 0.5, -0.5], color="#222222", linestyle="--")
+    axes[0].set(xlabel=ANGLE, ylabel=SPEED)
+    axes[1].set(xlabel=SPEED, ylabel=TORQUE)
     shared_legend(figure)
     return figure
 
@@ -134,22 +142,22 @@ def coverage(runs: list[tuple[str, Array, Array]]) -> Figure:
 def faults() -> Figure:
     """What the encoder shows with each fault of the catalogue, under the same torque, from 2 s on."""
     cases = [case for case in catalogue(2.0) if not case.nominal]
-    figure, axes = new_figure(
+    figure, axes = _panels(
         4, 4, title="The encoder's angle with each fault, under the same torque (grey: healthy)",
-        size=(12, 8), sharex=True, sharey=True,
+        size=(12, 8), share=True,
     )  # fmt: skip
     healthy = _measured(())
     t = 0.02 * np.arange(len(healthy))
-    for ax, case in zip(axes.flat, cases, strict=False):
+    for ax, case in zip(axes, cases, strict=False):
         ax.plot(t, healthy, color=GREY, linewidth=1.0)
         ax.plot(t, _measured(case.faults), color=RED, linewidth=1.0)
         ax.axvline(2.0, color="#222222", linewidth=0.6, linestyle=":")
         title_axes(ax, case.title)
-    for ax in axes.flat[len(cases) :]:
+    for ax in axes[len(cases) :]:
         ax.set_visible(False)
-    for ax in axes[:, 0]:
+    for ax in axes[::4]:
         ax.set_ylabel(ANGLE)
-    for ax in axes[-1]:
+    for ax in axes[12:]:
         ax.set_xlabel("time [s]")
     return figure
 

@@ -84,7 +84,8 @@ class Rig:
             raise InputError(f"rig: delay must be 0 s or more, got {self.delay}; 0.02 is one period")
         check_plant_faults(self.faults, tuple(PLANT_FAULTS))
         for fault in self.faults:
-            if fault.target != "plant_push" and fault.value < 0 or fault.target == "plant_mass" and not fault.value:
+            signed, zero = fault.target == "plant_push", fault.target != "plant_mass"
+            if not (signed or fault.value > 0 or (zero and fault.value == 0)):
                 raise InputError(f"fault {fault.target}: value must be positive, got {fault.value}")
         object.__setattr__(self, "_chunk", Stepper(steps(self.parameters, CHUNK, faulty=self._faulty)))
 

@@ -19,7 +19,6 @@ from scenarios.golf_robot.oracle import oracle
 from scenarios.golf_robot.prior import GolfRobotPrior
 from scenarios.golf_robot.rig import Rig
 
-
 WITHOUT_TORCH = """
 import sys
 class Refuse:
@@ -146,7 +145,9 @@ def test_every_recording_has_a_window(budget, data_set):
 
 
 def test_full_data_are_as_many_as_the_paper_s_comparison_needs():
-    counts = {role: sum(stem.startswith(role) for stem in stems("full")) for role in ("train", "valid", "test")}
+    counts = {
+        role: sum(stem.startswith(role) for stem in stems("full")) for role in ("train", "valid", "test")
+    }
     assert counts == {"train": 15, "valid": 6, "test": 15}
     with pytest.raises(InputError, match="quick"):
         stems("huge")
@@ -168,7 +169,9 @@ def test_rounded_torques_do_not_jump():
     t = 0.02 * np.arange(1001)
     for kind in ("stair", "pulse"):
         u = excitation(kind, np.random.default_rng(0), t)
-        assert np.abs(np.diff(u)).max() < 1.0 * np.pi / 2 * 0.02 / 0.2 + 1e-9, kind  # steepest of half a cosine
+        assert np.abs(np.diff(u)).max() < 1.0 * np.pi / 2 * 0.02 / 0.2 + 1e-9, (
+            kind
+        )  # steepest of half a cosine
 
 
 def test_a_recording_that_goes_too_far_is_repeated_with_less_torque(monkeypatch):

@@ -8,8 +8,8 @@ import pytest
 from hybrid_mpc.closed_loop import Fault, simulate
 from hybrid_mpc.closed_loop.faults import install
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.condensed import CondensedController
+from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.safeguard import SafeController
 from hybrid_mpc.pipeline.loops import make_estimator, working_point
 from scenarios.golf_robot import scenario
