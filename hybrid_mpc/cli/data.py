@@ -127,8 +127,6 @@ def _sampling(files: Sequence[Path], column: str) -> tuple[float, float]:
     for path in files:
         with path.open(encoding="utf-8", newline="") as file:
             times.append(np.array([float(row[column]) for row in csv.DictReader(file)]))
-    period = float(np.median(np.concatenate([np.diff(t) for t in times])))
-    lengths = [(t[-1] - t[0]) / max(1, round((t[-1] - t[0]) / period)) for t in times]
-    period = float(np.median(lengths))
-    off = [t - t[0] - period * np.arange(len(t)) for t in times]
-    return period, float(np.std(np.concatenate([o - o.mean() for o in off])))
+    lines = [np.polyfit(np.arange(len(t)), t, 1) for t in times]
+    off = [t - np.polyval(line, np.arange(len(t))) for t, line in zip(times, lines, strict=True)]
+    return float(np.median([line[0] for line in lines])), float(np.std(np.concatenate(off)))
