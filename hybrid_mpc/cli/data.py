@@ -98,8 +98,9 @@ def readme(scenario: Scenario, files: Sequence[Path], command: str) -> str:
         f"Sampling: {1e3 * period:.3g} ms; the time stamps, which are recorded, jitter by {1e3 * spread:.2g} ms "
         "(one standard deviation). Commas separate, points mark decimals, the first row is the header.",
         "",
-        f"Differentiated offline by a local quartic over {spec.smoothing:g} s "
-        f"(-3 dB at {bandwidth(period, spec.smoothing):.1f} Hz), then brought to {1e3 * spec.dt:g} ms.",
+        f"'hybrid-mpc run' first smooths and differentiates the outputs by a local quartic over "
+        f"{spec.smoothing:g} s (-3 dB at {bandwidth(period, spec.smoothing):.1f} Hz) and brings them to "
+        f"{1e3 * spec.dt:g} ms.",
         "", "| file | role |", "| --- | --- |",
         *(f"| {path.name} | {_role(scenario, path)} |" for path in files), "",
     ]  # fmt: skip
