@@ -254,12 +254,16 @@ def differentiation_error(runs: list[tuple[str, Array, Array]], window: float) -
 
 
 def window_table(seed: int, budget: str, data_set: str) -> str:
-    """Rows of a Markdown table: window, noise, bias and both, over the training runs."""
+    """Rows of a Markdown table: window, noise, bias and both, over the training runs, then over each kind."""
     runs = [run for run in recordings(seed, budget, data_set) if run[0].startswith("train")]
+    chosen = [(f"{window:g}", runs, window) for window in (0.16, 0.2, 0.22, 0.25, 0.28, 0.32)]
+    for kind in dict.fromkeys(run[0].split("_")[2] for run in runs):
+        of_kind = [run for run in runs if run[0].split("_")[2] == kind]
+        chosen.append((f"{SMOOTHING:g}, {kind}", of_kind, SMOOTHING))
     rows = []
-    for window in (0.16, 0.2, 0.22, 0.25, 0.28, 0.32):
-        errors = (f"{1e3 * error:.1f}" for error in differentiation_error(runs, window))
-        rows.append(f"| {window:g} | {' | '.join(errors)} |")
+    for name, some, window in chosen:
+        errors = (f"{1e3 * error:.1f}" for error in differentiation_error(some, window))
+        rows.append(f"| {name} | {' | '.join(errors)} |")
     return "\n".join(rows)
 
 
