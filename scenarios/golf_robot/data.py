@@ -58,7 +58,12 @@ def stems(budget: str, data_set: str = "b") -> list[str]:
 
 
 def windows() -> dict[str, tuple[Window, ...]]:
-    """Role of every recording by its stem: all of it is training, validation or test."""
+    """Role of every recording by its stem: all of it is training, validation or test.
+
+    Example:
+        >>> windows()["test_01_sine"]
+        (Window(start=0.0, end=20.0, role='test'),)
+    """
     names = {name for data_set in TRAIN for name in stems("full", data_set)}
     return {s: (Window(0.0, DURATION, role),) for role in ROLES for s in sorted(names) if s.startswith(role)}
 
@@ -71,6 +76,11 @@ def simulate(rig: Rig, x0: Array, u: Array, times: Array) -> list[RigState]:
         x0: Initial ``(phi, phi_dot)``.
         u: Torque ``(n_u,)`` [N m] held over periods of 20 ms from time 0.
         times: Increasing times [s], none negative, within the torque's length.
+
+    Example:
+        >>> states = simulate(Rig(), np.zeros(2), np.full(5, 0.3), np.array([0.0, 0.05, 0.1]))
+        >>> [round(state.t, 6) for state in states]
+        [0.0, 0.05, 0.1]
     """
     state, states = rig.reset(x0, 0), []
     edges = GRID * np.arange(1, len(u))
@@ -79,7 +89,7 @@ def simulate(rig: Rig, x0: Array, u: Array, times: Array) -> list[RigState]:
         for until in (*between, time):
             if until - state.t > 1e-12:
                 k = min(int((state.t + until) / 2 / GRID), len(u) - 1)
-                state = rig.step(state, u[k : k + 1], until - state.t)
+                state = rig.step(state, u[k : k + 1], float(until) - state.t)
         states.append(state)
     return states
 
@@ -119,6 +129,11 @@ def recordings(seed: int, budget: str, data_set: str = "b") -> Iterator[tuple[st
 
     Raises:
         InputError: If there is no such budget or data set.
+
+    Example:
+        >>> stem, table, states = next(recordings(0, "quick"))
+        >>> stem, table.shape, states.shape
+        ('train_01_sine', (2001, 3), (2001, 6))
     """
     rig, roles = Rig(), [str(role) for role in ROLES]
     for stem in stems(budget, data_set):

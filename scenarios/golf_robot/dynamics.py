@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf, pi
-from typing import Any
 
 import casadi as ca
-import numpy as np
-from numpy.typing import NDArray
 
 from scenarios.golf_robot.nominal import GEAR
-
-Array = NDArray[np.float64]
 
 N_STATES = 6  # phi, phi_dot, bristle, motor torque, twist, motor speed
 LOSSES = ("friction", "viscous", "drag", "belt damping", "motor friction", "motor viscous")
@@ -65,6 +59,11 @@ class RigParameters:
         ball_radius: Distance of the ball's centre from the axis [m]: 0.6. A 0.12 kg shaft and a 0.35 kg head
             there have the inertia and, with a clamp on the axis, the centre of mass of the paper's club.
         restitution: Of the impact [-]: 0.75 (ball on a metal face at 1 m/s: 0.7 to 0.8).
+
+    Example:
+        >>> p = RigParameters()
+        >>> round(p.rotor, 6), round((p.belt_stiffness / p.rotor) ** 0.5 / (2 * pi))
+        (0.00064, 126)
     """
 
     m: float = 0.5346
@@ -119,6 +118,10 @@ class Conditions:
         mass: Factor on the club's mass, inertia included [-].
         push: Torque on the club from outside [N m].
         limit: Twist at which the belt slips [rad]; infinite: it never does.
+
+    Example:
+        >>> Conditions(friction=2.0).mass
+        1.0
     """
 
     friction: ca.SX | float = 1.0
@@ -194,6 +197,10 @@ def elastic(twist: ca.SX, p: RigParameters) -> tuple[ca.SX, ca.SX]:
     """Belt torque [N m] at a twist [rad], and the share [-] of the full stiffness that acts there.
 
     Zero within the gap, ``belt_stiffness`` beyond it; the flanks come into contact over ``flank``.
+
+    Example:
+        >>> [round(float(ca.evalf(value)), 2) for value in elastic(ca.SX(4e-3), RigParameters())]
+        [1.0, 1.0]
     """
     above, below = twist - p.gap, twist + p.gap
     near, far = ca.sqrt(above**2 + p.flank**2), ca.sqrt(below**2 + p.flank**2)
@@ -227,71 +234,13 @@ def powers(s: ca.SX, torques: dict[str, ca.SX]) -> dict[str, ca.SX]:
     Args:
         s: State ``(6,)``.
         torques: As :func:`rhs` returns them.
+
+    Example:
+        >>> s = ca.SX.sym("s", 6)
+        >>> sorted(set(powers(s, rhs(s, ca.SX.sym("u"), RigParameters())[1])) - set(LOSSES))
+        ['motor', 'push']
     """
     v, w = s[1], s[5]
     speed = {"belt damping": v - w, "motor friction": w, "motor viscous": w}
     lost = {name: -torques[name] * speed.get(name, v) for name in LOSSES}
     return lost | {"motor": torques["motor"] * w, "push": torques["push"] * v}
-
-
-def rk4(f: ca.Function, s: ca.SX, u: ca.SX, h: ca.SX) -> ca.SX:
-    """One classical Runge-Kutta step of ``s_dot = f(s, u)`` over ``h`` [s]; order 4."""
-    k1 = f(s, u)
-    k2 = f(s + h / 2 * k1, u)
-    k3 = f(s + h / 2 * k2, u)
-    k4 = f(s + h * k3, u)
-    return s + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-
-
-def one_step(p: RigParameters, *, faulty: bool = False) -> ca.Function:
-    """Function ``(s, q, h) -> s`` of one RK4 step of length ``h`` [s] of the rig's equations.
-
-    Args:
-        p: Parameters.
-        faulty: True: ``q`` is the commanded torque [N m] and the four :class:`Conditions`, in their order;
-            else the torque alone.
-    """
-    s, q, h = ca.SX.sym("s", N_STATES), ca.SX.sym("q", 5 if faulty else 1), ca.SX.sym("h")
-    conditions = Conditions(*(q[i] for i in range(1, 5))) if faulty else HEALTHY
-    f = ca.Function("f", [s, q], [rhs(s, q[0], p, conditions)[0]])
-    after = rk4(f, s, q, h)
-    if faulty:
-        after[4] = ca.fmin(ca.fmax(after[4], -conditions.limit), conditions.limit)
-    return ca.Function("one", [s, q, h], [after])
-
-
-def steps(p: RigParameters, n: int, *, faulty: bool = False) -> ca.Function:
-    """Function ``(s, q, h) -> s`` of ``n`` times :func:`one_step` with the same ``q`` and ``h``."""
-    one = one_step(p, faulty=faulty)
-    s, q, h = ca.MX.sym("s", N_STATES), ca.MX.sym("q", one.size1_in(1)), ca.MX.sym("h")
-    return ca.Function("steps", [s, q, h], [one.fold(n)(s, ca.repmat(q, 1, n), ca.repmat(h, 1, n))])
-
-
-class Stepper:
-    """A compiled ``(s, q, h) -> s`` called on arrays without conversion: 20 us less than CasADi's own call.
-
-    The arrays it works in are its own, so one object serves one thread.
-
-    Args:
-        f: Function of three dense columns with one dense column as result.
-
-    Example:
-        >>> Stepper(steps(RigParameters(), 10))(np.zeros(6), np.zeros(1), 1e-4).shape
-        (6,)
-    """
-
-    def __init__(self, f: ca.Function) -> None:
-        self._ins = [np.zeros(f.size1_in(i)) for i in range(3)]
-        self._out = np.zeros(f.size1_out(0))
-        self._evaluate: Callable[[], None]
-        self._buffer: Any
-        self._buffer, self._evaluate = f.buffer()
-        for i, values in enumerate(self._ins):
-            self._buffer.set_arg(i, values.data)
-        self._buffer.set_res(0, self._out.data)
-
-    def __call__(self, s: Array, q: Array, h: float) -> Array:
-        """The state ``(6,)`` after the steps."""
-        self._ins[0][:], self._ins[1][:], self._ins[2][0] = s, q, h
-        self._evaluate()
-        return self._out.copy()

@@ -5,7 +5,8 @@ from __future__ import annotations
 import casadi as ca
 
 from hybrid_mpc.model import HybridModel
-from scenarios.golf_robot.dynamics import N_STATES, RigParameters, rhs, steps
+from scenarios.golf_robot.dynamics import N_STATES, RigParameters, rhs
+from scenarios.golf_robot.integration import steps
 from scenarios.golf_robot.nominal import GEAR, INPUTS, OUTPUTS, PARAMETERS, STATES
 
 

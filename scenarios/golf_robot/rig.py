@@ -13,7 +13,8 @@ from scipy.optimize import brentq
 
 from hybrid_mpc.closed_loop.faults import Fault, check_plant_faults
 from hybrid_mpc.errors import InputError
-from scenarios.golf_robot.dynamics import N_STATES, RigParameters, Stepper, steps
+from scenarios.golf_robot.dynamics import N_STATES, RigParameters
+from scenarios.golf_robot.integration import Stepper, steps
 
 Array = NDArray[np.float64]
 
@@ -37,6 +38,10 @@ class RigState:
         past: ``(n, 3)``: time, angle, speed at the ends of the last steps, oldest first, as far back as the
             sensor's delay can reach; the present is the last row.
         ball: True while a ball lies at the angle zero.
+
+    Example:
+        >>> Rig(ball=True).reset(np.array([-0.3, 0.0]), seed=0).ball
+        True
     """
 
     z: Array
@@ -99,6 +104,12 @@ class Rig:
 
     def with_faults(self, faults: Sequence[Fault]) -> Rig:
         """The same rig with ``faults`` beside those it has.
+
+        Args:
+            faults: With targets ``"plant_friction"`` and ``"plant_mass"`` (factors on the bearing's friction and
+                on the club's mass and inertia), ``"plant_push"`` (torque on the club [N m]), ``"plant_belt"``
+                (largest torque that the belt transmits, at the club [N m]), ``"plant_delay"`` (of the sensor,
+                beside the rig's own [s]).
 
         Raises:
             InputError: If a fault is not one of a rig's.

@@ -16,9 +16,9 @@ from scenarios.golf_robot.dynamics import (
     elastic,
     powers,
     rhs,
-    rk4,
     stored_energy,
 )
+from scenarios.golf_robot.integration import rk4
 from scenarios.golf_robot.nominal import GEAR
 from scenarios.golf_robot.rig import Rig
 
