@@ -86,12 +86,18 @@ def test_oracle_follows_the_rig():
 
 def test_oracle_jacobian_is_the_derivative_of_its_step():
     model = oracle(0.02)
-    z, u, e = np.array([0.3, 1.0, 1.3, 0.1, 2e-3, 1.1]), np.array([0.1]), 1e-6
-    a = np.array(model.with_jacobian(z[:2], z[2:], u)[2])
-    step = ca.Function("z", [q := ca.MX.sym("q", 6)], [ca.vertcat(*model.step(q[:2], q[2:], u))])
-    fd = np.column_stack([np.array(step(z + e * d) - step(z - e * d)).ravel() / (2 * e) for d in np.eye(6)])
-    # central differences: error e^2 times the third derivative (belt: 400 / flank^2 / J) and 1e-16 / e
-    assert a == pytest.approx(fd, rel=1e-3, abs=1e-4)
+    x, h, u = ca.MX.sym("x", 2), ca.MX.sym("h", 4), ca.MX.sym("u")
+    after = ca.vertcat(*model.step(x, h, u))
+    own = ca.Function("own", [x, h, u], [after, ca.jacobian(after, ca.vertcat(x, h)), ca.jacobian(after, u)])
+    for z in (
+        [0.3, 1.0, 1.3, 0.1, 2e-3, 1.1],
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [-0.2, -0.02, 1.9, 0.3, -1e-3, 3],
+    ):
+        x_next, h_next, a, b = (m.full() for m in model.with_jacobian(z[:2], z[2:], 0.1))
+        wanted = [m.full() for m in own(z[:2], z[2:], 0.1)]
+        for given, want in zip((np.vstack([x_next, h_next]), a, b), wanted, strict=True):
+            assert given == pytest.approx(want, rel=1e-9, abs=1e-10)  # rounding of entries up to 100
 
 
 def test_oracle_s_jacobian_is_sane_through_stiction_and_backlash():
