@@ -1,11 +1,11 @@
-"""Faults of sensors and actuators that need no knowledge of the plant."""
+"""Faults of sensors and actuators, which need no knowledge of the plant, and of plants that know their own."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError
 
 Array = NDArray[np.float64]
-Target = Literal[
-    "measurement_offset", "measurement_freeze", "measurement_dropout", "input_gain", "input_offset"
-]
+SIGNAL_TARGETS = (
+    "measurement_offset", "measurement_scale", "measurement_freeze", "measurement_dropout", "input_gain",
+    "input_offset",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -25,67 +26,145 @@ class Fault:
     Args:
         start: First instant [s].
         end: Instant from which it is gone [s]; ``inf`` for never.
-        target: ``"measurement_offset"`` adds ``value`` to the measurement; ``"measurement_freeze"`` repeats
-            the last one before the fault; ``"measurement_dropout"`` gives NaN; ``"input_gain"`` multiplies
-            the input that reaches the plant by ``value``; ``"input_offset"`` adds ``value`` to it.
-        value: Size, in the units of the output or input [-] for a gain. Freeze and dropout use none.
+        target: ``"measurement_offset"`` adds ``value`` to the measurement; ``"measurement_scale"`` multiplies
+            it; ``"measurement_freeze"`` repeats the last one before the fault; ``"measurement_dropout"`` gives
+            NaN; ``"input_gain"`` multiplies the input that reaches the plant by ``value``;
+            ``"input_offset"`` adds ``value`` to it. ``"plant_..."`` is one of the plant's own, which says what
+            it means; see :func:`install`.
+        value: Size, in the units of the output or input, [-] for a factor. Freeze and dropout use none.
         channel: Number of the output or input concerned.
+        ramp: Time [s] over which the size grows, in proportion, from nothing to ``value``. Default 0: at once.
 
     Raises:
-        InputError: If the interval is empty, the target unknown, or the value not finite.
+        InputError: If the interval is empty, the target unknown, the value not finite, or the ramp negative.
 
     Example:
         >>> corrupt_input([Fault(1.0, 2.0, "input_gain", 0.5)], 1.5, np.array([0.4]))
         array([0.2])
+        >>> corrupt_input([Fault(1.0, 9.0, "input_offset", 0.2, ramp=2.0)], 2.0, np.array([0.4]))
+        array([0.5])
     """
 
     start: float
     end: float
-    target: Target
+    target: str
     value: float = 0.0
     channel: int = 0
+    ramp: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.target not in get_args(Target):
-            raise InputError(f"fault target {self.target!r} is unknown; known: {', '.join(get_args(Target))}")
+        if self.target not in SIGNAL_TARGETS and not self.on_plant:
+            known = ", ".join(SIGNAL_TARGETS)
+            raise InputError(
+                f"fault target {self.target!r} is unknown; known: {known}, and what a plant knows as plant_..."
+            )
         if not self.start < self.end:
             raise InputError(f"fault {self.target}: the interval [{self.start}, {self.end}) s is empty")
         if not math.isfinite(self.value):
             raise InputError(f"fault {self.target}: value must be finite, got {self.value}")
+        if not (self.ramp >= 0 and math.isfinite(self.ramp)):
+            raise InputError(f"fault {self.target}: ramp must be 0 s or more and finite, got {self.ramp}")
 
     @property
     def on_input(self) -> bool:
         """True for a fault of an actuator."""
-        return self.target.startswith("input")
+        return self.target.startswith("input_")
+
+    @property
+    def on_plant(self) -> bool:
+        """True for a fault inside the machine, which only the plant can show."""
+        return self.target.startswith("plant_")
 
     def active(self, t: float) -> bool:
         """True at ``t`` [s]; instants within a nanosecond of ``start`` and ``end`` count as these."""
         return self.start - 1e-9 <= t < self.end - 1e-9
 
+    def value_at(self, t: float, neutral: float) -> float:
+        """Size at ``t`` [s]: on its ramp from ``neutral`` (1 for a factor, 0 for a sum) to ``value``.
+
+        Where ``neutral`` is infinite (a limit that is not there) the ramp is at its end from the start.
+
+        Example:
+            >>> Fault(0.0, math.inf, "input_gain", 0.5, ramp=10.0).value_at(5.0, 1.0)
+            0.75
+        """
+        if self.ramp == 0 or not math.isfinite(neutral):
+            return self.value
+        share = min(max((t - self.start) / self.ramp, 0.0), 1.0)
+        return neutral + share * (self.value - neutral)
+
 
 def check_channels(faults: Sequence[Fault], n_y: int, n_u: int) -> None:
-    """Refuse faults of channels that do not exist.
+    """Refuse faults of channels that do not exist, and faults that only a plant can show.
 
     Raises:
-        InputError: With the fault and the number of channels there are.
+        InputError: With the fault and the number of channels there are, or how to build the fault in.
     """
     for fault in faults:
+        if fault.on_plant:
+            raise InputError(
+                f"fault {fault.target} lies in the plant: build it in with "
+                "plant, faults = install(plant, faults) before simulating"
+            )
         n = n_u if fault.on_input else n_y
         if not 0 <= fault.channel < n:
             raise InputError(f"fault {fault.target}: channel {fault.channel} given, there are {n} (from 0)")
+
+
+def check_plant_faults(faults: Sequence[Fault], known: Sequence[str]) -> None:
+    """Refuse, on a plant's behalf, faults that are not among those it ``known``.
+
+    Raises:
+        InputError: With the fault and what the plant knows.
+    """
+    for fault in faults:
+        if fault.target not in known:
+            raise InputError(f"this plant has no fault {fault.target!r}; it knows: {', '.join(known)}")
+
+
+def install(plant: Any, faults: Sequence[Fault]) -> tuple[Any, tuple[Fault, ...]]:
+    """Build the faults of the machine into a plant; what is left are those of sensors and actuators.
+
+    Args:
+        plant: A plant; if any fault is its own, it has a method ``with_faults(faults) -> plant``.
+        faults: Faults of any target.
+
+    Returns:
+        The plant to simulate, and the faults to hand to ``simulate``.
+
+    Raises:
+        InputError: If the plant takes no faults, or not one of these.
+
+    Example:
+        >>> plant, faults = install("a plant", [Fault(0.0, 1.0, "input_gain", 0.8)])
+        >>> plant, len(faults)
+        ('a plant', 1)
+    """
+    inside = tuple(fault for fault in faults if fault.on_plant)
+    outside = tuple(fault for fault in faults if not fault.on_plant)
+    if not inside:
+        return plant, outside
+    if not hasattr(plant, "with_faults"):
+        raise InputError(
+            f"fault {inside[0].target}: the plant {type(plant).__name__} takes no faults; it needs a method "
+            "with_faults(faults) that returns the faulty plant"
+        )
+    return plant.with_faults(inside), outside
 
 
 def corrupt_measurement(faults: Sequence[Fault], t: float, y: Array, y_before: Array) -> Array:
     """Measurement ``(n_y,)`` that arrives at ``t``; ``y_before`` is the one that arrived before it."""
     y = y.copy()
     for fault in faults:
-        if not fault.active(t) or fault.on_input:
+        if not fault.active(t):
             continue
         if fault.target == "measurement_offset":
-            y[fault.channel] += fault.value
+            y[fault.channel] += fault.value_at(t, 0.0)
+        elif fault.target == "measurement_scale":
+            y[fault.channel] *= fault.value_at(t, 1.0)
         elif fault.target == "measurement_freeze":
             y[fault.channel] = y_before[fault.channel]
-        else:
+        elif fault.target == "measurement_dropout":
             y[fault.channel] = np.nan
     return y
 
@@ -95,7 +174,7 @@ def corrupt_input(faults: Sequence[Fault], t: float, u: Array) -> Array:
     u = u.copy()
     for fault in faults:
         if fault.active(t) and fault.target == "input_gain":
-            u[fault.channel] *= fault.value
+            u[fault.channel] *= fault.value_at(t, 1.0)
         elif fault.active(t) and fault.target == "input_offset":
-            u[fault.channel] += fault.value
+            u[fault.channel] += fault.value_at(t, 0.0)
     return u

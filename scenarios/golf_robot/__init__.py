@@ -30,8 +30,8 @@ scenario = Scenario(
     description=(
         "A motor swings a golf club through a belt (ratio 4). The prior is the paper's equation; the rig "
         "has dynamic friction with stiction and Stribeck effect, another friction forwards than backwards, "
-        "torque lag, cogging, drag and parameters some per cent off. Only the angle is measured. The data "
-        "are simulated, since the paper's are not public."
+        "a soft belt with backlash, torque lag, cogging, drag and parameters some per cent off. Only the "
+        "club's angle is measured. The data are simulated, since the paper's are not public."
     ),
     prior=_prior,
     data=DataSpec(
@@ -40,7 +40,7 @@ scenario = Scenario(
         outputs=("phi_rad",),
         dt=0.02,
         max_gap=0.05,
-        smoothing=0.25,  # encoder noise grows as length^-2.5 in the acceleration; the motion is below 1.5 Hz
+        smoothing=0.25,  # noise in the acceleration goes with length^-2.5, bias grows: docs/golf-robot.md
         warm_up=0.5,
         windows=windows(),
     ),

@@ -5,12 +5,17 @@ from __future__ import annotations
 import casadi as ca
 
 from hybrid_mpc.model import HybridModel
+from scenarios.golf_robot.dynamics import N_STATES, RigParameters, rhs
+from scenarios.golf_robot.integration import steps, steps_with_jacobian
 from scenarios.golf_robot.nominal import GEAR, INPUTS, OUTPUTS, PARAMETERS, STATES
-from scenarios.golf_robot.rig import RigParameters, chain, rhs
 
 
 def oracle(dt: float, parameters: RigParameters | None = None, sub_steps: int = 50) -> HybridModel:
-    """The rig as a :class:`HybridModel` whose ``h`` is (bristle [-], motor torque [N m]).
+    """The rig as a :class:`HybridModel`.
+
+    Its ``h`` is (bristle [-], motor torque [N m], belt twist [rad], motor speed / 4 [rad/s]). All of it is
+    smooth but for ``|phi_dot|`` in the bristle's equation and the drag, so its Jacobian exists through stiction
+    and backlash.
 
     Args:
         dt: Model period [s].
@@ -22,13 +27,14 @@ def oracle(dt: float, parameters: RigParameters | None = None, sub_steps: int = 
 
     Example:
         >>> oracle(0.02).n_h
-        2
+        4
     """
     p = parameters or RigParameters()
-    run = chain(p, sub_steps)
-    x, h, u, w = ca.MX.sym("x", 2), ca.MX.sym("h", 2), ca.MX.sym("u"), ca.MX.sym("xdot", 2)
+    run = steps(p, sub_steps)
+    x, h, u, w = ca.MX.sym("x", 2), ca.MX.sym("h", N_STATES - 2), ca.MX.sym("u"), ca.MX.sym("xdot", 2)
     after = run(ca.vertcat(x, h), u, dt / sub_steps)
-    s, v = ca.SX.sym("s", 4), ca.SX.sym("v")
+    end, a, b = steps_with_jacobian(p, sub_steps)(ca.vertcat(x, h), u, dt / sub_steps)
+    s, v = ca.SX.sym("s", N_STATES), ca.SX.sym("v")
     f = ca.Function("f", [s, v], [rhs(s, v, p)[0][:2]])
     return HybridModel(
         "oracle",
@@ -40,6 +46,7 @@ def oracle(dt: float, parameters: RigParameters | None = None, sub_steps: int = 
         xdot=ca.Function("xdot", [x, h, u], [f(ca.vertcat(x, h), u)]),
         output=ca.Function("output", [x, u], [x[0]]),
         energy_balance=ca.Function("energy_balance", [x, w, u], [_energy_balance(x, w, u)]),
+        with_jacobian=ca.Function("with_jacobian", [x, h, u], [end[:2], end[2:], a, b]),
     )
 
 

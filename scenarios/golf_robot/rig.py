@@ -2,141 +2,71 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from math import ceil, pi
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from math import ceil, inf
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline
+from scipy.optimize import brentq
 
+from hybrid_mpc.closed_loop.faults import Fault, check_plant_faults
 from hybrid_mpc.errors import InputError
-from scenarios.golf_robot.nominal import GEAR
+from scenarios.golf_robot.dynamics import N_STATES, RigParameters
+from scenarios.golf_robot.integration import Stepper, steps
 
 Array = NDArray[np.float64]
 
-CHUNK = 40  # RK4 sub-steps in one compiled call
+CHUNK = 10  # RK4 sub-steps in one compiled call
+STIFF = 2.3  # sub-step times the bristle's rate: RK4 is stable up to 2.78
+PLANT_FAULTS = {
+    "plant_friction": 1.0, "plant_mass": 1.0, "plant_push": 0.0, "plant_belt": inf, "plant_delay": 0.0
+}  # fmt: skip
+"""What can go wrong inside the rig, with the value of a healthy one."""
+SLOWEST_HIT = 0.05  # [rad/s]; slower, the club pushes the ball along and feels next to nothing
 
 
 @dataclass(frozen=True)
-class RigParameters:
-    """What the rig is made of. Each default is argued from hardware of this size, before any training.
-
-    Not in this form: belt compliance and backlash, transport delay, ball contact.
+class RigState:
+    """State of the rig.
 
     Args:
-        m: Club mass [kg]: +2 % (grip tape, screws) against the paper's 0.5241.
-        a: Centre of mass [m]: -2 % (9 mm: a clamp's tolerance) against 0.4702.
-        J: Inertia [kg m^2]: +4 % (pulley, rotor, clamp: a swing test misses some per cent) against 0.1445.
-        g: Gravity [m/s^2].
-        d: Viscous damping [N m s/rad]: +10 % (grease over 10 K) against 0.0132.
-        r: Friction radius [m], as the paper.
-        mu_c: Coulomb coefficient: -5 % against the paper's 1.5136, which averages over static friction.
-        mu_s: Static coefficient: 1.4 x Coulomb (dry or starved plain bearing: 1.2 to 1.6).
-        v_s: Stribeck speed [rad/s]: 0.3 (7 mm/s at 24.5 mm; boundary lubrication ends at 1 to 10 mm/s).
-        sigma0: Bristle stiffness [1/rad]: break-away after about 1.3 mrad (33 um at 24.5 mm).
-        sigma1: Bristle damping [s/rad]: half of critical at the stuck club's own frequency (36 rad/s).
-        v_d: Speed [rad/s] above which bristle damping fades (keeps LuGre passive).
-        asymmetry: Friction is this share larger forwards, smaller backwards: 8 % (axial play, seal lip).
-        lag: Motor torque time constant [s]: current loop of a small servo drive, 3 ms.
-        motor_gain: Torque constant against its data sheet: -2 % (magnets at temperature; +-5 % is usual).
-        cogging: Cogging amplitude at the motor [N m]: 1 % of the 0.5 N m peak torque.
-        cogging_order: Cogging periods per motor turn: least common multiple of 12 slots and 8 poles.
-        drag: Aerodynamic drag [N m s^2/rad^2]: shaft rho c_w D L^4/8 = 0.5e-3 (12 mm, 0.7 m), head 0.9e-3.
-        counts: Encoder counts per turn.
-        noise: Sensor noise [rad], one standard deviation.
-    """
-
-    m: float = 0.5346
-    a: float = 0.4608
-    J: float = 0.1503
-    g: float = 9.81
-    d: float = 0.0145
-    r: float = 0.0245
-    mu_c: float = 1.44
-    mu_s: float = 2.016
-    v_s: float = 0.3
-    sigma0: float = 1500.0
-    sigma1: float = 40.0
-    v_d: float = 0.05
-    asymmetry: float = 0.08
-    lag: float = 0.003
-    motor_gain: float = 0.98
-    cogging: float = 0.005
-    cogging_order: int = 24
-    drag: float = 1.4e-3
-    counts: int = 4096
-    noise: float = 0.2e-3
-
-
-def rhs(s: ca.SX, u: ca.SX, p: RigParameters) -> tuple[ca.SX, dict[str, ca.SX]]:
-    """Derivative of the rig's state ``s = (phi, phi_dot, bristle, motor torque)`` and its torques.
-
-    LuGre friction (Canudas de Wit, Olsson, Astrom, Lischinsky 1995); the bristle state is scaled to a
-    friction coefficient, ``sigma0`` times its deflection, so it is of order one.
-
-    Args:
-        s: State ``(4,)`` in rad, rad/s, -, N m (at the motor).
-        u: Commanded motor torque ``(1,)`` [N m].
-        p: Parameters.
-
-    Returns:
-        The derivative ``(4,)`` and the torques on the club [N m] by name, signed as in J phi_ddot = sum.
+        z: ``(6,)``: phi [rad], phi_dot [rad/s], bristle [-], motor torque [N m], belt twist [rad], motor
+            speed / 4 [rad/s].
+        t: Time since the reset [s].
+        past: ``(n, 3)``: time, angle, speed at the ends of the last steps, oldest first, as far back as the
+            sensor's delay can reach; the present is the last row.
+        ball: True while a ball lies at the angle zero.
 
     Example:
-        >>> ds, torques = rhs(ca.SX.sym("s", 4), ca.SX.sym("u"), RigParameters())
-        >>> ds.shape, sorted(torques)
-        ((4, 1), ['cogging', 'drag', 'friction', 'gravity', 'motor', 'viscous'])
+        >>> Rig(ball=True).reset(np.array([-0.3, 0.0]), seed=0).ball
+        True
     """
-    phi, v, b, motor = s[0], s[1], s[2], s[3]
-    side = 1 + p.asymmetry * ca.tanh(v / p.v_d)
-    level = side * (p.mu_c + (p.mu_s - p.mu_c) * ca.exp(-((v / p.v_s) ** 2)))
-    b_dot = p.sigma0 * (v - ca.fabs(v) * b / level)
-    load = ca.fabs(p.m * v * v * p.a + p.m * p.g * ca.cos(phi))
-    damping = p.sigma1 * ca.exp(-((v / p.v_d) ** 2)) / p.sigma0
-    order = GEAR * p.cogging_order
-    torques = {
-        "gravity": -p.m * p.g * p.a * ca.sin(phi),
-        "viscous": -p.d * v,
-        "friction": -p.r * load * (b + damping * b_dot),
-        "cogging": GEAR * p.cogging * ca.sin(order * phi),
-        "drag": -p.drag * ca.fabs(v) * v,
-        "motor": GEAR * motor,
-    }
-    total = sum(torques.values(), ca.SX(0))
-    return ca.vertcat(v, total / p.J, b_dot, (p.motor_gain * u - motor) / p.lag), torques
 
-
-def rk4(f: ca.Function, s: ca.SX, u: ca.SX, h: ca.SX) -> ca.SX:
-    """One classical Runge-Kutta step of ``s_dot = f(s, u)`` over ``h`` [s]; order 4."""
-    k1 = f(s, u)
-    k2 = f(s + h / 2 * k1, u)
-    k3 = f(s + h / 2 * k2, u)
-    k4 = f(s + h * k3, u)
-    return s + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-
-
-def chain(p: RigParameters, steps: int) -> ca.Function:
-    """Function ``(s, u, h) -> s`` of ``steps`` RK4 steps of length ``h`` [s] of the rig's equations."""
-    s, u, h = ca.SX.sym("s", 4), ca.SX.sym("u"), ca.SX.sym("h")
-    f = ca.Function("f", [s, u], [rhs(s, u, p)[0]])
-    one = ca.Function("one", [s, u, h], [rk4(f, s, u, h)])
-    return one.fold(steps)
+    z: Array
+    t: float
+    past: Array
+    ball: bool
 
 
 @dataclass(frozen=True)
 class Rig:
     """The golf robot in simulation (a :class:`hybrid_mpc.scenario.Plant`).
 
-    Its state is an array ``(phi, phi_dot, bristle, motor torque)``. It is integrated by RK4 with
-    sub-steps of at most ``sub_step``: the bristle relaxes at ``sigma0 |phi_dot| / mu``, about
-    5000 1/s at 5 rad/s, which RK4 takes up to 0.5 ms.
+    RK4 with sub-steps of at most ``sub_step``, less at high speed: the bristle relaxes at
+    ``sigma0 |phi_dot| / mu``, 5600 1/s at 5 rad/s.
 
     Args:
         parameters: What it is made of.
-        sub_step: Largest integration step [s]. Default 0.25 ms.
+        delay: Transport delay of the sensor [s]: 0, or one or two control periods.
+        ball: True: a ball lies at the angle zero after a reset. The first forward pass faster than
+            0.05 rad/s hits it, and the club loses the momentum that the ball takes.
+        faults: Faults of the machine itself, see :func:`scenarios.golf_robot.faults.catalogue`.
+        sub_step: Largest integration step [s]. Default 0.5 ms.
 
     Raises:
-        InputError: If ``sub_step`` is not positive.
+        InputError: If ``sub_step`` is not positive, ``delay`` is negative, or a fault is not one of a rig's.
 
     Example:
         >>> rig = Rig()
@@ -146,39 +76,146 @@ class Rig:
     """
 
     parameters: RigParameters = field(default_factory=RigParameters)
-    sub_step: float = 0.25e-3
-    _chunk: ca.Function = field(init=False, repr=False, compare=False)
+    delay: float = 0.0
+    ball: bool = False
+    faults: tuple[Fault, ...] = ()
+    sub_step: float = 0.5e-3
+    _chunk: Stepper = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not self.sub_step > 0:
-            raise InputError(f"rig: sub_step must be positive, got {self.sub_step}; 0.25e-3 is the default")
-        object.__setattr__(self, "_chunk", chain(self.parameters, CHUNK))
+            raise InputError(f"rig: sub_step must be positive, got {self.sub_step}; 0.5e-3 is the default")
+        if not self.delay >= 0:
+            raise InputError(f"rig: delay must be 0 s or more, got {self.delay}; 0.02 is one period")
+        check_plant_faults(self.faults, tuple(PLANT_FAULTS))
+        for fault in self.faults:
+            signed, zero = fault.target == "plant_push", fault.target != "plant_mass"
+            if not (signed or fault.value > 0 or (zero and fault.value == 0)):
+                raise InputError(f"fault {fault.target}: value must be positive, got {fault.value}")
+        object.__setattr__(self, "_chunk", Stepper(steps(self.parameters, CHUNK, faulty=self._faulty)))
 
-    def reset(self, x0: Array, seed: int) -> Array:
-        """State ``(4,)`` at the model state ``x0`` ``(2,)``: bristle relaxed, motor without torque.
+    def __reduce__(self) -> tuple[type[Rig], tuple[object, ...]]:
+        """Copies and other processes build their own compiled steps."""
+        return Rig, (self.parameters, self.delay, self.ball, self.faults, self.sub_step)
+
+    @property
+    def _faulty(self) -> bool:
+        return any(fault.target != "plant_delay" for fault in self.faults)
+
+    def with_faults(self, faults: Sequence[Fault]) -> Rig:
+        """The same rig with ``faults`` beside those it has.
+
+        Args:
+            faults: With targets ``"plant_friction"`` and ``"plant_mass"`` (factors on the bearing's friction and
+                on the club's mass and inertia), ``"plant_push"`` (torque on the club [N m]), ``"plant_belt"``
+                (largest torque that the belt transmits, at the club [N m]), ``"plant_delay"`` (of the sensor,
+                beside the rig's own [s]).
+
+        Raises:
+            InputError: If a fault is not one of a rig's.
+        """
+        return replace(self, faults=(*self.faults, *faults))
+
+    def reset(self, x0: Array, seed: int) -> RigState:
+        """State at the model state ``x0`` ``(2,)``: bristle and belt relaxed, motor without torque.
 
         The rig has nothing random inside, so ``seed`` changes nothing.
         """
-        return np.array([x0[0], x0[1], 0.0, 0.0], dtype=np.float64)
+        z = np.zeros(N_STATES)
+        z[:2], z[5] = x0, x0[1]
+        return RigState(z, 0.0, np.array([[0.0, z[0], z[1]]]), self.ball)
 
-    def step(self, state: Array, u: Array, dt: float) -> Array:
-        """State ``(4,)`` after ``dt`` [s] with the motor torque ``u`` ``(1,)`` [N m] held."""
-        chunks = max(1, ceil(dt / (CHUNK * self.sub_step) - 1e-9))
-        s, h = ca.DM(state), dt / (CHUNK * chunks)
-        for _ in range(chunks):
-            s = self._chunk(s, float(np.ravel(u)[0]), h)
-        return np.array(s, dtype=np.float64).ravel()
+    def step(self, state: RigState, u: Array, dt: float) -> RigState:
+        """State after ``dt`` [s] with the motor torque ``u`` ``(1,)`` [N m] held.
 
-    def measure(self, state: Array, rng: np.random.Generator) -> Array:
-        """Encoder angle ``(1,)`` [rad]: the noisy angle rounded to a count."""
-        count = 2 * pi / self.parameters.counts
-        noisy = state[0] + self.parameters.noise * rng.standard_normal()
+        Faults are taken as they are at the beginning of the step.
+        """
+        q, z, left, ball = self._held(state.t, u), state.z, dt, state.ball
+        while left > 1e-12:
+            length = left / ceil(left / (CHUNK * self._sub_step(z)) - 1e-9)
+            after = self._advance(z, q, length)
+            if ball and z[0] < 0.0 <= after[0] and after[1] > SLOWEST_HIT:
+                length, after, ball = *self._impact(z, q, length), False
+            z, left = after, left - length
+        t = state.t + dt
+        return RigState(z, t, self._remembered(state.past, t, z), ball)
+
+    def measure(self, state: RigState, rng: np.random.Generator) -> Array:
+        """Encoder angle ``(1,)`` [rad]: the noisy angle, ``delay`` ago, rounded to a count."""
+        count = self.parameters.count
+        noisy = self._delayed(state) + self.parameters.noise * rng.standard_normal()
         return np.array([count * np.round(noisy / count)])
 
-    def truth(self, state: Array) -> Array:
-        """True ``(phi, phi_dot)``."""
-        return state[:2].copy()
+    def truth(self, state: RigState) -> Array:
+        """True ``(phi, phi_dot)`` of the club, not delayed."""
+        return state.z[:2].copy()
 
-    def hidden(self, state: Array) -> Array:
-        """True ``(bristle [-], motor torque [N m])``, the oracle's hidden states."""
-        return state[2:].copy()
+    def hidden(self, state: RigState) -> Array:
+        """True ``(bristle [-], motor torque [N m], belt twist [rad], motor speed / 4 [rad/s])``."""
+        return state.z[2:].copy()
+
+    def _sub_step(self, z: Array) -> float:
+        """Largest sub-step [s] that the bristle takes at this speed, with what a block may add to it."""
+        p = self.parameters
+        rate = p.sigma0 * (abs(z[1]) + 0.5) / (p.mu_c * (1 - p.asymmetry))
+        return min(self.sub_step, STIFF / rate)
+
+    def _advance(self, z: Array, q: Array, length: float) -> Array:
+        return self._chunk(z, q, length / CHUNK)
+
+    def _held(self, t: float, u: Array) -> Array:
+        """What is held over a step: torque and, if there are faults, the conditions."""
+        torque = float(np.ravel(u)[0])
+        if not self._faulty:
+            return np.array([torque])
+        p, now = self.parameters, self._conditions(t)
+        limit = p.gap + now["plant_belt"] / p.belt_stiffness
+        return np.array([torque, now["plant_friction"], now["plant_mass"], now["plant_push"], limit])
+
+    def _conditions(self, t: float) -> dict[str, float]:
+        """Factors multiply, pushes and delays add, of two weak belts the weaker counts."""
+        now = dict(PLANT_FAULTS)
+        for fault in self.faults:
+            if not fault.active(t):
+                continue
+            value = fault.value_at(t, PLANT_FAULTS[fault.target])
+            if fault.target in ("plant_friction", "plant_mass"):
+                now[fault.target] *= value
+            elif fault.target == "plant_belt":
+                now[fault.target] = min(now[fault.target], value)
+            else:
+                now[fault.target] += value
+        return now
+
+    def _impact(self, z: Array, q: Array, length: float) -> tuple[float, Array]:
+        """Time [s] until the club reaches the ball within a block, and the state after the impact.
+
+        Of one body turning and one at rest: momentum is conserved about the axis and the speeds separate at
+        ``restitution`` times the approach. The motor takes no part: its belt is soft over a millisecond.
+        """
+        p = self.parameters
+        time = brentq(lambda tau: self._advance(z, q, tau)[0], 0.0, length, xtol=1e-12)
+        hit = self._advance(z, q, time)
+        club = (q[2] if len(q) > 1 else 1.0) * (p.J - p.rotor)
+        ball = p.ball_mass * p.ball_radius**2
+        hit[:2] = max(hit[0], 0.0), hit[1] * (club - p.restitution * ball) / (club + ball)
+        return time, hit
+
+    def _remembered(self, past: Array, t: float, z: Array) -> Array:
+        """The past with the present, without what no delay reaches."""
+        now = np.array([[t, z[0], z[1]]])
+        reach = self.delay + sum(fault.value for fault in self.faults if fault.target == "plant_delay")
+        if reach == 0.0:
+            return now
+        past = np.vstack([past, now])
+        return past[max(0, int(np.searchsorted(past[:, 0], t - reach, side="right")) - 1) :]
+
+    def _delayed(self, state: RigState) -> float:
+        """Angle [rad] that arrives now: cubic Hermite interpolation of the past; at first the oldest."""
+        delay = self.delay + self._conditions(state.t)["plant_delay"]
+        if delay <= 0.0:
+            return float(state.z[0])
+        t, phi, v = state.past.T
+        if len(t) == 1 or state.t - delay <= t[0]:
+            return float(phi[0])
+        return float(CubicHermiteSpline(t, phi, v)(state.t - delay))

@@ -4,7 +4,13 @@ from closed_loop_parts import Recorder, make_ekf, run
 from online_models import PendulumPlant
 
 from hybrid_mpc.closed_loop import Fault
-from hybrid_mpc.closed_loop.faults import check_channels, corrupt_input, corrupt_measurement
+from hybrid_mpc.closed_loop.faults import (
+    check_channels,
+    check_plant_faults,
+    corrupt_input,
+    corrupt_measurement,
+    install,
+)
 from hybrid_mpc.errors import InputError
 
 Y, BEFORE = np.array([1.0, 2.0]), np.array([7.0, 8.0])
@@ -15,6 +21,7 @@ Y, BEFORE = np.array([1.0, 2.0]), np.array([7.0, 8.0])
     [
         ("measurement_offset", 0, [1.5, 2.0]),
         ("measurement_offset", 1, [1.0, 2.5]),
+        ("measurement_scale", 1, [1.0, 1.0]),
         ("measurement_freeze", 1, [1.0, 8.0]),
         ("measurement_dropout", 0, [np.nan, 2.0]),
         ("input_gain", 0, [1.0, 2.0]),
@@ -67,6 +74,8 @@ def test_a_fault_may_last_for_ever():
         ((np.nan, 1.0, "input_gain"), "empty"),
         ((0.0, 1.0, "input_gain", np.nan), "finite"),
         ((0.0, 1.0, "input_gain", np.inf), "finite"),
+        ((0.0, 1.0, "input_gain", 1.0, 0, -1.0), "ramp"),
+        ((0.0, 1.0, "inputs", 1.0), "plant_"),
     ],
 )
 def test_bad_faults_are_refused(arguments, words):
@@ -81,6 +90,52 @@ def test_channels_that_do_not_exist_are_refused(target, channel):
     check_channels([Fault(0.0, 1.0, "measurement_offset", channel=1)], n_y=2, n_u=1)
     with pytest.raises(InputError, match=f"channel {channel}"):
         check_channels([Fault(0.0, 1.0, target, channel=channel)], n_y=2, n_u=1)
+
+
+@pytest.mark.parametrize(
+    ("target", "value", "want"),
+    [
+        ("measurement_offset", 0.4, [0.0, 0.1, 0.2, 0.4, 0.4]),
+        ("measurement_scale", 1.4, [0.0, 0.1, 0.2, 0.4, 0.4]),
+        ("input_offset", -0.8, [0.0, -0.2, -0.4, -0.8, -0.8]),
+        ("input_gain", 0.6, [0.0, -0.1, -0.2, -0.4, -0.4]),
+    ],
+)
+def test_a_ramp_grows_from_nothing_in_proportion(target, value, want):
+    fault, one = Fault(2.0, 99.0, target, value, ramp=4.0), np.ones(1)
+    times = (2.0, 3.0, 4.0, 6.0, 50.0)
+    if fault.on_input:
+        seen = [corrupt_input([fault], t, one)[0] - 1 for t in times]
+    else:
+        seen = [corrupt_measurement([fault], t, one, one)[0] - 1 for t in times]
+    np.testing.assert_allclose(seen, want, atol=1e-15)
+
+
+class Machine:
+    def __init__(self, faults=()):
+        self.faults = faults
+
+    def with_faults(self, faults):
+        check_plant_faults(faults, ["plant_load"])
+        return Machine(tuple(faults))
+
+
+def test_install_builds_the_plant_s_faults_in_and_leaves_the_rest():
+    load, gain = Fault(0.0, 1.0, "plant_load", 2.0), Fault(0.0, 1.0, "input_gain", 0.5)
+    plant, rest = install(Machine(), [gain, load])
+    assert plant.faults == (load,)
+    assert rest == (gain,)
+    same = Machine()
+    assert install(same, [gain]) == (same, (gain,))
+    with pytest.raises(InputError, match="plant_load"):
+        install(Machine(), [Fault(0.0, 1.0, "plant_lode", 2.0)])
+    with pytest.raises(InputError, match="with_faults"):
+        install(PendulumPlant(), [load])
+
+
+def test_a_plant_s_fault_is_not_silently_ignored_by_a_loop(model, safe):
+    with pytest.raises(InputError, match="install"):
+        run(model, safe, faults=[Fault(0.0, 1.0, "plant_load", 2.0)])
 
 
 def test_input_faults_act_behind_the_controller_when_they_say(model, safe):

@@ -1,0 +1,133 @@
+"""``hybrid-mpc data``: the recordings of a simulated machine."""
+
+from __future__ import annotations
+
+import csv
+import inspect
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from hybrid_mpc.data.differentiation import bandwidth
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.scenario import Scenario, load_scenario
+
+EXAMPLES = (
+    "Examples:\n\n"
+    "  hybrid-mpc data golf_robot --out recordings\n\n"
+    "  hybrid-mpc data golf_robot --out recordings_a --set a --seed 1 --budget quick"
+)
+
+
+def data(
+    scenario: Annotated[
+        str, typer.Argument(help="A registered name (see: hybrid-mpc scenarios) or a .py file.")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder to make; an existing one must be empty.")],
+    seed: Annotated[int, typer.Option(help="Seed of the recordings.", min=0)] = 0,
+    budget: Annotated[str, typer.Option(help="Amount: quick or full.")] = "full",
+    data_set: Annotated[str, typer.Option("--set", help="Data set of a scenario that has several.")] = "",
+) -> None:
+    """Write a simulated machine's recordings as CSV files, with a README on units, sampling and roles."""
+    files = write_data(load_scenario(scenario), out, seed, budget, data_set)
+    print(f"{len(files)} recordings and README.md in {out.resolve()}")
+
+
+def write_data(scenario: Scenario, out: Path, seed: int, budget: str, data_set: str = "") -> list[Path]:
+    """The recordings of a scenario that makes its own, and a README beside them.
+
+    Args:
+        scenario: The machine. If its ``make_data`` takes a keyword ``data_set``, it has several.
+        out: Folder; made if missing.
+        seed: Same seed, same files.
+        budget: Name of one of the scenario's budgets.
+        data_set: Default: the scenario's default.
+
+    Returns:
+        The CSV files.
+
+    Raises:
+        InputError: If the scenario makes no data, has no such budget or data set, or the folder is not empty.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     len(write_data(load_scenario("golf_robot"), Path(folder), 0, "quick"))
+        15
+    """
+    make = scenario.make_data
+    if make is None:
+        raise InputError(
+            f"{scenario.name} makes no data of its own; give its recordings to 'hybrid-mpc run' with --data"
+        )
+    if budget not in scenario.budgets:
+        raise InputError(f"{scenario.name} has no budget {budget!r}; it has: {', '.join(scenario.budgets)}")
+    several = "data_set" in inspect.signature(make).parameters
+    if data_set and not several:
+        raise InputError(f"{scenario.name} has one data set only; leave --set {data_set} out")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out} exists and is no empty folder; choose another --out")
+    options = {"data_set": data_set} if data_set else {}
+    files = make(out, seed, budget, **options)
+    command = f"hybrid-mpc data {scenario.name} --out {out.name} --seed {seed} --budget {budget}"
+    command += f" --set {data_set}" if data_set else ""
+    (out / "README.md").write_text(readme(scenario, files, command), encoding="utf-8")
+    return files
+
+
+def readme(scenario: Scenario, files: Sequence[Path], command: str) -> str:
+    """What a reader of the files must know, sampling and jitter as they are in the files.
+
+    Args:
+        scenario: The machine.
+        files: Its recordings.
+        command: What wrote them.
+    """
+    spec, prior = scenario.data, scenario.prior()
+    signals = [*zip(spec.inputs, prior.inputs, strict=True), *zip(spec.outputs, prior.outputs, strict=True)]
+    period, spread = _sampling(files, spec.time)
+    lines = [
+        f"# Recordings: {scenario.title}", "", scenario.description, "", f"Written by `{command}`.", "",
+        "| column | unit | meaning |", "| --- | --- | --- |",
+        f"| {spec.time} | s | time stamp of the row, as it was sampled |",
+        *(f"| {column} | {s.unit} | {_meaning(column in spec.inputs)} {s.name} |" for column, s in signals),
+        "",
+        f"Sampling: {1e3 * period:.3g} ms; the time stamps, which are recorded, jitter by {1e3 * spread:.2g} ms "
+        "(one standard deviation). Commas separate, points mark decimals, the first row is the header.",
+        "",
+        f"'hybrid-mpc run' first smooths and differentiates the outputs by a local quartic over "
+        f"{spec.smoothing:g} s (-3 dB at {bandwidth(period, spec.smoothing):.1f} Hz) and brings them to "
+        f"{1e3 * spec.dt:g} ms.",
+        "", "| file | role |", "| --- | --- |",
+        *(f"| {path.name} | {_role(scenario, path)} |" for path in files), "",
+    ]  # fmt: skip
+    return "\n".join(lines)
+
+
+def _meaning(is_input: bool) -> str:
+    return "input, held until the next row:" if is_input else "measured output:"
+
+
+def _role(scenario: Scenario, path: Path) -> str:
+    """Roles of a file's windows, in words; without any, it is split in order of time."""
+    windows = scenario.data.windows.get(path.stem)
+    if windows is None:
+        train, valid, test = (f"{100 * share:.0f} %" for share in scenario.data.fractions)
+        return f"first {train} training, next {valid} validation, last {test} test"
+    if len(windows) == 1:
+        return windows[0].role
+    return ", ".join(f"{w.role} {w.start:g} to {w.end:g} s" for w in windows)
+
+
+def _sampling(files: Sequence[Path], column: str) -> tuple[float, float]:
+    """Median period of the files, and the time stamps' standard deviation around whole periods [s]."""
+    times = []
+    for path in files:
+        with path.open(encoding="utf-8", newline="") as file:
+            times.append(np.array([float(row[column]) for row in csv.DictReader(file)]))
+    lines = [np.polyfit(np.arange(len(t)), t, 1) for t in times]
+    off = [t - np.polyval(line, np.arange(len(t))) for t, line in zip(times, lines, strict=True)]
+    return float(np.median([line[0] for line in lines])), float(np.std(np.concatenate(off)))

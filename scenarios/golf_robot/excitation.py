@@ -1,0 +1,103 @@
+"""Motor torques of the golf robot's recordings. No torch in here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.data.excitation import chirp, sinusoid, steps
+from hybrid_mpc.errors import InputError
+
+Array = NDArray[np.float64]
+
+PEAK = 0.5  # [N m] the motor's
+ROUNDED = 0.2  # [s]
+
+
+def excitation(kind: str, rng: np.random.Generator, t: Array) -> Array:
+    """Motor torque ``(n,)`` [N m] of one of the kinds.
+
+    Sines, steps and chirps are of the paper's size. A controller may use the whole 0.5 N m and goes to 0.9 rad
+    and 4 rad/s, so there are four further kinds with up to 0.5 N m. A step of that size from rest would swing
+    the club over the top; these do not: stairs go up in parts and reach the far angles slowly; pulses are long
+    enough for 4 rad/s and too short to get far; fast sines and chirps stay above the pendulum's 0.64 Hz.
+
+    =============  ==========================================================================
+    ``sine``       0.08 to 0.16 N m, 0.15 to 0.9 Hz
+    ``step``       levels up to 0.25 N m, held 1 to 3 s
+    ``chirp``      0.08 to 0.16 N m, 0.1 to 1.2 Hz, up or down
+    ``stair``      levels up to 0.5 N m, each at most 0.2 N m from the last, held 0.4 to 1.6 s
+    ``pulse``      0.25 to 0.5 N m of alternating sign, 0.2 to 0.4 s each
+    ``fastsine``   0.3 to 0.5 N m, 1 to 2 Hz
+    ``fastchirp``  0.3 to 0.5 N m, 1 to 2 Hz, up or down
+    =============  ==========================================================================
+
+    Args:
+        kind: One of these.
+        rng: Source of amplitudes, frequencies and levels.
+        t: Times ``(n,)`` [s], evenly spaced.
+
+    Raises:
+        InputError: If there is no such kind.
+
+    Example:
+        >>> excitation("sine", np.random.default_rng(0), np.arange(0.0, 1.0, 0.02)).shape
+        (50,)
+    """
+    if kind not in KINDS:
+        raise InputError(f"golf_robot: no excitation {kind!r}; there are: {', '.join(KINDS)}")
+    return KINDS[kind](rng, t)
+
+
+def _sine(rng: np.random.Generator, t: Array) -> Array:
+    amplitude, phase = rng.uniform(0.08, 0.16), rng.uniform(0.0, 2 * np.pi)
+    return sinusoid(t, amplitude, rng.uniform(0.15, 0.9), phase=phase)
+
+
+def _step(rng: np.random.Generator, t: Array) -> Array:
+    return steps(t, -0.25, 0.25, hold=(1.0, 3.0), rng=rng)
+
+
+def _chirp(rng: np.random.Generator, t: Array) -> Array:
+    amplitude = rng.uniform(0.08, 0.16)
+    f0, f1 = rng.permutation([rng.uniform(0.1, 0.3), rng.uniform(0.8, 1.2)])
+    return chirp(t, amplitude, f0, f1)
+
+
+def _stair(rng: np.random.Generator, t: Array) -> Array:
+    starts, level, levels = np.cumsum(rng.uniform(0.4, 1.6, len(t))), 0.0, [0.0]
+    for _ in starts:
+        level = rng.uniform(max(-PEAK, level - 0.2), min(PEAK, level + 0.2))
+        levels.append(level)
+    return _rounded(np.array(levels)[np.searchsorted(starts, t - t[0], side="right")], t)
+
+
+def _pulse(rng: np.random.Generator, t: Array) -> Array:
+    starts = np.cumsum(rng.uniform(0.2, 0.4, len(t)))
+    sizes = rng.uniform(0.25, PEAK, len(t) + 1) * np.where(np.arange(len(t) + 1) % 2, -1.0, 1.0)
+    return _rounded(sizes[np.searchsorted(starts, t - t[0], side="right")], t)
+
+
+def _rounded(levels: Array, t: Array) -> Array:
+    """Levels with each jump turned into half a cosine that ends ``ROUNDED`` after it."""
+    taps = np.sin(np.pi * np.arange(0.5, round(ROUNDED / (t[1] - t[0]))) / round(ROUNDED / (t[1] - t[0])))
+    return np.convolve(levels, taps / taps.sum())[: len(levels)]
+
+
+def _fastsine(rng: np.random.Generator, t: Array) -> Array:
+    amplitude, phase = rng.uniform(0.3, PEAK), rng.uniform(0.0, 2 * np.pi)
+    return sinusoid(t, amplitude, rng.uniform(1.0, 2.0), phase=phase)
+
+
+def _fastchirp(rng: np.random.Generator, t: Array) -> Array:
+    amplitude = rng.uniform(0.3, PEAK)
+    f0, f1 = rng.permutation([rng.uniform(1.0, 1.3), rng.uniform(1.6, 2.0)])
+    return chirp(t, amplitude, f0, f1)
+
+
+KINDS: Mapping[str, Callable[[np.random.Generator, Array], Array]] = {
+    "sine": _sine, "step": _step, "chirp": _chirp, "stair": _stair, "pulse": _pulse,
+    "fastsine": _fastsine, "fastchirp": _fastchirp,
+}  # fmt: skip
