@@ -1,27 +1,46 @@
-"""The condensed QP over the inputs, and the check of its answer."""
+"""The condensed QP over the inputs and the slacks of soft bounds, and the check of its answer."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.mpc.ocp import OCP
+from hybrid_mpc.mpc.soft import SoftRows
 from hybrid_mpc.mpc.solution import Status
 
 Array = NDArray[np.float64]
 
 # Relative to the gradient's size; DAQP works to 1e-6 in its own scaling by default.
 KKT_TOLERANCE = 1e-5
-# Share of an input's range; what is left is clipped away.
+# Share of an input's or a soft bound's range; what is left of an input's is clipped away.
 BOUND_TOLERANCE = 1e-6
 
 
-class InputQP:
-    """``min 1/2 s'Hs + g's`` over input steps ``s`` within the bounds and the limits of the change.
+@dataclass(frozen=True)
+class _Scaled:
+    """``min 1/2 s'hs + g's`` with ``lower <= s <= upper`` and ``row_lower <= a s <= row_upper``."""
 
-    Inputs are scaled by half their range and the Hessian by its diagonal. The solver (DAQP, through
-    ``casadi.conic``) is built once; :meth:`solve` checks its answer whatever status it reports.
+    h: Array
+    g: Array
+    a: Array
+    lower: Array
+    upper: Array
+    row_lower: Array
+    row_upper: Array
+
+
+class InputQP:
+    """``min 1/2 s'Hs + g's + penalties`` over input steps ``s`` within the limits of inputs and changes.
+
+    Inputs are scaled by half their range, soft bounds by half theirs, and the Hessian by its diagonal. The
+    solvers (DAQP, through ``casadi.conic``) are built once; :meth:`solve` checks their answer whatever
+    status they report. Soft bounds cost only where they act: the QP is first solved without them, and an
+    answer that keeps them all is the answer with them, since its penalty is zero. Else it is solved again
+    with one slack a row, ``N n_u + M`` unknowns.
 
     Args:
         ocp: The problem whose bounds hold.
@@ -36,10 +55,10 @@ class InputQP:
         (array([1.]), 'SOLVED')
     """
 
-    def __init__(self, ocp: OCP) -> None:
+    def __init__(self, ocp: OCP, soft: SoftRows | None = None, dt: float = 1.0) -> None:
         n, n_u = ocp.horizon * ocp.n_u, ocp.n_u
         half_range = 0.5 * (ocp.u_max - ocp.u_min)
-        self._ocp = ocp
+        self._ocp, self._soft, self._dt, self._n = ocp, soft, dt, n
         self._scale = np.tile(np.where(np.isfinite(half_range), half_range, 1.0), ocp.horizon)
         rows = np.eye(n) - np.eye(n, k=-n_u) if ocp.du_max is not None else np.zeros((0, n))
         self._rows = rows * self._scale / self._scale[:, None] if len(rows) else rows
@@ -47,8 +66,26 @@ class InputQP:
         options = {"error_on_fail": False}
         sparsity = {"h": ca.Sparsity.dense(n, n), "a": self._a.sparsity()}
         self._solver = ca.conic("input_qp", "daqp", sparsity, options)
+        if soft is None or not len(soft):
+            return
+        self._above, self._below = np.isfinite(soft.upper), np.isfinite(soft.lower)
+        m, wide = len(soft), len(rows) + int(np.sum(self._above)) + int(np.sum(self._below))
+        sparsity = {"h": ca.Sparsity.dense(n + m, n + m), "a": ca.Sparsity.dense(wide, n + m)}
+        self._soft_solver = ca.conic("soft_qp", "daqp", sparsity, options)
 
-    def solve(self, hessian: Array, gradient: Array, u: Array, u_prev: Array) -> tuple[Array, Status, float]:
+    @property
+    def scale(self) -> Array:
+        """What an input step of 1 means in the scaled QP ``(N n_u,)`` [input units]."""
+        return self._scale
+
+    def solve(
+        self,
+        hessian: Array,
+        gradient: Array,
+        u: Array,
+        u_prev: Array,
+        soft: tuple[Array, Array] | None = None,
+    ) -> tuple[Array, Status, float]:
         """Step from the plan ``u``, how the solve ended, and the relative KKT residual.
 
         Args:
@@ -56,29 +93,51 @@ class InputQP:
             gradient: ``(N n_u,)``.
             u: Plan ``(N, n_u)`` the step starts from.
             u_prev: Input ``(n_u,)`` held before.
+            soft: Values of the soft bounds ``(M,)`` without a step, and their derivatives by the step
+                ``(M, N n_u)``. Default: none.
         """
         ocp, scale = self._ocp, self._scale
         lower, upper = ((bound - u).ravel() / scale for bound in (ocp.u_min, ocp.u_max))
         row_lower, row_upper = self._row_bounds(u, u_prev)
         h, g = hessian * scale * scale[:, None], gradient * scale
         size = float(np.max(np.diag(h)))
-        h, g = h / size, g / size
-        answer = self._solver(h=h, g=g, a=self._a, lbx=lower, ubx=upper, lba=row_lower, uba=row_upper)
-        s, lam_x, lam_a = (answer[key].full().ravel() for key in ("x", "lam_x", "lam_a"))
-        step = s * scale
-        if not (np.all(np.isfinite(s)) and np.all(np.isfinite(lam_x)) and np.all(np.isfinite(lam_a))):
-            return step, Status.NOT_FINITE, float("nan")
-        if not self._solver.stats()["success"]:
-            return step, Status.QP_FAILED, float("nan")
-        rows = self._rows @ s
-        violation = _violation(s, lower, upper), _violation(rows, row_lower, row_upper)
-        stationarity = h @ s + g + lam_x + self._rows.T @ lam_a
-        size = max(1.0, float(np.max(np.abs(g))))
-        slack = _slackness(s, lower, upper, lam_x), _slackness(rows, row_lower, row_upper, lam_a)
-        kkt = max(float(np.max(np.abs(stationarity))), *slack) / size
-        if max(violation) > BOUND_TOLERANCE:
-            return step, Status.INFEASIBLE, kkt
-        return step, (Status.SOLVED if kkt <= KKT_TOLERANCE else Status.INACCURATE), kkt
+        hard = _Scaled(h / size, g / size, self._rows, lower, upper, row_lower, row_upper)
+        answer = self._solver(
+            h=hard.h, g=hard.g, a=self._a, lbx=lower, ubx=upper, lba=row_lower, uba=row_upper
+        )
+        s, status, kkt = _check(hard, answer, self._solver, self._n)
+        if soft is None or self._soft is None or not len(self._soft) or not status.ok:
+            return s * scale, status, kkt
+        value, slope = soft
+        if np.max(self._soft.excess(value + slope @ (s * scale)), initial=0.0) == 0.0:
+            return s * scale, status, kkt
+        full = self._with_slacks(hard, size, value, slope)
+        answer = self._soft_solver(
+            h=full.h, g=full.g, a=full.a, lbx=full.lower, ubx=full.upper,
+            lba=full.row_lower, uba=full.row_upper,
+        )  # fmt: skip
+        s, status, kkt = _check(full, answer, self._soft_solver, self._n)
+        return s[: self._n] * scale, status, kkt
+
+    def _with_slacks(self, hard: _Scaled, size: float, value: Array, slope: Array) -> _Scaled:
+        soft, n, m = self._soft, self._n, value.size
+        assert soft is not None
+        h = np.zeros((n + m, n + m))
+        h[:n, :n] = hard.h
+        h.flat[n * (n + m + 1) :: n + m + 1] = 2 * self._dt * soft.quadratic * soft.scale**2 / size
+        g = np.concatenate([hard.g, self._dt * soft.linear * soft.scale / size])
+        by_u, eye = slope * self._scale / soft.scale[:, None], np.eye(m)
+        above = np.hstack([by_u, -eye])[self._above]
+        below = np.hstack([by_u, eye])[self._below]
+        rows = np.hstack([hard.a, np.zeros((len(hard.a), m))])
+        lower = ((soft.lower - value) / soft.scale)[self._below]
+        upper = ((soft.upper - value) / soft.scale)[self._above]
+        return _Scaled(
+            h, g, np.vstack([rows, above, below]),
+            np.concatenate([hard.lower, np.zeros(m)]), np.concatenate([hard.upper, np.full(m, np.inf)]),
+            np.concatenate([hard.row_lower, np.full(upper.size, -np.inf), lower]),
+            np.concatenate([hard.row_upper, upper, np.full(lower.size, np.inf)]),
+        )  # fmt: skip
 
     def _row_bounds(self, u: Array, u_prev: Array) -> tuple[Array, Array]:
         if self._ocp.du_max is None:
@@ -86,6 +145,33 @@ class InputQP:
         du = np.diff(u, axis=0, prepend=u_prev[None])
         scale = self._scale
         return (-self._ocp.du_max - du).ravel() / scale, (self._ocp.du_max - du).ravel() / scale
+
+
+def _check(qp: _Scaled, answer: dict[str, ca.DM], solver: ca.Function, n: int) -> tuple[Array, Status, float]:
+    """The answer, what it is worth, and its KKT residual; the first ``n`` unknowns are inputs.
+
+    The residual of inputs is relative to the inputs' gradient, that of slacks to theirs: a large penalty
+    does not hide an error of the inputs.
+    """
+    s, lam_x, lam_a = (answer[key].full().ravel() for key in ("x", "lam_x", "lam_a"))
+    if not (np.all(np.isfinite(s)) and np.all(np.isfinite(lam_x)) and np.all(np.isfinite(lam_a))):
+        return s, Status.NOT_FINITE, float("nan")
+    if not solver.stats()["success"]:
+        return s, Status.QP_FAILED, float("nan")
+    rows = qp.a @ s
+    violation = _violation(s, qp.lower, qp.upper), _violation(rows, qp.row_lower, qp.row_upper)
+    stationarity = np.abs(qp.h @ s + qp.g + lam_x + qp.a.T @ lam_a)
+    sizes = (max(1.0, float(np.max(np.abs(part), initial=0.0))) for part in (qp.g[:n], qp.g[n:]))
+    own, slacks = sizes
+    slack = _slackness(s, qp.lower, qp.upper, lam_x), _slackness(rows, qp.row_lower, qp.row_upper, lam_a)
+    kkt = max(
+        float(np.max(stationarity[:n])) / own,
+        float(np.max(stationarity[n:], initial=0.0)) / slacks,
+        max(slack) / own,
+    )
+    if max(violation) > BOUND_TOLERANCE:
+        return s, Status.INFEASIBLE, kkt
+    return s, (Status.SOLVED if kkt <= KKT_TOLERANCE else Status.INACCURATE), kkt
 
 
 def _violation(value: Array, lower: Array, upper: Array) -> float:
