@@ -14,8 +14,11 @@ from hybrid_mpc.mpc.solution import Status
 
 Array = NDArray[np.float64]
 
-# Relative to the gradient's size; DAQP works to 1e-6 in its own scaling by default.
+# Relative to the gradient's size.
 KKT_TOLERANCE = 1e-5
+# In DAQP's own scaling, which an ill-conditioned Hessian (weights of 1e4 on one instant) stretches: at the default
+# of 1e-6 it returned bounds violated by 5e-5 of the range.
+PRIMAL_TOLERANCE = 1e-9
 # Share of an input's or a soft bound's range; what is left of an input's is clipped away.
 BOUND_TOLERANCE = 1e-6
 
@@ -63,7 +66,7 @@ class InputQP:
         rows = np.eye(n) - np.eye(n, k=-n_u) if ocp.du_max is not None else np.zeros((0, n))
         self._rows = rows * self._scale / self._scale[:, None] if len(rows) else rows
         self._a = ca.DM(ca.sparsify(ca.DM(self._rows)))
-        options = {"error_on_fail": False}
+        options = {"error_on_fail": False, "daqp": {"primal_tol": PRIMAL_TOLERANCE}}
         sparsity = {"h": ca.Sparsity.dense(n, n), "a": self._a.sparsity()}
         self._solver = ca.conic("input_qp", "daqp", sparsity, options)
         if soft is None or not len(soft):
