@@ -45,8 +45,9 @@ def propagate(a_t: Array, drift: Array, dz0: Array) -> Array:
         array([0. , 1. , 1.5])
     """
     dz = np.empty((len(drift) + 1, dz0.size))
-    dz[0] = dz0
-    for k in range(len(drift)):
-        np.dot(dz[k], a_t[k], out=dz[k + 1])
-        dz[k + 1] += drift[k]
+    dz[0] = now = dz0
+    for a, add, after in zip(a_t, drift, dz[1:], strict=True):
+        np.dot(now, a, out=after)
+        after += add
+        now = after
     return dz

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_mpc.mpc.buffered import BufferedFunction
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.soft import SoftRows
 from hybrid_mpc.mpc.solution import Status
@@ -65,16 +67,12 @@ class InputQP:
         self._scale = np.tile(np.where(np.isfinite(half_range), half_range, 1.0), ocp.horizon)
         rows = np.eye(n) - np.eye(n, k=-n_u) if ocp.du_max is not None else np.zeros((0, n))
         self._rows = rows * self._scale / self._scale[:, None] if len(rows) else rows
-        self._a = ca.DM(ca.sparsify(ca.DM(self._rows)))
-        options = {"error_on_fail": False, "daqp": {"primal_tol": PRIMAL_TOLERANCE}}
-        sparsity = {"h": ca.Sparsity.dense(n, n), "a": self._a.sparsity()}
-        self._solver = ca.conic("input_qp", "daqp", sparsity, options)
+        self._solver = _daqp(n, len(rows))
         if soft is None or not len(soft):
             return
         self._above, self._below = np.isfinite(soft.upper), np.isfinite(soft.lower)
-        m, wide = len(soft), len(rows) + int(np.sum(self._above)) + int(np.sum(self._below))
-        sparsity = {"h": ca.Sparsity.dense(n + m, n + m), "a": ca.Sparsity.dense(wide, n + m)}
-        self._soft_solver = ca.conic("soft_qp", "daqp", sparsity, options)
+        wide = len(rows) + int(np.sum(self._above)) + int(np.sum(self._below))
+        self._soft_solver = _daqp(n + len(soft), wide)
 
     @property
     def scale(self) -> Array:
@@ -105,21 +103,14 @@ class InputQP:
         h, g = hessian * scale * scale[:, None], gradient * scale
         size = float(np.max(np.diag(h)))
         hard = _Scaled(h / size, g / size, self._rows, lower, upper, row_lower, row_upper)
-        answer = self._solver(
-            h=hard.h, g=hard.g, a=self._a, lbx=lower, ubx=upper, lba=row_lower, uba=row_upper
-        )
-        s, status, kkt = _check(hard, answer, self._solver, self._n)
+        s, status, kkt = _check(hard, *_solve(self._solver, hard), self._n)
         if soft is None or self._soft is None or not len(self._soft) or not status.ok:
             return s * scale, status, kkt
         value, slope = soft
         if np.max(self._soft.excess(value + slope @ (s * scale)), initial=0.0) == 0.0:
             return s * scale, status, kkt
         full = self._with_slacks(hard, size, value, slope)
-        answer = self._soft_solver(
-            h=full.h, g=full.g, a=full.a, lbx=full.lower, ubx=full.upper,
-            lba=full.row_lower, uba=full.row_upper,
-        )  # fmt: skip
-        s, status, kkt = _check(full, answer, self._soft_solver, self._n)
+        s, status, kkt = _check(full, *_solve(self._soft_solver, full), self._n)
         return s[: self._n] * scale, status, kkt
 
     def _with_slacks(self, hard: _Scaled, size: float, value: Array, slope: Array) -> _Scaled:
@@ -150,38 +141,50 @@ class InputQP:
         return (-self._ocp.du_max - du).ravel() / scale, (self._ocp.du_max - du).ravel() / scale
 
 
-def _check(qp: _Scaled, answer: dict[str, ca.DM], solver: ca.Function, n: int) -> tuple[Array, Status, float]:
+def _daqp(n: int, rows: int) -> BufferedFunction:
+    options: dict[str, Any] = {"error_on_fail": False, "daqp": {"primal_tol": PRIMAL_TOLERANCE}}
+    sparsity = {"h": ca.Sparsity.dense(n, n), "a": ca.Sparsity.dense(rows, n)}
+    return BufferedFunction(ca.conic("input_qp", "daqp", sparsity, options))
+
+
+def _solve(solver: BufferedFunction, qp: _Scaled) -> tuple[Array, Array, Array]:
+    """Unknowns and the multipliers of their bounds and of the rows, as the solver leaves them.
+
+    ``casadi.conic`` takes ``h, g, a, lba, uba, lbx, ubx`` and returns ``x, cost, lam_a, lam_x``. Its status is
+    not asked for: it proves nothing that the check does not.
+    """
+    given = qp.h.ravel(), qp.g, qp.a.T.ravel(), qp.row_lower, qp.row_upper, qp.lower, qp.upper
+    for buffer, values in zip(solver.inputs, given, strict=False):
+        buffer[:] = values
+    solver()
+    s, _, lam_a, lam_x = solver.outputs
+    return s.copy(), lam_x, lam_a
+
+
+def _check(qp: _Scaled, s: Array, lam_x: Array, lam_a: Array, n: int) -> tuple[Array, Status, float]:
     """The answer, what it is worth, and its KKT residual; the first ``n`` unknowns are inputs.
 
     The residual of inputs is relative to the inputs' gradient, that of slacks to theirs: a large penalty
     does not hide an error of the inputs.
     """
-    s, lam_x, lam_a = (answer[key].full().ravel() for key in ("x", "lam_x", "lam_a"))
-    if not (np.all(np.isfinite(s)) and np.all(np.isfinite(lam_x)) and np.all(np.isfinite(lam_a))):
+    value, lower, upper, multiplier = s, qp.lower, qp.upper, lam_x
+    stationarity = qp.h @ s + qp.g + lam_x
+    if len(qp.a):
+        value = np.concatenate([s, qp.a @ s])
+        lower, upper = np.concatenate([lower, qp.row_lower]), np.concatenate([upper, qp.row_upper])
+        multiplier = np.concatenate([lam_x, lam_a])
+        stationarity += qp.a.T @ lam_a
+    violation = float(np.max(np.maximum(lower - value, value - upper), initial=0.0))
+    # Complementarity; a positive multiplier belongs to the upper bound.
+    distance = np.where(multiplier > 0, upper - value, value - lower)
+    slackness = np.max(np.minimum(np.abs(multiplier), np.abs(distance)))
+    residual, size = np.abs(stationarity), max(1.0, float(np.max(np.abs(qp.g[:n]))))
+    kkt = float(np.maximum(np.max(residual[:n]), slackness)) / size
+    if s.size > n:
+        slacks = float(np.max(residual[n:])) / max(1.0, float(np.max(np.abs(qp.g[n:]))))
+        kkt = float(np.maximum(kkt, slacks))
+    if not (np.isfinite(kkt) and np.isfinite(violation)):  # a NaN anywhere ends up in one of the two
         return s, Status.NOT_FINITE, float("nan")
-    if not solver.stats()["success"]:
-        return s, Status.QP_FAILED, float("nan")
-    rows = qp.a @ s
-    violation = _violation(s, qp.lower, qp.upper), _violation(rows, qp.row_lower, qp.row_upper)
-    stationarity = np.abs(qp.h @ s + qp.g + lam_x + qp.a.T @ lam_a)
-    sizes = (max(1.0, float(np.max(np.abs(part), initial=0.0))) for part in (qp.g[:n], qp.g[n:]))
-    own, slacks = sizes
-    slack = _slackness(s, qp.lower, qp.upper, lam_x), _slackness(rows, qp.row_lower, qp.row_upper, lam_a)
-    kkt = max(
-        float(np.max(stationarity[:n])) / own,
-        float(np.max(stationarity[n:], initial=0.0)) / slacks,
-        max(slack) / own,
-    )
-    if max(violation) > BOUND_TOLERANCE:
+    if violation > BOUND_TOLERANCE:
         return s, Status.INFEASIBLE, kkt
     return s, (Status.SOLVED if kkt <= KKT_TOLERANCE else Status.INACCURATE), kkt
-
-
-def _violation(value: Array, lower: Array, upper: Array) -> float:
-    return float(max(np.max(lower - value, initial=0.0), np.max(value - upper, initial=0.0)))
-
-
-def _slackness(value: Array, lower: Array, upper: Array, multiplier: Array) -> float:
-    """Largest complementarity error; a positive multiplier belongs to the upper bound."""
-    distance = np.where(multiplier > 0, upper - value, value - lower)
-    return float(np.max(np.minimum(np.abs(multiplier), np.abs(distance)), initial=0.0))

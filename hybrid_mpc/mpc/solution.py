@@ -16,7 +16,7 @@ class Status(Enum):
     """How a solve ended; the value is the message.
 
     Example:
-        >>> Status.QP_FAILED.ok, Status.SOLVED.ok
+        >>> Status.INFEASIBLE.ok, Status.SOLVED.ok
         (False, True)
     """
 
@@ -24,7 +24,6 @@ class Status(Enum):
     SOLVED = "the QP was solved and its solution checked"
     NOT_FINITE = "the estimate, the reference, the model or the plan holds a value that is not finite"
     STOPPED = "the iterations ended before convergence; the plan keeps the model and the limits"
-    QP_FAILED = "the QP solver reported a failure"
     INFEASIBLE = "the solution violates an input bound or the limit of its change"
     INACCURATE = "the solution fails the KKT check"
     NLP_FAILED = "the nonlinear solver's answer keeps neither the model nor the limits"

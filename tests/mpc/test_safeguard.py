@@ -35,7 +35,7 @@ class Failing:
             return solution
         prepared = self._controller.prepare(previous)
         kept = prepared.u if self._nonsense is None else np.full_like(prepared.u, self._nonsense)
-        return replace(solution, u=kept, status=Status.QP_FAILED)
+        return replace(solution, u=kept, status=Status.INACCURATE)
 
 
 @pytest.fixture(scope="module")
