@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from time import perf_counter
 from typing import Any
 
@@ -34,6 +35,7 @@ class IpoptController:
         ocp: The problem.
         tolerance: IPOPT's own, relative to its scaling.
         iterations: IPOPT's most iterations.
+        options: Further options of IPOPT by name. Default: the adaptive barrier.
 
     Raises:
         InputError: If problem and model do not fit, or an option is not positive.
@@ -45,7 +47,13 @@ class IpoptController:
     """
 
     def __init__(
-        self, model: HybridModel, ocp: OCP, *, tolerance: float = 1e-9, iterations: int = 500
+        self,
+        model: HybridModel,
+        ocp: OCP,
+        *,
+        tolerance: float = 1e-9,
+        iterations: int = 500,
+        options: Mapping[str, Any] | None = None,
     ) -> None:
         if not tolerance > 0 or iterations < 1:
             raise InputError(
@@ -54,12 +62,13 @@ class IpoptController:
         self._problem = Problem(model, ocp)
         self._bounds: dict[str, Array] = {}
         nlp = self._formulate()
-        options: dict[str, Any] = {"print_time": False, "error_on_fail": False}
-        options["ipopt"] = {
+        settings: dict[str, Any] = {"print_time": False, "error_on_fail": False}
+        settings["ipopt"] = {
             "print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": iterations,
             "mu_strategy": "adaptive",
+            **(options or {}),
         }  # fmt: skip
-        self._solver = ca.nlpsol("mpc", "ipopt", nlp, options)
+        self._solver = ca.nlpsol("mpc", "ipopt", nlp, settings)
         w, g = nlp["x"], nlp["g"]
         multipliers = ca.MX.sym("lam", g.shape[0])
         slope = ca.gradient(nlp["f"] + ca.dot(multipliers, g), w)
