@@ -21,6 +21,8 @@ KKT_TOLERANCE = 1e-5
 # In DAQP's own scaling, which an ill-conditioned Hessian (weights of 1e4 on one instant) stretches: at the default
 # of 1e-6 it returned bounds violated by 5e-5 of the range.
 PRIMAL_TOLERANCE = 1e-9
+# Numbers of soft bounds that QPs are built for, besides all of them.
+SOFT_SIZES = (8, 20, 50)
 # Share of an input's or a soft bound's range; what is left of an input's is clipped away.
 BOUND_TOLERANCE = 1e-6
 
@@ -38,14 +40,34 @@ class _Scaled:
     row_upper: Array
 
 
+class _Sides:
+    """The finite sides of soft bounds, each as ``sign (value - bound) / scale <= 0``."""
+
+    def __init__(self, soft: SoftRows) -> None:
+        above, below = np.flatnonzero(np.isfinite(soft.upper)), np.flatnonzero(np.isfinite(soft.lower))
+        self.row = np.concatenate([above, below])
+        self._sign = np.concatenate([np.ones(above.size), -np.ones(below.size)])
+        self._bound = np.concatenate([soft.upper[above], soft.lower[below]])
+        self.scale, self.linear, self.quadratic = (
+            v[self.row] for v in (soft.scale, soft.linear, soft.quadratic)
+        )
+
+    def of(self, values: Array) -> Array:
+        """Scaled violations of values ``(M,)``, or scaled rows of their derivatives ``(M, n)``."""
+        if values.ndim == 1:
+            return np.asarray(self._sign * (values[self.row] - self._bound) / self.scale)
+        return np.asarray((self._sign / self.scale)[:, None] * values[self.row])
+
+
 class InputQP:
     """``min 1/2 s'Hs + g's + penalties`` over input steps ``s`` within the limits of inputs and changes.
 
     Inputs are scaled by half their range, soft bounds by half theirs, and the Hessian by its diagonal. The
     solvers (DAQP, through ``casadi.conic``) are built once; :meth:`solve` checks their answer whatever
-    status they report. Soft bounds cost only where they act: the QP is first solved without them, and an
+    status they report. Soft bounds cost time only where they act: the QP is first solved without them, and an
     answer that keeps them all is the answer with them, since its penalty is zero. Else it is solved again
-    with one slack a row, ``N n_u + M`` unknowns.
+    with a slack for each of the few bounds that are violated most; an answer that keeps the others is the
+    answer with all of them. Else those that it violates are added, up to all.
 
     Args:
         ocp: The problem whose bounds hold.
@@ -63,16 +85,15 @@ class InputQP:
     def __init__(self, ocp: OCP, soft: SoftRows | None = None, dt: float = 1.0) -> None:
         n, n_u = ocp.horizon * ocp.n_u, ocp.n_u
         half_range = 0.5 * (ocp.u_max - ocp.u_min)
-        self._ocp, self._soft, self._dt, self._n = ocp, soft, dt, n
+        self._ocp, self._dt, self._n = ocp, dt, n
         self._scale = np.tile(np.where(np.isfinite(half_range), half_range, 1.0), ocp.horizon)
         rows = np.eye(n) - np.eye(n, k=-n_u) if ocp.du_max is not None else np.zeros((0, n))
         self._rows = rows * self._scale / self._scale[:, None] if len(rows) else rows
         self._solver = _daqp(n, len(rows))
-        if soft is None or not len(soft):
-            return
-        self._above, self._below = np.isfinite(soft.upper), np.isfinite(soft.lower)
-        wide = len(rows) + int(np.sum(self._above)) + int(np.sum(self._below))
-        self._soft_solver = _daqp(n + len(soft), wide)
+        self._sides = _Sides(soft) if soft is not None else None
+        m = 0 if self._sides is None else self._sides.row.size
+        sizes = sorted({min(size, m) for size in (*SOFT_SIZES, m)} - {0})
+        self._soft_solvers = {size: _daqp(n + size, len(rows) + size) for size in sizes}
 
     @property
     def scale(self) -> Array:
@@ -104,33 +125,57 @@ class InputQP:
         size = float(np.max(np.diag(h)))
         hard = _Scaled(h / size, g / size, self._rows, lower, upper, row_lower, row_upper)
         s, status, kkt = _check(hard, *_solve(self._solver, hard), self._n)
-        if soft is None or self._soft is None or not len(self._soft) or not status.ok:
+        if soft is None or not status.ok:
             return s * scale, status, kkt
-        value, slope = soft
-        if np.max(self._soft.excess(value + slope @ (s * scale)), initial=0.0) == 0.0:
-            return s * scale, status, kkt
-        full = self._with_slacks(hard, size, value, slope)
-        s, status, kkt = _check(full, *_solve(self._soft_solver, full), self._n)
-        return s[: self._n] * scale, status, kkt
+        return self._softly(hard, size, s, kkt, *soft)
 
-    def _with_slacks(self, hard: _Scaled, size: float, value: Array, slope: Array) -> _Scaled:
-        soft, n, m = self._soft, self._n, value.size
-        assert soft is not None
+    def _softly(
+        self, hard: _Scaled, size: float, s: Array, kkt: float, value: Array, slope: Array
+    ) -> tuple[Array, Status, float]:
+        """The answer with soft bounds, from the answer ``s`` without."""
+        sides, n = self._sides, self._n
+        assert sides is not None
+        value, slope = sides.of(value), sides.of(slope) * self._scale
+        wanted = np.zeros(value.size, dtype=bool)
+        for room, solver in self._soft_solvers.items():
+            beyond = value + slope @ s[:n]
+            wanted |= beyond > 0
+            count = int(np.count_nonzero(wanted))
+            if count == 0:
+                break
+            if count > room:
+                continue
+            # The nearest fill the room that is left: they are the likeliest to be violated next.
+            nearest = np.argsort(np.where(wanted, -np.inf, -beyond), kind="stable")[:room]
+            full = self._with_slacks(hard, size, value, slope, nearest)
+            s, status, kkt = _check(full, *_solve(solver, full), n)
+            others = np.ones(value.size, dtype=bool)
+            others[nearest] = False
+            if not status.ok or not np.any((value + slope @ s[:n])[others] > 0):
+                return s[:n] * self._scale, status, kkt
+            wanted[nearest] = True
+        return s[:n] * self._scale, Status.SOLVED, kkt
+
+    def _with_slacks(
+        self, hard: _Scaled, size: float, value: Array, slope: Array, chosen: NDArray[np.int64]
+    ) -> _Scaled:
+        """The scaled QP with a slack for each of the ``chosen`` sides of soft bounds."""
+        sides, n, m = self._sides, self._n, chosen.size
+        assert sides is not None
+        scale = sides.scale[chosen]
         h = np.zeros((n + m, n + m))
         h[:n, :n] = hard.h
-        h.flat[n * (n + m + 1) :: n + m + 1] = 2 * self._dt * soft.quadratic * soft.scale**2 / size
-        g = np.concatenate([hard.g, self._dt * soft.linear * soft.scale / size])
-        by_u, eye = slope * self._scale / soft.scale[:, None], np.eye(m)
-        above = np.hstack([by_u, -eye])[self._above]
-        below = np.hstack([by_u, eye])[self._below]
-        rows = np.hstack([hard.a, np.zeros((len(hard.a), m))])
-        lower = ((soft.lower - value) / soft.scale)[self._below]
-        upper = ((soft.upper - value) / soft.scale)[self._above]
+        h.flat[n * (n + m + 1) :: n + m + 1] = 2 * self._dt * sides.quadratic[chosen] * scale**2 / size
+        g = np.concatenate([hard.g, self._dt * sides.linear[chosen] * scale / size])
+        a = np.zeros((len(hard.a) + m, n + m))
+        a[: len(hard.a), :n] = hard.a
+        a[len(hard.a) :, :n] = slope[chosen]
+        a[len(hard.a) :, n:] = -np.eye(m)
+        none = np.full(m, np.inf)
         return _Scaled(
-            h, g, np.vstack([rows, above, below]),
-            np.concatenate([hard.lower, np.zeros(m)]), np.concatenate([hard.upper, np.full(m, np.inf)]),
-            np.concatenate([hard.row_lower, np.full(upper.size, -np.inf), lower]),
-            np.concatenate([hard.row_upper, upper, np.full(lower.size, np.inf)]),
+            h, g, a,
+            np.concatenate([hard.lower, np.zeros(m)]), np.concatenate([hard.upper, none]),
+            np.concatenate([hard.row_lower, -none]), np.concatenate([hard.row_upper, -value[chosen]]),
         )  # fmt: skip
 
     def _row_bounds(self, u: Array, u_prev: Array) -> tuple[Array, Array]:
