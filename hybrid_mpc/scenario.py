@@ -123,6 +123,10 @@ class ControlSpec:
         u_max: Upper input bounds ``(n_u,)``.
         du_max: Largest input change per period ``(n_u,)``; default: none.
         estimator_sigma: Standard deviations that the estimator is to assume, ``(n_y,)`` [output units].
+        x_min: Soft lower bounds of the states ``(n_x,)``; ``-inf`` for none. Default: none.
+        x_max: Soft upper bounds of the states ``(n_x,)``; ``inf`` for none. Default: none.
+        slack_linear: Linear penalties of their violation ``(n_x,)``. Default: that of :class:`~hybrid_mpc.mpc.OCP`.
+        slack_quadratic: Quadratic penalties ``(n_x,)``, positive. Default: that of the OCP.
     """
 
     horizon: int
@@ -133,6 +137,10 @@ class ControlSpec:
     u_max: tuple[float, ...]
     du_max: tuple[float, ...] | None = None
     estimator_sigma: tuple[float, ...] = ()
+    x_min: tuple[float, ...] | None = None
+    x_max: tuple[float, ...] | None = None
+    slack_linear: tuple[float, ...] | None = None
+    slack_quadratic: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -145,6 +153,17 @@ class Task:
         duration: Length [s].
         x0: Initial state ``(n_x,)`` [SI], at rest.
         reference: ``t (n,) [s] -> x_ref (n, n_x)`` [SI]; the controller previews it.
+        weight: ``t (n,) [s] -> (n, n_x)``, factors on the control problem's ``q``, not negative, previewed like
+            the reference: zero where a state does not matter, large where it must be met. An instant that
+            is to be met must lie on the grid of model periods. Default: 1 throughout.
+        control: The task's own control problem, e.g. with other limits. Default: the scenario's.
+
+    Example:
+        >>> def meet(t):  # at t = 1 s only, and from then on ordinarily
+        ...     return np.where(np.abs(t - 1.0) < 0.01, 1e3, 1.0 * (t > 1.0))[:, None] * np.ones(2)
+        >>> task = Task("hit", "Be there at 1 s", 2.0, (0.0, 0.0), lambda t: np.zeros((len(t), 2)), meet)
+        >>> task.weight(np.array([0.5, 1.0, 1.5]))[:, 0].tolist()
+        [0.0, 1000.0, 1.0]
     """
 
     name: str
@@ -152,6 +171,8 @@ class Task:
     duration: float
     x0: tuple[float, ...]
     reference: Callable[[Array], Array]
+    weight: Callable[[Array], Array] | None = None
+    control: ControlSpec | None = None
 
 
 @dataclass(frozen=True)

@@ -24,14 +24,15 @@ class ClosedLoopResult:
         t: ``(n,)`` [s].
         x: True states ``(n, n_x)`` at ``t_k``.
         y: Measurements ``(n, n_y)`` as they arrived, faults and noise included; NaN for a dropout.
-        u: Commanded inputs ``(n, n_u)``, held from ``t_k`` on.
-        x_hat: Estimated states ``(n, n_x)``.
+        u: Commanded inputs ``(n, n_u)``, held from ``t_k`` on (with an input delay: from that much later).
+        x_hat: Estimated states ``(n, n_x)``; with an input delay of the instant at which ``u`` will act.
         h: Estimated hidden states ``(n, n_h)``.
         d: Estimated input disturbance ``(n, n_u)``.
         reference: Reference ``(n, n_x)`` at ``t_k``.
         source: Name of the :class:`~hybrid_mpc.mpc.Source` of each input.
         status: Name of the :class:`~hybrid_mpc.mpc.Status` of each solve.
-        stage_cost: Stage cost ``(n,)`` per second on the true state; NaN if no cost was given.
+        stage_cost: Stage cost ``(n,)`` per second on the true state and the input that acts on it, with the
+            weight factors of that instant and without penalties of soft bounds.
         timing_ms: Durations ``(n,)`` [ms] of ``estimate``, ``solve``, ``monitor`` and ``total``. The only
             field in which two runs may differ.
         violation: Energy violation ``(n,)`` [W]; NaN without a monitor.

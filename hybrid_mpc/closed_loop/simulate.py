@@ -11,13 +11,15 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybrid_mpc.closed_loop.faults import Fault, check_channels, corrupt_input, corrupt_measurement
+from hybrid_mpc.closed_loop.faults import Fault, check_channels
+from hybrid_mpc.closed_loop.machine import Machine, Preview, Previews, fitting
 from hybrid_mpc.closed_loop.result import ClosedLoopResult
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation.kalman import Estimate, Estimator, TrueState
+from hybrid_mpc.estimation.delays import filtered, sees_truth
+from hybrid_mpc.estimation.kalman import Estimate, Estimator
 from hybrid_mpc.model import HybridModel
-from hybrid_mpc.mpc.condensed import CondensedController
 from hybrid_mpc.mpc.ocp import OCP
+from hybrid_mpc.mpc.problem import Controller
 from hybrid_mpc.mpc.safeguard import Decision, SafeController
 from hybrid_mpc.riccati import vector
 from hybrid_mpc.scenario import Plant
@@ -67,39 +69,55 @@ class Step:
 def simulate(
     plant: Plant,
     estimator: Estimator,
-    controller: SafeController | CondensedController,
-    reference: Callable[[Array], Array],
+    controller: SafeController | Controller,
+    reference: Preview,
     *,
     dt: float,
     duration: float,
     x0: ArrayLike,
     seed: int,
+    weight: Preview | None = None,
     horizon: int | None = None,
     monitor: Monitor | None = None,
     faults: Sequence[Fault] = (),
     stage_cost: OCP | None = None,
     on_step: Callable[[Step], None] | None = None,
+    sensor_delay: int = 0,
+    input_delay: int = 0,
+    late: Callable[[float], bool] | None = None,
 ) -> ClosedLoopResult:
     """Run a plant under control; deterministic except for the recorded durations.
 
     At ``t_k``: measure ``y_k``; estimate with ``y_k`` and ``u_{k-1}``; solve ``u_k``; monitor; hold ``u_k``.
-    No time passes between measuring and holding. Input faults act behind the controller, which is not
-    told.
+    No time passes between measuring and holding but the delays given. Input faults act behind the
+    controller, which is not told.
+
+    The preview reaches beyond the end of the run: reference and weight are asked for those times too. Where
+    they are not finite there (a recording that ends), their last value within the run is held.
+
+    With delays the estimate must be that of the instant at which the input will act: give
+    :class:`~hybrid_mpc.estimation.DelayCompensation` as estimator. Before the start the machine has rested
+    at ``x0`` with the first held input, and the sensor has measured it there.
 
     Args:
         plant: The machine.
-        estimator: Filter, or :class:`~hybrid_mpc.estimation.TrueState`, which is handed the truth.
+        estimator: Filter, or :class:`~hybrid_mpc.estimation.TrueState`, which is handed the truth, undelayed.
         controller: A :class:`~hybrid_mpc.mpc.SafeController`; a bare controller is guarded without fallback.
         reference: ``t (n,) -> x_ref (n, n_x)``, previewed over the horizon.
         dt: Period [s]; must be the models' own.
         duration: Length [s], rounded to whole periods.
         x0: Initial state ``(n_x,)``.
         seed: Seed of the plant and of the measurement noise.
+        weight: Factors on ``q``, ``t (n,) -> (n, n_x)``, previewed alike; they count in the recorded cost.
+            Default: 1.
         horizon: Periods of preview. Default: the controller's horizon.
         monitor: Default: none.
         faults: Default: none.
         stage_cost: Problem whose stage cost is recorded. Default: the controller's.
         on_step: Called after every period, e.g. to show progress.
+        sensor_delay: Periods after which a measurement arrives; faults of a sensor act on arrival.
+        input_delay: Periods after which an input reaches the plant: computing and transport.
+        late: ``t [s] -> True`` where the solve misses its deadline. Default: never.
 
     Returns:
         The record of ``round(duration / dt)`` periods.
@@ -109,62 +127,66 @@ def simulate(
 
     Example: see ``tests/closed_loop``; with a scenario::
 
-        result = simulate(plant, ekf, controller, task.reference, dt=0.02, duration=10.0, x0=task.x0, seed=0)
+        result = simulate(plant, ekf, controller, task.reference, weight=task.weight, dt=0.02,
+                          duration=task.duration, x0=task.x0, seed=0)
     """
     safe = controller if isinstance(controller, SafeController) else SafeController(controller)
     ocp, model = safe.controller.ocp, estimator.model
     _check_models(model, safe.controller.model)
     n = _periods(dt, duration, model.dt, safe.controller.model.dt)
     check_channels(faults, model.n_y, ocp.n_u)
-    x0 = vector(x0, ocp.n_x, "x0")
-    preview_steps = ocp.horizon if horizon is None else horizon
-    if preview_steps < 0:
-        raise InputError(f"horizon must not be negative, got {horizon}")
-    ahead: Array = np.arange(preview_steps + 1, dtype=np.float64) * dt
-    cost = ocp if stage_cost is None else stage_cost
-    if (cost.n_x, cost.n_u) != (ocp.n_x, ocp.n_u):
-        raise InputError(
-            f"stage_cost has {cost.n_x} states and {cost.n_u} inputs, needed: {ocp.n_x} and {ocp.n_u}"
-        )
-    rng = np.random.default_rng(seed)
-    state = plant.reset(x0, seed)
+    cost = _checked_cost(ocp, ocp if stage_cost is None else stage_cost)
+    previews = Previews(reference, weight, ocp, horizon, dt, n * dt)
+    machine = Machine(
+        plant, vector(x0, ocp.n_x, "x0"), seed, model.n_y, faults, dt, sensor_delay, input_delay
+    )
     estimate: Estimate | None = None
     decision: Decision | None = None
     memory = monitor.initial() if monitor is not None else None
     record = _Record(dt)
-    y = np.full(model.n_y, np.nan)
     for k in range(n):
         t = k * dt
-        x = _fitting(plant.truth(state), ocp.n_x, "the plant's truth")
-        y = corrupt_measurement(
-            faults, t, _fitting(plant.measure(state, rng), model.n_y, "the plant's measurement"), y
-        )
-        seen = np.concatenate([x, plant.hidden(state)]) if isinstance(estimator, TrueState) else y
-        preview: Array = np.asarray(reference(t + ahead), dtype=np.float64)
-        if preview.shape != (ahead.size, ocp.n_x):
-            raise InputError(f"reference returns {preview.shape}, needed: {(ahead.size, ocp.n_x)}")
+        x = fitting(plant.truth(machine.state), ocp.n_x, "the plant's truth")
+        y = machine.measure(t)
+        seen = np.concatenate([x, plant.hidden(machine.state)]) if sees_truth(estimator) else y
+        x_ref, factors = previews(t + input_delay * dt)
         clock = [perf_counter()]
         if estimate is None or decision is None:
             estimate = estimator.start(seen, t)
             decision = safe.initial(estimate)
+            machine.rest(decision.u)
         else:
             estimate = estimator.update(estimate, seen, decision.u)
         clock.append(perf_counter())
-        u_prev = decision.u
-        decision = safe.decide(decision, estimate, preview)
+        if late is not None and late(t):
+            decision = safe.late(decision, estimate, x_ref)
+        else:
+            decision = safe.decide(decision, estimate, x_ref, factors)
         clock.append(perf_counter())
         reading = None
         if monitor is not None:
-            memory, reading = monitor.update(memory, y, u_prev, estimate)
+            memory, reading = monitor.update(memory, y, machine.held_at_measurement(), filtered(estimate))
         clock.append(perf_counter())
-        with np.errstate(over="ignore"):  # an absurd reference costs infinitely much
-            stage = float(cost.stage_cost(x, decision.u, preview[0], decision.u - u_prev))
+        u, u_prev = machine.command(decision.u)
+        if input_delay:
+            x_ref, factors = previews(t)
+        now_factors = 1.0 if factors is None else factors[0]
+        with np.errstate(over="ignore", invalid="ignore"):  # an absurd reference costs infinitely much
+            stage = float(cost.stage_cost(x, u, x_ref[0], u - u_prev, now_factors))
         step = Step(k, t, x, y, estimate, decision, reading)
-        record.add(step, preview[0], stage, np.diff(clock) * 1e3)
+        record.add(step, x_ref[0], stage, np.diff(clock) * 1e3)
         if on_step is not None:
             on_step(step)
-        state = plant.step(state, corrupt_input(faults, t, decision.u), dt)
+        machine.advance(t)
     return record.result()
+
+
+def _checked_cost(ocp: OCP, cost: OCP) -> OCP:
+    if (cost.n_x, cost.n_u) != (ocp.n_x, ocp.n_u):
+        raise InputError(
+            f"stage_cost has {cost.n_x} states and {cost.n_u} inputs, needed: {ocp.n_x} and {ocp.n_u}"
+        )
+    return cost
 
 
 def _check_models(estimated: HybridModel, controlled: HybridModel) -> None:
@@ -174,13 +196,6 @@ def _check_models(estimated: HybridModel, controlled: HybridModel) -> None:
             f"the estimator's model {estimated.name} has (n_x, n_h, n_u) = {sizes[0]}, "
             f"the controller's model {controlled.name} {sizes[1]}; give both the same model"
         )
-
-
-def _fitting(values: ArrayLike, size: int, name: str) -> Array:
-    array: Array = np.array(values, dtype=np.float64)
-    if array.shape != (size,):
-        raise InputError(f"{name} has shape {array.shape}, the model needs {(size,)}")
-    return array
 
 
 def _periods(dt: float, duration: float, *periods: float) -> int:

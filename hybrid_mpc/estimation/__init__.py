@@ -1,5 +1,13 @@
 """State and disturbance estimation on a deployed model."""
 
+from hybrid_mpc.estimation.delays import DelayCompensation, DelayedEstimate
 from hybrid_mpc.estimation.kalman import Estimate, Estimator, ExtendedKalmanFilter, TrueState
 
-__all__ = ["Estimate", "Estimator", "ExtendedKalmanFilter", "TrueState"]
+__all__ = [
+    "DelayCompensation",
+    "DelayedEstimate",
+    "Estimate",
+    "Estimator",
+    "ExtendedKalmanFilter",
+    "TrueState",
+]

@@ -74,10 +74,10 @@ class ExtendedKalmanFilter:
         model: The deployed model.
         sigma_y: Standard deviations of the measurement noise ``(n_y,)``, positive [output units].
         sigma_x: Standard deviations of the process noise per period ``(n_x,)`` [state units].
-        sigma_d: Standard deviations of the step of ``d`` per period ``(n_u,)`` [input units]; 0 turns the
-            disturbance off.
         sigma_x0: Standard deviations of the first state ``(n_x,)``.
-        sigma_d0: Standard deviations of the first disturbance ``(n_u,)``.
+        sigma_d: Standard deviations of the step of ``d`` per period ``(n_u,)`` [input units]. Default: zero.
+        sigma_d0: Standard deviations of the first disturbance ``(n_u,)``. Default: zero. Without both there
+            is no disturbance observer: ``d`` stays exactly zero.
 
     Raises:
         InputError: If a shape does not fit, a deviation is negative or not finite, or ``sigma_y`` is 0.
@@ -90,8 +90,7 @@ class ExtendedKalmanFilter:
         >>> model = HybridModel("sum", 1.0, (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),),
         ...     ca.Function("f", [x, h, u], [x + u, h]), ca.Function("g", [x, h, u], [u]),
         ...     ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]))
-        >>> ekf = ExtendedKalmanFilter(model, sigma_y=[0.1], sigma_x=[0.1], sigma_d=[0.0],
-        ...                            sigma_x0=[0.1], sigma_d0=[0.0])
+        >>> ekf = ExtendedKalmanFilter(model, sigma_y=[0.1], sigma_x=[0.1], sigma_x0=[0.1])
         >>> estimate = ekf.update(ekf.start(np.array([1.0])), y=np.array([1.3]), u_prev=np.zeros(1))
         >>> estimate.x.round(3)
         array([1.2])
@@ -103,11 +102,13 @@ class ExtendedKalmanFilter:
         *,
         sigma_y: ArrayLike,
         sigma_x: ArrayLike,
-        sigma_d: ArrayLike,
         sigma_x0: ArrayLike,
-        sigma_d0: ArrayLike,
+        sigma_d: ArrayLike | None = None,
+        sigma_d0: ArrayLike | None = None,
     ) -> None:
         n_x, n_u, n_y = model.n_x, model.n_u, model.n_y
+        sigma_d = np.zeros(n_u) if sigma_d is None else sigma_d
+        sigma_d0 = np.zeros(n_u) if sigma_d0 is None else sigma_d0
         variance_y = _variance(sigma_y, n_y, "sigma_y")
         if not np.all(variance_y > 0):
             raise InputError(f"sigma_y must be positive, got {np.asarray(sigma_y)}")
@@ -266,6 +267,16 @@ class TrueState:
             raise InputError(f"true state: the plant gives {z.size} states, the oracle model needs {n_z}")
         p, empty = np.zeros((n_z + m.n_u, n_z + m.n_u)), np.full(m.n_y, np.nan)
         return Estimate(float(t), z[: m.n_x], z[m.n_x : n_z], np.zeros(m.n_u), p, empty, float("nan"))
+
+    def predict(self, estimate: Estimate, u: ArrayLike) -> Estimate:
+        """The model's own step with ``u`` ``(n_u,)`` held: what an oracle knows of the time ahead."""
+        m = self._model
+        x, h = (v.full().ravel() for v in m.step(estimate.x, estimate.h, np.asarray(u, dtype=float)))
+        return self.start(np.concatenate([x, h]), estimate.t + m.dt)
+
+    def correct(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> Estimate:
+        """The truth ``y`` at the estimate's own instant."""
+        return self.start(y, estimate.t)
 
     def update(self, estimate: Estimate, y: ArrayLike, u_prev: ArrayLike) -> Estimate:
         """The truth one period later; ``u_prev`` is not used."""

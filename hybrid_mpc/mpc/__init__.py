@@ -1,16 +1,31 @@
-"""Model predictive control: the problem, the condensed real-time iteration, the safeguard."""
+"""Model predictive control: the problem, its solvers behind one interface, the safeguard.
 
+Solvers: :class:`CondensedController` (real-time iteration), :class:`SQPController` (the same to convergence),
+:class:`IpoptController` (exact reference), :class:`BestOf` (any of these from several starts).
+"""
+
+from hybrid_mpc.mpc.best_of import BestOf
 from hybrid_mpc.mpc.condensed import CondensedController, Prepared
+from hybrid_mpc.mpc.nlp import IpoptController
 from hybrid_mpc.mpc.ocp import OCP
+from hybrid_mpc.mpc.problem import Controller, Problem
 from hybrid_mpc.mpc.safeguard import Decision, SafeController, Source
+from hybrid_mpc.mpc.soft import SoftBound
 from hybrid_mpc.mpc.solution import Solution, Status
+from hybrid_mpc.mpc.sqp import SQPController
 
 __all__ = [
     "OCP",
+    "BestOf",
     "CondensedController",
+    "Controller",
     "Decision",
+    "IpoptController",
     "Prepared",
+    "Problem",
+    "SQPController",
     "SafeController",
+    "SoftBound",
     "Solution",
     "Source",
     "Status",

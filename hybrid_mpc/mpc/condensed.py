@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from time import perf_counter
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,29 +12,37 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.mpc.buffered import BufferedFunction
+from hybrid_mpc.mpc.condensing import condense, propagate
 from hybrid_mpc.mpc.ocp import OCP
+from hybrid_mpc.mpc.problem import Problem, Target, weights_ok
 from hybrid_mpc.mpc.qp import InputQP
 from hybrid_mpc.mpc.solution import Solution, Status
 
 Array = NDArray[np.float64]
+NAN = float("nan")
 
 
 @dataclass(frozen=True)
 class Prepared:
     """Everything of an iteration that needs neither the estimate nor the reference.
 
-    With ``dz = (x, h) - (x_bar, h_bar)`` the linearised prediction is
-    ``dz_k = from_start_k dz_0 + from_d_k dd + defect_k + from_u_k du``.
+    With ``dz = (x, h) - (x_bar, h_bar)`` the linearised prediction is ``dz_{k+1} = A_k dz_k + B_k (du_k +
+    dd) + defect_k``; of it, ``x`` depends on the inputs by ``from_u``.
 
     Args:
         u: Linearisation inputs ``(N, n_u)``.
         z: Linearisation trajectory ``(N + 1, n_x + n_h)``.
         d: Linearisation disturbance ``(n_u,)``.
         u_prev: Input ``(n_u,)`` held before the plan.
-        maps: ``(N + 1, n_z, n_z + n_u + 1 + N n_u)``: from_start, from_d, defect and from_u side by side.
-        weighted: ``((N + 1) n_x, N n_u)``: state weights times the rows of from_u that belong to ``x``.
+        a_t: Transposed ``A_k`` ``(N, n_z, n_z)``.
+        b: ``B_k`` ``(N, n_z, n_u)``.
+        defects: ``(N, n_z)``.
+        from_u: Derivative of the states by the inputs ``((N + 1) n_x, N n_u)``.
+        weighted: State weights times ``from_u``.
         hessian: Hessian of the cost by ``du`` ``(N n_u, N n_u)``.
-        defect: Largest defect of the linearisation trajectory.
+        weight: Weight factors ``(N + 1, n_x)``.
+        soft: Soft bounds' values ``(M,)``, their derivatives by their state ``(M, n_x)`` and by the inputs
+            ``(M, N n_u)``.
         milliseconds: Time the preparation took.
     """
 
@@ -43,10 +50,14 @@ class Prepared:
     z: Array
     d: Array
     u_prev: Array
-    maps: Array
+    a_t: Array
+    b: Array
+    defects: Array
+    from_u: Array
     weighted: Array
     hessian: Array
-    defect: float
+    weight: Array
+    soft: tuple[Array, Array, Array]
     milliseconds: float
 
 
@@ -56,9 +67,10 @@ class CondensedController:
     A period's work is split: :meth:`prepare` shifts the previous plan, linearises the model along it in
     one mapped call and condenses states and hidden states away (their multiple-shooting trajectory and
     its defects are kept); :meth:`feedback` embeds the new estimate and solves the QP of ``N n_u``
-    unknowns. The QP's answer is checked, whatever status its solver reports. Everything is built here;
-    no method changes the object (apart from scratch buffers: not for several threads at once) or raises on
-    the numbers of an estimate, a reference or a plan.
+    unknowns (and a slack for every soft bound and period, where one acts). The QP's answer is checked,
+    whatever status its solver reports. Everything is built here; no method changes the object (apart from
+    scratch buffers: not for several threads at once) or raises on the numbers of an estimate, a reference,
+    a weight or a plan.
 
     Args:
         model: The deployed model; ``n_h`` may be 0.
@@ -73,6 +85,7 @@ class CondensedController:
     feedback control*, SIAM J. Control Optim. 43 (2005).
 
     Example:
+        >>> import casadi as ca
         >>> from hybrid_mpc.estimation import TrueState
         >>> from hybrid_mpc.signals import Signal
         >>> x, h, u, w = ca.MX.sym("x"), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w")
@@ -87,24 +100,18 @@ class CondensedController:
     """
 
     def __init__(self, model: HybridModel, ocp: OCP, *, iterations: int = 1) -> None:
-        if (ocp.n_x, ocp.n_u) != (model.n_x, model.n_u):
-            raise InputError(
-                f"the problem has {ocp.n_x} states and {ocp.n_u} inputs, model {model.name} has "
-                f"{model.n_x} and {model.n_u}"
-            )
         if iterations < 1:
             raise InputError(f"iterations must be at least 1, got {iterations}")
+        self._problem = Problem(model, ocp)
         assert model.with_jacobian is not None
         self._model, self._ocp, self._iterations = model, ocp, iterations
-        n, n_x, n_u = ocp.horizon, ocp.n_x, ocp.n_u
+        n, n_u = ocp.horizon, ocp.n_u
         self._stages = BufferedFunction(model.with_jacobian.map(n))
-        self._rollout = _rollout(model, n)
-        self._terminal = ocp.terminal_weight(model)
-        self._difference = np.eye(n * n_u) - np.eye(n * n_u, k=-n_u)
+        difference = np.eye(n * n_u) - np.eye(n * n_u, k=-n_u)
         r, r_delta = np.tile(ocp.r, n) * model.dt, np.tile(ocp.r_delta, n) * model.dt
-        self._input_hessian = 2 * (np.diag(r) + (self._difference.T * r_delta) @ self._difference)
-        self._qp = InputQP(ocp)
-        self._n_x = n_x
+        self._input_hessian = 2 * (np.diag(r) + (difference.T * r_delta) @ difference)
+        self._qp = InputQP(ocp, self._problem.soft, model.dt)
+        self._n_x = ocp.n_x
         self._evaluate_once()
 
     @property
@@ -117,41 +124,41 @@ class CondensedController:
         """The problem."""
         return self._ocp
 
+    @property
+    def problem(self) -> Problem:
+        """Problem and model made ready; what the plan costs on the model itself."""
+        return self._problem
+
+    @property
+    def qp(self) -> InputQP:
+        """The QP over the inputs."""
+        return self._qp
+
     def initial(self, estimate: Estimate, u: Array | None = None) -> Solution:
-        """A first plan: the model run freely from the estimate.
+        """A first plan: the model run freely from the estimate; see :meth:`Problem.initial`."""
+        return self._problem.initial(estimate, u)
 
-        Args:
-            estimate: Where the plan starts.
-            u: Inputs ``(N, n_u)``; ``u[0]`` counts as the input held before the next solve. Default:
-                zero, or the bound next to it.
-
-        Returns:
-            A plan of status INITIAL. Where the free run diverges, the state is held at the estimate.
-
-        Raises:
-            InputError: If ``u`` has another shape or is not finite.
-        """
-        n, ocp = self._ocp.horizon, self._ocp
-        start = np.zeros((n, ocp.n_u)) if u is None else np.asarray(u, dtype=float)
-        if start.shape != (n, ocp.n_u) or not np.all(np.isfinite(start)):
-            raise InputError(f"u: finite values of shape {(n, ocp.n_u)} needed, got {start}")
-        plan = np.clip(start, ocp.u_min, ocp.u_max)
-        z0 = np.concatenate([estimate.x, estimate.h])
-        z = np.vstack([z0, self._rollout(z0, (plan + estimate.d).T).full().T])
-        if not np.all(np.isfinite(z)):
-            z = np.tile(z0, (n + 1, 1))
-        x, h = z[:, : self._n_x], z[:, self._n_x :]
-        return Solution(plan, x, h, estimate.d, float("nan"), Status.INITIAL, float("nan"), float("nan"), {})
-
-    def prepare(self, previous: Solution) -> Prepared:
+    def prepare(self, previous: Solution, weight: Array | None = None) -> Prepared:
         """Linearise and condense along the previous plan, shifted by one period.
 
-        ``previous.u[0]`` is the input that is being held; the shifted plan repeats its last input.
+        Args:
+            previous: The last plan. ``previous.u[0]`` is the input that is being held; the shifted plan
+                repeats its last input.
+            weight: Factors on ``q`` ``(m, n_x)``, from now on in steps of ``dt``; if ``m < N + 1`` the last
+                value holds. Default: 1.
+
+        Raises:
+            InputError: If the weight has another shape.
         """
         u = np.vstack([previous.u[1:], previous.u[-1:]])
         z = np.hstack([previous.x, previous.h])
         z = np.vstack([z[1:], z[-1:]])
-        return self._condense(u, z, previous.d, previous.u[0], shifted=True)
+        weight = self._problem.weights(weight)
+        return self._condense(u, z, previous.d, previous.u[0], weight, shifted=True)
+
+    def linearise(self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array) -> Prepared:
+        """Linearise and condense along a trajectory as it is: ``u`` ``(N, n_u)``, ``z`` ``(N + 1, n_z)``."""
+        return self._condense(u, z, d, u_prev, weight, shifted=False)
 
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def feedback(self, prepared: Prepared, estimate: Estimate, reference: Array) -> Solution:
@@ -169,93 +176,109 @@ class CondensedController:
             InputError: If the reference has another shape.
         """
         start = perf_counter()
-        reference = np.asarray(reference, dtype=float)
-        if reference.ndim != 2 or len(reference) < 1 or reference.shape[1] != self._n_x:
-            raise InputError(f"reference: shape {reference.shape} given, (m, {self._n_x}) with m > 0 needed")
-        if not np.all(np.isfinite(reference)):
+        target = Target(self._problem.target(reference).x, prepared.weight)
+        if not (target.ok and np.all(np.isfinite(prepared.hessian))):
             return self._failed(prepared, Status.NOT_FINITE, start)
-        x_ref = self._reference(reference)
-        n_x, n_z = self._n_x, prepared.z.shape[1]
-        n_u = self._ocp.n_u
-        offset = np.concatenate([np.concatenate([estimate.x, estimate.h]) - prepared.z[0],
-                                 estimate.d - prepared.d, [1.0]])  # fmt: skip
-        free = prepared.maps[:, :, : n_z + n_u + 1] @ offset
-        error = prepared.z[:, :n_x] + free[:, :n_x] - x_ref
+        n_x = self._n_x
+        dz0 = np.concatenate([estimate.x, estimate.h]) - prepared.z[0]
+        drift = prepared.defects + prepared.b @ (estimate.d - prepared.d)
+        free = propagate(prepared.a_t, drift, dz0)
+        error = prepared.z[:, :n_x] + free[:, :n_x] - target.x
         u_bar = prepared.u.ravel()
-        gradient = 2 * prepared.weighted.T @ error.ravel() + self._input_gradient(u_bar, prepared.u_prev)
-        if not (np.all(np.isfinite(gradient)) and np.all(np.isfinite(prepared.hessian))):
+        gradient = 2 * error.ravel() @ prepared.weighted + self._input_gradient(u_bar, prepared.u_prev)
+        soft = self._soft_rows(prepared, free)
+        if not (np.all(np.isfinite(gradient)) and (soft is None or np.all(np.isfinite(soft[0])))):
             return self._failed(prepared, Status.NOT_FINITE, start)
-        step, status, kkt = self._qp.solve(prepared.hessian, gradient, prepared.u, prepared.u_prev)
+        step, status, kkt = self._qp.solve(prepared.hessian, gradient, prepared.u, prepared.u_prev, soft)
         if not status.ok:
             return self._failed(prepared, status, start, kkt)
         u = (u_bar + step).reshape(prepared.u.shape)
-        z = prepared.z + free + prepared.maps[:, :, n_z + n_u + 1 :] @ step
-        cost = self._cost(z[:, :n_x], u, x_ref, prepared.u_prev)
+        drift += (prepared.b @ step.reshape(len(u), -1, 1))[:, :, 0]
+        z = prepared.z + propagate(prepared.a_t, drift, dz0)
+        excess = np.zeros(0) if soft is None else self._problem.soft.excess(soft[0] + soft[1] @ step)
+        cost = self._problem.cost(z, u, prepared.u_prev, target, excess)
         if not np.isfinite(cost):
             return self._failed(prepared, Status.NOT_FINITE, start, kkt)
         u = np.clip(u, self._ocp.u_min, self._ocp.u_max)  # the QP keeps them to its tolerance only
-        return Solution(u, z[:, :n_x], z[:, n_x:], estimate.d, cost, status, kkt, prepared.defect,
-                        self._timing(prepared, start))  # fmt: skip
+        return Solution(u, z[:, :n_x], z[:, n_x:], estimate.d, cost, status, kkt, _largest(prepared.defects),
+                        self._timing(prepared, start), float(np.max(excess, initial=0.0)))  # fmt: skip
 
-    def solve(self, previous: Solution, estimate: Estimate, reference: Array) -> Solution:
+    def solve(
+        self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None
+    ) -> Solution:
         """:meth:`prepare` and :meth:`feedback`, linearised anew ``iterations`` times."""
-        prepared = self.prepare(previous)
+        prepared = self.prepare(previous, weight)
         solution = self.feedback(prepared, estimate, reference)
-        for _ in range(self._iterations - 1):
+        for i in range(1, self._iterations):
             if not solution.status.ok:
                 break
             spent = solution.timing
             z = np.hstack([solution.x, solution.h])
-            again = self._condense(solution.u, z, solution.d, prepared.u_prev, shifted=False)
+            again = self.linearise(solution.u, z, solution.d, prepared.u_prev, prepared.weight)
             solution = self.feedback(again, estimate, reference)
             total = {name: spent[name] + solution.timing[name] for name in spent}
-            solution = replace(solution, timing=total)
+            solution = replace(solution, timing=total, iterations=i + 1)
         return solution
 
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
-    def _condense(self, u: Array, z: Array, d: Array, u_prev: Array, *, shifted: bool) -> Prepared:
+    def _condense(
+        self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array, *, shifted: bool
+    ) -> Prepared:
         start = perf_counter()
-        n, n_x, n_u, n_z = self._ocp.horizon, self._n_x, self._ocp.n_u, z.shape[1]
-        z_next, a, b = self._linearise(z[:-1], u + d)
+        n, n_x = self._ocp.horizon, self._n_x
+        z_next, a_t, b = self._stage_derivatives(z[:-1], u + d)
         if shifted:  # the appended period has no trajectory yet: start it without a defect
             z = np.vstack([z[:-1], z_next[-1:]])
-        defect = z_next - z[1:]
-        first = n_z + n_u + 1
-        maps = np.zeros((n + 1, n_z, first + n * n_u))
-        maps[0, :, :n_z] = np.eye(n_z)
-        for k in range(n):
-            end = first + k * n_u
-            maps[k + 1, :, :end] = a[k] @ maps[k, :, :end]
-            maps[k + 1, :, n_z : n_z + n_u] += b[k]
-            maps[k + 1, :, first - 1] += defect[k]
-            maps[k + 1, :, end : end + n_u] = b[k]
-        from_u = maps[:, :n_x, first:]
-        weighted = from_u * (self._ocp.q * self._model.dt)[None, :, None]
-        weighted[-1] = self._terminal @ from_u[-1]
-        weighted = weighted.reshape((n + 1) * n_x, n * n_u)
-        hessian = 2 * from_u.reshape((n + 1) * n_x, n * n_u).T @ weighted + self._input_hessian
+        from_u = condense(a_t, b, n_x)
+        if weights_ok(weight):
+            stages, terminal = self._problem.state_weights(weight)
+            weighted = np.empty_like(from_u)
+            np.multiply(from_u[: n * n_x], stages.reshape(-1, 1), out=weighted[: n * n_x])
+            weighted[n * n_x :] = terminal @ from_u[n * n_x :]
+        else:
+            weighted = np.full_like(from_u, np.nan)
+        hessian = 2 * from_u.T @ weighted + self._input_hessian
+        soft = self._soft_derivatives(z, u, from_u)
         spent = (perf_counter() - start) * 1e3
-        largest = float(np.max(np.abs(defect)))
-        return Prepared(u, z, d, u_prev, maps, weighted, hessian, largest, spent)
+        return Prepared(
+            u, z, d, u_prev, a_t, b, z_next - z[1:], from_u, weighted, hessian, weight, soft, spent
+        )
 
-    def _linearise(self, z: Array, u: Array) -> tuple[Array, Array, Array]:
-        """Successors ``(N, n_z)``, and views of ``A`` ``(N, n_z, n_z)`` and ``B`` ``(N, n_z, n_u)``."""
+    def _stage_derivatives(self, z: Array, u: Array) -> tuple[Array, Array, Array]:
+        """Successors ``(N, n_z)``, transposed ``A`` ``(N, n_z, n_z)`` and ``B`` ``(N, n_z, n_u)``."""
         n, n_z, n_x = *z.shape, self._n_x
         into_x, into_h, into_u = self._stages.inputs
         into_x[:], into_h[:], into_u[:] = z[:, :n_x].ravel(), z[:, n_x:].ravel(), u.ravel()
         self._stages()
         x, h, a, b = (out.reshape(n, -1) for out in self._stages.outputs)
-        return (
-            np.hstack([x, h]),
-            a.reshape(n, n_z, n_z).transpose(0, 2, 1),
-            b.reshape(n, -1, n_z).transpose(0, 2, 1),
-        )
+        by_u = b.reshape(n, -1, n_z).transpose(0, 2, 1)
+        return np.hstack([x, h]), a.reshape(n, n_z, n_z).copy(), by_u.copy()  # the buffers are used again
+
+    def _soft_derivatives(self, z: Array, u: Array, from_u: Array) -> tuple[Array, Array, Array]:
+        rows, n_u = self._problem.soft, self._ocp.n_u
+        if not len(rows):
+            return np.zeros(0), np.zeros((0, self._n_x)), np.zeros((0, u.size))
+        value, by_x, by_u = rows.linearise(z[:, : self._n_x], u)
+        states = from_u.reshape(len(z), self._n_x, u.size)[rows.stage]
+        slope = (by_x[:, None, :] @ states)[:, 0, :]
+        direct = np.flatnonzero(np.any(by_u != 0, axis=1))
+        for j in range(n_u):
+            slope[direct, rows.stage[direct] * n_u + j] += by_u[direct, j]
+        return value, by_x, slope
+
+    def _soft_rows(self, prepared: Prepared, free: Array) -> tuple[Array, Array] | None:
+        """Values of the soft bounds before a step, and their derivatives by it."""
+        value, by_x, slope = prepared.soft
+        if not value.size:
+            return None
+        moved = np.sum(by_x * free[self._problem.soft.stage, : self._n_x], axis=1)
+        return value + moved, slope
 
     def _evaluate_once(self) -> None:
         """Solve once at zero, so that no later call is the first of a CasADi function, which is slow."""
         m = self._model
         x, h, d, p = np.zeros(m.n_x), np.zeros(m.n_h), np.zeros(m.n_u), np.zeros((0, 0))
-        zero = Estimate(0.0, x, h, d, p, np.zeros(0), float("nan"))
+        zero = Estimate(0.0, x, h, d, p, np.zeros(0), NAN)
         self.solve(self.initial(zero), zero, np.zeros((1, m.n_x)))
 
     def _input_gradient(self, u: Array, u_prev: Array) -> Array:
@@ -264,28 +287,14 @@ class CondensedController:
         gradient[: u_prev.size] -= 2 * self._model.dt * self._ocp.r_delta * u_prev
         return gradient
 
-    def _reference(self, reference: Array) -> Array:
-        rows = np.minimum(np.arange(self._ocp.horizon + 1), len(reference) - 1)
-        return np.asarray(reference[rows])
-
-    def _cost(self, x: Array, u: Array, x_ref: Array, u_prev: Array) -> float:
-        du = np.diff(u, axis=0, prepend=u_prev[None])
-        last = x[-1] - x_ref[-1]
-        stages = self._ocp.stage_cost(x[:-1], u, x_ref[:-1], du)
-        return float(np.sum(stages) * self._model.dt + last @ self._terminal @ last)
-
-    def _failed(
-        self, prepared: Prepared, status: Status, start: float, kkt: float = float("nan")
-    ) -> Solution:
+    def _failed(self, prepared: Prepared, status: Status, start: float, kkt: float = NAN) -> Solution:
         x, h = prepared.z[:, : self._n_x], prepared.z[:, self._n_x :]
-        return Solution(prepared.u, x, h, prepared.d, float("nan"), status, kkt, prepared.defect,
-                        self._timing(prepared, start))  # fmt: skip
+        return Solution(prepared.u, x, h, prepared.d, NAN, status, kkt, _largest(prepared.defects),
+                        self._timing(prepared, start), NAN)  # fmt: skip
 
     def _timing(self, prepared: Prepared, start: float) -> dict[str, float]:
         return {"prepare": prepared.milliseconds, "feedback": (perf_counter() - start) * 1e3}
 
 
-def _rollout(model: HybridModel, n: int) -> ca.Function:
-    z, u = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("u", model.n_u)
-    z_next = ca.vertcat(*model.step(z[: model.n_x], z[model.n_x :], u))
-    return ca.Function("z_step", [z, u], [z_next]).mapaccum("rollout", n)
+def _largest(defects: Array) -> float:
+    return float(np.max(np.abs(defects)))

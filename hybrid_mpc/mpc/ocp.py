@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model import HybridModel
+from hybrid_mpc.mpc.soft import SoftBound, state_bounds
 from hybrid_mpc.riccati import dare, linearisation, vector
 from hybrid_mpc.scenario import ControlSpec
 
@@ -18,11 +20,23 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class OCP:
-    """A quadratic tracking problem with bounded inputs.
+    """A quadratic tracking problem with bounded inputs and softly bounded states.
 
     The cost of a plan is ``sum_k stage_k dt + (x_N - x_ref_N)' P (x_N - x_ref_N)`` with
     ``stage_k = (x_k - x_ref_k)' diag(q) (x_k - x_ref_k) + u_k' diag(r) u_k + du_k' diag(r_delta) du_k``,
     ``du_k = u_k - u_{k-1}`` and ``k = 0 .. N-1``. Only the stages are multiplied by ``dt``.
+
+    References and weights may vary over time. Where a solve is given weight factors ``w_k`` ``(n_x,)``, ``q``
+    stands for ``w_k q`` at stage k and ``P`` for ``S P S`` with ``S = diag(sqrt(w_N))``. A task like "be at
+    x* at the time t*, no matter how" has factors of zero before ``t*``, large ones at ``t*`` and ordinary
+    ones after it, and a horizon that reaches beyond ``t*`` from the start on: the free part of the window
+    then shrinks by itself as ``t*`` comes near.
+
+    Bounds on states hold for ``x_1 .. x_N`` and are soft: a violation ``s`` costs ``slack_linear s +
+    slack_quadratic s^2`` per second. Above the hard bound's largest multiplier the linear penalty is exact,
+    so that a bound is violated only where no input can keep it; see :class:`~hybrid_mpc.mpc.SoftBound`. The
+    default, 1,000 times what the tolerated deviation ``1 / sqrt(q)`` costs, is far above it for weights by
+    Bryson's rule; weight factors of more than 100 ask for larger penalties.
 
     Args:
         horizon: N, number of model periods.
@@ -35,6 +49,12 @@ class OCP:
         terminal: ``"riccati"``, or a symmetric positive semi-definite ``(n_x, n_x)`` matrix ``P``.
         working_point: ``(x, u)`` at which ``"riccati"`` linearises the model. Default: zero. With a steep
             friction law take a moving point (see :func:`hybrid_mpc.riccati.lqr`).
+        x_min: Soft lower bounds of the states ``(n_x,)``; ``-inf`` for none. Default: none.
+        x_max: Soft upper bounds of the states ``(n_x,)``; ``inf`` for none. Default: none.
+        slack_linear: Penalties ``(n_x,)`` [cost/s/unit], not negative. Default: ``1000 sqrt(q)``.
+        slack_quadratic: Penalties ``(n_x,)`` [cost/s/unit^2], positive. Default: ``1000 q``. Where ``q`` is
+            zero, 1 stands for it in both.
+        soft: Soft bounds on expressions of ``(x, u)``. Default: none.
 
     Raises:
         InputError: If shapes do not fit, bounds cross, or a weight is negative or not finite.
@@ -53,6 +73,11 @@ class OCP:
     du_max: Array | None = None
     terminal: Array | Literal["riccati"] = "riccati"
     working_point: tuple[ArrayLike, ArrayLike] | None = None
+    x_min: Array = field(default_factory=lambda: np.zeros(0))
+    x_max: Array = field(default_factory=lambda: np.zeros(0))
+    slack_linear: Array = field(default_factory=lambda: np.zeros(0))
+    slack_quadratic: Array = field(default_factory=lambda: np.zeros(0))
+    soft: tuple[SoftBound, ...] = ()
 
     def __init__(
         self,
@@ -65,6 +90,11 @@ class OCP:
         du_max: ArrayLike | None = None,
         terminal: ArrayLike | Literal["riccati"] = "riccati",
         working_point: tuple[ArrayLike, ArrayLike] | None = None,
+        x_min: ArrayLike | None = None,
+        x_max: ArrayLike | None = None,
+        slack_linear: ArrayLike | None = None,
+        slack_quadratic: ArrayLike | None = None,
+        soft: Sequence[SoftBound] = (),
     ) -> None:
         if int(horizon) != horizon or horizon < 1:
             raise InputError(f"horizon must be a whole number of periods, at least 1; got {horizon}")
@@ -80,7 +110,11 @@ class OCP:
         if not (isinstance(terminal, str) and terminal == "riccati"):
             terminal = _terminal(terminal, n_x)
         fields = {"horizon": int(horizon), **weights, "u_min": lower, "u_max": upper, "du_max": du_max}
-        for name, value in {**fields, "terminal": terminal, "working_point": working_point}.items():
+        names = "x_min", "x_max", "slack_linear", "slack_quadratic"
+        states = state_bounds(q_v, x_min, x_max, slack_linear, slack_quadratic)
+        bounds = dict(zip(names, states, strict=True))
+        others = {"terminal": terminal, "working_point": working_point, "soft": tuple(soft)}
+        for name, value in {**fields, **bounds, **others}.items():
             object.__setattr__(self, name, value)
 
     @classmethod
@@ -93,7 +127,7 @@ class OCP:
         """The problem of a scenario's :class:`~hybrid_mpc.scenario.ControlSpec`."""
         return cls(
             spec.horizon, spec.q, spec.r, spec.r_delta, spec.u_min, spec.u_max, spec.du_max, terminal,
-            working_point,
+            working_point, spec.x_min, spec.x_max, spec.slack_linear, spec.slack_quadratic,
         )  # fmt: skip
 
     @property
@@ -106,12 +140,13 @@ class OCP:
         """Number of inputs."""
         return int(self.r.size)
 
-    def stage_cost(self, x: Array, u: Array, x_ref: Array, du: Array) -> Array:
-        """Stage cost ``(...)`` per second of states ``(..., n_x)`` and inputs ``(..., n_u)``."""
-        error = np.asarray(x) - np.asarray(x_ref)
-        return np.asarray(
-            error**2 @ self.q + np.asarray(u) ** 2 @ self.r + np.asarray(du) ** 2 @ self.r_delta
-        )
+    def stage_cost(self, x: Array, u: Array, x_ref: Array, du: Array, weight: Array | float = 1.0) -> Array:
+        """Stage cost ``(...)`` per second of states ``(..., n_x)`` and inputs ``(..., n_u)``.
+
+        ``weight`` ``(..., n_x)`` are factors on ``q``. Penalties of soft bounds are not in it.
+        """
+        error = weight * (np.asarray(x) - np.asarray(x_ref)) ** 2
+        return np.asarray(error @ self.q + np.asarray(u) ** 2 @ self.r + np.asarray(du) ** 2 @ self.r_delta)
 
     def saturate(self, u: Array, u_prev: Array) -> Array:
         """``u`` ``(n_u,)`` moved into the bounds and, around ``u_prev``, into the limit of its change.

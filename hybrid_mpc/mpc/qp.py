@@ -1,27 +1,73 @@
-"""The condensed QP over the inputs, and the check of its answer."""
+"""The condensed QP over the inputs and the slacks of soft bounds, and the check of its answer."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_mpc.mpc.buffered import BufferedFunction
 from hybrid_mpc.mpc.ocp import OCP
+from hybrid_mpc.mpc.soft import SoftRows
 from hybrid_mpc.mpc.solution import Status
 
 Array = NDArray[np.float64]
 
-# Relative to the gradient's size; DAQP works to 1e-6 in its own scaling by default.
+# Relative to the gradient's size.
 KKT_TOLERANCE = 1e-5
-# Share of an input's range; what is left is clipped away.
+# In DAQP's own scaling, which an ill-conditioned Hessian (weights of 1e4 on one instant) stretches: at the default
+# of 1e-6 it returned bounds violated by 5e-5 of the range.
+PRIMAL_TOLERANCE = 1e-9
+# Numbers of soft bounds that QPs are built for, besides all of them.
+SOFT_SIZES = (8, 20, 50)
+# Share of an input's or a soft bound's range; what is left of an input's is clipped away.
 BOUND_TOLERANCE = 1e-6
 
 
-class InputQP:
-    """``min 1/2 s'Hs + g's`` over input steps ``s`` within the bounds and the limits of the change.
+@dataclass(frozen=True)
+class _Scaled:
+    """``min 1/2 s'hs + g's`` with ``lower <= s <= upper`` and ``row_lower <= a s <= row_upper``."""
 
-    Inputs are scaled by half their range and the Hessian by its diagonal. The solver (DAQP, through
-    ``casadi.conic``) is built once; :meth:`solve` checks its answer whatever status it reports.
+    h: Array
+    g: Array
+    a: Array
+    lower: Array
+    upper: Array
+    row_lower: Array
+    row_upper: Array
+
+
+class _Sides:
+    """The finite sides of soft bounds, each as ``sign (value - bound) / scale <= 0``."""
+
+    def __init__(self, soft: SoftRows) -> None:
+        above, below = np.flatnonzero(np.isfinite(soft.upper)), np.flatnonzero(np.isfinite(soft.lower))
+        self.row = np.concatenate([above, below])
+        self._sign = np.concatenate([np.ones(above.size), -np.ones(below.size)])
+        self._bound = np.concatenate([soft.upper[above], soft.lower[below]])
+        self.scale, self.linear, self.quadratic = (
+            v[self.row] for v in (soft.scale, soft.linear, soft.quadratic)
+        )
+
+    def of(self, values: Array) -> Array:
+        """Scaled violations of values ``(M,)``, or scaled rows of their derivatives ``(M, n)``."""
+        if values.ndim == 1:
+            return np.asarray(self._sign * (values[self.row] - self._bound) / self.scale)
+        return np.asarray((self._sign / self.scale)[:, None] * values[self.row])
+
+
+class InputQP:
+    """``min 1/2 s'Hs + g's + penalties`` over input steps ``s`` within the limits of inputs and changes.
+
+    Inputs are scaled by half their range, soft bounds by half theirs, and the Hessian by its diagonal. The
+    solvers (DAQP, through ``casadi.conic``) are built once; :meth:`solve` checks their answer whatever
+    status they report. Soft bounds cost time only where they act: the QP is first solved without them, and an
+    answer that keeps them all is the answer with them, since its penalty is zero. Else it is solved again
+    with a slack for each of the few bounds that are violated most; an answer that keeps the others is the
+    answer with all of them. Else those that it violates are added, up to all.
 
     Args:
         ocp: The problem whose bounds hold.
@@ -36,19 +82,32 @@ class InputQP:
         (array([1.]), 'SOLVED')
     """
 
-    def __init__(self, ocp: OCP) -> None:
+    def __init__(self, ocp: OCP, soft: SoftRows | None = None, dt: float = 1.0) -> None:
         n, n_u = ocp.horizon * ocp.n_u, ocp.n_u
         half_range = 0.5 * (ocp.u_max - ocp.u_min)
-        self._ocp = ocp
+        self._ocp, self._dt, self._n = ocp, dt, n
         self._scale = np.tile(np.where(np.isfinite(half_range), half_range, 1.0), ocp.horizon)
         rows = np.eye(n) - np.eye(n, k=-n_u) if ocp.du_max is not None else np.zeros((0, n))
         self._rows = rows * self._scale / self._scale[:, None] if len(rows) else rows
-        self._a = ca.DM(ca.sparsify(ca.DM(self._rows)))
-        options = {"error_on_fail": False}
-        sparsity = {"h": ca.Sparsity.dense(n, n), "a": self._a.sparsity()}
-        self._solver = ca.conic("input_qp", "daqp", sparsity, options)
+        self._solver = _daqp(n, len(rows))
+        self._sides = _Sides(soft) if soft is not None else None
+        m = 0 if self._sides is None else self._sides.row.size
+        sizes = sorted({min(size, m) for size in (*SOFT_SIZES, m)} - {0})
+        self._soft_solvers = {size: _daqp(n + size, len(rows) + size) for size in sizes}
 
-    def solve(self, hessian: Array, gradient: Array, u: Array, u_prev: Array) -> tuple[Array, Status, float]:
+    @property
+    def scale(self) -> Array:
+        """What an input step of 1 means in the scaled QP ``(N n_u,)`` [input units]."""
+        return self._scale
+
+    def solve(
+        self,
+        hessian: Array,
+        gradient: Array,
+        u: Array,
+        u_prev: Array,
+        soft: tuple[Array, Array] | None = None,
+    ) -> tuple[Array, Status, float]:
         """Step from the plan ``u``, how the solve ended, and the relative KKT residual.
 
         Args:
@@ -56,29 +115,68 @@ class InputQP:
             gradient: ``(N n_u,)``.
             u: Plan ``(N, n_u)`` the step starts from.
             u_prev: Input ``(n_u,)`` held before.
+            soft: Values of the soft bounds ``(M,)`` without a step, and their derivatives by the step
+                ``(M, N n_u)``. Default: none.
         """
         ocp, scale = self._ocp, self._scale
         lower, upper = ((bound - u).ravel() / scale for bound in (ocp.u_min, ocp.u_max))
         row_lower, row_upper = self._row_bounds(u, u_prev)
         h, g = hessian * scale * scale[:, None], gradient * scale
         size = float(np.max(np.diag(h)))
-        h, g = h / size, g / size
-        answer = self._solver(h=h, g=g, a=self._a, lbx=lower, ubx=upper, lba=row_lower, uba=row_upper)
-        s, lam_x, lam_a = (answer[key].full().ravel() for key in ("x", "lam_x", "lam_a"))
-        step = s * scale
-        if not (np.all(np.isfinite(s)) and np.all(np.isfinite(lam_x)) and np.all(np.isfinite(lam_a))):
-            return step, Status.NOT_FINITE, float("nan")
-        if not self._solver.stats()["success"]:
-            return step, Status.QP_FAILED, float("nan")
-        rows = self._rows @ s
-        violation = _violation(s, lower, upper), _violation(rows, row_lower, row_upper)
-        stationarity = h @ s + g + lam_x + self._rows.T @ lam_a
-        size = max(1.0, float(np.max(np.abs(g))))
-        slack = _slackness(s, lower, upper, lam_x), _slackness(rows, row_lower, row_upper, lam_a)
-        kkt = max(float(np.max(np.abs(stationarity))), *slack) / size
-        if max(violation) > BOUND_TOLERANCE:
-            return step, Status.INFEASIBLE, kkt
-        return step, (Status.SOLVED if kkt <= KKT_TOLERANCE else Status.INACCURATE), kkt
+        hard = _Scaled(h / size, g / size, self._rows, lower, upper, row_lower, row_upper)
+        s, status, kkt = _check(hard, *_solve(self._solver, hard), self._n)
+        if soft is None or not status.ok:
+            return s * scale, status, kkt
+        return self._softly(hard, size, s, kkt, *soft)
+
+    def _softly(
+        self, hard: _Scaled, size: float, s: Array, kkt: float, value: Array, slope: Array
+    ) -> tuple[Array, Status, float]:
+        """The answer with soft bounds, from the answer ``s`` without."""
+        sides, n = self._sides, self._n
+        assert sides is not None
+        value, slope = sides.of(value), sides.of(slope) * self._scale
+        wanted = np.zeros(value.size, dtype=bool)
+        for room, solver in self._soft_solvers.items():
+            beyond = value + slope @ s[:n]
+            wanted |= beyond > 0
+            count = int(np.count_nonzero(wanted))
+            if count == 0:
+                break
+            if count > room:
+                continue
+            # The nearest fill the room that is left: they are the likeliest to be violated next.
+            nearest = np.argsort(np.where(wanted, -np.inf, -beyond), kind="stable")[:room]
+            full = self._with_slacks(hard, size, value, slope, nearest)
+            s, status, kkt = _check(full, *_solve(solver, full), n)
+            others = np.ones(value.size, dtype=bool)
+            others[nearest] = False
+            if not status.ok or not np.any((value + slope @ s[:n])[others] > 0):
+                return s[:n] * self._scale, status, kkt
+            wanted[nearest] = True
+        return s[:n] * self._scale, Status.SOLVED, kkt
+
+    def _with_slacks(
+        self, hard: _Scaled, size: float, value: Array, slope: Array, chosen: NDArray[np.int64]
+    ) -> _Scaled:
+        """The scaled QP with a slack for each of the ``chosen`` sides of soft bounds."""
+        sides, n, m = self._sides, self._n, chosen.size
+        assert sides is not None
+        scale = sides.scale[chosen]
+        h = np.zeros((n + m, n + m))
+        h[:n, :n] = hard.h
+        h.flat[n * (n + m + 1) :: n + m + 1] = 2 * self._dt * sides.quadratic[chosen] * scale**2 / size
+        g = np.concatenate([hard.g, self._dt * sides.linear[chosen] * scale / size])
+        a = np.zeros((len(hard.a) + m, n + m))
+        a[: len(hard.a), :n] = hard.a
+        a[len(hard.a) :, :n] = slope[chosen]
+        a[len(hard.a) :, n:] = -np.eye(m)
+        none = np.full(m, np.inf)
+        return _Scaled(
+            h, g, a,
+            np.concatenate([hard.lower, np.zeros(m)]), np.concatenate([hard.upper, none]),
+            np.concatenate([hard.row_lower, -none]), np.concatenate([hard.row_upper, -value[chosen]]),
+        )  # fmt: skip
 
     def _row_bounds(self, u: Array, u_prev: Array) -> tuple[Array, Array]:
         if self._ocp.du_max is None:
@@ -88,11 +186,50 @@ class InputQP:
         return (-self._ocp.du_max - du).ravel() / scale, (self._ocp.du_max - du).ravel() / scale
 
 
-def _violation(value: Array, lower: Array, upper: Array) -> float:
-    return float(max(np.max(lower - value, initial=0.0), np.max(value - upper, initial=0.0)))
+def _daqp(n: int, rows: int) -> BufferedFunction:
+    options: dict[str, Any] = {"error_on_fail": False, "daqp": {"primal_tol": PRIMAL_TOLERANCE}}
+    sparsity = {"h": ca.Sparsity.dense(n, n), "a": ca.Sparsity.dense(rows, n)}
+    return BufferedFunction(ca.conic("input_qp", "daqp", sparsity, options))
 
 
-def _slackness(value: Array, lower: Array, upper: Array, multiplier: Array) -> float:
-    """Largest complementarity error; a positive multiplier belongs to the upper bound."""
+def _solve(solver: BufferedFunction, qp: _Scaled) -> tuple[Array, Array, Array]:
+    """Unknowns and the multipliers of their bounds and of the rows, as the solver leaves them.
+
+    ``casadi.conic`` takes ``h, g, a, lba, uba, lbx, ubx`` and returns ``x, cost, lam_a, lam_x``. Its status is
+    not asked for: it proves nothing that the check does not.
+    """
+    given = qp.h.ravel(), qp.g, qp.a.T.ravel(), qp.row_lower, qp.row_upper, qp.lower, qp.upper
+    for buffer, values in zip(solver.inputs, given, strict=False):
+        buffer[:] = values
+    solver()
+    s, _, lam_a, lam_x = solver.outputs
+    return s.copy(), lam_x, lam_a
+
+
+def _check(qp: _Scaled, s: Array, lam_x: Array, lam_a: Array, n: int) -> tuple[Array, Status, float]:
+    """The answer, what it is worth, and its KKT residual; the first ``n`` unknowns are inputs.
+
+    The residual of inputs is relative to the inputs' gradient, that of slacks to theirs: a large penalty
+    does not hide an error of the inputs.
+    """
+    value, lower, upper, multiplier = s, qp.lower, qp.upper, lam_x
+    stationarity = qp.h @ s + qp.g + lam_x
+    if len(qp.a):
+        value = np.concatenate([s, qp.a @ s])
+        lower, upper = np.concatenate([lower, qp.row_lower]), np.concatenate([upper, qp.row_upper])
+        multiplier = np.concatenate([lam_x, lam_a])
+        stationarity += qp.a.T @ lam_a
+    violation = float(np.max(np.maximum(lower - value, value - upper), initial=0.0))
+    # Complementarity; a positive multiplier belongs to the upper bound.
     distance = np.where(multiplier > 0, upper - value, value - lower)
-    return float(np.max(np.minimum(np.abs(multiplier), np.abs(distance)), initial=0.0))
+    slackness = np.max(np.minimum(np.abs(multiplier), np.abs(distance)))
+    residual, size = np.abs(stationarity), max(1.0, float(np.max(np.abs(qp.g[:n]))))
+    kkt = float(np.maximum(np.max(residual[:n]), slackness)) / size
+    if s.size > n:
+        slacks = float(np.max(residual[n:])) / max(1.0, float(np.max(np.abs(qp.g[n:]))))
+        kkt = float(np.maximum(kkt, slacks))
+    if not (np.isfinite(kkt) and np.isfinite(violation)):  # a NaN anywhere ends up in one of the two
+        return s, Status.NOT_FINITE, float("nan")
+    if violation > BOUND_TOLERANCE:
+        return s, Status.INFEASIBLE, kkt
+    return s, (Status.SOLVED if kkt <= KKT_TOLERANCE else Status.INACCURATE), kkt

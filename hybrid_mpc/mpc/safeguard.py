@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
-from hybrid_mpc.mpc.condensed import CondensedController
+from hybrid_mpc.mpc.problem import Controller
 from hybrid_mpc.mpc.solution import Solution, Status
 from hybrid_mpc.riccati import lqr, vector
 
@@ -66,7 +66,7 @@ class SafeController:
 
     Example:
         >>> from hybrid_mpc.estimation import TrueState
-        >>> from hybrid_mpc.mpc.ocp import OCP
+        >>> from hybrid_mpc.mpc import OCP, CondensedController
         >>> from hybrid_mpc.signals import Signal
         >>> x, h, u, w = ca.MX.sym("x"), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w")
         >>> model = HybridModel("sum", 1.0, (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),),
@@ -82,7 +82,7 @@ class SafeController:
 
     def __init__(
         self,
-        controller: CondensedController,
+        controller: Controller,
         fallback: HybridModel | None = None,
         *,
         max_age: int = 5,
@@ -107,7 +107,7 @@ class SafeController:
             self._fallback(np.zeros(ocp.n_x))  # a CasADi function's first call is slow
 
     @property
-    def controller(self) -> CondensedController:
+    def controller(self) -> Controller:
         """The guarded controller."""
         return self._controller
 
@@ -122,20 +122,35 @@ class SafeController:
         plan = self._controller.initial(estimate, np.tile(held, (ocp.horizon, 1)))
         return Decision(held, Source.ZERO, plan, Status.INITIAL, 0)
 
-    def decide(self, previous: Decision, estimate: Estimate, reference: Array) -> Decision:
+    def decide(
+        self, previous: Decision, estimate: Estimate, reference: Array, weight: Array | None = None
+    ) -> Decision:
         """The input to hold from now on.
 
         Args:
             previous: The last decision; its ``u`` is being held.
             estimate: The state now.
             reference: ``(m, n_x)`` from now on in steps of ``dt``.
+            weight: Factors on ``q`` ``(m, n_x)``, as the reference. Default: 1.
         """
-        ocp, held = self._controller.ocp, previous.u
-        solution = self._controller.solve(previous.solution, estimate, reference)
+        solution = self._controller.solve(previous.solution, estimate, reference, weight)
         if solution.status.ok:
-            u = ocp.saturate(solution.u[0], held)
+            u = self._controller.ocp.saturate(solution.u[0], previous.u)
             plan = replace(solution, u=np.vstack([u[None], solution.u[1:]]))
             return Decision(u, Source.MPC, plan, solution.status, 0)
+        return self._without(previous, estimate, reference, solution)
+
+    def late(self, previous: Decision, estimate: Estimate, reference: Array) -> Decision:
+        """The input to hold where the solve has not come in time: as after a failed solve, status LATE."""
+        plan = previous.solution
+        shifted = np.vstack([plan.u[1:], plan.u[-1:]])
+        return self._without(previous, estimate, reference, replace(plan, u=shifted, status=Status.LATE))
+
+    def _without(
+        self, previous: Decision, estimate: Estimate, reference: Array, solution: Solution
+    ) -> Decision:
+        """The decision where no solution may be applied; ``solution`` holds the shifted plan and why."""
+        ocp, held = self._controller.ocp, previous.u
         u, source = self._instead(solution, estimate, np.asarray(reference, dtype=float), previous.age + 1)
         u = ocp.saturate(u, held)
         inputs = np.vstack([u[None], solution.u[1:]])

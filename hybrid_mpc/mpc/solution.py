@@ -16,21 +16,23 @@ class Status(Enum):
     """How a solve ended; the value is the message.
 
     Example:
-        >>> Status.QP_FAILED.ok, Status.SOLVED.ok
+        >>> Status.INFEASIBLE.ok, Status.SOLVED.ok
         (False, True)
     """
 
     INITIAL = "a first plan, not optimised"
     SOLVED = "the QP was solved and its solution checked"
     NOT_FINITE = "the estimate, the reference, the model or the plan holds a value that is not finite"
-    QP_FAILED = "the QP solver reported a failure"
-    INFEASIBLE = "the QP's solution violates an input bound or the limit of its change"
-    INACCURATE = "the QP's solution fails the KKT check"
+    STOPPED = "the iterations ended before convergence; the plan keeps the model and the limits"
+    INFEASIBLE = "the solution violates an input bound or the limit of its change"
+    INACCURATE = "the solution fails the KKT check"
+    NLP_FAILED = "the nonlinear solver's answer keeps neither the model nor the limits"
+    LATE = "the solve missed its deadline"
 
     @property
     def ok(self) -> bool:
         """True if the plan may be applied."""
-        return self is Status.SOLVED
+        return self in (Status.SOLVED, Status.STOPPED)
 
 
 @dataclass(frozen=True)
@@ -44,9 +46,11 @@ class Solution:
         d: Input disturbance ``(n_u,)`` that the prediction assumes: the model runs on ``u + d``.
         cost: Cost of the plan (see :class:`~hybrid_mpc.mpc.OCP`); NaN if it was not solved.
         status: How the solve ended.
-        kkt: KKT residual of the QP, relative to its gradient [-].
+        kkt: KKT residual in the QP's scaling, relative to its gradient [-]; of ``ipopt`` that of the NLP.
         defect: Largest defect ``|x_{k+1} - f(x_k, h_k, u_k)|`` at the last linearisation, over (x, h).
         timing: Durations [ms] by name (``prepare``, ``feedback``); recorded, never used to decide.
+        excess: Largest violation of a soft bound in the plan [its unit].
+        iterations: Linearisations (or iterations of the nonlinear solver) of this solve.
     """
 
     u: Array
@@ -58,3 +62,5 @@ class Solution:
     kkt: float
     defect: float
     timing: Mapping[str, float]
+    excess: float = 0.0
+    iterations: int = 1

@@ -9,7 +9,7 @@ from online_models import PendulumPlant, linear_model, pendulum_model
 
 from hybrid_mpc.closed_loop import ClosedLoopResult, Fault, simulate
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation import ExtendedKalmanFilter, TrueState
+from hybrid_mpc.estimation import DelayCompensation, ExtendedKalmanFilter, TrueState
 from hybrid_mpc.monitor.energy import EnergyMonitor
 from hybrid_mpc.mpc import OCP, CondensedController
 
@@ -171,6 +171,76 @@ def test_preview_reaches_the_controller():
     assert np.max(np.abs(blind.u[15])) > 0.1
 
 
+def test_weights_are_previewed_and_counted(model, safe):
+    seen = []
+
+    def weight(t):
+        seen.append(t.copy())
+        return np.column_stack([1.0 + (t > 0.3 - 1e-9), 0.5 + 0 * t])
+
+    result = run(model, safe, weight=weight)
+    assert all(len(t) == 11 for t in seen)
+    du = np.diff(result.u, axis=0, prepend=0.0)[:, 0]
+    error = (result.x - result.reference) ** 2 * weight(result.t)
+    stage = error @ [300.0, 1.0] + 0.05 * result.u[:, 0] ** 2 + 0.05 * du**2
+    np.testing.assert_allclose(result.stage_cost, stage, rtol=1e-12)
+    ones = run(model, safe, weight=lambda t: np.ones((len(t), 2)))
+    np.testing.assert_array_equal(ones.u, run(model, safe).u)
+    assert not np.array_equal(ones.u, result.u)
+
+
+def test_a_preview_that_ends_with_the_run_holds_its_last_value(model, safe):
+    end = 0.6
+    ends = lambda f: lambda t: np.where((t > end + 1e-9)[:, None], np.nan, f(t))  # noqa: E731
+    held = lambda f: lambda t: f(np.minimum(t, end))  # noqa: E731
+    weight = lambda t: np.column_stack([1 + t, 1 + t])  # noqa: E731
+    got = run(model, safe, reference=ends(sine), weight=ends(weight))
+    want = run(model, safe, reference=held(sine), weight=held(weight))
+    np.testing.assert_allclose(got.u, want.u, atol=1e-12)  # 0.6 s and 30 periods of 0.02 s differ by rounding
+    assert set(got.source) == {"MPC"}
+
+
+@pytest.mark.parametrize(("sensor", "inputs"), [(0, 0), (2, 0), (0, 2), (1, 1)])
+def test_delays_shift_what_arrives_and_what_acts(model, safe, sensor, inputs):
+    acted = []
+    plant = Recorder(PendulumPlant(noise=0.0), acted)
+    ekf = DelayCompensation(make_ekf(model), sensor_delay=sensor, input_delay=inputs)
+    monitor = CountingMonitor()
+    result = run(
+        model, safe, plant=plant, estimator=ekf, sensor_delay=sensor, input_delay=inputs, monitor=monitor
+    )
+    n = len(result.t)
+    np.testing.assert_array_equal(result.y[sensor:, 0], result.x[: n - sensor, 0])
+    np.testing.assert_array_equal(result.y[:sensor, 0], 0.1)  # the sensor saw the machine rest
+    np.testing.assert_array_equal(np.ravel(acted)[inputs:], result.u[: n - inputs, 0])
+    np.testing.assert_array_equal(np.ravel(acted)[:inputs], 0.0)
+    # What the monitor is given belongs together: measurement, input before it and estimate of one instant.
+    for k in range(sensor + 1, n):
+        _, y, u, estimate = monitor.calls[k]
+        assert y[0] == result.x[k - sensor, 0]
+        assert u[0] == acted[k - sensor - 1][0]
+        assert estimate.t == pytest.approx((k - sensor) * DT)
+    # The cost is that of the input that acts.
+    now = np.ravel(acted)
+    stage = ((result.x - result.reference) ** 2) @ [300.0, 1.0]
+    stage += 0.05 * now**2 + 0.05 * np.diff(now, prepend=0.0) ** 2
+    np.testing.assert_allclose(result.stage_cost, stage, rtol=1e-12)
+
+
+def test_a_late_solve_is_the_shifted_plan(model, safe):
+    steps = []
+    result = run(model, safe, late=lambda t: 0.3 - 1e-9 < t < 0.38, on_step=steps.append)
+    late = [k for k, status in enumerate(result.status) if status == "LATE"]
+    assert late == [15, 16, 17, 18]
+    assert [result.source[k] for k in late] == ["PLAN"] * 4
+    plan = steps[14].decision.solution.u
+    np.testing.assert_array_equal(result.u[15:19], plan[1:5])
+    assert result.source[19] == "MPC"
+    never = run(model, safe, late=lambda t: True)
+    assert set(never.status) == {"LATE"}
+    assert set(never.source) == {"PLAN", "FALLBACK"}
+
+
 def test_to_pandas_has_every_column(model, safe):
     table = run(model, safe).to_pandas()
     assert len(table) == 30
@@ -199,6 +269,9 @@ class Odd(PendulumPlant):
         ({"x0": [0.0, np.nan]}, "x0: values must be finite"),
         ({"horizon": -2}, "horizon"),
         ({"reference": lambda t: np.zeros(len(t))}, r"reference returns \(11,\)"),
+        ({"weight": lambda t: np.ones(len(t))}, r"weight returns \(11,\)"),
+        ({"sensor_delay": -1}, "sensor_delay"),
+        ({"input_delay": 1.5}, "input_delay"),
         ({"reference": lambda t: np.zeros((len(t), 1))}, r"needed: \(11, 2\)"),
         ({"faults": [Fault(0.0, 1.0, "input_gain", channel=1)]}, "channel 1 given, there are 1"),
         ({"plant": Odd("measure", np.zeros(2))}, r"measurement has shape \(2,\)"),

@@ -108,6 +108,16 @@ def test_constant_input_disturbance_is_found():
     assert abs(np.mean(ds[100:]) - 0.25) < 0.03
 
 
+def test_without_deviations_of_d_there_is_no_disturbance_observer():
+    model = pendulum_model(z=2)
+    ekf = ExtendedKalmanFilter(model, sigma_y=[1e-3], sigma_x=[1e-3, 1e-2], sigma_x0=[1e-2, 0.1])
+    e = ekf.start([0.0])
+    for k in range(50):
+        e = ekf.update(e, [0.01 * k], [0.3])  # far from what the model does
+    assert e.d[0] == 0.0
+    assert np.all(e.P[-1] == 0.0)
+
+
 def test_true_state_passes_the_truth_on():
     model = pendulum_model(z=3)
     oracle = TrueState(model)

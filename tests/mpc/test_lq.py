@@ -93,8 +93,61 @@ def test_bounds_and_limits_of_the_change(n_u, du_max, seed):
     assert solution.status is Status.SOLVED
     g, h = constraints(controller.ocp, u_prev)
     assert np.min(h - g @ want.ravel()) < 1e-9  # bounds are active: the case is not a free one
-    # DAQP takes constraints into its active set from 1e-6 (of half the range) on; ten times that.
-    np.testing.assert_allclose(solution.u, want, atol=5e-6)
+    # DAQP takes constraints into its active set from 1e-9 of half a range on, in its own scaling; NNLS rounds.
+    np.testing.assert_allclose(solution.u, want, atol=1e-8)
+
+
+@pytest.mark.parametrize("du_max", [None, 0.15])
+@pytest.mark.parametrize("seed", range(4))
+def test_weights_over_time(seed, du_max):
+    model, a, b, _ = random_linear(seed, n_u=1, n_h=2 * (seed % 2), radius=1.02)
+    ocp = problem(1, 10, bound=0.5, du_max=None if du_max is None else [du_max], r_delta=0.1)
+    rng = np.random.default_rng(seed)
+    z, reference, weight = rng.normal(size=len(a)), rng.normal(size=(11, 3)), rng.uniform(0, 2, (11, 3))
+    weight[:6], weight[6] = 0.0, [1e3, 1e3, 0.0]  # nothing counts until one instant at which two states do
+    controller, e = CondensedController(model, ocp), estimate_of(model, z)
+    got = controller.solve(controller.initial(e), e, reference, weight)
+    args = a, b, ocp, model.dt, ocp.terminal_weight(model), z, np.zeros(1), reference, np.zeros(1), weight
+    want = lq_plan(*args)
+    np.testing.assert_allclose(got.u, want, atol=1e-8)
+    assert got.cost == pytest.approx(np.sum(residuals(want, *args) ** 2), rel=1e-8)
+    short = controller.solve(controller.initial(e), e, reference, weight[:8])  # the last value holds
+    same = np.vstack([weight[:8], np.tile(weight[7], (3, 1))])
+    np.testing.assert_array_equal(short.u, controller.solve(controller.initial(e), e, reference, same).u)
+
+
+def test_a_weight_that_is_zero_throughout_leaves_only_effort():
+    model, *_ = random_linear(0, n_u=1)
+    controller, e = CondensedController(model, problem(1, 10)), estimate_of(model, np.ones(3))
+    got = controller.solve(controller.initial(e), e, np.ones((1, 3)), np.zeros((1, 3)))
+    np.testing.assert_allclose(got.u, 0.0, atol=1e-12)  # rounding
+    assert got.cost == pytest.approx(0.0, abs=1e-20)
+
+
+@pytest.mark.parametrize("weight", [np.full((1, 3), np.nan), np.full((1, 3), -1.0)])
+def test_a_weight_that_makes_no_sense_is_a_failed_solve(weight):
+    model, *_ = random_linear(0, n_u=1)
+    controller, e = CondensedController(model, problem(1, 10)), estimate_of(model, np.ones(3))
+    got = controller.solve(controller.initial(e), e, np.zeros((1, 3)), weight)
+    assert got.status is Status.NOT_FINITE
+    assert np.all(np.isfinite(got.u))
+
+
+@pytest.mark.parametrize("n_h", [0, 2])
+def test_a_disturbance_that_has_changed_since_the_last_plan(n_h):
+    model, a, b, _ = random_linear(5, n_u=2, n_h=n_h)
+    controller = CondensedController(model, problem(2, 12, r_delta=0.2))
+    rng = np.random.default_rng(1)
+    z, before, d = rng.normal(size=3 + n_h), rng.normal(size=2), rng.normal(size=2)
+    reference = rng.normal(size=(13, 3))
+    first = estimate_of(model, z, before)
+    plan = controller.solve(controller.initial(first), first, reference)
+    got = controller.solve(plan, estimate_of(model, z, d), reference)
+    np.testing.assert_array_equal(got.d, d)
+    args = a, b, controller.ocp, model.dt, controller.ocp.terminal_weight(model), z
+    # On a linear model the new plan owes nothing to the old one: not its trajectory, not its disturbance.
+    np.testing.assert_allclose(got.u, lq_plan(*args, d, reference, plan.u[0]), atol=1e-8)
+    assert np.max(np.abs(got.u - lq_plan(*args, before, reference, plan.u[0]))) > 0.1
 
 
 def test_the_oracle_agrees_with_slsqp():
@@ -121,7 +174,7 @@ def test_on_a_linear_model_the_first_guess_does_not_matter(guess):
     start[0] = 0.1  # the held input, which the cost does not see: no weight on changes
     u = controller.solve(controller.initial(e, start), e, np.zeros((1, 3))).u
     same = controller.solve(controller.initial(e), e, np.zeros((1, 3))).u
-    np.testing.assert_allclose(u, same, atol=5e-6)  # DAQP's tolerance, see above
+    np.testing.assert_allclose(u, same, atol=1e-8)  # DAQP's tolerance, see above
 
 
 @pytest.mark.parametrize(
@@ -132,6 +185,7 @@ def test_on_a_linear_model_the_first_guess_does_not_matter(guess):
         ({"reference": np.zeros(3)}, "reference"),
         ({"u": np.zeros((3, 1))}, r"\(10, 1\)"),
         ({"u": np.full((10, 1), np.nan)}, "finite"),
+        ({"weight": np.zeros((4, 2))}, r"weight: shape \(4, 2\)"),
         ({"iterations": 0}, "iterations"),
         ({"n_u": 2}, "3 states and 2 inputs"),
     ],
@@ -144,7 +198,7 @@ def test_bad_input_is_refused(change, words):
     def use():
         controller = CondensedController(model, problem(n_u, 10), iterations=iterations)
         plan = controller.initial(e, change.get("u"))
-        controller.solve(plan, e, change.get("reference", np.zeros((1, 3))))
+        controller.solve(plan, e, change.get("reference", np.zeros((1, 3))), change.get("weight"))
 
     with pytest.raises(InputError, match=words):
         use()

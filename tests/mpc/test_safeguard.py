@@ -28,14 +28,14 @@ class Failing:
     def __getattr__(self, name):
         return getattr(self._controller, name)
 
-    def solve(self, previous, estimate, reference):
+    def solve(self, previous, estimate, reference, weight=None):
         self._k += 1
-        solution = self._controller.solve(previous, estimate, reference)
+        solution = self._controller.solve(previous, estimate, reference, weight)
         if self._k not in self._periods:
             return solution
         prepared = self._controller.prepare(previous)
         kept = prepared.u if self._nonsense is None else np.full_like(prepared.u, self._nonsense)
-        return replace(solution, u=kept, status=Status.QP_FAILED)
+        return replace(solution, u=kept, status=Status.INACCURATE)
 
 
 @pytest.fixture(scope="module")

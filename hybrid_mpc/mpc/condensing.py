@@ -1,0 +1,53 @@
+"""Condensing: from the stages' Jacobians to the states as functions of the inputs."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def condense(a_t: Array, b: Array, n_x: int) -> Array:
+    """Derivative of the states by the inputs ``((N + 1) n_x, N n_u)``.
+
+    The products run transposed, on contiguous memory: rows of the scratch arrays are inputs. Of the hidden
+    states only the last period's derivative is ever kept: neither cost nor bounds see them.
+
+    Args:
+        a_t: Transposed ``A_k`` ``(N, n_z, n_z)``.
+        b: ``B_k`` ``(N, n_z, n_u)``.
+        n_x: Number of states; they come first in z.
+
+    Example:
+        >>> condense(np.ones((2, 1, 1)), np.ones((2, 1, 1)), 1)
+        array([[0., 0.],
+               [1., 0.],
+               [1., 1.]])
+    """
+    n, n_z, n_u = b.shape
+    from_u = np.zeros(((n + 1) * n_x, n * n_u))
+    now, after = np.empty((n * n_u, n_z)), np.empty((n * n_u, n_z))
+    for k in range(n):
+        end = k * n_u
+        np.matmul(now[:end], a_t[k], out=after[:end])
+        after[end : end + n_u] = b[k].T
+        from_u[(k + 1) * n_x : (k + 2) * n_x, : end + n_u] = after[: end + n_u, :n_x].T
+        now, after = after, now
+    return from_u
+
+
+def propagate(a_t: Array, drift: Array, dz0: Array) -> Array:
+    """``dz_{k+1} = A_k dz_k + drift_k`` from ``dz0``: ``(N + 1, n_z)``.
+
+    Example:
+        >>> propagate(np.full((2, 1, 1), 0.5), np.ones((2, 1)), np.zeros(1)).ravel()
+        array([0. , 1. , 1.5])
+    """
+    dz = np.empty((len(drift) + 1, dz0.size))
+    dz[0] = now = dz0
+    for a, add, after in zip(a_t, drift, dz[1:], strict=True):
+        np.dot(now, a, out=after)
+        after += add
+        now = after
+    return dz

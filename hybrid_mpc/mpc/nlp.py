@@ -1,0 +1,202 @@
+"""The exact reference: direct multiple shooting solved by IPOPT with exact derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from time import perf_counter
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimation.kalman import Estimate
+from hybrid_mpc.model import HybridModel
+from hybrid_mpc.mpc.ocp import OCP
+from hybrid_mpc.mpc.problem import Problem
+from hybrid_mpc.mpc.solution import Solution, Status
+
+Array = NDArray[np.float64]
+NAN = float("nan")
+FEASIBLE = 1e-6
+"""Largest defect and violation of a limit, as a share of its range, that an answer may have."""
+
+
+class IpoptController:
+    """Nonlinear MPC by IPOPT on the sparse multiple-shooting problem: the reference, slower than real time.
+
+    Unknowns are the inputs, the states and hidden states of every period, and a slack for every soft bound.
+    Second derivatives are exact. Whatever IPOPT reports, the answer counts only if it is finite and keeps
+    model and limits; it is SOLVED if IPOPT converged or the KKT residual is small, else STOPPED.
+
+    Args:
+        model: The deployed model; ``n_h`` may be 0.
+        ocp: The problem.
+        tolerance: IPOPT's own, relative to its scaling.
+        iterations: IPOPT's most iterations.
+        options: Further options of IPOPT by name. Default: the adaptive barrier.
+
+    Raises:
+        InputError: If problem and model do not fit, or an option is not positive.
+
+    Source: Wächter and Biegler, *On the implementation of an interior-point filter line-search algorithm
+    for large-scale nonlinear programming*, Math. Program. 106 (2006).
+
+    Example: as :class:`~hybrid_mpc.mpc.SQPController`, whose interface it shares.
+    """
+
+    def __init__(
+        self,
+        model: HybridModel,
+        ocp: OCP,
+        *,
+        tolerance: float = 1e-9,
+        iterations: int = 500,
+        options: Mapping[str, Any] | None = None,
+    ) -> None:
+        if not tolerance > 0 or iterations < 1:
+            raise InputError(
+                f"tolerance must be positive and iterations at least 1, got {tolerance} and {iterations}"
+            )
+        self._problem = Problem(model, ocp)
+        self._bounds: dict[str, Array] = {}
+        nlp = self._formulate()
+        settings: dict[str, Any] = {"print_time": False, "error_on_fail": False}
+        settings["ipopt"] = {
+            "print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": iterations,
+            "mu_strategy": "adaptive",
+            **(options or {}),
+        }  # fmt: skip
+        self._solver = ca.nlpsol("mpc", "ipopt", nlp, settings)
+        w, g = nlp["x"], nlp["g"]
+        multipliers = ca.MX.sym("lam", g.shape[0])
+        slope = ca.gradient(nlp["f"] + ca.dot(multipliers, g), w)
+        self._slope = ca.Function("slope", [w, nlp["p"], multipliers], [slope, ca.gradient(nlp["f"], w), g])
+
+    @property
+    def model(self) -> HybridModel:
+        """The model that predicts."""
+        return self._problem.model
+
+    @property
+    def ocp(self) -> OCP:
+        """The problem."""
+        return self._problem.ocp
+
+    @property
+    def problem(self) -> Problem:
+        """Problem and model made ready."""
+        return self._problem
+
+    def initial(self, estimate: Estimate, u: Array | None = None) -> Solution:
+        """A first plan: the model run freely from the estimate; see :meth:`Problem.initial`."""
+        return self._problem.initial(estimate, u)
+
+    @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
+    def solve(
+        self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None
+    ) -> Solution:
+        """The plan from now on; see :meth:`Controller.solve`. The previous plan, shifted, is the first guess."""
+        start = perf_counter()
+        problem, u_prev = self._problem, previous.u[0]
+        target = problem.target(reference, weight)
+        u = np.vstack([previous.u[1:], previous.u[-1:]])
+        z = np.hstack([previous.x, previous.h])
+        z = np.vstack([np.concatenate([estimate.x, estimate.h]), z[2:], z[-1:]])
+        given = np.concatenate([z[0], estimate.d, u_prev, target.x.ravel(), target.weight.ravel()])
+        failed = self._plan(u, z, estimate.d, NAN, Status.NOT_FINITE, NAN, start, 0)
+        if not (
+            target.ok and np.all(np.isfinite(given)) and np.all(np.isfinite(u)) and np.all(np.isfinite(z))
+        ):
+            return failed
+        slack = problem.soft.excess(problem.soft.values(z[:, : self.ocp.n_x], u))
+        answer = self._solver(x0=np.concatenate([u.ravel(), z.ravel(), slack]), p=given, **self._bounds)
+        stats = self._solver.stats()
+        w, lam_g, lam_x = (answer[key].full().ravel() for key in ("x", "lam_g", "lam_x"))
+        if not (np.all(np.isfinite(w)) and np.all(np.isfinite(lam_g)) and np.all(np.isfinite(lam_x))):
+            return failed
+        slope, objective, g = (m.full().ravel() for m in self._slope(w, given, lam_g))
+        kkt = float(np.max(np.abs(slope + lam_x)) / max(1.0, np.max(np.abs(objective))))
+        lower, upper = self._bounds["lbg"], self._bounds["ubg"]
+        violated = float(np.max(np.maximum(lower - g, g - upper) / self._g_scale, initial=0.0))
+        u_new = w[: u.size].reshape(u.shape)
+        beyond = np.maximum(self.ocp.u_min - u_new, u_new - self.ocp.u_max)
+        violated = max(violated, float(np.max(beyond / self._u_scale)))
+        z_new = w[u.size : u.size + z.size].reshape(z.shape)
+        if violated > FEASIBLE:
+            return self._plan(u, z, estimate.d, NAN, Status.NLP_FAILED, kkt, start, stats["iter_count"])
+        status = Status.SOLVED if stats["success"] or kkt <= FEASIBLE else Status.STOPPED
+        u_new = np.clip(u_new, self.ocp.u_min, self.ocp.u_max)
+        cost = problem.cost(z_new, u_new, u_prev, target)
+        return self._plan(u_new, z_new, estimate.d, cost, status, kkt, start, stats["iter_count"])
+
+    def _plan(
+        self, u: Array, z: Array, d: Array, cost: float, status: Status, kkt: float, start: float, i: int
+    ) -> Solution:
+        n_x, soft = self.ocp.n_x, self._problem.soft
+        excess = soft.excess(soft.values(z[:, :n_x], u)) if len(soft) else np.zeros(0)
+        defect = self._defect(z, u + d)
+        spent = {"solve": (perf_counter() - start) * 1e3}
+        largest = float(np.max(excess, initial=0.0))
+        return Solution(u, z[:, :n_x], z[:, n_x:], d, cost, status, kkt, defect, spent, largest, i)
+
+    def _defect(self, z: Array, u: Array) -> float:
+        n_x = self.ocp.n_x
+        x, h = self._step(z[:-1, :n_x].T, z[:-1, n_x:].T, u.T)
+        return float(np.max(np.abs(np.vstack([x.full(), h.full()]).T - z[1:])))
+
+    def _formulate(self) -> dict[str, ca.MX]:
+        """Problem of ``nlpsol``; sets the bounds of its unknowns ``(u, z, slacks)`` and rows."""
+        problem, ocp, model = self._problem, self.ocp, self.model
+        n, n_x, n_u = ocp.horizon, ocp.n_x, ocp.n_u
+        n_z, soft = n_x + model.n_h, problem.soft
+        u, z, s = ca.MX.sym("u", n_u, n), ca.MX.sym("z", n_z, n + 1), ca.MX.sym("s", len(soft))
+        z0, d, u_prev = ca.MX.sym("z0", n_z), ca.MX.sym("d", n_u), ca.MX.sym("u_prev", n_u)
+        x_ref, weight = ca.MX.sym("x_ref", n_x, n + 1), ca.MX.sym("weight", n_x, n + 1)
+        self._step = model.step.map(n)
+        x_next, h_next = self._step(z[:n_x, :-1], z[n_x:, :-1], u + ca.repmat(d, 1, n))
+        du = u - ca.horzcat(u_prev, u[:, :-1])
+        error = z[:n_x, :] - x_ref
+        last = ca.sqrt(weight[:, -1]) * error[:, -1]
+        stages = ca.sum2(weight[:, :-1] * error[:, :-1] ** 2), ca.sum2(u**2), ca.sum2(du**2)
+        stage = sum(ca.dot(q, v) for q, v in zip((ocp.q, ocp.r, ocp.r_delta), stages, strict=True))
+        penalty = ca.dot(soft.linear, s) + ca.dot(soft.quadratic, s**2)
+        f = model.dt * (stage + penalty) + last.T @ problem.terminal @ last
+        rows: list[tuple[ca.MX, Any, Any, Any]] = [
+            (z[:, 0] - z0, 0.0, 0.0, 1.0),
+            (z[:, 1:] - ca.vertcat(x_next, h_next), 0.0, 0.0, 1.0),
+        ]
+        half = 0.5 * (ocp.u_max - ocp.u_min)
+        self._u_scale = np.where(np.isfinite(half), half, 1.0)
+        if ocp.du_max is not None:
+            limit = np.tile(ocp.du_max, n)
+            rows.append((du, -limit, limit, np.tile(self._u_scale, n)))
+        value = ca.vertcat(*self._soft_values(u, z))
+        for bound, sign in ((soft.upper, 1.0), (soft.lower, -1.0)):
+            chosen = np.flatnonzero(np.isfinite(bound))
+            if chosen.size:
+                pick = [int(i) for i in chosen]
+                gap = sign * (value[pick] - bound[chosen]) - s[pick]
+                rows.append((gap, -np.inf, 0.0, soft.scale[chosen]))
+        sizes = [row[0].numel() for row in rows]
+        ends = [np.concatenate([np.broadcast_to(row[i], size) for row, size in zip(rows, sizes, strict=True)])
+                for i in (1, 2, 3)]  # fmt: skip
+        free = np.full(n_z * (n + 1), np.inf)
+        self._bounds = {
+            "lbx": np.concatenate([np.tile(ocp.u_min, n), -free, np.zeros(len(soft))]),
+            "ubx": np.concatenate([np.tile(ocp.u_max, n), free, np.full(len(soft), np.inf)]),
+            "lbg": ends[0], "ubg": ends[1],
+        }  # fmt: skip
+        self._g_scale = ends[2]
+        unknowns = ca.vertcat(ca.vec(u), ca.vec(z), s)
+        given = ca.vertcat(z0, d, u_prev, ca.vec(x_ref), ca.vec(weight))
+        return {"x": unknowns, "p": given, "f": f, "g": ca.vertcat(*(ca.vec(row[0]) for row in rows))}
+
+    def _soft_values(self, u: ca.MX, z: ca.MX) -> list[ca.MX]:
+        """Bounded values in the order of the problem's rows."""
+        ocp = self.ocp
+        chosen = [int(i) for i in np.flatnonzero(np.isfinite(ocp.x_min) | np.isfinite(ocp.x_max))]
+        values = [ca.vec(z[chosen, 1:])] if chosen else []
+        x = z[: ocp.n_x, :-1]
+        return values + [ca.vec(bound.expression.map(ocp.horizon)(x, u)) for bound in ocp.soft]

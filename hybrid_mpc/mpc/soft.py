@@ -1,0 +1,196 @@
+"""Soft bounds on states and on expressions of state and input: plain data, and their rows along a trajectory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.mpc.buffered import BufferedFunction
+
+if TYPE_CHECKING:
+    from hybrid_mpc.mpc.ocp import OCP
+
+Array = NDArray[np.float64]
+PENALTY = 1e3
+"""Default penalty of a bound's violation, in multiples of what the tolerated deviation ``1 / sqrt(q)`` costs."""
+
+
+@dataclass(frozen=True)
+class SoftBound:
+    """``lower <= expression(x, u) <= upper`` in every period of the horizon, as a penalty on its violation.
+
+    A violation ``s`` costs ``linear s + quadratic s^2`` per second. With ``linear`` above the largest
+    multiplier of the hard bound (cost per second and unit by which the bound is moved) the penalty is exact:
+    where the bound can be kept, the plan is that of the hard bound; where it cannot, the plan violates it as
+    little as the cost makes worth while, and there is always a plan.
+
+    Args:
+        expression: ``(x, u) -> e``, a column of ``n_e``.
+        lower: ``(n_e,)``; ``-inf`` for none.
+        upper: ``(n_e,)``; ``inf`` for none.
+        linear: Penalties ``(n_e,)`` [cost/s/unit], not negative.
+        quadratic: Penalties ``(n_e,)`` [cost/s/unit^2], positive: they make the QP strictly convex.
+
+    Raises:
+        InputError: If shapes do not fit, bounds cross, or a penalty is not as said.
+
+    Source: Nocedal and Wright, *Numerical Optimization*, 2006, theorem 17.3.
+
+    Example:
+        >>> x, u = ca.MX.sym("x", 2), ca.MX.sym("u")
+        >>> power = SoftBound(ca.Function("power", [x, u], [u * x[1]]), [-2.0], [5.0], [10.0], [1.0])
+        >>> power.lower
+        array([-2.])
+    """
+
+    expression: ca.Function
+    lower: Array
+    upper: Array
+    linear: Array
+    quadratic: Array
+
+    def __init__(
+        self,
+        expression: ca.Function,
+        lower: ArrayLike,
+        upper: ArrayLike,
+        linear: ArrayLike,
+        quadratic: ArrayLike,
+    ) -> None:
+        if (expression.n_in(), expression.n_out()) != (2, 1) or expression.size2_out(0) != 1:
+            raise InputError(f"soft bound: {expression} given; needed: a function (x, u) -> column")
+        n = int(expression.size1_out(0))
+        arrays = _checked("soft bound", n, lower, upper, linear, quadratic)
+        object.__setattr__(self, "expression", expression)
+        for name, value in zip(("lower", "upper", "linear", "quadratic"), arrays, strict=True):
+            object.__setattr__(self, name, value)
+
+
+def state_bounds(
+    q: Array,
+    x_min: ArrayLike | None,
+    x_max: ArrayLike | None,
+    linear: ArrayLike | None,
+    quadratic: ArrayLike | None,
+) -> tuple[Array, Array, Array, Array]:
+    """Bounds on the states and their penalties with the defaults filled in, each ``(n_x,)``.
+
+    Raises:
+        InputError: If shapes do not fit, bounds cross, or a penalty is not as :class:`SoftBound` says.
+    """
+    weight = np.where(q > 0, q, 1.0)
+    return _checked(
+        "state bounds", q.size,
+        np.full(q.size, -np.inf) if x_min is None else x_min,
+        np.full(q.size, np.inf) if x_max is None else x_max,
+        PENALTY * np.sqrt(weight) if linear is None else linear,
+        PENALTY * weight if quadratic is None else quadratic,
+    )  # fmt: skip
+
+
+def _checked(
+    what: str, n: int, lower: ArrayLike, upper: ArrayLike, linear: ArrayLike, quadratic: ArrayLike
+) -> tuple[Array, Array, Array, Array]:
+    low, up, lin, quad = (np.asarray(v, dtype=float).ravel() for v in (lower, upper, linear, quadratic))
+    for name, value in (("lower", low), ("upper", up), ("linear", lin), ("quadratic", quad)):
+        if value.shape != (n,):
+            raise InputError(f"{what}: {name} has {value.size} values, {n} needed")
+    if not np.all(low < up):
+        raise InputError(f"{what} cross: lower {low}, upper {up}; every lower must be below its upper")
+    if not (np.all(np.isfinite(lin)) and np.all(lin >= 0)):
+        raise InputError(f"{what}: linear penalties must be finite and not negative, got {lin}")
+    if not (np.all(np.isfinite(quad)) and np.all(quad > 0)):
+        raise InputError(f"{what}: quadratic penalties must be finite and positive, got {quad}")
+    return low, up, lin, quad
+
+
+class SoftRows:
+    """The M soft bounds of a problem along a trajectory, one row a bound and period.
+
+    Bounds on states hold for ``x_1 .. x_N`` (``x_0`` is given), expressions for ``(x_0, u_0) ..
+    (x_{N-1}, u_{N-1})``.
+
+    Args:
+        ocp: The problem.
+
+    Raises:
+        InputError: If an expression does not take the problem's ``(x, u)``.
+
+    Example:
+        >>> from hybrid_mpc.mpc.ocp import OCP
+        >>> rows = SoftRows(OCP(2, [1.0], [1.0], [0.0], [-9.0], [9.0], x_max=[0.5]))
+        >>> rows.excess(rows.values(np.array([[7.0], [0.6], [0.2]]), np.zeros((2, 1)))).round(6)
+        array([0.1, 0. ])
+    """
+
+    stage: NDArray[np.int64]
+    """State ``(M,)`` of the trajectory that a row looks at."""
+
+    def __init__(self, ocp: OCP) -> None:
+        n = ocp.horizon
+        self._n_x, self._n_u, self._horizon = ocp.n_x, ocp.n_u, n
+        self._states = np.flatnonzero(np.isfinite(ocp.x_min) | np.isfinite(ocp.x_max))
+        chosen = self._states
+        self._functions = [_expression(bound, ocp.n_x, ocp.n_u).map(n) for bound in ocp.soft]
+        self._buffered = [BufferedFunction(f) for f in self._functions]
+        parts = [(ocp.x_min, ocp.x_max, ocp.slack_linear, ocp.slack_quadratic)]
+        columns = [[np.tile(v[chosen], n) for v in parts[0]]]
+        columns += [[np.tile(v, n) for v in (b.lower, b.upper, b.linear, b.quadratic)] for b in ocp.soft]
+        self.lower, self.upper, self.linear, self.quadratic = (
+            np.concatenate([c[i] for c in columns]) for i in range(4)
+        )
+        stages = [np.repeat(np.arange(1, n + 1), chosen.size)]
+        stages += [np.repeat(np.arange(n), b.lower.size) for b in ocp.soft]
+        self.stage = np.concatenate(stages)
+        half = 0.5 * (self.upper - self.lower)
+        # One-sided bounds have no range: the violation that costs as much quadratically as linearly, or 1.
+        other = np.where(self.linear > 0, self.linear / self.quadratic, 1.0)
+        self.scale: Array = np.where(np.isfinite(half), half, other)
+
+    def __len__(self) -> int:
+        return int(self.stage.size)
+
+    def values(self, x: Array, u: Array) -> Array:
+        """Bounded values ``(M,)`` along states ``(N + 1, n_x)`` and inputs ``(N, n_u)``."""
+        return self.linearise(x, u)[0]
+
+    def linearise(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
+        """Values ``(M,)`` and their derivatives by the row's state ``(M, n_x)`` and input ``(M, n_u)``."""
+        n = self._horizon
+        by_x = np.tile(np.eye(self._n_x)[self._states], (n, 1))
+        rows = [(x[1:, self._states].ravel(), by_x, np.zeros((by_x.shape[0], self._n_u)))]
+        for f in self._buffered:
+            f.inputs[0][:], f.inputs[1][:] = x[:-1].ravel(), u.ravel()
+            f()
+            e, e_x, e_u = (out.copy() for out in f.outputs)
+            each = e.size // n
+            e_x = e_x.reshape(n, self._n_x, each).transpose(0, 2, 1).reshape(e.size, self._n_x)
+            e_u = e_u.reshape(n, self._n_u, each).transpose(0, 2, 1).reshape(e.size, self._n_u)
+            rows.append((e, e_x, e_u))
+        return (
+            np.concatenate([r[0] for r in rows]),
+            np.vstack([r[1] for r in rows]),
+            np.vstack([r[2] for r in rows]),
+        )
+
+    def excess(self, values: Array) -> Array:
+        """Violations ``(M,)``, zero where a bound is kept."""
+        return np.asarray(np.maximum(0.0, np.maximum(values - self.upper, self.lower - values)))
+
+    def penalty(self, excess: Array) -> float:
+        """Cost per second of violations ``(M,)``, summed."""
+        return float(self.linear @ excess + self.quadratic @ excess**2)
+
+
+def _expression(bound: SoftBound, n_x: int, n_u: int) -> ca.Function:
+    f = bound.expression
+    if (f.size_in(0), f.size_in(1)) != ((n_x, 1), (n_u, 1)):
+        raise InputError(f"soft bound: expression {f} does not take (x, u) of {n_x} states and {n_u} inputs")
+    x, u = ca.MX.sym("x", n_x), ca.MX.sym("u", n_u)
+    e = f(x, u)
+    return ca.Function("soft", [x, u], [ca.densify(m) for m in (e, ca.jacobian(e, x), ca.jacobian(e, u))])
