@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 from nn_export.build import build
 from nn_export.errors import ExportError, ProgramError
+from nn_export.horizon import fold, unroll
 from nn_export.jacobian import with_jacobian
 from nn_export.program import Node, Port, Program
 from nn_export.storage import load_programs, save_programs
 
 if TYPE_CHECKING:
     from nn_export.comparison import ParityReport, parity
+    from nn_export.torch_bridge import CasadiModule, from_casadi
     from nn_export.tracing import to_casadi, trace
 
 __all__ = [
@@ -21,6 +23,10 @@ __all__ = [
     "trace",
     "build",
     "with_jacobian",
+    "unroll",
+    "fold",
+    "from_casadi",
+    "CasadiModule",
     "parity",
     "ParityReport",
     "Program",
@@ -32,6 +38,7 @@ __all__ = [
     "ProgramError",
 ]
 _LAZY = {"trace": "tracing", "to_casadi": "tracing", "parity": "comparison", "ParityReport": "comparison"}
+_LAZY |= {"from_casadi": "torch_bridge", "CasadiModule": "torch_bridge"}
 
 
 def __getattr__(name: str) -> Any:
