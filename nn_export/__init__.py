@@ -7,6 +7,7 @@
 from typing import TYPE_CHECKING, Any
 
 from nn_export.build import build
+from nn_export.codegen import CFiles, compile_function, generate_c
 from nn_export.errors import ExportError, ProgramError
 from nn_export.horizon import fold, unroll
 from nn_export.jacobian import with_jacobian
@@ -27,6 +28,9 @@ __all__ = [
     "fold",
     "from_casadi",
     "CasadiModule",
+    "compile_function",
+    "generate_c",
+    "CFiles",
     "parity",
     "ParityReport",
     "Program",

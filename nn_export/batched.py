@@ -144,11 +144,12 @@ class Batched:
             count = 1 << min((samples - start).bit_length() - 1, CHUNK.bit_length() - 1)
             if count not in self._mapped:
                 self._mapped[count] = f.map(count)
-            buffer, evaluate = self._mapped[count].buffer()
+            machine: tuple[Any, Any] = self._mapped[count].buffer()
+            buffer, evaluate = machine
             for set_, data in ((buffer.set_arg, arrays), (buffer.set_res, results)):
                 for i, array in enumerate(data):
                     if array.size:
-                        set_(i, memoryview(array[start : start + count]))
+                        set_(i, memoryview(array[start : start + count].data))
             evaluate()
             if buffer.ret():
                 raise ExportError(

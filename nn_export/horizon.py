@@ -51,7 +51,7 @@ def unroll(
     Example:
         >>> x, u = ca.MX.sym("x"), ca.MX.sym("u")
         >>> step = ca.Function("step", [x, u], [0.5 * x + u], ["x", "u"], ["x_next"])
-        >>> print(unroll(step, 3)(8, [[0, 1, 1]]))
+        >>> print(unroll(step, 3)(8, ca.DM([[0, 1, 1]])))
         [[4, 3, 2.5]]
     """
     roles = _roles(step, n, states, held)
@@ -90,7 +90,7 @@ def fold(
     Example:
         >>> x, u = ca.MX.sym("x"), ca.MX.sym("u")
         >>> step = ca.Function("step", [x, u], [0.5 * x + u], ["x", "u"], ["x_next"])
-        >>> fold(step, 3)(8, [[0, 1, 1]])
+        >>> fold(step, 3)(8, ca.DM([[0, 1, 1]]))
         DM(2.5)
     """
     roles = _roles(step, n, states, held)

@@ -84,10 +84,9 @@ class CasadiModule(torch.nn.Module):
         for x in flat[1:]:
             dtype = torch.promote_types(dtype, x.dtype)
         wide = [x.to(torch.float64).expand(*batch, x.shape[-1]) for x in flat]
-        if torch.compiler.is_exporting():
-            results = tuple(self.batched.walk(wide))  # plain operators are what can be recorded
-        else:
-            results = _Call.apply(self.batched, *wide)
+        # An export records plain operators.
+        exporting = torch.compiler.is_exporting()
+        results = self.batched.walk(wide) if exporting else _Call.apply(self.batched, *wide)
         outputs = tuple(_dense(f.sparsity_out(i), y).to(dtype) for i, y in enumerate(results))
         return outputs if len(outputs) > 1 else outputs[0]
 
