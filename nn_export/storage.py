@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import tempfile
 from collections.abc import Mapping
@@ -16,17 +17,19 @@ from nn_export.errors import ProgramError
 from nn_export.program import Program, dumps, from_json, shape_of, to_json
 
 FORMAT = "nn_export programs"
-SCHEMA = 1
+SCHEMA = 2
 PROGRAMS, WEIGHTS = "programs.json", "weights.safetensors"
 MAX_JSON = 64 * 2**20  # bytes
 MAX_WEIGHTS = 2**30  # bytes
+MAX_DEPTH = 40  # of nested JSON: arguments are lists of lists at most
 
 
 def save_programs(folder: str | Path, programs: Mapping[str, Program]) -> None:
     """Write named programs with one shared weights file; other files of the folder are left alone.
 
     Equal arrays are stored once. Each file is replaced in one step; the JSON carries the hash of the
-    weights, so that a pair which does not belong together is noticed on loading.
+    weights and one of its own content, so that damage, or a pair which does not belong together, is noticed
+    on loading.
 
     Args:
         folder: Folder, made if missing.
@@ -65,8 +68,9 @@ def save_programs(folder: str | Path, programs: Mapping[str, Program]) -> None:
         "programs": entries,
     }
     try:
+        document["sha256"] = _content_hash(document)
         text = dumps(document)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RecursionError) as error:
         raise ProgramError(f"a program holds something that JSON has no form for: {error}") from error
     path = Path(folder)
     path.mkdir(parents=True, exist_ok=True)
@@ -85,7 +89,7 @@ def load_programs(folder: str | Path) -> dict[str, Program]:
 
     Raises:
         ProgramError: If a file is missing, damaged, foreign, larger than 64 MiB (JSON) or 1 GiB
-            (weights), or of another schema version.
+            (weights), of another schema version, or changed since it was saved.
 
     Example:
         >>> load_programs("/nowhere")
@@ -103,7 +107,19 @@ def load_programs(folder: str | Path) -> dict[str, Program]:
             raise ProgramError(f"{where}: expected the fields program and weights; save it again")
         weights = _weights(entry["weights"], tensors, f"{where}.weights")
         result[name] = from_json(entry["program"], weights, where)
+    given = document.pop("sha256", None)
+    if given != _content_hash(document):
+        raise ProgramError(
+            f"{path / PROGRAMS}: its content is not what was saved (field sha256): damaged or changed by hand; "
+            "save the programs again"
+        )
     return result
+
+
+def _content_hash(document: Mapping[str, Any]) -> str:
+    """Hash of what the JSON says, whatever its spaces and line ends."""
+    text = json.dumps(document, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _weights(table: Any, tensors: dict[str, np.ndarray], where: str) -> dict[str, np.ndarray]:
@@ -123,11 +139,13 @@ def _weights(table: Any, tensors: dict[str, np.ndarray], where: str) -> dict[str
 def _document(path: Path) -> dict[str, Any]:
     remedy = "save the programs again or restore the file"
     try:
-        document = json.loads(_read(path, MAX_JSON), parse_constant=_refuse)
+        document = json.loads(_read(path, MAX_JSON), parse_constant=_refuse, parse_float=_finite)
     except (ValueError, RecursionError) as error:
         if isinstance(error, ProgramError):
             raise
         raise ProgramError(f"{path}: not readable as JSON ({error!s:.80}); {remedy}") from error
+    if _too_deep(document):
+        raise ProgramError(f"{path}: nested deeper than {MAX_DEPTH} levels; {remedy}")
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise ProgramError(f"{path}: field format is not {FORMAT!r}; this file was not written by nn_export")
     if document.get("schema") != SCHEMA:
@@ -165,13 +183,32 @@ def _refuse(name: str) -> Any:
     raise ValueError(f"{name} is not JSON")
 
 
+def _finite(text: str) -> float:
+    if math.isinf(value := float(text)):
+        raise ValueError(f"{text:.20} is too large")
+    return value
+
+
+def _too_deep(data: Any) -> bool:
+    level = [data]
+    for _ in range(MAX_DEPTH):
+        inner = [v.values() if isinstance(v, dict) else v for v in level if isinstance(v, dict | list)]
+        level = [v for values in inner for v in values]
+        if not level:
+            return False
+    return True
+
+
 def _read(path: Path, limit: int) -> bytes:
     if not path.is_file():
         raise ProgramError(f"{path}: no such file; save the programs there first")
     size = path.stat().st_size
     if size > limit:
         raise ProgramError(f"{path}: {size} bytes, at most {limit} are read; it is no file of nn_export")
-    return path.read_bytes()
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ProgramError(f"{path}: cannot be read ({error}); check its permissions") from error
 
 
 def _write(path: Path, data: bytes) -> None:
