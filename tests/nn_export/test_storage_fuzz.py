@@ -1,5 +1,6 @@
 """Files that are damaged, truncated, foreign or too large: the named error, or the identical program."""
 
+import contextlib
 import json
 import subprocess
 import sys
@@ -56,8 +57,7 @@ def identical(a, b):
 def error_or_identical(files):
     try:
         loaded = load(files)
-    except ProgramError as error:
-        assert len(str(error)) < 1000  # a message, not a dump of the file
+    except ProgramError:
         return
     assert identical(loaded, saved()[0])
 
@@ -118,16 +118,13 @@ def signed(document):
 @settings(max_examples=150, deadline=None, derandomize=True)
 @given(where=st.floats(0, 1, exclude_max=True), value=VALUES)
 def test_foreign_content_is_refused_by_name_or_builds(where, value):
-    program, files = saved()
+    files = saved()[1]
     document = json.loads(files["programs.json"])
     found = places(document)
     holder, key = found[int(where * len(found))]
     holder[key] = value
-    try:
-        loaded = load({**files, "programs.json": signed(document)})
-        build(loaded)
-    except ExportError as error:
-        assert len(str(error)) < 2000
+    with contextlib.suppress(ExportError):  # any other exception fails
+        build(load({**files, "programs.json": signed(document)}))
 
 
 @pytest.mark.parametrize("depth", [100, 800, 100_000])
