@@ -5,6 +5,7 @@ Everything here works on the nonzeros of inputs and outputs, column by column, a
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -79,9 +80,7 @@ class Batched:
 
     def evaluate(self, args: list[Tensor]) -> list[Tensor]:
         """Nonzeros of the outputs ``(*batch, n)`` at those of the inputs, all with the same leading axes."""
-        samples = (
-            args[0][..., :1].numel() if args[0].shape[-1] else args[0].new_empty(args[0].shape[:-1]).numel()
-        )
+        samples = math.prod(args[0].shape[:-1])
         if self.steps is not None and (samples >= WALK_FROM or args[0].device.type != "cpu"):
             return self.walk(args)
         return self._run(args, samples)
@@ -89,6 +88,10 @@ class Batched:
     @cached_property
     def steps(self) -> list[tuple[Any, ...]] | None:
         """The scalar operations of the function; None if it has too many, or others than torch has."""
+        if (
+            _size(self.function) > 4 * MAX_WALK
+        ):  # an estimate, before a dense network is written out in scalars
+            return None
         try:
             f = self.function.expand()
         except RuntimeError:  # calls what has no scalar form: solvers, external code, tables
@@ -137,7 +140,7 @@ class Batched:
 
     def _run(self, args: list[Tensor], samples: int) -> list[Tensor]:
         f, shape, device = self.function, args[0].shape[:-1], args[0].device
-        arrays = [np.ascontiguousarray(a.detach().cpu().numpy()).reshape(samples, -1) for a in args]
+        arrays = [np.ascontiguousarray(a.detach().cpu().numpy()).reshape(samples, a.shape[-1]) for a in args]
         results = [np.empty((samples, f.nnz_out(i))) for i in range(f.n_out())]
         start = 0
         while start < samples:
@@ -185,6 +188,20 @@ def _joined(values: list[Any], shape: torch.Size, like: Tensor) -> Tensor:
     return torch.stack(
         [v.expand(shape) if isinstance(v, Tensor) else like.new_full(shape, v) for v in values], -1
     )
+
+
+def _size(f: ca.Function) -> float:
+    """Scalar operations, about."""
+    if not f.is_a("MXFunction"):
+        return float(f.n_instructions()) if f.is_a("SXFunction") else 0.0
+    total = 0.0
+    for k in range(f.n_instructions()):
+        code = f.instruction_id(k)
+        if code not in (ca.OP_INPUT, ca.OP_OUTPUT):
+            node = f.instruction_MX(k)
+            inner = 2.0 * node.dep(1).size2() if code == ca.OP_MTIMES else 1.0
+            total += _size(node.which_function()) if code == ca.OP_CALL else node.nnz() * inner
+    return total
 
 
 def _derivative(f: ca.Function, *, forward: bool) -> ca.Function:

@@ -98,7 +98,7 @@ def fold(
     outputs = step.call(symbols)
     last = [outputs[step.index_out(s)] for s in roles.states.values()]
     blocks = [ca.Function(step.name(), symbols, last, step.name_in(), list(roles.states.values()))]
-    while BASE ** len(blocks) <= n:
+    while BASE ** len(blocks) < n:
         size = BASE ** len(blocks)
         blocks.append(_chain([(blocks[-1], size // BASE)] * BASE, step, roles, f"{step.name()}_{size}"))
     pieces, rest = [], n

@@ -54,3 +54,48 @@ def test_a_wrong_derivative_is_seen():
     wrong = ca.Function("f", [x], [ca.tanh(x) + 1e-6 * ca.sin(x), x * x])
     # The slope of the error is 1e-6 at the zero sample; tanh and its slope round to 1e-16.
     assert abs(parity(Squares(), wrong, EXAMPLE, n=2).jacobian_abs - 1e-6) < 1e-15
+
+
+def wrong_second_derivative():
+    """A square whose Jacobian is right and says of itself that it is constant."""
+    x, y = ca.MX.sym("x", 2), ca.MX.sym("y", 2)
+    constant = {"is_diff_in": [False, False]}
+    jacobian = ca.Function("jac_f", [x, y], [ca.diag(2 * x)], ["x", "out_y"], ["jac_y_x"], constant)
+    options = {"custom_jacobian": jacobian, "jac_penalty": 0, "never_inline": True}
+    return ca.Function("f", [x], [x * x], ["x"], ["y"], options)
+
+
+class Square(nn.Module):
+    def forward(self, x):
+        return x * x
+
+
+def test_a_wrong_second_derivative_is_seen():
+    report = parity(Square(), wrong_second_derivative(), EXAMPLE, n=4)
+    assert report.jacobian_rel < 1e-15
+    assert report.hvp_rel > 0.5  # it is missing altogether
+    right = parity(Square(), to_casadi(Square(), EXAMPLE), EXAMPLE, n=20)
+    assert right.hvp_rel < 1e-15
+    unasked = parity(Square(), wrong_second_derivative(), EXAMPLE, n=4, hessians=False)
+    assert np.isnan(unasked.hvp_rel)
+    assert "Hessian" not in str(unasked)
+
+
+def test_shapes_are_read_off_the_function():
+    class Product(nn.Module):
+        def forward(self, a, b):
+            return a @ b
+
+    function = to_casadi(Product(), (torch.zeros(2, 3), torch.zeros(3)))
+    report = parity(Product(), function, n=20, seed=1)
+    assert max(report.value_rel, report.jacobian_rel, report.hvp_rel) < 1e-14  # sums of three products
+
+
+def test_saturated_gates_are_among_the_samples():
+    """A gate that gives NaN beyond 25 differs at the saturated sample alone."""
+    x = ca.MX.sym("x", 2)
+    fragile = ca.Function(
+        "f", [x], [ca.if_else(ca.logic_and(ca.fabs(x) > 25, ca.fabs(x) < 35), np.nan, x * x)]
+    )
+    assert parity(Square(), fragile, EXAMPLE, n=5, hessians=False).value_rel < 1e-15
+    assert parity(Square(), fragile, EXAMPLE, n=6, hessians=False).value_abs == np.inf
