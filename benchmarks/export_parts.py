@@ -24,7 +24,7 @@ from hybrid_mpc.identification.networks import GRUNetwork
 from hybrid_mpc.identification.step import HybridStep, Scaling, n_features
 from scenarios.golf_robot import scenario
 
-ROUNDS = 7
+ROUNDS = 15
 N_X, N_U = 2, 1
 SX_INSTRUCTIONS = 30_000
 """Scalar graphs above this are skipped: their Jacobians take minutes to build."""
@@ -128,12 +128,13 @@ def by_casadi(step: ca.Function, *, inline: bool) -> ca.Function:
     return ca.Function("by_casadi", [x, h, u], [*values, a, ca.densify(ca.jacobian(z, u))])
 
 
-def onnx_import(plain: ca.Function) -> ca.Function:
-    """The plain graph written as ONNX and read again, both by CasADi.
+def has_onnx() -> bool:
+    """True if this CasADi reads and writes ONNX."""
+    return hasattr(ca, "has_graphmodel") and bool(ca.has_graphmodel("onnx"))
 
-    Raises:
-        RuntimeError: If this CasADi has no ONNX reader.
-    """
+
+def onnx_import(plain: ca.Function) -> ca.Function:
+    """The plain graph written as ONNX and read again, both by CasADi."""
     with tempfile.TemporaryDirectory() as folder:
         path = str(Path(folder) / "step.onnx")
         ca.GraphBuilder(plain, {}).export_onnx(path, {})

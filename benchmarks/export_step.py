@@ -25,37 +25,40 @@ import torch
 
 import nn_export
 
+Functions = dict[str, ca.Function]
+ONNX_LIMIT = 128
+"""Hidden units up to which CasADi reads ONNX in seconds; its time grows faster than the number of weights."""
+
 
 def routes(
     z: int, program: nn_export.Program, cache: str | None
-) -> tuple[dict[str, Callable[[], ca.Function]], list]:
-    """How to build each route, and the reasons for those left out."""
-    plain = nn_export.build(program, plain=True)
-    composed = nn_export.with_jacobian(program, {"A": ("x", "h"), "B": ("u",)})
+) -> tuple[dict[str, Callable[[Functions], ca.Function]], list[str]]:
+    """How to build each route from those before it, and the reasons for those left out."""
+    blocks = {"A": ("x", "h"), "B": ("u",)}
     skipped = [parts.l4casadi_reason()]
-    found: dict[str, Callable[[], ca.Function]] = {
-        "value_plain": lambda: nn_export.build(program, plain=True),
-        "value": lambda: nn_export.build(program),
-        "plain": lambda: parts.by_casadi(nn_export.build(program, plain=True), inline=False),
-        "casadi": lambda: parts.by_casadi(nn_export.build(program), inline=True),
-        "composed": lambda: nn_export.with_jacobian(program, {"A": ("x", "h"), "B": ("u",)}),
+    found: dict[str, Callable[[Functions], ca.Function]] = {
+        "value_plain": lambda _: nn_export.build(program, plain=True),
+        "value": lambda _: nn_export.build(program, "value"),
+        "plain": lambda f: parts.by_casadi(f["value_plain"], inline=False),
+        "casadi": lambda f: parts.by_casadi(f["value"], inline=True),
+        "composed": lambda _: nn_export.with_jacobian(program, blocks),
     }
     scalars = 6 * z * (z + 6)
     if scalars <= parts.SX_INSTRUCTIONS:
-        found["value_sx"] = plain.expand
-        found["sx"] = lambda: parts.by_casadi(plain.expand(), inline=True)
+        found["value_sx"] = lambda f: f["value_plain"].expand()
+        found["sx"] = lambda f: parts.by_casadi(f["value_sx"], inline=True)
     else:
         skipped.append(f"SX: about {scalars} scalar operations, its Jacobian takes minutes to build")
-    try:
-        parts.onnx_import(plain)
-    except RuntimeError as error:
-        skipped.append(f"ONNX: {str(error).splitlines()[-1]}")
+    if not parts.has_onnx():
+        skipped.append("ONNX: this CasADi has no reader for it")
+    elif z <= ONNX_LIMIT:
+        found["value_onnx"] = lambda f: parts.onnx_import(f["value_plain"])
+        found["onnx"] = lambda f: parts.by_casadi(f["value_onnx"], inline=False)
     else:
-        found["value_onnx"] = lambda: parts.onnx_import(plain)
-        found["onnx"] = lambda: parts.by_casadi(parts.onnx_import(plain), inline=False)
+        skipped.append(f"ONNX: CasADi takes minutes to read it above {ONNX_LIMIT} units")
     if cache is not None:
-        found["value_c"] = lambda: nn_export.compile_function(nn_export.build(program, "value"), folder=cache)
-        found["c"] = lambda: nn_export.compile_function(composed, folder=cache)
+        found["value_c"] = lambda f: nn_export.compile_function(f["value"], folder=cache)
+        found["c"] = lambda f: nn_export.compile_function(f["composed"], folder=cache)
     return found, skipped
 
 
@@ -63,9 +66,10 @@ def measure(z: int, rate: dict[str, float], cache: str | None) -> dict[str, Any]
     """All routes at one size."""
     program = parts.golf_program(z)
     found, skipped = routes(z, program, cache)
-    functions, costs = {}, {}
+    functions: Functions = {}
+    costs: dict[str, dict[str, float]] = {}
     for name, build in found.items():
-        functions[name], costs[name] = parts.built(build)
+        functions[name], costs[name] = parts.built(lambda build=build: build(functions))
     rng = np.random.default_rng(z)
     point = [0.5 * rng.standard_normal(n) for n in (parts.N_X, z, parts.N_U)]
     times = parts.best_microseconds(functions, point)

@@ -1,7 +1,7 @@
 """Torch modules as CasADi functions: exact, without a compiler, readable on disk.
 
-``trace``, ``to_casadi`` and ``parity`` need torch and import it when first used; ``build``,
-``with_jacobian`` and ``load_programs`` need casadi and numpy only.
+``trace``, ``to_casadi``, ``from_casadi`` and ``parity`` need torch and import it when first used; all else
+(``build``, ``with_jacobian``, ``unroll``, ``compile_function``, ``load_programs`` ...) needs casadi and numpy only.
 """
 
 from typing import TYPE_CHECKING, Any

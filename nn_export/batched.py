@@ -81,9 +81,8 @@ class Batched:
     def evaluate(self, args: list[Tensor]) -> list[Tensor]:
         """Nonzeros of the outputs ``(*batch, n)`` at those of the inputs, all with the same leading axes."""
         samples = math.prod(args[0].shape[:-1])
-        if self.steps is not None and (samples >= WALK_FROM or args[0].device.type != "cpu"):
-            return self.walk(args)
-        return self._run(args, samples)
+        many = samples >= WALK_FROM or args[0].device.type != "cpu"
+        return self.walk(args) if many and self.steps is not None else self._run(args, samples)
 
     @cached_property
     def steps(self) -> list[tuple[Any, ...]] | None:

@@ -136,6 +136,9 @@ def test_graphs_grow_linearly_and_folds_hardly_at_all(program):
     assert long.n_instructions() == short.n_instructions()
     # Beyond the states of two more levels: each level holds its part of the inputs twice, 2 (1 + 1/8 + 1/64 ...).
     assert long.sz_w() - short.sz_w() < 2.3 * 4096 + 200
+    # A gradient holds the inputs' adjoints in the same way.
+    reverse = long.reverse(1).sz_w() - short.reverse(1).sz_w()
+    assert reverse < 2 * 2.3 * 4096 + 2 * 4096 + 1000
 
 
 @pytest.mark.parametrize(
