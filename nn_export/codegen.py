@@ -62,7 +62,7 @@ def compile_function(
 
     Raises:
         CompileError: If CasADi cannot write the function as C, the compiler fails or takes too long, or the
-            compiler named does not exist.
+            compiler named does not exist; if others may write into the folder.
 
     Example:
         >>> x = ca.MX.sym("x")
@@ -87,6 +87,10 @@ def compile_function(
     key = _key(source, command, flags)
     cache = _cache_folder() if folder is None else Path(folder)
     cache.mkdir(parents=True, exist_ok=True, mode=0o700)
+    if os.name == "posix" and cache.stat().st_mode & 0o002:
+        raise CompileError(
+            f"{cache}: anyone may write there, so anyone's code could be run; chmod o-w or take another"
+        )
     library = _cached(cache, key) or _build(source, cache, key, [*command, *flags], timeout)
     try:
         return ca.external(function.name(), str(library.resolve()))

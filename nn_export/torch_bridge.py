@@ -16,8 +16,9 @@ def from_casadi(function: ca.Function) -> CasadiModule:
     """A CasADi function as a torch module, e.g. a prior to train with.
 
     Gradients are CasADi's own derivative functions, of any order; branches that ``if_else`` does not take
-    cannot spoil them. ``torch.func`` (``vmap``, ``jacrev``, ``jacfwd``, ``jvp``, ``hessian``) works. Numbers that
-    are to be trained are inputs of the function: pass a ``torch.nn.Parameter``.
+    cannot spoil them. ``torch.func`` (``vmap``, ``jacrev``, ``jacfwd``, ``jvp``, ``hessian``) works; the older
+    ``torch.autograd.functional`` with ``vectorize=True`` does not. Numbers that are to be trained are inputs of the
+    function: pass a ``torch.nn.Parameter``.
 
     Args:
         function: Any CasADi function of real numbers. One that can be expanded to scalar operations (at most

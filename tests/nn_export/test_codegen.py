@@ -160,6 +160,10 @@ def test_named_errors(tmp_path):
         compile_function(f, folder=tmp_path, compiler="no-such-compiler")
     with pytest.raises(CompileError, match="unrecognized"):
         compile_function(f, folder=tmp_path, flags=["-fno-such-flag"])
+    (tmp_path / "open").mkdir()
+    (tmp_path / "open").chmod(0o777)
+    with pytest.raises(CompileError, match="anyone may write"):
+        compile_function(f, folder=tmp_path / "open")
     with pytest.raises(CompileError, match="longer timeout"):
         compile_function(f, folder=tmp_path, timeout=1e-4)
     callback = Callback()
