@@ -1,111 +1,130 @@
-"""How long a deployed step and its Jacobian take, before and after: GRU beside the golf robot, CasADi's VM.
+"""One deployed step and its Jacobian, before and after: a GRU beside the golf robot's prior.
 
-``python benchmarks/export_step.py [--out times.json]``. Routes are timed in turn in one run, the best of
-several rounds counts: other work on the machine only ever adds time.
+``python benchmarks/export_step.py [--quick] [--z 8 16 ...] [--compile] [--out step.json]``. Routes are timed in
+turn in one run, one thread, CasADi's machine unless compiled; the best of several rounds counts.
 
-- value_plain, value: the step alone as a plain graph and as ``nn_export.build`` makes it;
-- plain: Jacobian by CasADi, of a call of the plain graph;
-- casadi: Jacobian by CasADi, of the graph that ``nn_export.build`` makes (cells with exact Jacobians);
-- composed: ``nn_export.with_jacobian``.
+Values: ``value_plain`` (one graph of matrices), ``value`` (:func:`nn_export.build`), ``value_sx`` (expanded to
+scalars), ``value_onnx`` (the plain graph by way of CasADi's ONNX export and import), ``value_c`` (``build``, compiled).
+Jacobians by (x, h) and u: ``plain``, ``sx``, ``onnx`` (CasADi's derivatives of these), ``casadi`` (CasADi's
+derivatives of what ``build`` makes), ``composed`` (:func:`nn_export.with_jacobian`), ``c`` (that, compiled).
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import time
+import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
+import export_parts as parts
 import numpy as np
 import torch
 
 import nn_export
-from hybrid_mpc.identification.networks import GRUNetwork
-from hybrid_mpc.identification.step import HybridStep, Scaling, n_features
-from scenarios.golf_robot import scenario
 
-ROUNDS, CALLS = 9, 60
-
-
-def by_casadi(step: ca.Function, *, inline: bool) -> ca.Function:
-    """Values and the two Jacobians as :func:`nn_export.with_jacobian` gives them."""
-    x, h, u = (ca.MX.sym(name, step.size1_in(i)) for i, name in enumerate(("x", "h", "u")))
-    values = step.call([x, h, u], inline, False)
-    z = ca.vertcat(*values)
-    a = ca.densify(ca.horzcat(ca.jacobian(z, x), ca.jacobian(z, h)))
-    return ca.Function("by_casadi", [x, h, u], [*values, a, ca.densify(ca.jacobian(z, u))])
+Functions = dict[str, ca.Function]
+ONNX_LIMIT = 128
+"""Hidden units up to which CasADi reads ONNX in seconds; its time grows faster than the number of weights."""
 
 
-def call(function: ca.Function, point: list[np.ndarray]):
-    """A call without Python's conversions, and the arrays it writes."""
-    buffer, evaluate = function.buffer()
-    results = [np.zeros(function.nnz_out(i)) for i in range(function.n_out())]
-    for i, array in enumerate(point):
-        buffer.set_arg(i, memoryview(array))
-    for i, array in enumerate(results):
-        buffer.set_res(i, memoryview(array))
-    return lambda: (evaluate(), buffer), results
-
-
-def seconds(evaluate) -> float:
-    """Time of one of ``CALLS`` calls."""
-    start = time.perf_counter()
-    for _ in range(CALLS):
-        evaluate()
-    return (time.perf_counter() - start) / CALLS
-
-
-def measure(z: int) -> dict[str, float]:
-    """Microseconds by route, and the largest difference of the Jacobians from the plain route."""
-    torch.manual_seed(z)
-    prior = scenario.prior()
-
-    network = GRUNetwork(n_features(prior, True), z, prior.n_q)
-    ones = [(1.0,) * n for n in (len(prior.states), len(prior.inputs), prior.n_q, prior.n_q)]
-    module = HybridStep(prior, network, Scaling(*ones), scenario.data.dt)
-    examples = tuple(torch.zeros(n, dtype=torch.float64) for n in (len(prior.states), z, len(prior.inputs)))
-    program = nn_export.trace(module, examples, output_names=["x_next", "h_next"])
-    routes = {
-        "value_plain": nn_export.build(program, plain=True),
-        "value": nn_export.build(program),
-        "plain": by_casadi(nn_export.build(program, plain=True), inline=False),
-        "casadi": by_casadi(nn_export.build(program), inline=True),
-        "composed": nn_export.with_jacobian(program, {"A": ("x", "h"), "B": ("u",)}),
+def routes(
+    z: int, program: nn_export.Program, cache: str | None
+) -> tuple[dict[str, Callable[[Functions], ca.Function]], list[str]]:
+    """How to build each route from those before it, and the reasons for those left out."""
+    blocks = {"A": ("x", "h"), "B": ("u",)}
+    skipped = [parts.l4casadi_reason()]
+    found: dict[str, Callable[[Functions], ca.Function]] = {
+        "value_plain": lambda _: nn_export.build(program, plain=True),
+        "value": lambda _: nn_export.build(program, "value"),
+        "plain": lambda f: parts.by_casadi(f["value_plain"], inline=False),
+        "casadi": lambda f: parts.by_casadi(f["value"], inline=True),
+        "composed": lambda _: nn_export.with_jacobian(program, blocks),
     }
+    scalars = 6 * z * (z + 6)
+    if scalars <= parts.SX_INSTRUCTIONS:
+        found["value_sx"] = lambda f: f["value_plain"].expand()
+        found["sx"] = lambda f: parts.by_casadi(f["value_sx"], inline=True)
+    else:
+        skipped.append(f"SX: about {scalars} scalar operations, its Jacobian takes minutes to build")
+    if not parts.has_onnx():
+        skipped.append("ONNX: this CasADi has no reader for it")
+    elif z <= ONNX_LIMIT:
+        found["value_onnx"] = lambda f: parts.onnx_import(f["value_plain"])
+        found["onnx"] = lambda f: parts.by_casadi(f["value_onnx"], inline=False)
+    else:
+        skipped.append(f"ONNX: CasADi takes minutes to read it above {ONNX_LIMIT} units")
+    if cache is not None:
+        found["value_c"] = lambda f: nn_export.compile_function(f["value"], folder=cache)
+        found["c"] = lambda f: nn_export.compile_function(f["composed"], folder=cache)
+    return found, skipped
+
+
+def measure(z: int, rate: dict[str, float], cache: str | None) -> dict[str, Any]:
+    """All routes at one size."""
+    program = parts.golf_program(z)
+    found, skipped = routes(z, program, cache)
+    functions: Functions = {}
+    costs: dict[str, dict[str, float]] = {}
+    for name, build in found.items():
+        functions[name], costs[name] = parts.built(lambda build=build: build(functions))
     rng = np.random.default_rng(z)
-    point = [0.5 * rng.standard_normal(x.numel()) for x in examples]
-    calls = {name: call(function, point) for name, function in routes.items()}
-    best = dict.fromkeys(routes, np.inf)
-    for _ in range(ROUNDS):
-        for name, (evaluate, _results) in calls.items():
-            best[name] = min(best[name], seconds(evaluate))
-    pairs = zip(calls["plain"][1], calls["composed"][1], strict=True)
-    difference = max(float(np.abs(a - b).max()) for a, b in pairs)
-    return {"z": z, **{f"{name}_us": 1e6 * t for name, t in best.items()}, "difference": difference}
+    point = [0.5 * rng.standard_normal(n) for n in (parts.N_X, z, parts.N_U)]
+    times = parts.best_microseconds(functions, point)
+    needed = dict(zip(("value", "jacobian"), parts.multiply_adds(z), strict=True))
+    for name in functions:
+        kind = "value" if name.startswith("value") else "jacobian"
+        limit = 1e6 * needed[kind] / rate["dgemv_per_s"]
+        costs[name] |= {"us": times[name], "times_the_limit": times[name] / limit}
+    exact = functions["plain"].call(point)
+    worst = {
+        name: max(float(ca.norm_inf(ca.vec(a - b))) for a, b in zip(f.call(point), exact, strict=True))
+        for name, f in functions.items()
+        if not name.startswith("value")
+    }
+    return {"z": z, "multiply_adds": needed, "routes": costs, "difference": worst, "skipped": skipped}
+
+
+def table(row: dict[str, Any]) -> str:
+    """One size as text."""
+    needed = row["multiply_adds"]
+    lines = [
+        f"z = {row['z']}: {needed['value']} multiply-adds a value, {needed['jacobian']} with the Jacobian"
+    ]
+    lines.append("  route           time [us]  x limit  build [ms]  graph [MB]  work [kB]  plain / route")
+    for name, cost in row["routes"].items():
+        rival = row["routes"]["value_plain" if name.startswith("value") else "plain"]["us"]
+        lines.append(
+            f"  {name:14}{cost['us']:11.1f}{cost['times_the_limit']:9.1f}{cost['build_ms']:12.1f}"
+            f"{cost['graph_MB']:12.2f}{cost['work_kB']:11.1f}{rival / cost['us']:15.1f}"
+        )
+    lines.append(f"  largest difference of a Jacobian from plain: {max(row['difference'].values()):.1e}")
+    return "\n".join([*lines, *(f"  left out: {reason}" for reason in row["skipped"])])
 
 
 def main() -> None:
     """Print a table; write JSON where asked."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, help="JSON file to write")
-    parser.add_argument("--z", type=int, nargs="+", default=[8, 16, 32, 64], help="hidden units")
+    parser.add_argument("--quick", action="store_true", help="z = 8 and 32 only")
+    parser.add_argument(
+        "--compile", action="store_true", help="also the compiled routes (needs a C compiler)"
+    )
+    parser.add_argument("--z", type=int, nargs="+", help="hidden units; default 8 16 32 64 128 256")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    print("   z  value_plain  value  plain  casadi  composed [us]  plain/composed  difference")
+    rate = parts.rates()
+    print(f"dgemv {rate['dgemv_per_s'] / 1e9:.2f}, dgemm {rate['dgemm_per_s'] / 1e9:.2f} G multiply-adds/s; "
+          "limit: the multiply-adds at the rate of dgemv")  # fmt: skip
     rows = []
-    for z in given.z:
-        row = measure(z)
-        rows.append(row)
-        times = (
-            "{value_plain_us:13.1f}{value_us:7.1f}{plain_us:7.0f}{casadi_us:8.0f}{composed_us:10.1f}".format(
-                **row
-            )
-        )
-        ratio = row["plain_us"] / row["composed_us"]
-        print(f"{z:4d}{times}{ratio:20.1f}{row['difference']:12.1e}")
+    for z in given.z or ([8, 32] if given.quick else [8, 16, 32, 64, 128, 256]):
+        with tempfile.TemporaryDirectory() as cache:
+            rows.append(measure(z, rate, cache if given.compile else None))
+        print(table(rows[-1]), flush=True)
     if given.out is not None:
-        given.out.write_text(json.dumps(rows, indent=1))
+        given.out.write_text(json.dumps({"machine": parts.machine(), "rates": rate, "rows": rows}, indent=1))
 
 
 if __name__ == "__main__":

@@ -1,19 +1,22 @@
 """Torch modules as CasADi functions: exact, without a compiler, readable on disk.
 
-``trace``, ``to_casadi`` and ``parity`` need torch and import it when first used; ``build``,
-``with_jacobian`` and ``load_programs`` need casadi and numpy only.
+``trace``, ``to_casadi``, ``from_casadi`` and ``parity`` need torch and import it when first used; all else
+(``build``, ``with_jacobian``, ``unroll``, ``compile_function``, ``load_programs`` ...) needs casadi and numpy only.
 """
 
 from typing import TYPE_CHECKING, Any
 
 from nn_export.build import build
+from nn_export.codegen import CFiles, compile_function, generate_c
 from nn_export.errors import ExportError, ProgramError
+from nn_export.horizon import fold, unroll
 from nn_export.jacobian import with_jacobian
 from nn_export.program import Node, Port, Program
 from nn_export.storage import load_programs, save_programs
 
 if TYPE_CHECKING:
     from nn_export.comparison import ParityReport, parity
+    from nn_export.torch_bridge import CasadiModule, from_casadi
     from nn_export.tracing import to_casadi, trace
 
 __all__ = [
@@ -21,6 +24,13 @@ __all__ = [
     "trace",
     "build",
     "with_jacobian",
+    "unroll",
+    "fold",
+    "from_casadi",
+    "CasadiModule",
+    "compile_function",
+    "generate_c",
+    "CFiles",
     "parity",
     "ParityReport",
     "Program",
@@ -32,6 +42,7 @@ __all__ = [
     "ProgramError",
 ]
 _LAZY = {"trace": "tracing", "to_casadi": "tracing", "parity": "comparison", "ParityReport": "comparison"}
+_LAZY |= {"from_casadi": "torch_bridge", "CasadiModule": "torch_bridge"}
 
 
 def __getattr__(name: str) -> Any:

@@ -1,7 +1,8 @@
-"""Does the exported function compute what the module computes? Values and Jacobians."""
+"""Does the exported function compute what the module computes? Values, Jacobians, Hessians."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -9,9 +10,12 @@ import casadi as ca
 import numpy as np
 import torch
 
+from nn_export.batched import Batched
 from nn_export.errors import SignatureError
 from nn_export.operators.value import constant
 from nn_export.tracing import float64_copy
+
+ZEROS, LARGE, SATURATED = 1, 2, 5  # which of ten samples
 
 
 @dataclass(frozen=True)
@@ -27,12 +31,18 @@ class ParityReport:
         jacobian_rel: The same for the Jacobian of one output by all inputs.
         left_out: Number of entries of values and Jacobians that were not compared, because torch itself
             gave infinity or NaN there.
+        hvp_abs: Largest absolute error of an entry of a Hessian-vector product: of the outputs' sum with random
+            weights, along a random direction of all inputs.
+        hvp_rel: The same, relative as above. NaN if Hessians were not compared.
+        hvp_left_out: Number of entries of these products that were not compared, as above.
 
     Example:
-        >>> print(ParityReport(3, 0.0, 0.0, 1e-17, 1e-16))
-        parity over 3 samples: values 0.0e+00 abs, 0.0e+00 rel; Jacobians 1.0e-17 abs, 1.0e-16 rel
-        >>> print(str(ParityReport(3, 0.0, 0.0, 0.0, 0.0, left_out=6)).split("; ")[2])
-        6 entries left out, not finite in torch
+        >>> print(ParityReport(3, 0.0, 0.0, 1e-17, 1e-16, 6, 2e-16, 1e-15))
+        parity over 3 samples      absolute  relative
+          values                    0.0e+00   0.0e+00
+          Jacobians                 1.0e-17   1.0e-16
+          Hessian-vector products   2.0e-16   1.0e-15
+          6 entries left out, not finite in torch
     """
 
     n: int
@@ -41,36 +51,50 @@ class ParityReport:
     jacobian_abs: float
     jacobian_rel: float
     left_out: int = 0
+    hvp_abs: float = math.nan
+    hvp_rel: float = math.nan
+    hvp_left_out: int = 0
 
     def __str__(self) -> str:
-        left_out = f"; {self.left_out} entries left out, not finite in torch" if self.left_out else ""
-        return (
-            f"parity over {self.n} samples: values {self.value_abs:.1e} abs, {self.value_rel:.1e} rel; "
-            f"Jacobians {self.jacobian_abs:.1e} abs, {self.jacobian_rel:.1e} rel{left_out}"
-        )
+        rows = [
+            ("values", self.value_abs, self.value_rel),
+            ("Jacobians", self.jacobian_abs, self.jacobian_rel),
+        ]
+        if not math.isnan(self.hvp_rel):
+            rows.append(("Hessian-vector products", self.hvp_abs, self.hvp_rel))
+        lines = [f"parity over {self.n} samples".ljust(27) + "absolute  relative"]
+        lines += [f"  {name:23}{absolute:10.1e}{relative:10.1e}" for name, absolute, relative in rows]
+        if self.left_out:
+            lines.append(f"  {self.left_out} entries left out, not finite in torch")
+        if self.hvp_left_out:
+            lines.append(f"  {self.hvp_left_out} entries of products left out, not finite in torch")
+        return "\n".join(lines)
 
 
 def parity(
     module: torch.nn.Module,
     function: ca.Function,
-    example_inputs: Sequence[torch.Tensor],
+    example_inputs: Sequence[torch.Tensor] | None = None,
     *,
     n: int = 100,
     seed: int = 0,
     scale: Sequence[float | np.ndarray] | None = None,
+    hessians: bool = True,
 ) -> ParityReport:
     """Compare a module (in float64) with its CasADi function.
 
-    One sample in ten is all zeros, one in ten is 1000 times as large (saturated gates). Jacobians of
-    kinks (``abs`` at 0) are a matter of convention; functions with kinks may differ there.
+    Of ten samples one is all zeros, one is 1000 times as large, and one is 30 times the scale in every entry,
+    with random signs (saturated gates). Derivatives at kinks (``abs`` at 0) are a matter of convention;
+    functions with kinks may differ there.
 
     Args:
         module: The module that was exported.
         function: Its CasADi function.
-        example_inputs: Tensors that give the shapes.
+        example_inputs: Tensors that give the shapes. Default: those of the function, a column of n as ``(n,)``.
         n: Number of samples.
         seed: Seed of the samples.
         scale: Magnitude of each input's normal distribution, a number or an array of its shape. Default: 1 for all.
+        hessians: False leaves Hessian-vector products out, e.g. for operators that torch differentiates once.
 
     Returns:
         The largest differences. A value that is not finite on both sides is left out and counted; so is
@@ -87,37 +111,74 @@ def parity(
         >>> parity(linear, to_casadi(linear, x), x, n=5).value_rel < 1e-12
         True
     """
+    if example_inputs is None:
+        sizes = [function.size_in(i) for i in range(function.n_in())]
+        example_inputs = [torch.zeros(r if c == 1 else (r, c)) for r, c in sizes]
     scales = [1.0] * len(example_inputs) if scale is None else list(scale)
     if not len(scales) == len(example_inputs) == function.n_in():
         raise SignatureError(
             f"{len(example_inputs)} inputs, {len(scales)} scales, the function takes {function.n_in()}"
         )
     copy = float64_copy(module).requires_grad_(False)
-    rng = np.random.default_rng(seed)
+    rng, weights = np.random.default_rng(seed), np.random.default_rng([seed, 1])
     derivative = function.jacobian()
+    second = Batched(function).reverse.forward.function if hessians else None
     jacobian = torch.func.jacrev(_flat(copy), argnums=tuple(range(len(scales))))
-    values, jacobians = _Errors(), _Errors()
+    values, jacobians, products = _Errors(), _Errors(), _Errors()
     for k in range(n):
-        factor = {1: 0.0, 2: 1e3}.get(k % 10, 1.0)
-        kind = k % 10 if k % 10 in (1, 2) else 0
-        draws = [
-            factor * s * rng.standard_normal(tuple(x.shape)) + 0.0  # no negative zeros
-            for x, s in zip(example_inputs, scales, strict=True)
-        ]
+        kind = k % 10 if k % 10 in (ZEROS, LARGE, SATURATED) else 0
+        draws = [_draw(rng, kind, tuple(x.shape)) * s for x, s in zip(example_inputs, scales, strict=True)]
         tensors = [torch.tensor(d, dtype=torch.float64) for d in draws]
         held = [constant(d) for d in draws]
         ours = [ca.evalf(v.mx) for v in held]
         results = function.call(ours)
         blocks = derivative.call([*ours, *results])
         exact = jacobian(*tensors)
-        for i, output in enumerate(_leaves(copy(*tensors))):
-            expected, shape = output.detach().numpy().reshape(-1), tuple(output.shape)
+        outputs = [y.detach() for y in _leaves(copy(*tensors))]
+        for i, output in enumerate(outputs):
+            expected, shape = output.numpy().reshape(-1), tuple(output.shape)
             values.add((i, kind), _row_major(results[i], shape), expected)
             given = [blocks[i * len(held) + j].full()[_order(shape)] for j in range(len(held))]
             given = [g[:, x.positions.reshape(-1)] for g, x in zip(given, held, strict=True)]
             slopes = [e.detach().numpy().reshape(g.shape) for e, g in zip(exact[i], given, strict=True)]
             jacobians.add((i, kind), np.hstack(given), np.hstack(slopes), np.isfinite(expected).all())
-    return ParityReport(n, *values.largest, *jacobians.largest, values.left_out + jacobians.left_out)
+        if second is not None:
+            w = [weights.standard_normal(tuple(y.shape)) for y in outputs]
+            v = [weights.standard_normal(x.shape) for x in draws]
+            fixed = [*w, *v, *(np.zeros(y.shape) for y in w)]
+            curved = second.call([*ours, *(ca.evalf(constant(a).mx) for a in fixed)])
+            given = [_row_major(c, x.shape) for c, x in zip(curved, draws, strict=True)]
+            finite = all(bool(torch.isfinite(y).all()) for y in outputs)
+            products.add((0, kind), np.hstack(given), _hessian_product(copy, tensors, w, v), finite)
+    left_out = values.left_out + jacobians.left_out
+    hvp = products.largest if hessians else (math.nan, math.nan)
+    return ParityReport(n, *values.largest, *jacobians.largest, left_out, *hvp, products.left_out)
+
+
+def _draw(rng: np.random.Generator, kind: int, shape: tuple[int, ...]) -> np.ndarray:
+    draw = rng.standard_normal(shape)
+    factor = {ZEROS: 0.0, LARGE: 1e3}.get(kind, 1.0)
+    return (30.0 * np.sign(draw) if kind == SATURATED else factor * draw) + 0.0  # no negative zeros
+
+
+def _hessian_product(
+    module: torch.nn.Module, inputs: Sequence[torch.Tensor], w: Sequence[np.ndarray], v: Sequence[np.ndarray]
+) -> np.ndarray:
+    """Second derivative of the outputs' sum with weights ``w``, along ``v``, for all inputs in a row."""
+    xs = [x.clone().requires_grad_() for x in inputs]
+    total = _dot(_leaves(module(*xs)), w)
+    slopes = _gradient(total, xs)
+    return np.hstack([g.detach().numpy().reshape(-1) for g in _gradient(_dot(slopes, v), xs)])
+
+
+def _dot(tensors: Sequence[torch.Tensor], weights: Sequence[np.ndarray]) -> torch.Tensor:
+    return torch.stack([(t * torch.tensor(a)).sum() for t, a in zip(tensors, weights, strict=True)]).sum()
+
+
+def _gradient(total: torch.Tensor, xs: Sequence[torch.Tensor]) -> tuple[torch.Tensor, ...]:
+    if not total.requires_grad:  # constant or, for second derivatives, linear
+        return tuple(torch.zeros_like(x) for x in xs)
+    return torch.autograd.grad(total, xs, create_graph=True, materialize_grads=True)
 
 
 class _Errors:

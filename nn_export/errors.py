@@ -41,3 +41,11 @@ class TraceError(ExportError):
 
 class ProgramError(ExportError):
     """A program or its file is damaged, foreign, too large, or not understood."""
+
+
+class DerivativeError(ExportError):
+    """A CasADi function has no derivative where torch asks for one."""
+
+
+class CompileError(ExportError):
+    """A function could not be written as C, or the C compiler failed; its message is included."""

@@ -19,6 +19,8 @@ TORCH = (
     "nn_export/tracing.py",
     "nn_export/convert.py",
     "nn_export/comparison.py",
+    "nn_export/batched.py",
+    "nn_export/torch_bridge.py",
     "hybrid_mpc/physics.py",
     "hybrid_mpc/identification/",
 )

@@ -68,6 +68,7 @@ def test_parity_of_the_step(z, torch_cell):
     report = parity(module, function, examples(z), n=20, scale=(1e-3, 1.0, 1e-3))
     assert report.value_rel < 1e-12
     assert report.jacobian_rel < 1e-10
+    assert report.hvp_rel < 1e-10
 
 
 def test_hessian_is_exact():

@@ -1,0 +1,238 @@
+"""CasADi functions as C: compiled and cached, or written out to be taken elsewhere. No torch in here."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+
+from nn_export.c_program import main_program
+from nn_export.errors import CompileError
+
+_SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
+_LINK = {"win32": ["-shared"], "darwin": ["-dynamiclib", "-fPIC"]}.get(
+    sys.platform, ["-shared", "-fPIC", "-Wl,--no-undefined"]
+)
+
+
+def compile_function(
+    function: ca.Function,
+    *,
+    derivatives: bool = False,
+    folder: str | Path | None = None,
+    compiler: str | None = None,
+    flags: Sequence[str] = ("-O3",),
+    timeout: float = 600.0,
+) -> ca.Function:
+    """The same function as compiled C.
+
+    The library is cached under a hash of the C text, the compiler, its version and the flags; a cached file
+    whose own hash does not fit is made again. Any number of processes may compile at once: a library appears
+    under its name complete or not at all.
+
+    Args:
+        function: Any function that CasADi can write as C.
+        derivatives: True compiles its first derivatives too: Jacobian, forward and reverse. Without them
+            the result cannot be differentiated. For second derivatives compile the function that
+            has them as outputs.
+        folder: Folder of the libraries, made if missing. Default: ``nn_export`` in the user's cache folder
+            (``XDG_CACHE_HOME``, else ``~/.cache``). It holds code that will be run: share it with nobody.
+        compiler: Command. Default: the variable ``CC``, else the first of ``cc``, ``gcc``, ``clang``.
+        flags: Options of the compiler. Default: ``-O3``, which any machine of the same architecture can run;
+            ``-march=native`` binds to this one.
+        timeout: Longest time to compile [s].
+
+    Returns:
+        Function with the same name, inputs and outputs. The function as it is, with a ``RuntimeWarning``, if
+        there is no compiler.
+
+    Raises:
+        CompileError: If CasADi cannot write the function as C, the compiler fails or takes too long, or the
+            compiler named does not exist; if others may write into the folder.
+
+    Example:
+        >>> x = ca.MX.sym("x")
+        >>> with tempfile.TemporaryDirectory() as cache:
+        ...     compiled = compile_function(ca.Function("square", [x], [x * x]), folder=cache)
+        >>> compiled(3)
+        DM(9)
+    """
+    command = _compiler(compiler)
+    if command is None:
+        warnings.warn(
+            f"no C compiler found (cc, gcc, clang or the variable CC): {function.name()} stays in CasADi's machine, "
+            "which gives the same results; install one to make it faster",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+        return function
+    functions = [function]
+    if derivatives:
+        functions += [function.jacobian(), function.forward(1), function.reverse(1)]
+    source = _source(functions)
+    key = _key(source, command, flags)
+    cache = _cache_folder() if folder is None else Path(folder)
+    cache.mkdir(parents=True, exist_ok=True, mode=0o700)
+    if os.name == "posix" and cache.stat().st_mode & 0o002:
+        raise CompileError(
+            f"{cache}: anyone may write there, so anyone's code could be run; chmod o-w or take another"
+        )
+    library = _cached(cache, key) or _build(source, cache, key, [*command, *flags], timeout)
+    try:
+        return ca.external(function.name(), str(library.resolve()))
+    except RuntimeError as error:
+        raise CompileError(
+            f"{library} cannot be loaded: {_last(error)}; remove it or choose another folder"
+        ) from error
+
+
+@dataclass(frozen=True)
+class CFiles:
+    """What :func:`generate_c` wrote.
+
+    Args:
+        source: ``<name>.c``: the function, standard C with ``math.h`` alone.
+        header: ``<name>.h``: its declarations.
+        test: ``<name>_test.c``: a main program that evaluates it where the right results are known.
+    """
+
+    source: Path
+    header: Path
+    test: Path
+
+
+def generate_c(
+    function: ca.Function,
+    folder: str | Path,
+    *,
+    points: Sequence[Sequence[np.ndarray | float]] | None = None,
+    seed: int = 0,
+) -> CFiles:
+    """Write a function as self-contained C with a header and a test program.
+
+    ``cc <name>.c <name>_test.c -lm && ./a.out`` prints one line a sample (all outputs, column by column) and
+    ends with status 0 if all agree with CasADi to 1e-9 relative to the largest output (``-DTOLERANCE=...``
+    changes that).
+
+    Args:
+        function: Any function that CasADi can write as C.
+        folder: Folder, made if missing.
+        points: Samples for the test program: for each one value for each input. Default: three samples of
+            normal random numbers.
+        seed: Seed of the random samples.
+
+    Returns:
+        The paths.
+
+    Raises:
+        CompileError: If CasADi cannot write the function as C.
+
+    Example:
+        >>> x = ca.MX.sym("x")
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     files = generate_c(ca.Function("square", [x], [x * x]), folder)
+        ...     print(files.source.name, files.header.name, files.test.name)
+        square.c square.h square_test.c
+    """
+    name, path = function.name(), Path(folder)
+    path.mkdir(parents=True, exist_ok=True)
+    _source([function])  # raises what there is to raise
+    generator = ca.CodeGenerator(name, {"with_header": True})
+    generator.add(function)
+    generator.generate(f"{path.resolve()}{os.sep}")
+    if points is None:
+        rng = np.random.default_rng(seed)
+        points = [
+            [rng.standard_normal(function.size_in(i)) for i in range(function.n_in())] for _ in range(3)
+        ]
+    files = CFiles(path / f"{name}.c", path / f"{name}.h", path / f"{name}_test.c")
+    files.test.write_text(main_program(function, points))
+    return files
+
+
+def _compiler(given: str | None) -> list[str] | None:
+    named = given or os.environ.get("CC")
+    for candidate in [named] if named else ["cc", "gcc", "clang"]:
+        words = shlex.split(candidate)
+        if words and shutil.which(words[0]):
+            return words
+    if given:
+        raise CompileError(f"compiler {given!r}: no such command; install it or leave the argument out")
+    return None
+
+
+def _source(functions: list[ca.Function]) -> str:
+    try:
+        generator = ca.CodeGenerator("compiled")
+        for f in functions:
+            generator.add(f)
+        text: str = generator.dump()
+    except RuntimeError as error:
+        raise CompileError(f"{functions[0].name()} cannot be written as C: {_last(error)}") from error
+    if kinds := sorted(set(re.findall("#error Code generation not supported for (.*)", text))):
+        raise CompileError(
+            f"{functions[0].name()} cannot be written as C: CasADi has no C for {', '.join(kinds)}; leave "
+            "callbacks and solvers outside the function"
+        )
+    return text
+
+
+def _key(source: str, command: list[str], flags: Sequence[str]) -> str:
+    compiler = subprocess.run([*command, "--version"], capture_output=True, text=True, check=False)
+    parts = [source, *command, compiler.stdout, *flags, platform.machine(), sys.platform, version("casadi")]
+    if any("native" in flag for flag in flags):  # runs on this processor alone
+        parts.append(platform.node())
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
+
+
+def _cache_folder() -> Path:
+    given = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
+    return (Path(given) if given else Path.home() / ".cache") / "nn_export"
+
+
+def _cached(cache: Path, key: str) -> Path | None:
+    """The library of a key, if one is there whose name carries its own hash."""
+    for path in cache.glob(f"{key}-*{_SUFFIX}"):
+        if path.stem == f"{key}-{hashlib.sha256(path.read_bytes()).hexdigest()[:16]}":
+            return path
+    return None
+
+
+def _build(source: str, cache: Path, key: str, command: list[str], timeout: float) -> Path:
+    with tempfile.TemporaryDirectory(dir=cache, prefix=".build-") as work:
+        text, library = Path(work) / "compiled.c", Path(work) / f"library{_SUFFIX}"
+        text.write_text(source)
+        words = [*command, *_LINK, "-o", str(library), str(text), "-lm"]
+        try:
+            done = subprocess.run(words, capture_output=True, text=True, timeout=timeout, check=False)
+        except subprocess.TimeoutExpired as error:
+            raise CompileError(
+                f"the C compiler took more than {timeout:g} s; take -O0 or -O1, a matrix (MX) graph instead of a "
+                "scalar one, or a longer timeout"
+            ) from error
+        if done.returncode or not library.is_file():
+            raise CompileError(f"{shlex.join(words)} failed:\n{done.stderr[-2000:]}")
+        with library.open("rb+") as file:
+            digest = hashlib.sha256(file.read()).hexdigest()[:16]
+            os.fsync(file.fileno())
+        final = cache / f"{key}-{digest}{_SUFFIX}"
+        os.replace(library, final)
+    return final
+
+
+def _last(error: Exception) -> str:
+    return str(error).strip().splitlines()[-1]

@@ -1,0 +1,210 @@
+"""C code: the same numbers, cached by content, safe with damaged files and many processes."""
+
+import multiprocessing
+import os
+import shutil
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from nn_export import build, compile_function, generate_c, trace, unroll, with_jacobian
+from nn_export.errors import CompileError
+
+needs_compiler = pytest.mark.skipif(not shutil.which("cc"), reason="no C compiler on this machine")
+POINT = [np.array([0.3, -0.5]), np.linspace(-1, 1, 4), np.array([0.2])]
+
+
+class Cell(nn.Module):
+    """Linear layers, a GRU cell with its own Jacobian and scalar code between: all that an export holds."""
+
+    def __init__(self):
+        super().__init__()
+        torch.manual_seed(1)
+        self.cell, self.head = nn.GRUCell(3, 4), nn.Linear(4, 2)
+
+    def forward(self, x, h, u):
+        h_next = self.cell(torch.cat([torch.sin(x), u]), h)
+        return 0.9 * x + 0.1 * self.head(h_next), h_next
+
+
+@pytest.fixture(scope="module")
+def program():
+    examples = torch.zeros(2), torch.zeros(4), torch.zeros(1)
+    return trace(Cell(), examples, output_names=["x_next", "h_next"])
+
+
+def flat(values):
+    return np.concatenate([v.full().ravel(order="F") for v in values])
+
+
+@needs_compiler
+def test_compiled_functions_give_the_same_numbers(program, tmp_path):
+    step = build(program, "step")
+    for function, point in (
+        (step, POINT),
+        (with_jacobian(program, name="derived"), POINT),
+        (unroll(step, 5), [*POINT[:2], np.ones((1, 5))]),
+    ):
+        compiled = compile_function(function, folder=tmp_path, flags=["-O1"])
+        assert compiled.is_a("External")
+        assert (compiled.name_in(), compiled.name_out()) == (function.name_in(), function.name_out())
+        # The same operations; compilers may contract a product and a sum.
+        assert np.abs(flat(compiled(*point)) - flat(function(*point))).max() < 1e-14
+
+
+@needs_compiler
+def test_compiled_derivatives(program, tmp_path):
+    step = build(program, "step")
+    compiled = compile_function(step, derivatives=True, folder=tmp_path, flags=["-O0"])
+    x = ca.MX.sym("x", 2)
+    both = []
+    for f in (step, compiled):
+        y = ca.vertcat(*f(x, *POINT[1:]))
+        both.append(ca.Function("d", [x], [ca.jacobian(y, x), ca.gradient(ca.sumsqr(y), x)])(POINT[0]))
+    assert np.abs(flat(both[0]) - flat(both[1])).max() < 1e-14
+    plain = compile_function(step, folder=tmp_path, flags=["-O0"])
+    with pytest.raises(RuntimeError, match=r"[Dd]erivatives"):
+        plain.jacobian()
+
+
+@needs_compiler
+def test_cache_by_content(program, tmp_path):
+    step = build(program, "step")
+    compile_function(step, folder=tmp_path / "a", flags=["-O0"])
+    (library,) = (tmp_path / "a").iterdir()
+    before = library.stat().st_mtime_ns
+    compile_function(build(program, "step"), folder=tmp_path / "a", flags=["-O0"])
+    assert [p.stat().st_mtime_ns for p in (tmp_path / "a").iterdir()] == [before]
+    compile_function(step, folder=tmp_path / "a", flags=["-O1"])
+    assert len(list((tmp_path / "a").iterdir())) == 2
+
+
+@needs_compiler
+def test_a_damaged_library_is_made_again(tmp_path):
+    x = ca.MX.sym("x")
+    square = ca.Function("square", [x], [x * x])
+    compile_function(square, folder=tmp_path, flags=["-O0"])
+    (library,) = tmp_path.iterdir()
+    data = library.read_bytes()
+    library.unlink()  # not in place: it is loaded in this process
+    library.write_bytes(data[: len(data) // 2])
+    code = (
+        "import casadi as ca, sys; from nn_export import compile_function\n"
+        "x = ca.MX.sym('x'); f = ca.Function('square', [x], [x * x])\n"
+        "print(compile_function(f, folder=sys.argv[1], flags=['-O0'])(3))"
+    )
+    root = str(Path(__file__).parents[2])
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, cwd=root
+    )
+    assert done.stdout.strip() == "9", done.stderr
+    assert library.read_bytes() == data
+
+
+def _compile_and_call(folder):
+    x = ca.MX.sym("x")
+    return float(compile_function(ca.Function("cube", [x], [x**3]), folder=folder, flags=["-O0"])(2))
+
+
+@needs_compiler
+def test_many_processes_at_once(tmp_path):
+    with multiprocessing.get_context("spawn").Pool(3) as pool:
+        assert pool.map(_compile_and_call, [str(tmp_path)] * 6) == [8.0] * 6
+    assert [p.suffix for p in tmp_path.iterdir()] == [".so"]  # one library, and no scratch left
+
+
+def test_without_a_compiler_the_function_comes_back_with_one_warning(program, monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CC", raising=False)
+    step = build(program)
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        assert compile_function(step, folder=tmp_path / "c") is step
+    assert len(seen) == 1
+    assert "no C compiler" in str(seen[0].message)
+    assert not (tmp_path / "c").exists()
+
+
+def test_the_cache_lies_in_the_users_folder(program, monkeypatch, tmp_path):
+    if not shutil.which("cc"):
+        pytest.skip("no C compiler on this machine")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    x = ca.MX.sym("x")
+    compile_function(ca.Function("f", [x], [x]), flags=["-O0"])
+    assert len(list((tmp_path / "nn_export").iterdir())) == 1
+    if os.name == "posix":
+        assert (tmp_path / "nn_export").stat().st_mode & 0o077 == 0  # nobody else may put code there
+
+
+class Callback(ca.Callback):
+    def __init__(self):
+        super().__init__()
+        self.construct("callback", {})
+
+    def eval(self, arguments):
+        return arguments
+
+
+@needs_compiler
+def test_named_errors(tmp_path):
+    x = ca.MX.sym("x")
+    f = ca.Function("f", [x], [x])
+    with pytest.raises(CompileError, match="no such command"):
+        compile_function(f, folder=tmp_path, compiler="no-such-compiler")
+    with pytest.raises(CompileError, match="unrecognized"):
+        compile_function(f, folder=tmp_path, flags=["-fno-such-flag"])
+    (tmp_path / "open").mkdir()
+    (tmp_path / "open").chmod(0o777)
+    with pytest.raises(CompileError, match="anyone may write"):
+        compile_function(f, folder=tmp_path / "open")
+    with pytest.raises(CompileError, match="longer timeout"):
+        compile_function(f, folder=tmp_path, timeout=1e-4)
+    callback = Callback()
+    for write in (compile_function, generate_c):
+        with pytest.raises(CompileError, match="CallbackInternal"):
+            write(callback, folder=tmp_path)
+    inner = compile_function(f, folder=tmp_path, flags=["-O0"])
+    with pytest.raises(CompileError, match="undefined reference"):
+        compile_function(ca.Function("outer", [x], [inner(x) + 1]), folder=tmp_path, flags=["-O0"])
+    assert len(list(tmp_path.glob("*.so"))) == 1
+    assert not list(tmp_path.glob(".build*"))
+
+
+@needs_compiler
+def test_generated_c_stands_alone(program, tmp_path):
+    function = with_jacobian(program, {"A": ("x", "h"), "B": ("u",)}, "step")
+    rng = np.random.default_rng(0)
+    points = [[rng.standard_normal(p.shape) for p in POINT] for _ in range(2)]
+    files = generate_c(function, tmp_path / "with space", points=points)
+    assert {p.name for p in files.source.parent.iterdir()} == {"step.c", "step.h", "step_test.c"}
+    # An empty include path beyond the compiler's own, standard C, and the mathematics library alone.
+    command = ["cc", "-std=c99", "-pedantic", "-Wall", "-Werror", "-O1", "-o", str(tmp_path / "main")]
+    subprocess.run([*command, str(files.source), str(files.test), "-lm"], check=True, cwd=tmp_path)
+    done = subprocess.run([str(tmp_path / "main")], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "step: all agree\n")
+    printed = [np.array(line.split(), float) for line in done.stdout.splitlines()]
+    for point, row in zip(points, printed, strict=True):
+        assert np.abs(row - flat(function(*point))).max() < 1e-14
+
+
+@needs_compiler
+def test_the_test_program_sees_a_difference(tmp_path):
+    x = ca.MX.sym("x")
+    files = generate_c(ca.Function("f", [x], [ca.sqrt(x)]), tmp_path, points=[[4.0], [-1.0]])
+    right = files.source.read_text()
+    for text, status in (
+        (right, 0),
+        (right.replace("sqrt(", "1e-6+sqrt("), 1),
+        (right.replace("sqrt(", "fabs("), 1),
+    ):
+        files.source.write_text(text)
+        command = ["cc", "-o", str(tmp_path / "main"), str(files.source), str(files.test), "-lm"]
+        subprocess.run(command, check=True, capture_output=True)
+        assert subprocess.run([str(tmp_path / "main")], capture_output=True).returncode == status

@@ -1,0 +1,292 @@
+"""CasADi functions in torch: the same numbers, derivatives of any order, batches, torch.func, training."""
+
+import copy
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+
+import casadi as ca
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from nn_export import ExportError, from_casadi, parity, to_casadi
+from nn_export.batched import OPERATORS, WALK_FROM, Batched
+from nn_export.errors import DerivativeError, DtypeError, SignatureError
+
+torch.set_num_threads(1)
+f64 = {"dtype": torch.float64}
+
+
+def pendulum():
+    """A prior with a kink whose other branch has no derivative where it is not taken."""
+    x, u, J = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("J")
+    loss = ca.if_else(x[1] > 0, ca.sqrt(x[1]), x[1] ** 2)
+    xdot = ca.vertcat(x[1], (u - ca.sin(x[0]) - loss) / J)
+    return ca.Function("pendulum", [x, u, J], [xdot], ["x", "u", "J"], ["xdot"])
+
+
+def reference(x, u, J):
+    v = x[..., 1]
+    loss = torch.where(v > 0, torch.sqrt(torch.where(v > 0, v, 1.0)), v**2)
+    return torch.stack([v, (u[..., 0] - torch.sin(x[..., 0]) - loss) / J], -1)
+
+
+def matrices():
+    """MX: matrix inputs and outputs, a product, a sparse output."""
+    a, b = ca.MX.sym("a", 2, 3), ca.MX.sym("b", 3)
+    return ca.Function(
+        "matrices", [a, b], [ca.mtimes(a, ca.sin(b)), a * a, ca.diag(b)], ["a", "b"], ["y", "s", "d"]
+    )
+
+
+def samples(batch, seed=0, grad=False):
+    rng = np.random.default_rng(seed)
+    x, u = torch.tensor(rng.standard_normal((*batch, 2))), torch.tensor(rng.standard_normal((*batch, 1)))
+    return [t.requires_grad_(grad) for t in (x, u, torch.tensor(0.7, **f64))]
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (5,), (2, 3), (0,), (1030,), (2 * WALK_FROM,)])
+def test_values_in_any_batch(batch):
+    args = samples(batch)
+    given = from_casadi(pendulum())(*args)
+    assert given.shape == (*batch, 2)
+    assert torch.allclose(given, reference(*args), rtol=1e-14, atol=1e-14)  # a few operations in float64
+
+
+def test_first_second_and_third_derivatives():
+    module, args = from_casadi(pendulum()), samples((4,), grad=True)
+    assert torch.autograd.gradcheck(module, args)
+    assert torch.autograd.gradgradcheck(module, args)
+
+    def slopes(*a):
+        return torch.autograd.grad(torch.sin(module(*a)).sum(), a, create_graph=True)
+
+    assert torch.autograd.gradgradcheck(slopes, args)
+    assert torch.autograd.gradcheck(module, args, check_forward_ad=True)
+
+
+def test_matrices_and_sparse_outputs():
+    module = from_casadi(matrices())
+    rng = np.random.default_rng(0)
+    a, b = torch.tensor(rng.standard_normal((4, 2, 3))), torch.tensor(rng.standard_normal((4, 3)))
+    y, s, d = module(a, b)
+    assert torch.allclose(y, (a @ torch.sin(b)[..., None])[..., 0], rtol=1e-14)
+    assert torch.equal(s, a * a)
+    assert torch.equal(d, torch.diag_embed(b))
+    assert torch.autograd.gradgradcheck(module, (a.requires_grad_(), b.requires_grad_()))
+
+
+@pytest.mark.parametrize(
+    "transform",
+    [
+        torch.func.jacrev,
+        torch.func.jacfwd,
+        torch.func.hessian,
+        lambda f, argnums: torch.func.jacrev(torch.func.jacrev(f, argnums), argnums),
+        lambda f, argnums: torch.func.jacfwd(torch.func.jacfwd(f, argnums), argnums),
+        lambda f, argnums: torch.func.jacrev(torch.func.jacfwd(f, argnums), argnums),
+    ],
+)
+def test_torch_func(transform):
+    module, (x, u, J) = from_casadi(pendulum()), samples((3,))
+    for argnums in (0, 2):
+        given, expected = (
+            torch.func.vmap(transform(f, argnums=argnums), in_dims=(0, 0, None))(x, u, J)
+            for f in (module, reference)
+        )
+        assert torch.allclose(given, expected, rtol=1e-13, atol=1e-13)
+    nested = torch.func.vmap(
+        torch.func.vmap(module, in_dims=(0, None, None)), in_dims=(None, 1, None), out_dims=1
+    )
+    grid = nested(x, u.reshape(1, 3), J)
+    assert torch.allclose(grid[1, 2], reference(x[1], u[2], J), rtol=1e-14)
+
+
+def test_jvp_and_vjp():
+    module, args = from_casadi(pendulum()), tuple(samples((3,)))
+    for given, expected in zip(
+        torch.func.jvp(module, args, args), torch.func.jvp(reference, args, args), strict=True
+    ):
+        assert torch.allclose(given, expected, rtol=1e-14, atol=1e-14)
+
+
+def test_a_branch_not_taken_does_not_spoil_gradients():
+    x = torch.tensor([[0.3, -4.0]], **f64, requires_grad=True)
+    for n in (1, WALK_FROM):  # both ways of evaluation
+        (slope,) = torch.autograd.grad(
+            from_casadi(pendulum())(x.expand(n, 2), torch.zeros(1, **f64), torch.ones((), **f64)).sum(), x
+        )
+        assert torch.allclose(slope, n * torch.tensor([[-np.cos(0.3), 1 + 8.0]], **f64), rtol=1e-13)
+
+
+def test_float32_in_gives_the_exact_result_rounded_once():
+    module, args = from_casadi(pendulum()), samples((50,))
+    narrow = [a.float().requires_grad_() for a in args]
+    wide = [a.detach().double().requires_grad_() for a in narrow]
+    given, exact = module(*narrow), module(*wide)
+    assert given.dtype is torch.float32
+    assert torch.equal(given, exact.float())
+    given[:, 1].sum().backward()
+    exact[:, 1].sum().backward()
+    assert torch.equal(narrow[0].grad, wide[0].grad.float())
+    assert module(narrow[0], wide[1], narrow[2]).dtype is torch.float64  # the widest input
+
+
+def example_of(op):
+    """A function that contains one operation of the table, with a constant too."""
+    x, y = ca.SX.sym("x"), ca.SX.sym("y")
+    binary = {
+        ca.OP_ADD: x + y, ca.OP_SUB: x - y, ca.OP_MUL: x * y, ca.OP_DIV: x / y, ca.OP_POW: ca.fabs(x) ** y,
+        ca.OP_CONSTPOW: ca.fabs(x) ** 2.5, ca.OP_LT: x < y, ca.OP_LE: x <= y, ca.OP_EQ: x == y, ca.OP_NE: x != y,
+        ca.OP_AND: ca.logic_and(x > 0, y > 0), ca.OP_OR: ca.logic_or(x > 0, y > 0), ca.OP_NOT: ca.logic_not(x > 0),
+        ca.OP_FMIN: ca.fmin(x, 0.1), ca.OP_FMAX: ca.fmax(x, 0.1), ca.OP_FMOD: ca.fmod(x, 0.4),
+        ca.OP_COPYSIGN: ca.copysign(0.3, x), ca.OP_ATAN2: ca.atan2(x, y), ca.OP_HYPOT: ca.hypot(x, y),
+        ca.OP_IF_ELSE_ZERO: ca.if_else(x > 0, y, 3), ca.OP_NEG: -x, ca.OP_TWICE: 2 * x, ca.OP_SQ: x**2,
+        ca.OP_INV: 1 / x, ca.OP_FABS: ca.fabs(x), ca.OP_SIGN: ca.sign(x), ca.OP_FLOOR: ca.floor(3 * x),
+        ca.OP_CEIL: ca.ceil(3 * x), ca.OP_LOG: ca.log(ca.fabs(x)), ca.OP_LOG1P: ca.log1p(ca.fabs(x)),
+        ca.OP_SQRT: ca.sqrt(ca.fabs(x)), ca.OP_EXP: ca.exp(x), ca.OP_EXPM1: ca.expm1(x), ca.OP_ERF: ca.erf(x),
+        ca.OP_SIN: ca.sin(x), ca.OP_COS: ca.cos(x), ca.OP_TAN: ca.tan(x), ca.OP_SINH: ca.sinh(x),
+        ca.OP_COSH: ca.cosh(x), ca.OP_TANH: ca.tanh(x), ca.OP_ASIN: ca.asin(ca.tanh(x)),
+        ca.OP_ACOS: ca.acos(ca.tanh(x)),
+        ca.OP_ATAN: ca.atan(x), ca.OP_ASINH: ca.asinh(x), ca.OP_ACOSH: ca.acosh(1 + x**2),
+        ca.OP_ATANH: ca.atanh(ca.tanh(x) / 2),
+    }  # fmt: skip
+    return ca.Function("one", [x, y], [binary[op], 4.0]) if op in binary else None
+
+
+@pytest.mark.parametrize("op", sorted(OPERATORS))
+def test_every_operation_as_a_torch_operator(op):
+    function = example_of(op)
+    if op in (ca.OP_ASSIGN, ca.OP_LIFT):  # never made by a symbolic expression here
+        assert OPERATORS[op](*[torch.ones(1)] * (1 + (op == ca.OP_LIFT))) == 1
+        return
+    codes = {function.instruction_id(k) for k in range(function.n_instructions())}
+    assert op in codes
+    batched = Batched(function)
+    values = torch.tensor(np.random.default_rng(0).uniform(-1, 1, (2, 40, 1)))
+    values[1, ::4] = values[0, ::4]  # equal ones too
+    walked, run = batched.walk(list(values)), batched._run(list(values), 40)
+    for a, b in zip(walked, run, strict=True):
+        assert torch.allclose(a, b, rtol=1e-13, atol=0)  # two libraries' elementary functions
+
+
+def test_a_prior_in_casadi_learns_its_parameter():
+    """An inertia of 0.7 is found from accelerations, through a module that holds it as a parameter."""
+    x, u, J = samples((64,))
+    target = reference(x, u, J)
+
+    class Prior(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.dynamics, self.J = from_casadi(pendulum()), nn.Parameter(torch.tensor(1.0, **f64))
+
+        def forward(self, x, u):
+            return self.dynamics(x, u, self.J)
+
+    prior = Prior()
+    assert [name for name, _ in prior.named_parameters()] == ["J"]
+    optimizer = torch.optim.LBFGS(
+        prior.parameters(), max_iter=50, tolerance_change=0.0, line_search_fn="strong_wolfe"
+    )
+
+    def closure():
+        optimizer.zero_grad()
+        loss = ((prior(x, u) - target) ** 2).mean()
+        loss.backward()
+        return loss
+
+    optimizer.step(closure)
+    assert (
+        abs(prior.J.item() - 0.7) < 1e-6
+    )  # the optimizer stops at a gradient of 1e-7, the curvature is about 10
+
+
+def test_a_hybrid_of_a_casadi_prior_and_a_network_is_exported_again():
+    class Hybrid(nn.Module):
+        def __init__(self):
+            super().__init__()
+            torch.manual_seed(0)
+            self.prior, self.cell, self.head = from_casadi(pendulum()), nn.GRUCell(3, 4), nn.Linear(4, 1)
+            self.J = nn.Parameter(torch.tensor(0.7, **f64))
+
+        def forward(self, x, h, u):
+            h_next = self.cell(torch.cat([x, u], -1), h)
+            return x + 0.05 * self.prior(x, u + self.head(h_next), self.J), h_next
+
+    examples = (torch.zeros(2), torch.zeros(4), torch.zeros(1))
+    function = to_casadi(Hybrid(), examples, output_names=["x_next", "h_next"])
+    report = parity(Hybrid(), function, examples, n=10)
+    # The package's promise.
+    assert report.value_rel < 1e-12
+    assert report.jacobian_rel < 1e-10
+    assert report.hvp_rel < 1e-10
+
+
+def test_what_has_no_scalar_form_is_trained_with_too():
+    x, p = ca.MX.sym("x"), ca.MX.sym("p")
+    root = ca.rootfinder("root", "newton", {"x": x, "p": p, "g": x**3 - p})
+    module = from_casadi(ca.Function("cube_root", [p], [root(1.0, p)]))
+    p = torch.tensor([[8.0], [27.0]], **f64, requires_grad=True)
+    y = module(p)
+    assert torch.allclose(y, torch.tensor([[2.0], [3.0]], **f64), rtol=1e-9)  # Newton's tolerance
+    (slope,) = torch.autograd.grad(y.sum(), p)
+    assert torch.allclose(slope, torch.tensor([[1 / 12], [1 / 27]], **f64), rtol=1e-9)
+    with pytest.raises(ExportError, match="no form in torch operators"):
+        to_casadi(module, (torch.zeros(1),))
+
+
+def test_a_large_network_is_not_written_out_in_scalars():
+    cell = nn.GRUCell(4, 64).double()
+    batched = Batched(to_casadi(cell, (torch.zeros(4), torch.zeros(64))))
+    assert batched.steps is None
+    x, h = torch.randn(3, 4, **f64), torch.randn(3, 64, **f64)
+    assert torch.allclose(batched.evaluate([x, h])[0], cell(x, h), rtol=1e-12, atol=1e-13)
+
+
+def test_copies_and_pickles_evaluate_alike():
+    module, args = from_casadi(pendulum()), samples((5,))
+    expected = module(*args)
+    for other in (copy.deepcopy(module), pickle.loads(pickle.dumps(module))):
+        assert torch.equal(other(*args), expected)
+
+
+def test_threads_give_the_same_bits():
+    module = from_casadi(pendulum())
+    cases = [samples((n,), seed=n, grad=True) for n in (1, 3, 17, 100, 300) * 4]
+
+    def slopes(args):
+        return torch.autograd.grad(module(*args).square().sum(), args)
+
+    expected = [slopes(args) for args in cases]
+    with ThreadPoolExecutor(4) as pool:
+        for given, alone in zip(pool.map(slopes, cases), expected, strict=True):
+            assert all(torch.equal(a, b) for a, b in zip(given, alone, strict=True))
+
+
+class NoDerivative(ca.Callback):
+    def __init__(self):
+        super().__init__()
+        self.construct("no_derivative", {})
+
+    def eval(self, arguments):
+        return [2 * arguments[0]]
+
+
+def test_named_errors():
+    module, (x, u, J) = from_casadi(pendulum()), samples((3,))
+    with pytest.raises(SignatureError, match="3 tensors"):
+        module(x, u)
+    with pytest.raises(SignatureError, match=r"x must have the shape \(..., 2\), got \(3, 1\)"):
+        module(u, u, J)
+    with pytest.raises(SignatureError, match="broadcast"):
+        module(x, u[:2], J)
+    with pytest.raises(DtypeError, match="int64"):
+        module(x, u, torch.tensor(1))
+    with pytest.raises(SignatureError, match=r"casadi\.Function"):
+        from_casadi(lambda x: x)
+    callback = NoDerivative()
+    y = from_casadi(callback)(torch.ones(1, **f64, requires_grad=True))
+    assert y.item() == 2.0
+    with pytest.raises(DerivativeError, match="no_derivative has no derivative"):
+        y.sum().backward()

@@ -1,0 +1,23 @@
+"""The code in docs/export.md runs, from top to bottom."""
+
+import re
+from pathlib import Path
+
+PAGE = Path(__file__).parents[2] / "docs" / "export.md"
+
+
+def test_the_recipes_run(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    blocks = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.DOTALL | re.MULTILINE)
+    assert len(blocks) == 4  # the introduction and three recipes
+    namespace = {}
+    for block in blocks:
+        exec(compile(block, str(PAGE), "exec"), namespace)
+    printed = capsys.readouterr().out
+    assert "Hessian-vector products" in printed
+    assert "(1, 20)" in printed
+    assert "Prior:(x[2],u)->(output[2])" in printed
+    assert (tmp_path / "c_code" / "Step_test.c").is_file()
+    report = namespace["parity"](namespace["module"], namespace["step"], n=10)
+    assert report.value_rel < 1e-12  # the package's promise
