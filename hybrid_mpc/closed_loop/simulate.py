@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybrid_mpc.closed_loop.faults import Fault, check_channels
+from hybrid_mpc.closed_loop.faults import Fault, check_channels, install
 from hybrid_mpc.closed_loop.machine import Machine, Preview, Previews, fitting
 from hybrid_mpc.closed_loop.result import ClosedLoopResult
 from hybrid_mpc.errors import InputError
@@ -134,6 +134,7 @@ def simulate(
     ocp, model = safe.controller.ocp, estimator.model
     _check_models(model, safe.controller.model)
     n = _periods(dt, duration, model.dt, safe.controller.model.dt)
+    plant, faults = install(plant, faults)
     check_channels(faults, model.n_y, ocp.n_u)
     cost = _checked_cost(ocp, ocp if stage_cost is None else stage_cost)
     previews = Previews(reference, weight, ocp, horizon, dt, n * dt)
