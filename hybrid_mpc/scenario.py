@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError
 
 if TYPE_CHECKING:
+    from hybrid_mpc.closed_loop.faults import Fault
+    from hybrid_mpc.closed_loop.result import ClosedLoopResult
     from hybrid_mpc.model import HybridModel
     from hybrid_mpc.physics import Prior
 
@@ -157,6 +159,8 @@ class Task:
             the reference: zero where a state does not matter, large where it must be met. An instant that
             is to be met must lie on the grid of model periods. Default: 1 throughout.
         control: The task's own control problem, e.g. with other limits. Default: the scenario's.
+        faults: What disturbs the machine in this task; no controller knows it. Default: nothing.
+        figures: ``result -> {name with unit: number}``, figures of the task's own beside the cost. Default: none.
 
     Example:
         >>> def meet(t):  # at t = 1 s only, and from then on ordinarily
@@ -173,6 +177,8 @@ class Task:
     reference: Callable[[Array], Array]
     weight: Callable[[Array], Array] | None = None
     control: ControlSpec | None = None
+    faults: tuple[Fault, ...] = ()
+    figures: Callable[[ClosedLoopResult], dict[str, float]] | None = None
 
 
 @dataclass(frozen=True)
@@ -185,6 +191,8 @@ class Budget:
         teacher_steps: Optimiser steps with teacher forcing.
         free_run_steps: Optimiser steps on free runs.
         seeds: Closed loops per task and controller.
+        oracle_seeds: Closed loops per task of the oracles, which are slow.
+        tasks: Names of the tasks to run. Default: all.
         decay: Weight decay times the number of training samples. The less data, the more of it is needed to
             keep a network from learning their noise; large recordings do not notice the default.
     """
@@ -195,6 +203,8 @@ class Budget:
     free_run_steps: int
     seeds: int
     decay: float = 300.0
+    oracle_seeds: int = 1
+    tasks: tuple[str, ...] | None = None
 
 
 DEFAULT_BUDGETS: Mapping[str, Budget] = {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,6 +42,11 @@ class PriorFit:
     warnings: tuple[str, ...]
     stages: tuple[dict[str, Any], ...]
 
+    @property
+    def best(self) -> str:
+        """Name of the stage that won."""
+        return str(min(self.stages, key=lambda row: row["validation_error"])["stage"])
+
 
 def fit_prior(
     make: Callable[..., Prior],
@@ -49,6 +54,7 @@ def fit_prior(
     valid: Sequence[Trajectory],
     *,
     dt: float,
+    before: PriorFit | None = None,
     on_progress: Callable[[int, int, str], None] = lambda done, total, text: None,
 ) -> PriorFit:
     """Fit by equation error, then by output error over longer and longer free runs; the best one wins.
@@ -61,6 +67,8 @@ def fit_prior(
         train: Training trajectories.
         valid: Validation trajectories (chosen by, not fitted to).
         dt: Model period [s].
+        before: An earlier fit to the same recordings, smoothed otherwise: only the length of free run that
+            was best then is fitted, from its parameters on. Default: all lengths, from the nominal ones.
         on_progress: ``(done, total, text)`` after every stage.
 
     Raises:
@@ -72,22 +80,29 @@ def fit_prior(
     judge = _sample(
         cut_windows(valid or train, 0, round(_longest(valid or train, lengths) / dt), round(0.5 / dt))
     )
-    candidates = [("nominal", fit.nominal, None)]
-    theta, jacobian = fit.equation_error(_sample(cut_windows(train, 0, 1, 3), 4000))
-    candidates.append(("equation error", theta, jacobian))
+    if before is None:
+        candidates = [("nominal", fit.nominal, None)]
+        theta, jacobian = fit.equation_error(_sample(cut_windows(train, 0, 1, 3), 4000))
+        candidates.append(("equation error", theta, jacobian))
+    else:
+        candidates = [("the fit before", fit.scaled(before.values), None)]
+        stages = [s for s in stages if before.best == f"output error {s[0]:g} s"] or stages[:1]
     for i, (length, evaluations) in enumerate(stages):
-        on_progress(i, len(lengths), f"output error over {length:g} s")
+        on_progress(i, len(stages), f"output error over {length:g} s")
         windows = _sample(cut_windows(train, 0, round(length / dt), max(1, round(length / dt / 4))))
         start = min(candidates, key=lambda c: fit.judge(c[1], windows))[1]
         theta, jacobian = fit.output_error(start, windows, evaluations)
         candidates.append((f"output error {length:g} s", theta, jacobian))
-    on_progress(len(lengths), len(lengths), "done")
+    on_progress(len(stages), len(stages), "done")
     scores = [fit.judge(theta, judge) for _, theta, _ in candidates]
     if not np.isfinite(min(scores)):
         raise InputError("the prior diverges with every set of parameters tried; check its signs and units")
     best = int(np.argmin(scores))
+    if best == 0 and before is not None:
+        errors, warnings = dict(before.standard_errors), list(before.warnings)
+    else:
+        errors, warnings = fit.confidence(candidates[best][1], candidates[best][2])
     table = tuple({"stage": c[0], "validation_error": s} for c, s in zip(candidates, scores, strict=True))
-    errors, warnings = fit.confidence(candidates[best][1], candidates[best][2])
     return PriorFit(fit.values(candidates[best][1]), errors, tuple(warnings), table)
 
 
@@ -105,6 +120,9 @@ class _Fit:
     def values(self, theta: NDArray[np.float64]) -> dict[str, float]:
         fitted = {p.name: float(v) for p, v in zip(self.free, theta * self.unit, strict=True)}
         return {**self.prior.values, **fitted}
+
+    def scaled(self, values: Mapping[str, float]) -> NDArray[np.float64]:
+        return np.array([values[p.name] for p in self.free]) / self.unit
 
     def equation_error(self, windows: Windows) -> tuple[NDArray[np.float64], Any]:
         return self.output_error(self.nominal, windows, 40)

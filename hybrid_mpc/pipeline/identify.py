@@ -18,11 +18,12 @@ from hybrid_mpc.scenario import load_scenario
 if TYPE_CHECKING:
     from hybrid_mpc.data.trajectories import Trajectory
     from hybrid_mpc.identification.evaluation import FreeRun
+    from hybrid_mpc.identification.prior_fit import PriorFit
     from hybrid_mpc.identification.training import Trained, TrainingSettings
     from hybrid_mpc.physics import Prior
 
-ROUNDS = 2
-"""Fits of the prior: to polynomially smoothed states, then to those that it smoothed itself."""
+ROUNDS = ("polynomially smoothed", "smoothed by the prior")
+"""States that the prior is fitted to, one after the other."""
 MODELS = ("phy_nominal", "phy", "rnn", "pgrnn", "mopgrnn")
 
 
@@ -64,12 +65,11 @@ def prior_stage(context: Context) -> None:
 
     make, dt = context.scenario.prior, context.spec.dt
     train, valid = context.trajectories("train"), context.trajectories("valid")
-    for i in range(ROUNDS):
+    fit: PriorFit | None = None
+    for title in ROUNDS:
         fit = fit_prior(
-            make, train, valid, dt=dt,
-            on_progress=lambda done, total, text, i=i: context.progress.update(  # type: ignore[misc]
-                "prior", done + i * total, ROUNDS * total, text
-            ),
+            make, train, valid, dt=dt, before=fit,
+            on_progress=lambda done, total, text, key=title: context.progress.update(key, done, total, text),  # type: ignore[misc]
         )  # fmt: skip
         smoother = fit_smoother(make(fit.values), [*train, *valid], dt)
         train, valid = smoother.smooth(train), smoother.smooth(valid)
@@ -83,6 +83,7 @@ def prior_stage(context: Context) -> None:
         "units": {p.name: p.unit for p in make().parameters_spec},
         "smoother": {"sigma": smoother.sigma, "walk": smoother.walk},
     }
+    assert fit is not None
     context.save("prior", {**asdict(fit), **notes}, arrays)
 
 

@@ -50,13 +50,16 @@ def process_noise(model: HybridModel, trajectories: Sequence[Trajectory], most: 
     return np.maximum(np.sqrt(np.mean(np.square(errors), axis=0)), 1e-9)
 
 
-def make_estimator(model: HybridModel, control: ControlSpec, sigma_x: Array) -> ExtendedKalmanFilter:
+def make_estimator(
+    model: HybridModel, control: ControlSpec, sigma_x: Array, *, observer: bool = True
+) -> ExtendedKalmanFilter:
     """The extended Kalman filter that all controllers share, tuned by the model's own one-period errors.
 
     Args:
         model: The model to estimate with.
         control: Input range and sensor noise.
         sigma_x: Process noise ``(n_x,)`` per period, see :func:`process_noise`.
+        observer: Whether it estimates an unknown load at the input. Default: yes.
     """
     if len(control.estimator_sigma) != model.n_y:
         raise InputError(
@@ -70,23 +73,25 @@ def make_estimator(model: HybridModel, control: ControlSpec, sigma_x: Array) -> 
         model,
         sigma_y=np.array(control.estimator_sigma),
         sigma_x=sigma_x,
-        sigma_d=share,
+        sigma_d=share if observer else None,
         sigma_x0=first,
-        sigma_d0=5.0 * share,
+        sigma_d0=5.0 * share if observer else None,
     )
 
 
 def make_controller(
     model: HybridModel, prior: HybridModel, control: ControlSpec, *, iterations: int = 1
 ) -> SafeController:
-    """The condensed real-time iteration of a model behind the safeguards that stand on the prior.
+    """The condensed real-time iteration of a model behind the safeguards that stand on the prior."""
+    return SafeController(CondensedController(model, make_ocp(prior, control), iterations=iterations), prior)
 
-    Terminal weight and fallback linearise at a working speed: at rest the slope of dry friction would
-    pass for strong damping.
+
+def make_ocp(prior: HybridModel, control: ControlSpec) -> OCP:
+    """The problem of a control specification; terminal weight (and the fallback) at a working speed.
+
+    At rest the slope of dry friction would pass for strong damping.
     """
-    point = working_point(prior, control)
-    ocp = OCP.from_spec(control, working_point=point)
-    return SafeController(CondensedController(model, ocp, iterations=iterations), prior)
+    return OCP.from_spec(control, working_point=working_point(prior, control))
 
 
 def working_point(model: HybridModel, control: ControlSpec) -> tuple[Array, Array]:

@@ -1,56 +1,168 @@
-"""Closed-loop tasks of the golf robot and the optimal control problem they share. No torch in here."""
+"""Closed-loop tasks of the golf robot and the optimal control problems they share. No torch in here."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_mpc.closed_loop.faults import Fault
+from hybrid_mpc.closed_loop.result import ClosedLoopResult
 from hybrid_mpc.scenario import ControlSpec, Task
 
 Array = NDArray[np.float64]
 
-STEPS = (0.0, 0.4, -0.4, 0.65, 0.1, -0.65)  # [rad], each held STEP_TIME
-STEP_TIME = 1.6  # [s]
+# Bryson's rule: one over the square of the largest deviation that is tolerable: 10 mrad (7 mm at the head),
+# 0.25 rad/s, 0.5 N m of torque, 0.25 N m of change per period. The encoder's sigma: quantisation (0.44 mrad)
+# and noise. Limits: the drive's peak torque and slew, the angle the frame leaves free, a safe speed.
+CONTROL = ControlSpec(
+    horizon=50,
+    q=(1e4, 16.0),
+    r=(4.0,),
+    r_delta=(16.0,),
+    u_min=(-0.5,),
+    u_max=(0.5,),
+    du_max=(0.25,),
+    estimator_sigma=(0.5e-3,),
+    x_min=(-0.85, -2.5),
+    x_max=(0.85, 2.5),
+)
+# Strokes look 1.6 s ahead, swing farther and faster, and may pull the torque up in one period.
+HARD_STROKE = replace(CONTROL, horizon=80, r_delta=(4.0,), du_max=None, x_min=(-1.0, -5.0), x_max=(1.0, 5.0))
+PUTT = replace(HARD_STROKE, u_min=(-0.2,), u_max=(0.2,))
+
+IMPACT = 1.6
+"""Time [s] of the impact: as long as the strokes' horizon, so that the first plan ends in it."""
+FOLLOW_THROUGH = 0.4
+"""Time [s] after the impact in which the club may swing out freely, before it is to come to rest."""
+PUTTS = (0.8, 1.1, 1.4, 1.65, 1.9)
+HARD_STROKES = (3.0, 4.0)
+STEPS = (0.0, 0.4, -0.4, 0.65, -0.65)
+STEP_TIME = 1.2
+HEAVY_STEPS = (0.0, 0.3, -0.3, 0.5, -0.5)
 
 
 def sine_reference(t: Array) -> Array:
-    """``(n, 2)``: 0.8 rad at 0.4 Hz, faded in over 2 s (smooth acceleration), and its exact derivative.
+    """``(n, 2)``: 0.5 rad at 0.35 Hz and 0.2 rad at 0.9 Hz, faded in over 1 s, and its exact derivative.
 
-    The prior needs at most 0.31 N m for it; the friction reverses every 1.25 s.
+    The friction reverses about four times in a second, and the faster part is above the pendulum's own
+    0.6 Hz: neither gravity nor a slow observer carries the club along.
 
     Example:
         >>> sine_reference(np.zeros(1)).tolist()
         [[0.0, 0.0]]
     """
-    w, s = 2 * np.pi * 0.4, np.clip(t / 2.0, 0.0, 1.0)
-    fade, slope = s**3 * (10 - 15 * s + 6 * s**2), 30 * s**2 * (1 - s) ** 2 / 2.0
-    return 0.8 * np.column_stack([fade * np.sin(w * t), slope * np.sin(w * t) + fade * w * np.cos(w * t)])
+    s = np.clip(t, 0.0, 1.0)
+    fade, slope = s**3 * (10 - 15 * s + 6 * s**2), 30 * s**2 * (1 - s) ** 2
+    parts = [(a, 2 * np.pi * f) for a, f in ((0.5, 0.35), (0.2, 0.9))]
+    wave = sum((a * np.sin(w * t) for a, w in parts), np.zeros_like(t))
+    rate = sum((a * w * np.cos(w * t) for a, w in parts), np.zeros_like(t))
+    return np.column_stack([fade * wave, slope * wave + fade * rate])
 
 
-def step_reference(t: Array) -> Array:
-    """``(n, 2)``: hard steps in both directions up to 0.65 rad, of which holding takes 0.37 of 0.5 N m.
+def steps(levels: tuple[float, ...]) -> Callable[[Array], Array]:
+    """Reference ``t (n,) -> (n, 2)`` that holds each of ``levels`` [rad] for ``STEP_TIME``, the last for good.
 
     Example:
-        >>> step_reference(np.array([2.0])).tolist()
-        [[0.4, 0.0]]
+        >>> steps((0.0, 0.4))(np.array([0.0, 1.3])).tolist()
+        [[0.0, 0.0], [0.4, 0.0]]
     """
-    index = np.clip(np.floor(t / STEP_TIME + 1e-9).astype(int), 0, len(STEPS) - 1)
-    return np.column_stack([np.array(STEPS)[index], np.zeros(len(t))])
+
+    def reference(t: Array) -> Array:
+        index = np.clip(np.floor(t / STEP_TIME + 1e-9).astype(int), 0, len(levels) - 1)
+        return np.column_stack([np.array(levels)[index], np.zeros(len(t))])
+
+    return reference
+
+
+def stroke(speed: float) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
+    """Reference and weight factors of a stroke: pass ``phi = 0`` at ``IMPACT`` with ``speed`` [rad/s], then rest.
+
+    No swing is planned beforehand: up to the impact only effort counts, at it a miss by 5 mrad or by 10 mrad/s
+    costs 1, then nothing for ``FOLLOW_THROUGH``, then rest at 0 counts as in every task.
+
+    Example:
+        >>> reference, weight = stroke(1.4)
+        >>> reference(np.array([1.6])).tolist(), weight(np.array([0.5, 1.6, 1.8, 2.4])).round().tolist()
+        ([[0.0, 1.4]], [[0.0, 0.0], [200.0, 31250.0], [0.0, 0.0], [1.0, 1.0]])
+    """
+    dt, half = 0.02, 0.01
+    met = 1.0 / (np.array(CONTROL.q) * dt * np.array([5e-3, 1e-2]) ** 2)
+
+    def reference(t: Array) -> Array:
+        return np.column_stack([np.zeros(len(t)), np.where(np.abs(t - IMPACT) < half, speed, 0.0)])
+
+    def weight(t: Array) -> Array:
+        hit, rest = np.abs(t - IMPACT) < half, t > IMPACT + FOLLOW_THROUGH + half
+        return np.where(hit[:, None], met, np.where(rest[:, None], np.ones(2), np.zeros(2)))
+
+    return reference, weight
+
+
+def impact(result: ClosedLoopResult, speed: float) -> dict[str, float]:
+    """What a stroke reached, at the true crossing of ``phi = 0`` next to ``IMPACT`` (cubic between samples).
+
+    Args:
+        result: The loop.
+        speed: Wanted speed [rad/s].
+
+    Returns:
+        ``speed_rad_s`` wanted, ``speed_error_rel``, ``timing_error_s``, ``effort_nm2s`` (integral of u^2 up to
+        the impact). Errors are infinite where the club never crosses forwards.
+    """
+    t, x, u = result.t, result.x, result.u
+    effort = float(np.sum(u[t < IMPACT] ** 2) * (t[1] - t[0]))
+    crossings = np.flatnonzero((x[:-1, 0] < 0) & (x[1:, 0] >= 0))
+    times = [_crossing(t[k : k + 2], x[k : k + 2]) for k in crossings]
+    if not times:
+        return {
+            "speed_rad_s": speed,
+            "speed_error_rel": np.inf,
+            "timing_error_s": np.inf,
+            "effort_nm2s": effort,
+        }
+    at, reached = min(times, key=lambda c: abs(c[0] - IMPACT))
+    error = {"speed_error_rel": reached / speed - 1.0, "timing_error_s": at - IMPACT}
+    return {"speed_rad_s": speed, **error, "effort_nm2s": effort}
+
+
+def _crossing(t: Array, x: Array) -> tuple[float, float]:
+    """Time and speed of the zero of the cubic through two samples ``x (2, 2)`` of angle and speed."""
+    h = float(t[1] - t[0])
+    p0, v0, p1, v1 = x.ravel().tolist()
+    cubic = np.polynomial.Polynomial(
+        [p0, h * v0, 3 * (p1 - p0) - h * (2 * v0 + v1), 2 * (p0 - p1) + h * (v0 + v1)]
+    )
+    root = min(
+        (complex(r) for r in cubic.roots()), key=lambda r: abs(r.imag) + max(-r.real, r.real - 1.0, 0.0)
+    ).real
+    return float(t[0] + h * root), float(cubic.deriv()(root)) / h
+
+
+def _stroke_task(speed: float, control: ControlSpec) -> Task:
+    reference, weight = stroke(speed)
+    kind = "Putt" if control is PUTT else "Hard stroke"
+    return Task(
+        f"stroke_{speed:g}", f"{kind}: pass 0 at {IMPACT:g} s with {speed:g} rad/s, then rest", 3.0, (0.0, 0.0),
+        reference, weight, control, figures=lambda result: impact(result, speed),
+    )  # fmt: skip
+
+
+def _hold(t: Array) -> Array:
+    return np.tile([0.3, 0.0], (len(t), 1))
 
 
 TASKS = (
-    Task("track_sine", "Follow a sinusoid of 0.8 rad at 0.4 Hz", 10.0, (0.0, 0.0), sine_reference),
-    Task("track_step", "Follow steps of up to 0.65 rad", STEP_TIME * len(STEPS), (0.0, 0.0), step_reference),
-)
-
-# Bryson's rule: one over the square of the largest deviation that is tolerable: 0.05 rad, 1 rad/s,
-# 0.5 N m of torque, 0.25 N m of change per period. The encoder's sigma: quantisation (0.44 mrad) and noise.
-CONTROL = ControlSpec(
-    horizon=50,
-    q=(400.0, 1.0),
-    r=(4.0,),
-    r_delta=(16.0,),
-    u_min=(-0.5,),
-    u_max=(0.5,),
-    estimator_sigma=(0.5e-3,),
-)
+    Task("track_sine", "Follow two sinusoids of 0.5 and 0.2 rad", 6.0, (0.0, 0.0), sine_reference),
+    Task("track_step", "Follow steps of up to 0.65 rad", STEP_TIME * len(STEPS), (0.0, 0.0), steps(STEPS)),
+    *(_stroke_task(speed, PUTT) for speed in PUTTS),
+    *(_stroke_task(speed, HARD_STROKE) for speed in HARD_STROKES),
+    Task("reject_push", "Hold 0.3 rad against a push of a finger", 4.0, (0.3, 0.0), _hold,
+         faults=(Fault(1.5, 1.7, "plant_push", 1.2),)),
+    Task("reject_load", "Hold 0.3 rad against an unknown constant load", 4.0, (0.3, 0.0), _hold,
+         faults=(Fault(1.0, np.inf, "input_offset", -0.08),)),
+    Task("reject_heavy", "Follow steps of up to 0.5 rad with a club 20 % heavier", STEP_TIME * len(HEAVY_STEPS),
+         (0.0, 0.0), steps(HEAVY_STEPS), faults=(Fault(0.0, np.inf, "plant_mass", 1.2),)),
+)  # fmt: skip

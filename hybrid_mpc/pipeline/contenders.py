@@ -1,0 +1,91 @@
+"""The controllers that a scenario's closed loops compare: same problem, period, horizon and safeguards."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.artifact import Artifact
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimation import TrueState
+from hybrid_mpc.model import HybridModel
+from hybrid_mpc.mpc import BestOf, CondensedController, SafeController, SQPController
+from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_ocp
+from hybrid_mpc.scenario import ControlSpec, Scenario
+
+Array = NDArray[np.float64]
+ORACLE_ITERATIONS = 3
+"""Linearisations an oracle makes from each of its starts in a period; its last plan is one of them."""
+
+
+@dataclass(frozen=True)
+class Contender:
+    """One of the compared controllers.
+
+    Args:
+        model: ``"prior"``, ``"hybrid"`` or ``"oracle"``.
+        observer: Whether the estimator follows an unknown load at the input.
+        truth: Whether it is handed the plant's true state instead of the measurement.
+    """
+
+    model: str
+    observer: bool = False
+    truth: bool = False
+
+
+CONTENDERS: Mapping[str, Contender] = {
+    "prior": Contender("prior"),
+    "prior_observer": Contender("prior", observer=True),
+    "hybrid": Contender("hybrid"),
+    "hybrid_observer": Contender("hybrid", observer=True),
+    "oracle": Contender("oracle", observer=True),
+    "oracle_state": Contender("oracle", truth=True),
+}
+"""Baselines: the fitted prior without and with disturbance observer; the hybrid likewise; two oracles on the
+plant's own equations, one with the same measurements through the same kind of estimator, one with the truth."""
+ORACLES = ("oracle", "oracle_state")
+
+
+def build(
+    name: str, scenario: Scenario, artifact: Artifact, control: ControlSpec, noise: Mapping[str, Array]
+) -> tuple[Any, SafeController]:
+    """Estimator and controller of a contender.
+
+    Args:
+        name: Name in :data:`CONTENDERS`.
+        scenario: The machine, with its oracle if that is asked for.
+        artifact: Prior and hybrid.
+        control: The task's control problem.
+        noise: Process noise by model, see :func:`~hybrid_mpc.pipeline.loops.process_noise`.
+
+    Raises:
+        InputError: If there is no such contender, or the scenario has no oracle.
+    """
+    if name not in CONTENDERS:
+        raise InputError(f"no controller {name!r}; there are: {', '.join(CONTENDERS)}")
+    c, prior = CONTENDERS[name], artifact.models["prior"]
+    if c.model != "oracle":
+        model = artifact.models[c.model]
+        estimator = make_estimator(model, control, noise[c.model], observer=c.observer)
+        return estimator, make_controller(model, prior, control)
+    if scenario.oracle is None:
+        raise InputError(f"scenario {scenario.name} has no oracle")
+    model = scenario.oracle(prior.dt)
+    ocp = make_ocp(prior, control)
+    rivals = [CondensedController(artifact.models[m], ocp) for m in ("prior", "hybrid")]
+    best = BestOf(SQPController(model, ocp, iterations=ORACLE_ITERATIONS), rivals=rivals)
+    if c.truth:
+        return TrueState(model), SafeController(best, prior)
+    return make_estimator(model, control, _small(control, model), observer=c.observer), SafeController(
+        best, prior
+    )
+
+
+def _small(control: ControlSpec, model: HybridModel) -> Array:
+    """Process noise ``(n_x,)`` of a model that is right: a tenth of the sensor's, and that per period."""
+    sigma = 0.1 * np.asarray(control.estimator_sigma)
+    return np.concatenate([sigma, sigma / model.dt])
