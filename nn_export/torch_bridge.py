@@ -28,6 +28,9 @@ def from_casadi(function: ca.Function) -> CasadiModule:
     Returns:
         Module called with one tensor for each input, in the function's order. It has no parameters.
 
+    Raises:
+        SignatureError: If ``function`` is no CasADi function, or has no inputs or outputs.
+
     Example:
         >>> x, k = ca.SX.sym("x", 2), ca.SX.sym("k")
         >>> spring = from_casadi(ca.Function("spring", [x, k], [-k * x[0]], ["x", "k"], ["force"]))
