@@ -12,7 +12,7 @@ import torch
 
 from nn_export.batched import Batched
 from nn_export.errors import SignatureError
-from nn_export.operators.value import constant
+from nn_export.operators.value import Value, constant
 from nn_export.tracing import float64_copy
 
 ZEROS, LARGE, SATURATED = 1, 2, 5  # which of ten samples
@@ -138,18 +138,11 @@ def parity(
         for i, output in enumerate(outputs):
             expected, shape = output.numpy().reshape(-1), tuple(output.shape)
             values.add((i, kind), _row_major(results[i], shape), expected)
-            given = [blocks[i * len(held) + j].full()[_order(shape)] for j in range(len(held))]
-            given = [g[:, x.positions.reshape(-1)] for g, x in zip(given, held, strict=True)]
-            slopes = [e.detach().numpy().reshape(g.shape) for e, g in zip(exact[i], given, strict=True)]
-            jacobians.add((i, kind), np.hstack(given), np.hstack(slopes), np.isfinite(expected).all())
+            row = blocks[i * len(held) : (i + 1) * len(held)]
+            jacobians.add((i, kind), *_slopes(row, exact[i], held, shape), np.isfinite(expected).all())
         if second is not None:
-            w = [weights.standard_normal(tuple(y.shape)) for y in outputs]
-            v = [weights.standard_normal(x.shape) for x in draws]
-            fixed = [*w, *v, *(np.zeros(y.shape) for y in w)]
-            curved = second.call([*ours, *(ca.evalf(constant(a).mx) for a in fixed)])
-            given = [_row_major(c, x.shape) for c, x in zip(curved, draws, strict=True)]
-            finite = all(bool(torch.isfinite(y).all()) for y in outputs)
-            products.add((0, kind), np.hstack(given), _hessian_product(copy, tensors, w, v), finite)
+            given, product = _products(second, copy, tensors, outputs, weights)
+            products.add((0, kind), given, product, all(bool(torch.isfinite(y).all()) for y in outputs))
     left_out = values.left_out + jacobians.left_out
     hvp = products.largest if hessians else (math.nan, math.nan)
     return ParityReport(n, *values.largest, *jacobians.largest, left_out, *hvp, products.left_out)
@@ -161,14 +154,32 @@ def _draw(rng: np.random.Generator, kind: int, shape: tuple[int, ...]) -> np.nda
     return (30.0 * np.sign(draw) if kind == SATURATED else factor * draw) + 0.0  # no negative zeros
 
 
-def _hessian_product(
-    module: torch.nn.Module, inputs: Sequence[torch.Tensor], w: Sequence[np.ndarray], v: Sequence[np.ndarray]
-) -> np.ndarray:
-    """Second derivative of the outputs' sum with weights ``w``, along ``v``, for all inputs in a row."""
+def _slopes(
+    row: Sequence[ca.DM], exact: Sequence[torch.Tensor], held: Sequence[Value], shape: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Jacobian of one output of this shape by all inputs, ours and torch's, in row-major order."""
+    given = [block.full()[_order(shape)] for block in row]
+    given = [g[:, x.positions.reshape(-1)] for g, x in zip(given, held, strict=True)]
+    slopes = [e.detach().numpy().reshape(g.shape) for e, g in zip(exact, given, strict=True)]
+    return np.hstack(given), np.hstack(slopes)
+
+
+def _products(
+    second: ca.Function,
+    module: torch.nn.Module,
+    inputs: Sequence[torch.Tensor],
+    outputs: Sequence[torch.Tensor],
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Second derivative of the outputs' sum with random weights along a random direction: ours, torch's."""
+    w = [rng.standard_normal(tuple(y.shape)) for y in outputs]
+    v = [rng.standard_normal(tuple(x.shape)) for x in inputs]
+    arguments = [*(x.numpy() for x in inputs), *w, *v, *(np.zeros(y.shape) for y in w)]
+    given = second.call([ca.evalf(constant(a).mx) for a in arguments])
     xs = [x.clone().requires_grad_() for x in inputs]
-    total = _dot(_leaves(module(*xs)), w)
-    slopes = _gradient(total, xs)
-    return np.hstack([g.detach().numpy().reshape(-1) for g in _gradient(_dot(slopes, v), xs)])
+    slopes = _gradient(_dot(_leaves(module(*xs)), w), xs)
+    exact = [g.detach().numpy().reshape(-1) for g in _gradient(_dot(slopes, v), xs)]
+    return np.hstack([_row_major(g, x.shape) for g, x in zip(given, v, strict=True)]), np.hstack(exact)
 
 
 def _dot(tensors: Sequence[torch.Tensor], weights: Sequence[np.ndarray]) -> torch.Tensor:

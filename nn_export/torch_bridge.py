@@ -28,6 +28,9 @@ def from_casadi(function: ca.Function) -> CasadiModule:
     Returns:
         Module called with one tensor for each input, in the function's order. It has no parameters.
 
+    Raises:
+        SignatureError: If ``function`` is no CasADi function, or has no inputs or outputs.
+
     Example:
         >>> x, k = ca.SX.sym("x", 2), ca.SX.sym("k")
         >>> spring = from_casadi(ca.Function("spring", [x, k], [-k * x[0]], ["x", "k"], ["force"]))
@@ -76,15 +79,12 @@ class CasadiModule(torch.nn.Module):
         if len(inputs) != f.n_in():
             raise SignatureError(f"{f}: {f.n_in()} tensors are needed, got {len(inputs)}")
         flat = [_nonzeros(f, i, x) for i, x in enumerate(inputs)]
-        try:
-            batch = torch.broadcast_shapes(*(x.shape[:-1] for x in flat))
-        except RuntimeError as error:
-            shapes = ", ".join(str(tuple(x.shape)) for x in inputs)
-            raise SignatureError(f"{f}: leading axes of {shapes} cannot be broadcast together") from error
+        wide = [x.to(torch.float64) for x in flat]
+        if len({x.shape[:-1] for x in flat}) > 1:
+            wide = [x.expand(*_batch(f, inputs, flat), x.shape[-1]) for x in wide]
         dtype = flat[0].dtype
         for x in flat[1:]:
             dtype = torch.promote_types(dtype, x.dtype)
-        wide = [x.to(torch.float64).expand(*batch, x.shape[-1]) for x in flat]
         # An export records plain operators.
         exporting = torch.compiler.is_exporting()
         results = self.batched.walk(wide) if exporting else _Call.apply(self.batched, *wide)
@@ -127,6 +127,14 @@ class _Call(torch.autograd.Function):
         ]
         results = _Call.apply(batched, *moved)
         return results, (0,) * len(results)
+
+
+def _batch(f: ca.Function, inputs: tuple[Tensor, ...], flat: list[Tensor]) -> tuple[int, ...]:
+    try:
+        return tuple(torch.broadcast_shapes(*(x.shape[:-1] for x in flat)))
+    except RuntimeError as error:
+        shapes = ", ".join(str(tuple(x.shape)) for x in inputs)
+        raise SignatureError(f"{f}: leading axes of {shapes} cannot be broadcast together") from error
 
 
 def _nonzeros(f: ca.Function, i: int, x: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """CasADi functions in torch: the same numbers, derivatives of any order, batches, torch.func, training."""
 
 import copy
+import multiprocessing
 import pickle
 from concurrent.futures import ThreadPoolExecutor
 
@@ -262,6 +263,19 @@ def test_threads_give_the_same_bits():
     with ThreadPoolExecutor(4) as pool:
         for given, alone in zip(pool.map(slopes, cases), expected, strict=True):
             assert all(torch.equal(a, b) for a, b in zip(given, alone, strict=True))
+
+
+def _slope_bytes(module):
+    x = torch.linspace(0.1, 1, 1000, **f64).reshape(500, 2).requires_grad_()
+    module(x, torch.ones(1, **f64), torch.ones(1, **f64)).sum().backward()
+    return x.grad.numpy().tobytes()
+
+
+@pytest.mark.parametrize("context", ["fork", "spawn"])
+def test_processes_give_the_same_bits(context):
+    module = from_casadi(pendulum())
+    with multiprocessing.get_context(context).Pool(1) as pool:
+        assert pool.apply(_slope_bytes, (module,)) == _slope_bytes(module)
 
 
 class NoDerivative(ca.Callback):
