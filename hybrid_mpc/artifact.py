@@ -121,7 +121,7 @@ def load_artifact(folder: Path) -> Artifact:
         models = {name: build_model(name, programs, info) for name in names}
     except KeyError as error:
         raise InputError(f"{folder}: programs.json lacks {error}, which {FILE} names") from error
-    except nn_export.ProgramError as error:
+    except nn_export.ExportError as error:
         raise InputError(f"{folder}: {error}") from error
     return Artifact(models, calibration, provenance)
 
