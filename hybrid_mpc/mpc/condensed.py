@@ -281,6 +281,12 @@ class CondensedController:
         zero = Estimate(0.0, x, h, d, p, np.zeros(0), NAN)
         self.solve(self.initial(zero), zero, np.zeros((1, m.n_x)))
 
+    def gradient(self, prepared: Prepared, x_ref: Array) -> Array:
+        """Exact gradient ``(N n_u,)`` of the cost at a trajectory without defects; soft bounds left out."""
+        error = (prepared.z[:, : self._n_x] - x_ref).ravel()
+        u = prepared.u.ravel()
+        return np.asarray(2 * error @ prepared.weighted + self._input_gradient(u, prepared.u_prev))
+
     def _input_gradient(self, u: Array, u_prev: Array) -> Array:
         """Gradient of the input costs at the plan ``u`` ``(N n_u,)``."""
         gradient: Array = self._input_hessian @ u
