@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
-from hybrid_mpc.mpc.condensed import CondensedController, Prepared
+from hybrid_mpc.mpc.condensed import CondensedController
+from hybrid_mpc.mpc.condensing import Prepared
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.problem import Problem, Target
 from hybrid_mpc.mpc.solution import Solution, Status
