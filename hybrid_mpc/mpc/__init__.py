@@ -5,7 +5,8 @@ Solvers: :class:`CondensedController` (real-time iteration), :class:`SQPControll
 """
 
 from hybrid_mpc.mpc.best_of import BestOf
-from hybrid_mpc.mpc.condensed import CondensedController, Prepared
+from hybrid_mpc.mpc.condensed import CondensedController
+from hybrid_mpc.mpc.condensing import Prepared
 from hybrid_mpc.mpc.nlp import IpoptController
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.problem import Controller, Problem

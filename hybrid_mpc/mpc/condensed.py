@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
@@ -12,7 +12,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.mpc.buffered import BufferedFunction
-from hybrid_mpc.mpc.condensing import condense, propagate
+from hybrid_mpc.mpc.condensing import Prepared, condense, propagate
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.problem import Problem, Target, weights_ok
 from hybrid_mpc.mpc.qp import InputQP
@@ -20,45 +20,6 @@ from hybrid_mpc.mpc.solution import Solution, Status
 
 Array = NDArray[np.float64]
 NAN = float("nan")
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """Everything of an iteration that needs neither the estimate nor the reference.
-
-    With ``dz = (x, h) - (x_bar, h_bar)`` the linearised prediction is ``dz_{k+1} = A_k dz_k + B_k (du_k +
-    dd) + defect_k``; of it, ``x`` depends on the inputs by ``from_u``.
-
-    Args:
-        u: Linearisation inputs ``(N, n_u)``.
-        z: Linearisation trajectory ``(N + 1, n_x + n_h)``.
-        d: Linearisation disturbance ``(n_u,)``.
-        u_prev: Input ``(n_u,)`` held before the plan.
-        a_t: Transposed ``A_k`` ``(N, n_z, n_z)``.
-        b: ``B_k`` ``(N, n_z, n_u)``.
-        defects: ``(N, n_z)``.
-        from_u: Derivative of the states by the inputs ``((N + 1) n_x, N n_u)``.
-        weighted: State weights times ``from_u``.
-        hessian: Hessian of the cost by ``du`` ``(N n_u, N n_u)``.
-        weight: Weight factors ``(N + 1, n_x)``.
-        soft: Soft bounds' values ``(M,)``, their derivatives by their state ``(M, n_x)`` and by the inputs
-            ``(M, N n_u)``.
-        milliseconds: Time the preparation took.
-    """
-
-    u: Array
-    z: Array
-    d: Array
-    u_prev: Array
-    a_t: Array
-    b: Array
-    defects: Array
-    from_u: Array
-    weighted: Array
-    hessian: Array
-    weight: Array
-    soft: tuple[Array, Array, Array]
-    milliseconds: float
 
 
 class CondensedController:
@@ -280,6 +241,12 @@ class CondensedController:
         x, h, d, p = np.zeros(m.n_x), np.zeros(m.n_h), np.zeros(m.n_u), np.zeros((0, 0))
         zero = Estimate(0.0, x, h, d, p, np.zeros(0), NAN)
         self.solve(self.initial(zero), zero, np.zeros((1, m.n_x)))
+
+    def gradient(self, prepared: Prepared, x_ref: Array) -> Array:
+        """Exact gradient ``(N n_u,)`` of the cost at a trajectory without defects; soft bounds left out."""
+        error = (prepared.z[:, : self._n_x] - x_ref).ravel()
+        u = prepared.u.ravel()
+        return np.asarray(2 * error @ prepared.weighted + self._input_gradient(u, prepared.u_prev))
 
     def _input_gradient(self, u: Array, u_prev: Array) -> Array:
         """Gradient of the input costs at the plan ``u`` ``(N n_u,)``."""

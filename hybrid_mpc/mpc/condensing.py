@@ -2,10 +2,51 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Everything of an iteration that needs neither the estimate nor the reference.
+
+    With ``dz = (x, h) - (x_bar, h_bar)`` the linearised prediction is ``dz_{k+1} = A_k dz_k + B_k (du_k +
+    dd) + defect_k``; of it, ``x`` depends on the inputs by ``from_u``.
+
+    Args:
+        u: Linearisation inputs ``(N, n_u)``.
+        z: Linearisation trajectory ``(N + 1, n_x + n_h)``.
+        d: Linearisation disturbance ``(n_u,)``.
+        u_prev: Input ``(n_u,)`` held before the plan.
+        a_t: Transposed ``A_k`` ``(N, n_z, n_z)``.
+        b: ``B_k`` ``(N, n_z, n_u)``.
+        defects: ``(N, n_z)``.
+        from_u: Derivative of the states by the inputs ``((N + 1) n_x, N n_u)``.
+        weighted: State weights times ``from_u``.
+        hessian: Hessian of the cost by ``du`` ``(N n_u, N n_u)``.
+        weight: Weight factors ``(N + 1, n_x)``.
+        soft: Soft bounds' values ``(M,)``, their derivatives by their state ``(M, n_x)`` and by the inputs
+            ``(M, N n_u)``.
+        milliseconds: Time the preparation took.
+    """
+
+    u: Array
+    z: Array
+    d: Array
+    u_prev: Array
+    a_t: Array
+    b: Array
+    defects: Array
+    from_u: Array
+    weighted: Array
+    hessian: Array
+    weight: Array
+    soft: tuple[Array, Array, Array]
+    milliseconds: float
 
 
 def condense(a_t: Array, b: Array, n_x: int) -> Array:

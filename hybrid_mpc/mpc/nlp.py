@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
@@ -21,6 +21,15 @@ Array = NDArray[np.float64]
 NAN = float("nan")
 FEASIBLE = 1e-6
 """Largest defect and violation of a limit, as a share of its range, that an answer may have."""
+
+
+class Rows(NamedTuple):
+    """Constraints ``lower <= value <= upper``, and what counts as one unit of their violation."""
+
+    value: ca.MX
+    lower: ArrayLike
+    upper: ArrayLike
+    scale: ArrayLike
 
 
 class IpoptController:
@@ -111,25 +120,30 @@ class IpoptController:
         ):
             return failed
         slack = problem.soft.excess(problem.soft.values(z[:, : self.ocp.n_x], u))
-        answer = self._solver(x0=np.concatenate([u.ravel(), z.ravel(), slack]), p=given, **self._bounds)
+        guess = np.concatenate([u.ravel(), z.ravel(), slack])
+        answer = self._solver(x0=guess, p=given, **self._bounds)
         stats = self._solver.stats()
         w, lam_g, lam_x = (answer[key].full().ravel() for key in ("x", "lam_g", "lam_x"))
         if not (np.all(np.isfinite(w)) and np.all(np.isfinite(lam_g)) and np.all(np.isfinite(lam_x))):
             return failed
+        violated, kkt = self._check(w, given, lam_g, lam_x)
+        count = stats["iter_count"]
+        if not violated <= FEASIBLE:
+            return self._plan(u, z, estimate.d, NAN, Status.NLP_FAILED, kkt, start, count)
+        status = Status.SOLVED if stats["success"] or kkt <= FEASIBLE else Status.STOPPED
+        u = np.clip(w[: u.size].reshape(u.shape), self.ocp.u_min, self.ocp.u_max)
+        z = w[u.size : u.size + z.size].reshape(z.shape)
+        cost = problem.cost(z, u, u_prev, target)
+        return self._plan(u, z, estimate.d, cost, status, kkt, start, count)
+
+    def _check(self, w: Array, given: Array, lam_g: Array, lam_x: Array) -> tuple[float, float]:
+        """Largest violation as a share of its range, and the KKT residual relative to the objective's slope."""
         slope, objective, g = (m.full().ravel() for m in self._slope(w, given, lam_g))
         kkt = float(np.max(np.abs(slope + lam_x)) / max(1.0, np.max(np.abs(objective))))
-        lower, upper = self._bounds["lbg"], self._bounds["ubg"]
-        violated = float(np.max(np.maximum(lower - g, g - upper) / self._g_scale, initial=0.0))
-        u_new = w[: u.size].reshape(u.shape)
-        beyond = np.maximum(self.ocp.u_min - u_new, u_new - self.ocp.u_max)
-        violated = max(violated, float(np.max(beyond / self._u_scale)))
-        z_new = w[u.size : u.size + z.size].reshape(z.shape)
-        if violated > FEASIBLE:
-            return self._plan(u, z, estimate.d, NAN, Status.NLP_FAILED, kkt, start, stats["iter_count"])
-        status = Status.SOLVED if stats["success"] or kkt <= FEASIBLE else Status.STOPPED
-        u_new = np.clip(u_new, self.ocp.u_min, self.ocp.u_max)
-        cost = problem.cost(z_new, u_new, u_prev, target)
-        return self._plan(u_new, z_new, estimate.d, cost, status, kkt, start, stats["iter_count"])
+        beyond = np.maximum(self._bounds["lbg"] - g, g - self._bounds["ubg"]) / self._g_scale
+        u = w[: self.ocp.horizon * self.ocp.n_u].reshape(self.ocp.horizon, -1)
+        outside = np.maximum(self.ocp.u_min - u, u - self.ocp.u_max) / self._u_scale
+        return max(float(np.max(beyond, initial=0.0)), float(np.max(outside))), kkt
 
     def _plan(
         self, u: Array, z: Array, d: Array, cost: float, status: Status, kkt: float, start: float, i: int
@@ -147,51 +161,55 @@ class IpoptController:
         return float(np.max(np.abs(np.vstack([x.full(), h.full()]).T - z[1:])))
 
     def _formulate(self) -> dict[str, ca.MX]:
-        """Problem of ``nlpsol``; sets the bounds of its unknowns ``(u, z, slacks)`` and rows."""
-        problem, ocp, model = self._problem, self.ocp, self.model
+        """Problem of ``nlpsol`` over ``(u, z, slacks)``; keeps the bounds of its unknowns and rows."""
+        ocp, model, soft = self.ocp, self.model, self._problem.soft
         n, n_x, n_u = ocp.horizon, ocp.n_x, ocp.n_u
-        n_z, soft = n_x + model.n_h, problem.soft
+        n_z = n_x + model.n_h
         u, z, s = ca.MX.sym("u", n_u, n), ca.MX.sym("z", n_z, n + 1), ca.MX.sym("s", len(soft))
         z0, d, u_prev = ca.MX.sym("z0", n_z), ca.MX.sym("d", n_u), ca.MX.sym("u_prev", n_u)
         x_ref, weight = ca.MX.sym("x_ref", n_x, n + 1), ca.MX.sym("weight", n_x, n + 1)
         self._step = model.step.map(n)
-        x_next, h_next = self._step(z[:n_x, :-1], z[n_x:, :-1], u + ca.repmat(d, 1, n))
+        z_next = ca.vertcat(*self._step(z[:n_x, :-1], z[n_x:, :-1], u + ca.repmat(d, 1, n)))
         du = u - ca.horzcat(u_prev, u[:, :-1])
-        error = z[:n_x, :] - x_ref
-        last = ca.sqrt(weight[:, -1]) * error[:, -1]
-        stages = ca.sum2(weight[:, :-1] * error[:, :-1] ** 2), ca.sum2(u**2), ca.sum2(du**2)
-        stage = sum(ca.dot(q, v) for q, v in zip((ocp.q, ocp.r, ocp.r_delta), stages, strict=True))
-        penalty = ca.dot(soft.linear, s) + ca.dot(soft.quadratic, s**2)
-        f = model.dt * (stage + penalty) + last.T @ problem.terminal @ last
-        rows: list[tuple[ca.MX, Any, Any, Any]] = [
-            (z[:, 0] - z0, 0.0, 0.0, 1.0),
-            (z[:, 1:] - ca.vertcat(x_next, h_next), 0.0, 0.0, 1.0),
-        ]
         half = 0.5 * (ocp.u_max - ocp.u_min)
         self._u_scale = np.where(np.isfinite(half), half, 1.0)
+        rows = [Rows(z[:, 0] - z0, 0.0, 0.0, 1.0), Rows(z[:, 1:] - z_next, 0.0, 0.0, 1.0)]
         if ocp.du_max is not None:
             limit = np.tile(ocp.du_max, n)
-            rows.append((du, -limit, limit, np.tile(self._u_scale, n)))
-        value = ca.vertcat(*self._soft_values(u, z))
-        for bound, sign in ((soft.upper, 1.0), (soft.lower, -1.0)):
-            chosen = np.flatnonzero(np.isfinite(bound))
-            if chosen.size:
-                pick = [int(i) for i in chosen]
-                gap = sign * (value[pick] - bound[chosen]) - s[pick]
-                rows.append((gap, -np.inf, 0.0, soft.scale[chosen]))
-        sizes = [row[0].numel() for row in rows]
-        ends = [np.concatenate([np.broadcast_to(row[i], size) for row, size in zip(rows, sizes, strict=True)])
-                for i in (1, 2, 3)]  # fmt: skip
+            rows.append(Rows(du, -limit, limit, np.tile(self._u_scale, n)))
+        rows += self._soft_rows(u, z, s)
         free = np.full(n_z * (n + 1), np.inf)
         self._bounds = {
             "lbx": np.concatenate([np.tile(ocp.u_min, n), -free, np.zeros(len(soft))]),
             "ubx": np.concatenate([np.tile(ocp.u_max, n), free, np.full(len(soft), np.inf)]),
-            "lbg": ends[0], "ubg": ends[1],
+            "lbg": _filled(rows, 1), "ubg": _filled(rows, 2),
         }  # fmt: skip
-        self._g_scale = ends[2]
-        unknowns = ca.vertcat(ca.vec(u), ca.vec(z), s)
-        given = ca.vertcat(z0, d, u_prev, ca.vec(x_ref), ca.vec(weight))
-        return {"x": unknowns, "p": given, "f": f, "g": ca.vertcat(*(ca.vec(row[0]) for row in rows))}
+        self._g_scale = _filled(rows, 3)
+        return {
+            "x": ca.vertcat(ca.vec(u), ca.vec(z), s),
+            "p": ca.vertcat(z0, d, u_prev, ca.vec(x_ref), ca.vec(weight)),
+            "f": self._objective(u, du, z[:n_x, :] - x_ref, weight, s),
+            "g": ca.vertcat(*(ca.vec(row.value) for row in rows)),
+        }
+
+    def _objective(self, u: ca.MX, du: ca.MX, error: ca.MX, weight: ca.MX, s: ca.MX) -> ca.MX:
+        ocp, soft = self.ocp, self._problem.soft
+        last = ca.sqrt(weight[:, -1]) * error[:, -1]
+        stages = ca.sum2(weight[:, :-1] * error[:, :-1] ** 2), ca.sum2(u**2), ca.sum2(du**2)
+        stage = sum(ca.dot(q, v) for q, v in zip((ocp.q, ocp.r, ocp.r_delta), stages, strict=True))
+        penalty = ca.dot(soft.linear, s) + ca.dot(soft.quadratic, s**2)
+        return self.model.dt * (stage + penalty) + last.T @ self._problem.terminal @ last
+
+    def _soft_rows(self, u: ca.MX, z: ca.MX, s: ca.MX) -> list[Rows]:
+        soft, rows = self._problem.soft, []
+        value = ca.vertcat(*self._soft_values(u, z))
+        for bound, sign in ((soft.upper, 1.0), (soft.lower, -1.0)):
+            chosen = np.flatnonzero(np.isfinite(bound))
+            pick = [int(i) for i in chosen]
+            if pick:
+                gap = sign * (value[pick] - bound[chosen]) - s[pick]
+                rows.append(Rows(gap, -np.inf, 0.0, soft.scale[chosen]))
+        return rows
 
     def _soft_values(self, u: ca.MX, z: ca.MX) -> list[ca.MX]:
         """Bounded values in the order of the problem's rows."""
@@ -200,3 +218,8 @@ class IpoptController:
         values = [ca.vec(z[chosen, 1:])] if chosen else []
         x = z[: ocp.n_x, :-1]
         return values + [ca.vec(bound.expression.map(ocp.horizon)(x, u)) for bound in ocp.soft]
+
+
+def _filled(rows: list[Rows], field: int) -> Array:
+    """One field of all rows, a value an element."""
+    return np.concatenate([np.broadcast_to(row[field], row.value.numel()) for row in rows])

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
+from hybrid_mpc.mpc.buffered import BufferedFunction
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.soft import SoftRows
 from hybrid_mpc.mpc.solution import Solution, Status
@@ -132,7 +133,9 @@ class Problem:
 
     def run(self, z0: Array, u: Array) -> Array:
         """States and hidden states ``(N + 1, n_z)`` of the model from ``z0`` on inputs ``(N, n_u)``."""
-        return np.vstack([z0, self._rollout(z0, u.T).full().T])
+        self._rollout.inputs[0][:], self._rollout.inputs[1][:] = z0, u.ravel()
+        self._rollout()
+        return np.vstack([z0, self._rollout.outputs[0].reshape(len(u), -1)])
 
     def target(self, reference: ArrayLike, weight: ArrayLike | None = None) -> Target:
         """Reference and factors over the horizon; the last value holds where the preview is shorter.
@@ -188,7 +191,7 @@ class Problem:
         return total
 
 
-def _rollout(model: HybridModel, n: int) -> ca.Function:
+def _rollout(model: HybridModel, n: int) -> BufferedFunction:
     z, u = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("u", model.n_u)
     z_next = ca.vertcat(*model.step(z[: model.n_x], z[model.n_x :], u))
-    return ca.Function("z_step", [z, u], [z_next]).mapaccum("rollout", n)
+    return BufferedFunction(ca.Function("z_step", [z, u], [z_next]).mapaccum("rollout", n))

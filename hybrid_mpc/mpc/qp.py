@@ -22,7 +22,7 @@ KKT_TOLERANCE = 1e-5
 # of 1e-6 it returned bounds violated by 5e-5 of the range.
 PRIMAL_TOLERANCE = 1e-9
 # Numbers of soft bounds that QPs are built for, besides all of them.
-SOFT_SIZES = (8, 20, 50)
+SOFT_SIZES = (8, 16, 32, 64, 128, 256)
 # Share of an input's or a soft bound's range; what is left of an input's is clipped away.
 BOUND_TOLERANCE = 1e-6
 

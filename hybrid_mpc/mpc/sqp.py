@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
-from hybrid_mpc.mpc.condensed import CondensedController, Prepared
+from hybrid_mpc.mpc.condensed import CondensedController
+from hybrid_mpc.mpc.condensing import Prepared
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.problem import Problem, Target
 from hybrid_mpc.mpc.solution import Solution, Status
@@ -21,6 +22,9 @@ NAN = float("nan")
 ARMIJO = 1e-4
 KKT = 1e-6
 HALVINGS = 25
+# Iterations by Gauss-Newton alone: quick where the residuals are small, and steady far from the solution.
+GAUSS_NEWTON = 10
+MEMORY = 10
 
 
 class SQPController:
@@ -30,7 +34,9 @@ class SQPController:
     linear and kept by every QP, soft bounds are penalties within the cost. So the cost itself is the merit
     function, and a step along the QP's answer is accepted when it lowers the cost by a share (1e-4) of what
     the QP's convex model promises; the step is halved until it does (Burke's method for convex composite
-    functions: near a solution whose residuals are small full steps are taken). Slower than the RTI by the
+    functions: near a solution whose residuals are small full steps are taken). Where ten iterations were not
+    enough, the Gauss-Newton Hessian leaves out too much: from then on it is corrected by what the last steps
+    have shown of the gradient (damped BFGS updates), unless a soft bound acts. Slower than the RTI by the
     number of iterations, and independent of the first guess but for the basin that it lies in.
 
     Args:
@@ -109,25 +115,39 @@ class SQPController:
         solution = self._plan(u, z, estimate.d, cost, Status.NOT_FINITE, NAN, 0)
         if not (np.isfinite(cost) and target.ok):
             return replace(solution, timing=_spent(start))
+        memory = _Curvature()
         for i in range(1, self._iterations + 1):
             prepared = self._inner.linearise(u, z, estimate.d, u_prev, target.weight)
-            full = self._inner.feedback(prepared, estimate, reference)
+            memory.see(u, self._inner.gradient(prepared, target.x), i, self._on_soft_bounds(z, u))
+            curved = replace(prepared, hessian=memory.corrected(prepared.hessian))
+            full = self._inner.feedback(curved, estimate, reference)
             if not full.status.ok:
                 solution = replace(solution, status=full.status if i == 1 else Status.STOPPED)
                 break
-            promised, step = cost - full.cost, full.u - u
+            step = full.u - u
+            more = step.ravel() @ (curved.hessian - prepared.hessian) @ step.ravel()
+            promised = cost - full.cost - 0.5 * float(more)  # full.cost is the Gauss-Newton model's
             flat = promised <= self._tolerance * max(abs(cost), 1e-12)
-            kkt = max(full.kkt, self._residual(prepared, step))
-            done = flat and kkt <= KKT
+            kkt = max(full.kkt, self._residual(curved, step))
             found = self._search(z[0], u, step, estimate.d, u_prev, target, cost, promised)
-            if found is not None:
-                u, z, cost = found
-            done = done or (flat and found is None)  # what is left is rounding
+            stuck = found is None and not memory.pairs
+            u, z, cost = found if found is not None else (u, z, cost)
+            done = flat and (kkt <= KKT or stuck)  # stuck where it is flat: what is left is rounding
             status = Status.SOLVED if done else Status.STOPPED
             solution = self._plan(u, z, estimate.d, cost, status, kkt, i)
-            if done or found is None:
+            if done or stuck:
                 break
+            if found is None:
+                memory = _Curvature()
         return replace(solution, timing=_spent(start))
+
+    def _on_soft_bounds(self, z: Array, u: Array) -> bool:
+        """True if a soft bound acts or nearly does."""
+        soft = self.problem.soft
+        if not len(soft):
+            return False
+        values = soft.values(z[:, : self.ocp.n_x], u)
+        return bool(np.max(np.maximum(values - soft.upper, soft.lower - values) / soft.scale) > -1e-4)
 
     def _admissible(self, u: Array, u_prev: Array) -> Array:
         """``u`` moved into the limits one input after the other: the QPs keep what the first guess keeps."""
@@ -167,6 +187,41 @@ class SQPController:
             u, z[:, :n_x], z[:, n_x:], d, cost, status, kkt, 0.0, {},
             float(np.max(excess, initial=0.0)), i,
         )  # fmt: skip
+
+
+class _Curvature:
+    """What the last steps of one solve have shown of the curvature that Gauss-Newton leaves out."""
+
+    def __init__(self) -> None:
+        self.pairs: list[tuple[Array, Array]] = []
+        self._before: tuple[Array, Array] | None = None
+
+    def see(self, u: Array, gradient: Array, iteration: int, on_soft_bounds: bool) -> None:
+        """A new iterate ``u`` ``(N, n_u)`` and the exact gradient there ``(N n_u,)``."""
+        now = u.ravel(), gradient
+        if on_soft_bounds:
+            self.pairs = []  # the kink of a penalty is no curvature
+        elif self._before is not None and iteration > GAUSS_NEWTON:
+            self.pairs = [*self.pairs, (now[0] - self._before[0], now[1] - self._before[1])][-MEMORY:]
+        self._before = now
+
+    def corrected(self, hessian: Array) -> Array:
+        """The Gauss-Newton Hessian after damped BFGS updates, the oldest first: positive definite as before.
+
+        Source: Nocedal and Wright, *Numerical Optimization*, 2006, procedure 18.2.
+        """
+        b = hessian
+        for s, y in self.pairs:
+            bs = b @ s
+            sbs, sy = float(s @ bs), float(s @ y)
+            if not sbs > 1e-300:
+                continue
+            if sy < 0.2 * sbs:
+                share = 0.8 * sbs / (sbs - sy)
+                y = share * y + (1 - share) * bs
+                sy = 0.2 * sbs
+            b = b - np.outer(bs, bs / sbs) + np.outer(y, y / sy)
+        return np.asarray(0.5 * (b + b.T)) if self.pairs else hessian
 
 
 def _spent(start: float) -> dict[str, float]:
