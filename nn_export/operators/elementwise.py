@@ -190,7 +190,8 @@ def _table() -> dict[str, Operator]:
         "exp2": lambda x: ca.exp(math.log(2) * x), "log2": lambda x: ca.log(x) / math.log(2),
         "log10": ca.log10, "silu": lambda x: x * sigmoid(x), "mish": lambda x: x * ca.tanh(softplus_mx(x)),
         "log_sigmoid": log_sigmoid, "logical_not": lambda x: x == 0,
-        "isnan": lambda x: x != x, "isinf": lambda x: ca.fabs(x) == math.inf, "bitwise_not": lambda x: x == 0, "sgn": ca.sign,
+        "isnan": lambda x: x != x, "isinf": lambda x: ca.fabs(x) == math.inf,
+        "bitwise_not": lambda x: x == 0, "sgn": ca.sign,
     }  # fmt: skip
     pairs: dict[str, Callable[[ca.MX, ca.MX], ca.MX]] = {
         "mul.Tensor": lambda a, b: a * b, "div.Tensor": lambda a, b: a / b, "atan2.default": ca.atan2,
