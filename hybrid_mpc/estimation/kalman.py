@@ -129,6 +129,11 @@ class ExtendedKalmanFilter:
         """The model of this filter."""
         return self._model
 
+    @property
+    def noise_y(self) -> Array:
+        """Variances of the measurement noise ``(n_y,)``."""
+        return self._noise_y
+
     def start(self, y: ArrayLike, t: float = 0.0) -> Estimate:
         """Estimate at rest at ``y`` ``(n_y,)``: the smallest state with this output, ``d`` zero.
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +14,14 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation import TrueState
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.mpc import BestOf, CondensedController, SafeController, SQPController
-from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_ocp
+from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_ocp, process_noise, tuned_noise
 from hybrid_mpc.scenario import ControlSpec, Scenario
 
+if TYPE_CHECKING:
+    from hybrid_mpc.data.trajectories import Trajectory
+
 Array = NDArray[np.float64]
-ORACLE_ITERATIONS = 3
+ORACLE_ITERATIONS = 2
 """Linearisations an oracle makes from each of its starts in a period; its last plan is one of them."""
 
 
@@ -60,7 +63,7 @@ def build(
         scenario: The machine, with its oracle if that is asked for.
         artifact: Prior and hybrid.
         control: The task's control problem.
-        noise: Process noise by model, see :func:`~hybrid_mpc.pipeline.loops.process_noise`.
+        noise: Process noise by contender, see :func:`noise_of`.
 
     Raises:
         InputError: If there is no such contender, or the scenario has no oracle.
@@ -70,7 +73,7 @@ def build(
     c, prior = CONTENDERS[name], artifact.models["prior"]
     if c.model != "oracle":
         model = artifact.models[c.model]
-        estimator = make_estimator(model, control, noise[c.model], observer=c.observer)
+        estimator = make_estimator(model, control, noise[name], observer=c.observer)
         return estimator, make_controller(model, prior, control)
     if scenario.oracle is None:
         raise InputError(f"scenario {scenario.name} has no oracle")
@@ -80,12 +83,28 @@ def build(
     best = BestOf(SQPController(model, ocp, iterations=ORACLE_ITERATIONS), rivals=rivals)
     if c.truth:
         return TrueState(model), SafeController(best, prior)
-    return make_estimator(model, control, _small(control, model), observer=c.observer), SafeController(
-        best, prior
-    )
+    return make_estimator(model, control, noise[name], observer=c.observer), SafeController(best, prior)
 
 
-def _small(control: ControlSpec, model: HybridModel) -> Array:
-    """Process noise ``(n_x,)`` of a model that is right: a tenth of the sensor's, and that per period."""
-    sigma = 0.1 * np.asarray(control.estimator_sigma)
-    return np.concatenate([sigma, sigma / model.dt])
+def noise_of(
+    scenario: Scenario, artifact: Artifact, control: ControlSpec, recordings: Sequence[Trajectory]
+) -> dict[str, Array]:
+    """Process noise of every contender that estimates, each by maximum likelihood on the same recordings.
+
+    Args:
+        scenario: The machine.
+        artifact: Prior and hybrid.
+        control: Input range and sensor noise.
+        recordings: Training recordings with smoothed states.
+    """
+    models = dict(artifact.models)
+    if scenario.oracle is not None:
+        models["oracle"] = scenario.oracle(artifact.models["prior"].dt)
+    errors = {name: process_noise(model, recordings) for name, model in artifact.models.items()}
+    # the plant's own equations err by nothing but the smoothing: start from the better model's errors
+    errors["oracle"] = errors["hybrid"]
+    return {
+        name: tuned_noise(models[c.model], control, errors[c.model], recordings, observer=c.observer)
+        for name, c in CONTENDERS.items()
+        if c.model in models and not c.truth
+    }

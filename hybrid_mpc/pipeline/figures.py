@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from hybrid_mpc.identification.training import KINDS
+from hybrid_mpc.pipeline.contest import tasks_of
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.identify import MODELS, load_trained
 from hybrid_mpc.pipeline.judge import clean_windows
-from hybrid_mpc.pipeline.results import step_times
+from hybrid_mpc.pipeline.results import REPORTED, step_times
 from hybrid_mpc.plots import analysis, data, fit, loops, monitor, save, training
 
 Figures = dict[str, list[tuple[Path, str]]]
@@ -108,19 +109,21 @@ def _loops(context: Context) -> Any:
     if "reason" in context.result("control") or scenario.control is None:
         return
     prior = scenario.prior()
-    for task in scenario.tasks:
-        names = [n for n in ("prior", "hybrid", "oracle") if f"{task.name}/{n}/t" in arrays]
+    for task in tasks_of(scenario, context.budget.tasks):
+        names = {short: n for short, n in REPORTED.items() if f"{task.name}/{n}/t" in arrays}
         results = {
-            n: loops.Loop(*(arrays[f"{task.name}/{n}/{key}"] for key in ("t", "x", "u"))) for n in names
+            short: loops.Loop(*(arrays[f"{task.name}/{n}/{key}"] for key in ("t", "x", "u")))
+            for short, n in names.items()
         }
+        control = task.control or scenario.control
         figure = loops.closed_loops(
             task.title,
-            arrays[f"{task.name}/{names[0]}/t"],
-            arrays[f"{task.name}/{names[0]}/reference"],
+            arrays[f"{task.name}/{names['hybrid']}/t"],
+            arrays[f"{task.name}/{names['hybrid']}/reference"],
             results,
             states=prior.states,
             inputs=prior.inputs,
-            limits=(scenario.control.u_min, scenario.control.u_max),
+            limits=(control.u_min, control.u_max),
         )
         yield "control", f"loop_{task.name}", figure, f"{task.title}, first seed."
 

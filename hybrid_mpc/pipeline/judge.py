@@ -40,7 +40,7 @@ def monitor_stage(context: Context) -> None:
         context.save("monitor", {"reason": reason}, {})
         return
     model = load_artifact(context.out / "model").models["hybrid"]
-    sigma_x = np.array(context.result("control")["sigma_x"]["hybrid"])
+    sigma_x = np.array(context.result("control")["sigma_x"]["hybrid_observer"])
     whole = context.dataset.whole
     power, residual = [], []
     for i, recording in enumerate(whole):
@@ -88,6 +88,7 @@ def _load_loop(
         make_estimator(model, control, sigma_x),
         make_controller(model, prior, control),
         task.reference,
+        weight=task.weight,
         dt=model.dt,
         duration=task.duration,
         x0=np.array(task.x0),

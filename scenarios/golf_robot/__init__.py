@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from hybrid_mpc.scenario import DataSpec, Scenario
+from hybrid_mpc.scenario import DEFAULT_BUDGETS, DataSpec, Scenario
 from scenarios.golf_robot.data import make_data, windows
 from scenarios.golf_robot.oracle import oracle
 from scenarios.golf_robot.rig import Rig
-from scenarios.golf_robot.tasks import CONTROL, TASKS
+from scenarios.golf_robot.tasks import CONTROL, QUICK_TASKS, TASKS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -49,4 +50,8 @@ scenario = Scenario(
     oracle=oracle,
     control=CONTROL,
     tasks=TASKS,
+    budgets={
+        "quick": replace(DEFAULT_BUDGETS["quick"], tasks=QUICK_TASKS),
+        "full": replace(DEFAULT_BUDGETS["full"], oracle_seeds=2),
+    },
 )
