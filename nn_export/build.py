@@ -37,8 +37,8 @@ def build(program: Program, name: str | None = None, *, plain: bool = False) -> 
     Args:
         program: What :func:`nn_export.trace` made or :func:`nn_export.load_programs` read.
         name: Name of the function. Default: ``"program"``.
-        plain: One graph of matrices, all derivatives by CasADi. Default: each recurrent cell is a call
-            of a function that brings its exact Jacobian, and small parts between are scalar code: both values
+        plain: One graph of matrices, all derivatives by CasADi. Default: each GRU cell is a call of a
+            function that brings its exact Jacobian, and small parts between are scalar code: both values
             and derivatives are faster.
 
     Returns:
@@ -60,7 +60,7 @@ def build(program: Program, name: str | None = None, *, plain: bool = False) -> 
         symbols, values = graph(program, PLAIN)
         return function(name, symbols, [v.mx for v in values], program, outputs)
     pieces = Pieces()
-    symbols, values = graph(program, {**OPERATORS, **recurrent.table(pieces.call)}, pieces)
+    symbols, values = graph(program, {**OPERATORS, **recurrent.table(pieces.gru)}, pieces)
     return function(name, symbols, pieces.evaluate([v.mx for v in values]), program, outputs)
 
 

@@ -1,6 +1,6 @@
 """Value and Jacobian of a program in one function, composed by the chain rule.
 
-The graph is cut at its recurrent cells, whose Jacobians are known (:mod:`nn_export.operators.cells`). What lies
+The graph is cut at its GRU cells, whose Jacobians are known (:mod:`nn_export.operators.gru`). What lies
 between the cuts (features, integrators, read-outs) has few inputs and becomes scalar code with its own
 small Jacobian; pieces too large for that keep CasADi's derivatives of the matrix graph. No torch in here.
 """
@@ -16,7 +16,7 @@ import casadi as ca
 
 from nn_export.build import function, graph
 from nn_export.errors import ProgramError
-from nn_export.operators import OPERATORS, cells, recurrent
+from nn_export.operators import OPERATORS, gru, recurrent
 from nn_export.pieces import operations
 from nn_export.program import Program
 
@@ -56,7 +56,7 @@ def with_jacobian(
     if unknown := sorted({i for names in blocks.values() for i in names} - set(inputs)):
         raise ProgramError(f"no inputs {', '.join(unknown)}; the program has {', '.join(inputs)}")
     chain = _Chain()
-    symbols, outputs = graph(program, {**OPERATORS, **recurrent.table(chain.call)})
+    symbols, outputs = graph(program, {**OPERATORS, **recurrent.table(chain.gru)})
     sizes = {name: symbol.numel() for name, symbol in zip(inputs, symbols, strict=True)}
     for symbol in (s for s in symbols if s.numel()):  # CasADi has no empty symbols
         chain.add(symbol, _Known(symbol, {symbol.name(): ca.MX.eye(symbol.numel())}))
@@ -76,32 +76,20 @@ class _Known:
     slopes: dict[str, ca.MX]
 
 
-@dataclass(frozen=True)
-class _Cut:
-    """A cell, the expressions it is called with, and the symbols of its results."""
-
-    kind: cells.Kind
-    x: ca.MX
-    state: cells.State
-    w: cells.Weights
-    symbols: cells.State
-
-
 class _Chain:
     """The cuts of a graph: cells in order, each with its arguments; then what is known of their outputs."""
 
     def __init__(self) -> None:
-        self._cells: list[_Cut] = []
+        self._cells: list[tuple[ca.MX, ca.MX, ca.MX, gru.Weights]] = []
         self._known: dict[str, _Known] = {}
 
-    def call(self, kind: cells.Kind, x: ca.MX, state: cells.State, w: cells.Weights) -> cells.State:
-        """A cell: symbols in its place."""
-        if not cells.simple(x, w):
-            return cells.plain(kind, x, state, w)
-        n, k = state[-1].shape[0], len(self._cells)
-        symbols = tuple(ca.MX.sym(f"cell {k} {i}", n) for i in range(len(state)))
-        self._cells.append(_Cut(kind, x, state, w, symbols))
-        return symbols
+    def gru(self, x: ca.MX, state: gru.State, w: gru.Weights) -> gru.State:
+        """The operator: a symbol instead of the cell."""
+        if not gru.simple(x, w):
+            return gru.gru_call(x, state, w)
+        symbol = ca.MX.sym(f"cell {len(self._cells)}", state[0].shape[0])
+        self._cells.append((symbol, x, state[0], w))
+        return (symbol,)
 
     def add(self, symbol: ca.MX, known: _Known) -> None:
         """What a symbol stands for."""
@@ -109,10 +97,9 @@ class _Chain:
 
     def settle(self) -> None:
         """All cells in order."""
-        for cut in self._cells:
-            x, *state = self.derive([cut.x, *cut.state])
-            for symbol, known in zip(cut.symbols, _cell(cut, x, state), strict=True):
-                self.add(symbol, known)
+        for symbol, x, h, w in self._cells:
+            at_x, at_h = self.derive([x, h])
+            self.add(symbol, _cell(at_x, at_h, w))
 
     def derive(self, targets: list[ca.MX]) -> list[_Known]:
         """Expressions of the symbols, as values and slopes."""
@@ -165,25 +152,19 @@ def _edges(parts: list[ca.MX]) -> list[int]:
     return list(accumulate((p.numel() for p in parts), initial=0))
 
 
-def _cell(cut: _Cut, x: _Known, state: list[_Known]) -> list[_Known]:
-    """The new states: each gate's product with the slopes once, then scaled rows for each new state."""
-    n, at = cut.symbols[0].shape[0], cut.kind(x.value, tuple(k.value for k in state), cut.w)
-    slopes: list[dict[str, ca.MX]] = [{} for _ in at.state]
-
-    def add(k: int, name: str, term: ca.MX) -> None:
-        slopes[k][name] = slopes[k][name] + term if name in slopes[k] else term
-
-    for known, weight, factors in ((x, cut.w[0], at.by_input), (state[0], cut.w[1], at.by_hidden)):
-        blocks = cells.gates(weight, n)
+def _cell(x: _Known, h: _Known, w: gru.Weights) -> _Known:
+    n = h.value.shape[0]
+    at = gru.cell(x.value, h.value, w)
+    slopes: dict[str, ca.MX] = {}
+    for known, weight, factors in ((x, w[0], at.by_input), (h, w[1], at.by_hidden)):
+        blocks = gru.rows(weight, n)
         for name, slope in known.slopes.items():
-            products = [_times(block, slope) for block in blocks]
-            for k, by_gate in enumerate(factors):
-                add(k, name, cells.scaled(by_gate, products))
-    for k, row in enumerate(at.direct):
-        for known, d in zip(state, row, strict=True):
-            for name, slope in known.slopes.items() if d is not None else ():
-                add(k, name, ca.diag(d) if slope.is_eye() else ca.repmat(d, 1, slope.shape[1]) * slope)
-    return [_Known(value, slope) for value, slope in zip(at.state, slopes, strict=True)]
+            r, z, c = (_times(block, slope) for block in blocks)
+            term = gru.scaled(factors, (r, z, c))
+            if known is h:
+                term += ca.diag(at.z) if slope.is_eye() else ca.repmat(at.z, 1, slope.shape[1]) * slope
+            slopes[name] = slopes[name] + term if name in slopes else term
+    return _Known(at.h_next, slopes)
 
 
 def _times(a: ca.MX, b: ca.MX) -> ca.MX:

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import casadi as ca
 
-from nn_export.operators import cells
+from nn_export.operators import gru
 
 SCALAR_LIMIT = 3000
 """Scalar operations up to which a piece becomes scalar code: dense layers are faster as matrices."""
 
 
 class Pieces:
-    """Evaluates expressions of cut symbols: what lies between cells becomes scalar code where small.
+    """Evaluates expressions of cut symbols: what lies between GRU cells becomes scalar code where small.
 
     Example:
         >>> pieces, x = Pieces(), ca.MX.sym("x", 2)
@@ -25,30 +24,19 @@ class Pieces:
 
     def __init__(self) -> None:
         self._values: dict[str, ca.MX] = {}
-        self._cells: dict[tuple[Any, ...], tuple[cells.Weights, ca.Function]] = {}
 
     def add(self, symbol: ca.MX, value: ca.MX) -> None:
         """What a symbol stands for."""
         self._values[symbol.name()] = value
 
-    def call(self, kind: cells.Kind, x: ca.MX, state: cells.State, w: cells.Weights) -> cells.State:
-        """A cell: symbols that stand for the results of a call of its function."""
-        if not cells.simple(x, w):
-            return cells.plain(kind, x, state, w)
-        cell = self._function(kind, x.shape[0], tuple(s.shape[0] for s in state), w)
-        symbols = tuple(
-            ca.MX.sym(f"cell {len(self._values)} {i}", cell.size1_out(i)) for i in range(cell.n_out())
-        )
-        for symbol, value in zip(symbols, cell.call(self.evaluate([x, *state])), strict=True):
-            self.add(symbol, value)
-        return symbols
-
-    def _function(self, kind: cells.Kind, n_x: int, sizes: tuple[int, ...], w: cells.Weights) -> ca.Function:
-        """One function for all calls with the same weights, as in a sequence."""
-        key = (kind, n_x, sizes, *(id(v) for v in w))
-        if key not in self._cells:  # the weights are kept, so that their ids stay theirs
-            self._cells[key] = w, cells.cell_function(kind, n_x, sizes, w)
-        return self._cells[key][1]
+    def gru(self, x: ca.MX, state: gru.State, w: gru.Weights) -> gru.State:
+        """The operator: a symbol that stands for the call of the cell."""
+        if not gru.simple(x, w):
+            return gru.gru_call(x, state, w)
+        symbol = ca.MX.sym(f"cell {len(self._values)}", state[0].shape[0])
+        at_x, at_h = self.evaluate([x, state[0]])
+        self.add(symbol, gru.gru_call(at_x, (at_h,), w)[0])
+        return (symbol,)
 
     def evaluate(self, targets: list[ca.MX]) -> list[ca.MX]:
         """Expressions of the symbols at what these stand for."""

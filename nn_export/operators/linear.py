@@ -6,11 +6,10 @@ import math
 from collections.abc import Callable, Sequence
 
 import casadi as ca
-import numpy as np
 
 from nn_export.operators.elementwise import add, apply
 from nn_export.operators.reduce import mean
-from nn_export.operators.value import Value, arrange, from_matrix, matrix
+from nn_export.operators.value import Value, from_matrix, matrix
 
 
 def matmul(a: Value, b: Value) -> Value:
@@ -99,34 +98,9 @@ def batch_norm(
     return result, empty, empty
 
 
-def group_norm(
-    input: Value,
-    weight: Value | None,
-    bias: Value | None,
-    N: int,
-    C: int,
-    HxW: int,
-    group: int,
-    eps: float,
-) -> tuple[Value, ...]:
-    """Groups of channels (axis 1) to mean 0 and variance 1, then scaled and shifted by channel."""
-    size = (N * group, C // group * HxW)
-    x = matrix(input, *size)
-    mean, count = ca.sum2(x) / size[1], size[1]
-    centred = x - ca.repmat(mean, 1, count)
-    scale = 1 / ca.sqrt(ca.sum2(centred * centred) / count + eps)
-    y = centred * ca.repmat(scale, 1, count)
-    for channels, times in ((weight, True), (bias, False)):
-        if channels is not None:
-            by_channel = np.broadcast_to(channels.positions.reshape(1, C, 1), (N, C, HxW)).reshape(size)
-            part = arrange(channels.mx, by_channel)
-            y = y * part if times else y + part
-    return from_matrix(y, input.shape), from_matrix(mean, (N, group)), from_matrix(scale, (N, group))
-
-
 OPERATORS: dict[str, Callable[..., Value | tuple[Value, ...]]] = {
     "aten.mm.default": mm, "aten.bmm.default": mm, "aten.mv.default": mv, "aten.dot.default": dot,
     "aten.addmm.default": addmm, "aten.addmv.default": addmv, "aten.linear.default": linear,
-    "aten.layer_norm.default": layer_norm, "aten.native_group_norm.default": group_norm,
+    "aten.layer_norm.default": layer_norm,
     "aten._native_batch_norm_legit_no_training.default": batch_norm,
 }  # fmt: skip

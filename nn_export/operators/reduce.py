@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import reduce
-from itertools import accumulate
 
 import casadi as ca
 import numpy as np
@@ -46,10 +45,6 @@ def _root(x: ca.MX) -> ca.MX:  # square root with slope 0 at 0, as torch's norms
     return ca.if_else(x > 0, ca.sqrt(ca.if_else(x > 0, x, 1.0)), 0.0)
 
 
-def _power(x: ca.MX, exponent: float) -> ca.MX:  # with slope 0 at 0
-    return ca.if_else(x > 0, ca.if_else(x > 0, x, 1.0) ** exponent, 0.0)
-
-
 def sum_(self: Value, dim: Sequence[int] | None = None, keepdim: bool = False) -> Value:
     """Sum over axes."""
     return reduced(ca.sum2, self, dim, keepdim)
@@ -66,36 +61,23 @@ def mean(self: Value, dim: Sequence[int] | None = None, keepdim: bool = False) -
 
 
 def var(
-    self: Value, dim: Sequence[int] | None = None, *, correction: float | None = None, keepdim: bool = False
+    self: Value, dim: Sequence[int] | None = None, *, correction: float = 1, keepdim: bool = False
 ) -> Value:
-    """Variance over axes with ``n - correction`` in the denominator (1 if not given), at least 0."""
-    less = 1.0 if correction is None else float(correction)
+    """Variance over axes with ``n - correction`` in the denominator."""
 
     def f(x: ca.MX) -> ca.MX:
         n = x.shape[1]
         d = x - ca.repmat(ca.sum2(x) / n, 1, n)
-        return ca.sum2(d * d) / max(n - less, 0.0)
+        return ca.sum2(d * d) / (n - correction)
 
     return reduced(f, self, dim, keepdim)
 
 
 def std(
-    self: Value, dim: Sequence[int] | None = None, *, correction: float | None = None, keepdim: bool = False
+    self: Value, dim: Sequence[int] | None = None, *, correction: float = 1, keepdim: bool = False
 ) -> Value:
     """Standard deviation over axes, with slope 0 where it is 0, as in torch."""
     return apply(_root, var(self, dim, correction=correction, keepdim=keepdim))
-
-
-def std_dim(self: Value, dim: Sequence[int] | None, unbiased: bool = True, keepdim: bool = False) -> Value:
-    """Standard deviation over axes with ``n - 1`` or ``n`` in the denominator."""
-    return std(self, dim, correction=float(unbiased), keepdim=keepdim)
-
-
-def var_mean(
-    self: Value, dim: Sequence[int] | None = None, *, correction: float | None = None, keepdim: bool = False
-) -> tuple[Value, ...]:
-    """Variance and mean over axes."""
-    return var(self, dim, correction=correction, keepdim=keepdim), mean(self, dim, keepdim)
 
 
 def amax(self: Value, dim: Sequence[int] = (), keepdim: bool = False) -> Value:
@@ -118,61 +100,6 @@ def min_all(self: Value) -> Value:
     return amin(self)
 
 
-def _first(best: Callable[[ca.MX], ca.MX]) -> Callable[[ca.MX], ca.MX]:
-    """Number of the first column that holds the best of its row."""
-
-    def f(x: ca.MX) -> ca.MX:
-        top, columns = best(x), _columns(x)
-        index = ca.MX(ca.DM.ones(x.shape[0], 1)) * (len(columns) - 1)
-        for k in reversed(range(len(columns) - 1)):
-            index = ca.if_else(columns[k] == top, k, index)
-        return index
-
-    return f
-
-
-def _along(f: Callable[[ca.MX], ca.MX], self: Value, dim: int | None, keepdim: bool) -> Value:
-    return reduced(f, self, None if dim is None else [dim], keepdim)
-
-
-def argmax(self: Value, dim: int | None = None, keepdim: bool = False) -> Value:
-    """Place of the largest, the first where several are."""
-    return _along(_first(_largest), self, dim, keepdim)
-
-
-def argmin(self: Value, dim: int | None = None, keepdim: bool = False) -> Value:
-    """Place of the smallest, the first where several are."""
-    return _along(_first(_smallest), self, dim, keepdim)
-
-
-def max_dim(self: Value, dim: int, keepdim: bool = False) -> tuple[Value, ...]:
-    """Largest over an axis, and its place; the slope goes to the place."""
-    return _chosen(self, argmax(self, dim, keepdim), dim, keepdim)
-
-
-def min_dim(self: Value, dim: int, keepdim: bool = False) -> tuple[Value, ...]:
-    """Smallest over an axis, and its place; the slope goes to the place."""
-    return _chosen(self, argmin(self, dim, keepdim), dim, keepdim)
-
-
-def _chosen(self: Value, place: Value, dim: int, keepdim: bool) -> tuple[Value, ...]:
-    def choose(x: ca.MX) -> ca.MX:
-        columns, k = _columns(x), place_column
-        result = columns[-1]
-        for j in reversed(range(len(columns) - 1)):
-            result = ca.if_else(k == j, columns[j], result)
-        return result
-
-    place_column = arrange(place.mx, place.positions.reshape(-1, 1))
-    return _along(choose, self, dim, keepdim), place
-
-
-def any_(self: Value, dim: Sequence[int] | int | None = None, keepdim: bool = False) -> Value:
-    """1 where any element over the axes is not 0."""
-    dim = [dim] if isinstance(dim, int) else dim
-    return reduced(lambda x: ca.sum2(x != 0) > 0, self, dim, keepdim)
-
-
 def prod(self: Value) -> Value:
     """Product of all."""
     return reduced(_product, self, None, False)
@@ -184,20 +111,14 @@ def prod_dim(self: Value, dim: int, keepdim: bool = False) -> Value:
 
 
 def norm(self: Value, ord: float = 2, dim: Sequence[int] | None = None, keepdim: bool = False) -> Value:
-    """Vector norm of order 0, at least 1, or plus or minus infinity; slope 0 where it is 0, as in torch."""
+    """Vector norm of order 1, 2 or infinity."""
     if ord == 2:
         return reduced(lambda x: _root(ca.sum2(x * x)), self, dim, keepdim)
     if ord == 1:
         return reduced(lambda x: ca.sum2(ca.fabs(x)), self, dim, keepdim)
     if ord == math.inf:
         return reduced(lambda x: _largest(ca.fabs(x)), self, dim, keepdim)
-    if ord == -math.inf:
-        return reduced(lambda x: _smallest(ca.fabs(x)), self, dim, keepdim)
-    if ord == 0:
-        return reduced(lambda x: ca.sum2(x != 0), self, dim, keepdim)
-    if ord > 1:
-        return reduced(lambda x: _power(ca.sum2(ca.fabs(x) ** ord), 1 / ord), self, dim, keepdim)
-    raise ValueError(f"norm of order {ord}; known are 0, orders from 1 up, and both infinities")
+    raise ValueError(f"norm of order {ord}; known are 1, 2 and infinity")
 
 
 def logsumexp(self: Value, dim: Sequence[int], keepdim: bool = False) -> Value:
@@ -237,28 +158,15 @@ def cumsum(self: Value, dim: int) -> Value:
     return Value(self.shape, arrange(sums.mx, _back(sums, dim, self.mx.shape)))
 
 
-def cumprod(self: Value, dim: int) -> Value:
-    """Running product along an axis."""
-    if not self.shape:
-        return self
-    last = np.moveaxis(self.positions, dim, -1)
-    columns = _columns(arrange(self.mx, last.reshape(-1, last.shape[-1])))
-    products = from_matrix(ca.horzcat(*accumulate(columns, lambda a, b: a * b)), last.shape)
-    return Value(self.shape, arrange(products.mx, _back(products, dim, self.mx.shape)))
-
-
 def _back(value: Value, dim: int, size: tuple[int, int]) -> np.ndarray:
     return np.moveaxis(value.positions, -1, dim).reshape(size)
 
 
-OPERATORS: dict[str, Callable[..., Value | tuple[Value, ...]]] = {
+OPERATORS: dict[str, Callable[..., Value]] = {
     "aten.sum.default": sum_all, "aten.sum.dim_IntList": sum_, "aten.mean.dim": mean,
     "aten.mean.default": mean, "aten.var.correction": var, "aten.std.correction": std,
-    "aten.std.dim": std_dim, "aten.var_mean.correction": var_mean, "aten.amax.default": amax,
-    "aten.max.dim": max_dim, "aten.min.dim": min_dim, "aten.argmax.default": argmax,
-    "aten.argmin.default": argmin, "aten.any.default": any_, "aten.any.dim": any_, "aten.any.dims": any_,
-    "aten.cumprod.default": cumprod, "aten.amin.default": amin, "aten.max.default": max_all,
-    "aten.min.default": min_all,
+    "aten.amax.default": amax,
+    "aten.amin.default": amin, "aten.max.default": max_all, "aten.min.default": min_all,
     "aten.prod.default": prod, "aten.prod.dim_int": prod_dim, "aten.linalg_vector_norm.default": norm,
     "aten.logsumexp.default": logsumexp, "aten._softmax.default": softmax,
     "aten._log_softmax.default": log_softmax, "aten.cumsum.default": cumsum,

@@ -93,23 +93,6 @@ def index(self: Value, indices: Sequence[Value | None]) -> Value:
     return move(self, self.positions[key])
 
 
-def gather(self: Value, dim: int, index: Value) -> Value:
-    """Entries of an axis, chosen by a constant tensor for each place."""
-    chosen, axis = numbers(index).astype(int), dim % max(len(self.shape), 1)
-    if not self.shape:
-        return self
-    near = tuple(slice(None if i == axis else n) for i, n in enumerate(chosen.shape))
-    return move(self, np.take_along_axis(self.positions[near], chosen, axis=axis))
-
-
-def unfold(self: Value, dimension: int, size: int, step: int) -> Value:
-    """Windows of an axis, as a new last axis."""
-    windows = np.lib.stride_tricks.sliding_window_view(self.positions, size, axis=dimension)
-    index: list[slice] = [slice(None)] * len(self.shape)
-    index[dimension] = slice(None, None, step)
-    return move(self, windows[(*index, slice(None))])
-
-
 def cat(tensors: Sequence[Value], dim: int = 0) -> Value:
     """Joined along an axis."""
     return concatenate(list(tensors), dim)
@@ -167,8 +150,7 @@ OPERATORS: dict[str, Callable[..., Value | tuple[Value, ...]]] = {
     "aten.permute.default": permute, "aten.transpose.int": transpose, "aten.t.default": t,
     "aten.expand.default": expand, "aten.repeat.default": repeat, "aten.flip.default": flip,
     "aten.diagonal.default": diagonal, "aten.index_select.default": index_select,
-    "aten.gather.default": gather, "aten.unfold.default": unfold, "aten.index.Tensor": index,
-    "aten.cat.default": cat, "aten.stack.default": stack,
+    "aten.index.Tensor": index, "aten.cat.default": cat, "aten.stack.default": stack,
     "aten.split_with_sizes.default": split_with_sizes, "aten.constant_pad_nd.default": pad,
     "aten.full.default": full, "aten.full_like.default": full_like,
     "aten.scalar_tensor.default": scalar_tensor, "aten.arange.start_step": arange,

@@ -18,7 +18,6 @@ A34, B34 = (
 )
 V4, V3, M43 = B34[0].clone(), A34[:, 0].clone(), B34.T.clone()
 I2 = torch.tensor([2.0, 0.0]).double()
-I31 = torch.tensor([[3.0], [0.0], [2.0]]).double()
 
 
 def _gates(k):
@@ -61,11 +60,6 @@ CASES = {
     "_native_batch_norm_legit_no_training.default": (A34, V4, V4, V4, V4, 0.1, 1e-5),
     "mean.dim": (A34, [0]), "var.correction": ((A34, [1]), {"correction": 0.0}),
     "std.correction": ((A34, [0]), {"correction": 1.0}),
-    "std.dim": (A34, [1], False, True), "var_mean.correction": ((A34, [1]), {"correction": 0.5}),
-    "gather.default": (A34, 1, I31), "unfold.default": (V4, 0, 2, 2), "max.dim": (A34, 0),
-    "min.dim": (A34, 1, True), "argmax.default": (A34, 1), "argmin.default": (B34, 0, True),
-    "any.dim": (A34.round(), 0), "any.dims": (A34.round(), [1]), "cumprod.default": (A34, 1),
-    "native_group_norm.default": (A34.T[None].contiguous(), V4, V4, 1, 4, 3, 2, 1e-5),
     "amax.default": (A34, [0]),
     "amin.default": (A34, [1], True), "prod.dim_int": (A34, 0), "linalg_vector_norm.default": (A34, 2.0, [1]),
     "logsumexp.default": (A34, [1]), "_softmax.default": (A34, 0, False),
@@ -88,18 +82,7 @@ def _case(name):
         return (A34, 0.4), {}
     if short == "pow.Scalar":
         return (0.4, A34), {}
-    many = (
-        "Tensor",
-        "atan2",
-        "hypot",
-        "imum",
-        "fmax",
-        "fmin",
-        "logical_and",
-        "logical_or",
-        "logical_xor",
-        "pow",
-    )
+    many = ("Tensor", "atan2", "hypot", "imum", "logical_and", "logical_or", "logical_xor", "pow")
     if name in ELEMENTWISE and any(m in short for m in many):
         return (A34, V4), {}
     return (A34,), {}  # operators of one tensor
@@ -107,7 +90,6 @@ def _case(name):
 
 NAMES = [name for name in OPERATORS if name != "getitem"]
 RECURRENT = ("gru", "lstm", "rnn")
-INDEXING = ("index", "gather")
 OWN_SLOPES = {"aten.celu.default", "aten.detach.default"}  # tested below
 
 
@@ -138,7 +120,7 @@ class Setup:
         return not (
             self.base.startswith(("bitwise", "logical"))
             or (self.base == "where" and k == 0)
-            or (self.base.startswith(INDEXING) and k > 0)
+            or (self.base.startswith("index") and k > 0)
             or (self.base.startswith(RECURRENT) and k > 1)  # weights are constant
             or (
                 self.base == "_native_batch_norm_legit_no_training" and k > 2
@@ -146,7 +128,7 @@ class Setup:
         )
 
     def torch_side(self, a, k):
-        if self.base.startswith(INDEXING) and k > 0 and isinstance(a, torch.Tensor):
+        if self.base.startswith("index") and k > 0 and a is I2:
             return a.long()
         if isinstance(a, torch.Tensor) and (
             self.base.startswith("bitwise") or (self.base == "where" and k == 0)
@@ -201,8 +183,7 @@ def _differentiable(name):
 @pytest.mark.parametrize("name", [n for n in NAMES if _differentiable(n) and n not in OWN_SLOPES])
 def test_derivative_against_torch(name, plain):
     setup = Setup(name, inputs=True)
-    kept = [i for i, e in enumerate(setup.expected) if e.numel() and e.is_floating_point()]
-    kept = kept[:1] if "norm" in name else kept  # torch has no slopes of the statistics of a norm
+    kept = [i for i, e in enumerate(setup.expected) if e.numel()]
     exact = torch.autograd.functional.jacobian(
         lambda *t: tuple(setup.torch(*t)[i] for i in kept), tuple(setup.tensors)
     )
