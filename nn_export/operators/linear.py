@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from nn_export.operators.elementwise import add, apply
-from nn_export.operators.reduce import mean, sum_
+from nn_export.operators.reduce import mean, sum_, var
 from nn_export.operators.value import Value, arrange, concatenate, from_matrix, matrix, move
 
 
@@ -136,8 +136,8 @@ def group_norm(
         result = apply(lambda x, w: x * w, result, Value(channels, weight.mx))
     if bias is not None:
         result = add(result, Value(channels, bias.mx))
-    empty = Value((0,), ca.MX.zeros(0, 1))
-    return result, empty, empty
+    centre, spread = mean(parts, [2]), var(parts, [2], correction=0)
+    return result, centre, apply(lambda v: 1 / ca.sqrt(v + eps), spread)
 
 
 OPERATORS: dict[str, Callable[..., Value | tuple[Value, ...]]] = {

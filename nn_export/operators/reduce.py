@@ -151,6 +151,13 @@ def var_mean(
     return var(self, dim, correction=correction, keepdim=keepdim), mean(self, dim, keepdim)
 
 
+def std_mean(
+    self: Value, dim: Sequence[int] | None, unbiased: bool = True, keepdim: bool = False
+) -> tuple[Value, Value]:
+    """Standard deviation and mean over axes."""
+    return std_dim(self, dim, unbiased, keepdim), mean(self, dim, keepdim)
+
+
 def _first(better: Callable[[ca.MX, ca.MX], ca.MX]) -> Callable[..., tuple[Value, Value]]:
     def operator(self: Value, dim: int, keepdim: bool = False) -> tuple[Value, Value]:
         def f(x: ca.MX, position: bool) -> ca.MX:
@@ -236,6 +243,7 @@ OPERATORS: dict[str, Callable[..., Value | tuple[Value, ...]]] = {
     "aten.logsumexp.default": logsumexp, "aten._softmax.default": softmax,
     "aten._log_softmax.default": log_softmax, "aten.cumsum.default": cumsum,
     "aten.cumprod.default": cumprod, "aten.std.dim": std_dim, "aten.var_mean.correction": var_mean,
+    "aten.std_mean.dim": std_mean,
     "aten.max.dim": _first(lambda a, b: a > b), "aten.min.dim": _first(lambda a, b: a < b),
     "aten.any.default": any_, "aten.any.dim": any_, "aten.any.dims": any_, "aten.dist.default": dist,
 }  # fmt: skip
