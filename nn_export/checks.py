@@ -132,8 +132,9 @@ def _narrow(n: torch.fx.Node) -> str:
     if lossy == [torch.float32] and op == "aten._to_copy.default" and inputs[0] is not torch.float64:
         return ""
     if lossy == [torch.float32] and op in ("aten.mul.Tensor", "aten.mul.Scalar") and inputs == [torch.bool]:
-        if float(np.float32(n.args[1])) == n.args[1]:  # a product of 0 or 1 with it is exact
-            return ""
+        factor = n.args[1]
+        if isinstance(factor, int | float) and float(np.float32(factor)) == factor:
+            return ""  # a product of 0 or 1 with it is exact
     return f"in {lossy[0]}"
 
 

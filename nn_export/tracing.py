@@ -124,7 +124,7 @@ def _examples(module: Any, example_inputs: Any) -> tuple[Any, ...]:
     for path, x in pytree.tree_flatten_with_path(tuple(example_inputs))[0]:
         if not isinstance(x, torch.Tensor) or not x.is_floating_point():
             kind = x.dtype if isinstance(x, torch.Tensor) else type(x).__name__
-            at = path[0].idx if len(path) == 1 else pytree.keystr(path)
+            at = "_".join(_words(path))
             raise SignatureError(
                 f"example input {at} must be a tensor of real numbers, got {kind}; e.g. torch.zeros(3)"
             )
@@ -179,7 +179,7 @@ def _input_names(module: torch.nn.Module, examples: tuple[Any, ...]) -> list[str
     bound = inspect.signature(module.forward).bind(*examples)
     leaves = pytree.tree_flatten_with_path(tuple(bound.arguments.values()))[0]
     keys = list(bound.arguments)
-    return [_identifier("_".join([keys[path[0].idx], *_words(path[1:])])) for path, _ in leaves]
+    return [_identifier("_".join([keys[int(_words(path)[0])], *_words(path[1:])])) for path, _ in leaves]
 
 
 def _words(path: Sequence[Any]) -> list[str]:

@@ -175,6 +175,14 @@ def _round(x: ca.MX) -> ca.MX:  # half to even, as torch does
     return low + up
 
 
+def _fmax(a: ca.MX, b: ca.MX) -> ca.MX:  # a number wins against NaN
+    return ca.if_else(ca.logic_or(a >= b, b != b), a, b)
+
+
+def _fmin(a: ca.MX, b: ca.MX) -> ca.MX:
+    return ca.if_else(ca.logic_or(a <= b, b != b), a, b)
+
+
 def _xlogy(a: ca.MX, b: ca.MX) -> ca.MX:  # 0 log 0 = 0; slope log b at a = 0
     void = ca.logic_and(a == 0, b <= 0)
     return ca.if_else(void, 0.0, a * ca.log(ca.if_else(void, 1.0, b)))
@@ -208,8 +216,8 @@ def _table() -> dict[str, Operator]:
         "bitwise_and.Tensor": lambda a, b: ca.logic_and(a, b),
         "bitwise_or.Tensor": lambda a, b: ca.logic_or(a, b), "logical_and.default": ca.logic_and,
         "logical_or.default": ca.logic_or, "logical_xor.default": lambda a, b: (a != 0) != (b != 0),
-        "bitwise_xor.Tensor": lambda a, b: (a != 0) != (b != 0), "fmax.default": lambda a, b: ca.if_else(ca.logic_or(a >= b, b != b), a, b),
-        "fmin.default": lambda a, b: ca.if_else(ca.logic_or(a <= b, b != b), a, b), "xlogy.Tensor": _xlogy, "ldexp.Tensor": _ldexp,
+        "bitwise_xor.Tensor": lambda a, b: (a != 0) != (b != 0), "fmax.default": _fmax,
+        "fmin.default": _fmin, "xlogy.Tensor": _xlogy, "ldexp.Tensor": _ldexp,
     }  # fmt: skip
     comparisons: dict[str, Callable[[ca.MX, ca.MX], ca.MX]] = {
         "gt": lambda a, b: a > b, "ge": lambda a, b: a >= b, "lt": lambda a, b: a < b,

@@ -21,7 +21,9 @@ def matmul(a: Value, b: Value) -> Value:
     for value in (a, b):
         positions = value.positions.reshape(-1, *value.shape[-2:])
         stacks.append([arrange(value.mx, p) for p in positions])
-    products = [from_matrix(ca.mtimes(x, y), (1, x.shape[0], y.shape[1])) for x, y in zip(*stacks, strict=True)]
+    products = [
+        from_matrix(ca.mtimes(x, y), (1, x.shape[0], y.shape[1])) for x, y in zip(*stacks, strict=True)
+    ]
     joined = concatenate(products, 0)
     return move(joined, joined.positions.reshape((*a.shape[:-1], b.shape[-1])))
 

@@ -132,7 +132,7 @@ def unfold(self: Value, dimension: int, size: int, step: int) -> Value:
 def gather(self: Value, dim: int, index: Value) -> Value:
     """Entries of an axis by a constant tensor of positions."""
     chosen = numbers(index).astype(int)
-    at = list(np.indices(chosen.shape))
+    at: list[np.ndarray] = list(np.indices(chosen.shape))
     at[dim] = chosen
     return move(self, self.positions[tuple(at)])
 
@@ -181,7 +181,7 @@ def index_put(self: Value, indices: Sequence[Value | None], values: Value) -> Va
 def scatter(self: Value, dim: int, index: Value, src: Value) -> Value:
     """A copy with entries of an axis at constant positions replaced, each at most once."""
     chosen = numbers(index).astype(int)
-    at = list(np.indices(chosen.shape))
+    at: list[np.ndarray] = list(np.indices(chosen.shape))
     at[dim] = chosen
     where = _places(self)[tuple(at)]
     if np.unique(where).size < where.size:

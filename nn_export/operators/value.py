@@ -1,8 +1,9 @@
 """Tensors of any rank held as dense CasADi matrices.
 
 A tensor is stored without its axes of size 1: none left is a 1 x 1 matrix, one of n a column n x 1, two a
-matrix r x c; of more, which inputs and outputs cannot have, the last are the columns. Every movement of data (slicing, reshaping, broadcasting ...)
-is one selection of elements, found by doing the movement on an array of positions.
+matrix r x c; of more, which inputs and outputs cannot have, the last are the columns. Every movement of
+data (slicing, reshaping, broadcasting ...) is one selection of elements, found by doing the movement on an
+array of positions.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from nn_export import Node, Port, Program, build, to_casadi
+from nn_export import Node, Port, Program, build, parity, to_casadi
 from nn_export.operators import OPERATORS
 from nn_export.operators.elementwise import OPERATORS as ELEMENTWISE
 from nn_export.operators.value import constant, matrix_shape
@@ -92,7 +92,18 @@ def _case(name):
         return (A34, 0.4), {}
     if short == "pow.Scalar":
         return (0.4, A34), {}
-    many = ("Tensor", "atan2", "fmax", "fmin", "hypot", "imum", "logical_and", "logical_or", "logical_xor", "pow")
+    many = (
+        "Tensor",
+        "atan2",
+        "fmax",
+        "fmin",
+        "hypot",
+        "imum",
+        "logical_and",
+        "logical_or",
+        "logical_xor",
+        "pow",
+    )
     if name in ELEMENTWISE and any(m in short for m in many):
         return (A34, V4), {}
     return (A34,), {}  # operators of one tensor
@@ -101,7 +112,12 @@ def _case(name):
 NAMES = [name for name in OPERATORS if name not in ("getitem", "aten.empty.memory_format")]  # tested below
 RECURRENT = ("gru", "lstm", "rnn")
 INDEXED = ("index", "gather", "scatter", "embedding")
-OWN_SLOPES = {"aten.celu.default", "aten.detach.default", "aten.native_group_norm.default"}  # tested below
+OWN_SLOPES = {
+    "aten.celu.default",
+    "aten.detach.default",
+    "aten.native_group_norm.default",
+    "aten.copy.default",
+}  # tested below
 
 
 class Setup:
@@ -268,3 +284,49 @@ def test_the_logistic_function_far_out():
     assert np.isfinite(slopes(torch.sigmoid, point.numpy())).all()
     assert slopes(torch.sigmoid, [0.0]) == 0.25
     assert np.isnan(to_casadi(Call(torch.sigmoid), (point[:1],))(np.nan).full()).all()
+
+
+class Filled(torch.nn.Module):
+    """Writes into memory of its own, which becomes copies with parts replaced."""
+
+    def forward(self, x):
+        y = torch.empty(3, 4, dtype=x.dtype)
+        y[:] = x
+        y[0], y[1, 2], y[:, 3] = x[1], x[0, 0], 1.0
+        return y
+
+
+class Normed(torch.nn.Module):
+    """Axes beyond two inside the graph, none outside."""
+
+    def __init__(self):
+        super().__init__()
+        self.group, self.attention = torch.nn.GroupNorm(2, 4), torch.nn.MultiheadAttention(4, 2)
+
+    def forward(self, x):
+        return self.group(x), self.attention(x, x, x, need_weights=False)[0], x.repeat_interleave(2, 1)
+
+
+@pytest.mark.parametrize("module", [Filled(), Normed()])
+def test_modules_whose_operators_have_no_slope_alone(module):
+    torch.manual_seed(0)
+    inputs = (torch.zeros(3, 4),)
+    report = parity(module, to_casadi(module, inputs), inputs, n=6)
+    # The package's promise for values and Jacobians.
+    assert report.value_rel < 1e-12
+    assert report.jacobian_rel < 1e-10
+
+
+def test_memory_that_is_never_written_shows():
+    function = to_casadi(Call(lambda x: torch.empty(2, dtype=x.dtype) + x), (torch.zeros(2),))
+    assert np.isnan(function([1.0, 2.0]).full()).all()
+
+
+@pytest.mark.parametrize("f", [torch.amax, torch.amin, torch.max, torch.min])
+def test_equal_extremes_share_the_slope_as_in_torch(f):
+    x = torch.tensor([0.5, 0.5, 0.5, 0.5], dtype=torch.float64)
+    expected = torch.autograd.functional.jacobian(f, x).numpy()
+    symbol = ca.MX.sym("x", 4)
+    jacobian = ca.jacobian(to_casadi(Call(f), (x,))(symbol), symbol)
+    # Quarters are exact.
+    assert np.array_equal(ca.Function("j", [symbol], [jacobian])(x.numpy()).full().ravel(), expected)
