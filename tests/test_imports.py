@@ -18,6 +18,7 @@ ALLOWED = {
 TORCH = (
     "nn_export/tracing.py",
     "nn_export/convert.py",
+    "nn_export/checks.py",
     "nn_export/comparison.py",
     "hybrid_mpc/physics.py",
     "hybrid_mpc/identification/",

@@ -138,5 +138,7 @@ def test_parity_of_a_float32_stack_with_itself():
     inputs = (torch.zeros(3),)
     program = trace(module, inputs)
     for name, array in program.weights.items():
-        assert np.array_equal(array, module.state_dict()[name].double().numpy())  # float32 is exact in float64
+        assert np.array_equal(
+            array, module.state_dict()[name].double().numpy()
+        )  # float32 is exact in float64
     assert parity(module, build(program), inputs, n=6).value_rel < 1e-12  # the package's promise
