@@ -11,7 +11,7 @@ import numpy as np
 
 from nn_export.errors import ProgramError, ShapeError
 from nn_export.operators import OPERATORS, PLAIN, recurrent
-from nn_export.operators.value import Value, constant, matrix_shape
+from nn_export.operators.value import Value, constant, layout, matrix_shape
 from nn_export.pieces import Pieces
 from nn_export.program import Node, Program
 
@@ -37,7 +37,7 @@ def build(program: Program, name: str | None = None, *, plain: bool = False) -> 
     Args:
         program: What :func:`nn_export.trace` made or :func:`nn_export.load_programs` read.
         name: Name of the function. Default: ``"program"``.
-        plain: One graph of matrices, all derivatives by CasADi. Default: each GRU cell is a call of a
+        plain: One graph of matrices, all derivatives by CasADi. Default: each recurrent cell is a call of a
             function that brings its exact Jacobian, and small parts between are scalar code: both values
             and derivatives are faster.
 
@@ -60,7 +60,7 @@ def build(program: Program, name: str | None = None, *, plain: bool = False) -> 
         symbols, values = graph(program, PLAIN)
         return function(name, symbols, [v.mx for v in values], program, outputs)
     pieces = Pieces()
-    symbols, values = graph(program, {**OPERATORS, **recurrent.table(pieces.gru)}, pieces)
+    symbols, values = graph(program, {**OPERATORS, **recurrent.table(pieces.cell)}, pieces)
     return function(name, symbols, pieces.evaluate([v.mx for v in values]), program, outputs)
 
 
@@ -84,13 +84,14 @@ def graph(
         if pieces is not None and symbols[-1].numel():
             pieces.add(symbols[-1], symbols[-1])
     for weight, array in program.weights.items():
-        _size(f"weight {weight}", np.shape(array))
+        layout(np.shape(array))
         values["weight", weight] = constant(array)
     for node in program.nodes:
         values["node", node.name] = _evaluate(node, values, table)
     results = []
     for port in program.outputs:
         value = _resolve(port.source, values)
+        _size(f"output {port.name}", port.shape)
         if not isinstance(value, Value) or value.shape != port.shape:
             raise ProgramError(
                 f"output {port.name}: {port.source} has not its shape {port.shape}; export again"
@@ -128,7 +129,7 @@ def _evaluate(node: Node, values: dict[tuple[str, str], Any], table: Mapping[str
     where = f"node {node.name} ({node.op})" + (f" from {node.line}" if node.line else "")
     try:
         for shape in node.shapes:
-            matrix_shape(shape)
+            layout(shape)
         args, kwargs = _resolve(node.args, values), _resolve(node.kwargs, values)
         result = table[node.op](*args, **kwargs)
         given = tuple(v.shape for v in (result if isinstance(result, tuple) else (result,)))

@@ -4,39 +4,18 @@ from __future__ import annotations
 
 import inspect
 import math
-import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch.export.graph_signature import InputKind, OutputKind
 
-from nn_export.errors import (
-    DtypeError,
-    HiddenStateError,
-    SignatureError,
-    TrainingModeError,
-    UnsupportedOperatorError,
-)
+from nn_export.checks import LIKE_NOTHING, check_operators, op_name, results, source_line
+from nn_export.errors import DtypeError, HiddenStateError, SignatureError, UnsupportedOperatorError
 from nn_export.operators import OPERATORS
-from nn_export.operators.shape import OPERATORS as MOVEMENTS
 from nn_export.program import Node, Port
 
 _SKIPPED = {"aten._assert_tensor_metadata.default", "aten.sym_constrain_range_for_size.default"}
-_RANDOM = re.compile(
-    r"aten\.(native_dropout|dropout|bernoulli|rand|randn|normal|uniform|.*batch_norm_legit)\w*\."
-)
-_LIKE_NOTHING = {
-    "layout",
-    "device",
-    "pin_memory",
-    "memory_format",
-    "non_blocking",
-}  # where data lie, not what
-_TORCH = str(Path(torch.__file__).parent)
-
-
 Reference = dict[str, str]
 Graph = tuple[
     tuple[Node, ...], list[tuple[Reference, tuple[int, ...]]], dict[str, np.ndarray], tuple[Port, ...]
@@ -50,18 +29,18 @@ def convert(exported: torch.export.ExportedProgram, input_names: list[str], n_ou
         ExportError: One of the named errors that :func:`nn_export.trace` lists.
     """
     _check_mutations(exported)
-    refs, weights, inputs = _placeholders(exported, input_names)
     calls = [n for n in exported.graph.nodes if n.op not in ("placeholder", "output")]
     calls = [n for n in calls if str(n.target) not in _SKIPPED]
-    _check_operators(calls)
+    check_operators(calls)
+    refs, weights, inputs = _placeholders(exported, input_names)
     nodes = []
     for n in calls:
-        op = _op(n)
-        kwargs = {k: _plain(v, refs) for k, v in n.kwargs.items() if k not in _LIKE_NOTHING}
+        op = op_name(n)
+        kwargs = {k: _plain(v, refs) for k, v in n.kwargs.items() if k not in LIKE_NOTHING}
         if "dtype" in inspect.signature(OPERATORS[op]).parameters:
             kwargs["dtype"] = str(n.meta["val"].dtype).removeprefix("torch.")
         args = [_plain(a, refs) for a in n.args]
-        nodes.append(Node(n.name, op, args, kwargs, _shapes(n), _line(n)))
+        nodes.append(Node(n.name, op, args, kwargs, _shapes(n), source_line(n)))
         refs[n.name] = {"node": n.name}
     output = next(n for n in exported.graph.nodes if n.op == "output")
     found = list(output.args[0])
@@ -114,78 +93,8 @@ def _placeholders(
     return refs, weights, tuple(ports)
 
 
-def _check_operators(calls: list[torch.fx.Node]) -> None:
-    unknown, drawn = [], []
-    for n in calls:
-        op = _op(n)
-        if _RANDOM.match(op) and op not in OPERATORS:
-            drawn.append(f"  {op} at {_line(n)}")
-        elif op not in OPERATORS:
-            unknown.append(f"  {op} at {_line(n)}")
-        elif problem := _misfit(n, op):
-            unknown.append(f"  {op} at {_line(n)}: {problem}")
-    if drawn:
-        raise TrainingModeError(
-            "the module is random or uses batch statistics even in evaluation mode; remove these calls "
-            "(F.dropout needs training=self.training, BatchNorm track_running_stats=True):\n"
-            + "\n".join(drawn)
-        )
-    if unknown:
-        raise UnsupportedOperatorError(
-            "operators that nn_export does not know; write them with others (docs/export.md lists the "
-            "table), or compute them outside the module:\n" + "\n".join(dict.fromkeys(unknown))
-        )
-    for n in calls:
-        _check_precision(n)
-
-
-def _misfit(n: torch.fx.Node, op: str) -> str:
-    kwargs = {k: v for k, v in n.kwargs.items() if k not in _LIKE_NOTHING and k != "dtype"}
-    if "dtype" in n.kwargs and "dtype" not in inspect.signature(OPERATORS[op]).parameters:
-        kwargs["dtype"] = n.kwargs["dtype"]
-    try:
-        inspect.signature(OPERATORS[op]).bind(*n.args, **kwargs)
-    except TypeError as error:
-        return f"{error}; leave this argument at its default"
-    return ""
-
-
-def _check_precision(n: torch.fx.Node) -> None:
-    for value in _results(n):
-        line = _line(n)
-        if value.is_complex():
-            raise DtypeError(f"{n.target} at {line} is complex; use real and imaginary parts")
-        narrow = value.is_floating_point() and value.dtype is not torch.float64
-        if not narrow or str(n.target) in MOVEMENTS:
-            continue
-        if str(n.target) == "aten._to_copy.default" and isinstance(n.args[0], torch.fx.Node):
-            source = n.args[0].meta["val"]
-            if not source.is_floating_point() and value.dtype is torch.float32:
-                continue
-        raise DtypeError(
-            f"{n.target} at {line} computes in {value.dtype}, which the float64 export would not repeat; "
-            "use dtype=torch.float64 or x.dtype there"
-        )
-
-
-def _op(n: torch.fx.Node) -> str:
-    name = str(n.target)
-    return "getitem" if name == "<built-in function getitem>" else name
-
-
-def _results(n: torch.fx.Node) -> list[torch.Tensor]:
-    value = n.meta.get("val")
-    return [value] if isinstance(value, torch.Tensor) else list(value or ())
-
-
 def _shapes(n: torch.fx.Node) -> tuple[tuple[int, ...], ...]:
-    return tuple(tuple(int(size) for size in v.shape) for v in _results(n))
-
-
-def _line(n: torch.fx.Node) -> str:
-    frames = re.findall(r'File "([^"]+)", line (\d+), in \S+\n\s*(.*)', n.meta.get("stack_trace") or "")
-    own = [f for f in frames if not f[0].startswith(_TORCH)] or frames
-    return f"{Path(own[-1][0]).name}:{own[-1][1]}: {own[-1][2].strip()}" if own else "an unknown line"
+    return tuple(tuple(int(size) for size in v.shape) for v in results(n))
 
 
 def _plain(value: Any, refs: dict[str, Reference]) -> Any:

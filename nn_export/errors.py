@@ -31,6 +31,10 @@ class ShapeError(ExportError):
     """A value has more than two axes longer than one."""
 
 
+class DynamicShapeError(ExportError):
+    """The size of a result depends on the values of the inputs (``x[x > 0]``, ``nonzero``)."""
+
+
 class SignatureError(ExportError):
     """Example inputs or names do not fit the module."""
 

@@ -1,6 +1,6 @@
 """Value and Jacobian of a program in one function, composed by the chain rule.
 
-The graph is cut at its GRU cells, whose Jacobians are known (:mod:`nn_export.operators.gru`). What lies
+The graph is cut at its recurrent cells, whose Jacobians are known (:mod:`nn_export.operators.cells`). What lies
 between the cuts (features, integrators, read-outs) has few inputs and becomes scalar code with its own
 small Jacobian; pieces too large for that keep CasADi's derivatives of the matrix graph. No torch in here.
 """
@@ -16,7 +16,7 @@ import casadi as ca
 
 from nn_export.build import function, graph
 from nn_export.errors import ProgramError
-from nn_export.operators import OPERATORS, gru, recurrent
+from nn_export.operators import OPERATORS, cells, recurrent
 from nn_export.pieces import operations
 from nn_export.program import Program
 
@@ -56,7 +56,7 @@ def with_jacobian(
     if unknown := sorted({i for names in blocks.values() for i in names} - set(inputs)):
         raise ProgramError(f"no inputs {', '.join(unknown)}; the program has {', '.join(inputs)}")
     chain = _Chain()
-    symbols, outputs = graph(program, {**OPERATORS, **recurrent.table(chain.gru)})
+    symbols, outputs = graph(program, {**OPERATORS, **recurrent.table(chain.cell)})
     sizes = {name: symbol.numel() for name, symbol in zip(inputs, symbols, strict=True)}
     for symbol in (s for s in symbols if s.numel()):  # CasADi has no empty symbols
         chain.add(symbol, _Known(symbol, {symbol.name(): ca.MX.eye(symbol.numel())}))
@@ -80,16 +80,17 @@ class _Chain:
     """The cuts of a graph: cells in order, each with its arguments; then what is known of their outputs."""
 
     def __init__(self) -> None:
-        self._cells: list[tuple[ca.MX, ca.MX, ca.MX, gru.Weights]] = []
+        self._cells: list[tuple[list[ca.MX], cells.Kind, ca.MX, cells.State, cells.Weights]] = []
         self._known: dict[str, _Known] = {}
 
-    def gru(self, x: ca.MX, state: gru.State, w: gru.Weights) -> gru.State:
-        """The operator: a symbol instead of the cell."""
-        if not gru.simple(x, w):
-            return gru.gru_call(x, state, w)
-        symbol = ca.MX.sym(f"cell {len(self._cells)}", state[0].shape[0])
-        self._cells.append((symbol, x, state[0], w))
-        return (symbol,)
+    def cell(self, kind: cells.Kind, x: ca.MX, state: cells.State, w: cells.Weights) -> cells.State:
+        """The form of a cell: symbols instead of its results."""
+        if not cells.simple(x, w):
+            return cells.call(kind, x, state, w)
+        number = len(self._cells)
+        symbols = [ca.MX.sym(f"cell {number} {s}", kind.width(w)) for s in kind.states]
+        self._cells.append((symbols, kind, x, state, w))
+        return tuple(symbols)
 
     def add(self, symbol: ca.MX, known: _Known) -> None:
         """What a symbol stands for."""
@@ -97,9 +98,10 @@ class _Chain:
 
     def settle(self) -> None:
         """All cells in order."""
-        for symbol, x, h, w in self._cells:
-            at_x, at_h = self.derive([x, h])
-            self.add(symbol, _cell(at_x, at_h, w))
+        for symbols, kind, x, state, w in self._cells:
+            at_x, *at_state = self.derive([x, *state])
+            for symbol, known in zip(symbols, _cell(kind, at_x, at_state, w), strict=True):
+                self.add(symbol, known)
 
     def derive(self, targets: list[ca.MX]) -> list[_Known]:
         """Expressions of the symbols, as values and slopes."""
@@ -152,19 +154,26 @@ def _edges(parts: list[ca.MX]) -> list[int]:
     return list(accumulate((p.numel() for p in parts), initial=0))
 
 
-def _cell(x: _Known, h: _Known, w: gru.Weights) -> _Known:
-    n = h.value.shape[0]
-    at = gru.cell(x.value, h.value, w)
-    slopes: dict[str, ca.MX] = {}
-    for known, weight, factors in ((x, w[0], at.by_input), (h, w[1], at.by_hidden)):
-        blocks = gru.rows(weight, n)
+def _cell(kind: cells.Kind, x: _Known, state: list[_Known], w: cells.Weights) -> list[_Known]:
+    at = kind.step(x.value, tuple(s.value for s in state), w)
+    gates = len(at.slopes[0].by_input)
+    slopes: list[dict[str, ca.MX]] = [{} for _ in at.state]
+
+    def add(k: int, name: str, term: ca.MX) -> None:
+        slopes[k][name] = slopes[k][name] + term if name in slopes[k] else term
+
+    for hidden, known, weight in ((False, x, w[0]), (True, state[0], w[1])):
+        blocks = cells.rows(weight, gates) if known.slopes else []
         for name, slope in known.slopes.items():
-            r, z, c = (_times(block, slope) for block in blocks)
-            term = gru.scaled(factors, (r, z, c))
-            if known is h:
-                term += ca.diag(at.z) if slope.is_eye() else ca.repmat(at.z, 1, slope.shape[1]) * slope
-            slopes[name] = slopes[name] + term if name in slopes else term
-    return _Known(at.h_next, slopes)
+            products = [_times(block, slope) for block in blocks]
+            for k, by in enumerate(at.slopes):
+                add(k, name, cells.scaled(by.by_hidden if hidden else by.by_input, products))
+    for k, by in enumerate(at.slopes):
+        for old, diagonal in by.diagonal.items():
+            for name, slope in state[old].slopes.items():
+                whole = ca.repmat(diagonal, 1, slope.shape[1])
+                add(k, name, ca.diag(diagonal) if slope.is_eye() else whole * slope)
+    return [_Known(value, s) for value, s in zip(at.state, slopes, strict=True)]
 
 
 def _times(a: ca.MX, b: ca.MX) -> ca.MX:

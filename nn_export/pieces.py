@@ -6,14 +6,14 @@ import math
 
 import casadi as ca
 
-from nn_export.operators import gru
+from nn_export.operators import cells
 
 SCALAR_LIMIT = 3000
 """Scalar operations up to which a piece becomes scalar code: dense layers are faster as matrices."""
 
 
 class Pieces:
-    """Evaluates expressions of cut symbols: what lies between GRU cells becomes scalar code where small.
+    """Evaluates expressions of cut symbols: what lies between recurrent cells becomes scalar code where small.
 
     Example:
         >>> pieces, x = Pieces(), ca.MX.sym("x", 2)
@@ -29,14 +29,16 @@ class Pieces:
         """What a symbol stands for."""
         self._values[symbol.name()] = value
 
-    def gru(self, x: ca.MX, state: gru.State, w: gru.Weights) -> gru.State:
-        """The operator: a symbol that stands for the call of the cell."""
-        if not gru.simple(x, w):
-            return gru.gru_call(x, state, w)
-        symbol = ca.MX.sym(f"cell {len(self._values)}", state[0].shape[0])
-        at_x, at_h = self.evaluate([x, state[0]])
-        self.add(symbol, gru.gru_call(at_x, (at_h,), w)[0])
-        return (symbol,)
+    def cell(self, kind: cells.Kind, x: ca.MX, state: cells.State, w: cells.Weights) -> cells.State:
+        """The form of a cell: symbols that stand for the results of its call."""
+        if not cells.simple(x, w):
+            return cells.call(kind, x, state, w)
+        at_x, *at_state = self.evaluate([x, *state])
+        symbols = []
+        for value in cells.call(kind, at_x, tuple(at_state), w):
+            symbols.append(ca.MX.sym(f"cell {len(self._values)}", value.shape[0]))
+            self.add(symbols[-1], value)
+        return tuple(symbols)
 
     def evaluate(self, targets: list[ca.MX]) -> list[ca.MX]:
         """Expressions of the symbols at what these stand for."""

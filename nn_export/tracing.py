@@ -22,13 +22,13 @@ from nn_export.program import Port, Program
 # Kept whole: their decompositions lose structure, or derivatives at the far ends.
 _WHOLE = re.compile(
     r"aten\.(gru|lstm|rnn_tanh|rnn_relu|gru_cell|lstm_cell|rnn_tanh_cell|rnn_relu_cell|linear|layer_norm"
-    r"|softplus|silu|mish|celu|logsumexp|log_sigmoid|mv|dot|std)$"
+    r"|softplus|silu|mish|celu|logsumexp|log_sigmoid|mv|dot|std|std_mean|xlogy)$"
 )
 
 
 def trace(
     module: torch.nn.Module,
-    example_inputs: Sequence[torch.Tensor],
+    example_inputs: Sequence[Any],
     *,
     input_names: Sequence[str] | None = None,
     output_names: Sequence[str] | None = None,
@@ -40,8 +40,10 @@ def trace(
     Args:
         module: Any module; its ``forward`` takes tensors and returns a tensor or a tuple, list or
             dictionary of tensors.
-        example_inputs: One tensor for each argument of ``forward``; only their shapes matter.
-        input_names: Names of the inputs. Default: the argument names of ``forward``.
+        example_inputs: One tensor, or nested tuple, list or dictionary of tensors, for each argument of
+            ``forward``; only their shapes matter.
+        input_names: Names of the tensors. Default: the argument names of ``forward``, for a nested one
+            followed by its keys or positions: ``state_h``, ``hx_0``.
         output_names: Names of the outputs. Default: dictionary keys, else ``output_0``, ``output_1`` ...
             (``output`` if there is one).
 
@@ -53,6 +55,7 @@ def trace(
         ControlFlowError: If the module decides by values.
         TrainingModeError: If a layer draws random numbers or uses batch statistics.
         HiddenStateError: If the module writes into a buffer or an input.
+        DynamicShapeError: If the size of a result depends on values.
         DtypeError: If an output is complex or integer, or a result is computed in float32.
         SignatureError: If inputs or names do not fit.
         TraceError: If torch cannot trace the module for another reason.
@@ -82,7 +85,7 @@ def trace(
 
 def to_casadi(
     module: torch.nn.Module,
-    example_inputs: Sequence[torch.Tensor],
+    example_inputs: Sequence[Any],
     *,
     input_names: Sequence[str] | None = None,
     output_names: Sequence[str] | None = None,
@@ -113,19 +116,25 @@ def float64_copy(module: torch.nn.Module) -> torch.nn.Module:
     return copy.deepcopy(module).double().eval()
 
 
-def _examples(module: Any, example_inputs: Any) -> tuple[torch.Tensor, ...]:
+def _examples(module: Any, example_inputs: Any) -> tuple[Any, ...]:
     if not isinstance(module, torch.nn.Module):
         raise SignatureError(f"expected a torch.nn.Module, got {type(module).__name__}")
     if isinstance(example_inputs, torch.Tensor) or not isinstance(example_inputs, Sequence):
         raise SignatureError("example_inputs must be a tuple of tensors, e.g. (x, h)")
-    for i, x in enumerate(example_inputs):
+    for path, x in pytree.tree_flatten_with_path(tuple(example_inputs))[0]:
         if not isinstance(x, torch.Tensor) or not x.is_floating_point():
             kind = x.dtype if isinstance(x, torch.Tensor) else type(x).__name__
-            raise SignatureError(f"example input {i} must be a tensor of real numbers, got {kind}")
-    return tuple(x.detach().to(device="cpu", dtype=torch.float64).clone() for x in example_inputs)
+            at = "_".join(_words(path))
+            raise SignatureError(
+                f"example input {at} must be a tensor of real numbers, got {kind}; e.g. torch.zeros(3)"
+            )
+    copies: tuple[Any, ...] = pytree.tree_map(
+        lambda x: x.detach().to(device="cpu", dtype=torch.float64).clone(), tuple(example_inputs)
+    )
+    return copies
 
 
-def _export(module: torch.nn.Module, examples: tuple[torch.Tensor, ...]) -> torch.export.ExportedProgram:
+def _export(module: torch.nn.Module, examples: tuple[Any, ...]) -> torch.export.ExportedProgram:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # torch's own notes on its internals
         try:
@@ -135,10 +144,10 @@ def _export(module: torch.nn.Module, examples: tuple[torch.Tensor, ...]) -> torc
                 table.pop(op)
             return exported.run_decompositions(table)
         except Exception as error:
-            raise _explain(module, error) from error
+            raise _explain(module, examples, error) from error
 
 
-def _explain(module: torch.nn.Module, error: Exception) -> ExportError:
+def _explain(module: torch.nn.Module, examples: tuple[Any, ...], error: Exception) -> ExportError:
     name, text = type(module).__name__, f"{type(error).__name__}: {error}"
     signs = ("DataDependent", "data-dependent", "Dynamic control flow", "dynamic control flow", "aten.item")
     if any(sign in text for sign in signs):
@@ -148,9 +157,17 @@ def _explain(module: torch.nn.Module, error: Exception) -> ExportError:
             f"{name} decides by the values of its inputs{at}; use torch.where instead of if, and tensors "
             f"instead of float(x) or x.item(). torch says: {text[:600]}"
         )
-    if isinstance(error, TypeError) and "argument" in text:
-        return SignatureError(f"{name}: the example inputs do not fit forward(); torch says: {text[:600]}")
-    return TraceError(f"{name} cannot be traced; check that it runs on the example inputs. {text[:1500]}")
+    try:
+        float64_copy(module)(*examples)
+    except Exception as own:  # whatever the module says of these inputs, the user is to read
+        shapes = [tuple(x.shape) for x in pytree.tree_leaves(examples)]
+        return SignatureError(
+            f"{name} does not run on the example inputs of shapes {shapes}; give one tensor of the right shape "
+            f"for each argument of forward(). torch says: {type(own).__name__}: {str(own)[:600]}"
+        )
+    return TraceError(
+        f"{name} runs, but torch.export cannot trace it; simplify what it names. torch says: {text[:1500]}"
+    )
 
 
 def _identifier(text: str) -> str:
@@ -158,13 +175,15 @@ def _identifier(text: str) -> str:
     return clean if valid_name(clean) else f"v_{clean}".rstrip("_")
 
 
-def _input_names(module: torch.nn.Module, examples: tuple[torch.Tensor, ...]) -> list[str]:
+def _input_names(module: torch.nn.Module, examples: tuple[Any, ...]) -> list[str]:
     bound = inspect.signature(module.forward).bind(*examples)
-    names: list[str] = []
-    for key, value in bound.arguments.items():
-        several = isinstance(value, tuple)
-        names += [f"{key}_{i}" for i in range(len(value))] if several else [key]
-    return [_identifier(n) for n in names]
+    leaves = pytree.tree_flatten_with_path(tuple(bound.arguments.values()))[0]
+    keys = list(bound.arguments)
+    return [_identifier("_".join([keys[int(_words(path)[0])], *_words(path[1:])])) for path, _ in leaves]
+
+
+def _words(path: Sequence[Any]) -> list[str]:
+    return [str(getattr(k, "key", getattr(k, "name", getattr(k, "idx", "")))) for k in path]
 
 
 def _output_names(exported: torch.export.ExportedProgram) -> list[str]:
@@ -173,8 +192,7 @@ def _output_names(exported: torch.export.ExportedProgram) -> list[str]:
     tree = pytree.tree_unflatten(list(range(spec.num_leaves)), spec)
     names = []
     for path, _ in pytree.tree_flatten_with_path(tree)[0]:
-        parts = [getattr(k, "key", getattr(k, "name", getattr(k, "idx", ""))) for k in path]
-        text = "_".join(str(p) for p in parts)
+        text = "_".join(_words(path))
         names.append(_identifier(text if text and not text[0].isdigit() else f"output_{text}"))
     return names
 

@@ -18,6 +18,7 @@ ALLOWED = {
 TORCH = (
     "nn_export/tracing.py",
     "nn_export/convert.py",
+    "nn_export/checks.py",
     "nn_export/comparison.py",
     "nn_export/batched.py",
     "nn_export/torch_bridge.py",

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import casadi as ca
 import numpy as np
 
-from nn_export.operators.value import Value, broadcast, lift, matrix_shape
+from nn_export.operators.value import Value, broadcast, layout, lift
 
 Number = Value | float
 Operator = Callable[..., Value]
@@ -23,8 +23,8 @@ def apply(f: Callable[..., ca.MX], *args: Number) -> Value:
     values = [lift(a) for a in args]
     shape = tuple(int(n) for n in np.broadcast_shapes(*(v.shape for v in values)))
     if 0 in shape:
-        return Value(shape, ca.MX.zeros(*matrix_shape(shape)))
-    size = matrix_shape(shape)
+        return Value(shape, ca.MX.zeros(*layout(shape)))
+    size = layout(shape)
     parts = [v.mx if _number(v.mx) else broadcast(v, shape).mx for v in values]
     mx = f(*parts)
     return Value(shape, mx if mx.shape == size else ca.repmat(mx, *size))
@@ -137,11 +137,6 @@ def gelu(self: Value, *, approximate: str = "none") -> Value:
     return apply(lambda x: 0.5 * x * (1 + ca.tanh(k * (x + 0.044715 * x * x * x))), self)
 
 
-def gate(x: ca.MX) -> ca.MX:
-    """Logistic function through tanh: right to 1e-16 of 1, for factors. Nothing can overflow."""
-    return 0.5 + 0.5 * ca.tanh(0.5 * x)
-
-
 def sigmoid(x: ca.MX) -> ca.MX:
     """Logistic function, right to 1e-16 of itself down to exp(-350); neither it nor its slope overflows."""
     return 1 / (1 + ca.exp(-ca.if_else(x < -350, -350.0, x)))
@@ -167,7 +162,7 @@ def copy(self: Value, *, dtype: str | None = None) -> Value:
     """The same values as another type; integer types cut the fraction off."""
     if dtype == "bool":
         return apply(lambda x: x != 0, self)
-    if dtype in ("int64", "int32", "int16", "int8"):
+    if dtype in ("int64", "int32"):
         return apply(trunc, self)
     if dtype in (None, "float64", "float32"):
         return self
@@ -180,6 +175,23 @@ def _round(x: ca.MX) -> ca.MX:  # half to even, as torch does
     return low + up
 
 
+def _fmax(a: ca.MX, b: ca.MX) -> ca.MX:  # a number wins against NaN
+    return ca.if_else(ca.logic_or(a >= b, b != b), a, b)
+
+
+def _fmin(a: ca.MX, b: ca.MX) -> ca.MX:
+    return ca.if_else(ca.logic_or(a <= b, b != b), a, b)
+
+
+def _xlogy(a: ca.MX, b: ca.MX) -> ca.MX:  # 0 log 0 = 0; slope log b at a = 0
+    void = ca.logic_and(a == 0, b <= 0)
+    return ca.if_else(void, 0.0, a * ca.log(ca.if_else(void, 1.0, b)))
+
+
+def _ldexp(a: ca.MX, b: ca.MX) -> ca.MX:
+    return a * 2.0**b
+
+
 def _table() -> dict[str, Operator]:
     plain: dict[str, Callable[[ca.MX], ca.MX]] = {
         **{name: getattr(ca, name) for name in ("sin", "cos", "tan", "tanh", "exp", "log", "sqrt", "sign")},
@@ -190,7 +202,9 @@ def _table() -> dict[str, Operator]:
         "exp2": lambda x: ca.exp(math.log(2) * x), "log2": lambda x: ca.log(x) / math.log(2),
         "log10": ca.log10, "silu": lambda x: x * sigmoid(x), "mish": lambda x: x * ca.tanh(softplus_mx(x)),
         "log_sigmoid": log_sigmoid, "logical_not": lambda x: x == 0,
-        "isnan": lambda x: x != x,
+        "isnan": lambda x: x != x, "isinf": lambda x: ca.fabs(x) == math.inf,
+        "signbit": lambda x: ca.logic_or(x < 0, 1 / x < 0),
+        "bitwise_not": lambda x: x == 0, "sgn": ca.sign,
     }  # fmt: skip
     pairs: dict[str, Callable[[ca.MX, ca.MX], ca.MX]] = {
         "mul.Tensor": lambda a, b: a * b, "div.Tensor": lambda a, b: a / b, "atan2.default": ca.atan2,
@@ -202,6 +216,8 @@ def _table() -> dict[str, Operator]:
         "bitwise_and.Tensor": lambda a, b: ca.logic_and(a, b),
         "bitwise_or.Tensor": lambda a, b: ca.logic_or(a, b), "logical_and.default": ca.logic_and,
         "logical_or.default": ca.logic_or, "logical_xor.default": lambda a, b: (a != 0) != (b != 0),
+        "bitwise_xor.Tensor": lambda a, b: (a != 0) != (b != 0), "fmax.default": _fmax,
+        "fmin.default": _fmin, "xlogy.Tensor": _xlogy, "ldexp.Tensor": _ldexp,
     }  # fmt: skip
     comparisons: dict[str, Callable[[ca.MX, ca.MX], ca.MX]] = {
         "gt": lambda a, b: a > b, "ge": lambda a, b: a >= b, "lt": lambda a, b: a < b,

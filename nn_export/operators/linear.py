@@ -6,18 +6,26 @@ import math
 from collections.abc import Callable, Sequence
 
 import casadi as ca
+import numpy as np
 
 from nn_export.operators.elementwise import add, apply
-from nn_export.operators.reduce import mean
-from nn_export.operators.value import Value, from_matrix, matrix
+from nn_export.operators.reduce import mean, sum_, var
+from nn_export.operators.value import Value, arrange, concatenate, from_matrix, matrix, move
 
 
 def matmul(a: Value, b: Value) -> Value:
-    """Product of two matrices, or of two stacks of one matrix each."""
-    if any(n != 1 for n in (*a.shape[:-2], *b.shape[:-2])) or a.shape[-1] != b.shape[-2]:
+    """Product of two matrices, or of two equally long stacks of matrices."""
+    if a.shape[:-2] != b.shape[:-2] or a.shape[-1] != b.shape[-2]:
         raise ValueError(f"product of shapes {a.shape} and {b.shape}")
-    product = ca.mtimes(matrix(a, *a.shape[-2:]), matrix(b, *b.shape[-2:]))
-    return from_matrix(product, (*a.shape[:-1], b.shape[-1]))
+    stacks = []
+    for value in (a, b):
+        positions = value.positions.reshape(-1, *value.shape[-2:])
+        stacks.append([arrange(value.mx, p) for p in positions])
+    products = [
+        from_matrix(ca.mtimes(x, y), (1, x.shape[0], y.shape[1])) for x, y in zip(*stacks, strict=True)
+    ]
+    joined = concatenate(products, 0)
+    return move(joined, joined.positions.reshape((*a.shape[:-1], b.shape[-1])))
 
 
 def mm(self: Value, mat2: Value) -> Value:
@@ -98,9 +106,46 @@ def batch_norm(
     return result, empty, empty
 
 
+def trilinear(
+    i1: Value,
+    i2: Value,
+    i3: Value,
+    expand1: Sequence[int],
+    expand2: Sequence[int],
+    expand3: Sequence[int],
+    sumdim: Sequence[int],
+    unroll_dim: int = 1,
+) -> Value:
+    """Product of three tensors with new axes, summed over some: what ``nn.Bilinear`` is made of."""
+    parts = []
+    for value, axes in ((i1, expand1), (i2, expand2), (i3, expand3)):
+        positions = value.positions
+        for axis in sorted(axes):
+            positions = np.expand_dims(positions, axis)
+        parts.append(move(value, positions))
+    return sum_(apply(lambda a, b, c: a * b * c, *parts), sumdim)
+
+
+def group_norm(
+    input: Value, weight: Value | None, bias: Value | None, N: int, C: int, HxW: int, group: int, eps: float
+) -> tuple[Value, ...]:
+    """Groups of channels to mean 0 and variance 1, then scaled and shifted by channel."""
+    parts = move(input, input.positions.reshape(N, group, C // group * HxW))
+    normed = layer_norm(parts, parts.shape[-1:], eps=eps)
+    result = move(normed, normed.positions.reshape(input.shape))
+    channels = (1, C, *(1 for _ in input.shape[2:]))
+    if weight is not None:
+        result = apply(lambda x, w: x * w, result, Value(channels, weight.mx))
+    if bias is not None:
+        result = add(result, Value(channels, bias.mx))
+    centre, spread = mean(parts, [2]), var(parts, [2], correction=0)
+    return result, centre, apply(lambda v: 1 / ca.sqrt(v + eps), spread)
+
+
 OPERATORS: dict[str, Callable[..., Value | tuple[Value, ...]]] = {
     "aten.mm.default": mm, "aten.bmm.default": mm, "aten.mv.default": mv, "aten.dot.default": dot,
     "aten.addmm.default": addmm, "aten.addmv.default": addmv, "aten.linear.default": linear,
-    "aten.layer_norm.default": layer_norm,
+    "aten.layer_norm.default": layer_norm, "aten._trilinear.default": trilinear,
+    "aten.native_group_norm.default": group_norm,
     "aten._native_batch_norm_legit_no_training.default": batch_norm,
 }  # fmt: skip

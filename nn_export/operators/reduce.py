@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import reduce
+from itertools import accumulate
 
 import casadi as ca
 import numpy as np
 
-from nn_export.operators.elementwise import apply
-from nn_export.operators.value import Value, arrange, from_matrix
+from nn_export.operators.elementwise import add, apply
+from nn_export.operators.value import Value, arrange, concatenate, from_matrix, move
 
 
 def reduced(f: Callable[[ca.MX], ca.MX], self: Value, dim: Sequence[int] | None, keepdim: bool) -> Value:
@@ -37,12 +38,25 @@ def _smallest(x: ca.MX) -> ca.MX:
     return reduce(ca.fmin, _columns(x))
 
 
+def _shared(x: ca.MX, best: ca.MX) -> ca.MX:
+    """``best`` of the rows of ``x``, written as the mean of the elements that equal it."""
+    if x.shape[1] == 1:
+        return x
+    mask = x == ca.repmat(best, 1, x.shape[1])
+    count = ca.sum2(mask)
+    return ca.sum2(ca.if_else(mask, x, 0.0)) / count
+
+
 def _product(x: ca.MX) -> ca.MX:
     return reduce(lambda a, b: a * b, _columns(x))
 
 
 def _root(x: ca.MX) -> ca.MX:  # square root with slope 0 at 0, as torch's norms have
     return ca.if_else(x > 0, ca.sqrt(ca.if_else(x > 0, x, 1.0)), 0.0)
+
+
+def _power(x: ca.MX, e: float) -> ca.MX:  # slope 0 at 0
+    return ca.if_else(x > 0, ca.if_else(x > 0, x, 1.0) ** e, 0.0)
 
 
 def sum_(self: Value, dim: Sequence[int] | None = None, keepdim: bool = False) -> Value:
@@ -81,13 +95,13 @@ def std(
 
 
 def amax(self: Value, dim: Sequence[int] = (), keepdim: bool = False) -> Value:
-    """Largest over axes."""
-    return reduced(_largest, self, dim, keepdim)
+    """Largest over axes; equal ones share the slope, as in torch."""
+    return reduced(lambda x: _shared(x, _largest(x)), self, dim, keepdim)
 
 
 def amin(self: Value, dim: Sequence[int] = (), keepdim: bool = False) -> Value:
-    """Smallest over axes."""
-    return reduced(_smallest, self, dim, keepdim)
+    """Smallest over axes; equal ones share the slope, as in torch."""
+    return reduced(lambda x: _shared(x, _smallest(x)), self, dim, keepdim)
 
 
 def max_all(self: Value) -> Value:
@@ -111,14 +125,64 @@ def prod_dim(self: Value, dim: int, keepdim: bool = False) -> Value:
 
 
 def norm(self: Value, ord: float = 2, dim: Sequence[int] | None = None, keepdim: bool = False) -> Value:
-    """Vector norm of order 1, 2 or infinity."""
+    """Vector norm of order 1 or above, infinity, or minus infinity."""
     if ord == 2:
         return reduced(lambda x: _root(ca.sum2(x * x)), self, dim, keepdim)
     if ord == 1:
         return reduced(lambda x: ca.sum2(ca.fabs(x)), self, dim, keepdim)
     if ord == math.inf:
         return reduced(lambda x: _largest(ca.fabs(x)), self, dim, keepdim)
-    raise ValueError(f"norm of order {ord}; known are 1, 2 and infinity")
+    if ord == -math.inf:
+        return reduced(lambda x: _smallest(ca.fabs(x)), self, dim, keepdim)
+    if ord > 1:
+        return reduced(lambda x: _power(ca.sum2(ca.fabs(x) ** ord), 1 / ord), self, dim, keepdim)
+    raise ValueError(f"norm of order {ord}; known are -infinity, 1 and what is above 1")
+
+
+def std_dim(self: Value, dim: Sequence[int] | None, unbiased: bool = True, keepdim: bool = False) -> Value:
+    """Standard deviation over axes."""
+    return std(self, dim, correction=1 if unbiased else 0, keepdim=keepdim)
+
+
+def var_mean(
+    self: Value, dim: Sequence[int] | None = None, *, correction: float = 1, keepdim: bool = False
+) -> tuple[Value, Value]:
+    """Variance and mean over axes."""
+    return var(self, dim, correction=correction, keepdim=keepdim), mean(self, dim, keepdim)
+
+
+def std_mean(
+    self: Value, dim: Sequence[int] | None, unbiased: bool = True, keepdim: bool = False
+) -> tuple[Value, Value]:
+    """Standard deviation and mean over axes."""
+    return std_dim(self, dim, unbiased, keepdim), mean(self, dim, keepdim)
+
+
+def _first(better: Callable[[ca.MX, ca.MX], ca.MX]) -> Callable[..., tuple[Value, Value]]:
+    def operator(self: Value, dim: int, keepdim: bool = False) -> tuple[Value, Value]:
+        def f(x: ca.MX, position: bool) -> ca.MX:
+            parts = _columns(x)
+            best, at = parts[0], ca.MX.zeros(x.shape[0], 1)
+            for k, part in enumerate(parts[1:], 1):
+                taken = better(part, best)
+                best, at = ca.if_else(taken, part, best), ca.if_else(taken, float(k), at)
+            return at if position else best
+
+        values = reduced(lambda x: f(x, False), self, [dim], keepdim)
+        return values, reduced(lambda x: f(x, True), self, [dim], keepdim)
+
+    return operator
+
+
+def any_(self: Value, dim: Sequence[int] | int | None = None, keepdim: bool = False) -> Value:
+    """True where one is not zero."""
+    axes = [dim] if isinstance(dim, int) else dim
+    return reduced(lambda x: reduce(ca.logic_or, [c != 0 for c in _columns(x)]), self, axes, keepdim)
+
+
+def dist(self: Value, other: Value, p: float = 2) -> Value:
+    """Norm of a difference."""
+    return norm(add(self, other, alpha=-1), p)
 
 
 def logsumexp(self: Value, dim: Sequence[int], keepdim: bool = False) -> Value:
@@ -147,6 +211,14 @@ def softmax(self: Value, dim: int, half_to_float: bool) -> Value:
     return apply(lambda a, s: a / s, e, sum_(e, [dim], True))
 
 
+def cumprod(self: Value, dim: int) -> Value:
+    """Running product along an axis."""
+    if not self.shape:
+        return self
+    parts = [move(self, self.positions.take([k], axis=dim)) for k in range(self.shape[dim])]
+    return concatenate(list(accumulate(parts, lambda a, b: apply(lambda x, y: x * y, a, b))), dim)
+
+
 def cumsum(self: Value, dim: int) -> Value:
     """Running sum along an axis."""
     if not self.shape:
@@ -162,7 +234,7 @@ def _back(value: Value, dim: int, size: tuple[int, int]) -> np.ndarray:
     return np.moveaxis(value.positions, -1, dim).reshape(size)
 
 
-OPERATORS: dict[str, Callable[..., Value]] = {
+OPERATORS: dict[str, Callable[..., Value | tuple[Value, ...]]] = {
     "aten.sum.default": sum_all, "aten.sum.dim_IntList": sum_, "aten.mean.dim": mean,
     "aten.mean.default": mean, "aten.var.correction": var, "aten.std.correction": std,
     "aten.amax.default": amax,
@@ -170,4 +242,8 @@ OPERATORS: dict[str, Callable[..., Value]] = {
     "aten.prod.default": prod, "aten.prod.dim_int": prod_dim, "aten.linalg_vector_norm.default": norm,
     "aten.logsumexp.default": logsumexp, "aten._softmax.default": softmax,
     "aten._log_softmax.default": log_softmax, "aten.cumsum.default": cumsum,
+    "aten.cumprod.default": cumprod, "aten.std.dim": std_dim, "aten.var_mean.correction": var_mean,
+    "aten.std_mean.dim": std_mean,
+    "aten.max.dim": _first(lambda a, b: a > b), "aten.min.dim": _first(lambda a, b: a < b),
+    "aten.any.default": any_, "aten.any.dim": any_, "aten.any.dims": any_, "aten.dist.default": dist,
 }  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -121,6 +122,84 @@ def pad(self: Value, pad: Sequence[int], value: float = 0.0) -> Value:
     return move(flat, row_major[positions])
 
 
+def unfold(self: Value, dimension: int, size: int, step: int) -> Value:
+    """Windows of an axis, as a new last axis."""
+    p = np.lib.stride_tricks.sliding_window_view(self.positions, size, axis=dimension)
+    axis = dimension % len(self.shape)
+    return move(self, p[(slice(None),) * axis + (slice(None, None, step),)])
+
+
+def gather(self: Value, dim: int, index: Value) -> Value:
+    """Entries of an axis by a constant tensor of positions."""
+    chosen = numbers(index).astype(int)
+    at: list[np.ndarray] = list(np.indices(chosen.shape))
+    at[dim] = chosen
+    return move(self, self.positions[tuple(at)])
+
+
+def embedding(weight: Value, indices: Value, padding_idx: int = -1) -> Value:
+    """Rows by constant positions."""
+    return move(weight, weight.positions[numbers(indices).astype(int)])
+
+
+def _written(self: Value, where: np.ndarray, src: Value) -> Value:
+    """``self`` with the elements marked by their flat positions in ``where`` taken from ``src``."""
+    source = broadcast(src, where.shape)
+    flat = concatenate([view(self, [-1]), view(source, [-1])], 0)
+    chosen = np.arange(math.prod(self.shape))
+    chosen[where.reshape(-1)] = chosen.size + np.arange(where.size)
+    return move(flat, chosen.reshape(self.shape))
+
+
+def _places(self: Value) -> np.ndarray:
+    return np.arange(math.prod(self.shape)).reshape(self.shape)
+
+
+def slice_scatter(
+    self: Value, src: Value, dim: int = 0, start: int | None = None, end: int | None = None, step: int = 1
+) -> Value:
+    """A copy with part of an axis replaced."""
+    key: list[slice] = [slice(None)] * len(self.shape)
+    key[dim] = slice(start, None if end is not None and end > LONGEST else end, step)
+    return _written(self, _places(self)[tuple(key)], src)
+
+
+def select_scatter(self: Value, src: Value, dim: int, index: int) -> Value:
+    """A copy with one entry of an axis replaced."""
+    return _written(self, np.asarray(_places(self).take(index, axis=dim)), src)
+
+
+def index_put(self: Value, indices: Sequence[Value | None], values: Value) -> Value:
+    """A copy with elements at constant positions replaced, each at most once."""
+    key = tuple(slice(None) if i is None else numbers(i).astype(int) for i in indices)
+    where = _places(self)[key]
+    if np.unique(where).size < where.size:
+        raise ValueError("a position is written twice; the result would depend on the order")
+    return _written(self, where, values)
+
+
+def scatter(self: Value, dim: int, index: Value, src: Value) -> Value:
+    """A copy with entries of an axis at constant positions replaced, each at most once."""
+    chosen = numbers(index).astype(int)
+    at: list[np.ndarray] = list(np.indices(chosen.shape))
+    at[dim] = chosen
+    where = _places(self)[tuple(at)]
+    if np.unique(where).size < where.size:
+        raise ValueError("a position is written twice; the result would depend on the order")
+    cut = tuple(slice(n) for n in chosen.shape)
+    return _written(self, where, move(src, src.positions[cut]))
+
+
+def overwrite(self: Value, src: Value) -> Value:
+    """``src`` in the shape of ``self``."""
+    return broadcast(src, self.shape)
+
+
+def empty(size: Sequence[int], *, dtype: str = "float64") -> Value:
+    """Memory that was not written yet: NaN, so that what is never written shows."""
+    return broadcast(constant(math.nan), tuple(size))
+
+
 def full(size: Sequence[int], fill_value: float, *, dtype: str = "float64") -> Value:
     """A constant tensor; a float32 one holds the number that float32 can."""
     number = float(np.float32(fill_value)) if dtype == "float32" else float(fill_value)
@@ -138,8 +217,11 @@ def scalar_tensor(s: float, *, dtype: str = "float64") -> Value:
 
 
 def arange(start: float, end: float, step: float = 1, *, dtype: str = "float64") -> Value:
-    """Equally spaced numbers."""
-    return constant(np.arange(start, end, step))
+    """Equally spaced numbers; in float32 only those that float32 holds exactly."""
+    values = np.arange(start, end, step)
+    if dtype == "float32" and np.any(values.astype(np.float32) != values):
+        raise ValueError("arange in float32; use dtype=torch.float64 there")
+    return constant(values)
 
 
 OPERATORS: dict[str, Callable[..., Value | tuple[Value, ...]]] = {
@@ -154,4 +236,8 @@ OPERATORS: dict[str, Callable[..., Value | tuple[Value, ...]]] = {
     "aten.split_with_sizes.default": split_with_sizes, "aten.constant_pad_nd.default": pad,
     "aten.full.default": full, "aten.full_like.default": full_like,
     "aten.scalar_tensor.default": scalar_tensor, "aten.arange.start_step": arange,
+    "aten.unfold.default": unfold, "aten.gather.default": gather, "aten.embedding.default": embedding,
+    "aten.slice_scatter.default": slice_scatter, "aten.select_scatter.default": select_scatter,
+    "aten.index_put.default": index_put, "aten.scatter.src": scatter, "aten.copy.default": overwrite,
+    "aten.empty.memory_format": empty,
 }  # fmt: skip

@@ -1,8 +1,9 @@
 """Tensors of any rank held as dense CasADi matrices.
 
-A tensor is stored without its axes of size 1, so at most two axes remain: none is a 1 x 1 matrix, one
-of n a column n x 1, two a matrix r x c. Every movement of data (slicing, reshaping, broadcasting ...)
-is one selection of elements, found by doing the movement on an array of positions.
+A tensor is stored without its axes of size 1: none left is a 1 x 1 matrix, one of n a column n x 1, two a
+matrix r x c; of more, which inputs and outputs cannot have, the last are the columns. Every movement of
+data (slicing, reshaping, broadcasting ...) is one selection of elements, found by doing the movement on an
+array of positions.
 """
 
 from __future__ import annotations
@@ -30,13 +31,28 @@ def matrix_shape(shape: Shape) -> tuple[int, int]:
         >>> matrix_shape((1, 3)), matrix_shape((4, 1, 2)), matrix_shape(()), matrix_shape((0,))
         ((3, 1), (4, 2), (1, 1), (0, 1))
     """
+    if sum(n != 1 for n in shape) > 2:
+        raise ShapeError(
+            f"shape {shape} has more than two axes longer than 1; export one sample, not a batch"
+        )
+    return layout(shape)
+
+
+def layout(shape: Shape) -> tuple[int, int]:
+    """As :func:`matrix_shape`, for tensors inside a graph, which may have more axes.
+
+    Raises:
+        ShapeError: If there are more than 2**24 elements.
+
+    Example:
+        >>> layout((4, 1, 2)), layout((4, 3, 2))
+        ((4, 2), (12, 2))
+    """
     if math.prod(shape) > MAX_ELEMENTS:
         raise ShapeError(f"a value of shape {shape} is too large: at most {MAX_ELEMENTS} elements")
     kept = [n for n in shape if n != 1]
     if len(kept) > 2:
-        raise ShapeError(
-            f"shape {shape} has more than two axes longer than 1; export one sample, not a batch"
-        )
+        return math.prod(kept[:-1]), kept[-1]
     rows, columns = (*kept, 1, 1)[:2]
     return rows, columns
 
@@ -47,7 +63,7 @@ class Value:
 
     Args:
         shape: Shape in torch.
-        mx: Matrix of ``matrix_shape(shape)``.
+        mx: Matrix of ``layout(shape)``.
 
     Raises:
         ShapeError: If the two do not fit.
@@ -61,7 +77,7 @@ class Value:
     mx: ca.MX
 
     def __post_init__(self) -> None:
-        if self.mx.shape != matrix_shape(self.shape):
+        if self.mx.shape != layout(self.shape):
             raise ShapeError(f"shape {self.shape} does not fit a {self.mx.shape} matrix")
         if not self.mx.is_dense():
             object.__setattr__(self, "mx", ca.densify(self.mx))
@@ -76,7 +92,7 @@ class Value:
 def constant(array: Any) -> Value:
     """The array as a constant value."""
     data = np.asarray(array, dtype=np.float64)
-    rows, columns = matrix_shape(data.shape)
+    rows, columns = layout(data.shape)
     return Value(data.shape, ca.MX(ca.DM(data.reshape(rows, columns))))
 
 
@@ -105,7 +121,7 @@ def arrange(mx: ca.MX, positions: np.ndarray) -> ca.MX:
 
 def move(value: Value, positions: np.ndarray) -> Value:
     """The tensor of ``value``'s elements at ``positions``, which have the new shape."""
-    return Value(positions.shape, arrange(value.mx, positions.reshape(matrix_shape(positions.shape))))
+    return Value(positions.shape, arrange(value.mx, positions.reshape(layout(positions.shape))))
 
 
 def matrix(value: Value, rows: int, columns: int) -> ca.MX:
@@ -117,7 +133,7 @@ def from_matrix(mx: ca.MX, shape: Shape) -> Value:
     """A tensor of this shape from a matrix whose row-major order it has. Inverse of :func:`matrix`."""
     mx = mx if mx.is_dense() else ca.densify(mx)
     positions = np.arange(mx.numel()).reshape(mx.shape, order="F")
-    return Value(shape, arrange(mx, positions.reshape(shape).reshape(matrix_shape(shape))))
+    return Value(shape, arrange(mx, positions.reshape(shape).reshape(layout(shape))))
 
 
 def broadcast(value: Value, shape: Shape) -> Value:
@@ -125,7 +141,7 @@ def broadcast(value: Value, shape: Shape) -> Value:
     if value.shape == shape:
         return value
     if value.mx.numel() == 1:
-        return Value(shape, ca.repmat(value.mx, *matrix_shape(shape)))
+        return Value(shape, ca.repmat(value.mx, *layout(shape)))
     return move(value, np.broadcast_to(value.positions, shape))
 
 
@@ -135,7 +151,7 @@ def concatenate(values: list[Value], axis: int) -> Value:
     offsets = np.cumsum([0] + [v.mx.numel() for v in kept])
     joined = np.concatenate([v.positions + o for v, o in zip(kept, offsets, strict=False)], axis=axis)
     column = ca.vertcat(*[ca.vec(v.mx) for v in kept])
-    return Value(joined.shape, arrange(column, joined.reshape(matrix_shape(joined.shape))))
+    return Value(joined.shape, arrange(column, joined.reshape(layout(joined.shape))))
 
 
 def numbers(value: Value) -> np.ndarray:

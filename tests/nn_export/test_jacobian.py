@@ -75,6 +75,30 @@ class Layer(nn.Module):
         return self.batch(y[0]), last
 
 
+class Several(nn.Module):
+    """Two LSTM cells, the second with the first one's output as input and cell state."""
+
+    def __init__(self, cell):
+        super().__init__()
+        self.first, self.second = cell(2, 4), cell(4, 4, bias=False)
+
+    def forward(self, x, h):
+        a, c = self.first(torch.sin(x), (h[:4], h[4:]))
+        b, d = self.second(a * x.sum(), (h[:4], a + c))
+        return b, d, c
+
+
+class Twice(nn.Module):
+    """The same value as input and as hidden state."""
+
+    def __init__(self):
+        super().__init__()
+        self.cell, self.long = nn.GRUCell(3, 3), nn.LSTMCell(3, 3)
+
+    def forward(self, h):
+        return self.cell(h, h), self.long(h, (h, h))
+
+
 MODULES = {
     "hybrid step": (lambda: Step(6, True), examples(6)),
     "paper's cell": (lambda: Step(6, False), examples(6)),
@@ -84,6 +108,11 @@ MODULES = {
     "no cell": (lambda: nn.Sequential(nn.Linear(3, 70), nn.LayerNorm(70), nn.SiLU(), nn.Linear(70, 2)),
                 (torch.zeros(3),)),
     "lstm": (lambda: nn.LSTMCell(2, 3), (torch.zeros(2),)),
+    "lstm in series": (lambda: Several(nn.LSTMCell), (torch.zeros(2), torch.zeros(8))),
+    "lstm layers": (lambda: nn.LSTM(2, 3, 2, proj_size=2), (torch.zeros(3, 2),)),
+    "rnn layers": (lambda: nn.RNN(2, 3, 2, bidirectional=True), (torch.zeros(3, 2),)),
+    "rnn cell": (lambda: nn.RNNCell(2, 3, nonlinearity="relu"), (torch.zeros(2), torch.zeros(3))),
+    "one value twice": (lambda: Twice(), (torch.zeros(3),)),
 }  # fmt: skip
 
 
@@ -154,3 +183,61 @@ def test_an_exported_cell_still_expands_to_scalars():
     point = [0.1, 0.2], [0.3, 0.4, 0.5]
     # The same operations one by one.
     np.testing.assert_allclose(build(program).expand()(*point), build(program)(*point), rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("kind", ["gru", "lstm", "rnn_tanh", "rnn_relu"])
+@pytest.mark.parametrize("route", ["composed", "called"])
+def test_hessians_of_all_cells_against_torch(kind, route):
+    torch.manual_seed(4)
+    cells = {
+        "gru": nn.GRUCell(2, 3),
+        "lstm": Long(),
+        "rnn_tanh": nn.RNNCell(2, 3),
+        "rnn_relu": nn.RNNCell(2, 3, nonlinearity="relu"),
+    }
+    module, n = cells[kind].double(), 6 if kind == "lstm" else 3
+    program = trace(module, (torch.zeros(2), torch.zeros(n)))
+    z = ca.MX.sym("z", 2 + n)
+    parts = ca.vertsplit(z, [0, 2, 2 + n])
+    weights = np.linspace(-1, 1, n) + 0.3
+    value = build(program)(*parts).T @ weights
+    if route == "called":
+        hessian = ca.hessian(ca.sin(value), z)[0]
+    else:
+        slope = with_jacobian(program)(*parts)[-1].T @ weights
+        hessian = ca.jacobian(ca.cos(value) * slope, z)
+    point = torch.linspace(-0.9, 0.8, 2 + n, dtype=torch.float64)
+    expected = torch.func.hessian(lambda p: torch.sin(module(p[:2], p[2:]) @ torch.tensor(weights)))(point)
+    given = ca.Function("hessian", [z], [hessian])(point.numpy()).full()
+    # Some fifty roundings of numbers of order one.
+    np.testing.assert_allclose(given, expected.detach().numpy(), rtol=0, atol=1e-13)
+
+
+class Long(nn.Module):
+    """An LSTM cell with both states as one vector."""
+
+    def __init__(self):
+        super().__init__()
+        self.cell = nn.LSTMCell(2, 3)
+
+    def forward(self, x, s):
+        return torch.cat(self.cell(x, (s[:3], s[3:])))
+
+
+@pytest.mark.parametrize("direction", ["forward", "adjoint"])
+def test_sweeps_through_a_cell(direction):
+    torch.manual_seed(5)
+    module = Long().double()
+    function = build(trace(module, (torch.zeros(2), torch.zeros(6))))
+    x, s = torch.tensor([0.3, -0.4]).double(), torch.linspace(-1, 1, 6).double()
+    dx, ds = torch.tensor([0.7, 0.2]).double(), torch.linspace(0.5, -0.3, 6).double()
+    by = [ca.MX.sym("x", 2), ca.MX.sym("s", 6)]
+    if direction == "forward":
+        expected = torch.func.jvp(module, (x, s), (dx, ds))[1].detach().numpy()
+        swept = ca.jtimes(function(*by), ca.vertcat(*by), np.concatenate([dx, ds]))
+    else:
+        expected = torch.cat(torch.func.vjp(module, x, s)[1](ds)).detach().numpy()
+        swept = ca.jtimes(function(*by), ca.vertcat(*by), ds.numpy(), True)
+    given = ca.Function("swept", by, [swept])(x.numpy(), s.numpy()).full().ravel()
+    # Some fifty roundings of numbers of order one.
+    np.testing.assert_allclose(given, expected, rtol=0, atol=1e-14)

@@ -1,0 +1,51 @@
+"""The table of operators as a document: ``python -m nn_export.operators.table > docs/operators.md``."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+from nn_export.operators import OPERATORS, elementwise, linear, recurrent, reduce, shape
+
+GROUPS: dict[str, Mapping[str, Any]] = {
+    "Element by element, with broadcasting": elementwise.OPERATORS,
+    "Moving elements, constants": shape.OPERATORS,
+    "Products, linear layers, normalisations": linear.OPERATORS,
+    "Reductions": reduce.OPERATORS,
+    "Recurrent layers and cells": recurrent.OPERATORS,
+}
+HEAD = """# Operators
+
+Made from the code: `python -m nn_export.operators.table > docs/operators.md`. A module exports if `torch.export`
+reduces it to these. What is not here is refused by name, and so is any argument that is not in the third column.
+"""
+
+
+def document() -> str:
+    """The table as Markdown.
+
+    Example:
+        >>> document().splitlines()[0]
+        '# Operators'
+    """
+    parts = [HEAD]
+    for title, group in GROUPS.items():
+        parts.append(f"## {title}\n\n| operator | does | arguments |\n| --- | --- | --- |")
+        parts += [_row(name) for name in sorted(group)]
+        parts.append("")
+    return "\n".join(parts)
+
+
+def _row(name: str) -> str:
+    f = OPERATORS[name]
+    words = (f.__doc__ or "").strip().splitlines()
+    text = words[0].rstrip(".") if words else "as in torch"
+    text = text.replace("``", "`").replace("|", "\\|")
+    arguments = ", ".join(p for p in inspect.signature(f).parameters)
+    return f"| `{name.removeprefix('aten.').removesuffix('.default')}` | {text} | {arguments} |"
+
+
+if __name__ == "__main__":
+    sys.stdout.write(document())
