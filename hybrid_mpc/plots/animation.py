@@ -144,7 +144,8 @@ def _checked(path: Path, t: Array, x: Array, plans: Array, dt: float, draw: Draw
     if not np.all(np.isfinite(x)) or not np.all(np.diff(t) > 0) or not np.all(np.isfinite(t)):
         raise InputError(f"animation {path}: times must increase and the true states be finite; cut the loop")
     first = draw(x[0])
-    others = [draw(state) for state in x[:: max(1, n // 50)]]
+    ends = plans[:, -1][np.all(np.isfinite(plans[:, -1]), axis=1)]
+    others = [draw(state) for states in (x, ends) for state in states[:: max(1, n // 50)]]
     if any(len(lines) != len(first) for lines in others):
         raise InputError(f"animation {path}: draw must return the same number of lines for every state")
     moving = tuple(any(not np.array_equal(o[i], line) for o in others) for i, line in enumerate(first))
@@ -305,9 +306,8 @@ class _Scene:
         self._clock.set_text(f"t = {loop.t[k]:.2f} s")
         _place(self._machine, loop.draw(loop.x[k]))
         later = np.flatnonzero(ahead)[1:]
-        chosen = (
-            later[np.unique(np.linspace(0, len(later) - 1, GHOSTS + 1)[1:].astype(int))] if len(later) else []
-        )
+        even = np.linspace(0, len(later) - 1, GHOSTS + 1)[1:].astype(int)
+        chosen = later[np.unique(even)] if len(later) else later
         drawn: list[Sequence[Array] | None]
         drawn = [loop.draw(loop.plans[k, j]) for j in reversed(chosen)]  # the farthest first, the faintest
         hidden = GHOSTS - len(drawn)
@@ -326,7 +326,7 @@ def _place(bodies: Sequence[tuple[int, Line2D | Polygon]], lines: Sequence[Array
 
 
 def _closed(line: Array) -> bool:
-    return len(line) > 2 and bool(np.array_equal(line[0], line[-1]))
+    return len(line) > 2 and bool(np.allclose(line[0], line[-1], rtol=0.0, atol=1e-9))
 
 
 def _write(path: Path, pictures: Iterator[Image.Image], durations: Sequence[int]) -> None:
