@@ -339,7 +339,7 @@ def _write(path: Path, pictures: Iterator[Image.Image], durations: Sequence[int]
         sheet.paste(picture, (0, i * height))
     palette = sheet.quantize(128, dither=Image.Dither.NONE)
     colours = np.array(palette.getpalette()).reshape(-1, 3)
-    colours[np.argmax(colours.sum(axis=1))] = 255  # the paper is white, not the mean of what is nearly white
+    colours[colours.min(axis=1) >= 248] = 255  # Pillow looks colours up coarsely: keep the paper white
     palette.putpalette(colours.ravel().tolist())
     flat = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in frames]
     buffer = io.BytesIO()

@@ -18,6 +18,7 @@ from hybrid_mpc.plots.style import (
     colour,
     name_of,
     new_figure,
+    number,
     plain,
     plain_log,
     shared_legend,
@@ -70,7 +71,7 @@ def costs(table: Costs) -> Figure:
             f"plot of the costs: none of the tasks {sorted(table)} has a positive cost of 'oracle' to compare with"
         )
     present = _ordered({name for row in relative.values() for name in row})
-    height = 0.32 + 0.13 * len(present)
+    height = 0.25 + 0.11 * len(present)
     figure, axes = new_figure(1, 1, size=(9, 1.5 + height * len(table)))
     ax = axes[0, 0]
     log = max(points) > 5 * min(points) > 0
@@ -80,9 +81,8 @@ def costs(table: Costs) -> Figure:
         if k:
             ax.axhline(k - 0.5, color="#dddddd", linewidth=0.8, zorder=1)
         if not row:
-            ax.text(
-                0.02, k, "no cost of the oracle", transform=ax.get_yaxis_transform(), color=FAINT, va="center"
-            )
+            note, at = "no cost of the oracle", ax.get_yaxis_transform()
+            ax.text(0.98, k, note, transform=at, color=FAINT, fontsize=9, ha="right", va="center")
         for name, (mean, half) in row.items():
             at = k + 0.74 * ((present.index(name) + 0.5) / len(present) - 0.5)
             left = max(mean - half, lowest) if log else mean - half
@@ -115,8 +115,8 @@ def _relative(row: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, 
 def strokes(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Errors of speed and instant at the ball over the target speed: every stroke, and the mean of its speed.
 
-    Bands show the targets of 1 % and 10 ms. A stroke that never came past the ball (NaN) is counted beside
-    the controller's name. An axis is logarithmic beyond the band on both sides where the errors span more than
+    Bands show the targets of 1 % and 10 ms. The legend gives each controller's mean absolute errors over all
+    speeds, and how many strokes never came past the ball (NaN, in neither mean). An axis is logarithmic beyond the band on both sides where the errors span more than
     ten times of it.
 
     Args:
@@ -142,23 +142,31 @@ def strokes(rows: Sequence[Mapping[str, Any]]) -> Figure:
         (axes[1, 0], 2, "timing error [ms]", TIMING_TARGET, "ms"),
     )
     speeds = np.unique(np.concatenate([values[:, 0] for values in data.values()]))
-    apart = float(np.min(np.diff(speeds))) if len(speeds) > 1 else 1.0
     for ax, column, label, target, unit in panels:
         ax.axhspan(-target, target, color="#009E73", alpha=0.13, linewidth=0)
         title_axes(ax, f"target: within {target:g} {unit}")
         ax.axhline(0.0, color=FAINT, linewidth=0.8)
         for i, name in enumerate(present):
-            shift = 0.6 * apart * ((i + 0.5) / len(present) - 0.5)
-            _cloud(ax, data[name][:, 0], data[name][:, column], name, shift)
+            place = np.searchsorted(speeds, data[name][:, 0]) + 0.72 * ((i + 0.5) / len(present) - 0.5)
+            _cloud(ax, place, data[name][:, column], name)
         ax.set_ylabel(label)
         _scale(ax, np.concatenate([values[:, column] for values in data.values()]), target)
     axes[1, 0].set_xlabel("target speed of the club [rad/s]")
-    axes[1, 0].set_xticks(speeds, [f"{v:g}" for v in speeds])
+    axes[1, 0].set_xticks(range(len(speeds)), [f"{v:g}" for v in speeds])
+    axes[1, 0].set_xlim(-0.5, len(speeds) - 0.5)
     figure.align_ylabels([axes[0, 0], axes[1, 0]])
-    missed = {name: int(np.sum(~np.all(np.isfinite(data[name]), axis=1))) for name in present}
-    notes = {n: f" ({missed[n]} of {len(data[n])} missed)" for n in present if missed[n]}
-    _legend(figure, axes[0, 0], present, notes)
+    _legend(figure, axes[0, 0], present, {name: _note(data[name]) for name in present}, columns=2)
     return figure
+
+
+def _note(values: Array) -> str:
+    """Mean absolute errors of a controller's strokes, and how many never came past the ball."""
+    found = values[np.all(np.isfinite(values), axis=1)]
+    missed = f", {len(values) - len(found)} of {len(values)} missed" if len(found) < len(values) else ""
+    if not len(found):
+        return f": all {len(values)} missed"
+    speed, timing = (number(float(mean)) for mean in np.mean(np.abs(found[:, 1:]), axis=0))
+    return f": mean |error| {speed} %, {timing} ms{missed}"
 
 
 def _by_controller(rows: Sequence[Mapping[str, Any]]) -> dict[str, Array]:
@@ -183,14 +191,14 @@ def _by_controller(rows: Sequence[Mapping[str, Any]]) -> dict[str, Array]:
     return {name: np.array(values) * scale for name, values in data.items()}
 
 
-def _cloud(ax: Axes, speed: Array, error: Array, name: str, shift: float) -> None:
-    """Every stroke small and pale; the mean of each target speed large."""
+def _cloud(ax: Axes, place: Array, error: Array, name: str) -> None:
+    """Every stroke small and pale; the mean of each place large."""
     ink = _style(name)["color"]
     found = np.isfinite(error)
-    ax.plot(speed[found] + shift, error[found], ".", color=ink, markersize=4, alpha=0.45, zorder=2.6)
-    for v in np.unique(speed[found]):
-        mean = float(np.mean(error[found & (speed == v)]))
-        ax.plot(v + shift, mean, linestyle="", zorder=4, **_style(name))
+    ax.plot(place[found], error[found], ".", color=ink, markersize=4, alpha=0.45, zorder=2.6)
+    for at in np.unique(place[found]):
+        mean = float(np.mean(error[found & (place == at)]))
+        ax.plot(at, mean, linestyle="", zorder=4, **_style(name))
 
 
 def _scale(ax: Axes, errors: Array, target: float) -> None:
@@ -220,10 +228,14 @@ def _style(name: str) -> dict[str, Any]:
 
 
 def _legend(
-    figure: Figure, ax: Axes, present: Sequence[str], notes: Mapping[str, str] = MappingProxyType({})
+    figure: Figure,
+    ax: Axes,
+    present: Sequence[str],
+    notes: Mapping[str, str] = MappingProxyType({}),
+    columns: int = 3,
 ) -> None:
     """A legend in the order of the controllers, whichever task or stroke each of them has."""
     for name in present:
         label = CONTROLLERS[name][0] if name in CONTROLLERS else plain(name)
         ax.plot([], [], linestyle="", label=label + notes.get(name, ""), **_style(name))
-    shared_legend(figure, columns=3)
+    shared_legend(figure, columns=columns)
