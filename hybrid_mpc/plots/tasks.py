@@ -25,13 +25,13 @@ from hybrid_mpc.plots.style import (
     title_axes,
 )
 
-# Name, role whose colour it takes, marker, filled. With an observer: the same colour, hollow.
+# Name, role whose colour it takes, marker, filled. With a disturbance observer: the same colour, hollow.
 CONTROLLERS: Mapping[str, tuple[str, str, str, bool]] = MappingProxyType(
     {
         "prior": (name_of("prior"), "prior", "o", True),
-        "prior_observer": ("prior with disturbance observer", "prior", "s", False),
+        "prior_observer": ("prior with observer", "prior", "s", False),
         "hybrid": (name_of("hybrid"), "hybrid", "o", True),
-        "hybrid_observer": ("MOPGRNN with disturbance observer", "hybrid", "s", False),
+        "hybrid_observer": ("MOPGRNN with observer", "hybrid", "s", False),
         "oracle": ("oracle, measuring", "oracle", "D", True),
         "oracle_state": ("oracle, true state", "oracle", "D", False),
     }
@@ -116,8 +116,8 @@ def strokes(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Errors of speed and instant at the ball over the target speed: every stroke, and the mean of its speed.
 
     Bands show the targets of 1 % and 10 ms. The legend gives each controller's mean absolute errors over all
-    speeds, and how many strokes never came past the ball (NaN, in neither mean). An axis is logarithmic beyond the band on both sides where the errors span more than
-    ten times of it.
+    speeds, and how many strokes never came past the ball (NaN or None; in no mean). An axis is logarithmic
+    beyond the band on both sides where the errors span more than ten times of it.
 
     Args:
         rows: One mapping a stroke: ``controller``, ``speed_rad_s`` (the target, positive),
@@ -144,7 +144,7 @@ def strokes(rows: Sequence[Mapping[str, Any]]) -> Figure:
     speeds = np.unique(np.concatenate([values[:, 0] for values in data.values()]))
     for ax, column, label, target, unit in panels:
         ax.axhspan(-target, target, color="#009E73", alpha=0.13, linewidth=0)
-        title_axes(ax, f"target: within {target:g} {unit}")
+        title_axes(ax, f"band: target, within {target:g} {unit}; large: mean of a target speed")
         ax.axhline(0.0, color=FAINT, linewidth=0.8)
         for i, name in enumerate(present):
             place = np.searchsorted(speeds, data[name][:, 0]) + 0.72 * ((i + 0.5) / len(present) - 0.5)
@@ -156,6 +156,7 @@ def strokes(rows: Sequence[Mapping[str, Any]]) -> Figure:
     axes[1, 0].set_xlim(-0.5, len(speeds) - 0.5)
     figure.align_ylabels([axes[0, 0], axes[1, 0]])
     _legend(figure, axes[0, 0], present, {name: _note(data[name]) for name in present}, columns=2)
+    figure.legends[0].set_title("mean absolute errors of all strokes", {"size": 9})
     return figure
 
 
@@ -166,7 +167,7 @@ def _note(values: Array) -> str:
     if not len(found):
         return f": all {len(values)} missed"
     speed, timing = (number(float(mean)) for mean in np.mean(np.abs(found[:, 1:]), axis=0))
-    return f": mean |error| {speed} %, {timing} ms{missed}"
+    return f": {speed} %, {timing} ms{missed}"
 
 
 def _by_controller(rows: Sequence[Mapping[str, Any]]) -> dict[str, Array]:

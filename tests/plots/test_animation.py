@@ -88,7 +88,8 @@ def test_ghosts_fade_into_the_future(tmp_path):
     t, x, plans, u = swing(n=2)
 
     def cart(state):
-        return [[state[0], 0.0] + np.array([[-0.02, 0.0], [0.02, 0.0], [0.02, 0.1], [-0.02, 0.0]])]
+        corners = np.array([[-0.02, 0.0], [0.02, 0.0], [0.02, 0.1], [-0.02, 0.0]])
+        return [corners + np.array([state[0], 0.0])]
 
     plans = np.linspace([0.0, 0.0], [1.0, 0.0], 51)[None].repeat(2, axis=0)
     x = plans[:, 0] + [[0.0, 0.0], [1.0, 0.0]]

@@ -111,8 +111,8 @@ def test_strokes_show_units_targets_and_mean_absolute_errors():
         box = ax.patches[0].get_window_extent().transformed(ax.transData.inverted())
         np.testing.assert_allclose([box.y0, box.y1], [-target, target], atol=1e-9)
     assert names(figure) == [
-        "prior, fitted: mean |error| 3.00 %, 3.00 ms",
-        "MOPGRNN (hybrid): mean |error| 0.300 %, 4.00 ms",
+        "prior, fitted: 3.00 %, 3.00 ms",
+        "MOPGRNN (hybrid): 0.300 %, 4.00 ms",
     ]
     assert any(y == pytest.approx(0.1) for _, y in points(upper))  # the signed mean of +0.4 and -0.2 %
 
@@ -122,13 +122,23 @@ def test_strokes_that_missed_are_counted_and_not_drawn(tmp_path):
     figure = strokes(rows)
     assert names(figure) == [
         "prior, fitted: all 1 missed",
-        "MOPGRNN (hybrid): mean |error| 0.400 %, 3.00 ms, 1 of 2 missed",
+        "MOPGRNN (hybrid): 0.400 %, 3.00 ms, 1 of 2 missed",
     ]
     for ax in figure.axes:
         for line in ax.lines:
             assert np.all(np.isfinite(line.get_ydata()))
     assert save(figure, tmp_path / "a.png").exists()
     assert save(strokes(rows[2:]), tmp_path / "b.png").exists()  # no stroke hit at all
+
+
+def test_the_longest_legend_fits_into_the_figure():
+    rows = [stroke(name, error=0.123, timing=0.0456) for name in CONTROLLERS for _ in range(60)]
+    rows += [stroke(name, error=NAN, timing=NAN) for name in CONTROLLERS for _ in range(10)]
+    figure = strokes(rows)
+    figure.canvas.draw()
+    box = figure.legends[0].get_window_extent()
+    assert box.x0 >= 0
+    assert box.x1 <= figure.bbox.width
 
 
 def test_strokes_beyond_ten_bands_are_drawn_on_a_logarithmic_axis():
