@@ -90,7 +90,7 @@ def animate(
         fps: Frames a second at most; also never more than one a sample nor 250 in all.
         position: Signal of ``x[0]``, for its axis. Default: ``x_0`` without a unit.
         inputs: Signals of ``u``. Default: ``u_0, ...`` without units.
-        limits: Lower and upper bounds of the inputs, drawn as lines. Default: none.
+        limits: Lower and upper bounds of the inputs, drawn as lines where finite. Default: none.
         reference: Reference of ``x[0]``, ``(n,)``. Default: none.
 
     Returns:
@@ -104,7 +104,7 @@ def animate(
         >>> import tempfile
         >>> t = np.array([0.0, 0.1])
         >>> x, u, plans = np.array([[0.0], [0.1]]), np.zeros((2, 1)), np.full((2, 4, 1), np.nan)
-        >>> cart = lambda x: [x[0] + np.array([[-0.1, 0.0], [0.1, 0.0]])]
+        >>> cart = lambda x: [np.array([[x[0] - 0.1, 0.0], [x[0] + 0.1, 0.0]])]
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     path = animate(Path(folder) / "a.gif", t, x, plans, dt=0.1, draw=cart, u=u, title="A cart")
         ...     path.read_bytes()[:6]
@@ -270,9 +270,9 @@ class _Scene:
 
     def _input_panel(self, ax: Axes, index: int, signal: Signal, bounds: tuple[float, float] | None) -> None:
         dress(ax)
-        for bound in () if bounds is None else bounds:
+        for bound in filter(math.isfinite, bounds or ()):
             ax.axhline(bound, color=INK, linestyle=":", linewidth=1.1, label="input limits")
-        values = np.append(self._loop.u[:, index], () if bounds is None else bounds)
+        values = np.append(self._loop.u[:, index], bounds or ())
         values = values[np.isfinite(values)]
         low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
         margin = 0.1 * max(high - low, 1e-6)

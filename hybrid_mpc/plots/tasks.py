@@ -147,7 +147,8 @@ def strokes(rows: Sequence[Mapping[str, Any]]) -> Figure:
         title_axes(ax, f"band: target, within {target:g} {unit}; large: mean of a target speed")
         ax.axhline(0.0, color=FAINT, linewidth=0.8)
         for i, name in enumerate(present):
-            place = np.searchsorted(speeds, data[name][:, 0]) + 0.72 * ((i + 0.5) / len(present) - 0.5)
+            beside = 0.72 * ((i + 0.5) / len(present) - 0.5)
+            place = np.searchsorted(speeds, data[name][:, 0]).astype(np.float64) + beside
             _cloud(ax, place, data[name][:, column], name)
         ax.set_ylabel(label)
         _scale(ax, np.concatenate([values[:, column] for values in data.values()]), target)
@@ -156,7 +157,7 @@ def strokes(rows: Sequence[Mapping[str, Any]]) -> Figure:
     axes[1, 0].set_xlim(-0.5, len(speeds) - 0.5)
     figure.align_ylabels([axes[0, 0], axes[1, 0]])
     _legend(figure, axes[0, 0], present, {name: _note(data[name]) for name in present}, columns=2)
-    figure.legends[0].set_title("mean absolute errors of all strokes", {"size": 9})
+    figure.legends[0].set_title("mean absolute errors of the strokes that met the ball")
     return figure
 
 

@@ -134,7 +134,9 @@ def test_a_plan_that_runs_away_does_not_flatten_the_motion(tmp_path):
 
 def test_a_loop_that_stands_still_and_a_single_sample_are_drawn(tmp_path):
     t, x, plans, u = swing(n=3, horizon=2)
-    pictures, _ = frames(write(tmp_path / "a.gif", t, 0 * x, np.nan * plans, np.nan * u, limits=None))
+    pictures, _ = frames(
+        write(tmp_path / "a.gif", t, 0 * x, np.nan * plans, np.nan * u, limits=((-np.inf,), (1.0,)))
+    )
     assert np.any(pictures[0] < 100)
     assert write(tmp_path / "b.gif", t[:1], x[:1], plans[:1], u[:1]).exists()
 
