@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -229,6 +229,7 @@ class Scenario:
         control: The optimal control problem; default: none.
         tasks: Closed-loop tasks.
         budgets: Effort by name.
+        draw: ``x (n_x,) -> polylines (m, 2) [m]`` of the machine, for moving pictures; default: none.
 
     Example:
         >>> import numpy as np
@@ -248,6 +249,7 @@ class Scenario:
     control: ControlSpec | None = None
     tasks: tuple[Task, ...] = ()
     budgets: Mapping[str, Budget] = field(default_factory=lambda: DEFAULT_BUDGETS)
+    draw: Callable[[Array], Sequence[Array]] | None = None
 
 
 def registered_scenarios() -> dict[str, str]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.artifact import Artifact, load_artifact
 from hybrid_mpc.closed_loop import ClosedLoopResult, simulate
+from hybrid_mpc.closed_loop.simulate import Step
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.pipeline.contenders import CONTENDERS, ORACLES, build
 from hybrid_mpc.pipeline.context import Context
@@ -61,10 +62,13 @@ def contest(
     names = [n for n in CONTENDERS if _seeds(n, scenario, budget.seeds, budget.oracle_seeds)]
     common = context.settings.scenario, context.out / "model", dict(noise), context.settings.seed
     results: dict[tuple[str, str, int], ClosedLoopResult] = {}
+    arrays: dict[str, Array] = {}
     for i, task in enumerate(tasks):
         for name in TIMED:
             context.progress.update("timed loops", i, len(tasks), f"{task.name}, {name}")
-            (results[task.name, name, 0],) = loops(*common, task.name, name, (0,))
+            plans: list[Array] = []
+            (results[task.name, name, 0],) = loops(*common, task.name, name, (0,), on_plan=plans.append)
+            arrays[f"{task.name}/{name}/plans"] = np.stack(plans)
     jobs: dict[str, Any] = {}
     for name in reversed(names):  # the slow ones first
         count = _seeds(name, scenario, budget.seeds, budget.oracle_seeds)
@@ -76,7 +80,6 @@ def contest(
         task_name, name, seeds = arguments[-3:]
         results |= {(task_name, name, s): r for s, r in zip(seeds, done[key], strict=True)}
     rows: list[dict[str, Any]] = []
-    arrays: dict[str, Array] = {}
     for task in tasks:
         for (_, name, seed), r in sorted((k, r) for k, r in results.items() if k[0] == task.name):
             rows.append(_row(task, name, seed, r))
@@ -116,6 +119,7 @@ def loops(
     name: str,
     seeds: tuple[int, ...],
     report: Callable[[int, int, str], None] = lambda done, total, text: None,
+    on_plan: Callable[[Array], None] = lambda x: None,
 ) -> list[ClosedLoopResult]:
     """Loops of one task and contender; all contenders share problem, period, horizon and safeguards.
 
@@ -128,6 +132,7 @@ def loops(
         name: Contender.
         seeds: Numbers of the loops; same number, same sensor noise for every contender.
         report: Called with ``(done, total, text)`` as the loops go on.
+        on_plan: Called with the planned states ``(N + 1, n_x)`` of every period.
     """
     scenario, artifact = load_scenario(scenario_name), load_artifact(folder)
     (task,) = tasks_of(scenario, (task_name,))
@@ -137,6 +142,12 @@ def loops(
     estimator, controller = build(name, scenario, artifact, control, noise)
     dt = artifact.models["prior"].dt
     periods, results = round(task.duration / dt), []
+
+    def on_step(step: Step, i: int) -> None:
+        on_plan(step.decision.solution.x)
+        if step.k % 50 == 0:
+            report(i * periods + step.k, len(seeds) * periods, "periods")
+
     for i, seed in enumerate(seeds):
         results.append(
             simulate(
@@ -144,8 +155,7 @@ def loops(
                 dt=dt, duration=task.duration, x0=np.array(task.x0), seed=run_seed * 1000 + seed,
                 monitor=make_monitor(artifact.models["hybrid"], None) if CONTENDERS[name].model == "hybrid" else None,
                 faults=task.faults,
-                on_step=lambda step, i=i: report(  # type: ignore[misc]
-                    i * periods + step.k, len(seeds) * periods, "periods") if step.k % 50 == 0 else None,
+                on_step=lambda step, i=i: on_step(step, i),  # type: ignore[misc]
             )
         )  # fmt: skip
     return results

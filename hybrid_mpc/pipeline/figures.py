@@ -12,8 +12,8 @@ from hybrid_mpc.pipeline.contest import tasks_of
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.identify import MODELS, load_trained
 from hybrid_mpc.pipeline.judge import clean_windows
-from hybrid_mpc.pipeline.results import REPORTED, step_times
-from hybrid_mpc.plots import analysis, data, fit, loops, monitor, save, training
+from hybrid_mpc.pipeline.results import REPORTED, loop_table, step_times, summary
+from hybrid_mpc.plots import analysis, animation, data, fit, loops, monitor, save, tasks, training
 
 Figures = dict[str, list[tuple[Path, str]]]
 """Figure files with their captions by section of the report."""
@@ -23,13 +23,14 @@ SHOWN_RECORDINGS = 4
 
 def draw_all(context: Context) -> Figures:
     """Draw every figure that the run's stages allow into ``figures/``."""
-    parts = (_data, _training, _free_runs, _loops, _timing, _monitor, _analysis)
+    parts = (_data, _training, _free_runs, _overview, _loops, _timing, _monitor, _analysis)
     figures: Figures = {}
     for i, part in enumerate(parts):
         context.progress.update("figures", i, len(parts), part.__name__.strip("_"))
         for section, name, figure, caption in part(context):
             path = save(figure, context.out / "figures" / f"{name}.png")
             figures.setdefault(section, []).append((path, caption))
+    figures.setdefault("control", [])[:0] = _moving(context)
     return figures
 
 
@@ -126,6 +127,55 @@ def _loops(context: Context) -> Any:
             limits=(control.u_min, control.u_max),
         )
         yield "control", f"loop_{task.name}", figure, f"{task.title}, first seed."
+
+
+def _overview(context: Context) -> Any:
+    """Costs of all contenders, errors of the strokes."""
+    control = context.result("control")
+    if "reason" in control:
+        return
+    table = {
+        task: {name: (float(np.mean(cell["cost"])), summary(cell)["cost_ci95"]) for name, cell in row.items()}
+        for task, row in loop_table(control["loops"]).items()
+    }
+    if any("oracle" in row for row in table.values()):
+        finite = {
+            task: {n: (mean, np.nan if half is None else half) for n, (mean, half) in row.items()}
+            for task, row in table.items()
+        }
+        yield (
+            "control",
+            "costs",
+            tasks.costs(finite),
+            (
+                "Closed-loop cost of every controller over the measuring oracle's; lines: 95 % intervals over the seeds."
+            ),
+        )
+    strokes = [{"controller": r["controller"], **r["figures"]} for r in control["loops"] if r["figures"]]
+    if strokes and all({"speed_error_rel", "timing_error_s"} <= set(row) for row in strokes):
+        yield (
+            "control",
+            "strokes",
+            tasks.strokes(strokes),
+            "Strokes at the true crossing; bands: 1 % and 10 ms.",
+        )
+
+
+def _moving(context: Context) -> list[tuple[Path, str]]:
+    """One loop of the hybrid as a moving picture, with what it planned at every instant."""
+    arrays, scenario = context.arrays("control"), context.scenario
+    if scenario.draw is None or scenario.control is None or "reason" in context.result("control"):
+        return []
+    run = tasks_of(scenario, context.budget.tasks)
+    task = next((t for t in run if t.weight is not None), run[0])
+    control, prior = task.control or scenario.control, scenario.prior()
+    own = {k: arrays[f"{task.name}/{REPORTED['hybrid']}/{k}"] for k in ("t", "x", "u", "plans")}
+    path = animation.animate(
+        context.out / "figures" / f"{task.name}.gif", own["t"], own["x"], own["plans"], dt=context.spec.dt,
+        draw=scenario.draw, u=own["u"], title=task.title, position=prior.states[0], inputs=prior.inputs,
+        limits=(control.u_min, control.u_max),
+    )  # fmt: skip
+    return [(path, f"{task.title}: the machine, and in outline what the hybrid MPC plans.")]
 
 
 def _timing(context: Context) -> Any:

@@ -6,12 +6,12 @@ import shlex
 from typing import Any
 
 from hybrid_mpc.files import write_json
+from hybrid_mpc.pipeline.contenders import CONTENDERS
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.figures import Figures, draw_all
 from hybrid_mpc.pipeline.results import collect
 from hybrid_mpc.plots.style import name_of
 from hybrid_mpc.report import KeyFigure, Report, Section, Table, write_report
-from hybrid_mpc.pipeline.contenders import CONTENDERS
 from hybrid_mpc.report.schema import CONTROLLERS, MODELS
 from hybrid_mpc.report.texts import TITLES, paragraphs
 

@@ -20,6 +20,7 @@ from hybrid_mpc.plots.style import number
 
 Cell = str | float | int | bool | None
 _PNG = b"\x89PNG\r\n\x1a\n"
+_GIF = b"GIF8"
 
 
 @dataclass(frozen=True)
@@ -221,8 +222,11 @@ def _figure(section: Section, path: str | Path, caption: str) -> dict[str, Any]:
             f"report, section {section.title!r}: no figure {path}; draw it first, or leave it out"
         )
     content = path.read_bytes()
-    if not content.startswith(_PNG) or len(content) < 24:
-        raise InputError(f"report, section {section.title!r}: figure {path} is no PNG file")
-    width, height = struct.unpack(">II", content[16:24])
+    if content.startswith(_PNG) and len(content) >= 24:
+        kind, (width, height) = "png", struct.unpack(">II", content[16:24])
+    elif content.startswith(_GIF) and len(content) >= 10:
+        kind, (width, height) = "gif", struct.unpack("<HH", content[6:10])
+    else:
+        raise InputError(f"report, section {section.title!r}: figure {path} is no PNG or GIF file")
     data = base64.b64encode(content).decode("ascii")
-    return {"uri": f"data:image/png;base64,{data}", "caption": caption, "width": width, "height": height}
+    return {"uri": f"data:image/{kind};base64,{data}", "caption": caption, "width": width, "height": height}

@@ -134,7 +134,7 @@ def test_install_builds_the_plant_s_faults_in_and_leaves_the_rest():
 
 
 def test_a_plant_s_fault_is_not_silently_ignored_by_a_loop(model, safe):
-    with pytest.raises(InputError, match="install"):
+    with pytest.raises(InputError, match="with_faults"):
         run(model, safe, faults=[Fault(0.0, 1.0, "plant_load", 2.0)])
 
 

@@ -311,7 +311,8 @@ class Normed(torch.nn.Module):
 def test_modules_whose_operators_have_no_slope_alone(module):
     torch.manual_seed(0)
     inputs = (torch.zeros(3, 4),)
-    report = parity(module, to_casadi(module, inputs), inputs, n=6)
+    # torch has no second derivative of its fused attention
+    report = parity(module, to_casadi(module, inputs), inputs, n=6, hessians=False)
     # The package's promise for values and Jacobians.
     assert report.value_rel < 1e-12
     assert report.jacobian_rel < 1e-10

@@ -15,7 +15,7 @@ scenario = dataclasses.replace(scenario, budgets=tiny)
 """
 
 
-def recording(seed: int, seconds: float = 20.0, dt: float = 0.01) -> dict[str, np.ndarray]:
+def recording(seed: int, seconds: float = 12.0, dt: float = 0.01) -> dict[str, np.ndarray]:
     """A pendulum with dry friction (the README's prior has none), by semi-implicit Euler at 1 ms."""
     rng = np.random.default_rng(seed)
     n, fine = round(seconds / dt), round(dt / 1e-3)

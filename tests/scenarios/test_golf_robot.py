@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -18,6 +19,7 @@ from scenarios.golf_robot.nominal import GEAR, PARAMETERS
 from scenarios.golf_robot.oracle import oracle
 from scenarios.golf_robot.prior import GolfRobotPrior
 from scenarios.golf_robot.rig import Rig
+from scenarios.golf_robot.tasks import FOLLOW_THROUGH, IMPACT, impact
 
 WITHOUT_TORCH = """
 import sys
@@ -214,21 +216,50 @@ def test_smoothed_second_differences_are_the_differentiated_angle():
     assert np.convolve(second, smoothing()[::-1], "valid") == pytest.approx(direct, rel=1e-9, abs=1e-6)
 
 
-@pytest.mark.parametrize("task", scenario.tasks, ids=lambda task: task.name)
-def test_tasks_are_feasible_and_consistent(task):
-    t = np.linspace(0, task.duration, 4001)
+FOLLOWED = [task for task in scenario.tasks if task.weight is None]
+STROKES = [task for task in scenario.tasks if task.weight is not None]
+
+
+@pytest.mark.parametrize("task", FOLLOWED, ids=lambda task: task.name)
+def test_references_are_feasible_and_consistent(task):
+    t = np.linspace(0, task.duration, 6001)
     ref = task.reference(t)
-    assert ref.shape == (4001, 2)
-    assert task.duration >= 8
+    assert ref.shape == (6001, 2)
     assert np.abs(ref[:, 0]).max() <= 0.8
     assert ref[0] == pytest.approx(np.array(task.x0), abs=1e-9)
+    # second order differences: error (dt^2 / 6) times the third derivative, 150 rad/s^3 where a move begins
+    assert np.gradient(ref[:, 0], t)[1:-1] == pytest.approx(ref[1:-1, 1], abs=1e-4)
     p = {s.name: s.value for s in PARAMETERS}
-    smooth = task.name == "track_sine"
-    if smooth:  # second order differences: error (dt^2 / 6) times the third derivative, below 1e-4 rad/s
-        assert np.gradient(ref[:, 0], t)[1:-1] == pytest.approx(ref[1:-1, 1], abs=1e-4)
-    acceleration = np.gradient(ref[:, 1], t) if smooth else 0.0
     load = np.abs(p["m"] * ref[:, 1] ** 2 * p["a"] + p["m"] * p["g"] * np.cos(ref[:, 0]))
     friction = p["r"] * 1.5 * p["mu"] * load
-    torque = p["J"] * acceleration + p["m"] * p["g"] * p["a"] * np.sin(ref[:, 0])
+    torque = p["J"] * np.gradient(ref[:, 1], t) + p["m"] * p["g"] * p["a"] * np.sin(ref[:, 0])
     needed = (np.abs(torque) + friction).max() / GEAR  # with half as much friction again
     assert needed < scenario.control.u_max[0]
+
+
+@pytest.mark.parametrize("task", STROKES, ids=lambda task: task.name)
+def test_a_stroke_asks_for_nothing_but_the_impact_and_then_rest(task):
+    t = 0.02 * np.arange(round(task.duration / 0.02))
+    weight, reference = task.weight(t), task.reference(t)
+    (k,) = np.flatnonzero(weight[:, 0] > 1)
+    assert t[k] == pytest.approx(IMPACT)
+    assert t[k] <= task.control.horizon * 0.02 + 1e-9  # the first plan sees it
+    assert not weight[:k].any()
+    assert reference[k] == pytest.approx([0.0, float(task.name.split("_")[1])])
+    assert not np.delete(reference, k, axis=0).any()
+    assert (weight[t > IMPACT + FOLLOW_THROUGH + 0.01] == 1).all()
+    # a miss by 5 mrad and by 10 mrad/s costs 1 each
+    cost = weight[k] * task.control.q * 0.02 * np.array([5e-3, 1e-2]) ** 2
+    assert cost == pytest.approx([1.0, 1.0])
+
+
+def test_an_impact_is_read_off_the_true_crossing():
+    # phi = 0.1 sin(w (t - 1.61)): crosses 10 ms late at 0.1 w; a cubic between samples errs by (w dt)^4 / 384
+    w, t = 10.0, 0.02 * np.arange(150)
+    x = np.column_stack([0.1 * np.sin(w * (t - 1.61)), 0.1 * w * np.cos(w * (t - 1.61))])
+    figures = impact(SimpleNamespace(t=t, x=x, u=np.full((150, 1), 0.5)), 0.8)
+    assert figures["timing_error_s"] == pytest.approx(0.01, abs=1e-5)
+    assert figures["speed_error_rel"] == pytest.approx(0.25, abs=1e-3)
+    assert figures["effort_nm2s"] == pytest.approx(0.25 * 1.6)
+    never = impact(SimpleNamespace(t=t, x=0 * x - 1.0, u=np.zeros((150, 1))), 0.8)
+    assert never["speed_error_rel"] == np.inf
