@@ -148,7 +148,7 @@ def _overview(context: Context) -> Any:
             "costs",
             tasks.costs(finite),
             (
-                "Closed-loop cost of every controller over the measuring oracle's; lines: 95 % intervals over the seeds."
+                "Closed-loop cost of every controller over the measuring oracle's, with 95 % intervals over the seeds."
             ),
         )
     strokes = [{"controller": r["controller"], **r["figures"]} for r in control["loops"] if r["figures"]]
