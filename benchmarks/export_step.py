@@ -5,8 +5,9 @@ turn in one run, one thread, CasADi's machine unless compiled; the best of sever
 
 Values: ``value_plain`` (one graph of matrices), ``value`` (:func:`nn_export.build`), ``value_sx`` (expanded to
 scalars), ``value_onnx`` (the plain graph by way of CasADi's ONNX export and import), ``value_c`` (``build``, compiled).
-Jacobians by (x, h) and u: ``plain``, ``sx``, ``onnx`` (CasADi's derivatives of these), ``casadi`` (CasADi's
-derivatives of what ``build`` makes), ``composed`` (:func:`nn_export.with_jacobian`), ``c`` (that, compiled).
+Jacobians by (x, h) and u: ``plain``, ``sx``, ``onnx`` (CasADi's derivatives of a call of these), ``inlined`` (of the
+plain graph copied into the user's own: CasADi's best way, and the rival that counts), ``casadi`` (CasADi's derivatives
+of what ``build`` makes, inlined too), ``composed`` (:func:`nn_export.with_jacobian`), ``c`` (that, compiled).
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ def routes(
         "value_plain": lambda _: nn_export.build(program, plain=True),
         "value": lambda _: nn_export.build(program, "value"),
         "plain": lambda f: parts.by_casadi(f["value_plain"], inline=False),
+        "inlined": lambda f: parts.by_casadi(f["value_plain"], inline=True),
         "casadi": lambda f: parts.by_casadi(f["value"], inline=True),
         "composed": lambda _: nn_export.with_jacobian(program, blocks),
     }
@@ -93,12 +95,16 @@ def table(row: dict[str, Any]) -> str:
     lines = [
         f"z = {row['z']}: {needed['value']} multiply-adds a value, {needed['jacobian']} with the Jacobian"
     ]
-    lines.append("  route           time [us]  x limit  build [ms]  graph [MB]  work [kB]  plain / route")
+    lines.append(
+        "  route           time [us]  x limit  build [ms]  graph [MB]  work [kB]  plain / route  inlined / route"
+    )
     for name, cost in row["routes"].items():
-        rival = row["routes"]["value_plain" if name.startswith("value") else "plain"]["us"]
+        value = name.startswith("value")
+        rival, best = (row["routes"]["value_plain" if value else key]["us"] for key in ("plain", "inlined"))
         lines.append(
             f"  {name:14}{cost['us']:11.1f}{cost['times_the_limit']:9.1f}{cost['build_ms']:12.1f}"
             f"{cost['graph_MB']:12.2f}{cost['work_kB']:11.1f}{rival / cost['us']:15.1f}"
+            f"{best / cost['us']:17.1f}"
         )
     lines.append(f"  largest difference of a Jacobian from plain: {max(row['difference'].values()):.1e}")
     return "\n".join([*lines, *(f"  left out: {reason}" for reason in row["skipped"])])
