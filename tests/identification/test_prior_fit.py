@@ -51,3 +51,14 @@ def test_the_winner_is_the_best_on_validation(fit):
     errors = [stage["validation_error"] for stage in fit.stages]
     assert min(errors) < 0.2 * errors[0]  # the nominal parameters are 20 to 50 % off
     assert np.isfinite(errors).all()
+
+
+def test_a_fit_goes_on_from_another_with_the_length_that_won(fit):
+    train = [record(seed, seconds=3.0) for seed in range(3)]  # the same motions without noise
+    valid = [record(9, seconds=3.0, role="valid")]
+    again = fit_prior(Pendulum, train, valid, dt=DT, before=fit)
+    assert [stage["stage"] for stage in again.stages] == ["the fit before", fit.best]
+    for name, truth in TRUTH.items():
+        assert (
+            abs(again.values[name] - truth) < 0.1 * abs(fit.values[name] - truth) + 1e-6
+        )  # no noise, no error

@@ -116,6 +116,17 @@ def test_a_figure_that_is_no_png_is_named(tmp_path):
         render(Report("t", "s", "d", "c", (), (Section("Data", (), ((tmp_path / "a.png", "x"),)),)))
 
 
+def test_a_moving_picture_is_embedded_with_its_size(tmp_path):
+    from PIL import Image
+
+    frames = [Image.new("RGB", (30, 20), colour) for colour in ("white", "black")]
+    frames[0].save(tmp_path / "a.gif", save_all=True, append_images=frames[1:])
+    text = render(Report("t", "s", "d", "c", (), (Section("Data", (), ((tmp_path / "a.gif", "x"),)),)))
+    image = next(attrs for tag, attrs in Page(text).tags if tag == "img")
+    assert image["src"].startswith("data:image/gif;base64,")
+    assert (image["width"], image["height"]) == ("30", "20")
+
+
 def test_a_table_with_a_short_row_is_refused():
     with pytest.raises(InputError, match="row 1 has 1 cells"):
         Table(("a", "b"), ((1, 2), (3,)), "Numbers")

@@ -1,0 +1,67 @@
+"""Process noise by maximum likelihood, on a linear system whose noise is known."""
+
+from types import SimpleNamespace
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from hybrid_mpc.estimation import ExtendedKalmanFilter
+from hybrid_mpc.estimation.tuning import log_likelihood, most_likely
+from hybrid_mpc.model import HybridModel
+from hybrid_mpc.signals import Signal
+
+DT, SIGMA_Y, SIGMA_X = 0.1, 0.02, (0.0, 0.05)
+
+
+def mass() -> HybridModel:
+    x, h, u, w = ca.MX.sym("x", 2), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w", 2)
+    return HybridModel(
+        "mass", DT, (Signal("q", "m"), Signal("v", "m/s")), (Signal("F", "N"),), (Signal("q", "m"),),
+        step=ca.Function("f", [x, h, u], [ca.vertcat(x[0] + DT * x[1], x[1] + DT * u), h]),
+        xdot=ca.Function("g", [x, h, u], [ca.vertcat(x[1], u)]),
+        output=ca.Function("y", [x, u], [x[0]]),
+        energy_balance=ca.Function("e", [x, w, u], [(w[1] - u) * x[1]]),
+    )  # fmt: skip
+
+
+def filter_with(scale: float) -> ExtendedKalmanFilter:
+    sigma_x = scale * np.array(SIGMA_X)
+    return ExtendedKalmanFilter(mass(), sigma_y=[SIGMA_Y], sigma_x=sigma_x, sigma_x0=[0.1, 0.1])
+
+
+def recording(n: int, seed: int) -> SimpleNamespace:
+    rng = np.random.default_rng(seed)
+    u, x, y = rng.normal(size=(n, 1)), np.zeros(2), np.zeros((n, 1))
+    for k in range(n):
+        y[k] = x[0] + SIGMA_Y * rng.standard_normal()
+        x = np.array([x[0] + DT * x[1], x[1] + DT * u[k, 0]]) + np.array(SIGMA_X) * rng.standard_normal(2)
+    return SimpleNamespace(u=u, y=y)
+
+
+def test_likelihood_is_that_of_the_joint_gaussian():
+    n, run = 12, recording(12, 0)
+    f, c = np.array([[1.0, DT], [0.0, 1.0]]), np.array([1.0, 0.0])
+    # start: at rest at the first sample, known to 0.1 each; then the joint law of the samples 1 .. n - 1
+    mean, p = np.array([run.y[0, 0], 0.0]), np.diag([0.01, 0.01])
+    means, covariance = [], np.zeros((n - 1, n - 1))
+    states = []
+    for k in range(1, n):
+        mean, p = f @ mean + np.array([0.0, DT * run.u[k - 1, 0]]), f @ p @ f.T + np.diag(np.square(SIGMA_X))
+        means.append(c @ mean)
+        states.append(p)
+    for i in range(n - 1):
+        for j in range(i, n - 1):
+            covariance[i, j] = covariance[j, i] = c @ np.linalg.matrix_power(f, j - i) @ states[i] @ c
+    covariance += SIGMA_Y**2 * np.eye(n - 1)
+    exact = multivariate_normal(np.array(means), covariance).logpdf(run.y[1:, 0]) + 0.5 * (n - 1) * np.log(
+        2 * np.pi
+    )
+    assert log_likelihood(filter_with(1.0), run, skip=1) == pytest.approx(exact, rel=1e-9)  # rounding
+
+
+def test_the_true_noise_is_the_most_likely():
+    runs = [recording(600, seed) for seed in (1, 2)]
+    # 1200 samples: a factor of 3 in the noise lowers the likelihood by hundreds
+    assert most_likely(filter_with, runs, (0.1, 0.3, 1.0, 3.0, 10.0)) == 1.0

@@ -1,0 +1,79 @@
+"""What the closed loops of a run are summed up to, and what they are made of."""
+
+import numpy as np
+import pytest
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.pipeline.contenders import CONTENDERS, ORACLES
+from hybrid_mpc.pipeline.contest import _seeds, tasks_of
+from hybrid_mpc.pipeline.results import gap_closed, loop_table, summary, task_figures
+from hybrid_mpc.scenario import load_scenario
+
+GOLF = load_scenario("golf_robot")
+
+
+def cells(**costs):
+    return {name: {"cost": list(values), "rmse": [0.0] * len(values)} for name, values in costs.items()}
+
+
+def test_gap_is_measured_from_the_better_baseline():
+    row = cells(
+        prior=[3.0, 3.0],
+        prior_observer=[2.0, 2.0],
+        hybrid=[0.0, 0.0],
+        hybrid_observer=[1.25, 1.25],
+        oracle=[1.0],
+    )
+    assert gap_closed(row) == (pytest.approx(0.75), "")
+    row["hybrid_observer"]["cost"] = [2.5, 2.5]  # worse than the baseline shows as a negative share
+    assert gap_closed(row)[0] == pytest.approx(-0.5)
+
+
+def test_gap_needs_a_baseline_and_an_oracle_that_differ():
+    # means 1.5 and 1, standard errors sqrt(0.5 / 2) = 0.5 and 0: the distance is below twice the error
+    noisy = cells(prior=[1.0, 2.0], prior_observer=[9.0, 9.0], hybrid_observer=[1.0, 1.0], oracle=[1.0, 1.0])
+    value, why = gap_closed(noisy)
+    assert value is None
+    assert "do not differ" in why
+    assert gap_closed(cells(prior=[1.0], prior_observer=[1.0], hybrid_observer=[1.0])) == (
+        None,
+        "the scenario has no oracle",
+    )
+
+
+def test_summary_has_student_s_interval_and_none_for_one_seed():
+    # n = 2: t(0.975, 1) = 12.706, standard error 0.5
+    assert summary(cells(prior=[1.0, 2.0])["prior"])["cost_ci95"] == pytest.approx(12.706 * 0.5, rel=1e-4)
+    assert summary(cells(prior=[1.0])["prior"])["cost_ci95"] is None
+
+
+def test_rows_become_tables():
+    rows = [
+        {
+            "task": "a",
+            "controller": "prior",
+            "cost": c,
+            "tracking_rmse_rad": 0.1,
+            "figures": {"speed_error_rel": e},
+        }
+        for c, e in ((1.0, -0.02), (3.0, 0.04))
+    ]
+    assert loop_table(rows)["a"]["prior"] == {"cost": [1.0, 3.0], "rmse": [0.1, 0.1]}
+    assert task_figures(rows)["a"]["prior"]["mean_abs_speed_error_rel"] == pytest.approx(0.03)
+    rows[0]["figures"]["speed_error_rel"] = np.inf  # a stroke that never came is not averaged away
+    assert task_figures(rows)["a"]["prior"]["mean_abs_speed_error_rel"] is None
+
+
+def test_tasks_are_found_by_name():
+    assert tasks_of(GOLF, None) == GOLF.tasks
+    assert [t.name for t in tasks_of(GOLF, ("stroke_3", "track_sine"))] == ["stroke_3", "track_sine"]
+    with pytest.raises(InputError, match=r"no task nothing; there are: track_sine"):
+        tasks_of(GOLF, ("nothing",))
+    for budget in GOLF.budgets.values():
+        tasks_of(GOLF, budget.tasks)
+
+
+def test_every_contender_runs_and_oracles_less_often():
+    assert [_seeds(n, GOLF, 10, 2) for n in CONTENDERS] == [10, 10, 10, 10, 2, 1]
+    assert set(ORACLES) < set(CONTENDERS)
+    assert len({(c.model, c.observer, c.truth) for c in CONTENDERS.values()}) == len(CONTENDERS)
