@@ -22,7 +22,7 @@ def test_gap_is_measured_from_the_better_baseline():
         prior_observer=[2.0, 2.0],
         hybrid=[0.0, 0.0],
         hybrid_observer=[1.25, 1.25],
-        oracle=[1.0],
+        oracle=[1.0, 1.0],
     )
     assert gap_closed(row) == (pytest.approx(0.75), "")
     row["hybrid_observer"]["cost"] = [2.5, 2.5]  # worse than the baseline shows as a negative share
@@ -35,6 +35,9 @@ def test_gap_needs_a_baseline_and_an_oracle_that_differ():
     value, why = gap_closed(noisy)
     assert value is None
     assert "do not differ" in why
+    single = {**noisy, **cells(oracle=[0.1])}
+    assert gap_closed(single)[0] is None
+    assert "standard error" in gap_closed(single)[1]
     assert gap_closed(cells(prior=[1.0], prior_observer=[1.0], hybrid_observer=[1.0])) == (
         None,
         "the scenario has no oracle",

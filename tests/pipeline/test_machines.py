@@ -51,9 +51,12 @@ def test_torque_pendulum_on_the_real_recordings(tmp_path):
     fitted = results["identification"]["details"]["prior_parameters"]["values"]
     assert 0.75 < fitted["k_u"] < 0.95  # true torque is probably 1/1.2 of the commanded one
     alarms = results["monitor"]["alarms"]
-    pushes = [a for a in alarms if a["file"] == FILES[0] and 16.0 <= a["start_s"] <= 16.5]
-    assert pushes  # a strong push by hand at 16 s
-    for alarm in alarms:
+    # by hand: two gentle pushes off the top, at almost no speed, and a strong one
+    for start, end in ((7.0, 8.0), (11.0, 13.0), (16.0, 16.5)):
+        assert any(a["file"] == FILES[0] and start <= a["start_s"] <= end for a in alarms), (start, end)
+    for alarm in alarms:  # one that a push raised may end within the window after it
         for window in WINDOWS[alarm["file"]]:
-            assert alarm["end_s"] <= window.start or alarm["start_s"] >= window.end
+            assert not window.start <= alarm["start_s"] <= window.end
+    # the project's promise; docs/results tells how the figure came about
+    assert rmse["mopgrnn"] <= 0.8 * rmse["phy"]
     assert results["monitor"]["details"]["clean"]["alarms"] == 0
