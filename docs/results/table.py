@@ -25,13 +25,55 @@ def identification(results: dict[str, Any]) -> list[str]:
     return lines
 
 
+CONTENDERS = ("prior", "prior_observer", "hybrid", "hybrid_observer", "oracle", "oracle_state")
+
+
 def control(results: dict[str, Any]) -> list[str]:
-    """Closed-loop costs by task, with 95 % intervals over the seeds."""
-    tasks = results["control"].get("details", {}).get("tasks", {})
-    lines = ["| task | prior | hybrid | oracle |", "|" + " --- |" * 4] if tasks else []
-    for task, cells in tasks.items():
-        row = [f"{cells[n]['cost']:.4g} ± {cells[n]['cost_ci95']:.2g}" for n in ("prior", "hybrid", "oracle")]
-        lines.append(f"| {task} | " + " | ".join(row) + " |")
+    """Closed-loop costs by task, with 95 % intervals over the seeds, and the gap closed."""
+    details = results["control"].get("details")
+    if details is None:
+        return []
+    lines = ["| task | " + " | ".join(CONTENDERS) + " | gap closed |", "|" + " --- |" * 8]
+    for task, cells in details["tasks"].items():
+        row = []
+        for cell in (cells.get(name) for name in CONTENDERS):
+            half = None if cell is None else cell["cost_ci95"]
+            row.append(
+                "–"
+                if cell is None
+                else f"{cell['cost']:.3g}" + (f" ± {half:.1g}" if half is not None else "")
+            )
+        gap = details["gap_closed_by_task"][task]["value"]
+        lines.append(f"| {task} | " + " | ".join(row) + f" | {'–' if gap is None else f'{gap:.2f}'} |")
+    return lines
+
+
+def strokes(results: dict[str, Any]) -> list[str]:
+    """Mean absolute errors of the strokes, speed in % and instant in ms."""
+    figures = results["control"].get("details", {}).get("figures", {})
+    lines = ["| stroke | " + " | ".join(CONTENDERS) + " |", "|" + " --- |" * 7] if figures else []
+    for task, row in figures.items():
+        cells = []
+        for name in CONTENDERS:
+            f = row.get(name)
+            speed = None if f is None else f["mean_abs_speed_error_rel"]
+            cells.append(
+                "–" if speed is None else f"{100 * speed:.2f} %, {1e3 * f['mean_abs_timing_error_s']:.2f} ms"
+            )
+        lines.append(f"| {task} | " + " | ".join(cells) + " |")
+    return lines
+
+
+def files(results: dict[str, Any]) -> list[str]:
+    """RMSE by recording."""
+    by_file = results["identification"]["details"].get("by_file", {})
+    if not 1 <= len(by_file) <= 8:
+        return []
+    lines = ["| recording | phy [rad] | mopgrnn [rad] | ratio |", "|" + " --- |" * 4]
+    for name, row in by_file.items():
+        lines.append(
+            f"| {name} | {row['phy']:.4f} | {row['mopgrnn']:.4f} | {row['mopgrnn'] / row['phy']:.2f} |"
+        )
     return lines
 
 
@@ -53,8 +95,8 @@ def main() -> None:
     for path in sorted(HERE.glob("*.json")):
         results = json.loads(path.read_text())
         print(f"\n### {path.name}\n")
-        for part in (identification(results), control(results), rest(results)):
-            print("\n".join([*part, ""]))
+        for part in (identification, files, control, strokes, rest):
+            print("\n".join([*part(results), ""]))
 
 
 if __name__ == "__main__":
