@@ -151,7 +151,11 @@ def _overview(context: Context) -> Any:
                 "Closed-loop cost of every controller over the measuring oracle's, with 95 % intervals over the seeds."
             ),
         )
-    strokes = [{"controller": r["controller"], **r["figures"]} for r in control["loops"] if r["figures"]]
+    strokes = [
+        {"controller": r["controller"], **{k: _finite(v) for k, v in r["figures"].items()}}
+        for r in control["loops"]
+        if r["figures"]
+    ]
     if strokes and all({"speed_error_rel", "timing_error_s"} <= set(row) for row in strokes):
         yield (
             "control",

@@ -138,7 +138,7 @@ def task_figures(loops: list[Mapping[str, Any]]) -> dict[str, dict[str, dict[str
     for row in loops:
         for key in row["figures"]:
             same = [r for r in loops if (r["task"], r["controller"]) == (row["task"], row["controller"])]
-            values = [abs(r["figures"][key]) for r in same]
+            values = [abs(float(r["figures"][key])) for r in same]  # "inf" after a round through JSON
             mean = _finite(float(np.mean(values)))
             out.setdefault(row["task"], {}).setdefault(row["controller"], {})[f"mean_abs_{key}"] = mean
     return out
