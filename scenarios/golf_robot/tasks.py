@@ -181,5 +181,5 @@ TASKS = (
          (0.0, 0.0), steps(HEAVY_STEPS), faults=(Fault(0.0, np.inf, "plant_mass", 1.2),)),
 )  # fmt: skip
 
-QUICK_TASKS = ("track_sine", "track_step", "stroke_1.4", "stroke_3", "reject_load")
+QUICK_TASKS = ("track_sine", "stroke_1.4", "reject_load")
 """Tasks of the quick budget."""
