@@ -92,7 +92,7 @@ def rest(results: dict[str, Any]) -> list[str]:
 
 def main() -> None:
     """Print all tables."""
-    for path in sorted(HERE.glob("*.json")):
+    for path in sorted(p for p in HERE.glob("*.json") if not p.stem.endswith("identification")):
         results = json.loads(path.read_text())
         print(f"\n### {path.name}\n")
         for part in (identification, files, control, strokes, rest):
