@@ -88,6 +88,7 @@ def simulate(
 ) -> ClosedLoopResult:
     """Run a plant under control; deterministic except for the recorded durations.
 
+    Before the first step the controller makes its first plan (:meth:`~hybrid_mpc.mpc.SafeController.initial`).
     At ``t_k``: measure ``y_k``; estimate with ``y_k`` and ``u_{k-1}``; solve ``u_k``; monitor; hold ``u_k``.
     No time passes between measuring and holding but the delays given. Input faults act behind the
     controller, which is not told.
@@ -151,12 +152,13 @@ def simulate(
         y = machine.measure(t)
         seen = np.concatenate([x, plant.hidden(machine.state)]) if sees_truth(estimator) else y
         x_ref, factors = previews(t + input_delay * dt)
-        clock = [perf_counter()]
-        if estimate is None or decision is None:
+        if estimate is None or decision is None:  # the machine still rests: this is no part of a step
             estimate = estimator.start(seen, t)
-            decision = safe.initial(estimate)
+            decision = safe.initial(estimate, None, x_ref, factors)
             machine.rest(decision.u)
+            clock = [perf_counter()]
         else:
+            clock = [perf_counter()]
             estimate = estimator.update(estimate, seen, decision.u)
         clock.append(perf_counter())
         if late is not None and late(t):

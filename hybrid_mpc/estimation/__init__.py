@@ -2,6 +2,7 @@
 
 from hybrid_mpc.estimation.delays import DelayCompensation, DelayedEstimate
 from hybrid_mpc.estimation.kalman import Estimate, Estimator, ExtendedKalmanFilter, TrueState
+from hybrid_mpc.estimation.switching import SwitchingEstimate, SwitchingFilter
 
 __all__ = [
     "DelayCompensation",
@@ -9,5 +10,7 @@ __all__ = [
     "Estimate",
     "Estimator",
     "ExtendedKalmanFilter",
+    "SwitchingEstimate",
+    "SwitchingFilter",
     "TrueState",
 ]

@@ -129,10 +129,11 @@ class ExtendedKalmanFilter:
         """The model of this filter."""
         return self._model
 
-    @property
-    def noise_y(self) -> Array:
-        """Variances of the measurement noise ``(n_y,)``."""
-        return self._noise_y
+    def lost(self, estimate: Estimate) -> bool:
+        """True if an estimate is not finite or so uncertain that nothing is known any more."""
+        mean = np.concatenate([estimate.x, estimate.h, estimate.d])
+        known = np.all(np.isfinite(mean)) and np.max(np.diag(estimate.P)) <= self._lost
+        return not known
 
     def start(self, y: ArrayLike, t: float = 0.0) -> Estimate:
         """Estimate at rest at ``y`` ``(n_y,)``: the smallest state with this output, ``d`` zero.
@@ -167,7 +168,6 @@ class ExtendedKalmanFilter:
         empty = np.full(model.n_y, np.nan)
         return Estimate(estimate.t + model.dt, x.ravel(), h.ravel(), estimate.d, p, empty, float("nan"))
 
-    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
     def correct(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> Estimate:
         """Estimate after the measurement ``y`` ``(n_y,)``, in Joseph form.
 
@@ -178,26 +178,36 @@ class ExtendedKalmanFilter:
             y: Measurement ``(n_y,)``.
             u: Input ``(n_u,)`` of the output equation. Default: zero.
         """
+        return self.assess(estimate, y, u)[0]
+
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
+    def assess(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> tuple[Estimate, float]:
+        """:meth:`correct`, and the log-likelihood of the measurement, without its constant.
+
+        Source of the likelihood: Schweppe, *Evaluation of likelihood functions for Gaussian signals*, IEEE
+        T-IT 11 (1965).
+        """
         model = self._model
         y = np.asarray(y, dtype=float).ravel()
         seen = np.isfinite(y)
         if not seen.any():
-            return estimate
+            return estimate, 0.0
         held = estimate.d if u is None else np.asarray(u, dtype=float).ravel() + estimate.d
         y_hat, c_x, c_u = (m.full() for m in self._output(estimate.x, held))
         c = np.hstack([c_x, np.zeros((model.n_y, model.n_h)), c_u])
         innovation = np.where(seen, y - y_hat.ravel(), np.nan)
-        p, step, nis = estimate.P, np.zeros(c.shape[1]), 0.0
+        p, step, nis, size = estimate.P, np.zeros(c.shape[1]), 0.0, 0.0
         for i in np.flatnonzero(seen):  # one by one is exact, since the noises are independent
             pc = p @ c[i]
             s = float(c[i] @ pc) + self._noise_y[i]
             gain, error = pc / s, innovation[i] - c[i] @ step
             i_kc = np.eye(step.size) - np.outer(gain, c[i])
             p = i_kc @ p @ i_kc.T + self._noise_y[i] * np.outer(gain, gain)
-            step, nis = step + gain * error, nis + float(error / s * error)
+            step, nis, size = step + gain * error, nis + float(error / s * error), size + float(np.log(s))
         n_x, n_z = model.n_x, model.n_x + model.n_h
         x, h, d = estimate.x + step[:n_x], estimate.h + step[n_x:n_z], estimate.d + step[n_z:]
-        return Estimate(estimate.t, x, h, d, 0.5 * (p + p.T), innovation, nis)
+        after = Estimate(estimate.t, x, h, d, 0.5 * (p + p.T), innovation, nis)
+        return after, -0.5 * (nis + size)
 
     def update(self, estimate: Estimate, y: ArrayLike, u_prev: ArrayLike) -> Estimate:
         """:meth:`predict` with the input ``u_prev`` held since, then :meth:`correct` with ``y``.
@@ -205,9 +215,7 @@ class ExtendedKalmanFilter:
         A lost prediction is dropped: the estimate starts anew from ``y`` if any of it is finite.
         """
         predicted = self.predict(estimate, u_prev)
-        mean = np.concatenate([predicted.x, predicted.h, predicted.d])
-        known = np.all(np.isfinite(mean)) and np.max(np.diag(predicted.P)) <= self._lost
-        if not known and np.any(np.isfinite(np.asarray(y, dtype=float))):
+        if self.lost(predicted) and np.any(np.isfinite(np.asarray(y, dtype=float))):
             return self.start(y, predicted.t)
         return self.correct(predicted, y, u_prev)
 

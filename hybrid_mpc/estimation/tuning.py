@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.estimation.kalman import ExtendedKalmanFilter
+from hybrid_mpc.estimation.kalman import Estimate
 
 Array = NDArray[np.float64]
 
@@ -26,11 +26,24 @@ class Recording(Protocol):
         """Measurements ``(n, n_y)``."""
 
 
-def log_likelihood(estimator: ExtendedKalmanFilter, recording: Recording, skip: int = 25) -> float:
+class Assessor(Protocol):
+    """A filter that can say how likely its measurements are."""
+
+    def start(self, y: Array) -> Estimate:
+        """First estimate from the first measurement."""
+
+    def predict(self, estimate: Estimate, u: Array) -> Estimate:
+        """Estimate one period later with ``u`` held."""
+
+    def assess(self, estimate: Estimate, y: Array, u: Array) -> tuple[Estimate, float]:
+        """Estimate after a measurement, and its log-likelihood."""
+
+
+def log_likelihood(estimator: Assessor, recording: Recording, skip: int = 25) -> float:
     """Log-likelihood of the measured outputs under a filter's own innovations and their variances.
 
     Args:
-        estimator: The filter; its model's outputs are its positions.
+        estimator: The filter; an extended Kalman filter or several that switch.
         recording: Inputs and measurements.
         skip: Samples at the start that only end the filter's ignorance. Default 25.
 
@@ -39,20 +52,19 @@ def log_likelihood(estimator: ExtendedKalmanFilter, recording: Recording, skip: 
 
     Source: Schweppe, *Evaluation of likelihood functions for Gaussian signals*, IEEE T-IT 11 (1965).
     """
-    n_y, estimate, total = estimator.model.n_y, estimator.start(recording.y[0]), 0.0
+    estimate, total = estimator.start(recording.y[0]), 0.0
     for k in range(1, len(recording.y)):
         ahead = estimator.predict(estimate, recording.u[k - 1])
-        s = ahead.P[:n_y, :n_y] + np.diag(estimator.noise_y)
-        estimate = estimator.correct(ahead, recording.y[k])
-        if k >= skip and np.isfinite(estimate.nis):
-            total -= 0.5 * (estimate.nis + float(np.linalg.slogdet(s)[1]))
+        estimate, likelihood = estimator.assess(ahead, recording.y[k], recording.u[k - 1])
+        if k >= skip:
+            total += likelihood
         if not np.all(np.isfinite(estimate.x)):
             return -math.inf
     return total
 
 
 def most_likely(
-    make: Callable[[float], ExtendedKalmanFilter], recordings: Sequence[Recording], scales: Sequence[float]
+    make: Callable[[float], Assessor], recordings: Sequence[Recording], scales: Sequence[float]
 ) -> float:
     """The one of ``scales`` whose filter ``make(scale)`` makes the recordings most likely.
 

@@ -144,10 +144,7 @@ class BestOf:
 
     def _from(self, guess: Array, previous: Solution, estimate: Estimate) -> Solution:
         """A previous plan whose shift is the guess: solves shift what they are given."""
-        plan = self._controller.initial(estimate, guess)
-        before = [np.vstack([first[:1], later[:-1]]) for first, later in
-                  ((previous.u, plan.u), (plan.x, plan.x), (plan.h, plan.h))]  # fmt: skip
-        return replace(plan, u=before[0], x=before[1], h=before[2])
+        return self._controller.initial(estimate, guess).delayed(previous.u[0])
 
 
 def _checked(start: Array, ocp: OCP) -> Array:

@@ -60,6 +60,8 @@ class SafeController:
         max_age: Periods a plan may be followed without a successful solve.
         working_point: ``(x, u)`` at which the fallback is linearised; see :func:`hybrid_mpc.riccati.lqr`.
             Default: the problem's own, else zero.
+        first: Controller that makes the first plan, before the loop starts; an
+            :class:`~hybrid_mpc.mpc.SQPController` converges it. Default: ``controller``.
 
     Raises:
         InputError: If the fallback does not fit the problem or cannot be stabilised.
@@ -87,11 +89,14 @@ class SafeController:
         *,
         max_age: int = 5,
         working_point: tuple[Array, Array] | None = None,
+        first: Controller | None = None,
     ) -> None:
         if max_age < 0:
             raise InputError(f"max_age must not be negative, got {max_age}")
         ocp = controller.ocp
         self._controller, self._max_age = controller, max_age
+        self._first = controller if first is None else first
+        _check_first(self._first, controller)
         self._fallback = None
         if fallback is not None:
             if (fallback.n_x, fallback.n_u) != (ocp.n_x, ocp.n_u):
@@ -111,15 +116,34 @@ class SafeController:
         """The guarded controller."""
         return self._controller
 
-    def initial(self, estimate: Estimate, u: Array | None = None) -> Decision:
-        """Decision before the first: ``u`` ``(n_u,)`` is held (default: zero, or the bound next to it).
+    def initial(
+        self,
+        estimate: Estimate,
+        u: Array | None = None,
+        reference: Array | None = None,
+        weight: Array | None = None,
+    ) -> Decision:
+        """Decision before the first: an input is held, and there is a plan to go on from.
+
+        A real-time iteration improves a plan a little in every period; the first plan has no predecessor. So
+        make it here, while the machine rests and no deadline presses.
+
+        Args:
+            estimate: Where the plan starts.
+            u: Input ``(n_u,)`` that is held. Default: zero, or the bound next to it.
+            reference: ``(m, n_x)``, from the first period on in steps of ``dt``: the plan is optimised for it.
+                Default: none; the plan holds ``u``.
+            weight: Factors on ``q`` ``(m, n_x)``, as the reference. Default: 1.
 
         Raises:
-            InputError: If ``u`` has another size or is not finite.
+            InputError: If ``u`` has another size or is not finite, or another shape does not fit.
         """
         ocp = self._controller.ocp
         held = np.clip(np.zeros(ocp.n_u) if u is None else vector(u, ocp.n_u, "u"), ocp.u_min, ocp.u_max)
         plan = self._controller.initial(estimate, np.tile(held, (ocp.horizon, 1)))
+        if reference is not None:
+            solution = self._first.solve(plan, estimate, reference, weight)
+            plan = solution.delayed(held) if solution.status.ok else plan
         return Decision(held, Source.ZERO, plan, Status.INITIAL, 0)
 
     def decide(
@@ -171,6 +195,15 @@ class SafeController:
             if np.all(np.isfinite(u)):
                 return u, Source.FALLBACK
         return np.zeros(self._controller.ocp.n_u), Source.ZERO
+
+
+def _check_first(first: Controller, controller: Controller) -> None:
+    sizes = [(c.model.n_x, c.model.n_h, c.ocp.n_u, c.ocp.horizon) for c in (first, controller)]
+    if sizes[0] != sizes[1]:
+        raise InputError(
+            f"first: (n_x, n_h, n_u, N) = {sizes[0]}, the controller has {sizes[1]}; "
+            "give both the same model and problem"
+        )
 
 
 def _equilibrium_input(model: HybridModel) -> ca.Function:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -64,3 +64,11 @@ class Solution:
     timing: Mapping[str, float]
     excess: float = 0.0
     iterations: int = 1
+
+    def delayed(self, u_held: Array) -> Solution:
+        """The plan one period earlier, with ``u_held`` ``(n_u,)`` held in it: a solve that shifts it has this plan.
+
+        It loses its last period, which the shift appends anew.
+        """
+        x, h = (np.vstack([v[:1], v[:-1]]) for v in (self.x, self.h))
+        return replace(self, u=np.vstack([u_held[None], self.u[:-1]]), x=x, h=h)

@@ -80,9 +80,10 @@ def build(
     ocp = make_ocp(prior, control)
     rivals = [CondensedController(artifact.models[m], ocp) for m in ("prior", "hybrid")]
     best = BestOf(SQPController(model, ocp, iterations=ORACLE_ITERATIONS), rivals=rivals)
+    safe = SafeController(best, prior, first=BestOf(SQPController(model, ocp), rivals=rivals))
     if c.truth:
-        return TrueState(model), SafeController(best, prior)
-    return make_estimator(model, control, noise[name], observer=c.observer), SafeController(best, prior)
+        return TrueState(model), safe
+    return make_estimator(model, control, noise[name], observer=c.observer), safe
 
 
 def noise_of(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from hybrid_mpc.pipeline.contenders import CONTENDERS, ORACLES, build
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.loops import make_monitor
 from hybrid_mpc.pipeline.parallel import WORKERS, run_jobs
-from hybrid_mpc.scenario import ControlSpec, Scenario, Task, load_scenario
+from hybrid_mpc.scenario import Budget, ControlSpec, Scenario, Task, load_scenario
 
 Array = NDArray[np.float64]
 TIMED = ("prior_observer", "hybrid_observer")
@@ -42,10 +43,49 @@ def tasks_of(scenario: Scenario, names: tuple[str, ...] | None) -> tuple[Task, .
     return tuple(known[name] for name in names)
 
 
+@dataclass(frozen=True)
+class Part:
+    """Loops that run and are kept together: one task under one contender.
+
+    Args:
+        task: The task.
+        controller: The contender.
+        seeds: Numbers of the loops.
+        timed: Whether it runs alone on the machine, so that the durations of its steps count.
+    """
+
+    task: Task
+    controller: str
+    seeds: tuple[int, ...]
+    timed: bool = False
+
+    @property
+    def stage(self) -> str:
+        """Name of its checkpoint."""
+        return f"loops/{self.task.name}-{self.controller}-{self.seeds[0]}"
+
+
+def parts_of(scenario: Scenario, budget: Budget) -> list[Part]:
+    """All loops of a budget, in the order in which they run: the timed ones, then the slow ones first."""
+    tasks, parts = tasks_of(scenario, budget.tasks), []
+    for task in tasks:
+        parts += [Part(task, name, (0,), timed=True) for name in TIMED]
+    for name in reversed(list(CONTENDERS)):
+        seeds = range(1 if name in TIMED else 0, _seeds(name, scenario, budget.seeds, budget.oracle_seeds))
+        together = 1 if name in ORACLES else max(1, len(seeds))
+        for task in tasks:
+            parts += [
+                Part(task, name, tuple(seeds[i : i + together])) for i in range(0, len(seeds), together)
+            ]
+    return parts
+
+
 def contest(
     context: Context, artifact: Artifact, control: ControlSpec, noise: Mapping[str, Array]
 ) -> tuple[list[dict[str, Any]], dict[str, Array]]:
     """Run all loops; the timed ones alone, the others side by side in processes.
+
+    Every part is kept as it ends; what a run that was killed has kept is not run again.
 
     Args:
         context: The run.
@@ -57,44 +97,70 @@ def contest(
         One row a loop (task, controller, seed, cost, tracking error, share of solved steps, the task's own
         figures), and arrays: time series of the first seed, durations of the timed steps.
     """
-    scenario, budget = context.scenario, context.budget
-    tasks = tasks_of(scenario, budget.tasks)
-    names = [n for n in CONTENDERS if _seeds(n, scenario, budget.seeds, budget.oracle_seeds)]
+    parts = parts_of(context.scenario, context.budget)
     common = context.settings.scenario, context.out / "model", dict(noise), context.settings.seed
-    results: dict[tuple[str, str, int], ClosedLoopResult] = {}
-    arrays: dict[str, Array] = {}
-    for i, task in enumerate(tasks):
-        for name in TIMED:
-            context.progress.update("timed loops", i, len(tasks), f"{task.name}, {name}")
-            plans: list[Array] = []
-            (results[task.name, name, 0],) = loops(*common, task.name, name, (0,), on_plan=plans.append)
-            arrays[f"{task.name}/{name}/plans"] = np.stack(plans)
-    jobs: dict[str, Any] = {}
-    for name in reversed(names):  # the slow ones first
-        count = _seeds(name, scenario, budget.seeds, budget.oracle_seeds)
-        seeds = tuple(range(1 if name in TIMED else 0, count))
-        for task in tasks if seeds else ():
-            jobs[f"{task.name}, {name}"] = (loops, (*common, task.name, name, seeds))
-    done = run_jobs(jobs, context.progress.update, WORKERS)
-    for key, (_, arguments) in jobs.items():
-        task_name, name, seeds = arguments[-3:]
-        results |= {(task_name, name, s): r for s, r in zip(seeds, done[key], strict=True)}
+    missing = [part for part in parts if not context.done(part.stage)]
+    timed = [part for part in missing if part.timed]
+    for i, part in enumerate(timed):
+        context.progress.update("timed loops", i, len(timed), f"{part.task.name}, {part.controller}")
+        context.save(part.stage, *_kept(*common, part.task.name, part.controller, part.seeds, True))
+    jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
+        part.stage: (_kept, (*common, part.task.name, part.controller, part.seeds, False))
+        for part in missing
+        if not part.timed
+    }
+    run_jobs(jobs, context.progress.update, WORKERS, lambda stage, kept: context.save(stage, *kept))
     rows: list[dict[str, Any]] = []
-    for task in tasks:
-        for (_, name, seed), r in sorted((k, r) for k, r in results.items() if k[0] == task.name):
-            rows.append(_row(task, name, seed, r))
-            if seed == 0:
-                arrays |= {f"{task.name}/{name}/{key}": getattr(r, key) for key in SHOWN}
-                if name in TIMED:
-                    arrays[f"{task.name}/{name}/step_ms"] = r.timing_ms["total"]
-    return rows, arrays
+    arrays: dict[str, Array] = {}
+    for part in parts:
+        rows += context.result(part.stage)["rows"]
+        arrays |= context.arrays(part.stage)
+    order = [task.name for task in tasks_of(context.scenario, context.budget.tasks)]
+    return sorted(rows, key=lambda r: (order.index(r["task"]), r["controller"], r["seed"])), arrays
+
+
+def _kept(
+    scenario_name: str,
+    folder: Path,
+    noise: Mapping[str, Array],
+    run_seed: int,
+    task_name: str,
+    name: str,
+    seeds: tuple[int, ...],
+    timed: bool,
+    report: Callable[[int, int, str], None] = lambda done, total, text: None,
+) -> tuple[dict[str, Any], dict[str, Array]]:
+    """What is kept of the loops of a part: a row each, and time series of the first seed."""
+    (task,) = tasks_of(load_scenario(scenario_name), (task_name,))
+    plans: list[Array] = []
+    results = loops(
+        scenario_name,
+        folder,
+        noise,
+        run_seed,
+        task_name,
+        name,
+        seeds,
+        report,
+        plans.append if timed else None,
+    )
+    rows = [_row(task, name, seed, r) for seed, r in zip(seeds, results, strict=True)]
+    arrays: dict[str, Array] = {}
+    if seeds[0] == 0:
+        arrays |= {f"{task_name}/{name}/{key}": getattr(results[0], key) for key in SHOWN}
+    if timed:
+        arrays |= {
+            f"{task_name}/{name}/step_ms": results[0].timing_ms["total"],
+            f"{task_name}/{name}/plans": np.stack(plans),
+        }
+    return {"rows": rows}, arrays
 
 
 def _seeds(name: str, scenario: Scenario, seeds: int, oracle_seeds: int) -> int:
     if name not in ORACLES:
         return seeds
     # the oracle that sees the truth differs between seeds by nothing but its rivals' luck
-    return 0 if scenario.oracle is None else (oracle_seeds if name == "oracle" else oracle_seeds // 2)
+    return 0 if scenario.oracle is None else (oracle_seeds if name == "oracle" else min(2, oracle_seeds // 2))
 
 
 def _row(task: Task, name: str, seed: int, r: ClosedLoopResult) -> dict[str, Any]:
@@ -119,7 +185,7 @@ def loops(
     name: str,
     seeds: tuple[int, ...],
     report: Callable[[int, int, str], None] = lambda done, total, text: None,
-    on_plan: Callable[[Array], None] = lambda x: None,
+    on_plan: Callable[[Array], None] | None = None,
 ) -> list[ClosedLoopResult]:
     """Loops of one task and contender; all contenders share problem, period, horizon and safeguards.
 
@@ -132,7 +198,7 @@ def loops(
         name: Contender.
         seeds: Numbers of the loops; same number, same sensor noise for every contender.
         report: Called with ``(done, total, text)`` as the loops go on.
-        on_plan: Called with the planned states ``(N + 1, n_x)`` of every period.
+        on_plan: Called with the planned states ``(N + 1, n_x)`` of every period. Default: none.
     """
     scenario, artifact = load_scenario(scenario_name), load_artifact(folder)
     (task,) = tasks_of(scenario, (task_name,))
@@ -144,7 +210,8 @@ def loops(
     periods, results = round(task.duration / dt), []
 
     def on_step(step: Step, i: int) -> None:
-        on_plan(step.decision.solution.x)
+        if on_plan is not None:
+            on_plan(step.decision.solution.x)
         if step.k % 50 == 0:
             report(i * periods + step.k, len(seeds) * periods, "periods")
 

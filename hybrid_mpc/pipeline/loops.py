@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import ExtendedKalmanFilter
+from hybrid_mpc.estimation.switching import SwitchingFilter
 from hybrid_mpc.estimation.tuning import most_likely
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.monitor.calibration import Calibration
@@ -18,20 +19,30 @@ from hybrid_mpc.monitor.energy import EnergyMonitor
 from hybrid_mpc.mpc.condensed import CondensedController
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.safeguard import SafeController
+from hybrid_mpc.mpc.sqp import SQPController
 from hybrid_mpc.scenario import ControlSpec
 
 if TYPE_CHECKING:
     from hybrid_mpc.data.trajectories import Trajectory
 
 Array = NDArray[np.float64]
-DISTURBANCE_SHARE = 0.005
-"""Step of the estimated input disturbance per period, as a share of the input's range; the same for all. On the golf
-robot's training recordings the fitted prior is most likely with 0.003 (tried: 0.001, 0.003, 0.01); somewhat more,
-since unknown loads are in none of them."""
+QUIET_SHARE = 0.0003
+JUMP_SHARE = 0.05
+"""Step of the estimated input disturbance per period, as a share of the input's range: while nothing happens (drift,
+temperature), and when a load comes or goes. A load of a twentieth of what the drive can do is an ordinary one;
+a larger one takes a few periods."""
+SLIP = 10.0
+"""Process noise over the quiet one when the machine slips: sticking friction that breaks, backlash, an impact."""
+MODES = ("quiet", "slip", "jump")
+SWITCHES = ((0.9795, 0.02, 0.0005), (0.5, 0.4995, 0.0005), (0.45, 0.05, 0.5))
+"""Probability per period to go from one of the modes to another: a slip every second, a load that comes or goes in
+40 s, and either lasts a period or two."""
+FIRST_LOAD = 0.001
+"""Deviation of the first disturbance, as a share of the input's range. Small: a machine that sticks at rest shows
+nothing of its load, and what an observer makes of it there is wrong when it moves."""
 
 SCALES = (1.0, 3.0)
-"""Process noise over the model's one-period errors; the most likely one is taken. None below 1: a filter that trusts
-its model more than its errors allow takes a push for noise."""
+"""Process noise over the model's one-period errors; the most likely one is taken."""
 TUNED_PERIODS = 500
 TUNED_RECORDINGS = 3
 """So many periods of so many training recordings decide."""
@@ -83,8 +94,11 @@ def tuned_noise(
 
 def make_estimator(
     model: HybridModel, control: ControlSpec, sigma_x: Array, *, observer: bool = True
-) -> ExtendedKalmanFilter:
-    """The extended Kalman filter that all controllers share, tuned by the model's own one-period errors.
+) -> ExtendedKalmanFilter | SwitchingFilter:
+    """The estimator that all controllers share, tuned by the model's own one-period errors.
+
+    With observer it switches between three filters (``MODES``): one filter that is quick enough for a push lets
+    the encoder's steps through at all times, and one that is quiet takes a push for noise.
 
     Args:
         model: The model to estimate with.
@@ -98,23 +112,34 @@ def make_estimator(
             f"got {control.estimator_sigma}"
         )
     span = np.subtract(control.u_max, control.u_min)
-    share = DISTURBANCE_SHARE * span
     first = np.concatenate([control.estimator_sigma, np.full(model.n_x - model.n_y, 0.1)])
-    return ExtendedKalmanFilter(
-        model,
-        sigma_y=np.array(control.estimator_sigma),
-        sigma_x=sigma_x,
-        sigma_d=share if observer else None,
-        sigma_x0=first,
-        sigma_d0=5.0 * share if observer else None,
-    )
+
+    def filter_of(scale: float, step: float | None) -> ExtendedKalmanFilter:
+        return ExtendedKalmanFilter(
+            model,
+            sigma_y=np.array(control.estimator_sigma),
+            sigma_x=scale * sigma_x,
+            sigma_d=None if step is None else step * span,
+            sigma_x0=first,
+            sigma_d0=None if step is None else FIRST_LOAD * span,
+        )
+
+    if not observer:
+        return filter_of(1.0, None)
+    modes = filter_of(1.0, QUIET_SHARE), filter_of(SLIP, QUIET_SHARE), filter_of(1.0, JUMP_SHARE)
+    return SwitchingFilter(modes, SWITCHES)
 
 
 def make_controller(
     model: HybridModel, prior: HybridModel, control: ControlSpec, *, iterations: int = 1
 ) -> SafeController:
-    """The condensed real-time iteration of a model behind the safeguards that stand on the prior."""
-    return SafeController(CondensedController(model, make_ocp(prior, control), iterations=iterations), prior)
+    """The condensed real-time iteration of a model behind the safeguards that stand on the prior.
+
+    Its first plan, made before the loop starts, is converged.
+    """
+    ocp = make_ocp(prior, control)
+    rti = CondensedController(model, ocp, iterations=iterations)
+    return SafeController(rti, prior, first=SQPController(model, ocp))
 
 
 def make_ocp(prior: HybridModel, control: ControlSpec) -> OCP:
@@ -147,7 +172,7 @@ def make_monitor(model: HybridModel, calibration: Calibration | None) -> EnergyM
 
 def time_on_recording(
     controller: SafeController,
-    estimator: ExtendedKalmanFilter,
+    estimator: ExtendedKalmanFilter | SwitchingFilter,
     monitor: EnergyMonitor,
     trajectory: Trajectory,
     most: int,

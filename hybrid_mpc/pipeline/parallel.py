@@ -17,8 +17,11 @@ def run_jobs(
     jobs: Mapping[str, tuple[Callable[..., Any], tuple[Any, ...]]],
     on_progress: Callable[[str, int, int, str], None],
     workers: int,
+    on_result: Callable[[str, Any], None] = lambda name, result: None,
 ) -> dict[str, Any]:
     """Run ``function(*args, report)`` for each job and return the results by name.
+
+    ``on_result(name, result)`` is called as each job ends, so that what is done can be kept.
 
     A job calls ``report(done, total, text)`` as it goes. Jobs start in the order given, ``workers`` at a
     time, each in a fresh process, so results do not depend on how many run side by side.
@@ -47,6 +50,7 @@ def run_jobs(
                 if kind == "error":
                     raise RuntimeError(f"{name} failed:\n{value}")
                 results[name] = value
+                on_result(name, value)
                 process.join()
                 del running[connection]  # type: ignore[arg-type]
     finally:

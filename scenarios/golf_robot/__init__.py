@@ -54,6 +54,6 @@ scenario = Scenario(
     draw=draw,
     budgets={
         "quick": replace(DEFAULT_BUDGETS["quick"], tasks=QUICK_TASKS),
-        "full": replace(DEFAULT_BUDGETS["full"], oracle_seeds=2),
+        "full": replace(DEFAULT_BUDGETS["full"], oracle_seeds=10),
     },
 )

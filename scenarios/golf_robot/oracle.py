@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
+
 import casadi as ca
 
 from hybrid_mpc.model import HybridModel
+from nn_export import compile_function
+from nn_export.errors import CompileError
 from scenarios.golf_robot.dynamics import N_STATES, RigParameters, rhs
 from scenarios.golf_robot.integration import steps, steps_with_jacobian
 from scenarios.golf_robot.nominal import GEAR, INPUTS, OUTPUTS, PARAMETERS, STATES
@@ -15,7 +19,7 @@ def oracle(dt: float, parameters: RigParameters | None = None, sub_steps: int = 
 
     Its ``h`` is (bristle [-], motor torque [N m], belt twist [rad], motor speed / 4 [rad/s]). All of it is
     smooth but for ``|phi_dot|`` in the bristle's equation and the drag, so its Jacobian exists through stiction
-    and backlash.
+    and backlash. Its derivatives are compiled where there is a C compiler, else CasADi's virtual machine makes them.
 
     Args:
         dt: Model period [s].
@@ -46,8 +50,18 @@ def oracle(dt: float, parameters: RigParameters | None = None, sub_steps: int = 
         xdot=ca.Function("xdot", [x, h, u], [f(ca.vertcat(x, h), u)]),
         output=ca.Function("output", [x, u], [x[0]]),
         energy_balance=ca.Function("energy_balance", [x, w, u], [_energy_balance(x, w, u)]),
-        with_jacobian=ca.Function("with_jacobian", [x, h, u], [end[:2], end[2:], a, b]),
+        with_jacobian=_compiled(ca.Function("with_jacobian", [x, h, u], [end[:2], end[2:], a, b])),
     )
+
+
+def _compiled(f: ca.Function) -> ca.Function:
+    """The function as C; as it is where there is no compiler or it does not work: both compute the same."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        try:
+            return compile_function(f)
+        except CompileError:
+            return f
 
 
 def _energy_balance(x: ca.MX, xdot: ca.MX, u: ca.MX) -> ca.MX:

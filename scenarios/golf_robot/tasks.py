@@ -37,6 +37,8 @@ HARD_STROKE = replace(
     CONTROL, horizon=80, r=(4.0,), r_delta=(4.0,), du_max=None, x_min=(-1.0, -5.0), x_max=(1.0, 5.0),
     slack_linear=(1e6, 1e5),
 )  # fmt: skip
+# The fastest of the moves is above this speed: the limit of a careful commissioning.
+SLOW = replace(CONTROL, x_min=(-0.85, -2.0), x_max=(0.85, 2.0))
 PUTT = replace(HARD_STROKE, u_min=(-0.2,), u_max=(0.2,))
 
 IMPACT = 1.6
@@ -170,7 +172,8 @@ def _hold(t: Array) -> Array:
 
 TASKS = (
     Task("track_sine", "Follow two sinusoids of 0.5 and 0.2 rad", 6.0, (0.0, 0.0), sine_reference),
-    Task("track_step", "Follow moves of up to 0.9 rad in 0.8 s", STEP_TIME * len(STEPS), (0.0, 0.0), steps(STEPS)),
+    Task("track_step", "Follow moves of up to 0.9 rad in 0.8 s", STEP_TIME * len(STEPS), (0.0, 0.0), steps(STEPS),
+         control=SLOW),
     *(_stroke_task(speed, PUTT) for speed in PUTTS),
     *(_stroke_task(speed, HARD_STROKE) for speed in HARD_STROKES),
     Task("reject_push", "Hold 0.3 rad against a push of a finger", 4.0, (0.3, 0.0), _hold,

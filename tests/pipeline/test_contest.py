@@ -4,7 +4,7 @@ import pytest
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.pipeline.contenders import CONTENDERS, ORACLES
-from hybrid_mpc.pipeline.contest import _seeds, tasks_of
+from hybrid_mpc.pipeline.contest import _seeds, parts_of, tasks_of
 from hybrid_mpc.pipeline.results import gap_closed, loop_table, summary, task_figures
 from hybrid_mpc.scenario import load_scenario
 
@@ -77,7 +77,19 @@ def test_tasks_are_found_by_name():
         tasks_of(GOLF, budget.tasks)
 
 
+def test_parts_are_every_loop_once_and_the_timed_ones_come_first():
+    budget = GOLF.budgets["full"]
+    parts = parts_of(GOLF, budget)
+    loops = [(p.task.name, p.controller, seed) for p in parts for seed in p.seeds]
+    per_task = sum(_seeds(n, GOLF, budget.seeds, budget.oracle_seeds) for n in CONTENDERS)
+    assert len(loops) == len(set(loops)) == per_task * len(GOLF.tasks)
+    assert len({p.stage for p in parts}) == len(parts)
+    assert [p.timed for p in parts] == sorted((p.timed for p in parts), reverse=True)
+    assert all(len(p.seeds) == 1 for p in parts if p.controller in ORACLES)  # a kill loses one slow loop
+
+
 def test_every_contender_runs_and_oracles_less_often():
     assert [_seeds(n, GOLF, 10, 2) for n in CONTENDERS] == [10, 10, 10, 10, 2, 1]
+    assert [_seeds(n, GOLF, 10, 10) for n in CONTENDERS] == [10, 10, 10, 10, 10, 2]
     assert set(ORACLES) < set(CONTENDERS)
     assert len({(c.model, c.observer, c.truth) for c in CONTENDERS.values()}) == len(CONTENDERS)

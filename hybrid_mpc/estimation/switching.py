@@ -1,0 +1,175 @@
+"""Several Kalman filters side by side, and how probable each is: quick for a jump, quiet otherwise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimation.kalman import Estimate, ExtendedKalmanFilter
+from hybrid_mpc.model import HybridModel
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SwitchingEstimate(Estimate):
+    """What several filters believe together; its own fields are their means, weighted by probability.
+
+    Its ``nis`` is the mean of theirs: what the modes, the probable ones most, leave unexplained.
+
+    Args:
+        modes: Estimate of each filter.
+        probability: Of each filter's assumptions ``(m,)``; they sum to one.
+    """
+
+    modes: tuple[Estimate, ...]
+    probability: Array
+
+
+class SwitchingFilter:
+    """Interacting multiple models: filters on one model that differ in what they take for possible.
+
+    One Kalman filter is either quiet or quick: the step that it allows a disturbance makes it follow a sudden
+    load, and lets the sensor's noise through at all times. Here each filter assumes one mode of the noise
+    (quiet; drifting; a jump), a Markov chain says how often modes change, and the measurements say which of
+    them is now. No method changes the object. With one filter it is that filter.
+
+    Args:
+        filters: The modes; same model.
+        transition: Probability per period ``(m, m)`` to go from mode i (row) to mode j.
+
+    Raises:
+        InputError: If the filters' models differ, or the rows of ``transition`` are no probabilities.
+
+    Source: Blom and Bar-Shalom, *The interacting multiple model algorithm for systems with Markovian switching
+    coefficients*, IEEE Trans. Automatic Control 33 (1988).
+
+    Example:
+        >>> import casadi as ca
+        >>> from hybrid_mpc.signals import Signal
+        >>> x, h, u, w = ca.MX.sym("x"), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w")
+        >>> model = HybridModel("sum", 1.0, (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),),
+        ...     ca.Function("f", [x, h, u], [x + u, h]), ca.Function("g", [x, h, u], [u]),
+        ...     ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]))
+        >>> quiet, quick = (ExtendedKalmanFilter(model, sigma_y=[0.1], sigma_x=[0.01], sigma_x0=[0.1],
+        ...     sigma_d=[s]) for s in (0.0, 1.0))
+        >>> switching = SwitchingFilter([quiet, quick], [[0.99, 0.01], [0.5, 0.5]])
+        >>> estimate = switching.start(np.zeros(1))
+        >>> for y in (0.0, 0.0, 2.0, 4.0, 6.0):  # an unknown input of 2 from the second period on
+        ...     estimate = switching.update(estimate, np.array([y]), np.zeros(1))
+        >>> bool(abs(estimate.d[0] - 2.0) < 0.1)
+        True
+    """
+
+    def __init__(self, filters: Sequence[ExtendedKalmanFilter], transition: ArrayLike) -> None:
+        m, p = len(filters), np.asarray(transition, dtype=float)
+        if not m or any(f.model is not filters[0].model for f in filters):
+            raise InputError("a switching filter needs at least one filter, all on the same model")
+        if p.shape != (m, m) or np.any(p < 0) or not np.allclose(p.sum(axis=1), 1.0, atol=1e-9):
+            raise InputError(
+                f"transition: probabilities of shape {(m, m)} whose rows sum to 1 needed, got {p.tolist()}"
+            )
+        self._filters, self._transition = tuple(filters), p
+        self._first = _stationary(p)
+
+    @property
+    def model(self) -> HybridModel:
+        """The model of all its filters."""
+        return self._filters[0].model
+
+    def start(self, y: ArrayLike, t: float = 0.0) -> SwitchingEstimate:
+        """Estimate at rest at ``y`` ``(n_y,)``; see :meth:`ExtendedKalmanFilter.start`."""
+        empty = np.full(self.model.n_y, np.nan)
+        return _together([f.start(y, t) for f in self._filters], self._first, empty, float("nan"))
+
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
+    def predict(self, estimate: Estimate, u: ArrayLike) -> SwitchingEstimate:
+        """Estimate one period later with the input ``u`` ``(n_u,)`` held.
+
+        Raises:
+            InputError: If the estimate is not one of this class.
+        """
+        before = self._own(estimate)
+        joint = before.probability[:, None] * self._transition
+        after = joint.sum(axis=0)
+        share = joint / np.where(after > 0, after, 1.0)
+        modes = [
+            f.predict(_mixed(before.modes, share[:, j]), u) if after[j] > 0 else f.predict(before.modes[j], u)
+            for j, f in enumerate(self._filters)
+        ]
+        empty = np.full(self.model.n_y, np.nan)
+        return _together(modes, after, empty, float("nan"))
+
+    def correct(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> SwitchingEstimate:
+        """Estimate after the measurement ``y`` ``(n_y,)``; see :meth:`ExtendedKalmanFilter.correct`.
+
+        Raises:
+            InputError: If the estimate is not one of this class.
+        """
+        return self.assess(estimate, y, u)[0]
+
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
+    def assess(
+        self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None
+    ) -> tuple[SwitchingEstimate, float]:
+        """:meth:`correct`, and the log-likelihood of the measurement, without its constant."""
+        before = self._own(estimate)
+        if not np.any(np.isfinite(np.asarray(y, dtype=float))):
+            return before, 0.0
+        found = [f.assess(e, y, u) for f, e in zip(self._filters, before.modes, strict=True)]
+        likelihood = np.array([value for _, value in found])
+        largest = float(np.max(np.where(np.isfinite(likelihood), likelihood, -np.inf)))
+        weight = before.probability * np.exp(np.where(np.isfinite(likelihood), likelihood, -np.inf) - largest)
+        if not np.sum(weight) > 0:  # absurd to every filter: it says nothing of the modes
+            weight, largest = before.probability, -np.inf
+        modes, share = [e for e, _ in found], weight / weight.sum()
+        innovation = before.probability @ np.stack([e.innovation for e in modes])
+        nis = float(share @ np.array([e.nis for e in modes]))
+        return _together(modes, share, innovation, nis), largest + float(np.log(weight.sum()))
+
+    def update(self, estimate: Estimate, y: ArrayLike, u_prev: ArrayLike) -> SwitchingEstimate:
+        """:meth:`predict` with the input ``u_prev`` held since, then :meth:`correct` with ``y``.
+
+        A lost prediction is dropped: the estimate starts anew from ``y`` if any of it is finite.
+        """
+        predicted = self.predict(estimate, u_prev)
+        lost = any(f.lost(e) for f, e in zip(self._filters, predicted.modes, strict=True))
+        if lost and np.any(np.isfinite(np.asarray(y, dtype=float))):
+            return self.start(y, predicted.t)
+        return self.correct(predicted, y, u_prev)
+
+    def _own(self, estimate: Estimate) -> SwitchingEstimate:
+        if not isinstance(estimate, SwitchingEstimate) or len(estimate.modes) != len(self._filters):
+            raise InputError("SwitchingFilter goes on from its own estimates only; begin with start()")
+        return estimate
+
+
+def _mixed(modes: Sequence[Estimate], share: Array) -> Estimate:
+    """One Gaussian with mean and covariance of a mixture."""
+    first = modes[0]
+    z = np.stack([np.concatenate([e.x, e.h, e.d]) for e in modes])
+    mean = share @ z
+    off = z - mean
+    p = np.tensordot(share, np.stack([e.P for e in modes]), 1) + (off * share[:, None]).T @ off
+    n_x, n_z = first.x.size, first.x.size + first.h.size
+    empty = np.full(first.innovation.size, np.nan)
+    return Estimate(first.t, mean[:n_x], mean[n_x:n_z], mean[n_z:], p, empty, float("nan"))
+
+
+def _together(
+    modes: Sequence[Estimate], probability: Array, innovation: Array, nis: float
+) -> SwitchingEstimate:
+    m = _mixed(modes, probability)
+    return SwitchingEstimate(m.t, m.x, m.h, m.d, m.P, innovation, nis, tuple(modes), probability)
+
+
+def _stationary(transition: Array) -> Array:
+    """Shares ``(m,)`` of its time that the chain spends in each mode."""
+    m = len(transition)
+    rows = np.vstack([transition.T - np.eye(m), np.ones(m)])
+    shares = np.linalg.lstsq(rows, np.append(np.zeros(m), 1.0), rcond=None)[0]
+    return np.asarray(np.maximum(shares, 0.0) / np.maximum(shares, 0.0).sum())
