@@ -8,7 +8,7 @@ from hybrid_mpc.monitor.calibration import (
     with_residual,
 )
 from hybrid_mpc.monitor.energy import EnergyMonitor, MonitorReading, MonitorState
-from hybrid_mpc.monitor.replay import MonitorTrace, replay
+from hybrid_mpc.monitor.replay import MonitorTrace, judge, replay
 
 __all__ = [
     "EnergyMonitor",
@@ -20,5 +20,6 @@ __all__ = [
     "count_alarms",
     "alarm_intervals",
     "MonitorTrace",
+    "judge",
     "replay",
 ]

@@ -206,13 +206,14 @@ class EnergyMonitor:
         violations, residuals = _push(state.violations, violation), _push(state.residuals, residual)
         level = float(_mean_of_finite(violations))
         residual_level = float(np.linalg.norm(_mean_of_finite(residuals)))
-        alarms = self._alarms(level, residual_level, state.alarms)
+        alarms = self.alarms(level, residual_level, state.alarms)
         following = MonitorState(memory, x.reshape(-1), h.reshape(-1), violations, residuals, alarms)
         return following, MonitorReading(
             float(de_model), float(de_measured), violation, level, residual, residual_level, any(alarms)
         )
 
-    def _alarms(self, level: float, residual_level: float, were_on: tuple[bool, bool]) -> tuple[bool, bool]:
+    def alarms(self, level: float, residual_level: float, were_on: tuple[bool, bool]) -> tuple[bool, bool]:
+        """Whether power and residual alarm at these levels [W], [N m], after having been on or not."""
         c = self.calibration
         if c is None:
             return False, False

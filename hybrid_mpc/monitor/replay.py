@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -91,6 +91,25 @@ def replay(monitor: EnergyMonitor, estimator: EstimatorLike, trajectory: Traject
     columns = np.array(readings, dtype=np.float64).T
     balances, levels = (columns[0], columns[1]), (columns[2], columns[3], columns[4])
     return MonitorTrace(t, *balances, *levels, columns[5].astype(bool))
+
+
+def judge(monitor: EnergyMonitor, trace: MonitorTrace) -> MonitorTrace:
+    """The trace with the alarms of another calibration: those of ``monitor``.
+
+    Estimates and levels do not depend on the calibration, so nothing is replayed.
+
+    Args:
+        monitor: The monitor that judges; model and windows as in the replay.
+        trace: What :func:`replay` returned.
+
+    Example:
+        ``judge(EnergyMonitor(model, window=15, average=15, calibration=calibration), trace).intervals()``
+    """
+    on, alarm = (False, False), []
+    for level, residual in zip(trace.level_w, trace.residual_level, strict=True):
+        on = monitor.alarms(float(level), float(residual), on)
+        alarm.append(any(on))
+    return replace(trace, alarm=np.array(alarm, dtype=bool))
 
 
 def _check(t: Array, y: Array, u: Array, dt: float) -> None:

@@ -14,7 +14,7 @@ from hybrid_mpc.closed_loop.simulate import simulate
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.monitor.calibration import Calibration, alarm_intervals, calibrate, with_residual
-from hybrid_mpc.monitor.replay import MonitorTrace, replay
+from hybrid_mpc.monitor.replay import judge, replay
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_monitor, working_point
 from hybrid_mpc.riccati import hidden_fixed_point
@@ -42,10 +42,12 @@ def monitor_stage(context: Context) -> None:
     model = load_artifact(context.out / "model").models["hybrid"]
     sigma_x = np.array(context.result("control")["sigma_x"]["hybrid_observer"])
     whole = context.dataset.whole
-    power, residual = [], []
+    power, residual, traces = [], [], []
     for i, recording in enumerate(whole):
-        context.progress.update("recordings", i, 2 * len(whole), f"levels of {recording.name}")
-        trace = _trace(model, None, control, sigma_x, recording)
+        context.progress.update("recordings", i, len(whole), f"replay of {recording.name}")
+        # the estimator of the closed loops; the monitor ignores its disturbance estimate
+        trace = replay(make_monitor(model, None), make_estimator(model, control, sigma_x), recording)
+        traces.append(trace)
         nominal = _inside(context, recording, ("train", "valid", "nominal"))
         power.append(np.where(nominal, trace.level_w, np.nan))
         residual.append(np.where(nominal, trace.residual_level, np.nan))
@@ -54,9 +56,8 @@ def monitor_stage(context: Context) -> None:
     )
     set_calibration(context.out / "model", calibration.to_dict())
     alarms, arrays, clean = [], {}, {"seconds": 0.0, "alarms": 0, "test_seconds": 0.0, "test_alarms": 0}
-    for i, recording in enumerate(whole):
-        context.progress.update("recordings", len(whole) + i, 2 * len(whole), f"replay of {recording.name}")
-        trace = _trace(model, calibration, control, sigma_x, recording)
+    for recording, levels in zip(whole, traces, strict=True):
+        trace = judge(make_monitor(model, calibration), levels)
         alarms += [{"file": recording.name, "start_s": a, "end_s": b} for a, b in trace.intervals()]
         for key in ("t", "violation_w", "level_w", "residual_level", "alarm"):
             arrays[f"{recording.name}/{key}"] = getattr(trace, key)
@@ -120,17 +121,6 @@ def _inside(context: Context, recording: Trajectory, roles: tuple[str, ...]) -> 
     for start, end in clean_windows(context, recording, roles):
         inside |= (recording.t >= start) & (recording.t <= end)
     return inside
-
-
-def _trace(
-    model: HybridModel,
-    calibration: Calibration | None,
-    control: ControlSpec,
-    sigma_x: Array,
-    recording: Trajectory,
-) -> MonitorTrace:
-    """Replay with the estimator of the closed loops; the monitor ignores its disturbance estimate."""
-    return replay(make_monitor(model, calibration), make_estimator(model, control, sigma_x), recording)
 
 
 def _calibrate(levels: list[Array], dt: float, data_hash: str) -> Calibration:

@@ -8,7 +8,15 @@ import pytest
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model import HybridModel
-from hybrid_mpc.monitor import Calibration, EnergyMonitor, calibrate, count_alarms, replay, with_residual
+from hybrid_mpc.monitor import (
+    Calibration,
+    EnergyMonitor,
+    calibrate,
+    count_alarms,
+    judge,
+    replay,
+    with_residual,
+)
 from hybrid_mpc.signals import Signal
 
 DT, J, MGL, GAMMA = 0.02, 0.1, 1.5, 0.15
@@ -137,6 +145,9 @@ def test_alarm_rate_on_fresh_nominal_data_is_near_the_wanted_rate():
     calibration = calibrate(levels, DT, false_alarms_per_hour=60.0)
     armed = EnergyMonitor(model, window=11, average=10, calibration=calibration)
     runs = [replay(armed, Observer(model), simulate(5000, s, noise=NOISE)) for s in range(10, 16)]
+    unarmed = replay(monitor, Observer(model), simulate(5000, 10, noise=NOISE))
+    np.testing.assert_array_equal(judge(armed, unarmed).alarm, runs[0].alarm)
+    assert not unarmed.alarm.any()
     n = sum(count_alarms(r.alarm[100:], DT)[0] for r in runs)
     # 10 min at 60/h: 10 expected. Factor 3 for the threshold's own error (80 blocks, |scale| error 10 %
     # at -log(1/12) = 2.5 scales) and Poisson spread: P(n > 30 | 10) < 1e-6; no alarm at all has 5e-5.
@@ -202,7 +213,7 @@ def test_hysteresis_holds_between_release_and_threshold():
     )
     sequence, on, seen = [0.7, 1.1, 0.7, 0.4, 0.7], (False, False), []
     for level in sequence:
-        on = monitor._alarms(level, 0.0, on)
+        on = monitor.alarms(level, 0.0, on)
         seen.append(on[0])
     assert seen == [False, True, True, False, False]
 

@@ -12,7 +12,7 @@ from online_models import linear_model, pendulum_model
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation import ExtendedKalmanFilter
 from hybrid_mpc.estimation.kalman import Estimate
-from hybrid_mpc.mpc import OCP, CondensedController, SafeController, Source, Status
+from hybrid_mpc.mpc import OCP, CondensedController, SafeController, Source, SQPController, Status
 from hybrid_mpc.riccati import lqr
 
 POINT = [0.0, 1.0], [0.0]
@@ -208,3 +208,35 @@ def test_bad_input_is_refused(parts, arguments, words):
 
     with pytest.raises(InputError, match=words):
         use()
+
+
+def test_the_first_plan_is_made_before_the_loop_starts(parts):
+    model, prior, controller, _ = parts
+    estimate, target = estimate_of([0.2, -1.0]), np.zeros((1, 2))
+    safe = SafeController(controller, prior, first=SQPController(model, LIMITS))
+    first = safe.initial(estimate, None, target)
+    assert first.u == 0  # only a plan: the machine still rests
+    decision = safe.decide(first, estimate, target)
+    converged = SQPController(model, LIMITS)
+    best = converged.solve(converged.initial(estimate), estimate, target)
+    assert best.status is Status.SOLVED
+    alone = safe.decide(safe.initial(estimate), estimate, target)
+    left = [float(np.max(np.abs(d.solution.u - best.u))) for d in (decision, alone)]
+    # The plan handed over lacks only its last period, which one Gauss-Newton step finds but for a remainder.
+    assert left[0] < 1e-4
+    assert left[1] > 10 * left[0]
+
+
+def test_a_first_plan_that_fails_leaves_the_held_input(parts):
+    model, prior, controller, _ = parts
+    estimate = estimate_of([0.6, 0.0])
+    safe = SafeController(controller, prior, first=SQPController(model, LIMITS))
+    failed = safe.initial(estimate, [0.2], np.full((1, 2), np.nan))
+    np.testing.assert_array_equal(failed.solution.u, np.full((LIMITS.horizon, 1), 0.2))
+    other = replace_horizon(LIMITS)
+    with pytest.raises(InputError, match=r"first: .* give both the same model and problem"):
+        SafeController(controller, prior, first=CondensedController(model, other))
+
+
+def replace_horizon(ocp):
+    return OCP(7, ocp.q, ocp.r, ocp.r_delta, ocp.u_min, ocp.u_max, ocp.du_max, working_point=POINT)

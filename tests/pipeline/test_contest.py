@@ -1,11 +1,17 @@
 """What the closed loops of a run are summed up to, and what they are made of."""
 
+import shutil
+
+import numpy as np
 import pytest
 
+from hybrid_mpc.artifact import load_artifact
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.pipeline.contenders import CONTENDERS, ORACLES
-from hybrid_mpc.pipeline.contest import _seeds, parts_of, tasks_of
+from hybrid_mpc.pipeline.contest import _seeds, contest, parts_of, tasks_of
+from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.results import gap_closed, loop_table, summary, task_figures
+from hybrid_mpc.pipeline.settings import RunSettings
 from hybrid_mpc.scenario import load_scenario
 
 GOLF = load_scenario("golf_robot")
@@ -93,3 +99,40 @@ def test_every_contender_runs_and_oracles_less_often():
     assert [_seeds(n, GOLF, 10, 10) for n in CONTENDERS] == [10, 10, 10, 10, 10, 2]
     assert set(ORACLES) < set(CONTENDERS)
     assert len({(c.model, c.observer, c.truth) for c in CONTENDERS.values()}) == len(CONTENDERS)
+
+
+SHORT = """
+from dataclasses import replace
+from hybrid_mpc import Budget
+from scenarios.golf_robot import scenario
+task = replace(scenario.tasks[0], name="short", duration=0.2)
+budget = Budget(hidden=8, networks=1, teacher_steps=1, free_run_steps=1, seeds=2)
+scenario = replace(scenario, tasks=(task,), oracle=None, budgets={"quick": budget})
+"""
+
+
+def test_a_contest_that_was_killed_goes_on_from_what_it_kept(golf_artifact, tmp_path):
+    out, file = tmp_path / "run", tmp_path / "short.py"
+    file.write_text(SHORT)
+    shutil.copytree(golf_artifact, out / "model")
+    scenario = load_scenario(str(file))
+    context = Context(RunSettings(str(file)), scenario, out)
+    noise = {name: np.array([1e-4, 1e-2]) for name in CONTENDERS}
+    artifact = load_artifact(out / "model")
+    rows, arrays = contest(context, artifact, scenario.control, noise)
+    assert [(r["controller"], r["seed"]) for r in rows] == [
+        (name, seed) for name in sorted(set(CONTENDERS) - set(ORACLES)) for seed in (0, 1)
+    ]
+    kept = sorted((out / "checkpoints" / "loops").glob("*.json"))
+    assert len(kept) == 6  # two timed loops, what is left of their contenders, and two contenders whole
+    for lost in kept[1::3]:  # as a kill in between leaves them: arrays perhaps, but no JSON
+        lost.unlink()
+    stamps = {path: path.stat().st_mtime_ns for path in kept if path.exists()}
+    again, arrays_again = contest(context, artifact, scenario.control, noise)
+    assert again == rows
+    assert arrays.keys() == arrays_again.keys()
+    for key in arrays:
+        if not key.endswith("step_ms"):
+            np.testing.assert_array_equal(arrays[key], arrays_again[key])
+    assert all(path.is_file() for path in kept)
+    assert stamps == {path: path.stat().st_mtime_ns for path in stamps}
