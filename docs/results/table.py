@@ -64,6 +64,17 @@ def strokes(results: dict[str, Any]) -> list[str]:
     return lines
 
 
+def limits(results: dict[str, Any]) -> list[str]:
+    """Largest shares of the limits that the hybrid with observer used, and any controller of its inputs."""
+    used = results["control"].get("details", {}).get("limits_used", {})
+    names = ("u", "du", "x[0]", "x[1]")
+    lines = [f"| task | {' | '.join(names)} | u of any |", "|" + " --- |" * 6] if used else []
+    for task, row in used.items():
+        shares = [row["hybrid_observer"].get(name) for name in names] + [max(c["u"] for c in row.values())]
+        lines.append(f"| {task} | " + " | ".join("–" if s is None else f"{s:.3f}" for s in shares) + " |")
+    return lines
+
+
 def files(results: dict[str, Any]) -> list[str]:
     """RMSE by recording."""
     by_file = results["identification"]["details"].get("by_file", {})
@@ -95,7 +106,7 @@ def main() -> None:
     for path in sorted(p for p in HERE.glob("*.json") if not p.stem.endswith("identification")):
         results = json.loads(path.read_text())
         print(f"\n### {path.name}\n")
-        for part in (identification, files, control, strokes, rest):
+        for part in (identification, files, control, strokes, limits, rest):
             print("\n".join([*part(results), ""]))
 
 

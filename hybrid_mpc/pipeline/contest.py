@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.artifact import Artifact, load_artifact
 from hybrid_mpc.closed_loop import ClosedLoopResult, simulate
@@ -131,7 +131,10 @@ def _kept(
     report: Callable[[int, int, str], None] = lambda done, total, text: None,
 ) -> tuple[dict[str, Any], dict[str, Array]]:
     """What is kept of the loops of a part: a row each, and time series of the first seed."""
-    (task,) = tasks_of(load_scenario(scenario_name), (task_name,))
+    scenario = load_scenario(scenario_name)
+    (task,) = tasks_of(scenario, (task_name,))
+    control = task.control or scenario.control
+    assert control is not None
     plans: list[Array] = []
     results = loops(
         scenario_name,
@@ -144,7 +147,7 @@ def _kept(
         report,
         plans.append if timed else None,
     )
-    rows = [_row(task, name, seed, r) for seed, r in zip(seeds, results, strict=True)]
+    rows = [_row(task, control, name, seed, r) for seed, r in zip(seeds, results, strict=True)]
     arrays: dict[str, Array] = {}
     if seeds[0] == 0:
         arrays |= {f"{task_name}/{name}/{key}": getattr(results[0], key) for key in SHOWN}
@@ -163,7 +166,33 @@ def _seeds(name: str, scenario: Scenario, seeds: int, oracle_seeds: int) -> int:
     return 0 if scenario.oracle is None else (oracle_seeds if name == "oracle" else min(2, oracle_seeds // 2))
 
 
-def _row(task: Task, name: str, seed: int, r: ClosedLoopResult) -> dict[str, Any]:
+def limits_used(control: ControlSpec, r: ClosedLoopResult) -> dict[str, float]:
+    """Largest share of each limit that a loop used: 1 is the limit, more a violation.
+
+    Args:
+        control: The problem with the limits.
+        r: The loop; states are the plant's true ones.
+
+    Returns:
+        ``u``, and ``du`` and ``x[i]`` where there are such limits [-].
+    """
+    used = {"u": _share(r.u, control.u_min, control.u_max)}
+    if control.du_max is not None:
+        used["du"] = float(np.max(np.abs(np.diff(r.u, axis=0, prepend=0.0)) / np.array(control.du_max)))
+    for i in range(r.x.shape[1]):
+        low, high = (np.inf if v is None else abs(v[i]) for v in (control.x_min, control.x_max))
+        if np.isfinite(min(low, high)):
+            used[f"x[{i}]"] = _share(r.x[:, i], -low, high)
+    return used
+
+
+def _share(values: Array, low: ArrayLike, high: ArrayLike) -> float:
+    """Largest of values over their limit, of the limit's own sign."""
+    low, high = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
+    return float(np.max(np.where(values > 0, values / high, values / low)))
+
+
+def _row(task: Task, control: ControlSpec, name: str, seed: int, r: ClosedLoopResult) -> dict[str, Any]:
     return {
         "task": task.name,
         "controller": name,
@@ -171,7 +200,7 @@ def _row(task: Task, name: str, seed: int, r: ClosedLoopResult) -> dict[str, Any
         "cost": r.cost,
         "tracking_rmse_rad": r.tracking_rmse,
         "solved": r.source.count("MPC") / len(r.source),
-        "largest_u": float(np.abs(r.u).max()),
+        "limits": limits_used(control, r),
         "figures": task.figures(r) if task.figures is not None else {},
     }
 

@@ -115,11 +115,19 @@ def _control(context: Context) -> dict[str, Any]:
         },
         "figures": task_figures(control["loops"]),
         "share_of_solved_steps": solved,
-        "largest_u": {
-            n: max(r["largest_u"] for r in control["loops"] if r["controller"] == n) for n in names
-        },
+        "limits_used": limits_used(control["loops"]),
     }
     return {**out, "details": details}
+
+
+def limits_used(loops: list[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
+    """Largest share of each limit that any loop used, ``[task][controller][limit]``; see ``contest.limits_used``."""
+    out: dict[str, dict[str, dict[str, float]]] = {}
+    for row in loops:
+        cell = out.setdefault(row["task"], {}).setdefault(row["controller"], {})
+        for key, share in row["limits"].items():
+            cell[key] = max(float(share), cell.get(key, 0.0))
+    return out
 
 
 def loop_table(loops: list[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, list[float]]]]:

@@ -1,6 +1,8 @@
 """What the closed loops of a run are summed up to, and what they are made of."""
 
 import shutil
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,9 +10,10 @@ import pytest
 from hybrid_mpc.artifact import load_artifact
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.pipeline.contenders import CONTENDERS, ORACLES
-from hybrid_mpc.pipeline.contest import _seeds, contest, parts_of, tasks_of
+from hybrid_mpc.pipeline.contest import _seeds, contest, limits_used, parts_of, tasks_of
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.results import gap_closed, loop_table, summary, task_figures
+from hybrid_mpc.pipeline.results import limits_used as most_used
 from hybrid_mpc.pipeline.settings import RunSettings
 from hybrid_mpc.scenario import load_scenario
 
@@ -72,6 +75,22 @@ def test_rows_become_tables():
         "inf"  # as JSON holds it: a stroke that never came is not averaged away
     )
     assert task_figures(rows)["a"]["prior"]["mean_abs_speed_error_rel"] is None
+
+
+def test_limits_are_shares_of_the_side_that_they_bound():
+    control = replace(
+        GOLF.control, u_min=(-0.2,), u_max=(0.5,), du_max=(0.4,), x_min=(-1.0, -np.inf), x_max=(2.0, np.inf)
+    )
+    loop = SimpleNamespace(
+        u=np.array([[0.1], [0.25], [-0.1]]), x=np.array([[0.5, 9.0], [-0.75, 0.0], [1.0, 0.0]])
+    )
+    used = limits_used(control, loop)
+    assert used == {"u": pytest.approx(0.5), "du": pytest.approx(0.875), "x[0]": pytest.approx(0.75)}
+    rows = [
+        {"task": "a", "controller": "prior", "limits": used},
+        {"task": "a", "controller": "prior", "limits": {"u": 0.9}},
+    ]
+    assert most_used(rows)["a"]["prior"]["u"] == 0.9
 
 
 def test_tasks_are_found_by_name():
