@@ -1,13 +1,18 @@
 """State and disturbance estimation on a deployed model."""
 
+from hybrid_mpc.estimation.consistency import Consistency, Innovations, consistency, innovations
 from hybrid_mpc.estimation.delays import DelayCompensation, DelayedEstimate
 from hybrid_mpc.estimation.kalman import Estimate, Estimator, ExtendedKalmanFilter, TrueState
 
 __all__ = [
+    "Consistency",
     "DelayCompensation",
     "DelayedEstimate",
     "Estimate",
     "Estimator",
     "ExtendedKalmanFilter",
+    "Innovations",
     "TrueState",
+    "consistency",
+    "innovations",
 ]
