@@ -149,7 +149,9 @@ def innovations(estimator: ExtendedKalmanFilter, recording: Recording, skip: int
             f"(n, {estimator.model.n_u}) with n > 0"
         )
     estimate = estimator.start(recording.y[0])
-    rows, nis, degrees = [], [], []
+    rows: list[Array] = []
+    nis: list[float] = []
+    degrees: list[int] = []
     for k in range(1, n):
         u, y = recording.u[k - 1], recording.y[k]
         s = estimator.innovation_covariance(estimator.predict(estimate, u), u)
@@ -163,7 +165,7 @@ def innovations(estimator: ExtendedKalmanFilter, recording: Recording, skip: int
         degrees.append(int(np.isfinite(estimate.innovation).sum()))
     kept = slice(skip - 1, None)  # the first row belongs to the second sample
     return Innovations(
-        estimator.model.dt * np.arange(1, n)[kept],
+        estimator.model.dt * np.arange(1.0, n)[kept],
         np.array(rows).reshape(-1, n_y)[kept],
         np.array(nis)[kept],
         np.array(degrees, dtype=int)[kept],
