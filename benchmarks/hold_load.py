@@ -1,8 +1,9 @@
 """How still does the golf robot hold a load: ``python benchmarks/hold_load.py --model DIR --noise control.json``.
 
 The club is held at an angle for 60 s under the task's own control problem; after 1 s a constant load sets in at the
-motor. The sensor counts in steps of 1.53 mrad, and friction sticks. Printed for the last 30 s: the true angle's largest error in counts, the swings of more than two counts
-(turning points: a limit cycle has many, rest has none), and the range of the torque.
+motor. The encoder counts in steps of 1.53 mrad, and friction sticks. Printed for the last 30 s: the angle's largest
+error in counts, the swings (turning points with a move of more than two counts on either side: a limit cycle has many,
+rest has none), and the range of the torque.
 """
 
 from __future__ import annotations
