@@ -246,7 +246,7 @@ def main() -> int:
     given = parser.parse_args()
     rows, figures = run(given.loops, given.seed, given.model, lambda text: print(text, flush=True))
     print(json.dumps(figures, indent=1))
-    least = sorted(rows, key=lambda row: row.sources["MPC"])[:5]
+    least = sorted(rows, key=lambda row: row.sources["MPC"] / max(1, row.sources.total()))[:5]
     for row in least:
         print(f"least solved: {row.model} {row.draw} {dict(row.sources)} {dict(row.statuses)}")
     if given.out is not None:

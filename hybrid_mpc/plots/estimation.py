@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.plots.style import (
@@ -97,6 +98,7 @@ def innovations(
         bottom.bar(np.arange(1, lags + 1) + beside, r[:, i], width=width, label=plain(signal.name))
     bottom.axhspan(-correlation_band, correlation_band, color=BAND, alpha=0.15, linewidth=0)
     bottom.axhline(0.0, color=FAINT, linewidth=0.8)
+    bottom.xaxis.set_major_locator(MaxNLocator(integer=True))
     bottom.set_xlabel("lag [samples]")
     bottom.set_ylabel("autocorrelation of the\nnormalised innovations [-]")
     title_axes(bottom, "band: 95 % of white innovations, each lag by itself")

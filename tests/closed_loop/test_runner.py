@@ -1,8 +1,10 @@
 """The runner beside simulate on a clock that only moves when told, and once on the real one."""
 
+import re
 import time
 from collections import Counter
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -322,3 +324,15 @@ def test_in_real_time():
     assert np.median(report.lateness_ms) < 20.0
     assert report.sources["MPC"] >= 0.5 * report.periods
     assert isinstance(report.percentiles()["applied"]["p99"], float)
+
+
+def test_the_example_of_the_page_runs(capsys):
+    page = (Path(__file__).parents[2] / "docs" / "control.md").read_text()
+    (block,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    names: dict[str, object] = {}
+    exec(block, names)
+    report = names["report"]
+    assert report.periods + report.skipped == 100
+    assert "'median'" in capsys.readouterr().out
+    # A double integrator under MPC for 2 s; other load on the computer may cost periods, so only roughly.
+    assert abs(names["cart"]["q"] - 0.2) < 0.1
