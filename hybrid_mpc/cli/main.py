@@ -18,6 +18,7 @@ except ImportError as missing:  # the online half installs without the command l
     ) from None
 
 from hybrid_mpc import __version__
+from hybrid_mpc.cli import control as control_command
 from hybrid_mpc.cli import data as data_command
 from hybrid_mpc.cli import run as run_command
 from hybrid_mpc.cli import scenarios as scenarios_command
@@ -32,6 +33,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 app.command("run", epilog=run_command.EXAMPLES)(run_command.run)
+app.command("control", epilog=control_command.EXAMPLES)(control_command.control)
 app.command("data", epilog=data_command.EXAMPLES)(data_command.data)
 app.command("scenarios")(scenarios_command.scenarios)
 

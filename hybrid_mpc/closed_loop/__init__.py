@@ -1,7 +1,20 @@
-"""Closed loops in simulation: deterministic, with faults, measured on the plant's true state."""
+"""Closed loops: simulated ones, deterministic, with faults, measured on the plant's true state; and real ones."""
 
 from hybrid_mpc.closed_loop.faults import Fault
 from hybrid_mpc.closed_loop.result import ClosedLoopResult
+from hybrid_mpc.closed_loop.runner import Runner
 from hybrid_mpc.closed_loop.simulate import Monitor, Reading, simulate
+from hybrid_mpc.closed_loop.timing import Clock, RealClock, RunnerStep, RunReport
 
-__all__ = ["ClosedLoopResult", "Fault", "Monitor", "Reading", "simulate"]
+__all__ = [
+    "Clock",
+    "ClosedLoopResult",
+    "Fault",
+    "Monitor",
+    "Reading",
+    "RealClock",
+    "RunReport",
+    "Runner",
+    "RunnerStep",
+    "simulate",
+]

@@ -9,10 +9,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_mpc.errors import InputError
+
 if TYPE_CHECKING:
     import pandas as pd
 
+    from hybrid_mpc.model import HybridModel
+
 Array = NDArray[np.float64]
+UNITS = {"stage_cost": "1/s", "violation": "W", "level": "W"}
 
 
 @dataclass(frozen=True)
@@ -75,15 +80,39 @@ class ClosedLoopResult:
         """Root mean square of the true first state's deviation from its reference [its unit]."""
         return float(np.sqrt(np.mean((self.x[:, 0] - self.reference[:, 0]) ** 2)))
 
-    def to_pandas(self) -> pd.DataFrame:
-        """One row a period; vectors become columns ``x_0, x_1, ...``. Needs pandas."""
+    def to_pandas(self, model: HybridModel | None = None) -> pd.DataFrame:
+        """One row a period. Needs pandas.
+
+        Args:
+            model: Names and units of the columns: ``"x phi [rad]"``, ``"y phi [rad]"``, ``"t [s]"``. Default: numbers
+                without units, ``x_0``, ``x_1``, ``t``.
+
+        Raises:
+            InputError: If the model has other numbers of states, inputs or outputs.
+
+        Example: ``result.to_pandas(model)["u torque [N m]"]``
+        """
         import pandas as pd
 
-        columns: dict[str, object] = {"t": self.t}
+        columns: dict[str, object] = {"t" if model is None else "t [s]": self.t}
         for name in ("x", "y", "u", "x_hat", "h", "d", "reference"):
             values = getattr(self, name)
-            columns.update({f"{name}_{i}": values[:, i] for i in range(values.shape[1])})
+            labels = _labels(name, values.shape[1], model)
+            columns.update({label: values[:, i] for i, label in enumerate(labels)})
         for name in ("source", "status", "stage_cost", "violation", "level", "alarm"):
-            columns[name] = getattr(self, name)
-        columns.update({f"{name}_ms": values for name, values in self.timing_ms.items()})
+            unit = "" if model is None or name not in UNITS else f" [{UNITS[name]}]"
+            columns[name + unit] = getattr(self, name)
+        unit = "_ms" if model is None else " [ms]"
+        columns.update({f"{name}{unit}": values for name, values in self.timing_ms.items()})
         return pd.DataFrame(columns)
+
+
+def _labels(name: str, n: int, model: HybridModel | None) -> list[str]:
+    if model is None or name == "h":
+        return [f"{name}_{i}" for i in range(n)]
+    signals = model.outputs if name == "y" else model.inputs if name in ("u", "d") else model.states
+    if len(signals) != n:
+        raise InputError(
+            f"to_pandas: the loop has {n} columns of {name}, the model {model.name} {len(signals)}"
+        )
+    return [f"{name} {s.name} [{s.unit}]" for s in signals]

@@ -133,7 +133,7 @@ def simulate(
     """
     safe = controller if isinstance(controller, SafeController) else SafeController(controller)
     ocp, model = safe.controller.ocp, estimator.model
-    _check_models(model, safe.controller.model)
+    check_models(model, safe.controller.model)
     n = _periods(dt, duration, model.dt, safe.controller.model.dt)
     plant, faults = install(plant, faults)
     check_channels(faults, model.n_y, ocp.n_u)
@@ -192,7 +192,12 @@ def _checked_cost(ocp: OCP, cost: OCP) -> OCP:
     return cost
 
 
-def _check_models(estimated: HybridModel, controlled: HybridModel) -> None:
+def check_models(estimated: HybridModel, controlled: HybridModel) -> None:
+    """Refuse an estimator and a controller whose models have other sizes.
+
+    Raises:
+        InputError: With both models' sizes.
+    """
     sizes = [(m.n_x, m.n_h, m.n_u) for m in (estimated, controlled)]
     if sizes[0] != sizes[1]:
         raise InputError(

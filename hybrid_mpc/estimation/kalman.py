@@ -209,6 +209,19 @@ class ExtendedKalmanFilter:
         after = Estimate(estimate.t, x, h, d, 0.5 * (p + p.T), innovation, nis)
         return after, -0.5 * (nis + size)
 
+    def innovation_covariance(self, estimate: Estimate, u: ArrayLike | None = None) -> Array:
+        """Covariance ``(n_y, n_y)`` that a predicted estimate gives its innovation: ``C P C' + R``.
+
+        Args:
+            estimate: The predicted estimate.
+            u: Input ``(n_u,)`` of the output equation. Default: zero.
+        """
+        held = estimate.d if u is None else np.asarray(u, dtype=float).ravel() + estimate.d
+        _, c_x, c_u = (m.full() for m in self._output(estimate.x, held))
+        c = np.hstack([c_x, np.zeros((self._model.n_y, self._model.n_h)), c_u])
+        s: Array = c @ estimate.P @ c.T + np.diag(self._noise_y)
+        return 0.5 * (s + s.T)
+
     def update(self, estimate: Estimate, y: ArrayLike, u_prev: ArrayLike) -> Estimate:
         """:meth:`predict` with the input ``u_prev`` held since, then :meth:`correct` with ``y``.
 

@@ -131,6 +131,10 @@ class SwitchingFilter:
         nis = float(share @ np.array([e.nis for e in modes]))
         return _together(modes, share, innovation, nis), largest + float(np.log(weight.sum()))
 
+    def innovation_covariance(self, estimate: Estimate, u: ArrayLike | None = None) -> Array:
+        """Covariance ``(n_y, n_y)`` that a predicted estimate gives its innovation; that of the mixture."""
+        return self._filters[0].innovation_covariance(estimate, u)
+
     def update(self, estimate: Estimate, y: ArrayLike, u_prev: ArrayLike) -> SwitchingEstimate:
         """:meth:`predict` with the input ``u_prev`` held since, then :meth:`correct` with ``y``.
 

@@ -56,7 +56,8 @@ def catalogue(start: float = 2.0, end: float = inf, drift_time: float = 60.0) ->
 
     last = min(end, start + 4.0)
     gaps = tuple(
-        Fault(t, min(t + 0.1, end), "measurement_dropout") for t in np.arange(start, last, 0.5).tolist()
+        Fault(t, min(t + 0.1, end), "measurement_dropout")
+        for t in np.arange(start, last - 1e-9, 0.5).tolist()
     )
     push = Fault(start, min(start + 0.2, end), "plant_push", 1.0)
     return (

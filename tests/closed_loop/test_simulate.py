@@ -249,6 +249,26 @@ def test_to_pandas_has_every_column(model, safe):
     )
 
 
+def test_to_pandas_with_a_model_has_names_and_units(model, safe):
+    result = run(model, safe)
+    table, plain = result.to_pandas(model), result.to_pandas()
+    assert table.shape == plain.shape
+    names = [
+        "t [s]",
+        "x phi [rad]",
+        "y phi [rad]",
+        "u torque [N m]",
+        "x_hat phi_dot [rad/s]",
+        "level [W]",
+        "solve [ms]",
+    ]
+    assert set(names) <= set(table)
+    np.testing.assert_array_equal(table["x phi_dot [rad/s]"], result.x[:, 1])
+    other = linear_model(np.eye(3), np.ones((3, 1)), np.eye(3)[:1])
+    with pytest.raises(InputError, match="2 columns of x, the model linear 3"):
+        result.to_pandas(other)
+
+
 class Odd(PendulumPlant):
     """A plant of which one method returns another shape."""
 

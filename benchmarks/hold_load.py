@@ -1,0 +1,95 @@
+"""How still does the golf robot hold a load: ``python benchmarks/hold_load.py --model DIR --noise control.json``.
+
+The club is held at an angle for 60 s under the task's own control problem; after 1 s a constant load sets in at the
+motor. The encoder counts in steps of 1.53 mrad, and friction sticks. Printed for the last 30 s: the angle's largest
+error in counts, the swings (turning points with a move of more than two counts on either side: a limit cycle has many,
+rest has none), and the range of the torque.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+
+from hybrid_mpc.artifact import load_artifact
+from hybrid_mpc.closed_loop import Fault, simulate
+from hybrid_mpc.pipeline.loops import make_controller, make_estimator
+from scenarios.golf_robot import scenario
+from scenarios.golf_robot.tasks import CONTROL
+
+DT = 0.02
+COUNT = 2 * np.pi / 4096
+SIGMA_X = (1e-4, 2e-2)
+"""Process noise per period [rad, rad/s] where none is given."""
+HOLDS = ((0.3, -0.08), (0.3, 0.0), (-0.2, 0.08), (0.6, 0.05))
+"""Angle [rad] and load [N m]."""
+
+
+def swings(error, size: float) -> int:
+    """Number of turning points of ``error`` ``(n,)`` with a move of more than ``size`` on either side."""
+    low = high = error[0]
+    direction, count = 0, 0
+    for value in error:
+        low, high = min(low, value), max(high, value)
+        if direction >= 0 and high - value > size:  # it has turned down
+            count, direction, low = count + (direction > 0), -1, value
+        elif direction <= 0 and value - low > size:  # it has turned up
+            count, direction, high = count + (direction < 0), 1, value
+    return count
+
+
+def held(models, name: str, angle: float, load: float, *, sigma_x=SIGMA_X, seconds=60.0, last=30.0) -> dict:
+    """Figures of one loop."""
+    model = models[name]
+    estimator = make_estimator(model, CONTROL, np.array(sigma_x))
+    result = simulate(
+        scenario.plant(), estimator, make_controller(model, models["prior"], CONTROL),
+        lambda t: np.tile([angle, 0.0], (len(t), 1)), dt=DT, duration=seconds, x0=np.array([angle, 0.0]), seed=0,
+        faults=[Fault(1.0, np.inf, "input_offset", load)] if load else [],
+    )  # fmt: skip
+    late = result.t >= seconds - last - 1e-9
+    error = (result.x[late, 0] - angle) / COUNT
+    return {
+        "model": name,
+        "angle_rad": angle,
+        "load_nm": load,
+        "largest_error_counts": float(np.abs(error).max()),
+        "swings": swings(error, 2.0),
+        "torque_range_nm": float(np.ptp(result.u[late])),
+        "solved": result.source.count("MPC") / len(result.source),
+    }
+
+
+def main() -> None:
+    """Print a table; write JSON where asked."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--model", type=Path, required=True, help="artifact folder")
+    parser.add_argument("--noise", type=Path, help="control.json of a run: process noise of the filters")
+    parser.add_argument("--out", type=Path, help="JSON file to write")
+    given = parser.parse_args()
+    models, rows = load_artifact(given.model).models, []
+    noise = json.loads(given.noise.read_text())["sigma_x"] if given.noise else {}
+    print("| model | angle [rad] | load [N m] | largest error [counts] | swings | torque range [N m] |")
+    print("| --- | ---: | ---: | ---: | ---: | ---: |")
+    for name in models:
+        for angle, load in HOLDS:
+            row = held(models, name, angle, load, sigma_x=noise.get(f"{name}_observer", SIGMA_X))
+            rows.append(row)
+            print(
+                f"| {name} | {angle:g} | {load:g} | {row['largest_error_counts']:.2f} | {row['swings']} "
+                f"| {row['torque_range_nm']:.3f} |",
+                flush=True,
+            )
+    if given.out is not None:
+        given.out.write_text(json.dumps(rows, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

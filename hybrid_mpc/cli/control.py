@@ -1,0 +1,95 @@
+"""``hybrid-mpc control``: closed loops of a model that exists."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from hybrid_mpc.scenario import load_scenario
+
+EXAMPLES = (
+    "Examples:\n\n"
+    "  hybrid-mpc control golf_robot --model runs/golf/model --out loops\n\n"
+    "  hybrid-mpc control golf_robot --model runs/golf/model --task stroke --controller prior_observer "
+    "--controller hybrid_observer --solver sqp --seeds 5 --out strokes\n\n"
+    "  hybrid-mpc control golf_robot --model runs/golf/model --task track_sine --fault plant_friction=2@1.5 "
+    "--out worn"
+)
+
+
+def control(
+    scenario: Annotated[
+        str, typer.Argument(help="A registered name (see: hybrid-mpc scenarios) or a .py file.")
+    ],
+    model: Annotated[Path, typer.Option(help="Artifact folder: model/ of a finished run.")],
+    out: Annotated[Path, typer.Option(help="Folder to make; an existing one must be empty.")],
+    task: Annotated[
+        list[str] | None,
+        typer.Option(help="A task, or the beginning of tasks' names; may be repeated. Default: all."),
+    ] = None,
+    controller: Annotated[
+        list[str] | None,
+        typer.Option(help="A contender; may be repeated. Default: prior_observer and hybrid_observer."),
+    ] = None,
+    solver: Annotated[str, typer.Option(help="rti, sqp or ipopt.")] = "rti",
+    seeds: Annotated[int, typer.Option(help="Loops of each task and controller.", min=1)] = 10,
+    seed: Annotated[int, typer.Option(help="Seed of the loops.", min=0)] = 0,
+    fault: Annotated[
+        list[str] | None, typer.Option(help="TARGET=VALUE@START:END in every loop; may be repeated.")
+    ] = None,
+    noise: Annotated[
+        Path | None,
+        typer.Option(help="control.json with the filters' process noise. Default: that of the model's run."),
+    ] = None,
+    gif: Annotated[bool, typer.Option("--gif/--no-gif", help="Draw moving pictures.")] = True,
+) -> None:
+    """Close the loop around the simulated machine with a trained model, without training anything."""
+    from hybrid_mpc.cli.progress import make_progress
+    from hybrid_mpc.pipeline.control_job import DEFAULT_CONTROLLERS, ControlSettings, parsed_fault, prepared
+    from hybrid_mpc.pipeline.control_results import check_folder, run_control
+
+    check_folder(out)
+    settings = ControlSettings(
+        tuple(task or ()),
+        tuple(dict.fromkeys(controller or DEFAULT_CONTROLLERS)),
+        solver,
+        seeds,
+        seed,
+        tuple(parsed_fault(text) for text in fault or ()),
+    )
+    with make_progress() as progress:
+        progress.start("reading the model, and the filters' noise")
+        job = prepared(load_scenario(scenario), model, settings, noise)
+        progress.finish(job.noise_source)
+        results = run_control(job, out, progress, gif=gif)
+    for line in summary(results):
+        print(line)
+    print(f"results: {(out / 'results.json').resolve()}")
+
+
+def summary(results: dict[str, Any]) -> list[str]:
+    """One line a task and controller.
+
+    Args:
+        results: What results.json holds.
+    """
+    lines = [f"{'task':16} {'controller':16} {'cost':>10} {'95 %':>10} {'RMSE [rad]':>11} {'solved':>8}"]
+    for task, row in results["summary"].items():
+        for name, cell in row.items():
+            cost, rmse = cell["cost"], cell["tracking_rmse_rad"]["mean"]
+            lines.append(
+                f"{task:16} {name:16} {_number(cost['mean']):>10} {_number(cost['ci95'], '±'):>10} "
+                f"{_number(rmse):>11} {100 * cell['sources']['MPC']:>6.1f} %"
+            )
+    for name, times in results["step_ms"].items():
+        lines.append(
+            f"a step of {name}: median {times['median']:.2f} ms, 99 % within {times['p99']:.2f} ms, period "
+            f"{results['period_ms']:g} ms"
+        )
+    return lines
+
+
+def _number(value: float | None, sign: str = "") -> str:
+    return "-" if value is None else f"{sign}{value:.4g}"

@@ -1,0 +1,174 @@
+"""Clocks for the real-time runner, and the record of how it kept time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.closed_loop.simulate import Reading
+from hybrid_mpc.estimation.kalman import Estimate
+from hybrid_mpc.model import HybridModel
+from hybrid_mpc.mpc.safeguard import Decision
+
+Array = NDArray[np.float64]
+TIMED = ("measure", "estimate", "solve", "actuate", "monitor")
+QUANTILES = {"median": 0.5, "p95": 0.95, "p99": 0.99, "max": 1.0}
+
+
+class Clock(Protocol):
+    """What the runner knows of time."""
+
+    def now(self) -> float:
+        """Time [s] on a scale that never goes back."""
+
+    def sleep_until(self, t: float) -> None:
+        """Return at ``t`` [s] or as soon as possible after it; at once if it has passed."""
+
+
+class RealClock:
+    """The computer's monotonic clock.
+
+    Example:
+        >>> clock = RealClock()
+        >>> until = clock.now() + 0.002
+        >>> clock.sleep_until(until)
+        >>> clock.now() >= until
+        True
+    """
+
+    def now(self) -> float:
+        """Time [s] since some fixed instant."""
+        return time.perf_counter()
+
+    def sleep_until(self, t: float) -> None:
+        """Sleep; the operating system decides how punctual the return is."""
+        while (left := t - time.perf_counter()) > 0:
+            time.sleep(left)
+
+
+@dataclass(frozen=True)
+class RunnerStep:
+    """One period as ``on_step`` sees it.
+
+    Args:
+        k: Its number on the grid; skipped periods have none.
+        t: Its time [s] on the grid, since the start.
+        y: Measurement ``(n_y,)``; NaN where there was none.
+        estimate: What is believed.
+        decision: The input and where it came from.
+        reading: What the monitor says, or None.
+        lateness: Begin of the period after its instant on the grid [s].
+        applied: Instant after the grid's at which the input had been handed over [s].
+        spent: Durations [s] of measure, estimate, solve, actuate, monitor.
+    """
+
+    k: int
+    t: float
+    y: Array
+    estimate: Estimate
+    decision: Decision
+    reading: Reading | None
+    lateness: float
+    applied: float
+    spent: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class RunReport:
+    """How a real-time run went; counts are of all periods, rows of the last ones kept.
+
+    Args:
+        periods: Periods that ran.
+        sources: Number of inputs by the name of their :class:`~hybrid_mpc.mpc.Source`.
+        missing: Periods without a measurement (None, or nothing finite in it).
+        late: Periods in which the shifted plan was applied because the solve was, or would have been, late.
+        overruns: Periods whose input was applied after their deadline.
+        skipped: Periods that did not run at all, since one before them took too long.
+        stopped: ``"duration"`` or ``"stop"``: what ended the run.
+        t: Times ``(n,)`` [s] on the grid, since the start, of the periods kept.
+        y: Measurements ``(n, n_y)``; NaN where there was none.
+        u: Inputs ``(n, n_u)``.
+        x_hat: Estimated states ``(n, n_x)``.
+        source: Name of the source of each input.
+        status: Name of the :class:`~hybrid_mpc.mpc.Status` of each solve.
+        lateness_ms: Begin of each period after its instant on the grid ``(n,)`` [ms].
+        applied_ms: Instant after the grid's at which each input had been handed over ``(n,)`` [ms].
+        timing_ms: Durations ``(n,)`` [ms]: ``measure``, ``estimate``, ``solve``, ``actuate``, ``monitor``.
+        alarm: ``(n,)``, True while the monitor alarms.
+    """
+
+    periods: int
+    sources: Mapping[str, int]
+    missing: int
+    late: int
+    overruns: int
+    skipped: int
+    stopped: str
+    t: Array
+    y: Array
+    u: Array
+    x_hat: Array
+    source: tuple[str, ...]
+    status: tuple[str, ...]
+    lateness_ms: Array
+    applied_ms: Array
+    timing_ms: Mapping[str, Array]
+    alarm: NDArray[np.bool_]
+
+    def percentiles(self) -> dict[str, dict[str, float]]:
+        """Median, 95th and 99th percentile and maximum [ms] of lateness, applied instant and durations.
+
+        Example: ``runner.run(duration=10.0).percentiles()["lateness"]["p99"]``
+        """
+        rows = {"lateness": self.lateness_ms, "applied": self.applied_ms, **self.timing_ms}
+        return {name: percentiles(values) for name, values in rows.items()}
+
+
+def make_report(
+    steps: Sequence[RunnerStep], model: HybridModel, *, periods: int, sources: Mapping[str, int],
+    missing: int, late: int, overruns: int, skipped: int, stopped: str,
+) -> RunReport:  # fmt: skip
+    """The report of a run from the steps kept and the counts of all.
+
+    Args:
+        steps: The periods kept; may be empty.
+        model: For the sizes.
+        periods: This and the others: see :class:`RunReport`.
+        sources: See there.
+        missing: See there.
+        late: See there.
+        overruns: See there.
+        skipped: See there.
+        stopped: See there.
+    """
+    ms = 1e3 * np.array([s.spent for s in steps]).reshape(len(steps), len(TIMED))
+    return RunReport(
+        periods, sources, missing, late, overruns, skipped, stopped,
+        t=np.array([s.t for s in steps]),
+        y=np.array([s.y for s in steps]).reshape(-1, model.n_y),
+        u=np.array([s.decision.u for s in steps]).reshape(-1, model.n_u),
+        x_hat=np.array([s.estimate.x for s in steps]).reshape(-1, model.n_x),
+        source=tuple(s.decision.source.name for s in steps),
+        status=tuple(s.decision.status.name for s in steps),
+        lateness_ms=1e3 * np.array([s.lateness for s in steps]),
+        applied_ms=1e3 * np.array([s.applied for s in steps]),
+        timing_ms={name: ms[:, i] for i, name in enumerate(TIMED)},
+        alarm=np.array([s.reading is not None and bool(s.reading.alarm) for s in steps], dtype=bool),
+    )  # fmt: skip
+
+
+def percentiles(values: Array) -> dict[str, float]:
+    """Median, 95th and 99th percentile and maximum of ``values`` ``(n,)``; NaN where there are none.
+
+    Example:
+        >>> percentiles(np.arange(101.0))
+        {'median': 50.0, 'p95': 95.0, 'p99': 99.0, 'max': 100.0}
+    """
+    if len(values) == 0:
+        return dict.fromkeys(QUANTILES, float("nan"))
+    return {name: float(np.quantile(values, q)) for name, q in QUANTILES.items()}

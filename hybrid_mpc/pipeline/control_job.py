@@ -1,0 +1,270 @@
+"""Closed loops of an artifact that exists, without the run that made it: settings, parts and loops."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.artifact import FILE, Artifact, load_artifact
+from hybrid_mpc.closed_loop import ClosedLoopResult, Fault, simulate
+from hybrid_mpc.closed_loop.faults import check_channels, install
+from hybrid_mpc.closed_loop.simulate import Step
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.model import HybridModel
+from hybrid_mpc.mpc import OCP, Controller, IpoptController, SafeController, SQPController
+from hybrid_mpc.pipeline.contenders import CONTENDERS, ORACLES, build
+from hybrid_mpc.pipeline.control_noise import find_noise
+from hybrid_mpc.pipeline.loops import make_monitor
+from hybrid_mpc.scenario import ControlSpec, Scenario, Task
+
+Array = NDArray[np.float64]
+DEFAULT_CONTROLLERS = ("prior_observer", "hybrid_observer")
+SOLVERS: Mapping[str, Callable[[HybridModel, OCP], Controller] | None] = {
+    "rti": None,  # what the contenders are built with
+    "sqp": lambda model, ocp: SQPController(model, ocp),
+    "ipopt": lambda model, ocp: IpoptController(model, ocp),
+}
+
+
+@dataclass(frozen=True)
+class ControlSettings:
+    """What ``hybrid-mpc control`` runs.
+
+    Args:
+        tasks: Names, or beginnings of names, of tasks. Default: all.
+        controllers: Names of contenders.
+        solver: ``"rti"``, ``"sqp"`` or ``"ipopt"``; oracles have their own.
+        seeds: Loops of each task and controller.
+        seed: Seed of the first loop, times 1000, as in the main job.
+        faults: What goes wrong in every loop beside what the task itself brings.
+
+    Raises:
+        InputError: If a controller or solver is unknown, an oracle is asked for with another solver, or a number
+            is too small.
+
+    Example:
+        >>> ControlSettings(solver="newton")
+        Traceback (most recent call last):
+        hybrid_mpc.errors.InputError: no solver 'newton'; there are: rti, sqp, ipopt
+    """
+
+    tasks: tuple[str, ...] = ()
+    controllers: tuple[str, ...] = DEFAULT_CONTROLLERS
+    solver: str = "rti"
+    seeds: int = 10
+    seed: int = 0
+    faults: tuple[Fault, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.controllers if name not in CONTENDERS]
+        if unknown or not self.controllers:
+            given = f"no controller {', '.join(unknown)}" if unknown else "no controller is given"
+            raise InputError(f"{given}; there are: {', '.join(CONTENDERS)}")
+        if self.solver not in SOLVERS:
+            raise InputError(f"no solver {self.solver!r}; there are: {', '.join(SOLVERS)}")
+        oracles = [name for name in self.controllers if name in ORACLES]
+        if oracles and self.solver != "rti":
+            raise InputError(
+                f"controller {oracles[0]} has a solver of its own (several starts); leave --solver out or it"
+            )
+        if self.seeds < 1 or self.seed < 0:
+            raise InputError(f"seeds must be 1 or more and seed not negative, got {self.seeds}, {self.seed}")
+
+
+def selected_tasks(scenario: Scenario, names: Sequence[str]) -> tuple[Task, ...]:
+    """The tasks of these names or, where there is none of a name, those whose names begin so; all for none.
+
+    Raises:
+        InputError: If nothing fits a name.
+
+    Example:
+        >>> from hybrid_mpc.scenario import load_scenario
+        >>> [task.name for task in selected_tasks(load_scenario("golf_robot"), ["track", "stroke_4"])]
+        ['track_sine', 'track_step', 'stroke_4']
+    """
+    if not names:
+        return scenario.tasks
+    chosen: dict[str, Task] = {}
+    for name in names:
+        fitting = [t for t in scenario.tasks if t.name == name] or [
+            t for t in scenario.tasks if name and t.name.startswith(name)
+        ]
+        if not fitting:
+            known = ", ".join(t.name for t in scenario.tasks) or "none"
+            raise InputError(
+                f"scenario {scenario.name}: no task {name!r}, none begins so; there are: {known}"
+            )
+        chosen |= {t.name: t for t in fitting}
+    return tuple(t for t in scenario.tasks if t.name in chosen)
+
+
+def parsed_fault(text: str) -> Fault:
+    """A fault from ``TARGET[=VALUE][@START[:END]]``, times in seconds.
+
+    Args:
+        text: e.g. ``"input_gain=0.8@1.0"``; default value 0, start 0, end never.
+
+    Raises:
+        InputError: If it has another form, or there is no such fault.
+
+    Example:
+        >>> fault = parsed_fault("plant_friction=2@1:2.5")
+        >>> fault.target, fault.value, fault.start, fault.end
+        ('plant_friction', 2.0, 1.0, 2.5)
+    """
+    head, _, when = text.partition("@")
+    target, _, value = head.partition("=")
+    start, _, end = when.partition(":")
+    try:
+        numbers = [float(v) if v else d for v, d in ((start, 0.0), (end, math.inf), (value, 0.0))]
+    except ValueError as error:
+        raise InputError(
+            f"fault {text!r}: {error}; the form is TARGET=VALUE@START:END, e.g. input_gain=0.8@1.0:2.5"
+        ) from error
+    if math.isnan(numbers[0]) or math.isnan(numbers[1]):
+        raise InputError(f"fault {text!r}: times must be numbers of seconds")
+    return Fault(numbers[0], numbers[1], target, numbers[2])
+
+
+@dataclass(frozen=True)
+class Job:
+    """A scenario and an artifact that fit each other, and what to run.
+
+    Args:
+        scenario: The machine, with plant and control problem.
+        artifact: Prior and hybrid.
+        tasks: The tasks.
+        settings: What to run.
+        noise: Process noise by contender.
+        noise_source: Where that came from, in words.
+    """
+
+    scenario: Scenario
+    artifact: Artifact
+    tasks: tuple[Task, ...]
+    settings: ControlSettings
+    noise: Mapping[str, Array]
+    noise_source: str
+
+
+def prepared(scenario: Scenario, model: Path, settings: ControlSettings, noise: Path | None = None) -> Job:
+    """Load and check everything before the first loop.
+
+    Args:
+        scenario: The machine.
+        model: Artifact folder, or the folder of the run that holds it as ``model``.
+        settings: What to run.
+        noise: ``control.json`` of a run. Default: that of the run that the model lies in; without one the process
+            noise is estimated on recordings that the scenario makes (budget quick, the settings' seed).
+
+    Raises:
+        InputError: If the scenario has nothing to run, the folder holds no artifact, the artifact belongs to another
+            machine, or a task, fault or noise file does not fit.
+    """
+    if scenario.plant is None or scenario.control is None or not scenario.tasks:
+        lacks = (
+            "plant" if scenario.plant is None else "control problem" if scenario.control is None else "task"
+        )
+        raise InputError(f"scenario {scenario.name} has no {lacks}: there is no loop to close in simulation")
+    if scenario.oracle is None and (oracles := [c for c in settings.controllers if c in ORACLES]):
+        raise InputError(f"scenario {scenario.name} has no oracle; leave --controller {oracles[0]} out")
+    tasks = selected_tasks(scenario, settings.tasks)
+    folder = model / "model" if not (model / FILE).is_file() and (model / "model" / FILE).is_file() else model
+    if not (folder / FILE).is_file():
+        state = "holds something else" if folder.is_dir() else "does not exist"
+        raise InputError(
+            f"{folder} {state}; --model needs an artifact folder, such as model/ of a finished run"
+        )
+    artifact = load_artifact(folder)
+    _check_artifact(scenario, artifact, folder, scenario.control)
+    check_channels(install(scenario.plant(), settings.faults)[1], len(scenario.control.estimator_sigma), 1)
+    found = find_noise(scenario, artifact, folder, settings.controllers, settings.seed, noise)
+    return Job(scenario, artifact, tasks, settings, *found)
+
+
+def _check_artifact(scenario: Scenario, artifact: Artifact, folder: Path, control: ControlSpec) -> None:
+    missing = [name for name in ("prior", "hybrid") if name not in artifact.models]
+    if missing:
+        raise InputError(f"{folder} holds {', '.join(artifact.models)}; needed is a model {missing[0]} too")
+    made_for = artifact.provenance.get("scenario")
+    if made_for is not None and made_for != scenario.name:
+        raise InputError(f"{folder} was made for scenario {made_for}, not for {scenario.name}")
+    for name, model in artifact.models.items():
+        sizes = model.n_x, model.n_u, model.n_y
+        needed = len(control.q), len(control.r), len(control.estimator_sigma)
+        if sizes != needed:
+            raise InputError(
+                f"{folder}: model {name} has (states, inputs, outputs) = {sizes}, scenario {scenario.name} {needed}"
+            )
+
+
+def run_loops(
+    job: Job, report: Callable[[str, int, int, str], None]
+) -> Iterator[tuple[Task, str, int, ClosedLoopResult, Array]]:
+    """All loops one after the other, alone on the machine, so that the durations of their steps count.
+
+    Args:
+        job: What to run.
+        report: Called with ``(task, done, total, text)`` as the loops go on.
+
+    Yields:
+        Task, controller, number of the loop, its record, and the planned states ``(n, N + 1, n_x)``.
+    """
+    settings, dt = job.settings, job.artifact.models["prior"].dt
+    for task in job.tasks:
+        periods = round(task.duration / dt)
+        total = len(settings.controllers) * settings.seeds * periods
+        for i, name in enumerate(settings.controllers):
+            made = parts(job, task, name)
+            for seed in range(settings.seeds):
+                done = (i * settings.seeds + seed) * periods
+                say = partial(_report, report, task.name, done, total, f"{name}, seed {seed}")
+                yield task, name, seed, *_loop(job, task, name, seed, made, say)
+        report(task.name, total, total, "")
+
+
+def _report(
+    report: Callable[[str, int, int, str], None], key: str, done: int, total: int, text: str, k: int
+) -> None:
+    if k % 25 == 0:
+        report(key, done + k, total, text)
+
+
+def _loop(
+    job: Job, task: Task, name: str, seed: int, made: tuple[Any, SafeController], say: Callable[[int], None]
+) -> tuple[ClosedLoopResult, Array]:
+    """One loop, and its plans ``(n, N + 1, n_x)``."""
+    plans: list[Array] = []
+
+    def on_step(step: Step) -> None:
+        plans.append(step.decision.solution.x)
+        say(step.k)
+
+    assert job.scenario.plant is not None
+    hybrid = CONTENDERS[name].model == "hybrid"
+    result = simulate(
+        job.scenario.plant(), *made, task.reference, weight=task.weight, dt=job.artifact.models["prior"].dt,
+        duration=task.duration, x0=np.array(task.x0), seed=job.settings.seed * 1000 + seed,
+        monitor=make_monitor(job.artifact.models["hybrid"], None) if hybrid else None,
+        faults=(*task.faults, *job.settings.faults), on_step=on_step,
+    )  # fmt: skip
+    return result, np.stack(plans)
+
+
+def parts(job: Job, task: Task, name: str) -> tuple[Any, SafeController]:
+    """Estimator and controller of a contender for a task, with the solver that is asked for."""
+    control = task.control or job.scenario.control
+    assert control is not None
+    estimator, safe = build(name, job.scenario, job.artifact, control, job.noise)
+    make = SOLVERS[job.settings.solver]
+    if make is None:
+        return estimator, safe
+    inner = safe.controller
+    return estimator, SafeController(make(inner.model, inner.ocp), job.artifact.models["prior"])

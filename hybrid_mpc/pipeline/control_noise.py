@@ -1,0 +1,83 @@
+"""The process noise of the filters where there is no run at hand that has just estimated it."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.artifact import Artifact
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import read_json
+from hybrid_mpc.pipeline.contenders import CONTENDERS, ORACLES, noise_of
+from hybrid_mpc.scenario import Scenario
+
+Array = NDArray[np.float64]
+
+
+def find_noise(
+    scenario: Scenario,
+    artifact: Artifact,
+    folder: Path,
+    controllers: Sequence[str],
+    seed: int,
+    given: Path | None,
+) -> tuple[Mapping[str, Array], str]:
+    """Process noise of the filters of contenders, and in words where it came from.
+
+    Args:
+        scenario: The machine.
+        artifact: Prior and hybrid.
+        folder: Where the artifact lies; if in the folder of a run, that run's noise is taken.
+        controllers: Names of contenders.
+        seed: Seed of the recordings that the machine makes where there is no run.
+        given: ``control.json`` of a run, which is taken first.
+
+    Raises:
+        InputError: If the file does not hold what is needed, or there is neither a file nor a way to make data.
+    """
+    needed = [name for name in controllers if not CONTENDERS[name].truth]
+    beside = folder.resolve().parent / "checkpoints" / "control.json"
+    path = given if given is not None else beside if beside.is_file() else None
+    if path is not None:
+        n_x = artifact.models["prior"].n_x
+        try:
+            noise = {k: np.asarray(v, dtype=float) for k, v in read_json(path)["sigma_x"].items()}
+            ok = all(noise[name].shape == (n_x,) and np.all(noise[name] >= 0) for name in needed)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise InputError(
+                f"{path}: no process noise sigma_x for {', '.join(needed)} in it ({error}); --noise needs "
+                "checkpoints/control.json of a run"
+            ) from error
+        if not ok:
+            raise InputError(f"{path}: sigma_x must hold {n_x} numbers that are not negative")
+        return noise, f"{path.parent.parent.name}/{path.parent.name}/{path.name}"
+    if not needed:
+        return {}, "no filter"
+    if not any(name in ORACLES for name in needed):
+        scenario = replace(scenario, oracle=None)  # whose noise takes the longest
+    return _estimated_noise(scenario, artifact, seed), (
+        f"recordings of the simulated machine (quick, seed {seed}), smoothed by the prior"
+    )
+
+
+def _estimated_noise(scenario: Scenario, artifact: Artifact, seed: int) -> Mapping[str, Array]:
+    from hybrid_mpc.data.trajectories import load_trajectories
+    from hybrid_mpc.identification.smoothing import fit_smoother
+
+    if scenario.make_data is None or scenario.control is None:
+        raise InputError(
+            f"scenario {scenario.name} makes no data to estimate the filters' process noise on; give "
+            "--noise checkpoints/control.json of a run"
+        )
+    prior = scenario.prior(artifact.provenance.get("prior_parameters"))
+    with tempfile.TemporaryDirectory() as folder:
+        files = scenario.make_data(Path(folder), seed, "quick")
+        data = load_trajectories(files, scenario.data, outputs=prior.outputs, inputs=prior.inputs)
+    train = [t for t in data.trajectories if t.role == "train"]
+    smoothed = fit_smoother(prior, train, scenario.data.dt).smooth(train)
+    return noise_of(scenario, artifact, scenario.control, smoothed)

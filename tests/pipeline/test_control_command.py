@@ -1,0 +1,242 @@
+"""``hybrid-mpc control``: loops of an artifact without training, and what it refuses."""
+
+import json
+import shutil
+import sys
+
+import numpy as np
+import pytest
+
+from hybrid_mpc.cli import main
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.pipeline.control_job import (
+    ControlSettings,
+    parsed_fault,
+    parts,
+    prepared,
+    selected_tasks,
+)
+from hybrid_mpc.pipeline.control_results import interval, shares
+from hybrid_mpc.scenario import load_scenario
+
+GOLF = load_scenario("golf_robot")
+SIGMA = {name: [1e-4, 2e-2] for name in ("prior", "prior_observer", "hybrid", "hybrid_observer", "oracle")}
+MINE = """
+import dataclasses
+from scenarios.golf_robot import scenario as golf
+scenario = dataclasses.replace(golf, {change})
+"""
+
+
+@pytest.fixture(scope="module")
+def run_folder(golf_artifact, tmp_path_factory):
+    """A run's folder as far as the command looks at it."""
+    folder = tmp_path_factory.mktemp("run")
+    shutil.copytree(golf_artifact, folder / "model")
+    (folder / "checkpoints").mkdir()
+    (folder / "checkpoints" / "control.json").write_text(json.dumps({"sigma_x": SIGMA}))
+    return folder
+
+
+@pytest.fixture
+def call(monkeypatch, capsys):
+    """Run the command in this process: ``(exit code, stdout, stderr)``."""
+
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", ["hybrid-mpc", "control", *map(str, words)])
+        try:
+            main()
+            code = 0
+        except SystemExit as stop:
+            code = stop.code or 0
+        told = capsys.readouterr()
+        return code, told.out, told.err.replace("\n", " ")
+
+    return run
+
+
+def test_loops_of_two_controllers(call, run_folder, tmp_path):
+    out = tmp_path / "loops"
+    words = ["--task", "stroke_1.4", "--controller", "prior", "--controller", "hybrid_observer", "--seeds", 2]
+    code, told, _ = call("golf_robot", "--model", run_folder, "--out", out, *words)
+    assert code == 0
+    assert "hybrid_observer" in told
+    results = json.loads((out / "results.json").read_text())
+    assert (results["schema"], results["solver"]) == ("hybrid-mpc control", "rti")
+    assert results["noise"]["source"].endswith("checkpoints/control.json")
+    assert [(r["controller"], r["seed"]) for r in results["loops"]] == [
+        ("prior", 0), ("prior", 1), ("hybrid_observer", 0), ("hybrid_observer", 1),
+    ]  # fmt: skip
+    cell = results["summary"]["stroke_1.4"]["prior"]
+    costs = [r["cost"] for r in results["loops"] if r["controller"] == "prior"]
+    # Two values: mean +- t(0.975, 1) |difference| / 2, the table's t is 12.7062.
+    assert cell["cost"]["mean"] == pytest.approx(np.mean(costs), rel=1e-12)
+    assert cell["cost"]["ci95"] == pytest.approx(12.7062 * abs(costs[0] - costs[1]) / 2, rel=1e-5)
+    assert {"speed_error_rel", "timing_error_s"} <= set(cell["figures"])
+    assert sum(cell["sources"].values()) == pytest.approx(1.0)
+    times = results["step_ms"]["prior"]
+    assert 0 < times["median"] <= times["p95"] <= times["p99"] <= times["max"]
+    assert all(r["largest_u"] <= 0.2 for r in results["loops"])  # a putt's limit
+    assert {p.name for p in (out / "figures").iterdir()} == {
+        "stroke_1.4.png",
+        "stroke_1.4.gif",
+        "step_times.png",
+    }
+    again = tmp_path / "again"
+    assert call("golf_robot", "--model", run_folder / "model", "--out", again, "--no-gif", *words)[0] == 0
+    assert not (again / "figures" / "stroke_1.4.gif").exists()
+    repeated = json.loads((again / "results.json").read_text())
+    for r in (*results["loops"], *repeated["loops"]):
+        del r["timing_ms"]
+    assert repeated["loops"] == results["loops"]
+    assert repeated["summary"] == results["summary"]
+
+
+def test_a_fault_from_the_command_line_acts(call, run_folder, tmp_path):
+    costs = {}
+    for name, words in (("healthy", []), ("worn", ["--fault", "plant_friction=4@0.5"])):
+        out = tmp_path / name
+        options = ["--task", "track_sine", "--controller", "prior", "--seeds", 1, "--no-gif", *words]
+        assert call("golf_robot", "--model", run_folder, "--out", out, *options)[0] == 0
+        results = json.loads((out / "results.json").read_text())
+        costs[name] = results["loops"][0]["cost"]
+    assert results["faults"] == [{"target": "plant_friction", "value": 4.0, "start_s": 0.5, "end_s": "inf"}]
+    assert costs["worn"] > 2 * costs["healthy"]  # four times the friction on a filter without observer
+    assert results["summary"]["track_sine"]["prior"]["cost"]["ci95"] is None  # one seed
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--task", "golf"], ["no task 'golf'", "track_sine", "stroke_1.4"]),
+        (["--controller", "pid"], ["no controller pid", "hybrid_observer"]),
+        (["--solver", "newton"], ["no solver 'newton'", "rti, sqp, ipopt"]),
+        (["--controller", "oracle", "--solver", "sqp"], ["oracle", "--solver"]),
+        (["--fault", "fire=1"], ["'fire'", "measurement_offset"]),
+        (["--fault", "plant_fire=1@1"], ["plant_fire", "plant_friction"]),
+        (["--fault", "input_gain=lots"], ["input_gain=lots", "TARGET=VALUE@START:END"]),
+        (["--fault", "input_gain=0.5@2:1"], ["interval"]),
+        (["--noise", "nowhere.json"], ["nowhere.json is missing"]),
+        (["--seeds", "0"], ["seeds"]),
+    ],
+)
+def test_bad_options(call, run_folder, tmp_path, words, told):
+    code, _, error = call("golf_robot", "--model", run_folder, "--out", tmp_path / "o", *words)
+    assert code == 2
+    for word in told:
+        assert word in error
+    assert not (tmp_path / "o").exists()
+
+
+def test_bad_models(call, run_folder, tmp_path):
+    code, _, error = call("golf_robot", "--model", tmp_path / "none", "--out", tmp_path / "o")
+    assert (code, "none does not exist" in error) == (2, True)
+    (tmp_path / "letters").mkdir()
+    (tmp_path / "letters" / "a.txt").write_text("dear")
+    code, _, error = call("golf_robot", "--model", tmp_path / "letters", "--out", tmp_path / "o")
+    assert (code, "something else" in error) == (2, True)
+    for name, damage in (
+        ("weights.safetensors", lambda b: b[: len(b) // 2]),
+        ("programs.json", lambda b: b[:-100]),
+        ("model.json", lambda b: b.replace(b"schema_version", b"version")),
+    ):
+        folder = tmp_path / name
+        shutil.copytree(run_folder / "model", folder)
+        (folder / name).write_bytes(damage((folder / name).read_bytes()))
+        code, _, error = call("golf_robot", "--model", folder, "--out", tmp_path / "o")
+        assert code == 2, name
+        assert str(folder) in error
+    assert not (tmp_path / "o").exists()
+
+
+def test_a_model_of_another_machine(call, run_folder, tmp_path):
+    folder = tmp_path / "model"
+    shutil.copytree(run_folder / "model", folder)
+    note = json.loads((folder / "model.json").read_text())
+    note["provenance"] = {"scenario": "torque_pendulum"}
+    (folder / "model.json").write_text(json.dumps(note))
+    code, _, error = call("golf_robot", "--model", folder, "--out", tmp_path / "o")
+    assert code == 2
+    assert "made for scenario torque_pendulum, not for golf_robot" in error
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [("plant=None", "has no plant"), ("control=None", "has no control problem"), ("tasks=()", "has no task"),
+     ("make_data=None", "--noise"), ("oracle=None", "has no oracle")],
+)  # fmt: skip
+def test_scenarios_without_what_is_needed(call, golf_artifact, tmp_path, change, told):
+    path = tmp_path / "machine.py"
+    path.write_text(MINE.format(change=change))
+    words = ["--controller", "oracle"] if "oracle" in change else []
+    code, _, error = call(path, "--model", golf_artifact, "--out", tmp_path / "o", *words)
+    assert code == 2
+    assert told in error
+
+
+def test_bad_noise_files(call, run_folder, tmp_path):
+    bad = tmp_path / "control.json"
+    for content in ({}, {"sigma_x": {"prior": [1, 2]}}, {"sigma_x": 3}, {"sigma_x": {"prior_observer": "x"}}):
+        bad.write_text(json.dumps(content))
+        code, _, error = call("golf_robot", "--model", run_folder, "--noise", bad, "--out", tmp_path / "o")
+        assert (code, "no process noise sigma_x" in error) == (2, True), content
+    bad.write_text(json.dumps({"sigma_x": {**SIGMA, "prior_observer": [1e-3]}}))
+    code, _, error = call("golf_robot", "--model", run_folder, "--noise", bad, "--out", tmp_path / "o")
+    assert (code, "2 numbers" in error) == (2, True)
+
+
+def test_the_folder_must_be_empty(call, run_folder, tmp_path):
+    (tmp_path / "mine.txt").write_text("keep")
+    code, _, error = call("golf_robot", "--model", run_folder, "--out", tmp_path)
+    assert code == 2
+    assert "no empty folder" in error
+    assert (tmp_path / "mine.txt").read_text() == "keep"
+
+
+def test_help_has_an_example(call):
+    code, told, _ = call("--help")
+    assert code == 0
+    assert "hybrid-mpc control golf_robot --model runs/golf/model" in " ".join(told.split())
+
+
+def test_names_and_beginnings_of_tasks():
+    names = lambda *given: [t.name for t in selected_tasks(GOLF, given)]  # noqa: E731
+    assert len(names()) == len(GOLF.tasks)
+    assert all(name.startswith("stroke_") for name in names("stroke"))
+    assert len(names("stroke")) == 7
+    assert names("stroke_4", "track") == ["track_sine", "track_step", "stroke_4"]
+    with pytest.raises(InputError, match="no task ''"):
+        names("")
+
+
+@pytest.mark.parametrize("solver", ["sqp", "ipopt"])
+def test_solver_is_the_one_asked_for(run_folder, solver):
+    settings = ControlSettings(("stroke_1.4",), ("hybrid",), solver, 1)
+    job = prepared(GOLF, run_folder, settings)
+    _, safe = parts(job, job.tasks[0], "hybrid")
+    assert type(safe.controller).__name__.lower().startswith(solver)
+    assert safe.controller.ocp.horizon == 80  # the task's own problem
+    assert safe.controller.model.n_h == 8
+
+
+def test_faults_as_text():
+    fault = parsed_fault("measurement_freeze@1")
+    assert (fault.target, fault.value, fault.start, fault.end) == ("measurement_freeze", 0.0, 1.0, np.inf)
+    with pytest.raises(InputError, match="times"):
+        parsed_fault("input_gain=1@nan")
+
+
+def test_summaries():
+    assert interval([1.0, np.inf]) == {"mean": None, "ci95": None}
+    assert shares(("ZERO",))["ZERO"] == 1.0
+
+
+@pytest.mark.full
+def test_noise_is_estimated_where_there_is_no_run(golf_artifact):
+    settings = ControlSettings(("track_sine",), ("prior",), seeds=1)
+    job = prepared(GOLF, golf_artifact, settings)
+    assert "recordings of the simulated machine" in job.noise_source
+    angle, speed = job.noise["prior"]
+    # The rig accelerates by some rad/s^2 otherwise than the nominal prior: some 1e-2 rad/s within 20 ms.
+    assert 1e-6 < angle < 5e-3
+    assert 1e-3 < speed < 0.2
