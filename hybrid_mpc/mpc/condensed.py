@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
-from hybrid_mpc.mpc.buffered import BufferedFunction
 from hybrid_mpc.mpc.condensing import Prepared, condense, propagate
+from hybrid_mpc.mpc.curvature import read_stages, stage_function
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.problem import Problem, Target, weights_ok
 from hybrid_mpc.mpc.qp import InputQP
@@ -64,10 +64,9 @@ class CondensedController:
         if iterations < 1:
             raise InputError(f"iterations must be at least 1, got {iterations}")
         self._problem = Problem(model, ocp)
-        assert model.with_jacobian is not None
         self._model, self._ocp, self._iterations = model, ocp, iterations
         n, n_u = ocp.horizon, ocp.n_u
-        self._stages = BufferedFunction(model.with_jacobian.map(n))
+        self._stages = stage_function(model, n)
         difference = np.eye(n * n_u) - np.eye(n * n_u, k=-n_u)
         r, r_delta = np.tile(ocp.r, n) * model.dt, np.tile(ocp.r_delta, n) * model.dt
         self._input_hessian = 2 * (np.diag(r) + (difference.T * r_delta) @ difference)
@@ -146,7 +145,7 @@ class CondensedController:
         free = propagate(prepared.a_t, drift, dz0)
         error = prepared.z[:, :n_x] + free[:, :n_x] - target.x
         u_bar = prepared.u.ravel()
-        gradient = 2 * error.ravel() @ prepared.weighted + self._input_gradient(u_bar, prepared.u_prev)
+        gradient = 2 * error.ravel() @ prepared.weighted + self.input_gradient(u_bar, prepared.u_prev)
         soft = self._soft_rows(prepared, free)
         if not (np.all(np.isfinite(gradient)) and (soft is None or np.all(np.isfinite(soft[0])))):
             return self._failed(prepared, Status.NOT_FINITE, start)
@@ -186,10 +185,18 @@ class CondensedController:
         self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array, *, shifted: bool
     ) -> Prepared:
         start = perf_counter()
-        n, n_x = self._ocp.horizon, self._n_x
-        z_next, a_t, b = self._stage_derivatives(z[:-1], u + d)
+        derivatives = self._stage_derivatives(z[:-1], u + d)
         if shifted:  # the appended period has no trajectory yet: start it without a defect
-            z = np.vstack([z[:-1], z_next[-1:]])
+            z = np.vstack([z[:-1], derivatives[0][-1:]])
+        return self.condense(u, z, d, u_prev, weight, derivatives, start)
+
+    def condense(
+        self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array,
+        derivatives: tuple[Array, Array, Array], start: float,
+    ) -> Prepared:  # fmt: skip
+        """Condense derivatives ``(z_next, A_t, B)`` that are known; ``start`` is when the work began."""
+        n, n_x = self._ocp.horizon, self._n_x
+        z_next, a_t, b = derivatives
         from_u = condense(a_t, b, n_x)
         if weights_ok(weight):
             stages, terminal = self._problem.state_weights(weight)
@@ -207,13 +214,9 @@ class CondensedController:
 
     def _stage_derivatives(self, z: Array, u: Array) -> tuple[Array, Array, Array]:
         """Successors ``(N, n_z)``, transposed ``A`` ``(N, n_z, n_z)`` and ``B`` ``(N, n_z, n_u)``."""
-        n, n_z, n_x = *z.shape, self._n_x
-        into_x, into_h, into_u = self._stages.inputs
-        into_x[:], into_h[:], into_u[:] = z[:, :n_x].ravel(), z[:, n_x:].ravel(), u.ravel()
+        self._stages.inputs[0][:], self._stages.inputs[1][:] = z.ravel(), u.ravel()
         self._stages()
-        x, h, a, b = (out.reshape(n, -1) for out in self._stages.outputs)
-        by_u = b.reshape(n, -1, n_z).transpose(0, 2, 1)
-        return np.hstack([x, h]), a.reshape(n, n_z, n_z).copy(), by_u.copy()  # the buffers are used again
+        return read_stages(self._stages, *z.shape)
 
     def _soft_derivatives(self, z: Array, u: Array, from_u: Array) -> tuple[Array, Array, Array]:
         rows, n_u = self._problem.soft, self._ocp.n_u
@@ -242,13 +245,7 @@ class CondensedController:
         zero = Estimate(0.0, x, h, d, p, np.zeros(0), NAN)
         self.solve(self.initial(zero), zero, np.zeros((1, m.n_x)))
 
-    def gradient(self, prepared: Prepared, x_ref: Array) -> Array:
-        """Exact gradient ``(N n_u,)`` of the cost at a trajectory without defects; soft bounds left out."""
-        error = (prepared.z[:, : self._n_x] - x_ref).ravel()
-        u = prepared.u.ravel()
-        return np.asarray(2 * error @ prepared.weighted + self._input_gradient(u, prepared.u_prev))
-
-    def _input_gradient(self, u: Array, u_prev: Array) -> Array:
+    def input_gradient(self, u: Array, u_prev: Array) -> Array:
         """Gradient of the input costs at the plan ``u`` ``(N n_u,)``."""
         gradient: Array = self._input_hessian @ u
         gradient[: u_prev.size] -= 2 * self._model.dt * self._ocp.r_delta * u_prev

@@ -92,3 +92,28 @@ def propagate(a_t: Array, drift: Array, dz0: Array) -> Array:
         after += add
         now = after
     return dz
+
+
+def adjoint(a_t: Array, last: Array, stages: Array) -> Array:
+    """Multipliers ``(N, n_z)`` of the stages' results: derivative of the cost by ``z_1 .. z_N``.
+
+    Args:
+        a_t: Transposed ``A_k`` ``(N, n_z, n_z)``.
+        last: Derivative of the terminal cost by ``x_N`` ``(n_x,)``.
+        stages: Derivatives of the stage costs by ``x_0 .. x_{N-1}`` ``(N, n_x)``.
+
+    Example:
+        >>> adjoint(np.full((2, 1, 1), 0.5), np.ones(1), np.full((2, 1), 3.0)).ravel()
+        array([3.5, 1. ])
+    """
+    n, n_z, _ = a_t.shape
+    n_x = last.size
+    multipliers = np.zeros((n, n_z))
+    now = multipliers[-1]
+    now[:n_x] = last
+    for k in range(n - 1, 0, -1):
+        before = multipliers[k - 1]
+        np.dot(a_t[k], now, out=before)
+        before[:n_x] += stages[k]
+        now = before
+    return multipliers
