@@ -12,11 +12,11 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.mpc.condensing import Prepared, condense, propagate
-from hybrid_mpc.mpc.curvature import read_stages, stage_function
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.problem import Problem, Target, weights_ok
 from hybrid_mpc.mpc.qp import InputQP
 from hybrid_mpc.mpc.solution import Solution, Status
+from hybrid_mpc.mpc.stages import Derivatives, Stages
 
 Array = NDArray[np.float64]
 NAN = float("nan")
@@ -37,10 +37,12 @@ class CondensedController:
         model: The deployed model; ``n_h`` may be 0.
         ocp: The problem.
         iterations: Linearisations per solve; 1 is the RTI, more converge to the NLP's solution.
+        compiled: Whether the model and its Jacobian are compiled as C, cached as
+            :func:`nn_export.compile_function` says. Default: no.
 
     Raises:
-        InputError: If problem and model do not fit, ``iterations < 1``, or the terminal weight cannot be
-            found.
+        InputError: If problem and model do not fit, ``iterations < 1``, the terminal weight cannot be found,
+            or the model is to be compiled and cannot be.
 
     Source: Diehl, Bock, Schlöder, *A real-time iteration scheme for nonlinear optimization in optimal
     feedback control*, SIAM J. Control Optim. 43 (2005).
@@ -60,13 +62,13 @@ class CondensedController:
         ('SOLVED', array([-0.618034]))
     """
 
-    def __init__(self, model: HybridModel, ocp: OCP, *, iterations: int = 1) -> None:
+    def __init__(self, model: HybridModel, ocp: OCP, *, iterations: int = 1, compiled: bool = False) -> None:
         if iterations < 1:
             raise InputError(f"iterations must be at least 1, got {iterations}")
         self._problem = Problem(model, ocp)
         self._model, self._ocp, self._iterations = model, ocp, iterations
         n, n_u = ocp.horizon, ocp.n_u
-        self._stages = stage_function(model, n)
+        self._stages = Stages(model, n, compiled=compiled)
         difference = np.eye(n * n_u) - np.eye(n * n_u, k=-n_u)
         r, r_delta = np.tile(ocp.r, n) * model.dt, np.tile(ocp.r_delta, n) * model.dt
         self._input_hessian = 2 * (np.diag(r) + (difference.T * r_delta) @ difference)
@@ -88,6 +90,11 @@ class CondensedController:
     def problem(self) -> Problem:
         """Problem and model made ready; what the plan costs on the model itself."""
         return self._problem
+
+    @property
+    def stages(self) -> Stages:
+        """The model along the horizon."""
+        return self._stages
 
     @property
     def qp(self) -> InputQP:
@@ -185,14 +192,14 @@ class CondensedController:
         self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array, *, shifted: bool
     ) -> Prepared:
         start = perf_counter()
-        derivatives = self._stage_derivatives(z[:-1], u + d)
+        derivatives = self._stages.at(z[:-1], u + d)
         if shifted:  # the appended period has no trajectory yet: start it without a defect
             z = np.vstack([z[:-1], derivatives[0][-1:]])
         return self.condense(u, z, d, u_prev, weight, derivatives, start)
 
     def condense(
         self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array,
-        derivatives: tuple[Array, Array, Array], start: float,
+        derivatives: Derivatives, start: float,
     ) -> Prepared:  # fmt: skip
         """Condense derivatives ``(z_next, A_t, B)`` that are known; ``start`` is when the work began."""
         n, n_x = self._ocp.horizon, self._n_x
@@ -211,12 +218,6 @@ class CondensedController:
         return Prepared(
             u, z, d, u_prev, a_t, b, z_next - z[1:], from_u, weighted, hessian, weight, soft, spent
         )
-
-    def _stage_derivatives(self, z: Array, u: Array) -> tuple[Array, Array, Array]:
-        """Successors ``(N, n_z)``, transposed ``A`` ``(N, n_z, n_z)`` and ``B`` ``(N, n_z, n_u)``."""
-        self._stages.inputs[0][:], self._stages.inputs[1][:] = z.ravel(), u.ravel()
-        self._stages()
-        return read_stages(self._stages, *z.shape)
 
     def _soft_derivatives(self, z: Array, u: Array, from_u: Array) -> tuple[Array, Array, Array]:
         rows, n_u = self._problem.soft, self._ocp.n_u

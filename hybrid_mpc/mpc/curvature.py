@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from hybrid_mpc.model import HybridModel
-from hybrid_mpc.mpc.buffered import BufferedFunction
 from hybrid_mpc.mpc.ocp import OCP
+from hybrid_mpc.mpc.stages import Stages
 
 Array = NDArray[np.float64]
 
@@ -31,17 +29,16 @@ class StageCurvature:
     Hessian of the golf robot's problem by less than 0.5 %.
 
     Args:
-        model: The model.
+        stages: The model's stages.
         ocp: The problem; its weights and limits give the length of the differences.
     """
 
-    def __init__(self, model: HybridModel, ocp: OCP) -> None:
-        assert model.with_jacobian is not None
-        self._n_x, self._n_u, n = ocp.n_x, ocp.n_u, ocp.horizon
+    def __init__(self, stages: Stages, ocp: OCP) -> None:
+        self._n_x, self._n_u = ocp.n_x, ocp.n_u
         half = 0.5 * (ocp.u_max - ocp.u_min)
         tolerated = 1 / np.sqrt(np.where(ocp.q > 0, ocp.q, 1.0))
         self._shift = SHIFT * np.concatenate([tolerated, np.where(np.isfinite(half), half, 1.0)])
-        self._stages = stage_function(model, n)
+        self._stages = stages.side_by_side
 
     def of(self, z: Array, u: Array, a_t: Array, b: Array, adjoint: Array) -> Array:
         """Curvature ``(N, n_x + n_u, n_x + n_u)`` of every stage.
@@ -83,31 +80,6 @@ class StageCurvature:
         blocks = total.reshape(n, n_u, n, n_u)
         blocks[np.arange(n), :, np.arange(n)] += curvature[:, n_x:, n_x:]
         return np.asarray(total)
-
-
-def stage_function(model: HybridModel, n: int) -> BufferedFunction:
-    """``(z, u) -> (z_next, A, B)`` for ``n`` stages at once."""
-    return BufferedFunction(_stage(model).map(n))
-
-
-def rolled_out(model: HybridModel, n: int) -> BufferedFunction:
-    """``(z_0, u_0 .. u_{n-1}) -> (z_1 .. z_n, A, B)``: a run of the model and its Jacobians along it."""
-    return BufferedFunction(_stage(model).mapaccum("run_with_jacobian", n))
-
-
-def read_stages(stages: BufferedFunction, n: int, n_z: int) -> tuple[Array, Array, Array]:
-    """Successors ``(N, n_z)``, transposed ``A`` ``(N, n_z, n_z)`` and ``B`` ``(N, n_z, n_u)``, copied."""
-    z_next, a, b = (out.copy() for out in stages.outputs)
-    return z_next.reshape(n, n_z), a.reshape(n, n_z, n_z), b.reshape(n, -1, n_z).transpose(0, 2, 1)
-
-
-def _stage(model: HybridModel) -> ca.Function:
-    z, u = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("u", model.n_u)
-    assert model.with_jacobian is not None
-    # Written into the caller's graph where that is possible: a call less a stage.
-    inline = model.with_jacobian.is_a("MXFunction")
-    x_next, h_next, a, b = model.with_jacobian.call([z[: model.n_x], z[model.n_x :], u], inline, False)
-    return ca.Function("stage", [z, u], [ca.vertcat(x_next, h_next), ca.densify(a), ca.densify(b)])
 
 
 def convex(gauss_newton: Array, rest: Array) -> Array:

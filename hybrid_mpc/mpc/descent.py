@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.mpc.condensed import CondensedController
 from hybrid_mpc.mpc.condensing import Prepared, adjoint
-from hybrid_mpc.mpc.curvature import Secants, StageCurvature, convex, read_stages, rolled_out
+from hybrid_mpc.mpc.curvature import Secants, StageCurvature, convex
 from hybrid_mpc.mpc.problem import Target
 from hybrid_mpc.mpc.solution import Status
+from hybrid_mpc.mpc.stages import Derivatives
 
 Array = NDArray[np.float64]
 NAN = float("nan")
@@ -49,7 +50,7 @@ class Point:
     u: Array
     z: Array
     cost: float
-    derivatives: tuple[Array, Array, Array]
+    derivatives: Derivatives
     multipliers: Array
     gradient: Array
     on_soft: bool
@@ -60,15 +61,12 @@ class Landscape:
 
     def __init__(self, inner: CondensedController) -> None:
         self.inner, self.problem = inner, inner.problem
-        self._run = rolled_out(inner.model, inner.ocp.horizon)
-        self.stages = StageCurvature(inner.model, inner.ocp)
+        self.stages = StageCurvature(inner.stages, inner.ocp)
 
     def at(self, z0: Array, u: Array, case: Case) -> Point:
         """The run from ``z0`` on ``u`` and what is known along it."""
         problem, n_x = self.problem, self.inner.ocp.n_x
-        self._run.inputs[0][:], self._run.inputs[1][:] = z0, (u + case.d).ravel()
-        self._run()
-        derivatives = read_stages(self._run, len(u), z0.size)
+        derivatives = self.inner.stages.run(z0, u + case.d)
         z = np.vstack([z0, derivatives[0]])
         cost = problem.cost(z, u, case.u_prev, case.target)
         stages, terminal = problem.state_weights(case.target.weight)

@@ -21,27 +21,33 @@ Array = NDArray[np.float64]
 
 
 class SQPController:
-    """Nonlinear MPC by Gauss-Newton SQP to convergence, globalised by a line search.
+    """Nonlinear MPC by SQP to convergence with second derivatives, globalised by a line search.
 
     Every iterate is a run of the model itself: the dynamics hold exactly, limits of inputs and changes are
     linear and kept by every QP, soft bounds are penalties within the cost. So the cost itself is the merit
     function, and a step along the QP's answer is accepted when it lowers the cost by a share (1e-4) of what
     the QP's convex model promises; the step is halved until it does (Burke's method for convex composite
-    functions: near a solution whose residuals are small full steps are taken). Where ten iterations were not
-    enough, the Gauss-Newton Hessian leaves out too much: from then on it is corrected by what the last steps
-    have shown of the gradient (damped BFGS updates), unless a soft bound acts. Slower than the RTI by the
-    number of iterations, and independent of the first guess but for the basin that it lies in.
+    functions: near a solution full steps are taken).
+
+    The QP's Hessian is Gauss-Newton's and the dynamics' second derivatives by states and inputs, weighted
+    with their multipliers: under a steep friction law these are up to nine times Gauss-Newton's, which
+    alone takes 20 to 30 iterations (``docs/mpc.md``). They are differences of the exact Jacobians (``n_x +
+    n_u`` evaluations), come along with a plan, shifted by a period, and are taken anew where a step has left
+    more than a tenth of the residual. Where their sum with Gauss-Newton's is not convex it is made so; from
+    the seventh iteration on it is corrected by what the last steps have shown of the gradient (damped
+    BFGS), unless a soft bound acts. The plan is independent of the first guess but for the basin it lies in.
 
     Args:
         model: The deployed model; ``n_h`` may be 0. It must not be so unstable that a run over the horizon
             overflows: then no line search finds a finite cost.
         ocp: The problem.
-        tolerance: Converged when the QP promises to lower the cost by less than this share, and the KKT
-            residual is at most 1e-6.
+        tolerance: Converged when the convex model promises to lower the cost by less than this share, and
+            the KKT residual is at most 1e-6.
         iterations: Most linearisations; the plan then reached has the status STOPPED and may be applied.
+        compiled: As in :class:`~hybrid_mpc.mpc.CondensedController`.
 
     Raises:
-        InputError: If problem and model do not fit, or an option is not positive.
+        InputError: As :class:`~hybrid_mpc.mpc.CondensedController`, or if an option is not positive.
 
     Source: Burke, *Descent methods for composite nondifferentiable optimization problems*, Math. Program.
     33 (1985).
@@ -62,13 +68,19 @@ class SQPController:
     """
 
     def __init__(
-        self, model: HybridModel, ocp: OCP, *, tolerance: float = 1e-10, iterations: int = 100
+        self,
+        model: HybridModel,
+        ocp: OCP,
+        *,
+        tolerance: float = 1e-10,
+        iterations: int = 100,
+        compiled: bool = False,
     ) -> None:
         if not tolerance > 0 or iterations < 1:
             raise InputError(
                 f"tolerance must be positive and iterations at least 1, got {tolerance} and {iterations}"
             )
-        self._inner = CondensedController(model, ocp)
+        self._inner = CondensedController(model, ocp, compiled=compiled)
         self._tolerance, self._iterations = tolerance, iterations
         self._landscape = Landscape(self._inner)
 
