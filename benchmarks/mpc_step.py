@@ -33,7 +33,7 @@ from hybrid_mpc.identification.networks import GRUNetwork
 from hybrid_mpc.identification.step import HybridStep, Scaling, n_features
 from hybrid_mpc.mpc import OCP, CondensedController, IpoptController, SQPController
 from hybrid_mpc.mpc.buffered import BufferedFunction
-from hybrid_mpc.mpc.condensing import condense
+from hybrid_mpc.mpc.condensing import Condenser
 from scenarios.golf_robot import scenario
 
 PERIODS, RIVAL_PERIODS, SKIPPED = 150, 15, 3

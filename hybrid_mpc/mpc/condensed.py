@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
-from hybrid_mpc.mpc.condensing import Prepared, condense, propagate
+from hybrid_mpc.mpc.condensing import Condenser, Prepared, propagate
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.problem import Problem, Target, weights_ok
 from hybrid_mpc.mpc.qp import InputQP
@@ -74,6 +74,7 @@ class CondensedController:
         self._input_hessian = 2 * (np.diag(r) + (difference.T * r_delta) @ difference)
         self._qp = InputQP(ocp, self._problem.soft, model.dt)
         self._n_x = ocp.n_x
+        self._condenser = Condenser(n, ocp.n_x + model.n_h, n_u, ocp.n_x)
         self._evaluate_once()
 
     @property
@@ -204,7 +205,7 @@ class CondensedController:
         """Condense derivatives ``(z_next, A_t, B)`` that are known; ``start`` is when the work began."""
         n, n_x = self._ocp.horizon, self._n_x
         z_next, a_t, b = derivatives
-        from_u = condense(a_t, b, n_x)
+        from_u = self._condenser(a_t, b)
         if weights_ok(weight):
             stages, terminal = self._problem.state_weights(weight)
             weighted = np.empty_like(from_u)
