@@ -118,7 +118,7 @@ class CondensedController:
         Raises:
             InputError: If the weight has another shape.
         """
-        u = np.vstack([previous.u[1:], previous.u[-1:]])
+        u = self._ocp.held(np.vstack([previous.u[1:], previous.u[-1:]]))
         z = np.hstack([previous.x, previous.h])
         z = np.vstack([z[1:], z[-1:]])
         weight = self._problem.weights(weight)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
@@ -15,6 +17,7 @@ SHIFT = 1e-5
 """Step of the difference of two Jacobians, in tolerated deviations (states) and half ranges (inputs)."""
 FLOOR = 0.1
 """Least curvature along a direction, as a share of Gauss-Newton's: a step never gets more than ten times longer."""
+MATTERS = 0.01
 # Iterations before secants are kept: where the second derivatives are right they have nothing to add.
 EARLIEST = 6
 MEMORY = 10
@@ -40,7 +43,10 @@ class StageCurvature:
         self._shift = SHIFT * np.concatenate([tolerated, np.where(np.isfinite(half), half, 1.0)])
         self._stages = stages.side_by_side
 
-    def of(self, z: Array, u: Array, a_t: Array, b: Array, adjoint: Array) -> Array:
+    def of(
+        self, z: Array, u: Array, a_t: Array, b: Array, adjoint: Array, old: Array | None = None,
+        chosen: Sequence[int] | None = None,
+    ) -> Array:  # fmt: skip
         """Curvature ``(N, n_x + n_u, n_x + n_u)`` of every stage.
 
         Args:
@@ -49,26 +55,42 @@ class StageCurvature:
             a_t: Transposed ``A_k`` ``(N, n_z, n_z)``.
             b: ``B_k`` ``(N, n_z, n_u)``.
             adjoint: Multipliers ``(N, n_z)`` of the stages' results.
+            old: Curvature to keep but for the ``chosen`` states and inputs. Default: all is taken.
+            chosen: Their numbers, inputs after states.
         """
         n, n_z, n_u = b.shape
         n_x, size = self._n_x, self._shift.size
+        chosen = range(size) if old is None or chosen is None else chosen
         into_z, into_u = self._stages.inputs
         _, by_z, by_u = self._stages.outputs
         base = np.hstack([a_t[:, :n_x], b.transpose(0, 2, 1)])
         moved = np.empty_like(base)
-        curvature = np.empty((n, size, size))
-        for j, shift in enumerate(self._shift):
+        curvature = np.empty((n, size, size)) if old is None else old.copy()
+        for j in chosen:
             into_z[:], into_u[:] = z.ravel(), u.ravel()
             column = into_z[j::n_z] if j < n_x else into_u[j - n_x :: n_u]
             before = column.copy()
-            column += shift
+            column += self._shift[j]
             self._stages()
             moved[:, :n_x] = by_z.reshape(n, n_z, n_z)[:, :n_x]
             moved[:, n_x:] = by_u.reshape(n, n_u, n_z)
             moved -= base
             taken = (column - before)[:, None]  # as rounded
             curvature[:, j] = (moved @ adjoint[:, :, None])[:, :, 0] / taken
+        for j in set(range(size)) - set(chosen):
+            curvature[:, j, chosen] = curvature[:, chosen, j]
         return np.asarray(0.5 * (curvature + curvature.transpose(0, 2, 1)))
+
+    def that_matter(self, curvature: Array, from_u: Array, gauss_newton: Array) -> list[int]:
+        """States and inputs without whose curvature the Hessian would differ by more than a hundredth."""
+        least, size = MATTERS * float(np.max(np.diag(gauss_newton))), self._shift.size
+        found = []
+        for j in range(size):
+            alone = np.zeros_like(curvature)
+            alone[:, j], alone[:, :, j] = curvature[:, j], curvature[:, :, j]
+            if np.max(np.abs(self.condensed(alone, from_u))) > least:
+                found.append(j)
+        return found
 
     def condensed(self, curvature: Array, from_u: Array) -> Array:
         """The stages' curvature as that of the inputs ``(N n_u, N n_u)``; ``from_u`` as in ``Prepared``."""

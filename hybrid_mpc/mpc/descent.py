@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from time import perf_counter
 
@@ -76,10 +77,10 @@ class Landscape:
         gradient += self.inner.input_gradient(u.ravel(), case.u_prev)
         return Point(u, z, cost, derivatives, multipliers, gradient, self._on_soft_bounds(z, u))
 
-    def curvature(self, at: Point, case: Case) -> Array:
-        """Second derivatives of the stages, weighted; see :class:`StageCurvature`."""
+    def curvature(self, at: Point, case: Case, old: Array | None = None, chosen: Sequence[int] = ()) -> Array:
+        """Second derivatives of the stages, weighted; see :meth:`StageCurvature.of`."""
         _, a_t, b = at.derivatives
-        return self.stages.of(at.z[:-1], at.u + case.d, a_t, b, at.multipliers)
+        return self.stages.of(at.z[:-1], at.u + case.d, a_t, b, at.multipliers, old, chosen)
 
     def condensed(self, at: Point, case: Case) -> Prepared:
         """The Gauss-Newton model of the cost at a point."""
@@ -114,6 +115,8 @@ class Descent:
         self.at, self.curvature = at, curvature
         self.count, self.status, self.kkt, self.ended = 0, Status.STOPPED, NAN, False
         self._stale, self._fresh, self._plain = curvature is None, False, False
+        # What the first refreshing may keep in part; any further one takes all.
+        self._old = curvature
         self._secants = Secants()
 
     def iterate(self) -> None:
@@ -134,8 +137,7 @@ class Descent:
             kept = (problem.soft.penalty(problem.soft.excess(v)) for v in (value, value + slope @ step))
             promised += problem.model.dt * (next(kept) - next(kept))
         found, share = self._search(step.reshape(at.u.shape), promised)
-        size = float(np.max(np.diag(hessian) * qp.scale**2))
-        before = max(kkt, float(np.max(np.abs(qp.scale * moved))) / size)
+        before = max(kkt, self._residual(hessian, moved))
         flat = promised <= self._enough
         if found is None:
             self._lost(flat, before)
@@ -143,8 +145,8 @@ class Descent:
         smooth = share == 1.0 and not at.on_soft and not found.on_soft
         if smooth:  # the QP's multipliers hold on: what is left of the stationarity there
             left = found.gradient - at.gradient - moved
-            after = max(kkt, float(np.max(np.abs(qp.scale * left))) / size)
-            flat = 0.5 * float(left @ np.linalg.solve(hessian, left)) <= self._enough  # by weak duality
+            after = max(kkt, self._residual(hessian, left))
+            flat = after <= KKT and self._lowers_little(hessian, left)
             slow = after > SLOW * before
         else:
             after, slow = before, share < 1.0 or not before < SLOW * self.kkt
@@ -152,6 +154,18 @@ class Descent:
         self.at, self.kkt, self._stale, self._fresh, self._plain = found, after, slow, False, False
         self.ended = flat and after <= KKT
         self.status = Status.SOLVED if self.ended else Status.STOPPED
+
+    def _lowers_little(self, hessian: Array, left: Array) -> bool:
+        """True if the convex model at the new point promises next to nothing (weak duality)."""
+        qp = self._land.inner.qp
+        left, hessian = qp.by_blocks(left), qp.blocked_hessian(hessian)
+        return 0.5 * float(left @ np.linalg.solve(hessian, left)) <= self._enough
+
+    def _residual(self, hessian: Array, slope: Array) -> float:
+        """A gradient of the cost by the inputs in the QP's scaling."""
+        qp = self._land.inner.qp
+        size = np.max(np.diag(qp.blocked_hessian(hessian)) * qp.scale**2)
+        return float(np.max(np.abs(qp.scale * qp.by_blocks(slope))) / size)
 
     @property
     def _enough(self) -> float:
@@ -161,8 +175,13 @@ class Descent:
         if self._plain:
             return prepared.hessian
         if self._stale or self.curvature is None:
-            self.curvature, self._stale = self._land.curvature(self.at, self._case), False
-            self._fresh = True
+            old, chosen, stages = self._old, [], self._land.stages
+            if (
+                old is not None
+            ):  # from another period, or from before a step: mostly a few of them have changed
+                chosen = stages.that_matter(old, prepared.from_u, prepared.hessian)
+            self.curvature = self._land.curvature(self.at, self._case, old, chosen)
+            self._stale, self._fresh, self._old = False, True, None
         if not np.all(np.isfinite(self.curvature)):
             return prepared.hessian
         rest = self._land.stages.condensed(self.curvature, prepared.from_u)

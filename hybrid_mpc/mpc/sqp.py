@@ -132,12 +132,14 @@ class SQPController:
         return np.concatenate([given[1:], given[-1:]]) if np.all(np.isfinite(given)) else None
 
     def _admissible(self, u: Array, u_prev: Array) -> Array:
-        """``u`` moved into the limits one input after the other: the QPs keep what the first guess keeps."""
-        rows = []
-        for row in u:
-            u_prev = self.ocp.saturate(row, u_prev)
-            rows.append(u_prev)
-        return np.array(rows)
+        """``u`` held over its blocks and moved into the limits, one input after the other.
+
+        The QPs keep what the first guess keeps.
+        """
+        rows = u.copy()
+        for start in self.ocp.starts:
+            rows[start] = u_prev = self.ocp.saturate(u[start], u_prev)
+        return self.ocp.held(rows)
 
     def _plan(self, search: Descent, d: Array) -> Solution:
         at, soft, n_x = search.at, self.problem.soft, self.ocp.n_x

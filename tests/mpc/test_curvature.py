@@ -76,6 +76,23 @@ def test_a_hidden_state_leaves_out_little():
     assert left < 0.1 * without  # a random network's own curvature, with friction as the golf robot's
 
 
+def test_a_part_can_be_taken_anew():
+    model, ocp = pendulum_model(z=2, friction=0.5), problem()
+    controller, e = CondensedController(model, ocp), estimate_of(model)
+    land, u = Landscape(controller), np.random.default_rng(0).uniform(-0.4, 0.2, (ocp.horizon, 1))
+    case = Case(e.d, np.array([0.3]), controller.problem.target(np.full((1, 2), 2.0)))
+    at = land.at(np.concatenate([e.x, e.h]), u, case)
+    whole = land.curvature(at, case)
+    old = whole + 1.0
+    part = land.curvature(at, case, old, [1])
+    # Symmetric both ways; one-sided differences of two orders differ by their error, 3e-4 as above.
+    np.testing.assert_allclose(part[:, 1], whole[:, 1], atol=1e-3 * np.max(np.abs(whole)))
+    np.testing.assert_array_equal(part[:, [0, 2]][:, :, [0, 2]], old[:, [0, 2]][:, :, [0, 2]])
+    prepared = land.condensed(at, case)
+    assert 1 in land.stages.that_matter(whole, prepared.from_u, prepared.hessian)  # friction is the speed's
+    assert land.stages.that_matter(np.zeros_like(whole), prepared.from_u, prepared.hessian) == []
+
+
 def test_a_hessian_that_curves_down_is_made_convex():
     rng = np.random.default_rng(0)
     root, other = rng.normal(size=(2, 6, 6))
