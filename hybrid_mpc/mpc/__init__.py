@@ -1,6 +1,6 @@
 """Model predictive control: the problem, its solvers behind one interface, the safeguard.
 
-Solvers: :class:`CondensedController` (real-time iteration), :class:`SQPController` (the same to convergence),
+Solvers: :class:`CondensedController` (real-time iteration), :class:`SQPController` (to convergence, with second derivatives),
 :class:`IpoptController` (exact reference), :class:`BestOf` (any of these from several starts).
 """
 

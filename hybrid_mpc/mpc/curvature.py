@@ -18,6 +18,7 @@ SHIFT = 1e-5
 FLOOR = 0.1
 """Least curvature along a direction, as a share of Gauss-Newton's: a step never gets more than ten times longer."""
 MATTERS = 0.01
+"""Share of Gauss-Newton's largest curvature below which second derivatives are not worth taking anew."""
 # Iterations before secants are kept: where the second derivatives are right they have nothing to add.
 EARLIEST = 6
 MEMORY = 10
@@ -27,9 +28,9 @@ class StageCurvature:
     """Second derivatives of the dynamics by states and inputs, weighted with the multipliers of the dynamics.
 
     Of ``lambda' f(x, h, u)`` the block by ``(x, u)`` is taken, from differences of the model's exact
-    Jacobians: ``n_x + n_u`` evaluations of them. The blocks by the hidden state would take ``n_h`` more; a
-    GRU's curvature lies in its gates, which the states and inputs drive, and what is left out changes the
-    Hessian of the golf robot's problem by less than 0.5 %.
+    Jacobians: ``n_x + n_u`` evaluations of them. The blocks by the hidden state would take ``n_h`` more, and
+    a network's hidden state moves smoothly: what curves sharply is friction, and what states and inputs
+    drive. Without a hidden state nothing is left out.
 
     Args:
         stages: The model's stages.

@@ -30,8 +30,8 @@ class SQPController:
     functions: near a solution full steps are taken).
 
     The QP's Hessian is Gauss-Newton's and the dynamics' second derivatives by states and inputs, weighted
-    with their multipliers: under a steep friction law these are up to nine times Gauss-Newton's, which
-    alone takes 20 to 30 iterations (``docs/mpc.md``). They are differences of the exact Jacobians (``n_x +
+    with their multipliers: under a steep friction law these outweigh Gauss-Newton's, which alone then
+    converges slowly. They are differences of the exact Jacobians (``n_x +
     n_u`` evaluations), come along with a plan, shifted by a period, and are taken anew where a step has left
     more than a tenth of the residual. Where their sum with Gauss-Newton's is not convex it is made so; from
     the seventh iteration on it is corrected by what the last steps have shown of the gradient (damped

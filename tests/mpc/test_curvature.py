@@ -137,7 +137,7 @@ def closed_loop(controller, periods=25):
 def test_a_warm_start_converges_in_a_few_iterations():
     plans = closed_loop(SQPController(pendulum_model(z=3), problem(30)))
     assert all(p.status is Status.SOLVED and p.kkt <= 1e-6 for p in plans)
-    # Gauss-Newton alone takes 20 to 30 on the golf robot; Newton squares the error.
+    # Newton squares the error: from 1e-2 of a warm start to 1e-6 in three steps where it is right, and some slack.
     assert np.mean([p.iterations for p in plans[1:]]) < 5
 
 
