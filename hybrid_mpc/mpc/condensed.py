@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
-from hybrid_mpc.mpc.condensing import Condenser, Prepared, propagate
+from hybrid_mpc.mpc.condensing import Condenser, Prepared, condense_hessians, propagate
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.problem import Problem, Target, weights_ok
 from hybrid_mpc.mpc.qp import InputQP
@@ -154,6 +154,12 @@ class CondensedController:
         error = prepared.z[:, :n_x] + free[:, :n_x] - target.x
         u_bar = prepared.u.ravel()
         gradient = 2 * error.ravel() @ prepared.weighted + self.input_gradient(u_bar, prepared.u_prev)
+        if prepared.economic is not None:
+            slope, curvature = prepared.economic
+            slope = slope + (curvature[:, :, :n_x] @ free[:-1, :n_x, None])[:, :, 0]
+            gradient += (
+                slope[:, :n_x].ravel() @ prepared.from_u[: slope.shape[0] * n_x] + slope[:, n_x:].ravel()
+            )
         soft = self._soft_rows(prepared, free)
         if not (np.all(np.isfinite(gradient)) and (soft is None or np.all(np.isfinite(soft[0])))):
             return self._failed(prepared, Status.NOT_FINITE, start)
@@ -215,9 +221,12 @@ class CondensedController:
             weighted = np.full_like(from_u, np.nan)
         hessian = 2 * from_u.T @ weighted + self._input_hessian
         soft = self._soft_derivatives(z, u, from_u)
+        economic = self._problem.economic.convex(z[:, :n_x], u) if self._ocp.economic is not None else None
+        if economic is not None:
+            hessian += condense_hessians(economic[1], from_u, n_x)
         spent = (perf_counter() - start) * 1e3
         return Prepared(
-            u, z, d, u_prev, a_t, b, z_next - z[1:], from_u, weighted, hessian, weight, soft, spent
+            u, z, d, u_prev, a_t, b, z_next - z[1:], from_u, weighted, hessian, weight, soft, economic, spent
         )
 
     def _soft_derivatives(self, z: Array, u: Array, from_u: Array) -> tuple[Array, Array, Array]:

@@ -32,6 +32,8 @@ class Prepared:
         weight: Weight factors ``(N + 1, n_x)``.
         soft: Soft bounds' values ``(M,)``, their derivatives by their state ``(M, n_x)`` and by the inputs
             ``(M, N n_u)``.
+        economic: First derivatives ``(N, n_x + n_u)`` of the economic stage costs and their convex second ones;
+            None where there are none.
         milliseconds: Time the preparation took.
     """
 
@@ -47,6 +49,7 @@ class Prepared:
     hessian: Array
     weight: Array
     soft: tuple[Array, Array, Array]
+    economic: tuple[Array, Array] | None
     milliseconds: float
 
 
@@ -120,3 +123,21 @@ def adjoint(a_t: Array, last: Array, stages: Array) -> Array:
     for a, after, before in zip(*backwards, strict=True):
         dgemv(1.0, a, after, 1.0, before, trans=1, overwrite_y=1)
     return multipliers
+
+
+def condense_hessians(stages: Array, from_u: Array, n_x: int) -> Array:
+    """Second derivatives by the stages' ``(x, u)`` ``(N, n_x + n_u, n_x + n_u)`` as those by the inputs.
+
+    Example:
+        >>> condense_hessians(np.full((1, 2, 2), 3.0), np.array([[0.0], [5.0]]), 1)
+        array([[3.]])
+    """
+    n, size, _ = stages.shape
+    n_u = size - n_x
+    states = from_u[: n * n_x].reshape(n, n_x, n * n_u)
+    by_state = (stages[:, :n_x, :n_x] @ states).reshape(n * n_x, n * n_u)
+    by_input = (stages[:, n_x:, :n_x] @ states).reshape(n * n_u, n * n_u)
+    total = from_u[: n * n_x].T @ by_state + by_input + by_input.T
+    blocks = total.reshape(n, n_u, n, n_u)
+    blocks[np.arange(n), :, np.arange(n)] += stages[:, n_x:, n_x:]
+    return np.asarray(total)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
+from hybrid_mpc.mpc.condensing import condense_hessians
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.stages import Stages
 
@@ -95,14 +96,7 @@ class StageCurvature:
 
     def condensed(self, curvature: Array, from_u: Array) -> Array:
         """The stages' curvature as that of the inputs ``(N n_u, N n_u)``; ``from_u`` as in ``Prepared``."""
-        n, n_x, n_u = len(curvature), self._n_x, self._n_u
-        states = from_u[: n * n_x].reshape(n, n_x, n * n_u)
-        by_state = (curvature[:, :n_x, :n_x] @ states).reshape(n * n_x, n * n_u)
-        by_input = (curvature[:, n_x:, :n_x] @ states).reshape(n * n_u, n * n_u)
-        total = from_u[: n * n_x].T @ by_state + by_input + by_input.T
-        blocks = total.reshape(n, n_u, n, n_u)
-        blocks[np.arange(n), :, np.arange(n)] += curvature[:, n_x:, n_x:]
-        return np.asarray(total)
+        return condense_hessians(curvature, from_u, self._n_x)
 
 
 def convex(gauss_newton: Array, rest: Array) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.mpc.condensed import CondensedController
-from hybrid_mpc.mpc.condensing import Prepared, adjoint
+from hybrid_mpc.mpc.condensing import Prepared, adjoint, condense_hessians
 from hybrid_mpc.mpc.curvature import Secants, StageCurvature, convex
 from hybrid_mpc.mpc.problem import Target
 from hybrid_mpc.mpc.solution import Status
@@ -72,9 +72,12 @@ class Landscape:
         cost = problem.cost(z, u, case.u_prev, case.target)
         stages, terminal = problem.state_weights(case.target.weight)
         error = z[:, :n_x] - case.target.x
-        multipliers = adjoint(derivatives[1], 2 * terminal @ error[-1], 2 * stages * error[:-1])
-        gradient = (multipliers[:, None, :] @ derivatives[2]).ravel()
-        gradient += self.inner.input_gradient(u.ravel(), case.u_prev)
+        slopes, direct = 2 * stages * error[:-1], self.inner.input_gradient(u.ravel(), case.u_prev)
+        if self.inner.ocp.economic is not None:
+            economic = problem.economic.derivatives(z[:, :n_x], u)[0]
+            slopes, direct = slopes + economic[:, :n_x], direct + economic[:, n_x:].ravel()
+        multipliers = adjoint(derivatives[1], 2 * terminal @ error[-1], slopes)
+        gradient = (multipliers[:, None, :] @ derivatives[2]).ravel() + direct
         return Point(u, z, cost, derivatives, multipliers, gradient, self._on_soft_bounds(z, u))
 
     def curvature(self, at: Point, case: Case, old: Array | None = None, chosen: Sequence[int] = ()) -> Array:
@@ -185,6 +188,10 @@ class Descent:
         if not np.all(np.isfinite(self.curvature)):
             return prepared.hessian
         rest = self._land.stages.condensed(self.curvature, prepared.from_u)
+        if prepared.economic is not None:  # what curves down, which the convex model takes as flat
+            at, economic = self.at, self._land.problem.economic
+            down = economic.derivatives(at.z[:, : self._land.inner.ocp.n_x], at.u)[1] - prepared.economic[1]
+            rest = rest + condense_hessians(down, prepared.from_u, self._land.inner.ocp.n_x)
         return self._secants.corrected(convex(prepared.hessian, rest))
 
     def _lost(self, flat: bool, kkt: float) -> None:

@@ -191,7 +191,7 @@ class IpoptController:
         return {
             "x": ca.vertcat(ca.vec(u), ca.vec(z), s),
             "p": ca.vertcat(z0, d, u_prev, ca.vec(x_ref), ca.vec(weight)),
-            "f": self._objective(u, du, z[:n_x, :] - x_ref, weight, s),
+            "f": self._objective(u, du, z[:n_x, :] - x_ref, weight, s) + self._economic(z[:n_x, :-1], u),
             "g": ca.vertcat(*(ca.vec(row.value) for row in rows)),
         }
 
@@ -202,6 +202,10 @@ class IpoptController:
         stage = sum(ca.dot(q, v) for q, v in zip((ocp.q, ocp.r, ocp.r_delta), stages, strict=True))
         penalty = ca.dot(soft.linear, s) + ca.dot(soft.quadratic, s**2)
         return self.model.dt * (stage + penalty) + last.T @ self._problem.terminal @ last
+
+    def _economic(self, x: ca.MX, u: ca.MX) -> ca.MX:
+        f = self.ocp.economic
+        return self.model.dt * ca.sum2(f.map(self.ocp.horizon)(x, u)) if f is not None else ca.MX(0)
 
     def _soft_rows(self, u: ca.MX, z: ca.MX, s: ca.MX) -> list[Rows]:
         soft, rows = self._problem.soft, []

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -59,6 +60,10 @@ class OCP:
             e.g. ``(1, 1, 2, 4)`` for a horizon of 8. Every solve starts its first block now: the shifted last
             plan is only its first guess. Default: every period has an input of its own.
 
+        economic: A further stage cost per second, ``(x, u) -> scalar``, twice differentiable, of ``(x_0, u_0) ..
+            (x_{N-1}, u_{N-1})``; it may be negative and need not be convex. Where it curves down ``rti`` takes it
+            as flat; ``sqp`` and ``ipopt`` know its curvature. Default: none.
+
     Raises:
         InputError: If shapes do not fit, bounds cross, a weight is negative or not finite, or the blocks'
             lengths do not sum to the horizon.
@@ -83,6 +88,7 @@ class OCP:
     slack_quadratic: Array = field(default_factory=lambda: np.zeros(0))
     soft: tuple[SoftBound, ...] = ()
     blocks: tuple[int, ...] | None = None
+    economic: ca.Function | None = None
 
     def __init__(
         self,
@@ -101,6 +107,7 @@ class OCP:
         slack_quadratic: ArrayLike | None = None,
         soft: Sequence[SoftBound] = (),
         blocks: Sequence[int] | None = None,
+        economic: ca.Function | None = None,
     ) -> None:
         if int(horizon) != horizon or horizon < 1:
             raise InputError(f"horizon must be a whole number of periods, at least 1; got {horizon}")
@@ -120,8 +127,10 @@ class OCP:
         states = state_bounds(q_v, x_min, x_max, slack_linear, slack_quadratic)
         bounds = dict(zip(names, states, strict=True))
         others = {"terminal": terminal, "working_point": working_point, "soft": tuple(soft)}
+        if economic is not None and (economic.n_in(), economic.n_out(), economic.numel_out(0)) != (2, 1, 1):
+            raise InputError(f"economic: {economic} given; needed: a function (x, u) -> scalar")
         lengths = {"blocks": None if blocks is None else _blocks(blocks, int(horizon))}
-        for name, value in {**fields, **bounds, **others, **lengths}.items():
+        for name, value in {**fields, **bounds, **others, **lengths, "economic": economic}.items():
             object.__setattr__(self, name, value)
 
     @classmethod
