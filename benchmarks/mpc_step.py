@@ -1,17 +1,18 @@
 """How long a step of the nonlinear MPC takes: the golf robot's hybrid model with random weights, one core.
 
-``python benchmarks/mpc_step.py [--out times.json] [--z 32] [--n 50] [--rivals]``. Every solver solves the same
-problem for the same sequence of states (a recorded closed loop on the model itself, turning towards a new
+``python benchmarks/mpc_step.py [--out times.json] [--z 32] [--n 50] [--rivals] [--growth]``. Every solver solves
+the same problem for the same sequence of states (a recorded closed loop on the model itself, turning towards a new
 angle with the torque at its bound), each warm-started from its own last plan. The time is that of the whole
-Python call, in milliseconds; medians, the first solves are not counted.
+Python call, in milliseconds; medians, the first solves are not counted. Solvers that are compared take turns.
 
 - ``rti``: prepare + feedback of ``CondensedController``; ``rti_bounds``: with bounds on both states, which
-  act, along the loop that keeps them;
-- ``sqp``: ``SQPController`` to convergence;
-- ``ipopt``: multiple shooting over (x, h) with exact Hessian (``IpoptController``), with IPOPT's default
-  initial barrier and with one of 1e-3, which suits a warm start; the faster counts;
+  act, along the loop that keeps them; ``_compiled``: with the model's stages as C (``-O3``);
+- ``sqp``: ``SQPController`` to convergence (tolerance 1e-10 of the cost, KKT residual 1e-6);
+- ``ipopt``: multiple shooting over (x, h) with exact Hessian (``IpoptController``, tolerance 1e-9), with IPOPT's
+  default initial barrier and with one of 1e-3, which suits a warm start; the faster counts;
 - ``sqpmethod``: single shooting over u with exact Hessian, CasADi's ``sqpmethod`` with qrqp, tolerances 1e-6;
-- ``condense``: the products of the condensing alone, by numpy and by CasADi's BLASFEO kernel.
+- ``mandatory_ms``: the arithmetic that a step cannot do without, at the measured speed of ``dgemm``;
+- ``--growth``: exponents of the ``rti``'s and the ``sqp``'s time in N (20 to 200) and in z (16 to 256).
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ import argparse
 import json
 import tempfile
 import time
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import casadi as ca
@@ -31,12 +34,10 @@ from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.identification.export import model_info, trace_model
 from hybrid_mpc.identification.networks import GRUNetwork
 from hybrid_mpc.identification.step import HybridStep, Scaling, n_features
-from hybrid_mpc.mpc import OCP, CondensedController, IpoptController, SQPController
-from hybrid_mpc.mpc.buffered import BufferedFunction
-from hybrid_mpc.mpc.condensing import condense
+from hybrid_mpc.mpc import OCP, CondensedController, IpoptController, SQPController, Status
 from scenarios.golf_robot import scenario
 
-PERIODS, RIVAL_PERIODS, SKIPPED = 150, 15, 3
+PERIODS, RIVAL_PERIODS, GROWTH_PERIODS, SKIPPED = 150, 18, 30, 3
 GOAL = 0.6  # [rad], from rest at -0.3 rad
 
 
@@ -75,15 +76,31 @@ def record(model, ocp):
     return states
 
 
-def timed(controller, states):
-    """Median [ms] of whole solves along the states, share of solved ones, and the last solution."""
-    plan, spent, solved = controller.initial(states[0]), [], []
-    for e in states:
-        start = time.perf_counter()
-        plan = controller.solve(plan, e, np.array([[GOAL, 0.0]]))
-        spent.append(1e3 * (time.perf_counter() - start))
-        solved.append(plan.status.ok)
-    return float(np.median(spent[SKIPPED:])), float(np.mean(solved)), plan
+def timed(controllers, states, rounds=1):
+    """Of each controller by name: median [ms] of whole solves, share of solved ones, iterations; last plans.
+
+    The controllers take turns, ``rounds`` times, each along all states: so a load of the machine meets all of them.
+    """
+    plans, spent, solved, count = {}, *({name: [] for name in controllers} for _ in range(3))
+    for _ in range(rounds):
+        for name, controller in controllers.items():
+            plan, before = controller.initial(states[0]), len(spent[name])
+            for e in states:
+                start = time.perf_counter()
+                plan = controller.solve(plan, e, np.array([[GOAL, 0.0]]))
+                spent[name].append(1e3 * (time.perf_counter() - start))
+                solved[name].append(plan.status.ok)
+                count[name].append(plan.iterations)
+            plans[name] = plan
+            for values in (spent[name], solved[name], count[name]):
+                del values[before : before + SKIPPED]
+    row = {}
+    for name in controllers:
+        row[f"{name}_ms"] = float(np.median(spent[name]))
+        row[f"{name}_solved"] = float(np.mean(solved[name]))
+        row[f"{name}_iterations"] = float(np.mean(count[name]))
+        row[f"{name}_cost"] = plans[name].cost
+    return row, plans
 
 
 class SingleShooting:
@@ -119,24 +136,16 @@ class SingleShooting:
         given = np.concatenate([e.x, e.h, previous.u[0], reference[0]])
         guess = np.vstack([previous.u[1:], previous.u[-1:]])
         answer = self._solver(x0=guess, p=given, lbx=self.ocp.u_min, ubx=self.ocp.u_max)
-        self.iterations = self._solver.stats()["iter_count"]
-        plan = self.initial(e)
-        object.__setattr__(plan, "u", answer["x"].full())
-        object.__setattr__(plan, "cost", float(answer["f"]))
-        return plan
-
-
-def blasfeo_condensing(n: int, n_z: int) -> BufferedFunction:
-    """The products of the condensing in CasADi's virtual machine, by its BLASFEO kernel."""
-    a_t, b_t = ca.MX.sym("a_t", n_z, n_z * n), ca.MX.sym("b_t", n_z, n)
-    blocks, columns = [], ca.MX(n_z, 0)
-    for k in range(n):
-        a = a_t[:, k * n_z : (k + 1) * n_z]
-        columns = ca.mtimes(a, columns, "blasfeo") if k else columns
-        columns = ca.horzcat(columns, b_t[:, k])
-        blocks.append(columns[:2, :])
-    f = ca.Function("condense", [a_t, b_t], [ca.horzcat(*blocks)])
-    return BufferedFunction(f)
+        stats = self._solver.stats()
+        status = Status.SOLVED if stats["success"] else Status.STOPPED
+        # The plan's own fields beside the inputs do not matter to the next solve.
+        return replace(
+            previous,
+            u=answer["x"].full(),
+            cost=float(answer["f"]),
+            status=status,
+            iterations=stats["iter_count"],
+        )
 
 
 def median_us(call) -> float:
@@ -149,44 +158,81 @@ def median_us(call) -> float:
     return 1e6 * float(np.median(spent))
 
 
-def condensing_times(model, ocp, states) -> dict[str, float]:
-    """Microseconds of the condensing's products by the two routes."""
-    controller = CondensedController(model, ocp)
-    prepared = controller.prepare(controller.initial(states[0]))
-    routes = {"condense_numpy_us": median_us(lambda: condense(prepared.a_t, prepared.b, 2))}
-    kernel = blasfeo_condensing(ocp.horizon, model.n_x + model.n_h)
-    kernel.inputs[0][:] = prepared.a_t.ravel()
-    kernel.inputs[1][:] = prepared.b.ravel()
-    return routes | {"condense_blasfeo_us": median_us(kernel)}
+def mandatory_mflop(z: int, n: int) -> float:
+    """Condensing, its Hessian's half, and the products of the GRU's Jacobians; 2 states, 1 input."""
+    n_z = z + 2
+    return 1e-6 * (n**2 * n_z**2 + 2 * n**3 + n * 12 * z**2)
 
 
-def measure(z: int, n: int, rivals: bool) -> dict[str, float]:
-    """All times of one size."""
+def dgemm_gflops() -> float:
+    """Speed of a large product, one core."""
+    a = np.random.default_rng(0).normal(size=(400, 400))
+    return 2 * 400**3 / median_us(lambda: a @ a) / 1e3
+
+
+def measure(z: int, n: int) -> dict[str, float]:
+    """The library's times at one size."""
     model, ocp = hybrid(z), problem(n)
     states = record(model, ocp)
-    row: dict[str, float] = {"z": z, "n": n}
-    rti = CondensedController(model, ocp)
-    row["rti_ms"], row["rti_solved"], plan = timed(rti, states)
-    prepared = rti.prepare(plan)
-    row["prepare_ms"] = 1e-3 * median_us(lambda: rti.prepare(plan))
-    row["feedback_ms"] = 1e-3 * median_us(lambda: rti.feedback(prepared, states[-1], np.array([[GOAL, 0.0]])))
+    kinds = {
+        "rti": CondensedController(model, ocp), "rti_compiled": CondensedController(model, ocp, compiled=True)
+    }  # fmt: skip
+    row, plans = timed(kinds, states, rounds=2)
+    for name, suffix in (("rti", ""), ("rti_compiled", "_compiled")):
+        controller, plan = kinds[name], plans[name]
+        prepared = controller.prepare(plan)
+        row[f"prepare{suffix}_ms"] = 1e-3 * median_us(partial(controller.prepare, plan))
+        row[f"feedback{suffix}_ms"] = 1e-3 * median_us(
+            partial(controller.feedback, prepared, states[-1], np.array([[GOAL, 0.0]]))
+        )
     bounded = problem(n, x_max=[0.55, 1.0], x_min=[-np.inf, -1.0])
-    controller = CondensedController(model, bounded)
-    row["rti_bounds_ms"], row["rti_bounds_solved"], _ = timed(controller, record(model, bounded))
-    row["sqp_ms"], row["sqp_solved"], _ = timed(SQPController(model, ocp), states[:60])
-    row |= condensing_times(model, ocp, states)
-    if rivals:
-        few = states[:RIVAL_PERIODS]
-        row["sqp_same_ms"], _, sqp = timed(SQPController(model, ocp), few)
-        row["sqp_cost"] = sqp.cost
-        variants = {"ipopt_default_ms": {}, "ipopt_warm_ms": {"mu_strategy": "monotone", "mu_init": 1e-3}}
-        for name, options in variants.items():
-            row[name], row["ipopt_solved"], plan = timed(IpoptController(model, ocp, options=options), few)
-            row["ipopt_cost"], row["ipopt_iterations"] = plan.cost, plan.iterations
-        row["ipopt_ms"] = min(row["ipopt_default_ms"], row["ipopt_warm_ms"])
-        single = SingleShooting(model, ocp)
-        row["sqpmethod_ms"], _, plan = timed(single, few)
-        row["sqpmethod_cost"], row["sqpmethod_iterations"] = plan.cost, single.iterations
+    row |= timed({"rti_bounds": CondensedController(model, bounded)}, record(model, bounded))[0]
+    row |= timed({"sqp": SQPController(model, ocp), "sqp_compiled": SQPController(model, ocp, compiled=True)},
+                 states[:60], rounds=2)[0]  # fmt: skip
+    row["mandatory_mflop"], row["dgemm_gflops"] = mandatory_mflop(z, n), dgemm_gflops()
+    row["mandatory_ms"] = row["mandatory_mflop"] / row["dgemm_gflops"]
+    row["rti_to_mandatory"] = row["rti_ms"] / row["mandatory_ms"]
+    return {"z": z, "n": n, **row}
+
+
+def against_rivals(z: int, n: int) -> dict[str, float]:
+    """Library and textbook, taking turns."""
+    model, ocp = hybrid(z), problem(n)
+    variants = {"ipopt_default": {}, "ipopt_warm": {"mu_strategy": "monotone", "mu_init": 1e-3}}
+    solvers = {
+        "rti": CondensedController(model, ocp), "sqp": SQPController(model, ocp),
+        "rti_compiled": CondensedController(model, ocp, compiled=True),
+        "sqp_compiled": SQPController(model, ocp, compiled=True),
+        **{name: IpoptController(model, ocp, options=options) for name, options in variants.items()},
+        "sqpmethod": SingleShooting(model, ocp),
+    }  # fmt: skip
+    row, _ = timed(solvers, record(model, ocp)[:RIVAL_PERIODS], rounds=2)
+    best = {"ipopt": min(row[f"{v}_ms"] for v in variants), "sqpmethod": row["sqpmethod_ms"]}
+    for name in ("rti", "sqp", "rti_compiled", "sqp_compiled"):
+        row |= {f"{rival} / {name}": ms / row[f"{name}_ms"] for rival, ms in best.items()}
+    return {"z": z, "n": n, **row}
+
+
+def growth() -> dict[str, float]:
+    """Exponents: slopes of the logarithms, by least squares."""
+    row: dict[str, float] = {}
+    for letter, sizes in (
+        ("n", [(32, n) for n in (20, 50, 100, 200)]),
+        ("z", [(z, 50) for z in (16, 32, 64, 128, 256)]),
+    ):
+        times: dict[str, list[float]] = {"rti": [], "sqp": []}
+        for z, n in sizes:
+            model, ocp = hybrid(z), problem(n)
+            states = record(model, ocp)[:GROWTH_PERIODS]
+            got, _ = timed({"rti": CondensedController(model, ocp), "sqp": SQPController(model, ocp)}, states)
+            for name, values in times.items():
+                values.append(got[f"{name}_ms"])
+                row[f"{name}_ms at z={z} n={n}"] = got[f"{name}_ms"]
+        at = np.log([size[letter == "n"] for size in sizes])
+        row |= {
+            f"{name} exponent in {letter}": float(np.polyfit(at, np.log(v), 1)[0])
+            for name, v in times.items()
+        }
     return row
 
 
@@ -197,18 +243,20 @@ def main() -> None:
     parser.add_argument("--z", type=int, nargs="+", default=[32], help="hidden units")
     parser.add_argument("--n", type=int, nargs="+", default=[50], help="horizons")
     parser.add_argument("--rivals", action="store_true", help="textbook formulations too (slow)")
+    parser.add_argument("--growth", action="store_true", help="exponents in N and z too (slow)")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    rows = []
-    for z in given.z:
-        for n in given.n:
-            row = measure(z, n, given.rivals)
-            rows.append(row)
-            print("  ".join(f"{name} {value:.4g}" for name, value in row.items()), flush=True)
-            if given.rivals:
-                for name in ("ipopt", "sqpmethod"):
-                    ratios = row[f"{name}_ms"] / row["rti_ms"], row[f"{name}_ms"] / row["sqp_same_ms"]
-                    print(f"{name} / rti {ratios[0]:.0f}   {name} / sqp {ratios[1]:.1f}")
+    sizes = [(z, n) for z in given.z for n in given.n]
+    kinds = [("library", measure)] + ([("rivals", against_rivals)] if given.rivals else [])
+    rows = [{"part": part, **f(z, n)} for z, n in sizes for part, f in kinds]
+    rows += [{"part": "growth", **growth()}] if given.growth else []
+    for row in rows:
+        print(
+            "\n".join(
+                f"{name:28s} {v if isinstance(v, str) else format(v, '.4g')}" for name, v in row.items()
+            ),
+            "\n",
+        )
     if given.out is not None:
         given.out.write_text(json.dumps(rows, indent=1) + "\n")
 

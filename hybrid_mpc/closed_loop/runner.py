@@ -32,7 +32,8 @@ LONG = 250
 class Runner:
     """Steps estimator, controller and monitor against a machine's sensors and actuators, in real time.
 
-    Each period: wait for its instant, measure, estimate, decide, actuate, then monitor. A missing sample leaves
+    Before the clock starts, while the machine rests: the first sample, and the first plan from it. Each period:
+    wait for its instant, measure, estimate, decide, actuate, then monitor. A missing sample leaves
     the prediction. A solve that comes back after the deadline is dropped, and one that cannot be in time any more
     is not begun: the shifted plan is applied (:meth:`~hybrid_mpc.mpc.SafeController.late`). A solve that has begun
     is not interrupted. After a long delay the run goes on at the grid's nearest instant; the estimator is led
@@ -196,11 +197,18 @@ class _Run:
         self._decision: Decision | None = None
         self._memory: Any = None if runner._monitor is None else runner._monitor.initial()
         self._held: deque[Array] = deque(maxlen=sum(runner._delays) + 1)
+        self._first = np.zeros(0)
         self._start = 0.0
 
     def begin(self) -> None:
-        """The first period is now."""
-        self._start = self._r._clock.now()
+        """Measure and make the first plan while the machine still rests; the first period is then now."""
+        r = self._r
+        self._first = self._sample()
+        x_ref, factors = self._previews(r._delays[0] * r._dt)
+        self._estimate = r._estimator.start(self._first, 0.0)
+        self._decision = r._safe.initial(self._estimate, None, x_ref, factors)
+        self._held.extend([self._decision.u] * (self._held.maxlen or 1))
+        self._start = r._clock.now()
 
     def wait(self) -> None:
         """Until the next period's instant, to hold the last input for a whole one."""
@@ -211,10 +219,17 @@ class _Run:
         self.wait()
         r, clock, due = self._r, self._r._clock, self._start + self.k * self._r._dt
         times = [clock.now()]
-        y, t = self._sample(), self.k * r._dt
+        first, t = not self._count, self.k * r._dt
+        y = self._first if first else self._sample()
         times.append(clock.now())
         x_ref, factors = self._previews(t + r._delays[0] * r._dt)
-        estimate, previous = self._estimated(y, t)
+        previous = self._decision
+        assert previous is not None
+        if self._estimate is None:
+            self._estimate = r._estimator.start(y, t)
+        elif not first:
+            self._estimate = r._estimator.update(self._estimate, y, previous.u)
+        estimate = self._estimate
         times.append(clock.now())
         decision = self._decided(previous, estimate, x_ref, factors, due + r._deadline)
         times.append(clock.now())
@@ -225,7 +240,7 @@ class _Run:
             self._memory, reading = r._monitor.update(self._memory, y, self._held[0], filtered(estimate))
         times.append(clock.now())
         self._held.append(decision.u)
-        self._estimate, self._decision = estimate, decision
+        self._decision = decision
         spent = tuple(np.diff(times).tolist())
         step = RunnerStep(
             self.k, t, y, estimate, decision, reading, times[0] - due, times[4] - due, spent
@@ -238,15 +253,6 @@ class _Run:
     def _sample(self) -> Array:
         n_y, y = self._r._estimator.model.n_y, self._r._measure()
         return np.full(n_y, np.nan) if y is None else fitting(y, n_y, "what measure() returns")
-
-    def _estimated(self, y: Array, t: float) -> tuple[Estimate, Decision]:
-        estimator = self._r._estimator
-        if self._estimate is not None and self._decision is not None:
-            return estimator.update(self._estimate, y, self._decision.u), self._decision
-        estimate = estimator.start(y, t)
-        decision = self._decision or self._r._safe.initial(estimate)
-        self._held.extend([decision.u] * (self._held.maxlen or 1))
-        return estimate, decision
 
     def _decided(
         self, previous: Decision, estimate: Estimate, x_ref: Array, factors: Array | None, deadline: float

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import ExtendedKalmanFilter
+from hybrid_mpc.estimation.switching import SwitchingFilter
 from hybrid_mpc.estimation.tuning import Recording
 
 Array = NDArray[np.float64]
@@ -74,7 +75,11 @@ class Consistency:
 
 
 def consistency(
-    estimator: ExtendedKalmanFilter, recordings: Sequence[Recording], *, skip: int = 25, lags: int = 20
+    estimator: ExtendedKalmanFilter | SwitchingFilter,
+    recordings: Sequence[Recording],
+    *,
+    skip: int = 25,
+    lags: int = 20,
 ) -> Consistency:
     """Test a filter on recordings, which should be others than those it was tuned on.
 
@@ -131,7 +136,9 @@ def consistency(
     )
 
 
-def innovations(estimator: ExtendedKalmanFilter, recording: Recording, skip: int = 25) -> Innovations:
+def innovations(
+    estimator: ExtendedKalmanFilter | SwitchingFilter, recording: Recording, skip: int = 25
+) -> Innovations:
     """Innovations of a filter along a recording.
 
     Args:

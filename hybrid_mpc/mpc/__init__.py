@@ -1,7 +1,7 @@
 """Model predictive control: the problem, its solvers behind one interface, the safeguard.
 
-Solvers: :class:`CondensedController` (real-time iteration), :class:`SQPController` (the same to convergence),
-:class:`IpoptController` (exact reference), :class:`BestOf` (any of these from several starts).
+Solvers: :class:`CondensedController` (real-time iteration), :class:`SQPController` (to convergence, with second
+derivatives), :class:`IpoptController` (exact reference), :class:`BestOf` (any of these from several starts).
 """
 
 from hybrid_mpc.mpc.best_of import BestOf

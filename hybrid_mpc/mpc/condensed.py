@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
-from hybrid_mpc.mpc.buffered import BufferedFunction
-from hybrid_mpc.mpc.condensing import Prepared, condense, propagate
+from hybrid_mpc.mpc.condensing import Condenser, Prepared, condense_hessians, propagate
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.problem import Problem, Target, weights_ok
 from hybrid_mpc.mpc.qp import InputQP
 from hybrid_mpc.mpc.solution import Solution, Status
+from hybrid_mpc.mpc.stages import Derivatives, Stages
 
 Array = NDArray[np.float64]
 NAN = float("nan")
@@ -37,10 +37,12 @@ class CondensedController:
         model: The deployed model; ``n_h`` may be 0.
         ocp: The problem.
         iterations: Linearisations per solve; 1 is the RTI, more converge to the NLP's solution.
+        compiled: Whether the model and its Jacobian are compiled as C, cached as
+            :func:`nn_export.compile_function` says. Default: no.
 
     Raises:
-        InputError: If problem and model do not fit, ``iterations < 1``, or the terminal weight cannot be
-            found.
+        InputError: If problem and model do not fit, ``iterations < 1``, the terminal weight cannot be found,
+            or the model is to be compiled and cannot be.
 
     Source: Diehl, Bock, Schlöder, *A real-time iteration scheme for nonlinear optimization in optimal
     feedback control*, SIAM J. Control Optim. 43 (2005).
@@ -60,19 +62,19 @@ class CondensedController:
         ('SOLVED', array([-0.618034]))
     """
 
-    def __init__(self, model: HybridModel, ocp: OCP, *, iterations: int = 1) -> None:
+    def __init__(self, model: HybridModel, ocp: OCP, *, iterations: int = 1, compiled: bool = False) -> None:
         if iterations < 1:
             raise InputError(f"iterations must be at least 1, got {iterations}")
         self._problem = Problem(model, ocp)
-        assert model.with_jacobian is not None
         self._model, self._ocp, self._iterations = model, ocp, iterations
         n, n_u = ocp.horizon, ocp.n_u
-        self._stages = BufferedFunction(model.with_jacobian.map(n))
+        self._stages = Stages(model, n, compiled=compiled)
         difference = np.eye(n * n_u) - np.eye(n * n_u, k=-n_u)
         r, r_delta = np.tile(ocp.r, n) * model.dt, np.tile(ocp.r_delta, n) * model.dt
         self._input_hessian = 2 * (np.diag(r) + (difference.T * r_delta) @ difference)
         self._qp = InputQP(ocp, self._problem.soft, model.dt)
         self._n_x = ocp.n_x
+        self._condenser = Condenser(n, ocp.n_x + model.n_h, n_u, ocp.n_x)
         self._evaluate_once()
 
     @property
@@ -89,6 +91,11 @@ class CondensedController:
     def problem(self) -> Problem:
         """Problem and model made ready; what the plan costs on the model itself."""
         return self._problem
+
+    @property
+    def stages(self) -> Stages:
+        """The model along the horizon."""
+        return self._stages
 
     @property
     def qp(self) -> InputQP:
@@ -111,7 +118,7 @@ class CondensedController:
         Raises:
             InputError: If the weight has another shape.
         """
-        u = np.vstack([previous.u[1:], previous.u[-1:]])
+        u = self._ocp.held(np.vstack([previous.u[1:], previous.u[-1:]]))
         z = np.hstack([previous.x, previous.h])
         z = np.vstack([z[1:], z[-1:]])
         weight = self._problem.weights(weight)
@@ -146,7 +153,13 @@ class CondensedController:
         free = propagate(prepared.a_t, drift, dz0)
         error = prepared.z[:, :n_x] + free[:, :n_x] - target.x
         u_bar = prepared.u.ravel()
-        gradient = 2 * error.ravel() @ prepared.weighted + self._input_gradient(u_bar, prepared.u_prev)
+        gradient = 2 * error.ravel() @ prepared.weighted + self.input_gradient(u_bar, prepared.u_prev)
+        if prepared.economic is not None:
+            slope, curvature = prepared.economic
+            slope = slope + (curvature[:, :, :n_x] @ free[:-1, :n_x, None])[:, :, 0]
+            gradient += (
+                slope[:, :n_x].ravel() @ prepared.from_u[: slope.shape[0] * n_x] + slope[:, n_x:].ravel()
+            )
         soft = self._soft_rows(prepared, free)
         if not (np.all(np.isfinite(gradient)) and (soft is None or np.all(np.isfinite(soft[0])))):
             return self._failed(prepared, Status.NOT_FINITE, start)
@@ -186,11 +199,19 @@ class CondensedController:
         self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array, *, shifted: bool
     ) -> Prepared:
         start = perf_counter()
-        n, n_x = self._ocp.horizon, self._n_x
-        z_next, a_t, b = self._stage_derivatives(z[:-1], u + d)
+        derivatives = self._stages.at(z[:-1], u + d)
         if shifted:  # the appended period has no trajectory yet: start it without a defect
-            z = np.vstack([z[:-1], z_next[-1:]])
-        from_u = condense(a_t, b, n_x)
+            z = np.vstack([z[:-1], derivatives[0][-1:]])
+        return self.condense(u, z, d, u_prev, weight, derivatives, start)
+
+    def condense(
+        self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array,
+        derivatives: Derivatives, start: float,
+    ) -> Prepared:  # fmt: skip
+        """Condense derivatives ``(z_next, A_t, B)`` that are known; ``start`` is when the work began."""
+        n, n_x = self._ocp.horizon, self._n_x
+        z_next, a_t, b = derivatives
+        from_u = self._condenser(a_t, b)
         if weights_ok(weight):
             stages, terminal = self._problem.state_weights(weight)
             weighted = np.empty_like(from_u)
@@ -200,20 +221,13 @@ class CondensedController:
             weighted = np.full_like(from_u, np.nan)
         hessian = 2 * from_u.T @ weighted + self._input_hessian
         soft = self._soft_derivatives(z, u, from_u)
+        economic = self._problem.economic.convex(z[:, :n_x], u) if self._ocp.economic is not None else None
+        if economic is not None:
+            hessian += condense_hessians(economic[1], from_u, n_x)
         spent = (perf_counter() - start) * 1e3
         return Prepared(
-            u, z, d, u_prev, a_t, b, z_next - z[1:], from_u, weighted, hessian, weight, soft, spent
+            u, z, d, u_prev, a_t, b, z_next - z[1:], from_u, weighted, hessian, weight, soft, economic, spent
         )
-
-    def _stage_derivatives(self, z: Array, u: Array) -> tuple[Array, Array, Array]:
-        """Successors ``(N, n_z)``, transposed ``A`` ``(N, n_z, n_z)`` and ``B`` ``(N, n_z, n_u)``."""
-        n, n_z, n_x = *z.shape, self._n_x
-        into_x, into_h, into_u = self._stages.inputs
-        into_x[:], into_h[:], into_u[:] = z[:, :n_x].ravel(), z[:, n_x:].ravel(), u.ravel()
-        self._stages()
-        x, h, a, b = (out.reshape(n, -1) for out in self._stages.outputs)
-        by_u = b.reshape(n, -1, n_z).transpose(0, 2, 1)
-        return np.hstack([x, h]), a.reshape(n, n_z, n_z).copy(), by_u.copy()  # the buffers are used again
 
     def _soft_derivatives(self, z: Array, u: Array, from_u: Array) -> tuple[Array, Array, Array]:
         rows, n_u = self._problem.soft, self._ocp.n_u
@@ -242,13 +256,7 @@ class CondensedController:
         zero = Estimate(0.0, x, h, d, p, np.zeros(0), NAN)
         self.solve(self.initial(zero), zero, np.zeros((1, m.n_x)))
 
-    def gradient(self, prepared: Prepared, x_ref: Array) -> Array:
-        """Exact gradient ``(N n_u,)`` of the cost at a trajectory without defects; soft bounds left out."""
-        error = (prepared.z[:, : self._n_x] - x_ref).ravel()
-        u = prepared.u.ravel()
-        return np.asarray(2 * error @ prepared.weighted + self._input_gradient(u, prepared.u_prev))
-
-    def _input_gradient(self, u: Array, u_prev: Array) -> Array:
+    def input_gradient(self, u: Array, u_prev: Array) -> Array:
         """Gradient of the input costs at the plan ``u`` ``(N n_u,)``."""
         gradient: Array = self._input_hessian @ u
         gradient[: u_prev.size] -= 2 * self._model.dt * self._ocp.r_delta * u_prev

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.blas import dgemv
 
 Array = NDArray[np.float64]
 
@@ -31,6 +32,8 @@ class Prepared:
         weight: Weight factors ``(N + 1, n_x)``.
         soft: Soft bounds' values ``(M,)``, their derivatives by their state ``(M, n_x)`` and by the inputs
             ``(M, N n_u)``.
+        economic: First derivatives ``(N, n_x + n_u)`` of the economic stage costs and their convex second ones;
+            None where there are none.
         milliseconds: Time the preparation took.
     """
 
@@ -46,36 +49,45 @@ class Prepared:
     hessian: Array
     weight: Array
     soft: tuple[Array, Array, Array]
+    economic: tuple[Array, Array] | None
     milliseconds: float
 
 
-def condense(a_t: Array, b: Array, n_x: int) -> Array:
-    """Derivative of the states by the inputs ``((N + 1) n_x, N n_u)``.
+class Condenser:
+    """Derivative of the states by the inputs, on scratch memory of its own: not for several threads at once.
 
-    The products run transposed, on contiguous memory: rows of the scratch arrays are inputs. Of the hidden
-    states only the last period's derivative is ever kept: neither cost nor bounds see them.
+    The products run transposed, on contiguous memory: rows of the scratch arrays are inputs, a period's
+    array is written by one product from the one before. They are the condensing's whole arithmetic, ``N^2
+    n_u n_z^2`` operations; of the hidden states' derivatives neither cost nor bounds see anything.
 
     Args:
-        a_t: Transposed ``A_k`` ``(N, n_z, n_z)``.
-        b: ``B_k`` ``(N, n_z, n_u)``.
+        n: Periods N.
+        n_z: Number of states and hidden states.
+        n_u: Number of inputs.
         n_x: Number of states; they come first in z.
 
     Example:
-        >>> condense(np.ones((2, 1, 1)), np.ones((2, 1, 1)), 1)
+        >>> Condenser(2, 1, 1, 1)(np.ones((2, 1, 1)), np.ones((2, 1, 1)))
         array([[0., 0.],
                [1., 0.],
                [1., 1.]])
     """
-    n, n_z, n_u = b.shape
-    from_u = np.zeros(((n + 1) * n_x, n * n_u))
-    now, after = np.empty((n * n_u, n_z)), np.empty((n * n_u, n_z))
-    for k in range(n):
-        end = k * n_u
-        np.matmul(now[:end], a_t[k], out=after[:end])
-        after[end : end + n_u] = b[k].T
-        from_u[(k + 1) * n_x : (k + 2) * n_x, : end + n_u] = after[: end + n_u, :n_x].T
-        now, after = after, now
-    return from_u
+
+    def __init__(self, n: int, n_z: int, n_u: int, n_x: int) -> None:
+        self._by_inputs = np.zeros((n + 1, n * n_u, n_z))  # of z_0 .. z_N; later inputs' rows stay zero
+        self._newest = self._by_inputs[1:].reshape(n, n, n_u, n_z)
+        self._stages = np.arange(n)
+        self._before = [self._by_inputs[k, : k * n_u] for k in range(1, n)]
+        self._after = [self._by_inputs[k + 1, : k * n_u] for k in range(1, n)]
+        self._states = self._by_inputs[:, :, :n_x].transpose(0, 2, 1)
+        self._shape = (n + 1) * n_x, n * n_u
+
+    def __call__(self, a_t: Array, b: Array) -> Array:
+        """``((N + 1) n_x, N n_u)`` from transposed ``A_k`` ``(N, n_z, n_z)`` and ``B_k`` ``(N, n_z, n_u)``."""
+        self._newest[self._stages, self._stages] = b.transpose(0, 2, 1)
+        for before, a, after in zip(self._before, a_t[1:], self._after, strict=True):
+            np.dot(before, a, out=after)
+        return self._states.reshape(self._shape)
 
 
 def propagate(a_t: Array, drift: Array, dz0: Array) -> Array:
@@ -85,10 +97,47 @@ def propagate(a_t: Array, drift: Array, dz0: Array) -> Array:
         >>> propagate(np.full((2, 1, 1), 0.5), np.ones((2, 1)), np.zeros(1)).ravel()
         array([0. , 1. , 1.5])
     """
-    dz = np.empty((len(drift) + 1, dz0.size))
-    dz[0] = now = dz0
-    for a, add, after in zip(a_t, drift, dz[1:], strict=True):
-        np.dot(now, a, out=after)
-        after += add
-        now = after
+    dz = np.concatenate([dz0[None], drift])
+    for a, before, after in zip(a_t.transpose(0, 2, 1), dz[:-1], dz[1:], strict=True):
+        dgemv(1.0, a, before, 1.0, after, overwrite_y=1)  # in place: half the time of numpy's two calls
     return dz
+
+
+def adjoint(a_t: Array, last: Array, stages: Array) -> Array:
+    """Multipliers ``(N, n_z)`` of the stages' results: derivative of the cost by ``z_1 .. z_N``.
+
+    Args:
+        a_t: Transposed ``A_k`` ``(N, n_z, n_z)``.
+        last: Derivative of the terminal cost by ``x_N`` ``(n_x,)``.
+        stages: Derivatives of the stage costs by ``x_0 .. x_{N-1}`` ``(N, n_x)``.
+
+    Example:
+        >>> adjoint(np.full((2, 1, 1), 0.5), np.ones(1), np.full((2, 1), 3.0)).ravel()
+        array([3.5, 1. ])
+    """
+    n_x = last.size
+    multipliers = np.zeros((len(a_t), a_t.shape[1]))
+    multipliers[:-1, :n_x] = stages[1:]
+    multipliers[-1, :n_x] = last
+    backwards = a_t.transpose(0, 2, 1)[:0:-1], multipliers[:0:-1], multipliers[-2::-1]
+    for a, after, before in zip(*backwards, strict=True):
+        dgemv(1.0, a, after, 1.0, before, trans=1, overwrite_y=1)
+    return multipliers
+
+
+def condense_hessians(stages: Array, from_u: Array, n_x: int) -> Array:
+    """Second derivatives by the stages' ``(x, u)`` ``(N, n_x + n_u, n_x + n_u)`` as those by the inputs.
+
+    Example:
+        >>> condense_hessians(np.full((1, 2, 2), 3.0), np.array([[0.0], [5.0]]), 1)
+        array([[3.]])
+    """
+    n, size, _ = stages.shape
+    n_u = size - n_x
+    states = from_u[: n * n_x].reshape(n, n_x, n * n_u)
+    by_state = (stages[:, :n_x, :n_x] @ states).reshape(n * n_x, n * n_u)
+    by_input = (stages[:, n_x:, :n_x] @ states).reshape(n * n_u, n * n_u)
+    total = from_u[: n * n_x].T @ by_state + by_input + by_input.T
+    blocks = total.reshape(n, n_u, n, n_u)
+    blocks[np.arange(n), :, np.arange(n)] += stages[:, n_x:, n_x:]
+    return np.asarray(total)

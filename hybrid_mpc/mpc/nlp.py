@@ -177,6 +177,9 @@ class IpoptController:
         if ocp.du_max is not None:
             limit = np.tile(ocp.du_max, n)
             rows.append(Rows(du, -limit, limit, np.tile(self._u_scale, n)))
+        inside = [int(k) for k in np.setdiff1d(np.arange(n), ocp.starts)]
+        if inside:  # move blocks
+            rows.append(Rows(du[:, inside], 0.0, 0.0, np.tile(self._u_scale, len(inside))))
         rows += self._soft_rows(u, z, s)
         free = np.full(n_z * (n + 1), np.inf)
         self._bounds = {
@@ -188,7 +191,7 @@ class IpoptController:
         return {
             "x": ca.vertcat(ca.vec(u), ca.vec(z), s),
             "p": ca.vertcat(z0, d, u_prev, ca.vec(x_ref), ca.vec(weight)),
-            "f": self._objective(u, du, z[:n_x, :] - x_ref, weight, s),
+            "f": self._objective(u, du, z[:n_x, :] - x_ref, weight, s) + self._economic(z[:n_x, :-1], u),
             "g": ca.vertcat(*(ca.vec(row.value) for row in rows)),
         }
 
@@ -199,6 +202,10 @@ class IpoptController:
         stage = sum(ca.dot(q, v) for q, v in zip((ocp.q, ocp.r, ocp.r_delta), stages, strict=True))
         penalty = ca.dot(soft.linear, s) + ca.dot(soft.quadratic, s**2)
         return self.model.dt * (stage + penalty) + last.T @ self._problem.terminal @ last
+
+    def _economic(self, x: ca.MX, u: ca.MX) -> ca.MX:
+        f = self.ocp.economic
+        return self.model.dt * ca.sum2(f.map(self.ocp.horizon)(x, u)) if f is not None else ca.MX(0)
 
     def _soft_rows(self, u: ca.MX, z: ca.MX, s: ca.MX) -> list[Rows]:
         soft, rows = self._problem.soft, []

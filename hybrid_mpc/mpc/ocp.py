@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -55,9 +56,17 @@ class OCP:
         slack_quadratic: Penalties ``(n_x,)`` [cost/s/unit^2], positive. Default: ``1000 q``. Where ``q`` is
             zero, 1 stands for it in both.
         soft: Soft bounds on expressions of ``(x, u)``. Default: none.
+        blocks: Move blocking: numbers of periods over which the input is held, one block after the other,
+            e.g. ``(1, 1, 2, 4)`` for a horizon of 8. Every solve starts its first block now: the shifted last
+            plan is only its first guess. Default: every period has an input of its own.
+
+        economic: A further stage cost per second, ``(x, u) -> scalar``, twice differentiable, of ``(x_0, u_0) ..
+            (x_{N-1}, u_{N-1})``; it may be negative and need not be convex. Where it curves down ``rti`` takes it
+            as flat; ``sqp`` and ``ipopt`` know its curvature. Default: none.
 
     Raises:
-        InputError: If shapes do not fit, bounds cross, or a weight is negative or not finite.
+        InputError: If shapes do not fit, bounds cross, a weight is negative or not finite, or the blocks'
+            lengths do not sum to the horizon.
 
     Example:
         >>> OCP(20, (1.0, 0.1), (0.1,), (0.0,), (-1.0,), (1.0,)).q
@@ -78,6 +87,8 @@ class OCP:
     slack_linear: Array = field(default_factory=lambda: np.zeros(0))
     slack_quadratic: Array = field(default_factory=lambda: np.zeros(0))
     soft: tuple[SoftBound, ...] = ()
+    blocks: tuple[int, ...] | None = None
+    economic: ca.Function | None = None
 
     def __init__(
         self,
@@ -95,6 +106,8 @@ class OCP:
         slack_linear: ArrayLike | None = None,
         slack_quadratic: ArrayLike | None = None,
         soft: Sequence[SoftBound] = (),
+        blocks: Sequence[int] | None = None,
+        economic: ca.Function | None = None,
     ) -> None:
         if int(horizon) != horizon or horizon < 1:
             raise InputError(f"horizon must be a whole number of periods, at least 1; got {horizon}")
@@ -114,7 +127,10 @@ class OCP:
         states = state_bounds(q_v, x_min, x_max, slack_linear, slack_quadratic)
         bounds = dict(zip(names, states, strict=True))
         others = {"terminal": terminal, "working_point": working_point, "soft": tuple(soft)}
-        for name, value in {**fields, **bounds, **others}.items():
+        if economic is not None and (economic.n_in(), economic.n_out(), economic.numel_out(0)) != (2, 1, 1):
+            raise InputError(f"economic: {economic} given; needed: a function (x, u) -> scalar")
+        lengths = {"blocks": None if blocks is None else _blocks(blocks, int(horizon))}
+        for name, value in {**fields, **bounds, **others, **lengths, "economic": economic}.items():
             object.__setattr__(self, name, value)
 
     @classmethod
@@ -139,6 +155,22 @@ class OCP:
     def n_u(self) -> int:
         """Number of inputs."""
         return int(self.r.size)
+
+    @property
+    def starts(self) -> NDArray[np.int64]:
+        """First period of every move block; all periods where there are none."""
+        lengths = self.blocks if self.blocks is not None else (1,) * self.horizon
+        return np.cumsum((0, *lengths[:-1]))
+
+    def held(self, u: Array) -> Array:
+        """Inputs ``(N, n_u)`` held over the move blocks, each at its first value.
+
+        Example:
+            >>> ocp = OCP(4, [1.0], [1.0], [0.0], [-9.0], [9.0], blocks=(1, 3))
+            >>> ocp.held(np.arange(4.0)[:, None]).ravel()
+            array([0., 1., 1., 1.])
+        """
+        return u if self.blocks is None else np.repeat(u[self.starts], self.blocks, axis=0)
 
     def stage_cost(self, x: Array, u: Array, x_ref: Array, du: Array, weight: Array | float = 1.0) -> Array:
         """Stage cost ``(...)`` per second of states ``(..., n_x)`` and inputs ``(..., n_u)``.
@@ -186,6 +218,16 @@ class OCP:
         )
         values, vectors = np.linalg.eigh(0.5 * (reduced + reduced.T))
         return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+
+
+def _blocks(blocks: Sequence[int], horizon: int) -> tuple[int, ...]:
+    lengths = tuple(int(length) for length in blocks)
+    if lengths != tuple(blocks) or min(lengths, default=0) < 1 or sum(lengths) != horizon:
+        raise InputError(
+            f"blocks: {tuple(blocks)} given, {sum(blocks)} periods in all; needed: whole numbers of at least 1 "
+            f"that sum to the horizon of {horizon}"
+        )
+    return lengths
 
 
 def _check_weights(weights: dict[str, Array]) -> None:

@@ -13,6 +13,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.mpc.buffered import BufferedFunction
+from hybrid_mpc.mpc.economic import EconomicCost
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.soft import SoftRows
 from hybrid_mpc.mpc.solution import Solution, Status
@@ -103,6 +104,7 @@ class Problem:
         self.model, self.ocp = model, ocp
         self.terminal = ocp.terminal_weight(model)
         self.soft = SoftRows(ocp)
+        self.economic = EconomicCost(ocp, model.dt)
         self._rollout = _rollout(model, ocp.horizon)
         self._rows = np.arange(ocp.horizon + 1)
 
@@ -184,7 +186,7 @@ class Problem:
         error = x - target.x
         stage = np.sum(error[:-1] ** 2 * stages)
         stage += self.model.dt * np.sum(u**2 @ self.ocp.r + du**2 @ self.ocp.r_delta)
-        total = float(stage + error[-1] @ terminal @ error[-1])
+        total = float(stage + error[-1] @ terminal @ error[-1]) + self.economic.value(x, u)
         if len(self.soft):
             excess = self.soft.excess(self.soft.values(x, u)) if excess is None else excess
             total += self.model.dt * self.soft.penalty(excess)

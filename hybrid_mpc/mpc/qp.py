@@ -62,7 +62,8 @@ class _Sides:
 class InputQP:
     """``min 1/2 s'Hs + g's + penalties`` over input steps ``s`` within the limits of inputs and changes.
 
-    Inputs are scaled by half their range, soft bounds by half theirs, and the Hessian by its diagonal. The
+    Where the problem has move blocks, the unknowns are the blocks' inputs; all that comes in and goes out is
+    by period. Inputs are scaled by half their range, soft bounds by half theirs, and the Hessian by its diagonal. The
     solvers (DAQP, through ``casadi.conic``) are built once; :meth:`solve` checks their answer whatever
     status they report. Soft bounds cost time only where they act: the QP is first solved without them, and an
     answer that keeps them all is the answer with them, since its penalty is zero. Else it is solved again
@@ -83,10 +84,11 @@ class InputQP:
     """
 
     def __init__(self, ocp: OCP, soft: SoftRows | None = None, dt: float = 1.0) -> None:
-        n, n_u = ocp.horizon * ocp.n_u, ocp.n_u
+        self._starts, n_u = ocp.starts, ocp.n_u
+        n = self._starts.size * n_u
         half_range = 0.5 * (ocp.u_max - ocp.u_min)
         self._ocp, self._dt, self._n = ocp, dt, n
-        self._scale = np.tile(np.where(np.isfinite(half_range), half_range, 1.0), ocp.horizon)
+        self._scale = np.tile(np.where(np.isfinite(half_range), half_range, 1.0), self._starts.size)
         rows = np.eye(n) - np.eye(n, k=-n_u) if ocp.du_max is not None else np.zeros((0, n))
         self._rows = rows * self._scale / self._scale[:, None] if len(rows) else rows
         self._solver = _daqp(n, len(rows))
@@ -97,8 +99,25 @@ class InputQP:
 
     @property
     def scale(self) -> Array:
-        """What an input step of 1 means in the scaled QP ``(N n_u,)`` [input units]."""
+        """What a step of 1 of a block's input means in the scaled QP ``(M n_u,)`` [input units]."""
         return self._scale
+
+    def by_blocks(self, slopes: Array) -> Array:
+        """Derivatives by the inputs, the last axis ``N n_u``, as those by the blocks' inputs ``M n_u``.
+
+        Example:
+            >>> qp = InputQP(OCP(3, [1.0], [1.0], [0.0], [-1.0], [1.0], blocks=(1, 2)))
+            >>> qp.by_blocks(np.array([1.0, 2.0, 3.0]))
+            array([1., 5.])
+        """
+        if self._ocp.blocks is None:
+            return slopes
+        each = slopes.reshape(*slopes.shape[:-1], self._ocp.horizon, self._ocp.n_u)
+        return np.add.reduceat(each, self._starts, axis=-2).reshape(*slopes.shape[:-1], self._n)
+
+    def blocked_hessian(self, hessian: Array) -> Array:
+        """A Hessian by the inputs as that by the blocks' inputs."""
+        return hessian if self._ocp.blocks is None else self.by_blocks(self.by_blocks(hessian).T)
 
     def solve(
         self,
@@ -118,6 +137,17 @@ class InputQP:
             soft: Values of the soft bounds ``(M,)`` without a step, and their derivatives by the step
                 ``(M, N n_u)``. Default: none.
         """
+        if self._ocp.blocks is None:
+            return self._solve(hessian, gradient, u, u_prev, soft)
+        if soft is not None:
+            soft = soft[0], self.by_blocks(soft[1])
+        given = self.blocked_hessian(hessian), self.by_blocks(gradient), u[self._starts]
+        step, status, kkt = self._solve(*given, u_prev, soft)
+        return np.repeat(step.reshape(-1, u.shape[1]), self._ocp.blocks, axis=0).ravel(), status, kkt
+
+    def _solve(
+        self, hessian: Array, gradient: Array, u: Array, u_prev: Array, soft: tuple[Array, Array] | None
+    ) -> tuple[Array, Status, float]:
         ocp, scale = self._ocp, self._scale
         lower, upper = ((bound - u).ravel() / scale for bound in (ocp.u_min, ocp.u_max))
         row_lower, row_upper = self._row_bounds(u, u_prev)

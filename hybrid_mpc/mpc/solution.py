@@ -51,6 +51,8 @@ class Solution:
         timing: Durations [ms] by name (``prepare``, ``feedback``); recorded, never used to decide.
         excess: Largest violation of a soft bound in the plan [its unit].
         iterations: Linearisations (or iterations of the nonlinear solver) of this solve.
+        curvature: Second derivatives of the stages ``(N, n_x + n_u, n_x + n_u)`` that ``sqp`` starts its next
+            solve with; None from other solvers.
     """
 
     u: Array
@@ -64,6 +66,7 @@ class Solution:
     timing: Mapping[str, float]
     excess: float = 0.0
     iterations: int = 1
+    curvature: Array | None = None
 
     def delayed(self, u_held: Array) -> Solution:
         """The plan one period earlier, with ``u_held`` ``(n_u,)`` held in it: a solve that shifts it has this plan.
@@ -71,4 +74,6 @@ class Solution:
         It loses its last period, which the shift appends anew.
         """
         x, h = (np.vstack([v[:1], v[:-1]]) for v in (self.x, self.h))
-        return replace(self, u=np.vstack([u_held[None], self.u[:-1]]), x=x, h=h)
+        c = self.curvature
+        c = None if c is None else np.concatenate([c[:1], c[:-1]])
+        return replace(self, u=np.vstack([u_held[None], self.u[:-1]]), x=x, h=h, curvature=c)

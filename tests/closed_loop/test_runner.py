@@ -58,10 +58,10 @@ class Rig:
 
 
 class Slow:
-    """A controller whose solves of some periods take a time; it counts from the warm-up's two on."""
+    """A controller whose solves of some periods take a time; it counts from the warm-up's two and the first plan on."""
 
     def __init__(self, controller, clock, seconds):
-        self._controller, self._clock, self._seconds, self.k = controller, clock, seconds, -3
+        self._controller, self._clock, self._seconds, self.k = controller, clock, seconds, -4
 
     def __getattr__(self, name):
         return getattr(self._controller, name)
