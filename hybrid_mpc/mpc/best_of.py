@@ -43,9 +43,11 @@ class BestOf:
         controller: Solves from every guess, e.g. an :class:`~hybrid_mpc.mpc.SQPController`.
         starts: Guesses: input plans ``(N, n_u)``, or functions ``estimate -> (N, n_u)``.
         rivals: Controllers whose plans are guesses too; same states, inputs and horizon.
+        most: Guesses beside the previous plan that are solved from: those that are cheapest on a run of the
+            model. Default: all.
 
     Raises:
-        InputError: If a rival or a plan does not fit, or there is neither start nor rival.
+        InputError: If a rival or a plan does not fit, ``most < 1``, or there is neither start nor rival.
 
     Example:
         >>> import casadi as ca
@@ -71,8 +73,11 @@ class BestOf:
         *,
         starts: Sequence[Array | Start] = (),
         rivals: Sequence[Controller] = (),
+        most: int | None = None,
     ) -> None:
         ocp = controller.ocp
+        if most is not None and most < 1:
+            raise InputError(f"most: 1 or more guesses needed, got {most}; leave it out for all")
         for rival in rivals:
             given = rival.ocp.n_x, rival.ocp.n_u, rival.ocp.horizon
             if given != (ocp.n_x, ocp.n_u, ocp.horizon):
@@ -86,6 +91,7 @@ class BestOf:
         if not starts and not rivals:
             raise InputError("best of one start is the controller itself; give starts or rivals")
         self._controller, self._starts, self._rivals = controller, tuple(starts), tuple(rivals)
+        self._most = most
 
     @property
     def model(self) -> HybridModel:
@@ -116,16 +122,22 @@ class BestOf:
         """
         begin = perf_counter()
         known = np.all(np.isfinite(np.concatenate([estimate.x, estimate.h, estimate.d])))
-        first = self._controller.solve(previous, estimate, reference, weight)
-        solutions = [first]
-        for guess in self._guesses(previous, estimate, reference, weight) if known else ():
-            start = self._from(guess, previous, estimate)
-            solutions.append(self._controller.solve(start, estimate, reference, weight))
         target, u_prev = self.problem.target(reference, weight), previous.u[0]
         z0 = np.concatenate([estimate.x, estimate.h])
+
+        def cost_of(u: Array) -> float:
+            cost = self.problem.cost(self.problem.run(z0, u + estimate.d), u, u_prev, target)
+            return cost if np.isfinite(cost) else np.inf
+
+        first = self._controller.solve(previous, estimate, reference, weight)
+        solutions = [first]
+        guesses = self._guesses(previous, estimate, reference, weight) if known else []
+        for guess in sorted(guesses, key=cost_of)[: self._most]:
+            start = self._from(guess, previous, estimate)
+            solutions.append(self._controller.solve(start, estimate, reference, weight))
         best, least = first, np.inf
         for s in solutions:
-            cost = self.problem.cost(self.problem.run(z0, s.u + estimate.d), s.u, u_prev, target)
+            cost = cost_of(s.u)
             if s.status.ok and cost < least:
                 best, least = replace(s, cost=cost), cost
         return replace(best, timing={"solve": (perf_counter() - begin) * 1e3})

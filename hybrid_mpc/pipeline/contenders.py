@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 ORACLE_ITERATIONS = 2
-"""Linearisations an oracle makes from each of its starts in a period; its last plan is one of them."""
+FIRST_ITERATIONS = 10
+"""Linearisations an oracle makes from each of its starts in a period, and for its first plan from all of them. In a
+period it starts from its last plan and from the rival's that is cheaper by its own equations."""
 
 
 @dataclass(frozen=True)
@@ -79,8 +81,9 @@ def build(
     model = scenario.oracle(prior.dt)
     ocp = make_ocp(prior, control)
     rivals = [CondensedController(artifact.models[m], ocp) for m in ("prior", "hybrid")]
-    best = BestOf(SQPController(model, ocp, iterations=ORACLE_ITERATIONS), rivals=rivals)
-    safe = SafeController(best, prior, first=BestOf(SQPController(model, ocp), rivals=rivals))
+    best = BestOf(SQPController(model, ocp, iterations=ORACLE_ITERATIONS), rivals=rivals, most=1)
+    first = BestOf(SQPController(model, ocp, iterations=FIRST_ITERATIONS), rivals=rivals)
+    safe = SafeController(best, prior, first=first)
     if c.truth:
         return TrueState(model), safe
     return make_estimator(model, control, noise[name], observer=c.observer), safe

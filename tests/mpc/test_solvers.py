@@ -201,6 +201,29 @@ def test_the_best_of_several_starts_is_the_cheapest_of_them():
     assert got.cost == best.problem.cost(run, got.u, np.zeros(1), target)
 
 
+def test_of_many_guesses_only_the_cheapest_are_solved_from():
+    model, (ocp, reference, weight) = pendulum_model(z=3), stroke()
+    e = estimate_of(model, [0.0, 0.0])
+    solved_from = []
+
+    class Counting(SQPController):
+        def solve(self, previous, estimate, reference, weight=None):
+            solved_from.append(float(previous.u[1, 0]))  # what the shifted plan begins with
+            return super().solve(previous, estimate, reference, weight)
+
+    costs = {}
+    problem = SQPController(model, ocp).problem
+    for u in (0.5, -0.5, 0.1):
+        plan = np.full((60, 1), u)
+        z = problem.run(np.concatenate([e.x, e.h]), plan)
+        costs[u] = problem.cost(z, plan, np.zeros(1), problem.target(reference, weight))
+    best = BestOf(Counting(model, ocp), starts=[np.full((60, 1), u) for u in costs], most=1)
+    best.solve(best.initial(e), e, reference, weight)
+    assert solved_from == [0.0, min(costs, key=costs.get)]
+    with pytest.raises(InputError, match="most: 1 or more"):
+        BestOf(SQPController(model, ocp), starts=[np.zeros((60, 1))], most=0)
+
+
 def test_a_rivals_plan_is_a_start():
     # u = 0 is stationary on "even": only somebody else's plan shows the way down.
     model, ocp, e = even()
