@@ -13,6 +13,9 @@ from hybrid_mpc.estimation.kalman import Estimate, ExtendedKalmanFilter
 from hybrid_mpc.model import HybridModel
 
 Array = NDArray[np.float64]
+NEGLIGIBLE = 0.01
+"""Share of a mode's past below which another mode does not enter it: the wide covariance of an improbable jump would
+make the quiet filter a little restless all the time."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +100,8 @@ class SwitchingFilter:
         joint = before.probability[:, None] * self._transition
         after = joint.sum(axis=0)
         share = joint / np.where(after > 0, after, 1.0)
+        share = np.where(share < NEGLIGIBLE, 0.0, share)
+        share = share / share.sum(axis=0)
         modes = [
             f.predict(_mixed(before.modes, share[:, j]), u) if after[j] > 0 else f.predict(before.modes[j], u)
             for j, f in enumerate(self._filters)

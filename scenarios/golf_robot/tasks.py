@@ -31,14 +31,16 @@ CONTROL = ControlSpec(
     x_min=(-0.85, -2.5),
     x_max=(0.85, 2.5),
 )
-# Strokes look 1.6 s ahead, swing farther and faster, and may pull the torque up in one period. The penalty of
+# Strokes look 1.6 s ahead, swing faster, in a narrower frame, and may pull the torque up in one period. The penalty of
 # their limits must outweigh the impact's.
 HARD_STROKE = replace(
-    CONTROL, horizon=80, r=(4.0,), r_delta=(4.0,), du_max=None, x_min=(-1.0, -5.0), x_max=(1.0, 5.0),
+    CONTROL, horizon=80, r=(4.0,), r_delta=(4.0,), du_max=None, x_min=(-0.8, -5.0), x_max=(0.8, 5.0),
     slack_linear=(1e6, 1e5),
 )  # fmt: skip
-# The fastest of the moves is above this speed: the limit of a careful commissioning.
-SLOW = replace(CONTROL, x_min=(-0.85, -2.0), x_max=(0.85, 2.0))
+# The fastest of the moves reaches 1.41 rad/s: the limit of a careful commissioning acts, and hardly costs.
+SLOW = replace(CONTROL, x_min=(-0.85, -1.4), x_max=(0.85, 1.4))
+# A drive that is spared: the torque of a load that comes at once takes more than a period to build up.
+GENTLE = replace(CONTROL, du_max=(0.1,))
 PUTT = replace(HARD_STROKE, u_min=(-0.2,), u_max=(0.2,))
 
 IMPACT = 1.6
@@ -47,7 +49,7 @@ FOLLOW_THROUGH = 0.4
 """Time [s] after the impact in which the club may swing out freely, before it is to come to rest."""
 PUTTS = (0.8, 1.1, 1.4, 1.65, 1.9)
 HARD_STROKES = (3.0, 4.0)
-STEPS = (0.0, 0.4, -0.3, 0.6, 0.0)
+STEPS = (0.0, 0.3, -0.2, 0.4, 0.0)
 HEAVY_STEPS = (0.0, 0.3, -0.2, 0.5, 0.0)
 STEP_TIME = 1.3
 MOVE_TIME = 0.8
@@ -63,9 +65,26 @@ def sine_reference(t: Array) -> Array:
         >>> sine_reference(np.zeros(1)).tolist()
         [[0.0, 0.0]]
     """
+    return _waves(t, ((0.5, 0.35), (0.2, 0.9)))
+
+
+def swing_reference(t: Array) -> Array:
+    """``(n, 2)``: 0.3 rad at 0.35 Hz, faded in over 1 s: what disturbances are rejected on.
+
+    A club that is merely held sticks, and what holding it costs is the same for all models.
+
+    Example:
+        >>> swing_reference(np.zeros(1)).tolist()
+        [[0.0, 0.0]]
+    """
+    return _waves(t, ((0.3, 0.35),))
+
+
+def _waves(t: Array, waves: tuple[tuple[float, float], ...]) -> Array:
+    """Sum of sinusoids of amplitudes [rad] and frequencies [Hz], faded in over 1 s, and its derivative."""
     s = np.clip(t, 0.0, 1.0)
     fade, slope = s**3 * (10 - 15 * s + 6 * s**2), 30 * s**2 * (1 - s) ** 2
-    parts = [(a, 2 * np.pi * f) for a, f in ((0.5, 0.35), (0.2, 0.9))]
+    parts = [(a, 2 * np.pi * f) for a, f in waves]
     wave = sum((a * np.sin(w * t) for a, w in parts), np.zeros_like(t))
     rate = sum((a * w * np.cos(w * t) for a, w in parts), np.zeros_like(t))
     return np.column_stack([fade * wave, slope * wave + fade * rate])
@@ -166,20 +185,16 @@ def _stroke_task(speed: float, control: ControlSpec) -> Task:
     )  # fmt: skip
 
 
-def _hold(t: Array) -> Array:
-    return np.tile([0.3, 0.0], (len(t), 1))
-
-
 TASKS = (
     Task("track_sine", "Follow two sinusoids of 0.5 and 0.2 rad", 6.0, (0.0, 0.0), sine_reference),
-    Task("track_step", "Follow moves of up to 0.9 rad in 0.8 s", STEP_TIME * len(STEPS), (0.0, 0.0), steps(STEPS),
+    Task("track_step", "Follow moves of up to 0.6 rad in 0.8 s", STEP_TIME * len(STEPS), (0.0, 0.0), steps(STEPS),
          control=SLOW),
     *(_stroke_task(speed, PUTT) for speed in PUTTS),
     *(_stroke_task(speed, HARD_STROKE) for speed in HARD_STROKES),
-    Task("reject_push", "Hold 0.3 rad against a push of a finger", 4.0, (0.3, 0.0), _hold,
-         faults=(Fault(1.5, 1.7, "plant_push", 1.2),)),
-    Task("reject_load", "Hold 0.3 rad against an unknown constant load", 4.0, (0.3, 0.0), _hold,
-         faults=(Fault(1.0, np.inf, "input_offset", -0.08),)),
+    Task("reject_push", "Swing on while a hand pushes for a second", 5.0, (0.0, 0.0), swing_reference,
+         faults=(Fault(2.5, 3.5, "plant_push", 0.4),)),
+    Task("reject_load", "Swing on against an unknown constant load", 5.0, (0.0, 0.0), swing_reference,
+         control=GENTLE, faults=(Fault(2.0, np.inf, "input_offset", -0.08),)),
     Task("reject_heavy", "Follow moves with a club 20 % heavier", STEP_TIME * len(HEAVY_STEPS),
          (0.0, 0.0), steps(HEAVY_STEPS), faults=(Fault(0.0, np.inf, "plant_mass", 1.2),)),
 )  # fmt: skip

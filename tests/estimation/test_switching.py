@@ -75,6 +75,15 @@ def test_it_follows_a_jump_as_the_quick_filter_and_is_quiet_as_the_quiet_one(int
     assert errors["switching"][1] < 0.2 * errors["quiet"][1]
 
 
+def test_an_improbable_jump_leaves_the_quiet_filter_quiet(integrator):
+    # Mixed in as a thousandth it would put a variance of 1e-3 into the quiet filter in every period.
+    quiet = filter_of(integrator, 0.0)
+    switching = SwitchingFilter([quiet, filter_of(integrator, 1.0)], [[0.999, 0.001], [0.9, 0.1]])
+    ys = recorded(integrator, lambda k: 0.0, 3, n=100)
+    alone, both = estimates(quiet, ys)[-1], estimates(switching, ys)[-1]
+    np.testing.assert_allclose(both.modes[0].P, alone.P, rtol=1e-9)
+
+
 def test_probabilities_say_when_the_load_came(integrator):
     switching = SwitchingFilter([filter_of(integrator, 0.0), filter_of(integrator, 1.0)], TWO)
     found = estimates(switching, recorded(integrator, lambda k: 3.0 * (k >= 100), 1, n=200))
