@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 
@@ -108,8 +109,9 @@ class _Chain(Chain[_Known]):
         for k, by in enumerate(at.slopes):
             for old, diagonal in by.diagonal.items():
                 for name, slope in state[old].slopes.items():
+                    matrix: Any = ca.diag(diagonal)
                     whole = ca.repmat(diagonal, 1, slope.shape[1])
-                    add(k, name, ca.diag(diagonal) if slope.is_eye() else whole * slope)
+                    add(k, name, matrix if slope.is_eye() else whole * slope)
         return [_Known(value, s) for value, s in zip(at.state, slopes, strict=True)]
 
 

@@ -1,14 +1,16 @@
 """Values and Jacobians of a program at many points in one call, faster than point by point. No torch in here.
 
 The chain rule is that of :mod:`nn_export.jacobian`. What lies between recurrent cells is vectorised scalar code
-(:mod:`nn_export.vectorised`); cells run in numpy, a column a point. A cell's Jacobian is a sum of constant matrices with
-scaled rows, so row ``i`` of the Jacobians of all points is one product: (points x factors) (factors x columns).
+(:mod:`nn_export.vectorised`); cells run in numpy, a column a point. A cell's Jacobian is a sum of constant
+matrices with scaled rows, so row ``i`` of the Jacobians of all points is one product, (points x factors) (factors x
+columns).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import casadi as ca
 import numpy as np
@@ -45,9 +47,7 @@ class SideBySide:
         ((3, 2), (3, 2, 2), [[1.0, 0.0], [0.0, 0.42]])
     """
 
-    def __init__(
-        self, program: Program, n: int, blocks: Mapping[str, Sequence[str]] | None = None
-    ) -> None:
+    def __init__(self, program: Program, n: int, blocks: Mapping[str, Sequence[str]] | None = None) -> None:
         if n < 1:
             raise ProgramError(f"n = {n} points given; at least 1 needed")
         inputs = [port.name for port in program.inputs]
@@ -118,7 +118,9 @@ def _places(
             column = 0
             for name in names:
                 after = column + sizes[name]
-                slot = Slot((below - row, after - column), None, block, slice(row, below), slice(column, after))
+                slot = Slot(
+                    (below - row, after - column), None, block, slice(row, below), slice(column, after)
+                )
                 places.append(((t, name), slot))
                 column = after
         row = below
@@ -197,9 +199,12 @@ class _Chain(Chain[_Known]):
         known = []
         for k, symbol in enumerate(symbols):
             slopes: dict[str, Slope] = {}
-            for name in {**x.slopes, **{i: s for known_state in state for i, s in known_state.slopes.items()}}:
+            for name in {
+                **x.slopes,
+                **{i: s for known_state in state for i, s in known_state.slopes.items()},
+            }:
                 by = x.slopes.get(name), [s.slopes.get(name) for s in state]
-                slopes[name] = cell.differentiate(k, lambda m, at=symbol, i=name: self._slot(at, i, m), *by)
+                slopes[name] = cell.differentiate(k, partial(self._slot, symbol, name), *by)
             known.append(_Known(cell.values[k], slopes))
         self.steps.append(cell)
         return known

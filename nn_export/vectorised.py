@@ -19,27 +19,29 @@ def vectorised(f: ca.Function, n: int) -> ca.Function:
 
     Scalar code (an ``SXFunction``) becomes a graph whose every operation runs over all points: the work of CasADi's
     machine is done once and not ``n`` times, and the same operations give the same numbers. Any other function is
-    mapped.
+    mapped: called point by point.
 
     Args:
         f: The function.
         n: Number of points.
 
     Returns:
-        Function of matrices ``n x nnz``: a row has an argument's nonzeros, column by column; so have the results.
+        Function of dense matrices ``n x size``: a row has an argument's elements, column by column, or a result's.
 
     Example:
         >>> x = ca.SX.sym("x", 2)
         >>> vectorised(ca.Function("f", [x], [x[0] * x[1]]), 3)(ca.DM([[1, 2], [3, 4], [5, 6]]))
         DM([2, 12, 30])
     """
-    inputs = [ca.MX.sym(f"i{i}", n, f.nnz_in(i)) for i in range(f.n_in())]
+    kind: Any = ca.SX if f.is_a("SXFunction") else ca.MX
+    symbols = [kind.sym("v", *f.size_in(i)) for i in range(f.n_in())]
+    dense = ca.Function(f.name(), symbols, [ca.densify(r) for r in f.call(symbols)])
+    inputs = [ca.MX.sym(f"i{i}", n, f.numel_in(i)) for i in range(f.n_in())]
     results = None
-    if f.is_a("SXFunction") and f.n_instructions() <= MOST_INSTRUCTIONS:
-        results = _walk(f, n, inputs)
+    if kind is ca.SX and dense.n_instructions() <= MOST_INSTRUCTIONS:
+        results = _walk(dense, n, inputs)
     if results is None:
         given = [ca.reshape(v.T, f.size1_in(i), f.size2_in(i) * n) for i, v in enumerate(inputs)]
-        dense = ca.Function("dense", (s := f.mx_in()), [ca.densify(r) for r in f.call(s)])
         outputs = dense.map(n).call(given)
         results = [ca.reshape(r, f.numel_out(i), n).T for i, r in enumerate(outputs)]
     return ca.Function(f.name(), inputs, results)
@@ -61,7 +63,7 @@ def _walk(f: ca.Function, n: int, inputs: list[ca.MX]) -> list[ca.MX] | None:
         elif code == ca.OP_CALL or len(o) != 1 or len(i) not in (1, 2):
             return None
         else:
-            operation = ca.MX.unary if len(i) == 1 else ca.MX.binary
+            operation: Any = ca.MX.unary if len(i) == 1 else ca.MX.binary
             slots[o[0]] = operation(code, *(slots[j] for j in i))
     filled = [[v if v.shape[0] == n else ca.repmat(v, n, 1) for v in values] for values in results]
     return [ca.horzcat(*values) if values else ca.MX(n, 0) for values in filled]

@@ -16,7 +16,7 @@ from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.problem import Problem, Target, weights_ok
 from hybrid_mpc.mpc.qp import InputQP
 from hybrid_mpc.mpc.solution import Solution, Status
-from hybrid_mpc.mpc.stages import Derivatives, Stages
+from hybrid_mpc.mpc.stages import Derivatives, Stages, stages
 
 Array = NDArray[np.float64]
 NAN = float("nan")
@@ -68,7 +68,7 @@ class CondensedController:
         self._problem = Problem(model, ocp)
         self._model, self._ocp, self._iterations = model, ocp, iterations
         n, n_u = ocp.horizon, ocp.n_u
-        self._stages = Stages(model, n, compiled=compiled)
+        self._stages: Stages = stages(model, n, compiled=compiled)
         difference = np.eye(n * n_u) - np.eye(n * n_u, k=-n_u)
         r, r_delta = np.tile(ocp.r, n) * model.dt, np.tile(ocp.r_delta, n) * model.dt
         self._input_hessian = 2 * (np.diag(r) + (difference.T * r_delta) @ difference)
@@ -213,9 +213,9 @@ class CondensedController:
         z_next, a_t, b = derivatives
         from_u = self._condenser(a_t, b)
         if weights_ok(weight):
-            stages, terminal = self._problem.state_weights(weight)
+            by_stage, terminal = self._problem.state_weights(weight)
             weighted = np.empty_like(from_u)
-            np.multiply(from_u[: n * n_x], stages.reshape(-1, 1), out=weighted[: n * n_x])
+            np.multiply(from_u[: n * n_x], by_stage.reshape(-1, 1), out=weighted[: n * n_x])
             weighted[n * n_x :] = terminal @ from_u[n * n_x :]
         else:
             weighted = np.full_like(from_u, np.nan)

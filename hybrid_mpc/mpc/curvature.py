@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +43,7 @@ class StageCurvature:
         half = 0.5 * (ocp.u_max - ocp.u_min)
         tolerated = 1 / np.sqrt(np.where(ocp.q > 0, ocp.q, 1.0))
         self._shift = SHIFT * np.concatenate([tolerated, np.where(np.isfinite(half), half, 1.0)])
-        self._stages = stages.side_by_side
+        self._one, self._all = stages.slopes(1), stages.slopes(self._shift.size)
 
     def of(
         self, z: Array, u: Array, a_t: Array, b: Array, adjoint: Array, old: Array | None = None,
@@ -60,28 +60,34 @@ class StageCurvature:
             old: Curvature to keep but for the ``chosen`` states and inputs. Default: all is taken.
             chosen: Their numbers, inputs after states.
         """
-        n, n_z, n_u = b.shape
-        n_x, size = self._n_x, self._shift.size
+        size = self._shift.size
         chosen = range(size) if old is None or chosen is None else chosen
-        into_z, into_u = self._stages.inputs
-        _, by_z, by_u = self._stages.outputs
-        base = np.hstack([a_t[:, :n_x], b.transpose(0, 2, 1)])
-        moved = np.empty_like(base)
-        curvature = np.empty((n, size, size)) if old is None else old.copy()
-        for j in chosen:
-            into_z[:], into_u[:] = z.ravel(), u.ravel()
-            column = into_z[j::n_z] if j < n_x else into_u[j - n_x :: n_u]
-            before = column.copy()
-            column += self._shift[j]
-            self._stages()
-            moved[:, :n_x] = by_z.reshape(n, n_z, n_z)[:, :n_x]
-            moved[:, n_x:] = by_u.reshape(n, n_u, n_z)
-            moved -= base
-            taken = (column - before)[:, None]  # as rounded
-            curvature[:, j] = (moved @ adjoint[:, :, None])[:, :, 0] / taken
+        base = np.concatenate([a_t[:, : self._n_x].transpose(0, 2, 1), b], axis=2)
+        curvature = np.empty((len(b), size, size)) if old is None else old.copy()
+        for j, moved, taken in self._moved(z, u, chosen):
+            curvature[:, j] = (adjoint[:, None, :] @ (moved - base))[:, 0] / taken[:, None]
         for j in set(range(size)) - set(chosen):
             curvature[:, j, chosen] = curvature[:, chosen, j]
         return np.asarray(0.5 * (curvature + curvature.transpose(0, 2, 1)))
+
+    def _moved(self, z: Array, u: Array, chosen: Sequence[int]) -> Iterator[tuple[int, Array, Array]]:
+        """For each of the chosen: its number, the Jacobians after a shift of it, the shift as rounded."""
+        point = np.hstack([z[:, : self._n_x], u])
+        shifted = []
+        for j in chosen:
+            moved = point.copy()
+            moved[:, j] += self._shift[j]
+            shifted.append((j, moved, moved[:, j] - point[:, j]))
+        if not shifted:
+            return
+        together = len(shifted) == self._shift.size
+        for batch in [shifted] if together else [[one] for one in shifted]:
+            points = np.concatenate([moved for _, moved, _ in batch])
+            hidden = np.tile(z[:, self._n_x :], (len(batch), 1))
+            evaluate = self._all if together else self._one
+            slopes = evaluate(np.hstack([points[:, : self._n_x], hidden]), points[:, self._n_x :])
+            for (j, _, taken), part in zip(batch, np.split(slopes, len(batch)), strict=True):
+                yield j, part, taken
 
     def that_matter(self, curvature: Array, from_u: Array, gauss_newton: Array) -> list[int]:
         """States and inputs without whose curvature the Hessian would differ by more than a hundredth."""

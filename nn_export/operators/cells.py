@@ -57,7 +57,7 @@ class Step:
         slopes: Jacobian of each.
     """
 
-    state: State
+    state: tuple[Columns, ...]
     slopes: tuple[Slope, ...]
 
 
@@ -205,5 +205,5 @@ def _blocks(slope: Slope, w: Weights, symbols: list[ca.MX]) -> list[ca.MX]:
     by_hidden = scaled(slope.by_hidden, rows(w[1], len(slope.by_hidden)))
     if 0 in slope.diagonal:
         by_hidden = by_hidden + ca.diag(slope.diagonal[0])
-    others = [ca.diag(slope.diagonal[k]) for k in range(1, len(symbols) - 1)]
+    others: list[Any] = [ca.diag(slope.diagonal[k]) for k in range(1, len(symbols) - 1)]
     return [scaled(slope.by_input, rows(w[0], len(slope.by_input))), by_hidden, *others]
