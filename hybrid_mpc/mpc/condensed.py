@@ -16,7 +16,7 @@ from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.problem import Problem, Target, weights_ok
 from hybrid_mpc.mpc.qp import InputQP
 from hybrid_mpc.mpc.solution import Solution, Status
-from hybrid_mpc.mpc.stages import Derivatives, Stages, stages
+from hybrid_mpc.mpc.stages import Derivatives, Linearisation, stages
 
 Array = NDArray[np.float64]
 NAN = float("nan")
@@ -68,7 +68,7 @@ class CondensedController:
         self._problem = Problem(model, ocp)
         self._model, self._ocp, self._iterations = model, ocp, iterations
         n, n_u = ocp.horizon, ocp.n_u
-        self._stages: Stages = stages(model, n, compiled=compiled)
+        self._stages = stages(model, n, compiled=compiled)
         difference = np.eye(n * n_u) - np.eye(n * n_u, k=-n_u)
         r, r_delta = np.tile(ocp.r, n) * model.dt, np.tile(ocp.r_delta, n) * model.dt
         self._input_hessian = 2 * (np.diag(r) + (difference.T * r_delta) @ difference)
@@ -93,7 +93,7 @@ class CondensedController:
         return self._problem
 
     @property
-    def stages(self) -> Stages:
+    def stages(self) -> Linearisation:
         """The model along the horizon."""
         return self._stages
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from scipy.linalg import eigh
 
 from hybrid_mpc.mpc.condensing import condense_hessians
 from hybrid_mpc.mpc.ocp import OCP
-from hybrid_mpc.mpc.stages import Stages
+from hybrid_mpc.mpc.stages import Linearisation
 
 Array = NDArray[np.float64]
 
@@ -38,7 +38,7 @@ class StageCurvature:
         ocp: The problem; its weights and limits give the length of the differences.
     """
 
-    def __init__(self, stages: Stages, ocp: OCP) -> None:
+    def __init__(self, stages: Linearisation, ocp: OCP) -> None:
         self._n_x, self._n_u = ocp.n_x, ocp.n_u
         half = 0.5 * (ocp.u_max - ocp.u_min)
         tolerated = 1 / np.sqrt(np.where(ocp.q > 0, ocp.q, 1.0))
@@ -60,34 +60,32 @@ class StageCurvature:
             old: Curvature to keep but for the ``chosen`` states and inputs. Default: all is taken.
             chosen: Their numbers, inputs after states.
         """
-        size = self._shift.size
-        chosen = range(size) if old is None or chosen is None else chosen
-        base = np.concatenate([a_t[:, : self._n_x].transpose(0, 2, 1), b], axis=2)
-        curvature = np.empty((len(b), size, size)) if old is None else old.copy()
-        for j, moved, taken in self._moved(z, u, chosen):
-            curvature[:, j] = (adjoint[:, None, :] @ (moved - base))[:, 0] / taken[:, None]
-        for j in set(range(size)) - set(chosen):
-            curvature[:, j, chosen] = curvature[:, chosen, j]
+        n, size, n_x = len(b), self._shift.size, self._n_x
+        columns = np.arange(size) if old is None or chosen is None else np.array(chosen, dtype=int)
+        curvature = np.empty((n, size, size)) if old is None else old.copy()
+        if columns.size:
+            here = np.hstack([z[:, :n_x], u])
+            moved = np.repeat(here[None], columns.size, axis=0)
+            each = np.arange(columns.size)
+            moved[each, :, columns] += self._shift[columns, None]
+            taken = moved[each, :, columns] - here.T[columns]  # as rounded
+            change = self._slopes(moved, z[:, n_x:])
+            change -= np.concatenate([a_t[:, :n_x].transpose(0, 2, 1), b], axis=2)
+            weighted = (adjoint[:, None, :] @ change)[:, :, 0]
+            curvature[:, columns] = (weighted / taken[:, :, None]).transpose(1, 0, 2)
+        for j in sorted(set(range(size)) - set(columns.tolist())):
+            curvature[:, j, columns] = curvature[:, columns, j]
         return np.asarray(0.5 * (curvature + curvature.transpose(0, 2, 1)))
 
-    def _moved(self, z: Array, u: Array, chosen: Sequence[int]) -> Iterator[tuple[int, Array, Array]]:
-        """For each of the chosen: its number, the Jacobians after a shift of it, the shift as rounded."""
-        point = np.hstack([z[:, : self._n_x], u])
-        shifted = []
-        for j in chosen:
-            moved = point.copy()
-            moved[:, j] += self._shift[j]
-            shifted.append((j, moved, moved[:, j] - point[:, j]))
-        if not shifted:
-            return
-        together = len(shifted) == self._shift.size
-        for batch in [shifted] if together else [[one] for one in shifted]:
-            points = np.concatenate([moved for _, moved, _ in batch])
-            hidden = np.tile(z[:, self._n_x :], (len(batch), 1))
-            evaluate = self._all if together else self._one
-            slopes = evaluate(np.hstack([points[:, : self._n_x], hidden]), points[:, self._n_x :])
-            for (j, _, taken), part in zip(batch, np.split(slopes, len(batch)), strict=True):
-                yield j, part, taken
+    def _slopes(self, points: Array, hidden: Array) -> Array:
+        """Jacobians ``(m, N, n_z, n_x + n_u)`` at states and inputs ``(m, N, n_x + n_u)``."""
+        m, n, size = points.shape
+        n_x = self._n_x
+        if m == size:
+            flat = points.reshape(m * n, size)
+            z = np.hstack([flat[:, :n_x], np.tile(hidden, (m, 1))])
+            return self._all(z, flat[:, n_x:]).reshape(m, n, -1, size)
+        return np.stack([self._one(np.hstack([p[:, :n_x], hidden]), p[:, n_x:]) for p in points])
 
     def that_matter(self, curvature: Array, from_u: Array, gauss_newton: Array) -> list[int]:
         """States and inputs without whose curvature the Hessian would differ by more than a hundredth."""

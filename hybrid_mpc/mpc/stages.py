@@ -23,7 +23,7 @@ Slopes = Callable[[Array, Array], Array]
 """Jacobians of the successors by states and inputs ``(m, n_z, n_x + n_u)``, of ``z`` ``(m, n_z)`` and ``u``."""
 
 
-class Stages(Protocol):
+class Linearisation(Protocol):
     """A model's periods over a horizon, values and Jacobians in one call."""
 
     def at(self, z: Array, u: Array) -> Derivatives:
@@ -36,23 +36,23 @@ class Stages(Protocol):
         """A function for ``m = times N`` periods; made once, it is called often."""
 
 
-def stages(model: HybridModel, n: int, *, compiled: bool = False) -> Stages:
-    """The fastest way that a model has.
+def stages(model: HybridModel, n: int, *, compiled: bool = False) -> Linearisation:
+    """The fastest way that a model has: all periods at once where it can, else one after the other.
 
     Args:
         model: The model.
         n: Periods N.
-        compiled: Whether one period is compiled as C. Default: no; that needs no compiler.
+        compiled: Whether what is evaluated period by period is compiled as C. Default: no; that needs no
+            compiler.
 
     Raises:
         InputError: If it is to be compiled and there is no compiler, or it fails.
     """
-    if compiled or model.side_by_side is None:
-        return MappedStages(model, n, compiled=compiled)
-    return VectorisedStages(model, n)
+    kind = Stages if model.side_by_side is None else VectorisedStages
+    return kind(model, n, compiled=compiled)
 
 
-class MappedStages:
+class Stages:
     """One period after the other in CasADi's machine, or compiled.
 
     Args:
@@ -69,7 +69,7 @@ class MappedStages:
         >>> model = HybridModel("sum", 1.0, (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),),
         ...     ca.Function("f", [x, h, u], [x + u, h]), ca.Function("g", [x, h, u], [u]),
         ...     ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]))
-        >>> MappedStages(model, 3).run(np.zeros(1), np.ones((3, 1)))[0].ravel().tolist()
+        >>> Stages(model, 3).run(np.zeros(1), np.ones((3, 1)))[0].ravel().tolist()
         [1.0, 2.0, 3.0]
     """
 
@@ -80,17 +80,17 @@ class MappedStages:
         self._shape, self._n_x = (n, model.n_x + model.n_h), model.n_x
 
     def at(self, z: Array, u: Array) -> Derivatives:
-        """See :class:`Stages`."""
+        """See :class:`Linearisation`."""
         z_next, a_t, b = self._call(self._side_by_side, z, u)
         return z_next.copy(), a_t.copy(), b.copy()  # the next call overwrites them
 
     def run(self, z0: Array, u: Array) -> Derivatives:
-        """See :class:`Stages`."""
+        """See :class:`Linearisation`."""
         z_next, a_t, b = self._call(self._along, z0, u)
         return z_next.copy(), a_t.copy(), b.copy()
 
     def slopes(self, times: int) -> Slopes:
-        """See :class:`Stages`."""
+        """See :class:`Linearisation`."""
         n = self._shape[0]
 
         def evaluate(z: Array, u: Array) -> Array:
@@ -116,23 +116,29 @@ class VectorisedStages:
     Args:
         model: The model.
         n: Periods N.
+        compiled: Whether the run's ``step`` is compiled as C.
+
+    Raises:
+        InputError: If it is to be compiled and there is no compiler, or it fails.
     """
 
-    def __init__(self, model: HybridModel, n: int) -> None:
+    def __init__(self, model: HybridModel, n: int, *, compiled: bool = False) -> None:
         assert model.side_by_side is not None
         self._model, self._many, self._n, self._n_x = model, model.side_by_side, n, model.n_x
         self._at = self._many(n, {"A": ("x", "h"), "B": ("u",)})
         z, u = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("u", model.n_u)
-        z_next = ca.vertcat(*model.step(z[: model.n_x], z[model.n_x :], u))
-        self._along = BufferedFunction(ca.Function("z_step", [z, u], [z_next]).mapaccum("run", n))
+        inline = model.step.is_a("MXFunction")  # a call less a stage
+        z_next = ca.vertcat(*model.step.call([z[: model.n_x], z[model.n_x :], u], inline, False))
+        step = ca.Function("z_step", [z, u], [z_next])
+        self._along = BufferedFunction((_compiled(step) if compiled else step).mapaccum("run", n))
 
     def at(self, z: Array, u: Array) -> Derivatives:
-        """See :class:`Stages`."""
+        """See :class:`Linearisation`."""
         x_next, h_next, a, b = self._at(z[:, : self._n_x], z[:, self._n_x :], u)
         return np.hstack([x_next, h_next]), np.ascontiguousarray(a.transpose(0, 2, 1)), b
 
     def run(self, z0: Array, u: Array) -> Derivatives:
-        """See :class:`Stages`."""
+        """See :class:`Linearisation`."""
         self._along.inputs[0][:], self._along.inputs[1][:] = z0, u.ravel()
         self._along()
         z_next = self._along.outputs[0].reshape(self._n, -1).copy()
@@ -140,7 +146,7 @@ class VectorisedStages:
         return z_next, a_t, b
 
     def slopes(self, times: int) -> Slopes:
-        """See :class:`Stages`."""
+        """See :class:`Linearisation`."""
         many, n_x = self._many(times * self._n, {"slopes": ("x", "u")}), self._n_x
         return lambda z, u: many(z[:, :n_x], z[:, n_x:], u)[2]
 
