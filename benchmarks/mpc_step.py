@@ -6,7 +6,7 @@ angle with the torque at its bound), each warm-started from its own last plan. T
 Python call, in milliseconds; medians, the first solves are not counted. Solvers that are compared take turns.
 
 - ``rti``: prepare + feedback of ``CondensedController``; ``rti_bounds``: with bounds on both states, which
-  act, along the loop that keeps them; ``_compiled``: with the model's stages as C (``-O3``);
+  act, along the loop that keeps them; ``_compiled``: with what runs period by period as C (``-O3``);
 - ``sqp``: ``SQPController`` to convergence (tolerance 1e-10 of the cost, KKT residual 1e-6);
 - ``ipopt``: multiple shooting over (x, h) with exact Hessian (``IpoptController``, tolerance 1e-9), with IPOPT's
   default initial barrier and with one of 1e-3, which suits a warm start; the faster counts;

@@ -26,7 +26,7 @@ class CondensedController:
     """Nonlinear MPC by Gauss-Newton real-time iterations (RTI).
 
     A period's work is split: :meth:`prepare` shifts the previous plan, linearises the model along it in
-    one mapped call and condenses states and hidden states away (their multiple-shooting trajectory and
+    one call and condenses states and hidden states away (their multiple-shooting trajectory and
     its defects are kept); :meth:`feedback` embeds the new estimate and solves the QP of ``N n_u``
     unknowns (and a slack for every soft bound and period, where one acts). The QP's answer is checked,
     whatever status its solver reports. Everything is built here; no method changes the object (apart from
@@ -37,8 +37,9 @@ class CondensedController:
         model: The deployed model; ``n_h`` may be 0.
         ocp: The problem.
         iterations: Linearisations per solve; 1 is the RTI, more converge to the NLP's solution.
-        compiled: Whether the model and its Jacobian are compiled as C, cached as
-            :func:`nn_export.compile_function` says. Default: no.
+        compiled: Whether what is evaluated period by period is compiled as C, cached as
+            :func:`nn_export.compile_function` says: the runs of a model with a ``side_by_side``, else its
+            Jacobians too. Default: no.
 
     Raises:
         InputError: If problem and model do not fit, ``iterations < 1``, the terminal weight cannot be found,
