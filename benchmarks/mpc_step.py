@@ -253,8 +253,9 @@ def main() -> None:
     torch.set_num_threads(1)
     sizes = [(z, n) for z in given.z for n in given.n]
     kinds = [("library", measure)] + ([("rivals", against_rivals)] if given.rivals else [])
-    rows = [{"part": part, **f(z, n, clock)} for z, n in sizes for part, f in kinds]
-    rows += [{"part": "growth", **growth(clock)}] if given.growth else []
+    kind = {"clock": "processor" if given.cpu else "wall"}
+    rows = [{"part": part, **kind, **f(z, n, clock)} for z, n in sizes for part, f in kinds]
+    rows += [{"part": "growth", **kind, **growth(clock)}] if given.growth else []
     for row in rows:
         print(
             "\n".join(
