@@ -1,17 +1,19 @@
 """How long a step of the nonlinear MPC takes: the golf robot's hybrid model with random weights, one core.
 
-``python benchmarks/mpc_step.py [--out times.json] [--z 32] [--n 50] [--rivals] [--growth]``. Every solver solves
-the same problem for the same sequence of states (a recorded closed loop on the model itself, turning towards a new
-angle with the torque at its bound), each warm-started from its own last plan. The time is that of the whole
-Python call, in milliseconds; medians, the first solves are not counted. Solvers that are compared take turns.
+``python benchmarks/mpc_step.py [--out times.json] [--z 32] [--n 50] [--rivals] [--growth] [--cpu]``. Every
+solver solves the same problem for the same sequence of states (a recorded closed loop on the model itself,
+turning towards a new angle with the torque at its bound), each warm-started from its own last plan. The time
+is that of the whole Python call, in milliseconds; medians, the first solves are not counted. Solvers that are
+compared take turns.
 
 - ``rti``: prepare + feedback of ``CondensedController``; ``rti_bounds``: with bounds on both states, which
-  act, along the loop that keeps them; ``_compiled``: with the model's stages as C (``-O3``);
+  act, along the loop that keeps them; ``_compiled``: with what runs period by period as C (``-O3``);
 - ``sqp``: ``SQPController`` to convergence (tolerance 1e-10 of the cost, KKT residual 1e-6);
 - ``ipopt``: multiple shooting over (x, h) with exact Hessian (``IpoptController``, tolerance 1e-9), with IPOPT's
   default initial barrier and with one of 1e-3, which suits a warm start; the faster counts;
 - ``sqpmethod``: single shooting over u with exact Hessian, CasADi's ``sqpmethod`` with qrqp, tolerances 1e-6;
 - ``mandatory_ms``: the arithmetic that a step cannot do without, at the measured speed of ``dgemm``;
+- ``--cpu``: processor time instead, which leaves out what other work on a busy machine takes;
 - ``--growth``: exponents of the ``rti``'s and the ``sqp``'s time in N (20 to 200) and in z (16 to 256).
 """
 
@@ -76,7 +78,7 @@ def record(model, ocp):
     return states
 
 
-def timed(controllers, states, rounds=1):
+def timed(controllers, states, clock, rounds=1):
     """Of each controller by name: median [ms] of whole solves, share of solved ones, iterations; last plans.
 
     The controllers take turns, ``rounds`` times, each along all states: so a load of the machine meets all of them.
@@ -86,9 +88,9 @@ def timed(controllers, states, rounds=1):
         for name, controller in controllers.items():
             plan, before = controller.initial(states[0]), len(spent[name])
             for e in states:
-                start = time.perf_counter()
+                start = clock()
                 plan = controller.solve(plan, e, np.array([[GOAL, 0.0]]))
-                spent[name].append(1e3 * (time.perf_counter() - start))
+                spent[name].append(1e3 * (clock() - start))
                 solved[name].append(plan.status.ok)
                 count[name].append(plan.iterations)
             plans[name] = plan
@@ -148,13 +150,13 @@ class SingleShooting:
         )
 
 
-def median_us(call) -> float:
+def median_us(call, clock) -> float:
     """Median time of 200 calls."""
     spent = []
     for _ in range(200):
-        start = time.perf_counter()
+        start = clock()
         call()
-        spent.append(time.perf_counter() - start)
+        spent.append(clock() - start)
     return 1e6 * float(np.median(spent))
 
 
@@ -164,38 +166,38 @@ def mandatory_mflop(z: int, n: int) -> float:
     return 1e-6 * (n**2 * n_z**2 + 2 * n**3 + n * 12 * z**2)
 
 
-def dgemm_gflops() -> float:
+def dgemm_gflops(clock) -> float:
     """Speed of a large product, one core."""
     a = np.random.default_rng(0).normal(size=(400, 400))
-    return 2 * 400**3 / median_us(lambda: a @ a) / 1e3
+    return 2 * 400**3 / median_us(lambda: a @ a, clock) / 1e3
 
 
-def measure(z: int, n: int) -> dict[str, float]:
+def measure(z: int, n: int, clock) -> dict[str, float]:
     """The library's times at one size."""
     model, ocp = hybrid(z), problem(n)
     states = record(model, ocp)
     kinds = {
         "rti": CondensedController(model, ocp), "rti_compiled": CondensedController(model, ocp, compiled=True)
     }  # fmt: skip
-    row, plans = timed(kinds, states, rounds=2)
+    row, plans = timed(kinds, states, clock, rounds=2)
     for name, suffix in (("rti", ""), ("rti_compiled", "_compiled")):
         controller, plan = kinds[name], plans[name]
         prepared = controller.prepare(plan)
-        row[f"prepare{suffix}_ms"] = 1e-3 * median_us(partial(controller.prepare, plan))
+        row[f"prepare{suffix}_ms"] = 1e-3 * median_us(partial(controller.prepare, plan), clock)
         row[f"feedback{suffix}_ms"] = 1e-3 * median_us(
-            partial(controller.feedback, prepared, states[-1], np.array([[GOAL, 0.0]]))
+            partial(controller.feedback, prepared, states[-1], np.array([[GOAL, 0.0]])), clock
         )
     bounded = problem(n, x_max=[0.55, 1.0], x_min=[-np.inf, -1.0])
-    row |= timed({"rti_bounds": CondensedController(model, bounded)}, record(model, bounded))[0]
+    row |= timed({"rti_bounds": CondensedController(model, bounded)}, record(model, bounded), clock)[0]
     row |= timed({"sqp": SQPController(model, ocp), "sqp_compiled": SQPController(model, ocp, compiled=True)},
-                 states[:60], rounds=2)[0]  # fmt: skip
-    row["mandatory_mflop"], row["dgemm_gflops"] = mandatory_mflop(z, n), dgemm_gflops()
+                 states[:60], clock, rounds=2)[0]  # fmt: skip
+    row["mandatory_mflop"], row["dgemm_gflops"] = mandatory_mflop(z, n), dgemm_gflops(clock)
     row["mandatory_ms"] = row["mandatory_mflop"] / row["dgemm_gflops"]
     row["rti_to_mandatory"] = row["rti_ms"] / row["mandatory_ms"]
     return {"z": z, "n": n, **row}
 
 
-def against_rivals(z: int, n: int) -> dict[str, float]:
+def against_rivals(z: int, n: int, clock) -> dict[str, float]:
     """Library and textbook, taking turns."""
     model, ocp = hybrid(z), problem(n)
     variants = {"ipopt_default": {}, "ipopt_warm": {"mu_strategy": "monotone", "mu_init": 1e-3}}
@@ -206,14 +208,14 @@ def against_rivals(z: int, n: int) -> dict[str, float]:
         **{name: IpoptController(model, ocp, options=options) for name, options in variants.items()},
         "sqpmethod": SingleShooting(model, ocp),
     }  # fmt: skip
-    row, _ = timed(solvers, record(model, ocp)[:RIVAL_PERIODS], rounds=2)
+    row, _ = timed(solvers, record(model, ocp)[:RIVAL_PERIODS], clock, rounds=2)
     best = {"ipopt": min(row[f"{v}_ms"] for v in variants), "sqpmethod": row["sqpmethod_ms"]}
     for name in ("rti", "sqp", "rti_compiled", "sqp_compiled"):
         row |= {f"{rival} / {name}": ms / row[f"{name}_ms"] for rival, ms in best.items()}
     return {"z": z, "n": n, **row}
 
 
-def growth() -> dict[str, float]:
+def growth(clock) -> dict[str, float]:
     """Exponents: slopes of the logarithms, by least squares."""
     row: dict[str, float] = {}
     for letter, sizes in (
@@ -224,7 +226,8 @@ def growth() -> dict[str, float]:
         for z, n in sizes:
             model, ocp = hybrid(z), problem(n)
             states = record(model, ocp)[:GROWTH_PERIODS]
-            got, _ = timed({"rti": CondensedController(model, ocp), "sqp": SQPController(model, ocp)}, states)
+            kinds = {"rti": CondensedController(model, ocp), "sqp": SQPController(model, ocp)}
+            got, _ = timed(kinds, states, clock)
             for name, values in times.items():
                 values.append(got[f"{name}_ms"])
                 row[f"{name}_ms at z={z} n={n}"] = got[f"{name}_ms"]
@@ -244,12 +247,15 @@ def main() -> None:
     parser.add_argument("--n", type=int, nargs="+", default=[50], help="horizons")
     parser.add_argument("--rivals", action="store_true", help="textbook formulations too (slow)")
     parser.add_argument("--growth", action="store_true", help="exponents in N and z too (slow)")
+    parser.add_argument("--cpu", action="store_true", help="processor time instead of the wall clock's")
     given = parser.parse_args()
+    clock = time.process_time if given.cpu else time.perf_counter
     torch.set_num_threads(1)
     sizes = [(z, n) for z in given.z for n in given.n]
     kinds = [("library", measure)] + ([("rivals", against_rivals)] if given.rivals else [])
-    rows = [{"part": part, **f(z, n)} for z, n in sizes for part, f in kinds]
-    rows += [{"part": "growth", **growth()}] if given.growth else []
+    kind = {"clock": "processor" if given.cpu else "wall"}
+    rows = [{"part": part, **kind, **f(z, n, clock)} for z, n in sizes for part, f in kinds]
+    rows += [{"part": "growth", **kind, **growth(clock)}] if given.growth else []
     for row in rows:
         print(
             "\n".join(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -129,8 +130,10 @@ def load_artifact(folder: Path) -> Artifact:
 def build_model(name: str, programs: Mapping[str, nn_export.Program], info: ModelInfo) -> HybridModel:
     """The :class:`HybridModel` of ``programs["<name>/step"]`` and its siblings."""
     functions = {f: nn_export.build(programs[f"{name}/{f}"], f) for f in FUNCTIONS}
-    functions["with_jacobian"] = nn_export.with_jacobian(programs[f"{name}/step"], JACOBIANS)
-    return HybridModel(name, info.dt, info.states, info.inputs, info.outputs, **functions)
+    step = programs[f"{name}/step"]
+    functions["with_jacobian"] = nn_export.with_jacobian(step, JACOBIANS)
+    many = partial(nn_export.SideBySide, step)
+    return HybridModel(name, info.dt, info.states, info.inputs, info.outputs, **functions, side_by_side=many)
 
 
 def _signal_out(s: Signal) -> dict[str, Any]:

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.signals import Signal
+
+ManyPoints: TypeAlias = Callable[..., tuple[NDArray[np.float64], ...]]
+"""``(x, h, u)``, each ``(n, size)``, to ``(x_next, h_next)`` and Jacobians ``(n, n_z, columns)``."""
+SideBySide: TypeAlias = Callable[[int, Mapping[str, Sequence[str]]], ManyPoints]
+"""Makes such a function: from ``n`` and, for each Jacobian, the inputs that it is by, ``{"A": ("x", "h")}``."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +38,8 @@ class HybridModel:
         energy_balance: ``(x, xdot, u) -> dE`` [W] of the prior; zero along the prior's own flow.
         with_jacobian: ``(x, h, u) -> (x_next, h_next, A, B)`` with ``A`` of ``(x_next, h_next)`` by
             ``(x, h)`` and ``B`` by ``u``. Default: made from ``step`` by CasADi's own derivatives.
+        side_by_side: The same at many points in one call, where the model has a faster way than one call a
+            point: what :class:`nn_export.SideBySide` makes of a program. Default: none.
 
     Raises:
         InputError: If the functions' shapes do not fit the signals.
@@ -57,6 +68,7 @@ class HybridModel:
     output: ca.Function
     energy_balance: ca.Function
     with_jacobian: ca.Function | None = None
+    side_by_side: SideBySide | None = None
 
     def __post_init__(self) -> None:
         if not self.dt > 0:

@@ -1,7 +1,8 @@
 """Torch modules as CasADi functions: exact, without a compiler, readable on disk.
 
 ``trace``, ``to_casadi``, ``from_casadi`` and ``parity`` need torch and import it when first used; all else
-(``build``, ``with_jacobian``, ``unroll``, ``compile_function``, ``load_programs`` ...) needs casadi and numpy only.
+(``build``, ``with_jacobian``, ``SideBySide``, ``unroll``, ``compile_function``, ``load_programs`` ...) needs casadi
+and numpy only.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -12,6 +13,7 @@ from nn_export.errors import ExportError, ProgramError
 from nn_export.horizon import fold, unroll
 from nn_export.jacobian import with_jacobian
 from nn_export.program import Node, Port, Program
+from nn_export.side_by_side import SideBySide
 from nn_export.storage import load_programs, save_programs
 
 if TYPE_CHECKING:
@@ -24,6 +26,7 @@ __all__ = [
     "trace",
     "build",
     "with_jacobian",
+    "SideBySide",
     "unroll",
     "fold",
     "from_casadi",

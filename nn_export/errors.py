@@ -28,7 +28,7 @@ class DtypeError(ExportError):
 
 
 class ShapeError(ExportError):
-    """A value has more than two axes longer than one."""
+    """A value has more than two axes longer than one, or an array another shape than needed."""
 
 
 class DynamicShapeError(ExportError):

@@ -16,7 +16,7 @@ from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.problem import Problem, Target, weights_ok
 from hybrid_mpc.mpc.qp import InputQP
 from hybrid_mpc.mpc.solution import Solution, Status
-from hybrid_mpc.mpc.stages import Derivatives, Stages
+from hybrid_mpc.mpc.stages import Derivatives, Linearisation, stages
 
 Array = NDArray[np.float64]
 NAN = float("nan")
@@ -26,7 +26,7 @@ class CondensedController:
     """Nonlinear MPC by Gauss-Newton real-time iterations (RTI).
 
     A period's work is split: :meth:`prepare` shifts the previous plan, linearises the model along it in
-    one mapped call and condenses states and hidden states away (their multiple-shooting trajectory and
+    one call and condenses states and hidden states away (their multiple-shooting trajectory and
     its defects are kept); :meth:`feedback` embeds the new estimate and solves the QP of ``N n_u``
     unknowns (and a slack for every soft bound and period, where one acts). The QP's answer is checked,
     whatever status its solver reports. Everything is built here; no method changes the object (apart from
@@ -37,8 +37,9 @@ class CondensedController:
         model: The deployed model; ``n_h`` may be 0.
         ocp: The problem.
         iterations: Linearisations per solve; 1 is the RTI, more converge to the NLP's solution.
-        compiled: Whether the model and its Jacobian are compiled as C, cached as
-            :func:`nn_export.compile_function` says. Default: no.
+        compiled: Whether what is evaluated period by period is compiled as C, cached as
+            :func:`nn_export.compile_function` says: the runs of a model with a ``side_by_side``, else its
+            Jacobians too. Default: no.
 
     Raises:
         InputError: If problem and model do not fit, ``iterations < 1``, the terminal weight cannot be found,
@@ -68,7 +69,7 @@ class CondensedController:
         self._problem = Problem(model, ocp)
         self._model, self._ocp, self._iterations = model, ocp, iterations
         n, n_u = ocp.horizon, ocp.n_u
-        self._stages = Stages(model, n, compiled=compiled)
+        self._stages = stages(model, n, compiled=compiled)
         difference = np.eye(n * n_u) - np.eye(n * n_u, k=-n_u)
         r, r_delta = np.tile(ocp.r, n) * model.dt, np.tile(ocp.r_delta, n) * model.dt
         self._input_hessian = 2 * (np.diag(r) + (difference.T * r_delta) @ difference)
@@ -93,7 +94,7 @@ class CondensedController:
         return self._problem
 
     @property
-    def stages(self) -> Stages:
+    def stages(self) -> Linearisation:
         """The model along the horizon."""
         return self._stages
 
@@ -213,9 +214,9 @@ class CondensedController:
         z_next, a_t, b = derivatives
         from_u = self._condenser(a_t, b)
         if weights_ok(weight):
-            stages, terminal = self._problem.state_weights(weight)
+            by_stage, terminal = self._problem.state_weights(weight)
             weighted = np.empty_like(from_u)
-            np.multiply(from_u[: n * n_x], stages.reshape(-1, 1), out=weighted[: n * n_x])
+            np.multiply(from_u[: n * n_x], by_stage.reshape(-1, 1), out=weighted[: n * n_x])
             weighted[n * n_x :] = terminal @ from_u[n * n_x :]
         else:
             weighted = np.full_like(from_u, np.nan)

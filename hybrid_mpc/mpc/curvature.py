@@ -10,7 +10,7 @@ from scipy.linalg import eigh
 
 from hybrid_mpc.mpc.condensing import condense_hessians
 from hybrid_mpc.mpc.ocp import OCP
-from hybrid_mpc.mpc.stages import Stages
+from hybrid_mpc.mpc.stages import Linearisation
 
 Array = NDArray[np.float64]
 
@@ -38,12 +38,12 @@ class StageCurvature:
         ocp: The problem; its weights and limits give the length of the differences.
     """
 
-    def __init__(self, stages: Stages, ocp: OCP) -> None:
+    def __init__(self, stages: Linearisation, ocp: OCP) -> None:
         self._n_x, self._n_u = ocp.n_x, ocp.n_u
         half = 0.5 * (ocp.u_max - ocp.u_min)
         tolerated = 1 / np.sqrt(np.where(ocp.q > 0, ocp.q, 1.0))
         self._shift = SHIFT * np.concatenate([tolerated, np.where(np.isfinite(half), half, 1.0)])
-        self._stages = stages.side_by_side
+        self._one, self._all = stages.slopes(1), stages.slopes(self._shift.size)
 
     def of(
         self, z: Array, u: Array, a_t: Array, b: Array, adjoint: Array, old: Array | None = None,
@@ -60,28 +60,32 @@ class StageCurvature:
             old: Curvature to keep but for the ``chosen`` states and inputs. Default: all is taken.
             chosen: Their numbers, inputs after states.
         """
-        n, n_z, n_u = b.shape
-        n_x, size = self._n_x, self._shift.size
-        chosen = range(size) if old is None or chosen is None else chosen
-        into_z, into_u = self._stages.inputs
-        _, by_z, by_u = self._stages.outputs
-        base = np.hstack([a_t[:, :n_x], b.transpose(0, 2, 1)])
-        moved = np.empty_like(base)
+        n, size, n_x = len(b), self._shift.size, self._n_x
+        columns = np.arange(size) if old is None or chosen is None else np.array(chosen, dtype=int)
         curvature = np.empty((n, size, size)) if old is None else old.copy()
-        for j in chosen:
-            into_z[:], into_u[:] = z.ravel(), u.ravel()
-            column = into_z[j::n_z] if j < n_x else into_u[j - n_x :: n_u]
-            before = column.copy()
-            column += self._shift[j]
-            self._stages()
-            moved[:, :n_x] = by_z.reshape(n, n_z, n_z)[:, :n_x]
-            moved[:, n_x:] = by_u.reshape(n, n_u, n_z)
-            moved -= base
-            taken = (column - before)[:, None]  # as rounded
-            curvature[:, j] = (moved @ adjoint[:, :, None])[:, :, 0] / taken
-        for j in set(range(size)) - set(chosen):
-            curvature[:, j, chosen] = curvature[:, chosen, j]
+        if columns.size:
+            here = np.hstack([z[:, :n_x], u])
+            moved = np.repeat(here[None], columns.size, axis=0)
+            each = np.arange(columns.size)
+            moved[each, :, columns] += self._shift[columns, None]
+            taken = moved[each, :, columns] - here.T[columns]  # as rounded
+            change = self._slopes(moved, z[:, n_x:])
+            change -= np.concatenate([a_t[:, :n_x].transpose(0, 2, 1), b], axis=2)
+            weighted = (adjoint[:, None, :] @ change)[:, :, 0]
+            curvature[:, columns] = (weighted / taken[:, :, None]).transpose(1, 0, 2)
+        for j in sorted(set(range(size)) - set(columns.tolist())):
+            curvature[:, j, columns] = curvature[:, columns, j]
         return np.asarray(0.5 * (curvature + curvature.transpose(0, 2, 1)))
+
+    def _slopes(self, points: Array, hidden: Array) -> Array:
+        """Jacobians ``(m, N, n_z, n_x + n_u)`` at states and inputs ``(m, N, n_x + n_u)``."""
+        m, n, size = points.shape
+        n_x = self._n_x
+        if m == size:
+            flat = points.reshape(m * n, size)
+            z = np.hstack([flat[:, :n_x], np.tile(hidden, (m, 1))])
+            return self._all(z, flat[:, n_x:]).reshape(m, n, -1, size)
+        return np.stack([self._one(np.hstack([p[:, :n_x], hidden]), p[:, n_x:]) for p in points])
 
     def that_matter(self, curvature: Array, from_u: Array, gauss_newton: Array) -> list[int]:
         """States and inputs without whose curvature the Hessian would differ by more than a hundredth."""

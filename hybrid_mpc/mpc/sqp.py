@@ -136,6 +136,8 @@ class SQPController:
 
         The QPs keep what the first guess keeps.
         """
+        if self.ocp.du_max is None:
+            return self.ocp.held(np.clip(u, self.ocp.u_min, self.ocp.u_max))
         rows = u.copy()
         for start in self.ocp.starts:
             rows[start] = u_prev = self.ocp.saturate(u[start], u_prev)

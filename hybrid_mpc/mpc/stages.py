@@ -1,8 +1,10 @@
-"""The model along a horizon with its Jacobians: all periods side by side, or as one run. Compiled on request."""
+"""The model along a horizon with its Jacobians: all periods side by side, or as one run."""
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
+from typing import Protocol
 
 import casadi as ca
 import numpy as np
@@ -17,15 +19,46 @@ from nn_export.errors import CompileError
 Array = NDArray[np.float64]
 Derivatives = tuple[Array, Array, Array]
 """Successors ``(N, n_z)``, transposed ``A_k`` ``(N, n_z, n_z)`` and ``B_k`` ``(N, n_z, n_u)``."""
+Slopes = Callable[[Array, Array], Array]
+"""Jacobians of the successors by states and inputs ``(m, n_z, n_x + n_u)``, of ``z`` ``(m, n_z)`` and ``u``."""
 
 
-class Stages:
-    """A model's periods over a horizon, values and Jacobians in one call.
+class Linearisation(Protocol):
+    """A model's periods over a horizon, values and Jacobians in one call."""
+
+    def at(self, z: Array, u: Array) -> Derivatives:
+        """Every period from its own ``z`` ``(N, n_z)`` on ``u`` ``(N, n_u)``."""
+
+    def run(self, z0: Array, u: Array) -> Derivatives:
+        """A run of the model from ``z0`` ``(n_z,)`` on ``u`` ``(N, n_u)``."""
+
+    def slopes(self, times: int) -> Slopes:
+        """A function for ``m = times N`` periods; made once, it is called often."""
+
+
+def stages(model: HybridModel, n: int, *, compiled: bool = False) -> Linearisation:
+    """The fastest way that a model has: all periods at once where it can, else one after the other.
 
     Args:
         model: The model.
         n: Periods N.
-        compiled: Whether one period is compiled as C. Default: no; CasADi's machine needs no compiler.
+        compiled: Whether what is evaluated period by period is compiled as C. Default: no; that needs no
+            compiler.
+
+    Raises:
+        InputError: If it is to be compiled and there is no compiler, or it fails.
+    """
+    kind = Stages if model.side_by_side is None else VectorisedStages
+    return kind(model, n, compiled=compiled)
+
+
+class Stages:
+    """One period after the other in CasADi's machine, or compiled.
+
+    Args:
+        model: The model.
+        n: Periods N.
+        compiled: Whether one period is compiled as C.
 
     Raises:
         InputError: If it is to be compiled and there is no compiler, or it fails.
@@ -40,29 +73,82 @@ class Stages:
         [1.0, 2.0, 3.0]
     """
 
-    side_by_side: BufferedFunction
-    """``(z, u) -> (z_next, A, B)`` of N periods that know nothing of each other."""
-
     def __init__(self, model: HybridModel, n: int, *, compiled: bool = False) -> None:
         stage = _compiled(_stage(model)) if compiled else _stage(model)
-        self.side_by_side = BufferedFunction(stage.map(n))
+        self._side_by_side = BufferedFunction(stage.map(n))
         self._along = BufferedFunction(stage.mapaccum("run_with_jacobian", n))
-        self._shape = n, model.n_x + model.n_h
+        self._shape, self._n_x = (n, model.n_x + model.n_h), model.n_x
 
     def at(self, z: Array, u: Array) -> Derivatives:
-        """Every period from its own ``z`` ``(N, n_z)`` on ``u`` ``(N, n_u)``."""
-        return self._call(self.side_by_side, z, u)
+        """See :class:`Linearisation`."""
+        z_next, a_t, b = self._call(self._side_by_side, z, u)
+        return z_next.copy(), a_t.copy(), b.copy()  # the next call overwrites them
 
     def run(self, z0: Array, u: Array) -> Derivatives:
-        """A run of the model from ``z0`` ``(n_z,)`` on ``u`` ``(N, n_u)``."""
-        return self._call(self._along, z0, u)
+        """See :class:`Linearisation`."""
+        z_next, a_t, b = self._call(self._along, z0, u)
+        return z_next.copy(), a_t.copy(), b.copy()
+
+    def slopes(self, times: int) -> Slopes:
+        """See :class:`Linearisation`."""
+        n = self._shape[0]
+
+        def evaluate(z: Array, u: Array) -> Array:
+            parts = []
+            for k in range(0, times * n, n):
+                _, a_t, b = self._call(self._side_by_side, z[k : k + n], u[k : k + n])
+                parts.append(np.concatenate([a_t[:, : self._n_x].transpose(0, 2, 1), b], axis=2))
+            return np.concatenate(parts)
+
+        return evaluate
 
     def _call(self, f: BufferedFunction, z: Array, u: Array) -> Derivatives:
         n, n_z = self._shape
         f.inputs[0][:], f.inputs[1][:] = z.ravel(), u.ravel()
         f()
-        z_next, a, b = (out.copy() for out in f.outputs)  # the next call overwrites them
+        z_next, a, b = f.outputs
         return z_next.reshape(n, n_z), a.reshape(n, n_z, n_z), b.reshape(n, -1, n_z).transpose(0, 2, 1)
+
+
+class VectorisedStages:
+    """All periods at once, of a model with a ``side_by_side``; a run is one of ``step`` alone, then all at once.
+
+    Args:
+        model: The model.
+        n: Periods N.
+        compiled: Whether the run's ``step`` is compiled as C.
+
+    Raises:
+        InputError: If it is to be compiled and there is no compiler, or it fails.
+    """
+
+    def __init__(self, model: HybridModel, n: int, *, compiled: bool = False) -> None:
+        assert model.side_by_side is not None
+        self._model, self._many, self._n, self._n_x = model, model.side_by_side, n, model.n_x
+        self._at = self._many(n, {"A": ("x", "h"), "B": ("u",)})
+        z, u = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("u", model.n_u)
+        inline = model.step.is_a("MXFunction")  # a call less a stage
+        z_next = ca.vertcat(*model.step.call([z[: model.n_x], z[model.n_x :], u], inline, False))
+        step = ca.Function("z_step", [z, u], [z_next])
+        self._along = BufferedFunction((_compiled(step) if compiled else step).mapaccum("run", n))
+
+    def at(self, z: Array, u: Array) -> Derivatives:
+        """See :class:`Linearisation`."""
+        x_next, h_next, a, b = self._at(z[:, : self._n_x], z[:, self._n_x :], u)
+        return np.hstack([x_next, h_next]), np.ascontiguousarray(a.transpose(0, 2, 1)), b
+
+    def run(self, z0: Array, u: Array) -> Derivatives:
+        """See :class:`Linearisation`."""
+        self._along.inputs[0][:], self._along.inputs[1][:] = z0, u.ravel()
+        self._along()
+        z_next = self._along.outputs[0].reshape(self._n, -1).copy()
+        _, a_t, b = self.at(np.vstack([z0, z_next[:-1]]), u)
+        return z_next, a_t, b
+
+    def slopes(self, times: int) -> Slopes:
+        """See :class:`Linearisation`."""
+        many, n_x = self._many(times * self._n, {"slopes": ("x", "u")}), self._n_x
+        return lambda z, u: many(z[:, :n_x], z[:, n_x:], u)[2]
 
 
 def _stage(model: HybridModel) -> ca.Function:

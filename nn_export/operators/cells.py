@@ -16,18 +16,21 @@ Automatic differentiation makes the same matrices with one sweep of the cell a c
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import reduce
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
 from nn_export.operators.value import Value, matrix
 
+Columns = Any
+"""A matrix (n, batch) of CasADi or of numpy."""
 State = tuple[ca.MX, ...]
 Weights = tuple[Value, Value, Value | None, Value | None]
-Factors = tuple[ca.MX | None, ...]
+Factors = tuple[Columns | None, ...]
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,7 @@ class Slope:
 
     by_input: Factors
     by_hidden: Factors
-    diagonal: dict[int, ca.MX] = field(default_factory=dict)
+    diagonal: dict[int, Columns] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,7 @@ class Step:
         slopes: Jacobian of each.
     """
 
-    state: State
+    state: tuple[Columns, ...]
     slopes: tuple[Slope, ...]
 
 
@@ -66,69 +69,89 @@ class Kind:
         name: Name of its CasADi function.
         states: Names of its states, the hidden state first.
         gates: Number of gates: blocks of rows in its weights.
-        step: The cell on columns: ``step(x, state, weights)``.
+        equations: The cell on columns, of the gates' sums: ``equations(W x + b, R h + c, state)``, all of MX or
+            all of numpy.
     """
 
     name: str
     states: tuple[str, ...]
     gates: int
-    step: Callable[[ca.MX, State, Weights], Step]
+    equations: Callable[[Columns, Columns, tuple[Columns, ...]], Step]
+
+    def step(self, x: ca.MX, state: State, w: Weights) -> Step:
+        """The cell on columns."""
+        return self.equations(affine(w[0], x, w[2]), affine(w[1], state[0], w[3]), state)
 
     def width(self, w: Weights) -> int:
         """Number of units: also right where a projection makes ``h`` shorter."""
         return w[0].shape[0] // self.gates
 
 
-def gate(x: ca.MX) -> ca.MX:
+def gate(x: Columns) -> Columns:
     """Logistic function through tanh: right to 1e-16 of 1, for factors. Nothing can overflow."""
-    return 0.5 + 0.5 * ca.tanh(0.5 * x)
+    return 0.5 + 0.5 * _tanh(0.5 * x)
 
 
 def affine(w: Value, x: ca.MX, b: Value | None) -> ca.MX:
     """``w x + b`` for the columns of ``x``."""
-    y = ca.mtimes(matrix(w, *w.shape), x)
-    return y if b is None else y + ca.repmat(matrix(b, b.shape[0], 1), 1, x.shape[1])
+    by = matrix(w, *w.shape)
+    if b is None:
+        return ca.mtimes(by, x)
+    return ca.mac(by, x, ca.repmat(matrix(b, b.shape[0], 1), 1, x.shape[1]))  # one instruction less
 
 
-def _gru(x: ca.MX, state: State, w: Weights) -> Step:
+def _tanh(x: Columns) -> Columns:
+    return ca.tanh(x) if isinstance(x, ca.MX) else np.tanh(x)
+
+
+def _parts(x: Columns, count: int) -> Iterable[Columns]:
+    if isinstance(x, ca.MX):
+        return ca.vertsplit(x, x.shape[0] // count)
+    return x.reshape(count, -1, x.shape[1])  # views; np.split takes longer than a product
+
+
+def _positive(y: Columns, value: Columns) -> Columns:
+    return ca.if_else(y > 0, value, 0.0) if isinstance(y, ca.MX) else np.where(y > 0, value, 0.0)
+
+
+def _gru(x: Columns, hidden: Columns, state: tuple[Columns, ...]) -> Step:
     h = state[0]
-    xr, xz, xn = ca.vertsplit(affine(w[0], x, w[2]), h.shape[0])
-    hr, hz, q = ca.vertsplit(affine(w[1], h, w[3]), h.shape[0])
+    (xr, xz, xn), (hr, hz, q) = _parts(x, 3), _parts(hidden, 3)
     r, z = gate(xr + hr), gate(xz + hz)
-    n = ca.tanh(xn + r * q)
+    n = _tanh(xn + r * q)
     a, b = (h - n) * z * (1 - z), (1 - n * n) * (1 - z)
     g = b * q * r * (1 - r)
     return Step((n + z * (h - n),), (Slope((g, a, b), (g, a, b * r), {0: z}),))
 
 
-def _lstm(x: ca.MX, state: State, w: Weights) -> Step:
-    h, c = state
-    parts = ca.vertsplit(affine(w[0], x, w[2]) + affine(w[1], h, w[3]), c.shape[0])
-    i, f, g, o = gate(parts[0]), gate(parts[1]), ca.tanh(parts[2]), gate(parts[3])
+def _lstm(x: Columns, hidden: Columns, state: tuple[Columns, ...]) -> Step:
+    c = state[1]
+    at_i, at_f, at_g, at_o = _parts(x + hidden, 4)
+    i, f, g, o = gate(at_i), gate(at_f), _tanh(at_g), gate(at_o)
     c_next = f * c + i * g
-    t = ca.tanh(c_next)
+    t = _tanh(c_next)
     by = (g * i * (1 - i), c * f * (1 - f), i * (1 - g * g), None)
     k = o * (1 - t * t)
     by_output = (*(k * p for p in by[:3]), t * o * (1 - o))
     return Step((o * t, c_next), (Slope(by_output, by_output, {1: k * f}), Slope(by, by, {1: f})))
 
 
-def _tanh(x: ca.MX, state: State, w: Weights) -> Step:
-    y = ca.tanh(affine(w[0], x, w[2]) + affine(w[1], state[0], w[3]))
+def _rnn_tanh(x: Columns, hidden: Columns, state: tuple[Columns, ...]) -> Step:
+    y = _tanh(x + hidden)
     slope = 1 - y * y
     return Step((y,), (Slope((slope,), (slope,)),))
 
 
-def _relu(x: ca.MX, state: State, w: Weights) -> Step:
-    y = affine(w[0], x, w[2]) + affine(w[1], state[0], w[3])
-    slope = ca.if_else(y > 0, 1.0, 0.0)
-    return Step((ca.if_else(y > 0, y, 0.0),), (Slope((slope,), (slope,)),))
+def _rnn_relu(x: Columns, hidden: Columns, state: tuple[Columns, ...]) -> Step:
+    y = x + hidden
+    slope = _positive(y, 1.0)
+    return Step((_positive(y, y),), (Slope((slope,), (slope,)),))
 
 
 GRU = Kind("gru_cell", ("h",), 3, _gru)
 LSTM = Kind("lstm_cell", ("h", "c"), 4, _lstm)
-RNN_TANH = Kind("rnn_tanh_cell", ("h",), 1, _tanh)
-RNN_RELU = Kind("rnn_relu_cell", ("h",), 1, _relu)
+RNN_TANH = Kind("rnn_tanh_cell", ("h",), 1, _rnn_tanh)
+RNN_RELU = Kind("rnn_relu_cell", ("h",), 1, _rnn_relu)
 
 
 def rows(w: Value, gates: int) -> list[ca.MX]:
@@ -184,5 +207,5 @@ def _blocks(slope: Slope, w: Weights, symbols: list[ca.MX]) -> list[ca.MX]:
     by_hidden = scaled(slope.by_hidden, rows(w[1], len(slope.by_hidden)))
     if 0 in slope.diagonal:
         by_hidden = by_hidden + ca.diag(slope.diagonal[0])
-    others = [ca.diag(slope.diagonal[k]) for k in range(1, len(symbols) - 1)]
+    others: list[Any] = [ca.diag(slope.diagonal[k]) for k in range(1, len(symbols) - 1)]
     return [scaled(slope.by_input, rows(w[0], len(slope.by_input))), by_hidden, *others]

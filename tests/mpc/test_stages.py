@@ -1,16 +1,23 @@
 """The model along a horizon, in CasADi's machine and compiled."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from online_models import pendulum_model
 
+from hybrid_mpc.artifact import build_model
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
+from hybrid_mpc.identification.export import model_info, trace_model
+from hybrid_mpc.identification.networks import GRUNetwork
+from hybrid_mpc.identification.step import HybridStep, PriorStep, Scaling, n_features
 from hybrid_mpc.mpc import OCP, CondensedController, SQPController
 from hybrid_mpc.mpc.condensing import Condenser, adjoint, propagate
-from hybrid_mpc.mpc.stages import Stages
+from hybrid_mpc.mpc.stages import Stages, VectorisedStages, stages
+from scenarios.golf_robot import scenario
 
 OCP_ = OCP(8, [50.0, 0.5], [0.5], [0.2], [-2.0], [2.0], working_point=([0.0, 1.0], [0.0]))
 
@@ -27,6 +34,52 @@ def test_a_run_is_the_models_own_with_the_jacobians_along_it():
         np.testing.assert_allclose(b[k], by_u, rtol=1e-13, atol=1e-14)
     for got, want in zip(stages.at(z[:-1], u), (z_next, a_t, b), strict=True):
         np.testing.assert_array_equal(got, want)
+
+
+def golf_robot(z):
+    """The golf robot's model as it is loaded from an artifact: the hybrid, or with z = 0 the prior alone."""
+    torch.manual_seed(z)
+    prior, dt = scenario.prior(), scenario.data.dt
+    step = PriorStep(prior, dt)
+    if z:
+        scaling = Scaling(x=(0.5, 1.5), u=(0.2,), acceleration=(5.0,), correction=(0.5,))
+        step = HybridStep(prior, GRUNetwork(n_features(prior, True), z, prior.n_q), scaling, dt)
+    program = trace_model(step.requires_grad_(False))
+    return build_model("m", {f"m/{name}": p for name, p in program.items()}, model_info(prior, dt))
+
+
+@pytest.mark.parametrize("z", [0, 1, 6])
+def test_all_periods_at_once_are_as_one_after_the_other(z):
+    model, rng, n = golf_robot(z), np.random.default_rng(z), 7
+    at_once, mapped = stages(model, n), Stages(model, n)
+    assert isinstance(at_once, VectorisedStages)
+    for size in (0.1, 1.0, 30.0):
+        states, u = size * rng.normal(size=(2 * n, 2 + z)), size * rng.normal(size=(2 * n, 1))
+        pairs = [
+            *zip(at_once.at(states[:n], u[:n]), mapped.at(states[:n], u[:n]), strict=True),
+            *zip(at_once.run(states[0], u[:n]), mapped.run(states[0], u[:n]), strict=True),
+            (at_once.slopes(2)(states, u), mapped.slopes(2)(states, u)),
+        ]
+        for got, want in pairs:
+            # The same real function in another order of a few hundred roundings.
+            np.testing.assert_allclose(got, want, rtol=1e-12, atol=1e-12 * max(1.0, np.abs(want).max()))
+        _, a_t, b = mapped.at(states[:n], u[:n])
+        by_state_and_input = np.concatenate([a_t[:, :2].transpose(0, 2, 1), b], axis=2)
+        np.testing.assert_array_equal(mapped.slopes(1)(states[:n], u[:n]), by_state_and_input)
+
+
+@pytest.mark.parametrize("kind", [CondensedController, SQPController])
+def test_plans_are_the_same_either_way(kind):
+    model = golf_robot(6)
+    e = Estimate(0.0, np.array([0.4, 0.0]), np.zeros(6), np.zeros(1), np.eye(9), np.zeros(1), 0.0)
+    ocp = replace(OCP_, u_min=[-0.5], u_max=[0.5])
+    plans = [
+        c.solve(c.initial(e), e, np.zeros((1, 2)))
+        for c in (kind(m, ocp) for m in (model, replace(model, side_by_side=None)))
+    ]
+    # Roundings of 1e-16, which grow along the iterations and through differences of steps of 1e-5.
+    np.testing.assert_allclose(plans[0].u, plans[1].u, rtol=1e-7, atol=1e-9)
+    assert kind is CondensedController or plans[0].defect == 0.0  # it is a run of the model itself
 
 
 @pytest.mark.parametrize(("n", "n_u"), [(1, 1), (5, 1), (4, 2)])

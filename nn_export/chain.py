@@ -1,0 +1,112 @@
+"""The chain rule along a program that is cut at its recurrent cells: the order of it, whatever the numbers are."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from itertools import accumulate, pairwise
+from typing import Any, Generic, TypeVar
+
+import casadi as ca
+
+from nn_export.operators import cells
+from nn_export.pieces import operations
+
+SCALAR_LIMIT = 50_000
+"""Scalar operations, times sweeps of differentiation, up to which a piece becomes scalar code."""
+
+Known = TypeVar("Known")
+
+
+class Chain(ABC, Generic[Known]):
+    """The cuts of a graph: cells in order, each with its arguments; then what is known of their outputs."""
+
+    def __init__(self) -> None:
+        self._cells: list[tuple[list[ca.MX], cells.Kind, ca.MX, cells.State, cells.Weights]] = []
+        self._known: dict[str, Known] = {}
+
+    def cell(self, kind: cells.Kind, x: ca.MX, state: cells.State, w: cells.Weights) -> cells.State:
+        """The form of a cell: symbols instead of its results."""
+        if not cells.simple(x, w):
+            return cells.call(kind, x, state, w)
+        number = len(self._cells)
+        symbols = [ca.MX.sym(f"cell {number} {s}", kind.width(w)) for s in kind.states]
+        self._cells.append((symbols, kind, x, state, w))
+        return tuple(symbols)
+
+    def add(self, symbol: ca.MX, known: Known) -> None:
+        """What a symbol stands for."""
+        self._known[symbol.name()] = known
+
+    def settle(self) -> None:
+        """All cells in order."""
+        for symbols, kind, x, state, w in self._cells:
+            at_x, *at_state = self.derive([x, *state])
+            results = self._after(symbols, kind, at_x, at_state, w)
+            for symbol, known in zip(symbols, results, strict=True):
+                self.add(symbol, known)
+
+    def derive(self, targets: list[ca.MX]) -> list[Known]:
+        """Expressions of the symbols, as values and slopes."""
+        known: dict[int, Known] = {}
+        rest = []
+        for k, target in enumerate(targets):
+            if target.is_symbolic():
+                known[k] = self._known[target.name()]
+            elif not ca.symvar(target):
+                known[k] = self._constant(target)
+            else:
+                rest.append(k)
+        if rest:
+            chosen = [targets[k] for k in rest]
+            symbols = ca.symvar(ca.veccat(*chosen))
+            results = self._piece(symbols, chosen, [self._known[s.name()] for s in symbols])
+            known |= dict(zip(rest, results, strict=True))
+        return [known[k] for k in range(len(targets))]
+
+    @abstractmethod
+    def _constant(self, target: ca.MX) -> Known:
+        """A value without slopes."""
+
+    @abstractmethod
+    def _piece(self, symbols: list[ca.MX], targets: list[ca.MX], arguments: list[Known]) -> list[Known]:
+        """Expressions of symbols at what these stand for."""
+
+    @abstractmethod
+    def _after(
+        self, symbols: list[ca.MX], kind: cells.Kind, x: Known, state: list[Known], w: cells.Weights
+    ) -> list[Known]:
+        """The results of a cell, for which the symbols stand."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Expressions and their Jacobians.
+
+    Args:
+        scalar: True for an SX graph, False for one of MX.
+        inner: Its symbols.
+        values: The expressions.
+        blocks: The Jacobian of each expression, a row, by each symbol.
+    """
+
+    scalar: bool
+    inner: list[Any]
+    values: list[Any]
+    blocks: list[list[Any]]
+
+
+def differentiated(symbols: list[ca.MX], targets: list[ca.MX]) -> Piece:
+    """Expressions with their Jacobians, as scalar code where they are small."""
+    piece = ca.Function("piece", symbols, targets)
+    rows, columns = _edges(targets), _edges(symbols)
+    scalar = operations(piece) * min(rows[-1], columns[-1]) <= SCALAR_LIMIT
+    inner: list[Any] = [(ca.SX if scalar else ca.MX).sym("v", *s.shape) for s in symbols]
+    values = piece.call(inner, True, False)
+    whole = ca.jacobian(ca.veccat(*values), ca.veccat(*inner))
+    blocks = [[whole[a:b, c:d] for c, d in pairwise(columns)] for a, b in pairwise(rows)]
+    return Piece(scalar, inner, values, blocks)
+
+
+def _edges(parts: list[ca.MX]) -> list[int]:
+    return list(accumulate((p.numel() for p in parts), initial=0))
