@@ -117,21 +117,21 @@ def longer_period(model: HybridModel, periods: int) -> HybridModel:
         >>> slow.dt, float(slow.step(8.0, [], 1.0)[0])
         (3.0, 2.75)
     """
-    if int(periods) != periods or periods < 1:
+    if not isinstance(periods, int) or periods < 1:
         raise InputError(f"model {model.name}: periods must be a whole number of at least 1, got {periods}")
     x, h, u = ca.MX.sym("x", model.n_x), ca.MX.sym("h", model.n_h), ca.MX.sym("u", model.n_u)
     assert model.with_jacobian is not None
     inline = model.step.is_a("MXFunction"), model.with_jacobian.is_a("MXFunction")
     by_value, by_jacobian = [x, h], [x, h]
     a, b = ca.MX.eye(model.n_x + model.n_h), ca.MX.zeros(model.n_x + model.n_h, model.n_u)
-    for _ in range(int(periods)):
+    for _ in range(periods):
         by_value = model.step.call([*by_value, u], inline[0], False)
         *by_jacobian, a_k, b_k = model.with_jacobian.call([*by_jacobian, u], inline[1], False)
         a, b = a_k @ a, a_k @ b + b_k
     names = ["x", "h", "u"], ["x_next", "h_next"]
     return replace(
         model,
-        dt=int(periods) * model.dt,
+        dt=periods * model.dt,
         step=ca.Function("step", [x, h, u], by_value, *names),
         with_jacobian=ca.Function(
             "with_jacobian",

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 from online_models import linear_model, pendulum_model
 
+from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
-from hybrid_mpc.mpc import OCP, CondensedController, Status
+from hybrid_mpc.mpc import OCP, CondensedController, IpoptController, Status
 
 
 def ipopt_plan(model, ocp, terminal, z0, d, reference, u_prev):
@@ -139,3 +140,9 @@ def test_solve_is_pure_and_the_constructor_leaves_nothing_behind():
     np.testing.assert_array_equal(kept[2], first.h)
     for controller in (used, fresh):
         np.testing.assert_array_equal(controller.solve(plan, e, np.zeros((1, 2))).u, first.u)
+
+
+def test_an_option_that_ipopt_does_not_know_is_refused():
+    ocp = OCP(3, [1.0, 1.0], [1.0], [0.0], [-1.0], [1.0])
+    with pytest.raises(InputError, match="nonsense"):
+        IpoptController(pendulum_model(), ocp, options={"nonsense": 1})
