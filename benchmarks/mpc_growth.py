@@ -53,12 +53,16 @@ def main() -> None:
     """Draw."""
     here = Path(__file__).parent
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--times", type=Path, default=here / "mpc_step.json", help="JSON of mpc_step.py --growth")
+    parser.add_argument(
+        "--times", type=Path, default=here / "mpc_step.json", help="JSON of mpc_step.py --growth"
+    )
     parser.add_argument("--out", type=Path, default=here.parent / "docs" / "images", help="folder of the PNG")
     given = parser.parse_args()
     rows = [row for row in json.loads(given.times.read_text()) if row.get("part") == "growth"]
     if not rows:
-        raise SystemExit(f"{given.times} holds no growth; make it with mpc_step.py --growth --out {given.times}")
+        raise SystemExit(
+            f"{given.times} holds no growth; make it with mpc_step.py --growth --out {given.times}"
+        )
     print(save(draw(rows[-1]), given.out / "mpc_growth.png"))
 
 

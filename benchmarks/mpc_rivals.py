@@ -45,7 +45,10 @@ class DoMpc:
         n_x = model.n_x
         self._own = IpoptController(model, ocp)  # first plan, terminal weight, cost of a plan
         plant = do_mpc.model.Model("discrete", "MX")
-        z, u = plant.set_variable("_x", "z", (n_x + model.n_h, 1)), plant.set_variable("_u", "u", (model.n_u, 1))
+        z, u = (
+            plant.set_variable("_x", "z", (n_x + model.n_h, 1)),
+            plant.set_variable("_u", "u", (model.n_u, 1)),
+        )
         x_next, h_next = model.step(z[:n_x], z[n_x:], u)
         plant.set_rhs("z", ca.vertcat(x_next, h_next))
         plant.setup()
@@ -83,9 +86,7 @@ class DoMpc:
         stats = self.mpc.solver_stats
         status = Status.SOLVED if stats["success"] else Status.STOPPED
         self._last = z, u, u_prev
-        return replace(
-            previous, u=u, status=status, iterations=stats["iter_count"]
-        )
+        return replace(previous, u=u, status=status, iterations=stats["iter_count"])
 
     def cost(self, reference):
         """Cost of the last plan on the library's model."""
@@ -112,7 +113,9 @@ def against(z: int, n: int, rounds: int) -> dict[str, float]:
         row[f"{name}_cost"] = value
         difference = abs(value - plans["ipopt"].cost) / plans["ipopt"].cost
         if not difference < SAME:
-            raise SystemExit(f"{name} has the cost {value}, IPOPT {plans['ipopt'].cost}: not the same problem")
+            raise SystemExit(
+                f"{name} has the cost {value}, IPOPT {plans['ipopt'].cost}: not the same problem"
+            )
     best = {key: min(row[f"{key}{name}_ms"] for name in variants) for key in ("do_mpc", "ipopt")}
     for name in ("rti", "sqp"):
         row |= {f"{rival} / {name}": ms / row[f"{name}_ms"] for rival, ms in best.items()}
