@@ -3,10 +3,14 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.errors import InputError
 from hybrid_mpc.pipeline import observers
 from hybrid_mpc.pipeline.observers import JUDGED_PERIODS, JUDGED_RECORDINGS, estimation_stage, judged_parts
+from hybrid_mpc.pipeline.results import _estimation
+from hybrid_mpc.report.schema import SCHEMA, _check
 
 
 def recording(name, n):
@@ -55,3 +59,18 @@ def test_too_short_recordings_are_a_reason(monkeypatch, tmp_path):
     result, _ = kept["estimation"]
     for name in observers.OBSERVERS:
         assert "at least 100" in result[name]["reason"]
+
+
+@pytest.mark.parametrize(
+    "found",
+    [
+        {"reason": "no control problem"},
+        {"recordings": [], **{name: {"reason": "too short"} for name in observers.OBSERVERS}},
+    ],
+)
+def test_results_without_observers_fit_the_schema(found):
+    results = _estimation(SimpleNamespace(result=lambda stage: found))
+    _check(results, SCHEMA.keys["estimation"], "estimation", {"estimation": results})
+    bare = dict.fromkeys(observers.OBSERVERS)
+    with pytest.raises(InputError, match="without a reason"):
+        _check(bare, SCHEMA.keys["estimation"], "estimation", {"estimation": bare})
