@@ -71,7 +71,7 @@ class IpoptController:
         self._problem = Problem(model, ocp)
         self._bounds: dict[str, Array] = {}
         nlp = self._formulate()
-        settings: dict[str, Any] = {"print_time": False, "error_on_fail": False}
+        settings: dict[str, Any] = {"print_time": False, "error_on_fail": False, "calc_lam_p": False}
         settings["ipopt"] = {
             "print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": iterations,
             "mu_strategy": "adaptive",
