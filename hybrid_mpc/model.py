@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import casadi as ca
@@ -103,6 +103,57 @@ class HybridModel:
     def n_h(self) -> int:
         """Number of hidden states."""
         return int(self.step.size1_in(1))
+
+
+def longer_period(model: HybridModel, periods: int) -> HybridModel:
+    """The same model with a period that is a multiple of its own; the input is held all the while.
+
+    One step is ``periods`` steps of the model, the hidden state in each of them, and its Jacobian the chain of
+    theirs, so nothing is discretised anew. Estimator, controller, terminal weight and closed loop made of it all run
+    at the longer period: costs count its instants, ``du_max`` and ``r_delta`` its changes, and bounds on states hold
+    at its instants, not between them. A filter's noise per period is that of the longer one.
+
+    Args:
+        model: The deployed model.
+        periods: Periods of the model that make one of the new ones, at least 1.
+
+    Raises:
+        InputError: If ``periods`` is not a whole number of at least 1.
+
+    Example:
+        >>> x, h, u, w = ca.MX.sym("x"), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w")
+        >>> model = HybridModel("sum", 1.0, (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),),
+        ...     ca.Function("f", [x, h, u], [0.5 * x + u, h]), ca.Function("g", [x, h, u], [u]),
+        ...     ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]))
+        >>> slow = longer_period(model, 3)
+        >>> slow.dt, float(slow.step(8.0, [], 1.0)[0])
+        (3.0, 2.75)
+    """
+    if not isinstance(periods, int) or periods < 1:
+        raise InputError(f"model {model.name}: periods must be a whole number of at least 1, got {periods}")
+    x, h, u = ca.MX.sym("x", model.n_x), ca.MX.sym("h", model.n_h), ca.MX.sym("u", model.n_u)
+    assert model.with_jacobian is not None
+    inline = model.step.is_a("MXFunction"), model.with_jacobian.is_a("MXFunction")
+    by_value, by_jacobian = [x, h], [x, h]
+    a, b = ca.MX.eye(model.n_x + model.n_h), ca.MX.zeros(model.n_x + model.n_h, model.n_u)
+    for _ in range(periods):
+        by_value = model.step.call([*by_value, u], inline[0], False)
+        *by_jacobian, a_k, b_k = model.with_jacobian.call([*by_jacobian, u], inline[1], False)
+        a, b = a_k @ a, a_k @ b + b_k
+    names = ["x", "h", "u"], ["x_next", "h_next"]
+    return replace(
+        model,
+        dt=periods * model.dt,
+        step=ca.Function("step", [x, h, u], by_value, *names),
+        with_jacobian=ca.Function(
+            "with_jacobian",
+            [x, h, u],
+            [*by_jacobian, ca.densify(a), ca.densify(b)],
+            names[0],
+            [*names[1], "A", "B"],
+        ),
+        side_by_side=None,  # that of the model knows one of its own periods only
+    )
 
 
 def _with_jacobian(step: ca.Function) -> ca.Function:

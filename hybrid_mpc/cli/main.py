@@ -24,6 +24,15 @@ from hybrid_mpc.cli import run as run_command
 from hybrid_mpc.cli import scenarios as scenarios_command
 from hybrid_mpc.errors import InputError
 
+CTRL_C = 130
+INTERRUPTED = {
+    "run": "interrupted; finished stages are kept: the same command with --resume goes on",
+    "control": "interrupted; loops are kept at the end only, there is nothing to resume: the same command starts "
+    "them anew (with another --out if figures lie in it already)",
+    "data": "interrupted; the recordings are not complete: the same command with another --out makes them anew",
+}
+"""What is left after Ctrl-C, by command."""
+
 app = typer.Typer(
     name="hybrid-mpc",
     help="Measurements and an ODE in, a guarded real-time nonlinear MPC out.",
@@ -61,9 +70,11 @@ def main() -> None:
     except InputError as error:
         errors.print(f"[bold red]error:[/] {_escape(str(error))}")
         sys.exit(2)
-    except KeyboardInterrupt:
-        errors.print("interrupted; finished stages are kept: the same command with --resume goes on")
-        sys.exit(130)
+    except SystemExit as stop:
+        if stop.code == CTRL_C:  # typer takes the KeyboardInterrupt and says nothing
+            command = next((word for word in sys.argv[1:] if word in INTERRUPTED), "")
+            errors.print(INTERRUPTED.get(command, "interrupted"))
+        raise
 
 
 def _escape(text: str) -> str:

@@ -26,7 +26,8 @@ class Innovations:
         t: Times ``(n,)`` [s] since the recording's begin.
         normalised: ``L^-1 (y - y_predicted)`` with ``L L' = C P C' + R``, ``(n, n_y)`` [-]; white with unit
             variance if the filter's assumptions hold; NaN in rows with a missing output.
-        nis: Normalised innovations squared ``(n,)`` [-]; NaN without a measurement.
+        nis: Normalised innovations squared ``(n,)`` [-]; NaN without a measurement. A switching filter's are those of
+            its mixture's mean and covariance: its own ``nis`` favours whichever mode fits.
         degrees: Outputs measured ``(n,)``: degrees of freedom of each NIS.
     """
 
@@ -85,7 +86,8 @@ def consistency(
 
     The mean NIS is compared with the band that the chi-square distribution gives it, the autocorrelations of the
     normalised innovations with those of white ones (about zero, not about their mean: an offset is a failure too).
-    On a nonlinear model both hold approximately.
+    On a nonlinear model both hold approximately. A consistent switching filter has the same mean NIS, but its
+    single NIS scatter more than the band and ``nis_inside`` suppose: its innovations are a mixture of Gaussians.
 
     Args:
         estimator: The filter.
@@ -168,7 +170,8 @@ def innovations(
             np.linalg.solve(np.linalg.cholesky(s), estimate.innovation) if whole else np.full(n_y, np.nan)
         )
         rows.append(normalised)
-        nis.append(estimate.nis)
+        mixed = whole and isinstance(estimator, SwitchingFilter)
+        nis.append(float(normalised @ normalised) if mixed else estimate.nis)
         degrees.append(int(np.isfinite(estimate.innovation).sum()))
     kept = slice(skip - 1, None)  # the first row belongs to the second sample
     return Innovations(

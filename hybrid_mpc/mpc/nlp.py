@@ -47,7 +47,7 @@ class IpoptController:
         options: Further options of IPOPT by name. Default: the adaptive barrier.
 
     Raises:
-        InputError: If problem and model do not fit, or an option is not positive.
+        InputError: If problem and model do not fit, an option is not positive, or IPOPT does not know it.
 
     Source: Wächter and Biegler, *On the implementation of an interior-point filter line-search algorithm
     for large-scale nonlinear programming*, Math. Program. 106 (2006).
@@ -71,13 +71,16 @@ class IpoptController:
         self._problem = Problem(model, ocp)
         self._bounds: dict[str, Array] = {}
         nlp = self._formulate()
-        settings: dict[str, Any] = {"print_time": False, "error_on_fail": False}
+        settings: dict[str, Any] = {"print_time": False, "error_on_fail": False, "calc_lam_p": False}
         settings["ipopt"] = {
             "print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": iterations,
             "mu_strategy": "adaptive",
             **(options or {}),
         }  # fmt: skip
-        self._solver = ca.nlpsol("mpc", "ipopt", nlp, settings)
+        try:
+            self._solver = ca.nlpsol("mpc", "ipopt", nlp, settings)
+        except RuntimeError as error:
+            raise InputError(f"options: IPOPT does not take {dict(options or {})}: {error}") from error
         w, g = nlp["x"], nlp["g"]
         multipliers = ca.MX.sym("lam", g.shape[0])
         slope = ca.gradient(nlp["f"] + ca.dot(multipliers, g), w)

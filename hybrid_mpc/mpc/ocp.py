@@ -109,9 +109,9 @@ class OCP:
         blocks: Sequence[int] | None = None,
         economic: ca.Function | None = None,
     ) -> None:
-        if int(horizon) != horizon or horizon < 1:
+        if not whole(horizon) or horizon < 1:
             raise InputError(f"horizon must be a whole number of periods, at least 1; got {horizon}")
-        q_v, r_v = np.asarray(q, dtype=float).ravel(), np.asarray(r, dtype=float).ravel()
+        q_v, r_v = _numbers(q, "q"), _numbers(r, "r")
         n_x, n_u = q_v.size, r_v.size
         weights = {"q": q_v, "r": r_v, "r_delta": vector(r_delta, n_u, "r_delta")}
         _check_weights(weights)
@@ -127,7 +127,9 @@ class OCP:
         states = state_bounds(q_v, x_min, x_max, slack_linear, slack_quadratic)
         bounds = dict(zip(names, states, strict=True))
         others = {"terminal": terminal, "working_point": working_point, "soft": tuple(soft)}
-        if economic is not None and (economic.n_in(), economic.n_out(), economic.numel_out(0)) != (2, 1, 1):
+        if wrong := [bound for bound in soft if not isinstance(bound, SoftBound)]:
+            raise InputError(f"soft: {wrong[0]!r} given; needed: SoftBound(expression, lower, upper, ...)")
+        if economic is not None and not _is_stage_cost(economic):
             raise InputError(f"economic: {economic} given; needed: a function (x, u) -> scalar")
         lengths = {"blocks": None if blocks is None else _blocks(blocks, int(horizon))}
         for name, value in {**fields, **bounds, **others, **lengths, "economic": economic}.items():
@@ -220,9 +222,33 @@ class OCP:
         return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
+def whole(value: object) -> bool:
+    """Whether a value is a whole number.
+
+    Example:
+        >>> whole(3), whole(3.0), whole(2.5), whole(float("nan")), whole("3")
+        (True, True, False, False, False)
+    """
+    return isinstance(value, int | float | np.number) and bool(np.isfinite(value)) and int(value) == value
+
+
+def _numbers(values: ArrayLike, name: str) -> Array:
+    try:
+        array = np.asarray(values, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: numbers needed, got {values!r}") from error
+    if array.ndim > 1 and max(array.shape) < array.size:
+        raise InputError(f"{name}: shape {array.shape} given; needed: the diagonal alone, a weight each")
+    return array.ravel()
+
+
+def _is_stage_cost(f: object) -> bool:
+    return isinstance(f, ca.Function) and (f.n_in(), f.n_out(), f.numel_out(0)) == (2, 1, 1)
+
+
 def _blocks(blocks: Sequence[int], horizon: int) -> tuple[int, ...]:
-    lengths = tuple(int(length) for length in blocks)
-    if lengths != tuple(blocks) or min(lengths, default=0) < 1 or sum(lengths) != horizon:
+    lengths = tuple(int(length) for length in blocks if whole(length))
+    if len(lengths) < len(blocks) or min(lengths, default=0) < 1 or sum(lengths) != horizon:
         raise InputError(
             f"blocks: {tuple(blocks)} given, {sum(blocks)} periods in all; needed: whole numbers of at least 1 "
             f"that sum to the horizon of {horizon}"

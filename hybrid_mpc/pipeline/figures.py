@@ -13,17 +13,22 @@ from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.identify import MODELS, load_trained
 from hybrid_mpc.pipeline.judge import clean_windows
 from hybrid_mpc.pipeline.results import REPORTED, loop_table, step_times, summary
-from hybrid_mpc.plots import analysis, animation, data, fit, loops, monitor, save, tasks, training
+from hybrid_mpc.plots import analysis, animation, data, estimation, fit, loops, monitor, save, tasks, training
+from hybrid_mpc.report.schema import OBSERVERS
 
 Figures = dict[str, list[tuple[Path, str]]]
 """Figure files with their captions by section of the report."""
+OBSERVER_TITLES = {
+    "prior_observer": "Observer on the fitted prior",
+    "hybrid_observer": "Observer on the hybrid",
+}
 SHOWN_RUNS = 2
 SHOWN_RECORDINGS = 4
 
 
 def draw_all(context: Context) -> Figures:
     """Draw every figure that the run's stages allow into ``figures/``."""
-    parts = (_data, _training, _free_runs, _overview, _loops, _timing, _monitor, _analysis)
+    parts = (_data, _training, _free_runs, _overview, _loops, _estimation, _timing, _monitor, _analysis)
     figures: Figures = {}
     for i, part in enumerate(parts):
         context.progress.update("figures", i, len(parts), part.__name__.strip("_"))
@@ -180,6 +185,25 @@ def _moving(context: Context) -> list[tuple[Path, str]]:
         limits=(control.u_min, control.u_max),
     )  # fmt: skip
     return [(path, f"{task.title}: the machine, and in outline what the hybrid MPC plans.")]
+
+
+def _estimation(context: Context) -> Any:
+    result, arrays = context.result("estimation"), context.arrays("estimation")
+    for name in OBSERVERS:
+        own = result.get(name)
+        if own is None or "reason" in own:
+            continue
+        figure = estimation.innovations(
+            [arrays[f"{name}/nis/{i}"] for i in range(len(result["recordings"]))],
+            arrays[f"{name}/autocorrelation"],
+            dt=context.spec.dt,
+            outputs=context.scenario.prior().outputs,
+            mean_band=(own["nis_low"], own["nis_high"]),
+            correlation_band=own["correlation_band"],
+            title=OBSERVER_TITLES[name],
+        )
+        caption = f"{OBSERVER_TITLES[name]}: how surprised it was by test recordings."
+        yield "estimation", f"innovations_{name}", figure, caption
 
 
 def _timing(context: Context) -> Any:

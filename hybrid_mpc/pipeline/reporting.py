@@ -8,11 +8,11 @@ from typing import Any
 from hybrid_mpc.files import write_json
 from hybrid_mpc.pipeline.contenders import CONTENDERS
 from hybrid_mpc.pipeline.context import Context
-from hybrid_mpc.pipeline.figures import Figures, draw_all
+from hybrid_mpc.pipeline.figures import OBSERVER_TITLES, Figures, draw_all
 from hybrid_mpc.pipeline.results import collect
 from hybrid_mpc.plots.style import name_of
 from hybrid_mpc.report import KeyFigure, Report, Section, Table, write_report
-from hybrid_mpc.report.schema import CONTROLLERS, MODELS
+from hybrid_mpc.report.schema import CONTROLLERS, MODELS, OBSERVERS
 from hybrid_mpc.report.texts import TITLES, paragraphs
 
 
@@ -42,6 +42,7 @@ def _report(context: Context, results: dict[str, Any], figures: Figures) -> Repo
         "free_run": _score_table(results),
         "export": _export_table(results),
         "control": _control_table(results),
+        "estimation": _observer_table(results),
         "timing": _timing_table(results),
         "monitor": _alarm_table(results),
         "analysis": _pole_table(results),
@@ -131,6 +132,10 @@ def _notes(context: Context, results: dict[str, Any]) -> dict[str, dict[str, tup
                                   "on recorded states instead.",)  # fmt: skip
         else:
             after["control"] = (f"The gap closed is not defined: {reason}.",)
+    tested = results["estimation"]
+    without = [r["reason"] for r in (tested, *(tested[n] for n in OBSERVERS)) if r and "reason" in r]
+    if without:
+        after["estimation"] = (f"Not tested: {'; '.join(dict.fromkeys(without))}.",)
     warnings = context.result("prior")["warnings"]
     if warnings:
         after["models"] = ("Warnings of the fit: " + "; ".join(warnings) + ".",)
@@ -239,6 +244,18 @@ def _cost(cell: dict[str, Any] | None) -> str:
 
 def _gap(gap: dict[str, Any]) -> str:
     return "–" if gap["value"] is None else f"{gap['value']:.2f}"
+
+
+def _observer_table(results: dict[str, Any]) -> Table:
+    found = {OBSERVER_TITLES[n]: results["estimation"][n] for n in OBSERVERS}
+    rows = [
+        (title, r["mean_nis"], f"{r['nis_low']:.2f} to {r['nis_high']:.2f}", f"{100 * r['nis_inside']:.0f} %",
+         f"{r['ljung_box']:.0f}", f"{r['ljung_box_limit']:.0f}", r["samples"])
+        for title, r in found.items()
+        if r is not None and r["mean_nis"] is not None
+    ]  # fmt: skip
+    columns = ("observer", "mean NIS", "consistent", "below 95 %", "Ljung-Box", "white below", "samples")
+    return Table(columns, rows, "Innovations on test recordings, the first 25 samples of each left out.")
 
 
 def _timing_table(results: dict[str, Any]) -> Table | None:

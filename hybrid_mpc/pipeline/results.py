@@ -10,7 +10,7 @@ import numpy as np
 
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.deploy import versions
-from hybrid_mpc.report.schema import CONTROLLERS, MODELS, SCHEMA_VERSION, validate_results
+from hybrid_mpc.report.schema import CONTROLLERS, MODELS, OBSERVERS, SCHEMA, SCHEMA_VERSION, validate_results
 
 LOOP_FIGURES = ("cost", "tracking_rmse_rad")
 BASELINES = ("prior", "prior_observer")
@@ -36,6 +36,7 @@ def collect(context: Context) -> dict[str, Any]:
         "identification": _identification(context),
         "export": context.result("export"),
         "control": _control(context),
+        "estimation": _estimation(context),
         "timing": _timing(context),
         "monitor": _monitor(context),
         "analysis": _analysis(context),
@@ -182,6 +183,25 @@ def gap_closed(row: Mapping[str, Mapping[str, list[float]]]) -> tuple[float | No
     if gap <= 2.0 * error:
         return None, f"baseline {baseline.mean():.4g} and oracle {oracle.mean():.4g} do not differ enough"
     return float(baseline.mean() - hybrid.mean()) / gap, ""
+
+
+def _estimation(context: Context) -> dict[str, Any]:
+    found = context.result("estimation")
+    if "reason" in found:
+        return {**dict.fromkeys(OBSERVERS), "reason": found["reason"]}
+    out: dict[str, Any] = {}
+    for name in OBSERVERS:
+        keys = _keys("estimation", name)
+        own = found[name]
+        out[name] = dict.fromkeys(keys) | own if "reason" in own else {key: own[key] for key in keys}
+    return {**out, "details": {"recordings": found["recordings"]}}
+
+
+def _keys(*path: str) -> tuple[str, ...]:
+    group: Any = SCHEMA
+    for key in path:
+        group = group.keys[key]
+    return tuple(group.keys)
 
 
 def step_times(context: Context) -> dict[str, Any]:

@@ -9,9 +9,10 @@ from typing import Any
 
 from hybrid_mpc.errors import InputError
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 MODELS = ("phy_nominal", "phy", "rnn", "pgrnn", "mopgrnn")
 CONTROLLERS = ("prior", "hybrid", "oracle")
+OBSERVERS = ("prior_observer", "hybrid_observer")
 
 
 @dataclass(frozen=True)
@@ -86,6 +87,7 @@ def _fixed(kind: str, fits: Callable[[Any], bool]) -> Leaf:
 _TEXT = _fixed("a text that is not empty", _is_text)
 _SIZE = _number(positive=True)
 _COUNT = Leaf("a whole number, zero or above", _is_count)
+_SHARE = Leaf("a number between 0 and 1", lambda v: _is_number(v) and 0 <= v <= 1)
 _TRUTH = Leaf("true or false", lambda v: isinstance(v, bool))
 _INTERVALS = "a list of {file, start_s, end_s} with start_s <= end_s"
 _PER_MODEL = Group(dict.fromkeys(MODELS, _SIZE))
@@ -118,6 +120,19 @@ SCHEMA = Group(
             {
                 **{name: Group({"cost": _number(), "tracking_rmse_rad": _SIZE}) for name in CONTROLLERS},
                 "gap_closed": _number(),
+            }
+        ),
+        "estimation": Group(
+            {
+                name: Group(
+                    {
+                        **dict.fromkeys(("mean_nis", "nis_low", "nis_high"), _SIZE),
+                        "nis_inside": _SHARE,
+                        **dict.fromkeys(("ljung_box", "ljung_box_limit"), _SIZE),
+                        "samples": _COUNT,
+                    }
+                )
+                for name in OBSERVERS
             }
         ),
         "timing": Group(
@@ -158,7 +173,7 @@ def validate_results(results: Mapping[str, Any]) -> None:
         InputError: With the path of the first key that is missing, unknown or of the wrong kind.
 
     Example:
-        >>> validate_results({"schema_version": 1, "seed": 0})
+        >>> validate_results({"schema_version": 2, "seed": 0})
         Traceback (most recent call last):
         ...
         hybrid_mpc.errors.InputError: results: 'scenario' is missing; it must be a text that is not empty

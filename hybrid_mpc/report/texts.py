@@ -17,6 +17,7 @@ TITLES: Mapping[str, str] = {
     "free_run": "Free runs: how well the models predict",
     "export": "Export",
     "control": "Closed loops",
+    "estimation": "Estimation: are the observers as sure as they may be",
     "timing": "Time of a controller step",
     "monitor": "Energy monitor",
     "analysis": "Linear analysis",
@@ -112,6 +113,20 @@ TEXTS: Mapping[str, tuple[Markup, ...]] = {
             "It is summed over the tasks in which prior and oracle differ by more than twice the standard error."
         ),
     ),
+    "estimation": (
+        _M(
+            "An observer predicts every measurement before it comes, and says how far off it may be. The "
+            "<b>NIS</b> (normalised innovation squared) is the square of how far off it was, over the square "
+            "it had allowed for: an observer that knows how wrong it can be has an average of one (for each "
+            "measured output), above that it is too sure of itself, below too cautious."
+        ),
+        _M(
+            "The lower picture asks whether one error tells of the next. Bars outside the green band mean "
+            "that it does: there is something in the measurement, such as friction that the model lacks or "
+            "an encoder's steps, that the observer does not use. On recordings of a real machine few observers "
+            "pass these tests to the letter; how far they are off tells which noise to look at."
+        ),
+    ),
     "timing": (
         _M(
             "A controller step is everything between measurement and input: estimation, prediction, "
@@ -199,7 +214,7 @@ def paragraphs(section: str) -> tuple[Markup, ...]:
 
     Args:
         section: ``"data"``, ``"models"``, ``"training"``, ``"free_run"``, ``"export"``, ``"control"``,
-            ``"timing"``, ``"monitor"``, ``"analysis"`` or ``"glossary"``.
+            ``"estimation"``, ``"timing"``, ``"monitor"``, ``"analysis"`` or ``"glossary"``.
 
     Returns:
         Its paragraphs, as HTML.

@@ -7,7 +7,7 @@ import pytest
 from online_models import random_linear
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation import ExtendedKalmanFilter, consistency, innovations
+from hybrid_mpc.estimation import ExtendedKalmanFilter, SwitchingFilter, consistency, innovations
 
 SIGMA_Y, SIGMA_X = 0.1, 0.05
 
@@ -133,6 +133,26 @@ def test_bad_options_are_refused(options, words):
     model, *matrices = system()
     with pytest.raises(InputError, match=words):
         consistency(make(model), [recorded(*matrices, 200, 0)], **options)
+
+
+def test_a_switching_filter_is_judged_by_its_mixture():
+    model, a, b, c = system()
+    chain, steps = np.array([[0.95, 0.05], [0.5, 0.5]]), (SIGMA_X, 10 * SIGMA_X)
+    switching = SwitchingFilter([make(model), make(model, scale_x=10.0)], chain)
+    rng, runs = np.random.default_rng(10), []
+    for _ in range(3):  # a system whose noise switches as the filter supposes
+        x, u, y, mode = np.zeros(2), rng.normal(size=(800, 1)), np.zeros((800, 1)), 0
+        for k in range(800):
+            y[k] = c @ x + SIGMA_Y * rng.normal(size=1)
+            mode = rng.choice(2, p=chain[mode])
+            x = a @ x + b @ u[k] + steps[mode] * rng.normal(size=2)
+        runs.append(Run(y, u))
+    found = consistency(switching, runs)
+    first = found.runs[0]
+    np.testing.assert_array_equal(first.nis, first.normalised[:, 0] ** 2)
+    # 2325 squares of a mixture whose kurtosis is some 7 to 10: the mean's deviation is 0.05 to 0.06
+    assert found.mean_nis == pytest.approx(1.0, abs=0.2)
+    assert consistency(make(model), runs).mean_nis > 2.0  # a filter that knows the quiet mode only
 
 
 def test_no_recordings_and_bad_shapes_are_refused():

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 from online_models import linear_model, pendulum_model
 
+from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
-from hybrid_mpc.mpc import OCP, CondensedController, Status
+from hybrid_mpc.mpc import OCP, CondensedController, IpoptController, Status
 
 
 def ipopt_plan(model, ocp, terminal, z0, d, reference, u_prev):
@@ -139,3 +140,20 @@ def test_solve_is_pure_and_the_constructor_leaves_nothing_behind():
     np.testing.assert_array_equal(kept[2], first.h)
     for controller in (used, fresh):
         np.testing.assert_array_equal(controller.solve(plan, e, np.zeros((1, 2))).u, first.u)
+
+
+def test_an_option_that_ipopt_does_not_know_is_refused():
+    ocp = OCP(3, [1.0, 1.0], [1.0], [0.0], [-1.0], [1.0])
+    with pytest.raises(InputError, match="nonsense"):
+        IpoptController(pendulum_model(), ocp, options={"nonsense": 1})
+
+
+def test_a_weight_of_zero_at_the_end_makes_no_noise(capfd):
+    model, ocp = pendulum_model(), OCP(4, [1.0, 1.0], [1.0], [0.0], [-1.0], [1.0], terminal=np.eye(2))
+    estimate = Estimate(0.0, np.array([0.3, 0.0]), np.zeros(0), np.zeros(1), np.eye(3), np.zeros(1), 0.0)
+    controller = IpoptController(model, ocp)
+    weight = np.vstack([np.ones((4, 2)), np.zeros((1, 2))])  # as in a stroke before its follow-through
+    plan = controller.solve(controller.initial(estimate), estimate, np.zeros((1, 2)), weight)
+    assert plan.status is Status.SOLVED
+    told = capfd.readouterr()
+    assert "NaN" not in told.out + told.err  # the root of the weight has no slope there, and nobody needs it

@@ -185,3 +185,15 @@ def test_resume_of_a_damaged_checkpoint(call, arguments, finished, tmp_path):
     assert code == 2
     assert "evaluation.json" in message
     assert "damaged" in message
+
+
+def test_ctrl_c_says_how_to_go_on(call, arguments, tmp_path, monkeypatch):
+    from hybrid_mpc.pipeline import run as job
+
+    def stopped(*given, **more):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(job, "run", stopped)
+    code, told = call(*arguments, "--out", tmp_path / "run")
+    assert code == 130
+    assert "--resume" in told

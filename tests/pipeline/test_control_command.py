@@ -92,6 +92,20 @@ def test_loops_of_two_controllers(call, run_folder, tmp_path):
     assert repeated["summary"] == results["summary"]
 
 
+def test_ctrl_c_says_that_nothing_is_kept(call, run_folder, tmp_path, monkeypatch):
+    from hybrid_mpc.pipeline import control_results
+
+    def stopped(*given):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(control_results, "run_loops", stopped)
+    code, _, told = call("golf_robot", "--model", run_folder, "--out", tmp_path / "stopped")
+    assert code == 130
+    assert "nothing to resume" in told
+    assert "--resume" not in told  # which is an option of run alone
+    assert not (tmp_path / "stopped").exists()
+
+
 def test_a_fault_from_the_command_line_acts(call, run_folder, tmp_path):
     costs = {}
     for name, words in (("healthy", []), ("worn", ["--fault", "plant_friction=4@0.5"])):

@@ -35,6 +35,9 @@ def test_folder_holds_what_the_readme_says(finished):
     page = (finished / "report.html").read_text()
     assert not re.search(r"(src|href)=[\"']?https?:", page)
     names = {path.name for path in (finished / "figures").glob("*.png")}
+    for name in ("prior_observer", "hybrid_observer"):
+        assert found["estimation"][name]["samples"] > 100  # at least five times the 20 lags
+        assert f"innovations_{name}.png" in names
     assert {"recordings.png", "training.png", "errors.png", "step_times.png", "poles.png"} <= names
 
 

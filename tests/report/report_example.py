@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_mpc.plots import analysis, data, fit, loops, monitor, save, training
+from hybrid_mpc.plots import analysis, data, estimation, fit, loops, monitor, save, training
 from hybrid_mpc.plots.style import name_of
 from hybrid_mpc.report import KeyFigure, Report, Section, Table, write_report
 from hybrid_mpc.report.texts import TITLES, paragraphs
@@ -108,6 +108,15 @@ def times_figure():
     return loops.solve_times(times, 20.0)
 
 
+def innovations_figure():
+    rng = np.random.default_rng(5)
+    nis = [rng.chisquare(1, 300), rng.chisquare(1, 200)]
+    r = 0.05 * rng.normal(size=(20, 1))
+    return estimation.innovations(
+        nis, r, dt=0.02, outputs=OUTPUTS, mean_band=(0.88, 1.12), correlation_band=0.09
+    )
+
+
 def monitor_figure():
     t = np.arange(0.0, 60.0, 0.02)
     rng = np.random.default_rng(3)
@@ -164,6 +173,7 @@ FIGURES = {
     "parity": parity_figure,
     "loops": loop_figure,
     "times": times_figure,
+    "innovations": innovations_figure,
     "monitor": monitor_figure,
     "poles": poles_figure,
     "bode": bode_figure,
@@ -175,6 +185,7 @@ PLACES = {
     "free_run": ("free_run", "errors"),
     "export": ("parity",),
     "control": ("loops",),
+    "estimation": ("innovations",),
     "timing": ("times",),
     "monitor": ("monitor",),
     "analysis": ("poles", "bode"),

@@ -13,7 +13,7 @@ from hybrid_mpc.report.schema import SCHEMA, Group, validate_results
 
 PER_MODEL = {"phy_nominal": 1.0, "phy": 0.2, "rnn": 0.4, "pgrnn": 0.17, "mopgrnn": 0.15}
 RESULTS = {
-    "schema_version": 1,
+    "schema_version": 2,
     "scenario": "golf_robot",
     "seed": 0,
     "budget": "quick",
@@ -30,6 +30,18 @@ RESULTS = {
         "hybrid": {"cost": 2.0, "tracking_rmse_rad": 0.05},
         "oracle": {"cost": 1.5, "tracking_rmse_rad": 0.04},
         "gap_closed": 0.67,
+    },
+    "estimation": {
+        name: {
+            "mean_nis": 1.2,
+            "nis_low": 0.9,
+            "nis_high": 1.1,
+            "nis_inside": 0.93,
+            "ljung_box": 44.0,
+            "ljung_box_limit": 31.4,
+            "samples": 900,
+        }
+        for name in ("prior_observer", "hybrid_observer")
     },
     "timing": {
         "controller_step_ms": {"median": 2.0, "p95": 3.0, "p99": 4.0, "max": 9.0},
