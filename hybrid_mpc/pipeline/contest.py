@@ -163,7 +163,7 @@ def _seeds(name: str, scenario: Scenario, seeds: int, oracle_seeds: int) -> int:
     if name not in ORACLES:
         return seeds
     # the oracle that sees the truth differs between seeds by nothing but its rivals' luck
-    return 0 if scenario.oracle is None else (oracle_seeds if name == "oracle" else min(2, oracle_seeds // 2))
+    return 0 if scenario.oracle is None else (oracle_seeds if name == "oracle" else min(1, oracle_seeds // 2))
 
 
 def limits_used(control: ControlSpec, r: ClosedLoopResult) -> dict[str, float]:
