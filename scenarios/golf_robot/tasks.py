@@ -46,7 +46,10 @@ PUTT = replace(HARD_STROKE, u_min=(-0.2,), u_max=(0.2,))
 IMPACT = 1.6
 """Time [s] of the impact: as long as the strokes' horizon, so that the first plan ends in it."""
 FOLLOW_THROUGH = 0.4
-"""Time [s] after the impact in which the club may swing out freely, before it is to come to rest."""
+LONG_FOLLOW_THROUGH = 0.5
+"""Time [s] after the impact in which the club may swing out freely, before it is to come to rest. The long one is for
+the fastest stroke of either kind: after 0.4 s the motor is far from having brought that club back, and what is asked
+in vain costs every controller much the same and hides what tells them apart."""
 PUTTS = (0.8, 1.1, 1.4, 1.65, 1.9)
 HARD_STROKES = (3.0, 4.0)
 STEPS = (0.0, 0.3, -0.2, 0.4, 0.0)
@@ -112,11 +115,13 @@ def steps(levels: tuple[float, ...]) -> Callable[[Array], Array]:
     return reference
 
 
-def stroke(speed: float) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
+def stroke(
+    speed: float, follow_through: float = FOLLOW_THROUGH
+) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
     """Reference and weight factors of a stroke: pass ``phi = 0`` at ``IMPACT`` with ``speed`` [rad/s], then rest.
 
     No swing is planned beforehand: up to the impact only effort counts, at it a miss by 5 mrad or by 10 mrad/s
-    costs 1, then nothing for ``FOLLOW_THROUGH``, then rest at 0 counts as in every task.
+    costs 1, then nothing for ``follow_through`` [s], then rest at 0 counts as in every task.
 
     Example:
         >>> reference, weight = stroke(1.4)
@@ -130,7 +135,7 @@ def stroke(speed: float) -> tuple[Callable[[Array], Array], Callable[[Array], Ar
         return np.column_stack([np.zeros(len(t)), np.where(np.abs(t - IMPACT) < half, speed, 0.0)])
 
     def weight(t: Array) -> Array:
-        hit, rest = np.abs(t - IMPACT) < half, t > IMPACT + FOLLOW_THROUGH + half
+        hit, rest = np.abs(t - IMPACT) < half, t > IMPACT + follow_through + half
         return np.where(hit[:, None], met, np.where(rest[:, None], np.ones(2), np.zeros(2)))
 
     return reference, weight
@@ -177,7 +182,8 @@ def _crossing(t: Array, x: Array) -> tuple[float, float]:
 
 
 def _stroke_task(speed: float, control: ControlSpec) -> Task:
-    reference, weight = stroke(speed)
+    fastest = speed in (max(PUTTS), max(HARD_STROKES))
+    reference, weight = stroke(speed, LONG_FOLLOW_THROUGH if fastest else FOLLOW_THROUGH)
     kind = "Putt" if control is PUTT else "Hard stroke"
     return Task(
         f"stroke_{speed:g}", f"{kind}: pass 0 at {IMPACT:g} s with {speed:g} rad/s, then rest", 3.0, (0.0, 0.0),

@@ -19,7 +19,7 @@ from scenarios.golf_robot.nominal import GEAR, PARAMETERS
 from scenarios.golf_robot.oracle import oracle
 from scenarios.golf_robot.prior import GolfRobotPrior
 from scenarios.golf_robot.rig import Rig
-from scenarios.golf_robot.tasks import FOLLOW_THROUGH, IMPACT, impact
+from scenarios.golf_robot.tasks import FOLLOW_THROUGH, IMPACT, LONG_FOLLOW_THROUGH, impact
 
 WITHOUT_TORCH = """
 import sys
@@ -247,7 +247,9 @@ def test_a_stroke_asks_for_nothing_but_the_impact_and_then_rest(task):
     assert not weight[:k].any()
     assert reference[k] == pytest.approx([0.0, float(task.name.split("_")[1])])
     assert not np.delete(reference, k, axis=0).any()
-    assert (weight[t > IMPACT + FOLLOW_THROUGH + 0.01] == 1).all()
+    free = LONG_FOLLOW_THROUGH if task.name in ("stroke_1.9", "stroke_4") else FOLLOW_THROUGH
+    assert not weight[k + 1 : k + round(free / 0.02)].any()
+    assert (weight[t > IMPACT + free + 0.01] == 1).all()
     # a miss by 5 mrad and by 10 mrad/s costs 1 each
     cost = weight[k] * task.control.q * 0.02 * np.array([5e-3, 1e-2]) ** 2
     assert cost == pytest.approx([1.0, 1.0])
