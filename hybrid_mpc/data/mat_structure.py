@@ -17,7 +17,7 @@ TEXT = (16, 17, 18)
 MATRIX, COMPRESSED = 14, 15
 NUMERIC_CLASSES = range(6, 16)
 """Classes of arrays: double, single, int8 to uint64."""
-OPAQUE = 17
+CELL, STRUCT, CHAR, SPARSE, OPAQUE = 1, 2, 4, 5, 17
 COMPLEX = 0x08
 DEEPEST = 32
 """Matrices in matrices (cells, structs) that are followed: no recording has more than a few."""
@@ -63,7 +63,10 @@ def check_structure(content: bytes) -> None:
     order = "<" if content[126:128] == b"IM" else ">"
     for element in _elements(content, 128, len(content), order):
         if element.kind == COMPRESSED:
-            inner = zlib.decompress(content[element.begin : element.end])
+            try:
+                inner = zlib.decompress(content[element.begin : element.end])
+            except zlib.error as error:
+                raise ValueError("a compressed variable does not match its checksum") from error
             for matrix in _elements(inner, 0, len(inner), order):
                 _check_matrix(inner, matrix, order, 0)
         else:
@@ -102,10 +105,7 @@ def _check_matrix(data: bytes, matrix: Element, order: str, depth: int) -> None:
     kind, is_complex = flags & 0xFF, bool(flags >> 8 & COMPLEX)
     if kind != OPAQUE:
         _check_head(parts)
-    if kind in NUMERIC_CLASSES:
-        if len(parts) != 4 + is_complex or any(part.kind not in NUMBERS for part in parts[3:]):
-            raise ValueError("a variable without its numbers")
-        return
+        _check_body(kind, [part.kind for part in parts[3:]], is_complex)
     for part in parts[1:]:
         if part.kind == MATRIX:
             _check_matrix(data, part, order, depth + 1)
@@ -115,7 +115,26 @@ def _check_matrix(data: bytes, matrix: Element, order: str, depth: int) -> None:
 
 def _check_head(parts: list[Element]) -> None:
     """Flags, dimensions (two at least), name: what every variable begins with."""
-    if len(parts) < 3 or parts[1].kind not in (5, 6) or parts[1].end - parts[1].begin < 8:
+    size = parts[1].end - parts[1].begin if len(parts) >= 3 else 0
+    if size < 8 or size % 4 or parts[1].kind not in (5, 6):
         raise ValueError("a variable without its dimensions")
     if parts[2].kind not in (1, *TEXT):
         raise ValueError("a variable without its name")
+
+
+def _check_body(kind: int, rest: list[int], is_complex: bool) -> None:
+    """Types of the elements after the name: each kind of variable has its own."""
+    if kind == CELL:
+        fits = all(one == MATRIX for one in rest)
+    elif kind == STRUCT:
+        fits = rest[:2] in ([5, 1], [6, 1]) and all(one == MATRIX for one in rest[2:])
+    elif kind == CHAR:
+        fits = len(rest) == 1 and rest[0] in NUMBERS + TEXT
+    elif kind == SPARSE:
+        fits = len(rest) == 3 + is_complex and all(one in NUMBERS for one in rest)
+    elif kind in NUMERIC_CLASSES:
+        fits = len(rest) == 1 + is_complex and all(one in NUMBERS for one in rest)
+    else:
+        fits = True  # objects and functions, of which scipy gives the raw bytes at best
+    if not fits:
+        raise ValueError("a variable without its contents")
