@@ -157,11 +157,12 @@ def _shooting(
 def _again(
     before: PriorFit, stages: list[tuple[float, int]], methods: Sequence[str]
 ) -> tuple[list[tuple[float, int]], Sequence[str]]:
-    """What is fitted again after an earlier fit: the length or the method that won."""
-    if before.best.startswith("multiple shooting") and "multiple_shooting" in methods:
+    """What is fitted again after an earlier fit: the length or the method that won, of the methods asked for."""
+    won = before.best.startswith("multiple shooting")
+    if "multiple_shooting" in methods and (won or "output_error" not in methods):
         return [], ("multiple_shooting",)
     stages = [s for s in stages if before.best == f"output error {s[0]:g} s"] or stages[:1]
-    return stages, ("output_error",)
+    return stages, tuple(m for m in methods if m == "output_error")
 
 
 def _check_methods(methods: Sequence[str]) -> None:

@@ -78,6 +78,12 @@ def test_methods_are_those_asked_for_and_the_best_wins():
     assert two.best == "multiple shooting 0.5 s"  # of the two the one that knows of noise in the states
     again = fit_prior(Pendulum, train, valid, dt=DT, before=two, methods=("multiple_shooting",))
     assert [row["stage"] for row in again.stages] == ["the fit before", "multiple shooting 0.5 s"]
+    kept = fit_prior(Pendulum, train, valid, dt=DT, before=two, methods=("equation_error",))
+    assert (kept.values, kept.standard_errors, kept.correlations) == (
+        two.values,
+        two.standard_errors,
+        two.correlations,
+    )
 
 
 @pytest.mark.parametrize("methods", [("swarm",), (), "output_error"])
