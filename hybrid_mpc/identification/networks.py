@@ -231,8 +231,8 @@ class StackedGRU(StackedRecurrent):
         if not self.fused:
             return super().sequence(s, h)
         states = fused_states(s, h, self.w_ih, self.w_hh, self.b_ih, self.b_hh)
-        outputs = torch.matmul(self.w_out.mT, states) + self.b_out.mT
-        return outputs.mT, states[-1].mT
+        outputs = torch.baddbmm(self.b_out, states.flatten(1, 2), self.w_out).unflatten(1, states.shape[1:3])
+        return outputs.transpose(0, 1), states[:, -1]
 
     def _cell(self, gate_in: Tensor, h: Tensor) -> Tensor:
         gate_h = torch.baddbmm(self.b_hh, h, self.w_hh)
