@@ -72,7 +72,8 @@ def cut_segments(trajectories: Sequence[Trajectory], periods: int, most: int = M
         n = min(counts[i], most)
         parts.append(cut_windows([trajectories[i]], 0, periods, periods).take(torch.arange(n)))
         joined += [True] * (n - 1) + [False]
-    whole = Windows(torch.cat([p.x for p in parts]), torch.cat([p.u for p in parts]), 0)
+    x, u, xdot = (torch.cat([getattr(p, name) for p in parts]) for name in ("x", "u", "xdot"))
+    whole = Windows(x, u, 0, xdot)
     return Segments(whole, np.array(joined))
 
 
