@@ -1,7 +1,7 @@
 """From how far off, and how exactly, does each fit of a prior find the parameters? ``python benchmarks/prior_fit.py``.
 
-The paper's pendulum. Measured: angle and speed with noise of a hundredth of their spread. A fit has found the plant when l and d are within
-2 %. The starts lie on a grid over the bounds of the prior.
+The paper's pendulum. Measured: angle and speed with noise of a hundredth of their spread. A fit has found the plant
+when l and d are within 2 %. The starts lie on a grid over the bounds of the prior.
 """
 
 from __future__ import annotations
@@ -76,9 +76,7 @@ def basin(plant: DampedPendulum, grid: int) -> None:
     """Share of starts from which each fit finds the plant, and its time."""
     fit, runs = ParameterFit(PendulumPrior, DT), measured(plant, 0)
     truth = fit.scaled({"l": plant.parameters.l, "d": plant.parameters.d})
-    print(
-        f"\n{name}: found from so many of {grid * grid} starts\n\n| fit | found | s a fit |\n| --- | --- | --- |"
-    )
+    print(f"\nFound from so many of {grid * grid} starts\n\n| fit | found | s a fit |\n| --- | --- | --- |")
     for method, solve in methods(fit, runs).items():
         begin, found = process_time(), 0
         for start in starts(fit, grid):
