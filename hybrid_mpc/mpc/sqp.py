@@ -12,7 +12,8 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.mpc.condensed import CondensedController
-from hybrid_mpc.mpc.descent import Case, Descent, Landscape
+from hybrid_mpc.mpc.descent import Descent
+from hybrid_mpc.mpc.landscape import Case, Landscape
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.problem import Problem
 from hybrid_mpc.mpc.solution import Solution, Status
@@ -115,9 +116,10 @@ class SQPController:
         start = perf_counter()
         case = Case(estimate.d, previous.u[0], self.problem.target(reference, weight))
         u = self._admissible(np.vstack([previous.u[1:], previous.u[-1:]]), case.u_prev)
-        at = self._landscape.at(np.concatenate([estimate.x, estimate.h]), u, case)
+        run = self._landscape.run(np.concatenate([estimate.x, estimate.h]), u, case)
+        at = self._landscape.at(run, case)
         search = Descent(self._landscape, case, at, self._shifted(previous), self._tolerance)
-        if not (np.isfinite(at.cost) and np.all(np.isfinite(at.gradient)) and case.target.ok):
+        if not (np.isfinite(run.cost) and np.all(np.isfinite(at.gradient)) and case.target.ok):
             search.status = Status.NOT_FINITE
             return replace(self._plan(search, estimate.d), timing=_spent(start))
         while search.count < self._iterations and not search.ended:
@@ -126,8 +128,8 @@ class SQPController:
 
     def _shifted(self, previous: Solution) -> Array | None:
         """Second derivatives along the previous plan, a period later; None if it has none that fit."""
-        given, size = previous.curvature, self.ocp.n_x + self.ocp.n_u
-        if given is None or given.shape != (self.ocp.horizon, size, size):
+        given = previous.curvature
+        if given is None or not self._landscape.stages.fits(given, self.ocp.horizon):
             return None
         return np.concatenate([given[1:], given[-1:]]) if np.all(np.isfinite(given)) else None
 
@@ -144,8 +146,8 @@ class SQPController:
         return self.ocp.held(rows)
 
     def _plan(self, search: Descent, d: Array) -> Solution:
-        at, soft, n_x = search.at, self.problem.soft, self.ocp.n_x
-        excess = soft.excess(soft.values(at.z[:, :n_x], at.u)) if len(soft) else np.zeros(0)
+        at, n_x = search.at.run, self.ocp.n_x
+        excess = self.problem.soft.excess(at.soft[0])
         return Solution(
             at.u, at.z[:, :n_x], at.z[:, n_x:], d, at.cost, search.status, search.kkt, 0.0, {},
             float(np.max(excess, initial=0.0)), search.count, search.curvature,
