@@ -17,7 +17,7 @@ SHIFT = 1e-5
 """Step of the difference of two Jacobians, in tolerated deviations (states), half ranges (inputs) and 1 (hidden)."""
 FLOOR = 1e-3
 """Least curvature along a direction, as a share of Gauss-Newton's."""
-MATTERS = 0.05
+MATTERS = 0.2
 """Share of Gauss-Newton's curvature, along some direction, below which the hidden state's is left out: what is
 left out slows convergence down to that share a step."""
 AT_ONCE = 200
@@ -48,10 +48,14 @@ class StageCurvature:
         self._group = min(n_h, max(1, AT_ONCE // ocp.horizon))
         self._by_hidden = stages.slopes(self._group, hidden=True) if n_h else None
 
+    @property
+    def size(self) -> int:
+        """Number of a stage's states, inputs and hidden states."""
+        return self._shift.size + self._n_h
+
     def fits(self, curvature: Array, horizon: int) -> bool:
         """True for second derivatives that can go with this model's stages."""
-        few = self._shift.size
-        return curvature.shape in ((horizon, few, few), (horizon, few + self._n_h, few + self._n_h))
+        return curvature.shape in [(horizon, size, size) for size in (self._shift.size, self.size)]
 
     def of(
         self, z: Array, u: Array, a_t: Array, b: Array, adjoint: Array, soft: Array, old: Array | None = None
@@ -68,7 +72,7 @@ class StageCurvature:
             old: Curvature whose hidden part is kept. Default: all is taken.
         """
         few = self._shift.size
-        size = few + self._n_h if old is None else old.shape[1]
+        size = self.size if old is None else old.shape[1]
         curvature = np.empty((len(b), size, size)) if old is None else old.copy()
         curvature[:, :few, :few] = self._few(z[:-1], u[1], a_t, b, adjoint)
         if self._soft is not None and np.any(soft):

@@ -27,6 +27,8 @@ CORRECTIONS = 2
 """Most corrections of a step by what it was found to bend."""
 SLOW = 0.1
 """Share of the residual that the Hessian got wrong, above which second derivatives are taken anew."""
+AGAIN = (1, 4, 16, 64)
+"""Times at which a hidden state's curvature that hardly mattered is looked at again."""
 
 
 @dataclass(frozen=True)
@@ -196,7 +198,10 @@ class Descent:
 
     def _taken_anew(self, prepared: Prepared, multipliers: Array) -> Array:
         """Second derivatives here; the hidden state's, which change slowly, from the second time on."""
-        land, old = self._land, self.curvature if self._taken == 0 else None
+        land, old = self._land, self.curvature
+        small = old is not None and old.shape[1] < land.stages.size
+        if old is not None and (self._taken in AGAIN if small else self._taken > 0):
+            old = None
         curvature = land.curvature(self.at, self._case, multipliers, self._soft, old)
         if old is None:
             curvature = land.without_what_is_small(prepared, curvature)

@@ -15,6 +15,7 @@ from hybrid_mpc.mpc.soft import SoftRows
 from hybrid_mpc.mpc.solution import Status
 
 Array = NDArray[np.float64]
+Soft = tuple[Array, Array] | None
 
 # Relative to the gradient's size.
 KKT_TOLERANCE = 1e-5
@@ -143,12 +144,7 @@ class InputQP:
         return hessian if self._ocp.blocks is None else self.by_blocks(self.by_blocks(hessian).T)
 
     def solve(
-        self,
-        hessian: Array,
-        gradient: Array,
-        u: Array,
-        u_prev: Array,
-        soft: tuple[Array, Array] | None = None,
+        self, hessian: Array, gradient: Array, u: Array, u_prev: Array, soft: Soft = None
     ) -> tuple[Array, Status, float]:
         """Step from the plan ``u``, how the solve ended, and the relative KKT residual.
 
@@ -163,9 +159,7 @@ class InputQP:
         answer = self.answer(hessian, gradient, u, u_prev, soft)
         return answer.step, answer.status, answer.kkt
 
-    def answer(
-        self, hessian: Array, gradient: Array, u: Array, u_prev: Array, soft: tuple[Array, Array] | None = None
-    ) -> Answer:
+    def answer(self, hessian: Array, gradient: Array, u: Array, u_prev: Array, soft: Soft = None) -> Answer:
         """As :meth:`solve`, with the multipliers of the soft bounds."""
         if self._ocp.blocks is None:
             return self._solve(hessian, gradient, u, u_prev, soft)
@@ -176,9 +170,7 @@ class InputQP:
         step = np.repeat(answer.step.reshape(-1, u.shape[1]), self._ocp.blocks, axis=0)
         return replace(answer, step=step.ravel())
 
-    def _solve(
-        self, hessian: Array, gradient: Array, u: Array, u_prev: Array, soft: tuple[Array, Array] | None
-    ) -> Answer:
+    def _solve(self, hessian: Array, gradient: Array, u: Array, u_prev: Array, soft: Soft) -> Answer:
         ocp, scale = self._ocp, self._scale
         lower, upper = ((bound - u).ravel() / scale for bound in (ocp.u_min, ocp.u_max))
         row_lower, row_upper = self._row_bounds(u, u_prev)
@@ -190,9 +182,7 @@ class InputQP:
             return Answer(s * scale, status, kkt, np.zeros(0 if soft is None else soft[0].size))
         return self._softly(hard, size, s, kkt, *soft)
 
-    def _softly(
-        self, hard: _Scaled, size: float, s: Array, kkt: float, value: Array, slope: Array
-    ) -> Answer:
+    def _softly(self, hard: _Scaled, size: float, s: Array, kkt: float, value: Array, slope: Array) -> Answer:
         """The answer with soft bounds, from the answer ``s`` without."""
         sides, n, rows = self._sides, self._n, value.size
         assert sides is not None

@@ -96,7 +96,9 @@ def test_the_hidden_states_part_can_be_kept_or_left_out():
 def test_soft_bounds_are_in_the_lagrangian_and_its_hessian():
     x, u = ca.MX.sym("x", 2), ca.MX.sym("u")
     bound = SoftBound(ca.Function("power", [x, u], [u * x[1] + x[0] ** 3]), [-9.0], [9.0], [1.0], [1.0])
-    ocp = OCP(12, [50.0, 0.5], [0.5], [0.2], [-3.0], [3.0], working_point=POINT, soft=[bound], x_max=[9.0, 9.0])
+    ocp = OCP(
+        12, [50.0, 0.5], [0.5], [0.2], [-3.0], [3.0], working_point=POINT, soft=[bound], x_max=[9.0, 9.0]
+    )
     land, case, at = landscape(pendulum_model(z=2, friction=0.5), ocp)
     mu, z0 = np.random.default_rng(1).normal(size=36), at.run.z[0]
     shift = 1e-5 * np.random.default_rng(2).normal(size=(12, 1))
