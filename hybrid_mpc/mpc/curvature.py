@@ -212,7 +212,7 @@ def share_of(gauss_newton: Array, rest: Array) -> float:
     """Size of ``rest`` relative to ``gauss_newton``, at least that along any direction.
 
     Example:
-        >>> share_of(2.0 * np.eye(2), np.diag([1.0, 0.0]))
+        >>> round(share_of(2.0 * np.eye(2), np.diag([1.0, 0.0])), 9)
         0.5
     """
     try:
