@@ -18,7 +18,8 @@ from hybrid_mpc.signals import Parameter, Signal
 class Prior(nn.Module):
     """A mechanical ODE prior with its output equation and its energy balance.
 
-    The state is ``x = [q, v]``: positions first, then their velocities, so that ``q_dot = v`` is exact.
+    The state is ``x = [q, v]``: positions first, then their velocities, so that ``q_dot = v`` is exact. ``n_extra``
+    states of another kind (a lagging input, say) may follow, whose rates :meth:`extra_rates` gives.
     A subclass names its signals and parameters as class attributes and writes two methods. Every
     parameter becomes a float64 ``nn.Parameter`` of shape ``()`` under its name.
 
@@ -46,11 +47,13 @@ class Prior(nn.Module):
     inputs: ClassVar[tuple[Signal, ...]]
     outputs: ClassVar[tuple[Signal, ...]]
     parameters_spec: ClassVar[tuple[Parameter, ...]]
+    n_extra: ClassVar[int] = 0
 
     def __init__(self, values: Mapping[str, float] | None = None) -> None:
         super().__init__()
-        if len(self.states) % 2:
-            raise InputError(f"{type(self).__name__}: states must be [q, v] in pairs, got {len(self.states)}")
+        if (len(self.states) - self.n_extra) % 2:
+            found = len(self.states) - self.n_extra
+            raise InputError(f"{type(self).__name__}: states must be [q, v] in pairs, got {found}")
         values = dict(values or {})
         for spec in self.parameters_spec:
             value = torch.tensor(values.pop(spec.name, spec.value), dtype=torch.float64)
@@ -62,7 +65,7 @@ class Prior(nn.Module):
     @property
     def n_q(self) -> int:
         """Number of degrees of freedom."""
-        return len(self.states) // 2
+        return (len(self.states) - self.n_extra) // 2
 
     @property
     def values(self) -> dict[str, float]:
@@ -75,7 +78,15 @@ class Prior(nn.Module):
 
     def forward(self, x: Tensor, u: Tensor) -> Tensor:
         """Derivative ``xdot`` ``(..., n_x)`` of the state: exact kinematics and :meth:`acceleration`."""
+        if self.n_extra:
+            return torch.cat([self._velocity(x), self.acceleration(x, u), self.extra_rates(x, u)], dim=-1)
         return torch.cat([x[..., self.n_q :], self.acceleration(x, u)], dim=-1)
+
+    def extra_rates(self, x: Tensor, u: Tensor) -> Tensor:
+        """Rates ``(..., n_extra)`` of the states after ``[q, v]``; only a prior that has such states needs it."""
+        raise NotImplementedError(
+            f"{type(self).__name__} has n_extra states and must define extra_rates(x, u)"
+        )
 
     def output(self, x: Tensor, u: Tensor) -> Tensor:
         """Measured outputs ``(..., n_y)``. Default: the positions."""
@@ -94,5 +105,9 @@ class Prior(nn.Module):
         of motion times the velocity, ``inertia * (v_dot - acceleration(x, u)) * v``: the same number as the
         balance written out term by term, and no equation is written twice.
         """
-        v, v_dot = x[..., self.n_q :], xdot[..., self.n_q :]
+        v, v_dot = self._velocity(x), self._velocity(xdot)
         return (self.inertia(x) * (v_dot - self.acceleration(x, u)) * v).sum(-1)
+
+    def _velocity(self, x: Tensor) -> Tensor:
+        """The second ``n_q`` of a state or of its derivative."""
+        return x[..., self.n_q : 2 * self.n_q] if self.n_extra else x[..., self.n_q :]

@@ -68,9 +68,9 @@ class DataSpec:
     """How a machine's recordings are read.
 
     Args:
-        time: CSV column of the time stamps [s].
-        inputs: CSV columns of the inputs, in the order of the prior's inputs (zero-order hold).
-        outputs: CSV columns of the measured positions, in the order of the prior's outputs.
+        time: Column of the time stamps [s].
+        inputs: Columns of the inputs, in the order of the prior's inputs (zero-order hold).
+        outputs: Columns of the measured positions, in the order of the prior's outputs.
         dt: Model period [s]; declaring it is the request to resample to it.
         max_gap: Longest distance [s] between two samples; a run is cut where it is exceeded.
         smoothing: Length [s] of the local polynomial that first smooths and differentiates the positions; the
@@ -83,6 +83,8 @@ class DataSpec:
             test trajectory as a whole. Where an unstable point multiplies every error, short runs from many
             starts say more than one long one.
         inputs_of: Input columns of single recordings, by file stem, where they differ from ``inputs``.
+        units: Units of columns that are not in seconds or in their signal's unit, by column: ``"ms"``, ``"deg"``, or
+            the factor as a number (:mod:`hybrid_mpc.data.units`).
 
     Raises:
         InputError: If a length is not positive or the fractions do not sum to one.
@@ -99,6 +101,7 @@ class DataSpec:
     fractions: tuple[float, float, float] = (0.6, 0.2, 0.2)
     free_run: float | None = None
     inputs_of: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    units: Mapping[str, str | float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in ("dt", "max_gap", "smoothing", "warm_up"):

@@ -26,13 +26,13 @@ def run(
     budget: Annotated[str, typer.Option(help="Effort: quick or full.")] = "quick",
     resume: Annotated[bool, typer.Option("--resume", help="Finish the run that the folder holds.")] = False,
     time_column: Annotated[
-        str, typer.Option(help="CSV column of the time [s]. Default: the scenario's.")
+        str, typer.Option(help="Column of the time [s]. Default: the scenario's.")
     ] = "",
     input_column: Annotated[
-        list[str] | None, typer.Option(help="CSV column of an input, in the prior's order.")
+        list[str] | None, typer.Option(help="Column of an input, in the prior's order.")
     ] = None,
     output_column: Annotated[
-        list[str] | None, typer.Option(help="CSV column of a measured position, in the prior's order.")
+        list[str] | None, typer.Option(help="Column of a measured position, in the prior's order.")
     ] = None,
 ) -> None:
     """Fit the prior, train, export, close the loop, monitor, analyse, and write a report."""

@@ -1,20 +1,18 @@
-"""Read and write recordings as CSV tables, with messages that a user can act on."""
+"""Read recordings into checked tables, with messages that a user can act on."""
 
 from __future__ import annotations
 
-import csv
-import difflib
-import hashlib
-import io
-import math
-import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_mpc.data.array_files import mat_source, npz_source
+from hybrid_mpc.data.csv_files import csv_source
+from hybrid_mpc.data.sources import Columns, MissingColumn, Source
+from hybrid_mpc.data.units import factor
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.scenario import DataSpec
 from hybrid_mpc.signals import Signal
@@ -50,17 +48,25 @@ class Table:
         return float(np.median(np.diff(self.t)))
 
 
-def read_csv(
+def read_table(
     path: Path | str, spec: DataSpec, *, outputs: Sequence[Signal], inputs: Sequence[Signal]
 ) -> Table:
-    """Read one recording and check everything that would mislead an identification.
+    """Read one recording, whose ending tells its format, and check what would mislead an identification.
 
-    Columns that ``spec`` does not name are ignored. The separator is a comma, the decimal sign a point,
-    the first line the header, the encoding UTF-8.
+    Columns that ``spec`` does not name are ignored; ``spec.units`` are turned into the signals' own.
+
+    ==========  ========================================================================================
+    ``.npz``    named vectors (``numpy.savez``); objects are refused
+    ``.mat``    MATLAB's vectors, ``save`` with ``-v4``, ``-v6`` or ``-v7``, not 7.3; a struct's fields are
+                ``struct.field``, or ``field`` where that is unambiguous
+    any other   CSV: a comma between cells, decimals with a point, the first line the header, UTF-8
+    ==========  ========================================================================================
+
+    Where the time is a single number in ``.npz`` or ``.mat`` it is the sampling time, and time begins at 0.
 
     Args:
-        path: CSV file.
-        spec: Names of the columns, ``max_gap`` and ``warm_up`` [s], windows by file stem.
+        path: The file.
+        spec: Names of the columns, their units, ``max_gap`` and ``warm_up`` [s], windows by file stem.
         outputs: Signals of ``spec.outputs``, with their plausible ranges.
         inputs: Signals of ``spec.inputs``, with their plausible ranges.
 
@@ -68,13 +74,34 @@ def read_csv(
         The table with ``m`` rows.
 
     Raises:
-        InputError: If the file or a column is missing, a cell is no finite number, time stamps repeat or
-            decrease, values are implausible, the sampling is coarser than ``max_gap`` throughout, or
-            there are fewer samples than a window or the warm-up needs. Rows are counted from 1 as an
-            editor shows them (the header is row 1).
+        InputError: If the file or a column is missing, a cell is no finite number, columns differ in length,
+            time stamps repeat or decrease, values are implausible, the sampling is coarser than
+            ``max_gap`` throughout, or there are fewer samples than a window or the warm-up needs. Rows
+            are counted from 1 as an editor or MATLAB shows them (in CSV the header is row 1), the
+            indices of ``.npz`` from 0.
 
     Example:
         >>> import tempfile
+        >>> spec = DataSpec("Ts", ("tau",), ("phi",), dt=0.1, max_gap=0.2, smoothing=0.5, warm_up=0.5,
+        ...                 units={"phi": "deg"})
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = Path(folder) / "run.npz"
+        ...     np.savez(file, Ts=0.1, tau=np.zeros(40), phi=np.full(40, 90.0))
+        ...     table = read_table(file, spec, outputs=[Signal("phi", "rad")], inputs=[Signal("tau", "N m")])
+        >>> table.name, round(float(table.t[-1]), 6), round(float(table.y[0, 0]), 6)
+        ('run', 3.9, 1.570796)
+    """
+    return _table(source_of(Path(path)), spec, outputs, inputs)
+
+
+def read_csv(
+    path: Path | str, spec: DataSpec, *, outputs: Sequence[Signal], inputs: Sequence[Signal]
+) -> Table:
+    """Read one recording as CSV, whatever its ending; otherwise as :func:`read_table`.
+
+    Example:
+        >>> import tempfile
+        >>> from hybrid_mpc.data import write_csv
         >>> spec = DataSpec("t", ("tau",), ("phi",), dt=0.1, max_gap=0.2, smoothing=0.5, warm_up=0.5)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     t = 0.1 * np.arange(40)
@@ -83,133 +110,94 @@ def read_csv(
         >>> table.name, table.y.shape
         ('run', (40, 1))
     """
-    path = Path(path)
+    return _table(csv_source(Path(path)), spec, outputs, inputs)
+
+
+def read_tables(
+    paths: Sequence[Path | str], spec: DataSpec, *, outputs: Sequence[Signal], inputs: Sequence[Signal]
+) -> list[Table]:
+    """Read the recordings of one run: :func:`read_table` for each, with ``spec.inputs_of`` for those it names.
+
+    They may differ in format, length and sampling, and in columns that ``spec`` does not name.
+
+    Raises:
+        InputError: If one of them is bad, a column is in some of them and not in others, or two have one stem.
+
+    Example:
+        >>> spec = DataSpec("t", ("u",), ("y",), dt=0.1, max_gap=0.2, smoothing=0.5, warm_up=0.5)
+        >>> read_tables([], spec, outputs=[Signal("y", "rad")], inputs=[Signal("u", "N m")])
+        []
+    """
+    own = {
+        path: replace(spec, inputs=spec.inputs_of.get(path.stem, spec.inputs)) for path in map(Path, paths)
+    }
+    try:
+        tables = [read_table(path, own[path], outputs=outputs, inputs=inputs) for path in map(Path, paths)]
+    except MissingColumn as error:
+        raise InputError(f"{error}{_unequal(own)}") from None
+    stems = [table.name for table in tables]
+    if len(set(stems)) < len(stems):
+        raise InputError(
+            f"two recordings have the same file stem: {', '.join(sorted(stems))}. Give each file once, or "
+            "rename one: pieces and windows are named by the stem."
+        )
+    return tables
+
+
+def _unequal(specs: Mapping[Path, DataSpec]) -> str:
+    """Columns that some of the recordings have and others lack, for a message; nothing if there are none."""
+    there: dict[str, list[str]] = {}
+    missing: dict[str, list[str]] = {}
+    for path, spec in specs.items():
+        for name in (spec.time, *spec.inputs, *spec.outputs):
+            try:
+                source_of(path).find(name)
+                there.setdefault(name, []).append(path.name)
+            except MissingColumn:
+                missing.setdefault(name, []).append(path.name)
+            except InputError:
+                pass  # a fault of its own, told when its turn comes
+    lines = "".join(
+        f"\n  {name!r} is in {', '.join(there[name])} and not in {', '.join(files)}"
+        for name, files in missing.items()
+        if name in there
+    )
+    remedy = " All need those that the DataSpec names; inputs_of names other inputs for single recordings:"
+    return f" Columns differ between the recordings.{remedy}{lines}" if lines else ""
+
+
+def source_of(path: Path) -> Source:
+    """Open a recording's file by its ending.
+
+    Raises:
+        InputError: If it is missing, empty, damaged or not of the format that its ending says.
+    """
+    return {".npz": npz_source, ".mat": mat_source}.get(path.suffix.lower(), csv_source)(path)
+
+
+def _table(source: Source, spec: DataSpec, outputs: Sequence[Signal], inputs: Sequence[Signal]) -> Table:
+    path = source.path
     if len(spec.outputs) != len(outputs) or len(spec.inputs) != len(inputs):
         raise InputError(
             f"data specification: {len(spec.inputs)} input and {len(spec.outputs)} output columns for a "
             f"prior with {len(inputs)} inputs and {len(outputs)} outputs; "
             "name one column for each, in its order"
         )
-    content = _content(path)
-    header, rows = _rows(path, content)
     names = (spec.time, *spec.inputs, *spec.outputs)
-    places = [_column(path, header, name) for name in names]
-    lines = [line for line, _ in rows]
-    values = np.array([[_number(path, header, line, row, j) for j in places] for line, row in rows])
-    values = values.reshape(len(rows), len(places))
+    signals = (Signal("time", "s"), *inputs, *outputs)
+    columns = source.read([source.find(name) for name in names])
+    values = columns.values
+    for j, (name, signal) in enumerate(zip(names, signals, strict=True)):
+        if name in spec.units:
+            values[:, j] *= factor(name, spec.units[name], signal)
     t, split = values[:, 0], 1 + len(inputs)
-    _check_time(path, t, lines, spec)
-    for signal, name, column in zip((*inputs, *outputs), names[1:], values[:, 1:].T, strict=True):
-        _check_range(path, signal, name, column, lines)
-    sha256 = hashlib.sha256(content).hexdigest()
-    return Table(path.stem, path, sha256, t, values[:, 1:split], values[:, split:])
+    _check_time(path, t, columns, spec)
+    for signal, name, column in zip(signals[1:], names[1:], values[:, 1:].T, strict=True):
+        _check_range(path, signal, name, column, columns)
+    return Table(path.stem, path, source.sha256, t, values[:, 1:split], values[:, split:])
 
 
-def write_csv(path: Path | str, columns: Mapping[str, Array]) -> Path:
-    r"""Write columns of equal length as CSV: all of it or nothing, the same data as the same bytes.
-
-    Numbers are written with ten significant digits. The file appears under its name only when complete.
-
-    Args:
-        path: File to write; its folder is made if need be, an old file of that name is replaced.
-        columns: Values ``(m,)`` by column name.
-
-    Returns:
-        The path.
-
-    Raises:
-        InputError: If the columns differ in length or are not one-dimensional.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     write_csv(Path(folder) / "a.csv", {"t": np.array([0.0, 0.1])}).read_text()
-        't\n0\n0.1\n'
-    """
-    path = Path(path)
-    arrays = {name: np.asarray(column, dtype=float) for name, column in columns.items()}
-    shapes = {name: array.shape for name, array in arrays.items()}
-    if len(set(shapes.values())) != 1 or any(len(shape) != 1 for shape in shapes.values()):
-        raise InputError(f"{path}: columns must be one-dimensional and of one length, got {shapes}")
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(arrays)
-    writer.writerows([f"{value + 0.0:.10g}" for value in row] for row in zip(*arrays.values(), strict=True))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    part.write_bytes(text.getvalue().encode())
-    os.replace(part, path)
-    return path
-
-
-def _content(path: Path) -> bytes:
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        near = sorted(p.name for p in path.parent.glob("*.csv")) if path.parent.is_dir() else []
-        there = f"; that folder has: {', '.join(near)}" if near else ""
-        raise InputError(f"{path}: there is no such file{there}. Check the path given with --data.") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}). Give a readable CSV file.") from error
-    if not content.strip():
-        raise InputError(f"{path}: the file is empty. It needs a header line and rows of numbers.")
-    return content
-
-
-def _rows(path: Path, content: bytes) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Header and ``(row number, cells)``; blank lines are skipped but counted."""
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        row = content[: error.start].count(b"\n") + 1
-        raise InputError(f"{path}: row {row} is no UTF-8 text. Export the table as CSV (UTF-8).") from error
-    reader = csv.reader(io.StringIO(text, newline=""))
-    try:
-        rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
-    except csv.Error as error:
-        raise InputError(f"{path}: row {reader.line_num}: {error}. Export the table as plain CSV.") from error
-    header = [name.strip() for name in rows[0][1]] if rows else []
-    for line, cells in rows[1:]:
-        if len(cells) != len(header):
-            raise InputError(
-                f"{path}: row {line} has {len(cells)} cells, the header (row {rows[0][0]}) has "
-                f"{len(header)}. "
-                "Separate cells by commas, write decimals with a point, and complete or delete the row."
-            )
-    return header, rows[1:]
-
-
-def _column(path: Path, header: list[str], name: str) -> int:
-    count = header.count(name)
-    if count == 1:
-        return header.index(name)
-    there = ", ".join(repr(column) for column in header)
-    if count > 1:
-        raise InputError(f"{path}: column {name!r} appears {count} times in {there}. Rename all but one.")
-    near = difflib.get_close_matches(name, header, n=1)
-    hint = f" Did you mean {near[0]!r}?" if near else ""
-    raise InputError(
-        f"{path}: no column {name!r}; it has {there}.{hint} "
-        "Rename the column or name yours in the scenario's DataSpec."
-    )
-
-
-def _number(path: Path, header: list[str], line: int, row: list[str], place: int) -> float:
-    cell = row[place].strip()
-    try:
-        value = math.nan if "_" in cell else float(cell)
-    except ValueError:
-        value = math.nan
-    if math.isfinite(value):
-        return value
-    what = f"is {cell!r}, not a finite number" if cell else "is empty"
-    raise InputError(
-        f"{path}: row {line}, column {header[place]!r} {what}. Delete the row (longer gaps are cut out) "
-        "or repair the value."
-    )
-
-
-def _check_time(path: Path, t: Array, lines: list[int], spec: DataSpec) -> None:
+def _check_time(path: Path, t: Array, columns: Columns, spec: DataSpec) -> None:
     if len(t) < 2:
         raise InputError(f"{path}: {len(t)} row(s) of numbers; a recording needs many. Record it again.")
     steps = np.diff(t)
@@ -217,14 +205,15 @@ def _check_time(path: Path, t: Array, lines: list[int], spec: DataSpec) -> None:
         k = int(np.argmax(steps <= 0))
         what = "repeats" if steps[k] == 0 else "decreases"
         raise InputError(
-            f"{path}: row {lines[k + 1]}, column {spec.time!r}: time {what} ({t[k]:g} s, then "
+            f"{path}: {columns.place(k + 1)}, column {spec.time!r}: time {what} ({t[k]:g} s, then "
             f"{t[k + 1]:g} s). Time stamps must increase: delete the repeated rows or split "
             "the file into recordings."
         )
     if steps.min() > spec.max_gap * (1 + 1e-6):
         raise InputError(
             f"{path}: sampling is {np.median(steps):g} s, declared max_gap is {spec.max_gap:g} s: every step "
-            f"is a gap. Record faster, raise max_gap, or check that column {spec.time!r} is in seconds."
+            f"is a gap. Record faster, raise max_gap, or check that column {spec.time!r} is in seconds "
+            "(DataSpec.units names another unit)."
         )
     need = spec.warm_up + MIN_SCORED * spec.dt
     length = float(t[-1] - t[0])
@@ -232,7 +221,7 @@ def _check_time(path: Path, t: Array, lines: list[int], spec: DataSpec) -> None:
         raise InputError(
             f"{path}: {len(t)} samples over {length:g} s are fewer than the {need:g} s that the warm-up "
             f"({spec.warm_up:g} s) and {MIN_SCORED} periods need. Give a longer recording, or check that "
-            f"column {spec.time!r} is in seconds."
+            f"column {spec.time!r} is in seconds (DataSpec.units names another unit)."
         )
     for window in spec.windows.get(path.stem, ()):
         if window.start < t[0] - spec.dt or window.end > t[-1] + spec.dt:
@@ -242,7 +231,7 @@ def _check_time(path: Path, t: Array, lines: list[int], spec: DataSpec) -> None:
             )
 
 
-def _check_range(path: Path, signal: Signal, name: str, column: Array, lines: list[int]) -> None:
+def _check_range(path: Path, signal: Signal, name: str, column: Array, columns: Columns) -> None:
     bad = (column < signal.lower) | (column > signal.upper)
     if not bad.any():
         return
@@ -250,9 +239,9 @@ def _check_range(path: Path, signal: Signal, name: str, column: Array, lines: li
     hint = ""
     limit = max(abs(signal.lower), abs(signal.upper))
     if signal.unit in ("rad", "rad/s") and np.abs(column).max() > 4 * limit:
-        hint = " It looks like degrees: multiply by pi/180."
+        hint = f" It looks like degrees: say units={{{name!r}: 'deg'}} in the DataSpec."
     raise InputError(
-        f"{path}: row {lines[k]}, column {name!r}: {column[k]:g} is outside the plausible range "
+        f"{path}: {columns.place(k)}, column {name!r}: {column[k]:g} is outside the plausible range "
         f"{signal.lower:g} to {signal.upper:g} {signal.unit} of {signal.name} ({int(bad.sum())} such rows)."
         f"{hint} Check unit and sign, or widen the range of the signal in the scenario's prior."
     )

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from hybrid_mpc.data.differentiation import local_polynomial, window_samples
-from hybrid_mpc.data.tables import MIN_SCORED, Table, read_csv
+from hybrid_mpc.data.tables import MIN_SCORED, Table, read_tables
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.scenario import DataSpec, Role, Window
 from hybrid_mpc.signals import Signal
@@ -104,7 +104,7 @@ def load_trajectories(
     distance from each other; whoever writes ``windows`` should too.
 
     Args:
-        paths: CSV files with different stems.
+        paths: CSV, ``.npz`` or ``.mat`` files with different stems, of any lengths.
         spec: Columns, ``dt``, ``max_gap``, ``smoothing``, ``warm_up`` [s] and the split.
         outputs: Signals of the prior's outputs (positions).
         inputs: Signals of the prior's inputs.
@@ -113,8 +113,9 @@ def load_trajectories(
         The data set; it has at least one trajectory of each role.
 
     Raises:
-        InputError: If a recording is bad (see :func:`read_csv`), windows of different roles overlap, a
-            role gets no trajectory, or the sampling is too coarse for ``smoothing``.
+        InputError: If a recording is bad (see :func:`~hybrid_mpc.data.tables.read_table`), columns
+            differ between recordings, windows of different roles overlap, a role gets no trajectory, or
+            the sampling is too coarse for ``smoothing``.
 
     Example:
         >>> import tempfile
@@ -129,19 +130,9 @@ def load_trajectories(
         [('run', 'train', 299), ('run#2', 'valid', 94), ('run#3', 'test', 94)]
     """
     if not paths:
-        raise InputError("no recordings given; name at least one CSV file with --data")
+        raise InputError("no recordings given; name at least one file with --data")
     _check_windows(spec)
-    tables = [
-        read_csv(path, replace(spec, inputs=spec.inputs_of.get(Path(path).stem, spec.inputs)),
-                 outputs=outputs, inputs=inputs)
-        for path in paths
-    ]  # fmt: skip
-    stems = [table.name for table in tables]
-    if len(set(stems)) < len(stems):
-        raise InputError(
-            f"two recordings have the same file stem: {', '.join(sorted(stems))}. Give each file once, or "
-            "rename one: pieces and windows are named by the stem."
-        )
+    tables = read_tables(paths, spec, outputs=outputs, inputs=inputs)
     trajectories: list[Trajectory] = []
     whole: list[Trajectory] = []
     cuts: list[Cut] = []

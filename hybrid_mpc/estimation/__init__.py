@@ -2,8 +2,9 @@
 
 from hybrid_mpc.estimation.consistency import Consistency, Innovations, consistency, innovations
 from hybrid_mpc.estimation.delays import DelayCompensation, DelayedEstimate
-from hybrid_mpc.estimation.kalman import Estimate, Estimator, ExtendedKalmanFilter, TrueState
+from hybrid_mpc.estimation.kalman import Estimate, Estimator, ExtendedKalmanFilter
 from hybrid_mpc.estimation.switching import SwitchingEstimate, SwitchingFilter
+from hybrid_mpc.estimation.truth import TrueState
 
 __all__ = [
     "Consistency",

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation.kalman import Estimate, Estimator, TrueState
+from hybrid_mpc.estimation.kalman import Estimate, Estimator
+from hybrid_mpc.estimation.truth import TrueState
 from hybrid_mpc.model import HybridModel
 
 Array = NDArray[np.float64]

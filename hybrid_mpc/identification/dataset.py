@@ -26,11 +26,13 @@ class Windows:
         x: States ``(n, warm + horizon + 1, n_x)`` [SI].
         u: Inputs ``(n, warm + horizon, n_u)`` [SI].
         warm: Samples of the warm-up.
+        xdot: Derivatives of the states at the periods' starts ``(n, warm + horizon, n_x)`` [SI].
     """
 
     x: Tensor
     u: Tensor
     warm: int
+    xdot: Tensor
 
     @property
     def horizon(self) -> int:
@@ -42,7 +44,12 @@ class Windows:
 
     def take(self, index: Tensor) -> Windows:
         """The windows of ``index``."""
-        return Windows(self.x[index], self.u[index], self.warm)
+        index = index.to(self.x.device)
+        return Windows(self.x[index], self.u[index], self.warm, self.xdot[index])
+
+    def to(self, device: torch.device) -> Windows:
+        """The same windows on a device."""
+        return Windows(self.x.to(device), self.u.to(device), self.warm, self.xdot.to(device))
 
 
 def cut_windows(trajectories: Sequence[Trajectory], warm: int, horizon: int, stride: int) -> Windows:
@@ -51,12 +58,13 @@ def cut_windows(trajectories: Sequence[Trajectory], warm: int, horizon: int, str
     Raises:
         InputError: If no trajectory is long enough, or one holds a value that is not finite.
     """
-    x, u, length = [], [], warm + horizon
+    x, u, xdot, length = [], [], [], warm + horizon
     for trajectory in trajectories:
         _check_finite(trajectory)
         for start in range(0, len(trajectory.t) - length, stride):
             x.append(trajectory.x[start : start + length + 1])
             u.append(trajectory.u[start : start + length])
+            xdot.append(trajectory.xdot[start : start + length])
     if not x:
         longest = max((len(t.t) for t in trajectories), default=0)
         raise InputError(
@@ -64,7 +72,8 @@ def cut_windows(trajectories: Sequence[Trajectory], warm: int, horizon: int, str
             f"{warm} warm-up and {horizon} scored periods needs {length + 1}. Record longer runs or lower "
             "warm_up."
         )
-    return Windows(torch.tensor(np.stack(x)), torch.tensor(np.stack(u)), warm)
+    x_all, u_all, xdot_all = (torch.tensor(np.stack(parts)) for parts in (x, u, xdot))
+    return Windows(x_all, u_all, warm, xdot_all)
 
 
 def fitting_horizon(trajectories: Sequence[Trajectory], warm: int, most: int) -> int:
@@ -104,14 +113,33 @@ def scaling_of(prior: Prior, windows: Windows, dt: float, *, use_prior: bool) ->
     whole = residual[:, : residual.shape[1] // SPAN * SPAN] if residual.shape[1] >= SPAN else residual
     averaged = whole.unflatten(1, (-1, min(SPAN, whole.shape[1]))).mean(2).reshape(-1, n_q)
 
-    def rms(values: Tensor) -> tuple[float, ...]:
-        return tuple(float(v) for v in values.square().mean(0).sqrt().clamp_min(1e-9))
-
-    return Scaling(x=rms(x), u=rms(u), acceleration=rms(predicted), correction=rms(averaged))
+    return Scaling(x=_rms(x), u=_rms(u), acceleration=_rms(predicted), correction=_rms(averaged))
 
 
-def _check_finite(trajectory: Trajectory) -> None:
-    for name in ("x", "u"):
+def literal_scaling_of(prior: Prior, windows: Windows) -> Scaling:
+    """Scaling of the paper's literal form: root mean squares of signals, of the prior's xdot and of xdot."""
+    x, u = windows.x[:, :-1].flatten(0, 1), windows.u.flatten(0, 1)
+    return Scaling(
+        x=_rms(x), u=_rms(u), acceleration=_rms(prior(x, u)), correction=_rms(windows.xdot.flatten(0, 1))
+    )
+
+
+def _rms(values: Tensor) -> tuple[float, ...]:
+    return tuple(float(v) for v in values.square().mean(0).sqrt().clamp_min(1e-9))
+
+
+def check_rates(trajectories: Sequence[Trajectory]) -> None:
+    """Refuse trajectories whose derivative is not known: the literal form is trained on it.
+
+    Raises:
+        InputError: If xdot holds a value that is not finite.
+    """
+    for trajectory in trajectories:
+        _check_finite(trajectory, ("xdot",))
+
+
+def _check_finite(trajectory: Trajectory, names: Sequence[str] = ("x", "u")) -> None:
+    for name in names:
         bad = np.flatnonzero(~np.isfinite(getattr(trajectory, name)).all(axis=1))
         if len(bad):
             raise InputError(

@@ -13,8 +13,8 @@ from torch import Tensor, nn
 import nn_export
 from hybrid_mpc.artifact import INPUTS, OUTPUTS, ModelInfo, build_model
 from hybrid_mpc.data.trajectories import Trajectory
-from hybrid_mpc.identification.networks import GRUNetwork
-from hybrid_mpc.identification.step import HybridStep, PriorStep
+from hybrid_mpc.identification.networks import Network
+from hybrid_mpc.identification.step import PriorStep, RecurrentStep
 from hybrid_mpc.physics import Prior
 
 
@@ -43,7 +43,7 @@ class _Method(nn.Module):
         return result
 
 
-def trace_model(step: HybridStep | PriorStep) -> dict[str, nn_export.Program]:
+def trace_model(step: RecurrentStep | PriorStep) -> dict[str, nn_export.Program]:
     """Programs ``step, xdot, output, energy_balance`` of one model."""
     prior = step.prior
     modules: dict[str, nn.Module] = {
@@ -70,7 +70,7 @@ def model_info(prior: Prior, dt: float) -> ModelInfo:
 
 
 def check_parity(
-    step: HybridStep | PriorStep,
+    step: RecurrentStep | PriorStep,
     programs: dict[str, nn_export.Program],
     info: ModelInfo,
     trajectories: Sequence[Trajectory],
@@ -88,8 +88,8 @@ def check_parity(
     return Parity(report.value_rel, report.jacobian_rel)
 
 
-def _examples(step: HybridStep | PriorStep) -> dict[str, Tensor]:
-    n_h = 0 if isinstance(step, PriorStep) else cast(GRUNetwork, step.network).hidden
+def _examples(step: RecurrentStep | PriorStep) -> dict[str, Tensor]:
+    n_h = 0 if isinstance(step, PriorStep) else cast(Network, step.network).n_h
     n_x, n_u = len(step.prior.states), len(step.prior.inputs)
     shapes = {"x": n_x, "h": n_h, "u": n_u, "xdot": n_x}
     return {name: torch.zeros(n, dtype=torch.float64) for name, n in shapes.items()}

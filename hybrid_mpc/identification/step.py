@@ -1,6 +1,8 @@
-"""The hybrid step: exact kinematics, prior plus learned correction of the acceleration, Runge-Kutta.
+"""Models as steps: the prior alone, the hybrid step, and the paper's literal form.
 
-One code for training (any batch) and for export (one sample).
+The hybrid step has exact kinematics, prior plus learned correction of the acceleration, Runge-Kutta. In the literal
+form the network gives the whole derivative of the state and explicit Euler integrates it. One code for training (any
+batch) and for export (one sample).
 """
 
 from __future__ import annotations
@@ -26,8 +28,9 @@ class Scaling:
     Args:
         x: Scale of each state ``(n_x,)``.
         u: Scale of each input ``(n_u,)``.
-        acceleration: Scale of the prior's acceleration as a feature ``(n_q,)``.
-        correction: Scale of the network's output ``(n_q,)``.
+        acceleration: Scale of the prior's acceleration as a feature ``(n_q,)``; literal form: of its whole
+            xdot ``(n_x,)``.
+        correction: Scale of the network's output ``(n_q,)``; literal form: of xdot ``(n_x,)``.
     """
 
     x: tuple[float, ...]
@@ -59,11 +62,73 @@ class PriorStep(nn.Module):
         return self.prior(x, u)
 
 
-class HybridStep(nn.Module):
+class RecurrentStep(nn.Module):
+    """A step ``(x, h, u) -> (x_next, h_next)`` with a network in it: what every form of it can do.
+
+    A subclass defines ``features``, ``integrate``, ``derivative``, ``rate`` and ``measured_rate``.
+
+    Args:
+        prior: The ODE prior; it also names the states.
+        network: ``(s, h) -> (output, h_next)``, one network or a stack.
+        scaling: Magnitudes of features and outputs.
+        dt: Model period [s].
+        use_prior: False makes the plain recurrent network (RNN) of the paper's comparison.
+    """
+
+    scale_x: Tensor
+    scale_u: Tensor
+    scale_acceleration: Tensor
+    scale_correction: Tensor
+
+    def __init__(
+        self, prior: Prior, network: nn.Module, scaling: Scaling, dt: float, *, use_prior: bool = True
+    ) -> None:
+        super().__init__()
+        self.prior, self.network, self.dt, self.use_prior = prior, network, dt, use_prior
+        for name in ("x", "u", "acceleration", "correction"):
+            self.register_buffer(f"scale_{name}", torch.tensor(getattr(scaling, name), dtype=torch.float64))
+
+    def features(self, x: Tensor, u: Tensor) -> Tensor:
+        """Network inputs ``s``, scaled."""
+        raise NotImplementedError(f"{type(self).__name__} must define features(x, u)")
+
+    def correction(self, x: Tensor, h: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        """What the network gives [SI] (hybrid: acceleration ``(..., n_q)``), and the next hidden state."""
+        out, h_next = self.network(self.features(x, u), h)
+        return out * self.scale_correction, h_next
+
+    def integrate(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
+        """Next state with ``correction`` and ``u`` held over the period."""
+        raise NotImplementedError(f"{type(self).__name__} must define integrate(x, u, correction)")
+
+    def derivative(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
+        """Derivative of the state at the instant, ``(..., n_x)``."""
+        raise NotImplementedError(f"{type(self).__name__} must define derivative(x, u, correction)")
+
+    def rate(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
+        """Rate of change over the period that the training compares with :meth:`measured_rate`."""
+        raise NotImplementedError(f"{type(self).__name__} must define rate(x, u, correction)")
+
+    def measured_rate(self, x: Tensor, x_next: Tensor, xdot: Tensor) -> Tensor:
+        """What the model's rate is compared with, from measured states and their smoothed derivative."""
+        raise NotImplementedError(f"{type(self).__name__} must define measured_rate(x, x_next, xdot)")
+
+    def forward(self, x: Tensor, h: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        """Next state ``(..., n_x)`` and next hidden state."""
+        correction, h_next = self.correction(x, h, u)
+        return self.integrate(x, u, correction), h_next
+
+    def xdot(self, x: Tensor, h: Tensor, u: Tensor) -> Tensor:
+        """Derivative of the state at the instant, with the correction that ``(x, h, u)`` gives."""
+        return self.derivative(x, u, self.correction(x, h, u)[0])
+
+
+class HybridStep(RecurrentStep):
     """Prior and recurrent correction as a step ``(x, h, u) -> (x_next, h_next)`` (blueprint's hybrid step).
 
     ``h`` is updated once at ``(x_k, u_k)``; the correction of the acceleration is held over ``dt``; prior
-    and correction are integrated by Runge-Kutta of order 4.
+    and correction are integrated by Runge-Kutta of order 4. Rates are means over the period, so that an
+    input that jumps at a sample is credited to the period it acts in.
 
     Args:
         prior: The ODE prior; it also names the states.
@@ -75,11 +140,6 @@ class HybridStep(nn.Module):
         substeps: Runge-Kutta steps a period.
     """
 
-    scale_x: Tensor
-    scale_u: Tensor
-    scale_acceleration: Tensor
-    scale_correction: Tensor
-
     def __init__(
         self,
         prior: Prior,
@@ -90,11 +150,8 @@ class HybridStep(nn.Module):
         use_prior: bool = True,
         substeps: int | None = None,
     ) -> None:
-        super().__init__()
-        self.prior, self.network, self.dt, self.use_prior = prior, network, dt, use_prior
+        super().__init__(prior, network, scaling, dt, use_prior=use_prior)
         self.substeps = (substeps or required_substeps(prior, dt)) if use_prior else 1
-        for name in ("x", "u", "acceleration", "correction"):
-            self.register_buffer(f"scale_{name}", torch.tensor(getattr(scaling, name), dtype=torch.float64))
 
     def features(self, x: Tensor, u: Tensor) -> Tensor:
         """Network inputs ``s = [x, u, prior acceleration]``, scaled; an angle that turns as sin and cos."""
@@ -110,32 +167,71 @@ class HybridStep(nn.Module):
             parts.append(self.prior.acceleration(x, u) / self.scale_acceleration)
         return torch.cat(parts, dim=-1)
 
-    def correction(self, x: Tensor, h: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Learned acceleration ``(..., n_q)`` [SI] and next hidden state."""
-        out, h_next = self.network(self.features(x, u), h)
-        return out * self.scale_correction, h_next
-
     def integrate(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
         """Next state with ``correction`` and ``u`` held over the period."""
-        return rk4(lambda z: self._xdot(z, u, correction), x, self.dt, self.substeps)
+        return rk4(lambda z: self.derivative(z, u, correction), x, self.dt, self.substeps)
 
-    def forward(self, x: Tensor, h: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Next state ``(..., n_x)`` and next hidden state."""
-        correction, h_next = self.correction(x, h, u)
-        return self.integrate(x, u, correction), h_next
-
-    def xdot(self, x: Tensor, h: Tensor, u: Tensor) -> Tensor:
-        """Derivative of the state at the instant, with the correction that ``(x, h, u)`` gives."""
-        return self._xdot(x, u, self.correction(x, h, u)[0])
-
-    def _xdot(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
+    def derivative(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
+        """Derivative of the state at the instant: exact kinematics, prior plus correction."""
         acceleration = self.prior.acceleration(x, u) + correction if self.use_prior else correction
         velocity = x[..., self.prior.n_q :]
         return torch.cat([velocity, acceleration.expand(velocity.shape)], dim=-1)
 
+    def rate(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
+        """Mean rate over the period, ``(x_{k+1} - x_k) / dt``."""
+        return (self.integrate(x.expand(*correction.shape[:-1], -1), u, correction) - x) / self.dt
 
-def n_features(prior: Prior, use_prior: bool) -> int:
-    """Number of features that :meth:`HybridStep.features` gives."""
+    def measured_rate(self, x: Tensor, x_next: Tensor, xdot: Tensor) -> Tensor:
+        """Mean rate between two measured states; their derivative is not used."""
+        return (x_next - x) / self.dt
+
+
+class LiteralStep(RecurrentStep):
+    """The paper's literal form: the network gives the whole xdot, explicit Euler integrates it.
+
+    Features are ``[x, u, prior xdot]`` as they are (an angle that turns is no sine and cosine); the target
+    of teacher forcing is the derivative xdot of the recording at the sample, not a mean over the period.
+    Nothing ties ``q_dot`` to ``v``, and Euler feeds energy into an oscillation: both are the paper's.
+
+    Args:
+        prior: The ODE prior; it also names the states.
+        network: ``(s, h) -> (output, h_next)`` with n_x outputs, one network or a stack.
+        scaling: Magnitudes of features and outputs, those of xdot ``(n_x,)``.
+        dt: Period of the data [s].
+        use_prior: False leaves the prior's xdot out of the features (RNN).
+
+    Source: Schön, Götte, Timmermann: Multi-Objective Physics-Guided Recurrent Neural Networks for
+    Identifying Non-Autonomous Dynamical Systems (IFAC ALCOS 2022), Fig. 1.
+    """
+
+    def features(self, x: Tensor, u: Tensor) -> Tensor:
+        """Network inputs ``s = [x, u, prior xdot]``, scaled."""
+        parts = [x / self.scale_x, u / self.scale_u]
+        if self.use_prior:
+            parts.append(self.prior(x, u) / self.scale_acceleration)
+        return torch.cat(parts, dim=-1)
+
+    def integrate(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
+        """Next state by explicit Euler."""
+        return x + self.dt * correction
+
+    def derivative(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
+        """What the network gave."""
+        return correction
+
+    def rate(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
+        """What the network gave."""
+        return correction
+
+    def measured_rate(self, x: Tensor, x_next: Tensor, xdot: Tensor) -> Tensor:
+        """The derivative of the recording at the sample."""
+        return xdot
+
+
+def n_features(prior: Prior, use_prior: bool, *, literal: bool = False) -> int:
+    """Number of features of :meth:`HybridStep.features`, or :meth:`LiteralStep.features` if ``literal``."""
+    if literal:
+        return len(prior.states) * (2 if use_prior else 1) + len(prior.inputs)
     angles = sum(signal.periodic for signal in prior.states)
     return len(prior.states) + angles + len(prior.inputs) + (prior.n_q if use_prior else 0)
 

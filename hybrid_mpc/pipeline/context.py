@@ -83,7 +83,7 @@ class Context:
 
     @cached_property
     def dataset(self) -> Dataset:
-        """All trajectories of the user's CSV files, or of those that the simulated machine recorded."""
+        """All trajectories of the user's files, or of those that the simulated machine recorded."""
         files = list(self.settings.data) or sorted((self.out / "data").glob("*.csv"))
         prior = self.scenario.prior()
         return load_trajectories(files, self.spec, outputs=prior.outputs, inputs=prior.inputs)

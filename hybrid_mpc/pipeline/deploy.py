@@ -32,12 +32,12 @@ def versions() -> dict[str, str]:
 def export_stage(context: Context) -> None:
     """Write the hybrid and the fitted prior as one artifact; measure both against torch."""
     from hybrid_mpc.identification.export import check_parity, model_info, trace_model
-    from hybrid_mpc.identification.step import HybridStep, PriorStep
+    from hybrid_mpc.identification.step import PriorStep, RecurrentStep
     from hybrid_mpc.pipeline.identify import load_trained
 
     dt, settings = context.spec.dt, context.settings
     phy = context.scenario.prior(context.result("prior")["values"])
-    steps: dict[str, HybridStep | PriorStep] = {
+    steps: dict[str, RecurrentStep | PriorStep] = {
         "hybrid": load_trained(context, DEPLOYED).step(phy, dt),
         "prior": PriorStep(phy, dt),
     }

@@ -19,12 +19,12 @@ class RunSettings:
 
     Args:
         scenario: Registered name or path of a user's Python file.
-        data: CSV files of the user, in order; empty for a simulated machine.
+        data: Recordings of the user (CSV, npz, mat), in order; empty for a simulated machine.
         seed: Seed of data, training and closed loops.
         budget: Name of the scenario's budget.
-        inputs: CSV columns that replace the scenario's inputs; default: the scenario's.
-        outputs: CSV columns that replace the scenario's outputs; default: the scenario's.
-        time: CSV column that replaces the scenario's time; default: the scenario's.
+        inputs: Columns that replace the scenario's inputs; default: the scenario's.
+        outputs: Columns that replace the scenario's outputs; default: the scenario's.
+        time: Column that replaces the scenario's time; default: the scenario's.
     """
 
     scenario: str

@@ -50,6 +50,10 @@ class GolfRobotPrior(Prior):
         load = torch.abs(self.m * v * v * self.a + self.m * self.g * torch.cos(phi))
         return self.r * self.mu * torch.tanh(self.gamma * v) * load
 
+    def inertia(self, x: Tensor) -> Tensor:
+        """Inertia about the axis J [kg m^2], shape ``()``."""
+        return self.J
+
     def acceleration(self, x: Tensor, u: Tensor) -> Tensor:
         """Acceleration ``(..., 1)`` [rad/s^2] at ``x`` ``(..., 2)`` and ``u`` ``(..., 1)``."""
         phi, v = x[..., 0], x[..., 1]

@@ -53,6 +53,10 @@ class TorquePendulumPrior(Prior):
     def _losses(self, v: Tensor) -> Tensor:
         return self.d * v + self.F_c * torch.tanh(v / FRICTION_SPEED)
 
+    def inertia(self, x: Tensor) -> Tensor:
+        """Inertia about the axis J [kg m^2], shape ``()``."""
+        return self.J
+
     def acceleration(self, x: Tensor, u: Tensor) -> Tensor:
         """Angular acceleration ``(..., 1)`` [rad/s^2]."""
         phi, v = x[..., 0:1], x[..., 1:2]

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from hybrid_mpc.data import load_trajectories, write_csv
 from hybrid_mpc.data.trajectories import hold_mean
@@ -82,3 +83,76 @@ def test_what_cannot_be_split_is_refused(tmp_path):
         load_trajectories([file, file], SPEC, **SIGNALS)
     with pytest.raises(InputError, match="no recordings"):
         load_trajectories([], SPEC, **SIGNALS)
+
+
+def test_runs_of_different_length_sampling_and_format(tmp_path):
+    slow, fast = np.arange(0, 9, 0.01), np.arange(0, 4, 0.005)
+    long = record(tmp_path / "long.csv", slow)
+    one = {"t": slow, "tau": np.sign(np.cos(7 * slow)), "phi": np.sin(slow), "more": slow}
+    savemat(tmp_path / "matlab.mat", {"run": one})
+    np.savez(tmp_path / "short.npz", t=0.005, tau=np.sign(np.cos(7 * fast)), phi=np.sin(fast))
+    files = [long, tmp_path / "matlab.mat", tmp_path / "short.npz"]
+    data = load_trajectories(files, SPEC, **SIGNALS)
+    assert data.files == ("long.csv", "matlab.mat", "short.npz")
+    csv, mat, short = data.whole
+    assert (len(csv.t), len(mat.t), len(short.t)) == (449, 449, 199)
+    for name in ("t", "u", "y", "x", "xdot"):
+        # ten digits in CSV: 1e-10 times the gain of the second derivative, about 1e3 at 10 ms over 0.1 s
+        np.testing.assert_allclose(getattr(csv, name), getattr(mat, name), atol=1e-6)
+    np.testing.assert_allclose(short.x, np.c_[np.sin(short.t), np.cos(short.t)], atol=2e-5)
+    assert [t.role for t in data.trajectories] == 3 * ["train", "valid", "test"]
+    assert data.hash == load_trajectories(files[::-1], SPEC, **SIGNALS).hash
+
+
+def test_units_of_columns(tmp_path):
+    t = np.arange(0, 5, 0.01)
+    plain = load_trajectories([record(tmp_path / "run.csv", t)], SPEC, **SIGNALS).whole[0]
+    columns = {"t": 1e3 * t, "tau": np.sign(np.cos(7 * t)), "phi": np.rad2deg(np.sin(t))}
+    write_csv(tmp_path / "run.csv", columns)
+    spec = replace(SPEC, units={"t": "ms", "phi": "deg", "tau": 0.5})
+    got = load_trajectories([tmp_path / "run.csv"], spec, **SIGNALS).whole[0]
+    np.testing.assert_allclose(got.t, plain.t, atol=1e-12)
+    np.testing.assert_allclose(got.y, plain.y, atol=1e-9)  # ten digits of CSV
+    np.testing.assert_allclose(got.u, 0.5 * plain.u, atol=1e-12)
+    for units, match in (
+        ({"phi": "Nm"}, "unit 'Nm' of column 'phi' is none for phi .rad.; there are: rad, deg"),
+        ({"tau": 0.0}, "factor 0.0 of column 'tau' to torque .N m. must be finite and not zero"),
+    ):
+        with pytest.raises(InputError, match=match):
+            load_trajectories([tmp_path / "run.csv"], replace(SPEC, units=units), **SIGNALS)
+
+
+def test_unequal_columns_are_refused_by_file_and_column(tmp_path):
+    t = np.arange(0, 5, 0.01)
+    monday = record(tmp_path / "monday.csv", t)
+    other = write_csv(tmp_path / "tuesday.csv", {"t": t, "torque": t, "phi": t})
+    np.savez(tmp_path / "sunday.npz", t=t, tau=t, angle=t)
+    sunday = tmp_path / "sunday.npz"
+    with pytest.raises(InputError) as caught:
+        load_trajectories([monday, other, sunday], SPEC, **SIGNALS)
+    message = str(caught.value)
+    assert "tuesday.csv: no column 'tau'" in message
+    assert "'tau' is in monday.csv, sunday.npz and not in tuesday.csv" in message
+    assert "'phi' is in monday.csv, tuesday.csv and not in sunday.npz" in message
+    with pytest.raises(InputError) as caught:  # alone it lacks a column, but differs from none
+        load_trajectories([other], SPEC, **SIGNALS)
+    assert "differ" not in str(caught.value)
+    named = replace(SPEC, inputs_of={"tuesday": ("torque",)})
+    assert len(load_trajectories([monday, other], named, **SIGNALS).whole) == 2
+    more = write_csv(tmp_path / "more.csv", {"x": t, "t": t, "tau": t, "phi": t})  # nobody reads x
+    assert len(load_trajectories([monday, more], SPEC, **SIGNALS).whole) == 2
+
+
+def test_the_main_job_reads_mat_files(tmp_path):
+    from hybrid_mpc.pipeline.context import Context
+    from hybrid_mpc.pipeline.settings import RunSettings
+    from hybrid_mpc.scenario import load_scenario
+
+    t = np.arange(0, 30, 0.01)
+    savemat(tmp_path / "mine.mat", {"time_s": t, "u_nm": 0.1 * np.cos(t), "angle": np.sin(t)})
+    settings = RunSettings(
+        "golf_robot", (tmp_path / "mine.mat",), 0, "quick", outputs=("angle",), inputs=("u_nm",)
+    )
+    data = Context(settings, load_scenario("golf_robot"), tmp_path).dataset
+    assert data.files == ("mine.mat",)
+    np.testing.assert_allclose(data.whole[0].y[:, 0], np.sin(data.whole[0].t), atol=1e-12)

@@ -30,10 +30,10 @@ class Pendulum(Prior):
         return (self.J * xdot[..., 1] + self.mgl * phi.sin() + self.d * v - u[..., 0]) * v
 
 
-def record(seed, seconds=4.0, role="train", extra=lambda phi, v: 0.0, noise=0.0):
+def record(seed, seconds=4.0, role="train", extra=lambda phi, v: 0.0, noise=0.0, size=0.6):
     """A run under random steps of torque; ``extra`` [N m] is a torque that the prior lacks."""
     rng, n = np.random.default_rng(seed), round(seconds / DT)
-    u = np.repeat(rng.uniform(-0.6, 0.6, n // 20 + 1), 20)[:n, None]
+    u = np.repeat(rng.uniform(-size, size, n // 20 + 1), 20)[:n, None]
     x = np.empty((n, 2))
     x[0] = rng.uniform(-1, 1, 2)
 

@@ -6,17 +6,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from simulated_pendulum import DT, Pendulum, record
 
-from hybrid_mpc.identification.dataset import cut_windows, scaling_of
+from hybrid_mpc.identification.combination import VectorPerformanceIndex
+from hybrid_mpc.identification.dataset import cut_windows, literal_scaling_of, scaling_of
 from hybrid_mpc.identification.networks import StackedGRU
 from hybrid_mpc.identification.objectives import (
     OBJECTIVES,
-    VectorPerformanceIndex,
     energy_objective,
     error_objective,
     free_run,
     teacher_forced,
 )
-from hybrid_mpc.identification.step import HybridStep, n_features
+from hybrid_mpc.identification.step import HybridStep, LiteralStep, n_features
 
 losses = st.lists(st.lists(st.floats(1e-6, 1e6), min_size=2, max_size=2), min_size=1, max_size=8)
 
@@ -91,3 +91,28 @@ def test_a_loss_that_is_no_number_lowers_no_bound():
     index = VectorPerformanceIndex(torch.ones(2, 2).double())
     lowered = index.lower(torch.tensor([[math.nan, 0.5], [0.5, 0.5]]).double())
     assert lowered.bounds.tolist() == [[1.0, 1.0], [0.5, 0.5]]
+
+
+def test_predictions_stay_on_their_device():
+    """``meta`` computes nothing, but refuses a tensor made elsewhere."""
+    windows = cut_windows([record(0)], warm=5, horizon=3, stride=7)
+    there, step = windows.to(torch.device("meta")), hybrid(windows).to("meta")
+    for predict in (teacher_forced, free_run):
+        for objective in OBJECTIVES.values():
+            assert objective(step, predict(step, there)).device.type == "meta"
+
+
+def test_the_literal_form_is_judged_by_the_recorded_derivative():
+    run = record(0)
+    windows = cut_windows([run], warm=5, horizon=3, stride=7)
+    prior = Pendulum()
+    scaling = literal_scaling_of(prior, windows)
+    stack = StackedGRU(2, n_features(prior, True, literal=True), 4, 2, seed=0)
+    step = LiteralStep(prior, stack, scaling, DT)
+    with torch.no_grad():
+        forced, free = teacher_forced(step, windows), free_run(step, windows)
+    assert forced.xdot[0, 0, 1].tolist() == run.xdot[7 + 5].tolist()
+    torch.testing.assert_close(free.xdot, forced.xdot, rtol=0, atol=0)
+    # the first period starts at the measurement in both; rounding of states of order one over dt = 0.02
+    torch.testing.assert_close(free.xdot_hat[0], forced.xdot_hat[0], rtol=0, atol=1e-12)
+    torch.testing.assert_close(free.x_hat[1], free.x_hat[0] + DT * forced.xdot_hat[0], rtol=0, atol=1e-14)

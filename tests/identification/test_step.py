@@ -8,7 +8,15 @@ from simulated_pendulum import DT, Pendulum, record
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identification.networks import StackedGRU
-from hybrid_mpc.identification.step import HybridStep, PriorStep, Scaling, n_features, required_substeps, rk4
+from hybrid_mpc.identification.step import (
+    HybridStep,
+    LiteralStep,
+    PriorStep,
+    Scaling,
+    n_features,
+    required_substeps,
+    rk4,
+)
 from hybrid_mpc.scenario import load_scenario, registered_scenarios
 
 UNIT = Scaling(x=(1.0, 1.0), u=(1.0,), acceleration=(1.0,), correction=(1.0,))
@@ -63,7 +71,7 @@ def test_a_correction_acts_as_acceleration_and_kinematics_stay_exact():
     prior = Pendulum()
     step = HybridStep(prior, StackedGRU(1, 5, 4, 1, seed=0), UNIT, DT)
     x, u = torch.tensor([0.5, -1.0]).double(), torch.tensor([0.2]).double()
-    xdot = step._xdot(x, u, torch.tensor([3.0]).double())
+    xdot = step.derivative(x, u, torch.tensor([3.0]).double())
     torch.testing.assert_close(xdot, prior(x, u) + torch.tensor([0.0, 3.0]).double(), rtol=0, atol=1e-14)
 
 
@@ -72,3 +80,58 @@ def test_a_prior_too_stiff_for_its_period_is_refused():
     assert required_substeps(stiff, 0.1) >= 3  # the rate d / J = 25 1/s asks for ceil(2.5) or more
     with pytest.raises(InputError, match="smaller dt"):
         required_substeps(stiff, 10.0)
+
+
+class Copier(torch.nn.Module):
+    """A network that hands on some of its features."""
+
+    def __init__(self, keep):
+        super().__init__()
+        self.keep = keep
+
+    def forward(self, s, h):
+        return s[..., self.keep], h
+
+
+LITERAL = Scaling(x=(2.0, 3.0), u=(0.5,), acceleration=(4.0, 5.0), correction=(4.0, 5.0))
+X, U = torch.tensor([0.5, -1.0]).double(), torch.tensor([0.25]).double()
+H = torch.zeros(0).double()
+
+
+def test_the_literal_step_is_explicit_euler_of_what_the_network_says():
+    prior = Pendulum()
+    step = LiteralStep(prior, Copier(slice(3, 5)), LITERAL, DT)  # the prior's xdot, which is a feature
+    torch.testing.assert_close(step.xdot(X, H, U), prior(X, U), rtol=1e-15, atol=0)
+    torch.testing.assert_close(step(X, H, U)[0], X + DT * prior(X, U), rtol=1e-15, atol=0)
+    free = LiteralStep(
+        prior, Copier(slice(1, 3)), LITERAL, DT, use_prior=False
+    )  # [v, u]: no exact kinematics
+    torch.testing.assert_close(
+        free.xdot(X, H, U), torch.tensor([-4.0 / 3.0, 2.5], dtype=torch.float64), rtol=1e-15, atol=0
+    )
+
+
+@pytest.mark.parametrize("use_prior", [False, True])
+def test_features_of_both_forms_are_as_many_as_they_say(use_prior):
+    prior = Pendulum()
+    hybrid = HybridStep(prior, Copier(slice(0, 1)), UNIT, DT, use_prior=use_prior)
+    literal = LiteralStep(prior, Copier(slice(0, 2)), LITERAL, DT, use_prior=use_prior)
+    assert hybrid.features(X, U).shape == (n_features(prior, use_prior),)
+    assert literal.features(X, U).shape == (n_features(prior, use_prior, literal=True),)
+
+
+def test_literal_euler_feeds_energy_into_a_pendulum_and_the_hybrid_step_does_not():
+    """The reason for the hybrid step: the same network, the paper's integrator and ours."""
+    prior = Pendulum({"J": 0.1, "mgl": 1.2, "d": 0.0})
+    literal = LiteralStep(prior, Copier(slice(3, 5)), LITERAL, DT)
+    exact = PriorStep(prior, DT)
+    energies = []
+    for step in (literal, exact):
+        x = torch.tensor([0.5, 0.0]).double()
+        for _ in range(250):
+            x, _ = step(x, H, torch.zeros(1).double())
+        energies.append(float(0.05 * x[1] ** 2 + 1.2 * (1.0 - x[0].cos())))
+    start = 1.2 * (1.0 - math.cos(0.5))
+    assert energies[1] == pytest.approx(start, rel=1e-4)  # order 4 at 0.07 rad a step
+    # each step of Euler multiplies the energy by 1 + (w dt)^2 = 1.0048: 3.3 in 250, less at large angles
+    assert 2.0 < energies[0] / start < 4.0

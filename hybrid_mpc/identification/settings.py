@@ -1,0 +1,105 @@
+"""Everything that decides a training."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.identification.cells import Cell
+from hybrid_mpc.identification.combination import CombinationName
+from hybrid_mpc.identification.objectives import OBJECTIVES
+
+Kind = Literal["rnn", "pgrnn", "mopgrnn"]
+Form = Literal["hybrid", "literal"]
+Reading = Literal["stage", "one_step", "free_run"]
+KINDS: tuple[Kind, ...] = ("rnn", "pgrnn", "mopgrnn")
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """Everything that decides a training; two trainings with equal settings and data are equal.
+
+    Args:
+        kind: ``"rnn"`` (no prior), ``"pgrnn"`` (prior, error objective), ``"mopgrnn"`` (error and energy).
+        hidden: Hidden units z.
+        networks: Networks trained at once; they differ in their initial weights.
+        teacher_steps: Optimiser steps with teacher forcing.
+        free_run_steps: Optimiser steps on free runs.
+        seed: Seed of weights and batches.
+        warm: Warm-up samples of a window.
+        horizon: Most scored periods of a free-run window; fewer where a trajectory is short
+            (:func:`~hybrid_mpc.identification.dataset.fitting_horizon`).
+        batch: Windows a step.
+        decay: Weight decay of AdamW times the number of training samples: the weights' prior counts the
+            less, the more data there are. Small recordings need it, large ones do not notice.
+        learning_rates: Start and end of the cosine schedule, teacher forcing then free runs.
+        every: Steps between evaluations (bounds, validation, checkpoint).
+        cell: ``"gru"`` (torch's form), ``"gru_paper"`` (one bias a gate), ``"lstm"``, ``"feed_forward"``.
+        form: ``"hybrid"`` (exact kinematics, correction of the prior's acceleration, Runge-Kutta) or
+            ``"literal"`` (the paper's: the network gives xdot, explicit Euler).
+        objectives: Names in ``OBJECTIVES``. A mopgrnn is trained on all of them, the other kinds on the
+            first; the curve has them all.
+        combination: How a mopgrnn's objectives become one number: the vector performance index with a
+            ``"smooth_maximum"`` or a ``"hard_maximum"``, or as ablations ``"weighted_sum"`` and
+            ``"augmented_lagrangian"`` (:mod:`~hybrid_mpc.identification.combination`).
+        weights: Weights of the weighted sum, one for each objective; default: equal.
+        energy: Where the energy objective is taken: ``"stage"`` (what the stage predicts), ``"one_step"``
+            (always at the measured state), ``"free_run"`` (always at the model's own state). The last two
+            cost a second prediction in the other stage
+            (:func:`~hybrid_mpc.identification.objectives.energy_objective`).
+        fused: Sequences of the GRUs with few operations a step: faster, but not the same bits.
+
+    Raises:
+        InputError: If a name is not known, there is no objective, or weights do not fit the objectives.
+
+    Example:
+        >>> TrainingSettings("mopgrnn", 16, 4, 100, 100, seed=0, warm=10).objectives
+        ('error', 'energy')
+    """
+
+    kind: Kind
+    hidden: int
+    networks: int
+    teacher_steps: int
+    free_run_steps: int
+    seed: int
+    warm: int
+    horizon: int = 50
+    batch: int = 32
+    decay: float = 300.0
+    learning_rates: tuple[float, float, float, float] = (1e-2, 1e-3, 5e-3, 1e-4)
+    every: int = 25
+    cell: Cell = "gru"
+    form: Form = "hybrid"
+    objectives: tuple[str, ...] = ("error", "energy")
+    combination: CombinationName = "smooth_maximum"
+    weights: tuple[float, ...] = ()
+    energy: Reading = "stage"
+    fused: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("objectives", "weights"):  # lists, where they come from a file
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        names = {"kind": Kind, "cell": Cell, "form": Form, "combination": CombinationName, "energy": Reading}
+        for name, choices in names.items():
+            _check_choice(name, getattr(self, name), get_args(choices))
+        for objective in self.objectives:
+            _check_choice("objectives", objective, tuple(OBJECTIVES))
+        if not self.objectives:
+            raise InputError("objectives is empty; a training needs at least one, e.g. ('error',)")
+        if self.weights and len(self.weights) != len(self.objectives):
+            raise InputError(
+                f"weights has {len(self.weights)} numbers for the objectives {', '.join(self.objectives)}; "
+                "give one for each, or none for equal ones"
+            )
+
+    @property
+    def use_prior(self) -> bool:
+        """Whether the network sees the prior."""
+        return self.kind != "rnn"
+
+
+def _check_choice(name: str, value: Any, choices: tuple[Any, ...]) -> None:
+    if value not in choices:
+        raise InputError(f"{name} has no {value!r}; there are: {', '.join(map(str, choices))}")

@@ -1,0 +1,189 @@
+"""Recordings of the paper's pendulum: CSV files for the main job, exact runs for its experiment. No torch."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.data.excitation import sinusoid
+from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.scenario import Role, Window
+from scenarios.pendulum.plant import DampedPendulum
+
+Array = NDArray[np.float64]
+
+DURATION = 5.0  # [s], the paper's
+RECORD = 1e-3  # period of the recording [s], the paper's
+HELD = 10  # samples for which the torque is held: the model's period of 10 ms
+AMPLITUDE = (4.0, 20.0)  # [N m]; gravity asks for at most 22.1
+FREQUENCY = (0.2, 2.0)  # [Hz]; the pendulum's own is 2.3
+ANGLE, SPEED = 1.5, 5.0  # largest of x0 [rad], [rad/s]
+SIZES: Mapping[str, Mapping[Role, int]] = {
+    "quick": {"train": 6, "valid": 3, "test": 4},
+    "full": {"train": 15, "valid": 5, "test": 10},
+}
+ROLES: tuple[Role, ...] = ("train", "valid", "test")
+
+
+def stems(budget: str) -> list[str]:
+    """Names of the recordings of a budget, e.g. ``train_01``.
+
+    Raises:
+        InputError: If there is no such budget.
+
+    Example:
+        >>> stems("quick")[:2], len(stems("full"))
+        (['train_01', 'train_02'], 30)
+    """
+    if budget not in SIZES:
+        raise InputError(f"pendulum: no budget {budget!r}; it has: {', '.join(SIZES)}")
+    return [f"{role}_{k + 1:02d}" for role, n in SIZES[budget].items() for k in range(n)]
+
+
+def windows() -> dict[str, tuple[Window, ...]]:
+    """Role of every recording by its stem: all of it is training, validation or test.
+
+    Example:
+        >>> windows()["test_01"]
+        (Window(start=0.0, end=5.0, role='test'),)
+    """
+    return {s: (Window(0.0, DURATION, role),) for role in ROLES for s in stems("full") if s.startswith(role)}
+
+
+def simulate(plant: DampedPendulum, x0: Array, u: Array) -> Array:
+    """States ``(n, 2)`` every millisecond from ``x0`` ``(2,)`` under torques ``u`` ``(n,)`` [N m].
+
+    Args:
+        plant: The pendulum.
+        x0: Initial angle and speed.
+        u: Torque from each sample to the next.
+
+    Example:
+        >>> simulate(DampedPendulum(), np.array([0.3, 0.0]), np.zeros(11))[-1].round(4).tolist()
+        [0.297, -0.5798]
+    """
+    state, states = plant.reset(x0, 0), []
+    for torque in u:
+        states.append(plant.truth(state))
+        state = plant.step(state, np.array([torque]), RECORD)
+    return np.array(states)
+
+
+def run(plant: DampedPendulum, role: Role, number: int, seed: int) -> tuple[Array, Array, Array]:
+    """One run of 5 s: a sinusoidal torque of random size, frequency and phase from a random x0.
+
+    The torque is held for a model period of 10 ms, as a controller would: a discrete-time model can then be exact.
+
+    Args:
+        plant: The pendulum.
+        role: Of the run; each role has its own.
+        number: Counts from 1. The runs of fewer are the first of more.
+        seed: Same seed, same run.
+
+    Returns:
+        Times ``(n,)`` [s], torque ``(n,)`` [N m], true states ``(n, 2)``, every millisecond.
+
+    Example:
+        >>> t, u, x = run(DampedPendulum(), "train", 1, 0)
+        >>> t.shape, u.shape, x.shape
+        ((5001,), (5001,), (5001, 2))
+    """
+    rng = np.random.default_rng((seed, ROLES.index(role), number))
+    t = RECORD * np.arange(round(DURATION / RECORD) + 1, dtype=np.float64)
+    amplitude, frequency = rng.uniform(*AMPLITUDE), rng.uniform(*FREQUENCY)
+    grid = t[::HELD] + HELD * RECORD / 2  # the sinusoid in the middle of each period
+    u = np.repeat(sinusoid(grid, amplitude, frequency, phase=rng.uniform(0, 2 * np.pi)), HELD)[: len(t)]
+    x0 = np.array([rng.uniform(-ANGLE, ANGLE), rng.uniform(-SPEED, SPEED)])
+    return t, u, simulate(plant, x0, u)
+
+
+def exact_runs(role: Role, count: int, *, seed: int = 0, dt: float = HELD * RECORD) -> list[Trajectory]:
+    """The paper's data: runs with the full state measured and without noise, for its experiment.
+
+    Args:
+        role: ``"train"``, ``"valid"`` or ``"test"``; the first 3 of 15 training runs are those of 3.
+        count: Number of runs.
+        seed: Same seed, same runs.
+        dt: Period [s], 1, 2, 5 or 10 ms. Default 10 ms; the paper has 1 ms.
+
+    Returns:
+        Trajectories whose ``x`` is the state and ``xdot`` its derivative at the samples, both exact.
+
+    Raises:
+        InputError: If ``dt`` is none of these periods, or the role is another.
+
+    Example:
+        >>> [(r.name, r.x.shape) for r in exact_runs("train", 2)]
+        [('train_01', (501, 2)), ('train_02', (501, 2))]
+    """
+    every = round(dt / RECORD)
+    if abs(every * RECORD - dt) > 1e-9 or every < 1 or HELD % every:
+        raise InputError(f"pendulum: dt must be 0.001, 0.002, 0.005 or 0.01 s, got {dt}")
+    if role not in ROLES:
+        raise InputError(f"pendulum: no role {role!r}; there are: {', '.join(ROLES)}")
+    plant, out = DampedPendulum(noise=0.0), []
+    for number in range(1, count + 1):
+        t, u, x = (values[::every] for values in run(plant, role, number, seed))
+        xdot = np.column_stack([x[:, 1], plant.acceleration(x, u)])
+        out.append(Trajectory(f"{role}_{number:02d}", role, dt, t, u[:, None], x[:, :1], x, xdot))
+    return out
+
+
+def recordings(seed: int, budget: str) -> Iterator[tuple[str, Array]]:
+    """Stem and table ``(n, 4)`` of each recording: time [s], angle [rad], speed [rad/s], torque [N m].
+
+    The angle has the plant's noise; the speed is true: the main job reads the angle alone.
+
+    Raises:
+        InputError: If there is no such budget.
+
+    Example:
+        >>> stem, table = next(recordings(0, "quick"))
+        >>> stem, table.shape
+        ('train_01', (5001, 4))
+    """
+    plant = DampedPendulum()
+    for stem in stems(budget):
+        name, number = stem.split("_")
+        role = ROLES[[str(r) for r in ROLES].index(name)]
+        t, u, x = run(plant, role, int(number), seed)
+        noise = np.random.default_rng((seed, ROLES.index(role), int(number), 1)).standard_normal(len(t))
+        yield stem, np.column_stack([t, x[:, 0] + plant.noise * noise, x[:, 1], u])
+
+
+def make_data(folder: Path, seed: int, budget: str) -> list[Path]:
+    """Write the recordings of a budget as CSV files with columns time_s, phi_rad, phi_dot_rad_s, u_nm.
+
+    Args:
+        folder: Where to; made if missing. Files of the same name are replaced whole.
+        seed: Same seed, same files.
+        budget: ``"quick"`` (6 training, 3 validation, 4 test runs of 5 s) or ``"full"`` (15, 5, 10).
+
+    Returns:
+        The files.
+
+    Raises:
+        InputError: If there is no such budget.
+
+    Example:
+        >>> make_data(Path("out"), 0, "none")
+        Traceback (most recent call last):
+        ...
+        hybrid_mpc.errors.InputError: pendulum: no budget 'none'; it has: quick, full
+    """
+    stems(budget)
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for stem, table in recordings(seed, budget):
+        path = folder / f"{stem}.csv"
+        part = path.with_name(path.name + ".part")
+        header = "time_s,phi_rad,phi_dot_rad_s,u_nm"
+        np.savetxt(part, table, "%.6f", delimiter=",", header=header, comments="")
+        os.replace(part, path)
+        paths.append(path)
+    return paths

@@ -1,0 +1,53 @@
+"""The oracle: the pendulum's own equation as a model of the controller's form. No torch in here."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from hybrid_mpc.model import HybridModel
+from scenarios.pendulum.nominal import INPUTS, OUTPUTS, PUBLISHED, STATES
+from scenarios.pendulum.plant import PendulumParameters
+
+
+def oracle(dt: float, parameters: PendulumParameters | None = None, sub_steps: int = 10) -> HybridModel:
+    """The plant as a :class:`HybridModel` with an empty hidden state.
+
+    Args:
+        dt: Model period [s].
+        parameters: The plant's parameters. Default: the paper's.
+        sub_steps: RK4 steps per period. Default 10 (1 ms at 10 ms).
+
+    Returns:
+        The model; its energy balance is the prior's, with the published parameters.
+
+    Example:
+        >>> oracle(0.01).n_h
+        0
+    """
+    p = parameters or PendulumParameters()
+    x, h, u, w = ca.SX.sym("x", 2), ca.SX.sym("h", 0), ca.SX.sym("u"), ca.SX.sym("xdot", 2)
+
+    def rates(z: ca.SX) -> ca.SX:
+        return ca.vertcat(z[1], (u - p.gravity * ca.sin(z[0]) - p.d * z[1]) / p.inertia)
+
+    z, s = x, dt / sub_steps
+    for _ in range(sub_steps):
+        k1 = rates(z)
+        k2 = rates(z + s / 2 * k1)
+        k3 = rates(z + s / 2 * k2)
+        k4 = rates(z + s * k3)
+        z = z + s / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    published = {spec.name: spec.value for spec in PUBLISHED}
+    m, length, d, g = (published[name] for name in ("m", "l", "d", "g"))
+    torque = m * length**2 * w[1] + m * g * length * ca.sin(x[0]) + d * x[1] - u
+    return HybridModel(
+        "oracle",
+        dt,
+        STATES,
+        INPUTS,
+        OUTPUTS,
+        step=ca.Function("step", [x, h, u], [z, h]),
+        xdot=ca.Function("xdot", [x, h, u], [rates(x)]),
+        output=ca.Function("output", [x, u], [x[0]]),
+        energy_balance=ca.Function("energy_balance", [x, w, u], [x[1] * torque]),
+    )

@@ -1,0 +1,87 @@
+"""Closed-loop tasks of the paper's pendulum. No torch in here."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.closed_loop.faults import Fault
+from hybrid_mpc.scenario import ControlSpec, Task
+
+Array = NDArray[np.float64]
+
+# Bryson's rule: one over the square of the largest deviation that is tolerable: 10 mrad, 0.5 rad/s, 5 N m of change per
+# period. Torque that a reference needs is no deviation; its weight (100 N m) only keeps the problem regular. Half a
+# second ahead is five of the pendulum's time constants (2 m l^2 / d = 96 ms). 20 N m is what the data reach.
+CONTROL = ControlSpec(
+    horizon=50,
+    q=(1e4, 4.0),
+    r=(1e-4,),
+    r_delta=(0.04,),
+    u_min=(-20.0,),
+    u_max=(20.0,),
+    estimator_sigma=(1e-4,),
+)
+
+STEPS = (0.0, 0.5, -0.4, 0.6, 0.0)
+STEP_TIME = 0.8
+MOVE_TIME = 0.4
+LOAD = -3.0
+"""Unknown load [N m]: the torque that holds the pendulum at 0.14 rad."""
+
+
+def sine_reference(t: Array) -> Array:
+    """``(n, 2)``: 0.4 rad at 0.5 Hz and 0.15 rad at 1.2 Hz, faded in over 0.5 s, and its exact derivative.
+
+    Example:
+        >>> sine_reference(np.zeros(1)).tolist()
+        [[0.0, 0.0]]
+    """
+    return _waves(t, ((0.4, 0.5), (0.15, 1.2)))
+
+
+def swing_reference(t: Array) -> Array:
+    """``(n, 2)``: 0.3 rad at 0.5 Hz, faded in over 0.5 s: what the load is rejected on.
+
+    Example:
+        >>> swing_reference(np.zeros(1)).tolist()
+        [[0.0, 0.0]]
+    """
+    return _waves(t, ((0.3, 0.5),))
+
+
+def step_reference(t: Array) -> Array:
+    """``(n, 2)``: from level to level [rad], each for ``STEP_TIME``, along a quintic of ``MOVE_TIME``.
+
+    Example:
+        >>> step_reference(np.array([0.0, 0.8, 1.0, 1.2])).round(2).tolist()
+        [[0.0, 0.0], [0.0, 0.0], [0.25, 2.34], [0.5, 0.0]]
+    """
+    index = np.clip(np.floor(t / STEP_TIME + 1e-9).astype(int), 0, len(STEPS) - 1)
+    before = np.array(STEPS)[np.maximum(index - 1, 0)]
+    rise = np.array(STEPS)[index] - before
+    share, slope = _quintic((t - index * STEP_TIME) / MOVE_TIME)
+    return np.column_stack([before + rise * share, rise * slope / MOVE_TIME])
+
+
+def _waves(t: Array, waves: tuple[tuple[float, float], ...]) -> Array:
+    """Sum of sinusoids of amplitudes [rad] and frequencies [Hz], faded in over 0.5 s, and its derivative."""
+    fade, slope = _quintic(t / 0.5)
+    parts = [(a, 2 * np.pi * f) for a, f in waves]
+    wave = sum((a * np.sin(w * t) for a, w in parts), np.zeros_like(t))
+    rate = sum((a * w * np.cos(w * t) for a, w in parts), np.zeros_like(t))
+    return np.column_stack([fade * wave, 2 * slope * wave + fade * rate])
+
+
+def _quintic(s: Array) -> tuple[Array, Array]:
+    """From 0 to 1 while ``s`` does, with slope and curvature zero at both ends; and its slope."""
+    s = np.clip(s, 0.0, 1.0)
+    return s**3 * (10 - 15 * s + 6 * s**2), 30 * s**2 * (1 - s) ** 2
+
+
+TASKS = (
+    Task("track_sine", "Follow two sinusoids of 0.4 and 0.15 rad", 4.0, (0.0, 0.0), sine_reference),
+    Task("track_step", "Follow moves of up to 1 rad in 0.4 s", 4.0, (0.0, 0.0), step_reference),
+    Task("reject_load", "Swing on against an unknown constant load", 4.0, (0.0, 0.0), swing_reference,
+         faults=(Fault(1.5, np.inf, "input_offset", LOAD),)),
+)  # fmt: skip

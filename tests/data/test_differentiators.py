@@ -1,0 +1,183 @@
+import numpy as np
+import pytest
+from scipy.interpolate import make_smoothing_spline
+
+from hybrid_mpc.data import (
+    CausalPolynomial,
+    LocalPolynomial,
+    SmoothingSpline,
+    ZeroPhaseFilter,
+    bandwidth,
+    causal_derivatives,
+    differentiate,
+    gcv_cutoff,
+    local_polynomial,
+    noise_gain,
+)
+from hybrid_mpc.errors import InputError
+
+DT = 0.01
+METHODS = [
+    LocalPolynomial(0.2),
+    SmoothingSpline(6.0),
+    ZeroPhaseFilter(6.0),
+    CausalPolynomial(0.1),
+    CausalPolynomial(0.1, lag=0.0),
+]
+IDS = ["local", "spline", "filter", "causal", "causal_now"]
+
+
+@pytest.fixture(params=METHODS, ids=IDS)
+def method(request):
+    return request.param
+
+
+def parts(d):
+    return d.value, d.first, d.second
+
+
+@pytest.mark.parametrize("derivative", [0, 1, 2])
+def test_sines_come_out_as_the_response_says(method, derivative):
+    """Gain and phase, also where they are far from 1: below, at and above the bandwidth."""
+    t = np.arange(1200) * DT
+    for f in (0.7, 3.0, 7.0):
+        s = 2 * np.pi * f
+        got = parts(differentiate(np.exp(1j * s * t).real, DT, method))[derivative]
+        response = method.response(np.array([f]), DT, derivative)[0]
+        then = t - method.delay(DT)
+        expected = (response * (1j * s) ** derivative * np.exp(1j * s * then)).real
+        # 300 samples are more than any reach: kernels are below 1e-12 there, times their gain of about s^2
+        inner = slice(300, -300)
+        np.testing.assert_allclose(got[inner], expected[inner], atol=1e-8 * max(1.0, s**derivative))
+
+
+@pytest.mark.parametrize("method", [SmoothingSpline, ZeroPhaseFilter])
+@pytest.mark.parametrize(("cutoff", "dt"), [(6.0, 0.01), (0.5, 0.01), (3.0, 0.001), (40.0, 0.01)])
+def test_the_cutoff_is_where_the_value_has_lost_3_db(method, cutoff, dt):
+    gain = method(cutoff).response(np.array([cutoff]), dt)[0]
+    assert gain == pytest.approx(np.sqrt(0.5), abs=1e-6)  # equations of the slow splines lose digits
+    step = max(1 / (2**15 * dt), 1e-3 * cutoff)  # of the transform in which it is looked for
+    assert method(cutoff).bandwidth(dt) == pytest.approx(cutoff, abs=step)
+
+
+def test_spline_is_the_gain_of_theory():
+    m, f = SmoothingSpline(6.0), np.linspace(0.5, 45.0, 30)
+    w = 2 * np.pi * f * DT
+    b, d, w_c = (4 + 2 * np.cos(w)) / 6, 2 - 2 * np.cos(w), 2 * np.pi * 6.0 * DT
+    lam = (np.sqrt(2) - 1) * (4 + 2 * np.cos(w_c)) / 6 / (2 - 2 * np.cos(w_c)) ** 2
+    for derivative, exact in enumerate((b, np.sin(w) / w, d / w**2)):
+        theory = exact / (b + lam * d**2)
+        np.testing.assert_allclose(m.response(f, DT, derivative), theory, atol=1e-8)
+
+
+def test_local_polynomial_says_what_its_functions_say():
+    m, y = LocalPolynomial(0.2), np.random.default_rng(0).standard_normal(100)
+    for one, two in zip(parts(differentiate(y, DT, m)), parts(local_polynomial(y, DT, 0.2)), strict=True):
+        np.testing.assert_array_equal(one, two)
+    assert m.bandwidth(DT) == pytest.approx(bandwidth(DT, 0.2), abs=0.01)  # steps of both searches
+    for i in range(3):
+        assert m.noise_gain(DT, i) == pytest.approx(noise_gain(DT, 0.2, derivative=i), rel=1e-9)
+
+
+def test_causal_polynomial_is_the_online_one_and_knows_no_future():
+    y = np.random.default_rng(1).standard_normal((60, 2))
+    m = CausalPolynomial(0.1)
+    d = differentiate(y, DT, m)
+    assert m.delay(DT) == pytest.approx(0.05)
+    for k in (10, 37):
+        online = causal_derivatives(y[k - 10 : k + 1], DT)
+        for one, two in zip(parts(d), parts(online), strict=True):
+            np.testing.assert_allclose(one[k], two, rtol=1e-9, atol=1e-9)  # the same sums, in another order
+    assert np.isnan(d.first[:10]).all()
+    later = y.copy()
+    later[31:] += 5.0
+    np.testing.assert_array_equal(differentiate(later, DT, m).first[:31], d.first[:31])
+
+
+@pytest.mark.parametrize("derivative", [0, 1, 2])
+def test_noise_comes_through_as_said(method, derivative):
+    noise = np.random.default_rng(2).standard_normal(60_000)
+    got = np.nanstd(parts(differentiate(noise, DT, method))[derivative])
+    # values of neighbours depend on each other over about 20 samples: 60000 / 20 independent ones scatter by
+    # 1 / sqrt(2 * 3000) = 1.3 %; 4 sigma
+    assert got == pytest.approx(method.noise_gain(DT, derivative), rel=0.052)
+
+
+def test_columns_are_independent(method):
+    y = np.random.default_rng(3).standard_normal((200, 2))
+    both = parts(differentiate(y, DT, method))
+    for j in range(2):
+        for one, two in zip(both, parts(differentiate(y[:, j], DT, method)), strict=True):
+            assert one.shape == (200, 2)
+            np.testing.assert_allclose(one[:, j], two, rtol=1e-9, atol=1e-9)
+
+
+def test_straight_lines_pass_up_to_the_ends(method):
+    """No method bends a straight line, not even where it has too few neighbours."""
+    t = np.arange(400) * DT
+    d = differentiate(3.0 - 2.0 * t, DT, method)
+    known = np.isfinite(d.value)
+    assert known.sum() >= 390
+    # rounding 1e-15 times the noise gain of the second derivative, up to 1e4; recursions add up a few of them
+    np.testing.assert_allclose(d.value[known], (3.0 - 2.0 * (t - method.delay(DT)))[known], atol=1e-9)
+    np.testing.assert_allclose(d.first[known], -2.0, atol=1e-8)
+    np.testing.assert_allclose(d.second[known], 0.0, atol=1e-6)
+
+
+def test_gcv_is_scipys_and_finds_a_useful_bandwidth():
+    rng = np.random.default_rng(4)
+    t = np.arange(1500) * DT
+    true = np.sin(2 * np.pi * 0.7 * t)
+    y = true + 0.05 * rng.standard_normal(len(t))
+    value = SmoothingSpline(gcv_cutoff(y, DT)).derivatives(y, DT).value
+    scipys = make_smoothing_spline(np.arange(1500.0), y)(np.arange(1500.0))
+    # the trace over frequencies is right up to terms of the ends: the two curves differ by far less than the noise
+    assert np.abs(value - scipys).max() < 0.01 * 0.05
+    assert np.std(value - true) < 0.3 * 0.05
+
+
+def test_sweep_with_an_encoder_is_differentiated_within_noise_and_bias():
+    """The error is what the steps of the encoder explain, where the band holds the signal."""
+    t = np.arange(0, 20, DT)
+    phase = 2 * np.pi * (0.1 * t + (1.5 - 0.1) / 40 * t**2)
+    rate, step = 2 * np.pi * (0.1 + (1.5 - 0.1) / 20 * t), 2 * np.pi / 2000
+    y = np.round(np.sin(phase) / step) * step
+    acceleration = 2 * np.pi * 1.4 / 20 * np.cos(phase) - rate**2 * np.sin(phase)
+    for m in METHODS[:3]:
+        d = differentiate(y, DT, m)
+        inner = slice(100, -100)
+        first = np.std((d.first - rate * np.cos(phase))[inner])
+        second = np.std((d.second - acceleration)[inner])
+        # quantisation is white noise of step / sqrt(12) while the signal moves by steps: it must explain the errors
+        # up to a factor; the bias at 1.5 Hz of a -3 dB point at 6 to 8 Hz is below 1 % of 9.4 and 89
+        white = step / np.sqrt(12)
+        assert first < 2 * white * m.noise_gain(DT, 1) + 0.01 * 9.4
+        assert second < 2 * white * m.noise_gain(DT, 2) + 0.01 * 89
+        assert second > 0.3 * white * m.noise_gain(DT, 2)
+
+
+def test_bad_input_is_refused(method):
+    for y, dt, match in (
+        (np.zeros((4, 4, 4)), DT, "shape"),
+        (np.zeros(0), DT, "shape"),
+        (np.zeros(100), 0.0, "period must be positive"),
+        (np.r_[np.zeros(50), np.nan, np.zeros(50)], DT, "sample 50 is not finite"),
+        (np.zeros(4), DT, "samples, the signal has 4"),
+    ):
+        with pytest.raises(InputError, match=match):
+            differentiate(y, dt, method)
+
+
+def test_bad_settings_are_refused():
+    y = np.zeros(100_000)
+    for m, dt, match in (
+        (SmoothingSpline(60.0), DT, "below 50 Hz"),
+        (ZeroPhaseFilter(-1.0), DT, "positive"),
+        (SmoothingSpline(0.01), 1e-3, "too low to be computed"),
+        (CausalPolynomial(0.1, lag=0.2), DT, "lag of 0.2 s must be within"),
+        (CausalPolynomial(0.01), DT, "Raise smoothing"),
+    ):
+        with pytest.raises(InputError, match=match):
+            differentiate(y, dt, m)
+    with pytest.raises(InputError, match="16 samples"):
+        gcv_cutoff(np.zeros(10), DT)
