@@ -99,6 +99,11 @@ class CondensedController:
         return self._stages
 
     @property
+    def condenser(self) -> Condenser:
+        """The condensing."""
+        return self._condenser
+
+    @property
     def qp(self) -> InputQP:
         """The QP over the inputs."""
         return self._qp

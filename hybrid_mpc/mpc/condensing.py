@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from scipy.linalg.blas import dgemv
 
 Array = NDArray[np.float64]
+GROUP = 10
+"""Periods whose second derivatives are condensed by one product."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,11 @@ class Condenser:
             np.dot(before, a, out=after)
         return self._states.reshape(self._shape)
 
+    @property
+    def by_inputs(self) -> Array:
+        """Derivatives ``(N + 1, N n_u, n_z)`` of ``z_0 .. z_N`` by the inputs; the next call overwrites them."""
+        return self._by_inputs
+
 
 def propagate(a_t: Array, drift: Array, dz0: Array) -> Array:
     """``dz_{k+1} = A_k dz_k + drift_k`` from ``dz0``: ``(N + 1, n_z)``.
@@ -141,3 +148,32 @@ def condense_hessians(stages: Array, from_u: Array, n_x: int) -> Array:
     blocks = total.reshape(n, n_u, n, n_u)
     blocks[np.arange(n), :, np.arange(n)] += stages[:, n_x:, n_x:]
     return np.asarray(total)
+
+
+def condense_all(stages: Array, by_inputs: Array, n_x: int, n_u: int) -> Array:
+    """Second derivatives by the stages' ``(x, u, h)`` ``(N, n, n)`` as those by the inputs ``(N n_u, N n_u)``.
+
+    Args:
+        stages: Second derivatives.
+        by_inputs: Derivatives ``(N + 1, N n_u, n_z)`` of states and hidden states by the inputs.
+        n_x: Number of states.
+        n_u: Number of inputs.
+
+    Example:
+        >>> condense_all(np.full((1, 3, 3), 3.0), np.zeros((2, 1, 2)), 1, 1)
+        array([[3.]])
+    """
+    n, few = len(stages), n_x + n_u
+    z = np.r_[:n_x, few : stages.shape[1]]
+    by_z, mixed = stages[:, z[:, None], z], stages[:, n_x:few][:, :, z]
+    total, one_sided = np.zeros((n * n_u, n * n_u)), np.zeros((n * n_u, n * n_u))
+    for first in range(1, n, GROUP):  # the first state knows no input, later ones only those before them
+        last = min(first + GROUP, n)
+        m = (last - 1) * n_u
+        states = np.ascontiguousarray(by_inputs[first:last, :m].transpose(0, 2, 1))
+        flat = states.reshape(-1, m)
+        total[:m, :m] += flat.T @ (by_z[first:last] @ states).reshape(-1, m)
+        one_sided[first * n_u : last * n_u, :m] = (mixed[first:last] @ states).reshape(-1, m)
+    total += one_sided + one_sided.T
+    total.reshape(n, n_u, n, n_u)[np.arange(n), :, np.arange(n)] += stages[:, n_x:few, n_x:few]
+    return total

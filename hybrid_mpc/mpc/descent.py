@@ -1,103 +1,53 @@
-"""One solve of the SQP: runs of the model, their cost and derivatives, and the steps from one to the next."""
+"""One solve of the SQP: the steps from one run of the model to the next."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.mpc.condensed import CondensedController
-from hybrid_mpc.mpc.condensing import Prepared, adjoint, condense_hessians
-from hybrid_mpc.mpc.curvature import Secants, StageCurvature, convex
-from hybrid_mpc.mpc.problem import Target
+from hybrid_mpc.mpc.condensing import Prepared
+from hybrid_mpc.mpc.curvature import convex
+from hybrid_mpc.mpc.landscape import Case, Landscape, Point, Run
+from hybrid_mpc.mpc.qp import Answer
 from hybrid_mpc.mpc.solution import Status
-from hybrid_mpc.mpc.stages import Derivatives
 
 Array = NDArray[np.float64]
 NAN = float("nan")
 ARMIJO = 1e-4
 KKT = 1e-6
-HALVINGS = 25
+ATTEMPTS = 15
+"""Most QPs of an iteration, each damped more than the one before."""
+MORE = 4.0
+"""Factor of the damping from one attempt to the next; a good step takes as much away."""
+POOR, GOOD = 0.25, 0.5
+"""Shares of the promise: a step that keeps less asks for damping, one that keeps more for less of it."""
+CORRECTIONS = 2
+"""Most corrections of a step by what it was found to bend."""
 SLOW = 0.1
-"""Share of the residual that is left after a step, above which second derivatives are taken anew."""
+"""Share of the residual that the Hessian got wrong, above which second derivatives are taken anew."""
+AGAIN = (1, 4, 16, 64)
+"""Times at which a hidden state's curvature that hardly mattered is looked at again."""
 
 
 @dataclass(frozen=True)
-class Case:
-    """What one solve is given: disturbance, input held before, targets."""
-
-    d: Array
-    u_prev: Array
-    target: Target
-
-
-@dataclass(frozen=True)
-class Point:
-    """A run of the model on inputs.
+class _Step:
+    """What a search has found.
 
     Args:
-        u: Inputs ``(N, n_u)``.
-        z: Run ``(N + 1, n_z)``.
-        cost: Its cost, penalties of soft bounds included.
-        derivatives: Successors, transposed ``A`` and ``B`` of the stages.
-        multipliers: Derivative of the cost by ``z_1 .. z_N``, soft bounds left out ``(N, n_z)``.
-        gradient: Of the cost by the inputs, soft bounds left out ``(N n_u,)``.
-        on_soft: True if a soft bound acts or nearly does.
+        run: The model on the step; None if no step lowers the cost.
+        answer: The QP's.
+        hessian: The damped Hessian that the answer belongs to.
+        promised: What the model without damping promises of the step before its correction.
+        own: That model's curvature along the step, in the damping's metric.
     """
 
-    u: Array
-    z: Array
-    cost: float
-    derivatives: Derivatives
-    multipliers: Array
-    gradient: Array
-    on_soft: bool
-
-
-class Landscape:
-    """Cost and derivatives of a problem along runs of its model. Built once, for any number of cases."""
-
-    def __init__(self, inner: CondensedController) -> None:
-        self.inner, self.problem = inner, inner.problem
-        self.stages = StageCurvature(inner.stages, inner.ocp)
-
-    def at(self, z0: Array, u: Array, case: Case) -> Point:
-        """The run from ``z0`` on ``u`` and what is known along it."""
-        problem, n_x = self.problem, self.inner.ocp.n_x
-        derivatives = self.inner.stages.run(z0, u + case.d)
-        z = np.vstack([z0, derivatives[0]])
-        cost = problem.cost(z, u, case.u_prev, case.target)
-        stages, terminal = problem.state_weights(case.target.weight)
-        error = z[:, :n_x] - case.target.x
-        slopes, direct = 2 * stages * error[:-1], self.inner.input_gradient(u.ravel(), case.u_prev)
-        if self.inner.ocp.economic is not None:
-            economic = problem.economic.derivatives(z[:, :n_x], u)[0]
-            slopes, direct = slopes + economic[:, :n_x], direct + economic[:, n_x:].ravel()
-        multipliers = adjoint(derivatives[1], 2 * terminal @ error[-1], slopes)
-        gradient = (multipliers[:, None, :] @ derivatives[2]).ravel() + direct
-        return Point(u, z, cost, derivatives, multipliers, gradient, self._on_soft_bounds(z, u))
-
-    def curvature(self, at: Point, case: Case, old: Array | None = None, chosen: Sequence[int] = ()) -> Array:
-        """Second derivatives of the stages, weighted; see :meth:`StageCurvature.of`."""
-        _, a_t, b = at.derivatives
-        return self.stages.of(at.z[:-1], at.u + case.d, a_t, b, at.multipliers, old, chosen)
-
-    def condensed(self, at: Point, case: Case) -> Prepared:
-        """The Gauss-Newton model of the cost at a point."""
-        weight = case.target.weight
-        return self.inner.condense(
-            at.u, at.z, case.d, case.u_prev, weight, at.derivatives, perf_counter()
-        )  # fmt: skip
-
-    def _on_soft_bounds(self, z: Array, u: Array) -> bool:
-        soft = self.problem.soft
-        if not len(soft):
-            return False
-        values = soft.values(z[:, : self.inner.ocp.n_x], u)
-        return bool(np.max(np.maximum(values - soft.upper, soft.lower - values) / soft.scale) > -1e-4)
+    run: Run | None
+    answer: Answer
+    hessian: Array
+    promised: float
+    own: float
 
 
 class Descent:
@@ -117,52 +67,114 @@ class Descent:
         self._land, self._case, self._tolerance = landscape, case, tolerance
         self.at, self.curvature = at, curvature
         self.count, self.status, self.kkt, self.ended = 0, Status.STOPPED, NAN, False
-        self._stale, self._fresh, self._plain = curvature is None, False, False
-        # What the first refreshing may keep in part; any further one takes all.
-        self._old = curvature
-        self._secants = Secants()
+        self._stale, self._fresh, self._plain, self._taken = curvature is None, False, False, 0
+        self._soft = np.zeros(at.run.soft[0].size)  # multipliers
+        self._damping = 0.0
 
     def iterate(self) -> None:
-        """One linearisation, one QP, one line search."""
+        """One linearisation, and QPs until the step of one lowers the cost."""
         self.count += 1
-        at, qp, problem = self.at, self._land.inner.qp, self._land.problem
-        prepared = self._land.condensed(at, self._case)
+        prepared = self._land.condensed(self.at, self._case)
         hessian = self._hessian(prepared)
-        value, _, slope = prepared.soft
-        soft = (value, slope) if value.size else None
-        step, status, kkt = qp.solve(hessian, at.gradient, at.u, self._case.u_prev, soft)
-        if not status.ok:
-            self._refused(status)
-            return
-        moved = hessian @ step
-        promised = -float(step @ (at.gradient + 0.5 * moved))
-        if soft is not None:
-            kept = (problem.soft.penalty(problem.soft.excess(v)) for v in (value, value + slope @ step))
-            promised += problem.model.dt * (next(kept) - next(kept))
-        found, share = self._search(step.reshape(at.u.shape), promised)
-        before = max(kkt, self._residual(hessian, moved))
-        flat = promised <= self._enough
-        if found is None:
-            self._lost(flat, before)
-            return
-        smooth = share == 1.0 and not at.on_soft and not found.on_soft
-        if smooth:  # the QP's multipliers hold on: what is left of the stationarity there
-            left = found.gradient - at.gradient - moved
-            after = max(kkt, self._residual(hessian, left))
-            flat = after <= KKT and self._lowers_little(hessian, left)
-            slow = after > SLOW * before
+        found = self._search(prepared, hessian)
+        if not found.answer.status.ok:
+            self._refused(found.answer.status)
+        elif found.run is None:
+            self._lost(found)
         else:
-            after, slow = before, share < 1.0 or not before < SLOW * self.kkt
-        self._secants.see((found.u - at.u).ravel(), found.gradient - at.gradient, self.count, not smooth)
-        self.at, self.kkt, self._stale, self._fresh, self._plain = found, after, slow, False, False
-        self.ended = flat and after <= KKT
-        self.status = Status.SOLVED if self.ended else Status.STOPPED
+            self._go(hessian, found, found.run)
 
-    def _lowers_little(self, hessian: Array, left: Array) -> bool:
-        """True if the convex model at the new point promises next to nothing (weak duality)."""
+    def _go(self, hessian: Array, found: _Step, run: Run) -> None:
+        """Make a step, and judge by the QP's multipliers what is left to do there."""
+        answer, land = found.answer, self._land
+        before = max(answer.kkt, self._residual(hessian, found.hessian @ answer.step))
+        gained = self.at.run.cost - run.cost
+        new = land.at(run, self._case)
+        change = land.lagrangian(new, answer.multipliers)[1]
+        change = change - land.lagrangian(self.at, answer.multipliers)[1]
+        wrong = self._residual(hessian, change - hessian @ answer.step)
+        left = change - found.hessian @ answer.step
+        after = max(answer.kkt, self._residual(hessian, left))
+        self.at, self.kkt, self._soft = new, after, answer.multipliers
+        self._stale, self._fresh, self._plain = wrong > SLOW * before, False, False
+        self.ended = after <= KKT and self._promise(hessian, left) <= self._enough
+        self.status = Status.SOLVED if self.ended else Status.STOPPED
+        if gained < POOR * found.promised:
+            self._damping = max(2 * self._damping, 0.5 * found.own)
+        elif gained > GOOD * found.promised:
+            self._damping = self._damping / MORE if self._damping > 0.1 * found.own else 0.0
+
+    def _search(self, prepared: Prepared, hessian: Array) -> _Step:
+        """The first step, damped more and more, that lowers the cost enough, if there is one."""
+        first = None
+        for _ in range(ATTEMPTS):
+            damped = hessian
+            if self._damping:
+                damped = hessian + np.diag(self._damping * self._land.metric)
+            answer = self._answer(damped, self.at.gradient, prepared.soft[0], prepared.soft[2])
+            step = answer.step
+            own = float(step @ (hessian @ step)) / max(float(step**2 @ self._land.metric), 1e-300)
+            found = _Step(None, answer, damped, self._promised(prepared, hessian, step), own)
+            first = found if first is None else first
+            if not answer.status.ok:
+                return found
+            promised = self._promised(prepared, damped, step)
+            run, answer = self._along(prepared, damped, answer, promised)
+            if run is not None:
+                return _Step(run, answer, damped, found.promised, own)
+            if promised <= self._enough:
+                break
+            self._damping = max(MORE * self._damping, own)
+        assert first is not None
+        return first
+
+    def _along(
+        self, prepared: Prepared, damped: Array, answer: Answer, promised: float
+    ) -> tuple[Run | None, Answer]:
+        """The run on a step if it lowers the cost enough, or on the step corrected by what it was found to bend."""
+        least, before = self.at.run.cost - ARMIJO * promised, np.inf
+        for i in range(1 + CORRECTIONS):
+            run = self._trial(answer.step)
+            if run.cost <= least:
+                return run, answer
+            if i == CORRECTIONS or not run.cost < before:
+                break
+            before, answer = run.cost, self._corrected(prepared, damped, answer, run)
+            if not answer.status.ok:
+                break
+        return None, answer
+
+    def _corrected(self, prepared: Prepared, damped: Array, answer: Answer, run: Run) -> Answer:
+        """The QP once more, with what states and soft bounds were found to be beside the last answer's line."""
+        old, n_x, (value, _, slope) = self.at.run, self._land.inner.ocp.n_x, prepared.soft
+        bend = (run.z[:, :n_x] - old.z[:, :n_x]).ravel() - prepared.from_u @ answer.step
+        if len(slope):
+            value = run.soft[0] - slope @ answer.step
+        return self._answer(damped, self.at.gradient + 2 * bend @ prepared.weighted, value, slope)
+
+    def _answer(self, hessian: Array, gradient: Array, value: Array, slope: Array) -> Answer:
+        soft = (value, slope) if value.size else None
+        return self._land.inner.qp.answer(hessian, gradient, self.at.run.u, self._case.u_prev, soft)
+
+    def _trial(self, step: Array) -> Run:
+        ocp, run = self._land.inner.ocp, self.at.run
+        u = np.clip(run.u + step.reshape(run.u.shape), ocp.u_min, ocp.u_max)
+        return self._land.run(run.z[0], u, self._case)
+
+    def _promised(self, prepared: Prepared, hessian: Array, step: Array) -> float:
+        """By how much the convex model falls along a step."""
+        value, _, slope = prepared.soft
+        lowers = -float(step @ (self.at.gradient + 0.5 * (hessian @ step)))
+        if value.size:
+            lowers += self._land.penalty(value) - self._land.penalty(value + slope @ step)
+        return lowers
+
+    def _promise(self, hessian: Array, left: Array) -> float:
+        """What the convex model at the point promises at most (weak duality), ``left`` of the stationarity."""
         qp = self._land.inner.qp
         left, hessian = qp.by_blocks(left), qp.blocked_hessian(hessian)
-        return 0.5 * float(left @ np.linalg.solve(hessian, left)) <= self._enough
+        promise = 0.5 * float(left @ np.linalg.solve(hessian, left))
+        return promise + self._land.gap(self.at.run.soft[0], self._soft)
 
     def _residual(self, hessian: Array, slope: Array) -> float:
         """A gradient of the cost by the inputs in the QP's scaling."""
@@ -172,55 +184,49 @@ class Descent:
 
     @property
     def _enough(self) -> float:
-        return self._tolerance * max(abs(self.at.cost), 1e-12)
+        return self._tolerance * max(abs(self.at.run.cost), 1e-12)
 
     def _hessian(self, prepared: Prepared) -> Array:
         if self._plain:
             return prepared.hessian
+        multipliers, slope = self._land.lagrangian(self.at, self._soft)
         if self._stale or self.curvature is None:
-            old, chosen, stages = self._old, [], self._land.stages
-            if (
-                old is not None
-            ):  # from another period, or from before a step: mostly a few of them have changed
-                chosen = stages.that_matter(old, prepared.from_u, prepared.hessian)
-            self.curvature = self._land.curvature(self.at, self._case, old, chosen)
-            self._stale, self._fresh, self._old = False, True, None
+            self.curvature = self._taken_anew(prepared, multipliers)
         if not np.all(np.isfinite(self.curvature)):
             return prepared.hessian
-        rest = self._land.stages.condensed(self.curvature, prepared.from_u)
-        if prepared.economic is not None:  # what curves down, which the convex model takes as flat
-            at, economic = self.at, self._land.problem.economic
-            down = economic.derivatives(at.z[:, : self._land.inner.ocp.n_x], at.u)[1] - prepared.economic[1]
-            rest = rest + condense_hessians(down, prepared.from_u, self._land.inner.ocp.n_x)
-        return self._secants.corrected(convex(prepared.hessian, rest))
+        return convex(prepared.hessian, self._land.rest(prepared, self.curvature), self._held(slope))
 
-    def _lost(self, flat: bool, kkt: float) -> None:
-        """No share of the step lowers the cost: where it is flat what is left is rounding, else start anew."""
-        self.kkt = kkt
-        self.ended = (flat and kkt <= KKT) or self._plain
+    def _taken_anew(self, prepared: Prepared, multipliers: Array) -> Array:
+        """Second derivatives here; the hidden state's, which change slowly, from the second time on."""
+        land, old = self._land, self.curvature
+        small = old is not None and old.shape[1] < land.stages.size
+        if old is not None and (self._taken in AGAIN if small else self._taken > 0):
+            old = None
+        curvature = land.curvature(self.at, self._case, multipliers, self._soft, old)
+        if old is None:
+            curvature = land.without_what_is_small(prepared, curvature)
+        self._stale, self._fresh, self._taken = False, True, self._taken + 1
+        return curvature
+
+    def _held(self, slope: Array) -> NDArray[np.bool_] | None:
+        """Inputs that lie on a bound against which the cost pushes them."""
+        ocp, u = self._land.inner.ocp, self.at.run.u
+        if ocp.blocks is not None:
+            return None
+        s, near = slope.reshape(u.shape), 1e-6 * self._land.inner.qp.scale.reshape(u.shape)
+        return (((u <= ocp.u_min + near) & (s > 0)) | ((u >= ocp.u_max - near) & (s < 0))).ravel()
+
+    def _lost(self, found: _Step) -> None:
+        """No step lowers the cost: where it is flat what is left is rounding, else start anew."""
+        self.kkt = max(found.answer.kkt, self._residual(found.hessian, found.hessian @ found.answer.step))
+        flat = found.promised <= self._enough
+        self.ended = (flat and self.kkt <= KKT) or self._plain
         self.status = Status.SOLVED if self.ended and flat else Status.STOPPED
-        self._stale, self._plain, self._secants = not self._fresh, self._fresh, Secants()
+        self._stale, self._plain, self._damping = not self._fresh, self._fresh, 0.0
 
     def _refused(self, status: Status) -> None:
         """The QP's answer is no good: Gauss-Newton's Hessian is better conditioned, then it is over."""
         self.ended = self._plain
-        self._plain, self._secants = True, Secants()
+        self._plain, self._damping = True, 0.0
         if self.ended:
             self.status = status if self.count <= 2 else Status.STOPPED
-
-    def _search(self, step: Array, promised: float) -> tuple[Point | None, float]:
-        """The run on the first halved step that lowers the cost enough, if there is one, and the share."""
-        at, ocp, problem, case = self.at, self._land.inner.ocp, self._land.problem, self._case
-        share = 1.0
-        for _ in range(HALVINGS):
-            trial = np.clip(at.u + share * step, ocp.u_min, ocp.u_max)
-            if share == 1.0:
-                found = self._land.at(at.z[0], trial, case)
-                reached = found.cost
-            else:
-                z = problem.run(at.z[0], trial + case.d)
-                reached = problem.cost(z, trial, case.u_prev, case.target)
-            if reached <= at.cost - ARMIJO * share * promised:
-                return (found if share == 1.0 else self._land.at(at.z[0], trial, case)), share
-            share *= 0.5
-        return None, 0.0

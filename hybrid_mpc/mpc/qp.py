@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -15,6 +15,7 @@ from hybrid_mpc.mpc.soft import SoftRows
 from hybrid_mpc.mpc.solution import Status
 
 Array = NDArray[np.float64]
+Soft = tuple[Array, Array] | None
 
 # Relative to the gradient's size.
 KKT_TOLERANCE = 1e-5
@@ -25,6 +26,23 @@ PRIMAL_TOLERANCE = 1e-9
 SOFT_SIZES = (8, 16, 32, 64, 128, 256)
 # Share of an input's or a soft bound's range; what is left of an input's is clipped away.
 BOUND_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A QP's answer and what it is worth.
+
+    Args:
+        step: Of the inputs ``(N n_u,)``.
+        status: How the solve ended.
+        kkt: Relative KKT residual.
+        multipliers: Of the soft bounds' values ``(M,)``: what they cost per unit; none where none were given.
+    """
+
+    step: Array
+    status: Status
+    kkt: float
+    multipliers: Array
 
 
 @dataclass(frozen=True)
@@ -51,6 +69,12 @@ class _Sides:
         self.scale, self.linear, self.quadratic = (
             v[self.row] for v in (soft.scale, soft.linear, soft.quadratic)
         )
+
+    def multipliers(self, chosen: NDArray[np.int64], of_sides: Array, rows: int) -> Array:
+        """Multipliers ``(rows,)`` of the bounded values from those of ``chosen`` scaled sides."""
+        of_rows = np.zeros(rows)
+        np.add.at(of_rows, self.row[chosen], of_sides * self._sign[chosen] / self.scale[chosen])
+        return of_rows
 
     def of(self, values: Array) -> Array:
         """Scaled violations of values ``(M,)``, or scaled rows of their derivatives ``(M, n)``."""
@@ -120,12 +144,7 @@ class InputQP:
         return hessian if self._ocp.blocks is None else self.by_blocks(self.by_blocks(hessian).T)
 
     def solve(
-        self,
-        hessian: Array,
-        gradient: Array,
-        u: Array,
-        u_prev: Array,
-        soft: tuple[Array, Array] | None = None,
+        self, hessian: Array, gradient: Array, u: Array, u_prev: Array, soft: Soft = None
     ) -> tuple[Array, Status, float]:
         """Step from the plan ``u``, how the solve ended, and the relative KKT residual.
 
@@ -137,17 +156,21 @@ class InputQP:
             soft: Values of the soft bounds ``(M,)`` without a step, and their derivatives by the step
                 ``(M, N n_u)``. Default: none.
         """
+        answer = self.answer(hessian, gradient, u, u_prev, soft)
+        return answer.step, answer.status, answer.kkt
+
+    def answer(self, hessian: Array, gradient: Array, u: Array, u_prev: Array, soft: Soft = None) -> Answer:
+        """As :meth:`solve`, with the multipliers of the soft bounds."""
         if self._ocp.blocks is None:
             return self._solve(hessian, gradient, u, u_prev, soft)
         if soft is not None:
             soft = soft[0], self.by_blocks(soft[1])
         given = self.blocked_hessian(hessian), self.by_blocks(gradient), u[self._starts]
-        step, status, kkt = self._solve(*given, u_prev, soft)
-        return np.repeat(step.reshape(-1, u.shape[1]), self._ocp.blocks, axis=0).ravel(), status, kkt
+        answer = self._solve(*given, u_prev, soft)
+        step = np.repeat(answer.step.reshape(-1, u.shape[1]), self._ocp.blocks, axis=0)
+        return replace(answer, step=step.ravel())
 
-    def _solve(
-        self, hessian: Array, gradient: Array, u: Array, u_prev: Array, soft: tuple[Array, Array] | None
-    ) -> tuple[Array, Status, float]:
+    def _solve(self, hessian: Array, gradient: Array, u: Array, u_prev: Array, soft: Soft) -> Answer:
         ocp, scale = self._ocp, self._scale
         lower, upper = ((bound - u).ravel() / scale for bound in (ocp.u_min, ocp.u_max))
         row_lower, row_upper = self._row_bounds(u, u_prev)
@@ -156,15 +179,14 @@ class InputQP:
         hard = _Scaled(h / size, g / size, self._rows, lower, upper, row_lower, row_upper)
         s, status, kkt = _check(hard, *_solve(self._solver, hard), self._n)
         if soft is None or not status.ok:
-            return s * scale, status, kkt
+            return Answer(s * scale, status, kkt, np.zeros(0 if soft is None else soft[0].size))
         return self._softly(hard, size, s, kkt, *soft)
 
-    def _softly(
-        self, hard: _Scaled, size: float, s: Array, kkt: float, value: Array, slope: Array
-    ) -> tuple[Array, Status, float]:
+    def _softly(self, hard: _Scaled, size: float, s: Array, kkt: float, value: Array, slope: Array) -> Answer:
         """The answer with soft bounds, from the answer ``s`` without."""
-        sides, n = self._sides, self._n
+        sides, n, rows = self._sides, self._n, value.size
         assert sides is not None
+        multipliers = np.zeros(rows)
         value, slope = sides.of(value), sides.of(slope) * self._scale
         wanted = np.zeros(value.size, dtype=bool)
         for room, solver in self._soft_solvers.items():
@@ -178,13 +200,15 @@ class InputQP:
             # The nearest fill the room that is left: they are the likeliest to be violated next.
             nearest = np.argsort(np.where(wanted, -np.inf, -beyond), kind="stable")[:room]
             full = self._with_slacks(hard, size, value, slope, nearest)
-            s, status, kkt = _check(full, *_solve(solver, full), n)
+            found = _solve(solver, full)
+            s, status, kkt = _check(full, *found, n)
+            multipliers = sides.multipliers(nearest, size * found[2][len(hard.a) :], rows)
             others = np.ones(value.size, dtype=bool)
             others[nearest] = False
             if not status.ok or not np.any((value + slope @ s[:n])[others] > 0):
-                return s[:n] * self._scale, status, kkt
+                return Answer(s[:n] * self._scale, status, kkt, multipliers)
             wanted[nearest] = True
-        return s[:n] * self._scale, Status.SOLVED, kkt
+        return Answer(s[:n] * self._scale, Status.SOLVED, kkt, multipliers)
 
     def _with_slacks(
         self, hard: _Scaled, size: float, value: Array, slope: Array, chosen: NDArray[np.int64]

@@ -51,8 +51,8 @@ class Solution:
         timing: Durations [ms] by name (``prepare``, ``feedback``); recorded, never used to decide.
         excess: Largest violation of a soft bound in the plan [its unit].
         iterations: Linearisations (or iterations of the nonlinear solver) of this solve.
-        curvature: Second derivatives of the stages ``(N, n_x + n_u, n_x + n_u)`` that ``sqp`` starts its next
-            solve with; None from other solvers.
+        curvature: Second derivatives of the stages by ``(x, u, h)`` ``(N, n, n)``, or by ``(x, u)`` where the
+            hidden state's hardly matter, that ``sqp`` starts its next solve with; None from other solvers.
     """
 
     u: Array

@@ -1,4 +1,4 @@
-"""Sequential quadratic programming: the condensed iteration repeated to convergence, with a line search."""
+"""Sequential quadratic programming: the condensed iteration repeated to convergence, with damping."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.mpc.condensed import CondensedController
-from hybrid_mpc.mpc.descent import Case, Descent, Landscape
+from hybrid_mpc.mpc.descent import Descent
+from hybrid_mpc.mpc.landscape import Case, Landscape
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.problem import Problem
 from hybrid_mpc.mpc.solution import Solution, Status
@@ -21,21 +22,24 @@ Array = NDArray[np.float64]
 
 
 class SQPController:
-    """Nonlinear MPC by SQP to convergence with second derivatives, globalised by a line search.
+    """Nonlinear MPC by SQP to convergence with exact second derivatives, globalised by damping.
 
     Every iterate is a run of the model itself: the dynamics hold exactly, limits of inputs and changes are
     linear and kept by every QP, soft bounds are penalties within the cost. So the cost itself is the merit
-    function, and a step along the QP's answer is accepted when it lowers the cost by a share (1e-4) of what
-    the QP's convex model promises; the step is halved until it does (Burke's method for convex composite
-    functions: near a solution full steps are taken).
+    function, and a step is made when it lowers the cost by a share (1e-4) of what the QP's convex model
+    promises. One that does not is corrected first by what states and soft bounds were found to bend along it
+    (Fletcher's second-order correction: a stiff weight or penalty otherwise cuts every step short), then the QP
+    is solved again with more curvature in all directions (Levenberg and Marquardt's damping), which carries
+    over to the next iteration and falls where steps keep their promise.
 
-    The QP's Hessian is Gauss-Newton's and the dynamics' second derivatives by states and inputs, weighted
-    with their multipliers: under a steep friction law these outweigh Gauss-Newton's, which alone then
-    converges slowly. They are differences of the exact Jacobians (``n_x +
-    n_u`` evaluations), come along with a plan, shifted by a period, and are taken anew where a step has left
-    more than a tenth of the residual. Where their sum with Gauss-Newton's is not convex it is made so; from
-    the seventh iteration on it is corrected by what the last steps have shown of the gradient (damped
-    BFGS), unless a soft bound acts. The plan is independent of the first guess but for the basin it lies in.
+    The QP's Hessian is Gauss-Newton's and the second derivatives of the dynamics and of soft bounds by states,
+    inputs and hidden states, weighted with their multipliers: under a steep friction law or a trained network
+    these outweigh Gauss-Newton's, which alone then converges slowly. They are differences of the exact
+    Jacobians (``n_x + n_u + n_h`` evaluations), come along with a plan, shifted by a period, and are taken
+    anew where the Hessian got more than a tenth of the residual wrong, those by the hidden state from the
+    second time in a solve on. Where their sum with Gauss-Newton's is not convex it is made so, if possible in
+    the inputs alone that lie on a bound. The plan is independent of the first guess but for the basin it lies
+    in.
 
     Args:
         model: The deployed model; ``n_h`` may be 0. It must not be so unstable that a run over the horizon
@@ -50,7 +54,8 @@ class SQPController:
         InputError: As :class:`~hybrid_mpc.mpc.CondensedController`, or if an option is not positive.
 
     Source: Burke, *Descent methods for composite nondifferentiable optimization problems*, Math. Program.
-    33 (1985).
+    33 (1985); Fletcher, *Second order corrections for non-differentiable optimization*, Numerical Analysis,
+    Lecture Notes in Mathematics 912 (1982).
 
     Example:
         >>> import casadi as ca
@@ -109,15 +114,16 @@ class SQPController:
     ) -> Solution:
         """The plan from now on, converged; see :meth:`Controller.solve`.
 
-        Its ``kkt`` is the residual of the nonlinear problem in the QP's scaling: after the last step where no
-        soft bound acts, else before it (the change that this step makes in the QP's gradient).
+        Its ``kkt`` is the residual of the nonlinear problem in the QP's scaling, with the multipliers of the
+        last QP.
         """
         start = perf_counter()
         case = Case(estimate.d, previous.u[0], self.problem.target(reference, weight))
         u = self._admissible(np.vstack([previous.u[1:], previous.u[-1:]]), case.u_prev)
-        at = self._landscape.at(np.concatenate([estimate.x, estimate.h]), u, case)
+        run = self._landscape.run(np.concatenate([estimate.x, estimate.h]), u, case)
+        at = self._landscape.at(run, case)
         search = Descent(self._landscape, case, at, self._shifted(previous), self._tolerance)
-        if not (np.isfinite(at.cost) and np.all(np.isfinite(at.gradient)) and case.target.ok):
+        if not (np.isfinite(run.cost) and np.all(np.isfinite(at.gradient)) and case.target.ok):
             search.status = Status.NOT_FINITE
             return replace(self._plan(search, estimate.d), timing=_spent(start))
         while search.count < self._iterations and not search.ended:
@@ -126,8 +132,8 @@ class SQPController:
 
     def _shifted(self, previous: Solution) -> Array | None:
         """Second derivatives along the previous plan, a period later; None if it has none that fit."""
-        given, size = previous.curvature, self.ocp.n_x + self.ocp.n_u
-        if given is None or given.shape != (self.ocp.horizon, size, size):
+        given = previous.curvature
+        if given is None or not self._landscape.stages.fits(given, self.ocp.horizon):
             return None
         return np.concatenate([given[1:], given[-1:]]) if np.all(np.isfinite(given)) else None
 
@@ -144,8 +150,8 @@ class SQPController:
         return self.ocp.held(rows)
 
     def _plan(self, search: Descent, d: Array) -> Solution:
-        at, soft, n_x = search.at, self.problem.soft, self.ocp.n_x
-        excess = soft.excess(soft.values(at.z[:, :n_x], at.u)) if len(soft) else np.zeros(0)
+        at, n_x = search.at.run, self.ocp.n_x
+        excess = self.problem.soft.excess(at.soft[0])
         return Solution(
             at.u, at.z[:, :n_x], at.z[:, n_x:], d, at.cost, search.status, search.kkt, 0.0, {},
             float(np.max(excess, initial=0.0)), search.count, search.curvature,

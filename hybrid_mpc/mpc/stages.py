@@ -20,7 +20,8 @@ Array = NDArray[np.float64]
 Derivatives = tuple[Array, Array, Array]
 """Successors ``(N, n_z)``, transposed ``A_k`` ``(N, n_z, n_z)`` and ``B_k`` ``(N, n_z, n_u)``."""
 Slopes = Callable[[Array, Array], Array]
-"""Jacobians of the successors by states and inputs ``(m, n_z, n_x + n_u)``, of ``z`` ``(m, n_z)`` and ``u``."""
+"""Jacobians of the successors ``(m, n_z, n_x + n_u)`` by ``(x, u)``, of ``z`` ``(m, n_z)`` and ``u``; with
+``hidden`` by ``(x, u, h)``."""
 
 
 class Linearisation(Protocol):
@@ -29,10 +30,10 @@ class Linearisation(Protocol):
     def at(self, z: Array, u: Array) -> Derivatives:
         """Every period from its own ``z`` ``(N, n_z)`` on ``u`` ``(N, n_u)``."""
 
-    def run(self, z0: Array, u: Array) -> Derivatives:
-        """A run of the model from ``z0`` ``(n_z,)`` on ``u`` ``(N, n_u)``."""
+    def run(self, z0: Array, u: Array) -> Array:
+        """Trajectory ``(N + 1, n_z)`` of the model from ``z0`` ``(n_z,)`` on ``u`` ``(N, n_u)``."""
 
-    def slopes(self, times: int) -> Slopes:
+    def slopes(self, times: int, *, hidden: bool = False) -> Slopes:
         """A function for ``m = times N`` periods; made once, it is called often."""
 
 
@@ -69,41 +70,42 @@ class Stages:
         >>> model = HybridModel("sum", 1.0, (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),),
         ...     ca.Function("f", [x, h, u], [x + u, h]), ca.Function("g", [x, h, u], [u]),
         ...     ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]))
-        >>> Stages(model, 3).run(np.zeros(1), np.ones((3, 1)))[0].ravel().tolist()
-        [1.0, 2.0, 3.0]
+        >>> Stages(model, 3).run(np.zeros(1), np.ones((3, 1))).ravel().tolist()
+        [0.0, 1.0, 2.0, 3.0]
     """
 
     def __init__(self, model: HybridModel, n: int, *, compiled: bool = False) -> None:
         stage = _compiled(_stage(model)) if compiled else _stage(model)
         self._side_by_side = BufferedFunction(stage.map(n))
-        self._along = BufferedFunction(stage.mapaccum("run_with_jacobian", n))
+        self._along = _run(model, n, compiled)
         self._shape, self._n_x = (n, model.n_x + model.n_h), model.n_x
 
     def at(self, z: Array, u: Array) -> Derivatives:
         """See :class:`Linearisation`."""
-        z_next, a_t, b = self._call(self._side_by_side, z, u)
+        z_next, a_t, b = self._call(z, u)
         return z_next.copy(), a_t.copy(), b.copy()  # the next call overwrites them
 
-    def run(self, z0: Array, u: Array) -> Derivatives:
+    def run(self, z0: Array, u: Array) -> Array:
         """See :class:`Linearisation`."""
-        z_next, a_t, b = self._call(self._along, z0, u)
-        return z_next.copy(), a_t.copy(), b.copy()
+        return _trajectory(self._along, z0, u)
 
-    def slopes(self, times: int) -> Slopes:
+    def slopes(self, times: int, *, hidden: bool = False) -> Slopes:
         """See :class:`Linearisation`."""
-        n = self._shape[0]
+        n, n_x = self._shape[0], self._n_x
 
         def evaluate(z: Array, u: Array) -> Array:
             parts = []
             for k in range(0, times * n, n):
-                _, a_t, b = self._call(self._side_by_side, z[k : k + n], u[k : k + n])
-                parts.append(np.concatenate([a_t[:, : self._n_x].transpose(0, 2, 1), b], axis=2))
+                _, a_t, b = self._call(z[k : k + n], u[k : k + n])
+                a = a_t.transpose(0, 2, 1)
+                blocks = [a[:, :, :n_x], b, a[:, :, n_x:]] if hidden else [a[:, :, :n_x], b]
+                parts.append(np.concatenate(blocks, axis=2))
             return np.concatenate(parts)
 
         return evaluate
 
-    def _call(self, f: BufferedFunction, z: Array, u: Array) -> Derivatives:
-        n, n_z = self._shape
+    def _call(self, z: Array, u: Array) -> Derivatives:
+        (n, n_z), f = self._shape, self._side_by_side
         f.inputs[0][:], f.inputs[1][:] = z.ravel(), u.ravel()
         f()
         z_next, a, b = f.outputs
@@ -126,29 +128,36 @@ class VectorisedStages:
         assert model.side_by_side is not None
         self._model, self._many, self._n, self._n_x = model, model.side_by_side, n, model.n_x
         self._at = self._many(n, {"A": ("x", "h"), "B": ("u",)})
-        z, u = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("u", model.n_u)
-        inline = model.step.is_a("MXFunction")  # a call less a stage
-        z_next = ca.vertcat(*model.step.call([z[: model.n_x], z[model.n_x :], u], inline, False))
-        step = ca.Function("z_step", [z, u], [z_next])
-        self._along = BufferedFunction((_compiled(step) if compiled else step).mapaccum("run", n))
+        self._along = _run(model, n, compiled)
 
     def at(self, z: Array, u: Array) -> Derivatives:
         """See :class:`Linearisation`."""
         x_next, h_next, a, b = self._at(z[:, : self._n_x], z[:, self._n_x :], u)
         return np.hstack([x_next, h_next]), np.ascontiguousarray(a.transpose(0, 2, 1)), b
 
-    def run(self, z0: Array, u: Array) -> Derivatives:
+    def run(self, z0: Array, u: Array) -> Array:
         """See :class:`Linearisation`."""
-        self._along.inputs[0][:], self._along.inputs[1][:] = z0, u.ravel()
-        self._along()
-        z_next = self._along.outputs[0].reshape(self._n, -1).copy()
-        _, a_t, b = self.at(np.vstack([z0, z_next[:-1]]), u)
-        return z_next, a_t, b
+        return _trajectory(self._along, z0, u)
 
-    def slopes(self, times: int) -> Slopes:
+    def slopes(self, times: int, *, hidden: bool = False) -> Slopes:
         """See :class:`Linearisation`."""
-        many, n_x = self._many(times * self._n, {"slopes": ("x", "u")}), self._n_x
+        by = ("x", "u", "h") if hidden else ("x", "u")
+        many, n_x = self._many(times * self._n, {"slopes": by}), self._n_x
         return lambda z, u: many(z[:, :n_x], z[:, n_x:], u)[2]
+
+
+def _run(model: HybridModel, n: int, compiled: bool) -> BufferedFunction:
+    z, u = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("u", model.n_u)
+    inline = model.step.is_a("MXFunction")  # a call less a stage
+    z_next = ca.vertcat(*model.step.call([z[: model.n_x], z[model.n_x :], u], inline, False))
+    step = ca.Function("z_step", [z, u], [z_next])
+    return BufferedFunction((_compiled(step) if compiled else step).mapaccum("run", n))
+
+
+def _trajectory(f: BufferedFunction, z0: Array, u: Array) -> Array:
+    f.inputs[0][:], f.inputs[1][:] = z0, u.ravel()
+    f()
+    return np.concatenate([z0[None], f.outputs[0].reshape(len(u), -1)])
 
 
 def _stage(model: HybridModel) -> ca.Function:
