@@ -25,9 +25,7 @@ def run(
     seed: Annotated[int, typer.Option(help="Seed of data, training and closed loops.", min=0)] = 0,
     budget: Annotated[str, typer.Option(help="Effort: quick or full.")] = "quick",
     resume: Annotated[bool, typer.Option("--resume", help="Finish the run that the folder holds.")] = False,
-    time_column: Annotated[
-        str, typer.Option(help="Column of the time [s]. Default: the scenario's.")
-    ] = "",
+    time_column: Annotated[str, typer.Option(help="Column of the time [s]. Default: the scenario's.")] = "",
     input_column: Annotated[
         list[str] | None, typer.Option(help="Column of an input, in the prior's order.")
     ] = None,
