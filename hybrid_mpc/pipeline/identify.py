@@ -106,12 +106,14 @@ def training_stage(context: Context) -> None:
     trained = {kind: load_trained(context, kind) for kind in KINDS}
     best = {k: float(t.validation.min()) for k, t in trained.items()}
     skipped = {k: int(t.skipped.sum()) for k, t in trained.items()}
-    context.save("training", {"validation_e_sim_s": best, "skipped_updates": skipped})
+    faults = {k: [asdict(f) for f in t.faults] for k, t in trained.items()}
+    context.save("training", {"validation_e_sim_s": best, "skipped_updates": skipped, "faults": faults})
 
 
 def load_trained(context: Context, kind: str) -> Trained:
     """A finished training from the run's folder."""
     from hybrid_mpc.identification.step import Scaling
+    from hybrid_mpc.identification.trained import Fault
     from hybrid_mpc.identification.training import Trained, TrainingSettings
 
     folder = context.out / "checkpoints" / "training"
@@ -130,6 +132,7 @@ def load_trained(context: Context, kind: str) -> Trained:
         own["validation"],
         part["curve"],
         own["skipped"],
+        tuple(Fault(**fault) for fault in note.get("faults", ())),
     )
 
 
@@ -175,6 +178,7 @@ def _members(context: Context, name: str, phy: Prior) -> list[tuple[Any, Any]]:
     import torch
 
     from hybrid_mpc.identification.step import PriorStep
+    from hybrid_mpc.identification.trained import stack_for
 
     dt, double = context.spec.dt, torch.float64
     if name in ("phy_nominal", "phy"):
@@ -182,9 +186,8 @@ def _members(context: Context, name: str, phy: Prior) -> list[tuple[Any, Any]]:
         return [(PriorStep(prior, dt), torch.zeros(0, dtype=double))]
     trained = load_trained(context, name)
     order = np.argsort(trained.validation, kind="stable")
-    return [
-        (trained.step(phy, dt, int(i)), torch.zeros(trained.settings.hidden, dtype=double)) for i in order
-    ]
+    h0 = torch.zeros(stack_for(phy, trained.settings).n_h, dtype=double)
+    return [(trained.step(phy, dt, int(i)), h0) for i in order]
 
 
 def _settings(context: Context, kind: str) -> TrainingSettings:
@@ -229,5 +232,10 @@ def _train_kind(
     arrays |= {"own.validation": trained.validation, "own.skipped": trained.skipped}
     write_arrays(folder / f"{settings.kind}.npz", arrays)
     write_json(
-        folder / f"{settings.kind}.json", {"settings": asdict(settings), "scaling": asdict(trained.scaling)}
+        folder / f"{settings.kind}.json",
+        {
+            "settings": asdict(settings),
+            "scaling": asdict(trained.scaling),
+            "faults": [asdict(fault) for fault in trained.faults],
+        },
     )
