@@ -9,6 +9,7 @@ from PIL import Image
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.plots import animation
 from hybrid_mpc.plots.animation import animate
+from hybrid_mpc.plots.scene import GHOSTS, Scene
 from hybrid_mpc.signals import Signal
 from scenarios.golf_robot.drawing import draw
 
@@ -93,7 +94,7 @@ def test_ghosts_fade_into_the_future(tmp_path):
 
     plans = np.linspace([0.0, 0.0], [1.0, 0.0], 51)[None].repeat(2, axis=0)
     x = plans[:, 0] + [[0.0, 0.0], [1.0, 0.0]]
-    scene = animation._Scene(
+    scene = Scene(
         animation._checked(tmp_path / "a.gif", t, x, plans, 0.02, cart, u), "", Signal("q", "m"),
         (Signal("F", "N"),), None, None,
     )  # fmt: skip
@@ -103,15 +104,13 @@ def test_ghosts_fade_into_the_future(tmp_path):
     assert places == sorted(places, reverse=True)  # the farthest is drawn first ...
     assert shades == sorted(shades)  # ... and the faintest
     assert places[0] == pytest.approx(0.98)  # the end of the horizon: its cart's left corner
-    assert len(set(places)) == animation.GHOSTS
+    assert len(set(places)) == GHOSTS
 
 
 def test_axes_carry_units_and_the_legend_is_complete(tmp_path):
     t, x, plans, u = swing(n=3)
     loop = animation._checked(tmp_path / "a.gif", t, x, plans, 0.02, draw, u)
-    scene = animation._Scene(
-        loop, "A $1 swing", Signal("phi", "rad"), (Signal("u", "N m"),), ((-0.5,), (0.5,)), x[:, 0]
-    )
+    scene = Scene(loop, "A $1 swing", Signal("phi", "rad"), (Signal("u", "N m"),), ((-0.5,), (0.5,)), x[:, 0])
     figure = scene._figure
     labels = [ax.get_ylabel() for ax in figure.axes] + [
         figure.axes[0].get_xlabel(),
@@ -126,7 +125,7 @@ def test_a_plan_that_runs_away_does_not_flatten_the_motion(tmp_path):
     t, x, plans, u = swing(n=5)
     plans[3] *= 1e6
     loop = animation._checked(tmp_path / "a.gif", t, x, plans, 0.02, draw, u)
-    scene = animation._Scene(loop, "", Signal("phi", "rad"), (Signal("u", "N m"),), None, None)
+    scene = Scene(loop, "", Signal("phi", "rad"), (Signal("u", "N m"),), None, None)
     low, high = scene._figure.axes[1].get_ylim()
     span = np.ptp(x[:, 0])
     assert high - low <= 1.8 * 1.12 * span + 1e-9  # 0.4 of the motion to either side, 6 % margin each
