@@ -1,0 +1,30 @@
+"""What a training leaves in the run's folder is read back whole."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hybrid_mpc.identification import training
+from hybrid_mpc.identification.settings import TrainingSettings
+from hybrid_mpc.identification.step import Scaling
+from hybrid_mpc.identification.trained import Fault, Trained
+from hybrid_mpc.pipeline.identify import _train_kind, load_trained
+
+
+@pytest.mark.parametrize("faults", [(), (Fault(1, "energy", 30, True),)])
+def test_a_training_is_read_back_as_it_was(faults, tmp_path, monkeypatch):
+    settings = TrainingSettings("mopgrnn", 4, 2, 10, 5, seed=3, warm=2, cell="lstm")
+    trained = Trained(
+        settings, Scaling((1.0, 2.0), (3.0,), (4.0,), (5.0,)), {"w": np.eye(2)}, np.array([0.1, np.inf]),
+        {"step": np.zeros((1, 2))}, np.array([0, 5]), faults,
+    )  # fmt: skip
+    monkeypatch.setattr(training, "train", lambda *a, **k: trained)
+    folder = tmp_path / "checkpoints" / "training"
+    folder.mkdir(parents=True)
+    _train_kind("pendulum", {}, [], [], settings, folder, lambda *a: None)
+    found = load_trained(SimpleNamespace(out=tmp_path), "mopgrnn")
+    assert (found.settings, found.scaling, found.faults) == (settings, trained.scaling, faults)
+    np.testing.assert_equal(found.weights["w"], trained.weights["w"])
+    np.testing.assert_equal(found.validation, trained.validation)
+    np.testing.assert_equal(found.skipped, trained.skipped)
