@@ -83,8 +83,8 @@ class Previews:
     """Reference and weight factors over the horizon, in their shapes.
 
     Args:
-        reference: ``t (n,) -> (n, n_x)``.
-        weight: The same for the factors on ``q``, or None for 1.
+        reference: ``t (n,) -> (n, n_x)``, with ``n_p`` more columns where the economic stage cost has parameters.
+        weight: ``t (n,) -> (n, n_x)`` for the factors on ``q``, or None for 1.
         ocp: The problem.
         horizon: Periods of preview, or None for the problem's.
         dt: Period [s].
@@ -107,18 +107,20 @@ class Previews:
         if steps < 0:
             raise InputError(f"horizon must not be negative, got {horizon}")
         self._reference, self._weight, self._n_x, self._end = reference, weight, ocp.n_x, end
+        self._columns = ocp.n_x + ocp.n_p
         self._ahead: Array = np.arange(steps + 1, dtype=np.float64) * dt
 
     def __call__(self, t: float) -> tuple[Array, Array | None]:
         """Reference and factors (None for 1) from ``t`` on."""
         times = t + self._ahead
-        x_ref = self._over(self._reference, times, "reference")
-        return x_ref, None if self._weight is None else self._over(self._weight, times, "weight")
+        x_ref = self._over(self._reference, times, "reference", self._columns)
+        weight = None if self._weight is None else self._over(self._weight, times, "weight", self._n_x)
+        return x_ref, weight
 
-    def _over(self, preview: Preview, times: Array, name: str) -> Array:
+    def _over(self, preview: Preview, times: Array, name: str, columns: int) -> Array:
         values = np.array(preview(times), dtype=np.float64)
-        if values.shape != (times.size, self._n_x):
-            raise InputError(f"{name} returns {values.shape}, needed: {(times.size, self._n_x)}")
+        if values.shape != (times.size, columns):
+            raise InputError(f"{name} returns {values.shape}, needed: {(times.size, columns)}")
         beyond = (times > self._end + 1e-9) & ~np.all(np.isfinite(values), axis=1)
         if beyond.any():
             last = int(np.argmax(beyond)) - 1

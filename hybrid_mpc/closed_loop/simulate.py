@@ -104,7 +104,8 @@ def simulate(
         plant: The machine.
         estimator: Filter, or :class:`~hybrid_mpc.estimation.TrueState`, which is handed the truth, undelayed.
         controller: A :class:`~hybrid_mpc.mpc.SafeController`; a bare controller is guarded without fallback.
-        reference: ``t (n,) -> x_ref (n, n_x)``, previewed over the horizon.
+        reference: ``t (n,) -> x_ref (n, n_x)``, previewed over the horizon; with ``n_p`` more columns where the
+            economic stage cost has parameters (:meth:`~hybrid_mpc.mpc.Controller.solve`).
         dt: Period [s]; must be the models' own.
         duration: Length [s], rounded to whole periods.
         x0: Initial state ``(n_x,)``.
@@ -175,9 +176,9 @@ def simulate(
             x_ref, factors = previews(t)
         now_factors = 1.0 if factors is None else factors[0]
         with np.errstate(over="ignore", invalid="ignore"):  # an absurd reference costs infinitely much
-            stage = float(cost.stage_cost(x, u, x_ref[0], u - u_prev, now_factors))
+            stage = float(cost.stage_cost(x, u, x_ref[0, : x.size], u - u_prev, now_factors))
         step = Step(k, t, x, y, estimate, decision, reading)
-        record.add(step, x_ref[0], stage, np.diff(clock) * 1e3)
+        record.add(step, x_ref[0, : x.size], stage, np.diff(clock) * 1e3)
         if on_step is not None:
             on_step(step)
         machine.advance(t)

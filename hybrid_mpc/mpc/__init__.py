@@ -7,6 +7,8 @@ derivatives), :class:`IpoptController` (exact reference), :class:`BestOf` (any o
 from hybrid_mpc.mpc.best_of import BestOf
 from hybrid_mpc.mpc.condensed import CondensedController
 from hybrid_mpc.mpc.condensing import Prepared
+from hybrid_mpc.mpc.economic import output_cost
+from hybrid_mpc.mpc.limits import Limits
 from hybrid_mpc.mpc.nlp import IpoptController
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.problem import Controller, Problem
@@ -22,6 +24,7 @@ __all__ = [
     "Controller",
     "Decision",
     "IpoptController",
+    "Limits",
     "Prepared",
     "Problem",
     "SQPController",
@@ -30,4 +33,5 @@ __all__ = [
     "Solution",
     "Source",
     "Status",
+    "output_cost",
 ]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import START_LIMIT, Estimate
 from hybrid_mpc.model import HybridModel
+from hybrid_mpc.mpc.limits import Limits
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.problem import Controller, Problem
 from hybrid_mpc.mpc.solution import Solution
@@ -113,8 +114,9 @@ class BestOf:
         return self._controller.initial(estimate, u)
 
     def solve(
-        self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None
-    ) -> Solution:
+        self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,
+        *, limits: Limits | None = None,
+    ) -> Solution:  # fmt: skip
         """The cheapest plan of all guesses; see :meth:`Controller.solve`.
 
         Its cost is that on a run of the model. If no solve ends well, the one from the previous plan is
@@ -129,12 +131,13 @@ class BestOf:
             cost = self.problem.cost(self.problem.run(z0, u + estimate.d), u, u_prev, target)
             return cost if np.isfinite(cost) else np.inf
 
-        first = self._controller.solve(previous, estimate, reference, weight)
+        given = estimate, reference, weight
+        first = self._controller.solve(previous, *given, limits=limits)
         solutions = [first]
-        guesses = self._guesses(previous, estimate, reference, weight) if known else []
+        guesses = self._guesses(previous, *given, limits) if known else []
         for guess in sorted(guesses, key=cost_of)[: self._most]:
             start = self._from(guess, previous, estimate)
-            solutions.append(self._controller.solve(start, estimate, reference, weight))
+            solutions.append(self._controller.solve(start, *given, limits=limits))
         best, least = first, np.inf
         for s in solutions:
             cost = cost_of(s.u)
@@ -143,13 +146,14 @@ class BestOf:
         return replace(best, timing={"solve": (perf_counter() - begin) * 1e3})
 
     def _guesses(
-        self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None
-    ) -> list[Array]:
+        self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None,
+        limits: Limits | None,
+    ) -> list[Array]:  # fmt: skip
         guesses = [_checked(s(estimate), self.ocp) if callable(s) else s for s in self._starts]
         for rival in self._rivals:
             h = hidden_fixed_point(rival.model, estimate.x, previous.u[0], limit=START_LIMIT)
             own = replace(estimate, h=h)
-            plan = rival.solve(rival.initial(own, previous.u), own, reference, weight)
+            plan = rival.solve(rival.initial(own, previous.u), own, reference, weight, limits=limits)
             if plan.status.ok:
                 guesses.append(plan.u)
         return guesses

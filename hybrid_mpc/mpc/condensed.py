@@ -12,6 +12,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.mpc.condensing import Condenser, Prepared, condense_hessians, propagate
+from hybrid_mpc.mpc.limits import Limits
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.problem import Problem, Target, weights_ok
 from hybrid_mpc.mpc.qp import InputQP
@@ -135,23 +136,28 @@ class CondensedController:
         return self._condense(u, z, d, u_prev, weight, shifted=False)
 
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
-    def feedback(self, prepared: Prepared, estimate: Estimate, reference: Array) -> Solution:
+    def feedback(
+        self, prepared: Prepared, estimate: Estimate, reference: Array, limits: Limits | None = None
+    ) -> Solution:
         """Embed the estimate and the reference, solve the QP and check its answer.
 
         Args:
             prepared: What :meth:`prepare` returned.
             estimate: The state now; its ``d`` is assumed constant over the horizon.
-            reference: ``(m, n_x)``, from now on in steps of ``dt``; if ``m < N + 1`` its last value holds.
+            reference: ``(m, n_x)``, from now on in steps of ``dt``; if ``m < N + 1`` its last value holds;
+                see :meth:`Controller.solve`.
+            limits: Bounds of the inputs for this solve. Default: the problem's own.
 
         Returns:
             The plan. If its status is not ``ok`` the inputs are the shifted previous plan.
 
         Raises:
-            InputError: If the reference has another shape.
+            InputError: If the reference or the limits have another shape.
         """
         start = perf_counter()
-        target = Target(self._problem.target(reference).x, prepared.weight)
-        if not (target.ok and np.all(np.isfinite(prepared.hessian))):
+        target = replace(self._problem.target(reference), weight=prepared.weight)
+        hessian, economic = self._at_parameters(prepared, target)
+        if not target.ok or not np.all(np.isfinite(hessian)):
             return self._failed(prepared, Status.NOT_FINITE, start)
         n_x = self._n_x
         dz0 = np.concatenate([estimate.x, estimate.h]) - prepared.z[0]
@@ -160,8 +166,8 @@ class CondensedController:
         error = prepared.z[:, :n_x] + free[:, :n_x] - target.x
         u_bar = prepared.u.ravel()
         gradient = 2 * error.ravel() @ prepared.weighted + self.input_gradient(u_bar, prepared.u_prev)
-        if prepared.economic is not None:
-            slope, curvature = prepared.economic
+        if economic is not None:
+            slope, curvature = economic
             slope = slope + (curvature[:, :, :n_x] @ free[:-1, :n_x, None])[:, :, 0]
             gradient += (
                 slope[:, :n_x].ravel() @ prepared.from_u[: slope.shape[0] * n_x] + slope[:, n_x:].ravel()
@@ -169,33 +175,37 @@ class CondensedController:
         soft = self._soft_rows(prepared, free)
         if not (np.all(np.isfinite(gradient)) and (soft is None or np.all(np.isfinite(soft[0])))):
             return self._failed(prepared, Status.NOT_FINITE, start)
-        step, status, kkt = self._qp.solve(prepared.hessian, gradient, prepared.u, prepared.u_prev, soft)
-        if not status.ok:
-            return self._failed(prepared, status, start, kkt)
+        answer = self._qp.answer(hessian, gradient, prepared.u, prepared.u_prev, soft, limits)
+        step = answer.step
+        if not answer.status.ok:
+            return self._failed(prepared, answer.status, start, answer.kkt)
         u = (u_bar + step).reshape(prepared.u.shape)
         drift += (prepared.b @ step.reshape(len(u), -1, 1))[:, :, 0]
         z = prepared.z + propagate(prepared.a_t, drift, dz0)
         excess = np.zeros(0) if soft is None else self._problem.soft.excess(soft[0] + soft[1] @ step)
         cost = self._problem.cost(z, u, prepared.u_prev, target, excess)
         if not np.isfinite(cost):
-            return self._failed(prepared, Status.NOT_FINITE, start, kkt)
-        u = np.clip(u, self._ocp.u_min, self._ocp.u_max)  # the QP keeps them to its tolerance only
-        return Solution(u, z[:, :n_x], z[:, n_x:], estimate.d, cost, status, kkt, _largest(prepared.defects),
-                        self._timing(prepared, start), float(np.max(excess, initial=0.0)))  # fmt: skip
+            return self._failed(prepared, Status.NOT_FINITE, start, answer.kkt)
+        u = np.clip(u, *self._ocp.bounds(prepared.u_prev, limits))  # the QP keeps them to its tolerance only
+        return Solution(
+            u, z[:, :n_x], z[:, n_x:], estimate.d, cost, answer.status, answer.kkt, _largest(prepared.defects),
+            self._timing(prepared, start), float(np.max(excess, initial=0.0)),
+        )  # fmt: skip
 
     def solve(
-        self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None
-    ) -> Solution:
+        self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,
+        *, limits: Limits | None = None,
+    ) -> Solution:  # fmt: skip
         """:meth:`prepare` and :meth:`feedback`, linearised anew ``iterations`` times."""
         prepared = self.prepare(previous, weight)
-        solution = self.feedback(prepared, estimate, reference)
+        solution = self.feedback(prepared, estimate, reference, limits)
         for i in range(1, self._iterations):
             if not solution.status.ok:
                 break
             spent = solution.timing
             z = np.hstack([solution.x, solution.h])
             again = self.linearise(solution.u, z, solution.d, prepared.u_prev, prepared.weight)
-            solution = self.feedback(again, estimate, reference)
+            solution = self.feedback(again, estimate, reference, limits)
             total = {name: spent[name] + solution.timing[name] for name in spent}
             solution = replace(solution, timing=total, iterations=i + 1)
         return solution
@@ -212,9 +222,13 @@ class CondensedController:
 
     def condense(
         self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array,
-        derivatives: Derivatives, start: float,
+        derivatives: Derivatives, start: float, p: Array | None = None,
     ) -> Prepared:  # fmt: skip
-        """Condense derivatives ``(z_next, A_t, B)`` that are known; ``start`` is when the work began."""
+        """Condense derivatives ``(z_next, A_t, B)`` that are known; ``start`` is when the work began.
+
+        ``p`` ``(N + 1, n_p)`` are the values of the economic cost's parameters. Default: none are known yet; where
+        the cost has some it is left to the feedback.
+        """
         n, n_x = self._ocp.horizon, self._n_x
         z_next, a_t, b = derivatives
         from_u = self._condenser(a_t, b)
@@ -227,13 +241,21 @@ class CondensedController:
             weighted = np.full_like(from_u, np.nan)
         hessian = 2 * from_u.T @ weighted + self._input_hessian
         soft = self._soft_derivatives(z, u, from_u)
-        economic = self._problem.economic.convex(z[:, :n_x], u) if self._ocp.economic is not None else None
+        known = self._ocp.economic is not None and (p is not None or not self._ocp.n_p)
+        economic = self._problem.economic.convex(z[:, :n_x], u, p) if known else None
         if economic is not None:
             hessian += condense_hessians(economic[1], from_u, n_x)
         spent = (perf_counter() - start) * 1e3
         return Prepared(
             u, z, d, u_prev, a_t, b, z_next - z[1:], from_u, weighted, hessian, weight, soft, economic, spent
         )
+
+    def _at_parameters(self, prepared: Prepared, target: Target) -> tuple[Array, tuple[Array, Array] | None]:
+        """Hessian and economic derivatives, those that wait for the parameters' values included."""
+        if not self._ocp.n_p:
+            return prepared.hessian, prepared.economic
+        economic = self._problem.economic.convex(prepared.z[:, : self._n_x], prepared.u, target.p)
+        return prepared.hessian + condense_hessians(economic[1], prepared.from_u, self._n_x), economic
 
     def _soft_derivatives(self, z: Array, u: Array, from_u: Array) -> tuple[Array, Array, Array]:
         rows, n_u = self._problem.soft, self._ocp.n_u
@@ -260,7 +282,7 @@ class CondensedController:
         m = self._model
         x, h, d, p = np.zeros(m.n_x), np.zeros(m.n_h), np.zeros(m.n_u), np.zeros((0, 0))
         zero = Estimate(0.0, x, h, d, p, np.zeros(0), NAN)
-        self.solve(self.initial(zero), zero, np.zeros((1, m.n_x)))
+        self.solve(self.initial(zero), zero, np.zeros((1, m.n_x + self._ocp.n_p)))
 
     def input_gradient(self, u: Array, u_prev: Array) -> Array:
         """Gradient of the input costs at the plan ``u`` ``(N n_u,)``."""

@@ -154,11 +154,12 @@ class Descent:
 
     def _answer(self, hessian: Array, gradient: Array, value: Array, slope: Array) -> Answer:
         soft = (value, slope) if value.size else None
-        return self._land.inner.qp.answer(hessian, gradient, self.at.run.u, self._case.u_prev, soft)
+        case = self._case
+        return self._land.inner.qp.answer(hessian, gradient, self.at.run.u, case.u_prev, soft, case.limits)
 
     def _trial(self, step: Array) -> Run:
-        ocp, run = self._land.inner.ocp, self.at.run
-        u = np.clip(run.u + step.reshape(run.u.shape), ocp.u_min, ocp.u_max)
+        run, bounds = self.at.run, self._land.inner.ocp.bounds(self._case.u_prev, self._case.limits)
+        u = np.clip(run.u + step.reshape(run.u.shape), *bounds)
         return self._land.run(run.z[0], u, self._case)
 
     def _promised(self, prepared: Prepared, hessian: Array, step: Array) -> float:
@@ -194,7 +195,9 @@ class Descent:
             self.curvature = self._taken_anew(prepared, multipliers)
         if not np.all(np.isfinite(self.curvature)):
             return prepared.hessian
-        return convex(prepared.hessian, self._land.rest(prepared, self.curvature), self._held(slope))
+        return convex(
+            prepared.hessian, self._land.rest(prepared, self.curvature, self._case), self._held(slope)
+        )
 
     def _taken_anew(self, prepared: Prepared, multipliers: Array) -> Array:
         """Second derivatives here; the hidden state's, which change slowly, from the second time on."""
@@ -214,7 +217,8 @@ class Descent:
         if ocp.blocks is not None:
             return None
         s, near = slope.reshape(u.shape), 1e-6 * self._land.inner.qp.scale.reshape(u.shape)
-        return (((u <= ocp.u_min + near) & (s > 0)) | ((u >= ocp.u_max - near) & (s < 0))).ravel()
+        lower, upper = ocp.bounds(self._case.u_prev, self._case.limits)
+        return (((u <= lower + near) & (s > 0)) | ((u >= upper - near) & (s < 0))).ravel()
 
     def _lost(self, found: _Step) -> None:
         """No step lowers the cost: where it is flat what is left is rounding, else start anew."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.mpc.condensed import CondensedController
 from hybrid_mpc.mpc.condensing import Prepared, adjoint, condense_hessians
 from hybrid_mpc.mpc.curvature import StageCurvature
+from hybrid_mpc.mpc.limits import Limits
 from hybrid_mpc.mpc.problem import Target
 from hybrid_mpc.mpc.stages import Derivatives
 
@@ -19,11 +20,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Case:
-    """What one solve is given: disturbance, input held before, targets."""
+    """What one solve is given: disturbance, input held before, targets, and limits tighter than the problem's."""
 
     d: Array
     u_prev: Array
     target: Target
+    limits: Limits | None = None
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ class Landscape:
         error = run.z[:, :n_x] - case.target.x
         slopes, direct = 2 * stages * error[:-1], self.inner.input_gradient(run.u.ravel(), case.u_prev)
         if self.inner.ocp.economic is not None:
-            economic = problem.economic.derivatives(run.z[:, :n_x], run.u)[0]
+            economic = problem.economic.derivatives(run.z[:, :n_x], run.u, case.target.p)[0]
             slopes, direct = slopes + economic[:, :n_x], direct + economic[:, n_x:].ravel()
         multipliers = adjoint(derivatives[1], 2 * terminal @ error[-1], slopes)
         gradient = (multipliers[:, None, :] @ derivatives[2]).ravel() + direct
@@ -116,8 +118,9 @@ class Landscape:
     def condensed(self, at: Point, case: Case) -> Prepared:
         """The Gauss-Newton model of the cost at a point."""
         return self.inner.condense(
-            at.run.u, at.run.z, case.d, case.u_prev, case.target.weight, at.derivatives, perf_counter()
-        )
+            at.run.u, at.run.z, case.d, case.u_prev, case.target.weight, at.derivatives, perf_counter(),
+            case.target.p,
+        )  # fmt: skip
 
     def without_what_is_small(self, prepared: Prepared, curvature: Array) -> Array:
         """See :meth:`StageCurvature.without_what_is_small`; nothing was condensed since ``prepared``."""
@@ -143,11 +146,11 @@ class Landscape:
         proven = mu @ (values[acting] - bound) - np.sum(beyond**2 / (4 * dt * soft.quadratic[acting]))
         return self.penalty(values) - float(proven)
 
-    def rest(self, prepared: Prepared, curvature: Array) -> Array:
+    def rest(self, prepared: Prepared, curvature: Array, case: Case) -> Array:
         """What the exact Hessian has besides ``prepared``'s; nothing was condensed since."""
         rest = self.stages.condensed(curvature, prepared.from_u, self.inner.condenser.by_inputs)
         if prepared.economic is not None:  # what curves down, which the convex model takes as flat
             n_x = self.inner.ocp.n_x
-            exact = self.problem.economic.derivatives(prepared.z[:, :n_x], prepared.u)[1]
+            exact = self.problem.economic.derivatives(prepared.z[:, :n_x], prepared.u, case.target.p)[1]
             rest = rest + condense_hessians(exact - prepared.economic[1], prepared.from_u, n_x)
         return rest

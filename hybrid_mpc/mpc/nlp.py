@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
+from hybrid_mpc.mpc.limits import Limits
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.problem import Problem
 from hybrid_mpc.mpc.solution import Solution, Status
@@ -107,8 +108,9 @@ class IpoptController:
 
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def solve(
-        self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None
-    ) -> Solution:
+        self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,
+        *, limits: Limits | None = None,
+    ) -> Solution:  # fmt: skip
         """The plan from now on; see :meth:`Controller.solve`. The previous plan, shifted, is the first guess."""
         start = perf_counter()
         problem, u_prev = self._problem, previous.u[0]
@@ -116,7 +118,10 @@ class IpoptController:
         u = np.vstack([previous.u[1:], previous.u[-1:]])
         z = np.hstack([previous.x, previous.h])
         z = np.vstack([np.concatenate([estimate.x, estimate.h]), z[2:], z[-1:]])
-        given = np.concatenate([z[0], estimate.d, u_prev, target.x.ravel(), target.weight.ravel()])
+        given = np.concatenate(
+            [z[0], estimate.d, u_prev, target.x.ravel(), target.weight.ravel(), target.p.ravel()]
+        )
+        bounds = self._limited(self.ocp.bounds(u_prev, limits))
         failed = self._plan(u, z, estimate.d, NAN, Status.NOT_FINITE, NAN, start, 0)
         if not (
             target.ok and np.all(np.isfinite(given)) and np.all(np.isfinite(u)) and np.all(np.isfinite(z))
@@ -124,28 +129,37 @@ class IpoptController:
             return failed
         slack = problem.soft.excess(problem.soft.values(z[:, : self.ocp.n_x], u))
         guess = np.concatenate([u.ravel(), z.ravel(), slack])
-        answer = self._solver(x0=guess, p=given, **self._bounds)
+        answer = self._solver(x0=guess, p=given, **bounds)
         stats = self._solver.stats()
         w, lam_g, lam_x = (answer[key].full().ravel() for key in ("x", "lam_g", "lam_x"))
         if not (np.all(np.isfinite(w)) and np.all(np.isfinite(lam_g)) and np.all(np.isfinite(lam_x))):
             return failed
-        violated, kkt = self._check(w, given, lam_g, lam_x)
+        violated, kkt = self._check(w, given, lam_g, lam_x, bounds)
         count = stats["iter_count"]
         if not violated <= FEASIBLE:
             return self._plan(u, z, estimate.d, NAN, Status.NLP_FAILED, kkt, start, count)
         status = Status.SOLVED if stats["success"] or kkt <= FEASIBLE else Status.STOPPED
-        u = np.clip(w[: u.size].reshape(u.shape), self.ocp.u_min, self.ocp.u_max)
+        u = np.clip(w[: u.size].reshape(u.shape), *self.ocp.bounds(u_prev, limits))
         z = w[u.size : u.size + z.size].reshape(z.shape)
         cost = problem.cost(z, u, u_prev, target)
         return self._plan(u, z, estimate.d, cost, status, kkt, start, count)
 
-    def _check(self, w: Array, given: Array, lam_g: Array, lam_x: Array) -> tuple[float, float]:
+    def _limited(self, of_inputs: tuple[Array, Array]) -> dict[str, Array]:
+        """Bounds of unknowns and rows with those of the inputs put in."""
+        lower, upper = self._bounds["lbx"].copy(), self._bounds["ubx"].copy()
+        lower[: of_inputs[0].size], upper[: of_inputs[1].size] = (bound.ravel() for bound in of_inputs)
+        return {**self._bounds, "lbx": lower, "ubx": upper}
+
+    def _check(
+        self, w: Array, given: Array, lam_g: Array, lam_x: Array, bounds: dict[str, Array]
+    ) -> tuple[float, float]:
         """Largest violation as a share of its range, and the KKT residual relative to the objective's slope."""
         slope, objective, g = (m.full().ravel() for m in self._slope(w, given, lam_g))
         kkt = float(np.max(np.abs(slope + lam_x)) / max(1.0, np.max(np.abs(objective))))
-        beyond = np.maximum(self._bounds["lbg"] - g, g - self._bounds["ubg"]) / self._g_scale
-        u = w[: self.ocp.horizon * self.ocp.n_u].reshape(self.ocp.horizon, -1)
-        outside = np.maximum(self.ocp.u_min - u, u - self.ocp.u_max) / self._u_scale
+        beyond = np.maximum(bounds["lbg"] - g, g - bounds["ubg"]) / self._g_scale
+        n = self.ocp.horizon * self.ocp.n_u
+        outside = np.maximum(bounds["lbx"][:n] - w[:n], w[:n] - bounds["ubx"][:n])
+        outside = outside.reshape(self.ocp.horizon, -1) / self._u_scale
         return max(float(np.max(beyond, initial=0.0)), float(np.max(outside))), kkt
 
     def _plan(
@@ -171,6 +185,7 @@ class IpoptController:
         u, z, s = ca.MX.sym("u", n_u, n), ca.MX.sym("z", n_z, n + 1), ca.MX.sym("s", len(soft))
         z0, d, u_prev = ca.MX.sym("z0", n_z), ca.MX.sym("d", n_u), ca.MX.sym("u_prev", n_u)
         x_ref, weight = ca.MX.sym("x_ref", n_x, n + 1), ca.MX.sym("weight", n_x, n + 1)
+        p = ca.MX.sym("p", ocp.n_p, n + 1)
         self._step = model.step.map(n)
         z_next = ca.vertcat(*self._step(z[:n_x, :-1], z[n_x:, :-1], u + ca.repmat(d, 1, n)))
         du = u - ca.horzcat(u_prev, u[:, :-1])
@@ -193,8 +208,8 @@ class IpoptController:
         self._g_scale = _filled(rows, 3)
         return {
             "x": ca.vertcat(ca.vec(u), ca.vec(z), s),
-            "p": ca.vertcat(z0, d, u_prev, ca.vec(x_ref), ca.vec(weight)),
-            "f": self._objective(u, du, z[:n_x, :] - x_ref, weight, s) + self._economic(z[:n_x, :-1], u),
+            "p": ca.vertcat(z0, d, u_prev, ca.vec(x_ref), ca.vec(weight), ca.vec(p)),
+            "f": self._objective(u, du, z[:n_x, :] - x_ref, weight, s) + self._economic(z[:n_x, :-1], u, p),
             "g": ca.vertcat(*(ca.vec(row.value) for row in rows)),
         }
 
@@ -206,9 +221,13 @@ class IpoptController:
         penalty = ca.dot(soft.linear, s) + ca.dot(soft.quadratic, s**2)
         return self.model.dt * (stage + penalty) + last.T @ self._problem.terminal @ last
 
-    def _economic(self, x: ca.MX, u: ca.MX) -> ca.MX:
+    def _economic(self, x: ca.MX, u: ca.MX, p: ca.MX) -> ca.MX:
         f = self.ocp.economic
-        return self.model.dt * ca.sum2(f.map(self.ocp.horizon)(x, u)) if f is not None else ca.MX(0)
+        if f is None:
+            return ca.MX(0)
+        given = (x, u, p[:, :-1]) if f.n_in() > 2 else (x, u)
+        (stages,) = f.map(self.ocp.horizon).call(list(given))
+        return self.model.dt * ca.sum2(stages)
 
     def _soft_rows(self, u: ca.MX, z: ca.MX, s: ca.MX) -> list[Rows]:
         soft, rows = self._problem.soft, []

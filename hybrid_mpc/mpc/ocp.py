@@ -12,6 +12,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model import HybridModel
+from hybrid_mpc.mpc.checks import (
+    block_lengths,
+    check_weights,
+    diagonal,
+    input_bounds,
+    is_stage_cost,
+    terminal_matrix,
+    whole,
+)
+from hybrid_mpc.mpc.limits import Limits
 from hybrid_mpc.mpc.soft import SoftBound, state_bounds
 from hybrid_mpc.riccati import dare, linearisation, vector
 from hybrid_mpc.scenario import ControlSpec
@@ -62,7 +72,9 @@ class OCP:
 
         economic: A further stage cost per second, ``(x, u) -> scalar``, twice differentiable, of ``(x_0, u_0) ..
             (x_{N-1}, u_{N-1})``; it may be negative and need not be convex. Where it curves down ``rti`` takes it
-            as flat; ``sqp`` and ``ipopt`` know its curvature. Default: none.
+            as flat; ``sqp`` and ``ipopt`` know its curvature. With ``(x, u, p) -> scalar`` references have
+            ``n_p`` more columns, the values of ``p``: prices, or the outputs' reference
+            (:func:`~hybrid_mpc.mpc.output_cost`). Default: none.
 
     Raises:
         InputError: If shapes do not fit, bounds cross, a weight is negative or not finite, or the blocks'
@@ -111,17 +123,17 @@ class OCP:
     ) -> None:
         if not whole(horizon) or horizon < 1:
             raise InputError(f"horizon must be a whole number of periods, at least 1; got {horizon}")
-        q_v, r_v = _numbers(q, "q"), _numbers(r, "r")
+        q_v, r_v = diagonal(q, "q"), diagonal(r, "r")
         n_x, n_u = q_v.size, r_v.size
         weights = {"q": q_v, "r": r_v, "r_delta": vector(r_delta, n_u, "r_delta")}
-        _check_weights(weights)
-        lower, upper = _bounds(u_min, u_max, n_u)
+        check_weights(weights)
+        lower, upper = input_bounds(u_min, u_max, n_u)
         if du_max is not None:
             du_max = vector(du_max, n_u, "du_max")
             if not np.all(du_max > 0):
                 raise InputError(f"du_max must be positive, got {du_max}; leave it out for no limit")
         if not (isinstance(terminal, str) and terminal == "riccati"):
-            terminal = _terminal(terminal, n_x)
+            terminal = terminal_matrix(terminal, n_x)
         fields = {"horizon": int(horizon), **weights, "u_min": lower, "u_max": upper, "du_max": du_max}
         names = "x_min", "x_max", "slack_linear", "slack_quadratic"
         states = state_bounds(q_v, x_min, x_max, slack_linear, slack_quadratic)
@@ -129,9 +141,9 @@ class OCP:
         others = {"terminal": terminal, "working_point": working_point, "soft": tuple(soft)}
         if wrong := [bound for bound in soft if not isinstance(bound, SoftBound)]:
             raise InputError(f"soft: {wrong[0]!r} given; needed: SoftBound(expression, lower, upper, ...)")
-        if economic is not None and not _is_stage_cost(economic):
-            raise InputError(f"economic: {economic} given; needed: a function (x, u) -> scalar")
-        lengths = {"blocks": None if blocks is None else _blocks(blocks, int(horizon))}
+        if economic is not None and not is_stage_cost(economic):
+            raise InputError(f"economic: {economic} given; needed: a function (x, u) or (x, u, p) -> scalar")
+        lengths = {"blocks": None if blocks is None else block_lengths(blocks, int(horizon))}
         for name, value in {**fields, **bounds, **others, **lengths, "economic": economic}.items():
             object.__setattr__(self, name, value)
 
@@ -159,6 +171,11 @@ class OCP:
         return int(self.r.size)
 
     @property
+    def n_p(self) -> int:
+        """Number of parameters of the economic stage cost; references have ``n_x + n_p`` columns."""
+        return int(self.economic.numel_in(2)) if self.economic is not None and self.economic.n_in() > 2 else 0
+
+    @property
     def starts(self) -> NDArray[np.int64]:
         """First period of every move block; all periods where there are none."""
         lengths = self.blocks if self.blocks is not None else (1,) * self.horizon
@@ -182,8 +199,38 @@ class OCP:
         error = weight * (np.asarray(x) - np.asarray(x_ref)) ** 2
         return np.asarray(error @ self.q + np.asarray(u) ** 2 @ self.r + np.asarray(du) ** 2 @ self.r_delta)
 
-    def saturate(self, u: Array, u_prev: Array) -> Array:
+    def bounds(self, u_prev: Array, limits: Limits | None = None) -> tuple[Array, Array]:
+        """Lower and upper bounds of a plan's inputs, ``(N, n_u)`` each.
+
+        ``limits`` tighten the problem's own. Where ``du_max`` keeps the input ``u_prev`` from being within them
+        at once, it goes there as fast as ``du_max`` lets it.
+
+        Raises:
+            InputError: If the limits have another size.
+
+        Example:
+            >>> ocp = OCP(3, [1.0], [1.0], [0.0], [-1.0], [1.0], du_max=[0.2])
+            >>> ocp.bounds(np.array([0.9]), Limits([-0.5], [0.5]))[1].ravel().round(6)
+            array([0.7, 0.5, 0.5])
+        """
+        shape = (self.horizon, self.n_u)
+        if limits is None:
+            return np.broadcast_to(self.u_min, shape), np.broadcast_to(self.u_max, shape)
+        if limits.u_min.size != self.n_u:
+            raise InputError(f"limits of {limits.u_min.size} inputs given, the problem has {self.n_u}")
+        lower, upper = (np.clip(v, self.u_min, self.u_max) for v in (limits.u_min, limits.u_max))
+        if self.du_max is None:
+            return np.broadcast_to(lower, shape), np.broadcast_to(upper, shape)
+        change = np.arange(1.0, self.starts.size + 1)[:, None] * self.du_max
+        rows = np.minimum(lower, u_prev + change), np.maximum(upper, u_prev - change)
+        own = (np.clip(row, self.u_min, self.u_max) for row in rows)
+        lower, upper = (row if self.blocks is None else np.repeat(row, self.blocks, axis=0) for row in own)
+        return lower, upper
+
+    def saturate(self, u: Array, u_prev: Array, limits: Limits | None = None) -> Array:
         """``u`` ``(n_u,)`` moved into the bounds and, around ``u_prev``, into the limit of its change.
+
+        ``limits`` tighten the bounds as :meth:`bounds` says.
 
         Example:
             >>> OCP(5, [1.0], [1.0], [0.0], [-1.0], [1.0], du_max=[0.2]).saturate([3.0], [0.5])
@@ -192,7 +239,8 @@ class OCP:
         u = np.asarray(u, dtype=float)
         if self.du_max is not None:
             u = np.clip(u, u_prev - self.du_max, u_prev + self.du_max)
-        return np.clip(u, self.u_min, self.u_max)
+        lower, upper = self.bounds(u_prev, limits)
+        return np.clip(u, lower[0], upper[0])
 
     def terminal_weight(self, model: HybridModel) -> Array:
         """Terminal matrix ``(n_x, n_x)`` for a model.
@@ -220,71 +268,3 @@ class OCP:
         )
         values, vectors = np.linalg.eigh(0.5 * (reduced + reduced.T))
         return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
-
-
-def whole(value: object) -> bool:
-    """Whether a value is a whole number.
-
-    Example:
-        >>> whole(3), whole(3.0), whole(2.5), whole(float("nan")), whole("3")
-        (True, True, False, False, False)
-    """
-    return isinstance(value, int | float | np.number) and bool(np.isfinite(value)) and int(value) == value
-
-
-def _numbers(values: ArrayLike, name: str) -> Array:
-    try:
-        array = np.asarray(values, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: numbers needed, got {values!r}") from error
-    if array.ndim > 1 and max(array.shape) < array.size:
-        raise InputError(f"{name}: shape {array.shape} given; needed: the diagonal alone, a weight each")
-    return array.ravel()
-
-
-def _is_stage_cost(f: object) -> bool:
-    return isinstance(f, ca.Function) and (f.n_in(), f.n_out(), f.numel_out(0)) == (2, 1, 1)
-
-
-def _blocks(blocks: Sequence[int], horizon: int) -> tuple[int, ...]:
-    lengths = tuple(int(length) for length in blocks if whole(length))
-    if len(lengths) < len(blocks) or min(lengths, default=0) < 1 or sum(lengths) != horizon:
-        raise InputError(
-            f"blocks: {tuple(blocks)} given, {sum(blocks)} periods in all; needed: whole numbers of at least 1 "
-            f"that sum to the horizon of {horizon}"
-        )
-    return lengths
-
-
-def _check_weights(weights: dict[str, Array]) -> None:
-    for name, value in weights.items():
-        if value.size == 0 or not np.all(np.isfinite(value)) or np.any(value < 0):
-            raise InputError(f"{name}: weights must be finite and not negative, got {value}")
-    if not np.all(weights["r"] + weights["r_delta"] > 0):
-        raise InputError(
-            "every input needs a positive weight in r or r_delta, otherwise it is not determined"
-        )
-
-
-def _bounds(u_min: ArrayLike, u_max: ArrayLike, n_u: int) -> tuple[Array, Array]:
-    lower, upper = np.asarray(u_min, dtype=float).ravel(), np.asarray(u_max, dtype=float).ravel()
-    if lower.shape != (n_u,) or upper.shape != (n_u,):
-        raise InputError(f"u_min has {lower.size} and u_max {upper.size} values, {n_u} needed")
-    if not np.all(lower < upper):
-        raise InputError(
-            f"input bounds cross: u_min {lower}, u_max {upper}; every u_min must be below its u_max"
-        )
-    return lower, upper
-
-
-def _terminal(value: ArrayLike, n_x: int) -> Array:
-    if isinstance(value, str):
-        raise InputError(f"terminal: {value!r} given; needed: 'riccati' or an ({n_x}, {n_x}) matrix")
-    matrix = np.asarray(value, dtype=float)
-    if matrix.shape != (n_x, n_x) or not np.all(np.isfinite(matrix)) or not np.allclose(matrix, matrix.T):
-        raise InputError(
-            f"terminal: shape {matrix.shape} given; needed: a finite symmetric ({n_x}, {n_x}) matrix"
-        )
-    if np.min(np.linalg.eigvalsh(matrix)) < -1e-9 * max(1.0, float(np.max(np.abs(matrix)))):
-        raise InputError("terminal: the matrix has a negative eigenvalue; needed: positive semi-definite")
-    return matrix

@@ -14,6 +14,7 @@ from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.mpc.buffered import BufferedFunction
 from hybrid_mpc.mpc.economic import EconomicCost
+from hybrid_mpc.mpc.limits import Limits
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.soft import SoftRows
 from hybrid_mpc.mpc.solution import Solution, Status
@@ -36,7 +37,13 @@ class Controller(Protocol):
         """A first plan: the model run freely from the estimate; ``u`` ``(N, n_u)``, see :class:`Problem`."""
 
     def solve(
-        self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None
+        self,
+        previous: Solution,
+        estimate: Estimate,
+        reference: Array,
+        weight: Array | None = None,
+        *,
+        limits: Limits | None = None,
     ) -> Solution:
         """The plan from now on; ``previous.u[0]`` is the input that is being held.
 
@@ -44,7 +51,9 @@ class Controller(Protocol):
             previous: The last plan; shifted by one period it is the first guess.
             estimate: The state now; its ``d`` is assumed constant over the horizon.
             reference: ``(m, n_x)``, from now on in steps of ``dt``; if ``m < N + 1`` its last value holds.
+                Where the economic stage cost has parameters, ``n_p`` more columns are their values.
             weight: Factors on ``q`` ``(m, n_x)``, not negative, as the reference. Default: 1.
+            limits: Bounds of the inputs for this solve. Default: the problem's own.
         """
 
 
@@ -55,15 +64,17 @@ class Target:
     Args:
         x: Reference ``(N + 1, n_x)``.
         weight: Factors ``(N + 1, n_x)`` on ``q``.
+        p: Parameters of the economic stage cost ``(N + 1, n_p)``.
     """
 
     x: Array
     weight: Array
+    p: Array
 
     @property
     def ok(self) -> bool:
         """True if all is finite and no factor is negative."""
-        return bool(np.all(np.isfinite(self.x)) and weights_ok(self.weight))
+        return bool(np.all(np.isfinite(self.x)) and np.all(np.isfinite(self.p)) and weights_ok(self.weight))
 
 
 def weights_ok(weight: Array) -> bool:
@@ -143,10 +154,10 @@ class Problem:
         """Reference and factors over the horizon; the last value holds where the preview is shorter.
 
         Raises:
-            InputError: If a shape is not ``(m, n_x)`` with m > 0.
+            InputError: If a shape is not ``(m, n_x)``, or of the reference ``(m, n_x + n_p)``, with m > 0.
         """
-        x = self._preview(reference, "reference")
-        return Target(x, self.weights(weight))
+        rows = self._preview(reference, "reference", self.ocp.n_x + self.ocp.n_p)
+        return Target(rows[:, : self.ocp.n_x], self.weights(weight), rows[:, self.ocp.n_x :])
 
     def weights(self, weight: ArrayLike | None) -> Array:
         """Weight factors ``(N + 1, n_x)``; default: 1.
@@ -156,12 +167,12 @@ class Problem:
         """
         if weight is None:
             return np.ones((self.ocp.horizon + 1, self.ocp.n_x))
-        return self._preview(weight, "weight")
+        return self._preview(weight, "weight", self.ocp.n_x)
 
-    def _preview(self, values: ArrayLike, name: str) -> Array:
+    def _preview(self, values: ArrayLike, name: str, columns: int) -> Array:
         array = np.asarray(values, dtype=float)
-        if array.ndim != 2 or len(array) < 1 or array.shape[1] != self.ocp.n_x:
-            raise InputError(f"{name}: shape {array.shape} given, (m, {self.ocp.n_x}) with m > 0 needed")
+        if array.ndim != 2 or len(array) < 1 or array.shape[1] != columns:
+            raise InputError(f"{name}: shape {array.shape} given, (m, {columns}) with m > 0 needed")
         return np.asarray(array[np.minimum(self._rows, len(array) - 1)])
 
     def state_weights(self, weight: Array) -> tuple[Array, Array]:
@@ -186,7 +197,7 @@ class Problem:
         error = x - target.x
         stage = np.sum(error[:-1] ** 2 * stages)
         stage += self.model.dt * np.sum(u**2 @ self.ocp.r + du**2 @ self.ocp.r_delta)
-        total = float(stage + error[-1] @ terminal @ error[-1]) + self.economic.value(x, u)
+        total = float(stage + error[-1] @ terminal @ error[-1]) + self.economic.value(x, u, target.p)
         if len(self.soft):
             excess = self.soft.excess(self.soft.values(x, u)) if excess is None else excess
             total += self.model.dt * self.soft.penalty(excess)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.mpc.buffered import BufferedFunction
+from hybrid_mpc.mpc.limits import Limits
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.soft import SoftRows
 from hybrid_mpc.mpc.solution import Status
@@ -159,20 +160,26 @@ class InputQP:
         answer = self.answer(hessian, gradient, u, u_prev, soft)
         return answer.step, answer.status, answer.kkt
 
-    def answer(self, hessian: Array, gradient: Array, u: Array, u_prev: Array, soft: Soft = None) -> Answer:
-        """As :meth:`solve`, with the multipliers of the soft bounds."""
+    def answer(
+        self, hessian: Array, gradient: Array, u: Array, u_prev: Array, soft: Soft = None,
+        limits: Limits | None = None,
+    ) -> Answer:  # fmt: skip
+        """As :meth:`solve`, with the multipliers of the soft bounds; ``limits`` as :meth:`OCP.bounds` has them."""
         if self._ocp.blocks is None:
-            return self._solve(hessian, gradient, u, u_prev, soft)
+            return self._solve(hessian, gradient, u, u_prev, soft, limits)
         if soft is not None:
             soft = soft[0], self.by_blocks(soft[1])
         given = self.blocked_hessian(hessian), self.by_blocks(gradient), u[self._starts]
-        answer = self._solve(*given, u_prev, soft)
+        answer = self._solve(*given, u_prev, soft, limits)
         step = np.repeat(answer.step.reshape(-1, u.shape[1]), self._ocp.blocks, axis=0)
         return replace(answer, step=step.ravel())
 
-    def _solve(self, hessian: Array, gradient: Array, u: Array, u_prev: Array, soft: Soft) -> Answer:
-        ocp, scale = self._ocp, self._scale
-        lower, upper = ((bound - u).ravel() / scale for bound in (ocp.u_min, ocp.u_max))
+    def _solve(
+        self, hessian: Array, gradient: Array, u: Array, u_prev: Array, soft: Soft, limits: Limits | None
+    ) -> Answer:
+        scale = self._scale
+        bounds = (bound[self._starts] for bound in self._ocp.bounds(u_prev, limits))
+        lower, upper = ((bound - u).ravel() / scale for bound in bounds)
         row_lower, row_upper = self._row_bounds(u, u_prev)
         h, g = hessian * scale * scale[:, None], gradient * scale
         size = float(np.max(np.diag(h)))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
+from hybrid_mpc.mpc.limits import Limits
 from hybrid_mpc.mpc.problem import Controller
 from hybrid_mpc.mpc.solution import Solution, Status
 from hybrid_mpc.riccati import lqr, vector
@@ -147,8 +148,9 @@ class SafeController:
         return Decision(held, Source.ZERO, plan, Status.INITIAL, 0)
 
     def decide(
-        self, previous: Decision, estimate: Estimate, reference: Array, weight: Array | None = None
-    ) -> Decision:
+        self, previous: Decision, estimate: Estimate, reference: Array, weight: Array | None = None,
+        *, limits: Limits | None = None,
+    ) -> Decision:  # fmt: skip
         """The input to hold from now on.
 
         Args:
@@ -156,27 +158,33 @@ class SafeController:
             estimate: The state now.
             reference: ``(m, n_x)`` from now on in steps of ``dt``.
             weight: Factors on ``q`` ``(m, n_x)``, as the reference. Default: 1.
+            limits: Bounds of the inputs for this period, e.g. those of a guard; where ``du_max`` does not let the
+                input be within them at once, it goes there as fast as it may. Default: the problem's own.
         """
-        solution = self._controller.solve(previous.solution, estimate, reference, weight)
+        solution = self._controller.solve(previous.solution, estimate, reference, weight, limits=limits)
         if solution.status.ok:
-            u = self._controller.ocp.saturate(solution.u[0], previous.u)
+            u = self._controller.ocp.saturate(solution.u[0], previous.u, limits)
             plan = replace(solution, u=np.vstack([u[None], solution.u[1:]]))
             return Decision(u, Source.MPC, plan, solution.status, 0)
-        return self._without(previous, estimate, reference, solution)
+        return self._without(previous, estimate, reference, solution, limits)
 
-    def late(self, previous: Decision, estimate: Estimate, reference: Array) -> Decision:
+    def late(
+        self, previous: Decision, estimate: Estimate, reference: Array, *, limits: Limits | None = None
+    ) -> Decision:
         """The input to hold where the solve has not come in time: as after a failed solve, status LATE."""
         plan = previous.solution
         shifted = np.vstack([plan.u[1:], plan.u[-1:]])
-        return self._without(previous, estimate, reference, replace(plan, u=shifted, status=Status.LATE))
+        failed = replace(plan, u=shifted, status=Status.LATE)
+        return self._without(previous, estimate, reference, failed, limits)
 
     def _without(
-        self, previous: Decision, estimate: Estimate, reference: Array, solution: Solution
-    ) -> Decision:
+        self, previous: Decision, estimate: Estimate, reference: Array, solution: Solution,
+        limits: Limits | None,
+    ) -> Decision:  # fmt: skip
         """The decision where no solution may be applied; ``solution`` holds the shifted plan and why."""
         ocp, held = self._controller.ocp, previous.u
         u, source = self._instead(solution, estimate, np.asarray(reference, dtype=float), previous.age + 1)
-        u = ocp.saturate(u, held)
+        u = ocp.saturate(u, held, limits)
         inputs = np.vstack([u[None], solution.u[1:]])
         inputs = np.where(np.isfinite(inputs), inputs, u)
         known = bool(np.all(np.isfinite(np.concatenate([estimate.x, estimate.h, estimate.d]))))
@@ -190,7 +198,8 @@ class SafeController:
         if age <= self._max_age and np.all(np.isfinite(failed.u[0])):
             return failed.u[0], Source.PLAN
         if self._fallback is not None:
-            goal = reference[0] if np.all(np.isfinite(reference[0])) else np.zeros(self._controller.ocp.n_x)
+            goal = reference[0, : self._controller.ocp.n_x]
+            goal = goal if np.all(np.isfinite(goal)) else np.zeros_like(goal)
             u = self._fallback(goal).full().ravel() - self._gain @ (estimate.x - goal) - estimate.d
             if np.all(np.isfinite(u)):
                 return u, Source.FALLBACK

@@ -14,6 +14,7 @@ from hybrid_mpc.model import HybridModel
 from hybrid_mpc.mpc.condensed import CondensedController
 from hybrid_mpc.mpc.descent import Descent
 from hybrid_mpc.mpc.landscape import Case, Landscape
+from hybrid_mpc.mpc.limits import Limits
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.problem import Problem
 from hybrid_mpc.mpc.solution import Solution, Status
@@ -110,16 +111,17 @@ class SQPController:
 
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def solve(
-        self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None
-    ) -> Solution:
+        self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,
+        *, limits: Limits | None = None,
+    ) -> Solution:  # fmt: skip
         """The plan from now on, converged; see :meth:`Controller.solve`.
 
         Its ``kkt`` is the residual of the nonlinear problem in the QP's scaling, with the multipliers of the
         last QP.
         """
         start = perf_counter()
-        case = Case(estimate.d, previous.u[0], self.problem.target(reference, weight))
-        u = self._admissible(np.vstack([previous.u[1:], previous.u[-1:]]), case.u_prev)
+        case = Case(estimate.d, previous.u[0], self.problem.target(reference, weight), limits)
+        u = self._admissible(np.vstack([previous.u[1:], previous.u[-1:]]), case)
         run = self._landscape.run(np.concatenate([estimate.x, estimate.h]), u, case)
         at = self._landscape.at(run, case)
         search = Descent(self._landscape, case, at, self._shifted(previous), self._tolerance)
@@ -137,16 +139,19 @@ class SQPController:
             return None
         return np.concatenate([given[1:], given[-1:]]) if np.all(np.isfinite(given)) else None
 
-    def _admissible(self, u: Array, u_prev: Array) -> Array:
+    def _admissible(self, u: Array, case: Case) -> Array:
         """``u`` held over its blocks and moved into the limits, one input after the other.
 
         The QPs keep what the first guess keeps.
         """
+        u_prev = case.u_prev
+        lower, upper = self.ocp.bounds(u_prev, case.limits)
         if self.ocp.du_max is None:
-            return self.ocp.held(np.clip(u, self.ocp.u_min, self.ocp.u_max))
+            return self.ocp.held(np.clip(u, lower, upper))
         rows = u.copy()
         for start in self.ocp.starts:
-            rows[start] = u_prev = self.ocp.saturate(u[start], u_prev)
+            u_prev = np.clip(self.ocp.saturate(u[start], u_prev), lower[start], upper[start])
+            rows[start] = u_prev
         return self.ocp.held(rows)
 
     def _plan(self, search: Descent, d: Array) -> Solution:

@@ -66,7 +66,7 @@ class Slow:
     def __getattr__(self, name):
         return getattr(self._controller, name)
 
-    def solve(self, *arguments):
+    def solve(self, *arguments, **others):
         self.k += 1
         self._clock.t += self._seconds.get(self.k, 0.0)
         return self._controller.solve(*arguments)

@@ -49,7 +49,7 @@ def model_of_cost(model, ocp, u):
     case = Case(e.d, np.array([0.3]), controller.problem.target(np.full((1, 2), 2.0)))
     at = land.at(land.run(np.concatenate([e.x, e.h]), u[:, None], case), case)
     prepared = land.condensed(at, case)
-    rest = land.rest(prepared, land.curvature(at, case, at.multipliers, np.zeros(0)))
+    rest = land.rest(prepared, land.curvature(at, case, at.multipliers, np.zeros(0)), case)
     return at.gradient, prepared.hessian, rest
 
 
@@ -112,7 +112,7 @@ def test_soft_bounds_are_in_the_lagrangian_and_its_hessian():
     # Central differences over 1e-5: rounding 1e-16 / 1e-5 of the cost of some hundreds.
     assert 2 * float(shift.ravel() @ gradient) == pytest.approx(up - down, rel=1e-5)
     prepared = land.condensed(at, case)
-    rest = land.rest(prepared, land.curvature(at, case, multipliers, mu))
+    rest = land.rest(prepared, land.curvature(at, case, multipliers, mu), case)
     # The one-sided differences' 6e-4, see above.
     want = 0.5 * (slope_up - slope_down)
     got = (prepared.hessian + rest) @ shift.ravel()

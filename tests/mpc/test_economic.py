@@ -7,7 +7,7 @@ from online_models import pendulum_model
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
-from hybrid_mpc.mpc import OCP, CondensedController, IpoptController, SQPController, Status
+from hybrid_mpc.mpc import OCP, CondensedController, IpoptController, SQPController, Status, output_cost
 from hybrid_mpc.mpc.economic import EconomicCost
 
 POINT = [0.0, 1.0], [0.0]
@@ -79,3 +79,53 @@ def test_bad_expressions_are_refused(bad):
             pendulum_model(),
             OCP(5, [1.0, 1.0], [1.0], [0.0], [-1.0], [1.0], working_point=POINT, economic=bad),
         )
+
+
+HEIGHT = ca.Function("height", [X, U], [ca.vertcat(ca.sin(X[0]) + 0.1 * X[1], U**2)])
+COURSE = 0.3 + 0.2 * np.sin(0.3 * np.arange(21))
+
+
+def tracked(model, solver, reference, **options):
+    """The plan that tracks outputs which are no states, with ``reference`` ``(m, 4)``."""
+    ocp = OCP(
+        20, [0.1, 0.1], [0.5], [0.2], [-2.0], [2.0], terminal=np.zeros((2, 2)),
+        economic=output_cost(HEIGHT, [300.0, 0.5]),
+    )  # fmt: skip
+    controller, e = solver(model, ocp, **options), estimate_of(model, [-0.3, 0.5])
+    return controller.solve(controller.initial(e), e, reference)
+
+
+@pytest.mark.parametrize("z", [0, 3])
+def test_outputs_follow_their_reference_in_every_solver(z):
+    model = pendulum_model(z=z)
+    reference = np.column_stack([np.zeros((21, 2)), COURSE, np.full(21, 0.2)])
+    sqp, ipopt = (tracked(model, solver, reference) for solver in (SQPController, IpoptController))
+    rti = tracked(model, CondensedController, reference, iterations=40)
+    assert sqp.status is ipopt.status is rti.status is Status.SOLVED
+    assert sqp.cost == pytest.approx(ipopt.cost, rel=1e-6)  # the promise of sqp's documentation
+    np.testing.assert_allclose(
+        rti.u, ipopt.u, atol=1e-3
+    )  # the convexified Hessian changes the way, not the end
+
+    def missed(plan):
+        return np.abs(np.sin(plan.x[10:20, 0]) + 0.1 * plan.x[10:20, 1] - COURSE[10:20]).mean()
+
+    held = tracked(model, SQPController, reference[:1])  # without the preview
+    assert missed(sqp) < 0.5 * missed(held)
+
+
+def test_parameters_are_columns_of_the_reference():
+    model = pendulum_model()
+    with pytest.raises(InputError, match=r"shape \(1, 2\) given, \(m, 4\)"):
+        tracked(model, CondensedController, np.zeros((1, 2)))
+    plan = tracked(model, SQPController, np.array([[0.0, 0.0, np.nan, 0.0]]))
+    assert plan.status is Status.NOT_FINITE
+    assert (
+        tracked(model, CondensedController, np.array([[0.0, 0.0, np.nan, 0.0]])).status is Status.NOT_FINITE
+    )
+
+
+@pytest.mark.parametrize("weights", [[1.0], [1.0, -1.0], [np.nan, 1.0]])
+def test_bad_output_weights_are_refused(weights):
+    with pytest.raises(InputError, match="q_y"):
+        output_cost(HEIGHT, weights)

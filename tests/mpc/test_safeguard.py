@@ -28,7 +28,7 @@ class Failing:
     def __getattr__(self, name):
         return getattr(self._controller, name)
 
-    def solve(self, previous, estimate, reference, weight=None):
+    def solve(self, previous, estimate, reference, weight=None, *, limits=None):
         self._k += 1
         solution = self._controller.solve(previous, estimate, reference, weight)
         if self._k not in self._periods:

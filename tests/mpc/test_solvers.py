@@ -207,7 +207,7 @@ def test_of_many_guesses_only_the_cheapest_are_solved_from():
     solved_from = []
 
     class Counting(SQPController):
-        def solve(self, previous, estimate, reference, weight=None):
+        def solve(self, previous, estimate, reference, weight=None, *, limits=None):
             solved_from.append(float(previous.u[1, 0]))  # what the shifted plan begins with
             return super().solve(previous, estimate, reference, weight)
 
