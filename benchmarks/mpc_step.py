@@ -43,13 +43,18 @@ PERIODS, RIVAL_PERIODS, GROWTH_PERIODS, SKIPPED = 150, 18, 30, 3
 GOAL = 0.6  # [rad], from rest at -0.3 rad
 
 
-def hybrid(z: int):
-    """The golf robot's hybrid model with a GRU of ``z`` random units."""
+def programs(z: int):
+    """The traced programs of the golf robot's hybrid model with a GRU of ``z`` random units."""
     torch.manual_seed(z)
     prior, dt = scenario.prior(), scenario.data.dt
     network = GRUNetwork(n_features(prior, True), z, prior.n_q)
     scaling = Scaling(x=(0.5, 1.5), u=(0.2,), acceleration=(5.0,), correction=(0.5,))
-    program = trace_model(HybridStep(prior, network, scaling, dt).requires_grad_(False))
+    return trace_model(HybridStep(prior, network, scaling, dt).requires_grad_(False))
+
+
+def hybrid(z: int):
+    """That model."""
+    program, prior, dt = programs(z), scenario.prior(), scenario.data.dt
     with tempfile.TemporaryDirectory() as folder:
         save_artifact(Path(folder) / "model", {"hybrid": program}, model_info(prior, dt), provenance={})
         return load_artifact(Path(folder) / "model").models["hybrid"]
@@ -121,13 +126,16 @@ class SingleShooting:
             x, h = model.step(x, h, u[k])
             before = u[k]
         cost += (x - x_ref).T @ self._guide.problem.terminal @ (x - x_ref)
+        nlp = {"x": u, "p": ca.vertcat(z0, u_prev, x_ref), "f": cost}
+        self._solver = self._make(nlp)
+
+    def _make(self, nlp):
         options = {
             "print_time": False, "print_header": False, "print_iteration": False, "print_status": False,
             "error_on_fail": False, "max_iter": 50, "tol_pr": 1e-6, "tol_du": 1e-6, "qpsol": "qrqp",
             "qpsol_options": {"print_iter": False, "print_header": False, "error_on_fail": False},
         }  # fmt: skip
-        nlp = {"x": u, "p": ca.vertcat(z0, u_prev, x_ref), "f": cost}
-        self._solver = ca.nlpsol("single", "sqpmethod", nlp, options)
+        return ca.nlpsol("single", "sqpmethod", nlp, options)
 
     def initial(self, e):
         """A first plan."""
