@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hybrid_mpc.data.excitation_check import check_excitation
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_arrays, read_json, write_arrays, write_json
 from hybrid_mpc.pipeline.context import Context
@@ -30,7 +31,7 @@ MODELS = ("phy_nominal", "phy", "rnn", "pgrnn", "mopgrnn")
 def check_data(context: Context) -> None:
     """Read the user's recordings before anything is written: bad ones leave no folder behind."""
     if context.settings.data:
-        context.dataset  # noqa: B018  read, checked and kept
+        _excitation(context)  # reads, checks and keeps the recordings
     elif context.scenario.make_data is None:
         raise InputError(
             f"scenario {context.scenario.name} is a real machine: give its recordings with --data FILE.csv "
@@ -44,7 +45,7 @@ def data_stage(context: Context) -> None:
         assert context.scenario.make_data is not None
         context.progress.update("files", 0, 1, "recording the simulated machine")
         context.scenario.make_data(context.out / "data", context.settings.seed, context.settings.budget)
-    dataset = context.dataset
+    dataset, warnings = context.dataset, _excitation(context)
     roles = ("train", "valid", "test")
     context.save(
         "data",
@@ -54,8 +55,19 @@ def data_stage(context: Context) -> None:
             "cuts": [{"file": c.file, "from_s": c.start, "to_s": c.end, "why": c.why} for c in dataset.cuts],
             "pieces": {role: len(context.trajectories(role)) for role in roles},
             "seconds": {role: sum(len(t.t) * t.dt for t in context.trajectories(role)) for role in roles},
+            "warnings": list(warnings),
         },
     )
+
+
+def _excitation(context: Context) -> tuple[str, ...]:
+    """What the training recordings leave in doubt; an input that does nothing is refused."""
+    prior = context.scenario.prior()
+    free = sum(not p.fixed for p in prior.parameters_spec)
+    train = context.trajectories("train")
+    if not train:  # the prior's fit says so
+        return ()
+    return check_excitation(train, inputs=prior.inputs, outputs=prior.outputs, parameters=free)
 
 
 def prior_stage(context: Context) -> None:

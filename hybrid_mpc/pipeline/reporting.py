@@ -175,9 +175,8 @@ def _data_table(results: dict[str, Any]) -> Table:
         (f"cut: {c['file']}, {c['start_s']:.2f} to {c['end_s']:.2f} s: {why}", c["end_s"] - c["start_s"])
         for c, why in zip(data["cuts"], data["details"]["why_cut"], strict=True)
     ]
-    return Table(
-        ("part", "length [s]"), rows, f"{len(data['files'])} files; content hash {data['hash'][:16]}."
-    )
+    caption = f"{len(data['files'])} files; content hash {data['hash'][:16]}."
+    return Table(("part", "length [s]"), rows, " ".join([caption, *data["details"]["warnings"]]))
 
 
 def _prior_table(context: Context) -> Table:

@@ -31,7 +31,11 @@ def collect(context: Context) -> dict[str, Any]:
             "files": data["files"],
             "hash": data["hash"],
             "cuts": [{"file": c["file"], "start_s": c["from_s"], "end_s": c["to_s"]} for c in data["cuts"]],
-            "details": {"seconds": data["seconds"], "why_cut": [c["why"] for c in data["cuts"]]},
+            "details": {
+                "seconds": data["seconds"],
+                "why_cut": [c["why"] for c in data["cuts"]],
+                "warnings": data.get("warnings", []),  # older runs have none
+            },
         },
         "identification": _identification(context),
         "export": context.result("export"),

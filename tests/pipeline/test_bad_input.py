@@ -71,6 +71,14 @@ def empty(lines):
     lines.clear()
 
 
+def idle(lines):
+    lines[1:] = [f"{0.01 * k:.2f},0.1,{0.3 * np.sin(0.01 * k):.4f}" for k in range(2000)]
+
+
+def still(lines):
+    lines[1:] = [f"{0.01 * k:.2f},{0.1 * np.sin(0.01 * k):.4f},0.3" for k in range(2000)]
+
+
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
@@ -83,6 +91,8 @@ def empty(lines):
         (coarse, ["bad.csv", "max_gap"]),
         (degrees, ["bad.csv", "phi", "degrees"]),
         (empty, ["bad.csv", "empty"]),
+        (idle, ["bad", "tau", "0.1 throughout"]),
+        (still, ["bad", "phi", "never moved"]),
     ],
     ids=lambda value: value.__name__ if callable(value) else "",
 )
