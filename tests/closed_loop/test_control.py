@@ -166,6 +166,22 @@ def test_a_limit_on_the_speed_is_kept_in_closed_loop():
     assert set(slow.source) == {"MPC"}
 
 
+@pytest.mark.parametrize("sensor", [False, True])
+def test_a_limit_on_the_angle_that_can_be_kept_is_kept_to_a_milliradian(sensor):
+    model, plant = viscous()
+    beyond = lambda t: 0.7 * np.sin(3.0 * t[:, None]) * [1.0, 0.0]  # noqa: E731
+    ocp = OCP(30, [300.0, 1.0], [1e-3], [0.05], [-6.0], [6.0], x_min=[-0.5, -9.0], x_max=[0.5, 9.0],
+              working_point=POINT)  # fmt: skip
+    limited = SafeController(CondensedController(model, ocp))
+    # With a sensor the estimate moves with its noise (1 mrad here), so a limit of the estimate is not one of the truth.
+    estimator, tolerance = (make_ekf(model), 5e-3) if sensor else (TrueState(model), 1e-3)
+    free = loop(model, plant, beyond, 6.0, safe=make_safe(model, r=1e-3))
+    result = loop(model, plant, beyond, 6.0, safe=limited, estimator=estimator)
+    assert np.max(np.abs(free.x[:, 0])) > 0.6
+    assert 0.49 < np.max(np.abs(result.x[:, 0])) < 0.5 + tolerance
+    assert set(result.source) == {"MPC"}
+
+
 FAULTS = st.builds(
     Fault,
     st.floats(0, 0.5), st.floats(0.6, 2.0),
