@@ -5,7 +5,7 @@ INSTALLED := .venv/.installed
 # Arrays here are small: threads inside numpy and torch only cost time.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: install demo test test-full lint types clean
+.PHONY: install demo test test-full lint types docs clean
 
 install: $(INSTALLED)
 
@@ -30,6 +30,10 @@ test: lint types
 
 test-full: lint types
 	$(BIN)/python -m pytest -n 2 --dist loadgroup -q --durations=20
+
+# The site, in build/site; broken links and references stop it.
+docs: $(INSTALLED)
+	$(BIN)/mkdocs build
 
 clean:
 	rm -rf .venv build runs/demo

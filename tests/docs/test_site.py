@@ -1,0 +1,53 @@
+"""The site builds, its links lead somewhere, and every page of docs/ is in it."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+
+
+def pages(nav):
+    for entry in nav:
+        for value in entry.values():
+            yield from pages(value) if isinstance(value, list) else [value]
+
+
+def test_every_page_is_in_the_navigation():
+    nav = yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"]
+    assert sorted(pages(nav)) == sorted(str(p.relative_to(DOCS)) for p in DOCS.rglob("*.md"))
+
+
+@pytest.mark.parametrize("page", ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md"])
+def test_links_of_the_pages_beside_the_site(page):
+    for link in LINK.findall((ROOT / page).read_text()):
+        assert link.startswith("http") or (ROOT / link.partition("#")[0]).exists(), link
+
+
+@pytest.mark.full
+def test_the_site_builds_and_a_broken_link_stops_it(tmp_path):
+    build = [sys.executable, "-m", "mkdocs", "build", "--site-dir"]
+    done = subprocess.run([*build, tmp_path / "site"], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "site" / "api" / "mpc.html").read_text()
+    assert "CondensedController" in page
+    assert "&gt;&gt;&gt;" in page  # examples are shown as code
+    settings = (ROOT / "mkdocs.yml").read_text().replace("docs_dir: docs", f"docs_dir: {tmp_path}/docs")
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs" / "index.md").write_text("[nowhere](none.md)\n")
+    settings = settings[: settings.index("nav:")] + settings[settings.index("markdown_extensions:") :]
+    (tmp_path / "mkdocs.yml").write_text(settings.replace("docs/site/", f"{DOCS}/site/"))
+    broken = subprocess.run(
+        [*build, tmp_path / "other", "-f", tmp_path / "mkdocs.yml"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
+    assert broken.returncode != 0
+    assert "none.md" in broken.stderr
