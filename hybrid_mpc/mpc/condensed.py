@@ -162,7 +162,8 @@ class CondensedController:
         n_x = self._n_x
         dz0 = np.concatenate([estimate.x, estimate.h]) - prepared.z[0]
         drift = prepared.defects + prepared.b @ (estimate.d - prepared.d)
-        free = propagate(prepared.a_t, drift, dz0)
+        matrices = list(prepared.a_t.transpose(0, 2, 1))
+        free = propagate(matrices, drift, dz0)
         error = prepared.z[:, :n_x] + free[:, :n_x] - target.x
         u_bar = prepared.u.ravel()
         gradient = 2 * error.ravel() @ prepared.weighted + self.input_gradient(u_bar, prepared.u_prev)
@@ -181,7 +182,7 @@ class CondensedController:
             return self._failed(prepared, answer.status, start, answer.kkt)
         u = (u_bar + step).reshape(prepared.u.shape)
         drift += (prepared.b @ step.reshape(len(u), -1, 1))[:, :, 0]
-        z = prepared.z + propagate(prepared.a_t, drift, dz0)
+        z = prepared.z + propagate(matrices, drift, dz0)
         excess = np.zeros(0) if soft is None else self._problem.soft.excess(soft[0] + soft[1] @ step)
         cost = self._problem.cost(z, u, prepared.u_prev, target, excess)
         if not np.isfinite(cost):

@@ -192,7 +192,7 @@ class Problem:
             excess: Violations of the soft bounds ``(M,)``. Default: those of the trajectory.
         """
         x = z[:, : self.ocp.n_x]
-        du = np.diff(u, axis=0, prepend=u_prev[None])
+        du = u - np.vstack([u_prev, u[:-1]])
         stages, terminal = self.state_weights(target.weight)
         error = x - target.x
         stage = np.sum(error[:-1] ** 2 * stages)
