@@ -2,7 +2,8 @@
 
 do-mpc (https://www.do-mpc.com, extra ``bench``) solves the problem of ``mpc_step.py`` (golf robot's hybrid model with
 random weights, |u| bounded, no other bounds) along the same states, by turns with the library's solvers, each
-warm-started from its own last plan; whole Python calls, medians of processor time [ms], the first three solves of a round not counted.
+warm-started from its own last plan; whole Python calls, medians of processor time [ms], the first three solves of a
+round not counted.
 
 do-mpc sees a discrete model (``model_type="discrete"``): the hidden state steps once a period, so there is nothing
 for its collocation to discretise, and the NLP is that of ``IpoptController``: multiple shooting over (x, h), exact
