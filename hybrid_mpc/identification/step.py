@@ -263,14 +263,23 @@ def required_substeps(prior: Prior, dt: float) -> int:
     Raises:
         InputError: If more than ``MAX_SUBSTEPS`` would be needed.
     """
-    zeros = torch.zeros(len(prior.states), dtype=torch.float64)
-    u = torch.zeros(len(prior.inputs), dtype=torch.float64)
-    slope = torch.func.jacrev(lambda x: prior(x, u))(zeros)
+    return substeps_for(prior, len(prior.states), len(prior.inputs), dt, f"{type(prior).__name__}: the prior")
+
+
+def substeps_for(f: Callable[[Tensor, Tensor], Tensor], n_x: int, n_u: int, dt: float, name: str) -> int:
+    """:func:`required_substeps` of any ``xdot = f(x, u)``; ``name`` says in the error what is too stiff.
+
+    Raises:
+        InputError: If more than ``MAX_SUBSTEPS`` would be needed.
+    """
+    zeros = torch.zeros(n_x, dtype=torch.float64)
+    u = torch.zeros(n_u, dtype=torch.float64)
+    slope = torch.func.jacrev(lambda x: f(x, u))(zeros)
     rate = float(torch.linalg.eigvals(slope).abs().max())
     substeps = max(1, math.ceil(rate * dt))
     if not math.isfinite(rate) or substeps > MAX_SUBSTEPS:
         raise InputError(
-            f"{type(prior).__name__}: the prior's fastest mode at rest is {rate:.3g} 1/s; a period of {dt} s "
+            f"{name}'s fastest mode at rest is {rate:.3g} 1/s; a period of {dt} s "
             f"would need {substeps} sub-steps (at most {MAX_SUBSTEPS}). Smooth its friction (lower the slope "
             f"at zero speed) or take a smaller dt."
         )
