@@ -14,6 +14,7 @@ import nn_export
 from hybrid_mpc.artifact import INPUTS, OUTPUTS, ModelInfo, build_model
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.identification.networks import Network
+from hybrid_mpc.identification.output_network import OutputModel
 from hybrid_mpc.identification.sindy_step import SindyStep
 from hybrid_mpc.identification.step import PriorStep, RecurrentStep
 from hybrid_mpc.physics import Prior
@@ -47,13 +48,18 @@ class _Method(nn.Module):
         return result
 
 
-def trace_model(step: Step) -> dict[str, nn_export.Program]:
-    """Programs ``step, xdot, output, energy_balance`` of one model."""
+def trace_model(step: Step, output: OutputModel | None = None) -> dict[str, nn_export.Program]:
+    """Programs ``step, xdot, output, energy_balance`` of one model.
+
+    Args:
+        step: The model.
+        output: Its output, with a network G in it. Default: the prior's output.
+    """
     prior = step.prior
     modules: dict[str, nn.Module] = {
         "step": step,
         "xdot": _Method(step, "xdot"),
-        "output": _Method(prior, "output"),
+        "output": _Method(prior, "output") if output is None else output,
         "energy_balance": _Method(prior, "energy_balance"),
     }
     examples = _examples(step)
