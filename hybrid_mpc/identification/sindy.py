@@ -16,6 +16,7 @@ from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identification.dataset import Windows, check_rates, cut_windows
 from hybrid_mpc.identification.evaluation import free_runs, score
+from hybrid_mpc.identification.runge_kutta import MAX_SUBSTEPS
 from hybrid_mpc.identification.sindy_step import (
     Factor,
     Library,
@@ -25,7 +26,6 @@ from hybrid_mpc.identification.sindy_step import (
     machine_libraries,
     signal_names,
 )
-from hybrid_mpc.identification.step import MAX_SUBSTEPS
 from hybrid_mpc.physics import Prior
 
 __all__ = ["fit_sindy", "SindyStep", "SindyCandidate", "Library", "Factor", "machine_libraries", "Target"]

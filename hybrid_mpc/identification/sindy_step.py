@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.identification.step import rk4, substeps_for
+from hybrid_mpc.identification.runge_kutta import rk4, substeps_for
 from hybrid_mpc.physics import Prior
 
 STEEPNESS = (5.0, 10.0, 20.0, 50.0, 100.0)
