@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import TypeAlias, cast
 
 import numpy as np
 import torch
@@ -14,8 +14,13 @@ import nn_export
 from hybrid_mpc.artifact import INPUTS, OUTPUTS, ModelInfo, build_model
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.identification.networks import Network
+from hybrid_mpc.identification.output_network import OutputModel
+from hybrid_mpc.identification.sindy_step import SindyStep
 from hybrid_mpc.identification.step import PriorStep, RecurrentStep
 from hybrid_mpc.physics import Prior
+
+Step: TypeAlias = RecurrentStep | PriorStep | SindyStep
+"""What can be exported: every model as a step ``(x, h, u) -> (x_next, h_next)``."""
 
 
 @dataclass(frozen=True)
@@ -43,13 +48,18 @@ class _Method(nn.Module):
         return result
 
 
-def trace_model(step: RecurrentStep | PriorStep) -> dict[str, nn_export.Program]:
-    """Programs ``step, xdot, output, energy_balance`` of one model."""
+def trace_model(step: Step, output: OutputModel | None = None) -> dict[str, nn_export.Program]:
+    """Programs ``step, xdot, output, energy_balance`` of one model.
+
+    Args:
+        step: The model.
+        output: Its output, with a network G in it. Default: the prior's output.
+    """
     prior = step.prior
     modules: dict[str, nn.Module] = {
         "step": step,
         "xdot": _Method(step, "xdot"),
-        "output": _Method(prior, "output"),
+        "output": _Method(prior, "output") if output is None else output,
         "energy_balance": _Method(prior, "energy_balance"),
     }
     examples = _examples(step)
@@ -70,7 +80,7 @@ def model_info(prior: Prior, dt: float) -> ModelInfo:
 
 
 def check_parity(
-    step: RecurrentStep | PriorStep,
+    step: Step,
     programs: dict[str, nn_export.Program],
     info: ModelInfo,
     trajectories: Sequence[Trajectory],
@@ -88,8 +98,8 @@ def check_parity(
     return Parity(report.value_rel, report.jacobian_rel)
 
 
-def _examples(step: RecurrentStep | PriorStep) -> dict[str, Tensor]:
-    n_h = 0 if isinstance(step, PriorStep) else cast(Network, step.network).n_h
+def _examples(step: Step) -> dict[str, Tensor]:
+    n_h = cast(Network, step.network).n_h if isinstance(step, RecurrentStep) else 0
     n_x, n_u = len(step.prior.states), len(step.prior.inputs)
     shapes = {"x": n_x, "h": n_h, "u": n_u, "xdot": n_x}
     return {name: torch.zeros(n, dtype=torch.float64) for name, n in shapes.items()}

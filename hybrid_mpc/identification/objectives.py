@@ -46,7 +46,7 @@ def teacher_forced(step: RecurrentStep, windows: Windows) -> Prediction:
     period it acts in.
     """
     x, u = windows.x[:, :-1].transpose(0, 1), windows.u.transpose(0, 1)
-    features = step.features(x, u).unsqueeze(1)
+    features = step.stacked_features(x, u)
     stack = cast(StackedNetwork, step.network)
     out, _ = stack.sequence(features, stack.initial(len(windows)))
     correction = (out * step.scale_correction)[windows.warm :]
@@ -63,7 +63,7 @@ def warm_up(step: RecurrentStep, windows: Windows) -> Tensor:
     if windows.warm == 0:
         return h
     x, u = windows.x[:, : windows.warm].transpose(0, 1), windows.u[:, : windows.warm].transpose(0, 1)
-    return stack.sequence(step.features(x, u).unsqueeze(1), h)[1]
+    return stack.sequence(step.stacked_features(x, u), h)[1]
 
 
 def free_run(step: RecurrentStep, windows: Windows) -> Prediction:

@@ -13,6 +13,7 @@ from hybrid_mpc.identification.objectives import OBJECTIVES
 Kind = Literal["rnn", "pgrnn", "mopgrnn"]
 Form = Literal["hybrid", "literal"]
 Reading = Literal["stage", "one_step", "free_run"]
+PriorParameters = Literal["fixed", "trained"]
 KINDS: tuple[Kind, ...] = ("rnn", "pgrnn", "mopgrnn")
 
 
@@ -49,9 +50,13 @@ class TrainingSettings:
             cost a second prediction in the other stage
             (:func:`~hybrid_mpc.identification.objectives.energy_objective`).
         fused: Sequences of the GRUs with few operations a step: faster, but not the same bits.
+        prior_parameters: ``"fixed"`` at their fitted values, or ``"trained"`` along within their bounds, each
+            network its own (:mod:`~hybrid_mpc.identification.prior_stack`). The energy balance that trains and
+            judges keeps the fitted values.
 
     Raises:
-        InputError: If a name is not known, there is no objective, or weights do not fit the objectives.
+        InputError: If a name is not known, there is no objective, weights do not fit the objectives, or an rnn is
+            to train the prior that it does not have.
 
     Example:
         >>> TrainingSettings("mopgrnn", 16, 4, 100, 100, seed=0, warm=10).objectives
@@ -77,11 +82,13 @@ class TrainingSettings:
     weights: tuple[float, ...] = ()
     energy: Reading = "stage"
     fused: bool = False
+    prior_parameters: PriorParameters = "fixed"
 
     def __post_init__(self) -> None:
         for name in ("objectives", "weights"):  # lists, where they come from a file
             object.__setattr__(self, name, tuple(getattr(self, name)))
         names = {"kind": Kind, "cell": Cell, "form": Form, "combination": CombinationName, "energy": Reading}
+        names |= {"prior_parameters": PriorParameters}
         for name, choices in names.items():
             _check_choice(name, getattr(self, name), get_args(choices))
         for objective in self.objectives:
@@ -93,6 +100,8 @@ class TrainingSettings:
                 f"weights has {len(self.weights)} numbers for the objectives {', '.join(self.objectives)}; "
                 "give one for each, or none for equal ones"
             )
+        if self.kind == "rnn" and self.prior_parameters == "trained":
+            raise InputError("an rnn has no prior to train along; leave prior_parameters 'fixed'")
 
     @property
     def use_prior(self) -> bool:

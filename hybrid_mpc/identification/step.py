@@ -7,18 +7,14 @@ batch) and for export (one sample).
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.identification.prior_stack import StackedPrior
+from hybrid_mpc.identification.runge_kutta import required_substeps, rk4
 from hybrid_mpc.physics import Prior
-
-MAX_SUBSTEPS = 20
-"""A prior stiffer than this many Runge-Kutta sub-steps a period can follow needs another dt."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +69,8 @@ class RecurrentStep(nn.Module):
         scaling: Magnitudes of features and outputs.
         dt: Model period [s].
         use_prior: False makes the plain recurrent network (RNN) of the paper's comparison.
+        dynamics: The prior's equation with parameters that were, or are, trained along; names, output and energy
+            balance stay those of ``prior``. Default: ``prior``.
     """
 
     scale_x: Tensor
@@ -81,16 +79,36 @@ class RecurrentStep(nn.Module):
     scale_correction: Tensor
 
     def __init__(
-        self, prior: Prior, network: nn.Module, scaling: Scaling, dt: float, *, use_prior: bool = True
+        self,
+        prior: Prior,
+        network: nn.Module,
+        scaling: Scaling,
+        dt: float,
+        *,
+        use_prior: bool = True,
+        dynamics: Prior | StackedPrior | None = None,
     ) -> None:
         super().__init__()
         self.prior, self.network, self.dt, self.use_prior = prior, network, dt, use_prior
+        self.dynamics = dynamics
         for name in ("x", "u", "acceleration", "correction"):
             self.register_buffer(f"scale_{name}", torch.tensor(getattr(scaling, name), dtype=torch.float64))
 
     def features(self, x: Tensor, u: Tensor) -> Tensor:
         """Network inputs ``s``, scaled."""
         raise NotImplementedError(f"{type(self).__name__} must define features(x, u)")
+
+    def stacked_features(self, x: Tensor, u: Tensor) -> Tensor:
+        """Features of a stack ``(T, 1 or networks, n, n_in)`` at ``x`` ``(T, n, n_x)`` and ``u``, the same for all."""
+        if isinstance(self.dynamics, StackedPrior):
+            shape = (-1, self.dynamics.networks, -1, -1)
+            return self.features(x.unsqueeze(1).expand(shape), u.unsqueeze(1).expand(shape))
+        return self.features(x, u).unsqueeze(1)
+
+    @property
+    def physics(self) -> Prior | StackedPrior:
+        """Whose equation of motion it is: ``dynamics``, or the prior."""
+        return self.prior if self.dynamics is None else self.dynamics
 
     def correction(self, x: Tensor, h: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         """What the network gives [SI] (hybrid: acceleration ``(..., n_q)``), and the next hidden state."""
@@ -137,7 +155,8 @@ class HybridStep(RecurrentStep):
         dt: Model period [s].
         use_prior: False makes the plain recurrent network (RNN) of the paper's comparison: it sees no
             prior and gives the whole acceleration; the kinematics stay exact.
-        substeps: Runge-Kutta steps a period.
+        substeps: Runge-Kutta steps a period. Default: what the prior's stiffness asks for.
+        dynamics: See :class:`RecurrentStep`.
     """
 
     def __init__(
@@ -149,8 +168,9 @@ class HybridStep(RecurrentStep):
         *,
         use_prior: bool = True,
         substeps: int | None = None,
+        dynamics: Prior | StackedPrior | None = None,
     ) -> None:
-        super().__init__(prior, network, scaling, dt, use_prior=use_prior)
+        super().__init__(prior, network, scaling, dt, use_prior=use_prior, dynamics=dynamics)
         self.substeps = (substeps or required_substeps(prior, dt)) if use_prior else 1
 
     def features(self, x: Tensor, u: Tensor) -> Tensor:
@@ -164,7 +184,7 @@ class HybridStep(RecurrentStep):
                 parts.append(component / self.scale_x[i : i + 1])
         parts.append(u / self.scale_u)
         if self.use_prior:
-            parts.append(self.prior.acceleration(x, u) / self.scale_acceleration)
+            parts.append(self.physics.acceleration(x, u) / self.scale_acceleration)
         return torch.cat(parts, dim=-1)
 
     def integrate(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
@@ -173,7 +193,7 @@ class HybridStep(RecurrentStep):
 
     def derivative(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
         """Derivative of the state at the instant: exact kinematics, prior plus correction."""
-        acceleration = self.prior.acceleration(x, u) + correction if self.use_prior else correction
+        acceleration = self.physics.acceleration(x, u) + correction if self.use_prior else correction
         velocity = x[..., self.prior.n_q :]
         return torch.cat([velocity, acceleration.expand(velocity.shape)], dim=-1)
 
@@ -208,7 +228,7 @@ class LiteralStep(RecurrentStep):
         """Network inputs ``s = [x, u, prior xdot]``, scaled."""
         parts = [x / self.scale_x, u / self.scale_u]
         if self.use_prior:
-            parts.append(self.prior(x, u) / self.scale_acceleration)
+            parts.append(self.physics(x, u) / self.scale_acceleration)
         return torch.cat(parts, dim=-1)
 
     def integrate(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
@@ -234,44 +254,3 @@ def n_features(prior: Prior, use_prior: bool, *, literal: bool = False) -> int:
         return len(prior.states) * (2 if use_prior else 1) + len(prior.inputs)
     angles = sum(signal.periodic for signal in prior.states)
     return len(prior.states) + angles + len(prior.inputs) + (prior.n_q if use_prior else 0)
-
-
-def rk4(f: Callable[[Tensor], Tensor], x: Tensor, dt: float, substeps: int) -> Tensor:
-    """Classical Runge-Kutta of order 4 for ``xdot = f(x)`` over ``dt`` in equal sub-steps.
-
-    Example:
-        >>> x = rk4(lambda x: -x, torch.ones(1, dtype=torch.float64), 0.1, 2)
-        >>> abs(x.item() - math.exp(-0.1)) < 1e-8
-        True
-    """
-    s = dt / substeps
-    for _ in range(substeps):
-        k1 = f(x)
-        k2 = f(x + 0.5 * s * k1)
-        k3 = f(x + 0.5 * s * k2)
-        k4 = f(x + s * k3)
-        x = x + (s / 6.0) * (k1 + 2.0 * (k2 + k3) + k4)
-    return x
-
-
-def required_substeps(prior: Prior, dt: float) -> int:
-    """Sub-steps a period that keep every eigenvalue of the prior at rest within 1 / sub-step.
-
-    Friction is steepest at rest; Runge-Kutta of order 4 is stable up to 2.8 and accurate to per cents
-    of the fast mode at 1.
-
-    Raises:
-        InputError: If more than ``MAX_SUBSTEPS`` would be needed.
-    """
-    zeros = torch.zeros(len(prior.states), dtype=torch.float64)
-    u = torch.zeros(len(prior.inputs), dtype=torch.float64)
-    slope = torch.func.jacrev(lambda x: prior(x, u))(zeros)
-    rate = float(torch.linalg.eigvals(slope).abs().max())
-    substeps = max(1, math.ceil(rate * dt))
-    if not math.isfinite(rate) or substeps > MAX_SUBSTEPS:
-        raise InputError(
-            f"{type(prior).__name__}: the prior's fastest mode at rest is {rate:.3g} 1/s; a period of {dt} s "
-            f"would need {substeps} sub-steps (at most {MAX_SUBSTEPS}). Smooth its friction (lower the slope "
-            f"at zero speed) or take a smaller dt."
-        )
-    return substeps

@@ -12,6 +12,7 @@ from torch import nn
 
 from hybrid_mpc.identification.cells import make_stack
 from hybrid_mpc.identification.networks import StackedNetwork
+from hybrid_mpc.identification.prior_stack import PREFIX, StackedPrior, with_values
 from hybrid_mpc.identification.settings import TrainingSettings
 from hybrid_mpc.identification.step import HybridStep, LiteralStep, RecurrentStep, Scaling, n_features
 from hybrid_mpc.physics import Prior
@@ -42,7 +43,8 @@ class Trained:
     Args:
         settings: What it was trained with.
         scaling: Magnitudes inside the model.
-        weights: Best weights of each network by its validation, stacked.
+        weights: Best weights of each network by its validation, stacked; parameters of the prior that were trained
+            along are among them as ``prior.<name>`` ``(networks,)`` [SI].
         validation: Best validation error of each network ``(networks,)``.
         curve: ``step, free_run``, ``loss_`` and ``bound_`` with each objective's name, ``validation``; one row
             an evaluation, a column a network.
@@ -64,11 +66,23 @@ class Trained:
         return int(np.argmin(self.validation))
 
     def step(self, prior: Prior, dt: float, i: int | None = None) -> RecurrentStep:
-        """The step of network ``i`` (default: the best)."""
+        """The step of network ``i`` (default: the best), around the prior's parameters that were trained with it.
+
+        ``prior`` is the fitted one: it starts the parameters, and its energy balance and output are the step's.
+        """
+        i = self.best if i is None else i
+        values = self.prior_values(i)
+        dynamics = with_values(prior, values) if values else None
         stack = stack_for(prior, self.settings)
-        stack.load_state_dict({name: torch.tensor(value) for name, value in self.weights.items()})
-        network = stack.member(self.best if i is None else i)
-        return step_for(prior, network, self.scaling, dt, self.settings).requires_grad_(False)
+        own = {name: torch.tensor(w) for name, w in self.weights.items() if not name.startswith(PREFIX)}
+        stack.load_state_dict(own)
+        step = step_for(prior, stack.member(i), self.scaling, dt, self.settings, dynamics)
+        return step.requires_grad_(False)
+
+    def prior_values(self, i: int | None = None) -> dict[str, float]:
+        """Values [SI] of the parameters trained along with network ``i`` (default: the best); empty if none were."""
+        i = self.best if i is None else i
+        return {n.removeprefix(PREFIX): float(w[i]) for n, w in self.weights.items() if n.startswith(PREFIX)}
 
 
 def stack_for(prior: Prior, s: TrainingSettings) -> StackedNetwork:
@@ -84,8 +98,13 @@ def stack_for(prior: Prior, s: TrainingSettings) -> StackedNetwork:
 
 
 def step_for(
-    prior: Prior, network: nn.Module, scaling: Scaling, dt: float, s: TrainingSettings
+    prior: Prior,
+    network: nn.Module,
+    scaling: Scaling,
+    dt: float,
+    s: TrainingSettings,
+    dynamics: Prior | StackedPrior | None = None,
 ) -> RecurrentStep:
-    """The step of a training around a network or a stack."""
+    """The step of a training around a network or a stack; ``dynamics`` has the parameters trained along."""
     form = LiteralStep if s.form == "literal" else HybridStep
-    return form(prior, network, scaling, dt, use_prior=s.use_prior)
+    return form(prior, network, scaling, dt, use_prior=s.use_prior, dynamics=dynamics)

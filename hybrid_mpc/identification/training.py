@@ -73,7 +73,10 @@ def train(
 def _key(
     s: TrainingSettings, training: Sequence[Trajectory], validation: Sequence[Trajectory], prior: Prior
 ) -> str:
-    digest = hashlib.sha256(json.dumps([asdict(s), prior.values], sort_keys=True).encode())
+    settings = asdict(s)
+    if s.prior_parameters == "fixed":
+        del settings["prior_parameters"]  # the key is then that of trainings that could do nothing else
+    digest = hashlib.sha256(json.dumps([settings, prior.values], sort_keys=True).encode())
     for trajectory in (*training, *validation):
         digest.update(np.ascontiguousarray(trajectory.x).tobytes())
         digest.update(np.ascontiguousarray(trajectory.u).tobytes())

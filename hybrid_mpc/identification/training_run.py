@@ -23,6 +23,7 @@ from hybrid_mpc.identification.dataset import (
     scaling_of,
 )
 from hybrid_mpc.identification.objectives import OBJECTIVES, error_objective, free_run, teacher_forced
+from hybrid_mpc.identification.prior_stack import StackedPrior
 from hybrid_mpc.identification.settings import TrainingSettings
 from hybrid_mpc.identification.trained import Fault, Trained, stack_for, step_for
 from hybrid_mpc.physics import Prior
@@ -63,9 +64,12 @@ class TrainingRun:
         self.windows, self.valid = windows.to(self.device), self.valid.to(self.device)
         self.fixed = self.windows.take(torch.linspace(0, len(windows) - 1, 64).round().long().unique())
         prior = prior if device == "cpu" else copy.deepcopy(prior)  # the prior given stays where it is
-        step = step_for(prior, stack_for(prior, s), self.scaling, dt, s)
+        self.physics = StackedPrior(prior, s.networks) if s.prior_parameters == "trained" else None
+        step = step_for(prior, stack_for(prior, s), self.scaling, dt, s, self.physics)
         self.step = step.to(self.device)
         self.weights = dict(self.step.network.named_parameters())
+        if self.physics is not None:
+            self.weights |= self.physics.weights()
         self.decay = s.decay / sum(len(t.t) for t in training)
         self.optimizer = self._fresh_optimizer()
         self.done, self.free = 0, False
@@ -115,6 +119,8 @@ class TrainingRun:
         for group in self.optimizer.param_groups:
             group["lr"] = self._learning_rate()
         self.optimizer.step()
+        if self.physics is not None:
+            self.physics.project()
         self._note(losses, finite)
         self.done += 1
 
@@ -169,6 +175,8 @@ class TrainingRun:
         names = ("step", "free_run", *losses, *bounds, "validation")
         curve = {name: rows[:, i] for i, name in enumerate(names)}
         weights = {name: w.cpu().numpy() for name, w in self.best_weights.items()}
+        if self.physics is not None:
+            weights |= self.physics.in_si(self.best_weights)
         best, skipped = self.best.cpu().numpy(), self.skipped.cpu().numpy()
         faults = tuple(self.faults[i] for i in sorted(self.faults))
         return Trained(self.settings, self.scaling, weights, best, curve, skipped, faults)

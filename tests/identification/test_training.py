@@ -164,6 +164,9 @@ OPTIONS = (
     {"energy": "free_run"},
     {"objectives": ("error",)},
     {"fused": True},
+    {"prior_parameters": "trained"},
+    {"prior_parameters": "trained", "form": "literal"},
+    {"prior_parameters": "trained", "fused": True},
 )
 SHORT = replace(SMALL, teacher_steps=15, free_run_steps=10, every=5)
 

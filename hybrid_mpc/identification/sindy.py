@@ -1,0 +1,264 @@
+"""SINDy with control: a sparse equation of motion, picked from libraries of terms (pysindy, an optional extra)."""
+
+from __future__ import annotations
+
+import importlib
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.identification.dataset import Windows, check_rates, cut_windows
+from hybrid_mpc.identification.evaluation import free_runs, score
+from hybrid_mpc.identification.runge_kutta import MAX_SUBSTEPS
+from hybrid_mpc.identification.sindy_step import (
+    Factor,
+    Library,
+    SindyCandidate,
+    SindyStep,
+    evaluate,
+    machine_libraries,
+    signal_names,
+)
+from hybrid_mpc.physics import Prior
+
+__all__ = ["fit_sindy", "SindyStep", "SindyCandidate", "Library", "Factor", "machine_libraries", "Target"]
+
+Array = NDArray[np.float64]
+Target = Literal["mean_rate", "derivative"]
+THRESHOLDS = (0.0, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1)
+"""Shares of the acceleration's root mean square below which a term is dropped."""
+SAME = 0.02, 1e-3
+"""Validation errors this share of the best, or of the mean ``|xdot|_1``, above the best count as equal to it."""
+
+ALIKE = 1e-10
+"""Columns whose cosine is this near to 1 are one: no data of a machine tell them apart, and rounding is 1e-16."""
+
+
+def fit_sindy(
+    training: Sequence[Trajectory],
+    prior: Prior,
+    dt: float,
+    *,
+    validation: Sequence[Trajectory],
+    libraries: Sequence[Library] | None = None,
+    thresholds: Sequence[float] = THRESHOLDS,
+    target: Target = "mean_rate",
+    warm: int = 0,
+    ridge: float = 1e-5,
+) -> SindyStep:
+    """Identify the accelerations as sparse sums of candidate terms; kinematics are exact.
+
+    The runs are stacked, each with its own inputs. Every library is fitted with every threshold by pysindy's
+    sequentially thresholded least squares, on columns scaled to a root mean square of 1. The free runs over the
+    validation trajectories choose among all of them: of those that are as good as the best (``SAME``) the one of
+    fewest terms. A candidate that diverges or is too stiff has an infinite error and stays in ``step.candidates``.
+    If all of them are, the one that fits the training data best is returned with its infinite error.
+
+    Args:
+        training: Training trajectories.
+        prior: Names the signals; its energy balance and output judge the free runs. Its equation of motion is not used.
+        dt: Model period [s], that of the trajectories.
+        validation: Validation trajectories, which alone choose library and threshold. Use
+            :func:`~hybrid_mpc.identification.evaluation.judged` on noisy ones.
+        libraries: Default: :func:`~hybrid_mpc.identification.sindy_step.machine_libraries`.
+        thresholds: Default: ``THRESHOLDS``.
+        target: What is regressed: ``"mean_rate"``, the acceleration's mean over each period, against the terms' mean
+            over it with the input held (Simpson's rule, the state between two samples from the cubic through both),
+            or ``"derivative"``, the recorded derivative at the samples.
+        warm: Samples of the validation trajectories before the free run starts. Default 0.
+        ridge: Ridge while terms are dropped, a share of the columns' squares: it keeps two terms that are nearly
+            one from growing against each other. The terms that stay are fitted without it. Default 1e-5.
+
+    Returns:
+        The model with its equations and candidates.
+
+    Raises:
+        InputError: If pysindy is not installed, trajectories do not fit the prior or ``dt``, are not finite or too
+            short, or an input never changes.
+
+    Source: Brunton, Proctor, Kutz, *Sparse identification of nonlinear dynamics with control (SINDYc)*, IFAC
+    NOLCOS (2016); de Silva et al., *PySINDy*, Journal of Open Source Software 5 (2020).
+
+    Example:
+        >>> from scenarios.pendulum.data import exact_runs
+        >>> from scenarios.pendulum.prior import PendulumPrior
+        >>> step = fit_sindy(
+        ...     exact_runs("train", 2), PendulumPrior(), 0.01, validation=exact_runs("valid", 1)
+        ... )  # doctest: +SKIP
+        >>> step.equations()  # doctest: +SKIP
+        ("phi_dot' = -218 sin(phi) - 20.74 phi_dot + 9.877 u",)
+    """
+    pysindy = _pysindy()
+    _check(training, validation, prior, dt)
+    if target not in get_args(Target):
+        raise InputError(f"target has no {target!r}; there are: {', '.join(get_args(Target))}")
+    if not thresholds or min(thresholds) < 0.0:
+        raise InputError(f"thresholds must be at least one number, none below 0, got {tuple(thresholds)}")
+    windows = cut_windows(training, 0, 1, 1)
+    if target == "derivative":
+        check_rates(training)
+    fits: list[_Fit] = []
+    for library in libraries or machine_libraries(prior):
+        theta, rate = _regression(library, prior, windows, dt, target)
+        found = _sparse(pysindy, theta, rate, thresholds, ridge)
+        fits += _judged(prior, library, found, validation, dt, warm)
+    best = _choice(fits, validation)
+    return _pruned(prior, best, dt, tuple(fit.candidate for fit in fits))
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A candidate with what makes it a model."""
+
+    candidate: SindyCandidate
+    library: Library
+    coefficients: Array
+    substeps: int
+
+
+def _regression(
+    library: Library, prior: Prior, windows: Windows, dt: float, target: Target
+) -> tuple[Array, Array]:
+    """Terms ``(n, n_terms)`` and accelerations ``(n, n_q)`` of all periods of all runs."""
+    names, n_q = signal_names(prior, library), prior.n_q
+    x, x_next, u = windows.x[:, 0], windows.x[:, 1], windows.u[:, 0]
+    if target == "derivative":
+        return evaluate(library, names, x, u).numpy(), windows.xdot[:, 0, n_q : 2 * n_q].numpy()
+    (q, v), (q_next, v_next) = (z.split(n_q, dim=-1) for z in (x, x_next))
+    middle = torch.cat(
+        [0.5 * (q + q_next) - dt / 8.0 * (v_next - v), 1.5 / dt * (q_next - q) - 0.25 * (v + v_next)], -1
+    )
+    first, half, last = (evaluate(library, names, z, u) for z in (x, middle, x_next))
+    return ((first + 4.0 * half + last) / 6.0).numpy(), ((v_next - v) / dt).numpy()
+
+
+def _sparse(
+    pysindy: Any, theta: Array, rate: Array, thresholds: Sequence[float], ridge: float
+) -> list[tuple[float, Array, float]]:
+    """Threshold, coefficients ``(n_terms, n_q)`` [SI] and training error of each fit that differs from the others."""
+    scale, size = _rms(theta), _rms(rate)
+    columns = _distinct(theta / scale)
+    found: dict[bytes, tuple[float, Array, float]] = {}
+    for threshold in thresholds:
+        optimizer = pysindy.STLSQ(threshold=threshold, alpha=ridge * len(theta))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that a threshold leaves nothing: its free run will tell
+            optimizer.fit((theta / scale)[:, columns], rate / size)
+        coefficients = np.zeros((theta.shape[1], rate.shape[1]))
+        coefficients[columns] = np.asarray(optimizer.coef_).T / scale[columns, None] * size
+        error = float(np.abs(theta @ coefficients - rate).mean())
+        found.setdefault((coefficients != 0).tobytes(), (float(threshold), coefficients, error))
+    return list(found.values())
+
+
+def _judged(
+    prior: Prior,
+    library: Library,
+    found: list[tuple[float, Array, float]],
+    validation: Sequence[Trajectory],
+    dt: float,
+    warm: int,
+) -> list[_Fit]:
+    """E_sim of each fit's validation free runs; those of one library run side by side."""
+    substeps = []
+    for _, coefficients, _ in found:
+        try:
+            substeps.append(SindyStep(prior, library, torch.tensor(coefficients), dt).substeps)
+        except InputError:  # too stiff
+            substeps.append(0)
+    stable = [i for i, n in enumerate(substeps) if n]
+    errors = np.full(len(found), np.inf)
+    if stable:
+        stacked = torch.tensor(np.repeat([found[i][1] for i in stable], len(validation), axis=0))
+        step = SindyStep(prior, library, stacked, dt, max(substeps))
+        empty = torch.zeros(0, dtype=torch.float64)
+        with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges is scored as infinite
+            runs = free_runs(step, prior, list(validation) * len(stable), warm, empty)
+            for k, i in enumerate(stable):
+                errors[i] = score(runs[k * len(validation) : (k + 1) * len(validation)]).e_sim_s
+    return [
+        _Fit(
+            SindyCandidate(library.name, threshold, int(np.count_nonzero(c)), error, float(errors[i])),
+            library,
+            c,
+            max(substeps) or MAX_SUBSTEPS,
+        )
+        for i, (threshold, c, error) in enumerate(found)
+    ]
+
+
+def _choice(fits: list[_Fit], validation: Sequence[Trajectory]) -> _Fit:
+    """The fewest terms among those as good as the best on validation; if none runs, the best on training data."""
+    least = min(fit.candidate.validation for fit in fits)
+    if not np.isfinite(least):
+        return min(fits, key=lambda fit: fit.candidate.training)
+    size = np.mean([np.abs(np.diff(t.x, axis=0)).sum(1).mean() / t.dt for t in validation])
+    equal = [fit for fit in fits if fit.candidate.validation <= least + max(SAME[0] * least, SAME[1] * size)]
+    return min(equal, key=lambda fit: (fit.candidate.terms, fit.candidate.validation))
+
+
+def _pruned(prior: Prior, fit: _Fit, dt: float, candidates: tuple[SindyCandidate, ...]) -> SindyStep:
+    """The step without the terms that no acceleration has."""
+    keep = np.flatnonzero((fit.coefficients != 0).any(axis=1))
+    keep = keep if len(keep) else np.zeros(1, dtype=int)  # nothing was left: the acceleration is zero
+    library = Library(fit.library.name, tuple(fit.library.terms[i] for i in keep))
+    return SindyStep(prior, library, torch.tensor(fit.coefficients[keep]), dt, fit.substeps, candidates)
+
+
+def _distinct(scaled: Array) -> NDArray[np.intp]:
+    """Columns that are no multiple of an earlier one, such as abs(cos q) where no run goes beyond a right angle."""
+    alike = np.abs(scaled.T @ scaled) / len(scaled) > 1.0 - ALIKE
+    keep: list[int] = []
+    for j in range(scaled.shape[1]):
+        if not alike[j, keep].any():
+            keep.append(j)
+    return np.array(keep)
+
+
+def _rms(values: Array) -> Array:
+    size: Array = np.sqrt((values**2).mean(axis=0))
+    return np.where(size > 0.0, size, 1.0)
+
+
+def _check(training: Sequence[Trajectory], validation: Sequence[Trajectory], prior: Prior, dt: float) -> None:
+    if prior.n_extra:
+        raise InputError(
+            f"{type(prior).__name__} has states beside [q, v]; SINDy identifies accelerations only"
+        )
+    if not training or not validation:
+        raise InputError("SINDy needs training and validation trajectories, at least one of each")
+    sizes = {"x": len(prior.states), "u": len(prior.inputs)}
+    for trajectory in (*training, *validation):
+        for name, size in sizes.items():
+            columns = getattr(trajectory, name).shape[1]
+            if columns != size:
+                raise InputError(
+                    f"{trajectory.name}: {name} has {columns} columns, {type(prior).__name__} has {size}"
+                )
+        if abs(trajectory.dt - dt) > 1e-9 * dt:
+            raise InputError(
+                f"{trajectory.name}: its period is {trajectory.dt} s, the model's {dt} s; resample it"
+            )
+    for j, signal in enumerate(prior.inputs):
+        u = np.concatenate([t.u[:, j] for t in training])
+        if np.ptp(u) == 0.0:
+            raise InputError(
+                f"input {signal.name} is {u[0]:g} {signal.unit} in all training runs: nothing tells what it does. "
+                "Record runs that excite it."
+            )
+
+
+def _pysindy() -> Any:
+    try:
+        return importlib.import_module("pysindy")
+    except ImportError as missing:
+        raise InputError(
+            "SINDy needs pysindy, which is not installed: pip install 'hybrid-mpc[sindy]'"
+        ) from missing
