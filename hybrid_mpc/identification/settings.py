@@ -49,6 +49,8 @@ class TrainingSettings:
             cost a second prediction in the other stage
             (:func:`~hybrid_mpc.identification.objectives.energy_objective`).
         fused: Sequences of the GRUs with few operations a step: faster, but not the same bits.
+        validation_horizon: Most scored periods of a validation window. Default: five times ``horizon``. Trainings
+            with other horizons can be compared by their validation only if this is the same.
 
     Raises:
         InputError: If a name is not known, there is no objective, or weights do not fit the objectives.
@@ -77,6 +79,7 @@ class TrainingSettings:
     weights: tuple[float, ...] = ()
     energy: Reading = "stage"
     fused: bool = False
+    validation_horizon: int | None = None
 
     def __post_init__(self) -> None:
         for name in ("objectives", "weights"):  # lists, where they come from a file
