@@ -9,6 +9,9 @@ Routes: ``one`` and ``loop`` (``torch.nn.GRU`` with ``torch.nn.Linear``: one, an
 of it), ``two_plain`` and ``two_fused`` (two processes of 8 at the same time, each on its own core; the slower one
 counts). Routes in turn in each round, processor time (on a GPU wall time), best of the rounds; the ratio to ``one``
 is that of the bests. The goals are ratios of ``GOALS``.
+
+``memory_mb``: what three training steps add to the largest resident memory of a process that has torch loaded and the
+data made, each route in a process of its own; left out on a GPU.
 """
 
 from __future__ import annotations
@@ -16,6 +19,8 @@ from __future__ import annotations
 import argparse
 import json
 import platform
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -113,6 +118,54 @@ def two(pool: ProcessPoolExecutor, z: int, fused: bool, options: argparse.Namesp
     return max(future.result() for future in [pool.submit(half, *job) for _ in range(2)])
 
 
+def peak_mb() -> float:
+    """Largest resident memory of this process so far [MB]."""
+    status = Path("/proc/self/status")
+    if status.is_file():  # of this program alone, not of the process that started it
+        line = next(row for row in status.read_text().splitlines() if row.startswith("VmHWM"))
+        return int(line.split()[1]) / 1024
+    import resource
+
+    per_mb = 2**20 if sys.platform == "darwin" else 2**10
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / per_mb
+
+
+def make(route: str, z: int, s: Tensor, y: Tensor) -> Step:
+    """The training step of a route whose memory is measured."""
+    if route == "one":
+        return singles(z, 1, s, y)
+    return stacked(z, NETWORKS, route == "fused", s, y)
+
+
+def added_mb(route: str, z: int, options: argparse.Namespace) -> None:
+    """In a process of its own: print what training steps add to the peak."""
+    s, y = data(options.steps, options.batch, "cpu")
+    make(route, 2, s[:2], y[:2])()  # what torch itself takes when it first works
+    before = peak_mb()
+    step = make(route, z, s, y)
+    for _ in range(3):
+        step()
+    print(peak_mb() - before)
+
+
+def memory(z: int, options: argparse.Namespace) -> dict[str, float]:
+    """Megabytes that one network and 16 stacked ones take to train."""
+    command = [
+        sys.executable,
+        __file__,
+        "--z",
+        str(z),
+        "--batch",
+        str(options.batch),
+        "--steps",
+        str(options.steps),
+    ]
+    return {
+        route: float(subprocess.check_output([*command, "--memory", route], text=True))
+        for route in ("one", "plain", "fused")
+    }
+
+
 def measure(z: int, options: argparse.Namespace, pool: ProcessPoolExecutor | None) -> dict[str, Any]:
     """Milliseconds of all routes at one number of hidden units, and ratios to one network."""
     s, y = data(options.steps, options.batch, options.device)
@@ -132,7 +185,8 @@ def measure(z: int, options: argparse.Namespace, pool: ProcessPoolExecutor | Non
         for name, fused in (("two_plain", False), ("two_fused", True)):
             best[name] = two(pool, z, fused, options)
     ratios = {name: value / best["one"] for name, value in best.items()}
-    return {"ms": {name: 1e3 * value for name, value in best.items()}, "ratio": ratios, "goal": GOALS.get(z)}
+    row = {"ms": {name: 1e3 * value for name, value in best.items()}, "ratio": ratios, "goal": GOALS.get(z)}
+    return row if pool is None else {**row, "memory_mb": memory(z, options)}
 
 
 def main() -> None:
@@ -144,8 +198,12 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--memory", choices=["one", "plain", "fused"], help=argparse.SUPPRESS)
     options = parser.parse_args()
     torch.set_num_threads(1)
+    if options.memory:
+        added_mb(options.memory, options.z[0], options)
+        return
     results: dict[str, Any] = {
         "networks": NETWORKS, "features": N_IN, "batch": options.batch, "samples": options.steps,
         "device": options.device, "torch": torch.__version__, "machine": platform.machine(), "z": {},
@@ -161,6 +219,8 @@ def main() -> None:
         print(f"z = {z}: one network {result['ms']['one']:.1f} ms; goal {result['goal']} x")
         for name, ratio in result["ratio"].items():
             print(f"  {name:10}{result['ms'][name]:9.1f} ms{ratio:7.2f} x")
+        if "memory_mb" in result:
+            print("  memory " + ", ".join(f"{k} {v:.0f} MB" for k, v in result["memory_mb"].items()))
     if options.out:
         options.out.write_text(text + "\n")
 

@@ -22,6 +22,7 @@ from hybrid_mpc.cli import control as control_command
 from hybrid_mpc.cli import data as data_command
 from hybrid_mpc.cli import run as run_command
 from hybrid_mpc.cli import scenarios as scenarios_command
+from hybrid_mpc.cli import search as search_command
 from hybrid_mpc.errors import InputError
 
 CTRL_C = 130
@@ -29,6 +30,7 @@ INTERRUPTED = {
     "run": "interrupted; finished stages are kept: the same command with --resume goes on",
     "control": "interrupted; loops are kept at the end only, there is nothing to resume: the same command starts "
     "them anew (with another --out if figures lie in it already)",
+    "search": "interrupted; finished trials are kept: the same command with --resume goes on",
     "data": "interrupted; the recordings are not complete: the same command with another --out makes them anew",
 }
 """What is left after Ctrl-C, by command."""
@@ -44,6 +46,7 @@ app = typer.Typer(
 app.command("run", epilog=run_command.EXAMPLES)(run_command.run)
 app.command("control", epilog=control_command.EXAMPLES)(control_command.control)
 app.command("data", epilog=data_command.EXAMPLES)(data_command.data)
+app.command("search", epilog=search_command.EXAMPLES)(search_command.search)
 app.command("scenarios")(scenarios_command.scenarios)
 
 

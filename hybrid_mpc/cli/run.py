@@ -32,6 +32,10 @@ def run(
     output_column: Annotated[
         list[str] | None, typer.Option(help="Column of a measured position, in the prior's order.")
     ] = None,
+    network_settings: Annotated[
+        Path | None,
+        typer.Option("--settings", help="JSON file of network settings, as hybrid-mpc search leaves it."),
+    ] = None,
 ) -> None:
     """Fit the prior, train, export, close the loop, monitor, analyse, and write a report."""
     from hybrid_mpc.cli.progress import make_progress
@@ -47,6 +51,7 @@ def run(
         tuple(input_column or ()),
         tuple(output_column or ()),
         time_column,
+        network_settings,
     )
     with make_progress() as progress:
         results = run_job(settings, folder, resume=resume, progress=progress)

@@ -36,6 +36,8 @@ class TrainingSettings:
             less, the more data there are. Small recordings need it, large ones do not notice.
         learning_rates: Start and end of the cosine schedule, teacher forcing then free runs.
         every: Steps between evaluations (bounds, validation, checkpoint).
+        validation_horizon: Most scored periods of a validation window. Default: five times ``horizon``. Trainings
+            with other horizons can be compared by their validation only if this is the same.
         cell: ``"gru"`` (torch's form), ``"gru_paper"`` (one bias a gate), ``"lstm"``, ``"feed_forward"``.
         form: ``"hybrid"`` (exact kinematics, correction of the prior's acceleration, Runge-Kutta) or
             ``"literal"`` (the paper's: the network gives xdot, explicit Euler).
@@ -75,6 +77,7 @@ class TrainingSettings:
     decay: float = 300.0
     learning_rates: tuple[float, float, float, float] = (1e-2, 1e-3, 5e-3, 1e-4)
     every: int = 25
+    validation_horizon: int | None = None
     cell: Cell = "gru"
     form: Form = "hybrid"
     objectives: tuple[str, ...] = ("error", "energy")

@@ -242,7 +242,7 @@ def _cut(
         check_rates([*training, *validation])
     horizon = fitting_horizon(training, s.warm, s.horizon)
     windows = cut_windows(training, s.warm, horizon, max(1, horizon // 10))
-    horizon = fitting_horizon(validation, s.warm, 5 * s.horizon)
+    horizon = fitting_horizon(validation, s.warm, s.validation_horizon or 5 * s.horizon)
     return windows, cut_windows(validation, s.warm, horizon, max(1, horizon // 5))
 
 

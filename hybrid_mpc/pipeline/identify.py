@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -110,7 +110,7 @@ def training_stage(context: Context) -> None:
         kind: (
             _train_kind,
             (context.settings.scenario, values, context.smoothed("train"), context.smoothed("valid"),
-             _settings(context, kind), folder),
+             training_settings(context, kind), folder),
         )
         for kind in todo
     }  # fmt: skip
@@ -202,11 +202,12 @@ def _members(context: Context, name: str, phy: Prior) -> list[tuple[Any, Any]]:
     return [(trained.step(phy, dt, int(i)), h0) for i in order]
 
 
-def _settings(context: Context, kind: str) -> TrainingSettings:
+def training_settings(context: Context, kind: str) -> TrainingSettings:
+    """What the networks of a kind are trained with: the budget, and what the run's own file replaces of it."""
     from hybrid_mpc.identification.training import TrainingSettings
 
     b = context.budget
-    return TrainingSettings(
+    settings = TrainingSettings(
         kind=kind,  # type: ignore[arg-type]
         hidden=b.hidden,
         networks=b.networks,
@@ -216,6 +217,7 @@ def _settings(context: Context, kind: str) -> TrainingSettings:
         warm=context.warm,
         decay=b.decay,
     )
+    return replace(settings, **context.settings.network())
 
 
 def _train_kind(

@@ -32,6 +32,7 @@ def command(context: Context) -> str:
     for option, values in (("--input-column", s.inputs), ("--output-column", s.outputs)):
         words += [w for v in values for w in (option, v)]
     words += ["--time-column", s.time] if s.time else []
+    words += ["--settings", s.network_file.name] if s.network_file else []
     return shlex.join([*words, "--seed", str(s.seed), "--budget", s.budget])
 
 

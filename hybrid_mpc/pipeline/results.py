@@ -74,6 +74,8 @@ def _identification(context: Context) -> dict[str, Any]:
             key: _ratio(figures[key]["mopgrnn"], figures[key]["phy"]) for key in ("e_sim_s", "rmse_rad")
         },
     }
+    if network := context.settings.network():  # what replaced the budget's
+        details["network_settings"] = network
     return {**figures, "details": details}
 
 

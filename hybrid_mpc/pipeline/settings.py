@@ -1,8 +1,9 @@
-"""Settings of a run and the folder that holds it."""
+"""Settings of a run, those of its networks from a file, and the folder that holds it."""
 
 from __future__ import annotations
 
 import hashlib
+import math
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,9 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import digest, read_json, write_json
 
 FILE = "run.json"
+WHOLE = ("hidden", "networks", "teacher_steps", "free_run_steps", "horizon", "validation_horizon", "batch")
+NETWORK = (*WHOLE, "decay", "learning_rates")
+"""What a file of network settings may hold: arguments of ``identification.TrainingSettings``."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +29,8 @@ class RunSettings:
         inputs: Columns that replace the scenario's inputs; default: the scenario's.
         outputs: Columns that replace the scenario's outputs; default: the scenario's.
         time: Column that replaces the scenario's time; default: the scenario's.
+        network_file: JSON object with settings of the networks that replace the budget's, as a search leaves them;
+            default: none.
     """
 
     scenario: str
@@ -34,14 +40,58 @@ class RunSettings:
     inputs: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
     time: str = ""
+    network_file: Path | None = None
+
+    def network(self) -> dict[str, Any]:
+        """Settings of the networks that replace the budget's: what the file holds, checked."""
+        return {} if self.network_file is None else read_network(self.network_file)
 
     def identity(self) -> dict[str, Any]:
-        """Settings as plain data, with the content hash of every file in place of where it lies."""
+        """Settings as plain data, with the content hash of every file in place of where it lies.
+
+        Raises:
+            InputError: If a file cannot be read or is none of network settings.
+        """
         files = [{"name": path.name, "sha256": _sha256(path)} for path in self.data]
         scenario = self.scenario
         if scenario.endswith(".py") and Path(scenario).is_file():
             scenario = f"{Path(scenario).name} {_sha256(Path(scenario))}"
-        return {**asdict(replace(self, data=(), scenario=scenario)), "data": files}
+        plain = {**asdict(replace(self, data=(), scenario=scenario)), "data": files}
+        network = self.network()  # a run without such a file has no word of it
+        del plain["network_file"]
+        return plain | ({"network": network} if network else {})
+
+
+def read_network(path: Path) -> dict[str, Any]:
+    """Settings of networks from a JSON file.
+
+    Args:
+        path: An object with any of ``NETWORK``; ``learning_rates`` are four numbers.
+
+    Raises:
+        InputError: If the file is missing, damaged or holds anything else.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = (Path(folder) / "settings.json").write_text('{"hidden": 24, "decay": 300}')
+        ...     read_network(Path(folder) / "settings.json")
+        {'hidden': 24, 'decay': 300}
+    """
+    held = read_json(path)
+    if not isinstance(held, dict) or (unknown := sorted(set(held) - set(NETWORK))):
+        what = "no JSON object" if not isinstance(held, dict) else f"also {', '.join(unknown)}"
+        raise InputError(f"{path} holds {what}; network settings are any of: {', '.join(NETWORK)}")
+    for name, value in held.items():
+        numbers = value if name == "learning_rates" and isinstance(value, list) else [value]
+        kinds = (int,) if name in WHOLE else (int, float)
+        good = all(isinstance(v, kinds) and not isinstance(v, bool) and math.isfinite(v) for v in numbers)
+        positive = good and all(v > 0 or (v == 0 and name == "decay") for v in numbers)
+        if not positive or (name == "learning_rates" and len(numbers) != 4):
+            needed = "a whole number of 1 or more" if name in WHOLE else "a number of 0 or more"
+            needed = "four positive numbers" if name == "learning_rates" else needed
+            raise InputError(f"{path}: {name} is {value!r}; it must be {needed}")
+    return {name: tuple(v) if isinstance(v, list) else v for name, v in held.items()}
 
 
 def open_folder(out: Path, settings: RunSettings, *, resume: bool) -> None:
@@ -57,7 +107,10 @@ def open_folder(out: Path, settings: RunSettings, *, resume: bool) -> None:
         if not resume:
             raise InputError(f"{out} already holds a run; add --resume to finish it, or choose another --out")
         if digest(held.get("settings")) != digest(identity):
-            changed = sorted(k for k in identity if digest(identity[k]) != digest(held["settings"].get(k)))
+            before = held["settings"]
+            changed = sorted(
+                k for k in {*identity, *before} if digest(identity.get(k)) != digest(before.get(k))
+            )
             raise InputError(
                 f"{out} holds a run with other settings ({', '.join(changed)} differ); resume with the same "
                 f"ones or choose another --out"

@@ -1,0 +1,47 @@
+"""Figures of a search: what lies where, and what cannot be drawn."""
+
+import math
+
+import numpy as np
+import pytest
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.plots.search import STATES, history, settings
+
+ROWS = [
+    {"number": n, "state": state, "value": value, "values": {"hidden": 4 * 2**n, "decay": 10.0**n}}
+    for n, (state, value) in enumerate(
+        [("complete", 0.3), ("diverged", math.inf), ("complete", 0.5), ("pruned", 0.6), ("complete", 0.1)]
+    )
+]
+
+
+def points(ax, state):
+    """Points of a state, in the order of the trials."""
+    (line,) = [line for line in ax.lines if line.get_label() == STATES[state][2]]
+    return np.column_stack(line.get_data()).tolist()
+
+
+def test_every_trial_is_a_point_and_the_best_never_rises():
+    ax = history(ROWS, base=0.3).axes[0]
+    assert points(ax, "complete") == [[0, 0.3], [2, 0.5], [4, 0.1]]
+    assert points(ax, "pruned") == [[3, 0.6]]
+    assert points(ax, "diverged") == [[1, ax.get_ylim()[1]]]
+    (best,) = [line for line in ax.lines if line.get_label() == "best so far"]
+    assert np.column_stack(best.get_data()).tolist() == [[0, 0.3], [2, 0.3], [4, 0.1]]
+    (base,) = [line for line in ax.lines if line.get_label() == "settings it started from"]
+    assert set(base.get_ydata()) == {0.3}
+
+
+def test_a_panel_a_setting():
+    axes = settings(ROWS, ["hidden", "decay"]).axes
+    assert [ax.get_xlabel() for ax in axes] == ["hidden units z [-]", "decay [-]"]
+    assert points(axes[0], "complete") == [[4, 0.3], [16, 0.5], [64, 0.1]]
+    assert points(axes[1], "pruned") == [[1000, 0.6]]
+
+
+def test_what_cannot_be_drawn_is_refused():
+    with pytest.raises(InputError, match="no trial has a finite"):
+        history(ROWS[1:2])
+    with pytest.raises(InputError, match="no setting to draw"):
+        settings(ROWS, [])
