@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import digest, read_json, write_json
@@ -44,7 +44,14 @@ class RunSettings:
         return {**asdict(replace(self, data=(), scenario=scenario)), "data": files}
 
 
-def open_folder(out: Path, settings: RunSettings, *, resume: bool) -> None:
+class Identified(Protocol):
+    """Settings that tell whether two runs are the same."""
+
+    def identity(self) -> dict[str, Any]:
+        """Settings as plain data."""
+
+
+def open_folder(out: Path, settings: Identified, *, resume: bool) -> None:
     """Prepare the run's folder and note the settings in it.
 
     Raises:
