@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,7 +49,7 @@ def reproduce(
         out: Folder to make; it must be new or empty unless ``resume``.
         resume: Finish the reproduction that ``out`` holds.
         progress: Where to report. Default: nowhere.
-        workers: Processes side by side. Default: two.
+        workers: Processes side by side; 0 runs the jobs in this one. Default: two.
 
     Returns:
         The results (docs/reproduction.md).
@@ -93,7 +93,7 @@ class Work:
         effort: How much of it.
         out: The folder.
         progress: Where to report.
-        workers: Processes side by side.
+        workers: Processes side by side; 0 for none.
     """
 
     settings: ReproductionSettings
@@ -218,13 +218,15 @@ class Work:
             slots.free(key)
             self.progress.update("jobs", finished, total, f"{key} is done")
 
+        def told(key: str, done: int, of: int, text: str) -> None:
+            self.progress.update(slots.name(key), done, of, f"{key}: {text}")
+
         self.progress.update("jobs", finished, total, "")
-        run_jobs(
-            todo,
-            lambda key, done, of, text: self.progress.update(slots.name(key), done, of, f"{key}: {text}"),
-            self.workers,
-            ended,
-        )
+        if self.workers:
+            run_jobs(todo, told, self.workers, ended)
+            return
+        for key, (function, args) in todo.items():
+            ended(key, function(*args, partial(told, key)))
 
 
 class _Slots:
