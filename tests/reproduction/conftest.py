@@ -13,7 +13,7 @@ EXACT = """
 from dataclasses import replace
 from hybrid_mpc.reproduction import Effort
 from scenarios.pendulum import scenario
-effort = Effort(2, (1, 2), steps=30, free_run_steps=10, valid=1, test=2, hidden=4, every=10, batch=4)
+effort = Effort(2, (1, 2), steps=20, free_run_steps=5, valid=1, test=2, hidden=4, every=5, batch=4)
 scenario = replace(scenario, experiment=replace(scenario.experiment, efforts={"full": effort}))
 """
 MEASURED = """

@@ -60,9 +60,9 @@ def test_tables_claims_and_figures_are_written(finished):
 
 
 def test_the_hybrid_has_as_many_steps_as_the_others(finished):
-    for model, free in (("mopgrnn", 0), ("hybrid", 10)):
+    for model, free in (("mopgrnn", 0), ("hybrid", 5)):
         curve = np.load(finished / "checkpoints" / f"exact_02_{model}.npz")
-        assert curve["curve.step"][-1, 0] == 30
+        assert curve["curve.step"][-1, 0] == 20
         switched = curve["curve.free_run"][:, 0].any()
         assert switched == (free > 0)
 
@@ -72,7 +72,7 @@ def test_interrupted_and_resumed_equals_the_finished_one(exact, finished, tmp_pa
     """Also the test of determinism: everything but timing is the same, bit for bit."""
     out, settings = tmp_path / "out", ReproductionSettings(exact)
     with pytest.raises(KeyboardInterrupt):
-        reproduce(settings, out, workers=0, progress=Interrupting("exact_01_pgrnn", 20))
+        reproduce(settings, out, workers=0, progress=Interrupting("exact_01_pgrnn", 10))
     assert (out / "checkpoints" / "exact_01_pgrnn.safetensors").is_file()
     assert not (out / "checkpoints" / "exact_01_pgrnn.json").exists()
     assert not (out / "results.json").exists()
