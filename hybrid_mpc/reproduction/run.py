@@ -18,6 +18,7 @@ from hybrid_mpc.reproduction.experiment import Effort, Experiment
 from hybrid_mpc.reproduction.jobs import Case, Ruler, ensemble_job, fit_job, physics_job, sindy_job
 from hybrid_mpc.reproduction.outputs import write_outputs
 from hybrid_mpc.reproduction.settings import ReproductionSettings, case_key, experiment_of
+from hybrid_mpc.reproduction.slots import Slots
 from hybrid_mpc.reproduction.table import Row
 from hybrid_mpc.scenario import Scenario, load_scenario
 
@@ -208,7 +209,7 @@ class Work:
 
     def run(self, jobs: Jobs) -> None:
         """Run those of the jobs that are not done, and show how many are and what each process does."""
-        total, slots = len(jobs), _Slots(self.workers)
+        total, slots = len(jobs), Slots(self.workers)
         todo = {key: job for key, job in jobs.items() if not self.done(key)}
         finished = total - len(todo)
 
@@ -227,24 +228,6 @@ class Work:
             return
         for key, (function, args) in todo.items():
             ended(key, function(*args, partial(told, key)))
-
-
-class _Slots:
-    """Which process a job runs in, so that the terminal has a bar a process and not one a job."""
-
-    def __init__(self, count: int) -> None:
-        self._held: dict[int, str] = {}
-        self._count = count
-
-    def name(self, key: str) -> str:
-        slot = next((i for i, held in self._held.items() if held == key), None)
-        if slot is None:
-            slot = next((i for i in range(self._count) if i not in self._held), self._count)
-            self._held[slot] = key
-        return f"process {slot + 1}"
-
-    def free(self, key: str) -> None:
-        self._held = {i: held for i, held in self._held.items() if held != key}
 
 
 def record_stage(work: Work) -> None:
