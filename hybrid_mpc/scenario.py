@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from hybrid_mpc.closed_loop.result import ClosedLoopResult
     from hybrid_mpc.model import HybridModel
     from hybrid_mpc.physics import Prior
+    from hybrid_mpc.reproduction.experiment import Experiment
 
 Array = NDArray[np.float64]
 Role = Literal["train", "valid", "test", "nominal"]
@@ -233,6 +234,7 @@ class Scenario:
         tasks: Closed-loop tasks.
         budgets: Effort by name.
         draw: ``x (n_x,) -> polylines (m, 2) [m]`` of the machine, for moving pictures; default: none.
+        experiment: The paper's experiment on it, for ``hybrid-mpc reproduce``; default: none.
 
     Example:
         >>> import numpy as np
@@ -253,6 +255,7 @@ class Scenario:
     tasks: tuple[Task, ...] = ()
     budgets: Mapping[str, Budget] = field(default_factory=lambda: DEFAULT_BUDGETS)
     draw: Callable[[Array], Sequence[Array]] | None = None
+    experiment: Experiment | None = None
 
 
 def registered_scenarios() -> dict[str, str]:

@@ -20,6 +20,7 @@ except ImportError as missing:  # the online half installs without the command l
 from hybrid_mpc import __version__
 from hybrid_mpc.cli import control as control_command
 from hybrid_mpc.cli import data as data_command
+from hybrid_mpc.cli import reproduce as reproduce_command
 from hybrid_mpc.cli import run as run_command
 from hybrid_mpc.cli import scenarios as scenarios_command
 from hybrid_mpc.cli import search as search_command
@@ -28,6 +29,7 @@ from hybrid_mpc.errors import InputError
 CTRL_C = 130
 INTERRUPTED = {
     "run": "interrupted; finished stages are kept: the same command with --resume goes on",
+    "reproduce": "interrupted; what is done is kept: the same command with --resume goes on",
     "control": "interrupted; loops are kept at the end only, there is nothing to resume: the same command starts "
     "them anew (with another --out if figures lie in it already)",
     "search": "interrupted; finished trials are kept: the same command with --resume goes on",
@@ -45,6 +47,7 @@ app = typer.Typer(
 )
 app.command("run", epilog=run_command.EXAMPLES)(run_command.run)
 app.command("control", epilog=control_command.EXAMPLES)(control_command.control)
+app.command("reproduce", epilog=reproduce_command.EXAMPLES)(reproduce_command.reproduce)
 app.command("data", epilog=data_command.EXAMPLES)(data_command.data)
 app.command("search", epilog=search_command.EXAMPLES)(search_command.search)
 app.command("scenarios")(scenarios_command.scenarios)

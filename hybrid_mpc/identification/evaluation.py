@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.identification.smoothing import Smoother
+from hybrid_mpc.identification.trained import Trained, stack_for, step_for
 from hybrid_mpc.physics import Prior
 
 Array = NDArray[np.float64]
@@ -113,22 +114,58 @@ def free_runs(
         warm: Samples of the warm-up.
         h0: Hidden state before the warm-up ``(n_h,)``.
     """
+    x_all, u_all = _padded(trajectories)
+    x_hat = _states(step, x_all, u_all, warm, h0.expand(len(trajectories), -1))
+    return [_free_run(prior, t, x_hat[i], warm) for i, t in enumerate(trajectories)]
+
+
+def stacked_free_runs(
+    trained: Trained, prior: Prior, dt: float, judge: Prior, trajectories: Sequence[Trajectory], warm: int
+) -> list[list[FreeRun]]:
+    """:func:`free_runs` of all networks of a training at once: those of the first network, the second, ...
+
+    Args:
+        trained: The training.
+        prior: The prior that the networks correct.
+        dt: Model period [s].
+        judge: The prior whose energy balance judges.
+        trajectories: The runs; they may differ in length.
+        warm: Samples of the warm-up.
+    """
+    stack = stack_for(prior, trained.settings)
+    stack.load_state_dict({name: torch.tensor(value) for name, value in trained.weights.items()})
+    step = step_for(prior, stack, trained.scaling, dt, trained.settings)
+    x_all, u_all = (a.expand(stack.networks, *a.shape) for a in _padded(trajectories))
+    with torch.no_grad():
+        x_hat = _states(step, x_all, u_all, warm, stack.initial(len(trajectories)))
+    return [
+        [_free_run(judge, t, x_hat[k, i], warm) for i, t in enumerate(trajectories)]
+        for k in range(len(x_hat))
+    ]
+
+
+def _padded(trajectories: Sequence[Trajectory]) -> tuple[Tensor, Tensor]:
+    """States and inputs ``(runs, samples, n)``, short ones prolonged by their last sample."""
     longest = max(len(t.t) for t in trajectories)
     x_all, u_all = (
         torch.tensor(np.stack([_pad(a, longest) for a in arrays]))
         for arrays in ([t.x for t in trajectories], [t.u for t in trajectories])
     )
+    return x_all, u_all
+
+
+def _states(step: nn.Module, x_all: Tensor, u_all: Tensor, warm: int, h: Tensor) -> Array:
+    """States of the model from sample ``warm`` on, ``(..., samples - warm + 1, n_x)``."""
     with torch.no_grad():
-        h = h0.expand(len(trajectories), -1)
         for k in range(warm):
-            _, h = step(x_all[:, k], h, u_all[:, k])
-        x, states = x_all[:, warm], []
-        for k in range(warm, longest):
+            _, h = step(x_all[..., k, :], h, u_all[..., k, :])
+        x, states = x_all[..., warm, :], []
+        for k in range(warm, x_all.shape[-2]):
             states.append(x)
-            x, h = step(x, h, u_all[:, k])
+            x, h = step(x, h, u_all[..., k, :])
         states.append(x)
-    x_hat = torch.stack(states, 1).numpy()
-    return [_free_run(prior, t, x_hat[i], warm) for i, t in enumerate(trajectories)]
+    x_hat: Array = torch.stack(states, -2).numpy()
+    return x_hat
 
 
 def score(runs: Sequence[FreeRun]) -> Scores:

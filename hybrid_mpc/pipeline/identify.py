@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from hybrid_mpc.data.trajectories import Trajectory
     from hybrid_mpc.identification.evaluation import FreeRun
     from hybrid_mpc.identification.prior_fit import PriorFit
+    from hybrid_mpc.identification.smoothing import Smoother
     from hybrid_mpc.identification.training import Trained, TrainingSettings
     from hybrid_mpc.physics import Prior
 
@@ -72,19 +73,14 @@ def _excitation(context: Context) -> tuple[str, ...]:
 
 def prior_stage(context: Context) -> None:
     """Fit the prior's parameters, let it smooth the measurements, fit it to these, smooth once more."""
-    from hybrid_mpc.identification.prior_fit import fit_prior
-    from hybrid_mpc.identification.smoothing import fit_smoother
-
-    make, dt = context.scenario.prior, context.spec.dt
-    train, valid = context.trajectories("train"), context.trajectories("valid")
-    fit: PriorFit | None = None
-    for title in ROUNDS:
-        fit = fit_prior(
-            make, train, valid, dt=dt, before=fit,
-            on_progress=lambda done, total, text, key=title: context.progress.update(key, done, total, text),  # type: ignore[misc]
-        )  # fmt: skip
-        smoother = fit_smoother(make(fit.values), [*train, *valid], dt)
-        train, valid = smoother.smooth(train), smoother.smooth(valid)
+    make = context.scenario.prior
+    fit, smoother, train, valid = fit_and_smooth(
+        make,
+        context.trajectories("train"),
+        context.trajectories("valid"),
+        context.spec.dt,
+        on_progress=context.progress.update,
+    )
     arrays = {
         f"{t.name}/{key}": getattr(t, key)
         for t in (*train, *valid, *smoother.smooth(context.trajectories("test")))
@@ -95,8 +91,44 @@ def prior_stage(context: Context) -> None:
         "units": {p.name: p.unit for p in make().parameters_spec},
         "smoother": {"sigma": smoother.sigma, "walk": smoother.walk},
     }
-    assert fit is not None
     context.save("prior", {**asdict(fit), **notes}, arrays)
+
+
+def fit_and_smooth(
+    make: Callable[..., Prior],
+    train: Sequence[Trajectory],
+    valid: Sequence[Trajectory],
+    dt: float,
+    *,
+    methods: Sequence[str] | None = None,
+    on_progress: Callable[[str, int, int, str], None] = lambda key, done, total, text: None,
+) -> tuple[PriorFit, Smoother, list[Trajectory], list[Trajectory]]:
+    """Fit a prior to polynomially smoothed states, smooth by it, fit it to these, smooth once more.
+
+    Args:
+        make: Prior class or factory ``(values=None) -> Prior``.
+        train: Training trajectories.
+        valid: Validation trajectories.
+        dt: Model period [s].
+        methods: Methods of the fit. Default: those of :func:`~hybrid_mpc.identification.prior_fit.fit_prior`.
+        on_progress: ``(round, done, total, text)`` with a title of ``ROUNDS``.
+
+    Returns:
+        The last fit, the last smoother, and training and validation trajectories smoothed by it.
+    """
+    from hybrid_mpc.identification.prior_fit import DEFAULT_METHODS, fit_prior
+    from hybrid_mpc.identification.smoothing import fit_smoother
+
+    fit: PriorFit | None = None
+    for title in ROUNDS:
+        fit = fit_prior(
+            make, train, valid, dt=dt, before=fit, methods=methods or DEFAULT_METHODS,
+            on_progress=lambda done, total, text, key=title: on_progress(key, done, total, text),  # type: ignore[misc]
+        )  # fmt: skip
+        smoother = fit_smoother(make(fit.values), [*train, *valid], dt)
+        train, valid = smoother.smooth(train), smoother.smooth(valid)
+    assert fit is not None
+    return fit, smoother, list(train), list(valid)
 
 
 def training_stage(context: Context) -> None:

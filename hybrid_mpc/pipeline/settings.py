@@ -6,7 +6,7 @@ import hashlib
 import math
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import digest, read_json, write_json
@@ -94,7 +94,14 @@ def read_network(path: Path) -> dict[str, Any]:
     return {name: tuple(v) if isinstance(v, list) else v for name, v in held.items()}
 
 
-def open_folder(out: Path, settings: RunSettings, *, resume: bool) -> None:
+class Identified(Protocol):
+    """Settings that tell whether two runs are the same."""
+
+    def identity(self) -> dict[str, Any]:
+        """Settings as plain data."""
+
+
+def open_folder(out: Path, settings: Identified, *, resume: bool) -> None:
     """Prepare the run's folder and note the settings in it.
 
     Raises:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from hybrid_mpc.scenario import DEFAULT_BUDGETS, DataSpec, Scenario
-from scenarios.golf_robot.data import make_data, windows
+from hybrid_mpc.scenario import DEFAULT_BUDGETS, Scenario
+from scenarios.golf_robot.data import make_data
 from scenarios.golf_robot.drawing import draw
+from scenarios.golf_robot.experiment import DATA, EXPERIMENT
 from scenarios.golf_robot.oracle import oracle
 from scenarios.golf_robot.rig import Rig
 from scenarios.golf_robot.tasks import CONTROL, QUICK_TASKS, TASKS
@@ -36,22 +37,14 @@ scenario = Scenario(
         "club's angle is measured. The data are simulated, since the paper's are not public."
     ),
     prior=_prior,
-    data=DataSpec(
-        time="time_s",
-        inputs=("u_nm",),
-        outputs=("phi_rad",),
-        dt=0.02,
-        max_gap=0.05,
-        smoothing=0.25,  # noise in the acceleration goes with length^-2.5, bias grows: docs/golf-robot.md
-        warm_up=0.5,
-        windows=windows(),
-    ),
+    data=DATA,
     make_data=make_data,
     plant=Rig,
     oracle=oracle,
     control=CONTROL,
     tasks=TASKS,
     draw=draw,
+    experiment=EXPERIMENT,
     budgets={
         "quick": replace(DEFAULT_BUDGETS["quick"], tasks=QUICK_TASKS),
         "full": replace(DEFAULT_BUDGETS["full"], oracle_seeds=10),

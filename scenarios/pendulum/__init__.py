@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from hybrid_mpc.scenario import Budget, DataSpec, Scenario
 from scenarios.pendulum.data import make_data, windows
+from scenarios.pendulum.experiment import EXPERIMENT
 from scenarios.pendulum.oracle import oracle
 from scenarios.pendulum.plant import DampedPendulum
 from scenarios.pendulum.tasks import CONTROL, TASKS
@@ -48,6 +49,7 @@ scenario = Scenario(
     oracle=oracle,
     control=CONTROL,
     tasks=TASKS,
+    experiment=EXPERIMENT,
     budgets={
         "quick": Budget(hidden=16, networks=2, teacher_steps=1000, free_run_steps=100, seeds=2),
         "full": Budget(
