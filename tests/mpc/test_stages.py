@@ -95,7 +95,9 @@ def test_condensing_and_its_adjoint_are_sums_of_products(n, n_u):
     drift, z = (b @ step[:, :, None])[:, :, 0], [np.zeros(3)]
     for k in range(n):
         z.append(a[k] @ z[k] + drift[k])
-    np.testing.assert_allclose(propagate(list(a_t.transpose(0, 2, 1)), drift, np.zeros(3)), z, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(
+        propagate(list(a_t.transpose(0, 2, 1)), drift, np.zeros(3)), z, rtol=1e-12, atol=1e-12
+    )
     np.testing.assert_allclose(from_u @ step.ravel(), np.array(z)[:, :2].ravel(), rtol=1e-12, atol=1e-12)
     weights = rng.normal(size=(n + 1, 2))
     multipliers = adjoint(a_t, weights[-1], weights[:-1])
