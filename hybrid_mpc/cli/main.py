@@ -22,6 +22,7 @@ from hybrid_mpc.cli import control as control_command
 from hybrid_mpc.cli import data as data_command
 from hybrid_mpc.cli import run as run_command
 from hybrid_mpc.cli import scenarios as scenarios_command
+from hybrid_mpc.cli import study as study_command
 from hybrid_mpc.errors import InputError
 
 CTRL_C = 130
@@ -29,6 +30,7 @@ INTERRUPTED = {
     "run": "interrupted; finished stages are kept: the same command with --resume goes on",
     "control": "interrupted; loops are kept at the end only, there is nothing to resume: the same command starts "
     "them anew (with another --out if figures lie in it already)",
+    "study": "interrupted; finished runs are kept: the same command with --resume goes on",
     "data": "interrupted; the recordings are not complete: the same command with another --out makes them anew",
 }
 """What is left after Ctrl-C, by command."""
@@ -45,6 +47,7 @@ app.command("run", epilog=run_command.EXAMPLES)(run_command.run)
 app.command("control", epilog=control_command.EXAMPLES)(control_command.control)
 app.command("data", epilog=data_command.EXAMPLES)(data_command.data)
 app.command("scenarios")(scenarios_command.scenarios)
+app.add_typer(study_command.app, name="study")
 
 
 def _version(wanted: bool) -> None:
