@@ -56,7 +56,7 @@ def distributions(values: Values, label: str) -> Figure:
                 [first, third], [k, k], color=colour(level), linewidth=7.0, alpha=0.5, solid_capstyle="butt"
             )
             ax.plot(middle, k, "o", color=colour(level), markersize=5)
-        every = np.concatenate([v for v in finite.values()]) if finite else np.ones(1)
+        every = np.concatenate(list(finite.values())) if finite else np.ones(1)
         if every.min() > 0 and every.max() > 20 * every.min():
             ax.set_xscale("log")
             plain_log(ax.xaxis, *ax.get_xlim())
@@ -167,7 +167,7 @@ def _panels(
     most = max((len(row) for row in groups.values()), default=1)
     size = max(5.0, WIDE * columns), max(2.4, rows * max(least, 0.7 + a_row * most))
     figure, axes = new_figure(rows, columns, size=size)
-    panels = list(axes.flat)
+    panels: list[Axes] = axes.ravel().tolist()
     for ax in panels[len(groups) :]:
         ax.set_visible(False)
     return figure, panels

@@ -1,8 +1,9 @@
 """Studies: many closed loops from one configuration, on one machine or a cluster, none of them lost."""
 
-from hybrid_mpc.studies.configuration import RunConfig, Study
+from hybrid_mpc.studies.configuration import Study
 from hybrid_mpc.studies.draws import FaultKind, RandomFaults
 from hybrid_mpc.studies.results import StudyResults
+from hybrid_mpc.studies.run_config import RunConfig
 from hybrid_mpc.studies.runner import run_study
 
 __all__ = ["FaultKind", "RandomFaults", "RunConfig", "Study", "StudyResults", "run_study"]

@@ -6,20 +6,18 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
 from itertools import product
 from pathlib import Path
-from typing import Any
-
-import numpy as np
+from typing import Any, cast
 
 from hybrid_mpc.closed_loop.faults import Fault
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import digest, plain
+from hybrid_mpc.files import plain
 from hybrid_mpc.pipeline.contenders import CONTENDERS, ORACLES
 from hybrid_mpc.pipeline.control_job import DEFAULT_CONTROLLERS, SOLVERS, parsed_fault, selected_tasks
 from hybrid_mpc.scenario import load_scenario
-from hybrid_mpc.studies.draws import Intervals, RandomFaults, factors
+from hybrid_mpc.studies.draws import Intervals, RandomFaults, factors, generator
+from hybrid_mpc.studies.run_config import RunConfig
 from hybrid_mpc.studies.words import built, known
 
 ESTIMATORS: Mapping[str, tuple[bool, bool] | None] = {
@@ -33,75 +31,6 @@ MONITORS = ("own", "none", "energy")
 """``own``: what ``hybrid-mpc control`` runs, the uncalibrated energy monitor beside a hybrid; ``energy``: the same with
 the artifact's calibration, so that it alarms."""
 AXES = ("models", "tasks", "controllers", "estimators", "solvers", "horizons", "monitors", "faults", "seeds")
-
-
-@dataclass(frozen=True)
-class RunConfig:
-    """One closed loop of a study: all that decides what it computes, but for the content of its model.
-
-    Args:
-        scenario: Registered name or path of a user's file.
-        model: Label of the model in the study.
-        task: Name of the task.
-        controller: Name of the contender, with its estimator.
-        solver: ``"rti"``, ``"sqp"`` or ``"ipopt"``.
-        horizon: Periods; None for the task's own.
-        monitor: Name in :data:`MONITORS`.
-        faults: Beside what the task itself brings.
-        drawn_faults: Those that the draw takes at random.
-        late: Intervals [s] in which solves miss their deadline.
-        parameters: Parameters of the plant and their factors.
-        draw: Number of the draw that ``parameters`` and random faults are from.
-        seed: Number of the loop; the same number, the same sensor noise for all that share the draw.
-        duration: Longest duration [s]; None for the task's own.
-
-    Example:
-        >>> RunConfig("golf_robot", "model", "track_sine", "prior").id
-        '93d92566bd37d31ee834'
-    """
-
-    scenario: str
-    model: str
-    task: str
-    controller: str
-    solver: str = "rti"
-    horizon: int | None = None
-    monitor: str = "own"
-    faults: tuple[Fault, ...] = ()
-    drawn_faults: tuple[Fault, ...] = ()
-    late: Intervals = ()
-    parameters: tuple[tuple[str, float], ...] = ()
-    draw: int = 0
-    seed: int = 0
-    duration: float | None = None
-
-    @cached_property
-    def id(self) -> str:
-        """The first 20 hexadecimal digits of the SHA-256 of the configuration's JSON form."""
-        return digest(asdict(self))[:20]
-
-    @property
-    def noise_seed(self) -> int:
-        """Seed of plant and sensor noise; of the first draw that of ``hybrid-mpc control --seed 0``."""
-        if self.draw == 0:
-            return self.seed
-        return int(np.random.SeedSequence([self.seed, self.draw]).generate_state(1)[0])
-
-    def columns(self) -> dict[str, Any]:
-        """The configuration as the columns of a table."""
-        return {
-            "model": self.model,
-            "task": self.task,
-            "controller": self.controller,
-            "solver": self.solver,
-            "horizon": self.horizon,
-            "monitor": self.monitor,
-            "faults": fault_text(self.faults),
-            "drawn_faults": fault_text(self.drawn_faults, self.late),
-            "draw": self.draw,
-            "seed": self.seed,
-            **{f"factor_{name}": value for name, value in self.parameters},
-        }
 
 
 @dataclass(frozen=True)
@@ -182,7 +111,22 @@ hybrid, hybrid_observer, oracle, oracle_state
     @property
     def folders(self) -> dict[str, Path]:
         """Folders of the models by label."""
-        return {label: Path(folder) for label, folder in self.models}  # type: ignore[misc,union-attr]
+        return {label: Path(folder) for label, folder in cast("Sequence[tuple[str, str]]", self.models)}
+
+    @property
+    def spans(self) -> tuple[tuple[str, float], ...]:
+        """Varied parameters with their shares."""
+        return cast("tuple[tuple[str, float], ...]", self.vary)
+
+    @property
+    def loop_seeds(self) -> tuple[int, ...]:
+        """Numbers of the loops."""
+        return cast("tuple[int, ...]", self.seeds)
+
+    @property
+    def fault_sets(self) -> tuple[tuple[Fault, ...], ...]:
+        """Sets of faults."""
+        return cast("tuple[tuple[Fault, ...], ...]", self.faults)
 
     @property
     def contenders(self) -> tuple[str, ...]:
@@ -209,14 +153,14 @@ hybrid, hybrid_observer, oracle, oracle_state
         tasks = [t.name for t in selected_tasks(load_scenario(self.scenario), self.tasks)]
         drawn = [self._drawn(i) for i in range(self.draws)]
         outer = product(
-            self.folders, tasks, self.contenders, self.solvers, self.horizons, self.monitors, self.faults
+            self.folders, tasks, self.contenders, self.solvers, self.horizons, self.monitors, self.fault_sets
         )
         for model, task, contender, solver, horizon, monitor, faults in outer:
             for draw, (parameters, some, late) in enumerate(drawn):
-                for seed in self.seeds:  # type: ignore[union-attr]
+                for seed in self.loop_seeds:
                     yield RunConfig(
                         self.scenario, model, task, contender, solver, horizon, monitor,
-                        faults, some, late, parameters, draw, seed, self.duration,  # type: ignore[arg-type]
+                        faults, some, late, parameters, draw, seed, self.duration,
                     )  # fmt: skip
 
     def identity(self) -> dict[str, Any]:
@@ -229,23 +173,24 @@ hybrid, hybrid_observer, oracle, oracle_state
         return replace(self, models=models)
 
     def _drawn(self, i: int) -> tuple[tuple[tuple[str, float], ...], tuple[Fault, ...], Intervals]:
-        from hybrid_mpc.studies.draws import generator
-
         faults: tuple[tuple[Fault, ...], Intervals] = ((), ())
         if isinstance(self.random_faults, RandomFaults):
             faults = self.random_faults.drawn(generator(self.seed, i, "faults"))
-        return factors(self.vary, self.seed, i), *faults  # type: ignore[arg-type]
+        return factors(self.spans, self.seed, i), *faults
 
     def _check_numbers(self) -> None:
         for name, value, least in (("draws", self.draws, 1), ("seed", self.seed, 0)):
             if not isinstance(value, int) or isinstance(value, bool) or value < least:
                 raise InputError(f"study: {name} must be a whole number of at least {least}, got {value!r}")
-        for name, values, least in (("seeds", self.seeds, 0), ("horizons", self.horizons, 1)):
-            for value in values:  # type: ignore[union-attr]
-                whole = isinstance(value, int) and not isinstance(value, bool) and value >= least
-                if not whole and not (value is None and name == "horizons"):
-                    raise InputError(f"study: {name} are whole numbers of at least {least}, got {value!r}")
-        for name, span in self.vary:  # type: ignore[misc]
+        lists: tuple[tuple[str, Sequence[int | None], int], ...] = (
+            ("seeds", self.loop_seeds, 0),
+            ("horizons", [h for h in self.horizons if h is not None], 1),
+        )
+        for name, values, least in lists:
+            for number in values:
+                if not isinstance(number, int) or isinstance(number, bool) or number < least:
+                    raise InputError(f"study: {name} are whole numbers of at least {least}, got {number!r}")
+        for name, span in self.spans:
             if not (isinstance(span, int | float) and 0.0 < span < 1.0):
                 raise InputError(f"study: vary {name}: a share between 0 and 1 is needed, got {span!r}")
         if self.duration is not None and not (
@@ -273,22 +218,6 @@ hybrid, hybrid_observer, oracle, oracle_state
                 f"study: monitor energy is calibrated for the hybrid, {watched[0]} has none; take monitor own, or "
                 "controllers with a hybrid"
             )
-
-
-def fault_text(faults: Sequence[Fault], late: Intervals = ()) -> str:
-    """Faults in the form in which the command line takes them; ``"none"`` for none.
-
-    Example:
-        >>> fault_text([Fault(1.5, math.inf, "plant_friction", 2.0)], late=((1.0, 1.2),))
-        'plant_friction=2@1.5 + late@1:1.2'
-    """
-    parts = []
-    for f in faults:
-        end = "" if math.isinf(f.end) else f":{f.end:g}"
-        more = (f" channel {f.channel}" if f.channel else "") + (f" ramp {f.ramp:g}" if f.ramp else "")
-        parts.append(f"{f.target}={f.value:g}@{f.start:g}{end}{more}")
-    parts += [f"late@{a:g}" + ("" if math.isinf(b) else f":{b:g}") for a, b in late]
-    return " + ".join(parts) or "none"
 
 
 def _normal(s: Study) -> dict[str, Any]:

@@ -104,9 +104,10 @@ class RandomFaults:
         for i in rng.choice(len(self.kinds), size=n, replace=False).tolist():
             kind = self.kinds[i]
             assert isinstance(kind, FaultKind)
-            size, start = rng.uniform(kind.low, kind.high), float(rng.uniform(*self.start))
+            size, start = rng.uniform(kind.low, kind.high), float(rng.uniform(self.start[0], self.start[1]))
             sign = float(rng.choice([-1.0, 1.0])) if kind.signed else 1.0
-            length, lasts = rng.uniform(*(kind.length or self.length)), rng.random() < self.lasting
+            shortest, longest = kind.length or self.length
+            length, lasts = rng.uniform(shortest, longest), rng.random() < self.lasting
             end = math.inf if lasts and kind.length is None else start + float(length)
             if kind.target == LATE:
                 late.append((start, end))

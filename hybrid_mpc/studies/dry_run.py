@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hybrid_mpc.scenario import load_scenario
-from hybrid_mpc.studies.configuration import RunConfig, Study
+from hybrid_mpc.studies.configuration import Study
 from hybrid_mpc.studies.loops import TIMING, load_inputs
+from hybrid_mpc.studies.run_config import RunConfig
 
 PROBE_PERIODS = 20
 Kind = tuple[object, ...]
@@ -74,7 +75,7 @@ def _kind(run: RunConfig) -> Kind:
 
 def _first_runs(study: Study) -> list[RunConfig]:
     """One run of each kind and task."""
-    small = replace(study, draws=1, seeds=study.seeds[:1], faults=study.faults[:1])  # type: ignore[index]
+    small = replace(study, draws=1, seeds=study.loop_seeds[:1], faults=study.fault_sets[:1])
     kinds: dict[tuple[Kind, str], RunConfig] = {}
     for run in small.runs():
         kinds.setdefault((_kind(run), run.task), run)

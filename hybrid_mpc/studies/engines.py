@@ -13,7 +13,7 @@ from typing import Any, Protocol
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.studies.loops import LoopRunner, run_batch
 
-ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 CONNECT_S = 5.0
 """How long a scheduler is waited for."""
 WATCH_S = 1.0

@@ -12,7 +12,7 @@ from hybrid_mpc.studies.words import built
 
 
 def read_study(path: str | Path, **instead: Any) -> Study:
-    """The study that a YAML file describes: its keys are the fields of :class:`~hybrid_mpc.studies.Study`.
+    r"""The study that a YAML file describes: its keys are the fields of :class:`~hybrid_mpc.studies.Study`.
 
     Folders of models, and a scenario that is a ``.py`` file, are meant from the folder of the YAML file. The name is
     that of the file if it gives none.
@@ -28,7 +28,7 @@ def read_study(path: str | Path, **instead: Any) -> Study:
     Example:
         >>> import tempfile
         >>> path = Path(tempfile.mkdtemp()) / "mine.yaml"
-        >>> _ = path.write_text("scenario: golf_robot\\nmodels: {z32: runs/golf}\\nseeds: 2\\n")
+        >>> _ = path.write_text("scenario: golf_robot\nmodels: {z32: runs/golf}\nseeds: 2\n")
         >>> study = read_study(path)
         >>> study.name, study.seeds, study.folders["z32"] == path.parent / "runs/golf"
         ('mine', (0, 1), True)

@@ -29,8 +29,9 @@ from hybrid_mpc.pipeline.control_job import ControlSettings, Job, parts, prepare
 from hybrid_mpc.pipeline.control_results import row
 from hybrid_mpc.pipeline.loops import make_monitor
 from hybrid_mpc.scenario import Scenario, Task, load_scenario
-from hybrid_mpc.studies.configuration import RunConfig, Study
+from hybrid_mpc.studies.configuration import Study
 from hybrid_mpc.studies.draws import RandomFaults, varied
+from hybrid_mpc.studies.run_config import RunConfig
 
 KEPT_PARTS = 64
 """Controllers that a process keeps built; runs come ordered by controller, so few are asked for again."""
@@ -228,8 +229,8 @@ def _check_plant(scenario: Scenario, study: Study) -> None:
     """Refuse faults and parameters that the plant does not have."""
     if scenario.plant is None or scenario.control is None:
         return  # prepared says what lacks
-    plant = varied(scenario.plant(), [(name, 1.0) for name, _ in study.vary])  # type: ignore[misc]
-    sets: list[Any] = list(study.faults)
+    plant = varied(scenario.plant(), [(name, 1.0) for name, _ in study.spans])
+    sets: list[Any] = list(study.fault_sets)
     if isinstance(study.random_faults, RandomFaults):
         sets.append(study.random_faults.examples())
     for faults in sets:

@@ -178,7 +178,7 @@ class StudyResults:
 
         mine, theirs = self._checked(value), other._checked(value)
         shared = [c for c in (*FACTORS, *PAIR, "drawn_faults") if c in mine and c in theirs]
-        shared += sorted(c for c in set(mine) & set(theirs) if c.startswith("factor_"))
+        shared += sorted(str(c) for c in mine if str(c).startswith("factor_") and c in theirs)
         differs = [
             c
             for c in shared
@@ -190,7 +190,8 @@ class StudyResults:
         joined = mine.merge(theirs, on=on, suffixes=("", " "))
         if joined.empty:
             raise InputError(
-                f"{self.folder} and {other.folder} have no run in common: their tasks, controllers, draws or seeds differ"
+                f"{self.folder} and {other.folder} have no run in common: their tasks, controllers, draws or seeds "
+                "differ"
             )
         found = []
         for key, group in _groups(joined, by):
