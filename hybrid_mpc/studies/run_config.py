@@ -37,7 +37,7 @@ class RunConfig:
 
     Example:
         >>> RunConfig("golf_robot", "model", "track_sine", "prior").id
-        '93d92566bd37d31ee834'
+        '63b99f88c2a7316b97ed'
     """
 
     scenario: str

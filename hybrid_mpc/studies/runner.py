@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -143,11 +144,12 @@ def execute(configs: Iterable[Any], log: RunLog, engine: Engine, progress: Progr
         total: How many there are, for the report.
     """
     tally, waiting, pace = Tally(total, begin=time.monotonic()), iter(configs), _Pace()
-    again: list[Batch] = []
-    tries: dict[str, int] = {}
+    suspects = _Suspects()
     running = 0
     while True:
-        while running < AHEAD * engine.workers and (batch := _next_batch(again, waiting, pace)):
+        while batch := suspects.next(running) or (
+            _next_batch(waiting, pace) if running < AHEAD * engine.workers and not suspects.left else ()
+        ):
             engine.submit(batch)
             running += 1
         if not running:
@@ -159,12 +161,42 @@ def execute(configs: Iterable[Any], log: RunLog, engine: Engine, progress: Progr
         batch, result = ended
         if isinstance(result, Lost):
             tally.lost += 1
-            result = _lost(batch, result, tries, again)
+            result = suspects.judge(batch, result)
+        suspects.alone = None
         log.append(result)
         pace.learn(result)
         tally.runs += len(result)
         tally.failed += sum(row["status"] == "failed" for row in result)
         progress.update("runs", tally.runs, total, tally.text)
+
+
+class _Suspects:
+    """Runs whose worker died: they are begun again one at a time with nothing beside them, to find the culprit."""
+
+    def __init__(self) -> None:
+        self.left: list[Any] = []
+        self.alone: Any = None
+        self._tries: dict[str, int] = {}
+
+    def next(self, running: int) -> Batch:
+        """The next suspect once nothing else runs; empty if there is none, or something runs."""
+        if running or not self.left:
+            return ()
+        self.alone = self.left.pop()
+        return (self.alone,)
+
+    def judge(self, batch: Batch, lost: Lost) -> list[dict[str, Any]]:
+        """Suspect the runs of a lost batch; rows of those that are given up."""
+        given_up = []
+        for config in batch:
+            alone = self.alone is not None and config.id == self.alone.id
+            tries = self._tries[config.id] = self._tries.get(config.id, 0) + 1
+            if not alone or (tries < TRIES and not lost.final):
+                self.left.append(config)
+                continue
+            error = f"its worker died {tries} times ({lost}); out of memory, or a crash outside Python"
+            given_up.append({"id": config.id, **config.columns(), "status": "failed", "error": error})
+        return given_up
 
 
 class _Pace:
@@ -180,29 +212,9 @@ class _Pace:
             self.size = max(1, min(wanted, 2 * self.size, BATCH_MOST))
 
 
-def _next_batch(again: list[Batch], waiting: Iterator[Any], pace: _Pace) -> Batch:
-    """Some runs: those that were lost first; empty where none is left."""
-    if again:
-        return again.pop()
-    batch = []
-    for config in waiting:
-        batch.append(config)
-        if len(batch) >= pace.size:
-            break
-    return tuple(batch)
-
-
-def _lost(batch: Batch, lost: Lost, tries: dict[str, int], again: list[Batch]) -> list[dict[str, Any]]:
-    """Have the runs of a lost batch begun again one by one; rows of those that are given up."""
-    given_up = []
-    for config in batch:
-        tries[config.id] = tries.get(config.id, 0) + 1
-        if tries[config.id] < TRIES and not (lost.final and len(batch) == 1):
-            again.append((config,))
-            continue
-        error = f"its worker died {tries[config.id]} times ({lost}); out of memory, or a crash outside Python"
-        given_up.append({"id": config.id, **config.columns(), "status": "failed", "error": error})
-    return given_up
+def _next_batch(waiting: Iterator[Any], pace: _Pace) -> Batch:
+    """Some runs; empty where none is left."""
+    return tuple(islice(waiting, pace.size))
 
 
 def duration_text(seconds: float) -> str:
