@@ -185,7 +185,8 @@ def killed_and_resumed(tmp_path, kills, seed):
         if goal is None:  # somewhere before the first row
             time.sleep(rng.uniform(0.0, 3.0))
         else:  # a little after so many new ones
-            wait_for(lambda enough=len(kept) + goal: count(folder) > enough, process)
+            enough = len(kept) + goal
+            wait_for(lambda enough=enough: count(folder) > enough, process)
             time.sleep(rng.uniform(0.0, 0.05))
         os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
