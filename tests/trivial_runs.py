@@ -63,7 +63,7 @@ def stand_in(monkeypatch, run):
 class Here:
     """An engine that computes in this process, a batch at a time."""
 
-    name, workers = "here", 1
+    name, workers, died = "here", 1, 0
 
     def __init__(self, run):
         self._run, self._batches = run, []

@@ -146,7 +146,7 @@ def factors(vary: Sequence[tuple[str, float]], seed: int, draw: int) -> tuple[tu
 
     Example:
         >>> [(name, round(factor, 3)) for name, factor in factors([("m", 0.2)], seed=0, draw=1)]
-        [('m', 1.13)]
+        [('m', 1.194)]
     """
     return tuple(
         (name, float(1.0 + span * generator(seed, draw, name).uniform(-1.0, 1.0))) for name, span in vary

@@ -16,6 +16,10 @@ from hybrid_mpc.studies.loops import LoopRunner, run_batch
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 CONNECT_S = 5.0
 """How long a scheduler is waited for."""
+LOOK_S = 2.0
+"""How often the workers of a cluster are counted."""
+ALONE_S = 60.0
+"""How long a cluster may be without any."""
 WATCH_S = 1.0
 """How often a worker looks whether its parent is still there."""
 
@@ -41,6 +45,10 @@ class Engine(Protocol):
     @property
     def name(self) -> str:
         """What it is, for the record."""
+
+    @property
+    def died(self) -> int:
+        """Workers that have died so far; what they were at is begun again."""
 
     def submit(self, batch: Batch) -> None:
         """Begin a batch of configurations."""
@@ -92,8 +100,10 @@ class LocalEngine(_Futures):
         if workers < 1:
             raise InputError(f"study: workers must be 1 or more, got {workers}")
         self._run, self.workers, self.name = run, workers, f"joblib, {workers} processes"
+        self.died = 0
         self._pool: Any = None
         self._pools: dict[Any, Any] = {}
+        self._broken: list[Any] = []
 
     def submit(self, batch: Batch) -> None:
         """See :class:`Engine`."""
@@ -117,6 +127,8 @@ class LocalEngine(_Futures):
             rows: list[dict[str, Any]] = future.result()
             return rows
         except (BrokenExecutor, CancelledError) as error:
+            self.died += pool not in self._broken
+            self._broken.append(pool)
             self._pool = None if pool is self._pool else self._pool
             return Lost(f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}", False)
 
@@ -153,16 +165,43 @@ class DaskEngine(_Futures):
                 f"study: the scheduler {self._address} has no worker; start some: dask worker ADDRESS"
             )
         self.name = f"dask, {len(self._client.nthreads())} workers"
+        self.died = 0
+        self._seen = set(self._client.nthreads())
+        self._looked = self._manned = time.monotonic()
 
     @property
     def _address(self) -> str:
         return str(self._client.scheduler.address)
 
+    def next(self, timeout: float) -> tuple[Batch, list[dict[str, Any]] | Lost] | None:
+        """See :class:`Engine`.
+
+        Raises:
+            InputError: If the cluster has had no worker for a while.
+        """
+        now = time.monotonic()
+        if now - self._looked >= LOOK_S:
+            self._looked, there = now, set(self._client.nthreads())
+            self.died, self._seen = self.died + len(self._seen - there), there
+            self._manned = now if there else self._manned
+        if now - self._manned > ALONE_S:
+            raise self._alone()
+        return super().next(timeout)
+
     def submit(self, batch: Batch) -> None:
         """See :class:`Engine`."""
         if self._shared is None:
-            self._shared = self._client.scatter(self._run, broadcast=True, hash=False)
+            try:
+                self._shared = self._client.scatter(self._run, broadcast=True, hash=False, timeout=ALONE_S)
+            except TimeoutError as error:
+                raise self._alone() from error
         self._watch(self._client.submit(run_batch, self._shared, batch, pure=False), batch)
+
+    def _alone(self) -> InputError:
+        return InputError(
+            f"study: the scheduler {self._address} has had no worker for {ALONE_S:g} s; finished runs are kept, "
+            "--resume goes on when there are some"
+        )
 
     def _result(self, future: Any) -> list[dict[str, Any]] | Lost:
         from distributed.scheduler import KilledWorker

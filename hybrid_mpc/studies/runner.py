@@ -92,7 +92,8 @@ def run_study(
             told = execute(left, log, engine, say, study.size - len(done))
             say.finish(told.text)
             if not (out / RESULTS).is_file():
-                compact(out / RUNS, out / RESULTS, {**read_json(out / NOTE), "engine": engine.name})
+                made = {"engine": engine.name, "workers_died": told.died}
+                compact(out / RUNS, out / RESULTS, {**read_json(out / NOTE), **made})
     finally:
         engine.close()
     return StudyResults.load(out)
@@ -106,14 +107,14 @@ class Tally:
         total: Runs to do.
         runs: Runs that are done.
         failed: Those of them that failed.
-        lost: Batches whose worker died, and which another took.
+        died: Workers that have died, and whose runs were begun again.
         begin: When it began, on the monotonic clock.
     """
 
     total: int
     runs: int = 0
     failed: int = 0
-    lost: int = 0
+    died: int = 0
     begin: float = 0.0
 
     @property
@@ -126,8 +127,8 @@ class Tally:
             words.append(f"{duration_text((self.total - self.runs) / rate)} left")
         if self.failed:
             words.append(f"{self.failed} failed")
-        if self.lost:
-            words.append(f"{self.lost} lost with their worker and begun again")
+        if self.died:
+            words.append(f"{self.died} workers died, what they were at was begun again")
         return ", ".join(words)
 
 
@@ -160,11 +161,11 @@ def execute(configs: Iterable[Any], log: RunLog, engine: Engine, progress: Progr
         running -= 1
         batch, result = ended
         if isinstance(result, Lost):
-            tally.lost += 1
             result = suspects.judge(batch, result)
         suspects.alone = None
         log.append(result)
         pace.learn(result)
+        tally.died = engine.died
         tally.runs += len(result)
         tally.failed += sum(row["status"] == "failed" for row in result)
         progress.update("runs", tally.runs, total, tally.text)

@@ -12,7 +12,7 @@ import trivial_runs
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.pipeline.context import Silent
-from hybrid_mpc.studies import engines, run_study
+from hybrid_mpc.studies import StudyResults, engines, run_study
 from hybrid_mpc.studies.loops import TIMING
 
 TESTS = str(Path(__file__).parents[1])
@@ -70,28 +70,41 @@ def test_unreachable_scheduler(tmp_path, monkeypatch):
         run_study(trivial_runs.study(3), tmp_path / "s", workers=0)
 
 
-def test_a_cluster_computes_the_same_and_loses_a_worker(tmp_path, monkeypatch, cluster):
+class Killer(Silent):
+    """Kills a process after some runs."""
+
+    def __init__(self, process):
+        self._process, self.killed = process, False
+
+    def update(self, key, done, total, text):
+        if done >= 6 and not self.killed:
+            self._process.send_signal(signal.SIGKILL)
+            self.killed = True
+
+
+def test_a_cluster_computes_the_same_and_loses_its_workers(tmp_path, monkeypatch, cluster):
     address, workers = cluster
     trivial_runs.stand_in(monkeypatch, trivial_runs.slow)
-    study = trivial_runs.study(40)
-    killed = []
-
-    class Killer(Silent):
-        def update(self, key, done, total, text):
-            if done >= 6 and not killed:
-                workers[0].send_signal(signal.SIGKILL)  # it is at a run, the other one too
-                killed.append(done)
-
-    far = run_study(study, tmp_path / "far", cluster=address, progress=Killer())
-    assert killed
-    assert far.missing == 0
-    assert len(far.failed) == 0
-    processes = set(far.table["timing_pid"])
-    assert len(processes) == 2
-    late = far.table["timing_pid"].tolist()[-10:]
-    assert len(set(late)) == 1  # the one that lives on has done the rest, and what the other was at
+    monkeypatch.setattr(engines, "LOOK_S", 0.0)
+    study, killer = trivial_runs.study(40), Killer(workers[0])  # both workers are at a run all the time
+    far = run_study(study, tmp_path / "far", cluster=address, progress=killer)
+    assert killer.killed
+    assert far.note["workers_died"] == 1
+    assert (far.missing, len(far.failed)) == (0, 0)
+    assert far.table["id"].is_unique
+    assert len(set(far.table["timing_pid"])) == 2
+    # the one that lives on has done the rest, and what the other was at
+    assert len(set(far.table["timing_pid"].tolist()[-10:])) == 1
     near = run_study(study, tmp_path / "near", workers=2)
     assert comparable(far).equals(comparable(near))
+
+    monkeypatch.setattr(engines, "ALONE_S", 1.0)
+    with pytest.raises(InputError, match="has had no worker for 1 s"):
+        run_study(study, tmp_path / "alone", cluster=address, progress=Killer(workers[1]))
+    with pytest.raises(InputError, match="has no worker; start some"):
+        run_study(study, tmp_path / "alone", cluster=address, resume=True)
+    kept = StudyResults.load(tmp_path / "alone")
+    assert 6 <= len(kept.table) < 40
 
 
 def test_one_worker_two_workers(tmp_path, monkeypatch):
@@ -109,6 +122,7 @@ def test_a_local_worker_that_dies(tmp_path, monkeypatch, how):
     results = run_study(trivial_runs.study(12), tmp_path / "s")
     assert results.missing == 0
     assert results.table["id"].is_unique
+    assert results.note["workers_died"] == {"once": 1, "always": 3}[how]
     if how == "once":
         assert len(results.failed) == 0
     else:
