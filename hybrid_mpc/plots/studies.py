@@ -109,7 +109,7 @@ def pareto(points: Mapping[str, Mapping[str, tuple[float, float]]], cost: str) -
         cost: Name and unit of the cost.
 
     Returns:
-        The figure; durations on a logarithmic axis.
+        The figure; durations on a logarithmic axis where they span much.
 
     Raises:
         InputError: If there is no finite point.
@@ -137,13 +137,13 @@ def pareto(points: Mapping[str, Mapping[str, tuple[float, float]]], cost: str) -
                 ax.annotate(
                     plain(level), (time, value), xytext=(4, 3), textcoords="offset points", fontsize=7
                 )
-        ax.set_xscale("log")
-        if row:
-            times = [time for time, _ in row.values()]
-            plain_log(ax.xaxis, min(times), max(times))
+        times = [time for time, _ in row.values()] or [1.0]
+        if max(times) > 8 * min(times):
+            ax.set_xscale("log")
+            plain_log(ax.xaxis, *ax.get_xlim())
         title_axes(ax, plain(group))
+        ax.set_xlabel("median step [ms]")
         ax.set_ylabel(cost)
-    figure.supxlabel("median duration of a step [ms]", fontsize=10)
     if any(ax.get_legend_handles_labels()[0] for ax in panels):
         shared_legend(figure)
     return figure

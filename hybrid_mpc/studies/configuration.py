@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from itertools import product
+from itertools import count, product
 from pathlib import Path
 from typing import Any, cast
 
@@ -155,12 +155,13 @@ hybrid, hybrid_observer, oracle, oracle_state
         outer = product(
             self.folders, tasks, self.contenders, self.solvers, self.horizons, self.monitors, self.fault_sets
         )
+        number = count()
         for model, task, contender, solver, horizon, monitor, faults in outer:
             for draw, (parameters, some, late) in enumerate(drawn):
                 for seed in self.loop_seeds:
                     yield RunConfig(
                         self.scenario, model, task, contender, solver, horizon, monitor,
-                        faults, some, late, parameters, draw, seed, self.duration,
+                        faults, some, late, parameters, draw, seed, self.duration, next(number),
                     )  # fmt: skip
 
     def identity(self) -> dict[str, Any]:

@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.plots import save
 from hybrid_mpc.plots.style import name_of
@@ -89,11 +91,11 @@ def _head(results: StudyResults) -> list[KeyFigure]:
         KeyFigure("Computing time", duration_text(spent), "", "of all processes together"),
     ]
     if "controller" in results.factors:
-        paired = results.paired(by=[])
-        for _, row in paired.iterrows():
-            base = name_of(str(table["controller"].iloc[0]))
-            text = f"cost against {base}, mean over all runs"
-            figures.append(KeyFigure(name_of(row["controller"]), 100 * row["relative"], "%", text))
+        base = name_of(str(table["controller"].iloc[0]))
+        for name, rows in results.paired().groupby("controller", sort=False):
+            ratio = float(np.exp(np.log(rows["ratio"]).mean()))
+            text = f"of its cost with {base}: geometric mean over pairs"
+            figures.append(KeyFigure(f"Cost with {name_of(str(name))}", 100 * ratio, "%", text))
     return figures
 
 

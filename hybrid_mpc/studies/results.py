@@ -63,9 +63,13 @@ class StudyResults:
             raise InputError(f"{folder} holds no study; give the folder that 'study run --out' made")
         path = folder / RESULTS
         if path.is_file():
-            return cls(pq.read_table(path).to_pandas(), provenance_of(path), folder)
-        table = pd.DataFrame({row["id"]: row for row in rows(folder / "runs")}.values())
-        return cls(table, read_json(folder / "study.json"), folder)
+            table, note = pq.read_table(path).to_pandas(), provenance_of(path)
+        else:
+            table = pd.DataFrame({row["id"]: row for row in rows(folder / "runs")}.values())
+            note = read_json(folder / "study.json")
+        if "run" in table:  # they are kept in the order in which they ended
+            table = table.sort_values("run", ignore_index=True)
+        return cls(table, note, folder)
 
     @property
     def failed(self) -> pd.DataFrame:
@@ -85,7 +89,7 @@ class StudyResults:
     @property
     def figures(self) -> list[str]:
         """Columns that are results and numbers."""
-        known_ones = {*FACTORS, *PAIR, "id", "drawn_faults", "status", "error", "hidden_units"}
+        known_ones = {*FACTORS, *PAIR, "id", "run", "hidden_units"}
         names = self.table.select_dtypes("number").columns
         return [c for c in names if c not in known_ones and not c.startswith("factor_")]
 
@@ -134,8 +138,8 @@ class StudyResults:
 
         Returns:
             ``by``, ``over``, ``n`` pairs (of draws, where there are several), ``base`` (its mean), ``difference``,
-            ``low``, ``high``, ``relative`` (difference over the base's mean) and ``better`` (share of pairs in which
-            the difference is negative).
+            ``low``, ``high``, ``relative`` (difference over the base's mean), ``ratio`` (geometric mean of the pairs'
+            ratios; NaN where a value is not positive) and ``better`` (share of pairs with a negative difference).
 
         Raises:
             InputError: If there is no such column or level.
@@ -215,7 +219,7 @@ class StudyResults:
         return finite.groupby([*by, *keys], as_index=False, sort=True)[value].mean()
 
 
-DIFFERENCE = ("n", "base", "difference", "low", "high", "relative", "better")
+DIFFERENCE = ("n", "base", "difference", "low", "high", "relative", "ratio", "better")
 
 
 def _groups(table: pd.DataFrame, by: Sequence[str]) -> Any:
@@ -238,12 +242,15 @@ def _interval(values: Any) -> tuple[float, float]:
 
 
 def _difference(first: pd.DataFrame, second: pd.DataFrame, value: str) -> tuple[float, ...]:
-    """Of units that both have: number, mean of the first, difference with interval, relative, share of better ones."""
+    """Of units that both have: number, mean of the first, difference with interval, relative, ratio, better."""
     keys = [c for c in first.columns if c != value]
     both = first.merge(second, on=keys, suffixes=("", " "))
     change = both[f"{value} "] - both[value]
     middle, half = _interval(change)
     mean = float(both[value].mean()) if len(both) else math.nan
     relative = middle / mean if mean else math.nan
+    values = both[[value, f"{value} "]].to_numpy()
+    positive = len(both) > 0 and bool((values > 0).all())
+    ratio = float(np.exp(np.mean(np.diff(np.log(values), axis=1)))) if positive else math.nan
     better = float((change < 0).mean()) if len(both) else math.nan
-    return len(both), mean, middle, middle - half, middle + half, relative, better
+    return len(both), mean, middle, middle - half, middle + half, relative, ratio, better

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -34,6 +34,7 @@ class RunConfig:
         draw: Number of the draw that ``parameters`` and random faults are from.
         seed: Number of the loop; the same number, the same sensor noise for all that share the draw.
         duration: Longest duration [s]; None for the task's own.
+        number: Place in the study, no part of the run's identity.
 
     Example:
         >>> RunConfig("golf_robot", "model", "track_sine", "prior").id
@@ -54,11 +55,12 @@ class RunConfig:
     draw: int = 0
     seed: int = 0
     duration: float | None = None
+    number: int = field(default=0, compare=False)
 
     @cached_property
     def id(self) -> str:
         """The first 20 hexadecimal digits of the SHA-256 of the configuration's JSON form."""
-        return digest(asdict(self))[:20]
+        return digest({key: value for key, value in asdict(self).items() if key != "number"})[:20]
 
     @property
     def noise_seed(self) -> int:
@@ -70,6 +72,7 @@ class RunConfig:
     def columns(self) -> dict[str, Any]:
         """The configuration as the columns of a table."""
         return {
+            "run": self.number,
             "model": self.model,
             "task": self.task,
             "controller": self.controller,

@@ -94,7 +94,7 @@ def test_a_cluster_computes_the_same_and_loses_its_workers(tmp_path, monkeypatch
     assert far.table["id"].is_unique
     assert len(set(far.table["timing_pid"])) == 2
     # the one that lives on has done the rest, and what the other was at
-    assert len(set(far.table["timing_pid"].tolist()[-10:])) == 1
+    assert len(set(far.table["timing_pid"].tolist()[-8:])) == 1
     near = run_study(study, tmp_path / "near", workers=2)
     assert comparable(far).equals(comparable(near))
 

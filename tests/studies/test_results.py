@@ -73,6 +73,7 @@ def test_pairs_find_what_means_do_not():
     assert (found["low"], found["high"]) == pytest.approx((test.low, test.high), rel=1e-9)
     assert found["high"] < 0.0  # the shift of 0.3 is seen through machines that differ by 3
     assert found["relative"] == pytest.approx(found["difference"] / wide["prior"].mean())
+    assert found["ratio"] == pytest.approx(stats.gmean(wide["hybrid"] / wide["prior"]))
     summary = r.summary(by=["controller"]).set_index("controller")
     assert summary.loc["hybrid", "high"] > summary.loc["prior", "low"]  # the means' intervals overlap
     back = r.paired(base="hybrid").set_index("task").loc["track_sine"]
@@ -95,6 +96,7 @@ def test_studies_are_compared_run_by_run():
     found = one.compare(other)
     assert found.attrs["differs"] == {"model": ("z16", "z32")}
     assert found["relative"].to_numpy() == pytest.approx(0.1)
+    assert found["ratio"].to_numpy() == pytest.approx(1.1)
     assert set(found["n"]) == {10}
     assert one.compare(results(model="z16"))["difference"].abs().max() == 0.0
     half = StudyResults(other.table[other.table.draw < 4], NOTE, Path("."))
