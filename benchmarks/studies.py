@@ -154,6 +154,11 @@ def scale(runs: int) -> dict:
             for i in range(0, runs, 100):
                 log.append(lines[i : i + 100])
         logged = process_time() - begin
+        with RunLog(Path(place) / "single") as log:
+            begin = perf_counter()
+            for line in lines[:200]:
+                log.append([line])
+            single = perf_counter() - begin
         del lines
         begin = process_time()
         seen = sum(1 for _ in rows(folder))
@@ -173,6 +178,7 @@ def scale(runs: int) -> dict:
         "rows_read": seen,
         "name_us": 1e6 * named / runs,
         "log_us": 1e6 * logged / runs,
+        "append_one_wall_ms": 1e3 * single / min(200, runs),
         "read_us": 1e6 * read / runs,
         "compact_us": 1e6 * compacted / runs,
         "load_us": 1e6 * loaded / runs,

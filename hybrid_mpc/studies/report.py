@@ -95,7 +95,7 @@ def _head(results: StudyResults) -> list[KeyFigure]:
         for name, rows in results.paired().groupby("controller", sort=False):
             ratio = float(np.exp(np.log(rows["ratio"]).mean()))
             text = f"of its cost with {base}: geometric mean over pairs"
-            figures.append(KeyFigure(f"Cost with {name_of(str(name))}", 100 * ratio, "%", text))
+            figures.append(KeyFigure(f"Cost: {name_of(str(name))}", 100 * ratio, "%", text))
     return figures
 
 

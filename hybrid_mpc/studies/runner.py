@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -75,6 +76,7 @@ def run_study(
     note = {
         "schema_version": SCHEMA_VERSION,
         "study": study.identity(),
+        "scenario_sha256": _content(study.scenario),
         "models": models,
         "runs": study.size,
         "versions": versions(),
@@ -251,7 +253,10 @@ def _open_folder(out: Path, note: dict[str, Any]) -> None:
         write_json(path, note)
         return
     held = read_json(path)
-    differ = [key for key in note["study"] if digest(held["study"].get(key)) != digest(note["study"][key])]
+    mine, theirs = note["study"], held["study"]
+    differ = [key for key in mine if key != "name" and digest(theirs.get(key)) != digest(mine[key])]
+    if held.get("scenario_sha256") != note["scenario_sha256"]:
+        differ.append("the content of the scenario's file")
     differ += [
         f"the content of model {label}"
         for label, model in note["models"].items()
@@ -261,6 +266,12 @@ def _open_folder(out: Path, note: dict[str, Any]) -> None:
         raise InputError(
             f"{out} holds another study ({', '.join(differ)} differ); resume with the same one, or choose another --out"
         )
+
+
+def _content(scenario: str) -> str | None:
+    """SHA-256 of a user's scenario file; None for a registered scenario."""
+    path = Path(scenario)
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.suffix == ".py" and path.is_file() else None
 
 
 def _finished(out: Path, retry_failed: bool) -> set[str]:

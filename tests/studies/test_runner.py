@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -91,6 +92,14 @@ def test_the_folder_of_another_study(here, tmp_path):
     write_json(tmp_path / "s" / "study.json", note)
     with pytest.raises(InputError, match="content of model model"):
         run_study(trivial_runs.study(3), tmp_path / "s", resume=True)
+    machine = tmp_path / "machine.py"
+    machine.write_text("from scenarios.golf_robot import scenario\n")
+    own = replace(trivial_runs.study(3), scenario=str(machine))
+    run_study(own, tmp_path / "own")
+    run_study(replace(own, name="another name"), tmp_path / "own", resume=True)
+    machine.write_text("from scenarios.golf_robot import scenario  # another\n")
+    with pytest.raises(InputError, match="content of the scenario's file"):
+        run_study(own, tmp_path / "own", resume=True)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
     with pytest.raises(InputError, match="something else"):
