@@ -26,6 +26,8 @@ RUNS = "runs"
 SCHEMA_VERSION = 1
 BATCH_S = 0.5
 """Runs shorter than this are handed to workers several at a time, so that handing over costs little."""
+BATCHES_A_SECOND = 50.0
+"""Batches of all workers together are this many at most: a dask scheduler and the log take a few ms for each."""
 BATCH_MOST = 500
 AHEAD = 2
 """Batches a worker: one that it computes, and one that waits for it."""
@@ -146,7 +148,7 @@ def execute(configs: Iterable[Any], log: RunLog, engine: Engine, progress: Progr
         progress: Where to report.
         total: How many there are, for the report.
     """
-    tally, waiting, pace = Tally(total, begin=time.monotonic()), iter(configs), _Pace()
+    tally, waiting, pace = Tally(total, begin=time.monotonic()), iter(configs), _Pace(engine.workers)
     suspects = _Suspects()
     running = 0
     while True:
@@ -203,15 +205,15 @@ class _Suspects:
 
 
 class _Pace:
-    """How many runs make a batch: as many as fit into ``BATCH_S``."""
+    """How many runs make a batch: as many as fit into ``BATCH_S``, more where there are many workers."""
 
-    def __init__(self) -> None:
-        self.size = 1
+    def __init__(self, workers: int) -> None:
+        self.size, self._aim = 1, max(BATCH_S, workers / BATCHES_A_SECOND)
 
     def learn(self, done: list[dict[str, Any]]) -> None:
         spent = sum(row.get(f"{TIMING}total_s", 0.0) for row in done)
         if done:
-            wanted = int(BATCH_S * len(done) / max(spent, 1e-6))
+            wanted = int(self._aim * len(done) / max(spent, 1e-6))
             self.size = max(1, min(wanted, 2 * self.size, BATCH_MOST))
 
 

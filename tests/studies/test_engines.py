@@ -107,6 +107,7 @@ def test_a_cluster_computes_the_same_and_loses_its_workers(tmp_path, monkeypatch
     assert 6 <= len(kept.table) < 40
 
 
+@pytest.mark.full
 def test_one_worker_two_workers(tmp_path, monkeypatch):
     trivial_runs.stand_in(monkeypatch, trivial_runs.trivial)
     study = trivial_runs.study(300)

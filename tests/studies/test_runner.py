@@ -82,6 +82,14 @@ def test_short_runs_are_handed_over_together(here, tmp_path, monkeypatch):
     assert len(sizes) < 30  # doubling from 1 to at most 500
 
 
+@pytest.mark.parametrize(("workers", "size"), [(2, 5), (100, 20)])
+def test_batches_grow_with_the_workers(workers, size):
+    pace = runner._Pace(workers)
+    for _ in range(9):  # runs of 0.1 s: half a second a batch, or 2 s where 100 workers ask for 50 a second
+        pace.learn([{"timing_total_s": 0.1}] * pace.size)
+    assert pace.size == pytest.approx(size, abs=1)  # whole runs
+
+
 def test_the_folder_of_another_study(here, tmp_path):
     here(trivial_runs.trivial)
     run_study(trivial_runs.study(3), tmp_path / "s")
