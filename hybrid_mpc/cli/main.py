@@ -24,6 +24,7 @@ from hybrid_mpc.cli import reproduce as reproduce_command
 from hybrid_mpc.cli import run as run_command
 from hybrid_mpc.cli import scenarios as scenarios_command
 from hybrid_mpc.cli import search as search_command
+from hybrid_mpc.cli import study as study_command
 from hybrid_mpc.errors import InputError
 
 CTRL_C = 130
@@ -33,6 +34,7 @@ INTERRUPTED = {
     "control": "interrupted; loops are kept at the end only, there is nothing to resume: the same command starts "
     "them anew (with another --out if figures lie in it already)",
     "search": "interrupted; finished trials are kept: the same command with --resume goes on",
+    "study": "interrupted; finished runs are kept: the same command with --resume goes on",
     "data": "interrupted; the recordings are not complete: the same command with another --out makes them anew",
 }
 """What is left after Ctrl-C, by command."""
@@ -51,6 +53,7 @@ app.command("reproduce", epilog=reproduce_command.EXAMPLES)(reproduce_command.re
 app.command("data", epilog=data_command.EXAMPLES)(data_command.data)
 app.command("search", epilog=search_command.EXAMPLES)(search_command.search)
 app.command("scenarios")(scenarios_command.scenarios)
+app.add_typer(study_command.app, name="study")
 
 
 def _version(wanted: bool) -> None:

@@ -1,0 +1,172 @@
+"""``hybrid-mpc study``: many closed loops from one configuration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hybrid_mpc.errors import InputError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from hybrid_mpc.studies import Study, StudyResults
+    from hybrid_mpc.studies.dry_run import Plan
+
+EXAMPLES = (
+    "Examples:\n\n"
+    "  hybrid-mpc study list\n\n"
+    "  hybrid-mpc study run plant_variation --model runs/golf/model --out studies/variation --dry-run\n\n"
+    "  hybrid-mpc study run mine.yaml --workers 2 --out studies/mine\n\n"
+    "  hybrid-mpc study run horizon_size --model z16=runs/small --model z32=runs/golf --out studies/size\n\n"
+    "  hybrid-mpc study run mine.yaml --scheduler tcp://10.0.0.7:8786 --out studies/mine --resume"
+)
+FAILED = 1
+"""Exit code where runs have failed."""
+
+app = typer.Typer(
+    help="Many closed loops from one configuration: run, report, compare.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+
+
+@app.command("run", epilog=EXAMPLES)
+def run(
+    study: Annotated[str, typer.Argument(metavar="CONFIG", help="A YAML file, or a ready study's name.")],
+    out: Annotated[Path, typer.Option(help="Folder to make.")],
+    model: Annotated[
+        list[str] | None,
+        typer.Option(help="Artifact folder or run folder, or LABEL=FOLDER for several; replaces the file's."),
+    ] = None,
+    workers: Annotated[int, typer.Option(help="Processes on this machine.", min=1)] = 2,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a dask scheduler, tcp://HOST:PORT, in place of processes.")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Finish the study that the folder holds.")] = False,
+    retry_failed: Annotated[
+        bool, typer.Option("--retry-failed", help="With --resume: failed runs again.")
+    ] = False,
+    dry: Annotated[
+        bool, typer.Option("--dry-run", help="Say how many runs there are, and how long they take.")
+    ] = False,
+    noise: Annotated[
+        Path | None,
+        typer.Option(help="control.json with the filters' process noise. Default: that of each model's run."),
+    ] = None,
+) -> None:
+    """Run a study; exit code 1 if runs have failed."""
+    from hybrid_mpc.cli.progress import make_progress
+    from hybrid_mpc.studies import run_study
+    from hybrid_mpc.studies.dry_run import dry_run
+
+    wanted = _study(study, _models(model))
+    if dry:
+        with make_progress() as progress:
+            progress.start("timing a few periods of each kind of run")
+            plan = dry_run(wanted, workers=workers, noise=noise)
+            progress.finish("")
+        print("\n".join(_plan(plan, workers)))
+        return
+    with make_progress() as progress:
+        results = run_study(
+            wanted, out, workers=workers, cluster=scheduler, resume=resume, retry_failed=retry_failed, noise=noise,
+            progress=progress,
+        )  # fmt: skip
+    _tell(results)
+    if len(results.failed):
+        raise typer.Exit(FAILED)
+
+
+@app.command("report")
+def report(folder: Annotated[Path, typer.Argument(help="Folder of a study.")]) -> None:
+    """Write report.html, of a study that still runs too."""
+    from hybrid_mpc.studies import StudyResults
+    from hybrid_mpc.studies.report import write_study_report
+
+    print(f"report: {write_study_report(StudyResults.load(folder)).resolve()}")
+
+
+@app.command("compare")
+def compare(
+    first: Annotated[Path, typer.Argument(help="Folder of a study.")],
+    second: Annotated[Path, typer.Argument(help="Folder of another.")],
+    value: Annotated[str, typer.Option(help="Figure to compare.")] = "cost",
+) -> None:
+    """Compare two studies run by run, on common draws and seeds."""
+    from hybrid_mpc.studies import StudyResults
+
+    found = StudyResults.load(first).compare(StudyResults.load(second), value)
+    for column, (one, two) in found.attrs["differs"].items():
+        print(f"{column}: {one} against {two}")
+    print(f"{value} of {second} less that of {first}:")
+    print(_text(found))
+
+
+@app.command("list")
+def list_ready() -> None:
+    """List the studies that are ready."""
+    from hybrid_mpc.studies.ready import READY, ready_study
+
+    for name, ready in READY.items():
+        print(f"{name:16} {ready_study(name, 'model').size:6} runs with one model: {ready.title}")
+
+
+def _study(name: str, models: dict[str, str]) -> Study:
+    from hybrid_mpc.studies.files import read_study
+    from hybrid_mpc.studies.ready import READY, ready_study
+
+    if name in READY:
+        if not models:
+            raise InputError(f"study {name} needs a model: --model FOLDER, e.g. model/ of a finished run")
+        return ready_study(name, models)
+    if not Path(name).is_file() and Path(name).suffix not in (".yaml", ".yml"):
+        raise InputError(
+            f"no study {name!r}; ready are: {', '.join(READY)}. Or give the path of a .yaml file."
+        )
+    return read_study(name, **({"models": models} if models else {}))
+
+
+def _models(given: list[str] | None) -> dict[str, str]:
+    models: dict[str, str] = {}
+    for text in given or ():
+        label, equals, folder = text.partition("=")
+        if not equals:
+            label, folder = "model", text
+        if label in models:
+            raise InputError(
+                f"--model {text}: there is a model {label!r} already; give labels: --model LABEL=FOLDER"
+            )
+        models[label] = folder
+    return models
+
+
+def _plan(plan: Plan, workers: int) -> list[str]:
+    from hybrid_mpc.studies.runner import duration_text
+
+    axes = " x ".join(f"{n} {name}" for name, n in plan.axes.items() if n > 1) or "a single one"
+    lines = [f"{plan.runs} runs: {axes}"]
+    for (model, controller, solver, horizon), seconds in plan.kinds.items():
+        own = "" if horizon is None else f", horizon {horizon}"
+        lines.append(f"  {model}, {controller}, {solver}{own}: {seconds:.2f} s a run")
+    return [*lines, f"expected: {duration_text(plan.seconds)} in {workers} processes"]
+
+
+def _tell(results: StudyResults) -> None:
+    failed = results.failed
+    if len(failed) < len(results.table):
+        print(_text(results.summary()))
+    for _, row in failed.head(3).iterrows():
+        print(
+            f"failed: {row['model']}, {row['task']}, {row['controller']}, draw {row['draw']}, seed {row['seed']}:"
+        )
+        print(row["error"].rstrip())
+    if len(failed):
+        print(f"{len(failed)} of {len(results.table)} runs failed; the column 'error' has their tracebacks")
+    print(f"results: {(results.folder / 'results.parquet').resolve()}")
+
+
+def _text(table: pd.DataFrame) -> str:
+    return str(table.to_string(index=False, float_format=lambda v: f"{v:.4g}"))

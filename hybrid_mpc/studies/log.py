@@ -1,0 +1,146 @@
+"""The rows of a study while it runs: appended durably, whole after a kill at any moment."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import plain
+
+SEGMENT_ROWS = 10_000
+"""Rows of one file: a study of a million runs has a hundred of them."""
+LOCK = "lock"
+
+
+class RunLog:
+    """Append-only JSON lines in a few numbered files, one row a finished run.
+
+    What :meth:`append` has returned from is on the disk. A line that a kill tore apart is cut off when the log is
+    opened again: its run counts as not finished. One process at a time may hold the log.
+
+    Args:
+        folder: Folder of the files; made if missing.
+
+    Raises:
+        InputError: If another process holds the log.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> with RunLog(folder) as log:
+        ...     log.append([{"id": "a", "cost": 0.1}, {"id": "b", "cost": float("inf")}])
+        >>> [row["cost"] for row in rows(folder)]
+        [0.1, inf]
+    """
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self._folder = folder
+        self._lock = (folder / LOCK).open("w")
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            self._lock.close()
+            raise InputError(
+                f"{folder.parent}: another process is running this study; wait for it"
+            ) from error
+        files = segments(folder)
+        self._number = len(files) - 1 if files else 0
+        self._rows = _repaired(files[-1]) if files else 0
+        self._file = self._open()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, t: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let go of the files; the log may be opened again."""
+        os.close(self._file)
+        self._lock.close()
+
+    def append(self, new: Iterable[Mapping[str, Any]]) -> None:
+        """Add rows; on return they are on the disk.
+
+        Raises:
+            InputError: If they cannot be written (a full disk); what was there before is unharmed.
+        """
+        lines = [json.dumps(plain(row), separators=(",", ":")) + "\n" for row in new]
+        if not lines:
+            return
+        if self._rows >= SEGMENT_ROWS:
+            os.close(self._file)
+            self._number, self._rows = self._number + 1, 0
+            self._file = self._open()
+        end = os.fstat(self._file).st_size
+        try:
+            left = memoryview("".join(lines).encode())
+            while left:
+                left = left[os.write(self._file, left) :]
+            os.fsync(self._file)
+        except OSError as error:
+            os.ftruncate(self._file, end)  # needs no room
+            raise InputError(
+                f"{self._folder}: cannot write ({error.strerror}); the runs that were finished before are kept. Make "
+                "room, then the same command with --resume goes on"
+            ) from error
+        self._rows += len(lines)
+
+    def _open(self) -> int:
+        path = self._folder / f"{self._number:06}.jsonl"
+        return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+
+
+def segments(folder: Path) -> list[Path]:
+    """Files of a log, in order."""
+    return sorted(folder.glob("[0-9]*.jsonl"))
+
+
+def rows(folder: Path) -> Iterator[dict[str, Any]]:
+    """Rows of a log, in the order in which they were written; a torn last line is left out.
+
+    Raises:
+        InputError: If a line within is damaged.
+    """
+    for path in segments(folder):
+        with path.open("rb") as file:
+            for number, line in enumerate(file, 1):
+                if not line.endswith(b"\n"):
+                    return
+                yield _parsed(line, path, number)
+
+
+def _parsed(line: bytes, path: Path, number: int) -> dict[str, Any]:
+    try:
+        row = json.loads(line)
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise InputError(
+            f"{path}:{number} is damaged ({error}); delete this line, and --resume runs its run again"
+        ) from error
+    return {key: _number(value) for key, value in row.items()}
+
+
+def _number(value: Any) -> Any:
+    """Infinities and NaN, which are strings in JSON."""
+    return float(value) if value in ("inf", "-inf", "nan") else value
+
+
+def _repaired(path: Path) -> int:
+    """Rows of a file, after a torn line at its end was cut off."""
+    count = whole = 0
+    with path.open("rb") as file:
+        for line in file:
+            if line.endswith(b"\n"):
+                count, whole = count + 1, whole + len(line)
+    if whole < path.stat().st_size:
+        os.truncate(path, whole)
+    return count

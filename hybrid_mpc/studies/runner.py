@@ -1,0 +1,282 @@
+"""Run a study: every run once, kept as it ends, whatever happens to the process or to its workers."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import digest, plain, read_json, write_json
+from hybrid_mpc.pipeline.context import Progress, Silent
+from hybrid_mpc.pipeline.deploy import versions
+from hybrid_mpc.studies.configuration import Study
+from hybrid_mpc.studies.engines import Batch, Engine, Lost, make_engine
+from hybrid_mpc.studies.log import RunLog, rows
+from hybrid_mpc.studies.loops import TIMING, load_inputs
+from hybrid_mpc.studies.results import StudyResults
+from hybrid_mpc.studies.table import RESULTS, compact
+
+NOTE = "study.json"
+RUNS = "runs"
+SCHEMA_VERSION = 1
+BATCH_S = 0.5
+"""Runs shorter than this are handed to workers several at a time, so that handing over costs little."""
+BATCHES_A_SECOND = 50.0
+"""Batches of all workers together are this many at most: a dask scheduler and the log take a few ms for each."""
+BATCH_MOST = 500
+AHEAD = 2
+"""Batches a worker: one that it computes, and one that waits for it."""
+TRIES = 3
+"""How many workers may die of a run before it is given up."""
+
+
+def run_study(
+    study: Study,
+    out: str | Path,
+    *,
+    workers: int = 2,
+    cluster: Any = None,
+    resume: bool = False,
+    retry_failed: bool = False,
+    noise: Path | None = None,
+    progress: Progress | None = None,
+) -> StudyResults:
+    """Run a study into a folder and return its results.
+
+    Finished runs are on the disk as they end; after a kill at any moment, Ctrl-C or a full disk ``resume=True`` runs
+    what is missing. Results depend on nothing but the study: not on order, number of workers, or engine; only columns
+    that begin with ``timing_`` differ. A run that raises is kept with its traceback, and the others go on.
+
+    Args:
+        study: What to run.
+        out: Folder to make; it must be new or empty unless ``resume``.
+        workers: Processes on this machine.
+        cluster: Address of a dask scheduler or a ``distributed.Client``, in place of processes. Default: none.
+        resume: Finish the study that ``out`` holds.
+        retry_failed: Run those again that have failed.
+        noise: ``control.json`` of a run with the filters' process noise. Default: that of each model's run.
+        progress: Where to report; default: nowhere.
+
+    Returns:
+        The results, also in ``out/results.parquet``.
+
+    Raises:
+        InputError: For any bad input, an unreachable scheduler, or a disk that is full.
+
+    Example:
+        >>> results = run_study(Study("golf_robot", "runs/golf"), "studies/first")  # doctest: +SKIP
+    """
+    out, say = Path(out), progress or Silent()
+    _check_folder(out, resume=resume)
+    say.start("reading the models, and the filters' noise")
+    run, models = load_inputs(study, noise, read_json(out / NOTE)["models"] if resume else None)
+    note = {
+        "schema_version": SCHEMA_VERSION,
+        "study": study.identity(),
+        "scenario_sha256": _content(study.scenario),
+        "models": models,
+        "runs": study.size,
+        "versions": versions(),
+    }
+    say.finish(f"{study.size} runs")
+    engine = make_engine(run, workers, cluster)
+    try:
+        _open_folder(out, note)
+        with RunLog(out / RUNS) as log:
+            done = _finished(out, retry_failed)
+            say.start("running")
+            left = (config for config in study.runs() if config.id not in done)
+            if study.size > len(done):
+                (out / RESULTS).unlink(missing_ok=True)
+            told = execute(left, log, engine, say, study.size - len(done))
+            say.finish(told.text)
+            if not (out / RESULTS).is_file():
+                made = {"engine": engine.name, "workers_died": told.died}
+                compact(out / RUNS, out / RESULTS, {**read_json(out / NOTE), **made})
+    finally:
+        engine.close()
+    return StudyResults.load(out)
+
+
+@dataclass
+class Tally:
+    """What became of the runs so far.
+
+    Args:
+        total: Runs to do.
+        runs: Runs that are done.
+        failed: Those of them that failed.
+        died: Workers that have died, and whose runs were begun again.
+        begin: When it began, on the monotonic clock.
+    """
+
+    total: int
+    runs: int = 0
+    failed: int = 0
+    died: int = 0
+    begin: float = 0.0
+
+    @property
+    def text(self) -> str:
+        """In words, with rate and remaining time."""
+        spent = max(time.monotonic() - self.begin, 1e-9)
+        rate = self.runs / spent
+        words = [f"{rate:.3g} runs/s"]
+        if 0 < self.runs < self.total:
+            words.append(f"{duration_text((self.total - self.runs) / rate)} left")
+        if self.failed:
+            words.append(f"{self.failed} failed")
+        if self.died:
+            words.append(f"{self.died} workers died, what they were at was begun again")
+        return ", ".join(words)
+
+
+def execute(configs: Iterable[Any], log: RunLog, engine: Engine, progress: Progress, total: int) -> Tally:
+    """Run configurations in an engine and log their rows.
+
+    At any time a few batches are under way; a row is logged before the next batch is asked for.
+
+    Args:
+        configs: Each with ``id`` and ``columns()``; taken as they are needed.
+        log: Where the rows go.
+        engine: Where they are computed.
+        progress: Where to report.
+        total: How many there are, for the report.
+    """
+    tally, waiting, pace = Tally(total, begin=time.monotonic()), iter(configs), _Pace(engine.workers)
+    suspects = _Suspects()
+    running = 0
+    while True:
+        while batch := suspects.next(running) or (
+            _next_batch(waiting, pace) if running < AHEAD * engine.workers and not suspects.left else ()
+        ):
+            engine.submit(batch)
+            running += 1
+        if not running:
+            return tally
+        ended = engine.next(timeout=1.0)
+        if ended is None:
+            continue
+        running -= 1
+        batch, result = ended
+        if isinstance(result, Lost):
+            result = suspects.judge(batch, result)
+        suspects.alone = None
+        log.append(result)
+        pace.learn(result)
+        tally.died = engine.died
+        tally.runs += len(result)
+        tally.failed += sum(row["status"] == "failed" for row in result)
+        progress.update("runs", tally.runs, total, tally.text)
+
+
+class _Suspects:
+    """Runs whose worker died: they are begun again one at a time with nothing beside them, to find the culprit."""
+
+    def __init__(self) -> None:
+        self.left: list[Any] = []
+        self.alone: Any = None
+        self._tries: dict[str, int] = {}
+
+    def next(self, running: int) -> Batch:
+        """The next suspect once nothing else runs; empty if there is none, or something runs."""
+        if running or not self.left:
+            return ()
+        self.alone = self.left.pop()
+        return (self.alone,)
+
+    def judge(self, batch: Batch, lost: Lost) -> list[dict[str, Any]]:
+        """Suspect the runs of a lost batch; rows of those that are given up."""
+        given_up = []
+        for config in batch:
+            alone = self.alone is not None and config.id == self.alone.id
+            tries = self._tries[config.id] = self._tries.get(config.id, 0) + 1
+            if not alone or (tries < TRIES and not lost.final):
+                self.left.append(config)
+                continue
+            error = f"its worker died {tries} times ({lost}); out of memory, or a crash outside Python"
+            given_up.append({"id": config.id, **config.columns(), "status": "failed", "error": error})
+        return given_up
+
+
+class _Pace:
+    """How many runs make a batch: as many as fit into ``BATCH_S``, more where there are many workers."""
+
+    def __init__(self, workers: int) -> None:
+        self.size, self._aim = 1, max(BATCH_S, workers / BATCHES_A_SECOND)
+
+    def learn(self, done: list[dict[str, Any]]) -> None:
+        spent = sum(row.get(f"{TIMING}total_s", 0.0) for row in done)
+        if done:
+            wanted = int(self._aim * len(done) / max(spent, 1e-6))
+            self.size = max(1, min(wanted, 2 * self.size, BATCH_MOST))
+
+
+def _next_batch(waiting: Iterator[Any], pace: _Pace) -> Batch:
+    """Some runs; empty where none is left."""
+    return tuple(islice(waiting, pace.size))
+
+
+def duration_text(seconds: float) -> str:
+    """A duration as people say it.
+
+    Example:
+        >>> duration_text(42.0), duration_text(600.0), duration_text(7300.0), duration_text(4e5)
+        ('42 s', '10 min', '2.0 h', '4.6 d')
+    """
+    for size, unit, digits in ((86400.0, "d", 1), (3600.0, "h", 1), (60.0, "min", 0)):
+        if seconds >= 2 * size or (unit != "min" and seconds >= 1.5 * size):
+            return f"{seconds / size:.{digits}f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+def _check_folder(out: Path, *, resume: bool) -> None:
+    """Refuse a folder that holds something else, or (without ``resume``) a study."""
+    if (out / NOTE).is_file():
+        if not resume:
+            raise InputError(
+                f"{out} already holds a study; add --resume to finish it, or choose another --out"
+            )
+    elif out.exists() and (not out.is_dir() or {p.name for p in out.iterdir()} - {f"{NOTE}.part"}):
+        raise InputError(f"{out} exists and holds something else than a study; choose another --out")
+    elif resume:
+        raise InputError(f"{out} holds no study to resume; leave --resume out")
+
+
+def _open_folder(out: Path, note: dict[str, Any]) -> None:
+    """Note what the folder holds, or compare it with what it holds already."""
+    path = out / NOTE
+    if not path.is_file():
+        write_json(path, note)
+        return
+    held = read_json(path)
+    mine, theirs = note["study"], held["study"]
+    differ = [key for key in mine if key != "name" and digest(theirs.get(key)) != digest(mine[key])]
+    if held.get("scenario_sha256") != note["scenario_sha256"]:
+        differ.append("the content of the scenario's file")
+    differ += [
+        f"the content of model {label}"
+        for label, model in note["models"].items()
+        if label in held["models"] and plain(held["models"][label])["sha256"] != model["sha256"]
+    ]
+    if differ:
+        raise InputError(
+            f"{out} holds another study ({', '.join(differ)} differ); resume with the same one, or choose another --out"
+        )
+
+
+def _content(scenario: str) -> str | None:
+    """SHA-256 of a user's scenario file; None for a registered scenario."""
+    path = Path(scenario)
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.suffix == ".py" and path.is_file() else None
+
+
+def _finished(out: Path, retry_failed: bool) -> set[str]:
+    """Ids of the runs that need not run."""
+    status = {row["id"]: row["status"] for row in rows(out / RUNS)}
+    return {id for id, how in status.items() if how == "done" or not retry_failed}
