@@ -1,0 +1,90 @@
+"""LQR gains over a grid of operating points."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybrid_mpc.analysis.friction import Kind, linearize_secant
+from hybrid_mpc.analysis.linearize import column, hidden_fixed_point, linearize
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.model import HybridModel
+from hybrid_mpc.riccati import dare, vector
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class GainSchedule:
+    """LQR gains by operating point: ``du = -gain[k] @ dz`` with ``z = (x, h)``.
+
+    Args:
+        x: Operating points ``(n, n_x)``.
+        u: Inputs there ``(n, n_u)``.
+        gain: ``(n, n_u, n_x + n_h)`` [input unit / state unit].
+        radius: Spectral radius of each closed loop ``(n,)``.
+        open_radius: That of each open loop ``(n,)``.
+    """
+
+    x: Array
+    u: Array
+    gain: Array
+    radius: Array
+    open_radius: Array
+
+
+def gain_schedule(
+    model: HybridModel, points: Iterable[tuple[ArrayLike, ArrayLike]], q: ArrayLike, r: ArrayLike,
+    *, speed: ArrayLike | None = None, kind: Kind = "harmonic",
+) -> GainSchedule:  # fmt: skip
+    """LQR of the linearisation at each point, hidden states (at their fixed points) without weight.
+
+    Args:
+        model: The model.
+        points: Operating points ``(x, u)``.
+        q: Weights of the states ``(n_x,)``.
+        r: Weights of the inputs ``(n_u,)``, positive.
+        speed: Size of the motion that the friction is linearised for, see :func:`linearize_secant`. Default: the
+            tangent at the point.
+        kind: How, see there.
+
+    Raises:
+        InputError: If there is no point, a size is wrong, or a linearisation is not stabilisable.
+
+    Source: Rugh and Shamma, *Research on gain scheduling*, Automatica 36 (2000).
+
+    Example:
+        >>> import casadi as ca
+        >>> from hybrid_mpc.signals import Signal
+        >>> x, h, u, w = ca.MX.sym("x"), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w")
+        >>> model = HybridModel("sum", 1.0, (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),),
+        ...     ca.Function("f", [x, h, u], [x + u, h]), ca.Function("g", [x, h, u], [u]),
+        ...     ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]))
+        >>> gain_schedule(model, [([0.0], [0.0])], [1.0], [1.0]).gain.round(6).ravel()
+        array([0.618034])
+    """
+    given = [(column(model, "x", x, model.n_x), column(model, "u", u, model.n_u)) for x, u in points]
+    if not given:
+        raise InputError("gain schedule: no operating point given")
+    weights = np.diag(np.concatenate([vector(q, model.n_x, "q"), np.zeros(model.n_h)]))
+    costs = np.diag(vector(r, model.n_u, "r"))
+    gains, radii, before = [], [], []
+    for x, u in given:
+        h = hidden_fixed_point(model, x, u)
+        if speed is None:
+            system = linearize(model, x, u, h)
+        else:
+            system = linearize_secant(model, x, u, speed, h, kind=kind)
+        _, k = dare(system.A, system.B, weights, costs)
+        gains.append(k)
+        radii.append(_radius(system.A - system.B @ k))
+        before.append(_radius(system.A))
+    xs, us = np.stack([x for x, _ in given]), np.stack([u for _, u in given])
+    return GainSchedule(xs, us, np.stack(gains), np.array(radii), np.array(before))
+
+
+def _radius(a: Array) -> float:
+    return float(np.abs(np.linalg.eigvals(a)).max())
