@@ -5,11 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.analysis.friction import Kind, linearize_secant
-from hybrid_mpc.analysis.linearize import column, hidden_fixed_point, linearize
+from hybrid_mpc.analysis.linearize import (
+    RESIDUAL,
+    column,
+    hidden_fixed_point,
+    linearize,
+    newton,
+    settled_hidden,
+)
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.riccati import dare, vector
@@ -84,6 +92,35 @@ def gain_schedule(
         before.append(_radius(system.A))
     xs, us = np.stack([x for x, _ in given]), np.stack([u for _, u in given])
     return GainSchedule(xs, us, np.stack(gains), np.array(radii), np.array(before))
+
+
+def holding_input(model: HybridModel, q: ArrayLike, *, u_guess: ArrayLike | None = None) -> Array:
+    """Input ``(n_u,)`` that holds a machine at rest at positions ``q`` ``(n_x / 2,)``, with its hidden state settled.
+
+    Args:
+        model: The model, state ``[q, v]``, with as many inputs as positions.
+        q: The positions.
+        u_guess: Start ``(n_u,)``. Default: zero.
+
+    Raises:
+        InputError: If the numbers of inputs and positions differ, or no such input is found.
+
+    Example:
+        ``gain_schedule(model, [(np.append(q, 0.0), holding_input(model, [q])) for q in angles], weights, costs)``
+    """
+    n_q = model.n_x // 2
+    if model.n_u != n_q:
+        raise InputError(f"model {model.name}: {model.n_u} inputs cannot be found from {n_q} positions; give them")
+    x = np.concatenate([column(model, "q", q, n_q), np.zeros(n_q)])
+    start = np.zeros(model.n_u) if u_guess is None else column(model, "u_guess", u_guess, model.n_u)
+    h, u, v = ca.MX.sym("h", model.n_h), ca.MX.sym("u", model.n_u), ca.MX.sym("x", model.n_x)
+    x_next, h_next = model.step(v, h, u)
+    unknown, change = ca.vertcat(h, u), ca.vertcat(h_next - h, x_next[n_q:] - v[n_q:])
+    residual = ca.Function("hold", [unknown, v], [change, ca.densify(ca.jacobian(change, unknown))])
+    found, size = newton(residual, np.concatenate([settled_hidden(model, x, start), start]), x)
+    if size > RESIDUAL:
+        raise InputError(f"model {model.name}: no input found that holds q = {x[:n_q].tolist()} (residual {size:.2g})")
+    return found[model.n_h :]
 
 
 def _radius(a: Array) -> float:

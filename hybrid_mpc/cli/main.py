@@ -18,6 +18,7 @@ except ImportError as missing:  # the online half installs without the command l
     ) from None
 
 from hybrid_mpc import __version__
+from hybrid_mpc.cli import analyze as analyze_command
 from hybrid_mpc.cli import control as control_command
 from hybrid_mpc.cli import data as data_command
 from hybrid_mpc.cli import run as run_command
@@ -43,6 +44,7 @@ app = typer.Typer(
 )
 app.command("run", epilog=run_command.EXAMPLES)(run_command.run)
 app.command("control", epilog=control_command.EXAMPLES)(control_command.control)
+app.command("analyze", epilog=analyze_command.EXAMPLES)(analyze_command.analyze)
 app.command("data", epilog=data_command.EXAMPLES)(data_command.data)
 app.command("scenarios")(scenarios_command.scenarios)
 
