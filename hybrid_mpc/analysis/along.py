@@ -46,6 +46,26 @@ class AlongTrajectory:
         names = signal_names(self.model)
         return control_toolbox().ss(*matrices, self.model.dt, remove_useless_states=False, **names)
 
+    def mean(self, skip: int = 0) -> Any:
+        """The matrices' means over the trajectory as ``control.StateSpace``: statistical linearisation.
+
+        For a deviation that is Gaussian the mean slope is the linear map that predicts a function best; so this is
+        what motions like this one see of a friction, and of all else that is nonlinear, networks included.
+
+        Args:
+            skip: Periods left out at the start.
+
+        Raises:
+            InputError: If nothing is left.
+
+        Source: Roberts and Spanos, *Random Vibration and Statistical Linearization*, 1990, section 5.3.
+        """
+        if not 0 <= skip < len(self.A):
+            raise InputError(f"mean: {skip} periods to leave out, the trajectory has {len(self.A)}")
+        matrices = (m[skip:].mean(axis=0) for m in (self.A, self.B, self.C, self.D))
+        names = signal_names(self.model)
+        return control_toolbox().ss(*matrices, self.model.dt, remove_useless_states=False, **names)
+
     def transition(self, start: int, end: int) -> Array:
         """``A_{end-1} ... A_start`` ``(n_z, n_z)``: what a deviation at ``start`` has become at ``end``.
 

@@ -15,7 +15,7 @@ from hybrid_mpc.plots import analysis, analysis_loops, analysis_models, save
 Named = Iterator[tuple[str, Figure, str]]
 _TITLES = {
     "rest": "at rest, where the slope of dry friction dominates", "working": "with friction of working size",
-    "moving": "in motion at working speed",
+    "moving": "in motion at working speed", "driven": "along a driven run, on average",
 }  # fmt: skip
 
 
@@ -96,16 +96,16 @@ def _measured(subject: Subject, f: Findings) -> Named:
 def _loops(subject: Subject, f: Findings) -> Named:
     shown, curves = {}, {}
     for loop, points in f.result["loops"].items():
-        for mode, row in points["moving"].items():
-            at = f"loops/{loop}/moving/{mode}"
+        for mode, row in points["driven"].items():
+            at = f"loops/{loop}/driven/{mode}"
             label = f"{loop}, {mode}"
             curves[label] = f.arrays[f"{at}/L"]
             if row["stable"]:
                 shown[label] = {k: f.arrays[f"{at}/{k}"] for k in ("omega", "S", "T")}
     if shown:
-        caption = "Sensitivity functions at the plant's input, linearised in motion at working speed."
+        caption = "Sensitivity functions at the plant's input, linearised along a driven run."
         yield "sensitivity", analysis_loops.sensitivity_functions(shown), caption
-    caption = "Nyquist curves of the loops, linearised in motion; positive frequencies."
+    caption = "Nyquist curves of the loops, linearised along a driven run; positive frequencies."
     yield "nyquist", analysis_loops.nyquist(curves, modulus=0.5), caption
 
 

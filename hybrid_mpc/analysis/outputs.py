@@ -10,7 +10,6 @@ from hybrid_mpc.analysis.study import POINTS, Findings, Subject
 from hybrid_mpc.files import plain, write_arrays, write_json, write_text
 from hybrid_mpc.report import KeyFigure, Report, Section, Table, write_report
 
-TITLES = {"rest": "tangent at rest", "working": "friction of working size", "moving": "tangent in motion"}
 MODES = 6
 """Modes of each linearisation in the page's table; the CSV has all."""
 
@@ -194,9 +193,9 @@ def _key_figures(result: dict[str, Any]) -> list[KeyFigure]:
             error = 100 * row["median_relative_error"]
             keys.append(KeyFigure(f"Response to the machine's inputs, {name} against machine", error, "%", "median"))
     for name in ("prior on prior", "hybrid on hybrid"):
-        row = result["loops"].get(name, {}).get("moving", {}).get("quiet", {})
+        row = result["loops"].get(name, {}).get("driven", {}).get("quiet", {})
         if isinstance(row, dict) and "margins" in row:
-            keys.append(KeyFigure(f"Delay margin in motion, {name}", 1e3 * row["margins"]["delay"], "ms"))
+            keys.append(KeyFigure(f"Delay margin, driven, {name}", 1e3 * row["margins"]["delay"], "ms"))
     return keys
 
 

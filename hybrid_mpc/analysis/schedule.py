@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import brentq
 
 from hybrid_mpc.analysis.friction import Kind, linearize_secant
 from hybrid_mpc.analysis.linearize import (
@@ -118,9 +119,26 @@ def holding_input(model: HybridModel, q: ArrayLike, *, u_guess: ArrayLike | None
     unknown, change = ca.vertcat(h, u), ca.vertcat(h_next - h, x_next[n_q:] - v[n_q:])
     residual = ca.Function("hold", [unknown, v], [change, ca.densify(ca.jacobian(change, unknown))])
     found, size = newton(residual, np.concatenate([settled_hidden(model, x, start), start]), x)
+    if size > RESIDUAL and model.n_u == 1 and (near := _between(model, x, float(start[0]))) is not None:
+        found, size = newton(residual, np.concatenate([settled_hidden(model, x, near), near]), x)
     if size > RESIDUAL:
         raise InputError(f"model {model.name}: no input found that holds q = {x[:n_q].tolist()} (residual {size:.2g})")
     return found[model.n_h :]
+
+
+def _between(model: HybridModel, x: Array, guess: float) -> Array | None:
+    """An input near which the speed changes sign with the hidden state settled, if one is found around a guess."""
+    n_q = model.n_x // 2
+
+    def gained(u: float) -> float:
+        held = np.array([u])
+        return float(model.step(x, settled_hidden(model, x, held), held)[0][n_q])
+
+    for reach in 0.01 * 2.0 ** np.arange(12):
+        low, high = guess - reach, guess + reach
+        if gained(low) * gained(high) < 0:
+            return np.array([brentq(gained, low, high, xtol=1e-9)])
+    return None
 
 
 def _radius(a: Array) -> float:

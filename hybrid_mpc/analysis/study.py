@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_mpc.analysis.along import linearize_along
 from hybrid_mpc.analysis.contraction import contraction, feature_box, gru_weights
 from hybrid_mpc.analysis.equilibria import equilibria
 from hybrid_mpc.analysis.friction import friction_slopes, linearize_secant
@@ -34,9 +35,9 @@ from nn_export import Program
 Array = NDArray[np.float64]
 Say = Callable[[str, int, int, str], None]
 Part = tuple[dict[str, Any], dict[str, Any]]
-POINTS = ("rest", "working", "moving")
-"""Linearisations: the tangent at rest, the describing function of motions of working size around it, and the tangent
-in motion at working speed."""
+POINTS = ("rest", "working", "moving", "driven")
+"""Linearisations: the tangent at rest, the describing function of motions of working size around it, the tangent in
+motion at working speed, and the mean along a driven run."""
 PERIOD, PERIODS, BAND = 20.0, 4, (0.1, 3.0)
 """The multisine: its period [s], periods that count, and band [Hz]."""
 GRID = 21
@@ -169,6 +170,7 @@ def _systems(subject: Subject, name: str, point: tuple[Array, Array]) -> dict[st
     return {
         "rest": linearize(model, x, u, h), "working": linearize_secant(model, x, u, subject.speed, h),
         "moving": linearize_at_speed(model, x[: model.n_x // 2], subject.speed, u),
+        "driven": linearize_along(model, x, _drive(subject, model, 30.0), h).mean(round(5.0 / model.dt)),
     }  # fmt: skip
 
 

@@ -30,12 +30,13 @@ SECTIONS: Sequence[tuple[str, str, tuple[str, ...], tuple[str, ...], tuple[str, 
         "Linearised models",
         "linear",
         ("modes",),
-        ("poles", "bode_rest", "bode_working", "bode_moving", "steps"),
+        ("poles", "bode_rest", "bode_working", "bode_moving", "bode_driven", "steps"),
         (
-            "Each model three times: the tangent at rest; at rest with friction of working size; the tangent in motion. "
-            "The last is no point of rest: it holds for deviations over times that are short against the motion. With "
-            "friction of working size only the columns by the speeds are chords: what a network made of the other "
-            "signals stays its tangent at rest.",
+            "Each model four times: the tangent at rest; at rest with friction of working size; the tangent in motion; "
+            "the mean of the tangents along a run driven by a multisine (statistical linearisation). The tangent in motion "
+            "holds for deviations over times that are short against the motion. With friction of working size only the "
+            "columns by the speeds are chords: what a network made of the other signals stays its tangent at rest, and "
+            "that is stiction where the machine sticks.",
         ),
     ),
     (

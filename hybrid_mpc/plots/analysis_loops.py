@@ -125,7 +125,8 @@ def gain_schedules(
             values = checked(f"gains of {name}", gain, len(q), len(states))
             label = name_of(name) + {"rest": ", tangent at rest", "working": ", friction of working size"}.get(point, "")
             for ax, column in zip(axes[0], values.T, strict=True):
-                ax.plot(q, column, color=colour(name), linestyle=":" if point == "rest" else "-", label=label)
+                ax.plot(q, column, color=colour(name), linestyle=":" if point == "rest" else "-", marker=".", markersize=4,
+                        label=label)  # fmt: skip
     for ax, signal in zip(axes[0], states, strict=True):
         ax.set_xlabel(axis_label(position))
         title_axes(ax, f"gain of {axis_label(signal)}")

@@ -27,7 +27,8 @@ from hybrid_mpc.plots.style import (
 )
 from hybrid_mpc.signals import Signal
 
-_POINTS = {"rest": "tangent at rest", "working": "friction of working size", "moving": "tangent in motion"}
+_POINTS = {"rest": "tangent at rest", "working": "friction of working size", "moving": "tangent in motion",
+           "driven": "mean of a driven run"}
 
 
 def measured_bode(
@@ -145,7 +146,7 @@ def friction_damping(curves: Mapping[str, Mapping[str, Array]], *, working_speed
     kinds = (("secant", "--", "secant"), ("harmonic", "-", "describing function"), ("moving", ":", "tangent at the speed"))
     for ax, (name, one) in zip(axes[0], curves.items(), strict=True):
         speed = np.asarray(one["speed"], dtype=float)
-        ax.axhline(float(one["tangent"]), color=INK, linewidth=1.0, label="tangent at rest")
+        ax.axhline(float(one["tangent"]), color=INK, linestyle="-.", linewidth=1.0, label="tangent at rest")
         for key, dashes, label in kinds:
             values = checked(f"{key} of {name}", one[key], speed.size)
             ax.loglog(speed, np.where(values > 0, values, np.nan), color=colour(name), linestyle=dashes, label=label)
