@@ -116,14 +116,18 @@ def linearize_along(
             f"({model.n_h},) needed"
         )
     if not free and given.shape != (n, model.n_x):
-        raise InputError(f"model {model.name}: x {given.shape} given, ({model.n_x},) or ({n}, {model.n_x}) needed")
+        raise InputError(
+            f"model {model.name}: x {given.shape} given, ({model.n_x},) or ({n}, {model.n_x}) needed"
+        )
     states, hidden = np.empty((n, model.n_x)), np.empty((n, model.n_h))
     now, h_now = given if free else given[0], start
     for k in range(n):
         states[k], hidden[k] = (now if free else given[k]), h_now
         now, h_now = (m.full().ravel() for m in model.step(states[k], h_now, inputs[k]))
     if not (np.all(np.isfinite(states)) and np.all(np.isfinite(hidden))):
-        raise InputError(f"model {model.name}: the free run is not finite; take a shorter one or other inputs")
+        raise InputError(
+            f"model {model.name}: the free run is not finite; take a shorter one or other inputs"
+        )
     every = jacobians(model).map(n)(states.T, hidden.T, inputs.T)
     a, b, c, d = (m.full().reshape(m.shape[0], n, -1).transpose(1, 0, 2) for m in every)
     return AlongTrajectory(model, states, hidden, inputs, a, b, c, d)

@@ -83,7 +83,9 @@ def gru_weights(program: Program) -> GruWeights:
     for argument in _cell(program).args[2:]:
         name = argument.get("weight") if isinstance(argument, dict) else None
         if name is None:
-            raise InputError("contraction: the cell's weights are computed in the program; only stored ones are read")
+            raise InputError(
+                "contraction: the cell's weights are computed in the program; only stored ones are read"
+            )
         found.append(np.asarray(program.weights[name], dtype=float))
     if len(found) != 4:
         raise InputError("contraction: the GRU cell has no biases; only cells with them are read")
@@ -149,7 +151,9 @@ def contraction(cell: GruWeights, lower: ArrayLike, upper: ArrayLike) -> Contrac
     """
     low, high = (np.asarray(v, dtype=float).reshape(-1) for v in (lower, upper))
     if low.size != cell.w.shape[1] or high.size != low.size or not np.all(np.isfinite([low, high])):
-        raise InputError(f"contraction: {cell.w.shape[1]} finite lower and upper bounds of the cell's inputs needed")
+        raise InputError(
+            f"contraction: {cell.w.shape[1]} finite lower and upper bounds of the cell's inputs needed"
+        )
     if np.any(low > high):
         raise InputError("contraction: a lower bound lies above its upper bound")
     n = cell.r.shape[1]
@@ -169,7 +173,9 @@ def contraction(cell: GruWeights, lower: ArrayLike, upper: ArrayLike) -> Contrac
         (r[0] <= 0.5) & (r[1] >= 0.5), 0.25, np.maximum(r[0] * (1 - r[0]), r[1] * (1 - r[1]))
     )
     by = np.abs(cell.r).reshape(3, n, n)
-    bound = (apart * z[1])[:, None] * by[1] + (slope * swing)[:, None] * by[0] + (slope * r[1])[:, None] * by[2]
+    bound = (
+        (apart * z[1])[:, None] * by[1] + (slope * swing)[:, None] * by[0] + (slope * r[1])[:, None] * by[2]
+    )
     index, weights = _perron(bound)
     rate = float(np.max(np.where(index < 1, z[1] + (1 - z[1]) * index, z[0] + (1 - z[0]) * index)))
     reach = np.maximum(-h[0], h[1])

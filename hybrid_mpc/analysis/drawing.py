@@ -52,7 +52,11 @@ def _friction(subject: Subject, f: Findings) -> Named:
     }
     unit = some.states[some.n_x // 2].unit
     figure = analysis_models.friction_damping(curves, working_speed=float(subject.speed[0]), unit=unit)
-    yield "friction", figure, "Damping as seen by the tangent at rest and by motions of a size; negative slopes are left out."
+    yield (
+        "friction",
+        figure,
+        "Damping as seen by the tangent at rest and by motions of a size; negative slopes are left out.",
+    )
 
 
 def _linear(subject: Subject, f: Findings) -> Named:
@@ -80,7 +84,11 @@ def _linear(subject: Subject, f: Findings) -> Named:
         }
         for point in POINTS
     }  # fmt: skip
-    yield "steps", analysis_models.step_responses(steps, **signals), "Unit step responses of the linearisations."
+    yield (
+        "steps",
+        analysis_models.step_responses(steps, **signals),
+        "Unit step responses of the linearisations.",
+    )
 
 
 def _measured(subject: Subject, f: Findings) -> Named:
@@ -88,9 +96,16 @@ def _measured(subject: Subject, f: Findings) -> Named:
     keys = ("omega", "response", "coherence", "deviation")
     curves = {n: {k: f.arrays[f"measured/{n}/{k}"] for k in keys} for n in ("measured", *subject.models)}
     figure = analysis_models.measured_bode(
-        curves, input_signal=some.inputs[0], output_signal=some.outputs[0], source=f.result["measured"]["source"]
+        curves,
+        input_signal=some.inputs[0],
+        output_signal=some.outputs[0],
+        source=f.result["measured"]["source"],
     )
-    yield "measured", figure, "Machine and models driven by the same inputs; band: two standard deviations of the machine's."
+    yield (
+        "measured",
+        figure,
+        "Machine and models driven by the same inputs; band: two standard deviations of the machine's.",
+    )
 
 
 def _loops(subject: Subject, f: Findings) -> Named:
@@ -130,7 +145,11 @@ def _sensitivity(subject: Subject, f: Findings) -> Named:
     figure = analysis_models.sensitivities(
         f.arrays[f"sensitivity/{first}/t"], relative, names, output_signal=some.states[0]
     )
-    yield "sensitivity_parameters", figure, "Change of a free run per relative change of each of the prior's parameters."
+    yield (
+        "sensitivity_parameters",
+        figure,
+        "Change of a free run per relative change of each of the prior's parameters.",
+    )
 
 
 def _some(subject: Subject) -> Any:

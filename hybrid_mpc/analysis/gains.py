@@ -80,13 +80,19 @@ def mpc_gain(
     x0, u0 = column(model, "x", x, n_x), column(model, "u", u, n_u)
     h0 = hidden_fixed_point(model, x0, u0) if h is None else column(model, "h", h, model.n_h)
     if np.any(u0 <= ocp.u_min) or np.any(u0 >= ocp.u_max):
-        raise InputError(f"MPC gain: the input {u0.tolist()} lies on or outside the bounds, where it does not move")
+        raise InputError(
+            f"MPC gain: the input {u0.tolist()} lies on or outside the bounds, where it does not move"
+        )
     if ocp.economic is not None:
-        raise InputError("MPC gain: the problem has an economic stage cost; its gain depends on the whole plan")
+        raise InputError(
+            "MPC gain: the problem has an economic stage cost; its gain depends on the whole plan"
+        )
     z0 = np.concatenate([x0, h0])
     plan, z = np.tile(u0, (n, 1)), np.tile(z0, (n + 1, 1))
     if np.any(controller.problem.soft.excess(controller.problem.soft.values(z[:, :n_x], plan)) > 0):
-        raise InputError(f"MPC gain: the point x = {x0.tolist()} violates a soft bound; take one where none acts")
+        raise InputError(
+            f"MPC gain: the point x = {x0.tolist()} violates a soft bound; take one where none acts"
+        )
     sys = linearize(model, x0, u0, h0) if system is None else system
     a, b = np.asarray(sys.A, dtype=float), np.asarray(sys.B, dtype=float)
     derivatives = z[1:], np.tile(a.T, (n, 1, 1)), np.tile(b, (n, 1, 1))
@@ -170,10 +176,14 @@ def steady_filter(
     h0 = hidden_fixed_point(model, x0, u0) if h is None else column(model, "h", h, model.n_h)
     sys = linearize(model, x0, u0, h0) if system is None else system
     if np.any(np.asarray(sys.D) != 0):
-        raise InputError(f"model {model.name}: an output depends on the input at once; the loop here has no such path")
+        raise InputError(
+            f"model {model.name}: an output depends on the input at once; the loop here has no such path"
+        )
     n_z, n_u = model.n_x + model.n_h, model.n_u
     n_w = n_z + n_u
-    known = Estimate(0.0, x0, h0, np.zeros(n_u), np.zeros((n_w, n_w)), np.full(model.n_y, np.nan), float("nan"))
+    known = Estimate(
+        0.0, x0, h0, np.zeros(n_u), np.zeros((n_w, n_w)), np.full(model.n_y, np.nan), float("nan")
+    )
     noise = np.diag(ekf.predict(known, u0).P)  # of a state that was known exactly: what one period adds
     noise_y = ekf.innovation_covariance(known, u0)
     f, g = np.eye(n_w), np.zeros((n_w, n_u))

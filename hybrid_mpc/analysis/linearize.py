@@ -180,4 +180,3 @@ def column(model: HybridModel, name: str, value: ArrayLike, n: int) -> Array:
     if array.size != n or not np.isfinite(array).all():
         raise InputError(f"model {model.name}: {name} must be {n} finite numbers, got {array.tolist()}")
     return array
-

@@ -113,17 +113,20 @@ class Loop:
         gains, phases, _, _, at_phase, _ = control.stability_margins(given, returnall=True)
         gains, phases = np.atleast_1d(gains), np.radians(np.atleast_1d(phases))
         g = response.magnitude[0, 0] * np.exp(1j * response.phase[0, 0])
-        at_nyquist = complex(g[-1])  # the grid ends on the real axis, a crossing that python-control leaves out
-        if at_nyquist.real < 0:
-            gains = np.append(gains, 1.0 / abs(at_nyquist))
+        at_nyquist = float(g[-1].real)
+        ends = [at_nyquist, _at_rest(broken)]  # real: crossings that python-control leaves out
+        gains = np.append(gains, [-1.0 / end for end in ends if end < 0])
+        at = np.atleast_1d(at_phase)
+        delays = [(p % (2 * np.pi)) / w for p, w in zip(phases, at, strict=True)]
+        if at_nyquist > 1:  # one period turns it to below -1, and no gain crossover tells
+            delays.append(dt)
         disk, _, _ = control.disk_margins(broken, omega, skew=0.0)
         size = min(float(disk), 2.0)
-        at = np.atleast_1d(at_phase)
         return Margins(
             float(min((k for k in gains if k > 1), default=np.inf)),
             float(max((k for k in gains if k < 1), default=0.0)),
             float(np.abs(phases).min(initial=np.inf)),
-            float(min(((p % (2 * np.pi)) / w for p, w in zip(phases, at, strict=True)), default=np.inf)),
+            float(min(delays, default=np.inf)),
             self._delay_periods(input),
             float(at.max()) if at.size else float("nan"),
             float(np.abs(1 + g).min()),
@@ -200,18 +203,20 @@ def mpc_loop(gain: MpcGain, filter: SteadyFilter, plant: Any, *, delay: int = 0)
             f"outputs, gain of {n_u} inputs by {n_z} states; these do not fit each other"
         )
     if np.any(np.asarray(plant.D) != 0):
-        raise InputError("loop: an output of the plant depends on its input at once; the loop here has no such path")
+        raise InputError(
+            "loop: an output of the plant depends on its input at once; the loop here has no such path"
+        )
     if delay < 0:
         raise InputError(f"loop: delay must be a whole number of periods, not negative, got {delay}")
-    k = np.hstack([gain.by_state, gain.by_load])
-    keep = np.eye(n_w) - filter.gain @ filter.C
-    forward = np.hstack([keep @ filter.F, keep @ filter.G])
+    # a disturbance that the filter takes for constant stays zero: it is no state of the loop
+    alive = (np.arange(n_w) < n_z) | np.any(filter.gain != 0, axis=1)
+    k, follow = np.hstack([gain.by_state, gain.by_load])[:, alive], filter.gain[alive]
+    keep = np.eye(int(alive.sum())) - follow @ filter.C[:, alive]
+    forward = np.hstack([keep @ filter.F[np.ix_(alive, alive)], keep @ filter.G[alive]])
     out = k @ forward
-    out[:, n_w:] += gain.by_before
-    a = np.vstack([forward, out])
-    b = np.vstack([filter.gain, k @ filter.gain])
-    control = control_toolbox()
-    feedback = control.ss(a, b, out, k @ filter.gain, plant.dt, remove_useless_states=False)
+    out[:, len(keep) :] += gain.by_before
+    a, b = np.vstack([forward, out]), np.vstack([follow, k @ follow])
+    feedback = control_toolbox().ss(a, b, out, k @ follow, plant.dt, remove_useless_states=False)
     late = plant
     for _ in range(delay):
         late = _delayed(late)
@@ -259,6 +264,16 @@ def _response(sys: Any, omega: ArrayLike) -> Complex:
     return np.asarray(np.moveaxis(response.magnitude * np.exp(1j * response.phase), -1, 0))
 
 
+def _at_rest(sys: Any) -> float:
+    """Gain of a single loop at the frequency zero; 0 with an integrator, whose curve goes to infinity there."""
+    a, b, c, d = (np.asarray(m, dtype=float) for m in (sys.A, sys.B, sys.C, sys.D))
+    if not len(a):
+        return float(d.item())
+    if np.abs(np.linalg.eigvals(a) - 1.0).min() < 1e-9:
+        return 0.0
+    return float((c @ np.linalg.solve(np.eye(len(a)) - a, b) + d).item())
+
+
 def _grid(sys: Any, dt: float) -> Array:
     """Frequencies up to Nyquist, with all slow poles and the circle's top covered."""
     poles = np.linalg.eigvals(sys.A).astype(np.complex128)
@@ -267,4 +282,4 @@ def _grid(sys: Any, dt: float) -> Array:
     lowest = min(0.01 * float(moving.min(initial=np.pi / dt)), 1e-3 * np.pi / dt)
     near = (moving[:, None] * np.linspace(0.9, 1.1, 41)).ravel()
     omega = np.concatenate([np.geomspace(lowest, np.pi / dt, FREQUENCIES), near])
-    return np.unique(omega[omega <= np.pi / dt])
+    return np.append(np.unique(omega[omega < (1 - 1e-12) * np.pi / dt]), np.pi / dt)

@@ -82,7 +82,9 @@ def lyapunov_exponent(
         v = a @ v
         size = float(np.linalg.norm(v))
         if not size > 0:
-            raise InputError("Lyapunov exponent: a step forgets everything at once; the exponent is minus infinity")
+            raise InputError(
+                "Lyapunov exponent: a step forgets everything at once; the exponent is minus infinity"
+            )
         steps[k], v = np.log(size), v / size
     counted = steps[int(SETTLE * n) :]
     means = np.array([b.mean() for b in np.array_split(counted, BLOCKS)]) / model.dt

@@ -43,7 +43,9 @@ class MeasuredResponse:
     averages: float
 
 
-def welch_response(pieces: Sequence[tuple[ArrayLike, ArrayLike]], dt: float, *, length: float) -> MeasuredResponse:
+def welch_response(
+    pieces: Sequence[tuple[ArrayLike, ArrayLike]], dt: float, *, length: float
+) -> MeasuredResponse:
     """H1 estimate ``S_uy / S_uu`` with its coherence, averaged over half-overlapping Hann windows of all pieces.
 
     H1 is unbiased by noise of the output. A window that is short against the machine's ringing smears its resonance.
@@ -73,7 +75,9 @@ def welch_response(pieces: Sequence[tuple[ArrayLike, ArrayLike]], dt: float, *, 
     for given_u, given_y in pieces:
         u, y = np.asarray(given_u, dtype=float).ravel(), np.asarray(given_y, dtype=float).ravel()
         if u.shape != y.shape:
-            raise InputError(f"frequency response: {u.size} inputs and {y.size} outputs given, as many of each needed")
+            raise InputError(
+                f"frequency response: {u.size} inputs and {y.size} outputs given, as many of each needed"
+            )
         if n < 8 or u.size < n:
             continue
         windows = 1 + (u.size - n) // (n // 2)

@@ -75,7 +75,11 @@ def tables(result: dict[str, Any]) -> dict[str, Table]:
         "gain_schedule": _schedule, "memory": _memory, "sensitivity": _sensitivity,
     }  # fmt: skip
     parts = {"modes": "linear", "margins": "loops", "gain_schedule": "schedule"}
-    return {name: make(part) for name, make in makers.items() if "reason" not in (part := result[parts.get(name, name)])}
+    return {
+        name: make(part)
+        for name, make in makers.items()
+        if "reason" not in (part := result[parts.get(name, name)])
+    }
 
 
 def _equilibria(part: dict[str, Any]) -> Table:
@@ -145,7 +149,9 @@ def _schedule(part: dict[str, Any]) -> Table:
         for point in ("rest", "working"):
             f = found[point]
             low, high = f["gain_lowest"], f["gain_highest"]
-            rows.append((model, point, low[0], high[0], low[1], high[1], f["radius"], len(found["positions_lost"])))
+            rows.append(
+                (model, point, low[0], high[0], low[1], high[1], f["radius"], len(found["positions_lost"]))
+            )
     return Table(
         ("model", "point", "position gain, lowest", "highest", "speed gain, lowest", "highest",
          "largest spectral radius", "positions that nothing holds"), rows,
@@ -191,7 +197,9 @@ def _key_figures(result: dict[str, Any]) -> list[KeyFigure]:
     for name, row in result["measured"].items():
         if isinstance(row, dict):
             error = 100 * row["median_relative_error"]
-            keys.append(KeyFigure(f"Response to the machine's inputs, {name} against machine", error, "%", "median"))
+            keys.append(
+                KeyFigure(f"Response to the machine's inputs, {name} against machine", error, "%", "median")
+            )
     for name in ("prior on prior", "hybrid on hybrid"):
         row = result["loops"].get(name, {}).get("driven", {}).get("quiet", {})
         if isinstance(row, dict) and "margins" in row:

@@ -183,4 +183,3 @@ def _hautus(a: Array, b: Array) -> bool:
         if np.linalg.svd(pencil, compute_uv=False)[-1] <= RANK_TOLERANCE * largest:
             return False
     return True
-

@@ -111,7 +111,9 @@ def holding_input(model: HybridModel, q: ArrayLike, *, u_guess: ArrayLike | None
     """
     n_q = model.n_x // 2
     if model.n_u != n_q:
-        raise InputError(f"model {model.name}: {model.n_u} inputs cannot be found from {n_q} positions; give them")
+        raise InputError(
+            f"model {model.name}: {model.n_u} inputs cannot be found from {n_q} positions; give them"
+        )
     x = np.concatenate([column(model, "q", q, n_q), np.zeros(n_q)])
     start = np.zeros(model.n_u) if u_guess is None else column(model, "u_guess", u_guess, model.n_u)
     h, u, v = ca.MX.sym("h", model.n_h), ca.MX.sym("u", model.n_u), ca.MX.sym("x", model.n_x)
@@ -122,7 +124,9 @@ def holding_input(model: HybridModel, q: ArrayLike, *, u_guess: ArrayLike | None
     if size > RESIDUAL and model.n_u == 1 and (near := _between(model, x, float(start[0]))) is not None:
         found, size = newton(residual, np.concatenate([settled_hidden(model, x, near), near]), x)
     if size > RESIDUAL:
-        raise InputError(f"model {model.name}: no input found that holds q = {x[:n_q].tolist()} (residual {size:.2g})")
+        raise InputError(
+            f"model {model.name}: no input found that holds q = {x[:n_q].tolist()} (residual {size:.2g})"
+        )
     return found[model.n_h :]
 
 

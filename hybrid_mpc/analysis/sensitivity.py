@@ -50,10 +50,14 @@ class Sensitivities:
         some = np.flatnonzero(size > 0)
         _, r, order = qr(rows[:, some] / size[some], mode="economic", pivoting=True)
         keep = np.sort(some[order[: len(r)][np.abs(np.diag(r)) > share]])
-        return Sensitivities(tuple(self.names[i] for i in keep), self.values[keep], self.x, self.by[:, :, keep])
+        return Sensitivities(
+            tuple(self.names[i] for i in keep), self.values[keep], self.x, self.by[:, :, keep]
+        )
 
     def _rows(self, sigma: ArrayLike) -> Array:
-        return np.asarray((self.relative / np.asarray(sigma, dtype=float)[None, :, None]).reshape(-1, len(self.names)))
+        return np.asarray(
+            (self.relative / np.asarray(sigma, dtype=float)[None, :, None]).reshape(-1, len(self.names))
+        )
 
     def correlation(self, sigma: ArrayLike) -> Array:
         """Correlation ``(n_p, n_p)`` that a least-squares fit of this run would leave between the parameters.
@@ -139,16 +143,22 @@ def parameter_sensitivities(
     """
     chosen = parameter_names(program) if names is None else tuple(names)
     if not chosen:
-        raise InputError("sensitivities: the program has no scalar weight that begins with 'prior.'; give names")
+        raise InputError(
+            "sensitivities: the program has no scalar weight that begins with 'prior.'; give names"
+        )
     values = np.array([float(program.weights[n]) for n in chosen if n in program.weights])
     step = build(with_parameters(program, chosen), "step", plain=True)
     n_x, n_h, n_u = (step.numel_in(i) for i in range(3))
     inputs, now = np.asarray(u, dtype=float), np.asarray(x, dtype=float).reshape(-1)
     if inputs.ndim != 2 or inputs.shape[1] != n_u or now.shape != (n_x,):
-        raise InputError(f"sensitivities: x {now.shape} and u {inputs.shape} given, ({n_x},) and (n, {n_u}) needed")
+        raise InputError(
+            f"sensitivities: x {now.shape} and u {inputs.shape} given, ({n_x},) and (n, {n_u}) needed"
+        )
     z, v, p = ca.MX.sym("z", n_x + n_h), ca.MX.sym("v", n_u), ca.MX.sym("p", len(chosen))
     after = ca.vertcat(*step(z[:n_x], z[n_x:], v, *ca.vertsplit(p)))
-    f = ca.Function("f", [z, v, p], [after, ca.densify(ca.jacobian(after, z)), ca.densify(ca.jacobian(after, p))])
+    f = ca.Function(
+        "f", [z, v, p], [after, ca.densify(ca.jacobian(after, z)), ca.densify(ca.jacobian(after, p))]
+    )
     state, slope = np.concatenate([now, np.zeros(n_h)]), np.zeros((n_x + n_h, len(chosen)))
     states, slopes = [state[:n_x]], [slope[:n_x]]
     for held in inputs:

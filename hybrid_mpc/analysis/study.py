@@ -17,7 +17,13 @@ from hybrid_mpc.analysis.gains import mpc_gain, steady_filter
 from hybrid_mpc.analysis.linearize import hidden_fixed_point, linearize, linearize_at_speed
 from hybrid_mpc.analysis.loop import Loop, mpc_loop
 from hybrid_mpc.analysis.lyapunov import lyapunov_exponent
-from hybrid_mpc.analysis.measured import MeasuredResponse, multisine_response, run_model, run_plant, welch_response
+from hybrid_mpc.analysis.measured import (
+    MeasuredResponse,
+    multisine_response,
+    run_model,
+    run_plant,
+    welch_response,
+)
 from hybrid_mpc.analysis.properties import frequency_response
 from hybrid_mpc.analysis.reduction import physical_states
 from hybrid_mpc.analysis.schedule import gain_schedule, holding_input
@@ -141,7 +147,13 @@ def _equilibria(subject: Subject) -> Part:
     for name, model in subject.models.items():
         found = equilibria(model, np.zeros(model.n_u), _pairs(outer))
         rows = [
-            {"x": p.x, "residual": p.residual, "radius": abs(p.poles[0]), "stability": p.stability, "hits": p.hits}
+            {
+                "x": p.x,
+                "residual": p.residual,
+                "radius": abs(p.poles[0]),
+                "stability": p.stability,
+                "hits": p.hits,
+            }
             for p in found.points
         ]
         counts = {"starts": found.starts, "converged": found.converged, "unseen": found.unseen}
@@ -220,7 +232,9 @@ def _measured(subject: Subject) -> Part:
         raise InputError(f"responses are estimated for one input; this machine has {some.n_u}")
     if subject.recordings:
         length = min(10.0, 0.25 * max(u.size for u, _, _ in subject.recordings) * some.dt)
-        found = {"measured": welch_response([(u, y) for u, y, _ in subject.recordings], some.dt, length=length)}
+        found = {
+            "measured": welch_response([(u, y) for u, y, _ in subject.recordings], some.dt, length=length)
+        }
         for name, model in models.items():
             pieces = [(u, run_model(model, x0)(u)) for u, _, x0 in subject.recordings]
             found[name] = welch_response(pieces, some.dt, length=length)
@@ -233,7 +247,9 @@ def _measured(subject: Subject) -> Part:
         found |= {name: multisine_response(run_model(m, zero), m.dt, **drive) for name, m in models.items()}
         source = f"odd multisine of {amplitude:g} {some.inputs[0].unit}, {BAND[0]:g} to {BAND[1]:g} Hz, {PERIODS} periods"
     else:
-        raise InputError("there is neither a recording (--data) nor a simulated machine to take a response from")
+        raise InputError(
+            "there is neither a recording (--data) nor a simulated machine to take a response from"
+        )
     result: dict[str, Any] = {"source": source}
     arrays: dict[str, Any] = {}
     for name, one in found.items():
@@ -266,7 +282,12 @@ def _schedule(subject: Subject) -> Part:
         for point, speed in (("rest", None), ("working", subject.speed)):
             found = gain_schedule(model, points, *weights, speed=speed)
             key = f"{name}/{point}"
-            arrays |= {f"{key}/x": found.x, f"{key}/u": found.u, f"{key}/gain": found.gain, f"{key}/radius": found.radius}
+            arrays |= {
+                f"{key}/x": found.x,
+                f"{key}/u": found.u,
+                f"{key}/gain": found.gain,
+                f"{key}/radius": found.radius,
+            }
             result[name][point] = {
                 "gain_lowest": found.gain[:, 0, :2].min(axis=0), "gain_highest": found.gain[:, 0, :2].max(axis=0),
                 "radius": found.radius.max(), "holding_input": [float(found.u.min()), float(found.u.max())],
@@ -285,7 +306,9 @@ def _held(model: HybridModel, positions: Array) -> tuple[list[tuple[Array, Array
         except InputError:
             lost.append(q)
     if not found:
-        raise InputError(f"model {model.name}: no position of the range can be held by an input that was found")
+        raise InputError(
+            f"model {model.name}: no position of the range can be held by an input that was found"
+        )
     return [(np.array([q, 0.0]), found[q]) for q in sorted(found)], sorted(lost)
 
 

@@ -162,5 +162,3 @@ def _recordings(
 
     found = load_trajectories(request.data, scenario.data, outputs=model.outputs, inputs=model.inputs)
     return tuple((piece.u[:, 0], piece.y[:, 0], piece.x[0]) for piece in found.whole)
-
-

@@ -21,10 +21,14 @@ def analyze(
     model: Annotated[Path, typer.Argument(help="Artifact folder: model/ of a finished run.")],
     out: Annotated[Path, typer.Option(help="Folder to make; an existing one must be empty.")],
     scenario: Annotated[
-        str, typer.Option(help="The machine, a registered name or a .py file. Default: the one the model was made for.")
+        str,
+        typer.Option(
+            help="The machine, a registered name or a .py file. Default: the one the model was made for."
+        ),
     ] = "",
     data: Annotated[
-        list[Path] | None, typer.Option(help="A recording to take a frequency response from; may be repeated.")
+        list[Path] | None,
+        typer.Option(help="A recording to take a frequency response from; may be repeated."),
     ] = None,
     speed: Annotated[
         float | None, typer.Option(help="Size of the motions that friction is linearised for [units of v].")
@@ -63,7 +67,11 @@ def command(request: Request, out: Path) -> str:
         request: What was asked for.
         out: Where it was written.
     """
-    words = ["hybrid-mpc analyze", f"{request.folder.parent.name}/{request.folder.name}".lstrip("/"), f"--out {out.name}"]
+    words = [
+        "hybrid-mpc analyze",
+        f"{request.folder.parent.name}/{request.folder.name}".lstrip("/"),
+        f"--out {out.name}",
+    ]
     words += [f"--scenario {request.scenario}"] if request.scenario else []
     words += [f"--data {path.name}" for path in request.data]
     words += [f"--speed {request.speed:g}"] if request.speed is not None else []

@@ -45,7 +45,9 @@ def sensitivity_functions(loops: Mapping[str, Mapping[str, Array]], *, title: st
     if not loops:
         raise InputError("sensitivity functions: there is no loop to draw")
     figure, axes = new_figure(1, 2, sharex=True, sharey=True, size=(10, 4.2), title=title)
-    for ax, key, text in zip(axes[0], "ST", ("S: what is left of a load", "T: what the input takes of it"), strict=True):
+    for ax, key, text in zip(
+        axes[0], "ST", ("S: what is left of a load", "T: what the input takes of it"), strict=True
+    ):
         for i, (name, one) in enumerate(loops.items()):
             omega = np.asarray(one["omega"], dtype=float)
             size = checked(f"{key} of {name}", np.abs(one[key]), omega.size)
@@ -99,7 +101,10 @@ def nyquist(loops: Mapping[str, Array], *, modulus: float | None = None) -> Figu
 
 
 def gain_schedules(
-    schedules: Mapping[str, Mapping[str, tuple[Array, Array]]], *, position: Signal, states: tuple[Signal, ...]
+    schedules: Mapping[str, Mapping[str, tuple[Array, Array]]],
+    *,
+    position: Signal,
+    states: tuple[Signal, ...],
 ) -> Figure:
     """LQR gains of the physical states over the position.
 
@@ -123,7 +128,10 @@ def gain_schedules(
     for name, points in schedules.items():
         for point, (q, gain) in points.items():
             values = checked(f"gains of {name}", gain, len(q), len(states))
-            label = name_of(name) + {"rest": ", tangent at rest", "working": ", friction of working size"}.get(point, "")
+            label = name_of(name) + {
+                "rest": ", tangent at rest",
+                "working": ", friction of working size",
+            }.get(point, "")
             for ax, column in zip(axes[0], values.T, strict=True):
                 ax.plot(q, column, color=colour(name), linestyle=":" if point == "rest" else "-", marker=".", markersize=4,
                         label=label)  # fmt: skip

@@ -27,8 +27,12 @@ from hybrid_mpc.plots.style import (
 )
 from hybrid_mpc.signals import Signal
 
-_POINTS = {"rest": "tangent at rest", "working": "friction of working size", "moving": "tangent in motion",
-           "driven": "mean of a driven run"}
+_POINTS = {
+    "rest": "tangent at rest",
+    "working": "friction of working size",
+    "moving": "tangent in motion",
+    "driven": "mean of a driven run",
+}
 
 
 def measured_bode(
@@ -143,16 +147,26 @@ def friction_damping(curves: Mapping[str, Mapping[str, Array]], *, working_speed
     if not curves:
         raise InputError("friction: there is nothing to draw")
     figure, axes = new_figure(1, len(curves), size=(5.0 * len(curves), 4.4), sharey=True)
-    kinds = (("secant", "--", "secant"), ("harmonic", "-", "describing function"), ("moving", ":", "tangent at the speed"))
+    kinds = (
+        ("secant", "--", "secant"),
+        ("harmonic", "-", "describing function"),
+        ("moving", ":", "tangent at the speed"),
+    )
     for ax, (name, one) in zip(axes[0], curves.items(), strict=True):
         speed = np.asarray(one["speed"], dtype=float)
         ax.axhline(float(one["tangent"]), color=INK, linestyle="-.", linewidth=1.0, label="tangent at rest")
         for key, dashes, label in kinds:
             values = checked(f"{key} of {name}", one[key], speed.size)
-            ax.loglog(speed, np.where(values > 0, values, np.nan), color=colour(name), linestyle=dashes, label=label)
+            ax.loglog(
+                speed, np.where(values > 0, values, np.nan), color=colour(name), linestyle=dashes, label=label
+            )
         ax.axvline(working_speed, color=FAINT, linewidth=0.9)
         ax.annotate(
-            " working speed", (working_speed, 0.02), xycoords=("data", "axes fraction"), fontsize=8, color=FAINT
+            " working speed",
+            (working_speed, 0.02),
+            xycoords=("data", "axes fraction"),
+            fontsize=8,
+            color=FAINT,
         )
         ax.set_xlabel(f"size of the speed [{unit}]")
         title_axes(ax, name_of(name))
@@ -197,10 +211,14 @@ def sensitivities(
     """
     if not relative or not names:
         raise InputError("sensitivities: there is nothing to draw")
-    figure, axes = new_figure((len(names) + 1) // 2, 2, sharex=True, size=(10, 1.7 * ((len(names) + 1) // 2) + 1))
+    figure, axes = new_figure(
+        (len(names) + 1) // 2, 2, sharex=True, size=(10, 1.7 * ((len(names) + 1) // 2) + 1)
+    )
     for j, (ax, parameter) in enumerate(zip(axes.ravel(), names, strict=False)):
         for name, values in relative.items():
-            ax.plot(t, checked(f"sensitivity of {name}", values, len(t), len(names))[:, j], **line_style(name))
+            ax.plot(
+                t, checked(f"sensitivity of {name}", values, len(t), len(names))[:, j], **line_style(name)
+            )
         title_axes(ax, f"by {plain(parameter)}")
     for ax in axes.ravel()[len(names) :]:
         ax.set_visible(False)
