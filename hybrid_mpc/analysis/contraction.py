@@ -204,7 +204,8 @@ def _sigmoid(v: Array) -> Array:
 
 def _perron(matrix: Array) -> tuple[float, Array]:
     """A weighting of the largest-element norm, and the norm of a non-negative matrix in it: its spectral radius, but
-    for the sliver that keeps all weights positive."""
+    for the sliver that keeps all weights positive.
+    """
     padded = matrix + 1e-12 * max(1.0, float(matrix.max(initial=0.0)))
     values, vectors = np.linalg.eig(padded)
     weights = np.abs(vectors[:, int(np.argmax(values.real))].real)

@@ -55,7 +55,7 @@ def _friction(subject: Subject, f: Findings) -> Named:
     yield (
         "friction",
         figure,
-        "Damping as seen by the tangent at rest and by motions of a size; negative slopes are left out.",
+        "Damping as seen at rest and by motions of a size; negative slopes are left out.",
     )
 
 
@@ -104,7 +104,7 @@ def _measured(subject: Subject, f: Findings) -> Named:
     yield (
         "measured",
         figure,
-        "Machine and models driven by the same inputs; band: two standard deviations of the machine's.",
+        "Machine and models driven by the same inputs; band: two deviations.",
     )
 
 
@@ -126,13 +126,11 @@ def _loops(subject: Subject, f: Findings) -> Named:
 
 def _schedule(subject: Subject, f: Findings) -> Named:
     some = _some(subject)
-    curves = {
-        name: {
-            point: (f.arrays[f"schedule/{name}/{point}/x"][:, 0], f.arrays[f"schedule/{name}/{point}/gain"][:, 0, : some.n_x])
-            for point in ("rest", "working")
-        }
-        for name in subject.models
-    }  # fmt: skip
+    curves: dict[str, dict[str, Any]] = {}
+    for name in subject.models:
+        for point in ("rest", "working"):
+            x, gain = (f.arrays[f"schedule/{name}/{point}/{key}"] for key in ("x", "gain"))
+            curves.setdefault(name, {})[point] = x[:, 0], gain[:, 0, : some.n_x]
     figure = analysis_loops.gain_schedules(curves, position=some.states[0], states=some.states)
     yield "schedule", figure, "LQR gains over the position: tangent at rest, and friction of working size."
 
@@ -148,7 +146,7 @@ def _sensitivity(subject: Subject, f: Findings) -> Named:
     yield (
         "sensitivity_parameters",
         figure,
-        "Change of a free run per relative change of each of the prior's parameters.",
+        "Change of a free run per relative change of the prior's parameters.",
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -138,11 +138,11 @@ def _point(model: HybridModel, z: Array, error: float, hits: int, u: Array) -> E
 
 def _turned(model: HybridModel, z: Array, box: Array) -> Array:
     """Periodic states moved by whole turns into the region, where they can be."""
-    z: Any = z.copy()
+    turned = z.copy()
     for i, signal in enumerate(model.states):
         if signal.periodic and np.isfinite(z[i]):
-            z[i] = box[i, 0] + (z[i] - box[i, 0]) % (2 * np.pi)
-    return z
+            turned[i] = box[i, 0] + (z[i] - box[i, 0]) % (2 * np.pi)
+    return turned
 
 
 def _apart(model: HybridModel, difference: Array) -> Array:

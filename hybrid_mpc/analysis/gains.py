@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class MpcGain:
-    """First input of an MPC to first order: ``du_0 = by_state dz + by_load dd + by_before du_before + by_reference dr``.
+    """An MPC to first order: ``du_0 = by_state dz + by_load dd + by_before du_before + by_reference dr``.
 
     It is exact as long as no bound acts and the prediction's linearisation stays the same.
 

@@ -246,7 +246,7 @@ def _open(plant: Any, feedback: Any) -> tuple[Array, Array, Array, Array]:
 
 def _closed(plant: Any, feedback: Any) -> Any:
     """From loads at the inputs and noise at the outputs to outputs and the controller's inputs."""
-    a, b, c, d = _open(plant, feedback)
+    a, b, c, _ = _open(plant, feedback)
     n, (n_y, n_u) = plant.nstates, (plant.noutputs, plant.ninputs)
     g, k = np.asarray(feedback.B, dtype=float), np.asarray(feedback.D, dtype=float)
     noise = np.vstack([b[:n] @ k, g])

@@ -75,17 +75,18 @@ def lyapunov_exponent(
     n = len(maps)
     if n < 50:
         raise InputError(f"Lyapunov exponent: {n} periods given, at least 50 needed for a mean over time")
-    v = np.random.default_rng(seed).normal(size=maps.shape[1])
-    v /= np.linalg.norm(v)
+    v: Array = np.asarray(np.random.default_rng(seed).normal(size=maps.shape[1]), dtype=np.float64)
+    v = np.asarray(v / np.linalg.norm(v))
     steps = np.empty(n)
     for k, a in enumerate(maps):
-        v = a @ v
+        v = np.asarray(a @ v)
         size = float(np.linalg.norm(v))
         if not size > 0:
             raise InputError(
                 "Lyapunov exponent: a step forgets everything at once; the exponent is minus infinity"
             )
-        steps[k], v = np.log(size), v / size
+        steps[k] = np.log(size)
+        v = np.asarray(v / size)
     counted = steps[int(SETTLE * n) :]
     means = np.array([b.mean() for b in np.array_split(counted, BLOCKS)]) / model.dt
     deviation = float(means.std(ddof=1) / np.sqrt(BLOCKS))

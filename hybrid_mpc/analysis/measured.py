@@ -32,7 +32,7 @@ class MeasuredResponse:
         omega: Frequencies ``(n,)`` [rad/s].
         response: Complex response ``(n,)``.
         coherence: ``(n,)``: share of the output's power that is linear in the input; 1 is clean.
-        deviation: Standard deviation of ``|response|`` ``(n,)``: noise, and nonlinearity, as far as it looks like noise.
+        deviation: Standard deviation of ``|response|`` ``(n,)``: noise, and nonlinearity that looks like noise.
         averages: Independent averages behind each value.
     """
 
@@ -90,7 +90,7 @@ def welch_response(
             "windows or more data"
         )
     uu, yy, uy = total[0].real[1:-1], total[1].real[1:-1], total[2][1:-1]
-    omega = 2 * np.pi * np.arange(1, n // 2) / (n * dt)
+    omega = np.asarray(2 * np.pi * np.arange(1, n // 2) / (n * dt), dtype=np.float64)
     averages = max(1.0, 9 / 11 * count)
     return _response(omega, uu[: omega.size], yy[: omega.size], uy[: omega.size], averages)
 
@@ -128,7 +128,7 @@ def multisine_response(
             f"multisine: at least 2 periods of a multiple of {dt:g} s needed, got {periods} of {period:g} s, {settle} "
             "left out"
         )
-    t = dt * np.arange((settle + periods) * n)
+    t = np.asarray(dt * np.arange((settle + periods) * n), dtype=np.float64)
     u = multisine(t, amplitude, *band, period=period, odd=odd, offset=bias)
     y = np.asarray(run(u), dtype=float).ravel()
     if y.shape != u.shape:

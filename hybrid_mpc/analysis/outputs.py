@@ -49,7 +49,7 @@ def write_analysis(
 
 
 def as_csv(table: Table) -> str:
-    """A table as CSV: a header, numbers with all their digits, texts with commas quoted.
+    r"""A table as CSV: a header, numbers with all their digits, texts with commas quoted.
 
     Example:
         >>> as_csv(Table(("model", "x [rad]"), (("prior", 0.1), ("a, b", None))))
@@ -75,11 +75,8 @@ def tables(result: dict[str, Any]) -> dict[str, Table]:
         "gain_schedule": _schedule, "memory": _memory, "sensitivity": _sensitivity,
     }  # fmt: skip
     parts = {"modes": "linear", "margins": "loops", "gain_schedule": "schedule"}
-    return {
-        name: make(part)
-        for name, make in makers.items()
-        if "reason" not in (part := result[parts.get(name, name)])
-    }
+    found = {name: result[parts.get(name, name)] for name in makers}
+    return {name: make(found[name]) for name, make in makers.items() if "reason" not in found[name]}
 
 
 def _equilibria(part: dict[str, Any]) -> Table:

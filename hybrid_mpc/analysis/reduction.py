@@ -41,7 +41,7 @@ class Reduced:
 
 
 def hankel_singular_values(sys: Any) -> Array:
-    """Hankel singular values ``(n,)`` of a discrete system, largest first; infinite for each pole not inside the circle.
+    """Hankel singular values ``(n,)`` of a discrete system, largest first; infinite for each unstable pole.
 
     Raises:
         InputError: If the system has no period.
@@ -98,7 +98,7 @@ def balanced_truncation(sys: Any, order: int) -> Reduced:
     c = np.hstack([kept[2], stable[2] @ t])
     small = control_toolbox().ss(
         a, b, c, stable[3], dt, remove_useless_states=False,
-        inputs=list(sys.input_labels), outputs=list(sys.output_labels), name=f"{sys.name}_reduced",
+        inputs=list(sys.input_labels), outputs=list(sys.output_labels), name=str(sys.name) + "_reduced",
     )  # fmt: skip
     hankel = np.concatenate([np.full(fixed, np.inf), values])
     return Reduced(small, hankel, fixed + r, float(2 * values[r:].sum()))
@@ -150,7 +150,7 @@ def physical_states(
     small = control.ss(
         turn @ reduced.system.A @ np.linalg.inv(turn), turn @ reduced.system.B / by_u, c[:, :n_x], d, sys.dt,
         remove_useless_states=False, states=[s.name for s in model.states], inputs=list(sys.input_labels),
-        outputs=list(sys.output_labels), name=f"{model.name}_reduced",
+        outputs=list(sys.output_labels), name=model.name + "_reduced",
     )  # fmt: skip
     return Reduced(small, reduced.hankel, n_x, reduced.bound)
 
@@ -158,7 +158,7 @@ def physical_states(
 def _scale(value: ArrayLike | None, n: int, name: str) -> Array:
     scale = np.ones(n) if value is None else np.asarray(value, dtype=float).reshape(-1)
     if scale.shape != (n,) or not np.all(np.isfinite(scale)) or not np.all(scale > 0):
-        raise InputError(f"{name}: {n} positive numbers needed, got {value}")
+        raise InputError(f"{name}: {n} positive numbers needed, got {scale.tolist()}")
     return scale
 
 

@@ -83,10 +83,8 @@ def gain_schedule(
     gains, radii, before = [], [], []
     for x, u in given:
         h = hidden_fixed_point(model, x, u)
-        if speed is None:
-            system = linearize(model, x, u, h)
-        else:
-            system = linearize_secant(model, x, u, speed, h, kind=kind)
+        chord = None if speed is None else linearize_secant(model, x, u, speed, h, kind=kind)
+        system = linearize(model, x, u, h) if chord is None else chord
         _, k = dare(system.A, system.B, weights, costs)
         gains.append(k)
         radii.append(_radius(system.A - system.B @ k))

@@ -2,21 +2,51 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.analysis.study import Subject
 from hybrid_mpc.artifact import FILE, Artifact, load_artifact
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import ExtendedKalmanFilter
 from hybrid_mpc.model import HybridModel
-from hybrid_mpc.scenario import ControlSpec, Scenario, load_scenario
-from nn_export import load_programs
+from hybrid_mpc.mpc import OCP
+from hybrid_mpc.scenario import ControlSpec, Plant, Scenario, load_scenario
+from nn_export import Program, load_programs
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is analysed.
+
+    Args:
+        models: By name; ``"prior"`` and ``"hybrid"`` are compared.
+        programs: Exported programs of the artifact, ``"prior/step"`` and so on.
+        x_range: Working range of the states ``(n_x, 2)``.
+        u_range: That of the inputs ``(n_u, 2)``.
+        speed: Working speeds ``(n_x / 2,)``.
+        ocp: The control problem; default: none, then there are no loops.
+        filters: Estimators by model and mode, ``("hybrid", "quiet")``; default: none.
+        plant: The simulated machine; default: none.
+        recordings: Inputs ``(n,)``, outputs ``(n,)`` and first states of recordings; default: none.
+        outer: Range in which points of rest are looked for ``(n_x, 2)``. Default: ``x_range``.
+    """
+
+    models: Mapping[str, HybridModel]
+    programs: Mapping[str, Program]
+    x_range: Array
+    u_range: Array
+    speed: Array
+    ocp: OCP | None = None
+    filters: Mapping[tuple[str, str], ExtendedKalmanFilter] = field(default_factory=dict)
+    plant: Plant | None = None
+    recordings: Sequence[tuple[Array, Array, Array]] = ()
+    outer: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -77,7 +107,8 @@ def subject_of(request: Request) -> tuple[Subject, tuple[str, ...]]:
     control = scenario.control if scenario is not None else None
     speed = _speed(model, control, request.speed)
     notes = [f"scenario {name}" if name else "no scenario: no loops, no response of a machine"]
-    ocp, filters = None, {}
+    ocp: OCP | None = None
+    filters: dict[tuple[str, str], ExtendedKalmanFilter] = {}
     if scenario is not None and control is not None and {"prior", "hybrid"} <= set(artifact.models):
         from hybrid_mpc.pipeline.loops import make_ocp
 

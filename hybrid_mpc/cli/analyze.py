@@ -67,11 +67,8 @@ def command(request: Request, out: Path) -> str:
         request: What was asked for.
         out: Where it was written.
     """
-    words = [
-        "hybrid-mpc analyze",
-        f"{request.folder.parent.name}/{request.folder.name}".lstrip("/"),
-        f"--out {out.name}",
-    ]
+    folder = f"{request.folder.parent.name}/{request.folder.name}".lstrip("/")
+    words = ["hybrid-mpc analyze", folder, f"--out {out.name}"]
     words += [f"--scenario {request.scenario}"] if request.scenario else []
     words += [f"--data {path.name}" for path in request.data]
     words += [f"--speed {request.speed:g}"] if request.speed is not None else []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -24,6 +25,7 @@ from hybrid_mpc.plots.style import (
 )
 from hybrid_mpc.signals import Signal
 
+_POINTS = {"rest": ", tangent at rest", "working": ", friction of working size"}
 _COLOURS = ("#0072B2", "#D55E00", "#CC79A7", "#009E73", "#E69F00", "#56B4E9")
 
 
@@ -45,9 +47,8 @@ def sensitivity_functions(loops: Mapping[str, Mapping[str, Array]], *, title: st
     if not loops:
         raise InputError("sensitivity functions: there is no loop to draw")
     figure, axes = new_figure(1, 2, sharex=True, sharey=True, size=(10, 4.2), title=title)
-    for ax, key, text in zip(
-        axes[0], "ST", ("S: what is left of a load", "T: what the input takes of it"), strict=True
-    ):
+    texts = ("S: what is left of a load", "T: what the input takes of it")
+    for ax, key, text in zip(axes[0], "ST", texts, strict=True):
         for i, (name, one) in enumerate(loops.items()):
             omega = np.asarray(one["omega"], dtype=float)
             size = checked(f"{key} of {name}", np.abs(one[key]), omega.size)
@@ -128,13 +129,12 @@ def gain_schedules(
     for name, points in schedules.items():
         for point, (q, gain) in points.items():
             values = checked(f"gains of {name}", gain, len(q), len(states))
-            label = name_of(name) + {
-                "rest": ", tangent at rest",
-                "working": ", friction of working size",
-            }.get(point, "")
+            style: dict[str, Any] = {
+                "color": colour(name), "linestyle": ":" if point == "rest" else "-", "marker": ".", "markersize": 4,
+                "label": name_of(name) + _POINTS.get(point, ""),
+            }  # fmt: skip
             for ax, column in zip(axes[0], values.T, strict=True):
-                ax.plot(q, column, color=colour(name), linestyle=":" if point == "rest" else "-", marker=".", markersize=4,
-                        label=label)  # fmt: skip
+                ax.plot(q, column, **style)
     for ax, signal in zip(axes[0], states, strict=True):
         ax.set_xlabel(axis_label(position))
         title_axes(ax, f"gain of {axis_label(signal)}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -75,8 +76,8 @@ def measured_bode(
         if machine:
             style |= {"linestyle": "none", "marker": "o", "markersize": 4, "markerfacecolor": "none"}
             spread = np.asarray(one["deviation"], dtype=float)[shown]
-            upper.fill_between(w, np.maximum(size - 2 * spread, 1e-3 * size), size + 2 * spread, color=FAINT, alpha=0.25,
-                               linewidth=0)  # fmt: skip
+            band = np.maximum(size - 2 * spread, 1e-3 * size), size + 2 * spread
+            upper.fill_between(w, *band, color=FAINT, alpha=0.25, linewidth=0)
         upper.loglog(w, size, **style)
         middle.semilogx(w, np.degrees(np.unwrap(np.angle(g[shown]))), **style)
         lower.semilogx(w, np.asarray(one["coherence"], dtype=float)[shown], **style)
@@ -150,7 +151,7 @@ def friction_damping(curves: Mapping[str, Mapping[str, Array]], *, working_speed
     kinds = (
         ("secant", "--", "secant"),
         ("harmonic", "-", "describing function"),
-        ("moving", ":", "tangent at the speed"),
+        ("moving", ":", "tangent in motion"),
     )
     for ax, (name, one) in zip(axes[0], curves.items(), strict=True):
         speed = np.asarray(one["speed"], dtype=float)
@@ -180,12 +181,12 @@ def friction_damping(curves: Mapping[str, Mapping[str, Array]], *, working_speed
 
 def _one_legend(figure: Figure) -> None:
     """The kinds of lines once, in ink: the panels' colours tell models apart, not kinds."""
-    seen: dict[str, str] = {}
+    seen: dict[str, Any] = {}
     for ax in figure.axes:
         for line in ax.get_lines():
             label = str(line.get_label())
             if not label.startswith("_"):
-                seen.setdefault(label, str(line.get_linestyle()))
+                seen.setdefault(label, line.get_linestyle())
     handles = [Line2D([], [], color=INK, linestyle=dashes) for dashes in seen.values()]
     figure.legend(handles, list(seen), loc="outside lower center", ncols=len(seen), frameon=False, fontsize=9)
 

@@ -131,12 +131,10 @@ def test_steady_gain_is_where_the_filter_settles_and_python_control_s():
 def test_poles_of_the_loop_are_lqr_s_and_the_filter_s():
     model, a, b, _ = random_linear(3, n_x=3, n_u=1, radius=1.05)
     controller = controller_of(model)
-    gain, steady = (
-        mpc_gain(controller, np.zeros(3), np.zeros(1)),
-        steady_filter(filter_of(model), np.zeros(3), np.zeros(1)),
-    )
+    gain = mpc_gain(controller, np.zeros(3), np.zeros(1))
+    steady = steady_filter(filter_of(model), np.zeros(3), np.zeros(1))
     loop = mpc_loop(gain, steady, linearize(model, np.zeros(3), np.zeros(1)))
-    k, _, lqr = control.dlqr(a, b, *lq_weights(controller))
+    _, _, lqr = control.dlqr(a, b, *lq_weights(controller))
     known = np.concatenate([lqr, np.linalg.eigvals((np.eye(3) - steady.gain[:3] @ steady.C[:, :3]) @ a)])
     # Separation principle; beside them the input's memory, which nothing uses (0).
     for pole in known:
