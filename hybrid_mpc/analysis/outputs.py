@@ -53,7 +53,7 @@ def as_csv(table: Table) -> str:
 
     Example:
         >>> as_csv(Table(("model", "x [rad]"), (("prior", 0.1), ("a, b", None))))
-        'model,x [rad]\\nprior,0.1\\n"a, b",\\n'
+        'model,x [rad]\nprior,0.1\n"a, b",\n'
     """
     rows = [table.columns, *table.rows]
     return "".join(",".join(_field(value) for value in row) + "\n" for row in rows)

@@ -1,18 +1,29 @@
 """The study of an artifact's models, its tables and figures, and the command."""
 
 import csv
+import doctest
+import importlib
 import json
+import pkgutil
+import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
+import hybrid_mpc.analysis
+from hybrid_mpc.analysis import run_model
 from hybrid_mpc.analysis.outputs import write_analysis
 from hybrid_mpc.analysis.study import study
+from hybrid_mpc.analysis.study_signals import measured_part
 from hybrid_mpc.analysis.subject import Request, Subject, check_out, subject_of
+from hybrid_mpc.analysis.toolbox import control_toolbox
 from hybrid_mpc.artifact import load_artifact
 from hybrid_mpc.cli.main import app
+from hybrid_mpc.data import write_csv
+from hybrid_mpc.data.excitation import multisine
 from hybrid_mpc.errors import InputError
 from nn_export import load_programs
 from scenarios.golf_robot import scenario
@@ -47,10 +58,44 @@ def test_a_study_without_a_control_problem_says_what_it_leaves_out(prior_alone, 
     ]
     assert np.array_equal(poles, findings.arrays["linear/prior/rest/poles"])  # all digits
     kept = json.loads((tmp_path / "analysis.json").read_text())
-    assert kept["equilibria"]["prior"]["points"][1]["stability"] == "stable"
+    assert kept["equilibria"]["prior"]["points"][0]["stability"] == "stable"
     for picture in (tmp_path / "figures").glob("*.png"):
         with Image.open(picture) as image:
             assert min(image.size) > 300
+
+
+def test_recordings_are_taken_before_the_simulated_machine(golf_artifact, prior_alone, tmp_path):
+    model, t = prior_alone.models["prior"], 0.02 * np.arange(3000)
+    u = multisine(t, 0.25, 0.1, 2.0, period=20.0)
+    phi = run_model(model, [0.0, 0.0])(u)
+    file = write_csv(tmp_path / "run.csv", {"time_s": t, "u_nm": u, "phi_rad": phi})
+    noise = tmp_path / "control.json"
+    noise.write_text(
+        json.dumps({"sigma_x": {n: [1e-4, 2e-2] for n in ("prior_observer", "hybrid_observer")}})
+    )
+    subject, notes = subject_of(Request(golf_artifact, "golf_robot", (file,), noise=noise))
+    assert len(subject.recordings) == 1
+    assert "control.json" in notes[1]
+    assert set(subject.filters) == {(m, f) for m in ("prior", "hybrid") for f in ("quiet", "jump")}
+    result, curves = measured_part(replace(prior_alone, recordings=subject.recordings))
+    # The "machine" is the model itself, but for its first speed, which is smoothed from the recording.
+    assert result["prior"]["median_relative_error"] < 0.02
+    assert np.median(curves["measured/coherence"][:20]) > 0.9
+    assert "1 recordings" in result["source"]
+
+
+def test_without_python_control_it_is_said_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "control", None)
+    with pytest.raises(InputError, match=r"hybrid-mpc\[analysis\]"):
+        control_toolbox()
+
+
+MODULES = sorted(m.name for m in pkgutil.iter_modules(hybrid_mpc.analysis.__path__, "hybrid_mpc.analysis."))
+
+
+@pytest.mark.parametrize("name", [*MODULES, *(f"hybrid_mpc.plots.analysis_{m}" for m in ("loops", "models"))])
+def test_examples(name):
+    assert doctest.testmod(importlib.import_module(name)).failed == 0
 
 
 def test_what_does_not_fit_is_refused(golf_artifact, tmp_path):
