@@ -17,14 +17,17 @@ import hybrid_mpc.analysis
 from hybrid_mpc.analysis import run_model
 from hybrid_mpc.analysis.outputs import write_analysis
 from hybrid_mpc.analysis.study import study
+from hybrid_mpc.analysis.study_loops import loops_part
 from hybrid_mpc.analysis.study_signals import measured_part
 from hybrid_mpc.analysis.subject import Request, Subject, check_out, subject_of
 from hybrid_mpc.analysis.toolbox import control_toolbox
 from hybrid_mpc.artifact import load_artifact
 from hybrid_mpc.cli.main import app
+from hybrid_mpc.closed_loop import simulate
 from hybrid_mpc.data import write_csv
 from hybrid_mpc.data.excitation import multisine
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.pipeline.loops import make_controller
 from nn_export import load_programs
 from scenarios.golf_robot import scenario
 
@@ -135,3 +138,29 @@ def test_the_command_analyses_prior_and_hybrid_with_their_loops(golf_artifact, t
     assert found["loops"]["hybrid on hybrid"]["moving"]["jump"]["margins"]["gain_up"] > 1
     assert "--scenario golf_robot" in (out / "analysis.html").read_text()
     assert len(list((out / "figures").glob("*.png"))) == 12
+
+
+@pytest.mark.full
+def test_the_delay_that_the_margins_allow_is_the_delay_that_the_rig_stands(golf_artifact, tmp_path):
+    noise = tmp_path / "control.json"
+    noise.write_text(
+        json.dumps({"sigma_x": {n: [1e-4, 2e-2] for n in ("prior_observer", "hybrid_observer")}})
+    )
+    subject, _ = subject_of(Request(golf_artifact, "golf_robot", noise=noise))
+    filters = {key: f for key, f in subject.filters.items() if key[0] == "prior"}
+    subject = replace(subject, models={"prior": subject.models["prior"]}, filters=filters)
+    loops, _ = loops_part(subject, {"prior": (np.zeros(2), np.zeros(0))})
+    controller = make_controller(subject.models["prior"], subject.models["prior"], scenario.control)
+    task = next(t for t in scenario.tasks if t.name == "track_sine")
+    for mode in ("quiet", "jump"):
+        allowed = loops["prior on prior"]["driven"][mode]["margins"]["delay_periods"]
+        restless = []
+        for delay in (0, allowed, allowed + 1):
+            run = simulate(
+                scenario.plant(), subject.filters["prior", mode], controller, task.reference, dt=0.02, duration=4.0,
+                x0=np.array(task.x0), seed=0, input_delay=delay,
+            )  # fmt: skip
+            restless.append(np.sqrt(np.mean(np.diff(run.u[50:, 0]) ** 2)))
+        # A loop that stands the delay moves its input as the task asks; one that does not swings between its bounds.
+        assert restless[1] < 1.3 * restless[0]
+        assert restless[2] > 1.5 * restless[1]
