@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hybrid_mpc.analysis.symbolic import jacobians
+from hybrid_mpc.analysis.toolbox import control_toolbox, signal_names
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model import HybridModel
 
@@ -37,13 +38,9 @@ def fixed_point(model: HybridModel, u: ArrayLike, x_guess: ArrayLike) -> tuple[A
     Example:
         ``x, h = fixed_point(model, [0.0], [3.0, 0.0])``
     """
-    x0, u0 = _column(model, "x_guess", x_guess, model.n_x), _column(model, "u", u, model.n_u)
-    x, h = ca.MX.sym("x", model.n_x), ca.MX.sym("h", model.n_h)
-    z, v = ca.vertcat(x, h), ca.MX.sym("u", model.n_u)
-    r = ca.vertcat(*model.step(x, h, v)) - z
-    residual = ca.Function("residual", [z, v], [r, ca.densify(ca.jacobian(r, z))])
-    start = np.concatenate([x0, _settled_hidden(model, x0, u0)])
-    found, size = _newton(residual, start, u0)
+    x0, u0 = column(model, "x_guess", x_guess, model.n_x), column(model, "u", u, model.n_u)
+    start = np.concatenate([x0, settled_hidden(model, x0, u0)])
+    found, size = newton(rest_residual(model), start, u0)
     if size > RESIDUAL:
         raise InputError(
             f"model {model.name}: no fixed point found from x = {x0.tolist()} under u = {u0.tolist()} "
@@ -61,14 +58,14 @@ def hidden_fixed_point(model: HybridModel, x: ArrayLike, u: ArrayLike) -> Array:
     Example:
         ``h = hidden_fixed_point(model, [0.0, 2.0], [0.1])``
     """
-    x0, u0 = _column(model, "x", x, model.n_x), _column(model, "u", u, model.n_u)
+    x0, u0 = column(model, "x", x, model.n_x), column(model, "u", u, model.n_u)
     if model.n_h == 0:
         return np.zeros(0)
     h = ca.MX.sym("h", model.n_h)
     p = ca.MX.sym("p", model.n_x + model.n_u)
     r = model.step(p[: model.n_x], h, p[model.n_x :])[1] - h
     residual = ca.Function("residual", [h, p], [r, ca.densify(ca.jacobian(r, h))])
-    found, size = _newton(residual, _settled_hidden(model, x0, u0), np.concatenate([x0, u0]))
+    found, size = newton(residual, settled_hidden(model, x0, u0), np.concatenate([x0, u0]))
     if size > RESIDUAL:
         raise InputError(
             f"model {model.name}: the hidden state finds no rest at x = {x0.tolist()} (residual {size:.2g}); "
@@ -77,47 +74,35 @@ def hidden_fixed_point(model: HybridModel, x: ArrayLike, u: ArrayLike) -> Array:
     return found
 
 
-def linearize(model: HybridModel, x: ArrayLike, u: ArrayLike, h: ArrayLike | None = None) -> Any:
-    """Discrete state space of small deviations around ``(x, h, u)``, from exact derivatives.
+def linearize(
+    model: HybridModel, x: ArrayLike, u: ArrayLike, h: ArrayLike | None = None, *, continuous: bool = False
+) -> Any:
+    """State space of small deviations around ``(x, h, u)``, from exact derivatives.
 
     Args:
         model: The model.
         x: Operating point ``(n_x,)``; it need not be an equilibrium.
         u: Input ``(n_u,)``.
         h: Hidden state ``(n_h,)``. Default: its fixed point while ``x`` and ``u`` are held.
+        continuous: The ODE itself instead of its step, where there is no hidden state. Default: no.
 
     Returns:
-        ``control.StateSpace`` with period ``model.dt`` over the states ``[x; h]``; no state is removed.
+        ``control.StateSpace`` with period ``model.dt`` (0 if continuous) over the states ``[x; h]``; no state is
+        removed.
 
     Raises:
-        InputError: If a size is wrong or the hidden state finds no rest.
+        InputError: If a size is wrong, the hidden state finds no rest, or python-control is not installed.
 
     Example:
         ``control.damp(linearize(model, x, u))``
     """
-    import control
-
-    x0, u0 = _column(model, "x", x, model.n_x), _column(model, "u", u, model.n_u)
-    h0 = hidden_fixed_point(model, x0, u0) if h is None else _column(model, "h", h, model.n_h)
-    assert model.with_jacobian is not None
-    _, _, a, b = model.with_jacobian(x0, h0, u0)
-    x_sym, u_sym = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
-    y = model.output(x_sym, u_sym)
-    output = ca.Function("output", [x_sym, u_sym], [ca.jacobian(y, x_sym), ca.jacobian(y, u_sym)])
-    c, d = (m.full() for m in output(x0, u0))
-    states = [s.name for s in model.states] + [f"h{i}" for i in range(model.n_h)]
+    control = control_toolbox()
+    x0, u0 = column(model, "x", x, model.n_x), column(model, "u", u, model.n_u)
+    h0 = hidden_fixed_point(model, x0, u0) if h is None else column(model, "h", h, model.n_h)
+    a, b, c, d = (m.full() for m in jacobians(model, continuous=continuous)(x0, h0, u0))
     return control.ss(
-        a.full(),
-        b.full(),
-        np.hstack([c, np.zeros((model.n_y, model.n_h))]),
-        d,
-        model.dt,
-        remove_useless_states=False,
-        name=model.name,
-        states=states,
-        inputs=[s.name for s in model.inputs],
-        outputs=_distinct([s.name for s in model.outputs]),
-    )
+        a, b, c, d, 0 if continuous else model.dt, remove_useless_states=False, **signal_names(model)
+    )  # fmt: skip
 
 
 def linearize_at_speed(model: HybridModel, q: ArrayLike, v_work: ArrayLike, u: ArrayLike) -> Any:
@@ -144,11 +129,19 @@ def linearize_at_speed(model: HybridModel, q: ArrayLike, v_work: ArrayLike, u: A
         ``linearize_at_speed(model, [0.0], [2.0], [0.1])``
     """
     n_q = model.n_x // 2
-    x = np.concatenate([_column(model, "q", q, n_q), _column(model, "v_work", v_work, n_q)])
+    x = np.concatenate([column(model, "q", q, n_q), column(model, "v_work", v_work, n_q)])
     return linearize(model, x, u)
 
 
-def _newton(residual: ca.Function, z: Array, p: Array) -> tuple[Array, float]:
+def rest_residual(model: HybridModel) -> ca.Function:
+    """``(z, u)`` to what one step changes of ``z = (x, h)``, and its Jacobian by ``z``."""
+    x, h = ca.MX.sym("x", model.n_x), ca.MX.sym("h", model.n_h)
+    z, v = ca.vertcat(x, h), ca.MX.sym("u", model.n_u)
+    r = ca.vertcat(*model.step(x, h, v)) - z
+    return ca.Function("residual", [z, v], [r, ca.densify(ca.jacobian(r, z))])
+
+
+def newton(residual: ca.Function, z: Array, p: Array) -> tuple[Array, float]:
     """Newton with step halving; the best point and its largest residual (inf if it is not finite)."""
     r, jacobian = (np.asarray(m.full()) for m in residual(z, p))
     for _ in range(ITERATIONS):
@@ -169,19 +162,21 @@ def _newton(residual: ca.Function, z: Array, p: Array) -> tuple[Array, float]:
     return z, size if np.isfinite(size) else float("inf")
 
 
-def _settled_hidden(model: HybridModel, x: Array, u: Array, steps: int = 100) -> Array:
+def settled_hidden(model: HybridModel, x: Array, u: Array, steps: int = 100) -> Array:
+    """Hidden state ``(n_h,)`` after some periods at held ``x`` and ``u``, from zero."""
     h = np.zeros(model.n_h)
     for _ in range(steps if model.n_h else 0):
         h = model.step(x, h, u)[1].full().ravel()
     return h
 
 
-def _column(model: HybridModel, name: str, value: ArrayLike, n: int) -> Array:
+def column(model: HybridModel, name: str, value: ArrayLike, n: int) -> Array:
+    """``n`` finite numbers.
+
+    Raises:
+        InputError: If they are not.
+    """
     array = np.asarray(value, dtype=np.float64).reshape(-1)
     if array.size != n or not np.isfinite(array).all():
         raise InputError(f"model {model.name}: {name} must be {n} finite numbers, got {array.tolist()}")
     return array
-
-
-def _distinct(names: Sequence[str]) -> list[str]:
-    return [n if names.count(n) == 1 else f"{n}_{i}" for i, n in enumerate(names)]

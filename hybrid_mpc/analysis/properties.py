@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hybrid_mpc.analysis.toolbox import period
 from hybrid_mpc.errors import InputError
 
 Array = NDArray[np.float64]
@@ -88,7 +89,7 @@ def analyze(sys: Any, *, split: float | None = None) -> LinearAnalysis:
         >>> analyze(control.ss([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.1)).stable
         True
     """
-    dt = _period(sys)
+    dt = period(sys)
     poles = np.linalg.eigvals(sys.A).astype(np.complex128)
     poles = poles[np.argsort(-np.abs(poles), kind="stable")]
     frequency, damping = np.full(poles.size, np.inf), np.ones(poles.size)
@@ -128,7 +129,7 @@ def stabilisable(sys: Any) -> bool:
         >>> stabilisable(control.ss([[2.0]], [[0.0]], [[1.0]], [[0.0]], 0.1, remove_useless_states=False))
         False
     """
-    _period(sys)
+    period(sys)
     return _hautus(np.asarray(sys.A), np.asarray(sys.B))
 
 
@@ -143,7 +144,7 @@ def detectable(sys: Any) -> bool:
         >>> detectable(control.ss([[2.0]], [[1.0]], [[1.0]], [[0.0]], 0.1))
         True
     """
-    _period(sys)
+    period(sys)
     return _hautus(np.asarray(sys.A).T, np.asarray(sys.C).T)
 
 
@@ -159,7 +160,7 @@ def frequency_response(sys: Any, omega: ArrayLike) -> FrequencyResponse:
         >>> round(float(frequency_response(sys, [1e-6]).magnitude[0, 0, 0]), 6)
         2.0
     """
-    dt = _period(sys)
+    dt = period(sys)
     w = np.asarray(omega, dtype=np.float64).reshape(-1)
     if w.size == 0 or not (w.min() > 0 and w.max() <= np.pi / dt * (1 + 1e-9)):
         raise InputError(f"frequency response: give frequencies in (0, {np.pi / dt:.6g}] rad/s (Nyquist)")
@@ -182,10 +183,3 @@ def _hautus(a: Array, b: Array) -> bool:
         if np.linalg.svd(pencil, compute_uv=False)[-1] <= RANK_TOLERANCE * largest:
             return False
     return True
-
-
-def _period(sys: Any) -> float:
-    dt = sys.dt
-    if dt is None or dt is True or not dt > 0:
-        raise InputError(f"linear analysis: needs a discrete system with a period, its dt is {dt}")
-    return float(dt)

@@ -18,6 +18,7 @@ except ImportError as missing:  # the online half installs without the command l
     ) from None
 
 from hybrid_mpc import __version__
+from hybrid_mpc.cli import analyze as analyze_command
 from hybrid_mpc.cli import control as control_command
 from hybrid_mpc.cli import data as data_command
 from hybrid_mpc.cli import reproduce as reproduce_command
@@ -35,6 +36,7 @@ INTERRUPTED = {
     "them anew (with another --out if figures lie in it already)",
     "search": "interrupted; finished trials are kept: the same command with --resume goes on",
     "study": "interrupted; finished runs are kept: the same command with --resume goes on",
+    "analyze": "interrupted; figures and tables are not complete: the same command with another --out makes them anew",
     "data": "interrupted; the recordings are not complete: the same command with another --out makes them anew",
 }
 """What is left after Ctrl-C, by command."""
@@ -50,6 +52,7 @@ app = typer.Typer(
 app.command("run", epilog=run_command.EXAMPLES)(run_command.run)
 app.command("control", epilog=control_command.EXAMPLES)(control_command.control)
 app.command("reproduce", epilog=reproduce_command.EXAMPLES)(reproduce_command.reproduce)
+app.command("analyze", epilog=analyze_command.EXAMPLES)(analyze_command.analyze)
 app.command("data", epilog=data_command.EXAMPLES)(data_command.data)
 app.command("search", epilog=search_command.EXAMPLES)(search_command.search)
 app.command("scenarios")(scenarios_command.scenarios)

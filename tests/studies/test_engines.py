@@ -15,13 +15,15 @@ from hybrid_mpc.pipeline.context import Silent
 from hybrid_mpc.studies import StudyResults, engines, run_study
 from hybrid_mpc.studies.loops import TIMING
 
-TESTS = str(Path(__file__).parents[1])
+ROOT, TESTS = (
+    str(Path(__file__).parents[i]) for i in (2, 1)
+)  # the root first: tests/ has a folder nn_export
 
 
 @pytest.fixture(autouse=True)
 def importable(monkeypatch):
     """Workers import the runs of the tests."""
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([TESTS, os.environ.get("PYTHONPATH", "")]))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([ROOT, TESTS, os.environ.get("PYTHONPATH", "")]))
 
 
 @pytest.fixture

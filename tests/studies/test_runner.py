@@ -19,7 +19,7 @@ from hybrid_mpc.files import read_json, write_json
 from hybrid_mpc.studies import StudyResults, run_study, runner
 from hybrid_mpc.studies.log import RunLog, rows
 
-TESTS = Path(__file__).parents[1]
+ROOT, TESTS = (Path(__file__).parents[i] for i in (2, 1))  # the root first: tests/ has a folder nn_export
 RUNS = 150
 
 
@@ -164,7 +164,7 @@ def test_ctrl_c_keeps_what_is_finished(here, tmp_path, monkeypatch):
 def begun(folder, run="noted", runs=RUNS, **environment):
     """A study in a process group of its own."""
     words = [sys.executable, str(TESTS / "trivial_runs.py"), str(folder), run, str(runs)]
-    paths = os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])
+    paths = os.pathsep.join([str(ROOT), str(TESTS), os.environ.get("PYTHONPATH", "")])
     environment = {**os.environ, "PYTHONPATH": paths, **environment}
     return subprocess.Popen(
         words,

@@ -1,0 +1,195 @@
+"""From an artifact folder and a scenario to what is analysed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.artifact import FILE, Artifact, load_artifact
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimation.kalman import ExtendedKalmanFilter
+from hybrid_mpc.model import HybridModel
+from hybrid_mpc.mpc import OCP
+from hybrid_mpc.scenario import ControlSpec, Plant, Scenario, load_scenario
+from nn_export import Program, load_programs
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is analysed.
+
+    Args:
+        models: By name; ``"prior"`` and ``"hybrid"`` are compared.
+        programs: Exported programs of the artifact, ``"prior/step"`` and so on.
+        x_range: Working range of the states ``(n_x, 2)``.
+        u_range: That of the inputs ``(n_u, 2)``.
+        speed: Working speeds ``(n_x / 2,)``.
+        ocp: The control problem; default: none, then there are no loops.
+        filters: Estimators by model and mode, ``("hybrid", "quiet")``; default: none.
+        plant: The simulated machine; default: none.
+        recordings: Inputs ``(n,)``, outputs ``(n,)`` and first states of recordings; default: none.
+        outer: Range in which points of rest are looked for ``(n_x, 2)``. Default: ``x_range``.
+    """
+
+    models: Mapping[str, HybridModel]
+    programs: Mapping[str, Program]
+    x_range: Array
+    u_range: Array
+    speed: Array
+    ocp: OCP | None = None
+    filters: Mapping[tuple[str, str], ExtendedKalmanFilter] = field(default_factory=dict)
+    plant: Plant | None = None
+    recordings: Sequence[tuple[Array, Array, Array]] = ()
+    outer: Array | None = None
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is to be analysed, as it is asked for.
+
+    Args:
+        folder: Artifact folder, or the folder of the run that holds it as ``model``.
+        scenario: Name or file. Default: the one that the artifact names; without any there are no loops.
+        data: Recordings.
+        speed: Working speed. Default: that of the scenario's weights, else 1.
+        noise: ``control.json`` with the filters' process noise. Default: that of the artifact's run, else estimated on
+            recordings that the scenario makes.
+        seed: Of these recordings.
+    """
+
+    folder: Path
+    scenario: str = ""
+    data: tuple[Path, ...] = ()
+    speed: float | None = None
+    noise: Path | None = None
+    seed: int = 0
+
+
+def check_out(out: Path) -> None:
+    """Refuse a folder that holds something.
+
+    Raises:
+        InputError: If it does.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out} exists and is no empty folder; choose another --out")
+
+
+def subject_of(request: Request) -> tuple[Subject, tuple[str, ...]]:
+    """What is analysed, and in words where it came from.
+
+    Args:
+        request: What is asked for.
+
+    Raises:
+        InputError: If there is no artifact, the scenario does not fit it, or a recording is bad.
+    """
+    folder = request.folder
+    if not (folder / FILE).is_file() and (folder / "model" / FILE).is_file():
+        folder = folder / "model"
+    if not (folder / FILE).is_file():
+        raise InputError(f"{folder} holds no artifact; give model/ of a finished run")
+    artifact = load_artifact(folder)
+    named = str(artifact.provenance.get("scenario") or "")
+    name = request.scenario or named
+    scenario = load_scenario(name) if name else None
+    if scenario is not None and named and scenario.name != named:
+        raise InputError(f"{folder} was made for scenario {named}, not for {scenario.name}")
+    if scenario is None and request.data:
+        raise InputError("--data needs --scenario: only it says which columns are which")
+    model = next(iter(artifact.models.values()))
+    control = scenario.control if scenario is not None else None
+    speed = _speed(model, control, request.speed)
+    notes = [f"scenario {name}" if name else "no scenario: no loops, no response of a machine"]
+    ocp: OCP | None = None
+    filters: dict[tuple[str, str], ExtendedKalmanFilter] = {}
+    if scenario is not None and control is not None and {"prior", "hybrid"} <= set(artifact.models):
+        from hybrid_mpc.pipeline.loops import make_ocp
+
+        ocp = make_ocp(artifact.models["prior"], control)
+        filters, source = _filters(request, scenario, artifact, control, folder)
+        notes.append(f"filters' noise: {source}")
+    subject = Subject(
+        artifact.models, load_programs(folder), _range(model, control), _inputs(model, control), speed, ocp, filters,
+        scenario.plant() if scenario is not None and scenario.plant is not None else None,
+        _recordings(request, scenario, model), _outer(model),
+    )  # fmt: skip
+    return subject, tuple(notes)
+
+
+def _speed(model: HybridModel, control: ControlSpec | None, given: float | None) -> Array:
+    n_v = model.n_x - model.n_x // 2
+    if given is not None:
+        if not (np.isfinite(given) and given > 0):
+            raise InputError(f"--speed must be positive, got {given}")
+        return np.full(n_v, given)
+    if control is None:
+        return np.ones(n_v)
+    weights = np.asarray(control.q[model.n_x // 2 :], dtype=float)
+    return 1.0 / np.sqrt(np.where(weights > 0, weights, 1.0))
+
+
+def _range(model: HybridModel, control: ControlSpec | None) -> Array:
+    """Working range of the states: the limits of the control problem, else the signals', else a unit."""
+    box = _outer(model)
+    if control is not None and control.x_min is not None and control.x_max is not None:
+        limits = np.column_stack([control.x_min, control.x_max])
+        box = np.where(np.isfinite(limits), limits, box)
+    return box
+
+
+def _outer(model: HybridModel) -> Array:
+    """Whole range of the states: the signals', a turn for an angle that turns, else a unit either way."""
+    rows = []
+    for s in model.states:
+        size = np.pi if s.periodic else 1.0
+        rows.append([s.lower if np.isfinite(s.lower) else -size, s.upper if np.isfinite(s.upper) else size])
+    return np.array(rows)
+
+
+def _inputs(model: HybridModel, control: ControlSpec | None) -> Array:
+    given = None if control is None else np.column_stack([control.u_min, control.u_max]).astype(float)
+    rows = []
+    for i, s in enumerate(model.inputs):
+        low, high = (s.lower, s.upper) if given is None or not np.all(np.isfinite(given[i])) else given[i]
+        rows.append([low if np.isfinite(low) else -1.0, high if np.isfinite(high) else 1.0])
+    return np.array(rows)
+
+
+def _filters(
+    request: Request, scenario: Scenario, artifact: Artifact, control: ControlSpec, folder: Path
+) -> tuple[dict[tuple[str, str], ExtendedKalmanFilter], str]:
+    """The observers of the closed loops: while nothing happens, and in the periods after a load came or went."""
+    from hybrid_mpc.pipeline.control_noise import find_noise
+    from hybrid_mpc.pipeline.loops import FIRST_LOAD, JUMP_SHARE, QUIET_SHARE
+
+    names = {"prior": "prior_observer", "hybrid": "hybrid_observer"}
+    noise, source = find_noise(scenario, artifact, folder, tuple(names.values()), request.seed, request.noise)
+    span = np.subtract(control.u_max, control.u_min)
+    filters = {}
+    for mode, share in (("quiet", QUIET_SHARE), ("jump", JUMP_SHARE)):
+        for name, contender in names.items():
+            model = artifact.models[name]
+            first = np.concatenate([control.estimator_sigma, np.full(model.n_x - model.n_y, 0.1)])
+            filters[name, mode] = ExtendedKalmanFilter(
+                model, sigma_y=np.array(control.estimator_sigma), sigma_x=noise[contender], sigma_d=share * span,
+                sigma_x0=first, sigma_d0=FIRST_LOAD * span,
+            )  # fmt: skip
+    return filters, source
+
+
+def _recordings(
+    request: Request, scenario: Scenario | None, model: HybridModel
+) -> tuple[tuple[Array, Array, Array], ...]:
+    if not request.data or scenario is None:
+        return ()
+    from hybrid_mpc.data.trajectories import load_trajectories
+
+    found = load_trajectories(request.data, scenario.data, outputs=model.outputs, inputs=model.inputs)
+    return tuple((piece.u[:, 0], piece.y[:, 0], piece.x[0]) for piece in found.whole)
