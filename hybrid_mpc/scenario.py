@@ -233,6 +233,8 @@ class Scenario:
         tasks: Closed-loop tasks.
         budgets: Effort by name.
         draw: ``x (n_x,) -> polylines (m, 2) [m]`` of the machine, for moving pictures; default: none.
+        causes: What may break, by name: the prior's parameters (or ``"gain of <input>"``) that change together then,
+            for :class:`~hybrid_mpc.monitor.Diagnoser`. Default: each by itself.
 
     Example:
         >>> import numpy as np
@@ -253,6 +255,7 @@ class Scenario:
     tasks: tuple[Task, ...] = ()
     budgets: Mapping[str, Budget] = field(default_factory=lambda: DEFAULT_BUDGETS)
     draw: Callable[[Array], Sequence[Array]] | None = None
+    causes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 def registered_scenarios() -> dict[str, str]:

@@ -20,6 +20,7 @@ except ImportError as missing:  # the online half installs without the command l
 from hybrid_mpc import __version__
 from hybrid_mpc.cli import control as control_command
 from hybrid_mpc.cli import data as data_command
+from hybrid_mpc.cli import monitor as monitor_command
 from hybrid_mpc.cli import run as run_command
 from hybrid_mpc.cli import scenarios as scenarios_command
 from hybrid_mpc.errors import InputError
@@ -44,6 +45,7 @@ app = typer.Typer(
 app.command("run", epilog=run_command.EXAMPLES)(run_command.run)
 app.command("control", epilog=control_command.EXAMPLES)(control_command.control)
 app.command("data", epilog=data_command.EXAMPLES)(data_command.data)
+app.command("monitor", epilog=monitor_command.EXAMPLES)(monitor_command.monitor)
 app.command("scenarios")(scenarios_command.scenarios)
 
 

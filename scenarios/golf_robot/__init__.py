@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from hybrid_mpc.scenario import DEFAULT_BUDGETS, DataSpec, Scenario
 from scenarios.golf_robot.data import make_data, windows
 from scenarios.golf_robot.drawing import draw
+from scenarios.golf_robot.faults import CAUSES
 from scenarios.golf_robot.oracle import oracle
 from scenarios.golf_robot.rig import Rig
 from scenarios.golf_robot.tasks import CONTROL, QUICK_TASKS, TASKS
@@ -52,6 +53,7 @@ scenario = Scenario(
     control=CONTROL,
     tasks=TASKS,
     draw=draw,
+    causes=CAUSES,
     budgets={
         "quick": replace(DEFAULT_BUDGETS["quick"], tasks=QUICK_TASKS),
         "full": replace(DEFAULT_BUDGETS["full"], oracle_seeds=10),
