@@ -75,6 +75,7 @@ class EnergyMonitor:
     (1964) for the polynomial; Peano kernel theorem for the weighting.
 
     Example:
+        >>> import casadi as ca
         >>> from hybrid_mpc.signals import Signal
         >>> x, h, u, w = ca.MX.sym("x", 2), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w", 2)
         >>> model = HybridModel(
