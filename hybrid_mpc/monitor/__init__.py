@@ -11,6 +11,13 @@ from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.diagnosis import Change, Diagnoser, Diagnosis
 from hybrid_mpc.monitor.energy import EnergyMonitor
 from hybrid_mpc.monitor.learning import learn_detector
+from hybrid_mpc.monitor.plausibility import (
+    Plausibility,
+    excess_bound,
+    learn_plausibility,
+    plan_distance,
+    region_bound,
+)
 from hybrid_mpc.monitor.reading import MonitorReading, MonitorState
 from hybrid_mpc.monitor.replay import MonitorTrace, judge, replay
 from hybrid_mpc.monitor.standard import guard_monitor, learn_from
@@ -26,6 +33,11 @@ __all__ = [
     "Diagnoser",
     "Diagnosis",
     "Change",
+    "Plausibility",
+    "learn_plausibility",
+    "excess_bound",
+    "region_bound",
+    "plan_distance",
     "Calibration",
     "calibrate",
     "with_residual",

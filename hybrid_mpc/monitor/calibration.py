@@ -11,11 +11,14 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.monitor.detector import Detector
+from hybrid_mpc.monitor.plausibility import Plausibility
 
 Array = NDArray[np.float64]
 BLOCK_S = 5.0
 MIN_BLOCKS = 30
 MAX_EXTRAPOLATION = 20.0
+LATER: Mapping[str, Any] = {"detector": Detector, "plausibility": Plausibility}
+"""Fields that calibrations of earlier versions lack."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,7 @@ class Calibration:
         residual_threshold: Residual level [N m or N] above which the alarm starts too. Default: never.
         residual_release: Residual level [N m or N] below which that ends.
         detector: Detector of scaled residuals, learned from nominal data. Default: none.
+        plausibility: What is ordinary in the training data, for bounds in the plan. Default: none.
 
     Raises:
         InputError: If ``0 < release_w <= threshold_w`` does not hold, or not so for the residual.
@@ -53,6 +57,7 @@ class Calibration:
     residual_threshold: float | None = None
     residual_release: float | None = None
     detector: Detector | None = None
+    plausibility: Plausibility | None = None
 
     def __post_init__(self) -> None:
         residual = self.residual_release, self.residual_threshold
@@ -68,10 +73,15 @@ class Calibration:
             )
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain dictionary for JSON; without a detector there is no such field in it."""
-        values = asdict(self)
-        values["detector"] = None if self.detector is None else self.detector.to_dict()
-        return {name: value for name, value in values.items() if name != "detector" or value is not None}
+        """Plain dictionary for JSON; what is not there has no field in it, as in earlier versions."""
+        values = asdict(replace(self, detector=None, plausibility=None))
+        for name in LATER:
+            part = getattr(self, name)
+            if part is None:
+                del values[name]
+            else:
+                values[name] = part.to_dict()
+        return values
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Calibration:
@@ -81,11 +91,12 @@ class Calibration:
             InputError: If a field is missing or unknown.
         """
         names = {f.name for f in fields(cls)}
-        if set(values) | {"detector"} != names:
-            raise InputError(f"calibration: got fields {sorted(values)}, it needs {sorted(names)}")
-        detector = values.get("detector")
-        found = None if detector is None else Detector.from_dict(detector)
-        return cls(**{**values, "detector": found})
+        if set(values) | set(LATER) != names:
+            raise InputError(
+                f"calibration: got fields {sorted(values)}, it needs {sorted(names - set(LATER))}"
+            )
+        found = {name: kind.from_dict(values[name]) for name, kind in LATER.items() if values.get(name)}
+        return cls(**{**values, **found})
 
 
 def calibrate(

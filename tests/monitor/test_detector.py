@@ -9,7 +9,7 @@ from monitor_parts import DT, GAMMA, NOISE, Observer, pendulum, simulate
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import plain
-from hybrid_mpc.monitor import Calibration, Detector, EnergyMonitor, learn_detector, replay
+from hybrid_mpc.monitor import Calibration, Detector, EnergyMonitor, Plausibility, learn_detector, replay
 from hybrid_mpc.monitor.learning import detector_levels
 
 WINDOW = {"window": 11, "average": 5, "free_run": 0.6}
@@ -124,10 +124,11 @@ def test_levels_are_those_of_the_update(learned):
 
 def test_it_survives_json_and_old_calibrations_are_still_read(learned):
     _, detector = learned
-    calibration = Calibration(0.2, 0.1, 1.0, 1000, 0.1, "by hand", detector=detector)
+    ordinary = Plausibility(0.99, (1.0,) * 5, (0.1, 0.1), (0.0, 0.0), ((1.0, 0.0), (0.0, 1.0)), 4.0, 1.0)
+    calibration = Calibration(0.2, 0.1, 1.0, 1000, 0.1, "by hand", detector=detector, plausibility=ordinary)
     back = Calibration.from_dict(json.loads(json.dumps(plain(calibration.to_dict()))))
     assert back == calibration
-    without = replace(calibration, detector=None).to_dict()
+    without = replace(calibration, detector=None, plausibility=None).to_dict()
     assert "detector" not in without  # what earlier versions wrote, and read
     assert Calibration.from_dict(without).detector is None
     only_forces = replace(detector, energy=(), energy_threshold=np.inf)

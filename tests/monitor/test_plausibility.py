@@ -20,16 +20,16 @@ from hybrid_mpc.monitor.plausibility import (
 from hybrid_mpc.mpc import OCP, SQPController
 from hybrid_mpc.signals import Signal
 
-DT, TRAINED = 0.05, 1.0  # s, m/s
+DT, TRAINED, WALL = 0.05, 1.0, 0.05  # s, N, m
 
 
 def cart(invented: float) -> HybridModel:
-    """1 kg, 0.3 N s/m; a correction of 0.2 sin(2 v) is right; beyond the trained speed one is invented."""
+    """1 kg, 0.3 N s/m; a correction of 0.2 sin(2 v) is right; beyond the trained input one is invented."""
     x, h, u, w = ca.MX.sym("x", 2), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w", 2)
 
     def rhs(z):
-        beyond = ca.fmax(0, ca.fabs(z[1]) - TRAINED)
-        extra = 0.2 * ca.sin(2 * z[1]) + invented * ca.sign(z[1]) * beyond**2
+        beyond = ca.fmax(0, ca.fabs(u) - TRAINED)
+        extra = 0.2 * ca.sin(2 * z[1]) + invented * ca.sign(u) * beyond**2
         return ca.vertcat(z[1], u - 0.3 * z[1] + extra)
 
     z = x + DT * rhs(x + 0.5 * DT * rhs(x))
@@ -51,13 +51,13 @@ class Data:
 @pytest.fixture(scope="module")
 def data():
     rng = np.random.default_rng(0)
-    v = rng.uniform(-TRAINED, TRAINED, 3000)
-    return Data(np.column_stack([rng.uniform(-3, 3, 3000), v]), rng.uniform(-1, 1, (3000, 1)))
+    x = np.column_stack([rng.uniform(-3, 3, 3000), rng.uniform(-2, 2, 3000)])
+    return Data(x, rng.uniform(-TRAINED, TRAINED, (3000, 1)))
 
 
 @pytest.fixture(scope="module")
 def ordinary(data):
-    return learn_plausibility(cart(5.0), [data], data_hash="abc")
+    return learn_plausibility(cart(4.0), [data], data_hash="abc")
 
 
 def values(bound, x, u):
@@ -66,9 +66,9 @@ def values(bound, x, u):
 
 def test_a_learned_correction_is_not_punished_where_it_was_learned(data, ordinary):
     rng = np.random.default_rng(1)
-    x = np.column_stack([rng.uniform(-3, 3, 4000), rng.uniform(-TRAINED, TRAINED, 4000)])
-    u = rng.uniform(-1, 1, (4000, 1))
-    model = cart(5.0)
+    x = np.column_stack([rng.uniform(-3, 3, 4000), rng.uniform(-2, 2, 4000)])
+    u = rng.uniform(-TRAINED, TRAINED, (4000, 1))
+    model = cart(4.0)
     excess = values(excess_bound(model, ordinary), x, u)
     # 1 % by the quantile; on other samples, and by 2,000 samples' own error, up to twice that
     assert np.mean(excess.max(axis=1) > 0) < 0.02
@@ -77,65 +77,48 @@ def test_a_learned_correction_is_not_punished_where_it_was_learned(data, ordinar
 
 
 def test_an_invented_one_is(ordinary):
-    x, u = np.array([[0.0, 2.0], [0.0, -2.0]]), np.zeros((2, 1))
-    # 5 N at 2 m/s are 10 W; ordinary there is 0.2 v and what a parabola through the data extrapolates
-    assert np.all(values(excess_bound(cart(5.0), ordinary), x, u).max(axis=1) > 5.0)
-    assert np.all(plan_distance(ordinary, np.array([[0.0, 4.0]]), np.zeros((1, 1))) > 1.0)
+    x, u = np.array([[0.0, 2.0], [0.0, -2.0]]), np.full((2, 1), 2.0)
+    # 4 N at 2 m/s are 8 W; ordinary there is 0.4 W at most, and what the fit extrapolates in u
+    assert np.all(values(excess_bound(cart(4.0), ordinary), x, u).max(axis=1) > 4.0)
+    assert np.all(plan_distance(ordinary, np.array([[0.0, 6.0]]), np.zeros((1, 1))) > 1.0)
 
 
-def planned(model, soft):
-    ocp = OCP(40, [1.0, 0.0], [0.5], [0.0], [-1.0], [1.0], terminal=np.diag([5.0, 5.0]), soft=soft)
-    controller = SQPController(model, ocp, iterations=60)
-    estimate = TrueState(model).start(np.array([-3.0, 0.0]))
-    first = controller.initial(estimate, np.zeros((40, 1)))
-    return controller.solve(first, estimate, np.zeros((41, 2)))
-
-
-def driven(model, u):
-    """Cost of inputs on a machine, and its largest speed."""
-    x, cost, fastest = np.array([-3.0, 0.0]), 0.0, 0.0
-    for value in u.ravel():
-        cost += DT * (x[0] ** 2 + 0.5 * value**2)
-        x = model.step(x, [], value)[0].full().ravel()
-        fastest = max(fastest, abs(x[1]))
-    return cost + 5 * x[0] ** 2 + 5 * x[1] ** 2, fastest
+def driven(model, soft):
+    """Cost, and how far beyond the wall, of a machine that ``model`` plans for."""
+    truth = cart(0.0)
+    ocp = OCP(
+        40, [1.0, 0.0], [0.05], [0.0], [-2.0], [2.0], terminal=np.diag([5.0, 5.0]), soft=soft,
+        x_min=[-np.inf] * 2, x_max=[WALL, np.inf],
+    )  # fmt: skip
+    controller, sees = SQPController(model, ocp, iterations=20), TrueState(model)
+    x, cost, farthest = np.array([-2.0, 0.0]), 0.0, -2.0
+    plan = controller.initial(sees.start(x), np.zeros((40, 1)))
+    for _ in range(90):
+        plan = controller.solve(plan, sees.start(x), np.zeros((41, 2)))
+        u = float(plan.u[0, 0])
+        cost += DT * (x[0] ** 2 + 0.05 * u**2)
+        x = truth.step(x, [], u)[0].full().ravel()
+        farthest = max(farthest, float(x[0]))
+    return cost, max(0.0, farthest - WALL)
 
 
 def test_a_plan_does_not_live_on_what_the_network_invented(ordinary):
-    model, truth = cart(5.0), cart(0.0)
+    # It brakes late, for beyond the trained input the network promises three times the force; the cart hits the wall.
+    model = cart(4.0)
     bounds = [excess_bound(model, ordinary), region_bound(model, ordinary)]
-    free, kept = planned(model, []), planned(model, bounds)
-    assert free.status.ok
-    assert kept.status.ok
-    assert np.abs(free.x[:, 1]).max() > 1.3  # it goes where pushing is free of charge
-    assert np.abs(kept.x[:, 1]).max() < np.abs(free.x[:, 1]).max() - 0.1
-    # and the machine, which gives nothing for free, is better served by the plan that did not count on it
-    assert driven(truth, kept.u)[0] < driven(truth, free.u)[0]
-    error = [np.abs(p.x[-1, 0] - trajectory(truth, p.u)[-1, 0]) for p in (free, kept)]
-    assert error[1] < 0.5 * error[0]
+    free, kept = driven(model, []), driven(model, bounds)
+    assert free[1] > 0.1
+    # Near rest power says nothing, and the region reaches beyond the data by half: some of it is left.
+    assert kept[1] < 0.5 * free[1]
 
 
-def trajectory(model, u):
-    x = [np.array([-3.0, 0.0])]
-    for value in u.ravel():
-        x.append(model.step(x[-1], [], value)[0].full().ravel())
-    return np.array(x)
-
-
-def test_a_plan_within_the_region_is_the_same(ordinary):
+def test_a_right_model_pays_nothing_for_the_bounds(data):
     model = cart(0.0)
-    slow = OCP(40, [1.0, 0.0], [4.0], [0.0], [-0.3], [0.3], terminal=np.diag([5.0, 5.0]))
-    plans = []
-    for soft in ([], [excess_bound(model, ordinary), region_bound(model, ordinary)]):
-        ocp = OCP(40, slow.q, slow.r, slow.r_delta, slow.u_min, slow.u_max, terminal=slow.terminal, soft=soft)
-        controller = SQPController(model, ocp, iterations=60)
-        estimate = TrueState(model).start(np.array([-1.0, 0.0]))
-        plans.append(
-            controller.solve(controller.initial(estimate, np.zeros((40, 1))), estimate, np.zeros((41, 2)))
-        )
-    assert np.abs(plans[0].x[:, 1]).max() < TRAINED
-    # Slacks that are zero change nothing; where 1 % of the ordinary exceeds its quantile they may, a little.
-    assert plans[1].cost == pytest.approx(plans[0].cost, rel=0.02)
+    known = learn_plausibility(model, [data])
+    free = driven(model, [])
+    kept = driven(model, [excess_bound(model, known), region_bound(model, known)])
+    # slacks that are zero change nothing but the solver's last digits
+    assert kept[0] == pytest.approx(free[0], rel=1e-3)
 
 
 def test_it_survives_json(ordinary):
