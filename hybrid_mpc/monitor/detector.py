@@ -145,16 +145,20 @@ class Detector:
         """
         n = len(self.force)
         end = 3 + 3 * n
-        v2 = sum([v * v for v in numbers[3 + 2 * n : end]])
         stop = len(numbers) - 4 if self.energy else len(numbers)
-        u2 = sum([u * u for u in numbers[end:stop]])
+        v2 = u2 = 0.0
+        for v in numbers[3 + 2 * n : end]:
+            v2 += v * v
+        for u in numbers[end:stop]:
+            u2 += u * u
         near = 1.0 / (1.0 + v2 / self.rest_speed**2)
-        most, sums, largest = CAP * self.force_threshold, list(state.sums), 0.0
+        most, drift, sums, largest = CAP * self.force_threshold, self.drift, list(state.sums), 0.0
         for i, (a0, a1, a2, a3) in enumerate(self.force):
             z = numbers[3 + i] / math.sqrt(a0 + a1 * v2 + a2 * u2 + a3 * near)
             if z == z:  # not NaN
-                sums[i] = min(max(0.0, sums[i] + z - self.drift), most)
-                sums[n + i] = min(max(0.0, sums[n + i] - z - self.drift), most)
+                up, down = sums[i] + z - drift, sums[n + i] - z - drift
+                sums[i] = 0.0 if up < 0.0 else min(up, most)
+                sums[n + i] = 0.0 if down < 0.0 else min(down, most)
             largest = max(largest, sums[i], sums[n + i])
         force = largest / self.force_threshold
         power = self._power(numbers[-4:]) / self.energy_threshold if self.energy else 0.0

@@ -155,9 +155,12 @@ class EnergyMonitor:
         Raises:
             InputError: If a shape does not fit the model.
         """
-        x, h, y, u_prev = _flat(estimate.x), _flat(estimate.h), _flat(y), _flat(u_prev)
+        x, h = _copied(estimate.x), _copied(estimate.h)
+        y, u_prev = np.asarray(y, dtype=np.float64), np.asarray(u_prev, dtype=np.float64)
         if (x.size, h.size, u_prev.size, y.size) != self._sizes:
             raise self._unfit(y, u_prev, x, h)
+        if y.ndim != 1 or u_prev.ndim != 1:
+            y, u_prev = y.reshape(-1), u_prev.reshape(-1)
         ins = self._ins
         ins[0][:], ins[1][:], ins[2][:], ins[3][:], ins[4][:] = state.memory, state.x, state.h, u_prev, y
         left = state.left and self._free_runs(state)
@@ -171,8 +174,9 @@ class EnergyMonitor:
             residual_level = _length_of_mean(memory[middle:end].reshape(self.average, n_q))
         alarms = self.alarms(level, residual_level, state.alarms)
         numbers = self._outs[1].tolist()
-        travel = numbers[3 + n_q : 3 + 2 * n_q]
-        frozen = any(map(_beyond, travel, self._resolution)) if self._resolution else False
+        frozen = False
+        for travel, step in zip(numbers[3 + n_q : 3 + 2 * n_q], self._resolution, strict=False):
+            frozen = frozen or abs(travel) > FROZEN_STEPS * step
         energy, seconds = self._older(numbers, left) if left else (math.nan, 0.0)
         scores: tuple[float, ...]
         found, scores, detected = state.detector, (), False
@@ -223,13 +227,9 @@ class EnergyMonitor:
         )
 
 
-def _flat(values: Any) -> Array:
+def _copied(values: Any) -> Array:
     array = np.array(values, dtype=np.float64)
     return array if array.ndim == 1 else array.reshape(-1)
-
-
-def _beyond(travel: float, step: float) -> bool:
-    return abs(travel) > FROZEN_STEPS * step
 
 
 def _mean_of_finite(values: Array) -> float:
