@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,8 @@ OUTPUTS = {
     "output": ("y",),
     "energy_balance": ("dE",),
 }
+PARAMETRIC = "parametric"
+"""Program ``(x, u, p) -> acceleration`` of the prior, which artifacts of earlier versions lack."""
 JACOBIANS = {"A": ("x", "h"), "B": ("u",)}
 
 
@@ -42,12 +44,14 @@ class ModelInfo:
         states: Signals of x.
         inputs: Signals of u.
         outputs: Signals of y.
+        parameters: Values [SI] of the prior's parameters by name. Default: unknown.
     """
 
     dt: float
     states: tuple[Signal, ...]
     inputs: tuple[Signal, ...]
     outputs: tuple[Signal, ...]
+    parameters: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -90,6 +94,7 @@ def save_artifact(
         "models": list(programs),
         "dt_s": info.dt,
         **{role: [_signal_out(s) for s in getattr(info, role)] for role in ("states", "inputs", "outputs")},
+        "parameters": dict(info.parameters),
         "calibration": calibration,
         "provenance": provenance or {},
     }
@@ -112,10 +117,11 @@ def load_artifact(folder: Path) -> Artifact:
         raise InputError(f"{folder / FILE} is no artifact of schema version {SCHEMA_VERSION}")
     try:
         signals = {r: tuple(_signal_in(s) for s in description[r]) for r in ("states", "inputs", "outputs")}
-        info = ModelInfo(float(description["dt_s"]), **signals)
+        parameters = {str(k): float(v) for k, v in description.get("parameters", {}).items()}
+        info = ModelInfo(float(description["dt_s"]), **signals, parameters=parameters)
         names = [str(name) for name in description["models"]]
         calibration, provenance = description["calibration"], description["provenance"]
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{folder / FILE} is damaged: {type(error).__name__} {error}") from error
     try:
         programs = nn_export.load_programs(folder)
@@ -129,11 +135,17 @@ def load_artifact(folder: Path) -> Artifact:
 
 def build_model(name: str, programs: Mapping[str, nn_export.Program], info: ModelInfo) -> HybridModel:
     """The :class:`HybridModel` of ``programs["<name>/step"]`` and its siblings."""
-    functions = {f: nn_export.build(programs[f"{name}/{f}"], f) for f in FUNCTIONS}
+    functions: dict[str, Any] = {f: nn_export.build(programs[f"{name}/{f}"], f) for f in FUNCTIONS}
     step = programs[f"{name}/step"]
     functions["with_jacobian"] = nn_export.with_jacobian(step, JACOBIANS)
     many = partial(nn_export.SideBySide, step)
-    return HybridModel(name, info.dt, info.states, info.inputs, info.outputs, **functions, side_by_side=many)
+    known: dict[str, Any] = {}
+    if info.parameters and f"{name}/{PARAMETRIC}" in programs:
+        parametric = nn_export.build(programs[f"{name}/{PARAMETRIC}"], PARAMETRIC)
+        known = {"parameters": info.parameters, "parametric": parametric}
+    return HybridModel(
+        name, info.dt, info.states, info.inputs, info.outputs, **functions, side_by_side=many, **known
+    )
 
 
 def _signal_out(s: Signal) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 import casadi as ca
@@ -40,6 +40,9 @@ class HybridModel:
             ``(x, h)`` and ``B`` by ``u``. Default: made from ``step`` by CasADi's own derivatives.
         side_by_side: The same at many points in one call, where the model has a faster way than one call a
             point: what :class:`nn_export.SideBySide` makes of a program. Default: none.
+        parameters: Values [SI] of the prior's parameters by name. Default: none.
+        parametric: ``(x, u, p) -> a`` ``(n_q,)``: the prior's acceleration with its parameters, in the order of
+            ``parameters``, as an input. Default: none; then nobody can tell what broke.
 
     Raises:
         InputError: If the functions' shapes do not fit the signals.
@@ -69,6 +72,8 @@ class HybridModel:
     energy_balance: ca.Function
     with_jacobian: ca.Function | None = None
     side_by_side: SideBySide | None = None
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    parametric: ca.Function | None = None
 
     def __post_init__(self) -> None:
         if not self.dt > 0:
@@ -83,6 +88,9 @@ class HybridModel:
         object.__setattr__(self, "with_jacobian", with_jacobian)
         n_z = self.n_x + self.n_h
         _check(self.name, "with_jacobian", with_jacobian, [x, h, u], [x, h, (n_z, n_z), (n_z, self.n_u)])
+        if self.parametric is not None:
+            a = self.parametric.size_out(0)  # a prior may have states after [q, v]
+            _check(self.name, "parametric", self.parametric, [x, u, (len(self.parameters), 1)], [a])
 
     @property
     def n_x(self) -> int:

@@ -235,6 +235,8 @@ class Scenario:
         budgets: Effort by name.
         draw: ``x (n_x,) -> polylines (m, 2) [m]`` of the machine, for moving pictures; default: none.
         experiment: The paper's experiment on it, for ``hybrid-mpc reproduce``; default: none.
+        causes: What may break, by name: the prior's parameters (or ``"gain of <input>"``) that change together then,
+            for :class:`~hybrid_mpc.monitor.Diagnoser`. Default: each by itself.
 
     Example:
         >>> import numpy as np
@@ -256,6 +258,7 @@ class Scenario:
     budgets: Mapping[str, Budget] = field(default_factory=lambda: DEFAULT_BUDGETS)
     draw: Callable[[Array], Sequence[Array]] | None = None
     experiment: Experiment | None = None
+    causes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 def registered_scenarios() -> dict[str, str]:

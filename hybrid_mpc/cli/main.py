@@ -21,6 +21,7 @@ from hybrid_mpc import __version__
 from hybrid_mpc.cli import analyze as analyze_command
 from hybrid_mpc.cli import control as control_command
 from hybrid_mpc.cli import data as data_command
+from hybrid_mpc.cli import monitor as monitor_command
 from hybrid_mpc.cli import reproduce as reproduce_command
 from hybrid_mpc.cli import run as run_command
 from hybrid_mpc.cli import scenarios as scenarios_command
@@ -37,6 +38,7 @@ INTERRUPTED = {
     "search": "interrupted; finished trials are kept: the same command with --resume goes on",
     "study": "interrupted; finished runs are kept: the same command with --resume goes on",
     "analyze": "interrupted; figures and tables are not complete: the same command with another --out makes them anew",
+    "monitor": "interrupted; tables and pictures are not complete: the same command with another --out makes them anew",
     "data": "interrupted; the recordings are not complete: the same command with another --out makes them anew",
 }
 """What is left after Ctrl-C, by command."""
@@ -55,6 +57,7 @@ app.command("reproduce", epilog=reproduce_command.EXAMPLES)(reproduce_command.re
 app.command("analyze", epilog=analyze_command.EXAMPLES)(analyze_command.analyze)
 app.command("data", epilog=data_command.EXAMPLES)(data_command.data)
 app.command("search", epilog=search_command.EXAMPLES)(search_command.search)
+app.command("monitor", epilog=monitor_command.EXAMPLES)(monitor_command.monitor)
 app.command("scenarios")(scenarios_command.scenarios)
 app.add_typer(study_command.app, name="study")
 

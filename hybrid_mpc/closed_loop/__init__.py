@@ -1,6 +1,7 @@
 """Closed loops: simulated ones, deterministic, with faults, measured on the plant's true state; and real ones."""
 
 from hybrid_mpc.closed_loop.faults import Fault
+from hybrid_mpc.closed_loop.guard import Guard, Mode, Switch
 from hybrid_mpc.closed_loop.result import ClosedLoopResult
 from hybrid_mpc.closed_loop.runner import Runner
 from hybrid_mpc.closed_loop.simulate import Monitor, Reading, simulate
@@ -10,11 +11,14 @@ __all__ = [
     "Clock",
     "ClosedLoopResult",
     "Fault",
+    "Guard",
+    "Mode",
     "Monitor",
     "Reading",
     "RealClock",
     "RunReport",
     "Runner",
     "RunnerStep",
+    "Switch",
     "simulate",
 ]

@@ -14,6 +14,7 @@ from hybrid_mpc.errors import InputError
 if TYPE_CHECKING:
     import pandas as pd
 
+    from hybrid_mpc.closed_loop.guard import Switch
     from hybrid_mpc.model import HybridModel
 
 Array = NDArray[np.float64]
@@ -43,6 +44,7 @@ class ClosedLoopResult:
         violation: Energy violation ``(n,)`` [W]; NaN without a monitor.
         level: Alarm level ``(n,)`` [W]; NaN without a monitor.
         alarm: ``(n,)``, True while the monitor alarms.
+        switches: Changes of the guard's mode, in their order. Default: none.
 
     Example:
         >>> one = np.ones((2, 1))
@@ -69,6 +71,16 @@ class ClosedLoopResult:
     violation: Array
     level: Array
     alarm: NDArray[np.bool_]
+    switches: tuple[Switch, ...] = ()
+
+    @property
+    def mode(self) -> tuple[str, ...]:
+        """Name of the guard's mode in each period."""
+        names = ["NORMAL"] * len(self.t)
+        for switch in self.switches:
+            first = int(np.searchsorted(self.t, switch.t - 0.5 * self.dt))
+            names[first:] = [switch.after.name] * (len(names) - first)
+        return tuple(names)
 
     @property
     def cost(self) -> float:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hybrid_mpc.closed_loop.guard import Guard, GuardedLoop
 from hybrid_mpc.closed_loop.machine import Preview, Previews, fitting
 from hybrid_mpc.closed_loop.simulate import Monitor, check_models
 from hybrid_mpc.closed_loop.timing import Clock, RealClock, RunnerStep, RunReport, make_report
@@ -59,6 +60,7 @@ class Runner:
         sensor_delay: Periods after which a measurement arrives; pairs it with its input for the monitor.
         clock: Default: the computer's.
         on_step: Called at the end of every period with a :class:`RunnerStep`; must be short.
+        guard: What to do on alarms of the monitor, which it needs. Default: nothing.
         keep: Periods whose rows the report keeps, the last ones. Default 100 000.
 
     Raises:
@@ -88,6 +90,7 @@ class Runner:
         clock: Clock | None = None,
         on_step: Callable[[RunnerStep], None] | None = None,
         keep: int = 100_000,
+        guard: Guard | None = None,
     ) -> None:
         safe = controller if isinstance(controller, SafeController) else SafeController(controller)
         self._safe, self._estimator, self._ocp = safe, estimator, safe.controller.ocp
@@ -104,6 +107,9 @@ class Runner:
         if not 0 < self._deadline <= self._dt * (1 + 1e-9):
             raise InputError(f"Runner: deadline must lie within the period of {self._dt} s, got {deadline} s")
         self._delays = _whole(input_delay, "input_delay"), _whole(sensor_delay, "sensor_delay")
+        if guard is not None and monitor is None:
+            raise InputError("Runner: a guard acts on a monitor's alarms; give monitor= as well")
+        self._guard = guard
         if keep < 1:
             raise InputError(f"Runner: keep must be 1 or more periods, got {keep}")
         self._measure, self._actuate, self._monitor = measure, actuate, monitor
@@ -189,6 +195,8 @@ class _Run:
 
     def __init__(self, runner: Runner, previews: Previews) -> None:
         self._r, self._previews = runner, previews
+        self._guarded = None if runner._guard is None else runner._guard.begin(runner._safe)
+        self._control: SafeController | GuardedLoop = self._guarded or runner._safe
         self.k = self._skipped = self._missing = self._late = self._overruns = self._count = 0
         self._sources: Counter[str] = Counter()
         self._rows: deque[RunnerStep] = deque(maxlen=runner._keep)
@@ -206,7 +214,7 @@ class _Run:
         self._first = self._sample()
         x_ref, factors = self._previews(r._delays[0] * r._dt)
         self._estimate = r._estimator.start(self._first, 0.0)
-        self._decision = r._safe.initial(self._estimate, None, x_ref, factors)
+        self._decision = self._control.initial(self._estimate, None, x_ref, factors)
         self._held.extend([self._decision.u] * (self._held.maxlen or 1))
         self._start = r._clock.now()
 
@@ -230,6 +238,8 @@ class _Run:
         elif not first:
             self._estimate = r._estimator.update(self._estimate, y, previous.u)
         estimate = self._estimate
+        if self._guarded is not None:
+            self._guarded.measured(t, y, previous.u)
         times.append(clock.now())
         decision = self._decided(previous, estimate, x_ref, factors, due + r._deadline)
         times.append(clock.now())
@@ -238,6 +248,8 @@ class _Run:
         reading = None
         if r._monitor is not None:
             self._memory, reading = r._monitor.update(self._memory, y, self._held[0], filtered(estimate))
+            if self._guarded is not None:
+                self._guarded.watched(t, reading)
         times.append(clock.now())
         self._held.append(decision.u)
         self._decision = decision
@@ -257,7 +269,7 @@ class _Run:
     def _decided(
         self, previous: Decision, estimate: Estimate, x_ref: Array, factors: Array | None, deadline: float
     ) -> Decision:
-        safe, clock = self._r._safe, self._r._clock
+        safe, clock = self._control, self._r._clock
         begin = clock.now()
         # Half of the time left is always tried: else a slow spell would end all solving.
         needed = min(min(self._solves, default=0.0), 0.5 * self._r._deadline)
@@ -288,6 +300,8 @@ class _Run:
                 y = np.full(r._estimator.model.n_y, np.nan)
                 self._estimate = r._estimator.update(self._estimate, y, self._decision.u)
                 self._held.append(self._decision.u)
+                if self._guarded is not None:
+                    self._guarded.measured(self.k * r._dt, y, self._decision.u)
         self._skipped += skipped
         self.k = following
 
@@ -296,7 +310,7 @@ class _Run:
         return make_report(
             list(self._rows), self._r._estimator.model, periods=self._count, sources=dict(self._sources),
             missing=self._missing, late=self._late, overruns=self._overruns, skipped=self._skipped,
-            stopped=stopped,
+            stopped=stopped, switches=() if self._guarded is None else tuple(self._guarded.switches),
         )  # fmt: skip
 
 

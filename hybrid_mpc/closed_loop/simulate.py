@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.closed_loop.faults import Fault, check_channels, install
+from hybrid_mpc.closed_loop.guard import Guard, GuardedLoop
 from hybrid_mpc.closed_loop.machine import Machine, Preview, Previews, fitting
 from hybrid_mpc.closed_loop.result import ClosedLoopResult
 from hybrid_mpc.errors import InputError
@@ -85,6 +86,7 @@ def simulate(
     sensor_delay: int = 0,
     input_delay: int = 0,
     late: Callable[[float], bool] | None = None,
+    guard: Guard | None = None,
 ) -> ClosedLoopResult:
     """Run a plant under control; deterministic except for the recorded durations.
 
@@ -120,6 +122,7 @@ def simulate(
         sensor_delay: Periods after which a measurement arrives; faults of a sensor act on arrival.
         input_delay: Periods after which an input reaches the plant: computing and transport.
         late: ``t [s] -> True`` where the solve misses its deadline. Default: never.
+        guard: What to do on alarms of the monitor, which it needs. Default: nothing.
 
     Returns:
         The record of ``round(duration / dt)`` periods.
@@ -143,6 +146,8 @@ def simulate(
     machine = Machine(
         plant, vector(x0, ocp.n_x, "x0"), seed, model.n_y, faults, dt, sensor_delay, input_delay
     )
+    guarded = _guarded(guard, safe, monitor)
+    control = safe if guarded is None else guarded
     estimate: Estimate | None = None
     decision: Decision | None = None
     memory = monitor.initial() if monitor is not None else None
@@ -155,21 +160,25 @@ def simulate(
         x_ref, factors = previews(t + input_delay * dt)
         if estimate is None or decision is None:  # the machine still rests: this is no part of a step
             estimate = estimator.start(seen, t)
-            decision = safe.initial(estimate, None, x_ref, factors)
+            decision = control.initial(estimate, None, x_ref, factors)
             machine.rest(decision.u)
             clock = [perf_counter()]
         else:
             clock = [perf_counter()]
             estimate = estimator.update(estimate, seen, decision.u)
+        if guarded is not None:
+            guarded.measured(t, y, decision.u)
         clock.append(perf_counter())
         if late is not None and late(t):
-            decision = safe.late(decision, estimate, x_ref)
+            decision = control.late(decision, estimate, x_ref)
         else:
-            decision = safe.decide(decision, estimate, x_ref, factors)
+            decision = control.decide(decision, estimate, x_ref, factors)
         clock.append(perf_counter())
         reading = None
         if monitor is not None:
             memory, reading = monitor.update(memory, y, machine.held_at_measurement(), filtered(estimate))
+            if guarded is not None:
+                guarded.watched(t, reading)
         clock.append(perf_counter())
         u, u_prev = machine.command(decision.u)
         if input_delay:
@@ -182,7 +191,13 @@ def simulate(
         if on_step is not None:
             on_step(step)
         machine.advance(t)
-    return record.result()
+    return record.result(guarded)
+
+
+def _guarded(guard: Guard | None, safe: SafeController, monitor: object | None) -> GuardedLoop | None:
+    if guard is not None and monitor is None:
+        raise InputError("a guard acts on a monitor's alarms; give monitor= as well")
+    return None if guard is None else guard.begin(safe)
 
 
 def _checked_cost(ocp: OCP, cost: OCP) -> OCP:
@@ -229,7 +244,7 @@ class _Record:
     def add(self, step: Step, reference: Array, stage: float, spent: Array) -> None:
         self._rows.append((step, reference, stage, spent))
 
-    def result(self) -> ClosedLoopResult:
+    def result(self, guarded: GuardedLoop | None) -> ClosedLoopResult:
         steps = [row[0] for row in self._rows]
         readings = [step.reading for step in steps]
         spent = np.array([row[3] for row in self._rows])
@@ -251,4 +266,5 @@ class _Record:
             violation=np.array([np.nan if r is None else r.violation_w for r in readings]),
             level=np.array([np.nan if r is None else r.level_w for r in readings]),
             alarm=np.array([r is not None and bool(r.alarm) for r in readings]),
+            switches=() if guarded is None else tuple(guarded.switches),
         )

@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_mpc.closed_loop.guard import Switch
 from hybrid_mpc.closed_loop.simulate import Reading
 from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
@@ -100,6 +101,7 @@ class RunReport:
         applied_ms: Instant after the grid's at which each input had been handed over ``(n,)`` [ms].
         timing_ms: Durations ``(n,)`` [ms]: ``measure``, ``estimate``, ``solve``, ``actuate``, ``monitor``.
         alarm: ``(n,)``, True while the monitor alarms.
+        switches: Changes of the guard's mode in the whole run. Default: none.
     """
 
     periods: int
@@ -119,6 +121,7 @@ class RunReport:
     applied_ms: Array
     timing_ms: Mapping[str, Array]
     alarm: NDArray[np.bool_]
+    switches: tuple[Switch, ...] = ()
 
     def percentiles(self) -> dict[str, dict[str, float]]:
         """Median, 95th and 99th percentile and maximum [ms] of lateness, applied instant and durations.
@@ -131,7 +134,7 @@ class RunReport:
 
 def make_report(
     steps: Sequence[RunnerStep], model: HybridModel, *, periods: int, sources: Mapping[str, int],
-    missing: int, late: int, overruns: int, skipped: int, stopped: str,
+    missing: int, late: int, overruns: int, skipped: int, stopped: str, switches: tuple[Switch, ...] = (),
 ) -> RunReport:  # fmt: skip
     """The report of a run from the steps kept and the counts of all.
 
@@ -145,6 +148,7 @@ def make_report(
         overruns: See there.
         skipped: See there.
         stopped: See there.
+        switches: See there.
     """
     ms = 1e3 * np.array([s.spent for s in steps]).reshape(len(steps), len(TIMED))
     return RunReport(
@@ -159,6 +163,7 @@ def make_report(
         applied_ms=1e3 * np.array([s.applied for s in steps]),
         timing_ms={name: ms[:, i] for i, name in enumerate(TIMED)},
         alarm=np.array([s.reading is not None and bool(s.reading.alarm) for s in steps], dtype=bool),
+        switches=switches,
     )  # fmt: skip
 
 

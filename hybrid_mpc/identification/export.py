@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 import nn_export
-from hybrid_mpc.artifact import INPUTS, OUTPUTS, ModelInfo, build_model
+from hybrid_mpc.artifact import INPUTS, OUTPUTS, PARAMETRIC, ModelInfo, build_model
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.identification.networks import Network
 from hybrid_mpc.identification.output_network import OutputModel
@@ -48,8 +48,35 @@ class _Method(nn.Module):
         return result
 
 
+class _Parametric(nn.Module):
+    """The prior's acceleration with its parameters as an input ``p`` ``(n_p,)``, in the order of its specification."""
+
+    def __init__(self, prior: Prior) -> None:
+        super().__init__()
+        self.prior, self.names = prior, list(prior.values)
+
+    def forward(self, x: Tensor, u: Tensor, p: Tensor) -> Tensor:
+        values = {name: p[i] for i, name in enumerate(self.names)}
+        xdot: Tensor = torch.func.functional_call(self.prior, values, (x, u))
+        return xdot[..., self.prior.n_q : 2 * self.prior.n_q]
+
+
+def trace_parametric(prior: Prior) -> nn_export.Program:
+    """Program ``(x, u, p) -> acceleration (n_q,)`` of a prior: how it depends on its parameters.
+
+    Args:
+        prior: The prior; the order of ``p`` is that of ``prior.values``.
+    """
+    sizes = len(prior.states), len(prior.inputs), len(prior.parameters_spec)
+    examples = [torch.zeros(n, dtype=torch.float64) for n in sizes[:2]]
+    examples.append(torch.tensor(list(prior.values.values()), dtype=torch.float64))
+    return nn_export.trace(
+        _Parametric(prior), tuple(examples), input_names=["x", "u", "p"], output_names=["acceleration"]
+    )
+
+
 def trace_model(step: Step, output: OutputModel | None = None) -> dict[str, nn_export.Program]:
-    """Programs ``step, xdot, output, energy_balance`` of one model.
+    """Programs ``step, xdot, output, energy_balance`` of one model, and ``parametric`` of its prior.
 
     Args:
         step: The model.
@@ -63,7 +90,7 @@ def trace_model(step: Step, output: OutputModel | None = None) -> dict[str, nn_e
         "energy_balance": _Method(prior, "energy_balance"),
     }
     examples = _examples(step)
-    return {
+    programs = {
         name: nn_export.trace(
             module,
             tuple(examples[i] for i in INPUTS[name]),
@@ -72,11 +99,12 @@ def trace_model(step: Step, output: OutputModel | None = None) -> dict[str, nn_e
         )
         for name, module in modules.items()
     }
+    return {**programs, PARAMETRIC: trace_parametric(prior)} if prior.parameters_spec else programs
 
 
 def model_info(prior: Prior, dt: float) -> ModelInfo:
     """Period and signals of the models built on ``prior``."""
-    return ModelInfo(dt, prior.states, prior.inputs, prior.outputs)
+    return ModelInfo(dt, prior.states, prior.inputs, prior.outputs, prior.values)
 
 
 def check_parity(

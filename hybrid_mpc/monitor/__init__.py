@@ -1,4 +1,4 @@
-"""Online plausibility: the energy violation, its calibrated alarm, and replay on recordings."""
+"""Online plausibility: the energy violation, its calibrated alarm, what broke, and replay on recordings."""
 
 from hybrid_mpc.monitor.calibration import (
     Calibration,
@@ -7,13 +7,37 @@ from hybrid_mpc.monitor.calibration import (
     count_alarms,
     with_residual,
 )
-from hybrid_mpc.monitor.energy import EnergyMonitor, MonitorReading, MonitorState
+from hybrid_mpc.monitor.detector import Detector
+from hybrid_mpc.monitor.diagnosis import Change, Diagnoser, Diagnosis
+from hybrid_mpc.monitor.energy import EnergyMonitor
+from hybrid_mpc.monitor.learning import learn_detector
+from hybrid_mpc.monitor.plausibility import (
+    Plausibility,
+    excess_bound,
+    learn_plausibility,
+    plan_distance,
+    region_bound,
+)
+from hybrid_mpc.monitor.reading import MonitorReading, MonitorState
 from hybrid_mpc.monitor.replay import MonitorTrace, judge, replay
+from hybrid_mpc.monitor.standard import guard_monitor, learn_from
 
 __all__ = [
     "EnergyMonitor",
     "MonitorState",
     "MonitorReading",
+    "Detector",
+    "learn_detector",
+    "learn_from",
+    "guard_monitor",
+    "Diagnoser",
+    "Diagnosis",
+    "Change",
+    "Plausibility",
+    "learn_plausibility",
+    "excess_bound",
+    "region_bound",
+    "plan_distance",
     "Calibration",
     "calibrate",
     "with_residual",

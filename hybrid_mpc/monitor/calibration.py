@@ -10,11 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.monitor.detector import Detector
+from hybrid_mpc.monitor.plausibility import Plausibility
 
 Array = NDArray[np.float64]
 BLOCK_S = 5.0
 MIN_BLOCKS = 30
 MAX_EXTRAPOLATION = 20.0
+LATER: Mapping[str, Any] = {"detector": Detector, "plausibility": Plausibility}
+"""Fields that calibrations of earlier versions lack."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +35,8 @@ class Calibration:
         data_hash: Hash of the nominal data.
         residual_threshold: Residual level [N m or N] above which the alarm starts too. Default: never.
         residual_release: Residual level [N m or N] below which that ends.
+        detector: Detector of scaled residuals, learned from nominal data. Default: none.
+        plausibility: What is ordinary in the training data, for bounds in the plan. Default: none.
 
     Raises:
         InputError: If ``0 < release_w <= threshold_w`` does not hold, or not so for the residual.
@@ -50,6 +56,8 @@ class Calibration:
     data_hash: str = ""
     residual_threshold: float | None = None
     residual_release: float | None = None
+    detector: Detector | None = None
+    plausibility: Plausibility | None = None
 
     def __post_init__(self) -> None:
         residual = self.residual_release, self.residual_threshold
@@ -65,8 +73,15 @@ class Calibration:
             )
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain dictionary for JSON."""
-        return asdict(self)
+        """Plain dictionary for JSON; what is not there has no field in it, as in earlier versions."""
+        values = asdict(replace(self, detector=None, plausibility=None))
+        for name in LATER:
+            part = getattr(self, name)
+            if part is None:
+                del values[name]
+            else:
+                values[name] = part.to_dict()
+        return values
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Calibration:
@@ -76,9 +91,12 @@ class Calibration:
             InputError: If a field is missing or unknown.
         """
         names = {f.name for f in fields(cls)}
-        if set(values) != names:
-            raise InputError(f"calibration: got fields {sorted(values)}, it needs {sorted(names)}")
-        return cls(**values)
+        if set(values) | set(LATER) != names:
+            raise InputError(
+                f"calibration: got fields {sorted(values)}, it needs {sorted(names - set(LATER))}"
+            )
+        found = {name: kind.from_dict(values[name]) for name, kind in LATER.items() if values.get(name)}
+        return cls(**{**values, **found})
 
 
 def calibrate(
@@ -123,7 +141,7 @@ def calibrate(
         raise InputError(
             f"calibration: {false_alarms_per_hour}/h is too many; ask for at most {1800 / BLOCK_S:g}/h"
         )
-    maxima, finite = _block_maxima(levels, max(round(BLOCK_S / dt), 1))
+    maxima, finite = block_maxima(levels, max(round(BLOCK_S / dt), 1))
     needed = max(MIN_BLOCKS, int(np.ceil(1.0 / (rate * MAX_EXTRAPOLATION))))
     if maxima.size < needed:
         raise InputError(
@@ -132,7 +150,7 @@ def calibrate(
             f"{false_alarms_per_hour:g} false alarms an hour need {needed * BLOCK_S / 60:.1f} min. "
             "Record more, or ask for a higher rate."
         )
-    location, scale = _gumbel(maxima)
+    location, scale = gumbel(maxima)
     threshold = max(location - scale * float(np.log(rate)), floor_w)
     release = min(max(0.5 * threshold, float(np.quantile(finite, 0.95))), threshold)
     hours = finite.size * dt / 3600.0
@@ -187,7 +205,8 @@ def alarm_intervals(
     return [(float(start + a * dt), float(start + b * dt)) for a, b in zip(firsts, lasts, strict=True)]
 
 
-def _block_maxima(levels: Sequence[Array], size: int) -> tuple[Array, Array]:
+def block_maxima(levels: Sequence[Array], size: int) -> tuple[Array, Array]:
+    """Largest finite level of each whole block of ``size`` samples, and all finite levels."""
     maxima, finite = [], []
     for level in levels:
         values = np.asarray(level, dtype=np.float64).reshape(-1)
@@ -200,7 +219,7 @@ def _block_maxima(levels: Sequence[Array], size: int) -> tuple[Array, Array]:
     return np.concatenate(maxima), np.concatenate(finite)
 
 
-def _gumbel(maxima: Array) -> tuple[float, float]:
+def gumbel(maxima: Array) -> tuple[float, float]:
     """Location and scale from the first two L-moments."""
     ordered = np.sort(maxima)
     n = ordered.size

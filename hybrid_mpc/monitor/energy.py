@@ -2,75 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Protocol
+import math
+from typing import Any
 
-import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model import HybridModel
+from hybrid_mpc.monitor.balance import Layout, check_model, reading_function
 from hybrid_mpc.monitor.calibration import Calibration
+from hybrid_mpc.monitor.detector import Detector
+from hybrid_mpc.monitor.reading import QUIET, EstimateLike, MonitorReading, MonitorState
 
 Array = NDArray[np.float64]
-
-
-class EstimateLike(Protocol):
-    """What the monitor reads of an estimate: ``x`` (n_x,) and ``h`` (n_h,). It ignores ``d``."""
-
-    @property
-    def x(self) -> Any:
-        """Estimated state ``(n_x,)``."""
-
-    @property
-    def h(self) -> Any:
-        """Hidden state ``(n_h,)`` before this sample's input."""
-
-
-@dataclass(frozen=True)
-class MonitorState:
-    """All that the monitor remembers. Never changed in place.
-
-    Args:
-        memory: Past measurements, model increments and inputs of the window, in one vector; NaN until filled.
-        x: Estimated state ``(n_x,)`` at the latest sample.
-        h: Hidden state ``(n_h,)`` at the latest sample.
-        violations: The latest ``average`` violations [W]; NaN where there was none.
-        residuals: The latest ``average`` residual forces ``(average, n_q)``; NaN where there was none.
-        alarms: True while the alarm on the violation, and the one on the residual force, is on.
-    """
-
-    memory: Array
-    x: Array
-    h: Array
-    violations: Array
-    residuals: Array
-    alarms: tuple[bool, bool]
-
-
-@dataclass(frozen=True)
-class MonitorReading:
-    """One reading. It speaks of the window's centre, ``EnergyMonitor.delay`` before this sample.
-
-    Args:
-        dE_model_w: Energy balance [W] with the model's acceleration.
-        dE_measured_w: Energy balance [W] with the measured acceleration, at the same state.
-        violation_w: ``|dE_model_w - dE_measured_w|`` [W].
-        level_w: Mean violation [W] over the last ``average`` samples.
-        residual: Force that the model does not explain ``(n_q,)`` [N m for an angle, N for a length]; what
-            sticking friction may hold is taken off near rest.
-        residual_level: Length of the mean residual over the last ``average`` samples.
-        alarm: True while either alarm is on; always False without a calibration.
-    """
-
-    dE_model_w: float
-    dE_measured_w: float
-    violation_w: float
-    level_w: float
-    residual: Array
-    residual_level: float
-    alarm: bool
+FROZEN_STEPS = 3.0
+"""Steps of the sensor that the estimator must have predicted while the sensor repeated itself."""
 
 
 class EnergyMonitor:
@@ -96,6 +43,15 @@ class EnergyMonitor:
     and ``rest_speed``: only what exceeds this dead band counts there; it closes linearly up to twice the
     speed. So a hand that holds the machine still shows, and sticking friction does not.
 
+    The one step starts from an estimate that has followed the measurements, and so has half forgotten what went
+    wrong. With ``free_run`` the model also runs on its own, from ``(x_hat, h)`` of up to so long ago under the
+    applied inputs; its positions go through the same cubic, and what its balance, at its own state, departs from
+    the measured one adds up to an energy. Two such runs, begun half a length apart, take turns: the reading is of
+    the older one. Noise averages out in it, what takes power steadily does not.
+
+    With ``resolution`` a sensor that repeats itself while the one-step predictions add up to more than three of its
+    steps is held for frozen, until it moves.
+
     A missing (NaN) measurement gives NaN readings until it has left the window. The level is the mean of
     the finite ones of the last ``average`` violations, NaN (and no alarm) while fewer than half are finite.
     Positions must count on through full turns. Not for several threads at once (it reuses its buffers).
@@ -104,16 +60,22 @@ class EnergyMonitor:
         model: Model whose outputs are its positions ``q`` (state ``[q, v]``).
         window: Samples in the local polynomial, odd, at least 5.
         average: Samples in the moving average of the level.
-        calibration: Thresholds of the alarm. Default: none, then there is no alarm.
+        calibration: Thresholds of the alarm. Default: none, then there is no alarm from the levels.
         rest_speed: Speed [unit of v] below which friction may stick. Default 0.2.
+        free_run: Length [s] of the model's free runs. Default 0: none.
+        resolution: Step of each sensor ``(n_y,)``. Default: unknown, then there is no test for freezing.
+        detector: Detector of scaled residuals. Default: none.
+        history: Time [s] over which :func:`~hybrid_mpc.monitor.diagnosis.diagnose` looks back. Default 0: not at all.
 
     Raises:
-        InputError: If the window or average is unfit, or the outputs are not the positions.
+        InputError: If the window or average is unfit, a free run is no longer than two windows, the outputs are not
+            the positions, the energy balance says nothing, or the model cannot say what a history needs.
 
     Source: energy balance and violation of the paper (energy objective, powers in W); Savitzky and Golay
     (1964) for the polynomial; Peano kernel theorem for the weighting.
 
     Example:
+        >>> import casadi as ca
         >>> from hybrid_mpc.signals import Signal
         >>> x, h, u, w = ca.MX.sym("x", 2), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w", 2)
         >>> model = HybridModel(
@@ -135,17 +97,27 @@ class EnergyMonitor:
         average: int,
         calibration: Calibration | None = None,
         rest_speed: float = 0.2,
+        free_run: float = 0.0,
+        resolution: ArrayLike | None = None,
+        detector: Detector | None = None,
+        history: float = 0.0,
     ) -> None:
-        _check(model, window, average, rest_speed)
-        self.model = model
-        self.window = window
-        self.average = average
-        self.calibration = calibration
-        self._function = _reading_function(model, window, rest_speed)
-        sizes_in = [self._function.size1_in(i) for i in range(5)]
-        sizes_out = [self._function.size1_out(i) for i in range(3)]
-        self._ins = [np.zeros(n) for n in sizes_in]
-        self._outs = [np.zeros(n) for n in sizes_out]
+        _check(window, average, rest_speed)
+        check_model(model)
+        self.layout = Layout(model, window, average, round(free_run / model.dt), round(history / model.dt))
+        if free_run and self.layout.length < 2 * window:
+            raise InputError(
+                f"energy monitor: a free run of {free_run} s given; two windows, {2 * window * model.dt:g} s, needed"
+            )
+        self.model, self.window, self.average = model, window, average
+        self.calibration, self.detector, self.rest_speed = calibration, detector, rest_speed
+        self._resolution = _positive(resolution, model.n_y)
+        if detector is not None:
+            detector.check(model.n_y, bool(self.layout.length), model.dt)
+        self._function = reading_function(self.layout, rest_speed)
+        self._ins = [np.zeros(self._function.size1_in(i)) for i in range(6)]
+        self._outs = [np.zeros(self._function.size1_out(i)) for i in range(2)]
+        self._sizes = tuple(values.size for values in self._ins[1:5])
         buffer: Any
         buffer, self._evaluate = self._function.buffer()
         for i, array in enumerate(self._ins):
@@ -161,15 +133,10 @@ class EnergyMonitor:
 
     def initial(self) -> MonitorState:
         """State before the first sample."""
-        model = self.model
-        return MonitorState(
-            np.full(self._ins[0].size, np.nan),
-            np.full(model.n_x, np.nan),
-            np.full(model.n_h, np.nan),
-            np.full(self.average, np.nan),
-            np.full((self.average, model.n_x // 2), np.nan),
-            (False, False),
-        )
+        empty = np.full(self.model.n_x, np.nan), np.full(self.model.n_h, np.nan)
+        first = None if self.detector is None else self.detector.initial()
+        memory, left = self.layout.initial()
+        return MonitorState(memory, *empty, QUIET, left, first)
 
     def update(
         self, state: MonitorState, y: Array, u_prev: Array, estimate: EstimateLike
@@ -188,132 +155,114 @@ class EnergyMonitor:
         Raises:
             InputError: If a shape does not fit the model.
         """
+        x, h = _copied(estimate.x), _copied(estimate.h)
         y, u_prev = np.asarray(y, dtype=np.float64), np.asarray(u_prev, dtype=np.float64)
-        x, h = np.array(estimate.x, dtype=np.float64), np.array(estimate.h, dtype=np.float64)
-        model = self.model
-        sizes = y.size, u_prev.size, x.size, h.size
-        if sizes != (model.n_y, model.n_u, model.n_x, model.n_h):
-            raise InputError(
-                f"monitor of model {model.name}: y, u_prev, x, h have {sizes} entries, "
-                f"the model needs {(model.n_y, model.n_u, model.n_x, model.n_h)}"
-            )
+        if (x.size, h.size, u_prev.size, y.size) != self._sizes:
+            raise self._unfit(y, u_prev, x, h)
+        if y.ndim != 1 or u_prev.ndim != 1:
+            y, u_prev = y.reshape(-1), u_prev.reshape(-1)
         ins = self._ins
-        for target, value in zip(ins, (state.memory, state.x, state.h, u_prev, y), strict=True):
-            target[:] = value.reshape(-1)
+        ins[0][:], ins[1][:], ins[2][:], ins[3][:], ins[4][:] = state.memory, state.x, state.h, u_prev, y
+        left = state.left and self._free_runs(state)
         self._evaluate()
-        memory, (de_model, de_measured), residual = (out.copy() for out in self._outs)
-        violation = abs(float(de_model - de_measured))
-        violations, residuals = _push(state.violations, violation), _push(state.residuals, residual)
-        level = float(_mean_of_finite(violations))
-        residual_level = float(np.linalg.norm(_mean_of_finite(residuals)))
+        memory, place, n_q = self._outs[0].copy(), self.layout.averaged, self.model.n_y
+        middle, end = place + self.average, self.layout.runs
+        level = _mean_of_finite(memory[place:middle])
+        if n_q == 1:
+            residual_level = abs(_mean_of_finite(memory[middle:end]))
+        else:
+            residual_level = _length_of_mean(memory[middle:end].reshape(self.average, n_q))
         alarms = self.alarms(level, residual_level, state.alarms)
-        following = MonitorState(memory, x.reshape(-1), h.reshape(-1), violations, residuals, alarms)
-        return following, MonitorReading(
-            float(de_model), float(de_measured), violation, level, residual, residual_level, any(alarms)
-        )
+        numbers = self._outs[1].tolist()
+        frozen = False
+        for travel, step in zip(numbers[3 + n_q : 3 + 2 * n_q], self._resolution, strict=False):
+            frozen = frozen or abs(travel) > FROZEN_STEPS * step
+        energy, seconds = self._older(numbers, left) if left else (math.nan, 0.0)
+        scores: tuple[float, ...]
+        found, scores, detected = state.detector, (), False
+        if self.detector is not None:
+            found, scores, detected = self.detector.update(found, numbers)
+        alarm = alarms[0] or alarms[1] or frozen or detected
+        return MonitorState(memory, x, h, alarms, left, found, frozen), MonitorReading(
+            numbers[0], numbers[1], numbers[2], level, self._outs[1][3 : 3 + n_q].copy(), residual_level, alarm,
+            energy, seconds, frozen, scores, tuple(numbers),
+        )  # fmt: skip
 
     def alarms(self, level: float, residual_level: float, were_on: tuple[bool, bool]) -> tuple[bool, bool]:
         """Whether power and residual alarm at these levels [W], [N m], after having been on or not."""
         c = self.calibration
         if c is None:
-            return False, False
+            return QUIET
         power = level > (c.release_w if were_on[0] else c.threshold_w)
         if c.residual_threshold is None or c.residual_release is None:
             return power, False
         return power, residual_level > (c.residual_release if were_on[1] else c.residual_threshold)
 
+    def _free_runs(self, state: MonitorState) -> tuple[int, ...]:
+        """Periods left of each free run, after beginning those anew that have ended; whose windows are full."""
+        left = state.left
+        if min(left) <= 1:
+            left = self.layout.begin_runs(self._ins[0], left, state.x, state.h)
+        else:
+            left = left[0] - 1, left[1] - 1
+        youngest, judged = self.layout.length - self.window + 2, self._ins[5]
+        judged[0], judged[1] = left[0] <= youngest, left[1] <= youngest
+        return left
 
-def _push(values: Array, latest: Any) -> Array:
-    following = np.empty_like(values)
-    following[:-1], following[-1] = values[1:], latest
-    return following
+    def _older(self, numbers: list[float], left: tuple[int, ...]) -> tuple[float, float]:
+        """Energy and time of the older free run; puts its sums and the time at the end of the numbers."""
+        sums = (numbers[-6:-3], left[0]), (numbers[-3:], left[1])
+        (older, periods), younger = sums if left[0] <= left[1] else sums[::-1]
+        if older[0] != older[0]:  # NaN: not begun yet, or a measurement was missing
+            older, periods = younger
+        seconds = max(self.layout.length - self.window + 3 - periods, 0) * self.model.dt
+        numbers[-6:] = *older, seconds
+        return numbers[-4], seconds
 
-
-def _mean_of_finite(values: Array) -> Any:
-    """Mean along the first axis of the rows without NaN; NaN where fewer than half are."""
-    total = values.sum(axis=0)
-    if np.isfinite(total).all():
-        return total / len(values)
-    finite = values[np.isfinite(values.reshape(len(values), -1)).all(axis=1)]
-    return finite.mean(axis=0) if len(finite) and 2 * len(finite) >= len(values) else total * np.nan
-
-
-def _weights(window: int, dt: float) -> tuple[Array, Array, Array, Array, Array]:
-    """Weights of position, velocity, acceleration, and the Peano kernel at nodes with its slopes."""
-    s = (np.arange(window) - 0.5 * (window - 1)) * dt
-    scale = s[-1]
-    fit = np.linalg.pinv(np.vander(s / scale, 4, increasing=True))
-    position, velocity, acceleration = fit[0], fit[1] / scale, 2.0 * fit[2] / scale**2
-    kernel = np.maximum(s[None, :] - s[:, None], 0.0) @ acceleration
-    return position, velocity, acceleration, kernel, np.diff(kernel) / dt
-
-
-def _inertia(model: HybridModel, x: ca.MX, u: ca.MX) -> ca.MX:
-    """Inertia matrix ``M(q)`` of the energy balance, which is ``v' M a`` plus terms without ``a``."""
-    n_q = model.n_x // 2
-    a, rows = ca.MX.sym("a", n_q), []
-    for i in range(n_q):
-        v = ca.DM.zeros(n_q)
-        v[i] = 1.0
-        state, rate = ca.vertcat(x[:n_q], v), ca.vertcat(v, a)
-        rows.append(ca.jacobian(model.energy_balance(state, rate, u), a))
-    return ca.graph_substitute(ca.vertcat(*rows), [a], [ca.MX.zeros(n_q)])
+    def _unfit(self, y: Array, u_prev: Array, x: Array, h: Array) -> InputError:
+        model = self.model
+        return InputError(
+            f"monitor of model {model.name}: y, u_prev, x, h have {(y.size, u_prev.size, x.size, h.size)} entries, "
+            f"the model needs {(model.n_y, model.n_u, model.n_x, model.n_h)}"
+        )
 
 
-def _residual(
-    model: HybridModel, a_measured: ca.MX, a_model: ca.MX, x: ca.MX, h: ca.MX, u: ca.MX, rest_speed: float
-) -> ca.MX:
-    """Force ``(n_q,)`` that the model does not explain; near rest, what friction could not hold either."""
-    n_q = model.n_x // 2
-    inertia, speed = _inertia(model, x, u), rest_speed * ca.DM.ones(n_q)
-    back, forth = (model.xdot(ca.vertcat(x[:n_q], s), h, u)[n_q:] for s in (-speed, speed))
-    friction = ca.fmax(0, 0.5 * inertia @ (back - forth))
-    held = inertia @ (a_measured - 0.5 * (back + forth))  # friction of either direction taken out
-    held = ca.sign(held) * ca.fmax(0, ca.fabs(held) - friction)
-    near = ca.fmax(0, ca.fmin(1, 2 - ca.fabs(x[n_q:]) / rest_speed))
-    return near * held + (1 - near) * (inertia @ (a_measured - a_model))
+def _copied(values: Any) -> Array:
+    array = np.array(values, dtype=np.float64)
+    return array if array.ndim == 1 else array.reshape(-1)
 
 
-def _reading_function(model: HybridModel, window: int, rest_speed: float) -> ca.Function:
-    """``(memory, x_prev, h_prev, u_prev, y) -> (memory_next, [dE_model, dE_measured], residual)``."""
-    n_q, n_u, dt = model.n_x // 2, model.n_u, model.dt
-    position, velocity, acceleration, kernel, slope = _weights(window, dt)
-    row = 2 * n_q + n_u
-    memory = ca.MX.sym("memory", window * n_q + (window - 1) * row)
-    x, h, u = ca.MX.sym("x", model.n_x), ca.MX.sym("h", model.n_h), ca.MX.sym("u", n_u)
-    y = ca.MX.sym("y", n_q)
-    x_next = model.step(x, h, u)[0]
-    dv = x_next[n_q:] - x[n_q:]
-    dp = x_next[:n_q] - x[:n_q] - dt * x[n_q:]
-    ys = ca.vertcat(memory[n_q : window * n_q], y)
-    rows = ca.vertcat(memory[window * n_q + row :], dv, dp, u)
-    y_grid, row_grid = ca.reshape(ys, n_q, window), ca.reshape(rows, row, window - 1)
-    # Positions relative to the newest: after many turns the small differences keep their digits.
-    relative = y_grid - ca.repmat(y, 1, window)
-    q, v, a_measured = (relative @ ca.DM(w) for w in (position, velocity, acceleration))
-    a_model = row_grid[:n_q, :] @ ca.DM(kernel[1:]) - row_grid[n_q : 2 * n_q, :] @ ca.DM(slope)
-    u_mean = row_grid[2 * n_q :, :] @ ca.DM(0.5 * dt * (kernel[:-1] + kernel[1:]))
-    state = ca.vertcat(q + y, v)
-    balances = [model.energy_balance(state, ca.vertcat(v, a), u_mean) for a in (a_model, a_measured)]
-    residual = _residual(model, a_measured, a_model, state, h, u_mean, rest_speed)
-    outs = [ca.vertcat(ys, rows), ca.vertcat(*balances), residual]
-    return ca.Function("monitor", [memory, x, h, u, y], [ca.densify(out) for out in outs])
+def _mean_of_finite(values: Array) -> float:
+    """Mean of the values that are no NaN; NaN where fewer than half are."""
+    total = float(np.add.reduce(values))
+    if math.isfinite(total):
+        return total / values.size
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if finite.size and 2 * finite.size >= values.size else math.nan
 
 
-def _check(model: HybridModel, window: int, average: int, rest_speed: float) -> None:
+def _length_of_mean(values: Array) -> float:
+    """Length of the mean ``(n_q,)`` of the rows ``(average, n_q)`` without NaN; NaN where fewer than half are."""
+    finite = values[np.isfinite(values).all(axis=1)]
+    if not (len(finite) and 2 * len(finite) >= len(values)):
+        return math.nan
+    mean = finite.sum(axis=0) / len(finite)
+    return math.sqrt(float(mean.dot(mean)))
+
+
+def _positive(resolution: ArrayLike | None, n_y: int) -> tuple[float, ...]:
+    if resolution is None:
+        return ()
+    steps = np.asarray(resolution, dtype=float).ravel()
+    if steps.shape != (n_y,) or not (np.all(np.isfinite(steps)) and np.all(steps > 0)):
+        raise InputError(f"energy monitor: resolution needs {n_y} positive steps of the sensors, got {steps}")
+    return tuple(steps.tolist())
+
+
+def _check(window: int, average: int, rest_speed: float) -> None:
     if not rest_speed > 0:
         raise InputError(f"energy monitor: rest_speed must be positive, got {rest_speed}")
     if window < 5 or window % 2 == 0:
         raise InputError(f"energy monitor: window must be an odd number of at least 5 samples, got {window}")
     if average < 1:
         raise InputError(f"energy monitor: average must be at least 1 sample, got {average}")
-    n_q = model.n_x // 2
-    x, u = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
-    jacobian = ca.Function("C", [x, u], [ca.jacobian(model.output(x, u), ca.vertcat(x, u))])
-    given = np.array(jacobian(0, 0).full())
-    if given.shape[0] != n_q or not np.array_equal(given, np.eye(n_q, model.n_x + model.n_u)):
-        raise InputError(
-            f"energy monitor: the outputs of model {model.name} must be its positions "
-            f"{[s.name for s in model.states[:n_q]]}; it measures {[s.name for s in model.outputs]}. "
-            "Give a model whose output is x[:n_q]."
-        )

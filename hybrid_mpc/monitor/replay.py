@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.monitor.calibration import alarm_intervals
 from hybrid_mpc.monitor.energy import EnergyMonitor
+from hybrid_mpc.monitor.reading import MonitorReading, MonitorState
 
 Array = NDArray[np.float64]
 
@@ -43,7 +45,10 @@ class TrajectoryLike(Protocol):
 
 @dataclass(frozen=True)
 class MonitorTrace:
-    """Readings over time, all ``(n,)``; see :class:`~hybrid_mpc.monitor.energy.MonitorReading`.
+    """Readings over time, all ``(n,)``; see :class:`~hybrid_mpc.monitor.reading.MonitorReading`.
+
+    ``scores`` are ``(n, 2)`` and ``numbers`` ``(n, columns)``; without a detector there are no scores. ``state`` is the
+    monitor's after the last sample.
 
     Example:
         >>> z = np.zeros(3)
@@ -58,19 +63,31 @@ class MonitorTrace:
     level_w: Array
     residual_level: Array
     alarm: NDArray[np.bool_]
+    energy_j: Array = field(default_factory=lambda: np.zeros(0))
+    energy_s: Array = field(default_factory=lambda: np.zeros(0))
+    frozen: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    scores: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    numbers: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    state: MonitorState | None = None
 
     def intervals(self) -> list[tuple[float, float]]:
         """Alarms as ``(first, last)`` [s] in the recording's own time."""
         return [(float(self.t[int(a)]), float(self.t[int(b)])) for a, b in alarm_intervals(self.alarm, 1.0)]
 
 
-def replay(monitor: EnergyMonitor, estimator: EstimatorLike, trajectory: TrajectoryLike) -> MonitorTrace:
+def replay(
+    monitor: EnergyMonitor,
+    estimator: EstimatorLike,
+    trajectory: TrajectoryLike,
+    on_reading: Callable[[int, MonitorState, MonitorReading], None] | None = None,
+) -> MonitorTrace:
     """Feed a recording to the estimator and the monitor, sample by sample.
 
     Args:
         monitor: The monitor.
         estimator: With ``start(y, t)`` and ``update(estimate, y, u_prev)``.
         trajectory: With ``t`` (n,), ``y`` (n, n_y), ``u`` (n, n_u) on the model's grid.
+        on_reading: Called with each sample's number, the state after it and its reading. Default: none.
 
     Raises:
         InputError: If the recording is empty, its lengths differ, or its period is not the model's.
@@ -86,11 +103,17 @@ def replay(monitor: EnergyMonitor, estimator: EstimatorLike, trajectory: Traject
         u_prev = u[k - 1] if k else np.full(monitor.model.n_u, np.nan)
         if k:
             estimate = estimator.update(estimate, y[k], u_prev)
-        state, r = monitor.update(state, y[k], u_prev, estimate)
-        readings.append((r.dE_model_w, r.dE_measured_w, r.violation_w, r.level_w, r.residual_level, r.alarm))
-    columns = np.array(readings, dtype=np.float64).T
-    balances, levels = (columns[0], columns[1]), (columns[2], columns[3], columns[4])
-    return MonitorTrace(t, *balances, *levels, columns[5].astype(bool))
+        state, reading = monitor.update(state, y[k], u_prev, estimate)
+        readings.append(reading)
+        if on_reading is not None:
+            on_reading(k, state, reading)
+    names = "dE_model_w", "dE_measured_w", "violation_w", "level_w", "residual_level", "energy_j", "energy_s"
+    columns: dict[str, Any] = {name: np.array([getattr(r, name) for r in readings]) for name in names}
+    for name in ("alarm", "frozen"):
+        columns[name] = np.array([getattr(r, name) for r in readings], dtype=bool)
+    scores = np.array([r.scores for r in readings], dtype=np.float64)
+    numbers = np.array([r.numbers for r in readings], dtype=np.float64)
+    return MonitorTrace(t, **columns, scores=scores, numbers=numbers, state=state)
 
 
 def judge(monitor: EnergyMonitor, trace: MonitorTrace) -> MonitorTrace:

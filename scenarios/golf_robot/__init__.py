@@ -9,6 +9,7 @@ from hybrid_mpc.scenario import DEFAULT_BUDGETS, Scenario
 from scenarios.golf_robot.data import make_data
 from scenarios.golf_robot.drawing import draw
 from scenarios.golf_robot.experiment import DATA, EXPERIMENT
+from scenarios.golf_robot.faults import CAUSES
 from scenarios.golf_robot.oracle import oracle
 from scenarios.golf_robot.rig import Rig
 from scenarios.golf_robot.tasks import CONTROL, QUICK_TASKS, TASKS
@@ -45,6 +46,7 @@ scenario = Scenario(
     tasks=TASKS,
     draw=draw,
     experiment=EXPERIMENT,
+    causes=CAUSES,
     budgets={
         "quick": replace(DEFAULT_BUDGETS["quick"], tasks=QUICK_TASKS),
         "full": replace(DEFAULT_BUDGETS["full"], oracle_seeds=10),

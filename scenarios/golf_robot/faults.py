@@ -10,6 +10,9 @@ import numpy as np
 from hybrid_mpc.closed_loop.faults import Fault
 from hybrid_mpc.errors import InputError
 
+CAUSES = {"friction": ("d", "mu"), "mass": ("m", "J"), "motor": ("gain of u",)}
+"""What may break, and the prior's parameters that change together then."""
+
 
 @dataclass(frozen=True)
 class FaultCase:

@@ -1,0 +1,81 @@
+"""What the diagnosis says of known faults: ``python benchmarks/guard_causes.py --model DIR --noise control.json
+--detector FILE.json [--seeds 3] [--after 0.5 1.2 2.2] [--keep DIR]``.
+
+The loops of guard_delays.py, replayed; what the diagnosis says so long [s] after the onset, of its whole history and of
+the time since the onset alone. An artifact of an earlier version is completed with the prior's program of its
+provenance (torch).
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from guard_delays import Estimate
+from guard_loops import DT, FAULTS, Loops, fault_plans, read_noise
+
+from hybrid_mpc.artifact import load_artifact
+from hybrid_mpc.files import read_json
+from hybrid_mpc.monitor import Detector, Diagnoser, guard_monitor
+from scenarios.golf_robot import scenario
+
+
+def completed(artifact):
+    """The hybrid, which knows how its prior depends on its parameters."""
+    model = artifact.models["hybrid"]
+    if model.parametric is not None:
+        return model
+    import nn_export
+    from hybrid_mpc.identification.export import trace_parametric
+
+    prior = scenario.prior(artifact.provenance["prior_parameters"])
+    return replace(
+        model, parameters=prior.values, parametric=nn_export.build(trace_parametric(prior), "parametric")
+    )
+
+
+def said(monitor, diagnoser, loop, onset: float, after) -> list[str]:
+    """Texts at the instants."""
+    state, texts, wanted = monitor.initial(), [], {round((onset + s) / DT): s for s in after}
+    for k in range(len(loop["t"])):
+        u_prev = loop["u"][k - 1] if k else np.zeros(1)
+        state, _ = monitor.update(state, loop["y"][k], u_prev, Estimate(loop["x_hat"][k], loop["h"][k]))
+        if k in wanted:
+            whole, recent = diagnoser.diagnose(state).text, diagnoser.diagnose(state, wanted[k]).text
+            texts.append(f"{wanted[k]:g} s: {whole} [since the onset: {recent}]")
+    return texts
+
+
+def main() -> None:
+    """Print what is said."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--model", type=Path, required=True, help="artifact folder with prior and hybrid")
+    parser.add_argument(
+        "--noise", type=Path, required=True, help="control.json of a run: process noise of the filter"
+    )
+    parser.add_argument("--detector", type=Path, required=True, help="JSON file with a field 'detector'")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--after", type=float, nargs="+", default=(0.5, 1.2, 2.2))
+    parser.add_argument("--keep", type=Path, help="folder of the loops")
+    given = parser.parse_args()
+    artifact = load_artifact(given.model)
+    monitor = guard_monitor(
+        completed(artifact), Detector.from_dict(read_json(given.detector)["detector"]), diagnose=True
+    )
+    diagnoser, loops = (
+        Diagnoser(monitor, scenario.causes),
+        Loops(artifact, read_noise(given.noise), given.keep),
+    )
+    for plan in fault_plans(FAULTS, given.seeds, 500):
+        for text in said(monitor, diagnoser, loops.run(plan), plan.onset, given.after):
+            print(f"{plan.case} {plan.seed}, {text}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

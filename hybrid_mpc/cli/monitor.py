@@ -1,0 +1,90 @@
+"""``hybrid-mpc monitor``: the energy monitor over recordings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.scenario import load_scenario
+
+EXAMPLES = (
+    "Examples:\n\n"
+    "  hybrid-mpc monitor runs/golf/model day1.csv day2.csv --learn 1 --out nominal\n\n"
+    "  hybrid-mpc monitor runs/golf/model today.csv --calibration nominal/calibration.json --out today\n\n"
+    "  hybrid-mpc monitor runs/mine/model today.csv --scenario my_machine.py --out today"
+)
+
+
+def monitor(
+    model: Annotated[Path, typer.Argument(help="Artifact folder: model/ of a finished run.")],
+    recordings: Annotated[list[Path], typer.Argument(help="Recordings: CSV, .npz or .mat.")],
+    out: Annotated[Path, typer.Option(help="Folder to make; an existing one must be empty.")],
+    scenario: Annotated[
+        str, typer.Option(help="Columns and period: a name or a .py file. Default: the model's own.")
+    ] = "",
+    learn: Annotated[
+        float,
+        typer.Option(help="The recordings are nominal: learn a detector for so many false alarms an hour."),
+    ] = 0.0,
+    calibration: Annotated[
+        Path | None, typer.Option(help="calibration.json with a detector. Default: the model's own.")
+    ] = None,
+    resolution: Annotated[
+        list[float] | None,
+        typer.Option(help="Step of a sensor [its unit]; once for each: test for freezing."),
+    ] = None,
+    noise: Annotated[
+        Path | None,
+        typer.Option(help="control.json with the filter's noise. Default: that of the model's run."),
+    ] = None,
+) -> None:
+    """Say where in recordings the model does not describe the machine, and what would explain it."""
+    from hybrid_mpc.artifact import FILE
+    from hybrid_mpc.files import read_json
+    from hybrid_mpc.pipeline.control_results import check_folder
+    from hybrid_mpc.pipeline.monitor_job import learn as learn_job
+    from hybrid_mpc.pipeline.monitor_job import prepared, watch
+
+    check_folder(out)
+    if not scenario:
+        folder = model if (model / FILE).is_file() else model / "model"
+        scenario = str(read_json(folder / FILE).get("provenance", {}).get("scenario", ""))
+        if not scenario:
+            raise InputError(f"{folder / FILE} does not say whose model it is; give --scenario")
+    job = prepared(
+        load_scenario(scenario), model, recordings, noise=noise, resolution=tuple(resolution) if resolution else None,
+        calibration=None if learn else calibration,
+    )  # fmt: skip
+    if learn:
+        found = learn_job(job, learn, out)
+        print(
+            f"learned from {60 * found.hours:.1f} min, for {found.false_alarms_per_hour:g} false alarms an hour"
+        )
+        print(f"detector: {(out / 'calibration.json').resolve()}")
+        return
+    for line in summary(watch(job, out)):
+        print(line)
+    print(f"results: {(out / 'monitor.json').resolve()}")
+
+
+def summary(results: dict[str, Any]) -> list[str]:
+    """One line a recording and alarm.
+
+    Args:
+        results: What monitor.json holds.
+    """
+    lines = []
+    for row in results["recordings"]:
+        n = len(row["alarms"])
+        lines.append(f"{row['recording']}: {row['seconds']:.1f} s, {n} alarm{'' if n == 1 else 's'}")
+        for alarm in row["alarms"]:
+            why = f": {alarm['diagnosis']}" if alarm["diagnosis"] else ""
+            lines.append(f"  {alarm['start_s']:.2f} to {alarm['end_s']:.2f} s{why}")
+    lines += [
+        f"gap in {cut['file']}: {cut['start']:.2f} to {cut['end']:.2f} s, {cut['why']}"
+        for cut in results["gaps"]
+    ]
+    return lines

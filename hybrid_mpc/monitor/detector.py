@@ -1,0 +1,210 @@
+"""Detector of small, lasting departures: residuals in units of their own scatter, summed up."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.errors import InputError
+
+Array = NDArray[np.float64]
+CAP = 1.5
+"""A sum goes no higher than so many thresholds: what has passed is soon forgotten."""
+SHORTEST_S = 0.08
+"""Accumulated times of a free run below this say little."""
+TERMS = 4
+"""Terms of a scale: constant, squared speed, squared input, and rest (force) or one over the time (energy)."""
+
+
+@dataclass(frozen=True)
+class DetectorState:
+    """What the detector remembers.
+
+    Args:
+        sums: Sums of each force upwards, then downwards.
+        on: True while the alarm on a force, on the energy, is on.
+    """
+
+    sums: tuple[float, ...]
+    on: tuple[bool, bool]
+
+
+@dataclass(frozen=True)
+class Detector:
+    """Cumulative sums of scaled residual forces, and a threshold on the scaled power of the free runs.
+
+    A nominal residual grows with speed, input and near rest. Its variance is learned as
+    ``a_0 + a_1 |v|^2 + a_2 |u|^2 + a_3 / (1 + |v|^2 / rest_speed^2)`` with coefficients that are not negative, and
+    ``z`` is the residual over its deviation. ``g = max(0, g + |z| - drift)``, upwards and downwards apart, rises under
+    a lasting departure above ``drift`` and falls otherwise: the sooner over its threshold, the larger the departure.
+    The energy of a free run, over the time it was accumulated in, has the last term ``a_3 / time``; it is an average
+    already and is compared as it is. Either alarm ends at its ``release``.
+
+    Args:
+        dt: Period [s] it was learned at.
+        force: Coefficients of each force's variance ``(n_q, 4)`` [N^2 m^2 or N^2, ...].
+        energy: Coefficients of the power's variance ``(4,)`` [W^2, ...]; empty without free runs.
+        drift: Departure [deviations] that counts as nothing.
+        force_threshold: Sum [deviations] above which the force's alarm starts.
+        energy_threshold: Scaled power above which the energy's alarm starts; infinite without free runs.
+        release: Share of the threshold at which an alarm ends.
+        rest_speed: Speed [unit of v] of the scale's term at rest.
+        false_alarms_per_hour: Wanted rate on nominal data [1/h].
+        hours: Duration of the nominal data [h].
+        interval: 5 % and 95 % of a block bootstrap of the thresholds: ``(force low, high, energy low, high)``.
+        method: How the thresholds were found.
+        data_hash: Hash of the nominal data.
+
+    Raises:
+        InputError: If a number is not as said.
+
+    Source: Page, *Continuous inspection schemes*, Biometrika 41 (1954).
+
+    Example:
+        >>> detector = Detector(0.02, ((0.01, 0.0, 0.0, 0.0),), (), 0.5, 4.0)
+        >>> state, alarms = detector.initial(), []
+        >>> for force in (0.0, 0.3, 0.3, 0.3):  # three deviations
+        ...     numbers = [0.0, 0.0, 0.0, force, 0.0, 1.0, 0.0]
+        ...     state, scores, alarm = detector.update(state, numbers)
+        ...     alarms.append(alarm)
+        >>> alarms
+        [False, False, True, True]
+    """
+
+    dt: float
+    force: tuple[tuple[float, ...], ...]
+    energy: tuple[float, ...]
+    drift: float
+    force_threshold: float
+    energy_threshold: float = math.inf
+    release: float = 0.5
+    rest_speed: float = 0.2
+    false_alarms_per_hour: float = math.nan
+    hours: float = 0.0
+    interval: tuple[float, ...] = ()
+    method: str = ""
+    data_hash: str = ""
+
+    def __post_init__(self) -> None:
+        wrong = [row for row in (*self.force, self.energy or (1.0,) * TERMS) if not _fit(row)]
+        if wrong or not self.force:
+            raise InputError(
+                f"detector: scales need {TERMS} numbers each, not negative, not all 0; got {wrong}"
+            )
+        if not (self.dt > 0 and self.rest_speed > 0 and 0 <= self.drift < math.inf and 0 < self.release <= 1):
+            raise InputError(
+                f"detector: dt {self.dt} and rest_speed {self.rest_speed} must be positive, drift {self.drift} not "
+                f"negative, release {self.release} within 0 to 1"
+            )
+        if not (self.force_threshold > 0 and self.energy_threshold > 0):
+            given = self.force_threshold, self.energy_threshold
+            raise InputError(f"detector: thresholds must be positive, got {given}")
+
+    def initial(self) -> DetectorState:
+        """State before the first sample."""
+        return DetectorState((0.0,) * (2 * len(self.force)), (False, False))
+
+    def check(self, n_q: int, free_runs: bool, dt: float | None = None) -> None:
+        """Refuse a monitor that this detector was not learned for.
+
+        Raises:
+            InputError: If it has another number of forces, no free runs to judge, or another period.
+        """
+        if len(self.force) != n_q:
+            raise InputError(f"detector: learned for {len(self.force)} forces, the model has {n_q}")
+        if self.energy and not free_runs:
+            raise InputError(
+                "detector: it judges free runs, the monitor has none; give free_run=0.8 [s], say"
+            )
+        if dt is not None and abs(dt - self.dt) > 1e-9 * self.dt:
+            raise InputError(
+                f"detector: learned at a period of {self.dt} s, the model's is {dt} s; learn it anew"
+            )
+
+    def deviations(self, v2: Array, u2: Array) -> Array:
+        """Standard deviations ``(n, n_q)`` of nominal residual forces at squared speeds and inputs ``(n,)``."""
+        terms = np.column_stack([np.ones(len(v2)), v2, u2, 1.0 / (1.0 + v2 / self.rest_speed**2)])
+        return np.asarray(np.sqrt(terms @ np.array(self.force).T))
+
+    def update(
+        self, state: DetectorState, numbers: Sequence[float]
+    ) -> tuple[DetectorState, tuple[float, float], bool]:
+        """One sample.
+
+        Args:
+            state: State after the sample before.
+            numbers: What :attr:`MonitorReading.numbers` holds; a departure that is not finite changes nothing.
+
+        Returns:
+            The next state; the largest sum and the scaled power as shares of their thresholds; whether an alarm is on.
+        """
+        n = len(self.force)
+        end = 3 + 3 * n
+        stop = len(numbers) - 4 if self.energy else len(numbers)
+        v2 = u2 = 0.0
+        for v in numbers[3 + 2 * n : end]:
+            v2 += v * v
+        for u in numbers[end:stop]:
+            u2 += u * u
+        near = 1.0 / (1.0 + v2 / self.rest_speed**2)
+        most, drift, sums, largest = CAP * self.force_threshold, self.drift, list(state.sums), 0.0
+        for i, (a0, a1, a2, a3) in enumerate(self.force):
+            z = numbers[3 + i] / math.sqrt(a0 + a1 * v2 + a2 * u2 + a3 * near)
+            if z == z:  # not NaN
+                up, down = sums[i] + z - drift, sums[n + i] - z - drift
+                sums[i] = 0.0 if up < 0.0 else min(up, most)
+                sums[n + i] = 0.0 if down < 0.0 else min(down, most)
+            largest = max(largest, sums[i], sums[n + i])
+        force = largest / self.force_threshold
+        power = self._power(numbers[-4:]) / self.energy_threshold if self.energy else 0.0
+        was = state.on
+        on = force > (self.release if was[0] else 1.0), power > (self.release if was[1] else 1.0)
+        return DetectorState(tuple(sums), on), (force, power), on[0] or on[1]
+
+    def _power(self, numbers: Sequence[float]) -> float:
+        """Mean power of the older free run over its deviation, from energy, squared speed and input, and time."""
+        energy, v2, u2, seconds = numbers
+        if not (seconds >= SHORTEST_S and energy == energy):
+            return 0.0
+        a0, a1, a2, a3 = self.energy
+        v2, u2 = v2 / seconds, u2 / seconds
+        return abs(energy) / seconds / math.sqrt(a0 + a1 * v2 + a2 * u2 + a3 / seconds)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain dictionary for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Detector:
+        """Detector from :meth:`to_dict`'s dictionary, read back from JSON too.
+
+        Raises:
+            InputError: If a field is unknown or a needed one is missing.
+
+        Example:
+            >>> detector = Detector(0.02, ((0.01, 0.0, 0.0, 0.0),), (), 0.5, 4.0)
+            >>> Detector.from_dict(detector.to_dict()).force_threshold
+            4.0
+        """
+        names = {f.name for f in fields(cls)}
+        if not set(values) <= names:
+            raise InputError(f"detector: unknown fields {sorted(set(values) - names)}")
+        given: dict[str, Any] = {
+            k: float(v) if v in ("inf", "nan") else v for k, v in values.items()
+        }  # JSON's stand-ins
+        try:
+            given["force"] = tuple(tuple(map(float, row)) for row in given["force"])
+            given["energy"] = tuple(map(float, given["energy"]))
+            given["interval"] = tuple(map(float, given.get("interval", ())))
+            return cls(**given)
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(f"detector: damaged: {type(error).__name__} {error}") from error
+
+
+def _fit(row: Sequence[float]) -> bool:
+    return len(row) == TERMS and all(math.isfinite(a) and a >= 0 for a in row) and any(row)

@@ -1,0 +1,193 @@
+"""A detector learned from nominal data: scales of its residuals, thresholds for a wanted rate of false alarms."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.monitor.calibration import BLOCK_S, block_maxima, calibrate, gumbel
+from hybrid_mpc.monitor.detector import SHORTEST_S, Detector
+
+Array = NDArray[np.float64]
+ROUNDS = 5
+FLOOR = 1e-3
+"""Smallest constant of a variance, as a share of its mean: a scale must not vanish where the data were quiet."""
+BOOTSTRAPS = 200
+NEIGHBOURS = 6
+"""Blocks of 5 s that are drawn together: half a minute, longer than what one motion does to the next."""
+ODD = 1e-4
+"""A largest block less probable than this under the rest of its own kind is no nominal one."""
+
+
+def learn_detector(
+    runs: Sequence[Array],
+    dt: float,
+    n_q: int,
+    *,
+    free_runs: bool = True,
+    drift: float = 1.0,
+    false_alarms_per_hour: float = 1.0,
+    rest_speed: float = 0.2,
+    data_hash: str = "",
+    seed: int = 0,
+) -> Detector:
+    """A detector from nominal readings.
+
+    Scales come from weighted least squares of the squared residuals with coefficients that are not negative, and
+    thresholds from a Gumbel tail of the block maxima (:func:`~hybrid_mpc.monitor.calibration.calibrate`), half of the
+    wanted rate for either alarm. Beside them stands what a block bootstrap makes of the same maxima: half a minute is
+    drawn at a time, so that neighbours stay together.
+
+    Args:
+        runs: ``MonitorReading.numbers`` of nominal runs, each ``(n, columns)``.
+        dt: Period [s].
+        n_q: Degrees of freedom.
+        free_runs: Whether the numbers hold free runs. Default: yes.
+        drift: See :class:`~hybrid_mpc.monitor.detector.Detector`. Default 1.
+        false_alarms_per_hour: Wanted rate [1/h]; default 1.
+        rest_speed: Speed [unit of v] of the scale's term at rest.
+        data_hash: Hash of the data, kept in the result.
+        seed: Of the bootstrap.
+
+    Raises:
+        InputError: If there is too little data for the rate, no motion, or an alarm in what should be nominal.
+
+    Source: Lawson and Hanson (1974) for the least squares; Künsch, *The jackknife and the bootstrap for general
+    stationary observations*, Annals of Statistics 17 (1989).
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> numbers = np.zeros((40_000, 7))
+        >>> numbers[:, 5] = np.sin(0.01 * np.arange(40_000))
+        >>> numbers[:, 3] = rng.normal(size=40_000) * (0.1 + 0.2 * np.abs(numbers[:, 5]))
+        >>> detector = learn_detector([numbers], 0.02, 1, free_runs=False, false_alarms_per_hour=10)
+        >>> bool(detector.force[0][1] > 0.01)  # its variance grows with speed
+        True
+    """
+    if not runs or any(run.ndim != 2 for run in runs):
+        raise InputError(
+            "learn_detector: no nominal runs given; needed: arrays (n, columns) of reading numbers"
+        )
+    rows = np.concatenate([np.asarray(run, dtype=np.float64) for run in runs])
+    end = rows.shape[1] - (4 if free_runs else 0)
+    v2, u2 = (rows[:, 3 + 2 * n_q : 3 + 3 * n_q] ** 2).sum(1), (rows[:, 3 + 3 * n_q : end] ** 2).sum(1)
+    features = np.column_stack([np.ones(len(rows)), v2, u2, 1.0 / (1.0 + v2 / rest_speed**2)])
+    force = tuple(_scale(features, rows[:, 3 + i], f"force {i}") for i in range(n_q))
+    energy: tuple[float, ...] = ()
+    if free_runs:
+        energy_j, v2, u2, seconds = rows[:, -4:].T
+        long = seconds >= SHORTEST_S
+        time = np.where(long, seconds, np.inf)
+        features = np.column_stack([np.ones(len(rows)), v2 / time, u2 / time, 1.0 / time])
+        energy = _scale(features[long], (energy_j / time)[long], "power of the free runs")
+    raw = Detector(dt, force, energy, drift, 1e300, 1e300 if free_runs else math.inf, rest_speed=rest_speed)
+    levels = [detector_levels(raw, run) for run in runs]
+    rate = false_alarms_per_hour / (2 if free_runs else 1)
+    rng = np.random.default_rng(seed)
+    sums = _threshold([a for a, _ in levels], dt, rate, rng, "forces")
+    power = _threshold([b for _, b in levels], dt, rate, rng, "power") if free_runs else (math.inf, ())
+    return replace(
+        raw,
+        force_threshold=sums[0],
+        energy_threshold=power[0],
+        false_alarms_per_hour=false_alarms_per_hour,
+        hours=len(rows) * dt / 3600.0,
+        interval=(*sums[1], *power[1]),
+        method=f"Gumbel tail of maxima in blocks of {BLOCK_S:g} s, block bootstrap beside it",
+        data_hash=data_hash,
+    )
+
+
+def detector_levels(detector: Detector, run: Array) -> tuple[Array, Array]:
+    """Largest sum of the forces and scaled power ``(n,)`` along a run's numbers ``(n, columns)``.
+
+    They are not shares of the thresholds, and no alarm limits the sums.
+
+    Example:
+        >>> detector = Detector(0.02, ((0.01, 0.0, 0.0, 0.0),), (), 0.5, 4.0)
+        >>> run = np.array([[0.0, 0.0, 0.0, 0.3, 0.0, 1.0, 0.0]] * 3)
+        >>> detector_levels(detector, run)[0].round(6)
+        array([2.5, 5. , 7.5])
+    """
+    free = replace(detector, force_threshold=1e300, energy_threshold=1e300 if detector.energy else math.inf)
+    state, scores = free.initial(), []
+    for numbers in run.tolist():
+        state, score, _ = free.update(state, numbers)
+        scores.append(score)
+    levels = np.array(scores).reshape(-1, 2) * 1e300
+    return levels[:, 0], levels[:, 1] if detector.energy else np.zeros(len(levels))
+
+
+def _scale(features: Array, values: Array, what: str) -> tuple[float, ...]:
+    """Coefficients of the variance of ``values``, by least squares with weights from the fit before."""
+    known = np.isfinite(values) & np.isfinite(features).all(axis=1)
+    features, squares = features[known], values[known] ** 2
+    if not squares.size or not np.mean(squares) > 0:
+        raise InputError(
+            f"learn_detector: the {what} is zero or missing throughout; record the machine in motion"
+        )
+    floor = FLOOR * float(np.mean(squares))
+    spread = np.full(squares.size, float(np.mean(squares)))
+    found = np.zeros(features.shape[1])
+    for _ in range(ROUNDS):
+        found, _ = nnls(features / spread[:, None], squares / spread)
+        found[0] = max(found[0], floor)
+        spread = features @ found
+    return tuple(float(a) for a in found)
+
+
+def _threshold(
+    levels: Sequence[Array], dt: float, rate: float, rng: np.random.Generator, what: str
+) -> tuple[float, tuple[float, float]]:
+    """Threshold at the wanted rate, and 5 % to 95 % of it over resampled blocks."""
+    fit = calibrate(levels, dt, false_alarms_per_hour=rate)
+    maxima, _ = block_maxima(levels, max(round(BLOCK_S / dt), 1))
+    check_nominal(maxima, what)
+    log_rate = math.log(rate * BLOCK_S / 3600.0)
+    groups = math.ceil(maxima.size / NEIGHBOURS)
+    starts = rng.integers(0, max(maxima.size - NEIGHBOURS, 0) + 1, size=(BOOTSTRAPS, groups))
+    drawn = maxima[np.minimum(starts[:, :, None] + np.arange(NEIGHBOURS), maxima.size - 1)].reshape(
+        BOOTSTRAPS, -1
+    )
+    found = []
+    for sample in drawn:
+        location, scale = gumbel(sample)
+        found.append(location - scale * log_rate)
+    low, high = np.quantile(found, [0.05, 0.95])
+    return fit.threshold_w, (float(low), float(high))
+
+
+def check_nominal(maxima: Array, what: str) -> None:
+    """Refuse data in which a block stands out so far that it can be no nominal one.
+
+    Location and scale come from the quartiles, which a few odd blocks hardly move.
+
+    Args:
+        maxima: Largest level of each block, in their order.
+        what: Whose, for the message.
+
+    Raises:
+        InputError: With the places of the odd blocks.
+
+    Example:
+        >>> check_nominal(np.append(np.random.default_rng(0).gumbel(size=60), 30.0), "forces")
+        Traceback (most recent call last):
+        hybrid_mpc.errors.InputError: calibration data of the forces hold an alarm: ... s stand out ...
+    """
+    low, high = np.quantile(maxima, [0.25, 0.75])
+    scale = max((high - low) / (-math.log(-math.log(0.75)) + math.log(-math.log(0.25))), 1e-12)
+    location = low + scale * math.log(-math.log(0.25))
+    limit = location - scale * math.log(-math.log1p(-ODD) / maxima.size)
+    odd = np.flatnonzero(maxima > limit)
+    if odd.size:
+        places = ", ".join(f"{i * BLOCK_S:g}" for i in odd[:5])
+        raise InputError(
+            f"calibration data of the {what} hold an alarm: blocks of {BLOCK_S:g} s from {places} s stand out "
+            f"(up to {maxima.max():.3g}, nominal blocks stay below {limit:.3g}); cut them out, or find what was wrong"
+        )

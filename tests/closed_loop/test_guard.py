@@ -1,0 +1,212 @@
+"""A guard that reacts: nothing changes without an alarm, nothing jumps with one."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from closed_loop_parts import DT, make_ekf, make_safe, run, sine
+from online_models import PendulumPlant, pendulum_model
+
+from hybrid_mpc.closed_loop import Fault, Guard, Mode, Runner
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.monitor import EnergyMonitor
+from hybrid_mpc.mpc import Limits
+
+DU = 0.4
+
+
+@dataclass(frozen=True)
+class Said:
+    """A reading."""
+
+    alarm: bool
+    frozen: bool = False
+    violation_w: float = 0.0
+    level_w: float = 0.0
+
+
+class Told:
+    """A monitor that alarms when it is told to; its state counts periods."""
+
+    def __init__(self, alarms=(), frozen=()):
+        self._alarms, self._frozen = alarms, frozen
+
+    def initial(self):
+        return 0
+
+    def update(self, state, y, u_prev, estimate):
+        frozen = any(a <= state < b for a, b in self._frozen)
+        return state + 1, Said(frozen or any(a <= state < b for a, b in self._alarms), frozen)
+
+
+def guarded(guard, monitor, **changes):
+    model = pendulum_model(3)
+    return run(model, make_safe(model, du_max=DU), guard=guard, monitor=monitor, duration=1.2, **changes)
+
+
+def backup(**times):
+    prior = pendulum_model()
+    return Guard(backup=make_safe(prior, du_max=DU), backup_estimator=make_ekf(prior), **times)
+
+
+def test_without_an_alarm_the_loop_is_bit_equal():
+    plain, same = guarded(None, Told()), guarded(backup(limits=Limits([-0.5], [0.5])), Told())
+    for name in ("x", "u", "x_hat", "h", "stage_cost"):
+        assert np.array_equal(getattr(plain, name), getattr(same, name)), name
+    assert same.switches == ()
+    assert set(same.mode) == {"NORMAL"}
+
+
+@pytest.mark.parametrize("mode", [Mode.LIMITED, Mode.BACKUP, Mode.FALLBACK, Mode.REST])
+def test_there_and_back_without_a_bump(mode):
+    prior, limits = pendulum_model(), Limits([-1.0], [1.0])
+    guard = Guard(
+        mode, limits=limits, backup=make_safe(prior, du_max=DU), backup_estimator=make_ekf(prior),
+        dwell=0.1, quiet=0.1,
+    )  # fmt: skip
+    result = guarded(guard, Told([(20, 25)]))
+    assert [(s.before.name, s.after.name) for s in result.switches] == [
+        ("NORMAL", mode.name),
+        (mode.name, "NORMAL"),
+    ]
+    first, last = (round(s.t / DT) for s in result.switches)
+    assert first == 21  # the period after the reading
+    assert last == 30  # the last alarm is that of period 24, five periods of quiet after it
+    assert result.mode[first - 1 : first + 1] == ("NORMAL", mode.name)
+    # rounding of sums of inputs of order 1
+    assert np.max(np.abs(np.diff(result.u, axis=0))) <= DU + 1e-12
+    inside = np.abs(result.u[first + 3 : last])  # three periods of du_max from anywhere into the limits
+    assert np.max(inside) <= 1.0 + 1e-12
+    if mode is Mode.REST:
+        assert np.max(inside) == 0.0
+    expected = {Mode.FALLBACK: "FALLBACK", Mode.REST: "ZERO"}.get(mode, "MPC")
+    assert set(result.source[first:last]) == {expected}
+    assert set(result.source[last:]) == {"MPC"}
+    assert np.all(np.isfinite(result.x))
+
+
+def test_the_backup_continues_the_plan():
+    # the same model as main and backup: the first input after the switch is nearly that of the loop without it
+    model = pendulum_model()
+    guard = Guard(backup=make_safe(model, du_max=DU), backup_estimator=make_ekf(model), dwell=0.1, quiet=0.1)
+    arguments = {"duration": 1.2, "sensor_delay": 0}
+    plain = run(model, make_safe(model, du_max=DU), **arguments)
+    switched = run(model, make_safe(model, du_max=DU), guard=guard, monitor=Told([(30, 32)]), **arguments)
+    assert len(switched.switches) == 2
+    # same estimate, same plan but for its last period, one iteration: 1e-3 of inputs of order 1
+    np.testing.assert_allclose(switched.u, plain.u, atol=5e-3)
+
+
+def test_a_frozen_sensor_takes_precedence_and_the_dwell_is_kept():
+    guard = backup(dwell=0.3, quiet=0.04)
+    result = guarded(guard, Told(alarms=[(10, 40)], frozen=[(15, 17)]))
+    names = [(round(s.t / DT), s.after.name) for s in result.switches]
+    assert names[0] == (11, "BACKUP")
+    assert names[1] == (16, "REST")  # to a more careful mode at once
+    assert names[2] == (32, "BACKUP")  # back not before 0.3 s in it, and one period after the reading
+    assert names[3][1] == "NORMAL"
+
+
+def test_a_flickering_alarm_does_not_flicker_through():
+    result = guarded(backup(dwell=0.1, quiet=0.2), Told([(k, k + 1) for k in range(10, 40, 4)]))
+    assert len(result.switches) == 2
+
+
+def test_no_estimate_and_no_solve_are_survived_in_every_mode():
+    for mode in (Mode.LIMITED, Mode.BACKUP, Mode.FALLBACK, Mode.REST):
+        prior = pendulum_model()
+        guard = Guard(
+            mode, limits=Limits([-1.0], [1.0]), backup=make_safe(prior, du_max=DU), backup_estimator=make_ekf(prior),
+            dwell=0.1, quiet=0.1,
+        )  # fmt: skip
+        result = guarded(
+            guard, Told([(10, 20)]), late=lambda t: round(t / DT) % 3 == 0,
+            faults=[Fault(0.2, 0.5, "measurement_dropout")],
+        )  # fmt: skip
+        assert np.all(np.isfinite(result.u))
+        assert np.max(np.abs(np.diff(result.u, axis=0))) <= DU + 1e-12
+
+
+def test_a_frozen_encoder_brings_the_machine_to_rest():
+    step = 2e-3
+
+    @dataclass(frozen=True)
+    class Counting:
+        plant: PendulumPlant
+
+        def measure(self, state, rng):
+            return step * np.round(self.plant.measure(state, rng) / step)
+
+        def __getattr__(self, name):
+            return getattr(self.plant, name)
+
+    model = pendulum_model()
+    monitor = EnergyMonitor(model, window=5, average=5, resolution=[step])
+    results = [
+        run(model, make_safe(model, du_max=DU), plant=Counting(PendulumPlant(noise=0.0)), duration=3.0,
+            monitor=monitor, guard=guard, faults=[Fault(1.0, np.inf, "measurement_freeze")])
+        for guard in (None, Guard())
+    ]  # fmt: skip
+    free, held = results
+    assert [s.after.name for s in held.switches] == ["REST"]
+    assert held.switches[0].t < 1.2
+    assert np.max(np.abs(held.u[-50:])) == 0.0
+    # nobody drives it: it swings out from at most 0.5 rad; the loop that believes the sensor pushes on
+    assert np.max(np.abs(held.x[:, 0])) < 0.7
+    assert np.max(np.abs(free.x[:, 0])) > np.max(np.abs(held.x[:, 0]))
+    assert np.sum(free.stage_cost) > np.sum(held.stage_cost)
+
+
+class FakeClock:
+    """Time passes only in sleep."""
+
+    def __init__(self):
+        self.t = 0.0
+
+    def now(self):
+        return self.t
+
+    def sleep_until(self, t):
+        self.t = max(self.t, t)
+
+
+def test_the_runner_does_the_same():
+    plant, inputs = PendulumPlant(noise=0.0), []
+    state = [plant.reset(np.array([0.1, 0.0]), 0)]
+    rng = np.random.default_rng(0)
+
+    def actuate(u):
+        inputs.append(u.copy())
+        state[0] = plant.step(state[0], u, DT)
+
+    model = pendulum_model(3)
+    runner = Runner(
+        lambda: plant.measure(state[0], rng), actuate, make_ekf(model), make_safe(model, du_max=DU), sine,
+        monitor=Told([(20, 25)]), guard=backup(dwell=0.1, quiet=0.1), clock=FakeClock(),
+    )  # fmt: skip
+    report = runner.run(duration=1.0)
+    assert [s.after.name for s in report.switches] == ["BACKUP", "NORMAL"]
+    assert [round(s.t / DT) for s in report.switches] == [21, 30]
+    assert np.max(np.abs(np.diff(report.u, axis=0))) <= DU + 1e-12
+    again = runner.run(duration=0.2)  # a run remembers nothing of another
+    assert again.switches == ()
+
+
+def test_bad_input_speaks():
+    with pytest.raises(InputError, match="belong together"):
+        Guard(backup=make_safe(pendulum_model()))
+    with pytest.raises(InputError, match="needs a controller"):
+        Guard(Mode.BACKUP)
+    with pytest.raises(InputError, match="needs limits"):
+        Guard(Mode.LIMITED)
+    with pytest.raises(InputError, match="0 s or more"):
+        Guard(dwell=-1.0)
+    with pytest.raises(InputError, match="give monitor="):
+        guarded(Guard(), None)
+    model, prior = pendulum_model(3), pendulum_model()
+    shorter = Guard(backup=make_safe(prior, horizon=10), backup_estimator=make_ekf(prior))
+    with pytest.raises(InputError, match="give both one problem"):
+        run(model, make_safe(model), guard=shorter, monitor=Told())
+    mixed = Guard(backup=make_safe(prior), backup_estimator=make_ekf(model))
+    with pytest.raises(InputError, match="that of its estimator"):
+        run(model, make_safe(model), guard=mixed, monitor=Told())

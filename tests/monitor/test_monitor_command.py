@@ -1,0 +1,96 @@
+"""``hybrid-mpc monitor`` on recordings whose contents are known."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from hybrid_mpc.cli.main import app
+from hybrid_mpc.data import write_csv
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.monitor import Detector
+from hybrid_mpc.pipeline.monitor_job import MonitorJob, prepared, watched
+from hybrid_mpc.scenario import load_scenario
+from scenarios.golf_robot.rig import Rig
+
+DT = 0.02
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, golf_artifact):
+    """A recording in which the club is pushed from 8 s on, with a gap before; noise and a detector by hand."""
+    out = tmp_path_factory.mktemp("monitor")
+    rig, rng, n = Rig(), np.random.default_rng(0), 600
+    state, phi = rig.reset(np.zeros(2), 0), []
+    u = 0.25 * np.sin(2 * np.pi * 0.8 * DT * np.arange(n))
+    for k in range(n):
+        phi.append(rig.measure(state, rng)[0])
+        state = rig.step(state, np.array([u[k] + (0.2 if k >= 400 else 0.0)]), DT)
+    kept = (np.arange(n) < 100) | (np.arange(n) >= 110)
+    columns = {"time_s": DT * np.arange(n), "u_nm": u, "phi_rad": np.array(phi)}
+    write_csv(out / "pushed.csv", {name: values[kept] for name, values in columns.items()})
+    (out / "control.json").write_text(json.dumps({"sigma_x": {"hybrid_observer": [1e-4, 1e-2]}}))
+    # Wide scales: the network of this artifact is untrained, so the prior's own errors are nominal here.
+    detector = Detector(DT, ((0.02, 0.01, 0.0, 0.0),), (0.05, 0.1, 0.0, 0.0), 2.0, 15.0, 4.0)
+    (out / "calibration.json").write_text(json.dumps({"detector": detector.to_dict()}))
+    return out
+
+
+def command(folder, model, out, *more):
+    arguments = [
+        "monitor",
+        str(model),
+        str(folder / "pushed.csv"),
+        "--scenario",
+        "golf_robot",
+        "--out",
+        str(out),
+    ]
+    return CliRunner().invoke(app, [*arguments, "--noise", str(folder / "control.json"), *more])
+
+
+def test_it_says_where_and_writes_what_it_saw(folder, golf_artifact, tmp_path):
+    done = command(folder, golf_artifact, tmp_path / "out", "--calibration", str(folder / "calibration.json"))
+    assert done.exit_code == 0, done.output
+    found = json.loads((tmp_path / "out" / "monitor.json").read_text())
+    first, second = found["recordings"]
+    assert first["alarms"] == []
+    starts = [alarm["start_s"] for alarm in second["alarms"]]
+    assert starts
+    assert 8.0 <= starts[0] < 9.0  # half a period of the motion at most
+    assert "gap in pushed.csv" in done.output
+    rows = (tmp_path / "out" / "pushed_2.csv").read_text().splitlines()
+    assert rows[0].startswith("t_s,phi_rad,dE_model_w")
+    assert len(rows) == 1 + round(second["seconds"] / DT)
+    assert len(rows) > 480
+    assert (tmp_path / "out" / "pushed_2.png").stat().st_size > 10_000
+
+
+def test_too_little_nominal_data_says_how_much_is_needed(folder, golf_artifact, tmp_path):
+    done = command(folder, golf_artifact, tmp_path / "out", "--learn", "1")
+    assert isinstance(done.exception, InputError)
+    assert "false alarms an hour need" in str(done.exception)
+
+
+def test_bad_input_speaks(folder, golf_artifact, tmp_path):
+    (tmp_path / "empty.json").write_text("{}")
+    done = command(folder, golf_artifact, tmp_path / "out", "--calibration", str(tmp_path / "empty.json"))
+    assert "holds no detector" in str(done.exception)
+    files, scenario = [folder / "pushed.csv"], load_scenario("golf_robot")
+    with pytest.raises(InputError, match="no control problem"):
+        prepared(replace(scenario, control=None), golf_artifact, files)
+    with pytest.raises(InputError, match=r"resamples to 0\.01 s"):
+        prepared(replace(scenario, data=replace(scenario.data, dt=0.01)), golf_artifact, files)
+
+
+def test_an_alarm_is_explained_once(folder, golf_artifact):
+    job = prepared(
+        load_scenario("golf_robot"), golf_artifact, [folder / "pushed.csv"], noise=folder / "control.json",
+        calibration=folder / "calibration.json",
+    )  # fmt: skip
+    assert isinstance(job, MonitorJob)
+    trace, alarms = watched(job, job.data.whole[1])
+    assert len(alarms) == len(trace.intervals())
+    assert all(alarm["diagnosis"] for alarm in alarms)

@@ -1,0 +1,108 @@
+"""A pendulum whose faults are known, and estimators, that the tests of the monitor share; no torch."""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from hybrid_mpc.model import HybridModel
+from hybrid_mpc.signals import Signal
+
+DT, J, MGL, GAMMA = 0.02, 0.1, 1.5, 0.15
+
+
+def pendulum(
+    friction: float = GAMMA, push: float = 0.0, dry: float = 0.0, inertia: float = J, mgl: float = MGL
+) -> HybridModel:
+    x, h, u, w = ca.MX.sym("x", 2), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w", 2)
+
+    def balance(x, w, u, friction=friction):
+        losses = friction * x[1] + dry * ca.tanh(x[1] / 0.02)
+        return (inertia * w[1] + mgl * ca.sin(x[0]) + losses - u - push) * x[1]
+
+    def rhs(x):
+        losses = friction * x[1] + dry * ca.tanh(x[1] / 0.02)
+        return ca.vertcat(x[1], (u + push - mgl * ca.sin(x[0]) - losses) / inertia)
+
+    p = ca.MX.sym("p", 3)
+    a = (u + push - p[1] * ca.sin(x[0]) - p[2] * x[1]) / p[0]
+    z = x
+    for _ in range(4):
+        d = DT / 4
+        k1 = rhs(z)
+        k2 = rhs(z + d / 2 * k1)
+        k3 = rhs(z + d / 2 * k2)
+        z = z + d / 6 * (k1 + 2 * k2 + 2 * k3 + rhs(z + d * k3))
+    return HybridModel(
+        "pendulum", DT, (Signal("phi", "rad"), Signal("phi_dot", "rad/s")), (Signal("tau", "N m"),),
+        (Signal("phi", "rad"),),
+        step=ca.Function("step", [x, h, u], [z, h]),
+        xdot=ca.Function("xdot", [x, h, u], [rhs(x)]),
+        output=ca.Function("output", [x, u], [x[0]]),
+        energy_balance=ca.Function("energy", [x, w, u], [balance(x, w, u)]),
+        parameters={"J": inertia, "mgl": mgl, "gamma": friction},
+        parametric=ca.Function("parametric", [x, u, p], [a]),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Estimate:
+    x: np.ndarray
+    h: np.ndarray
+    d: np.ndarray
+
+
+@dataclass(frozen=True)
+class Run:
+    t: np.ndarray
+    y: np.ndarray
+    u: np.ndarray
+    x: np.ndarray
+
+
+class Exact:
+    """Knows the true states of a run."""
+
+    def __init__(self, run):
+        self.run, self.k = run, 0
+
+    def start(self, y, t):
+        self.k = 0
+        return Estimate(self.run.x[0], np.zeros(0), np.zeros(1))
+
+    def update(self, estimate, y, u_prev):
+        self.k += 1
+        return Estimate(self.run.x[self.k], np.zeros(0), np.zeros(1))
+
+
+class Observer:
+    """A Luenberger observer with disturbance: exact model prediction, fixed gains (poles near 0.7)."""
+
+    def __init__(self, model):
+        self.step = model.step
+
+    def start(self, y, t):
+        return Estimate(np.array([y[0], 0.0]), np.zeros(0), np.zeros(1))
+
+    def update(self, estimate, y, u_prev):
+        x = self.step(estimate.x, estimate.h, u_prev + estimate.d)[0].full().ravel()
+        e = y[0] - x[0]
+        return Estimate(x + np.array([0.6, 5.0]) * e, np.zeros(0), estimate.d + 3.0 * e)
+
+
+def simulate(n, seed=0, fault=None, at=10**9, noise=0.0, kind="sine"):
+    rng = np.random.default_rng(seed)
+    t = np.arange(n) * DT
+    u = 0.8 * np.sin(2 * np.pi * 0.5 * t) + 0.5 * np.sin(2 * np.pi * 0.37 * t + seed)
+    if kind == "steps":
+        u = rng.choice([-1.2, 1.2], n // 7 + 1).repeat(7)[:n]
+    if kind == "rest":
+        u = np.zeros(n)
+    model, broken = pendulum(), fault or pendulum()
+    x = np.zeros((n, 2))
+    for k in range(n - 1):
+        x[k + 1] = (broken if k >= at else model).step(x[k], [], u[k])[0].full().ravel()
+    return Run(t, x[:, :1] + noise * rng.standard_normal((n, 1)), u[:, None], x)
+
+
+NOISE = 1e-4  # rad: an encoder of about 14 bits
