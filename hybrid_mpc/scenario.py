@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_mpc.benchmark_spec import BenchmarkSpec
 from hybrid_mpc.errors import InputError
 
 if TYPE_CHECKING:
@@ -233,6 +234,7 @@ class Scenario:
         tasks: Closed-loop tasks.
         budgets: Effort by name.
         draw: ``x (n_x,) -> polylines (m, 2) [m]`` of the machine, for moving pictures; default: none.
+        benchmark: How ``hybrid-mpc benchmark`` judges the machine on recordings; default: not at all.
 
     Example:
         >>> import numpy as np
@@ -253,6 +255,7 @@ class Scenario:
     tasks: tuple[Task, ...] = ()
     budgets: Mapping[str, Budget] = field(default_factory=lambda: DEFAULT_BUDGETS)
     draw: Callable[[Array], Sequence[Array]] | None = None
+    benchmark: BenchmarkSpec | None = None
 
 
 def registered_scenarios() -> dict[str, str]:

@@ -18,6 +18,7 @@ except ImportError as missing:  # the online half installs without the command l
     ) from None
 
 from hybrid_mpc import __version__
+from hybrid_mpc.cli import benchmark as benchmark_command
 from hybrid_mpc.cli import control as control_command
 from hybrid_mpc.cli import data as data_command
 from hybrid_mpc.cli import run as run_command
@@ -27,6 +28,7 @@ from hybrid_mpc.errors import InputError
 CTRL_C = 130
 INTERRUPTED = {
     "run": "interrupted; finished stages are kept: the same command with --resume goes on",
+    "benchmark": "interrupted; what is fitted and trained is kept: the same command goes on",
     "control": "interrupted; loops are kept at the end only, there is nothing to resume: the same command starts "
     "them anew (with another --out if figures lie in it already)",
     "data": "interrupted; the recordings are not complete: the same command with another --out makes them anew",
@@ -43,6 +45,7 @@ app = typer.Typer(
 )
 app.command("run", epilog=run_command.EXAMPLES)(run_command.run)
 app.command("control", epilog=control_command.EXAMPLES)(control_command.control)
+app.command("benchmark", epilog=benchmark_command.EXAMPLES)(benchmark_command.benchmark)
 app.command("data", epilog=data_command.EXAMPLES)(data_command.data)
 app.command("scenarios")(scenarios_command.scenarios)
 

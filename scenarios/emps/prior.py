@@ -1,0 +1,50 @@
+"""Prior of the EMPS: a mass with viscous and dry friction."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from hybrid_mpc.physics import Prior
+from hybrid_mpc.signals import Parameter, Signal
+
+FRICTION_SPEED = 2e-3
+"""Speed [m/s] over which dry friction changes its sign, a twentieth of the slowest motion."""
+
+
+class EmpsPrior(Prior):
+    """``M q_ddot = F - F_v q_dot - F_c tanh(q_dot / v_c) - offset``.
+
+    Source: A. Janot, M. Gautier, M. Brunot, *Data Set and Reference Models of EMPS* (2019), with the nominal values.
+
+    Example:
+        >>> prior = EmpsPrior({"M": 100.0, "offset": 0.0})
+        >>> prior(torch.zeros(2, dtype=torch.float64), torch.tensor([50.0], dtype=torch.float64)).tolist()
+        [0.0, 0.5]
+    """
+
+    states: ClassVar[tuple[Signal, ...]] = (Signal("q", "m", -1.0, 1.0), Signal("q_dot", "m/s", -5.0, 5.0))
+    inputs: ClassVar[tuple[Signal, ...]] = (Signal("force", "N", -1000.0, 1000.0),)
+    outputs: ClassVar[tuple[Signal, ...]] = (states[0],)
+    parameters_spec: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("M", 95.11, "kg", 50.0, 150.0, "inertia at the carriage"),
+        Parameter("F_v", 203.5, "N s/m", 50.0, 400.0, "viscous friction"),
+        Parameter("F_c", 20.39, "N", 0.0, 60.0, "dry friction"),
+        Parameter("offset", -3.16, "N", -20.0, 20.0, "offset of the force"),
+    )
+
+    M: Tensor
+    F_v: Tensor
+    F_c: Tensor
+    offset: Tensor
+
+    def inertia(self, x: Tensor) -> Tensor:
+        """Mass M [kg], shape ``()``."""
+        return self.M
+
+    def acceleration(self, x: Tensor, u: Tensor) -> Tensor:
+        """Acceleration ``(..., 1)`` [m/s^2]."""
+        v = x[..., 1:2]
+        return (u - self.F_v * v - self.F_c * torch.tanh(v / FRICTION_SPEED) - self.offset) / self.M
