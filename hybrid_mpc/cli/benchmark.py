@@ -32,6 +32,12 @@ def benchmark(
     out: Annotated[Path | None, typer.Option(help="Folder to make. Default: runs/MACHINE-benchmark.")] = None,
     budget: Annotated[str, typer.Option(help="Effort: quick or full.")] = "quick",
     seed: Annotated[int, typer.Option(help="Seed of the networks.", min=0)] = 0,
+    refit: Annotated[
+        float | None,
+        typer.Option(
+            help="A machine that has changed: fit the prior anew to so many seconds of each test file."
+        ),
+    ] = None,
     workers: Annotated[int, typer.Option(help="Kinds of networks trained side by side.", min=1)] = 2,
 ) -> None:
     """Fit the prior, train networks on it, and judge free runs over unseen recordings."""
@@ -42,7 +48,9 @@ def benchmark(
     from hybrid_mpc.scenario import load_scenario
 
     folder = out or Path("runs") / f"{Path(machine).stem}-benchmark"
-    settings = BenchmarkSettings(machine, tuple(data or ()), tuple(test or ()), model, budget, seed, workers)
+    settings = BenchmarkSettings(
+        machine, tuple(data or ()), tuple(test or ()), model, budget, seed, workers, refit
+    )
     with make_progress() as progress:
         results, runs = run_job(settings, folder, progress=progress)
         draw(load_scenario(machine), results, runs, folder)

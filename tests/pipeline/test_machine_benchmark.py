@@ -8,6 +8,7 @@ import pytest
 
 from hybrid_mpc.cli import main
 from hybrid_mpc.data import write_csv
+from hybrid_mpc.errors import InputError
 from hybrid_mpc.identification.dataset import cut_windows
 from hybrid_mpc.pipeline.machine_benchmark.free_runs import figures_of, run_freely
 from hybrid_mpc.pipeline.machine_benchmark.job import BenchmarkSettings, benchmark
@@ -49,17 +50,17 @@ TRUE = {"k": 4.0, "d": 0.6, "cubic": 0.5}
 DELAY = 0.13
 
 
-def recording(path, *, seed, seconds=100.0):
+def recording(path, *, seed, seconds=100.0, k=TRUE["k"]):
     """The cart with a stiffening spring that no prior knows, its input 0.13 s late, an encoder of 0.1 mm."""
     rng, n, sub = np.random.default_rng(seed), round(seconds / 0.1), 20
     u = np.repeat(rng.uniform(-2, 2, n // 5), 5)
     x, s = np.zeros(2), []
-    for k in range(n * sub):
-        if k % sub == 0:
+    for i in range(n * sub):
+        if i % sub == 0:
             s.append(x[0])
-        late = k - round(DELAY / 0.1 * sub)
+        late = i - round(DELAY / 0.1 * sub)
         held = u[late // sub] if late >= 0 else 0.0
-        a = held - TRUE["k"] * x[0] - TRUE["cubic"] * x[0] ** 3 - TRUE["d"] * x[1]
+        a = held - k * x[0] - TRUE["cubic"] * x[0] ** 3 - TRUE["d"] * x[1]
         x = x + 0.1 / sub * np.array([x[1] + 0.5 * 0.1 / sub * a, a])
     return write_csv(path, {"t": 0.1 * np.arange(n), "u": u, "s": np.round(np.array(s), 4)})
 
@@ -165,6 +166,22 @@ def test_a_model_made_before_gives_the_same_figures_and_an_interrupted_run_goes_
     (out / "checkpoints" / "pgrnn.npz").unlink()
     resumed, _ = benchmark(BenchmarkSettings(str(scenario), (train,), (test,)), out)
     assert resumed["test"] == results["test"]
+
+
+def test_a_changed_machine_is_known_again_after_a_few_seconds(machine, made, tmp_path):
+    scenario, _, _ = machine
+    changed = recording(tmp_path / "changed.csv", seed=2, seconds=40.0, k=7.0)
+    settings = BenchmarkSettings(str(scenario), test=(changed,), model=made[0], refit=10.0)
+    results, _ = benchmark(settings, tmp_path / "judged")
+    found = results["test"]["changed.csv"]["refit"]
+    values = {row["parameter"]: row["fitted"] for row in found["prior"]}
+    assert 7.0 < values["k"] < 7.75  # the cubic spring counts as at most 3 * 0.5 * 0.7^2 more
+    for name in ("phy", "hybrid"):
+        assert found["after"][name]["rmse"] < 0.25 * found["before"][name]["rmse"]
+    with pytest.raises(InputError, match="longer than it"):
+        benchmark(
+            BenchmarkSettings(str(scenario), test=(changed,), model=made[0], refit=50.0), tmp_path / "no"
+        )
 
 
 def test_the_delay_takes_samples_from_the_start_only(machine):

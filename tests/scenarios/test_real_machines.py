@@ -53,8 +53,8 @@ def test_each_prior_is_the_equation_it_says():
     assert disk_prior(x, torch.tensor([0.5], dtype=torch.float64)).tolist() == pytest.approx(
         [-2.0, a], rel=1e-12
     )  # rounding
-    a = (10.0 + 203.5 * 2.0 + 20.39 + 3.16) / 95.11
-    assert EmpsPrior()(x, torch.tensor([10.0], dtype=torch.float64)).tolist() == pytest.approx(
+    a = (10.0 + (203.5 - 7.0) * 2.0 + 20.39 + 3.16) / 95.11
+    assert EmpsPrior({"F_a": 7.0})(x, torch.tensor([10.0], dtype=torch.float64)).tolist() == pytest.approx(
         [-2.0, a], rel=1e-12
     )  # rounding
     driven, falling = torch.tensor([[0.4, 7.0, 1.0], [0.4, 7.0, 0.0]], dtype=torch.float64)

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import digest, read_json, write_json
 from hybrid_mpc.identification.settings import KINDS
@@ -21,6 +22,7 @@ from hybrid_mpc.pipeline.machine_benchmark.recordings import (
     read_test,
     read_training,
 )
+from hybrid_mpc.pipeline.machine_benchmark.refit import refitted
 from hybrid_mpc.pipeline.machine_benchmark.store import BenchmarkModel, load_model, physics_of, save_model
 from hybrid_mpc.scenario import Scenario, load_scenario
 
@@ -41,6 +43,8 @@ class BenchmarkSettings:
         budget: Name of the machine's effort. Default: quick.
         seed: Of the networks.
         workers: Kinds of networks trained side by side.
+        refit: Length [s] of each test file's start that the prior's parameters are fitted to anew, for a machine that
+            has changed; the rest is then judged with the old parameters and with the new ones. Default: none.
     """
 
     scenario: str
@@ -50,6 +54,7 @@ class BenchmarkSettings:
     budget: str = "quick"
     seed: int = 0
     workers: int = 1
+    refit: float | None = None
 
 
 def benchmark(
@@ -99,6 +104,8 @@ def benchmark(
         )
         test[name] = {m: figures_of(runs[name], m, unit=spec.unit, scale=spec.scale) for m in MODELS}
         test[name]["hybrid"] = figures_of(runs[name], model.hybrid, unit=spec.unit, scale=spec.scale)
+        if settings.refit is not None:
+            test[name]["refit"] = _changed(scenario, model, trajectories[0], settings.refit)
         test[name]["scored_s"] = sum(len(run.t) for run in runs[name]) * model.dt
     progress.finish("")
     results = {
@@ -114,6 +121,21 @@ def benchmark(
     }
     write_json(out / "results.json", results)
     return results, runs
+
+
+def _changed(scenario: Scenario, model: BenchmarkModel, whole: Trajectory, seconds: float) -> dict[str, Any]:
+    """Figures over what follows a recording's first seconds, with the old parameters and with those fitted to them."""
+    spec, data = benchmark_of(scenario), scenario.data
+    physics, rest = refitted(scenario.prior, model.physics, whole, seconds=seconds, dt=model.dt)
+    found: dict[str, Any] = {"seconds": seconds, "prior": physics.fit.rows(scenario.prior().parameters_spec)}
+    for key, own in (("before", model.physics), ("after", physics)):
+        prior = scenario.prior(own.fit.values)
+        runs = run_freely(prior, own, model.networks, [rest], warm_up=data.warm_up, length=spec.length)
+        found[key] = {
+            name: figures_of(runs, candidate, unit=spec.unit, scale=spec.scale)
+            for name, candidate in (("phy", "phy"), ("hybrid", model.hybrid))
+        }
+    return found
 
 
 def describe(model: BenchmarkModel, scenario: Scenario) -> dict[str, Any]:
