@@ -52,7 +52,7 @@ scenario = Scenario(
                 8, 2, teacher_steps=0, free_run_steps=150, horizon=150, batch=16, decay=3000.0
             ),
             "full": BenchmarkBudget(
-                16, 8, teacher_steps=0, free_run_steps=1500, horizon=400, batch=32, decay=3000.0
+                16, 4, teacher_steps=0, free_run_steps=800, horizon=400, batch=32, decay=3000.0
             ),
         },
         unit="mm",

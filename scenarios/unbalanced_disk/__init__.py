@@ -57,7 +57,7 @@ scenario = Scenario(
     benchmark=BenchmarkSpec(
         {
             "quick": BenchmarkBudget(16, 2, teacher_steps=200, free_run_steps=200, horizon=60, batch=32),
-            "full": BenchmarkBudget(32, 8, teacher_steps=1000, free_run_steps=3000, horizon=100, batch=64),
+            "full": BenchmarkBudget(32, 4, teacher_steps=500, free_run_steps=1500, horizon=80, batch=48),
         },
         largest_delay=0.06,
     ),

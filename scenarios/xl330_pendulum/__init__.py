@@ -48,7 +48,7 @@ scenario = Scenario(
                 16, 2, teacher_steps=150, free_run_steps=150, horizon=80, batch=32, decay=1000.0
             ),
             "full": BenchmarkBudget(
-                32, 8, teacher_steps=500, free_run_steps=2500, horizon=250, batch=32, decay=1000.0
+                32, 4, teacher_steps=500, free_run_steps=2000, horizon=250, batch=32, decay=1000.0
             ),
         },
     ),

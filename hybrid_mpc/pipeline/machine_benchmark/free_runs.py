@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
 
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.identification.evaluation import judged
@@ -18,6 +16,9 @@ from hybrid_mpc.identification.step import PriorStep
 from hybrid_mpc.identification.trained import Trained, stack_for, step_for
 from hybrid_mpc.physics import Prior
 from hybrid_mpc.pipeline.machine_benchmark.physics import Physics, lost_samples, shifted
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
 
 Array = NDArray[np.float64]
 MODELS = ("phy", *KINDS)
@@ -67,6 +68,8 @@ def run_freely(
     Returns:
         A run for each trajectory; candidates are ``phy``, ``rnn``, ``rnn mean`` and so on.
     """
+    import torch
+
     dt = trajectories[0].dt
     warm = warm_samples(warm_up, physics.delay, dt)
     starts = judged(shifted(trajectories, physics.delay), physics.smoother(prior, dt), warm)
@@ -139,6 +142,8 @@ def _first(trajectory: Trajectory, n: int) -> Trajectory:
 
 def _simulate(step: nn.Module, h0: Tensor, trajectories: Sequence[Trajectory], warm: int) -> Array:
     """States ``(networks, runs, n, n_x)`` of the samples after ``warm``; shorter runs go on under their last input."""
+    import torch
+
     longest = max(len(t.t) for t in trajectories)
     x_all, u_all = (
         torch.tensor(np.stack([_padded(getattr(t, key), longest) for t in trajectories]))

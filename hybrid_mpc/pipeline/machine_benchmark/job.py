@@ -80,7 +80,8 @@ def benchmark(
     spec = benchmark_of(scenario)
     _check(settings, scenario)
     tests = {path.name: read_test(scenario, path) for path in settings.test}
-    started, notes = time.monotonic(), {}
+    started = time.monotonic()
+    notes: dict[str, Any] = {}
     if settings.model is not None:
         model = load_model(settings.model, scenario.name)
     else:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from hybrid_mpc.benchmark_spec import BenchmarkBudget
 from hybrid_mpc.data.trajectories import Trajectory
@@ -64,13 +65,13 @@ def train_all(
         workers: Kinds trained side by side.
         on_progress: ``(kind, done, total, text)``.
     """
-    jobs = {
+    jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
         kind: (_train, (scenario, dict(values), list(training), list(validation), settings(kind), folder))
         for kind in reversed(KINDS)
         if not (folder / f"{kind}.json").is_file()
     }
     run_jobs(jobs, on_progress, workers)
-    return {kind: load_trained(folder, kind) for kind in KINDS}
+    return {str(kind): load_trained(folder, kind) for kind in KINDS}
 
 
 def _train(

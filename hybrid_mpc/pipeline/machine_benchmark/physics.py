@@ -11,10 +11,10 @@ import numpy as np
 
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.identification.lags import delayed
+from hybrid_mpc.identification.prior_long_runs import OutputErrorFit, Runs, cut_runs
 from hybrid_mpc.identification.prior_result import PriorFit
 from hybrid_mpc.identification.smoothing import Smoother, fit_smoother
 from hybrid_mpc.physics import Prior
-from hybrid_mpc.pipeline.machine_benchmark.output_error import OutputErrorFit, Runs, cut_runs
 
 STAGES = ((1.0, 15, 48), (5.0, 10, 48))
 """Free runs from polynomially smoothed states: length [s], most simulations, most runs."""

@@ -9,8 +9,8 @@ import numpy as np
 
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.identification.prior_long_runs import OutputErrorFit, cut_runs
 from hybrid_mpc.physics import Prior
-from hybrid_mpc.pipeline.machine_benchmark.output_error import OutputErrorFit, cut_runs
 from hybrid_mpc.pipeline.machine_benchmark.physics import Physics, shifted
 
 LENGTHS = (0.5, 1.0)

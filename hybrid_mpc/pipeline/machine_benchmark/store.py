@@ -77,7 +77,7 @@ def load_model(folder: Path, scenario: str) -> BenchmarkModel:
     if note["scenario"] != scenario:
         raise InputError(f"{folder} holds a model of {note['scenario']}, not of {scenario}")
     physics = physics_of(note["physics"])
-    networks = {kind: load_trained(folder, kind) for kind in KINDS}
+    networks: dict[str, Trained] = {kind: load_trained(folder, kind) for kind in KINDS}
     validation = {name: float(value) for name, value in note["validation"].items()}
     return BenchmarkModel(note["scenario"], note["dt"], physics, networks, note["hybrid"], validation)
 
@@ -92,7 +92,7 @@ def physics_of(plain: Mapping[str, Any]) -> Physics:
 def save_trained(folder: Path, trained: Trained) -> None:
     """Write the networks of one kind."""
     kind = trained.settings.kind
-    arrays = {f"weights.{n}": v for n, v in trained.weights.items()}
+    arrays: dict[str, Any] = {f"weights.{n}": v for n, v in trained.weights.items()}
     arrays |= {f"curve.{n}": v for n, v in trained.curve.items()}
     arrays |= {"own.validation": trained.validation, "own.skipped": trained.skipped}
     write_arrays(folder / f"{kind}.npz", arrays)

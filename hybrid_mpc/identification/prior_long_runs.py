@@ -165,7 +165,7 @@ class OutputErrorFit:
             f_scale=0.1,
             max_nfev=evaluations,
         )
-        noise = np.sqrt(max(np.mean(residuals(result.x[None]) ** 2), 1e-30))
+        noise = np.sqrt(max(float(np.mean(residuals(result.x[None]) ** 2)), 1e-30))
         return result.x, jacobian(result.x) / noise
 
     def result(self, theta: Array, slope: Array, stages: Sequence[dict[str, Any]]) -> PriorFit:
