@@ -49,9 +49,11 @@ class BenchmarkSpec:
         largest_delay: Longest delay [s] of the input that is searched for; zero: none. Default: 0.
         length: Length [s] of a run after what is given. Default: the whole recording.
         piece: Length [s] of the pieces that long training recordings are cut into. Default: 25 s.
+        cycle: Roles of these pieces, again and again in order of time, where a recording's parts are not alike and
+            its last ones would not be a fair sample. Default: none, the data specification splits.
 
     Raises:
-        InputError: If a length, the scale or the delay is out of its range.
+        InputError: If a length, the scale or the delay is out of its range, or a cycle lacks a role that is needed.
 
     Example:
         >>> BenchmarkSpec({}, unit="mm", scale=1e3).length is None
@@ -64,12 +66,17 @@ class BenchmarkSpec:
     largest_delay: float = 0.0
     length: float | None = None
     piece: float = 25.0
+    cycle: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not (self.scale > 0 and self.piece > 0 and (self.length is None or self.length > 0)):
             raise InputError(
                 f"benchmark specification: scale, piece and length must be positive, got {self.scale}, "
                 f"{self.piece}, {self.length}"
+            )
+        if self.cycle and not {"train", "valid"} <= set(self.cycle) <= {"train", "valid", "test"}:
+            raise InputError(
+                f"benchmark specification: cycle needs 'train' and 'valid', and may have 'test'; got {self.cycle}"
             )
         if self.largest_delay < 0:
             raise InputError(

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,10 @@ import torch
 from energy_checks import check_energy_balance
 
 from hybrid_mpc.data import write_csv
+from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identification.step import required_substeps
-from hybrid_mpc.pipeline.machine_benchmark.recordings import read_test, read_training
+from hybrid_mpc.pipeline.machine_benchmark.recordings import in_turn, read_test, read_training
 from scenarios.emps import NEWTON_PER_VOLT
 from scenarios.emps import scenario as emps
 from scenarios.emps.prior import EmpsPrior
@@ -93,7 +95,7 @@ def test_volts_become_newtons(tmp_path):
 def test_a_recording_that_is_too_short_is_refused(tmp_path):
     t = 0.025 * np.arange(60)
     np.savez(tmp_path / "short.npz", u=t, th=t, dt=0.025)
-    with pytest.raises(InputError, match="no piece"):
+    with pytest.raises(InputError, match="too short to be cut into 7 pieces"):
         read_training(disk, [tmp_path / "short.npz"])
 
 
@@ -114,4 +116,16 @@ def test_the_real_recordings_are_read_whole_and_split(scenario, file, seconds):
     data = read_training(scenario, [path])
     shares = [sum(len(p.t) for p in part) / len(whole.t) for part in (data.train, data.valid, data.held_back)]
     # the distance between the parts and the rest of cutting into equal pieces are a few per cent of short runs
-    np.testing.assert_allclose(shares, scenario.data.fractions, atol=0.03)
+    planned = [5 / 7, 1 / 7, 1 / 7] if scenario is disk else scenario.data.fractions
+    np.testing.assert_allclose(shares, planned, atol=0.03)
+
+
+def test_the_disks_parts_take_turns_and_share_no_smoothing():
+    t = 0.025 * np.arange(8000)
+    z = np.zeros((len(t), 1))
+    run = Trajectory("run", "", 0.025, t, z, z, np.hstack([z, z]), np.hstack([z, z]))
+    parts = in_turn(run, disk.benchmark, disk.data.smoothing)
+    assert [p.role for p in parts][:7] == list(disk.benchmark.cycle)
+    assert len(parts) == 8  # 200 s in pieces of 25 s
+    for one, two in pairwise(parts):
+        assert two.t[0] - one.t[-1] > disk.data.smoothing - 1e-9

@@ -13,6 +13,9 @@ from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.scenario import Role, Scenario
 
+SCORED = 50
+"""Fewest periods of a piece after its warm-up."""
+
 
 @dataclass(frozen=True)
 class Recordings:
@@ -56,14 +59,22 @@ def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
         InputError: If a file is bad, or no piece is left for training or validation.
     """
     prior, spec = scenario.prior(), benchmark_of(scenario)
+    needed: tuple[Role, ...] = () if spec.cycle else ("train", "valid")
     dataset = load_trajectories(
-        paths, scenario.data, outputs=prior.outputs, inputs=prior.inputs, needed=("train", "valid")
+        paths, scenario.data, outputs=prior.outputs, inputs=prior.inputs, needed=needed
     )
-
-    def of(role: Role) -> tuple[Trajectory, ...]:
-        return tuple(p for t in dataset.by_role(role) for p in pieces(t, spec.piece))
-
-    return Recordings(of("train"), of("valid"), of("test"), dataset)
+    if spec.cycle:
+        parts = [p for t in dataset.whole for p in in_turn(t, spec, scenario.data.smoothing)]
+        shortest = scenario.data.warm_up + SCORED * scenario.data.dt
+        if any(len(p.t) * p.dt < shortest for p in parts):
+            raise InputError(
+                f"a recording is too short to be cut into {len(spec.cycle)} pieces of {shortest:.3g} s and more, which "
+                "training and validation need; give longer ones"
+            )
+    else:
+        parts = [p for t in dataset.trajectories for p in pieces(t, spec.piece)]
+    train, valid, held = (tuple(p for p in parts if p.role == role) for role in ("train", "valid", "test"))
+    return Recordings(train, valid, held, dataset)
 
 
 def read_test(scenario: Scenario, path: Path) -> tuple[Trajectory, ...]:
@@ -80,6 +91,26 @@ def read_test(scenario: Scenario, path: Path) -> tuple[Trajectory, ...]:
             f"{path}: no part is long enough for a free run after {spec.warm_up:g} s that are given"
         )
     return whole
+
+
+def in_turn(trajectory: Trajectory, spec: BenchmarkSpec, distance: float) -> tuple[Trajectory, ...]:
+    """Pieces of a whole recording with the cycle's roles in turn; ``distance`` [s] between them is in none of them.
+
+    Example:
+        >>> z = np.zeros((400, 1))
+        >>> run = Trajectory("run", "", 0.1, 0.1 * np.arange(400), z, z, np.zeros((400, 2)), np.zeros((400, 2)))
+        >>> spec = BenchmarkSpec(piece=10.0, cycle=("train", "valid"))
+        >>> [(p.role, len(p.t)) for p in in_turn(run, spec, 0.4)]
+        [('train', 96), ('valid', 96), ('train', 96), ('valid', 96)]
+    """
+    seconds = min(spec.piece, len(trajectory.t) * trajectory.dt / len(spec.cycle))
+    margin = round(0.5 * distance / trajectory.dt)
+    parts = []
+    for i, part in enumerate(pieces(trajectory, seconds)):
+        index = np.arange(len(part.t))
+        inner = (index >= margin) & (index < len(part.t) - margin)
+        parts.append(part.part(inner, part.name, spec.cycle[i % len(spec.cycle)]))
+    return tuple(parts)
 
 
 def pieces(trajectory: Trajectory, seconds: float) -> tuple[Trajectory, ...]:
