@@ -67,8 +67,8 @@ def rmse(physics, trajectory):
 def test_three_seconds_make_the_prior_know_the_heavier_mass(machines):
     before, after, physics = machines
     new, rest = refitted(scenario.prior, physics, after, seconds=3.0, dt=0.02)
-    # the inertia stays at its data-sheet value, so torque and dry friction seem smaller by what it has grown, and gravity
-    # hardly changes; in 3 s viscous friction is not told from the torque (it went to zero), hence a tenth
+    # the inertia stays at its data-sheet value, so torque and dry friction seem smaller by what it has grown, and
+    # gravity hardly changes; in 3 s viscous friction is not told from the torque (it went to zero), hence a tenth
     assert new.fit.values["k_u"] == pytest.approx(0.83 / 1.27, rel=0.1)
     assert new.fit.values["F_c"] == pytest.approx(0.15 / 1.27, rel=0.1)
     assert new.fit.values["mgl"] == pytest.approx(2.98 * 1.28 / 1.27, rel=0.05)
