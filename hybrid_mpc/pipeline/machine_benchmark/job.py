@@ -27,6 +27,9 @@ from hybrid_mpc.pipeline.machine_benchmark.store import BenchmarkModel, load_mod
 from hybrid_mpc.scenario import Scenario, load_scenario
 
 SCHEMA = 1
+IN_MOTION = 0.1
+"""Least length [s] that is given of a validation piece: it begins in motion, while a recording that gives less (EMPS,
+20 ms) begins at rest, and two samples tell no speed beside an unknown acceleration."""
 CANDIDATES = ("phy", "pgrnn", "mopgrnn", "pgrnn mean", "mopgrnn mean")
 """What ``hybrid`` may be: the one with the least error on the validation pieces."""
 
@@ -181,7 +184,8 @@ def _made(
     )
     progress.finish("")
     prior = scenario.prior(physics.fit.values)
-    runs = run_freely(prior, physics, networks, data.valid, warm_up=warm_up, length=spec.length)
+    known = max(warm_up, IN_MOTION)
+    runs = run_freely(prior, physics, networks, data.valid, warm_up=known, length=spec.length)
     validation = {
         name: figures_of(runs, name, unit=spec.unit, scale=spec.scale)["rmse"] for name in runs[0].y_hat
     }
