@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_mpc.benchmark_spec import BenchmarkSpec
 from hybrid_mpc.errors import InputError
 
 if TYPE_CHECKING:
@@ -237,6 +238,7 @@ class Scenario:
         experiment: The paper's experiment on it, for ``hybrid-mpc reproduce``; default: none.
         causes: What may break, by name: the prior's parameters (or ``"gain of <input>"``) that change together then,
             for :class:`~hybrid_mpc.monitor.Diagnoser`. Default: each by itself.
+        benchmark: How ``hybrid-mpc benchmark`` judges the machine on recordings; default: not at all.
 
     Example:
         >>> import numpy as np
@@ -259,6 +261,7 @@ class Scenario:
     draw: Callable[[Array], Sequence[Array]] | None = None
     experiment: Experiment | None = None
     causes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    benchmark: BenchmarkSpec | None = None
 
 
 def registered_scenarios() -> dict[str, str]:

@@ -19,6 +19,7 @@ except ImportError as missing:  # the online half installs without the command l
 
 from hybrid_mpc import __version__
 from hybrid_mpc.cli import analyze as analyze_command
+from hybrid_mpc.cli import benchmark as benchmark_command
 from hybrid_mpc.cli import control as control_command
 from hybrid_mpc.cli import data as data_command
 from hybrid_mpc.cli import monitor as monitor_command
@@ -33,6 +34,7 @@ CTRL_C = 130
 INTERRUPTED = {
     "run": "interrupted; finished stages are kept: the same command with --resume goes on",
     "reproduce": "interrupted; what is done is kept: the same command with --resume goes on",
+    "benchmark": "interrupted; what is fitted and trained is kept: the same command goes on",
     "control": "interrupted; loops are kept at the end only, there is nothing to resume: the same command starts "
     "them anew (with another --out if figures lie in it already)",
     "search": "interrupted; finished trials are kept: the same command with --resume goes on",
@@ -55,6 +57,7 @@ app.command("run", epilog=run_command.EXAMPLES)(run_command.run)
 app.command("control", epilog=control_command.EXAMPLES)(control_command.control)
 app.command("reproduce", epilog=reproduce_command.EXAMPLES)(reproduce_command.reproduce)
 app.command("analyze", epilog=analyze_command.EXAMPLES)(analyze_command.analyze)
+app.command("benchmark", epilog=benchmark_command.EXAMPLES)(benchmark_command.benchmark)
 app.command("data", epilog=data_command.EXAMPLES)(data_command.data)
 app.command("search", epilog=search_command.EXAMPLES)(search_command.search)
 app.command("monitor", epilog=monitor_command.EXAMPLES)(monitor_command.monitor)

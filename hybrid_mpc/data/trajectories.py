@@ -95,6 +95,7 @@ def load_trajectories(
     *,
     outputs: tuple[Signal, ...],
     inputs: tuple[Signal, ...],
+    needed: Sequence[Role] = ROLES,
 ) -> Dataset:
     """Read recordings, cut them at gaps, smooth and differentiate, resample to ``spec.dt``, give roles.
 
@@ -108,9 +109,10 @@ def load_trajectories(
         spec: Columns, ``dt``, ``max_gap``, ``smoothing``, ``warm_up`` [s] and the split.
         outputs: Signals of the prior's outputs (positions).
         inputs: Signals of the prior's inputs.
+        needed: Roles that must not be empty. Default: all three.
 
     Returns:
-        The data set; it has at least one trajectory of each role.
+        The data set; it has at least one trajectory of each role that is needed.
 
     Raises:
         InputError: If a recording is bad (see :func:`~hybrid_mpc.data.tables.read_table`), columns
@@ -140,7 +142,7 @@ def load_trajectories(
         segments = list(_segments(table, spec, cuts))
         whole += segments
         trajectories += _pieces(table, segments, spec, cuts)
-    _check_roles(trajectories, cuts, spec)
+    _check_roles(trajectories, cuts, spec, needed)
     return Dataset(
         trajectories=tuple(trajectories),
         whole=tuple(whole),
@@ -264,8 +266,10 @@ def _check_windows(spec: DataSpec) -> None:
                 )
 
 
-def _check_roles(trajectories: list[Trajectory], cuts: list[Cut], spec: DataSpec) -> None:
-    missing = [role for role in ROLES if all(piece.role != role for piece in trajectories)]
+def _check_roles(
+    trajectories: list[Trajectory], cuts: list[Cut], spec: DataSpec, needed: Sequence[Role]
+) -> None:
+    missing = [role for role in needed if all(piece.role != role for piece in trajectories)]
     if missing:
         dropped = "".join(f"\n  {cut.file} {cut.start:g} to {cut.end:g} s: {cut.why}" for cut in cuts)
         raise InputError(

@@ -100,9 +100,21 @@ def energy_objective(step: RecurrentStep, prediction: Prediction) -> Tensor:
     return _per_network((model - measured).abs())
 
 
+def position_objective(step: RecurrentStep, prediction: Prediction) -> Tensor:
+    """Root mean square error of the positions a period later [SI], a value per network.
+
+    On free runs it is the figure by which simulations are judged, while the mean absolute error of xdot weighs what a
+    period changes and so mostly accelerations.
+    """
+    n_q = step.prior.n_q
+    gap = (prediction.x_hat - prediction.x) + step.dt * (prediction.xdot_hat - prediction.xdot)
+    return _per_network(gap[..., :n_q].square().sum(-1)).clamp_min(1e-24).sqrt()
+
+
 OBJECTIVES: dict[str, Callable[[RecurrentStep, Prediction], Tensor]] = {
     "error": error_objective,
     "energy": energy_objective,
+    "position": position_objective,
 }
 """All objectives by name; one more is an entry here, named in ``TrainingSettings.objectives``."""
 

@@ -22,7 +22,7 @@ from hybrid_mpc.identification.dataset import (
     literal_scaling_of,
     scaling_of,
 )
-from hybrid_mpc.identification.objectives import OBJECTIVES, error_objective, free_run, teacher_forced
+from hybrid_mpc.identification.objectives import OBJECTIVES, free_run, teacher_forced
 from hybrid_mpc.identification.prior_stack import StackedPrior
 from hybrid_mpc.identification.settings import TrainingSettings
 from hybrid_mpc.identification.trained import Fault, Trained, stack_for, step_for
@@ -129,7 +129,8 @@ class TrainingRun:
         with torch.no_grad():
             losses = self._losses(self.fixed)
             self.index = self.index.updated(losses)
-            valid = error_objective(self.step, free_run(self.step, self.valid))
+            judge = OBJECTIVES[self.settings.objectives[0]]
+            valid = judge(self.step, free_run(self.step, self.valid))
         valid = torch.where(torch.isfinite(valid), valid, math.inf)
         better = valid < self.best
         self.best = torch.where(better, valid, self.best)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+from hybrid_mpc.benchmark_spec import BenchmarkBudget, BenchmarkSpec
 from hybrid_mpc.scenario import Budget, ControlSpec, DataSpec, Scenario, Window
 
 if TYPE_CHECKING:
@@ -92,4 +93,11 @@ scenario = Scenario(
         "quick": Budget(hidden=16, networks=4, teacher_steps=300, free_run_steps=400, seeds=2, decay=6000.0),
         "full": Budget(hidden=16, networks=16, teacher_steps=300, free_run_steps=800, seeds=10, decay=6000.0),
     },
+    benchmark=BenchmarkSpec(
+        {
+            "quick": BenchmarkBudget(16, 4, teacher_steps=300, free_run_steps=400, horizon=50, decay=6000.0),
+            "full": BenchmarkBudget(16, 16, teacher_steps=300, free_run_steps=1200, horizon=50, decay=6000.0),
+        },
+        length=2.5,  # a swing-up, from hanging down
+    ),
 )

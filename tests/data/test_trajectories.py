@@ -156,3 +156,23 @@ def test_the_main_job_reads_mat_files(tmp_path):
     data = Context(settings, load_scenario("golf_robot"), tmp_path).dataset
     assert data.files == ("mine.mat",)
     np.testing.assert_allclose(data.whole[0].y[:, 0], np.sin(data.whole[0].t), atol=1e-12)
+
+
+def test_roles_that_are_not_needed_may_be_empty(tmp_path):
+    t = 0.01 * np.arange(1000)
+    file = write_csv(tmp_path / "run.csv", {"t": t, "tau": 0 * t, "phi": np.sin(t)})
+    whole = DataSpec(
+        "t",
+        ("tau",),
+        ("phi",),
+        dt=0.02,
+        max_gap=0.05,
+        smoothing=0.1,
+        warm_up=0.5,
+        fractions=(0.75, 0.25, 0.0),
+    )
+    signals = {"outputs": (Signal("phi", "rad"),), "inputs": (Signal("tau", "N m"),)}
+    with pytest.raises(InputError, match="left for test"):
+        load_trajectories([file], whole, **signals)
+    data = load_trajectories([file], whole, **signals, needed=("train", "valid"))
+    assert [piece.role for piece in data.trajectories] == ["train", "valid"]

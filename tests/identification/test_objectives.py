@@ -1,4 +1,5 @@
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import torch
@@ -11,9 +12,11 @@ from hybrid_mpc.identification.dataset import cut_windows, literal_scaling_of, s
 from hybrid_mpc.identification.networks import StackedGRU
 from hybrid_mpc.identification.objectives import (
     OBJECTIVES,
+    Prediction,
     energy_objective,
     error_objective,
     free_run,
+    position_objective,
     teacher_forced,
 )
 from hybrid_mpc.identification.step import HybridStep, LiteralStep, n_features
@@ -116,3 +119,14 @@ def test_the_literal_form_is_judged_by_the_recorded_derivative():
     # the first period starts at the measurement in both; rounding of states of order one over dt = 0.02
     torch.testing.assert_close(free.xdot_hat[0], forced.xdot_hat[0], rtol=0, atol=1e-12)
     torch.testing.assert_close(free.x_hat[1], free.x_hat[0] + DT * forced.xdot_hat[0], rtol=0, atol=1e-14)
+
+
+def test_the_position_objective_is_the_rms_error_a_period_later():
+    x = torch.zeros(3, 1, 2, 2, dtype=torch.float64)
+    step = SimpleNamespace(prior=SimpleNamespace(n_q=1), dt=0.1)
+    # two networks: the first is off by 0.2 in position and gains 0.1 over the period, the second is right
+    x_hat = torch.stack([x[:, 0] + torch.tensor([0.2, 5.0], dtype=torch.float64), x[:, 0]], dim=1)
+    rate = torch.stack([x[:, 0] + torch.tensor([1.0, 7.0], dtype=torch.float64), x[:, 0]], dim=1)
+    got = position_objective(step, Prediction(x, x_hat, x[..., :1], x, rate))
+    # the velocity's error of 5 and 7 does not count; 1e-12 is the floor under the root
+    torch.testing.assert_close(got, torch.tensor([0.3, 1e-12], dtype=torch.float64), rtol=1e-12, atol=0)

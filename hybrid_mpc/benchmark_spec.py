@@ -1,0 +1,84 @@
+"""How a machine is judged on recordings, and with what effort: the part of a scenario that ``benchmark`` reads."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from hybrid_mpc.errors import InputError
+
+
+@dataclass(frozen=True)
+class BenchmarkBudget:
+    """Effort of the networks of one benchmark.
+
+    Args:
+        hidden: Hidden units z.
+        networks: Networks of each kind.
+        teacher_steps: Optimiser steps with teacher forcing.
+        free_run_steps: Optimiser steps on free runs.
+        horizon: Most scored periods of a free run in training.
+        batch: Windows a step. Default: 32.
+        decay: Weight decay times the number of training samples. Default: that of the training.
+
+    Example:
+        >>> BenchmarkBudget(hidden=16, networks=2, teacher_steps=100, free_run_steps=200, horizon=40).batch
+        32
+    """
+
+    hidden: int
+    networks: int
+    teacher_steps: int
+    free_run_steps: int
+    horizon: int
+    batch: int = 32
+    decay: float = 300.0
+
+
+@dataclass(frozen=True)
+class BenchmarkSpec:
+    """How a machine's models are judged by free runs over recordings that they have not seen.
+
+    What is given at the start of a run is the scenario's ``warm_up``. The whole recording after it is one run, or
+    its first ``length`` seconds.
+
+    Args:
+        budgets: Effort by name, ``"quick"`` and ``"full"``.
+        unit: Unit of the figures. Default: ``"rad"``.
+        scale: Figures' units in an SI unit of the output. Default: 1.
+        largest_delay: Longest delay [s] of the input that is searched for; zero: none. Default: 0.
+        length: Length [s] of a run after what is given. Default: the whole recording.
+        piece: Length [s] of the pieces that long training recordings are cut into. Default: 25 s.
+        cycle: Roles of these pieces, again and again in order of time, where a recording's parts are not alike and
+            its last ones would not be a fair sample. Default: none, the data specification splits.
+
+    Raises:
+        InputError: If a length, the scale or the delay is out of its range, or a cycle lacks a role that is needed.
+
+    Example:
+        >>> BenchmarkSpec({}, unit="mm", scale=1e3).length is None
+        True
+    """
+
+    budgets: Mapping[str, BenchmarkBudget] = field(default_factory=dict)
+    unit: str = "rad"
+    scale: float = 1.0
+    largest_delay: float = 0.0
+    length: float | None = None
+    piece: float = 25.0
+    cycle: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not (self.scale > 0 and self.piece > 0 and (self.length is None or self.length > 0)):
+            raise InputError(
+                f"benchmark specification: scale, piece and length must be positive, got {self.scale}, "
+                f"{self.piece}, {self.length}"
+            )
+        if self.cycle and not {"train", "valid"} <= set(self.cycle) <= {"train", "valid", "test"}:
+            raise InputError(
+                f"benchmark specification: cycle needs 'train' and 'valid', and may have 'test'; got {self.cycle}"
+            )
+        if self.largest_delay < 0:
+            raise InputError(
+                f"benchmark specification: largest_delay must not be negative, got {self.largest_delay}"
+            )

@@ -1,0 +1,59 @@
+"""``hybrid-mpc benchmark``: a machine's models judged on recordings that they have not seen."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+EXAMPLES = (
+    "Examples:\n\n"
+    "  hybrid-mpc benchmark unbalanced_disk --data multisine_2024.npz --test hidden_2024.npz --out runs/disk\n\n"
+    "  hybrid-mpc benchmark emps --data DATA_EMPS.mat --test DATA_EMPS_PULSES.mat --budget full --out runs/emps\n\n"
+    "  hybrid-mpc benchmark unbalanced_disk --model runs/disk --test another.npz --out runs/disk-another"
+)
+
+
+def benchmark(
+    machine: Annotated[
+        str, typer.Argument(help="A registered name (see: hybrid-mpc scenarios) or a .py file.")
+    ],
+    data: Annotated[
+        list[Path] | None, typer.Option(help="A recording to train on; give it once for each file.")
+    ] = None,
+    test: Annotated[
+        list[Path] | None,
+        typer.Option(help="A recording to judge on. Default: what the training holds back."),
+    ] = None,
+    model: Annotated[
+        Path | None, typer.Option(help="Folder of a benchmark made before: judge its model, train nothing.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder to make. Default: runs/MACHINE-benchmark.")] = None,
+    budget: Annotated[str, typer.Option(help="Effort: quick or full.")] = "quick",
+    seed: Annotated[int, typer.Option(help="Seed of the networks.", min=0)] = 0,
+    refit: Annotated[
+        float | None,
+        typer.Option(
+            help="A machine that has changed: fit the prior anew to so many seconds of each test file."
+        ),
+    ] = None,
+    workers: Annotated[int, typer.Option(help="Kinds of networks trained side by side.", min=1)] = 2,
+) -> None:
+    """Fit the prior, train networks on it, and judge free runs over unseen recordings."""
+    from hybrid_mpc.cli.progress import make_progress
+    from hybrid_mpc.pipeline.machine_benchmark.figures import draw
+    from hybrid_mpc.pipeline.machine_benchmark.job import BenchmarkSettings, table
+    from hybrid_mpc.pipeline.machine_benchmark.job import benchmark as run_job
+    from hybrid_mpc.scenario import load_scenario
+
+    folder = out or Path("runs") / f"{Path(machine).stem}-benchmark"
+    settings = BenchmarkSettings(
+        machine, tuple(data or ()), tuple(test or ()), model, budget, seed, workers, refit
+    )
+    with make_progress() as progress:
+        results, runs = run_job(settings, folder, progress=progress)
+        draw(load_scenario(machine), results, runs, folder)
+    for line in table(results):
+        print(line)
+    print(f"results: {(folder / 'results.json').resolve()}")

@@ -1,0 +1,134 @@
+"""Recordings of a benchmark: training files in pieces with roles, test files as whole runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from hybrid_mpc.benchmark_spec import BenchmarkSpec
+from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.scenario import Role, Scenario
+
+SCORED = 50
+"""Fewest periods of a piece after its warm-up."""
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """The training files of a benchmark.
+
+    Args:
+        train: Pieces that are fitted and trained on.
+        valid: Pieces that choose; nothing is fitted to them.
+        held_back: Pieces that neither fit nor choose; may be none.
+        dataset: The files as they were read.
+    """
+
+    train: tuple[Trajectory, ...]
+    valid: tuple[Trajectory, ...]
+    held_back: tuple[Trajectory, ...]
+    dataset: Dataset
+
+
+def benchmark_of(scenario: Scenario) -> BenchmarkSpec:
+    """The scenario's convention.
+
+    Raises:
+        InputError: If it has none.
+
+    Example:
+        >>> from scenarios.torque_pendulum import scenario
+        >>> benchmark_of(scenario).length
+        2.5
+    """
+    if scenario.benchmark is None:
+        raise InputError(
+            f"scenario {scenario.name} has no benchmark: give it one with Scenario(benchmark=BenchmarkSpec(...))"
+        )
+    return scenario.benchmark
+
+
+def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
+    """Read training files; long ones are cut into pieces of the benchmark's length.
+
+    Raises:
+        InputError: If a file is bad, or no piece is left for training or validation.
+    """
+    prior, spec = scenario.prior(), benchmark_of(scenario)
+    needed: tuple[Role, ...] = () if spec.cycle else ("train", "valid")
+    dataset = load_trajectories(
+        paths, scenario.data, outputs=prior.outputs, inputs=prior.inputs, needed=needed
+    )
+    if spec.cycle:
+        parts = [p for t in dataset.whole for p in in_turn(t, spec, scenario.data.smoothing)]
+        shortest = scenario.data.warm_up + SCORED * scenario.data.dt
+        if any(len(p.t) * p.dt < shortest for p in parts):
+            raise InputError(
+                f"a recording is too short to be cut into {len(spec.cycle)} pieces of {shortest:.3g} s and more, which "
+                "training and validation need; give longer ones"
+            )
+    else:
+        parts = [p for t in dataset.trajectories for p in pieces(t, spec.piece)]
+    train, valid, held = (tuple(p for p in parts if p.role == role) for role in ("train", "valid", "test"))
+    return Recordings(train, valid, held, dataset)
+
+
+def read_test(scenario: Scenario, path: Path) -> tuple[Trajectory, ...]:
+    """A test file as whole runs, one for each side of a gap; windows known for a file's name are not looked at.
+
+    Raises:
+        InputError: If the file is bad or nothing of it is long enough.
+    """
+    prior = scenario.prior()
+    spec = replace(scenario.data, windows={})
+    whole = load_trajectories([path], spec, outputs=prior.outputs, inputs=prior.inputs, needed=()).whole
+    if not whole:
+        raise InputError(
+            f"{path}: no part is long enough for a free run after {spec.warm_up:g} s that are given"
+        )
+    return whole
+
+
+def in_turn(trajectory: Trajectory, spec: BenchmarkSpec, distance: float) -> tuple[Trajectory, ...]:
+    """Pieces of a whole recording with the cycle's roles in turn; ``distance`` [s] between them is in none of them.
+
+    Example:
+        >>> z = np.zeros((400, 1))
+        >>> run = Trajectory("run", "", 0.1, 0.1 * np.arange(400), z, z, np.zeros((400, 2)), np.zeros((400, 2)))
+        >>> spec = BenchmarkSpec(piece=10.0, cycle=("train", "valid"))
+        >>> [(p.role, len(p.t)) for p in in_turn(run, spec, 0.4)]
+        [('train', 96), ('valid', 96), ('train', 96), ('valid', 96)]
+    """
+    seconds = min(spec.piece, len(trajectory.t) * trajectory.dt / len(spec.cycle))
+    margin = round(0.5 * distance / trajectory.dt)
+    parts = []
+    for i, part in enumerate(pieces(trajectory, seconds)):
+        index = np.arange(len(part.t))
+        inner = (index >= margin) & (index < len(part.t) - margin)
+        parts.append(part.part(inner, part.name, spec.cycle[i % len(spec.cycle)]))
+    return tuple(parts)
+
+
+def pieces(trajectory: Trajectory, seconds: float) -> tuple[Trajectory, ...]:
+    """Equal pieces of about ``seconds``; a few samples at the end may be left over.
+
+    Example:
+        >>> z = np.zeros((101, 1))
+        >>> run = Trajectory("run", "train", 0.1, 0.1 * np.arange(101), z, z, np.zeros((101, 2)), np.zeros((101, 2)))
+        >>> [(p.name, len(p.t)) for p in pieces(run, 5.0)], len(pieces(run, 60.0))
+        ([('run.1', 50), ('run.2', 50)], 1)
+    """
+    count = round(len(trajectory.t) * trajectory.dt / seconds)
+    if count < 2:
+        return (trajectory,)
+    n, index = len(trajectory.t) // count, np.arange(len(trajectory.t))
+    return tuple(
+        trajectory.part(
+            (index >= i * n) & (index < (i + 1) * n), f"{trajectory.name}.{i + 1}", trajectory.role
+        )
+        for i in range(count)
+    )

@@ -1,0 +1,62 @@
+"""Prior of the unbalanced disk: a driven pendulum with viscous and dry friction, scaled by its inertia."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from hybrid_mpc.physics import Prior
+from hybrid_mpc.signals import Parameter, Signal
+
+FRICTION_SPEED = 0.05
+"""Speed [rad/s] over which dry friction changes its sign. The data ask for a sharper one (a fit ran to the smallest it
+was given); this is what a few Runge-Kutta steps a period can follow."""
+
+
+class UnbalancedDiskPrior(Prior):
+    r"""``phi_ddot = -w_0^2 sin(phi + phi_0) - gamma phi_dot - F_c tanh(phi_dot / v_c) + K_u u``; phi = 0 hangs down.
+
+    ``u`` is the motor's voltage: ``gamma`` holds the back-EMF beside the bearing's friction. Motion tells accelerations
+    only; ``J`` is fixed and turns them into torques, so that the energy balance is in watts.
+
+    Source: structure and nominal values, GerbenBeintema/gym-unbalanced-disk; J from the first version of its simulator.
+
+    Example:
+        >>> prior = UnbalancedDiskPrior({"K_u": 20.0})
+        >>> prior(torch.zeros(2, dtype=torch.float64), torch.tensor([0.5], dtype=torch.float64)).tolist()
+        [0.0, 10.0]
+    """
+
+    states: ClassVar[tuple[Signal, ...]] = (
+        Signal("phi", "rad", -60.0, 60.0, periodic=True),
+        Signal("phi_dot", "rad/s", -100.0, 100.0),
+    )
+    inputs: ClassVar[tuple[Signal, ...]] = (Signal("voltage", "V", -12.0, 12.0),)
+    outputs: ClassVar[tuple[Signal, ...]] = (states[0],)
+    parameters_spec: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("J", 2.44e-4, "kg m^2", 2.44e-4, 2.44e-4, "inertia (fixed: it shows in no motion)"),
+        Parameter("w_0", 11.34, "rad/s", 8.0, 15.0, "natural frequency"),
+        Parameter("gamma", 1.33, "1/s", 0.0, 6.0, "viscous friction and back-EMF over J"),
+        Parameter("F_c", 6.06, "rad/s^2", 0.0, 20.0, "dry friction over J"),
+        Parameter("K_u", 28.1, "rad/s^2/V", 10.0, 60.0, "acceleration a volt"),
+        Parameter("phi_0", 0.0, "rad", -0.3, 0.3, "angle of the encoder's zero from hanging down"),
+    )
+
+    J: Tensor
+    w_0: Tensor
+    gamma: Tensor
+    F_c: Tensor
+    K_u: Tensor
+    phi_0: Tensor
+
+    def inertia(self, x: Tensor) -> Tensor:
+        """Inertia about the axis J [kg m^2], shape ``()``."""
+        return self.J
+
+    def acceleration(self, x: Tensor, u: Tensor) -> Tensor:
+        """Angular acceleration ``(..., 1)`` [rad/s^2]."""
+        phi, v = x[..., 0:1], x[..., 1:2]
+        friction = self.gamma * v + self.F_c * torch.tanh(v / FRICTION_SPEED)
+        return self.K_u * u - self.w_0 * self.w_0 * torch.sin(phi + self.phi_0) - friction

@@ -1,0 +1,253 @@
+"""``hybrid-mpc benchmark`` on a machine that is simulated here, and what it refuses."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+
+from hybrid_mpc.cli import main
+from hybrid_mpc.data import write_csv
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.identification.dataset import cut_windows
+from hybrid_mpc.pipeline.machine_benchmark.free_runs import figures_of, run_freely
+from hybrid_mpc.pipeline.machine_benchmark.job import BenchmarkSettings, benchmark
+from hybrid_mpc.pipeline.machine_benchmark.physics import fit_physics, shifted
+from hybrid_mpc.pipeline.machine_benchmark.recordings import read_test, read_training
+from hybrid_mpc.scenario import load_scenario
+
+MACHINE = """
+import torch
+from hybrid_mpc.benchmark_spec import BenchmarkBudget, BenchmarkSpec
+from hybrid_mpc.physics import Prior
+from hybrid_mpc.scenario import DataSpec, Scenario
+from hybrid_mpc.signals import Parameter, Signal
+
+
+class Cart(Prior):
+    states = (Signal("s", "m"), Signal("v", "m/s"))
+    inputs = (Signal("F", "N"),)
+    outputs = (states[0],)
+    parameters_spec = (Parameter("k", 1.0, "N/kg/m", 0.2, 9.0), Parameter("d", 0.5, "1/s", 0.0, 2.0))
+
+    def inertia(self, x):
+        return 1.0
+
+    def acceleration(self, x, u):
+        return u - self.k * x[..., 0:1] - self.d * x[..., 1:2]
+
+
+scenario = Scenario(
+    "cart", "A cart", "", prior=Cart,
+    data=DataSpec("t", ("u",), ("s",), dt=0.1, max_gap=0.25, smoothing=0.7, warm_up=1.0, fractions=(0.6, 0.2, 0.2)),
+    benchmark=BenchmarkSpec(
+        {"quick": BenchmarkBudget(4, 2, teacher_steps=5, free_run_steps=5, horizon=10, batch=8)},
+        unit="mm", scale=1e3, largest_delay=0.3, piece=20.0,
+    ),
+)
+"""
+TRUE = {"k": 4.0, "d": 0.6, "cubic": 0.5}
+DELAY = 0.13
+
+
+def recording(path, *, seed, seconds=100.0, k=TRUE["k"]):
+    """The cart with a stiffening spring that no prior knows, its input 0.13 s late, an encoder of 0.1 mm."""
+    rng, n, sub = np.random.default_rng(seed), round(seconds / 0.1), 20
+    u = np.repeat(rng.uniform(-2, 2, n // 5), 5)
+    x, s = np.zeros(2), []
+    for i in range(n * sub):
+        if i % sub == 0:
+            s.append(x[0])
+        late = i - round(DELAY / 0.1 * sub)
+        held = u[late // sub] if late >= 0 else 0.0
+        a = held - k * x[0] - TRUE["cubic"] * x[0] ** 3 - TRUE["d"] * x[1]
+        x = x + 0.1 / sub * np.array([x[1] + 0.5 * 0.1 / sub * a, a])
+    return write_csv(path, {"t": 0.1 * np.arange(n), "u": u, "s": np.round(np.array(s), 4)})
+
+
+@pytest.fixture(scope="module")
+def machine(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("cart")
+    (folder / "cart.py").write_text(MACHINE)
+    train = recording(folder / "train.csv", seed=0)
+    test = recording(folder / "test.csv", seed=1, seconds=40.0)
+    return folder / "cart.py", train, test
+
+
+@pytest.fixture(scope="module")
+def made(machine, tmp_path_factory):
+    """A finished benchmark, by the command itself."""
+    scenario, train, test = machine
+    out = tmp_path_factory.mktemp("out") / "run"
+    settings = BenchmarkSettings(str(scenario), (train,), (test,))
+    results, runs = benchmark(settings, out)
+    return out, results, runs
+
+
+def test_the_delay_and_the_parameters_are_found(machine):
+    scenario = load_scenario(str(machine[0]))
+    data = read_training(scenario, [machine[1]])
+    physics = fit_physics(scenario.prior, data.train, data.valid, dt=0.1, length=20.0, largest_delay=0.3)
+    # a tenth of a period; the delayed input is a mean over the period, which a swing of 3 s hardly notices
+    assert abs(physics.delay - DELAY) < 0.01
+    # the cubic spring counts as a stiffer one: at most 3 * 0.5 * 0.7^2 more, with swings of up to 0.7 m
+    assert TRUE["k"] < physics.fit.values["k"] < TRUE["k"] + 0.75
+    assert abs(physics.fit.values["d"] - TRUE["d"]) < 0.15
+    assert set(physics.fit.standard_errors) == {"k", "d"}
+
+
+def test_roles_do_not_overlap_and_long_recordings_are_cut(machine):
+    scenario = load_scenario(str(machine[0]))
+    data = read_training(scenario, [machine[1]])
+    assert [len(p.t) for p in data.train] == [
+        199,
+        199,
+        199,
+    ]  # 60 s in pieces of 20 s, less the smoothing's distance
+    times = [{round(v, 3) for p in part for v in p.t} for part in (data.train, data.valid, data.held_back)]
+    assert all(times)
+    assert not times[0] & times[1]
+    assert not (times[0] | times[1]) & times[2]
+
+
+def test_a_test_file_is_judged_after_what_is_given_and_on_nothing_before(machine, made):
+    out, results, runs = made
+    assert set(results["test"]) == {"test.csv"}
+    run = runs["test.csv"][0]
+    # 10 periods of warm-up: 11 samples are given, the next one is the first that counts
+    assert run.t[0] == pytest.approx(1.1)
+    assert len(run.t) == 400 - 11 - 1  # the last sample's input has no period after it
+    row = results["test"]["test.csv"]
+    assert set(row) == {"phy", "rnn", "pgrnn", "mopgrnn", "hybrid", "scored_s"}
+    for name in ("phy", "hybrid"):
+        assert row[name]["unit"] == "mm"
+        assert 0 < row[name]["relative"] < 0.3  # the prior knows the machine but for its cubic spring
+    error = 1e3 * (run.y_hat["phy"] - run.y)[:, 0]
+    assert row["phy"]["rmse"] == pytest.approx(np.sqrt(np.mean(error**2)))
+    assert json.loads((out / "results.json").read_text())["test"]["test.csv"]["phy"] == row["phy"]
+
+
+def test_nothing_after_the_warm_up_is_known_to_a_free_run(machine, made, tmp_path):
+    from hybrid_mpc.pipeline.machine_benchmark.store import load_model
+
+    scenario, model = load_scenario(str(machine[0])), load_model(made[0], "cart")
+    prior = scenario.prior(model.physics.fit.values)
+    lines = machine[2].read_text().splitlines()
+    # from the 12th sample on, the measured position is something else; time and input are as they were
+    changed = [*lines[:12], *(",".join([*line.split(",")[:2], "0.5"]) for line in lines[12:])]
+    (tmp_path / "changed.csv").write_text("\n".join(changed) + "\n")
+    assert lines[0].split(",") == ["t", "u", "s"]
+    found = [
+        run_freely(prior, model.physics, model.networks, read_test(scenario, path), warm_up=1.0, length=None)[
+            0
+        ]
+        for path in (machine[2], tmp_path / "changed.csv")
+    ]
+    for name, y_hat in found[0].y_hat.items():
+        np.testing.assert_array_equal(y_hat, found[1].y_hat[name], err_msg=name)
+    assert not np.allclose(found[0].y, found[1].y)
+
+
+def test_the_recommended_model_is_the_best_on_the_validation_part(made):
+    _, results, _ = made
+    validation = results["model"]["validation"]["rmse"]
+    candidates = {
+        name: v for name, v in validation.items() if "rnn" not in name.split() and name != "rnn mean"
+    }
+    assert results["model"]["hybrid"] == min(candidates, key=candidates.get)
+
+
+def test_a_model_made_before_gives_the_same_figures_and_an_interrupted_run_goes_on(machine, made, tmp_path):
+    scenario, train, test = machine
+    out, results, _ = made
+    again, _ = benchmark(BenchmarkSettings(str(scenario), test=(test,), model=out), tmp_path / "again")
+    assert again["test"] == results["test"]
+    (out / "checkpoints" / "pgrnn.json").unlink()  # as if it had been killed before this was written
+    (out / "checkpoints" / "pgrnn.npz").unlink()
+    resumed, _ = benchmark(BenchmarkSettings(str(scenario), (train,), (test,)), out)
+    assert resumed["test"] == results["test"]
+
+
+def test_a_changed_machine_is_known_again_after_a_few_seconds(machine, made, tmp_path):
+    scenario, _, _ = machine
+    changed = recording(tmp_path / "changed.csv", seed=2, seconds=40.0, k=7.0)
+    settings = BenchmarkSettings(str(scenario), test=(changed,), model=made[0], refit=10.0)
+    results, _ = benchmark(settings, tmp_path / "judged")
+    found = results["test"]["changed.csv"]["refit"]
+    values = {row["parameter"]: row["fitted"] for row in found["prior"]}
+    assert 7.0 < values["k"] < 7.75  # the cubic spring counts as at most 3 * 0.5 * 0.7^2 more
+    for name in ("phy", "hybrid"):
+        assert found["after"][name]["rmse"] < 0.25 * found["before"][name]["rmse"]
+    with pytest.raises(InputError, match="longer than it"):
+        benchmark(
+            BenchmarkSettings(str(scenario), test=(changed,), model=made[0], refit=50.0), tmp_path / "no"
+        )
+
+
+def test_the_delay_takes_samples_from_the_start_only(machine):
+    scenario = load_scenario(str(machine[0]))
+    (whole,) = read_test(scenario, machine[2])
+    (late,) = shifted([whole], DELAY)
+    assert late.t[-1] == whole.t[-1]
+    assert len(whole.t) - len(late.t) == 2
+    assert len(cut_windows([late], 0, 10, 10)) > 0
+
+
+def test_a_diverging_run_is_infinite_and_not_nan():
+    from hybrid_mpc.pipeline.machine_benchmark.free_runs import Run
+
+    y = np.array([[0.0], [1.0]])
+    run = Run("run", np.arange(2.0), y, y, {"rnn": np.array([[0.0], [np.nan]])})
+    assert figures_of([run], "rnn", unit="rad", scale=1.0)["rmse"] == float("inf")
+
+
+@pytest.fixture
+def call(monkeypatch, capsys):
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", ["hybrid-mpc", "benchmark", *map(str, words)])
+        try:
+            main()
+            code = 0
+        except SystemExit as stop:
+            code = stop.code or 0
+        told = capsys.readouterr()
+        return code, told.out, told.err.replace("\n", " ")
+
+    return run
+
+
+def test_the_command_judges_a_model_and_draws_it(call, machine, made, tmp_path):
+    out = tmp_path / "judged"
+    code, told, _ = call(machine[0], "--model", made[0], "--test", machine[2], "--out", out)
+    assert code == 0
+    assert "hybrid" in told
+    assert (out / "results.json").is_file()
+    assert (out / "figures" / "test.png").stat().st_size > 10_000  # an empty page of this size has about 2 kB
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ((), "--data FILE, or a model made before"),
+        (("--data", "a.csv", "--model", "m"), "leave --data out"),
+        (("--model", "nowhere"), "--test FILE"),
+        (("--data", "a.csv", "--budget", "huge"), "no benchmark budget 'huge'; it has: quick"),
+        (("--data", "missing.csv"), "there is no such file"),
+        (("--model", "nowhere", "--test", "TEST"), "holds no model of a benchmark"),
+    ],
+)
+def test_what_the_command_refuses(call, machine, tmp_path, words, message):
+    words = [machine[2] if word == "TEST" else word for word in words]
+    code, _, told = call(machine[0], *words, "--out", tmp_path / "out")
+    assert code == 2
+    assert message in told
+    assert not (tmp_path / "out" / "results.json").exists()
+
+
+def test_a_folder_of_another_benchmark_is_refused(call, machine, made):
+    code, _, told = call(machine[0], "--data", machine[2], "--out", made[0])
+    assert code == 2
+    assert "other settings (data differ)" in told
+    code, _, told = call("golf_robot", "--data", machine[2], "--out", made[0])
+    assert code == 2
+    assert "has no benchmark" in told
