@@ -16,6 +16,8 @@ from hybrid_mpc.pipeline.machine_benchmark.physics import fit_physics, shifted
 from hybrid_mpc.pipeline.machine_benchmark.recordings import read_test, read_training
 from hybrid_mpc.scenario import load_scenario
 
+pytestmark = pytest.mark.xdist_group("machine")  # they share what is made once
+
 MACHINE = """
 import torch
 from hybrid_mpc.benchmark_spec import BenchmarkBudget, BenchmarkSpec

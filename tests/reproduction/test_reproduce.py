@@ -20,6 +20,8 @@ from hybrid_mpc.reproduction.settings import ReproductionSettings
 
 from .conftest import Interrupting
 
+pytestmark = pytest.mark.xdist_group("reproduce")  # they share what is made once
+
 MODELS = ("phy_nominal", "phy", "rnn", "pgrnn", "mopgrnn", "hybrid")
 
 
