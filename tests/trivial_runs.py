@@ -84,6 +84,7 @@ NOTE = {"sha256": "0", "provenance": {}, "noise": {"source": "none", "sigma_x": 
 if __name__ == "__main__":
     import trivial_runs
 
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's job in the background ignores it
     runner.load_inputs = lambda *given: (getattr(trivial_runs, sys.argv[2]), {"model": NOTE})
     out = Path(sys.argv[1])
     run_study(study(int(sys.argv[3])), out, workers=2, resume=(out / "study.json").is_file())
