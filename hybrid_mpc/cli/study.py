@@ -113,9 +113,9 @@ def _run_monitor(
             f"study monitor needs one model, got {len(models)}: --model FOLDER, e.g. model/ of a finished run"
         )
     with make_progress() as progress:
+        wanted = monitor_study(next(iter(models.values())), budget)
         results = run_monitor_study(
-            monitor_study(next(iter(models.values())), budget), out, workers=workers, resume=resume, retry_failed=retry_failed,
-            noise=noise, progress=progress,
+            wanted, out, workers=workers, resume=resume, retry_failed=retry_failed, noise=noise, progress=progress,
         )  # fmt: skip
     print((out / "table.md").read_text(encoding="utf-8"))
     print(f"report: {(out / 'report.html').resolve()}")

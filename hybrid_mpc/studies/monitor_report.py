@@ -55,7 +55,7 @@ def write_monitor_report(out: Path, results: Mapping[str, Any], note: Mapping[st
         _setup(results, note),
     ]
     tables = [t for section in sections[:4] for t in section.tables]
-    write_text(out / "table.md", "\n\n".join(markdown(t) for t in tables) + "\n")
+    write_text(out / "table.md", "\n\n".join(f"{t.caption}\n\n{markdown(t)}" for t in tables) + "\n")
     scenario = load_scenario(note["study"]["scenario"])
     report = Report(
         f"Study {note['study']['name']}", scenario.title, scenario.description,
