@@ -174,8 +174,10 @@ def roc(loops: Rows, faulted: Rows, method: str) -> dict[str, list[float]]:
     scores = np.array([row["scores"][method] for row in faulted])
     if not (blocks.size and scores.size):
         return {"factor": [], "per_hour": [], "found": []}
-    top = 1.01 * max(blocks.max(), 1.0, scores.max())
-    factors = np.geomspace(0.99 * max(blocks.min(), 1e-3), top, ROC_POINTS)
+    ranks = np.unique(np.geomspace(1, blocks.size, ROC_POINTS).round().astype(int))[::-1]
+    passed = np.sort(blocks)[blocks.size - ranks]  # so many blocks pass just below these
+    top = max(blocks.max(), scores.max())
+    factors = np.array([*(passed * (1 - 1e-9)), blocks.max(), top])
     hours = blocks.size * BLOCK_S / 3600
     return {
         "factor": factors.tolist(),

@@ -10,7 +10,7 @@ import pytest
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.monitor.detection import METHODS, Judges, held, learn_judges
 
-DT, STEP = 0.02, 1.5e-3
+DT, STEP, RATE = 0.02, 1.5e-3, 2.5
 PERIODS = 9_000  # 180 s: 35 blocks of 5 s after the first second
 
 
@@ -35,11 +35,11 @@ def trace(seed, force=0.0, output=0.0):
 
 @pytest.fixture(scope="module")
 def judges():
-    return learn_judges([trace(seed) for seed in range(2)], DT, (STEP,), rate=10.0)
+    return learn_judges([trace(seed) for seed in range(2)], DT, (STEP,), rate=RATE)
 
 
 def found(judges, which, method):
-    return judges.alarm(judges.levels(which), which, method, 10.0)
+    return judges.alarm(judges.levels(which), which, method, RATE)
 
 
 def test_each_sees_what_it_is_for(judges):
@@ -68,8 +68,8 @@ def test_rates_are_shared_and_thresholds_fall_with_them(judges):
 
 def test_score_passes_one_where_a_part_passes_its_threshold(judges):
     levels = judges.levels(trace(13, output=3e-3))
-    score = judges.score(levels, "innovation_rms", 10.0)
-    assert np.array_equal(score > 1.0, levels["innovation_rms"] > judges.threshold("innovation_rms", 10.0))
+    score = judges.score(levels, "innovation_rms", RATE)
+    assert np.array_equal(score > 1.0, levels["innovation_rms"] > judges.threshold("innovation_rms", RATE))
 
 
 def test_round_trip(judges):

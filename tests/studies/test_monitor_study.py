@@ -138,7 +138,9 @@ def test_run_resume_report(stand_in, tmp_path, monkeypatch, capsys):
     assert json.loads((out / "results.json").read_text())["nominal_hours"] == again["nominal_hours"] == 0.5
     (out / "report.html").unlink()
     monkeypatch.setattr(sys, "argv", ["hybrid-mpc", "study", "report", str(out)])
-    main()
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 0
     assert (out / "report.html").is_file()
     assert "report.html" in capsys.readouterr().out
 
