@@ -163,7 +163,7 @@ class MonitorStudy:
     Example:
         >>> study = MonitorStudy("golf_robot", "runs/golf", seeds=2, guard_seeds=1, nominal_hours=1.0)
         >>> study.size, sum(job.kind == "nominal" for job in study.jobs())
-        (38, 2)
+        (28, 2)
     """
 
     scenario: str
