@@ -129,6 +129,16 @@ class ExtendedKalmanFilter:
         """The model of this filter."""
         return self._model
 
+    @property
+    def noise(self) -> tuple[Array, Array]:
+        """Variances of the process noise of ``(x, h, d)`` a period ``(n,)``, and of the measurement ``(n_y,)``."""
+        return self._noise.copy(), self._noise_y.copy()
+
+    @property
+    def limit(self) -> float:
+        """Variance above which nothing is known any more."""
+        return float(self._lost)
+
     def lost(self, estimate: Estimate) -> bool:
         """True if an estimate is not finite or so uncertain that nothing is known any more."""
         mean = np.concatenate([estimate.x, estimate.h, estimate.d])

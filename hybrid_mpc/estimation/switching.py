@@ -84,6 +84,16 @@ class SwitchingFilter:
         """The model of all its filters."""
         return self._filters[0].model
 
+    @property
+    def filters(self) -> tuple[ExtendedKalmanFilter, ...]:
+        """The modes."""
+        return self._filters
+
+    @property
+    def transition(self) -> Array:
+        """Probability per period ``(m, m)`` to go from mode i to mode j."""
+        return self._transition.copy()
+
     def start(self, y: ArrayLike, t: float = 0.0) -> SwitchingEstimate:
         """Estimate at rest at ``y`` ``(n_y,)``; see :meth:`ExtendedKalmanFilter.start`."""
         empty = np.full(self.model.n_y, np.nan)

@@ -7,6 +7,7 @@ from hybrid_mpc.monitor.calibration import (
     count_alarms,
     with_residual,
 )
+from hybrid_mpc.monitor.detection import METHODS, Judges, learn_judges
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.diagnosis import Change, Diagnoser, Diagnosis
 from hybrid_mpc.monitor.energy import EnergyMonitor
@@ -28,6 +29,9 @@ __all__ = [
     "MonitorReading",
     "Detector",
     "learn_detector",
+    "METHODS",
+    "Judges",
+    "learn_judges",
     "learn_from",
     "guard_monitor",
     "Diagnoser",

@@ -72,7 +72,7 @@ def run_study(
         >>> results = run_study(Study("golf_robot", "runs/golf"), "studies/first")  # doctest: +SKIP
     """
     out, say = Path(out), progress or Silent()
-    _check_folder(out, resume=resume)
+    check_folder(out, resume=resume)
     say.start("reading the models, and the filters' noise")
     run, models = load_inputs(study, noise, read_json(out / NOTE)["models"] if resume else None)
     note = {
@@ -86,9 +86,9 @@ def run_study(
     say.finish(f"{study.size} runs")
     engine = make_engine(run, workers, cluster)
     try:
-        _open_folder(out, note)
+        open_folder(out, note)
         with RunLog(out / RUNS) as log:
-            done = _finished(out, retry_failed)
+            done = finished(out, retry_failed)
             say.start("running")
             left = (config for config in study.runs() if config.id not in done)
             if study.size > len(done):
@@ -235,7 +235,7 @@ def duration_text(seconds: float) -> str:
     return f"{seconds:.0f} s"
 
 
-def _check_folder(out: Path, *, resume: bool) -> None:
+def check_folder(out: Path, *, resume: bool) -> None:
     """Refuse a folder that holds something else, or (without ``resume``) a study."""
     if (out / NOTE).is_file():
         if not resume:
@@ -248,7 +248,7 @@ def _check_folder(out: Path, *, resume: bool) -> None:
         raise InputError(f"{out} holds no study to resume; leave --resume out")
 
 
-def _open_folder(out: Path, note: dict[str, Any]) -> None:
+def open_folder(out: Path, note: dict[str, Any]) -> None:
     """Note what the folder holds, or compare it with what it holds already."""
     path = out / NOTE
     if not path.is_file():
@@ -276,7 +276,7 @@ def _content(scenario: str) -> str | None:
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.suffix == ".py" and path.is_file() else None
 
 
-def _finished(out: Path, retry_failed: bool) -> set[str]:
+def finished(out: Path, retry_failed: bool) -> set[str]:
     """Ids of the runs that need not run."""
     status = {row["id"]: row["status"] for row in rows(out / RUNS)}
     return {id for id, how in status.items() if how == "done" or not retry_failed}

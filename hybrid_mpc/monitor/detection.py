@@ -1,0 +1,234 @@
+"""The guard's detector, baselines on the filter's innovations, and a combination, all learned and judged alike."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.monitor.calibration import BLOCK_S, MAX_EXTRAPOLATION, MIN_BLOCKS, block_maxima, gumbel
+from hybrid_mpc.monitor.detector import Detector
+from hybrid_mpc.monitor.energy import FROZEN_STEPS
+from hybrid_mpc.monitor.learning import detector_levels, learn_detector
+from hybrid_mpc.monitor.standard import DRIFT, SETTLING_S
+
+Array = NDArray[np.float64]
+WINDOW_S = 0.2
+"""Window [s] over which the baselines average."""
+RELEASE = 0.5
+METHODS: Mapping[str, Mapping[str, float]] = MappingProxyType(
+    {
+        "guard": {"forces": 0.5, "power": 0.5, "freeze": 0.0},
+        "guard_or_innovation": {"forces": 0.25, "power": 0.25, "freeze": 0.0, "innovation_rms": 0.5},
+        "level": {"level": 1.0},
+        "innovation_chi2": {"innovation_chi2": 1.0},
+        "innovation_rms": {"innovation_rms": 1.0},
+    }
+)
+"""By method the parts that alarm, each with its share of the wanted rate; 0 for one whose threshold is fixed.
+
+``guard``: sums of scaled residual forces, power of the free runs, freeze test. ``level``: the averaged one-step
+violation alone. ``innovation_chi2``: normalised innovation squared, averaged over 0.2 s, what a chi-square test looks
+at; its threshold is learned too, for the innovations of a switching filter are not white. ``innovation_rms``: root mean
+square of the output's residual over 0.2 s. ``guard_or_innovation``: either, each at half the rate.
+"""
+
+
+class TraceLike(Protocol):
+    """What is judged of a loop of n periods."""
+
+    @property
+    def numbers(self) -> Array:
+        """``MonitorReading.numbers`` ``(n, columns)`` of a :func:`~hybrid_mpc.monitor.guard_monitor`."""
+
+    @property
+    def level_w(self) -> Array:
+        """Averaged one-step violation ``(n,)`` [W]."""
+
+    @property
+    def innovation(self) -> Array:
+        """Innovations ``(n, n_y)`` of the loop's filter."""
+
+    @property
+    def nis(self) -> Array:
+        """Their normalised squares ``(n,)``."""
+
+
+@dataclass(frozen=True)
+class Judges:
+    """All methods, learned from the same nominal loops.
+
+    Args:
+        detector: Scales of residual forces and power; its thresholds are set by the wanted rate.
+        tails: By part location and scale of the Gumbel tail of its maxima in blocks of 5 s.
+        resolution: Step of each sensor ``(n_y,)``.
+        hours: Nominal data learned from [h].
+        blocks: Blocks of 5 s among them.
+
+    Example:
+        >>> tails = {"forces": (3.0, 0.5), "power": (2.0, 0.4)}
+        >>> judges = Judges(Detector(0.02, ((0.01, 0, 0, 0),), (0.01, 0, 0, 0), 2.0, 1.0, 1.0), tails, (1.5e-3,))
+        >>> round(judges.threshold("forces", 1.0), 2), judges.threshold("freeze", 1.0)
+        (6.29, 1.0)
+    """
+
+    detector: Detector
+    tails: Mapping[str, tuple[float, float]]
+    resolution: tuple[float, ...]
+    hours: float = 0.0
+    blocks: int = 0
+
+    def threshold(self, part: str, rate: float) -> float:
+        """Level that a part passes at that rate [1/h] on nominal data; 1 for the freeze test, a share already."""
+        if part == "freeze":
+            return 1.0
+        location, scale = self.tails[part]
+        return max(location - scale * math.log(rate * BLOCK_S / 3600.0), 1e-12)
+
+    def detector_at(self, rate: float) -> Detector:
+        """The detector with thresholds for that rate [1/h] in all, half of it for each alarm."""
+        force, power = (self.threshold(part, 0.5 * rate) for part in ("forces", "power"))
+        return replace(
+            self.detector, force_threshold=force, energy_threshold=power, false_alarms_per_hour=rate,
+            method=f"Gumbel tail of maxima in blocks of {BLOCK_S:g} s",
+        )  # fmt: skip
+
+    def levels(self, trace: TraceLike) -> dict[str, Array]:
+        """Level ``(n,)`` of each part along a loop; zero where it says nothing, and while the estimator settles."""
+        dt, n_q = self.detector.dt, len(self.resolution)
+        forces, power = detector_levels(self.detector, trace.numbers)
+        travel = np.abs(trace.numbers[:, 3 + n_q : 3 + 2 * n_q]) / (FROZEN_STEPS * np.array(self.resolution))
+        squares = (trace.innovation**2).sum(axis=1)
+        found = {
+            "forces": forces,
+            "power": power,
+            "freeze": travel.max(axis=1),
+            "level": trace.level_w,
+            "innovation_chi2": _averaged(trace.nis, dt),
+            "innovation_rms": np.sqrt(_averaged(squares, dt)),
+        }
+        result = {name: np.nan_to_num(level) for name, level in found.items()}
+        for level in result.values():
+            level[: round(SETTLING_S / dt)] = 0.0
+        return result
+
+    def score(self, levels: Mapping[str, Array], method: str, rate: float) -> Array:
+        """Largest share ``(n,)`` of its threshold among a method's parts."""
+        return np.asarray(
+            np.max(
+                [levels[p] / self.threshold(p, share * rate) for p, share in METHODS[method].items()], axis=0
+            )
+        )
+
+    def alarm(
+        self, levels: Mapping[str, Array], trace: TraceLike, method: str, rate: float
+    ) -> NDArray[np.bool_]:
+        """Alarm ``(n,)`` of a method: each part's with its hysteresis, sums capped as online."""
+        parts, on = METHODS[method], np.zeros(len(trace.level_w), dtype=bool)
+        for part, share in parts.items():
+            if part == "forces":
+                on |= self._detected(trace.numbers, 2 * share * rate)
+            elif part == "freeze":
+                on |= levels[part] > 1.0
+            elif part != "power":
+                on |= held(levels[part], self.threshold(part, share * rate))
+        on[: round(SETTLING_S / self.detector.dt)] = False
+        return on
+
+    def _detected(self, numbers: Array, rate: float) -> NDArray[np.bool_]:
+        detector = self.detector_at(rate)
+        state, found = detector.initial(), []
+        for row in numbers.tolist():
+            state, _, alarm = detector.update(state, row)
+            found.append(alarm)
+        return np.array(found, dtype=bool)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain dictionary for JSON."""
+        return {
+            "detector": self.detector.to_dict(), "tails": {k: list(v) for k, v in self.tails.items()},
+            "resolution": list(self.resolution), "hours": self.hours, "blocks": self.blocks,
+        }  # fmt: skip
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Judges:
+        """Judges from :meth:`to_dict`'s dictionary.
+
+        Raises:
+            InputError: If the detector in it is damaged.
+        """
+        tails = {name: (float(a), float(b)) for name, (a, b) in values["tails"].items()}
+        detector = Detector.from_dict(values["detector"])
+        resolution = tuple(float(r) for r in values["resolution"])
+        return cls(detector, tails, resolution, float(values["hours"]), int(values["blocks"]))
+
+
+def learn_judges(
+    traces: Sequence[TraceLike],
+    dt: float,
+    resolution: Sequence[float],
+    *,
+    rate: float = 1.0,
+    data_hash: str = "",
+) -> Judges:
+    """All methods from nominal loops, for wanted rates of false alarms down to ``rate``.
+
+    Thresholds are Gumbel tails of block maxima, as :func:`~hybrid_mpc.monitor.calibrate` makes them. The loops are
+    known to be nominal, so a block that stands out is no reason to refuse them.
+
+    Args:
+        traces: Nominal loops; the first second of each is left out.
+        dt: Period [s].
+        resolution: Step of each sensor ``(n_y,)``.
+        rate: Smallest wanted rate [1/h]; default 1.
+        data_hash: Hash of the data, kept in the detector.
+
+    Raises:
+        InputError: If there is too little data for the rate, or no motion.
+    """
+    skipped = round(SETTLING_S / dt)
+    runs = [trace.numbers[skipped:] for trace in traces]
+    share = min(s for parts in METHODS.values() for s in parts.values() if s)
+    needed = max(MIN_BLOCKS, math.ceil(3600.0 / (share * rate * BLOCK_S * MAX_EXTRAPOLATION)))
+    size = round(BLOCK_S / dt)
+    blocks = sum(len(run) // size for run in runs)
+    if blocks < needed:
+        raise InputError(
+            f"learn_judges: {blocks * BLOCK_S / 60:.1f} min of nominal loops in whole blocks of {BLOCK_S:g} s; a rate "
+            f"of {rate:g}/h, of which a part gets {share:g}, needs {needed * BLOCK_S / 60:.1f} min"
+        )
+    detector = learn_detector(
+        runs, dt, len(resolution), drift=DRIFT, false_alarms_per_hour=rate, data_hash=data_hash, trusted=True
+    )
+    hours = sum(len(run) for run in runs) * dt / 3600.0
+    judges = Judges(detector, {}, tuple(resolution), hours, blocks)
+    levels = [judges.levels(trace) for trace in traces]
+    tails = {}
+    for part in levels[0]:
+        if part != "freeze":
+            maxima, _ = block_maxima([level[part][skipped:] for level in levels], size)
+            tails[part] = gumbel(maxima)
+    return replace(judges, tails=tails)
+
+
+def held(level: Array, threshold: float, release: float = RELEASE) -> NDArray[np.bool_]:
+    """Alarm ``(n,)`` that begins above a threshold and ends below a share of it.
+
+    Example:
+        >>> held(np.array([0.6, 1.1, 0.6, 0.4]), 1.0).tolist()
+        [False, True, True, False]
+    """
+    state = np.where(level > threshold, 1, np.where(level > release * threshold, 0, -1))
+    places = np.maximum.accumulate(np.where(state != 0, np.arange(len(state)), -1))
+    return np.asarray((places >= 0) & (state[np.maximum(places, 0)] == 1))
+
+
+def _averaged(values: Array, dt: float) -> Array:
+    n = max(round(WINDOW_S / dt), 1)
+    return np.convolve(np.nan_to_num(values), np.ones(n) / n)[: len(values)]

@@ -1,0 +1,137 @@
+"""Run the ready study ``monitor``: learn, then judge; resumable, with a report."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from hybrid_mpc.artifact import load_artifact
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import read_json, write_json
+from hybrid_mpc.monitor import Judges
+from hybrid_mpc.pipeline.context import Progress, Silent
+from hybrid_mpc.pipeline.deploy import versions
+from hybrid_mpc.studies.configuration import Study
+from hybrid_mpc.studies.engines import Engine, make_engine
+from hybrid_mpc.studies.log import RunLog, rows
+from hybrid_mpc.studies.loops import load_inputs
+from hybrid_mpc.studies.monitor_loops import CONTROLLER, JUDGES, LEARNING, PRIOR, MonitorRunner, learn
+from hybrid_mpc.studies.monitor_plan import LEARN, MonitorJob, MonitorStudy
+from hybrid_mpc.studies.monitor_report import write_monitor_report
+from hybrid_mpc.studies.monitor_results import monitor_results
+from hybrid_mpc.studies.runner import NOTE, RUNS, SCHEMA_VERSION, check_folder, execute, finished, open_folder
+
+RESULTS = "results.json"
+KIND = "monitor"
+
+
+def run_monitor_study(
+    study: MonitorStudy,
+    out: str | Path,
+    *,
+    workers: int = 2,
+    resume: bool = False,
+    retry_failed: bool = False,
+    noise: Path | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Run the study into a folder and return its results.
+
+    What is finished is on the disk; after a kill at any moment ``resume=True`` goes on.
+
+    Args:
+        study: What to run.
+        out: Folder to make; new or empty unless ``resume``.
+        workers: Processes.
+        resume: Finish the study that ``out`` holds.
+        retry_failed: Run those jobs again that have failed.
+        noise: ``control.json`` of a run with the filters' process noise. Default: that of the model's run.
+        progress: Where to report; default: nowhere.
+
+    Returns:
+        What ``out/results.json`` holds; beside it are ``report.html``, ``table.md`` and the figures.
+
+    Raises:
+        InputError: For bad input, too little nominal data for the rates, or if every job has failed.
+
+    Example:
+        >>> results = run_monitor_study(monitor_study("runs/golf"), "studies/monitor")  # doctest: +SKIP
+    """
+    out, say = Path(out), progress or Silent()
+    check_folder(out, resume=resume)
+    say.start("reading the model, and the filters' noise")
+    held = read_json(out / NOTE)["models"] if resume else None
+    loops, models = load_inputs(
+        Study(study.scenario, study.model, tasks=(study.task,), controllers=(PRIOR, CONTROLLER)), noise, held
+    )
+    (model,) = loops.models
+    note = {
+        "schema_version": SCHEMA_VERSION, "kind": KIND, "study": study.identity(), "scenario_sha256": None,
+        "models": models, "runs": study.size, "versions": versions(),
+    }  # fmt: skip
+    say.finish(f"{study.size} jobs")
+    engine = make_engine(MonitorRunner(study, model, str(out.resolve())), workers, None)
+    try:
+        open_folder(out, note)
+        jobs = list(study.jobs())
+        with RunLog(out / RUNS) as log:
+            todo = _Todo(out, log, engine, say, finished(out, retry_failed))
+            first = [job for job in jobs if job.kind == LEARN]
+            todo.run("nominal loops to learn from", first)
+            if not (out / JUDGES).is_file():
+                _learn(study, out, first, load_artifact(Path(model.folder)).models["hybrid"].dt)
+            todo.run("nominal, faulted and guarded loops", [job for job in jobs if job.kind != LEARN])
+    finally:
+        engine.close()
+    return finish(out)
+
+
+def finish(out: Path) -> dict[str, Any]:
+    """Results and report of a study's folder, of one that still runs too.
+
+    Args:
+        out: Its folder.
+
+    Raises:
+        InputError: If nothing has been judged yet.
+    """
+    note = read_json(out / NOTE)
+    done = {row["id"]: row for row in rows(out / RUNS)}
+    judges = Judges.from_dict(read_json(out / JUDGES))
+    results = monitor_results(note["study"], judges, list(done.values()))
+    write_json(out / RESULTS, results)
+    write_monitor_report(out, results, note)
+    return results
+
+
+def is_monitor_study(folder: Path) -> bool:
+    """Whether a folder holds this study."""
+    return (folder / NOTE).is_file() and read_json(folder / NOTE).get("kind") == KIND
+
+
+class _Todo:
+    """What is left of a study, run in its engine."""
+
+    def __init__(self, out: Path, log: RunLog, engine: Engine, say: Progress, done: set[str]) -> None:
+        self._out, self._log, self._engine, self._say, self._done = out, log, engine, say, done
+
+    def run(self, title: str, jobs: Iterable[MonitorJob]) -> None:
+        """Those of the jobs that are not done."""
+        left = [job for job in jobs if job.id not in self._done]
+        self._say.start(title)
+        told = execute(iter(left), self._log, self._engine, self._say, len(left))
+        self._say.finish(told.text if left else "done before")
+
+
+def _learn(study: MonitorStudy, out: Path, jobs: list[MonitorJob], dt: float) -> None:
+    failed = [row for row in rows(out / RUNS) if row["kind"] == LEARN and row["status"] == "failed"]
+    paths = [out / LEARNING / f"{job.id}.npz" for job in jobs]
+    if failed and not all(path.is_file() for path in paths):
+        raise InputError(
+            f"{out}: a nominal loop to learn from has failed: {failed[-1]['error'].strip().splitlines()[-1]}; "
+            "--resume --retry-failed runs it again"
+        )
+    write_json(out / JUDGES, learn(study, paths, dt).to_dict())
+    shutil.rmtree(out / LEARNING)

@@ -1,0 +1,91 @@
+"""Methods of detection, learned and judged alike, on made-up readings."""
+
+import json
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.monitor.detection import METHODS, Judges, held, learn_judges
+
+DT, STEP, RATE = 0.02, 1.5e-3, 2.5
+PERIODS = 9_000  # 180 s: 35 blocks of 5 s after the first second
+
+
+def trace(seed, force=0.0, output=0.0):
+    """Noise; from the middle on a lasting force, or outputs off by so much."""
+    rng = np.random.default_rng(seed)
+    speed = np.sin(0.05 * np.arange(PERIODS))
+    numbers = np.zeros((PERIODS, 11))
+    numbers[:, 3] = rng.normal(scale=0.01, size=PERIODS)
+    numbers[:, 5], numbers[:, 6] = speed, 0.1 * speed
+    numbers[:, 7], numbers[:, 10] = rng.normal(scale=0.01, size=PERIODS), 0.4
+    numbers[:, 8], numbers[:, 9] = 0.4 * speed**2, 0.004 * speed**2
+    innovation = rng.normal(scale=5e-4, size=(PERIODS, 1))
+    half = PERIODS // 2
+    numbers[half:, 3] += force
+    innovation[half:] += output
+    level = np.abs(numbers[:, 3] * speed)
+    return SimpleNamespace(
+        numbers=numbers, level_w=level, innovation=innovation, nis=(innovation[:, 0] / 5e-4) ** 2
+    )
+
+
+@pytest.fixture(scope="module")
+def judges():
+    return learn_judges([trace(seed) for seed in range(2)], DT, (STEP,), rate=RATE)
+
+
+def found(judges, which, method):
+    return judges.alarm(judges.levels(which), which, method, RATE)
+
+
+def test_each_sees_what_it_is_for(judges):
+    half = PERIODS // 2
+    force, output = trace(20, force=0.1), trace(21, output=3e-3)
+    for method, sees in {"guard": (1, 0), "innovation_rms": (0, 1), "guard_or_innovation": (1, 1)}.items():
+        for which, seen in zip((force, output), sees, strict=True):
+            alarm = found(judges, which, method)
+            assert not alarm[:half].any()  # 90 s at 2.5 an hour: one in sixteen seeds alarms
+            # ten deviations of either pass any threshold within half a second
+            assert alarm[half : half + 25].any() == bool(seen)
+
+
+def test_a_frozen_sensor_is_one_whose_travel_passes_three_steps(judges):
+    frozen = trace(12)
+    frozen.numbers[6000:6005, 4] = 3.1 * STEP
+    assert np.flatnonzero(found(judges, frozen, "guard")).tolist() == list(range(6000, 6005))
+
+
+def test_rates_are_shared_and_thresholds_fall_with_them(judges):
+    assert judges.threshold("forces", 1.0) > judges.threshold("forces", 10.0)
+    assert judges.detector_at(2.0).force_threshold == judges.threshold("forces", 1.0)
+    for shares in METHODS.values():
+        assert math.isclose(sum(shares.values()), 1.0)
+
+
+def test_score_passes_one_where_a_part_passes_its_threshold(judges):
+    levels = judges.levels(trace(13, output=3e-3))
+    score = judges.score(levels, "innovation_rms", RATE)
+    assert np.array_equal(score > 1.0, levels["innovation_rms"] > judges.threshold("innovation_rms", RATE))
+
+
+def test_round_trip(judges):
+    again = Judges.from_dict(json.loads(json.dumps(judges.to_dict())))
+    assert again.threshold("power", 3.0) == judges.threshold("power", 3.0)
+    assert again.detector.force == judges.detector.force
+
+
+def test_too_little_data_says_how_much_is_needed():
+    with pytest.raises(InputError, match=r"2\.9 min of nominal loops.*needs 12\.0 min"):
+        learn_judges([trace(0)], DT, (STEP,), rate=1.0)
+
+
+def test_hysteresis_is_that_of_a_loop():
+    level, on, wanted = np.random.default_rng(0).uniform(0, 1.5, 500), False, []
+    for value in level:
+        on = value > (0.5 if on else 1.0)
+        wanted.append(on)
+    assert held(level, 1.0).tolist() == wanted
