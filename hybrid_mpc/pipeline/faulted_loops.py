@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.artifact import Artifact
 from hybrid_mpc.closed_loop import ClosedLoopResult, Fault, Guard, Mode, simulate
+from hybrid_mpc.errors import InputError
 from hybrid_mpc.monitor import Detector, MonitorTrace, guard_monitor
 from hybrid_mpc.monitor.calibration import alarm_intervals
 from hybrid_mpc.pipeline.contenders import build
@@ -106,7 +108,7 @@ def faulted(
         )  # fmt: skip
         # The estimator is deterministic: over the record it says again what it said in the loop.
         trace, alarms = explained(monitor, estimator, Samples(result.t, result.y, result.u), scenario.causes)
-        rows.append({**_told(case, task.name, start, trace, alarms), "switches": _switches(result)})
+        rows.append({**_told(case, task.name, start, trace, alarms), "switches": switches(result)})
         arrays |= kept(case.name, trace, result.y)
     return rows, arrays
 
@@ -129,10 +131,26 @@ def _told(
     }
 
 
-def _switches(result: ClosedLoopResult) -> list[dict[str, Any]]:
+def switches(result: ClosedLoopResult) -> list[dict[str, Any]]:
+    """Changes of the guard's mode in a loop, as plain data."""
     return [
         {"t_s": s.t, "before": s.before.name, "after": s.after.name, "why": s.why} for s in result.switches
     ]
+
+
+def stored_detector(artifact: Artifact, folder: Path | None = None) -> Detector:
+    """The detector that the main job left in an artifact.
+
+    Raises:
+        InputError: If there is none.
+    """
+    found = (artifact.calibration or {}).get("detector")
+    if not found:
+        raise InputError(
+            f"{folder or 'the artifact'} holds no detector for the guard: an earlier version made it, or its run had "
+            "too little nominal data (its report says why); run the main job again"
+        )
+    return Detector.from_dict(found)
 
 
 def kept(name: str, trace: MonitorTrace, y: Array) -> dict[str, Array]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -37,6 +38,7 @@ def overview(
     force_unit: str = "N m",
     thresholds: Mapping[str, float] | None = None,
     notes: Sequence[tuple[float, str]] = (),
+    marks: Sequence[tuple[float, str]] = (),
     title: str = "",
 ) -> Figure:
     """Violation, residual force, energy of the free runs, scores, position; alarms shaded throughout.
@@ -48,6 +50,7 @@ def overview(
         force_unit: Unit of the residual force.
         thresholds: ``"violation"`` [W] and ``"residual"``, where the monitor has them. Default: none.
         notes: Times [s] and what to write there, e.g. what a diagnosis says. Default: none.
+        marks: Times [s] of vertical lines and what they are, for the legend. Default: none.
         title: Title. Default: none.
 
     Returns:
@@ -89,6 +92,8 @@ def overview(
             ax.axvspan(start, end, color=ALARM, alpha=0.3, linewidth=0, label="alarm")
         for start, end in intervals(trace.t, trace.frozen) if trace.frozen.size else ():
             ax.axvspan(start, end, ymax=0.05, color=INK, linewidth=0, label="sensor frozen")
+        for (time, text), style in zip(marks, cycle(("-", ":", "-.")), strict=False):
+            ax.axvline(time, color=INK, linestyle=style, linewidth=1.2, label=plain(text))
         ax.set_xlim(trace.t[0], trace.t[-1])
     for time, text in notes:
         by_name["violation"].annotate(
