@@ -38,7 +38,9 @@ def monitor(
     ] = None,
     resolution: Annotated[
         list[float] | None,
-        typer.Option(help="Step of a sensor [its unit]; once for each: test for freezing."),
+        typer.Option(
+            help="Step of a sensor [its unit]; once for each: test for freezing. Default: by its noise."
+        ),
     ] = None,
     noise: Annotated[
         Path | None,

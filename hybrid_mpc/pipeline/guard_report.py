@@ -107,8 +107,13 @@ def guard_words(results: dict[str, Any]) -> tuple[str, ...]:
         if test["seconds"] > 0:
             words.append(
                 f"In {test['seconds']:.0f} s of test recordings it alarmed {_times(test['alarms'])}; that bounds its "
-                f"rate there at {test['at_most_per_hour']:.3g} an hour (95 %), and a longer test would say more."
+                f"rate there at {test['at_most_per_hour']:.3g} an hour (95 %)."
             )
+            if details["loops"]:
+                words[-1] += (
+                    " They were driven otherwise, and wider, than the loops: an alarm there says that the model is "
+                    "less right where the loops do not go."
+                )
         else:
             words.append("No test recording is long enough to try it on.")
     if "plausibility" in details:

@@ -18,7 +18,7 @@ from hybrid_mpc.monitor import Calibration, Detector, Diagnoser, EnergyMonitor, 
 from hybrid_mpc.monitor.replay import EstimatorLike, TrajectoryLike, replay
 from hybrid_mpc.monitor.standard import learn_from
 from hybrid_mpc.pipeline.control_noise import find_noise
-from hybrid_mpc.pipeline.loops import make_estimator, make_monitor
+from hybrid_mpc.pipeline.loops import make_estimator, make_monitor, sensor_steps
 from hybrid_mpc.scenario import Scenario
 
 Array = NDArray[np.float64]
@@ -80,7 +80,8 @@ def prepared(
         model: Artifact folder, or the folder of the run that holds it as ``model``.
         recordings: CSV, ``.npz`` or ``.mat`` files.
         noise: ``control.json`` of a run. Default: as ``hybrid-mpc control`` finds it.
-        resolution: Step of each sensor. Default: unknown.
+        resolution: Step of each sensor. Default: with a detector what the filters' assumed noise comes to, as in the
+            main job.
         calibration: ``calibration.json`` with a detector. Default: the artifact's, if it has one.
 
     Raises:
@@ -106,6 +107,8 @@ def prepared(
     if calibration is not None and detector is None:
         raise InputError(f"{calibration} holds no detector; make it with hybrid-mpc monitor ... --learn 1")
     found = None if detector is None else Detector.from_dict(detector)
+    if found is not None and resolution is None:
+        resolution = sensor_steps(scenario.control)
     return MonitorJob(scenario, artifact, data, np.asarray(sigma["hybrid_observer"]), resolution, found)
 
 
