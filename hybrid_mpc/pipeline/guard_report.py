@@ -128,7 +128,7 @@ def guard_words(results: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _times(n: int) -> str:
-    return "never" if n == 0 else "once" if n == 1 else f"{n} times"
+    return {0: "never", 1: "once", 2: "twice"}.get(n, f"{n} times")
 
 
 def guard_figures(context: Context) -> Iterator[tuple[str, str, Figure, str]]:

@@ -110,7 +110,7 @@ def repeated(task: Task, dt: float, shares: Array) -> Task:
         (6.0, [[0.5, 1.0], [0.25, 0.5]])
     """
     n_q, length = len(task.x0) // 2, round(task.duration / dt)
-    rows = task.reference(np.arange(length + 1) * dt)
+    rows = task.reference(np.arange(length + 1, dtype=np.float64) * dt)
     first, last = rows[0], rows[-1]
     fastest = np.abs(rows[:, n_q : 2 * n_q]).max(axis=0)
     far = np.abs(last - first)[:n_q] / np.maximum(fastest, 1e-9)  # a quintic's top speed is 15/8 of its mean
