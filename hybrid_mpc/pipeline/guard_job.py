@@ -153,7 +153,9 @@ def _nominal_data(context: Context, artifact: Artifact, control: ControlSpec) ->
     source = "recordings that nothing was trained on"
     if sum(len(run) // size for run in runs) < blocks_needed(RATES[-1]):
         runs = inside((*HELD, "train"))
-        source = "undisturbed recordings, those of the training among them, which the model fits better than new ones"
+        source = (
+            "undisturbed recordings, also those of the training, which the model fits better than new ones"
+        )
     return NominalData(runs, source, context.dataset.hash)
 
 

@@ -94,7 +94,7 @@ def guard_words(results: dict[str, Any]) -> tuple[str, ...]:
     """What this run's detector was learned from, what it does not promise, and the plan's plausibility."""
     guard, details = results["guard"], results["guard"].get("details", {})
     if guard["data_hash"] is None:
-        words = [f"There is no learned detector: {guard['reason']}."]
+        words = [f"{guard['reason'][0].upper()}{guard['reason'][1:]}."]
     else:
         rate = guard["false_alarms_per_hour"]
         words = [f"The detector was learned from {details['source']}."]
