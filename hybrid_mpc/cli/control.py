@@ -15,7 +15,9 @@ EXAMPLES = (
     "  hybrid-mpc control golf_robot --model runs/golf/model --task stroke --controller prior_observer "
     "--controller hybrid_observer --solver sqp --seeds 5 --out strokes\n\n"
     "  hybrid-mpc control golf_robot --model runs/golf/model --task track_sine --fault plant_friction=2@1.5 "
-    "--out worn"
+    "--out worn\n\n"
+    "  hybrid-mpc control golf_robot --model runs/golf/model --task track_sine --fault measurement_freeze@3 --guard "
+    "--out frozen"
 )
 
 
@@ -31,7 +33,9 @@ def control(
     ] = None,
     controller: Annotated[
         list[str] | None,
-        typer.Option(help="A contender; may be repeated. Default: prior_observer and hybrid_observer."),
+        typer.Option(
+            help="A contender; may be repeated. Default: prior_observer (not with --guard) and hybrid_observer."
+        ),
     ] = None,
     solver: Annotated[str, typer.Option(help="rti, sqp or ipopt.")] = "rti",
     seeds: Annotated[int, typer.Option(help="Loops of each task and controller.", min=1)] = 10,
@@ -43,21 +47,32 @@ def control(
         Path | None,
         typer.Option(help="control.json with the filters' process noise. Default: that of the model's run."),
     ] = None,
+    guard: Annotated[
+        bool,
+        typer.Option("--guard", help="Watch with the model's detector; no input while the sensor is frozen."),
+    ] = False,
     gif: Annotated[bool, typer.Option("--gif/--no-gif", help="Draw moving pictures.")] = True,
 ) -> None:
     """Close the loop around the simulated machine with a trained model, without training anything."""
     from hybrid_mpc.cli.progress import make_progress
-    from hybrid_mpc.pipeline.control_job import DEFAULT_CONTROLLERS, ControlSettings, parsed_fault, prepared
+    from hybrid_mpc.pipeline.control_job import (
+        DEFAULT_CONTROLLERS,
+        GUARDED_CONTROLLERS,
+        ControlSettings,
+        parsed_fault,
+        prepared,
+    )
     from hybrid_mpc.pipeline.control_results import check_folder, run_control
 
     check_folder(out)
     settings = ControlSettings(
         tuple(task or ()),
-        tuple(dict.fromkeys(controller or DEFAULT_CONTROLLERS)),
+        tuple(dict.fromkeys(controller or (GUARDED_CONTROLLERS if guard else DEFAULT_CONTROLLERS))),
         solver,
         seeds,
         seed,
         tuple(parsed_fault(text) for text in fault or ()),
+        guard,
     )
     with make_progress() as progress:
         progress.start("reading the model, and the filters' noise")
@@ -83,12 +98,23 @@ def summary(results: dict[str, Any]) -> list[str]:
                 f"{task:16} {name:16} {_number(cost['mean']):>10} {_number(cost['ci95'], '±'):>10} "
                 f"{_number(rmse):>11} {100 * cell['sources']['MPC']:>6.1f} %"
             )
+    lines += [line for row in results["loops"] if "guard" in row for line in _guarded(row)]
     for name, times in results["step_ms"].items():
         lines.append(
             f"a step of {name}: median {times['median']:.2f} ms, 99 % within {times['p99']:.2f} ms, period "
             f"{results['period_ms']:g} ms"
         )
     return lines
+
+
+def _guarded(row: dict[str, Any]) -> list[str]:
+    """What the guard of one loop saw and did."""
+    found = row["guard"]
+    if not found["alarms"]:
+        return [f"guard, {row['task']}, seed {row['seed']}: no alarm"]
+    when = ", ".join(f"{a['start_s']:.2f} to {a['end_s']:.2f} s" for a in found["alarms"])
+    modes = "".join(f"; {s['after'].lower()} from {s['t_s']:.2f} s on" for s in found["switches"])
+    return [f"guard, {row['task']}, seed {row['seed']}: alarm {when}{modes}"]
 
 
 def _number(value: float | None, sign: str = "") -> str:

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.scenario import load_scenario
 
+if TYPE_CHECKING:
+    from hybrid_mpc.monitor import Detector
+
 EXAMPLES = (
     "Examples:\n\n"
+    "  hybrid-mpc monitor runs/golf/model today.csv --out today\n\n"
     "  hybrid-mpc monitor runs/golf/model day1.csv day2.csv --learn 1 --out nominal\n\n"
     "  hybrid-mpc monitor runs/golf/model today.csv --calibration nominal/calibration.json --out today\n\n"
     "  hybrid-mpc monitor runs/mine/model today.csv --scenario my_machine.py --out today"
@@ -34,7 +38,9 @@ def monitor(
     ] = None,
     resolution: Annotated[
         list[float] | None,
-        typer.Option(help="Step of a sensor [its unit]; once for each: test for freezing."),
+        typer.Option(
+            help="Step of a sensor [its unit]; once for each: test for freezing. Default: by its noise."
+        ),
     ] = None,
     noise: Annotated[
         Path | None,
@@ -65,9 +71,24 @@ def monitor(
         )
         print(f"detector: {(out / 'calibration.json').resolve()}")
         return
+    print(watching(job.detector))
     for line in summary(watch(job, out)):
         print(line)
     print(f"results: {(out / 'monitor.json').resolve()}")
+
+
+def watching(detector: Detector | None) -> str:
+    """What decides on alarms, in a line.
+
+    Args:
+        detector: The job's.
+    """
+    if detector is None:
+        return "watched with the artifact's thresholds of violation and residual; it holds no detector (see --learn)"
+    return (
+        f"watched with a detector for {detector.false_alarms_per_hour:g} false alarms an hour, learned from "
+        f"{60 * detector.hours:.1f} min (hash {detector.data_hash[:16] or 'unknown'})"
+    )
 
 
 def summary(results: dict[str, Any]) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -37,7 +37,7 @@ def run(
         typer.Option("--settings", help="JSON file of network settings, as hybrid-mpc search leaves it."),
     ] = None,
 ) -> None:
-    """Fit the prior, train, export, close the loop, monitor, analyse, and write a report."""
+    """Fit the prior, train, export, close the loop, monitor, learn the guard, analyse, and write a report."""
     from hybrid_mpc.cli.progress import make_progress
     from hybrid_mpc.pipeline.run import run as run_job
     from hybrid_mpc.pipeline.settings import RunSettings
@@ -75,6 +75,25 @@ def summary(results: dict[str, object]) -> list[str]:
             lines.append(
                 f"closed loop, {name:8} cost {loop['cost']:.4g}, tracking {loop['tracking_rmse_rad']:.4g} rad"
             )
+    lines += guard_lines(results["guard"])
+    return lines
+
+
+def guard_lines(guard: Any) -> list[str]:
+    """What the run says of its energy guard.
+
+    Args:
+        guard: The group of that name in the results.
+    """
+    if guard["data_hash"] is None:
+        return [f"energy guard: {guard['reason']}"]
+    lines = [
+        f"energy guard: learned from {60 * guard['hours']:.1f} min for {guard['false_alarms_per_hour']:g} false alarms "
+        "an hour"
+    ]
+    for row in guard["faults"] or ():
+        seen = "never seen" if row["delay_s"] is None else f"seen after {row['delay_s']:.2f} s"
+        lines.append(f"  {row['fault']}: {seen}" + (f": {row['diagnosis']}" if row["diagnosis"] else ""))
     return lines
 
 

@@ -18,14 +18,17 @@ from hybrid_mpc.closed_loop.faults import check_channels, install
 from hybrid_mpc.closed_loop.simulate import Step
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model import HybridModel
+from hybrid_mpc.monitor import guard_monitor
 from hybrid_mpc.mpc import OCP, Controller, IpoptController, SafeController, SQPController
 from hybrid_mpc.pipeline.contenders import CONTENDERS, ORACLES, build
 from hybrid_mpc.pipeline.control_noise import find_noise
-from hybrid_mpc.pipeline.loops import make_monitor
+from hybrid_mpc.pipeline.faulted_loops import GUARD, stored_detector
+from hybrid_mpc.pipeline.loops import make_monitor, sensor_steps
 from hybrid_mpc.scenario import ControlSpec, Scenario, Task
 
 Array = NDArray[np.float64]
 DEFAULT_CONTROLLERS = ("prior_observer", "hybrid_observer")
+GUARDED_CONTROLLERS = ("hybrid_observer",)
 SOLVERS: Mapping[str, Callable[[HybridModel, OCP], Controller] | None] = {
     "rti": None,  # what the contenders are built with
     "sqp": lambda model, ocp: SQPController(model, ocp),
@@ -44,6 +47,7 @@ class ControlSettings:
         seeds: Loops of each task and controller.
         seed: Seed of the first loop, times 1000, as in the main job.
         faults: What goes wrong in every loop beside what the task itself brings.
+        guard: Whether the artifact's detector watches, and a frozen sensor takes the input away. Default: no.
 
     Raises:
         InputError: If a controller or solver is unknown, an oracle is asked for with another solver, or a number
@@ -61,6 +65,7 @@ class ControlSettings:
     seeds: int = 10
     seed: int = 0
     faults: tuple[Fault, ...] = field(default=())
+    guard: bool = False
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.controllers if name not in CONTENDERS]
@@ -73,6 +78,12 @@ class ControlSettings:
         if oracles and self.solver != "rti":
             raise InputError(
                 f"controller {oracles[0]} has a solver of its own (several starts); leave --solver out or it"
+            )
+        others = [name for name in self.controllers if CONTENDERS[name].model != "hybrid"]
+        if self.guard and others:
+            raise InputError(
+                f"the guard watches with the hybrid, controller {others[0]} has another model; with --guard give "
+                "--controller hybrid_observer or hybrid alone"
             )
         if self.seeds < 1 or self.seed < 0:
             raise InputError(f"seeds must be 1 or more and seed not negative, got {self.seeds}, {self.seed}")
@@ -184,6 +195,8 @@ def prepared(scenario: Scenario, model: Path, settings: ControlSettings, noise: 
         )
     artifact = load_artifact(folder)
     _check_artifact(scenario, artifact, folder, scenario.control)
+    if settings.guard:
+        stored_detector(artifact, folder)
     check_channels(install(scenario.plant(), settings.faults)[1], len(scenario.control.estimator_sigma), 1)
     found = find_noise(scenario, artifact, folder, settings.controllers, settings.seed, noise)
     return Job(scenario, artifact, tasks, settings, *found)
@@ -248,12 +261,18 @@ def _loop(
         say(step.k)
 
     assert job.scenario.plant is not None
-    hybrid = CONTENDERS[name].model == "hybrid"
+    control = task.control or job.scenario.control
+    assert control is not None
+    model, monitor, guard = job.artifact.models["hybrid"], None, None
+    if job.settings.guard:
+        steps = sensor_steps(control)
+        monitor, guard = guard_monitor(model, stored_detector(job.artifact), resolution=steps), GUARD
+    elif CONTENDERS[name].model == "hybrid":
+        monitor = make_monitor(model, None)
     result = simulate(
         job.scenario.plant(), *made, task.reference, weight=task.weight, dt=job.artifact.models["prior"].dt,
         duration=task.duration, x0=np.array(task.x0), seed=job.settings.seed * 1000 + seed,
-        monitor=make_monitor(job.artifact.models["hybrid"], None) if hybrid else None,
-        faults=(*task.faults, *job.settings.faults), on_step=on_step,
+        monitor=monitor, guard=guard, faults=(*task.faults, *job.settings.faults), on_step=on_step,
     )  # fmt: skip
     return result, np.stack(plans)
 

@@ -14,9 +14,11 @@ from hybrid_mpc.closed_loop import ClosedLoopResult
 from hybrid_mpc.closed_loop.timing import percentiles
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import write_json
+from hybrid_mpc.monitor.calibration import alarm_intervals
 from hybrid_mpc.mpc import Source
 from hybrid_mpc.pipeline.control_job import Job, run_loops
 from hybrid_mpc.pipeline.deploy import versions
+from hybrid_mpc.pipeline.faulted_loops import stored_detector, switches
 from hybrid_mpc.scenario import Task
 
 if TYPE_CHECKING:
@@ -48,7 +50,7 @@ def run_control(job: Job, out: Path, progress: Progress, *, gif: bool = True) ->
     progress.start("closing the loop")
     firsts: dict[str, dict[str, tuple[ClosedLoopResult, Array]]] = {}
     for task, name, seed, result, plans in run_loops(job, progress.update):
-        rows.append(row(task, name, seed, result))
+        rows.append(row(task, name, seed, result, guarded=job.settings.guard))
         steps.setdefault(name, []).append(result.timing_ms["total"])
         if seed == 0:
             firsts.setdefault(task.name, {})[name] = (result, plans)
@@ -72,8 +74,17 @@ def check_folder(out: Path) -> None:
         raise InputError(f"{out} exists and is no empty folder; choose another --out")
 
 
-def row(task: Task, name: str, seed: int, result: ClosedLoopResult) -> dict[str, Any]:
-    """Figures of one loop."""
+def row(
+    task: Task, name: str, seed: int, result: ClosedLoopResult, *, guarded: bool = False
+) -> dict[str, Any]:
+    """Figures of one loop; with a guard its alarms and changes of mode too."""
+    watched: dict[str, Any] = {}
+    if guarded:
+        alarms = alarm_intervals(result.alarm, result.dt)
+        watched["guard"] = {
+            "alarms": [{"start_s": a, "end_s": b} for a, b in alarms],
+            "switches": switches(result),
+        }
     return {
         "task": task.name,
         "controller": name,
@@ -84,6 +95,7 @@ def row(task: Task, name: str, seed: int, result: ClosedLoopResult) -> dict[str,
         "sources": shares(result.source),
         "figures": dict(task.figures(result)) if task.figures is not None else {},
         "timing_ms": {key: percentiles(result.timing_ms[key]) for key in TIMES},
+        **watched,
     }
 
 
@@ -134,6 +146,7 @@ def collected(job: Job, rows: Sequence[dict[str, Any]], times: Mapping[str, Arra
             {"target": f.target, "value": f.value, "start_s": f.start, "end_s": f.end}
             for f in settings.faults
         ],
+        **({"guard": stored_detector(job.artifact).to_dict()} if settings.guard else {}),
         "model": {"provenance": dict(job.artifact.provenance)},
         "noise": {"source": job.noise_source, "sigma_x": {k: v.tolist() for k, v in job.noise.items()}},
         "versions": versions(),

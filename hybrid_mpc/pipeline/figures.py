@@ -10,6 +10,7 @@ import numpy as np
 from hybrid_mpc.identification.training import KINDS
 from hybrid_mpc.pipeline.contest import tasks_of
 from hybrid_mpc.pipeline.context import Context
+from hybrid_mpc.pipeline.guard_report import guard_figures
 from hybrid_mpc.pipeline.identify import MODELS, load_trained
 from hybrid_mpc.pipeline.judge import clean_windows
 from hybrid_mpc.pipeline.results import REPORTED, loop_table, step_times, summary
@@ -28,7 +29,8 @@ SHOWN_RECORDINGS = 4
 
 def draw_all(context: Context) -> Figures:
     """Draw every figure that the run's stages allow into ``figures/``."""
-    parts = (_data, _training, _free_runs, _overview, _loops, _estimation, _timing, _monitor, _analysis)
+    judged = _estimation, _timing, _monitor, guard_figures, _analysis
+    parts = (_data, _training, _free_runs, _overview, _loops, *judged)
     figures: Figures = {}
     for i, part in enumerate(parts):
         context.progress.update("figures", i, len(parts), part.__name__.strip("_"))

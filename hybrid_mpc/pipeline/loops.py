@@ -170,6 +170,19 @@ def make_monitor(model: HybridModel, calibration: Calibration | None) -> EnergyM
     )
 
 
+def sensor_steps(control: ControlSpec) -> tuple[float, ...]:
+    """Steps of the sensors, at most: what an even error within a step makes the deviation that filters assume.
+
+    A real one may be finer; then a frozen sensor is found a little later.
+
+    Example:
+        >>> spec = ControlSpec(9, (1.0,), (1.0,), (1.0,), (-1.0,), (1.0,), estimator_sigma=(0.001,))
+        >>> [round(step, 6) for step in sensor_steps(spec)]
+        [0.003464]
+    """
+    return tuple(float(np.sqrt(12.0) * sigma) for sigma in control.estimator_sigma)
+
+
 def time_on_recording(
     controller: SafeController,
     estimator: ExtendedKalmanFilter | SwitchingFilter,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,15 +15,16 @@ from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_json, write_json, write_text
 from hybrid_mpc.monitor import Calibration, Detector, Diagnoser, EnergyMonitor, MonitorTrace, guard_monitor
-from hybrid_mpc.monitor.replay import replay
+from hybrid_mpc.monitor.replay import EstimatorLike, TrajectoryLike, replay
 from hybrid_mpc.monitor.standard import learn_from
 from hybrid_mpc.pipeline.control_noise import find_noise
-from hybrid_mpc.pipeline.loops import make_estimator, make_monitor
+from hybrid_mpc.pipeline.loops import make_estimator, make_monitor, sensor_steps
 from hybrid_mpc.scenario import Scenario
 
 Array = NDArray[np.float64]
 DIAGNOSED_S = 2.0
 """An alarm is explained so long after its start, or at its end: by then the history holds nothing older."""
+FROZEN = "the sensor repeats itself while motion is predicted"
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,8 @@ def prepared(
         model: Artifact folder, or the folder of the run that holds it as ``model``.
         recordings: CSV, ``.npz`` or ``.mat`` files.
         noise: ``control.json`` of a run. Default: as ``hybrid-mpc control`` finds it.
-        resolution: Step of each sensor. Default: unknown.
+        resolution: Step of each sensor. Default: with a detector what the filters' assumed noise comes to, as in the
+            main job.
         calibration: ``calibration.json`` with a detector. Default: the artifact's, if it has one.
 
     Raises:
@@ -105,6 +107,8 @@ def prepared(
     if calibration is not None and detector is None:
         raise InputError(f"{calibration} holds no detector; make it with hybrid-mpc monitor ... --learn 1")
     found = None if detector is None else Detector.from_dict(detector)
+    if found is not None and resolution is None:
+        resolution = sensor_steps(scenario.control)
     return MonitorJob(scenario, artifact, data, np.asarray(sigma["hybrid_observer"]), resolution, found)
 
 
@@ -170,22 +174,47 @@ def watch(job: MonitorJob, out: Path) -> dict[str, Any]:
 
 def watched(job: MonitorJob, recording: Trajectory) -> tuple[MonitorTrace, list[dict[str, Any]]]:
     """Trace of a recording, and its alarms with what explains them (empty where nothing can say)."""
-    monitor, texts = job.monitor, {}
+    return explained(job.monitor, job.estimator, recording, job.scenario.causes)
+
+
+def explained(
+    monitor: EnergyMonitor,
+    estimator: EstimatorLike,
+    recording: TrajectoryLike,
+    causes: Mapping[str, tuple[str, ...]],
+) -> tuple[MonitorTrace, list[dict[str, Any]]]:
+    """Replay a monitor, and say of each alarm what explains it.
+
+    Args:
+        monitor: The monitor; with history and detector its alarms are explained.
+        estimator: The estimator of the closed loops.
+        recording: On the model's grid.
+        causes: What may break, see :class:`~hybrid_mpc.monitor.Diagnoser`. Empty: each parameter by itself.
+
+    Returns:
+        The trace, and ``{start_s, end_s, diagnosis}`` of each alarm; no diagnosis where nothing can say.
+    """
     can = monitor.layout.history and monitor.detector is not None
-    diagnoser = Diagnoser(monitor, job.scenario.causes or None) if can else None
+    diagnoser = Diagnoser(monitor, causes or None) if can else None
+    dt, last = monitor.model.dt, len(recording.t) - 1
+    texts: dict[int, str] = {}
     began: list[int] = []
-    wait = round(DIAGNOSED_S / recording.dt)
 
     def look(k: int, state: Any, reading: Any) -> None:
         if reading.alarm and (not began or began[-1] < 0):
             began.append(k)
-        elif began and began[-1] >= 0 and (not reading.alarm or k == began[-1] + wait):
-            if diagnoser is not None and began[-1] not in texts:
-                texts[began[-1]] = diagnoser.diagnose(state, (k - began[-1]) * recording.dt).text
-            if not reading.alarm:
-                began.append(-1)
+        if not began or began[-1] < 0:
+            return
+        start = began[-1]
+        if reading.frozen:
+            texts[start] = FROZEN
+        due = not reading.alarm or k == start + round(DIAGNOSED_S / dt) or k == last
+        if due and diagnoser is not None and start not in texts:
+            texts[start] = diagnoser.diagnose(state, (k - start) * dt).text
+        if not reading.alarm:
+            began.append(-1)
 
-    trace = replay(monitor, job.estimator, recording, look)
+    trace = replay(monitor, estimator, recording, look)
     alarms = [
         {"start_s": float(trace.t[a]), "end_s": end, "diagnosis": texts.get(a, "")}
         for a, (_, end) in zip([k for k in began if k >= 0], trace.intervals(), strict=True)

@@ -9,6 +9,7 @@ from hybrid_mpc.files import write_json
 from hybrid_mpc.pipeline.contenders import CONTENDERS
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.figures import OBSERVER_TITLES, Figures, draw_all
+from hybrid_mpc.pipeline.guard_report import guard_tables, guard_words
 from hybrid_mpc.pipeline.results import collect
 from hybrid_mpc.plots.style import name_of
 from hybrid_mpc.report import KeyFigure, Report, Section, Table, write_report
@@ -48,13 +49,13 @@ def _report(context: Context, results: dict[str, Any], figures: Figures) -> Repo
         "monitor": _alarm_table(results),
         "analysis": _pole_table(results),
     }
-    notes = _notes(context, results)
+    notes, several = _notes(context, results), {"guard": guard_tables(results)}
     sections = tuple(
         Section(
             TITLES[key],
             notes["instead"].get(key, paragraphs(key)),
             figures.get(key, ()),
-            [t for t in (tables.get(key),) if t is not None and t.rows],
+            [t for t in (tables.get(key), *several.get(key, ())) if t is not None and t.rows],
             notes["after"].get(key, ()),
         )
         for key in TITLES
@@ -143,6 +144,7 @@ def _notes(context: Context, results: dict[str, Any]) -> dict[str, dict[str, tup
     if results["monitor"]["alarms"] is not None:
         method = results["monitor"]["details"]["calibration"]["method"]
         after["monitor"] = (_monitor_words(context, results), f"Calibration: {method}.")
+    after["guard"] = guard_words(results)
     points = results["analysis"]["details"]
     reasons = [
         f"{m}: {points[m]['fixed_point_reason']}" for m in points if "fixed_point_reason" in _dict(points[m])

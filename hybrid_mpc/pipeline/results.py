@@ -10,6 +10,7 @@ import numpy as np
 
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.deploy import versions
+from hybrid_mpc.pipeline.guard_report import guard_results
 from hybrid_mpc.report.schema import CONTROLLERS, MODELS, OBSERVERS, SCHEMA, SCHEMA_VERSION, validate_results
 
 LOOP_FIGURES = ("cost", "tracking_rmse_rad")
@@ -43,6 +44,7 @@ def collect(context: Context) -> dict[str, Any]:
         "estimation": _estimation(context),
         "timing": _timing(context),
         "monitor": _monitor(context),
+        "guard": guard_results(context),
         "analysis": _analysis(context),
     }
     validate_results(results)

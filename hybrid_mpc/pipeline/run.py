@@ -1,4 +1,4 @@
-"""The main job: data, prior, training, evaluation, export, control, estimation, monitor, analysis, report."""
+"""The main job: data, prior, training, evaluation, export, control, estimation, monitor, guard, analysis, report."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 from hybrid_mpc.pipeline import deploy, identify, judge
 from hybrid_mpc.pipeline.context import Context, Progress, Silent
+from hybrid_mpc.pipeline.guard_job import guard_stage
 from hybrid_mpc.pipeline.observers import estimation_stage
 from hybrid_mpc.pipeline.reporting import report_stage
 from hybrid_mpc.pipeline.settings import RunSettings, open_folder
@@ -22,6 +23,7 @@ STAGES: tuple[tuple[str, str, Callable[[Context], None]], ...] = (
     ("control", "closing the loop", deploy.control_stage),
     ("estimation", "testing the observers", estimation_stage),
     ("monitor", "calibrating the energy monitor", judge.monitor_stage),
+    ("guard", "learning the energy guard", guard_stage),
     ("analysis", "linear analysis", judge.analysis_stage),
     ("report", "writing the report", report_stage),
 )

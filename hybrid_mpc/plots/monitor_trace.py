@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -37,6 +38,7 @@ def overview(
     force_unit: str = "N m",
     thresholds: Mapping[str, float] | None = None,
     notes: Sequence[tuple[float, str]] = (),
+    marks: Sequence[tuple[float, str]] = (),
     title: str = "",
 ) -> Figure:
     """Violation, residual force, energy of the free runs, scores, position; alarms shaded throughout.
@@ -48,6 +50,7 @@ def overview(
         force_unit: Unit of the residual force.
         thresholds: ``"violation"`` [W] and ``"residual"``, where the monitor has them. Default: none.
         notes: Times [s] and what to write there, e.g. what a diagnosis says. Default: none.
+        marks: Times [s] of vertical lines, and what is written beside them. Default: none.
         title: Title. Default: none.
 
     Returns:
@@ -89,7 +92,10 @@ def overview(
             ax.axvspan(start, end, color=ALARM, alpha=0.3, linewidth=0, label="alarm")
         for start, end in intervals(trace.t, trace.frozen) if trace.frozen.size else ():
             ax.axvspan(start, end, ymax=0.05, color=INK, linewidth=0, label="sensor frozen")
+        for (time, _), style in zip(marks, cycle(("-", ":", "-.")), strict=False):
+            ax.axvline(time, color=INK, linestyle=style, linewidth=1.2)
         ax.set_xlim(trace.t[0], trace.t[-1])
+    _marks(by_name["position"], marks, 0.5 * float(trace.t[0] + trace.t[-1]))
     for time, text in notes:
         by_name["violation"].annotate(
             plain(text), (time, 1.0), xycoords=("data", "axes fraction"), va="top", fontsize=8, color=INK
@@ -98,6 +104,16 @@ def overview(
         title_axes(by_name["violation"], plain(title))
     shared_legend(figure)
     return figure
+
+
+def _marks(ax: Axes, marks: Sequence[tuple[float, str]], middle: float) -> None:
+    """What the vertical lines are, one below the other, on the side with more room."""
+    for i, (time, text) in enumerate(marks):
+        side = 1 if time < middle - 1e-9 else -1
+        ax.annotate(
+            plain(text), (time, 0.96), xycoords=("data", "axes fraction"), xytext=(4 * side, -12 * i), va="top",
+            textcoords="offset points", ha="left" if side > 0 else "right", fontsize=8, color=INK,
+        )  # fmt: skip
 
 
 def _violation(ax: Axes, trace: MonitorTrace, threshold: float | None) -> None:

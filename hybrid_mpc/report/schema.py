@@ -9,7 +9,7 @@ from typing import Any
 
 from hybrid_mpc.errors import InputError
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 MODELS = ("phy_nominal", "phy", "rnn", "pgrnn", "mopgrnn")
 CONTROLLERS = ("prior", "hybrid", "oracle")
 OBSERVERS = ("prior_observer", "hybrid_observer")
@@ -63,6 +63,18 @@ def _is_interval(value: Any) -> bool:
         and _is_text(value["file"])
         and all(_is_number(value[key]) for key in ("start_s", "end_s"))
         and value["start_s"] <= value["end_s"]
+    )
+
+
+def _is_broken(value: Any) -> bool:
+    keys = {"fault", "start_s", "delay_s", "diagnosis"}
+    return (
+        isinstance(value, Mapping)
+        and set(value) == keys
+        and _is_text(value["fault"])
+        and isinstance(value["diagnosis"], str)
+        and _is_number(value["start_s"])
+        and (value["delay_s"] is None or (_is_number(value["delay_s"]) and value["delay_s"] >= 0))
     )
 
 
@@ -149,6 +161,17 @@ SCHEMA = Group(
                 "alarms": Leaf(_INTERVALS, _list_of(_is_interval)),
             }
         ),
+        "guard": Group(
+            {
+                **dict.fromkeys(
+                    ("false_alarms_per_hour", "hours", "force_threshold", "energy_threshold"), _SIZE
+                ),
+                "data_hash": Leaf("a text that is not empty", _is_text),
+                "test_seconds": _SIZE,
+                "test_alarms": _COUNT,
+                "faults": Leaf("a list of {fault, start_s, delay_s, diagnosis}", _list_of(_is_broken)),
+            }
+        ),
         "analysis": Group(
             {
                 "eigenvalues": Leaf("a list of [real part, imaginary part]", _list_of(_is_pair)),
@@ -173,7 +196,7 @@ def validate_results(results: Mapping[str, Any]) -> None:
         InputError: With the path of the first key that is missing, unknown or of the wrong kind.
 
     Example:
-        >>> validate_results({"schema_version": 2, "seed": 0})
+        >>> validate_results({"schema_version": 3, "seed": 0})
         Traceback (most recent call last):
         ...
         hybrid_mpc.errors.InputError: results: 'scenario' is missing; it must be a text that is not empty

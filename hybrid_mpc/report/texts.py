@@ -20,6 +20,7 @@ TITLES: Mapping[str, str] = {
     "estimation": "Estimation: are the observers as sure as they may be",
     "timing": "Time of a controller step",
     "monitor": "Energy monitor",
+    "guard": "Energy guard",
     "analysis": "Linear analysis",
     "glossary": "Names and definitions",
 }
@@ -155,6 +156,22 @@ TEXTS: Mapping[str, tuple[Markup, ...]] = {
             "were calibrated on undisturbed data."
         ),
     ),
+    "guard": (
+        _M(
+            "The guard looks at the same violation sooner and closer: residual forces in units of their own "
+            "scatter, summed up for as long as they last; the energy by which the model, running on its own "
+            "for half a second, departs from the machine; and whether the sensor repeats itself while motion "
+            "is predicted. What is ordinary was learned where nothing was wrong, for a wanted rate of "
+            "false alarms, and lies in the model's folder: <code>hybrid-mpc monitor</code> and "
+            "<code>hybrid-mpc control --guard</code> use it."
+        ),
+        _M(
+            "From top to bottom: violation, residual force, energy of the free run, what is compared with the "
+            "thresholds (1 is an alarm), and the measured position. Pink shading marks alarms, lines what "
+            "breaks and what the guard does. What explains an alarm is a change of the prior's "
+            "parameters; where the prior's form is not the machine's, its size is off by that."
+        ),
+    ),
     "analysis": (
         _M(
             "Around a point of rest the models can be replaced by linear ones. The poles tell how the "
@@ -214,7 +231,7 @@ def paragraphs(section: str) -> tuple[Markup, ...]:
 
     Args:
         section: ``"data"``, ``"models"``, ``"training"``, ``"free_run"``, ``"export"``, ``"control"``,
-            ``"estimation"``, ``"timing"``, ``"monitor"``, ``"analysis"`` or ``"glossary"``.
+            ``"estimation"``, ``"timing"``, ``"monitor"``, ``"guard"``, ``"analysis"`` or ``"glossary"``.
 
     Returns:
         Its paragraphs, as HTML.

@@ -1,16 +1,18 @@
 """``hybrid-mpc monitor`` on recordings whose contents are known."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from hybrid_mpc.artifact import set_calibration
 from hybrid_mpc.cli.main import app
 from hybrid_mpc.data import write_csv
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.monitor import Detector
+from hybrid_mpc.monitor import Calibration, Detector
 from hybrid_mpc.pipeline.monitor_job import MonitorJob, prepared, watched
 from hybrid_mpc.scenario import load_scenario
 from scenarios.golf_robot.rig import Rig
@@ -66,6 +68,24 @@ def test_it_says_where_and_writes_what_it_saw(folder, golf_artifact, tmp_path):
     assert len(rows) == 1 + round(second["seconds"] / DT)
     assert len(rows) > 480
     assert (tmp_path / "out" / "pushed_2.png").stat().st_size > 10_000
+
+
+def test_the_artifact_s_own_detector_needs_no_option(folder, golf_artifact, tmp_path):
+    model = shutil.copytree(golf_artifact, tmp_path / "model")
+    detector = Detector.from_dict(json.loads((folder / "calibration.json").read_text())["detector"])
+    detector = replace(detector, false_alarms_per_hour=2.0, hours=0.05, data_hash="0123456789abcdef0123")
+    set_calibration(model, Calibration(9.0, 9.0, 1.0, 1, 1.0, "by hand", detector=detector).to_dict())
+    done = command(folder, model, tmp_path / "out")
+    assert done.exit_code == 0, done.output
+    told = "watched with a detector for 2 false alarms an hour, learned from 3.0 min (hash 0123456789abcdef)"
+    assert told in done.output
+    found = json.loads((tmp_path / "out" / "monitor.json").read_text())
+    assert found["detector"]["data_hash"] == detector.data_hash
+    assert (
+        8.0 <= found["recordings"][1]["alarms"][0]["start_s"] < 9.0
+    )  # as with the same detector from a file
+    without = command(folder, golf_artifact, tmp_path / "without")
+    assert "holds no detector" in without.output
 
 
 def test_too_little_nominal_data_says_how_much_is_needed(folder, golf_artifact, tmp_path):

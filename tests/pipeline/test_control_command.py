@@ -3,12 +3,15 @@
 import json
 import shutil
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from hybrid_mpc.artifact import set_calibration
 from hybrid_mpc.cli import main
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.monitor import Calibration, Detector
 from hybrid_mpc.pipeline.control_job import (
     ControlSettings,
     parsed_fault,
@@ -115,13 +118,39 @@ def test_a_fault_from_the_command_line_acts(call, run_folder, tmp_path):
         results = json.loads((out / "results.json").read_text())
         costs[name] = results["loops"][0]["cost"]
     assert results["faults"] == [{"target": "plant_friction", "value": 4.0, "start_s": 0.5, "end_s": "inf"}]
+    assert "guard" not in results
+    assert "guard" not in results["loops"][0]
     assert costs["worn"] > 2 * costs["healthy"]  # four times the friction on a filter without observer
     assert results["summary"]["track_sine"]["prior"]["cost"]["ci95"] is None  # one seed
+
+
+def test_a_guarded_loop_lets_go_of_a_frozen_sensor(call, run_folder, tmp_path):
+    folder = shutil.copytree(run_folder, tmp_path / "run")
+    # Wide scales: only the test for freezing is to speak.
+    detector = Detector(0.02, ((9.0, 0.0, 0.0, 0.0),), (9.0, 0.0, 0.0, 0.0), 2.0, 50.0, 50.0)
+    detector = replace(detector, false_alarms_per_hour=1.0)
+    calibration = Calibration(9.0, 9.0, 1.0, 1, 1.0, "by hand", detector=detector)
+    options = ["--task", "track_sine", "--seeds", 1, "--no-gif", "--fault", "measurement_freeze@1.5"]
+    words = ["golf_robot", "--model", folder, "--out"]
+    code, _, error = call(*words, tmp_path / "none", *options, "--guard")
+    assert (code, "holds no detector" in error) == (2, True)
+    set_calibration(folder / "model", calibration.to_dict())
+    code, told, _ = call(*words, tmp_path / "guarded", *options, "--guard")
+    assert code == 0
+    assert "rest from" in told
+    results = json.loads((tmp_path / "guarded" / "results.json").read_text())
+    assert results["controllers"] == ["hybrid_observer"]  # what the guard watches, where none is named
+    assert Detector.from_dict(results["guard"]) == detector
+    (loop,) = results["loops"]
+    assert loop["guard"]["switches"][0]["after"] == "REST"
+    assert 1.5 <= loop["guard"]["alarms"][0]["start_s"] < 2.0  # in motion: three steps are predicted at once
+    assert loop["sources"]["ZERO"] > 0.5
 
 
 @pytest.mark.parametrize(
     ("words", "told"),
     [
+        (["--guard", "--controller", "prior"], ["controller prior has another model", "hybrid_observer"]),
         (["--task", "golf"], ["no task 'golf'", "track_sine", "stroke_1.4"]),
         (["--controller", "pid"], ["no controller pid", "hybrid_observer"]),
         (["--solver", "newton"], ["no solver 'newton'", "rti, sqp, ipopt"]),

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from hybrid_mpc.monitor import MonitorTrace
 from hybrid_mpc.plots import analysis, data, estimation, fit, loops, monitor, save, training
+from hybrid_mpc.plots.monitor_trace import overview
 from hybrid_mpc.plots.style import name_of
 from hybrid_mpc.report import KeyFigure, Report, Section, Table, write_report
 from hybrid_mpc.report.texts import TITLES, paragraphs
@@ -164,6 +166,17 @@ def parity_figure():
     return fit.parity(errors, {"values": 1e-12, "Jacobians": 1e-10})
 
 
+def guard_figure():
+    t = np.arange(0.0, 6.0, 0.02)
+    late = np.maximum(t - 3.0, 0.0)
+    scores = np.column_stack([np.minimum(20 * late, 1.5), 8 * late / (1 + late)])
+    seen = MonitorTrace(
+        t, t, t, 0.02 * late, 0.01 * late, 0.1 * late, scores[:, 0] > 1, 0.2 * late, late, late < 0, scores
+    )
+    marks = ((3.0, "friction doubles"), (3.1, "guard: rest"))
+    return overview(seen, np.sin(2 * t), output=OUTPUTS[0], marks=marks, title="something breaks at 3 s")
+
+
 FIGURES = {
     "recordings": lambda: data.recordings(pieces(), OUTPUTS, INPUTS),
     "coverage": lambda: data.coverage(pieces(), STATES),
@@ -175,6 +188,7 @@ FIGURES = {
     "times": times_figure,
     "innovations": innovations_figure,
     "monitor": monitor_figure,
+    "guard": guard_figure,
     "poles": poles_figure,
     "bode": bode_figure,
 }
@@ -188,6 +202,7 @@ PLACES = {
     "estimation": ("innovations",),
     "timing": ("times",),
     "monitor": ("monitor",),
+    "guard": ("guard",),
     "analysis": ("poles", "bode"),
     "glossary": (),
 }

@@ -13,7 +13,7 @@ from hybrid_mpc.report.schema import SCHEMA, Group, validate_results
 
 PER_MODEL = {"phy_nominal": 1.0, "phy": 0.2, "rnn": 0.4, "pgrnn": 0.17, "mopgrnn": 0.15}
 RESULTS = {
-    "schema_version": 2,
+    "schema_version": 3,
     "scenario": "golf_robot",
     "seed": 0,
     "budget": "quick",
@@ -49,6 +49,16 @@ RESULTS = {
         "misses": 0,
     },
     "monitor": {"threshold_w": 0.06, "false_alarms_per_hour": 0.0, "alarms": []},
+    "guard": {
+        "false_alarms_per_hour": 2.0,
+        "hours": 0.05,
+        "force_threshold": 20.0,
+        "energy_threshold": 5.0,
+        "data_hash": "00ff",
+        "test_seconds": 76.0,
+        "test_alarms": 0,
+        "faults": [{"fault": "friction", "start_s": 3.0, "delay_s": None, "diagnosis": ""}],
+    },
     "analysis": {"eigenvalues": [[0.99, 0.01]], "stabilisable": True, "detectable": True},
 }
 

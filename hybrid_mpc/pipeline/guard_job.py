@@ -1,0 +1,222 @@
+"""Stage guard: detector and plausibility of the energy guard, learned, kept in the artifact, and tried out."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from hybrid_mpc.artifact import Artifact, load_artifact, set_calibration
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.monitor import Calibration, Detector, guard_monitor, learn_detector, learn_plausibility
+from hybrid_mpc.monitor.calibration import BLOCK_S, MAX_EXTRAPOLATION, MIN_BLOCKS
+from hybrid_mpc.monitor.replay import replay
+from hybrid_mpc.monitor.standard import DRIFT, SETTLING_S
+from hybrid_mpc.pipeline.context import Context
+from hybrid_mpc.pipeline.faulted_loops import faulted, kept
+from hybrid_mpc.pipeline.judge import RATES, clean_windows
+from hybrid_mpc.pipeline.loops import make_estimator, make_monitor, sensor_steps
+from hybrid_mpc.pipeline.monitor_job import explained
+from hybrid_mpc.pipeline.nominal_loops import CONTENDER, nominal_loops, run_nominal
+from hybrid_mpc.pipeline.parallel import WORKERS, run_jobs
+from hybrid_mpc.scenario import ControlSpec
+
+Array = NDArray[np.float64]
+HELD = ("valid", "nominal")
+"""Roles that no parameter was fitted to. Test recordings are kept to try the detector on."""
+
+
+@dataclass(frozen=True)
+class NominalData:
+    """What the detector is learned from.
+
+    Args:
+        runs: Reading numbers, each ``(n, columns)``.
+        source: Where they come from, in words.
+        data_hash: Hash of the data.
+        loops: What was run for it. Default: nothing.
+    """
+
+    runs: Sequence[Array]
+    source: str
+    data_hash: str
+    loops: tuple[dict[str, Any], ...] = field(default=())
+
+
+def guard_stage(context: Context) -> None:
+    """Learn detector and plausibility, put them into the artifact, and try them on faults and test recordings."""
+    control = context.scenario.control
+    if control is None:
+        reason = "the guard's estimator needs the scenario's control problem (input range, sensor noise)"
+        context.save("guard", {"reason": reason}, {})
+        return
+    artifact = load_artifact(context.out / "model")
+    model = artifact.models["hybrid"]
+    data = _nominal_data(context, artifact, control)
+    result: dict[str, Any] = {"source": data.source, "loops": data.loops}
+    found: dict[str, Any] = {}
+    try:
+        found["detector"] = learned(data.runs, model.dt, model.n_y, data.data_hash)
+    except InputError as none:
+        result["reason"] = f"no detector could be learned from {data.source}: {none}"
+    try:
+        found["plausibility"] = learn_plausibility(
+            model, context.smoothed("train"), data_hash=context.dataset.hash
+        )
+    except InputError as none:
+        result["plausibility_reason"] = str(none)
+    calibration = Calibration.from_dict(context.result("monitor")["calibration"])
+    set_calibration(context.out / "model", replace(calibration, **found).to_dict())
+    result |= {name: part.to_dict() for name, part in found.items()}
+    detector: Detector | None = found.get("detector")
+    recorded, arrays = _recorded(context, artifact, control, detector, calibration)
+    result |= recorded
+    if detector is not None and context.scenario.plant is not None and context.scenario.tasks:
+        context.progress.update("faults", 0, 1, "loops in which something breaks")
+        result["faults"], more = faulted(
+            context.scenario, artifact, noise(context), detector, context.settings.seed
+        )
+        arrays |= more
+    context.save("guard", result, arrays)
+
+
+def learned(runs: Sequence[Array], dt: float, n_q: int, data_hash: str) -> Detector:
+    """The detector for the lowest of the rates 1, 2, 5 and 10 an hour that the data are long enough for.
+
+    Args:
+        runs: Reading numbers of nominal runs, each ``(n, columns)``.
+        dt: Period [s].
+        n_q: Degrees of freedom.
+        data_hash: Hash of the data.
+
+    Raises:
+        InputError: If they are too short for any of them (it says how much is needed), or hold an alarm.
+
+    Example:
+        >>> learned([np.zeros((3000, 11))], 0.02, 1, "")
+        Traceback (most recent call last):
+        hybrid_mpc.errors.InputError: 1.0 min in whole blocks of 5 s are too little: 10 false alarms an hour need ...
+    """
+    size = max(round(BLOCK_S / dt), 1)
+    blocks = sum(len(run) // size for run in runs)
+    for rate in RATES:
+        if blocks >= blocks_needed(rate):
+            return learn_detector(runs, dt, n_q, drift=DRIFT, false_alarms_per_hour=rate, data_hash=data_hash)
+    least, most = (blocks_needed(rate) * BLOCK_S / 60 for rate in (RATES[-1], RATES[0]))
+    raise InputError(
+        f"{blocks * BLOCK_S / 60:.1f} min in whole blocks of {BLOCK_S:g} s are too little: {RATES[-1]:g} false alarms "
+        f"an hour need {least:g} min, {RATES[0]:g} an hour {most:g} min; record the machine for longer and learn with "
+        "hybrid-mpc monitor MODEL NOMINAL.csv --learn RATE"
+    )
+
+
+def blocks_needed(rate: float) -> int:
+    """Blocks of 5 s that a rate of false alarms [1/h] needs, half of it for either of the detector's two alarms.
+
+    Example:
+        >>> [blocks_needed(rate) for rate in (1.0, 2.0, 10.0)]
+        [72, 36, 30]
+    """
+    return max(MIN_BLOCKS, int(np.ceil(3600.0 / (0.5 * rate * BLOCK_S * MAX_EXTRAPOLATION) - 1e-9)))
+
+
+def noise(context: Context) -> dict[str, Array]:
+    """Process noise of the run's filters by contender."""
+    return {name: np.array(values) for name, values in context.result("control")["sigma_x"].items()}
+
+
+def _nominal_data(context: Context, artifact: Artifact, control: ControlSpec) -> NominalData:
+    """Loops of the simulated machine, like those that the guard will watch; else undisturbed recordings."""
+    scenario = context.scenario
+    if scenario.plant is not None and any(not task.faults for task in scenario.tasks):
+        return _from_loops(context)
+    model = artifact.models["hybrid"]
+    monitor, estimator = guard_monitor(model), make_estimator(model, control, noise(context)[CONTENDER])
+    whole, numbers = context.dataset.whole, []
+    for i, recording in enumerate(whole):
+        context.progress.update("nominal data", i, len(whole), f"replay of {recording.name}")
+        numbers.append(replay(monitor, estimator, recording).numbers)
+
+    def inside(roles: tuple[str, ...]) -> list[Array]:
+        return [
+            rows[_settled(recording.t, start, end)]
+            for recording, rows in zip(whole, numbers, strict=True)
+            for start, end in clean_windows(context, recording, roles)
+        ]
+
+    runs, size = inside(HELD), max(round(BLOCK_S / model.dt), 1)
+    source = "recordings that nothing was trained on"
+    if sum(len(run) // size for run in runs) < blocks_needed(RATES[-1]):
+        runs = inside((*HELD, "train"))
+        source = (
+            "undisturbed recordings, also those of the training, which the model fits better than new ones"
+        )
+    return NominalData(runs, source, context.dataset.hash)
+
+
+def _settled(t: Array, start: float, end: float) -> NDArray[np.bool_]:
+    """The samples of a stretch whose readings hold nothing from before it."""
+    return np.asarray((t >= start + SETTLING_S) & (t <= end))
+
+
+def _from_loops(context: Context) -> NominalData:
+    wanted = nominal_loops(context.scenario, context.budget)
+    common = context.settings.scenario, context.out / "model", noise(context), context.settings.seed
+    jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
+        loop.stage: (run_nominal, (*common, loop)) for loop in wanted if not context.done(loop.stage)
+    }
+    run_jobs(jobs, context.progress.update, WORKERS, lambda stage, kept: context.save(stage, *kept))
+    told, runs, content = [], [], hashlib.sha256()
+    for loop in wanted:
+        kept = context.arrays(loop.stage)
+        told.append(context.result(loop.stage))
+        runs.append(kept["numbers"])
+        for name in ("y", "u"):
+            content.update(np.ascontiguousarray(kept[name], dtype="<f8").tobytes())
+    minutes = sum(row["seconds"] for row in told) / 60
+    source = f"{len(told)} loops of the simulated machine under the hybrid MPC, {minutes:.1f} min"
+    return NominalData(runs, source, content.hexdigest(), tuple(told))
+
+
+def _recorded(
+    context: Context,
+    artifact: Artifact,
+    control: ControlSpec,
+    detector: Detector | None,
+    calibration: Calibration,
+) -> tuple[dict[str, Any], dict[str, Array]]:
+    """Recordings with test windows, watched by the guard's monitor, or without detector by that of the thresholds."""
+    model = artifact.models["hybrid"]
+    if detector is None:
+        monitor = make_monitor(model, calibration)
+    else:
+        diagnose = model.parametric is not None
+        monitor = guard_monitor(model, detector, resolution=sensor_steps(control), diagnose=diagnose)
+    estimator = make_estimator(model, control, noise(context)[CONTENDER])
+    tested = [r for r in context.dataset.whole if clean_windows(context, r, ("test",))]
+    found: list[dict[str, Any]] = []
+    arrays: dict[str, Array] = {}
+    seconds, starts = 0.0, 0
+    for i, recording in enumerate(tested):
+        context.progress.update("test recordings", i, len(tested), recording.name)
+        trace, alarms = explained(monitor, estimator, recording, context.scenario.causes)
+        found += [{"file": recording.name, **alarm} for alarm in alarms]
+        edges = np.diff(trace.alarm.astype(int), prepend=0) == 1
+        for window in clean_windows(context, recording, ("test",)):
+            inside = _settled(recording.t, *window)
+            seconds += float(inside.sum() * model.dt)
+            starts += int((edges & inside).sum())
+        if not arrays or (alarms and not arrays["recorded/alarm"].any()):  # one is shown, best with an alarm
+            arrays = kept("recorded", trace, recording.y)
+            shown = recording.name
+    result: dict[str, Any] = {"test": {"seconds": seconds, "alarms": starts, "list": found}}
+    if seconds > 0:
+        result["test"]["at_most_per_hour"] = 0.5 * float(chi2.ppf(0.95, 2 * starts + 2)) / (seconds / 3600)
+    if arrays:
+        result["shown"] = shown
+    return result, arrays
