@@ -51,25 +51,6 @@ MONITOR_WINDOW_S = 0.3
 """Window [s] of the monitor's derivative and of the average that makes its level."""
 
 
-def process_noise(model: HybridModel, trajectories: Sequence[Trajectory], most: int = 4000) -> Array:
-    """Standard deviations ``(n_x,)`` of the model's one-period errors on measured trajectories [SI].
-
-    Args:
-        model: The model.
-        trajectories: Measured trajectories (the training ones).
-        most: Largest number of periods to look at.
-    """
-    errors: list[Array] = []
-    for trajectory in trajectories:
-        h = np.zeros(model.n_h)
-        for k in range(len(trajectory.t) - 1):
-            x_next, h = (m.full().ravel() for m in model.step(trajectory.x[k], h, trajectory.u[k]))
-            errors.append(x_next - trajectory.x[k + 1])
-        if len(errors) >= most:
-            break
-    return np.maximum(np.sqrt(np.mean(np.square(errors), axis=0)), 1e-9)
-
-
 def tuned_noise(
     model: HybridModel, control: ControlSpec, base: Array, recordings: Sequence[Trajectory], *, observer: bool
 ) -> Array:
@@ -78,7 +59,7 @@ def tuned_noise(
     Args:
         model: The model to estimate with.
         control: Input range and sensor noise.
-        base: Its one-period errors, see :func:`process_noise`.
+        base: Its one-period errors, see :func:`~hybrid_mpc.estimation.process_noise`.
         recordings: Training recordings.
         observer: Whether the estimator follows an unknown load.
     """
@@ -103,7 +84,7 @@ def make_estimator(
     Args:
         model: The model to estimate with.
         control: Input range and sensor noise.
-        sigma_x: Process noise ``(n_x,)`` per period, see :func:`process_noise`.
+        sigma_x: Process noise ``(n_x,)`` per period, see :func:`~hybrid_mpc.estimation.process_noise`.
         observer: Whether it estimates an unknown load at the input. Default: yes.
     """
     if len(control.estimator_sigma) != model.n_y:

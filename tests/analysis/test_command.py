@@ -139,7 +139,7 @@ def test_the_command_analyses_prior_and_hybrid_with_their_loops(golf_artifact, t
     assert found["loops"]["prior on prior"]["driven"]["quiet"]["stable"]
     assert found["loops"]["hybrid on hybrid"]["moving"]["jump"]["margins"]["gain_up"] > 1
     assert "--scenario golf_robot" in (out / "analysis.html").read_text()
-    assert len(list((out / "figures").glob("*.png"))) == 12
+    assert len(list((out / "figures").glob("*.png"))) == 13
 
 
 @pytest.mark.full
