@@ -55,7 +55,8 @@ def find_noise(
             ) from error
         if not ok:
             raise InputError(f"{path}: sigma_x must hold {n_x} numbers that are not negative")
-        return noise, f"{path.parent.parent.name}/{path.parent.name}/{path.name}"
+        names = path.parent.parent.name, path.parent.name, path.name
+        return noise, "/".join(name for name in names if name)
     if not needed:
         return {}, "no filter"
     if not any(name in ORACLES for name in needed):
