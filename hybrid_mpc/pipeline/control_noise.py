@@ -39,6 +39,9 @@ def find_noise(
 
     Raises:
         InputError: If the file does not hold what is needed, or there is neither a file nor a way to make data.
+
+    Example:
+        ``noise, source = find_noise(scenario, artifact, Path("runs/golf/model"), ("hybrid_observer",), 0, None)``
     """
     needed = [name for name in controllers if not CONTENDERS[name].truth]
     beside = folder.resolve().parent / "checkpoints" / "control.json"

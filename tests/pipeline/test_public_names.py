@@ -12,7 +12,11 @@ from hybrid_mpc.pipeline.run import run
 
 WITHOUT_TORCH = """
 import sys
-sys.modules["torch"] = None  # importing it fails
+class Refuse:
+    def find_spec(self, name, *rest):
+        if name.split(".")[0] == "torch":
+            raise ImportError("torch is refused here")
+sys.meta_path.insert(0, Refuse())
 import hybrid_mpc.pipeline
 assert "casadi" not in sys.modules  # nothing is loaded before it is asked for
 from hybrid_mpc.pipeline import (
