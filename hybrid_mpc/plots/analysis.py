@@ -86,18 +86,10 @@ def pole_map(poles: Mapping[str, Any], dt: float, *, zeros: Mapping[str, Any] | 
 
 
 def _points(ax: Axes, model: str, z: Any, marker: str, label: str) -> None:
-    hollow = marker != "x"
-    ax.scatter(
-        z.real,
-        z.imag,
-        s=52,
-        marker=marker,
-        linewidths=1.6,
-        facecolors="none" if hollow else colour(model),
-        **({"edgecolors": colour(model)} if hollow else {}),
-        label=label,
-        zorder=4,
-    )
+    ink: dict[str, Any] = {"facecolors": colour(model)}
+    if marker != "x":
+        ink = {"facecolors": "none", "edgecolors": colour(model)}
+    ax.scatter(z.real, z.imag, s=52, marker=marker, linewidths=1.6, label=label, zorder=4, **ink)
 
 
 def _half_width(near: Any) -> float:
