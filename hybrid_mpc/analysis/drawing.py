@@ -18,6 +18,8 @@ _TITLES = {
     "moving": "in motion at working speed", "driven": "along a driven run, on average",
 }  # fmt: skip
 
+_NOTES = {"moving": " A phase that rises at the resonance tells of negative damping."}
+
 
 def figures(folder: Path, subject: Subject, findings: Findings) -> dict[str, tuple[Path, str]]:
     """Draw what was found; parts that could not be had have no figure.
@@ -48,7 +50,7 @@ def _friction(subject: Subject, f: Findings) -> Named:
     curves = {
         name: {k: f.arrays[f"friction/{name}/{k}"] for k in ("speed", "secant", "harmonic", "moving")}
         | {"tangent": np.asarray(f.result["friction"][name]["tangent_1_s"])}
-        for name in subject.models
+        for name in _names(subject)
     }
     unit = some.states[some.n_x // 2].unit
     figure = analysis_models.friction_damping(curves, working_speed=float(subject.speed[0]), unit=unit)
@@ -61,12 +63,17 @@ def _friction(subject: Subject, f: Findings) -> Named:
 
 def _linear(subject: Subject, f: Findings) -> Named:
     some = _some(subject)
-    poles = {name: f.arrays[f"linear/{name}/rest/poles"] for name in subject.models}
-    yield "poles", analysis.pole_map(poles, some.dt), "Poles of the one-step maps at rest."
+    for point, figure in (("rest", "poles"), ("driven", "poles_driven")):
+        poles, zeros = (
+            {n: f.arrays.get(f"linear/{n}/{point}/{kind}", ()) for n in _names(subject)}
+            for kind in ("poles", "zeros")
+        )
+        caption = f"Poles and zeros of the linearisations {_TITLES[point]}."
+        yield figure, analysis.pole_map(poles, some.dt, zeros=zeros), caption
     signals: dict[str, Any] = {"input_signal": some.inputs[0], "output_signal": some.outputs[0]}
     for point in POINTS:
         curves = {}
-        for key in (f"{name}{suffix}" for name in subject.models for suffix in ("", "_reduced")):
+        for key in (f"{name}{suffix}" for name in _names(subject) for suffix in ("", "_reduced")):
             name = key.removesuffix("_reduced")
             at = f"linear/{name}/{point}{key[len(name) :]}"
             if f"{at}/omega" in f.arrays:
@@ -74,13 +81,17 @@ def _linear(subject: Subject, f: Findings) -> Named:
                 curves[label] = (
                     f.arrays[f"{at}/omega"], f.arrays[f"{at}/magnitude"][0, 0], f.arrays[f"{at}/phase"][0, 0]
                 )  # fmt: skip
-        figure = analysis.bode(curves, **signals, nyquist=np.pi / some.dt)
-        yield f"bode_{point}", figure, f"Bode plot of the linearisations {_TITLES[point]}."
+        drawn = analysis.bode(curves, **signals, nyquist=np.pi / some.dt)
+        yield (
+            f"bode_{point}",
+            drawn,
+            f"Bode plot of the linearisations {_TITLES[point]}.{_NOTES.get(point, '')}",
+        )
     steps = {
         point: {
             name: (f.arrays[f"linear/{name}/{point}/t"], np.reshape(
                 f.arrays[f"linear/{name}/{point}/step"], (some.n_y, some.n_u, -1))[0, 0])
-            for name in subject.models
+            for name in _names(subject)
         }
         for point in POINTS
     }  # fmt: skip
@@ -94,7 +105,7 @@ def _linear(subject: Subject, f: Findings) -> Named:
 def _measured(subject: Subject, f: Findings) -> Named:
     some = _some(subject)
     keys = ("omega", "response", "coherence", "deviation")
-    curves = {n: {k: f.arrays[f"measured/{n}/{k}"] for k in keys} for n in ("measured", *subject.models)}
+    curves = {n: {k: f.arrays[f"measured/{n}/{k}"] for k in keys} for n in ("measured", *_names(subject))}
     figure = analysis_models.measured_bode(
         curves,
         input_signal=some.inputs[0],
@@ -127,7 +138,7 @@ def _loops(subject: Subject, f: Findings) -> Named:
 def _schedule(subject: Subject, f: Findings) -> Named:
     some = _some(subject)
     curves: dict[str, dict[str, Any]] = {}
-    for name in subject.models:
+    for name in _names(subject):
         for point in ("rest", "working"):
             x, gain = (f.arrays[f"schedule/{name}/{point}/{key}"] for key in ("x", "gain"))
             curves.setdefault(name, {})[point] = x[:, 0], gain[:, 0, : some.n_x]
@@ -138,7 +149,7 @@ def _schedule(subject: Subject, f: Findings) -> Named:
 def _sensitivity(subject: Subject, f: Findings) -> Named:
     some = _some(subject)
     first = next(iter(subject.models))
-    relative = {name: f.arrays[f"sensitivity/{name}/relative"][:, 0] for name in subject.models}
+    relative = {name: f.arrays[f"sensitivity/{name}/relative"][:, 0] for name in _names(subject)}
     names = f.result["sensitivity"][first]["parameters"]
     figure = analysis_models.sensitivities(
         f.arrays[f"sensitivity/{first}/t"], relative, names, output_signal=some.states[0]
@@ -148,6 +159,11 @@ def _sensitivity(subject: Subject, f: Findings) -> Named:
         figure,
         "Change of a free run per relative change of the prior's parameters.",
     )
+
+
+def _names(subject: Subject) -> list[str]:
+    """Models in the order they are drawn in: priors first, so that what has a network lies above them."""
+    return sorted(subject.models, key=lambda name: subject.models[name].n_h)
 
 
 def _some(subject: Subject) -> Any:

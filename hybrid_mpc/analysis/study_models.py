@@ -27,6 +27,8 @@ Part: TypeAlias = tuple[dict[str, Any], dict[str, Any]]
 POINTS = ("rest", "working", "moving", "driven")
 """Linearisations: the tangent at rest, the describing function of motions of working size around it, the tangent in
 motion at working speed, and the mean along a driven run."""
+FARTHEST = 1e6
+"""Zeros farther out belong to a way through the system that begins later: rounding, over the fall of its gain."""
 LEVEL = 0.5
 """Its size over the input's range."""
 
@@ -131,8 +133,16 @@ def linear_part(subject: Subject, points: Mapping[str, tuple[Array, Array]]) -> 
             step = control.step_response(system, t)
             arrays |= {f"{name}/{point}/t": t, f"{name}/{point}/step": step.outputs}
             arrays[f"{name}/{point}/poles"] = np.array([m.pole for m in found.modes])
+            if model.n_u == model.n_y:
+                arrays[f"{name}/{point}/zeros"] = _zeros(system)
             result[name][point] = row
     return result, arrays
+
+
+def _zeros(system: Any) -> NDArray[np.complex128]:
+    """Zeros of a square system; those that rounding alone keeps from infinity are left out."""
+    found = np.asarray(system.zeros(), dtype=np.complex128)
+    return found[np.abs(found) < FARTHEST]
 
 
 def drive(subject: Subject, model: HybridModel, seconds: float) -> Array:

@@ -5,6 +5,7 @@ from hybrid_mpc.estimation.delays import DelayCompensation, DelayedEstimate
 from hybrid_mpc.estimation.kalman import Estimate, Estimator, ExtendedKalmanFilter
 from hybrid_mpc.estimation.switching import SwitchingEstimate, SwitchingFilter
 from hybrid_mpc.estimation.truth import TrueState
+from hybrid_mpc.estimation.tuning import log_likelihood, most_likely, process_noise
 
 __all__ = [
     "Consistency",
@@ -19,4 +20,7 @@ __all__ = [
     "TrueState",
     "consistency",
     "innovations",
+    "log_likelihood",
+    "most_likely",
+    "process_noise",
 ]

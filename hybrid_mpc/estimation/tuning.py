@@ -1,4 +1,4 @@
-"""Process noise of a filter by maximum likelihood on recordings."""
+"""Process noise of a filter: a model's errors over one period, and their scale by maximum likelihood."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
+from hybrid_mpc.model import HybridModel
 
 Array = NDArray[np.float64]
 
@@ -26,6 +28,14 @@ class Recording(Protocol):
         """Measurements ``(n, n_y)``."""
 
 
+class Known(Recording, Protocol):
+    """A recording whose states are known, smoothed for instance."""
+
+    @property
+    def x(self) -> Array:
+        """States ``(n, n_x)``."""
+
+
 class Assessor(Protocol):
     """A filter that can say how likely its measurements are."""
 
@@ -37,6 +47,37 @@ class Assessor(Protocol):
 
     def assess(self, estimate: Estimate, y: Array, u: Array) -> tuple[Estimate, float]:
         """Estimate after a measurement, and its log-likelihood."""
+
+
+def process_noise(model: HybridModel, recordings: Sequence[Known], most: int = 4000) -> Array:
+    """Standard deviations ``(n_x,)`` of the model's one-period errors on recordings [SI].
+
+    The hidden state runs along the measured states, from zero.
+
+    Args:
+        model: The model.
+        recordings: Smoothed recordings on the model's grid (the training ones).
+        most: After so many periods no further recording is looked at. Default 4000.
+
+    Raises:
+        InputError: If there is no period to look at.
+
+    Example:
+        ``ExtendedKalmanFilter(model, sigma_x=process_noise(model, train), sigma_y=[1e-3], sigma_x0=[1e-3, 0.1])``
+    """
+    errors: list[Array] = []
+    for recording in recordings:
+        h = np.zeros(model.n_h)
+        for k in range(len(recording.u) - 1):
+            x_next, h = (m.full().ravel() for m in model.step(recording.x[k], h, recording.u[k]))
+            errors.append(x_next - recording.x[k + 1])
+        if len(errors) >= most:
+            break
+    if not errors:
+        raise InputError(
+            "process noise: no recording with at least two samples given; pass training recordings"
+        )
+    return np.maximum(np.sqrt(np.mean(np.square(errors), axis=0)), 1e-9)
 
 
 def log_likelihood(estimator: Assessor, recording: Recording, skip: int = 25) -> float:

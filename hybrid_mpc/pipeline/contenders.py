@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.artifact import Artifact
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation import TrueState
+from hybrid_mpc.estimation import TrueState, process_noise
 from hybrid_mpc.mpc import BestOf, CondensedController, SafeController, SQPController
-from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_ocp, process_noise, tuned_noise
+from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_ocp, tuned_noise
 from hybrid_mpc.scenario import ControlSpec, Scenario
 
 if TYPE_CHECKING:

@@ -39,6 +39,9 @@ def find_noise(
 
     Raises:
         InputError: If the file does not hold what is needed, or there is neither a file nor a way to make data.
+
+    Example:
+        ``noise, source = find_noise(scenario, artifact, Path("runs/golf/model"), ("hybrid_observer",), 0, None)``
     """
     needed = [name for name in controllers if not CONTENDERS[name].truth]
     beside = folder.resolve().parent / "checkpoints" / "control.json"
@@ -55,7 +58,8 @@ def find_noise(
             ) from error
         if not ok:
             raise InputError(f"{path}: sigma_x must hold {n_x} numbers that are not negative")
-        return noise, f"{path.parent.parent.name}/{path.parent.name}/{path.name}"
+        names = path.parent.parent.name, path.parent.name, path.name
+        return noise, "/".join(name for name in names if name)
     if not needed:
         return {}, "no filter"
     if not any(name in ORACLES for name in needed):

@@ -51,25 +51,6 @@ MONITOR_WINDOW_S = 0.3
 """Window [s] of the monitor's derivative and of the average that makes its level."""
 
 
-def process_noise(model: HybridModel, trajectories: Sequence[Trajectory], most: int = 4000) -> Array:
-    """Standard deviations ``(n_x,)`` of the model's one-period errors on measured trajectories [SI].
-
-    Args:
-        model: The model.
-        trajectories: Measured trajectories (the training ones).
-        most: Largest number of periods to look at.
-    """
-    errors: list[Array] = []
-    for trajectory in trajectories:
-        h = np.zeros(model.n_h)
-        for k in range(len(trajectory.t) - 1):
-            x_next, h = (m.full().ravel() for m in model.step(trajectory.x[k], h, trajectory.u[k]))
-            errors.append(x_next - trajectory.x[k + 1])
-        if len(errors) >= most:
-            break
-    return np.maximum(np.sqrt(np.mean(np.square(errors), axis=0)), 1e-9)
-
-
 def tuned_noise(
     model: HybridModel, control: ControlSpec, base: Array, recordings: Sequence[Trajectory], *, observer: bool
 ) -> Array:
@@ -78,9 +59,12 @@ def tuned_noise(
     Args:
         model: The model to estimate with.
         control: Input range and sensor noise.
-        base: Its one-period errors, see :func:`process_noise`.
+        base: Its one-period errors, see :func:`~hybrid_mpc.estimation.process_noise`.
         recordings: Training recordings.
         observer: Whether the estimator follows an unknown load.
+
+    Example:
+        ``tuned_noise(model, scenario.control, process_noise(model, train), train, observer=True)``
     """
     places = np.linspace(0, len(recordings) - 1, min(TUNED_RECORDINGS, len(recordings))).round().astype(int)
     parts = [
@@ -103,8 +87,14 @@ def make_estimator(
     Args:
         model: The model to estimate with.
         control: Input range and sensor noise.
-        sigma_x: Process noise ``(n_x,)`` per period, see :func:`process_noise`.
+        sigma_x: Process noise ``(n_x,)`` per period, see :func:`~hybrid_mpc.estimation.process_noise`.
         observer: Whether it estimates an unknown load at the input. Default: yes.
+
+    Raises:
+        InputError: If ``estimator_sigma`` has another number of outputs.
+
+    Example:
+        ``make_estimator(model, scenario.control, process_noise(model, train))``
     """
     if len(control.estimator_sigma) != model.n_y:
         raise InputError(
@@ -136,6 +126,15 @@ def make_controller(
     """The condensed real-time iteration of a model behind the safeguards that stand on the prior.
 
     Its first plan, made before the loop starts, is converged.
+
+    Args:
+        model: The model to plan with.
+        prior: The fitted prior, for terminal weight and fallback.
+        control: The control problem.
+        iterations: Linearisations a period. Default: one.
+
+    Example:
+        ``make_controller(models["hybrid"], models["prior"], scenario.control)``
     """
     ocp = make_ocp(prior, control)
     rti = CondensedController(model, ocp, iterations=iterations)
@@ -146,12 +145,27 @@ def make_ocp(prior: HybridModel, control: ControlSpec) -> OCP:
     """The problem of a control specification; terminal weight (and the fallback) at a working speed.
 
     At rest the slope of dry friction would pass for strong damping.
+
+    Args:
+        prior: The fitted prior.
+        control: The control problem.
+
+    Example:
+        ``CondensedController(models["hybrid"], make_ocp(models["prior"], scenario.control))``
     """
     return OCP.from_spec(control, working_point=working_point(prior, control))
 
 
 def working_point(model: HybridModel, control: ControlSpec) -> tuple[Array, Array]:
-    """``(x, u)`` in motion at the position zero: speeds of the tolerated size ``1 / sqrt(q)``."""
+    """``(x, u)`` in motion at the position zero: speeds of the tolerated size ``1 / sqrt(q)``.
+
+    Args:
+        model: The model, state ``[q, v]``.
+        control: The control problem; a speed without weight is 1.
+
+    Example:
+        ``x, u = working_point(models["prior"], scenario.control)``
+    """
     x = np.zeros(model.n_x)
     half = model.n_x // 2
     weights = np.asarray(control.q[half:], dtype=float)
@@ -160,7 +174,15 @@ def working_point(model: HybridModel, control: ControlSpec) -> tuple[Array, Arra
 
 
 def make_monitor(model: HybridModel, calibration: Calibration | None) -> EnergyMonitor:
-    """The energy monitor with its default window: about 0.3 s for the derivative and for the level."""
+    """The energy monitor with its default window: about 0.3 s for the derivative and for the level.
+
+    Args:
+        model: The model that is held against the machine.
+        calibration: Its thresholds; None: its levels raise no alarm.
+
+    Example:
+        ``make_monitor(artifact.models["hybrid"], None)``
+    """
     half = max(2, round(0.5 * MONITOR_WINDOW_S / model.dt))
     return EnergyMonitor(
         model,

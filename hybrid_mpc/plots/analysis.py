@@ -30,12 +30,14 @@ _MARKERS = {"phy": "x", "prior": "x", "mopgrnn": "o", "hybrid": "o", "oracle": "
 _DAMPING = (0.1, 0.3, 0.5, 0.7, 0.9)
 
 
-def pole_map(poles: Mapping[str, Any], dt: float) -> Figure:
-    """Poles of the linearised models in the z-plane; right, the slow poles near z = 1 enlarged.
+def pole_map(poles: Mapping[str, Any], dt: float, *, zeros: Mapping[str, Any] | None = None) -> Figure:
+    """Poles (and zeros) of the linearised models in the z-plane; right, the slow ones near z = 1 enlarged.
 
     Args:
         poles: Eigenvalues ``(n,)``, complex, of each model's one-step map.
         dt: Model period [s]; sets the natural frequencies of the grid.
+        zeros: Zeros ``(n,)``, complex, by model: then poles are crosses and zeros circles, and the title counts zeros
+            that lie outside of the frame. Default: none, and the markers tell the models apart.
 
     Returns:
         The figure: unit circle (stable inside), lines of constant damping and natural frequency.
@@ -48,6 +50,7 @@ def pole_map(poles: Mapping[str, Any], dt: float) -> Figure:
         2
     """
     values = {m: np.ravel(np.asarray(p, dtype=complex)) for m, p in poles.items()}
+    nulls = {m: np.ravel(np.asarray(z, dtype=complex)) for m, z in (zeros or {}).items()}
     if not dt > 0 or not any(len(p) for p in values.values()):
         raise InputError(f"pole map: needs at least one pole and a positive dt, got dt = {dt}")
     figure, axes = new_figure(1, 2, size=(10, 5.4))
@@ -59,18 +62,11 @@ def pole_map(poles: Mapping[str, Any], dt: float) -> Figure:
     for ax, spacing, reach in grids:
         _z_grid(ax, dt, spacing, reach)
         for model, p in values.items():
-            open_marker = _MARKERS.get(model, "D") != "x"
-            ax.scatter(
-                p.real,
-                p.imag,
-                s=52,
-                marker=_MARKERS.get(model, "D"),
-                linewidths=1.6,
-                facecolors="none" if open_marker else colour(model),
-                **({"edgecolors": colour(model)} if open_marker else {}),
-                label=name_of(model),
-                zorder=4,
-            )
+            if zeros is None:
+                _points(ax, model, p, _MARKERS.get(model, "D"), name_of(model))
+            else:
+                _points(ax, model, p, "x", f"{name_of(model)}: poles")
+                _points(ax, model, nulls.get(model, p[:0]), "o", f"{name_of(model)}: zeros")
         ax.set_aspect("equal")
         ax.set_xlabel("real part [-]")
         ax.set_ylabel("imaginary part [-]")
@@ -81,10 +77,19 @@ def pole_map(poles: Mapping[str, Any], dt: float) -> Figure:
     box = (1.0 - half, -0.675 * half), 1.35 * half, 1.35 * half
     whole.add_patch(Rectangle(*box, fill=False, edgecolor="black", linewidth=0.8, zorder=5))
     grid = "grid: damping ratio, natural frequency every {:.3g} rad/s"
-    title_axes(whole, "z-plane, stable inside the circle\n" + grid.format(0.1 * np.pi / dt))
+    away = sum(int(np.sum(np.maximum(np.abs(z.real), np.abs(z.imag)) > extent)) for z in nulls.values())
+    outside = f", {away} zero{'s' * (away != 1)} outside of the frame" if away else ""
+    title_axes(whole, f"z-plane, stable inside the circle{outside}\n" + grid.format(0.1 * np.pi / dt))
     title_axes(zoom, "the frame enlarged: slow poles near z = 1\n" + grid.format(_round(half / dt / 5)))
     shared_legend(figure)
     return figure
+
+
+def _points(ax: Axes, model: str, z: Any, marker: str, label: str) -> None:
+    ink: dict[str, Any] = {"facecolors": colour(model)}
+    if marker != "x":
+        ink = {"facecolors": "none", "edgecolors": colour(model)}
+    ax.scatter(z.real, z.imag, s=52, marker=marker, linewidths=1.6, label=label, zorder=4, **ink)
 
 
 def _half_width(near: Any) -> float:
@@ -163,11 +168,20 @@ def bode(
         raise InputError("Bode plot: there is no model to draw")
     figure, axes = new_figure(2, 1, sharex=True, size=(9, 5.4))
     magnitude_ax, phase_ax = axes[:, 0]
+    lowest, phases = np.inf, []
     for model, (omega, magnitude, phase) in responses.items():
         omega = np.asarray(omega, dtype=float)
         line = line_style(model) | {"linewidth": 1.7}
-        magnitude_ax.loglog(omega, checked(f"magnitude of {model}", magnitude, len(omega)), **line)
-        phase_ax.semilogx(omega, np.degrees(checked(f"phase of {model}", phase, len(omega))), **line)
+        size = checked(f"magnitude of {model}", magnitude, len(omega))
+        angle = np.degrees(checked(f"phase of {model}", phase, len(omega)))
+        # at the Nyquist frequency itself a sampled response is real: its size may vanish, its phase jump
+        clear = omega < (np.inf if nyquist is None else 0.98 * nyquist)
+        magnitude_ax.loglog(omega, size, **line)
+        phase_ax.semilogx(omega[clear], angle[clear], **line)
+        lowest = min(lowest, float(size[clear & (size > 0)].min(initial=np.inf)))
+        phases.append(angle[clear])
+    if nyquist is not None and np.isfinite(lowest):
+        magnitude_ax.set_ylim(bottom=0.5 * lowest)
     for ax in (magnitude_ax, phase_ax):
         if nyquist is not None:
             ax.axvline(nyquist, color=FAINT, linestyle=":", label="Nyquist frequency")
@@ -178,7 +192,7 @@ def bode(
     phase_ax.set_ylabel("phase [°]")
     phase_ax.set_xlabel("angular frequency [rad/s]")
     title_axes(magnitude_ax, f"from {axis_label(input_signal)} to {axis_label(output_signal)}")
-    phase_ax.yaxis.set_major_locator(MultipleLocator(45))
+    phase_ax.yaxis.set_major_locator(MultipleLocator(45 if np.ptp(np.concatenate(phases)) < 270 else 90))
     figure.align_ylabels([magnitude_ax, phase_ax])
     shared_legend(figure)
     return figure

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -27,13 +27,15 @@ from hybrid_mpc.signals import Signal
 
 _POINTS = {"rest": ", tangent at rest", "working": ", friction of working size"}
 _COLOURS = ("#0072B2", "#D55E00", "#CC79A7", "#009E73", "#E69F00", "#56B4E9")
+_DASHES = ("-", "--", ":", "-.")
 
 
 def sensitivity_functions(loops: Mapping[str, Mapping[str, Array]], *, title: str = "") -> Figure:
     """Sensitivity and complementary sensitivity of loops at the plant's input.
 
     Args:
-        loops: By loop: ``omega`` ``(n,)`` [rad/s], complex ``S`` and ``T`` ``(n,)``.
+        loops: By loop: ``omega`` ``(n,)`` [rad/s], complex ``S`` and ``T`` ``(n,)``. Names that differ after their last
+            comma only (``"prior on prior, quiet"``) share a colour.
         title: Title over the figure. Default: none.
 
     Raises:
@@ -48,11 +50,12 @@ def sensitivity_functions(loops: Mapping[str, Mapping[str, Array]], *, title: st
         raise InputError("sensitivity functions: there is no loop to draw")
     figure, axes = new_figure(1, 2, sharex=True, sharey=True, size=(10, 4.2), title=title)
     texts = ("S: what is left of a load", "T: what the input takes of it")
+    looks = _looks(loops)
     for ax, key, text in zip(axes[0], "ST", texts, strict=True):
-        for i, (name, one) in enumerate(loops.items()):
+        for name, one in loops.items():
             omega = np.asarray(one["omega"], dtype=float)
             size = checked(f"{key} of {name}", np.abs(one[key]), omega.size)
-            ax.loglog(omega, size, color=_COLOURS[i % len(_COLOURS)], linewidth=1.4, label=plain(name))
+            ax.loglog(omega, size, **looks[name])
         ax.axhline(1.0, color=FAINT, linewidth=0.8)
         ax.set_xlabel("angular frequency [rad/s]")
         title_axes(ax, text)
@@ -64,11 +67,31 @@ def sensitivity_functions(loops: Mapping[str, Mapping[str, Array]], *, title: st
     return figure
 
 
+def _looks(names: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Colours by what stands before the last comma of a name (the loop), dashes by what follows it (its filter)."""
+    loops: list[str] = []
+    variants: list[str] = []
+    looks = {}
+    for name in names:
+        loop, _, variant = name.rpartition(", ")
+        loop, variant = (loop, variant) if loop else (variant, "")
+        loops += [loop] * (loop not in loops)
+        variants += [variant] * (variant not in variants)
+        looks[name] = {
+            "color": _COLOURS[loops.index(loop) % len(_COLOURS)],
+            "linestyle": _DASHES[variants.index(variant) % len(_DASHES)],
+            "linewidth": 1.5,
+            "label": plain(name),
+        }
+    return looks
+
+
 def nyquist(loops: Mapping[str, Array], *, modulus: float | None = None) -> Figure:
     """Nyquist curves of loops in negative-feedback sign, around -1.
 
     Args:
-        loops: By loop: complex loop gain ``(n,)`` along increasing frequency.
+        loops: By loop: complex loop gain ``(n,)`` along increasing frequency; names as in
+            :func:`sensitivity_functions`.
         modulus: Radius of a circle around -1 to draw, e.g. the smallest distance wanted. Default: none.
 
     Raises:
@@ -87,9 +110,10 @@ def nyquist(loops: Mapping[str, Array], *, modulus: float | None = None) -> Figu
     if modulus is not None:
         ax.plot(-1 + modulus * np.cos(angle), modulus * np.sin(angle), color=FAINT, linewidth=0.8, linestyle="--",
                 label=f"distance {modulus:g} from -1")  # fmt: skip
-    for i, (name, curve) in enumerate(loops.items()):
+    looks = _looks(loops)
+    for name, curve in loops.items():
         g = np.asarray(curve)
-        ax.plot(g.real, g.imag, color=_COLOURS[i % len(_COLOURS)], linewidth=1.4, label=plain(name))
+        ax.plot(g.real, g.imag, **looks[name])
     ax.plot([-1], [0], marker="+", color=INK, markersize=10)
     ax.set_xlim(-2.2, 1.2)
     ax.set_ylim(-1.9, 1.3)

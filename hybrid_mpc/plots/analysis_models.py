@@ -168,6 +168,7 @@ def friction_damping(curves: Mapping[str, Mapping[str, Array]], *, working_speed
             xycoords=("data", "axes fraction"),
             fontsize=8,
             color=FAINT,
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
         )
         ax.set_xlabel(f"size of the speed [{unit}]")
         title_axes(ax, name_of(name))

@@ -26,9 +26,7 @@ Array = NDArray[np.float64]
 Share = bool | Literal["none", "all", "row", "col"]
 
 DPI = 110
-INK = "#222222"
-FAINT = "#8a8a8a"
-ALARM = "#CC79A7"
+INK, FAINT, ALARM = "#222222", "#8a8a8a", "#CC79A7"
 
 COLOURS: Mapping[str, str] = MappingProxyType(
     {
@@ -113,10 +111,16 @@ def plain(text: str) -> str:
 def line_style(role: str) -> dict[str, Any]:
     """Keyword arguments of a line of a role: colour, dashes, width, order of drawing and legend name.
 
+    A variant of a known role, ``"hybrid, reduced"``, has its colour, dashed, and lies above it.
+
     Example:
-        >>> line_style("phy_nominal")["linestyle"]
-        '--'
+        >>> line_style("phy_nominal")["linestyle"], line_style("prior, reduced")["label"]
+        ('--', 'prior, fitted, reduced')
     """
+    base, _, variant = role.partition(", ")
+    if variant and base in COLOURS:
+        label = f"{name_of(base)}, {plain(variant)}"
+        return line_style(base) | {"linestyle": "--", "zorder": 3.5, "label": label}
     measured = role in ("measured", "reference")
     return {
         "color": colour(role),

@@ -62,6 +62,12 @@ def test_a_study_without_a_control_problem_says_what_it_leaves_out(prior_alone, 
         complex(float(r["pole, real"]), float(r["pole, imaginary"])) for r in rows if r["point"] == "rest"
     ]
     assert np.array_equal(poles, findings.arrays["linear/prior/rest/poles"])  # all digits
+    omega, size = (findings.arrays[f"linear/prior/rest/{key}"] for key in ("omega", "magnitude"))
+    zeros, poles = (findings.arrays[f"linear/prior/rest/{key}"] for key in ("zeros", "poles"))
+    z = np.exp(1j * omega * 0.02)[:, None]
+    product = np.prod(np.abs(z - zeros), axis=1) / np.prod(np.abs(z - poles), axis=1)
+    # Poles and zeros are the response but for a factor; near the Nyquist frequency it is 1e-3 of the largest.
+    assert np.ptp(size[0, 0] / product) < 1e-9 * np.max(size[0, 0] / product)
     kept = json.loads((tmp_path / "analysis.json").read_text())
     assert kept["equilibria"]["prior"]["points"][0]["stability"] == "stable"
     for picture in (tmp_path / "figures").glob("*.png"):
@@ -139,7 +145,7 @@ def test_the_command_analyses_prior_and_hybrid_with_their_loops(golf_artifact, t
     assert found["loops"]["prior on prior"]["driven"]["quiet"]["stable"]
     assert found["loops"]["hybrid on hybrid"]["moving"]["jump"]["margins"]["gain_up"] > 1
     assert "--scenario golf_robot" in (out / "analysis.html").read_text()
-    assert len(list((out / "figures").glob("*.png"))) == 12
+    assert len(list((out / "figures").glob("*.png"))) == 13
 
 
 @pytest.mark.full

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from hybrid_mpc.estimation import ExtendedKalmanFilter
-from hybrid_mpc.estimation.tuning import log_likelihood, most_likely
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimation import ExtendedKalmanFilter, log_likelihood, most_likely, process_noise
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.signals import Signal
 
@@ -65,3 +65,20 @@ def test_the_true_noise_is_the_most_likely():
     runs = [recording(600, seed) for seed in (1, 2)]
     # 1200 samples: a factor of 3 in the noise lowers the likelihood by hundreds
     assert most_likely(filter_with, runs, (0.1, 0.3, 1.0, 3.0, 10.0)) == 1.0
+
+
+def test_process_noise_is_the_error_of_one_period():
+    rng, n, model = np.random.default_rng(3), 4000, mass()
+    u, x = rng.normal(size=(n, 1)), np.zeros((n, 2))
+    for k in range(n - 1):
+        x[k + 1] = x[k] + DT * np.array([x[k, 1], u[k, 0]])
+        x[k + 1] += np.array([0.001, 0.05]) * rng.standard_normal(2)
+    found = process_noise(model, [SimpleNamespace(u=u, y=x[:, :1], x=x)])
+    # A standard deviation of 4,000 samples is off by 1 / sqrt(8000) = 1.1 %; four of these.
+    assert np.abs(found / [0.001, 0.05] - 1).max() < 0.045
+    half = SimpleNamespace(u=u[:100], y=x[:100, :1], x=x[:100])
+    assert np.array_equal(
+        process_noise(model, [half, half], most=50), process_noise(model, [half])
+    )  # the second one is not looked at
+    with pytest.raises(InputError, match="two samples"):
+        process_noise(model, [])
