@@ -26,7 +26,9 @@ def samples(trajectories: Sequence[Trajectory]) -> NDArray[np.float64]:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seed", type=int, default=0)
     found = runs(SET, parser.parse_args().seed, Path())
     training, test = ([t for t in found if t.role == role] for role in ("train", "test"))

@@ -1,9 +1,9 @@
 """How many of a training's steps should be made on free runs: a trial on another seed than the reported one.
 
 ``python docs/results/reproduction/free_run_share.py --out runs/share`` makes the golf robot's data set (b) with
-``--seed 1``, fits the prior to 15 sequences, trains MOPGRNNs of 1500 steps of which 0, 200, 500 and 1000 are made on free
-runs, and prints their E_sim on validation runs, which a share would be chosen by, and on test runs. Finished trainings
-are kept in the folder.
+``--seed 1``, fits the prior to 15 sequences, trains MOPGRNNs of 1500 steps of which 0, 200, 500 and 1000 are made on
+free runs, and prints their E_sim on validation runs, which a share would be chosen by, and on test runs. Finished
+trainings are kept in the folder.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ DATA_SET, COUNT = "b", 15
 
 def main() -> None:
     """Train, print a line a share."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--networks", type=int, default=8)
@@ -42,10 +44,14 @@ def main() -> None:
     record_stage(work)
     key = case_key(DATA_SET, COUNT, "prior")
     if not work.done(key):
-        train, valid = (work.trajectories(DATA_SET, role, n) for role, n in (("train", COUNT), ("valid", effort.valid)))
+        train, valid = (
+            work.trajectories(DATA_SET, role, n) for role, n in (("train", COUNT), ("valid", effort.valid))
+        )
         fit_job("golf_robot", train, valid, effort.fit, work.folder / key, lambda *_: None)
     case = work.case(DATA_SET, COUNT)
-    print("| steps on free runs | validation E_sim [s] | test E_sim [s] | seconds |\n| --- | --- | --- | --- |")
+    print(
+        "| steps on free runs | validation E_sim [s] | test E_sim [s] | seconds |\n| --- | --- | --- | --- |"
+    )
     for free in options.steps:
         key = case_key(DATA_SET, COUNT, f"free{free}")
         if not work.done(key):

@@ -74,7 +74,8 @@ def summary(results: dict[str, Any]) -> list[str]:
     return [
         f"### {name_of(results)}",
         "",
-        f"`{command(results)}`; its jobs took {seconds / 60:.0f} min in all, two of them side by side, on a machine with other work.",
+        f"`{command(results)}`; its jobs took {seconds / 60:.0f} min in all, two of them side by side, on a machine "
+        "with other work.",
         "",
         *tables(results),
         *(f"- {line}" for line in claim_lines(results)),
