@@ -1,12 +1,11 @@
 """``hybrid-mpc benchmark`` on a machine that is simulated here, and what it refuses."""
 
 import json
-import sys
+from functools import partial
 
 import numpy as np
 import pytest
 
-from hybrid_mpc.cli import main
 from hybrid_mpc.data import write_csv
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identification.dataset import cut_windows
@@ -15,8 +14,6 @@ from hybrid_mpc.pipeline.machine_benchmark.job import BenchmarkSettings, benchma
 from hybrid_mpc.pipeline.machine_benchmark.physics import fit_physics, shifted
 from hybrid_mpc.pipeline.machine_benchmark.recordings import read_test, read_training
 from hybrid_mpc.scenario import load_scenario
-
-pytestmark = pytest.mark.xdist_group("machine")  # they share what is made once
 
 MACHINE = """
 import torch
@@ -204,18 +201,9 @@ def test_a_diverging_run_is_infinite_and_not_nan():
 
 
 @pytest.fixture
-def call(monkeypatch, capsys):
-    def run(*words):
-        monkeypatch.setattr(sys, "argv", ["hybrid-mpc", "benchmark", *map(str, words)])
-        try:
-            main()
-            code = 0
-        except SystemExit as stop:
-            code = stop.code or 0
-        told = capsys.readouterr()
-        return code, told.out, told.err.replace("\n", " ")
-
-    return run
+def call(call):
+    """Run the command in this process: ``(exit code, stdout, stderr)``."""
+    return partial(call, "benchmark")
 
 
 def test_the_command_judges_a_model_and_draws_it(call, machine, made, tmp_path):

@@ -1,11 +1,10 @@
 """``hybrid-mpc study``: run, report, compare, list."""
 
-import sys
+from functools import partial
 
 import pytest
 import trivial_runs
 
-from hybrid_mpc.cli import main
 from hybrid_mpc.studies import runner
 from hybrid_mpc.studies.ready import READY
 
@@ -13,20 +12,9 @@ YAML = "scenario: golf_robot\nmodels: nowhere\ntasks: [track_sine]\ncontrollers:
 
 
 @pytest.fixture
-def call(monkeypatch, capsys):
+def call(call):
     """Run the command in this process: ``(exit code, stdout, stderr)``."""
-
-    def run(*words):
-        monkeypatch.setattr(sys, "argv", ["hybrid-mpc", "study", *map(str, words)])
-        try:
-            main()
-            code = 0
-        except SystemExit as stop:
-            code = stop.code or 0
-        told = capsys.readouterr()
-        return code, told.out, told.err.replace("\n", " ")
-
-    return run
+    return partial(call, "study")
 
 
 @pytest.fixture
