@@ -8,8 +8,8 @@ import pytest
 
 from hybrid_mpc.cli.data import readme, write_data
 from hybrid_mpc.data import load_trajectories, write_csv
+from hybrid_mpc.data_spec import Window
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.scenario import Window
 from scenarios.golf_robot import scenario
 from scenarios.torque_pendulum import scenario as torque_pendulum
 
