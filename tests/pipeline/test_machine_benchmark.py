@@ -9,6 +9,7 @@ import pytest
 from hybrid_mpc.data import write_csv
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identification.dataset import cut_windows
+from hybrid_mpc.pipeline.machine_benchmark import networks
 from hybrid_mpc.pipeline.machine_benchmark.free_runs import figures_of, run_freely
 from hybrid_mpc.pipeline.machine_benchmark.job import BenchmarkSettings, benchmark
 from hybrid_mpc.pipeline.machine_benchmark.physics import fit_physics, shifted
@@ -71,6 +72,19 @@ def machine(tmp_path_factory):
     train = recording(folder / "train.csv", seed=0)
     test = recording(folder / "test.csv", seed=1, seconds=40.0)
     return folder / "cart.py", train, test
+
+
+@pytest.fixture(scope="module", autouse=True)
+def trained_here():
+    """Networks are trained in this process: others of their own would take longer to start than to train."""
+
+    def one_by_one(jobs, on_progress, workers):
+        for name, (function, arguments) in jobs.items():
+            function(*arguments, lambda *told, name=name: on_progress(name, *told))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(networks, "run_jobs", one_by_one)
+        yield
 
 
 @pytest.fixture(scope="module")
