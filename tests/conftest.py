@@ -15,7 +15,10 @@ LONG = (
     "reproduction/test_reproduce.py",
     "pipeline/test_machine_benchmark.py",
     "pipeline/test_search_command.py",
+    "identification/test_training_options.py",
     "identification/test_training.py",
+    "studies/test_engines.py",
+    "studies/test_loops.py",
 )
 """Modules that take longest. Processes that share the tests by whole modules must not end with one of them."""
 

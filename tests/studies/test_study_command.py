@@ -24,17 +24,6 @@ def config(tmp_path):
     return path
 
 
-@pytest.fixture
-def here(monkeypatch):
-    """Runs in this process."""
-
-    def use(run):
-        trivial_runs.stand_in(monkeypatch, run)
-        monkeypatch.setattr(runner, "make_engine", lambda run, workers, cluster: trivial_runs.Here(run))
-
-    return use
-
-
 def steps(run):
     """What the report needs beside the cost."""
     return {
