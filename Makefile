@@ -26,10 +26,10 @@ types: $(INSTALLED)
 	$(BIN)/mypy
 
 test: lint types
-	$(BIN)/python -m pytest -m 'not full' -n 2 --dist loadgroup -q --durations=8
+	$(BIN)/python -m pytest -m 'not full' -n 2 --dist loadfile --no-loadscope-reorder -q --durations=8
 
 test-full: lint types
-	$(BIN)/python -m pytest -n 2 --dist loadgroup -q --durations=20
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -q --durations=20
 
 # The site, in build/site; broken links and references stop it.
 docs: $(INSTALLED)

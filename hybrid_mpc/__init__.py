@@ -6,8 +6,9 @@ What a user's own machine is written with stands here; everything else is import
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
+from hybrid_mpc.data_spec import DataSpec, Window
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.scenario import Budget, ControlSpec, DataSpec, Scenario, Task, Window
+from hybrid_mpc.scenario import Budget, ControlSpec, Scenario, Task
 from hybrid_mpc.signals import Parameter, Signal
 
 if TYPE_CHECKING:

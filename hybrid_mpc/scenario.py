@@ -8,12 +8,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.benchmark_spec import BenchmarkSpec
+from hybrid_mpc.data_spec import DataSpec
 from hybrid_mpc.errors import InputError
 
 if TYPE_CHECKING:
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from hybrid_mpc.reproduction.experiment import Experiment
 
 Array = NDArray[np.float64]
-Role = Literal["train", "valid", "test", "nominal"]
 
 
 class Plant(Protocol):
@@ -47,74 +47,6 @@ class Plant(Protocol):
 
     def hidden(self, state: Any) -> Array:
         """True internal states ``(n_h,)`` in the order of the scenario's oracle model (may be empty)."""
-
-
-@dataclass(frozen=True)
-class Window:
-    """A part of a recording and what it is used for.
-
-    Args:
-        start: First time [s] in the recording's own time.
-        end: Last time [s].
-        role: ``"train"``, ``"valid"``, ``"test"``, or ``"nominal"``: known to be free of disturbances but used
-            for no free run (standing at an unstable point, say); the monitor must stay quiet there.
-    """
-
-    start: float
-    end: float
-    role: Role
-
-
-@dataclass(frozen=True)
-class DataSpec:
-    """How a machine's recordings are read.
-
-    Args:
-        time: Column of the time stamps [s].
-        inputs: Columns of the inputs, in the order of the prior's inputs (zero-order hold).
-        outputs: Columns of the measured positions, in the order of the prior's outputs.
-        dt: Model period [s]; declaring it is the request to resample to it.
-        max_gap: Longest distance [s] between two samples; a run is cut where it is exceeded.
-        smoothing: Length [s] of the local polynomial that first smooths and differentiates the positions; the
-            prior is fitted to that, then smooths them once more by its own equations.
-        warm_up: Measured past [s] that starts every free run: x(0) is smoothed from it, h warmed up on
-            it, and none of it is scored.
-        windows: Known windows by file stem. A recording that is not named here is split by ``fractions``.
-        fractions: Shares of training, validation and test samples, in this order of time.
-        free_run: Length [s] of the free runs that judge a model, started every fifth of it. Default: each
-            test trajectory as a whole. Where an unstable point multiplies every error, short runs from many
-            starts say more than one long one.
-        inputs_of: Input columns of single recordings, by file stem, where they differ from ``inputs``.
-        units: Units of columns that are not in seconds or in their signal's unit, by column: ``"ms"``, ``"deg"``, or
-            the factor as a number (:mod:`hybrid_mpc.data.units`).
-
-    Raises:
-        InputError: If a length is not positive or the fractions do not sum to one.
-    """
-
-    time: str
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    dt: float
-    max_gap: float
-    smoothing: float
-    warm_up: float
-    windows: Mapping[str, tuple[Window, ...]] = field(default_factory=dict)
-    fractions: tuple[float, float, float] = (0.6, 0.2, 0.2)
-    free_run: float | None = None
-    inputs_of: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    units: Mapping[str, str | float] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        for name in ("dt", "max_gap", "smoothing", "warm_up"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"data specification: {name} must be positive, got {getattr(self, name)}")
-        if self.free_run is not None and not self.free_run > 0:
-            raise InputError(
-                f"data specification: free_run must be positive or left out, got {self.free_run}"
-            )
-        if abs(sum(self.fractions) - 1.0) > 1e-9 or min(self.fractions) < 0:
-            raise InputError(f"data specification: fractions must sum to 1, got {self.fractions}")
 
 
 @dataclass(frozen=True)

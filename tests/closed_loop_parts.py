@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from online_models import PendulumPlant, pendulum_model
 
-from hybrid_mpc.closed_loop import simulate
+from hybrid_mpc.closed_loop import Runner, simulate
 from hybrid_mpc.estimation import ExtendedKalmanFilter
 from hybrid_mpc.mpc import OCP, CondensedController, SafeController
 
@@ -59,3 +59,45 @@ def run(model, safe, **changes):
     arguments |= changes
     head = [arguments.pop(name) for name in ("plant", "estimator", "controller", "reference")]
     return simulate(*head, **arguments)
+
+
+@dataclass
+class FakeClock:
+    """Stands still but for sleeping and what a test adds."""
+
+    t: float = 5.0
+
+    def now(self):
+        return self.t
+
+    def sleep_until(self, t):
+        self.t = max(self.t, t)
+
+
+@dataclass
+class Rig:
+    """A plant behind two callbacks: advances by a period with each input, the one before measured then."""
+
+    plant: PendulumPlant = field(default_factory=PendulumPlant)
+    seed: int = 0
+    gaps: tuple = ()
+
+    def __post_init__(self):
+        self.rng = np.random.default_rng(self.seed)
+        self.state = self.plant.reset(np.array([0.1, 0.0]), self.seed)
+        self.u, self.y = [], []
+
+    def measure(self):
+        if self.u:
+            self.state = self.plant.step(self.state, self.u[-1], DT)
+        y = self.plant.measure(self.state, self.rng)
+        self.y.append(y)
+        return None if len(self.y) - 1 in self.gaps else y
+
+    def actuate(self, u):
+        self.u.append(u)
+
+
+def make_runner(model, safe, rig, clock=None, **options):
+    return Runner(rig.measure, rig.actuate, options.pop("estimator", None) or make_ekf(model), safe,
+                  options.pop("reference", sine), clock=clock or FakeClock(), **options)  # fmt: skip

@@ -1,8 +1,51 @@
 """Shared material of the tests."""
 
+import sys
 from pathlib import Path
 
 import pytest
+
+LONG = (
+    "pipeline/test_machines.py",
+    "pipeline/test_run.py",
+    "nn_export/test_random_modules.py",
+    "studies/test_study_runner.py",
+    "scenarios/test_pendulum.py",
+    "notebooks/test_notebooks.py",
+    "reproduction/test_reproduce.py",
+    "pipeline/test_machine_benchmark.py",
+    "pipeline/test_search_command.py",
+    "identification/test_training_options.py",
+    "identification/test_training.py",
+    "studies/test_engines.py",
+    "studies/test_loops.py",
+)
+"""Modules that take longest. Processes that share the tests by whole modules must not end with one of them."""
+
+
+def pytest_collection_modifyitems(items):
+    """The long modules first, the others as they were."""
+    rank = {Path(__file__).parent / path: i for i, path in enumerate(LONG)}
+    items.sort(key=lambda item: rank.get(item.path, len(LONG)))
+
+
+@pytest.fixture
+def call(monkeypatch, capsys):
+    """Run ``hybrid-mpc`` with some words in this process: ``(exit code, stdout, stderr)``."""
+
+    def run(*words):
+        from hybrid_mpc.cli import main
+
+        monkeypatch.setattr(sys, "argv", ["hybrid-mpc", *map(str, words)])
+        try:
+            main()
+            code = 0
+        except SystemExit as stop:
+            code = stop.code or 0
+        told = capsys.readouterr()
+        return code, told.out, told.err.replace("\n", " ")
+
+    return run
 
 
 @pytest.fixture(scope="session")

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from hybrid_mpc.cli.options import ScenarioName
+
 EXAMPLES = (
     "Examples:\n\n"
     "  hybrid-mpc benchmark unbalanced_disk --data multisine_2024.npz --test hidden_2024.npz --out runs/disk\n\n"
@@ -16,9 +18,7 @@ EXAMPLES = (
 
 
 def benchmark(
-    machine: Annotated[
-        str, typer.Argument(help="A registered name (see: hybrid-mpc scenarios) or a .py file.")
-    ],
+    machine: ScenarioName,
     data: Annotated[
         list[Path] | None, typer.Option(help="A recording to train on; give it once for each file.")
     ] = None,

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from hybrid_mpc.cli.options import EmptyFolder, ScenarioName
 from hybrid_mpc.scenario import load_scenario
 
 EXAMPLES = (
@@ -22,11 +23,9 @@ EXAMPLES = (
 
 
 def control(
-    scenario: Annotated[
-        str, typer.Argument(help="A registered name (see: hybrid-mpc scenarios) or a .py file.")
-    ],
+    scenario: ScenarioName,
     model: Annotated[Path, typer.Option(help="Artifact folder: model/ of a finished run.")],
-    out: Annotated[Path, typer.Option(help="Folder to make; an existing one must be empty.")],
+    out: EmptyFolder,
     task: Annotated[
         list[str] | None,
         typer.Option(help="A task, or the beginning of tasks' names; may be repeated. Default: all."),

@@ -11,6 +11,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from hybrid_mpc.cli.options import EmptyFolder, ScenarioName
 from hybrid_mpc.data.differentiation import bandwidth
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.scenario import Scenario, load_scenario
@@ -23,10 +24,8 @@ EXAMPLES = (
 
 
 def data(
-    scenario: Annotated[
-        str, typer.Argument(help="A registered name (see: hybrid-mpc scenarios) or a .py file.")
-    ],
-    out: Annotated[Path, typer.Option(help="Folder to make; an existing one must be empty.")],
+    scenario: ScenarioName,
+    out: EmptyFolder,
     seed: Annotated[int, typer.Option(help="Seed of the recordings.", min=0)] = 0,
     budget: Annotated[str, typer.Option(help="Amount: quick or full.")] = "full",
     data_set: Annotated[str, typer.Option("--set", help="Data set of a scenario that has several.")] = "",

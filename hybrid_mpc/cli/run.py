@@ -7,6 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
+from hybrid_mpc.cli.options import InputColumns, OutputColumns, Recordings, ScenarioName, TimeColumn
+
 EXAMPLES = (
     "Examples:\n\n"
     "  hybrid-mpc run golf_robot --out runs/golf\n\n"
@@ -17,21 +19,15 @@ EXAMPLES = (
 
 
 def run(
-    scenario: Annotated[
-        str, typer.Argument(help="A registered name (see: hybrid-mpc scenarios) or a .py file.")
-    ],
-    data: Annotated[list[Path] | None, typer.Option(help="A recording; give it once for each file.")] = None,
+    scenario: ScenarioName,
+    data: Recordings = None,
     out: Annotated[Path | None, typer.Option(help="Folder to make. Default: runs/SCENARIO.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of data, training and closed loops.", min=0)] = 0,
     budget: Annotated[str, typer.Option(help="Effort: quick or full.")] = "quick",
     resume: Annotated[bool, typer.Option("--resume", help="Finish the run that the folder holds.")] = False,
-    time_column: Annotated[str, typer.Option(help="Column of the time [s]. Default: the scenario's.")] = "",
-    input_column: Annotated[
-        list[str] | None, typer.Option(help="Column of an input, in the prior's order.")
-    ] = None,
-    output_column: Annotated[
-        list[str] | None, typer.Option(help="Column of a measured position, in the prior's order.")
-    ] = None,
+    time_column: TimeColumn = "",
+    input_column: InputColumns = None,
+    output_column: OutputColumns = None,
     network_settings: Annotated[
         Path | None,
         typer.Option("--settings", help="JSON file of network settings, as hybrid-mpc search leaves it."),

@@ -7,6 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
+from hybrid_mpc.cli.options import InputColumns, OutputColumns, Recordings, ScenarioName, TimeColumn
+
 EXAMPLES = (
     "Examples:\n\n"
     "  hybrid-mpc search golf_robot --out runs/search\n\n"
@@ -17,10 +19,8 @@ EXAMPLES = (
 
 
 def search(
-    scenario: Annotated[
-        str, typer.Argument(help="A registered name (see: hybrid-mpc scenarios) or a .py file.")
-    ],
-    data: Annotated[list[Path] | None, typer.Option(help="A recording; give it once for each file.")] = None,
+    scenario: ScenarioName,
+    data: Recordings = None,
     out: Annotated[Path | None, typer.Option(help="Folder to make. Default: runs/search-SCENARIO.")] = None,
     trials: Annotated[int, typer.Option(help="Trainings in all.", min=1)] = 20,
     budget: Annotated[str, typer.Option(help="Effort of a training: quick or full.")] = "quick",
@@ -39,13 +39,9 @@ def search(
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with the search that the folder holds.")
     ] = False,
-    time_column: Annotated[str, typer.Option(help="Column of the time [s]. Default: the scenario's.")] = "",
-    input_column: Annotated[
-        list[str] | None, typer.Option(help="Column of an input, in the prior's order.")
-    ] = None,
-    output_column: Annotated[
-        list[str] | None, typer.Option(help="Column of a measured position, in the prior's order.")
-    ] = None,
+    time_column: TimeColumn = "",
+    input_column: InputColumns = None,
+    output_column: OutputColumns = None,
 ) -> None:
     """Search hidden units and other settings of the networks by the validation error of free runs."""
     from hybrid_mpc.cli.progress import make_progress

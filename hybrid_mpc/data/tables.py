@@ -13,8 +13,8 @@ from hybrid_mpc.data.array_files import mat_source, npz_source
 from hybrid_mpc.data.csv_files import csv_source
 from hybrid_mpc.data.sources import Columns, MissingColumn, Source
 from hybrid_mpc.data.units import factor
+from hybrid_mpc.data_spec import DataSpec
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.scenario import DataSpec
 from hybrid_mpc.signals import Signal
 
 Array = NDArray[np.float64]

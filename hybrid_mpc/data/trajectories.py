@@ -15,8 +15,8 @@ from scipy.interpolate import CubicSpline
 
 from hybrid_mpc.data.differentiation import local_polynomial, window_samples
 from hybrid_mpc.data.tables import MIN_SCORED, Table, read_tables
+from hybrid_mpc.data_spec import DataSpec, Role, Window
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.scenario import DataSpec, Role, Window
 from hybrid_mpc.signals import Signal
 
 Array = NDArray[np.float64]

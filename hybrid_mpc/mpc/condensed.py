@@ -241,7 +241,7 @@ class CondensedController:
         else:
             weighted = np.full_like(from_u, np.nan)
         hessian = 2 * from_u.T @ weighted + self._input_hessian
-        soft = self._soft_derivatives(z, u, from_u)
+        soft = self._problem.soft.condensed(z[:, :n_x], u, from_u)
         known = self._ocp.economic is not None and (p is not None or not self._ocp.n_p)
         economic = self._problem.economic.convex(z[:, :n_x], u, p) if known else None
         if economic is not None:
@@ -257,18 +257,6 @@ class CondensedController:
             return prepared.hessian, prepared.economic
         economic = self._problem.economic.convex(prepared.z[:, : self._n_x], prepared.u, target.p)
         return prepared.hessian + condense_hessians(economic[1], prepared.from_u, self._n_x), economic
-
-    def _soft_derivatives(self, z: Array, u: Array, from_u: Array) -> tuple[Array, Array, Array]:
-        rows, n_u = self._problem.soft, self._ocp.n_u
-        if not len(rows):
-            return np.zeros(0), np.zeros((0, self._n_x)), np.zeros((0, u.size))
-        value, by_x, by_u = rows.linearise(z[:, : self._n_x], u)
-        states = from_u.reshape(len(z), self._n_x, u.size)[rows.stage]
-        slope = (by_x[:, None, :] @ states)[:, 0, :]
-        direct = np.flatnonzero(np.any(by_u != 0, axis=1))
-        for j in range(n_u):
-            slope[direct, rows.stage[direct] * n_u + j] += by_u[direct, j]
-        return value, by_x, slope
 
     def _soft_rows(self, prepared: Prepared, free: Array) -> tuple[Array, Array] | None:
         """Values of the soft bounds before a step, and their derivatives by it."""

@@ -178,6 +178,24 @@ class SoftRows:
             np.vstack([r[2] for r in rows]),
         )
 
+    def condensed(self, x: Array, u: Array, from_u: Array) -> tuple[Array, Array, Array]:
+        """Values ``(M,)`` and their derivatives by the row's state ``(M, n_x)`` and by all inputs ``(M, N n_u)``.
+
+        Args:
+            x: States ``(N + 1, n_x)``.
+            u: Inputs ``(N, n_u)``.
+            from_u: Derivatives of the states by the inputs ``((N + 1) n_x, N n_u)``.
+        """
+        if not len(self):
+            return np.zeros(0), np.zeros((0, self._n_x)), np.zeros((0, u.size))
+        value, by_x, by_u = self.linearise(x, u)
+        states = from_u.reshape(len(x), self._n_x, u.size)[self.stage]
+        slope = (by_x[:, None, :] @ states)[:, 0, :]
+        direct = np.flatnonzero(np.any(by_u != 0, axis=1))
+        for j in range(self._n_u):
+            slope[direct, self.stage[direct] * self._n_u + j] += by_u[direct, j]
+        return value, by_x, slope
+
     def excess(self, values: Array) -> Array:
         """Violations ``(M,)``, zero where a bound is kept."""
         return np.asarray(np.maximum(0.0, np.maximum(values - self.upper, self.lower - values)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping
@@ -12,6 +11,7 @@ from typing import Any, Self
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import plain
+from hybrid_mpc.studies.lock import hold
 
 SEGMENT_ROWS = 10_000
 """Rows of one file: a study of a million runs has a hundred of them."""
@@ -44,7 +44,7 @@ class RunLog:
         self._folder = folder
         self._lock = (folder / LOCK).open("w")
         try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            hold(self._lock)
         except OSError as error:
             self._lock.close()
             raise InputError(
@@ -97,7 +97,8 @@ class RunLog:
 
     def _open(self) -> int:
         path = self._folder / f"{self._number:06}.jsonl"
-        return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        binary = getattr(os, "O_BINARY", 0)  # on Windows: line ends as they are written
+        return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | binary, 0o644)
 
 
 def segments(folder: Path) -> list[Path]:

@@ -112,7 +112,7 @@ def _sequence(
 def _layer(cell: Cell) -> Callable[..., tuple[Value, ...]]:
     def operator(
         input: Value,
-        hx: Value,
+        hx: Value | Sequence[Value],
         params: Sequence[Value],
         has_biases: bool,
         num_layers: int,
@@ -121,26 +121,9 @@ def _layer(cell: Cell) -> Callable[..., tuple[Value, ...]]:
         bidirectional: bool,
         batch_first: bool,
     ) -> tuple[Value, ...]:
+        states = [hx] if isinstance(hx, Value) else hx  # an LSTM's are h and c
         flags = (has_biases, num_layers, dropout, train, bidirectional, batch_first)
-        return _sequence(cell, input, [hx], params, *flags)
-
-    return operator
-
-
-def _lstm(cell: Cell) -> Callable[..., tuple[Value, ...]]:
-    def operator(
-        input: Value,
-        hx: Sequence[Value],
-        params: Sequence[Value],
-        has_biases: bool,
-        num_layers: int,
-        dropout: float,
-        train: bool,
-        bidirectional: bool,
-        batch_first: bool,
-    ) -> tuple[Value, ...]:
-        flags = (has_biases, num_layers, dropout, train, bidirectional, batch_first)
-        return _sequence(cell, input, hx, params, *flags)
+        return _sequence(cell, input, states, params, *flags)
 
     return operator
 
@@ -152,7 +135,7 @@ def table(form: Form) -> dict[str, Callable[..., Value | tuple[Value, ...]]]:
     )
     return {
         "aten.gru.input": _layer(gru), "aten.rnn_tanh.input": _layer(tanh),
-        "aten.rnn_relu.input": _layer(relu), "aten.lstm.input": _lstm(lstm),
+        "aten.rnn_relu.input": _layer(relu), "aten.lstm.input": _layer(lstm),
         "aten.gru_cell.default": _cell(gru), "aten.rnn_tanh_cell.default": _cell(tanh),
         "aten.rnn_relu_cell.default": _cell(relu), "aten.lstm_cell.default": _lstm_cell(lstm),
     }  # fmt: skip

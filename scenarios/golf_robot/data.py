@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_mpc.data_spec import Role, Window
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.scenario import Role, Window
 from scenarios.golf_robot.excitation import excitation
 from scenarios.golf_robot.rig import Rig, RigState
 

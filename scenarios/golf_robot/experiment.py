@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from hybrid_mpc.data.trajectories import Trajectory, load_trajectories
+from hybrid_mpc.data_spec import DataSpec
 from hybrid_mpc.reproduction.claims import Claim, above, below, level, narrower, ordered, steady
 from hybrid_mpc.reproduction.experiment import Effort, Experiment
-from hybrid_mpc.scenario import DataSpec
 from scenarios.golf_robot.data import SIZES, make_data, windows
 from scenarios.golf_robot.nominal import INPUTS, OUTPUTS
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.data.excitation import sinusoid
 from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.data_spec import Role, Window
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.scenario import Role, Window
 from scenarios.pendulum.plant import DampedPendulum
 
 Array = NDArray[np.float64]

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from hybrid_mpc.benchmark_spec import BenchmarkBudget, BenchmarkSpec
-from hybrid_mpc.scenario import Budget, ControlSpec, DataSpec, Scenario, Window
+from hybrid_mpc.data_spec import DataSpec, Window
+from hybrid_mpc.scenario import Budget, ControlSpec, Scenario
 
 if TYPE_CHECKING:
     from hybrid_mpc.physics import Prior

@@ -31,8 +31,6 @@ from hybrid_mpc.pipeline.loops import make_controller
 from nn_export import load_programs
 from scenarios.golf_robot import scenario
 
-pytestmark = pytest.mark.xdist_group("analyze")  # they share what is made once
-
 PARTS = ("equilibria", "friction", "linear", "measured", "schedule", "loops", "memory", "sensitivity")
 
 

@@ -21,13 +21,14 @@ def bench():
     return module
 
 
-def test_twenty_loops_survive(bench, golf_artifact):
-    rows, figures = bench.run(20, 0, golf_artifact, say=lambda text: None)
+def test_ten_loops_survive(bench, golf_artifact):
+    # three of these have forced failures, one a frozen encoder, two single dropouts
+    rows, figures = bench.run(10, 9, golf_artifact, say=lambda text: None)
     assert figures["exceptions"] == 0, [row.error for row in rows]
     assert figures["not_finite"] == 0
     assert figures["largest_excess_nm"] <= 1e-12  # rounding of the slew, a difference of inputs below 1 N m
     assert figures["shares"]["outside_forced"]["MPC"] >= 0.9
-    assert figures["steps"] == 20 * bench.PERIODS
+    assert figures["steps"] == 10 * bench.PERIODS
     assert figures["moving"] == 1.0
     assert set(figures["loops_by_model"]) == {"prior", "hybrid"}
     assert figures["forced_steps"] > 0

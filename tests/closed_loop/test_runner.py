@@ -2,59 +2,19 @@
 
 import re
 import time
-from collections import Counter
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import pytest
-from closed_loop_parts import DT, make_ekf, make_safe, run, sine
-from online_models import PendulumPlant, pendulum_model
+from closed_loop_parts import DT, FakeClock, Rig, make_ekf, make_runner, make_safe, run, sine
+from online_models import pendulum_model
 
 from hybrid_mpc.closed_loop import Fault, RealClock, Runner
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation import DelayCompensation, TrueState
+from hybrid_mpc.estimation import DelayCompensation
 from hybrid_mpc.monitor.energy import EnergyMonitor
 from hybrid_mpc.mpc import SafeController
 
 N = 30
-
-
-@dataclass
-class FakeClock:
-    """Stands still but for sleeping and what a test adds."""
-
-    t: float = 5.0
-
-    def now(self):
-        return self.t
-
-    def sleep_until(self, t):
-        self.t = max(self.t, t)
-
-
-@dataclass
-class Rig:
-    """A plant behind two callbacks: advances by a period with each input, the one before measured then."""
-
-    plant: PendulumPlant = field(default_factory=PendulumPlant)
-    seed: int = 0
-    gaps: tuple = ()
-
-    def __post_init__(self):
-        self.rng = np.random.default_rng(self.seed)
-        self.state = self.plant.reset(np.array([0.1, 0.0]), self.seed)
-        self.u, self.y = [], []
-
-    def measure(self):
-        if self.u:
-            self.state = self.plant.step(self.state, self.u[-1], DT)
-        y = self.plant.measure(self.state, self.rng)
-        self.y.append(y)
-        return None if len(self.y) - 1 in self.gaps else y
-
-    def actuate(self, u):
-        self.u.append(u)
 
 
 class Slow:
@@ -72,11 +32,6 @@ class Slow:
         return self._controller.solve(*arguments)
 
 
-def make(model, safe, rig, clock=None, **options):
-    return Runner(rig.measure, rig.actuate, options.pop("estimator", None) or make_ekf(model), safe,
-                  options.pop("reference", sine), clock=clock or FakeClock(), **options)  # fmt: skip
-
-
 def same(report, want, names=("y", "u", "x_hat")):
     for name in names:
         np.testing.assert_array_equal(getattr(report, name), getattr(want, name), name)
@@ -85,7 +40,7 @@ def same(report, want, names=("y", "u", "x_hat")):
 
 def test_without_missed_deadlines_it_is_simulate(model, safe):
     rig = Rig()
-    report = make(model, safe, rig, monitor=EnergyMonitor(model, window=5, average=3)).run(N * DT)
+    report = make_runner(model, safe, rig, monitor=EnergyMonitor(model, window=5, average=3)).run(N * DT)
     want = run(model, safe, monitor=EnergyMonitor(model, window=5, average=3))
     same(report, want)
     np.testing.assert_array_equal(report.t, want.t)
@@ -100,11 +55,11 @@ def test_without_missed_deadlines_it_is_simulate(model, safe):
 
 def test_missing_samples_are_nan_samples(model, safe):
     gaps = (7, 8, 9, 20)
-    report = make(model, safe, Rig(gaps=gaps)).run(N * DT)
+    report = make_runner(model, safe, Rig(gaps=gaps)).run(N * DT)
     faults = [Fault(k * DT, (k + 1) * DT, "measurement_dropout") for k in gaps]
     same(report, run(model, safe, faults=faults))
     assert report.missing == len(gaps)
-    same(make(model, safe, Rig(gaps=range(N))).run(N * DT),
+    same(make_runner(model, safe, Rig(gaps=range(N))).run(N * DT),
          run(model, safe, faults=[Fault(0.0, 9.0, "measurement_dropout")]))  # fmt: skip
 
 
@@ -119,7 +74,9 @@ def test_delays_known_to_the_estimator_are_those_of_simulate(model, safe):
                 self.state = self.plant.step(self.state, acting, DT)
             return self.plant.measure(self.state, self.rng)
 
-    report = make(model, safe, Delayed(), estimator=ekf, input_delay=2, monitor=monitors[0]).run(N * DT)
+    report = make_runner(model, safe, Delayed(), estimator=ekf, input_delay=2, monitor=monitors[0]).run(
+        N * DT
+    )
     want = run(model, safe, estimator=ekf, input_delay=2, monitor=monitors[1])
     same(report, want)
     np.testing.assert_array_equal(report.alarm, want.alarm)
@@ -131,7 +88,7 @@ def test_solves_that_come_late_are_shifted_plans(model, seconds):
     late = {12: seconds, 13: seconds, 20: seconds}
     controller = Slow(make_safe(model, horizon=10).controller, clock, late)
     slow = SafeController(controller, pendulum_model())
-    report = make(model, slow, Rig(), clock, deadline=0.01).run(N * DT)
+    report = make_runner(model, slow, Rig(), clock, deadline=0.01).run(N * DT)
     want = run(model, make_safe(model, horizon=10), late=lambda t: round(t / DT) in late)
     same(report, want)
     assert (report.late, report.overruns, report.skipped) == (3, 3, 0)
@@ -160,7 +117,7 @@ def test_no_solve_is_begun_that_cannot_be_in_time(model):
 def test_after_a_long_solve_periods_are_skipped_on_the_grid(model):
     clock = FakeClock()
     controller = Slow(make_safe(model, horizon=10).controller, clock, {10: 3.3 * DT, 15: 1.3 * DT})
-    report = make(model, SafeController(controller), Rig(), clock).run(N * DT)
+    report = make_runner(model, SafeController(controller), Rig(), clock).run(N * DT)
     grid = np.round(report.t / DT).astype(int)
     # 3.3 periods: two are lost, the third is begun late; 1.3 periods: none is lost.
     np.testing.assert_array_equal(grid, [*range(11), *range(13, N)])
@@ -180,7 +137,7 @@ def test_after_a_long_solve_periods_are_skipped_on_the_grid(model):
 def test_after_a_very_long_break_the_estimate_starts_anew(model):
     clock = FakeClock()
     controller = Slow(make_safe(model, horizon=10).controller, clock, {4: 3600.0})
-    report = make(model, SafeController(controller), Rig(), clock).run(3600.0 + N * DT)
+    report = make_runner(model, SafeController(controller), Rig(), clock).run(3600.0 + N * DT)
     assert report.skipped == round(3600.0 / DT) - 1
     assert report.x_hat[5, 1] == 0.0  # at rest at the first measurement
     assert report.x_hat[5, 0] == pytest.approx(report.y[5, 0], abs=1e-12)  # Newton's tolerance
@@ -189,132 +146,40 @@ def test_after_a_very_long_break_the_estimate_starts_anew(model):
 def test_a_machine_too_slow_for_its_period_keeps_trying(model):
     clock = FakeClock()
     controller = Slow(make_safe(model, horizon=10).controller, clock, dict.fromkeys(range(-2, 999), 0.03))
-    report = make(model, SafeController(controller), Rig(), clock).run(N * DT)
+    report = make_runner(model, SafeController(controller), Rig(), clock).run(N * DT)
     assert controller.k > report.periods / 3  # solves go on being begun
     assert report.late == report.periods
     assert np.all(np.abs(report.u) <= 6.0)
 
 
-@pytest.mark.parametrize("absurd", [np.nan, np.inf, -np.inf, 1e300, -1e200])
-def test_no_number_raises(model, safe, absurd):
-    rig = Rig()
-
-    def measure():
-        y = rig.measure()
-        return [absurd] if 5 <= len(rig.y) < 12 else y
-
-    reference = lambda t: np.where((t > 0.4)[:, None], absurd, sine(t))  # noqa: E731
-    runner = Runner(measure, rig.actuate, make_ekf(model), safe, reference, clock=FakeClock())
-    report = runner.run(N * DT)
-    assert report.periods == N
-    assert np.all(np.abs(np.array(rig.u)) <= 6.0)  # finite and within the limits
-    assert Counter(report.source) == report.sources
-
-
-@pytest.mark.parametrize("where", ["measure", "actuate", "reference", "stop", "on_step"])
-@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
-def test_a_failing_callback_leaves_the_safe_input(model, safe, where, error):
-    rig, calls = Rig(), Counter()
-
-    def guard(name, function):
-        def call(*arguments):
-            calls[name] += 1
-            if name == where and calls[name] == 9:
-                raise error("cable")
-            return function(*arguments)
-
-        return call
-
-    callbacks = [guard("measure", rig.measure), guard("actuate", rig.actuate)]
-    runner = Runner(
-        *callbacks, make_ekf(model), safe, guard("reference", sine), clock=FakeClock(),
-        on_step=guard("on_step", lambda step: None), safe_input=[0.25],
-    )  # fmt: skip
-    with pytest.raises(error, match="cable"):
-        runner.run(N * DT, stop=guard("stop", lambda: False))
-    np.testing.assert_array_equal(rig.u[-1], [0.25])
-    assert 7 <= len(rig.u) <= 10
-
-
-def test_the_first_failure_is_raised_if_the_actuator_stays_broken(model, safe):
-    rig = Rig()
-
-    def broken(u):
-        raise OSError(f"no actuator, attempt {len(rig.u)}")
-
-    with pytest.raises(OSError, match="no actuator"):
-        Runner(rig.measure, broken, make_ekf(model), safe, sine, clock=FakeClock()).run(1.0)
-
-
 def test_stop_and_the_rows_kept(model, safe):
     rig, steps = Rig(), []
-    runner = make(model, safe, rig, keep=4, on_step=steps.append)
+    runner = make_runner(model, safe, rig, keep=4, on_step=steps.append)
     report = runner.run(stop=lambda: len(rig.u) == 11)
     assert (report.stopped, report.periods, len(report.t)) == ("stop", 11, 4)
     np.testing.assert_allclose(report.t, DT * np.arange(7, 11), atol=1e-12)
     assert [s.k for s in steps] == list(range(11))
-    empty = make(model, safe, Rig()).run(stop=lambda: True)
+    empty = make_runner(model, safe, Rig()).run(stop=lambda: True)
     assert empty.periods == 0
     assert np.isnan(empty.percentiles()["solve"]["p99"])
 
 
 def test_two_runs_of_one_runner_are_independent(model, safe):
-    runner = make(model, safe, rig := Rig())
+    runner = make_runner(model, safe, rig := Rig())
     first = runner.run(N * DT)
     rig.__post_init__()
     same(runner.run(N * DT), first)
 
 
 def test_a_bare_controller_is_guarded(model, safe):
-    bare = make(model, safe.controller, Rig()).run(N * DT)
-    np.testing.assert_array_equal(bare.u, make(model, safe, Rig()).run(N * DT).u)
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"deadline": 0.03}, "deadline must lie within the period"),
-        ({"deadline": 0.0}, "deadline"),
-        ({"safe_input": [7.0]}, "outside the limits"),
-        ({"safe_input": [np.nan]}, "finite"),
-        ({"input_delay": -1}, "input_delay"),
-        ({"sensor_delay": 0.5}, "sensor_delay"),
-        ({"keep": 0}, "keep"),
-        ({"estimator": "prior"}, "same model"),
-        ({"estimator": "truth"}, "TrueState"),
-        ({"estimator": "slower"}, "period is 0.04"),
-    ],
-)
-def test_bad_arguments_are_refused(model, safe, change, words):
-    estimators = {
-        "prior": lambda: make_ekf(pendulum_model()),
-        "truth": lambda: TrueState(model),
-        "slower": lambda: make_ekf(pendulum_model(z=2, dt=0.04)),
-    }
-    if "estimator" in change:
-        change = {"estimator": estimators[change["estimator"]]()}
-    with pytest.raises(InputError, match=words):
-        make(model, safe, Rig(), **change)
-
-
-@pytest.mark.parametrize(("duration", "stop"), [(None, None), (0.0, None), (np.nan, None), (np.inf, None)])
-def test_a_run_needs_an_end(model, safe, duration, stop):
-    with pytest.raises(InputError, match=r"duration"):
-        make(model, safe, Rig()).run(duration, stop)
-
-
-def test_a_measurement_of_another_shape_is_refused_after_the_safe_input(model, safe):
-    rig = Rig()
-    runner = Runner(lambda: [0.0, 0.0], rig.actuate, make_ekf(model), safe, sine, clock=FakeClock())
-    with pytest.raises(InputError, match=r"measure\(\) returns has shape \(2,\)"):
-        runner.run(1.0)
-    assert len(rig.u) == 1
+    bare = make_runner(model, safe.controller, Rig()).run(N * DT)
+    np.testing.assert_array_equal(bare.u, make_runner(model, safe, Rig()).run(N * DT).u)
 
 
 def test_in_real_time():
     model = pendulum_model()
     rig, begin = Rig(), time.perf_counter()
-    report = make(model, make_safe(model, horizon=10), rig, RealClock()).run(1.0)
+    report = make_runner(model, make_safe(model, horizon=10), rig, RealClock()).run(1.0)
     # 50 whole periods. Other load on the computer may delay any step, not hasten one.
     assert time.perf_counter() - begin >= 1.0
     assert report.periods + report.skipped == 50

@@ -10,8 +10,8 @@ from scipy.sparse import csc_array
 
 from hybrid_mpc.data import read_table, write_csv
 from hybrid_mpc.data.mat_structure import check_structure, version
+from hybrid_mpc.data_spec import DataSpec, Window
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.scenario import DataSpec, Window
 from hybrid_mpc.signals import Signal
 
 SPEC = DataSpec("time_s", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.2)

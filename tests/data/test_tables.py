@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybrid_mpc.data import read_csv, write_csv
+from hybrid_mpc.data_spec import DataSpec, Window
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.scenario import DataSpec, Window
 from hybrid_mpc.signals import Signal
 
 SPEC = DataSpec("time_s", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.2)

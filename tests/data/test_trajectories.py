@@ -6,8 +6,8 @@ from scipy.io import savemat
 
 from hybrid_mpc.data import load_trajectories, write_csv
 from hybrid_mpc.data.trajectories import hold_mean
+from hybrid_mpc.data_spec import DataSpec, Window
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.scenario import DataSpec, Window
 from hybrid_mpc.signals import Signal
 
 SPEC = DataSpec("t", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.2)

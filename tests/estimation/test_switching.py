@@ -63,13 +63,13 @@ def test_it_follows_a_jump_as_the_quick_filter_and_is_quiet_as_the_quiet_one(int
     start, load, errors = 250, 3.0, {}
     for name, e in (("quiet", quiet), ("quick", quick), ("switching", switching)):
         before, after = [], []
-        for seed in range(10):
+        for seed in range(5):
             ys = recorded(integrator, lambda k: load * (k >= start), seed)
             d = np.array([v.d[0] for v in estimates(e, ys)])
             before.append(np.sqrt(np.mean(d[50:start] ** 2)))
             after.append(np.sqrt(np.mean((d[start + 20 :] - load) ** 2)))
         errors[name] = np.mean(before), np.mean(after)
-    # Wide margins: ten runs of 400 samples leave a few per cent of scatter in such means.
+    # Wide margins: five runs of 400 samples leave a few per cent of scatter in such means.
     assert errors["switching"][0] < 0.3 * errors["quick"][0]
     assert errors["switching"][1] < 0.8 * errors["quick"][1]
     assert errors["switching"][1] < 0.2 * errors["quiet"][1]

@@ -1,5 +1,7 @@
 """A pendulum with known parameters, simulated by an integrator of its own: data for these tests."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.integrate import solve_ivp
 
@@ -47,3 +49,29 @@ def record(seed, seconds=4.0, role="train", extra=lambda phi, v: 0.0, noise=0.0,
     xdot = np.array([f(0, *pair) for pair in zip(x, u[:, 0], strict=True)])
     x = x + noise * rng.standard_normal(x.shape)
     return Trajectory(f"run{seed}", role, DT, DT * np.arange(n), u, x[:, :1], x, xdot)
+
+
+def drag(phi, v):
+    """A torque [N m] that the prior lacks."""
+    return -0.08 * np.tanh(v / 0.5)
+
+
+def dragged():
+    """Two runs to train on and one to validate with, under that torque."""
+    runs = [record(seed, seconds=3.0, extra=drag) for seed in range(3)]
+    return runs[:2], [replace(runs[2], role="valid")]
+
+
+class Killed(Exception):
+    """What a test raises in the middle of a training."""
+
+
+def same_training(one, two):
+    """Settings, scaling, weights, curves and validation agree to the last bit."""
+    assert one.settings == two.settings
+    assert one.scaling == two.scaling
+    for name, weight in one.weights.items():
+        np.testing.assert_array_equal(weight, two.weights[name])
+    for name, column in one.curve.items():
+        np.testing.assert_array_equal(column, two.curve[name])
+    np.testing.assert_array_equal(one.validation, two.validation)

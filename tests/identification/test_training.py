@@ -3,47 +3,36 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from simulated_pendulum import DT, TRUTH, Pendulum, record
+from simulated_pendulum import DT, TRUTH, Killed, Pendulum, dragged, same_training
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identification.checkpoint import load_checkpoint, save_checkpoint
 from hybrid_mpc.identification.dataset import cut_windows, fitting_horizon
-from hybrid_mpc.identification.objectives import OBJECTIVES, energy_objective, free_run, teacher_forced
+from hybrid_mpc.identification.objectives import OBJECTIVES, energy_objective
 from hybrid_mpc.identification.training import KINDS, TrainingSettings, train
 from hybrid_mpc.identification.training_run import REPEATS, TrainingRun
 
 SMALL = TrainingSettings("mopgrnn", 4, 2, 20, 20, seed=3, warm=10, horizon=20, batch=8, every=10)
 
 
-def drag(phi, v):
-    """A torque [N m] that the prior lacks."""
-    return -0.08 * np.tanh(v / 0.5)
-
-
 @pytest.fixture(scope="module")
 def data():
-    runs = [record(seed, seconds=3.0, extra=drag) for seed in range(3)]
-    return [*runs[:2]], [replace(runs[2], role="valid")]
+    return dragged()
 
 
 PRIOR = Pendulum(TRUTH)
 
 
-def same(one, two):
-    assert one.settings == two.settings
-    assert one.scaling == two.scaling
-    for name, weight in one.weights.items():
-        np.testing.assert_array_equal(weight, two.weights[name])
-    for name, column in one.curve.items():
-        np.testing.assert_array_equal(column, two.curve[name])
-    np.testing.assert_array_equal(one.validation, two.validation)
+@pytest.fixture(scope="module")
+def whole(data):
+    """What ``SMALL`` comes to when nothing goes wrong."""
+    return train(PRIOR, *data, SMALL)
 
 
-def test_training_is_deterministic_and_the_seed_matters(data):
-    one = train(PRIOR, *data, SMALL)
-    same(one, train(PRIOR, *data, SMALL))
+def test_training_is_deterministic_and_the_seed_matters(data, whole):
+    same_training(whole, train(PRIOR, *data, SMALL))
     other = train(PRIOR, *data, replace(SMALL, seed=4))
-    assert not np.array_equal(one.weights["w_hh"], other.weights["w_hh"])
+    assert not np.array_equal(whole.weights["w_hh"], other.weights["w_hh"])
 
 
 RECORDED = {
@@ -64,12 +53,8 @@ def test_a_training_with_defaults_is_what_it_has_always_been(data, kind):
     np.testing.assert_allclose([(w * np.cos(np.arange(w.size))).sum() for w in weights], prints, rtol=1e-9)
 
 
-class Killed(Exception):
-    pass
-
-
 @pytest.mark.parametrize("at", [10, 20, 30])  # within a stage, between the stages, within the second
-def test_a_killed_training_resumes_to_the_same_bits(data, tmp_path, at):
+def test_a_killed_training_resumes_to_the_same_bits(data, whole, tmp_path, at):
     def kill(done, total, error):
         if done == at:
             raise Killed
@@ -80,7 +65,7 @@ def test_a_killed_training_resumes_to_the_same_bits(data, tmp_path, at):
     seen = []
     resumed = train(PRIOR, *data, SMALL, checkpoint=file, on_progress=lambda d, t, e: seen.append(d))
     assert seen[0] == at + 10  # it went on, it did not start anew
-    same(resumed, train(PRIOR, *data, SMALL))
+    same_training(resumed, whole)
 
 
 def test_a_damaged_or_foreign_checkpoint_is_refused(data, tmp_path):
@@ -107,8 +92,8 @@ def test_a_checkpoint_gives_back_what_it_got(tmp_path):
     assert [f.name for f in tmp_path.iterdir()] == ["c"]
 
 
-def test_bounds_never_rise_within_a_stage(data):
-    curve = train(PRIOR, *data, SMALL).curve
+def test_bounds_never_rise_within_a_stage(whole):
+    curve = whole.curve
     for stage in (0.0, 1.0):
         rows = curve["free_run"][:, 0] == stage
         assert rows.sum() >= 2
@@ -151,98 +136,6 @@ def test_a_gradient_that_is_no_number_is_skipped_and_counted_for_its_network_alo
     assert norm == pytest.approx(1.0, rel=1e-12)  # the other network's is clipped to one
 
 
-OPTIONS = (
-    {"cell": "gru_paper"},
-    {"cell": "lstm"},
-    {"cell": "feed_forward"},
-    {"form": "literal"},
-    {"form": "literal", "kind": "rnn", "cell": "gru_paper"},
-    {"combination": "hard_maximum"},
-    {"combination": "weighted_sum", "weights": (0.9, 0.1)},
-    {"combination": "augmented_lagrangian"},
-    {"energy": "one_step"},
-    {"energy": "free_run"},
-    {"objectives": ("error",)},
-    {"fused": True},
-    {"prior_parameters": "trained"},
-    {"prior_parameters": "trained", "form": "literal"},
-    {"prior_parameters": "trained", "fused": True},
-)
-SHORT = replace(SMALL, teacher_steps=15, free_run_steps=10, every=5)
-
-
-@pytest.mark.parametrize("options", OPTIONS, ids=str)
-def test_every_option_trains_resumes_and_makes_a_model(data, options, tmp_path):
-    def kill(done, total, error):
-        if done == 10:
-            raise Killed
-
-    settings, file = replace(SHORT, **options), tmp_path / "training.safetensors"
-    whole = train(PRIOR, *data, settings)
-    assert (whole.validation < whole.curve["validation"][0]).all()
-    assert not whole.faults
-    with pytest.raises(Killed):
-        train(PRIOR, *data, settings, checkpoint=file, on_progress=kill)
-    same(whole, train(PRIOR, *data, settings, checkpoint=file))
-    if options not in ({"energy": "one_step"}, {"fused": True}):
-        assert not np.array_equal(whole.validation, train(PRIOR, *data, SHORT).validation)
-    step = whole.step(PRIOR, DT)
-    x_next, h_next = step(
-        torch.zeros(2).double(), torch.zeros(step.network.n_h).double(), torch.ones(1).double()
-    )
-    assert torch.isfinite(torch.cat([x_next, h_next])).all()
-
-
-def test_both_readings_of_the_energy_objective(data):
-    for free in (False, True):
-        losses = {}
-        for energy in ("stage", "one_step", "free_run"):
-            run = TrainingRun(PRIOR, *data, replace(SMALL, energy=energy))
-            with torch.no_grad():
-                run.weights["w_out"].fill_(0.5)  # off the prior, so that the readings differ
-                run.free = free
-                losses[energy] = run._losses(run.fixed)
-                one, own = (
-                    energy_objective(run.step, p(run.step, run.fixed)) for p in (teacher_forced, free_run)
-                )
-        assert torch.equal(losses["one_step"][:, 1], one)
-        assert torch.equal(losses["free_run"][:, 1], own)
-        assert torch.equal(losses["stage"], losses["free_run" if free else "one_step"])
-        assert (losses["one_step"][:, 1] != losses["free_run"][:, 1]).all()
-        assert torch.equal(losses["one_step"][:, 0], losses["free_run"][:, 0])  # the error keeps to its stage
-
-
-def test_any_number_of_objectives(data, monkeypatch):
-    def square(step, p):
-        return (p.xdot_hat - p.xdot).square().sum(-1).mean(dim=(0, 2))
-
-    monkeypatch.setitem(OBJECTIVES, "square", square)
-    curve = train(PRIOR, *data, replace(SHORT, objectives=("error", "energy", "square"))).curve
-    for name in ("error", "energy", "square"):
-        assert (curve[f"loss_{name}"] > 0).all()
-        assert (np.diff(curve[f"bound_{name}"][curve["free_run"][:, 0] == 0], axis=0) <= 0).all()
-    two = train(PRIOR, *data, SHORT).curve
-    assert not np.array_equal(curve["loss_error"][1:], two["loss_error"][1:])  # the third one counts
-
-
-@pytest.mark.parametrize(
-    ("wrong", "words"),
-    [
-        ({"kind": "gru"}, "mopgrnn"),
-        ({"cell": "rnn"}, "gru_paper"),
-        ({"objectives": ("error", "power")}, "error, energy"),
-        ({"objectives": ()}, "at least one"),
-        ({"combination": "sum"}, "weighted_sum"),
-        ({"weights": (1.0,)}, "one for each"),
-        ({"energy": "both"}, "one_step"),
-        ({"form": "euler"}, "literal"),
-    ],
-)
-def test_settings_that_are_none_are_refused_with_what_there_is(wrong, words):
-    with pytest.raises(InputError, match=words):
-        replace(SMALL, **wrong)
-
-
 def failing(monkeypatch, broken):
     """Make the energy of network 0 no number in the calls with gradient whose number ``broken`` accepts."""
     calls = iter(range(10_000))
@@ -256,8 +149,7 @@ def failing(monkeypatch, broken):
     monkeypatch.setitem(OBJECTIVES, "energy", energy)
 
 
-def test_a_loss_that_is_no_number_again_and_again_stops_its_network_alone(data, monkeypatch, tmp_path):
-    whole = train(PRIOR, *data, SMALL)
+def test_a_loss_that_is_no_number_again_and_again_stops_its_network_alone(data, whole, monkeypatch, tmp_path):
     failing(monkeypatch, lambda k: k >= 12)
     trained = train(PRIOR, *data, SMALL, checkpoint=tmp_path / "c")
     (fault,) = trained.faults
@@ -271,7 +163,7 @@ def test_a_loss_that_is_no_number_again_and_again_stops_its_network_alone(data, 
     late = trained.curve["step"][:, 0] >= 20
     assert np.ptp(trained.curve["validation"][late, 0]) == 0.0
     assert trained.curve["validation"][-1, 0] == trained.validation[0]
-    same(trained, train(PRIOR, *data, SMALL, checkpoint=tmp_path / "c"))
+    same_training(trained, train(PRIOR, *data, SMALL, checkpoint=tmp_path / "c"))
     assert train(PRIOR, *data, SMALL, checkpoint=tmp_path / "c").faults == trained.faults
 
 
@@ -290,16 +182,6 @@ def test_a_training_without_a_network_left_ends(data, monkeypatch):
     assert trained.faults[0].stopped
     assert trained.curve["step"][-1, 0] == 10  # the evaluation after the stop is the last
     assert trained.validation[0] == trained.curve["validation"][0, 0]
-
-
-def test_the_literal_form_wants_the_derivative(data):
-    train_runs, valid = data
-    xdot = train_runs[1].xdot.copy()
-    xdot[40] = np.nan
-    bad = [train_runs[0], replace(train_runs[1], xdot=xdot)]
-    with pytest.raises(InputError, match=r"run1: xdot is not finite at 0\.8 s"):
-        train(PRIOR, bad, valid, replace(SHORT, form="literal"))
-    train(PRIOR, bad, valid, replace(SHORT, teacher_steps=1, free_run_steps=0))  # the hybrid does not
 
 
 def cut(trajectory, n):

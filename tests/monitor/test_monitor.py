@@ -42,12 +42,17 @@ def test_violation_is_J_v_times_the_acceleration_error_under_a_constant_push():
     assert expected.max() > 0.5
 
 
-def test_alarm_rate_on_fresh_nominal_data_is_near_the_wanted_rate():
+@pytest.fixture(scope="module")
+def levels():
+    """Levels of four nominal runs of 100 s."""
     model = pendulum()
     monitor = EnergyMonitor(model, window=11, average=10)
-    levels = [
-        replay(monitor, Observer(model), simulate(5000, s, noise=NOISE)).level_w[100:] for s in range(4)
-    ]
+    return [replay(monitor, Observer(model), simulate(5000, s, noise=NOISE)).level_w[100:] for s in range(4)]
+
+
+def test_alarm_rate_on_fresh_nominal_data_is_near_the_wanted_rate(levels):
+    model = pendulum()
+    monitor = EnergyMonitor(model, window=11, average=10)
     calibration = calibrate(levels, DT, false_alarms_per_hour=60.0)
     armed = EnergyMonitor(model, window=11, average=10, calibration=calibration)
     runs = [replay(armed, Observer(model), simulate(5000, s, noise=NOISE)) for s in range(10, 16)]
@@ -61,13 +66,9 @@ def test_alarm_rate_on_fresh_nominal_data_is_near_the_wanted_rate():
 
 
 @pytest.mark.parametrize(("fault", "limit"), [(pendulum(friction=3 * GAMMA), 1.0), (pendulum(push=0.5), 0.5)])
-def test_faults_raise_the_alarm_in_time(fault, limit):
+def test_faults_raise_the_alarm_in_time(levels, fault, limit):
     model = pendulum()
-    monitor = EnergyMonitor(model, window=11, average=10)
-    levels = [
-        replay(monitor, Observer(model), simulate(5000, s, noise=NOISE)).level_w[100:] for s in range(2)
-    ]
-    calibration = calibrate(levels, DT, false_alarms_per_hour=20.0)
+    calibration = calibrate(levels[:2], DT, false_alarms_per_hour=20.0)
     armed = EnergyMonitor(model, window=11, average=10, calibration=calibration)
     run = simulate(700, seed=20, fault=fault, at=500, noise=NOISE)
     trace = replay(armed, Observer(model), run)

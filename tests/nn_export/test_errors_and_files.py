@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 import pytest
 import torch
+from export_parts import Call
 from torch import nn
 
 from nn_export import Program, ProgramError, build, to_casadi, trace
@@ -19,15 +20,6 @@ from nn_export.errors import (
     TrainingModeError,
     UnsupportedOperatorError,
 )
-
-
-class Call(nn.Module):
-    def __init__(self, f):
-        super().__init__()
-        self.f = f
-
-    def forward(self, x):
-        return self.f(x)
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
+from export_parts import Call
 from torch import nn
 from torch.nn import functional as F
 
@@ -22,15 +23,6 @@ from nn_export.errors import (
 )
 
 X = torch.zeros(4)
-
-
-class Call(nn.Module):
-    def __init__(self, f):
-        super().__init__()
-        self.f = f
-
-    def forward(self, x):
-        return self.f(x)
 
 
 class Unknown(nn.Module):

@@ -1,28 +1,9 @@
 """Bad input ends with exit code 2 and a message that names file, row or field, and a remedy; nothing is left."""
 
-import sys
-
 import numpy as np
 import pytest
 
-from hybrid_mpc.cli import main
-
 from .conftest import recording, write
-
-pytestmark = pytest.mark.xdist_group("run")  # these share one finished run
-
-
-@pytest.fixture
-def call(monkeypatch, capsys):
-    """Run the command line in this process: ``(exit code, what it printed on stderr)``."""
-
-    def run(*words):
-        monkeypatch.setattr(sys, "argv", ["hybrid-mpc", *map(str, words)])
-        with pytest.raises(SystemExit) as stop:
-            main()
-        return stop.value.code, capsys.readouterr().err.replace("\n", " ")
-
-    return run
 
 
 def rows(columns):
@@ -101,7 +82,7 @@ def test_bad_recordings(call, machine, tmp_path, damage, words):
     damage(lines)
     bad, out = tmp_path / "bad.csv", tmp_path / "out"
     bad.write_text("\n".join(lines) + "\n" if lines else "")
-    code, message = call("run", machine / "my_machine.py", "--data", bad, "--out", out)
+    code, _, message = call("run", machine / "my_machine.py", "--data", bad, "--out", out)
     assert code == 2
     for word in words:
         assert word in message
@@ -109,23 +90,23 @@ def test_bad_recordings(call, machine, tmp_path, damage, words):
 
 
 def test_missing_file_and_missing_data(call, machine, tmp_path):
-    code, message = call(
+    code, _, message = call(
         "run", machine / "my_machine.py", "--data", tmp_path / "none.csv", "--out", tmp_path / "o"
     )
     assert code == 2
     assert "none.csv" in message
-    code, message = call("run", machine / "my_machine.py", "--out", tmp_path / "o")
+    code, _, message = call("run", machine / "my_machine.py", "--out", tmp_path / "o")
     assert code == 2
     assert "--data" in message
     assert not (tmp_path / "o").exists()
 
 
 def test_unknown_scenario_and_budget(call, machine, tmp_path):
-    code, message = call("run", "golf_robott", "--out", tmp_path / "o")
+    code, _, message = call("run", "golf_robott", "--out", tmp_path / "o")
     assert code == 2
     assert "golf_robot" in message
     data = machine / "monday.csv"
-    code, message = call(
+    code, _, message = call(
         "run", machine / "my_machine.py", "--data", data, "--budget", "huge", "--out", tmp_path / "o"
     )
     assert code == 2
@@ -151,27 +132,11 @@ def test_unknown_scenario_and_budget(call, machine, tmp_path):
 def test_bad_scenario_files(call, tmp_path, source, words):
     path = tmp_path / "machine.py"
     path.write_text(source)
-    code, message = call("run", path, "--out", tmp_path / "o")
+    code, _, message = call("run", path, "--out", tmp_path / "o")
     assert code == 2
     for word in words:
         assert word in message
     assert not (tmp_path / "o").exists()
-
-
-def test_folder_of_another_run_or_of_something_else(call, arguments, finished, tmp_path):
-    code, message = call(*arguments, "--out", finished)
-    assert code == 2
-    assert "--resume" in message
-    code, message = call(*arguments, "--seed", "7", "--out", finished, "--resume")
-    assert code == 2
-    assert "seed" in message
-    (tmp_path / "letter.txt").write_text("mine")
-    code, message = call(*arguments, "--out", tmp_path)
-    assert code == 2
-    assert "something else" in message
-    code, message = call(*arguments, "--out", tmp_path / "fresh", "--resume")
-    assert code == 2
-    assert "no run to resume" in message
 
 
 def test_columns_by_option(call, machine, tmp_path):
@@ -179,22 +144,11 @@ def test_columns_by_option(call, machine, tmp_path):
     renamed = dict(zip(("t", "torque", "angle"), recording(6).values(), strict=True))
     data = write(tmp_path / "renamed.csv", renamed)
     options = ["--time-column", "t", "--input-column", "torque", "--output-column", "angel"]
-    code, message = call("run", machine / "my_machine.py", "--data", data, "--out", tmp_path / "o", *options)
+    code, _, message = call(
+        "run", machine / "my_machine.py", "--data", data, "--out", tmp_path / "o", *options
+    )
     assert code == 2
     assert "'angle'" in message
-
-
-def test_resume_of_a_damaged_checkpoint(call, arguments, finished, tmp_path):
-    import shutil
-
-    out = tmp_path / "copy"
-    shutil.copytree(finished, out)
-    (out / "checkpoints" / "report.json").unlink()
-    (out / "checkpoints" / "evaluation.json").write_text("{broken")
-    code, message = call(*arguments, "--out", out, "--resume")
-    assert code == 2
-    assert "evaluation.json" in message
-    assert "damaged" in message
 
 
 def test_ctrl_c_says_how_to_go_on(call, arguments, tmp_path, monkeypatch):
@@ -204,6 +158,6 @@ def test_ctrl_c_says_how_to_go_on(call, arguments, tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(job, "run", stopped)
-    code, told = call(*arguments, "--out", tmp_path / "run")
+    code, _, told = call(*arguments, "--out", tmp_path / "run")
     assert code == 130
     assert "--resume" in told

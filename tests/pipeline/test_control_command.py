@@ -2,14 +2,13 @@
 
 import json
 import shutil
-import sys
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 from hybrid_mpc.artifact import set_calibration
-from hybrid_mpc.cli import main
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.monitor import Calibration, Detector
 from hybrid_mpc.pipeline.control_job import (
@@ -42,20 +41,9 @@ def run_folder(golf_artifact, tmp_path_factory):
 
 
 @pytest.fixture
-def call(monkeypatch, capsys):
+def call(call):
     """Run the command in this process: ``(exit code, stdout, stderr)``."""
-
-    def run(*words):
-        monkeypatch.setattr(sys, "argv", ["hybrid-mpc", "control", *map(str, words)])
-        try:
-            main()
-            code = 0
-        except SystemExit as stop:
-            code = stop.code or 0
-        told = capsys.readouterr()
-        return code, told.out, told.err.replace("\n", " ")
-
-    return run
+    return partial(call, "control")
 
 
 def test_loops_of_two_controllers(call, run_folder, tmp_path):

@@ -1,22 +1,20 @@
 """``hybrid-mpc benchmark`` on a machine that is simulated here, and what it refuses."""
 
 import json
-import sys
+from functools import partial
 
 import numpy as np
 import pytest
 
-from hybrid_mpc.cli import main
 from hybrid_mpc.data import write_csv
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identification.dataset import cut_windows
+from hybrid_mpc.pipeline.machine_benchmark import networks
 from hybrid_mpc.pipeline.machine_benchmark.free_runs import figures_of, run_freely
 from hybrid_mpc.pipeline.machine_benchmark.job import BenchmarkSettings, benchmark
 from hybrid_mpc.pipeline.machine_benchmark.physics import fit_physics, shifted
 from hybrid_mpc.pipeline.machine_benchmark.recordings import read_test, read_training
 from hybrid_mpc.scenario import load_scenario
-
-pytestmark = pytest.mark.xdist_group("machine")  # they share what is made once
 
 MACHINE = """
 import torch
@@ -74,6 +72,19 @@ def machine(tmp_path_factory):
     train = recording(folder / "train.csv", seed=0)
     test = recording(folder / "test.csv", seed=1, seconds=40.0)
     return folder / "cart.py", train, test
+
+
+@pytest.fixture(scope="module", autouse=True)
+def trained_here():
+    """Networks are trained in this process: others of their own would take longer to start than to train."""
+
+    def one_by_one(jobs, on_progress, workers):
+        for name, (function, arguments) in jobs.items():
+            function(*arguments, lambda *told, name=name: on_progress(name, *told))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(networks, "run_jobs", one_by_one)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -204,18 +215,9 @@ def test_a_diverging_run_is_infinite_and_not_nan():
 
 
 @pytest.fixture
-def call(monkeypatch, capsys):
-    def run(*words):
-        monkeypatch.setattr(sys, "argv", ["hybrid-mpc", "benchmark", *map(str, words)])
-        try:
-            main()
-            code = 0
-        except SystemExit as stop:
-            code = stop.code or 0
-        told = capsys.readouterr()
-        return code, told.out, told.err.replace("\n", " ")
-
-    return run
+def call(call):
+    """Run the command in this process: ``(exit code, stdout, stderr)``."""
+    return partial(call, "benchmark")
 
 
 def test_the_command_judges_a_model_and_draws_it(call, machine, made, tmp_path):

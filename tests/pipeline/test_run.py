@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,8 +15,6 @@ import pytest
 from hybrid_mpc.artifact import load_artifact
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.report.schema import validate_results
-
-pytestmark = pytest.mark.xdist_group("run")  # these share one finished run
 
 
 def results(folder):
@@ -86,6 +85,54 @@ def test_killed_and_resumed_run_equals_the_finished_one(finished, arguments, tmp
     assert (out / "model" / "weights.safetensors").read_bytes() == (
         finished / "model" / "weights.safetensors"
     ).read_bytes()
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("seed", range(4))
+def test_killed_several_times(finished, arguments, tmp_path, seed):
+    """At random moments; whatever the moment, --resume finishes the run to the same results."""
+    rng, out = np.random.default_rng(seed), tmp_path / "run"
+    command = [sys.executable, "-m", "hybrid_mpc.cli", *arguments, "--out", str(out)]
+    for _ in range(3):
+        resume = ["--resume"] if (out / "run.json").is_file() else []
+        process = subprocess.Popen(
+            [*command, *resume], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+        )
+        time.sleep(float(rng.uniform(3.0, 25.0)))
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    resume = ["--resume"] if (out / "run.json").is_file() else []
+    done = subprocess.run([*command, *resume], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert without_timing(out) == without_timing(finished)
+
+
+def test_folder_of_another_run_or_of_something_else(call, arguments, finished, tmp_path):
+    code, _, message = call(*arguments, "--out", finished)
+    assert code == 2
+    assert "--resume" in message
+    code, _, message = call(*arguments, "--seed", "7", "--out", finished, "--resume")
+    assert code == 2
+    assert "seed" in message
+    (tmp_path / "letter.txt").write_text("mine")
+    code, _, message = call(*arguments, "--out", tmp_path)
+    assert code == 2
+    assert "something else" in message
+    code, _, message = call(*arguments, "--out", tmp_path / "fresh", "--resume")
+    assert code == 2
+    assert "no run to resume" in message
+
+
+def test_resume_of_a_damaged_checkpoint(call, arguments, finished, tmp_path):
+    out = tmp_path / "copy"
+    shutil.copytree(finished, out)
+    (out / "checkpoints" / "report.json").unlink()
+    (out / "checkpoints" / "evaluation.json").write_text("{broken")
+    code, _, message = call(*arguments, "--out", out, "--resume")
+    assert code == 2
+    assert "evaluation.json" in message
+    assert "damaged" in message
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from hybrid_mpc.pipeline.search_job import SearchSettings, usage
 from hybrid_mpc.pipeline.settings import RunSettings, open_folder, read_network
 from hybrid_mpc.scenario import load_scenario
 
-pytestmark = [pytest.mark.xdist_group("search"), pytest.mark.full]  # these share one search of 20 s
+pytestmark = pytest.mark.full  # these share one search of 20 s
 PNG = b"\x89PNG"
 
 

@@ -5,12 +5,12 @@ import json
 import subprocess
 import sys
 import types
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from hybrid_mpc.cli import main
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identification.step import PriorStep
 from hybrid_mpc.reproduction import run as run_module
@@ -19,8 +19,6 @@ from hybrid_mpc.reproduction.run import reproduce
 from hybrid_mpc.reproduction.settings import ReproductionSettings
 
 from .conftest import Interrupting
-
-pytestmark = pytest.mark.xdist_group("reproduce")  # they share what is made once
 
 MODELS = ("phy_nominal", "phy", "rnn", "pgrnn", "mopgrnn", "hybrid")
 
@@ -126,16 +124,9 @@ def test_on_the_command_line_with_two_processes(exact, finished, tmp_path):
 
 
 @pytest.fixture
-def call(monkeypatch, capsys):
-    """Run the command line in this process: ``(exit code, what it printed on stderr)``."""
-
-    def run(*words):
-        monkeypatch.setattr(sys, "argv", ["hybrid-mpc", "reproduce", *map(str, words)])
-        with pytest.raises(SystemExit) as stop:
-            main()
-        return stop.value.code, capsys.readouterr().err.replace("\n", " ")
-
-    return run
+def call(call):
+    """Run the command in this process: ``(exit code, stdout, stderr)``."""
+    return partial(call, "reproduce")
 
 
 @pytest.mark.parametrize(
@@ -152,7 +143,7 @@ def call(monkeypatch, capsys):
     ],
 )
 def test_bad_settings(call, tmp_path, words, told):
-    code, message = call(*words, "--out", tmp_path / "o")
+    code, _, message = call(*words, "--out", tmp_path / "o")
     assert code == 2
     for word in told:
         assert word in message
@@ -160,18 +151,18 @@ def test_bad_settings(call, tmp_path, words, told):
 
 
 def test_folder_of_another_reproduction_or_of_something_else(call, exact, finished, tmp_path):
-    code, message = call(exact, "--out", finished)
+    code, _, message = call(exact, "--out", finished)
     assert code == 2
     assert "--resume" in message
     for option in (["--seed", "7"], ["--networks", "1"], ["--form", "literal"], ["--sequences", "1"]):
-        code, message = call(exact, "--out", finished, "--resume", *option)
+        code, _, message = call(exact, "--out", finished, "--resume", *option)
         assert code == 2
         assert option[0].lstrip("-") in message
-    code, message = call("pendulum", "--out", finished, "--resume")
+    code, _, message = call("pendulum", "--out", finished, "--resume")
     assert code == 2
     assert "scenario" in message
     (tmp_path / "letter.txt").write_text("mine")
-    code, message = call(exact, "--out", tmp_path)
+    code, _, message = call(exact, "--out", tmp_path)
     assert code == 2
     assert "something else" in message
 

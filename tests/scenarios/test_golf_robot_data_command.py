@@ -1,30 +1,23 @@
 """``hybrid-mpc data``: what it writes can be read back, and what it refuses."""
 
-import sys
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
-from hybrid_mpc.cli import main
 from hybrid_mpc.cli.data import readme, write_data
 from hybrid_mpc.data import load_trajectories, write_csv
+from hybrid_mpc.data_spec import Window
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.scenario import Window
 from scenarios.golf_robot import scenario
 from scenarios.torque_pendulum import scenario as torque_pendulum
 
 
 @pytest.fixture
-def call(monkeypatch, capsys):
-    def run(*words):
-        monkeypatch.setattr(sys, "argv", ["hybrid-mpc", "data", *map(str, words)])
-        with pytest.raises(SystemExit) as stop:
-            main()
-        said = capsys.readouterr()
-        return stop.value.code, (said.out + said.err).replace("\n", " ")
-
-    return run
+def call(call):
+    """Run the command in this process: ``(exit code, stdout, stderr)``."""
+    return partial(call, "data")
 
 
 @pytest.fixture
@@ -34,7 +27,9 @@ def few(monkeypatch):
 
 
 def test_it_writes_what_a_run_reads(call, few, tmp_path):
-    code, said = call("golf_robot", "--out", tmp_path / "d", "--budget", "quick", "--seed", 3, "--set", "a")
+    code, said, _ = call(
+        "golf_robot", "--out", tmp_path / "d", "--budget", "quick", "--seed", 3, "--set", "a"
+    )
     assert (code, said.count("4 recordings")) == (0, 1)
     files = sorted((tmp_path / "d").glob("*.csv"))
     assert [file.stem for file in files if "train" in file.stem] == ["train_01_step", "train_02_chirp"]
@@ -71,7 +66,7 @@ def test_what_it_refuses(call, few, tmp_path):
         (("golf_robott", "--out", tmp_path / "x"), "golf_robot"),
         (("torque_pendulum", "--out", tmp_path / "x"), "no data of its own"),
     ):
-        code, said = call(*words)
+        code, _, said = call(*words)
         assert code == 2, words
         assert need in said, words
     assert [path.name for path in tmp_path.iterdir()] == ["full"]  # nothing is left behind

@@ -1,11 +1,10 @@
 """``hybrid-mpc study``: run, report, compare, list."""
 
-import sys
+from functools import partial
 
 import pytest
 import trivial_runs
 
-from hybrid_mpc.cli import main
 from hybrid_mpc.studies import runner
 from hybrid_mpc.studies.ready import READY
 
@@ -13,20 +12,9 @@ YAML = "scenario: golf_robot\nmodels: nowhere\ntasks: [track_sine]\ncontrollers:
 
 
 @pytest.fixture
-def call(monkeypatch, capsys):
+def call(call):
     """Run the command in this process: ``(exit code, stdout, stderr)``."""
-
-    def run(*words):
-        monkeypatch.setattr(sys, "argv", ["hybrid-mpc", "study", *map(str, words)])
-        try:
-            main()
-            code = 0
-        except SystemExit as stop:
-            code = stop.code or 0
-        told = capsys.readouterr()
-        return code, told.out, told.err.replace("\n", " ")
-
-    return run
+    return partial(call, "study")
 
 
 @pytest.fixture
@@ -34,17 +22,6 @@ def config(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text(YAML)
     return path
-
-
-@pytest.fixture
-def here(monkeypatch):
-    """Runs in this process."""
-
-    def use(run):
-        trivial_runs.stand_in(monkeypatch, run)
-        monkeypatch.setattr(runner, "make_engine", lambda run, workers, cluster: trivial_runs.Here(run))
-
-    return use
 
 
 def steps(run):

@@ -10,8 +10,9 @@ import numpy as np
 
 from hybrid_mpc.benchmark_spec import BenchmarkSpec
 from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
+from hybrid_mpc.data_spec import Role
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.scenario import Role, Scenario
+from hybrid_mpc.scenario import Scenario
 
 SCORED = 50
 """Fewest periods of a piece after its warm-up."""

@@ -1,0 +1,23 @@
+"""Words that several commands take; a default is the command's own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, TypeAlias
+
+import typer
+
+ScenarioName: TypeAlias = Annotated[
+    str, typer.Argument(help="A registered name (see: hybrid-mpc scenarios) or a .py file.")
+]
+Recordings: TypeAlias = Annotated[
+    list[Path] | None, typer.Option(help="A recording; give it once for each file.")
+]
+TimeColumn: TypeAlias = Annotated[str, typer.Option(help="Column of the time [s]. Default: the scenario's.")]
+InputColumns: TypeAlias = Annotated[
+    list[str] | None, typer.Option(help="Column of an input, in the prior's order.")
+]
+OutputColumns: TypeAlias = Annotated[
+    list[str] | None, typer.Option(help="Column of a measured position, in the prior's order.")
+]
+EmptyFolder: TypeAlias = Annotated[Path, typer.Option(help="Folder to make; an existing one must be empty.")]

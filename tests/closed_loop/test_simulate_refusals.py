@@ -1,0 +1,76 @@
+"""The record as a table, and what a simulation refuses."""
+
+import numpy as np
+import pytest
+from closed_loop_parts import make_ekf, run
+from online_models import PendulumPlant, linear_model, pendulum_model
+
+from hybrid_mpc.closed_loop import Fault
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.mpc import OCP
+
+
+def test_to_pandas_has_every_column(model, safe):
+    table = run(model, safe).to_pandas()
+    assert len(table) == 30
+    assert {"t", "x_0", "x_1", "u_0", "h_1", "d_0", "reference_1", "source", "alarm", "solve_ms"} <= set(
+        table
+    )
+
+
+def test_to_pandas_with_a_model_has_names_and_units(model, safe):
+    result = run(model, safe)
+    table, plain = result.to_pandas(model), result.to_pandas()
+    assert table.shape == plain.shape
+    names = [
+        "t [s]",
+        "x phi [rad]",
+        "y phi [rad]",
+        "u torque [N m]",
+        "x_hat phi_dot [rad/s]",
+        "level [W]",
+        "solve [ms]",
+    ]
+    assert set(names) <= set(table)
+    np.testing.assert_array_equal(table["x phi_dot [rad/s]"], result.x[:, 1])
+    other = linear_model(np.eye(3), np.ones((3, 1)), np.eye(3)[:1])
+    with pytest.raises(InputError, match="2 columns of x, the model linear 3"):
+        result.to_pandas(other)
+
+
+class Odd(PendulumPlant):
+    """A plant of which one method returns another shape."""
+
+    def __init__(self, name, value):
+        super().__init__()
+        object.__setattr__(self, name, lambda *_: value)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"dt": 0.01}, r"dt = 0\.01 s given, a model's period is 0\.02"),
+        ({"dt": np.nan}, "dt"),
+        ({"duration": 0.005}, "shorter than one period"),
+        ({"duration": np.inf}, "duration"),
+        ({"duration": np.nan}, "duration"),
+        ({"x0": [0.0]}, "x0: 1 values given, 2 needed"),
+        ({"x0": [0.0, np.nan]}, "x0: values must be finite"),
+        ({"horizon": -2}, "horizon"),
+        ({"reference": lambda t: np.zeros(len(t))}, r"reference returns \(11,\)"),
+        ({"weight": lambda t: np.ones(len(t))}, r"weight returns \(11,\)"),
+        ({"sensor_delay": -1}, "sensor_delay"),
+        ({"input_delay": 1.5}, "input_delay"),
+        ({"reference": lambda t: np.zeros((len(t), 1))}, r"needed: \(11, 2\)"),
+        ({"faults": [Fault(0.0, 1.0, "input_gain", channel=1)]}, "channel 1 given, there are 1"),
+        ({"plant": Odd("measure", np.zeros(2))}, r"measurement has shape \(2,\)"),
+        ({"plant": Odd("truth", np.zeros(3))}, r"truth has shape \(3,\)"),
+        ({"estimator": "prior"}, "give both the same model"),
+        ({"stage_cost": OCP(3, [1.0], [1.0], [0.0], [-1.0], [1.0])}, "stage_cost"),
+    ],
+)
+def test_bad_input_is_refused(model, safe, change, words):
+    if change.get("estimator") == "prior":
+        change = {"estimator": make_ekf(pendulum_model())}
+    with pytest.raises(InputError, match=words):
+        run(model, safe, **change)

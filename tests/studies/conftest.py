@@ -1,0 +1,17 @@
+"""What the tests of studies share."""
+
+import pytest
+import trivial_runs
+
+from hybrid_mpc.studies import runner
+
+
+@pytest.fixture
+def here(monkeypatch):
+    """Run studies in this process: ``here(run)``."""
+
+    def use(run):
+        trivial_runs.stand_in(monkeypatch, run)
+        monkeypatch.setattr(runner, "make_engine", lambda run, workers, cluster: trivial_runs.Here(run))
+
+    return use
