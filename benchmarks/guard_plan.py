@@ -4,7 +4,7 @@
 Nominal loops of the golf robot's rig on two tasks, sines and steps to random levels (guard_loops.py), the same seeds
 with a free plan and with bounds learned from the recordings: ``quantile`` punishes beyond the fitted 99 % quantile
 itself (``reach`` 1), ``bounds`` beyond its extrapolated tail, as learned; ``excess`` and ``region`` are either bound
-alone. ``--minutes 4`` learns from so much of nominal loops in place of the recordings. Printed by task and arm: the cost
+alone. ``--minutes 4`` learns from so much of nominal loops in place of the recordings. Printed by task and arm: cost
 over that of the free plan, mean of the paired differences with the 95 % interval of Student's t; the share of planned
 samples beyond the excess's and the region's bound; processor time over that of the free plan. Each loop is
 written to FILE as soon as it is there, and not run again.

@@ -10,6 +10,7 @@ from hybrid_mpc.monitor.calibration import (
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.diagnosis import Change, Diagnoser, Diagnosis
 from hybrid_mpc.monitor.energy import EnergyMonitor
+from hybrid_mpc.monitor.held_out import HeldOut, leave_one_out
 from hybrid_mpc.monitor.learning import learn_detector
 from hybrid_mpc.monitor.plausibility import (
     Plausibility,
@@ -30,6 +31,8 @@ __all__ = [
     "learn_detector",
     "learn_from",
     "guard_monitor",
+    "leave_one_out",
+    "HeldOut",
     "Diagnoser",
     "Diagnosis",
     "Change",
