@@ -30,7 +30,7 @@ from hybrid_mpc.artifact import load_artifact
 from hybrid_mpc.closed_loop import simulate
 from hybrid_mpc.data.trajectories import load_trajectories
 from hybrid_mpc.files import read_json, write_json
-from hybrid_mpc.monitor import excess_bound, learn_plausibility, region_bound
+from hybrid_mpc.monitor import Plausibility, excess_bound, learn_plausibility, region_bound
 from hybrid_mpc.mpc import OCP, CondensedController, SafeController, SQPController
 from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_ocp
 from scenarios.golf_robot import scenario
@@ -151,7 +151,8 @@ def main() -> None:
     ordinary = learned(given, artifact, noise, say)
     say(f"{ordinary.samples} samples, terms {ordinary.terms}, reach {ordinary.reach:.3f}")
     kept = read_json(given.out) if given.out is not None and given.out.is_file() else {}
-    loops = kept.get("loops", []) if kept.get("plausibility") == ordinary.to_dict() else []
+    same = bool(kept) and Plausibility.from_dict(kept["plausibility"]) == ordinary
+    loops = kept["loops"] if same else []
     rows = {(r["task"], r["seed"], r["arm"]): r for r in loops if r["seconds"] == given.seconds}
     rig, arms = Rig(artifact, noise, ordinary), ["free", *(a for a in given.arms if a != "free")]
     for seed in range(3000, 3000 + given.seeds):

@@ -178,9 +178,8 @@ def balance_function(model: HybridModel) -> ca.Function:
 def excess_bound(model: HybridModel, ordinary: Plausibility, *, strength: float = STRENGTH) -> SoftBound:
     """Soft bound on what ``|dE_model|`` exceeds its ordinary size by; nothing within it.
 
-    Ordinary is ``reach`` times the quantile that was fitted. With the quantile itself a plan of 50 periods would be
-    punished for a sample or two that are as ordinary as the rest, and out of all proportion: the penalty must outweigh
-    what an optimiser gains by inventing, which is far more than a tracking error costs.
+    Ordinary is ``reach`` times the quantile that was fitted: the quantile itself would punish every plan of 50 periods
+    for a sample or two that are as ordinary as the rest.
 
     Args:
         model: The model that plans.

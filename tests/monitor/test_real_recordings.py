@@ -87,20 +87,21 @@ def test_every_push_by_hand_is_found_and_nothing_else(found):
 
 @needs_data
 def test_a_torque_nobody_told_of_is_found_in_a_clean_window(model, data, found):
-    """The same recording, with a fifth of its largest torque taken off the input that the monitor is told."""
+    """The same recording, with 0.3 of its 1.5 N m taken off the input that the monitor is told for a second."""
     recording = next(r for r in data.whole if r.name == "energy_shaping_1p5Nm")
     start = recording.part(recording.t < 4.0, recording.name, recording.role)
     pushed = replace(start, u=start.u - 0.3 * ((start.t > 1.0) & (start.t < 2.0))[:, None])
     trace = replay(guard_monitor(model), make_estimator(model, scenario.control, np.array(SIGMA_X)), pushed)
     (first, _), *_ = judged(found["energy_shaping_1p5Nm"].detector, trace).intervals()
-    # half a window late, and the sums must rise
-    assert 1.0 < first < 1.5
+    # While it acts: read half a window late, and at this torque 0.25 N m are three deviations, two of which count as 0.
+    assert 1.0 < first < 2.0
 
 
 @needs_data
 def test_one_false_alarm_an_hour_cannot_be_told_from_a_minute(real, model, data):
+    short = tuple(r.part(r.t < 3.5, r.name, r.role) for r in data.whole)
     with pytest.raises(InputError, match=r"0\.5 false alarms an hour need 6\.0 min"):
-        real.judge(model, SIGMA_X, data, rate=1.0)
+        real.judge(model, SIGMA_X, replace(data, whole=short), rate=1.0)
 
 
 def test_windows_and_what_is_settled_in_them():
