@@ -25,7 +25,8 @@ PUSHES = {
     "sac_0p9Nm": ((7.0, 7.8), (8.8, 9.3), (10.2, 11.2), (14.1, 15.3), (18.0, 18.6), (22.0, 22.5)),
     "ilqr_0p9Nm": ((2.7, 3.6), (10.0, 10.9)),
 }
-"""By hand [s]: what these recordings show between their clean windows, read off angle, torque and speed."""
+"""By hand [s]: what these recordings show between their clean windows, read off angle, torque and speed once the
+alarms were known; nobody wrote them down."""
 needs_data = pytest.mark.skipif(not RECORDINGS.is_dir(), reason="the real recordings are not on this machine")
 
 
