@@ -11,6 +11,7 @@ from hybrid_mpc.monitor.detection import METHODS, Judges, learn_judges
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.diagnosis import Change, Diagnoser, Diagnosis
 from hybrid_mpc.monitor.energy import EnergyMonitor
+from hybrid_mpc.monitor.held_out import HeldOut, leave_one_out
 from hybrid_mpc.monitor.learning import learn_detector
 from hybrid_mpc.monitor.plausibility import (
     Plausibility,
@@ -34,6 +35,8 @@ __all__ = [
     "learn_judges",
     "learn_from",
     "guard_monitor",
+    "leave_one_out",
+    "HeldOut",
     "Diagnoser",
     "Diagnosis",
     "Change",

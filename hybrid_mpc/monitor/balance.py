@@ -197,9 +197,11 @@ def reading_function(layout: Layout, rest_speed: float) -> ca.Function:
     state = ca.vertcat(q + y, v)
     balances = [model.energy_balance(state, ca.vertcat(v, a), u_mean) for a in (a_model, a_measured)]
     residual = _residual(model, a_measured, a_model, state, h, u_mean, rest_speed)
-    # What is predicted while the sensor repeats itself; a missing sample or estimate begins anew.
+    # What is predicted while the sensor repeats itself; a missing sample or estimate begins anew. Where friction may
+    # stick nothing counts: there an estimate creeps that does not know of it.
     y_before = memory[(window - 1) * n_q : window * n_q]
-    ahead = memory[layout.one_step : layout.one_step + n_q] + x_next[:n_q] - x[:n_q]
+    moved = x_next[:n_q] - x[:n_q]
+    ahead = memory[layout.one_step : layout.one_step + n_q] + moved * (ca.fabs(moved) > rest_speed * dt)
     travel = ca.if_else(ca.logic_and(y == y_before, ahead == ahead), ahead, 0)
     violation = ca.fabs(balances[0] - balances[1])
     averaged = memory[layout.averaged : layout.runs]

@@ -106,6 +106,7 @@ def calibrate(
     false_alarms_per_hour: float = 1.0,
     data_hash: str = "",
     floor_w: float = 1e-6,
+    block_s: float = BLOCK_S,
 ) -> Calibration:
     """Threshold that nominal levels pass upwards at the wanted rate.
 
@@ -120,9 +121,10 @@ def calibrate(
         false_alarms_per_hour: Wanted rate [1/h]; default 1.
         data_hash: Hash of the data, kept in the result.
         floor_w: Smallest threshold [W]: below it lies rounding. Default 1e-6.
+        block_s: Length of a block [s]; much longer than what one sample does to the next. Default 5.
 
     Raises:
-        InputError: If ``dt`` or the rate is not positive, more alarms are wanted than one in two blocks,
+        InputError: If ``dt``, the block or the rate is not positive, more alarms are wanted than one in two blocks,
             or there is too little data: 30 blocks, and one twentieth of the mean time between alarms.
 
     Source: Coles (2001), An Introduction to Statistical Modeling of Extreme Values, ch. 3;
@@ -134,27 +136,29 @@ def calibrate(
         >>> bool(c.threshold_w > np.quantile(noise, 0.999))
         True
     """
-    if not dt > 0 or not false_alarms_per_hour > 0:
-        raise InputError(f"calibration: dt and rate must be positive, got {dt} s, {false_alarms_per_hour}/h")
-    rate = false_alarms_per_hour * BLOCK_S / 3600.0
+    if not dt > 0 or not false_alarms_per_hour > 0 or not block_s > 0:
+        raise InputError(
+            f"calibration: dt, rate and block must be positive, got {dt} s, {false_alarms_per_hour}/h, {block_s} s"
+        )
+    rate = false_alarms_per_hour * block_s / 3600.0
     if rate > 0.5:
         raise InputError(
-            f"calibration: {false_alarms_per_hour}/h is too many; ask for at most {1800 / BLOCK_S:g}/h"
+            f"calibration: {false_alarms_per_hour}/h is too many; ask for at most {1800 / block_s:g}/h"
         )
-    maxima, finite = block_maxima(levels, max(round(BLOCK_S / dt), 1))
+    maxima, finite = block_maxima(levels, max(round(block_s / dt), 1))
     needed = max(MIN_BLOCKS, int(np.ceil(1.0 / (rate * MAX_EXTRAPOLATION))))
     if maxima.size < needed:
         raise InputError(
-            f"calibration: {maxima.size * BLOCK_S / 60:.1f} min of nominal data "
-            f"in whole blocks of {BLOCK_S:g} s; "
-            f"{false_alarms_per_hour:g} false alarms an hour need {needed * BLOCK_S / 60:.1f} min. "
+            f"calibration: {maxima.size * block_s / 60:.1f} min of nominal data "
+            f"in whole blocks of {block_s:g} s; "
+            f"{false_alarms_per_hour:g} false alarms an hour need {needed * block_s / 60:.1f} min. "
             "Record more, or ask for a higher rate."
         )
     location, scale = gumbel(maxima)
     threshold = max(location - scale * float(np.log(rate)), floor_w)
     release = min(max(0.5 * threshold, float(np.quantile(finite, 0.95))), threshold)
     hours = finite.size * dt / 3600.0
-    method = f"Gumbel tail of maxima in blocks of {BLOCK_S:g} s (L-moments), {maxima.size} blocks"
+    method = f"Gumbel tail of maxima in blocks of {block_s:g} s (L-moments), {maxima.size} blocks"
     return Calibration(threshold, release, false_alarms_per_hour, finite.size, hours, method, data_hash)
 
 

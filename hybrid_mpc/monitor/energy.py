@@ -50,7 +50,8 @@ class EnergyMonitor:
     the older one. Noise averages out in it, what takes power steadily does not.
 
     With ``resolution`` a sensor that repeats itself while the one-step predictions add up to more than three of its
-    steps is held for frozen, until it moves.
+    steps is held for frozen, until it moves. Predictions slower than ``rest_speed`` do not count: where friction sticks
+    an estimate creeps on, and the sensor rightly stands still.
 
     A missing (NaN) measurement gives NaN readings until it has left the window. The level is the mean of
     the finite ones of the last ``average`` violations, NaN (and no alarm) while fewer than half are finite.

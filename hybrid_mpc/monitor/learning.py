@@ -37,13 +37,14 @@ def learn_detector(
     data_hash: str = "",
     seed: int = 0,
     trusted: bool = False,
+    block_s: float = BLOCK_S,
 ) -> Detector:
     """A detector from nominal readings.
 
     Scales come from weighted least squares of the squared residuals with coefficients that are not negative, and
     thresholds from a Gumbel tail of the block maxima (:func:`~hybrid_mpc.monitor.calibration.calibrate`), half of the
-    wanted rate for either alarm. Beside them stands what a block bootstrap makes of the same maxima: half a minute is
-    drawn at a time, so that neighbours stay together.
+    wanted rate for either alarm. Beside them stands what a block bootstrap makes of the same maxima: six blocks, half a
+    minute, are drawn at a time, so that neighbours stay together.
 
     Args:
         runs: ``MonitorReading.numbers`` of nominal runs, each ``(n, columns)``.
@@ -57,6 +58,7 @@ def learn_detector(
         seed: Of the bootstrap.
         trusted: Whether the data are known to be nominal, as simulated ones are: then a block that stands out is one
             of theirs. Default: no; they are refused.
+        block_s: Length of a block [s]. Default 5; shorter where there is little data, and a higher rate is enough.
 
     Raises:
         InputError: If there is too little data for the rate, no motion, or an alarm in what should be nominal.
@@ -94,8 +96,10 @@ def learn_detector(
     rate = false_alarms_per_hour / (2 if free_runs else 1)
     rng = np.random.default_rng(seed)
     checked = "" if trusted else "forces", "" if trusted else "power"
-    sums = _threshold([a for a, _ in levels], dt, rate, rng, checked[0])
-    power = _threshold([b for _, b in levels], dt, rate, rng, checked[1]) if free_runs else (math.inf, ())
+    sums = _threshold([a for a, _ in levels], dt, rate, rng, checked[0], block_s)
+    power: tuple[float, tuple[float, ...]] = (math.inf, ())
+    if free_runs:
+        power = _threshold([b for _, b in levels], dt, rate, rng, checked[1], block_s)
     return replace(
         raw,
         force_threshold=sums[0],
@@ -103,7 +107,7 @@ def learn_detector(
         false_alarms_per_hour=false_alarms_per_hour,
         hours=len(rows) * dt / 3600.0,
         interval=(*sums[1], *power[1]),
-        method=f"Gumbel tail of maxima in blocks of {BLOCK_S:g} s, block bootstrap beside it",
+        method=f"Gumbel tail of maxima in blocks of {block_s:g} s, block bootstrap beside it",
         data_hash=data_hash,
     )
 
@@ -147,14 +151,14 @@ def _scale(features: Array, values: Array, what: str) -> tuple[float, ...]:
 
 
 def _threshold(
-    levels: Sequence[Array], dt: float, rate: float, rng: np.random.Generator, what: str
+    levels: Sequence[Array], dt: float, rate: float, rng: np.random.Generator, what: str, block_s: float
 ) -> tuple[float, tuple[float, float]]:
     """Threshold at the wanted rate, and its 5 % to 95 % over resampled blocks; without ``what`` nothing is checked."""
-    fit = calibrate(levels, dt, false_alarms_per_hour=rate)
-    maxima, _ = block_maxima(levels, max(round(BLOCK_S / dt), 1))
+    fit = calibrate(levels, dt, false_alarms_per_hour=rate, block_s=block_s)
+    maxima, _ = block_maxima(levels, max(round(block_s / dt), 1))
     if what:
-        check_nominal(maxima, what)
-    log_rate = math.log(rate * BLOCK_S / 3600.0)
+        check_nominal(maxima, what, block_s)
+    log_rate = math.log(rate * block_s / 3600.0)
     groups = math.ceil(maxima.size / NEIGHBOURS)
     starts = rng.integers(0, max(maxima.size - NEIGHBOURS, 0) + 1, size=(BOOTSTRAPS, groups))
     drawn = maxima[np.minimum(starts[:, :, None] + np.arange(NEIGHBOURS), maxima.size - 1)].reshape(
@@ -168,7 +172,7 @@ def _threshold(
     return fit.threshold_w, (float(low), float(high))
 
 
-def check_nominal(maxima: Array, what: str) -> None:
+def check_nominal(maxima: Array, what: str, block_s: float = BLOCK_S) -> None:
     """Refuse data in which a block stands out so far that it can be no nominal one.
 
     Location and scale come from the quartiles, which a few odd blocks hardly move.
@@ -176,6 +180,7 @@ def check_nominal(maxima: Array, what: str) -> None:
     Args:
         maxima: Largest level of each block, in their order.
         what: Whose, for the message.
+        block_s: Length of a block [s]. Default 5.
 
     Raises:
         InputError: With the places of the odd blocks.
@@ -191,8 +196,8 @@ def check_nominal(maxima: Array, what: str) -> None:
     limit = location - scale * math.log(-math.log1p(-ODD) / maxima.size)
     odd = np.flatnonzero(maxima > limit)
     if odd.size:
-        places = ", ".join(f"{i * BLOCK_S:g}" for i in odd[:5])
+        places = ", ".join(f"{i * block_s:g}" for i in odd[:5])
         raise InputError(
-            f"calibration data of the {what} hold an alarm: blocks of {BLOCK_S:g} s from {places} s stand out "
+            f"calibration data of the {what} hold an alarm: blocks of {block_s:g} s from {places} s stand out "
             f"(up to {maxima.max():.3g}, nominal blocks stay below {limit:.3g}); cut them out, or find what was wrong"
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
@@ -209,6 +209,10 @@ def _expression(bound: SoftBound, n_x: int, n_u: int) -> ca.Function:
     f = bound.expression
     if (f.size_in(0), f.size_in(1)) != ((n_x, 1), (n_u, 1)):
         raise InputError(f"soft bound: expression {f} does not take (x, u) of {n_x} states and {n_u} inputs")
-    x, u = ca.MX.sym("x", n_x), ca.MX.sym("u", n_u)
-    e = f(x, u)
-    return ca.Function("soft", [x, u], [ca.densify(m) for m in (e, ca.jacobian(e, x), ca.jacobian(e, u))])
+    # One Jacobian by both, in scalar code where the expression is some: two would run through its calls twice.
+    kind: Any = ca.SX if f.is_a("SXFunction") else ca.MX
+    z, x, u = kind.sym("z", n_x + n_u), ca.MX.sym("x", n_x), ca.MX.sym("u", n_u)
+    e = f(z[:n_x], z[n_x:])
+    both = ca.Function("both", [z], [ca.densify(e), ca.densify(ca.jacobian(e, z))], {"cse": True})
+    value, slope = both(ca.vertcat(x, u))
+    return ca.Function("soft", [x, u], [value, slope[:, :n_x], slope[:, n_x:]])

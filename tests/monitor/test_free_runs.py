@@ -127,6 +127,25 @@ def test_standing_still_is_no_frozen_sensor():
     assert not any(r.frozen for r in found)
 
 
+def test_an_estimate_that_creeps_while_friction_sticks_is_no_frozen_sensor():
+    """At 0.1 rad/s for 4 s: 400 steps of the sensor, which stands still; twice the speed of rest is motion."""
+    run = simulate(200, kind="rest")
+
+    class Creeping:
+        def __init__(self, speed):
+            self.x = np.array([0.0, speed])
+
+        def start(self, y, t):
+            return Estimate(self.x, np.zeros(0), np.zeros(1))
+
+        def update(self, estimate, y, u_prev):
+            return Estimate(self.x, np.zeros(0), np.zeros(1))
+
+    monitor = EnergyMonitor(pendulum(), window=5, average=1, resolution=[1e-3], rest_speed=0.2)
+    assert not any(r.frozen for r in readings(monitor, Creeping(0.1), run))
+    assert any(r.frozen for r in readings(monitor, Creeping(0.4), run))
+
+
 def test_a_sensor_that_moves_again_is_not_frozen():
     run = counted(simulate(200), 1e-3)
     y = run.y.copy()

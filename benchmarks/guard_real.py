@@ -1,0 +1,140 @@
+"""The guard's monitor on the torque pendulum's real recordings: ``python benchmarks/guard_real.py --model RUN
+[--data ../shared/data/torque_pendulum] [--models hybrid prior] [--rate 12] [--out FILE.json] [--pictures FOLDER]``.
+
+RUN is what ``hybrid-mpc run torque_pendulum`` has left. Each recording is judged by a detector learned from the clean
+windows of the other five alone, from blocks of 1 s (there is a minute of clean data in all). A window is clean where
+the recordings' own description says that no hand was on the pendulum. Printed by recording: alarms that begin in clean
+windows, and the highest that the scores get there, as shares of their thresholds; samples of clean windows in which an
+alarm from before is still on; the alarms outside. With ``--pictures`` a figure of each recording.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from hybrid_mpc.artifact import load_artifact
+from hybrid_mpc.data.trajectories import load_trajectories
+from hybrid_mpc.files import read_json, write_json
+from hybrid_mpc.monitor.held_out import HeldOut, leave_one_out
+from hybrid_mpc.pipeline.loops import make_estimator
+from scenarios.torque_pendulum import scenario
+
+CLEAN = {
+    "energy_shaping_0p9Nm": ((0.0, 5.0), (8.0, 11.0), (13.0, 16.0)),
+    "energy_shaping_1p5Nm": ((0.0, 20.0),),
+    "sac_0p9Nm": ((0.0, 7.0),),
+    "ilqr_0p9Nm": ((0.0, 2.0), (4.0, 9.0), (11.0, 18.0)),
+    "ddp_closed_loop": ((0.0, 6.0),),
+    "dircol_closed_loop": ((0.0, 3.5),),
+}
+"""Windows [s] without a hand on the pendulum, as the recordings are described."""
+RESOLUTION = 0.0029
+"""Step of the encoder [rad]."""
+BLOCK_S = 1.0
+RATE = 12.0
+"""False alarms an hour: the fewest that half a minute of other recordings can be drawn on to (a twentieth of the time
+between two of them must be there, for either alarm)."""
+
+
+def read(folder: Path, model):
+    """All recordings, whole, on the model's grid."""
+    files = [folder / f"{name}.csv" for name in CLEAN]
+    return load_trajectories(
+        files, replace(scenario.data, windows={}), outputs=model.outputs, inputs=model.inputs
+    )
+
+
+def judge(model, sigma_x, data, rate: float = RATE) -> list[HeldOut]:
+    """Every recording, by the detector of the others."""
+    return leave_one_out(
+        model, make_estimator(model, scenario.control, np.asarray(sigma_x)), data.whole, CLEAN,
+        false_alarms_per_hour=rate, resolution=[RESOLUTION], block_s=BLOCK_S, data_hash=data.hash,
+    )  # fmt: skip
+
+
+def row_of(found: HeldOut, dt: float) -> dict:
+    """What a table says of a recording."""
+    return {
+        "recording": found.name,
+        "clean_s": float(found.clean.sum() * dt),
+        "false_alarms": found.inside,
+        "highest_forces": found.highest[0],
+        "highest_power": found.highest[1],
+        "left_over_s": found.left_over * dt,
+        "outside_s": float((~found.clean).sum() * dt),
+        "alarms_outside": found.outside,
+        "share_outside": float(found.trace.alarm[~found.clean].mean()) if not found.clean.all() else None,
+        "detector": found.detector.to_dict(),
+    }
+
+
+def table(rows) -> list[str]:
+    """Markdown lines."""
+    lines = [
+        "| recording | clean | false alarms | highest: forces, power | left over | alarms outside [s] |",
+        "| --- | ---: | ---: | ---: | ---: | --- |",
+    ]
+    for r in rows:
+        outside = ", ".join(f"{a:.2f} to {b:.2f}" for a, b in r["alarms_outside"]) or "–"
+        lines.append(
+            f"| `{r['recording']}` | {r['clean_s']:.1f} s | {len(r['false_alarms'])} | {r['highest_forces']:.2f}, "
+            f"{r['highest_power']:.2f} | {r['left_over_s']:.2f} s | {outside} |"
+        )
+    seconds, alarms = sum(r["clean_s"] for r in rows), sum(len(r["false_alarms"]) for r in rows)
+    # Poisson: no event in T bounds the rate at 3.00 / T with 95 %
+    bound = f", at most {-np.log(0.05) / seconds * 3600:.0f} an hour (95 %)" if not alarms else ""
+    return [*lines, f"{alarms} false alarms in {seconds:.1f} s of clean windows{bound}"]
+
+
+def picture(found: HeldOut, y, path: Path, title: str) -> None:
+    """Everything the monitor says, alarms shaded; clean windows as bars at the top."""
+    from hybrid_mpc.plots import save
+    from hybrid_mpc.plots.monitor_trace import overview
+    from scenarios.torque_pendulum import make_prior
+
+    figure = overview(found.trace, y, output=make_prior().outputs[0], title=title)
+    for start, end in CLEAN[found.name]:
+        for ax in figure.axes:
+            ax.axvspan(start, min(end, found.trace.t[-1]), ymin=0.94, color="#009E73", alpha=0.7, linewidth=0)
+    save(figure, path)
+
+
+def main() -> None:
+    """Print tables; write JSON and figures where asked."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--model", type=Path, required=True, help="folder of a run of torque_pendulum")
+    parser.add_argument("--data", type=Path, default=Path("../shared/data/torque_pendulum"))
+    parser.add_argument("--models", nargs="+", default=["hybrid", "prior"], choices=["hybrid", "prior"])
+    parser.add_argument("--rate", type=float, default=RATE, help="wanted false alarms an hour")
+    parser.add_argument("--out", type=Path, help="JSON file to write")
+    parser.add_argument("--pictures", type=Path, help="folder for a figure of each recording")
+    given = parser.parse_args()
+    artifact = load_artifact(given.model / "model")
+    noise = read_json(given.model / "checkpoints" / "control.json")["sigma_x"]
+    result = {}
+    for name in given.models:
+        model = artifact.models[name]
+        data = read(given.data, model)
+        found = judge(model, noise[f"{name}_observer"], data, given.rate)
+        rows = [row_of(f, model.dt) for f in found]
+        print(f"\n{name}, {given.rate:g} false alarms an hour wanted\n")
+        print("\n".join(table(rows)), flush=True)
+        result[name] = {"rate": given.rate, "data_hash": data.hash, "recordings": rows}
+        if given.pictures is not None:
+            for f, recording in zip(found, data.whole, strict=True):
+                path = given.pictures / f"guard_torque_pendulum_{f.name}_{name}.png"
+                picture(f, recording.y[:, 0], path, f"{f.name}, {name}, calibrated on the others")
+    if given.out is not None:
+        write_json(given.out, result)
+
+
+if __name__ == "__main__":
+    main()
