@@ -87,9 +87,11 @@ class DataSpec:
         inputs_of: Input columns of single recordings, by file stem, where they differ from ``inputs``.
         units: Units of columns that are not in seconds or in their signal's unit, by column: ``"ms"``, ``"deg"``, or
             the factor as a number (:mod:`hybrid_mpc.data.units`).
+        largest_delay: Longest delay [s] of the inputs that the main job searches for, with the prior's parameters, and
+            then gives the deployed models. Default 0: none is searched, the input acts at once.
 
     Raises:
-        InputError: If a length is not positive or the fractions do not sum to one.
+        InputError: If a length is not positive, the delay is negative, or the fractions do not sum to one.
     """
 
     time: str
@@ -104,8 +106,13 @@ class DataSpec:
     free_run: float | None = None
     inputs_of: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     units: Mapping[str, str | float] = field(default_factory=dict)
+    largest_delay: float = 0.0
 
     def __post_init__(self) -> None:
+        if not 0 <= self.largest_delay < np.inf:
+            raise InputError(
+                f"data specification: largest_delay must be 0 s or more, got {self.largest_delay}"
+            )
         for name in ("dt", "max_gap", "smoothing", "warm_up"):
             if not getattr(self, name) > 0:
                 raise InputError(f"data specification: {name} must be positive, got {getattr(self, name)}")
@@ -134,6 +141,9 @@ class ControlSpec:
         x_max: Soft upper bounds of the states ``(n_x,)``; ``inf`` for none. Default: none.
         slack_linear: Linear penalties of their violation ``(n_x,)``. Default: that of :class:`~hybrid_mpc.mpc.OCP`.
         slack_quadratic: Quadratic penalties ``(n_x,)``, positive. Default: that of the OCP.
+        around: State ``(n_x,)`` near which the machine works: terminal weight and fallback are made there. Default: zero.
+        starts: Inputs, each ``(horizon, n_u)``, from which the first plan is sought besides none, for a task with
+            several ways (a swing-up); the cheapest plan is taken. Default: none.
     """
 
     horizon: int
@@ -148,6 +158,8 @@ class ControlSpec:
     x_max: tuple[float, ...] | None = None
     slack_linear: tuple[float, ...] | None = None
     slack_quadratic: tuple[float, ...] | None = None
+    around: tuple[float, ...] | None = None
+    starts: tuple[tuple[tuple[float, ...], ...], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -228,7 +240,7 @@ class Scenario:
         description: A paragraph for the report: the machine, its traps, the source of its data.
         prior: Prior class or factory ``(values=None) -> Prior``; imported lazily, since it needs torch.
         data: How recordings are read.
-        make_data: ``(folder, seed, budget name) -> CSV paths`` for a simulated machine; default: none.
+        make_data: ``(folder, seed, budget name) -> CSV or npz paths`` for a simulated machine; default: none.
         plant: ``() -> Plant``; default: none (then there is no closed loop, only timing).
         oracle: ``(dt) -> HybridModel`` with the plant's own equations, its hidden states as ``h``.
         control: The optimal control problem; default: none.

@@ -16,6 +16,7 @@ from hybrid_mpc.estimation.tuning import most_likely
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.monitor.calibration import Calibration
 from hybrid_mpc.monitor.energy import EnergyMonitor
+from hybrid_mpc.mpc.best_of import BestOf
 from hybrid_mpc.mpc.condensed import CondensedController
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.safeguard import SafeController
@@ -64,7 +65,8 @@ def process_noise(model: HybridModel, trajectories: Sequence[Trajectory], most: 
         h = np.zeros(model.n_h)
         for k in range(len(trajectory.t) - 1):
             x_next, h = (m.full().ravel() for m in model.step(trajectory.x[k], h, trajectory.u[k]))
-            errors.append(x_next - trajectory.x[k + 1])
+            if k >= model.waiting:  # before, nobody knows what was under way
+                errors.append(x_next - trajectory.x[k + 1])
         if len(errors) >= most:
             break
     return np.maximum(np.sqrt(np.mean(np.square(errors), axis=0)), 1e-9)
@@ -135,11 +137,18 @@ def make_controller(
 ) -> SafeController:
     """The condensed real-time iteration of a model behind the safeguards that stand on the prior.
 
-    Its first plan, made before the loop starts, is converged.
+    Its first plan, made before the loop starts, is converged, from every start that the control problem names.
     """
     ocp = make_ocp(prior, control)
     rti = CondensedController(model, ocp, iterations=iterations)
-    return SafeController(rti, prior, first=SQPController(model, ocp))
+    return SafeController(rti, prior, first=first_controller(model, ocp, control))
+
+
+def first_controller(model: HybridModel, ocp: OCP, control: ControlSpec) -> SQPController | BestOf:
+    """What makes the first plan: SQP, from each of the control problem's starts where it names some."""
+    sqp = SQPController(model, ocp)
+    starts = [np.array(start, dtype=float) for start in control.starts]
+    return BestOf(sqp, starts=starts) if starts else sqp
 
 
 def make_ocp(prior: HybridModel, control: ControlSpec) -> OCP:
@@ -151,8 +160,8 @@ def make_ocp(prior: HybridModel, control: ControlSpec) -> OCP:
 
 
 def working_point(model: HybridModel, control: ControlSpec) -> tuple[Array, Array]:
-    """``(x, u)`` in motion at the position zero: speeds of the tolerated size ``1 / sqrt(q)``."""
-    x = np.zeros(model.n_x)
+    """``(x, u)`` in motion at the position zero, or where the problem says: speeds of the tolerated size ``1 / sqrt(q)``."""
+    x = np.zeros(model.n_x) if control.around is None else np.array(control.around, dtype=float)
     half = model.n_x // 2
     weights = np.asarray(control.q[half:], dtype=float)
     x[half:] = 1.0 / np.sqrt(np.where(weights > 0, weights, 1.0))
