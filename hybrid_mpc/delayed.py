@@ -21,8 +21,8 @@ TINY = 1e-9
 def with_input_delay(model: HybridModel, delay: float) -> HybridModel:
     """The model with an input that acts ``delay`` later, any delay: ``h = [waiting inputs, the oldest first; h]``.
 
-    A delay of ``m`` periods and a share ``f`` makes ``(1 - f) u_{k-m} + f u_{k-m-1}`` act in period ``k``, the mean over
-    the period: what :func:`hybrid_mpc.identification.lags.delayed` gives the training. Estimator, controller and
+    A delay of ``m`` periods and a share ``f`` makes ``(1 - f) u_{k-m} + f u_{k-m-1}`` act in period ``k``, the mean
+    over the period: what :func:`hybrid_mpc.identification.lags.delayed` gives the training. Estimator, controller and
     monitor take such a model as any other; the first estimate takes the inputs before it for zero. ``xdot``, the energy
     balance and ``parametric`` are those of the model: they take the input that acts.
 

@@ -93,7 +93,8 @@ class HybridModel:
         _check(self.name, "with_jacobian", with_jacobian, [x, h, u], [x, h, (n_z, n_z), (n_z, self.n_u)])
         if not 0 <= self.waiting <= self.n_h or self.waiting % self.n_u:
             raise InputError(
-                f"model {self.name}: waiting must be whole inputs within the {self.n_h} entries of h, got {self.waiting}"
+                f"model {self.name}: waiting must be whole inputs within the {self.n_h} entries of h, "
+                f"got {self.waiting}"
             )
         if self.parametric is not None:
             a = self.parametric.size_out(0)  # a prior may have states after [q, v]

@@ -141,7 +141,7 @@ class ControlSpec:
         x_max: Soft upper bounds of the states ``(n_x,)``; ``inf`` for none. Default: none.
         slack_linear: Linear penalties of their violation ``(n_x,)``. Default: that of :class:`~hybrid_mpc.mpc.OCP`.
         slack_quadratic: Quadratic penalties ``(n_x,)``, positive. Default: that of the OCP.
-        around: State ``(n_x,)`` near which the machine works: terminal weight and fallback are made there. Default: zero.
+        around: State ``(n_x,)`` near which the machine works, for terminal weight and fallback. Default: zero.
         starts: Inputs, each ``(horizon, n_u)``, from which the first plan is sought besides none, for a task with
             several ways (a swing-up); the cheapest plan is taken. Default: none.
     """

@@ -90,10 +90,11 @@ def readme(scenario: Scenario, files: Sequence[Path], command: str) -> str:
     signals = [*zip(spec.inputs, prior.inputs, strict=True), *zip(spec.outputs, prior.outputs, strict=True)]
     period, spread = _sampling(files, spec.time)
     arrays = all(path.suffix == ".npz" for path in files)
+    stamp = "one number, the sampling time" if arrays else "time stamp of the row, as it was sampled"
     lines = [
         f"# Recordings: {scenario.title}", "", scenario.description, "", f"Written by `{command}`.", "",
         "| column | unit | meaning |", "| --- | --- | --- |",
-        f"| {spec.time} | s | {'one number, the sampling time' if arrays else 'time stamp of the row, as it was sampled'} |",
+        f"| {spec.time} | s | {stamp} |",
         *(f"| {column} | {s.unit} | {_meaning(column in spec.inputs)} {s.name} |" for column, s in signals),
         "",
         f"Sampling: {1e3 * period:.3g} ms, even; arrays of numpy by these names."

@@ -160,7 +160,7 @@ def make_ocp(prior: HybridModel, control: ControlSpec) -> OCP:
 
 
 def working_point(model: HybridModel, control: ControlSpec) -> tuple[Array, Array]:
-    """``(x, u)`` in motion at the position zero, or where the problem says: speeds of the tolerated size ``1 / sqrt(q)``."""
+    """``(x, u)`` in motion at the position zero, or where the problem says: speeds of the size ``1 / sqrt(q)``."""
     x = np.zeros(model.n_x) if control.around is None else np.array(control.around, dtype=float)
     half = model.n_x // 2
     weights = np.asarray(control.q[half:], dtype=float)

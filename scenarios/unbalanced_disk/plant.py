@@ -40,8 +40,8 @@ class DiskState:
 class DiskPlant:
     """A disk like the real one (a :class:`hybrid_mpc.scenario.Plant`), of another structure than the prior.
 
-    The prior is a driven pendulum with viscous friction, dry friction ``tanh(phi_dot / v_c)`` of one size, a torque that
-    follows the voltage at once, and a delay of any length in front. This plant has
+    The prior is a driven pendulum with viscous friction, dry friction ``tanh(phi_dot / v_c)`` of one size, a torque
+    that follows the voltage at once, and a delay of any length in front. This plant has
 
     - a motor with inductance and back-EMF: the current is a state, torque lags the voltage by 1.2 ms;
     - LuGre's dry friction: a bristle is a state, so the disk creeps and springs back before it slips; the friction is

@@ -41,8 +41,8 @@ BACK = (0.45, 0.65)
 def pumps(horizon: int) -> tuple[tuple[tuple[float, ...], ...], ...]:
     """Voltages ``(horizon, 1)`` from which a swing-up is sought: full voltage one way, then the other, then none.
 
-    Which way first, for how long, and for how long back is what tells the ways up apart; a plan that begins with none of
-    them sees only the slope from where the disk hangs.
+    Which way first, for how long, and for how long back is what tells the ways up apart; a plan that begins with none
+    of them sees only the slope from where the disk hangs.
 
     Example:
         >>> len(pumps(60)), pumps(60)[0][0], pumps(60)[0][-1]
