@@ -65,11 +65,13 @@ class Artifact:
         models: Deployed models.
         calibration: Calibration of the energy monitor in plain form, or None.
         provenance: Data hash, versions, seed, metrics.
+        input_delay: Delay [s] that the models hold. Default: none.
     """
 
     models: Mapping[str, HybridModel]
     calibration: Mapping[str, Any] | None
     provenance: Mapping[str, Any]
+    input_delay: float = 0.0
 
 
 def save_artifact(
@@ -135,7 +137,7 @@ def load_artifact(folder: Path) -> Artifact:
         raise InputError(f"{folder}: programs.json lacks {error}, which {FILE} names") from error
     except nn_export.ExportError as error:
         raise InputError(f"{folder}: {error}") from error
-    return Artifact(models, calibration, provenance)
+    return Artifact(models, calibration, provenance, delay)
 
 
 def build_model(name: str, programs: Mapping[str, nn_export.Program], info: ModelInfo) -> HybridModel:

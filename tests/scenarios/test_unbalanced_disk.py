@@ -147,7 +147,8 @@ def test_recordings_are_files_like_the_real_ones(tmp_path, monkeypatch):
         np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)  # whole encoder steps
     read = load_trajectories(files, scenario.data, outputs=OUTPUTS, inputs=INPUTS)
     assert {t.role for t in read.trajectories} == {"train", "valid", "test"}
-    assert {len(t.t) for t in read.trajectories} == {data.SAMPLES}
+    # a file's last sample may fall off the grid by rounding
+    assert {data.SAMPLES - len(t.t) for t in read.trajectories} <= {0, 1}
     assert max(abs(t.u).max() for t in read.trajectories) <= PEAK
 
 
