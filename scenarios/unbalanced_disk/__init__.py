@@ -14,7 +14,6 @@ from hybrid_mpc.benchmark_spec import BenchmarkBudget, BenchmarkSpec
 from hybrid_mpc.scenario import DEFAULT_BUDGETS, DataSpec, Scenario
 from scenarios.unbalanced_disk.data import make_data, windows
 from scenarios.unbalanced_disk.nominal import DT
-from scenarios.unbalanced_disk.oracle import oracle
 from scenarios.unbalanced_disk.plant import DiskPlant
 from scenarios.unbalanced_disk.tasks import CONTROL, TASKS
 
@@ -73,7 +72,6 @@ scenario = Scenario(
     ),
     make_data=make_data,
     plant=DiskPlant,
-    oracle=oracle,
     control=CONTROL,
     tasks=TASKS,
     draw=draw,
@@ -81,7 +79,7 @@ scenario = Scenario(
         "quick": replace(
             DEFAULT_BUDGETS["quick"], teacher_steps=400, free_run_steps=60, tasks=("swing_up", "track_up")
         ),
-        "full": replace(DEFAULT_BUDGETS["full"], oracle_seeds=10),
+        "full": DEFAULT_BUDGETS["full"],
     },
     benchmark=BenchmarkSpec(
         {

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from math import isfinite
 
 import casadi as ca
-import numpy as np
 
 from hybrid_mpc.errors import InputError
 
@@ -127,26 +126,6 @@ def steps(p: DiskParameters, n: int) -> ca.Function:
     return _repeated(ca.Function("one", [s, u, h], [rk4(f, s, u, h)]), n, "steps")
 
 
-def steps_with_slopes(p: DiskParameters, n: int) -> ca.Function:
-    """Function ``(s | W, u, h) -> s | W`` of ``n`` steps; ``W`` ``(4, 6)``: derivatives by (start, old u, new u).
-
-    Which of the two voltages acts is the caller's to say: the input has three rows, the voltage and its derivatives by
-    both. The sensitivities are integrated beside the state: the derivative of Runge-Kutta's own map.
-    """
-    s, w = ca.SX.sym("s", N_STATES), ca.SX.sym("w", N_STATES, N_STATES + 2)
-    u, h = ca.SX.sym("u", 3), ca.SX.sym("h")
-    ds = rhs(s, u[0], p)
-    by_u = ca.horzcat(ca.SX(N_STATES, N_STATES), ca.jacobian(ds, u[0]) @ u[1:].T)
-    rates = ca.vertcat(ds, ca.vec(ca.densify(ca.jacobian(ds, s) @ w + by_u)))
-    both = ca.vertcat(s, ca.vec(w))
-    f = ca.Function("f", [both, u], [rates])
-    return _repeated(ca.Function("one", [both, u, h], [rk4(f, both, u, h)]), n, "steps_with_slopes")
-
-
 def _repeated(one: ca.Function, n: int, name: str) -> ca.Function:
     s, u, h = (ca.MX.sym(label, one.size1_in(i)) for i, label in enumerate("suh"))
     return ca.Function(name, [s, u, h], [one.fold(n)(s, ca.repmat(u, 1, n), ca.repmat(h, 1, n))])
-
-
-UNIT = np.eye(N_STATES, N_STATES + 2)
-"""Derivatives at the start of a period."""

@@ -1,4 +1,4 @@
-"""Signals and nominal parameters of the unbalanced disk, shared by prior, plant and oracle. No torch in here."""
+"""Signals and nominal parameters of the unbalanced disk, shared by prior and data. No torch in here."""
 
 from __future__ import annotations
 

@@ -108,7 +108,7 @@ class DiskPlant:
         return state.z[:2].copy()
 
     def hidden(self, state: DiskState) -> Array:
-        """``(3,)``: the command before [V], motor current [A], bristle [rad]: the oracle's hidden state.
+        """``(3,)``: the command before [V], motor current [A], bristle [rad].
 
         The command before is under way or acts, whichever is the case after less than a period.
         """
