@@ -92,7 +92,7 @@ def rhs(s: ca.SX, u: ca.SX, p: DiskParameters) -> ca.SX:
 
     Example:
         >>> rhs(ca.DM.zeros(4), ca.DM(1.0), DiskParameters()).full().ravel().round(3).tolist()
-        [0.0, 4.629, 200.0, 0.0]
+        [0.0, 4.63, 200.0, 0.0]
     """
     phi, v, i, z = s[0], s[1], s[2], s[3]
     level = 1 + (p.stiction - 1) * ca.exp(-((v / p.stribeck) ** 2))
