@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import nn_export
+from hybrid_mpc.delayed import with_input_delay
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_json, write_json
 from hybrid_mpc.model import HybridModel
@@ -45,6 +46,7 @@ class ModelInfo:
         inputs: Signals of u.
         outputs: Signals of y.
         parameters: Values [SI] of the prior's parameters by name. Default: unknown.
+        input_delay: Time [s] from a command to the input that the programs take. Default: none.
     """
 
     dt: float
@@ -52,6 +54,7 @@ class ModelInfo:
     inputs: tuple[Signal, ...]
     outputs: tuple[Signal, ...]
     parameters: Mapping[str, float] = field(default_factory=dict)
+    input_delay: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -62,11 +65,13 @@ class Artifact:
         models: Deployed models.
         calibration: Calibration of the energy monitor in plain form, or None.
         provenance: Data hash, versions, seed, metrics.
+        input_delay: Delay [s] that the models hold. Default: none.
     """
 
     models: Mapping[str, HybridModel]
     calibration: Mapping[str, Any] | None
     provenance: Mapping[str, Any]
+    input_delay: float = 0.0
 
 
 def save_artifact(
@@ -97,6 +102,7 @@ def save_artifact(
         "parameters": dict(info.parameters),
         "calibration": calibration,
         "provenance": provenance or {},
+        **({"input_delay_s": info.input_delay} if info.input_delay else {}),
     }
     write_json(folder / FILE, description)
 
@@ -118,7 +124,8 @@ def load_artifact(folder: Path) -> Artifact:
     try:
         signals = {r: tuple(_signal_in(s) for s in description[r]) for r in ("states", "inputs", "outputs")}
         parameters = {str(k): float(v) for k, v in description.get("parameters", {}).items()}
-        info = ModelInfo(float(description["dt_s"]), **signals, parameters=parameters)
+        delay = float(description.get("input_delay_s", 0.0))
+        info = ModelInfo(float(description["dt_s"]), **signals, parameters=parameters, input_delay=delay)
         names = [str(name) for name in description["models"]]
         calibration, provenance = description["calibration"], description["provenance"]
     except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -130,11 +137,11 @@ def load_artifact(folder: Path) -> Artifact:
         raise InputError(f"{folder}: programs.json lacks {error}, which {FILE} names") from error
     except nn_export.ExportError as error:
         raise InputError(f"{folder}: {error}") from error
-    return Artifact(models, calibration, provenance)
+    return Artifact(models, calibration, provenance, delay)
 
 
 def build_model(name: str, programs: Mapping[str, nn_export.Program], info: ModelInfo) -> HybridModel:
-    """The :class:`HybridModel` of ``programs["<name>/step"]`` and its siblings."""
+    """The :class:`HybridModel` of ``programs["<name>/step"]`` and its siblings, with the input's delay."""
     functions: dict[str, Any] = {f: nn_export.build(programs[f"{name}/{f}"], f) for f in FUNCTIONS}
     step = programs[f"{name}/step"]
     functions["with_jacobian"] = nn_export.with_jacobian(step, JACOBIANS)
@@ -143,9 +150,10 @@ def build_model(name: str, programs: Mapping[str, nn_export.Program], info: Mode
     if info.parameters and f"{name}/{PARAMETRIC}" in programs:
         parametric = nn_export.build(programs[f"{name}/{PARAMETRIC}"], PARAMETRIC)
         known = {"parameters": info.parameters, "parametric": parametric}
-    return HybridModel(
+    model = HybridModel(
         name, info.dt, info.states, info.inputs, info.outputs, **functions, side_by_side=many, **known
     )
+    return with_input_delay(model, info.input_delay) if info.input_delay else model
 
 
 def _signal_out(s: Signal) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
@@ -49,9 +50,11 @@ class DataSpec:
         inputs_of: Input columns of single recordings, by file stem, where they differ from ``inputs``.
         units: Units of columns that are not in seconds or in their signal's unit, by column: ``"ms"``, ``"deg"``, or
             the factor as a number (:mod:`hybrid_mpc.data.units`).
+        largest_delay: Longest delay [s] of the inputs that the main job searches for, with the prior's parameters, and
+            then gives the deployed models. Default 0: none is searched, the input acts at once.
 
     Raises:
-        InputError: If a length is not positive or the fractions do not sum to one.
+        InputError: If a length is not positive, the delay is negative, or the fractions do not sum to one.
     """
 
     time: str
@@ -66,8 +69,13 @@ class DataSpec:
     free_run: float | None = None
     inputs_of: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     units: Mapping[str, str | float] = field(default_factory=dict)
+    largest_delay: float = 0.0
 
     def __post_init__(self) -> None:
+        if not 0 <= self.largest_delay < math.inf:
+            raise InputError(
+                f"data specification: largest_delay must be 0 s or more, got {self.largest_delay}"
+            )
         for name in ("dt", "max_gap", "smoothing", "warm_up"):
             if not getattr(self, name) > 0:
                 raise InputError(f"data specification: {name} must be positive, got {getattr(self, name)}")

@@ -43,6 +43,8 @@ class HybridModel:
         parameters: Values [SI] of the prior's parameters by name. Default: none.
         parametric: ``(x, u, p) -> a`` ``(n_q,)``: the prior's acceleration with its parameters, in the order of
             ``parameters``, as an input. Default: none; then nobody can tell what broke.
+        waiting: Leading entries of ``h`` that are inputs on their way to the machine, the oldest first; ``xdot``,
+            ``energy_balance`` and ``parametric`` then take the input that acts. Default 0: none waits.
 
     Raises:
         InputError: If the functions' shapes do not fit the signals.
@@ -74,6 +76,7 @@ class HybridModel:
     side_by_side: SideBySide | None = None
     parameters: Mapping[str, float] = field(default_factory=dict)
     parametric: ca.Function | None = None
+    waiting: int = 0
 
     def __post_init__(self) -> None:
         if not self.dt > 0:
@@ -88,6 +91,11 @@ class HybridModel:
         object.__setattr__(self, "with_jacobian", with_jacobian)
         n_z = self.n_x + self.n_h
         _check(self.name, "with_jacobian", with_jacobian, [x, h, u], [x, h, (n_z, n_z), (n_z, self.n_u)])
+        if not 0 <= self.waiting <= self.n_h or self.waiting % self.n_u:
+            raise InputError(
+                f"model {self.name}: waiting must be whole inputs within the {self.n_h} entries of h, "
+                f"got {self.waiting}"
+            )
         if self.parametric is not None:
             a = self.parametric.size_out(0)  # a prior may have states after [q, v]
             _check(self.name, "parametric", self.parametric, [x, u, (len(self.parameters), 1)], [a])

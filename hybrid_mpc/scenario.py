@@ -66,6 +66,9 @@ class ControlSpec:
         x_max: Soft upper bounds of the states ``(n_x,)``; ``inf`` for none. Default: none.
         slack_linear: Linear penalties of their violation ``(n_x,)``. Default: that of :class:`~hybrid_mpc.mpc.OCP`.
         slack_quadratic: Quadratic penalties ``(n_x,)``, positive. Default: that of the OCP.
+        around: State ``(n_x,)`` near which the machine works, for terminal weight and fallback. Default: zero.
+        starts: Inputs, each ``(horizon, n_u)``, from which the first plan is sought besides none, for a task with
+            several ways (a swing-up); the cheapest plan is taken. Default: none.
     """
 
     horizon: int
@@ -80,6 +83,8 @@ class ControlSpec:
     x_max: tuple[float, ...] | None = None
     slack_linear: tuple[float, ...] | None = None
     slack_quadratic: tuple[float, ...] | None = None
+    around: tuple[float, ...] | None = None
+    starts: tuple[tuple[tuple[float, ...], ...], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -160,7 +165,7 @@ class Scenario:
         description: A paragraph for the report: the machine, its traps, the source of its data.
         prior: Prior class or factory ``(values=None) -> Prior``; imported lazily, since it needs torch.
         data: How recordings are read.
-        make_data: ``(folder, seed, budget name) -> CSV paths`` for a simulated machine; default: none.
+        make_data: ``(folder, seed, budget name) -> CSV or npz paths`` for a simulated machine; default: none.
         plant: ``() -> Plant``; default: none (then there is no closed loop, only timing).
         oracle: ``(dt) -> HybridModel`` with the plant's own equations, its hidden states as ``h``.
         control: The optimal control problem; default: none.

@@ -30,7 +30,7 @@ def data(
     budget: Annotated[str, typer.Option(help="Amount: quick or full.")] = "full",
     data_set: Annotated[str, typer.Option("--set", help="Data set of a scenario that has several.")] = "",
 ) -> None:
-    """Write a simulated machine's recordings as CSV files, with a README on units, sampling and roles."""
+    """Write a simulated machine's recordings as CSV or npz files, with a README on units, sampling and roles."""
     files = write_data(load_scenario(scenario), out, seed, budget, data_set)
     print(f"{len(files)} recordings and README.md in {out.resolve()}")
 
@@ -46,7 +46,7 @@ def write_data(scenario: Scenario, out: Path, seed: int, budget: str, data_set: 
         data_set: Default: the scenario's default.
 
     Returns:
-        The CSV files.
+        The files.
 
     Raises:
         InputError: If the scenario makes no data, has no such budget or data set, or the folder is not empty.
@@ -88,13 +88,17 @@ def readme(scenario: Scenario, files: Sequence[Path], command: str) -> str:
     spec, prior = scenario.data, scenario.prior()
     signals = [*zip(spec.inputs, prior.inputs, strict=True), *zip(spec.outputs, prior.outputs, strict=True)]
     period, spread = _sampling(files, spec.time)
+    arrays = all(path.suffix == ".npz" for path in files)
+    stamp = "one number, the sampling time" if arrays else "time stamp of the row, as it was sampled"
     lines = [
         f"# Recordings: {scenario.title}", "", scenario.description, "", f"Written by `{command}`.", "",
         "| column | unit | meaning |", "| --- | --- | --- |",
-        f"| {spec.time} | s | time stamp of the row, as it was sampled |",
+        f"| {spec.time} | s | {stamp} |",
         *(f"| {column} | {s.unit} | {_meaning(column in spec.inputs)} {s.name} |" for column, s in signals),
         "",
-        f"Sampling: {1e3 * period:.3g} ms; the time stamps, which are recorded, jitter by {1e3 * spread:.2g} ms "
+        f"Sampling: {1e3 * period:.3g} ms, even; arrays of numpy by these names."
+        if arrays
+        else f"Sampling: {1e3 * period:.3g} ms; the time stamps, which are recorded, jitter by {1e3 * spread:.2g} ms "
         "(one standard deviation). Commas separate, points mark decimals, the first row is the header.",
         "",
         f"'hybrid-mpc run' first smooths and differentiates the outputs by a local quartic over "
@@ -125,6 +129,10 @@ def _sampling(files: Sequence[Path], column: str) -> tuple[float, float]:
     """Median period of the files, and the time stamps' standard deviation around whole periods [s]."""
     times = []
     for path in files:
+        if path.suffix == ".npz":  # one number, the sampling time
+            with np.load(path) as arrays:
+                times.append(float(arrays[column]) * np.arange(2))
+            continue
         with path.open(encoding="utf-8", newline="") as file:
             times.append(np.array([float(row[column]) for row in csv.DictReader(file)]))
     lines = [np.polyfit(np.arange(len(t)), t, 1) for t in times]

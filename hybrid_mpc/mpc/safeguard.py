@@ -109,6 +109,7 @@ class SafeController:
             zero = np.zeros(ocp.n_x), np.zeros(ocp.n_u)
             feedback = lqr(fallback, *zero, ocp.q, ocp.r + ocp.r_delta, working_point=point)
             self._gain = feedback.gain[:, : ocp.n_x]
+            self._late = feedback.gain[:, ocp.n_x : ocp.n_x + fallback.waiting]
             self._fallback = _equilibrium_input(fallback)
             self._fallback(np.zeros(ocp.n_x))  # a CasADi function's first call is slow
 
@@ -200,7 +201,12 @@ class SafeController:
         if self._fallback is not None:
             goal = reference[0, : self._controller.ocp.n_x]
             goal = goal if np.all(np.isfinite(goal)) else np.zeros_like(goal)
-            u = self._fallback(goal).full().ravel() - self._gain @ (estimate.x - goal) - estimate.d
+            best = self._fallback(goal).full().ravel()
+            u = best - self._gain @ (estimate.x - goal) - estimate.d
+            if self._late.size:  # what is under way to the machine already
+                u = u - self._late @ (
+                    estimate.h[: self._late.shape[1]] - np.tile(best, self._late.shape[1] // u.size)
+                )
             if np.all(np.isfinite(u)):
                 return u, Source.FALLBACK
         return np.zeros(self._controller.ocp.n_u), Source.ZERO

@@ -82,7 +82,8 @@ def build(
     ocp = make_ocp(prior, control)
     rivals = [CondensedController(artifact.models[m], ocp) for m in ("prior", "hybrid")]
     best = BestOf(SQPController(model, ocp, iterations=ORACLE_ITERATIONS), rivals=rivals, most=1)
-    first = BestOf(SQPController(model, ocp, iterations=FIRST_ITERATIONS), rivals=rivals)
+    starts = [np.array(start, dtype=float) for start in control.starts]
+    first = BestOf(SQPController(model, ocp, iterations=FIRST_ITERATIONS), starts=starts, rivals=rivals)
     safe = SafeController(best, prior, first=first)
     if c.truth:
         return TrueState(model), safe

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
+
+import numpy as np
 
 from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
 from hybrid_mpc.errors import InputError
@@ -84,7 +87,8 @@ class Context:
     @cached_property
     def dataset(self) -> Dataset:
         """All trajectories of the user's files, or of those that the simulated machine recorded."""
-        files = list(self.settings.data) or sorted((self.out / "data").glob("*.csv"))
+        made = self.out / "data"
+        files = list(self.settings.data) or sorted(made.glob("*.csv")) or sorted(made.glob("*.npz"))
         prior = self.scenario.prior()
         return load_trajectories(files, self.spec, outputs=prior.outputs, inputs=prior.inputs)
 
@@ -93,12 +97,35 @@ class Context:
         return [t for t in self.dataset.trajectories if t.role == role]
 
     def smoothed(self, role: str) -> list[Trajectory]:
-        """Trajectories of one role with the states that the fitted prior's equations smooth them to."""
+        """Trajectories of one role with the states that the fitted prior's equations smooth them to.
+
+        Their inputs are those that act; of a delay's first samples nobody knows what acted, so they are left out.
+        """
+        return self._with_states(self._acting(self.trajectories(role)))
+
+    def commanded(self, role: str) -> list[Trajectory]:
+        """The same with the inputs as they were commanded: what the deployed models, which hold the delay, take."""
+        return self._with_states([self._late(t) for t in self.trajectories(role)])
+
+    @property
+    def delay(self) -> float:
+        """Delay of the input [s] that was fitted with the prior; zero for none."""
+        return float(self.result("prior").get("delay", 0.0))
+
+    def _with_states(self, trajectories: list[Trajectory]) -> list[Trajectory]:
         arrays = self.arrays("prior")
-        return [
-            replace(t, x=arrays[f"{t.name}/x"], xdot=arrays[f"{t.name}/xdot"])
-            for t in self.trajectories(role)
-        ]
+        return [replace(t, x=arrays[f"{t.name}/x"], xdot=arrays[f"{t.name}/xdot"]) for t in trajectories]
+
+    def _acting(self, trajectories: list[Trajectory]) -> list[Trajectory]:
+        if not self.delay:
+            return trajectories
+        from hybrid_mpc.identification.lags import delayed
+
+        return [delayed(t, self.delay) for t in trajectories]
+
+    def _late(self, t: Trajectory) -> Trajectory:
+        lost = math.ceil(self.delay / t.dt - 1e-6)
+        return t.part(np.arange(len(t.t)) >= lost, t.name, t.role) if lost else t
 
     def save(self, stage: str, result: Mapping[str, Any], arrays: Mapping[str, Any] | None = None) -> None:
         """Keep a stage's result; its JSON is written last and means that the stage is done."""

@@ -72,6 +72,7 @@ def find_noise(
 def _estimated_noise(scenario: Scenario, artifact: Artifact, seed: int) -> Mapping[str, Array]:
     from hybrid_mpc.data.trajectories import load_trajectories
     from hybrid_mpc.identification.smoothing import fit_smoother
+    from hybrid_mpc.pipeline.machine_benchmark.physics import shifted, with_states
 
     if scenario.make_data is None or scenario.control is None:
         raise InputError(
@@ -83,5 +84,6 @@ def _estimated_noise(scenario: Scenario, artifact: Artifact, seed: int) -> Mappi
         files = scenario.make_data(Path(folder), seed, "quick")
         data = load_trajectories(files, scenario.data, outputs=prior.outputs, inputs=prior.inputs)
     train = [t for t in data.trajectories if t.role == "train"]
-    smoothed = fit_smoother(prior, train, scenario.data.dt).smooth(train)
-    return noise_of(scenario, artifact, scenario.control, smoothed)
+    delay = artifact.input_delay
+    smoother = fit_smoother(prior, shifted(train, delay), scenario.data.dt)
+    return noise_of(scenario, artifact, scenario.control, with_states(train, smoother, delay))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+from dataclasses import replace
 from importlib.metadata import version
 
 import numpy as np
@@ -42,6 +43,7 @@ def export_stage(context: Context) -> None:
         "prior": PriorStep(phy, dt),
     }
     info = model_info(phy, dt)
+    deployed = replace(info, input_delay=context.delay)
     programs, parities = {}, []
     for i, (name, step) in enumerate(steps.items()):
         context.progress.update("models", i, len(steps), name)
@@ -58,7 +60,7 @@ def export_stage(context: Context) -> None:
         "prior_parameters": phy.values,
         "test_scores": context.result("evaluation")["scores"][DEPLOYED]["best"],
     }
-    save_artifact(context.out / "model", programs, info, provenance=provenance)
+    save_artifact(context.out / "model", programs, deployed, provenance=provenance)
     context.save(
         "export",
         {
@@ -76,7 +78,7 @@ def control_stage(context: Context) -> None:
             "control", {"reason": f"scenario {context.scenario.name} defines no control problem"}, {}
         )
         return
-    noise = noise_of(context.scenario, artifact, control, context.smoothed("train"))
+    noise = noise_of(context.scenario, artifact, control, context.commanded("train"))
     if context.scenario.plant is None:
         _only_timing(context, artifact, control, noise)
     else:

@@ -13,6 +13,7 @@ from hybrid_mpc.data.excitation_check import check_excitation
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_arrays, read_json, write_arrays, write_json
 from hybrid_mpc.pipeline.context import Context
+from hybrid_mpc.pipeline.late_prior import prior_with_delay
 from hybrid_mpc.pipeline.parallel import WORKERS, run_jobs
 from hybrid_mpc.scenario import load_scenario
 
@@ -74,6 +75,9 @@ def _excitation(context: Context) -> tuple[str, ...]:
 def prior_stage(context: Context) -> None:
     """Fit the prior's parameters, let it smooth the measurements, fit it to these, smooth once more."""
     make = context.scenario.prior
+    if context.spec.largest_delay:
+        prior_with_delay(context)
+        return
     fit, smoother, train, valid = fit_and_smooth(
         make,
         context.trajectories("train"),

@@ -16,6 +16,7 @@ from hybrid_mpc.estimation.tuning import most_likely
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.monitor.calibration import Calibration
 from hybrid_mpc.monitor.energy import EnergyMonitor
+from hybrid_mpc.mpc.best_of import BestOf
 from hybrid_mpc.mpc.condensed import CondensedController
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.safeguard import SafeController
@@ -125,7 +126,7 @@ def make_controller(
 ) -> SafeController:
     """The condensed real-time iteration of a model behind the safeguards that stand on the prior.
 
-    Its first plan, made before the loop starts, is converged.
+    Its first plan, made before the loop starts, is converged, from every start that the control problem names.
 
     Args:
         model: The model to plan with.
@@ -138,7 +139,14 @@ def make_controller(
     """
     ocp = make_ocp(prior, control)
     rti = CondensedController(model, ocp, iterations=iterations)
-    return SafeController(rti, prior, first=SQPController(model, ocp))
+    return SafeController(rti, prior, first=first_controller(model, ocp, control))
+
+
+def first_controller(model: HybridModel, ocp: OCP, control: ControlSpec) -> SQPController | BestOf:
+    """What makes the first plan: SQP, from each of the control problem's starts where it names some."""
+    sqp = SQPController(model, ocp)
+    starts = [np.array(start, dtype=float) for start in control.starts]
+    return BestOf(sqp, starts=starts) if starts else sqp
 
 
 def make_ocp(prior: HybridModel, control: ControlSpec) -> OCP:
@@ -157,7 +165,7 @@ def make_ocp(prior: HybridModel, control: ControlSpec) -> OCP:
 
 
 def working_point(model: HybridModel, control: ControlSpec) -> tuple[Array, Array]:
-    """``(x, u)`` in motion at the position zero: speeds of the tolerated size ``1 / sqrt(q)``.
+    """``(x, u)`` in motion at the position zero, or where the problem says: speeds of the size ``1 / sqrt(q)``.
 
     Args:
         model: The model, state ``[q, v]``.
@@ -166,7 +174,7 @@ def working_point(model: HybridModel, control: ControlSpec) -> tuple[Array, Arra
     Example:
         ``x, u = working_point(models["prior"], scenario.control)``
     """
-    x = np.zeros(model.n_x)
+    x = np.zeros(model.n_x) if control.around is None else np.array(control.around, dtype=float)
     half = model.n_x // 2
     weights = np.asarray(control.q[half:], dtype=float)
     x[half:] = 1.0 / np.sqrt(np.where(weights > 0, weights, 1.0))

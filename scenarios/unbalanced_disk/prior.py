@@ -9,6 +9,7 @@ from torch import Tensor
 
 from hybrid_mpc.physics import Prior
 from hybrid_mpc.signals import Parameter, Signal
+from scenarios.unbalanced_disk.nominal import INPUTS, OUTPUTS, PARAMETERS, STATES
 
 FRICTION_SPEED = 0.05
 """Speed [rad/s] over which dry friction changes its sign. The data ask for a sharper one (a fit ran to the smallest it
@@ -29,20 +30,10 @@ class UnbalancedDiskPrior(Prior):
         [0.0, 10.0]
     """
 
-    states: ClassVar[tuple[Signal, ...]] = (
-        Signal("phi", "rad", -60.0, 60.0, periodic=True),
-        Signal("phi_dot", "rad/s", -100.0, 100.0),
-    )
-    inputs: ClassVar[tuple[Signal, ...]] = (Signal("voltage", "V", -12.0, 12.0),)
-    outputs: ClassVar[tuple[Signal, ...]] = (states[0],)
-    parameters_spec: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("J", 2.44e-4, "kg m^2", 2.44e-4, 2.44e-4, "inertia (fixed: it shows in no motion)"),
-        Parameter("w_0", 11.34, "rad/s", 8.0, 15.0, "natural frequency"),
-        Parameter("gamma", 1.33, "1/s", 0.0, 6.0, "viscous friction and back-EMF over J"),
-        Parameter("F_c", 6.06, "rad/s^2", 0.0, 20.0, "dry friction over J"),
-        Parameter("K_u", 28.1, "rad/s^2/V", 10.0, 60.0, "acceleration a volt"),
-        Parameter("phi_0", 0.0, "rad", -0.3, 0.3, "angle of the encoder's zero from hanging down"),
-    )
+    states: ClassVar[tuple[Signal, ...]] = STATES
+    inputs: ClassVar[tuple[Signal, ...]] = INPUTS
+    outputs: ClassVar[tuple[Signal, ...]] = OUTPUTS
+    parameters_spec: ClassVar[tuple[Parameter, ...]] = PARAMETERS
 
     J: Tensor
     w_0: Tensor

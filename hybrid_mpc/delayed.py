@@ -1,0 +1,143 @@
+"""A deployed model whose input acts later: the inputs on their way are part of its hidden state. No torch in here."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.model import HybridModel, ManyPoints, SideBySide
+
+Array = NDArray[np.float64]
+TINY = 1e-9
+"""Share of a period below which a delay's rest counts as none."""
+
+
+def with_input_delay(model: HybridModel, delay: float) -> HybridModel:
+    """The model with an input that acts ``delay`` later, any delay: ``h = [waiting inputs, the oldest first; h]``.
+
+    A delay of ``m`` periods and a share ``f`` makes ``(1 - f) u_{k-m} + f u_{k-m-1}`` act in period ``k``, the mean
+    over the period: what :func:`hybrid_mpc.identification.lags.delayed` gives the training. Estimator, controller and
+    monitor take such a model as any other; the first estimate takes the inputs before it for zero. ``xdot``, the energy
+    balance and ``parametric`` are those of the model: they take the input that acts.
+
+    Args:
+        model: The model without delay.
+        delay: Of the input [s], positive.
+
+    Raises:
+        InputError: If the delay is not positive, or the model has inputs that wait already.
+
+    Example:
+        >>> from hybrid_mpc.signals import Signal
+        >>> x, h, u, w = ca.MX.sym("x"), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w")
+        >>> model = HybridModel("sum", 1.0, (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),),
+        ...     ca.Function("f", [x, h, u], [x + u, h]), ca.Function("g", [x, h, u], [u]),
+        ...     ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]))
+        >>> late = with_input_delay(model, 0.75)
+        >>> [v.full().ravel().tolist() for v in late.step(0.0, 4.0, 8.0)]  # three quarters of the old, one of the new
+        [[5.0], [8.0]]
+    """
+    if not (delay > 0 and math.isfinite(delay)):
+        raise InputError(f"model {model.name}: the input's delay must be positive, got {delay} s")
+    if model.waiting:
+        raise InputError(f"model {model.name} has inputs that wait already; give the one without delay")
+    queue = _Queue(delay / model.dt, model.n_u)
+    x, u = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
+    h = ca.MX.sym("h", queue.size + model.n_h)
+    waiting = ca.vertcat(h[: queue.size], u)
+    own, acting, later = h[queue.size :], ca.DM(queue.share) @ waiting, waiting[model.n_u :]
+    assert model.with_jacobian is not None
+    inline = model.step.is_a("MXFunction"), model.with_jacobian.is_a("MXFunction")
+    x_next, h_next = model.step.call([x, own, acting], inline[0], False)
+    x_slope, h_slope, a, b = model.with_jacobian.call([x, own, acting], inline[1], False)
+    names, after = ["x", "h", "u"], ["x_next", "h_next"]
+    slopes = queue.slopes(model.n_x, a, b)
+    return replace(
+        model,
+        step=ca.Function("step", [x, h, u], [x_next, ca.vertcat(later, h_next)], names, after),
+        xdot=ca.Function("xdot", [x, h, u], [model.xdot(x, own, u)], names, ["xdot"]),
+        with_jacobian=ca.Function(
+            "with_jacobian",
+            [x, h, u],
+            [x_slope, ca.vertcat(later, h_slope), *slopes],
+            names,
+            [*after, "A", "B"],
+        ),
+        side_by_side=None
+        if model.side_by_side is None
+        else _side_by_side(model.side_by_side, model.n_x, queue),
+        waiting=queue.size,
+    )
+
+
+class _Queue:
+    """Waiting inputs: how many entries, and how much of each (and of the new input) acts.
+
+    Args:
+        periods: Delay in periods.
+        n_u: Inputs.
+    """
+
+    def __init__(self, periods: float, n_u: int) -> None:
+        whole = math.floor(periods + TINY)
+        rest = max(periods - whole, 0.0)
+        late = rest > TINY
+        self.n_u, self.size = n_u, (whole + late) * n_u
+        share = np.zeros((n_u, self.size + n_u))
+        share[:, :n_u] = (rest if late else 1.0) * np.eye(n_u)
+        if late:
+            share[:, n_u : 2 * n_u] = (1.0 - rest) * np.eye(n_u)
+        self.share = share
+
+    def slopes(self, n_x: int, a: ca.MX, b: ca.MX) -> tuple[ca.MX, ca.MX]:
+        """``A`` and ``B`` of the delayed model from those of the model."""
+        n, n_u = self.size, self.n_u
+        old, new = b @ ca.DM(self.share[:, :n]), b @ ca.DM(self.share[:, n:])
+        moved = ca.DM(np.eye(n, n + n_u, n_u))
+        rows = ca.horzcat(ca.MX(n, n_x), ca.MX(moved[:, :n]), ca.MX(n, a.shape[1] - n_x))
+        own = ca.horzcat(a[:, :n_x], old, a[:, n_x:])
+        return (
+            ca.densify(ca.vertcat(own[:n_x, :], rows, own[n_x:, :])),
+            ca.densify(ca.vertcat(new[:n_x, :], ca.MX(moved[:, n:]), new[n_x:, :])),
+        )
+
+
+def _side_by_side(inner: SideBySide, n_x: int, queue: _Queue) -> SideBySide:
+    """The delayed model at many points in one call, of the model's own way."""
+
+    def make(n: int, blocks: Mapping[str, Sequence[str]]) -> ManyPoints:
+        many = inner(n, {name: (name,) for name in ("x", "h", "u")})
+        size, n_u = queue.size, queue.n_u
+        moved = np.eye(size, size + n_u, n_u)
+
+        def evaluate(x: Array, h: Array, u: Array) -> tuple[Array, ...]:
+            waiting = np.hstack([h[:, :size], u])
+            x_next, h_next, by_x, by_h, by_u = many(x, h[:, size:], waiting @ queue.share.T)
+            by_queue = by_u @ queue.share
+            zero_x, zero_h = np.zeros((n, size, by_x.shape[2])), np.zeros((n, size, by_h.shape[2]))
+            shift = np.broadcast_to(moved, (n, *moved.shape))
+            columns = {
+                "x": _inserted(by_x, n_x, zero_x),
+                "u": _inserted(by_queue[:, :, size:], n_x, shift[:, :, size:]),
+                "h": np.concatenate(
+                    [_inserted(by_queue[:, :, :size], n_x, shift[:, :, :size]), _inserted(by_h, n_x, zero_h)],
+                    axis=2,
+                ),
+            }
+            slopes = (np.concatenate([columns[name] for name in names], axis=2) for names in blocks.values())
+            return x_next, np.hstack([waiting[:, n_u:], h_next]), *slopes
+
+        return evaluate
+
+    return make
+
+
+def _inserted(rows: Array, n_x: int, queue: Array) -> Array:
+    """Rows of a Jacobian ``(n, n_x + n_h, columns)`` with those of the waiting inputs after the states'."""
+    return np.concatenate([rows[:, :n_x], queue, rows[:, n_x:]], axis=1)

@@ -1,0 +1,150 @@
+"""Recordings of the simulated disk, files like those of the real one. No torch in here."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.data.excitation import chirp, multisine, steps
+from hybrid_mpc.data_spec import Role, Window
+from hybrid_mpc.errors import InputError
+from scenarios.unbalanced_disk.nominal import DT
+from scenarios.unbalanced_disk.plant import DiskPlant
+
+Array = NDArray[np.float64]
+
+SAMPLES = 1000
+"""Of a recording: 25 s, the pieces of the real ones."""
+PEAK = 3.0  # [V]
+LARGEST = 2.8
+"""Angle [rad]: a recording that goes beyond is repeated with less voltage. Over the top every error multiplies."""
+SMALLER = 0.9  # times the voltage, then
+SIZES: Mapping[str, Mapping[Role, int]] = {
+    "quick": {"train": 8, "valid": 3, "test": 4},
+    "full": {"train": 20, "valid": 6, "test": 8},
+}
+ROLES: tuple[Role, ...] = ("train", "valid", "test")
+
+
+def _multisine(rng: np.random.Generator, t: Array) -> Array:
+    u = multisine(t, rng.uniform(0.6, 1.0) * PEAK, 0.56, 2.6, lower=-PEAK, upper=PEAK)
+    return np.roll(u, int(rng.integers(len(t))))
+
+
+def _wide(rng: np.random.Generator, t: Array) -> Array:
+    u = multisine(t, rng.uniform(0.8, 1.0) * PEAK, 0.5, 10.6, lower=-PEAK, upper=PEAK)
+    return np.roll(u, int(rng.integers(len(t))))
+
+
+def _swing(rng: np.random.Generator, t: Array) -> Array:
+    f0, f1 = rng.permutation([rng.uniform(0.9, 1.2), rng.uniform(1.7, 2.1)])
+    return chirp(t, rng.uniform(0.5, 1.0) * PEAK, f0, f1)
+
+
+def _step(rng: np.random.Generator, t: Array) -> Array:
+    return steps(t, -PEAK, PEAK, hold=(0.15, 1.2), rng=rng)
+
+
+KINDS: Mapping[str, Callable[[np.random.Generator, Array], Array]] = {
+    "multisine": _multisine, "swing": _swing, "step": _step, "wide": _wide,
+}  # fmt: skip
+"""Voltages: multisines of the band of the recording of 2024 (0.56 to 2.6 Hz) and of 2022 (to 10.6 Hz), chirps through
+the disk's own 1.9 Hz, which swing far, and steps."""
+
+
+def stems(budget: str) -> list[str]:
+    """Names of the recordings of a budget, e.g. ``train_01_multisine``; the kinds take turns.
+
+    Raises:
+        InputError: If there is no such budget.
+
+    Example:
+        >>> stems("quick")[:2], len(stems("full"))
+        (['train_01_multisine', 'train_02_swing'], 34)
+    """
+    if budget not in SIZES:
+        raise InputError(f"unbalanced_disk: no budget {budget!r}; it has: {', '.join(SIZES)}")
+    kinds = list(KINDS)
+    return [
+        f"{role}_{k + 1:02d}_{kinds[k % len(kinds)]}" for role, n in SIZES[budget].items() for k in range(n)
+    ]
+
+
+def windows() -> dict[str, tuple[Window, ...]]:
+    """Role of every simulated recording by its stem: all of it is training, validation or test.
+
+    Example:
+        >>> windows()["test_01_multisine"]
+        (Window(start=0.0, end=25.0, role='test'),)
+    """
+    end = SAMPLES * DT
+    return {s: (Window(0.0, end, role),) for role in ROLES for s in stems("full") if s.startswith(role)}
+
+
+def record(plant: DiskPlant, kind: str, seed: tuple[int, ...]) -> tuple[Array, Array]:
+    """One recording: voltages commanded ``(n,)`` [V] and encoder angles at the same instants ``(n,)`` [rad].
+
+    If the disk goes beyond 2.8 rad, the recording is repeated with nine tenths of the voltage.
+
+    Args:
+        plant: The disk.
+        kind: Of the voltage, one of ``KINDS``.
+        seed: Of everything random in it.
+
+    Example:
+        >>> u, th = record(DiskPlant(), "multisine", (0, 0, 1))
+        >>> u.shape, th.shape, bool(abs(th).max() < 2.81)
+        ((1000,), (1000,), True)
+    """
+    rng = np.random.default_rng(seed)
+    u = KINDS[kind](rng, DT * np.arange(SAMPLES, dtype=np.float64))
+    x0 = np.array([rng.uniform(-0.4, 0.4), 0.0])
+    while True:
+        state, angles = plant.reset(x0, 0), np.empty(SAMPLES)
+        for k in range(SAMPLES):
+            angles[k] = plant.measure(state, rng)[0]
+            if abs(angles[k]) > LARGEST:
+                break
+            state = plant.step(state, u[k : k + 1], DT)
+        else:
+            return u, angles
+        u = SMALLER * u
+
+
+def make_data(folder: Path, seed: int, budget: str) -> list[Path]:
+    """Write the recordings of a budget as ``.npz`` files with ``u`` [V], ``th`` [rad] and ``dt`` [s], as the real ones.
+
+    Args:
+        folder: Where to; made if missing. Files of the same name are replaced whole.
+        seed: Same seed, same files.
+        budget: ``"quick"`` (8 training, 3 validation, 4 test recordings of 25 s) or ``"full"`` (20, 6, 8).
+
+    Returns:
+        The files.
+
+    Raises:
+        InputError: If there is no such budget.
+
+    Example:
+        >>> make_data(Path("out"), 0, "none")
+        Traceback (most recent call last):
+        ...
+        hybrid_mpc.errors.InputError: unbalanced_disk: no budget 'none'; it has: quick, full
+    """
+    names, plant = stems(budget), DiskPlant()
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for stem in names:
+        role, number, kind = stem.split("_")
+        u, th = record(plant, kind, (seed, [str(r) for r in ROLES].index(role), int(number)))
+        path = folder / f"{stem}.npz"
+        part = path.with_name(path.name + ".part")
+        with part.open("wb") as file:
+            np.savez(file, u=u, th=th, dt=np.array(DT))
+        os.replace(part, path)
+        paths.append(path)
+    return paths
