@@ -3,6 +3,12 @@
 from hybrid_mpc.estimation.consistency import Consistency, Innovations, consistency, innovations
 from hybrid_mpc.estimation.delays import DelayCompensation, DelayedEstimate
 from hybrid_mpc.estimation.kalman import Estimate, Estimator, ExtendedKalmanFilter
+from hybrid_mpc.estimation.parameters import (
+    parameter_factors,
+    parameter_filter,
+    parameter_states,
+    with_parameter_states,
+)
 from hybrid_mpc.estimation.switching import SwitchingEstimate, SwitchingFilter
 from hybrid_mpc.estimation.truth import TrueState
 
@@ -19,4 +25,8 @@ __all__ = [
     "TrueState",
     "consistency",
     "innovations",
+    "parameter_factors",
+    "parameter_filter",
+    "parameter_states",
+    "with_parameter_states",
 ]
