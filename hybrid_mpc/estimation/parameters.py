@@ -31,9 +31,9 @@ def with_parameter_states(
 ) -> HybridModel:
     """The same model with states that the prior's parameters follow, one for each group of them.
 
-    The states ``theta`` ``(n_g,)`` are constant hidden states after the model's own ``h``. The parameters of group i are
-    multiplied by ``exp(L tanh(theta_i / L))`` with ``L = log(most)``: a small ``theta`` is the relative change, and no
-    estimate leaves the bounds. A period adds what that changes in the prior's acceleration,
+    The states ``theta`` ``(n_g,)`` are constant hidden states after the model's own ``h``. The parameters of group i
+    are multiplied by ``exp(L tanh(theta_i / L))`` with ``L = log(most)``: a small ``theta`` is the relative change, and
+    no estimate leaves the bounds. A period adds what that changes in the prior's acceleration,
     ``a(x, u, p(theta)) - a(x, u, p)`` in the middle of the model's own step, held over the period and damped as the
     changed prior damps it (linearly implicit, so that steep friction stays stable); what the network adds stays as it
     is. At zero the model is the one given, to the last bit.

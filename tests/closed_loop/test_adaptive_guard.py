@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from closed_loop_parts import make_ekf, run
-from monitor_parts import J, MGL, pendulum
+from monitor_parts import MGL, J, pendulum
 
 from hybrid_mpc.closed_loop import Guard, Mode
 from hybrid_mpc.estimation import parameter_factors, parameter_filter, with_parameter_states
