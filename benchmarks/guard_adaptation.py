@@ -1,5 +1,5 @@
 """What a backup that adapts is worth: ``python benchmarks/guard_adaptation.py --model DIR --noise control.json
---detector calibration.json [--seeds 8] [--first 720] [--keep DIR] [--out FILE.json]``.
+--detector calibration.json [--seeds 8] [--first 720] [--cases ...] [--arms ...] [--keep DIR] [--out FILE.json]``.
 
 The golf robot's rig on the sinusoidal task, 6 s, a fault from 1.5 to 3.5 s on to the end (guard_loops.py), the same
 seeds three times: hybrid MPC with its observer (off), the same with a guard whose backup estimates what mass and
@@ -92,12 +92,12 @@ def figures(plan: Plan, result) -> dict:
     }
 
 
-def loops(arms: Arms, cases, seeds: range, keep: Path | None) -> dict:
+def loops(arms: Arms, cases, names, seeds: range, keep: Path | None) -> dict:
     """Figures by fault and arm, in the order of the seeds."""
-    rows: dict = {case: {arm: [] for arm in ARMS} for case in cases}
+    rows: dict = {case: {arm: [] for arm in names} for case in cases}
     for seed in seeds:
         for case in cases:
-            for arm in ARMS:
+            for arm in names:
                 plan = Plan(case, "sine", seed, LENGTH_S)
                 path = None if keep is None else keep / f"{plan.name}_{arm}.json"
                 if path is not None and path.is_file():
@@ -119,23 +119,27 @@ def ratio(costs, base) -> tuple[float, float]:
     return float(value), float(student.ppf(0.975, n - 1) * spread) if n > 1 else float("nan")
 
 
-def table(rows) -> tuple[str, dict]:
+def table(rows, names) -> tuple[str, dict]:
     """Mean costs and ratios to "off", as text and as data."""
-    lines = ["| fault | " + " | ".join(ARMS) + " | guard / off | always / off | switched after [s] |"]
-    lines.append("| --- |" + " ---: |" * 6)
+    heads = [*names, *(f"{arm} / off" for arm in names[1:]), "switched after [s]"]
+    lines = ["| fault | " + " | ".join(heads) + " |", "| --- |" + " ---: |" * len(heads)]
     summary: dict = {}
     for case, row in rows.items():
         costs = {arm: [f["cost"] for f in found] for arm, found in row.items()}
-        ratios = {arm: ratio(costs[arm], costs["off"]) for arm in ARMS[1:]}
-        first = [f["switches"][0][0] for f in row["guard"] if f["switches"]]
+        ratios = {arm: ratio(costs[arm], costs["off"]) for arm in names[1:]}
+        first = [f["switches"][0][0] for f in row.get("guard", ()) if f["switches"]]
         when = f"{np.median(first):.2f} ({len(first)} of {len(costs['off'])})" if first else "never"
-        cells = [f"{np.mean(costs[arm]):.3g}" for arm in ARMS]
+        cells = [f"{np.mean(costs[arm]):.3g}" for arm in names]
         cells += [f"{v:.2f} ± {h:.2f}" for v, h in ratios.values()]
         lines.append(f"| {case} | " + " | ".join([*cells, when]) + " |")
         summary[case] = {
             "mean_cost": {arm: float(np.mean(values)) for arm, values in costs.items()},
             "ratio": {arm: {"mean": v, "ci95": h} for arm, (v, h) in ratios.items()},
-            "largest_ratio_guard": float(np.max(np.divide(costs["guard"], costs["off"]))),
+            "largest_ratio": {arm: float(np.max(np.divide(costs[arm], costs["off"]))) for arm in names[1:]},
+            "beyond_limits": {
+                arm: [float(max(f[key] for f in found)) for key in ("angle_beyond", "speed_beyond")]
+                for arm, found in row.items()
+            },
         }
     return "\n".join(lines), summary
 
@@ -169,6 +173,7 @@ def main() -> None:
     parser.add_argument("--noise", type=Path, required=True, help="control.json of a run: process noise")
     parser.add_argument("--detector", type=Path, required=True, help="JSON file with a field 'detector'")
     parser.add_argument("--cases", nargs="+", default=CASES, help="faults")
+    parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS), help="controllers beside off")
     parser.add_argument("--seeds", type=int, default=8, help="loops of each fault and arm")
     parser.add_argument("--first", type=int, default=720, help="first seed")
     parser.add_argument("--keep", type=Path, help="folder of finished loops")
@@ -183,8 +188,9 @@ def main() -> None:
         return
     if given.keep is not None:
         given.keep.mkdir(parents=True, exist_ok=True)
-    rows = loops(arms, given.cases, range(given.first, given.first + given.seeds), given.keep)
-    text, summary = table(rows)
+    names = list(dict.fromkeys(["off", *given.arms]))
+    rows = loops(arms, given.cases, names, range(given.first, given.first + given.seeds), given.keep)
+    text, summary = table(rows, names)
     print(text)
     if given.out is None:
         print(json.dumps(summary, indent=1))
