@@ -38,6 +38,8 @@ from scenarios.golf_robot.tasks import CONTROL
 CASES = ("none", "friction_x2", "mass_+50", "mass_+20", "motor_-20", "push")
 ARMS = ("off", "guard", "always")
 LENGTH_S = 6.0
+PATIENCE_S = 0.8
+"""A push of 0.2 s raises alarms for up to 0.7 s: the window of the monitor, and what the observer still makes of it."""
 RESOLUTION = 2 * np.pi / 4096
 GROUPS = {name: CAUSES[name] for name in ("mass", "friction")}
 """A motor that weakens is a club that grows heavier, but for the viscous friction."""
@@ -61,7 +63,7 @@ class Arms:
             adaptive, len(GROUPS), sigma_y=CONTROL.estimator_sigma, sigma_x=sigma_x,
             sigma_x0=[*CONTROL.estimator_sigma, 0.1], sigma_d=QUIET_SHARE * span, sigma_d0=FIRST_LOAD * span,
         )  # fmt: skip
-        self.guard = Guard(backup=self.adaptive, backup_estimator=self.filter)
+        self.guard = Guard(backup=self.adaptive, backup_estimator=self.filter, patience=PATIENCE_S)
 
     def run(self, plan: Plan, arm: str):
         """One loop."""
