@@ -39,7 +39,7 @@ CASES = ("none", "friction_x2", "mass_+50", "mass_+20", "motor_-20", "push")
 ARMS = ("off", "guard", "always")
 LENGTH_S = 6.0
 PATIENCE_S = 0.8
-"""A push of 0.2 s raises alarms for up to 0.7 s: the window of the monitor, and what the observer still makes of it."""
+"""A push of 0.2 s raised alarms for up to 0.7 s, through the monitor's windows and what the observer makes of it."""
 RESOLUTION = 2 * np.pi / 4096
 GROUPS = {name: CAUSES[name] for name in ("mass", "friction")}
 """A motor that weakens is a club that grows heavier, but for the viscous friction."""
