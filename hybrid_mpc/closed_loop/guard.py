@@ -76,9 +76,12 @@ class Guard:
         backup_estimator: Its estimator.
         dwell: Shortest time [s] in a mode before going back. Default 0.5.
         quiet: Time [s] without alarm before going back. Default 1.
+        patience: Time [s] for which the model must have been in doubt before ``on_model``; alarms less than ``quiet``
+            apart count as one. A push is over by then, and the normal controller's observer deals with it better than
+            a backup that takes it for a fault. A frozen sensor is never waited for. Default 0: at once.
 
     Raises:
-        InputError: If a mode lacks what it needs, or a time is negative.
+        InputError: If a mode lacks what it needs, a time is negative, or there is patience without quiet.
 
     Example:
         >>> Guard(limits=Limits([-0.2], [0.2])).on_model.name, Guard().on_model.name
@@ -92,6 +95,7 @@ class Guard:
     backup_estimator: Estimator | None
     dwell: float
     quiet: float
+    patience: float
 
     def __init__(
         self,
@@ -103,6 +107,7 @@ class Guard:
         backup_estimator: Estimator | None = None,
         dwell: float = 0.5,
         quiet: float = 1.0,
+        patience: float = 0.0,
     ) -> None:
         if (backup is None) != (backup_estimator is None):
             raise InputError("guard: backup and backup_estimator belong together; give both or neither")
@@ -115,9 +120,16 @@ class Guard:
             )
         if Mode.LIMITED in (on_model, on_sensor) and limits is None:
             raise InputError("guard: mode LIMITED needs limits, e.g. Limits([-0.2], [0.2])")
-        if not (0 <= dwell < math.inf and 0 <= quiet < math.inf):
-            raise InputError(f"guard: dwell and quiet must be 0 s or more, got {dwell} s and {quiet} s")
-        values = on_model, on_sensor, limits, guarded, backup_estimator, float(dwell), float(quiet)
+        times = float(dwell), float(quiet), float(patience)
+        if not all(0 <= value < math.inf for value in times):
+            raise InputError(
+                f"guard: dwell, quiet and patience must be 0 s or more, got {dwell} s, {quiet} s and {patience} s"
+            )
+        if patience > 0 and quiet == 0:
+            raise InputError(
+                f"guard: patience of {patience} s needs a quiet above 0 s, to tell one alarm from the next"
+            )
+        values = on_model, on_sensor, limits, guarded, backup_estimator, *times
         for name, value in zip(self.__dataclass_fields__, values, strict=True):
             object.__setattr__(self, name, value)
 
@@ -152,6 +164,7 @@ class GuardedLoop:
         self._made: tuple[Solution | None, SafeController] = None, safe
         self._since, self._why = 0.0, ""
         self._alarm = self._frozen = -math.inf
+        self._doubt = -math.inf
         self._estimate: Estimate | None = None
         self.switches: list[Switch] = []
 
@@ -217,12 +230,14 @@ class GuardedLoop:
         """What the monitor said of the period at ``t``; decides on the next period's mode."""
         guard = self._guard
         if reading.alarm:
+            if t - self._alarm >= guard.quiet - TINY:
+                self._doubt = t
             self._alarm = t
         if getattr(reading, "frozen", False):
             self._frozen = t
         if self._frozen == t or t - self._frozen < guard.quiet - TINY:
             wanted, why = guard.on_sensor, "the sensor repeats itself while motion is predicted"
-        elif self._alarm == t or t - self._alarm < guard.quiet - TINY:
+        elif self._in_doubt(t):
             wanted, why = guard.on_model, "the model does not describe the machine"
         else:
             wanted, why = Mode.NORMAL, f"no alarm for {guard.quiet:g} s"
@@ -230,6 +245,11 @@ class GuardedLoop:
         if back and t - self._since < guard.dwell - TINY:
             wanted = self._mode
         self._next, self._why = wanted, why
+
+    def _in_doubt(self, t: float) -> bool:
+        """True while alarms come that have come for the time of patience."""
+        on = self._alarm == t or t - self._alarm < self._guard.quiet - TINY
+        return on and self._alarm - self._doubt >= self._guard.patience - TINY
 
     def _active(self, estimate: Estimate) -> tuple[SafeController, Estimate]:
         backup = self._guard.backup

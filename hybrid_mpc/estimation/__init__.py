@@ -3,6 +3,12 @@
 from hybrid_mpc.estimation.consistency import Consistency, Innovations, consistency, innovations
 from hybrid_mpc.estimation.delays import DelayCompensation, DelayedEstimate
 from hybrid_mpc.estimation.kalman import Estimate, Estimator, ExtendedKalmanFilter
+from hybrid_mpc.estimation.parameters import (
+    parameter_factors,
+    parameter_filter,
+    parameter_states,
+    with_parameter_states,
+)
 from hybrid_mpc.estimation.switching import SwitchingEstimate, SwitchingFilter
 from hybrid_mpc.estimation.truth import TrueState
 from hybrid_mpc.estimation.tuning import log_likelihood, most_likely, process_noise
@@ -23,4 +29,8 @@ __all__ = [
     "log_likelihood",
     "most_likely",
     "process_noise",
+    "parameter_factors",
+    "parameter_filter",
+    "parameter_states",
+    "with_parameter_states",
 ]

@@ -64,8 +64,10 @@ class Estimator(Protocol):
 class ExtendedKalmanFilter:
     """Extended Kalman filter over ``(x, h, d)`` with the model's exact Jacobian.
 
-    The input disturbance ``d`` is a random walk; the hidden state carries no noise of its own, it
-    follows the state. On a linear model this is the Kalman filter. No method changes the object.
+    The input disturbance ``d`` is a random walk; a network's hidden state carries no noise of its own, it
+    follows the state. Hidden states that are parameters do
+    (:func:`~hybrid_mpc.estimation.with_parameter_states`). On a linear model this is the Kalman filter. No method
+    changes the object.
 
     A prediction that is not finite, or whose deviation is a million times the largest one given here, is
     lost (an unstable model without measurements for long, an absurd one): the next measurement starts anew.
@@ -78,6 +80,8 @@ class ExtendedKalmanFilter:
         sigma_d: Standard deviations of the step of ``d`` per period ``(n_u,)`` [input units]. Default: zero.
         sigma_d0: Standard deviations of the first disturbance ``(n_u,)``. Default: zero. Without both there
             is no disturbance observer: ``d`` stays exactly zero.
+        sigma_h: Standard deviations of the step of the hidden states per period ``(n_h,)``. Default: zero.
+        sigma_h0: Standard deviations of the first hidden states ``(n_h,)``. Default: zero.
 
     Raises:
         InputError: If a shape does not fit, a deviation is negative or not finite, or ``sigma_y`` is 0.
@@ -105,21 +109,24 @@ class ExtendedKalmanFilter:
         sigma_x0: ArrayLike,
         sigma_d: ArrayLike | None = None,
         sigma_d0: ArrayLike | None = None,
+        sigma_h: ArrayLike | None = None,
+        sigma_h0: ArrayLike | None = None,
     ) -> None:
-        n_x, n_u, n_y = model.n_x, model.n_u, model.n_y
+        n_x, n_h, n_u, n_y = model.n_x, model.n_h, model.n_u, model.n_y
         sigma_d = np.zeros(n_u) if sigma_d is None else sigma_d
         sigma_d0 = np.zeros(n_u) if sigma_d0 is None else sigma_d0
+        hidden = _variance(np.zeros(n_h) if sigma_h is None else sigma_h, n_h, "sigma_h")
+        hidden0 = _variance(np.zeros(n_h) if sigma_h0 is None else sigma_h0, n_h, "sigma_h0")
         variance_y = _variance(sigma_y, n_y, "sigma_y")
         if not np.all(variance_y > 0):
             raise InputError(f"sigma_y must be positive, got {np.asarray(sigma_y)}")
-        hidden = np.zeros(model.n_h)
         self._model = model
         self._noise_y = variance_y
         self._noise = np.concatenate(
             [_variance(sigma_x, n_x, "sigma_x"), hidden, _variance(sigma_d, n_u, "sigma_d")]
         )
         self._first = np.concatenate(
-            [_variance(sigma_x0, n_x, "sigma_x0"), hidden, _variance(sigma_d0, n_u, "sigma_d0")]
+            [_variance(sigma_x0, n_x, "sigma_x0"), hidden0, _variance(sigma_d0, n_u, "sigma_d0")]
         )
         self._lost = LOST * max(np.max(v) for v in (self._noise, self._first, self._noise_y))
         self._output = _output_with_jacobian(model)

@@ -112,6 +112,19 @@ def test_a_flickering_alarm_does_not_flicker_through():
     assert len(result.switches) == 2
 
 
+def test_a_patient_guard_waits_for_what_lasts():
+    patient = backup(dwell=0.1, quiet=0.2, patience=0.3)
+    passing = guarded(patient, Told([(10, 15), (20, 24)]))  # an alarm of 0.26 s, with a gap in it
+    assert passing.switches == ()
+    apart = guarded(patient, Told([(10, 20), (32, 42)]))  # two of 0.18 s, more than quiet apart
+    assert apart.switches == ()
+    lasting = guarded(patient, Told([(10, 15), (20, 40)]))
+    assert round(lasting.switches[0].t / DT) == 26  # the reading 15 periods after the first, plus one
+    assert lasting.switches[0].after is Mode.BACKUP
+    frozen = guarded(patient, Told(frozen=[(10, 12)]))
+    assert round(frozen.switches[0].t / DT) == 11  # a sensor is not waited for
+
+
 def test_no_estimate_and_no_solve_are_survived_in_every_mode():
     for mode in (Mode.LIMITED, Mode.BACKUP, Mode.FALLBACK, Mode.REST):
         prior = pendulum_model()
@@ -201,6 +214,10 @@ def test_bad_input_speaks():
         Guard(Mode.LIMITED)
     with pytest.raises(InputError, match="0 s or more"):
         Guard(dwell=-1.0)
+    with pytest.raises(InputError, match="patience must be 0 s or more"):
+        Guard(patience=-1.0)
+    with pytest.raises(InputError, match="needs a quiet above 0 s"):
+        Guard(quiet=0.0, patience=0.5)
     with pytest.raises(InputError, match="give monitor="):
         guarded(Guard(), None)
     model, prior = pendulum_model(3), pendulum_model()
