@@ -20,4 +20,5 @@ InputColumns: TypeAlias = Annotated[
 OutputColumns: TypeAlias = Annotated[
     list[str] | None, typer.Option(help="Column of a measured position, in the prior's order.")
 ]
+Device: TypeAlias = Annotated[str, typer.Option(help="Where networks are trained: cpu, cuda, cuda:1, ...")]
 EmptyFolder: TypeAlias = Annotated[Path, typer.Option(help="Folder to make; an existing one must be empty.")]

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from hybrid_mpc.cli.options import Device
+
 EXAMPLES = (
     "Examples:\n\n"
     "  hybrid-mpc reproduce pendulum --budget quick --out runs/fig3_quick\n\n"
@@ -35,6 +37,7 @@ def reproduce(
     resume: Annotated[
         bool, typer.Option("--resume", help="Finish the reproduction that the folder holds.")
     ] = False,
+    device: Device = "cpu",
 ) -> None:
     """Rebuild the paper's experiment on a machine: tables, figures, and its claims beside what was found."""
     from hybrid_mpc.cli.progress import make_progress
@@ -44,7 +47,7 @@ def reproduce(
 
     folder = out or Path("runs") / f"reproduce_{Path(scenario).stem}"
     amounts = parsed_sequences(sequences) if sequences else None
-    settings = ReproductionSettings(scenario, budget, networks, amounts, seed, form)
+    settings = ReproductionSettings(scenario, budget, networks, amounts, seed, form, device)
     with make_progress() as progress:
         results = run_job(settings, folder, resume=resume, progress=progress)
     for line in (*text_table(results), *claim_lines(results)):

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hybrid_mpc.cli.options import InputColumns, OutputColumns, Recordings, ScenarioName, TimeColumn
+from hybrid_mpc.cli.options import Device, InputColumns, OutputColumns, Recordings, ScenarioName, TimeColumn
 
 EXAMPLES = (
     "Examples:\n\n"
@@ -32,6 +32,7 @@ def run(
         Path | None,
         typer.Option("--settings", help="JSON file of network settings, as hybrid-mpc search leaves it."),
     ] = None,
+    device: Device = "cpu",
 ) -> None:
     """Fit the prior, train, export, close the loop, monitor, learn the guard, analyse, and write a report."""
     from hybrid_mpc.cli.progress import make_progress
@@ -48,6 +49,7 @@ def run(
         tuple(output_column or ()),
         time_column,
         network_settings,
+        device,
     )
     with make_progress() as progress:
         results = run_job(settings, folder, resume=resume, progress=progress)

@@ -146,7 +146,7 @@ def training_stage(context: Context) -> None:
         kind: (
             _train_kind,
             (context.settings.scenario, values, context.smoothed("train"), context.smoothed("valid"),
-             training_settings(context, kind), folder),
+             training_settings(context, kind), folder, context.settings.device),
         )
         for kind in todo
     }  # fmt: skip
@@ -263,6 +263,7 @@ def _train_kind(
     validation: Sequence[Trajectory],
     settings: TrainingSettings,
     folder: Path,
+    device: str,
     report: Callable[[int, int, str], None],
 ) -> None:
     """Job of one process: train one kind and leave its files."""
@@ -275,6 +276,7 @@ def _train_kind(
         validation,
         settings,
         checkpoint=folder / f"{settings.kind}.safetensors",
+        device=device,
         on_progress=lambda done, total, error: report(done, total, f"validation E_sim {error:.4g}"),
     )
     arrays: dict[str, Any] = {f"weights.{n}": v for n, v in trained.weights.items()}

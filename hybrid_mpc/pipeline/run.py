@@ -8,6 +8,7 @@ from typing import Any
 
 from hybrid_mpc.pipeline import deploy, identify, judge
 from hybrid_mpc.pipeline.context import Context, Progress, Silent
+from hybrid_mpc.pipeline.devices import check_device
 from hybrid_mpc.pipeline.guard_job import guard_stage
 from hybrid_mpc.pipeline.observers import estimation_stage
 from hybrid_mpc.pipeline.reporting import report_stage
@@ -56,6 +57,7 @@ def run(
     context = Context(settings, scenario, out, progress or Silent())
     context.budget  # noqa: B018  an unknown budget is refused before a folder is made
     identify.check_data(context)
+    check_device(settings.device)
     open_folder(out, settings, resume=resume)
     for name, title, stage in STAGES:
         context.progress.start(title)

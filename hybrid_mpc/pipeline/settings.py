@@ -31,6 +31,7 @@ class RunSettings:
         time: Column that replaces the scenario's time; default: the scenario's.
         network_file: JSON object with settings of the networks that replace the budget's, as a search leaves them;
             default: none.
+        device: Where the networks are trained, ``"cpu"`` or e.g. ``"cuda"``. Default: cpu.
     """
 
     scenario: str
@@ -41,6 +42,7 @@ class RunSettings:
     outputs: tuple[str, ...] = ()
     time: str = ""
     network_file: Path | None = None
+    device: str = "cpu"
 
     def network(self) -> dict[str, Any]:
         """Settings of the networks that replace the budget's: what the file holds, checked."""
@@ -59,6 +61,8 @@ class RunSettings:
         plain = {**asdict(replace(self, data=(), scenario=scenario)), "data": files}
         network = self.network()  # a run without such a file has no word of it
         del plain["network_file"]
+        if self.device == "cpu":
+            del plain["device"]  # as in runs from before there was a choice
         return plain | ({"network": network} if network else {})
 
 

@@ -53,6 +53,7 @@ class Case:
         smoother: ``sigma`` and ``walk`` of the smoother; None where states are exact.
         ruler: What judges.
         folder: Where the files go.
+        device: Where the networks are trained.
     """
 
     scenario: str
@@ -63,6 +64,7 @@ class Case:
     smoother: dict[str, tuple[float, ...]] | None
     ruler: Ruler
     folder: Path
+    device: str = "cpu"
 
     @property
     def dt(self) -> float:
@@ -145,7 +147,8 @@ def ensemble_job(
     make, ruler = load_scenario(case.scenario).prior, case.ruler
     prior = make(case.values)
     trained = train(
-        prior, case.training, case.validation, settings, checkpoint=case.folder / f"{key}.safetensors",
+        prior, case.training, case.validation, settings,
+        checkpoint=case.folder / f"{key}.safetensors", device=case.device,
         on_progress=lambda done, total, error: report(done, total, f"validation E_sim {error:.4g}"),
     )  # fmt: skip
     with np.errstate(over="ignore", invalid="ignore"):  # a network that diverges is judged as such

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.files import read_arrays, read_json
 from hybrid_mpc.pipeline.context import Progress, Silent
+from hybrid_mpc.pipeline.devices import check_device
 from hybrid_mpc.pipeline.parallel import WORKERS, run_jobs
 from hybrid_mpc.pipeline.settings import open_folder
 from hybrid_mpc.reproduction.experiment import Effort, Experiment
@@ -66,6 +67,7 @@ def reproduce(
     work = Work(
         settings, scenario, experiment, settings.effort(experiment), out, progress or Silent(), workers
     )
+    check_device(settings.device)
     open_folder(out, settings, resume=resume)
     stages: tuple[tuple[str, Callable[[Work], None]], ...] = (
         ("recording the machine", record_stage),
@@ -171,6 +173,7 @@ class Work:
             fit["smoother"],
             self.ruler,
             self.folder,
+            self.settings.device,
         )
 
     def training(self, model: str) -> TrainingSettings:

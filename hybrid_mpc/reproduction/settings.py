@@ -26,6 +26,7 @@ class ReproductionSettings:
         seed: Seed of data and training.
         form: ``"hybrid"`` (exact kinematics, the network corrects the prior's acceleration) or ``"literal"``
             (the paper's: it gives the whole derivative, explicit Euler integrates).
+        device: Where the networks are trained, ``"cpu"`` or e.g. ``"cuda"``. Default: cpu.
 
     Example:
         >>> ReproductionSettings("pendulum", sequences=(3, 15)).effort(load_scenario("pendulum").experiment).networks
@@ -38,6 +39,7 @@ class ReproductionSettings:
     sequences: tuple[int, ...] | None = None
     seed: int = 0
     form: str = "hybrid"
+    device: str = "cpu"
 
     def effort(self, experiment: Experiment) -> Effort:
         """The budget's effort with these networks and sequences.
@@ -66,6 +68,8 @@ class ReproductionSettings:
             scenario = f"{path.name} {hashlib.sha256(path.read_bytes()).hexdigest()}"
         effort = self.effort(experiment_of(load_scenario(self.scenario)))
         own = {"command": "reproduce", **asdict(replace(self, scenario=scenario)), "effort": asdict(effort)}
+        if self.device == "cpu":
+            del own["device"]  # as in reproductions from before there was a choice
         return own | {"networks": effort.networks, "sequences": effort.sequences}
 
     def _sequences(self, experiment: Experiment, effort: Effort) -> tuple[int, ...]:
