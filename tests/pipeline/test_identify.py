@@ -22,7 +22,7 @@ def test_a_training_is_read_back_as_it_was(faults, tmp_path, monkeypatch):
     monkeypatch.setattr(training, "train", lambda *a, **k: trained)
     folder = tmp_path / "checkpoints" / "training"
     folder.mkdir(parents=True)
-    _train_kind("pendulum", {}, [], [], settings, folder, lambda *a: None)
+    _train_kind("pendulum", {}, [], [], settings, folder, "cpu", lambda *a: None)
     found = load_trained(SimpleNamespace(out=tmp_path), "mopgrnn")
     assert (found.settings, found.scaling, found.faults) == (settings, trained.scaling, faults)
     np.testing.assert_equal(found.weights["w"], trained.weights["w"])

@@ -169,3 +169,16 @@ def test_artifact_holds_data_only(finished):
     assert artifact.models["prior"].n_h == 0
     assert artifact.calibration is not None
     assert artifact.provenance["data_hash"] == results(finished)["data"]["hash"]
+
+
+def test_the_main_job_says_what_its_guard_lacks(finished):
+    found = results(finished)["guard"]
+    assert found["data_hash"] is None
+    assert "need 2.5 min" in found["reason"]
+    assert (finished / "figures" / "guard_recorded.png").stat().st_size > 10_000
+    page = (finished / "report.html").read_text()
+    assert "Energy guard" in page
+    assert "No detector could be learned" in page
+    stored = load_artifact(finished / "model").calibration
+    assert "detector" not in stored
+    assert stored["plausibility"]["samples"] > 200
