@@ -50,6 +50,21 @@ def read_json(path: Path) -> Any:
         raise InputError(f"{path} is damaged: {error}") from error
 
 
+def write_table(path: Path, header: str, table: NDArray[np.float64]) -> None:
+    """Write a table ``(n, columns)`` as CSV with six decimals, whole or not at all.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "a.csv"
+        >>> write_table(path, "time_s,u_nm", np.array([[0.0, 0.5]])); path.read_text().splitlines()
+        ['time_s,u_nm', '0.000000,0.500000']
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(path.name + ".part")
+    np.savetxt(part, table, "%.6f", delimiter=",", header=header, comments="")
+    os.replace(part, path)
+
+
 def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write arrays as ``.npz`` (no pickle), whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -101,3 +101,27 @@ class Rig:
 def make_runner(model, safe, rig, clock=None, **options):
     return Runner(rig.measure, rig.actuate, options.pop("estimator", None) or make_ekf(model), safe,
                   options.pop("reference", sine), clock=clock or FakeClock(), **options)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Said:
+    """A reading."""
+
+    alarm: bool
+    frozen: bool = False
+    violation_w: float = 0.0
+    level_w: float = 0.0
+
+
+class Told:
+    """A monitor that alarms when it is told to; its state counts periods."""
+
+    def __init__(self, alarms=(), frozen=()):
+        self._alarms, self._frozen = alarms, frozen
+
+    def initial(self):
+        return 0
+
+    def update(self, state, y, u_prev, estimate):
+        frozen = any(a <= state < b for a, b in self._frozen)
+        return state + 1, Said(frozen or any(a <= state < b for a, b in self._alarms), frozen)

@@ -11,7 +11,6 @@ import numpy as np
 
 from hybrid_mpc.data.excitation_check import check_excitation
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import read_arrays, read_json, write_arrays, write_json
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.late_prior import prior_with_delay
 from hybrid_mpc.pipeline.parallel import WORKERS, run_jobs
@@ -160,28 +159,9 @@ def training_stage(context: Context) -> None:
 
 def load_trained(context: Context, kind: str) -> Trained:
     """A finished training from the run's folder."""
-    from hybrid_mpc.identification.step import Scaling
-    from hybrid_mpc.identification.trained import Fault
-    from hybrid_mpc.identification.training import Trained, TrainingSettings
+    from hybrid_mpc.pipeline.trained_files import load_trained as load
 
-    folder = context.out / "checkpoints" / "training"
-    note, arrays = read_json(folder / f"{kind}.json"), read_arrays(folder / f"{kind}.npz")
-    part: dict[str, dict[str, Any]] = {"weights": {}, "curve": {}, "own": {}}
-    for name, value in arrays.items():
-        group, _, key = name.partition(".")
-        part[group][key] = value
-    note["settings"]["learning_rates"] = tuple(note["settings"]["learning_rates"])
-    scaling = Scaling(**{name: tuple(v) for name, v in note["scaling"].items()})
-    own = part["own"]
-    return Trained(
-        TrainingSettings(**note["settings"]),
-        scaling,
-        part["weights"],
-        own["validation"],
-        part["curve"],
-        own["skipped"],
-        tuple(Fault(**fault) for fault in note.get("faults", ())),
-    )
+    return load(context.out / "checkpoints" / "training", kind)
 
 
 def evaluation_stage(context: Context) -> None:
@@ -268,6 +248,7 @@ def _train_kind(
 ) -> None:
     """Job of one process: train one kind and leave its files."""
     from hybrid_mpc.identification.training import train
+    from hybrid_mpc.pipeline.trained_files import save_trained
 
     prior = load_scenario(scenario).prior(values)
     trained = train(
@@ -279,15 +260,4 @@ def _train_kind(
         device=device,
         on_progress=lambda done, total, error: report(done, total, f"validation E_sim {error:.4g}"),
     )
-    arrays: dict[str, Any] = {f"weights.{n}": v for n, v in trained.weights.items()}
-    arrays |= {f"curve.{n}": v for n, v in trained.curve.items()}
-    arrays |= {"own.validation": trained.validation, "own.skipped": trained.skipped}
-    write_arrays(folder / f"{settings.kind}.npz", arrays)
-    write_json(
-        folder / f"{settings.kind}.json",
-        {
-            "settings": asdict(settings),
-            "scaling": asdict(trained.scaling),
-            "faults": [asdict(fault) for fault in trained.faults],
-        },
-    )
+    save_trained(folder, trained)

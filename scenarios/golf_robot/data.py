@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.data_spec import Role, Window
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import write_table
 from scenarios.golf_robot.excitation import excitation
 from scenarios.golf_robot.rig import Rig, RigState
 
@@ -164,12 +164,9 @@ def make_data(folder: Path, seed: int, budget: str, *, data_set: str = "b") -> l
         hybrid_mpc.errors.InputError: golf_robot: no budget 'none'; it has: quick, full
     """
     stems(budget, data_set)
-    folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for stem, table, _ in recordings(seed, budget, data_set):
         path = folder / f"{stem}.csv"
-        part = path.with_name(path.name + ".part")
-        np.savetxt(part, table, "%.6f", delimiter=",", header="time_s,phi_rad,u_nm", comments="")
-        os.replace(part, path)
+        write_table(path, "time_s,phi_rad,u_nm", table)
         paths.append(path)
     return paths

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from hybrid_mpc.data.excitation import sinusoid
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.data_spec import Role, Window
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import write_table
 from scenarios.pendulum.plant import DampedPendulum
 
 Array = NDArray[np.float64]
@@ -177,13 +177,9 @@ def make_data(folder: Path, seed: int, budget: str) -> list[Path]:
         hybrid_mpc.errors.InputError: pendulum: no budget 'none'; it has: quick, full
     """
     stems(budget)
-    folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for stem, table in recordings(seed, budget):
         path = folder / f"{stem}.csv"
-        part = path.with_name(path.name + ".part")
-        header = "time_s,phi_rad,phi_dot_rad_s,u_nm"
-        np.savetxt(part, table, "%.6f", delimiter=",", header=header, comments="")
-        os.replace(part, path)
+        write_table(path, "time_s,phi_rad,phi_dot_rad_s,u_nm", table)
         paths.append(path)
     return paths

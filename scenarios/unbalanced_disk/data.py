@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.data.excitation import chirp, multisine, steps
 from hybrid_mpc.data_spec import Role, Window
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import write_arrays
 from scenarios.unbalanced_disk.nominal import DT
 from scenarios.unbalanced_disk.plant import DiskPlant
 
@@ -136,15 +136,11 @@ def make_data(folder: Path, seed: int, budget: str) -> list[Path]:
         hybrid_mpc.errors.InputError: unbalanced_disk: no budget 'none'; it has: quick, full
     """
     names, plant = stems(budget), DiskPlant()
-    folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for stem in names:
         role, number, kind = stem.split("_")
         u, th = record(plant, kind, (seed, [str(r) for r in ROLES].index(role), int(number)))
         path = folder / f"{stem}.npz"
-        part = path.with_name(path.name + ".part")
-        with part.open("wb") as file:
-            np.savez(file, u=u, th=th, dt=np.array(DT))
-        os.replace(part, path)
+        write_arrays(path, {"u": u, "th": th, "dt": np.array(DT)})
         paths.append(path)
     return paths

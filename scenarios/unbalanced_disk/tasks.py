@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.closed_loop.faults import Fault
 from hybrid_mpc.closed_loop.result import ClosedLoopResult
 from hybrid_mpc.scenario import ControlSpec, Task
+from scenarios.references import faded_sines
 from scenarios.unbalanced_disk.nominal import DT
 
 Array = NDArray[np.float64]
@@ -89,7 +90,7 @@ def sway(t: Array) -> Array:
         >>> sway(np.zeros(1)).round(3).tolist()
         [[3.142, 0.0]]
     """
-    return _waves(t, ((0.25, 0.5), (0.1, 1.1))) + np.array([pi, 0.0])
+    return faded_sines(t, ((0.25, 0.5), (0.1, 1.1))) + np.array([pi, 0.0])
 
 
 def swing(t: Array) -> Array:
@@ -99,17 +100,7 @@ def swing(t: Array) -> Array:
         >>> swing(np.zeros(1)).tolist()
         [[0.0, 0.0]]
     """
-    return _waves(t, ((0.5, 0.6), (0.3, 1.5)))
-
-
-def _waves(t: Array, waves: tuple[tuple[float, float], ...]) -> Array:
-    """Sum of sinusoids of amplitudes [rad] and frequencies [Hz], faded in over 1 s, and its derivative."""
-    s = np.clip(t, 0.0, 1.0)
-    fade, slope = s**3 * (10 - 15 * s + 6 * s**2), 30 * s**2 * (1 - s) ** 2
-    parts = [(a, 2 * np.pi * f) for a, f in waves]
-    wave = sum((a * np.sin(w * t) for a, w in parts), np.zeros_like(t))
-    rate = sum((a * w * np.cos(w * t) for a, w in parts), np.zeros_like(t))
-    return np.column_stack([fade * wave, slope * wave + fade * rate])
+    return faded_sines(t, ((0.5, 0.6), (0.3, 1.5)))
 
 
 def stood(result: ClosedLoopResult) -> dict[str, float]:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from closed_loop_parts import make_ekf, run
+from closed_loop_parts import Told, make_ekf, run
 from monitor_parts import MGL, J, pendulum
 
 from hybrid_mpc.closed_loop import Guard, Mode
@@ -41,27 +41,6 @@ class Heavier:
         return np.zeros(0)
 
 
-@dataclass(frozen=True)
-class Said:
-    alarm: bool
-    frozen: bool = False
-    violation_w: float = 0.0
-    level_w: float = 0.0
-
-
-class Told:
-    """A monitor that alarms between two periods."""
-
-    def __init__(self, begin=10**9, end=10**9):
-        self._begin, self._end = begin, end
-
-    def initial(self):
-        return 0
-
-    def update(self, state, y, u_prev, estimate):
-        return state + 1, Said(self._begin <= state < self._end)
-
-
 def safe_on(model, terminal="riccati"):
     ocp = OCP(
         20, (300.0, 1.0), [0.05], [0.05], [-6.0], [6.0], [DU], terminal, working_point=([0.0, 1.0], [0.0])
@@ -96,7 +75,7 @@ def test_without_an_alarm_the_loop_is_bit_equal(parts):
 
 
 def test_a_false_alarm_is_hardly_felt(parts):
-    plain, guarded = (loop(parts, Told(60, 70), g, 1.6, broken=10**9) for g in (None, parts[2]))
+    plain, guarded = (loop(parts, Told([(60, 70)]), g, 1.6, broken=10**9) for g in (None, parts[2]))
     assert [s.after for s in guarded.switches] == [Mode.BACKUP]
     assert np.array_equal(guarded.u[:61], plain.u[:61])
     # two filters of other noise on the same angles, noisy by 1e-4 rad; inputs are of order 1
@@ -105,7 +84,7 @@ def test_a_false_alarm_is_hardly_felt(parts):
 
 def test_it_takes_over_within_the_limits_and_pays(parts):
     plain = loop(parts, Told(), None)
-    guarded = loop(parts, Told(BROKEN + 10, 10**9), parts[2])
+    guarded = loop(parts, Told([(BROKEN + 10, 10**9)]), parts[2])
     assert [s.after for s in guarded.switches] == [Mode.BACKUP]
     assert set(guarded.source) == {"MPC"}
     # rounding of sums of inputs of order 1
@@ -115,7 +94,7 @@ def test_it_takes_over_within_the_limits_and_pays(parts):
 
 
 def test_and_back(parts):
-    guarded = loop(parts, Told(BROKEN + 10, BROKEN + 20), parts[2])
+    guarded = loop(parts, Told([(BROKEN + 10, BROKEN + 20)]), parts[2])
     assert [s.after for s in guarded.switches] == [Mode.BACKUP, Mode.NORMAL]
     assert np.max(np.abs(np.diff(guarded.u, axis=0))) <= DU + 1e-12
     assert np.all(np.isfinite(guarded.x))

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from closed_loop_parts import DT, make_ekf, make_safe, run, sine
+from closed_loop_parts import DT, Told, make_ekf, make_safe, run, sine
 from online_models import PendulumPlant, pendulum_model
 
 from hybrid_mpc.closed_loop import Fault, Guard, Mode, Runner
@@ -13,30 +13,6 @@ from hybrid_mpc.monitor import EnergyMonitor
 from hybrid_mpc.mpc import Limits
 
 DU = 0.4
-
-
-@dataclass(frozen=True)
-class Said:
-    """A reading."""
-
-    alarm: bool
-    frozen: bool = False
-    violation_w: float = 0.0
-    level_w: float = 0.0
-
-
-class Told:
-    """A monitor that alarms when it is told to; its state counts periods."""
-
-    def __init__(self, alarms=(), frozen=()):
-        self._alarms, self._frozen = alarms, frozen
-
-    def initial(self):
-        return 0
-
-    def update(self, state, y, u_prev, estimate):
-        frozen = any(a <= state < b for a, b in self._frozen)
-        return state + 1, Said(frozen or any(a <= state < b for a, b in self._alarms), frozen)
 
 
 def guarded(guard, monitor, **changes):

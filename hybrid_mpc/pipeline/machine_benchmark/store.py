@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import read_arrays, read_json, write_arrays, write_json
+from hybrid_mpc.files import read_json, write_json
 from hybrid_mpc.identification.prior_result import PriorFit
-from hybrid_mpc.identification.settings import KINDS, TrainingSettings
-from hybrid_mpc.identification.step import Scaling
-from hybrid_mpc.identification.trained import Fault, Trained
+from hybrid_mpc.identification.settings import KINDS
+from hybrid_mpc.identification.trained import Trained
 from hybrid_mpc.pipeline.machine_benchmark.physics import Physics
+from hybrid_mpc.pipeline.trained_files import load_trained, save_trained
 
 NOTE = "benchmark_model.json"
 SCHEMA = 1
@@ -87,43 +87,3 @@ def physics_of(plain: Mapping[str, Any]) -> Physics:
     fit = dict(plain["fit"])
     fit |= {"warnings": tuple(fit["warnings"]), "stages": tuple(fit["stages"])}
     return Physics(PriorFit(**fit), plain["delay"], tuple(plain["sigma"]), tuple(plain["walk"]))
-
-
-def save_trained(folder: Path, trained: Trained) -> None:
-    """Write the networks of one kind."""
-    kind = trained.settings.kind
-    arrays: dict[str, Any] = {f"weights.{n}": v for n, v in trained.weights.items()}
-    arrays |= {f"curve.{n}": v for n, v in trained.curve.items()}
-    arrays |= {"own.validation": trained.validation, "own.skipped": trained.skipped}
-    write_arrays(folder / f"{kind}.npz", arrays)
-    write_json(
-        folder / f"{kind}.json",
-        {
-            "settings": asdict(trained.settings),
-            "scaling": asdict(trained.scaling),
-            "faults": [asdict(fault) for fault in trained.faults],
-        },
-    )
-
-
-def load_trained(folder: Path, kind: str) -> Trained:
-    """Read the networks of one kind.
-
-    Raises:
-        InputError: If a file is missing or damaged.
-    """
-    note, arrays = read_json(folder / f"{kind}.json"), read_arrays(folder / f"{kind}.npz")
-    part: dict[str, dict[str, Any]] = {"weights": {}, "curve": {}, "own": {}}
-    for name, value in arrays.items():
-        group, _, key = name.partition(".")
-        part[group][key] = value
-    note["settings"]["learning_rates"] = tuple(note["settings"]["learning_rates"])
-    return Trained(
-        TrainingSettings(**note["settings"]),
-        Scaling(**{name: tuple(v) for name, v in note["scaling"].items()}),
-        part["weights"],
-        part["own"]["validation"],
-        part["curve"],
-        part["own"]["skipped"],
-        tuple(Fault(**fault) for fault in note["faults"]),
-    )

@@ -1,0 +1,52 @@
+"""Trained networks on disk, as the jobs keep them between their stages: JSON and plain arrays, a pair a kind."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from hybrid_mpc.files import read_arrays, read_json, write_arrays, write_json
+from hybrid_mpc.identification.settings import TrainingSettings
+from hybrid_mpc.identification.step import Scaling
+from hybrid_mpc.identification.trained import Fault, Trained
+
+
+def save_trained(folder: Path, trained: Trained) -> None:
+    """Write the networks of one kind."""
+    kind = trained.settings.kind
+    arrays: dict[str, Any] = {f"weights.{n}": v for n, v in trained.weights.items()}
+    arrays |= {f"curve.{n}": v for n, v in trained.curve.items()}
+    arrays |= {"own.validation": trained.validation, "own.skipped": trained.skipped}
+    write_arrays(folder / f"{kind}.npz", arrays)
+    write_json(
+        folder / f"{kind}.json",
+        {
+            "settings": asdict(trained.settings),
+            "scaling": asdict(trained.scaling),
+            "faults": [asdict(fault) for fault in trained.faults],
+        },
+    )
+
+
+def load_trained(folder: Path, kind: str) -> Trained:
+    """Read the networks of one kind.
+
+    Raises:
+        InputError: If a file is missing or damaged.
+    """
+    note, arrays = read_json(folder / f"{kind}.json"), read_arrays(folder / f"{kind}.npz")
+    part: dict[str, dict[str, Any]] = {"weights": {}, "curve": {}, "own": {}}
+    for name, value in arrays.items():
+        group, _, key = name.partition(".")
+        part[group][key] = value
+    note["settings"]["learning_rates"] = tuple(note["settings"]["learning_rates"])
+    return Trained(
+        TrainingSettings(**note["settings"]),
+        Scaling(**{name: tuple(v) for name, v in note["scaling"].items()}),
+        part["weights"],
+        part["own"]["validation"],
+        part["curve"],
+        part["own"]["skipped"],
+        tuple(Fault(**fault) for fault in note.get("faults", ())),
+    )
