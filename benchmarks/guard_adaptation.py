@@ -6,7 +6,7 @@ seeds three times: hybrid MPC with its observer (off), the same with a guard who
 friction have become (guard), and that backup all the time without a guard (always). Cost on the true state; ratios to
 "off" of the mean costs with 95 % intervals from the paired loops. ``--keep`` is a folder that finished loops lie in.
 ``--time`` prints the processor time of a period instead. The detector is that of ``hybrid-mpc monitor ... --learn``
-or of ``guard_delays.py --out`` (its field ``detector``).
+or ``judges.json`` of ``hybrid-mpc study run monitor``.
 """
 
 from __future__ import annotations
@@ -25,12 +25,10 @@ from guard_loops import DT, Plan
 from scipy.stats import t as student
 
 from hybrid_mpc.artifact import load_artifact
-from hybrid_mpc.closed_loop import Guard, simulate
-from hybrid_mpc.estimation import parameter_filter, with_parameter_states
+from hybrid_mpc.closed_loop import simulate
 from hybrid_mpc.files import read_json, write_json
 from hybrid_mpc.monitor import Detector, guard_monitor
-from hybrid_mpc.mpc import OCP, CondensedController, SafeController, SQPController
-from hybrid_mpc.pipeline.loops import FIRST_LOAD, QUIET_SHARE, make_controller, make_estimator, make_ocp
+from hybrid_mpc.pipeline import make_adaptive_guard, make_controller, make_estimator
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.faults import CAUSES
 from scenarios.golf_robot.tasks import CONTROL
@@ -38,11 +36,7 @@ from scenarios.golf_robot.tasks import CONTROL
 CASES = ("none", "friction_x2", "mass_+50", "mass_+20", "motor_-20", "push")
 ARMS = ("off", "guard", "always")
 LENGTH_S = 6.0
-PATIENCE_S = 0.8
-"""A push of 0.2 s raised alarms for up to 0.7 s, through the monitor's windows and what the observer makes of it."""
 RESOLUTION = 2 * np.pi / 4096
-GROUPS = {name: CAUSES[name] for name in ("mass", "friction")}
-"""A motor that weakens is a club that grows heavier, but for the viscous friction."""
 
 
 class Arms:
@@ -54,16 +48,8 @@ class Arms:
         self.estimator = make_estimator(hybrid, CONTROL, sigma_x)
         self.controller = make_controller(hybrid, prior, CONTROL)
         self.monitor = guard_monitor(hybrid, detector, resolution=[RESOLUTION])
-        adaptive = with_parameter_states(hybrid, GROUPS)
-        plain, span = make_ocp(prior, CONTROL), np.subtract(CONTROL.u_max, CONTROL.u_min)
-        ocp = OCP.from_spec(CONTROL, plain.terminal_weight(hybrid), plain.working_point)
-        first = SQPController(adaptive, ocp)
-        self.adaptive = SafeController(CondensedController(adaptive, ocp), prior, first=first)
-        self.filter = parameter_filter(
-            adaptive, len(GROUPS), sigma_y=CONTROL.estimator_sigma, sigma_x=sigma_x,
-            sigma_x0=[*CONTROL.estimator_sigma, 0.1], sigma_d=QUIET_SHARE * span, sigma_d0=FIRST_LOAD * span,
-        )  # fmt: skip
-        self.guard = Guard(backup=self.adaptive, backup_estimator=self.filter, patience=PATIENCE_S)
+        self.guard = make_adaptive_guard(hybrid, prior, CONTROL, sigma_x, CAUSES)
+        self.adaptive, self.filter = self.guard.backup, self.guard.backup_estimator
 
     def run(self, plan: Plan, arm: str):
         """One loop."""

@@ -50,6 +50,12 @@ def control(
         bool,
         typer.Option("--guard", help="Watch with the model's detector; no input while the sensor is frozen."),
     ] = False,
+    adapt: Annotated[
+        bool,
+        typer.Option(
+            "--adapt", help="--guard, with a backup that learns what has become of mass and friction."
+        ),
+    ] = False,
     gif: Annotated[bool, typer.Option("--gif/--no-gif", help="Draw moving pictures.")] = True,
 ) -> None:
     """Close the loop around the simulated machine with a trained model, without training anything."""
@@ -66,12 +72,12 @@ def control(
     check_folder(out)
     settings = ControlSettings(
         tuple(task or ()),
-        tuple(dict.fromkeys(controller or (GUARDED_CONTROLLERS if guard else DEFAULT_CONTROLLERS))),
+        tuple(dict.fromkeys(controller or (GUARDED_CONTROLLERS if guard or adapt else DEFAULT_CONTROLLERS))),
         solver,
         seeds,
         seed,
         tuple(parsed_fault(text) for text in fault or ()),
-        guard,
+        "adapt" if adapt else "rest" if guard else "",
     )
     with make_progress() as progress:
         progress.start("reading the model, and the filters' noise")

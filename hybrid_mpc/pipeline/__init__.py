@@ -13,6 +13,7 @@ from hybrid_mpc.pipeline.settings import RunSettings
 
 if TYPE_CHECKING:
     from hybrid_mpc.pipeline.control_noise import find_noise
+    from hybrid_mpc.pipeline.guards import make_adaptive_guard
     from hybrid_mpc.pipeline.loops import (
         make_controller,
         make_estimator,
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 __all__ = [
     "RunSettings",
     "find_noise",
+    "make_adaptive_guard",
     "make_controller",
     "make_estimator",
     "make_monitor",
@@ -35,7 +37,11 @@ __all__ = [
     "working_point",
 ]
 
-_HOMES = {"run_job": ("run", "run"), "find_noise": ("control_noise", "find_noise")}
+_HOMES = {
+    "run_job": ("run", "run"),
+    "find_noise": ("control_noise", "find_noise"),
+    "make_adaptive_guard": ("guards", "make_adaptive_guard"),
+}
 
 
 def __getattr__(name: str) -> Any:

@@ -13,16 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.artifact import FILE, Artifact, load_artifact
-from hybrid_mpc.closed_loop import ClosedLoopResult, Fault, simulate
+from hybrid_mpc.closed_loop import ClosedLoopResult, Fault, Guard, simulate
 from hybrid_mpc.closed_loop.faults import check_channels, install
 from hybrid_mpc.closed_loop.simulate import Step
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model import HybridModel
-from hybrid_mpc.monitor import guard_monitor
+from hybrid_mpc.monitor import EnergyMonitor, guard_monitor
 from hybrid_mpc.mpc import OCP, Controller, IpoptController, SafeController, SQPController
 from hybrid_mpc.pipeline.contenders import CONTENDERS, ORACLES, build
 from hybrid_mpc.pipeline.control_noise import find_noise
-from hybrid_mpc.pipeline.faulted_loops import GUARD, stored_detector
+from hybrid_mpc.pipeline.faulted_loops import stored_detector
+from hybrid_mpc.pipeline.guards import REACTIONS, RESTING, adaptable, make_adaptive_guard
 from hybrid_mpc.pipeline.loops import make_monitor, sensor_steps
 from hybrid_mpc.scenario import ControlSpec, Scenario, Task
 
@@ -47,7 +48,8 @@ class ControlSettings:
         seeds: Loops of each task and controller.
         seed: Seed of the first loop, times 1000, as in the main job.
         faults: What goes wrong in every loop beside what the task itself brings.
-        guard: Whether the artifact's detector watches, and a frozen sensor takes the input away. Default: no.
+        guard: ``"rest"``: the artifact's detector watches, and a frozen sensor takes the input away; ``"adapt"``: and
+            an alarm that lasts hands over to a backup that estimates the prior's parameters. Default: not watched.
 
     Raises:
         InputError: If a controller or solver is unknown, an oracle is asked for with another solver, or a number
@@ -65,7 +67,7 @@ class ControlSettings:
     seeds: int = 10
     seed: int = 0
     faults: tuple[Fault, ...] = field(default=())
-    guard: bool = False
+    guard: str = ""
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.controllers if name not in CONTENDERS]
@@ -74,6 +76,8 @@ class ControlSettings:
             raise InputError(f"{given}; there are: {', '.join(CONTENDERS)}")
         if self.solver not in SOLVERS:
             raise InputError(f"no solver {self.solver!r}; there are: {', '.join(SOLVERS)}")
+        if self.guard not in ("", *REACTIONS):
+            raise InputError(f"no guard {self.guard!r}; there are: {', '.join(REACTIONS)}")
         oracles = [name for name in self.controllers if name in ORACLES]
         if oracles and self.solver != "rti":
             raise InputError(
@@ -197,6 +201,8 @@ def prepared(scenario: Scenario, model: Path, settings: ControlSettings, noise: 
     _check_artifact(scenario, artifact, folder, scenario.control)
     if settings.guard:
         stored_detector(artifact, folder)
+    if settings.guard == "adapt":
+        adaptable(artifact.models["hybrid"], scenario.causes)
     check_channels(install(scenario.plant(), settings.faults)[1], len(scenario.control.estimator_sigma), 1)
     found = find_noise(scenario, artifact, folder, settings.controllers, settings.seed, noise)
     return Job(scenario, artifact, tasks, settings, *found)
@@ -235,11 +241,11 @@ def run_loops(
         periods = round(task.duration / dt)
         total = len(settings.controllers) * settings.seeds * periods
         for i, name in enumerate(settings.controllers):
-            made = parts(job, task, name)
+            made, watched = parts(job, task, name), watch(job, task, name)
             for seed in range(settings.seeds):
                 done = (i * settings.seeds + seed) * periods
                 say = partial(_report, report, task.name, done, total, f"{name}, seed {seed}")
-                yield task, name, seed, *_loop(job, task, name, seed, made, say)
+                yield task, name, seed, *_loop(job, task, seed, made, watched, say)
         report(task.name, total, total, "")
 
 
@@ -251,7 +257,12 @@ def _report(
 
 
 def _loop(
-    job: Job, task: Task, name: str, seed: int, made: tuple[Any, SafeController], say: Callable[[int], None]
+    job: Job,
+    task: Task,
+    seed: int,
+    made: tuple[Any, SafeController],
+    watched: tuple[Any, Guard | None],
+    say: Callable[[int], None],
 ) -> tuple[ClosedLoopResult, Array]:
     """One loop, and its plans ``(n, N + 1, n_x)``."""
     plans: list[Array] = []
@@ -261,20 +272,29 @@ def _loop(
         say(step.k)
 
     assert job.scenario.plant is not None
-    control = task.control or job.scenario.control
-    assert control is not None
-    model, monitor, guard = job.artifact.models["hybrid"], None, None
-    if job.settings.guard:
-        steps = sensor_steps(control)
-        monitor, guard = guard_monitor(model, stored_detector(job.artifact), resolution=steps), GUARD
-    elif CONTENDERS[name].model == "hybrid":
-        monitor = make_monitor(model, None)
+    monitor, guard = watched
     result = simulate(
         job.scenario.plant(), *made, task.reference, weight=task.weight, dt=job.artifact.models["prior"].dt,
         duration=task.duration, x0=np.array(task.x0), seed=job.settings.seed * 1000 + seed,
         monitor=monitor, guard=guard, faults=(*task.faults, *job.settings.faults), on_step=on_step,
     )  # fmt: skip
     return result, np.stack(plans)
+
+
+def watch(job: Job, task: Task, name: str) -> tuple[EnergyMonitor | None, Guard | None]:
+    """Monitor and guard of a contender for a task, as far as they are asked for."""
+    control, models = task.control or job.scenario.control, job.artifact.models
+    assert control is not None
+    if not job.settings.guard:
+        return (make_monitor(models["hybrid"], None) if CONTENDERS[name].model == "hybrid" else None), None
+    detector = stored_detector(job.artifact)
+    monitor = guard_monitor(models["hybrid"], detector, resolution=sensor_steps(control))
+    if job.settings.guard == "rest":
+        return monitor, RESTING
+    guard = make_adaptive_guard(
+        models["hybrid"], models["prior"], control, job.noise[name], job.scenario.causes
+    )
+    return monitor, guard
 
 
 def parts(job: Job, task: Task, name: str) -> tuple[Any, SafeController]:

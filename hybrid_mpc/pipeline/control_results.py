@@ -50,7 +50,7 @@ def run_control(job: Job, out: Path, progress: Progress, *, gif: bool = True) ->
     progress.start("closing the loop")
     firsts: dict[str, dict[str, tuple[ClosedLoopResult, Array]]] = {}
     for task, name, seed, result, plans in run_loops(job, progress.update):
-        rows.append(row(task, name, seed, result, guarded=job.settings.guard))
+        rows.append(row(task, name, seed, result, guarded=bool(job.settings.guard)))
         steps.setdefault(name, []).append(result.timing_ms["total"])
         if seed == 0:
             firsts.setdefault(task.name, {})[name] = (result, plans)

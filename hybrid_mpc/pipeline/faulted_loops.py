@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.artifact import Artifact
-from hybrid_mpc.closed_loop import ClosedLoopResult, Fault, Guard, Mode, simulate
+from hybrid_mpc.closed_loop import ClosedLoopResult, Fault, simulate
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.monitor import Detector, MonitorTrace, guard_monitor
 from hybrid_mpc.monitor.calibration import alarm_intervals
 from hybrid_mpc.pipeline.contenders import build
+from hybrid_mpc.pipeline.guards import RESTING
 from hybrid_mpc.pipeline.loops import sensor_steps
 from hybrid_mpc.pipeline.monitor_job import explained
 from hybrid_mpc.pipeline.nominal_loops import CONTENDER, knows
@@ -27,9 +28,6 @@ SEED = 600
 """Number of these loops, away from those that the detector is learned from."""
 SHOWN = ("t", "violation_w", "level_w", "residual_level", "energy_j", "energy_s", "frozen", "scores", "alarm")
 """What of a trace is kept for the report."""
-GUARD = Guard(Mode.NORMAL, Mode.REST)
-"""Records where the model does not describe the machine, and takes the input away where the sensor is frozen: what
-docs/energy-guard.md found sensible."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +102,7 @@ def faulted(
         result = simulate(
             scenario.plant(), estimator, controller, task.reference, weight=task.weight, dt=model.dt,
             duration=task.duration, x0=np.array(task.x0), seed=run_seed * 1000 + SEED, monitor=monitor,
-            guard=GUARD, faults=(*task.faults, Fault(start, math.inf, case.target, case.value)),
+            guard=RESTING, faults=(*task.faults, Fault(start, math.inf, case.target, case.value)),
         )  # fmt: skip
         # The estimator is deterministic: over the record it says again what it said in the loop.
         trace, alarms = explained(monitor, estimator, Samples(result.t, result.y, result.u), scenario.causes)

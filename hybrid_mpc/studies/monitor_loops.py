@@ -22,6 +22,7 @@ from hybrid_mpc.monitor import METHODS, EnergyMonitor, Judges, guard_monitor, le
 from hybrid_mpc.monitor.calibration import BLOCK_S
 from hybrid_mpc.pipeline.contenders import build
 from hybrid_mpc.pipeline.control_job import selected_tasks
+from hybrid_mpc.pipeline.guards import RESTING, make_adaptive_guard
 from hybrid_mpc.scenario import ControlSpec, Task, load_scenario
 from hybrid_mpc.studies.lockstep import Loop, Trace, run_together
 from hybrid_mpc.studies.loops import ModelInput
@@ -74,7 +75,7 @@ class _Loops:
         self._task = plain_task(self._task)
         self._model = self._artifact.models["hybrid"]
         self._judges: Judges | None = None
-        self._made: dict[tuple[str, int | None], Any] = {}
+        self._made: dict[Any, Any] = {}
 
     @property
     def _control(self) -> ControlSpec:
@@ -148,11 +149,7 @@ class _Loops:
     def _guarded(self, plan: LoopPlan, arm: str) -> dict[str, Any]:
         detector = self.judges.detector_at(self._study.rates[0])
         monitor = guard_monitor(self._model, detector, resolution=self.judges.resolution)
-        guard = Guard(Mode.NORMAL, Mode.REST)
-        if arm == "backup":
-            estimator, controller = self._parts(PRIOR)
-            guard = Guard(Mode.BACKUP, Mode.REST, backup=controller, backup_estimator=estimator)
-        result, _ = self._simulated(plan, monitor, guard)
+        result, _ = self._simulated(plan, monitor, self._guard(arm))
         onset = plan.onset(self._model.dt)
         early = sum(switch.t < onset for switch in result.switches)
         return {
@@ -160,6 +157,20 @@ class _Loops:
             "switches": len(result.switches),
             "early_switches": early,
         }
+
+    def _guard(self, arm: str) -> Guard:
+        if arm == "rest":
+            return RESTING
+        if arm == "backup":
+            estimator, controller = self._parts(PRIOR)
+            return Guard(Mode.BACKUP, Mode.REST, backup=controller, backup_estimator=estimator)
+        if arm not in self._made:
+            prior, sigma_x = self._artifact.models["prior"], self._noise[CONTROLLER]
+            self._made[arm] = make_adaptive_guard(
+                self._model, prior, self._control, sigma_x, self._scenario.causes
+            )
+        guard: Guard = self._made[arm]
+        return guard
 
 
 def plain_task(task: Task) -> Task:

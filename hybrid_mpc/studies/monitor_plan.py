@@ -163,7 +163,7 @@ class MonitorStudy:
     Example:
         >>> study = MonitorStudy("golf_robot", "runs/golf", seeds=2, guard_seeds=1, nominal_hours=1.0)
         >>> study.size, sum(job.kind == "nominal" for job in study.jobs())
-        (28, 2)
+        (34, 2)
     """
 
     scenario: str
@@ -224,8 +224,9 @@ class MonitorStudy:
         return {**whole, "model": "model"}
 
 
-ARMS = ("rest", "backup")
-"""Reactions: record faults of the model, rest when the sensor freezes; the same with the prior's MPC as backup."""
+ARMS = ("rest", "backup", "adapt")
+"""Reactions: record faults of the model, rest when the sensor freezes; the same with the prior's MPC as backup; with
+one that adapts."""
 NOMINALS = (
     ("none", "task"), ("none", "moves"), ("drift_up", "task"), ("none", "task"), ("none", "moves"),
     ("drift_down", "moves"),

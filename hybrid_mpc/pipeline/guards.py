@@ -1,0 +1,100 @@
+"""What a watched loop does on an alarm: record it, or go over to a backup that adapts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.closed_loop.guard import Guard, Mode
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimation.parameters import parameter_filter, with_parameter_states
+from hybrid_mpc.model import HybridModel
+from hybrid_mpc.mpc.condensed import CondensedController
+from hybrid_mpc.mpc.ocp import OCP
+from hybrid_mpc.mpc.safeguard import SafeController
+from hybrid_mpc.pipeline.loops import FIRST_LOAD, QUIET_SHARE, first_controller, make_ocp
+from hybrid_mpc.scenario import ControlSpec
+
+Array = NDArray[np.float64]
+REACTIONS = ("rest", "adapt")
+"""What ``hybrid-mpc control --guard`` and ``--adapt`` do."""
+RESTING = Guard(Mode.NORMAL, Mode.REST)
+"""Records where the model does not describe the machine, and takes the input away where the sensor is frozen."""
+PATIENCE_S = 0.8
+"""A push of 0.2 s raised alarms for up to 0.7 s, through the monitor's windows and what the observer makes of it; a
+backup that takes it for a heavier machine costs more than it saves (docs/energy-guard.md)."""
+GAIN = "gain of "
+
+
+def make_adaptive_guard(
+    model: HybridModel,
+    prior: HybridModel,
+    control: ControlSpec,
+    sigma_x: Array,
+    causes: Mapping[str, Sequence[str]],
+    *,
+    patience: float = PATIENCE_S,
+) -> Guard:
+    """A guard whose backup estimates what has become of the prior's parameters, and plans with it.
+
+    The backup's filter runs all the time, so it has found the change when the guard switches. A frozen sensor takes
+    the input away.
+
+    Args:
+        model: The model that the normal controller plans with; it must know its parameters.
+        prior: The fitted prior, for terminal weight and fallback.
+        control: The control problem.
+        sigma_x: Process noise ``(n_x,)`` per period of the model's estimator.
+        causes: Parameters that change together, by name, as a scenario's ``causes``. Gains of inputs are left out
+            where there are other causes: a weaker motor is a heavier machine, but for its friction.
+        patience: Time [s] for which the model must have been in doubt. Default 0.8.
+
+    Raises:
+        InputError: If there are no causes, the model does not know its parameters, or one of them is unknown.
+
+    Example:
+        ``make_adaptive_guard(hybrid, prior, scenario.control, sigma_x, scenario.causes)``
+    """
+    groups = adaptable(model, causes)
+    adaptive = with_parameter_states(model, groups)
+    span = np.subtract(control.u_max, control.u_min)
+    plain = make_ocp(prior, control)
+    ocp = OCP.from_spec(control, plain.terminal_weight(model), plain.working_point)
+    backup = SafeController(
+        CondensedController(adaptive, ocp), prior, first=first_controller(adaptive, ocp, control)
+    )
+    first = [*control.estimator_sigma, *np.full(model.n_x - model.n_y, 0.1)]
+    estimator = parameter_filter(
+        adaptive, len(groups), sigma_y=control.estimator_sigma, sigma_x=sigma_x, sigma_x0=first,
+        sigma_d=QUIET_SHARE * span, sigma_d0=FIRST_LOAD * span,
+    )  # fmt: skip
+    return Guard(Mode.BACKUP, Mode.REST, backup=backup, backup_estimator=estimator, patience=patience)
+
+
+def adaptable(model: HybridModel, causes: Mapping[str, Sequence[str]]) -> dict[str, tuple[str, ...]]:
+    """Those of the causes that a backup adapts to.
+
+    Raises:
+        InputError: If there are none, or the model does not know its parameters.
+
+    Example:
+        ``adaptable(hybrid, {"mass": ("m", "J"), "motor": ("gain of u",)})`` is ``{"mass": ("m", "J")}``.
+    """
+    groups = {name: tuple(names) for name, names in causes.items()}
+    if not groups:
+        raise InputError(
+            'a guard that adapts needs causes: groups of parameters that may change, e.g. {"mass": ("m", "J")}; '
+            "a scenario names them in its field causes"
+        )
+    if model.parametric is None:
+        raise InputError(
+            f"a guard that adapts needs a model that knows its parameters; model {model.name} is of an artifact of an "
+            "earlier version: train it anew"
+        )
+    return {name: names for name, names in groups.items() if not _is_gain(names)} or groups
+
+
+def _is_gain(names: Sequence[str]) -> bool:
+    return all(name.startswith(GAIN) for name in names)
