@@ -1,9 +1,10 @@
 """What the diagnosis says of known faults: ``python benchmarks/guard_causes.py --model DIR --noise control.json
 --detector FILE.json [--seeds 3] [--after 0.5 1.2 2.2] [--keep DIR]``.
 
-The loops of guard_delays.py, replayed; what the diagnosis says so long [s] after the onset, of its whole history and of
+Loops of guard_loops.py, replayed; what the diagnosis says so long [s] after the onset, of its whole history and of
 the time since the onset alone. An artifact of an earlier version is completed with the prior's program of its
-provenance (torch).
+provenance (torch). The detector is that of ``hybrid-mpc monitor ... --learn`` or ``judges.json`` of
+``hybrid-mpc study run monitor``.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import argparse
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
-from guard_delays import Estimate
 from guard_loops import DT, FAULTS, Loops, fault_plans, read_noise
 
 from hybrid_mpc.artifact import load_artifact
@@ -45,7 +46,8 @@ def said(monitor, diagnoser, loop, onset: float, after) -> list[str]:
     state, texts, wanted = monitor.initial(), [], {round((onset + s) / DT): s for s in after}
     for k in range(len(loop["t"])):
         u_prev = loop["u"][k - 1] if k else np.zeros(1)
-        state, _ = monitor.update(state, loop["y"][k], u_prev, Estimate(loop["x_hat"][k], loop["h"][k]))
+        estimate = SimpleNamespace(x=loop["x_hat"][k], h=loop["h"][k])
+        state, _ = monitor.update(state, loop["y"][k], u_prev, estimate)
         if k in wanted:
             whole, recent = diagnoser.diagnose(state).text, diagnoser.diagnose(state, wanted[k]).text
             texts.append(f"{wanted[k]:g} s: {whole} [since the onset: {recent}]")

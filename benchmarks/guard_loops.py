@@ -1,4 +1,4 @@
-"""Closed loops of the golf robot's rig, nominal and faulted, that detectors are judged on; see guard_delays.py.
+"""Closed loops of the golf robot's rig, nominal and faulted, that the guard's benchmarks share.
 
 A loop is kept as one ``.npz``: what the machine did, what the estimator believed. Monitors change nothing in a loop,
 so any number of them can be replayed over the same one.

@@ -140,7 +140,7 @@ def main() -> None:
     parser.add_argument("--noise", type=Path, required=True, help="control.json of a run")
     parser.add_argument("--data", type=Path, nargs="+", default=[], help="training recordings")
     parser.add_argument("--minutes", type=float, default=0.0, help="learn from so much of nominal loops")
-    parser.add_argument("--keep", type=Path, help="folder of nominal loops (guard_delays.py --keep)")
+    parser.add_argument("--keep", type=Path, help="folder of nominal loops")
     parser.add_argument("--seeds", type=int, default=6)
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--arms", nargs="+", default=["bounds", "quantile"], choices=ARMS)

@@ -22,7 +22,7 @@ AVERAGE_S = 0.1
 FREE_RUN_S = 0.6
 HISTORY_S = 2.0
 DRIFT = 2.0
-"""Departure [deviations] that the detector's sums count as nothing. Measured: benchmarks/guard_delays.py."""
+"""Departure [deviations] that the detector's sums count as nothing. What that finds how soon: docs/energy-guard.md."""
 SETTLING_S = 1.0
 """Beginning [s] of a recording that nothing is learned from: the estimator does not know the speed yet."""
 

@@ -139,6 +139,7 @@ def test_a_guarded_loop_lets_go_of_a_frozen_sensor(call, run_folder, tmp_path):
     ("words", "told"),
     [
         (["--guard", "--controller", "prior"], ["controller prior has another model", "hybrid_observer"]),
+        (["--adapt", "--controller", "prior"], ["controller prior has another model", "hybrid_observer"]),
         (["--task", "golf"], ["no task 'golf'", "track_sine", "stroke_1.4"]),
         (["--controller", "pid"], ["no controller pid", "hybrid_observer"]),
         (["--solver", "newton"], ["no solver 'newton'", "rti, sqp, ipopt"]),

@@ -20,7 +20,8 @@ sys.meta_path.insert(0, Refuse())
 import hybrid_mpc.pipeline
 assert "casadi" not in sys.modules  # nothing is loaded before it is asked for
 from hybrid_mpc.pipeline import (
-    find_noise, make_controller, make_estimator, make_monitor, make_ocp, tuned_noise, working_point
+    find_noise, make_adaptive_guard, make_controller, make_estimator, make_monitor, make_ocp, tuned_noise,
+    working_point,
 )
 print(make_ocp.__module__)
 """
