@@ -16,6 +16,8 @@ RUNS = 2
 """Free runs side by side, half a length apart: the older one always has half a length behind it."""
 RUN_SUMS = 3
 """Sums of a free run: energy departure, squared speed, squared input."""
+HELD_SHARE = 0.25
+"""Change of an input, as a share of its plausible range, that no sticking friction is believed to hold."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ class Layout:
     @property
     def averaged(self) -> int:
         """Where the latest violations begin; the residuals follow them."""
-        return self.one_step + self.n_q
+        return self.one_step + 3 * self.n_q + self.model.n_u
 
     @property
     def runs(self) -> int:
@@ -170,6 +172,40 @@ def _free_run(
     return ca.vertcat(x, h, ring, sums), sums
 
 
+def _pushed(
+    layout: Layout, memory: ca.MX, still: ca.MX, x: ca.MX, h: ca.MX, u: ca.MX
+) -> tuple[ca.MX, ca.MX, ca.MX]:
+    """Speed and travel ``(n_q,)`` that the change of the input since the sensors' last step would have caused, and the
+    input then.
+
+    An estimator takes a frozen sensor for a standing machine, and an unknown load for what holds it; the controller
+    pulls, and nothing moves. A load that is there cancels, for the input's change alone counts, and only beyond
+    ``HELD_SHARE`` of its range. The model is asked only then, for it costs two evaluations.
+    """
+    model, n_q = layout.model, layout.n_q
+    first = layout.one_step + n_q
+    speed, travel, before = ca.vertsplit(
+        memory[first : layout.averaged], [0, n_q, 2 * n_q, 2 * n_q + model.n_u]
+    )
+    before = ca.if_else(still, before, u)
+    spans = ca.DM([HELD_SHARE * (s.upper - s.lower) for s in model.inputs])
+    strong = ca.logic_and(still, ca.mmax(ca.fabs(u - before) - spans) > 0)
+    sizes = {"x": model.n_x, "h": model.n_h, "u": model.n_u, "before": model.n_u}
+    sym = [ca.MX.sym(name, size) for name, size in sizes.items()]
+    change = model.xdot(*sym[:3])[n_q:] - model.xdot(*sym[:2], sym[3])[n_q:]
+    asked = ca.Function("asked", sym, [ca.densify(change)])
+    none = ca.Function("none", sym, [ca.DM.zeros(n_q)])
+    push = ca.Function.if_else("push", asked, none)(strong, x, h, u, before)
+    speed = ca.if_else(strong, speed + model.dt * push, 0)
+    travel = ca.if_else(still, travel + model.dt * ca.fabs(speed), 0)
+    return ca.if_else(_known(speed), speed, 0), ca.if_else(_known(travel), travel, 0), before
+
+
+def _known(values: ca.MX) -> ca.MX:
+    """Where values are numbers. ``values == values`` is true for CasADi, whatever they are."""
+    return ca.fabs(values) < np.inf
+
+
 def reading_function(layout: Layout, rest_speed: float) -> ca.Function:
     """``(memory, x_prev, h_prev, u_prev, y, judged) -> (memory_next, numbers)``.
 
@@ -202,19 +238,22 @@ def reading_function(layout: Layout, rest_speed: float) -> ca.Function:
     y_before = memory[(window - 1) * n_q : window * n_q]
     moved = x_next[:n_q] - x[:n_q]
     ahead = memory[layout.one_step : layout.one_step + n_q] + moved * (ca.fabs(moved) > rest_speed * dt)
-    travel = ca.if_else(ca.logic_and(y == y_before, ahead == ahead), ahead, 0)
+    travel = ca.if_else(ca.logic_and(y == y_before, _known(ahead)), ahead, 0)
+    pushed = _pushed(layout, memory, ca.mmin(y == y_before), x, h, u)
+    shown = ca.if_else(pushed[1] > ca.fabs(travel), pushed[1], travel)
     violation = ca.fabs(balances[0] - balances[1])
     averaged = memory[layout.averaged : layout.runs]
     outs = [
         ys,
         rows,
         travel,
+        *pushed,
         averaged[1 : layout.average],
         violation,
         averaged[layout.average + n_q :],
         residual,
     ]
-    numbers = [*balances, violation, residual, travel, v, u_mean]
+    numbers = [*balances, violation, residual, shown, v, u_mean]
     if layout.length:
         for i in range(RUNS):
             part = memory[layout.runs + i * layout.run : layout.runs + (i + 1) * layout.run]

@@ -51,7 +51,10 @@ class EnergyMonitor:
 
     With ``resolution`` a sensor that repeats itself while the one-step predictions add up to more than three of its
     steps is held for frozen, until it moves. Predictions slower than ``rest_speed`` do not count: where friction sticks
-    an estimate creeps on, and the sensor rightly stands still.
+    an estimate creeps on, and the sensor rightly stands still. A sensor that freezes near rest is taken for a standing
+    machine by the estimator, and by a controller for one that needs a stronger pull: so what the change of the
+    input since the last step of the sensors would have moved counts as well, once it is more than a quarter of the
+    input's plausible range (none without a range). A machine that is blocked looks the same.
 
     A missing (NaN) measurement gives NaN readings until it has left the window. The level is the mean of
     the finite ones of the last ``average`` violations, NaN (and no alarm) while fewer than half are finite.

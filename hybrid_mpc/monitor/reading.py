@@ -64,7 +64,7 @@ class MonitorReading:
         energy_j: Energy [J] by which the model's own free run departs from the measurement, accumulated over
             ``energy_s``; NaN without free runs, and after a missing measurement until the next run.
         energy_s: Time [s] over which it was accumulated.
-        frozen: True while the sensor repeats itself although the estimator predicts motion.
+        frozen: True while the sensor repeats itself although the estimator predicts motion or the input asks for it.
         scores: What the detector compares with its thresholds, each as a share of its threshold: the sum of residual
             forces, the power of the free runs. Default: none.
         numbers: What a detector is learned from: both balances, violation, residual, travel, speed and input at the

@@ -1,0 +1,89 @@
+"""Keep the results of machine benchmarks beside this file and print them as tables for docs/machines.md.
+
+``python docs/results/machines/table.py`` prints the tables of all that are here;
+``python docs/results/machines/table.py --take runs/disk24 --name unbalanced_disk_2024`` first takes ``results.json``
+and the figures of a folder that ``hybrid-mpc benchmark`` wrote.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+from pathlib import Path
+from typing import Any
+
+from hybrid_mpc.files import read_json, write_json
+
+HERE = Path(__file__).parent
+IMAGES = HERE.parents[1] / "images"
+MODELS = ("phy", "rnn", "pgrnn", "mopgrnn", "hybrid")
+DROPPED = ("timing", "versions")
+
+
+def take(folder: Path, name: str) -> None:
+    """Copy a folder's results here and its figures to docs/images."""
+    results = read_json(folder / "results.json")
+    write_json(HERE / f"{name}.json", {k: v for k, v in results.items() if k not in DROPPED})
+    for path in sorted((folder / "figures").glob("*.png")):
+        stem = path.stem.replace(" ", "_")
+        shutil.copyfile(path, IMAGES / f"machine_{name}_{stem}.png")
+
+
+def digits(value: float) -> str:
+    """Three significant digits.
+
+    Example:
+        >>> digits(0.012345), digits(123.4)
+        ('0.0123', '123')
+    """
+    return f"{value:.3g}"
+
+
+def errors(results: dict[str, Any]) -> list[str]:
+    """Free runs: a row a test file, the validation part first."""
+    unit = results["model"]["validation"]["unit"]
+    known = results["model"]["validation"]["rmse"]
+    chosen = results["model"]["hybrid"]
+    lines = [
+        f"| free runs [{unit}] | {' | '.join(MODELS)} | hybrid / phy |",
+        "| --- |" + " ---: |" * (len(MODELS) + 1),
+    ]
+    rows = {"validation": {**known, "hybrid": known[chosen]}}
+    rows |= {name: {m: f[m]["rmse"] for m in MODELS} for name, f in results["test"].items()}
+    for name, row in rows.items():
+        cells = [digits(row[m]) for m in MODELS]
+        lines.append(f"| {name} | {' | '.join(cells)} | {row['hybrid'] / row['phy']:.2f} |")
+    return [*lines, "", f"Recommended by validation: {chosen}."]
+
+
+def parameters(results: dict[str, Any]) -> list[str]:
+    """The fitted prior: a row a parameter that was fitted."""
+    lines = ["| parameter | unit | nominal | fitted | standard error |", "| --- | --- | ---: | ---: | ---: |"]
+    for row in results["model"]["prior"]:
+        if row["standard_error"] is not None:
+            cells = [digits(row[key]) for key in ("nominal", "fitted", "standard_error")]
+            lines.append(f"| {row['parameter']} | {row['unit']} | {' | '.join(cells)} |")
+    delay = results["model"]["delay_s"]
+    return [*lines, *([f"| delay | ms | | {1e3 * delay:.1f} | |"] if delay else [])]
+
+
+def main() -> None:
+    """Take results where asked; print the tables of all."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--take", type=Path, help="folder of a benchmark")
+    parser.add_argument("--name", help="stem of its files here, e.g. emps")
+    given = parser.parse_args()
+    if given.take is not None:
+        if not given.name:
+            parser.error("--take needs --name")
+        take(given.take, given.name)
+    for path in sorted(HERE.glob("*.json")):
+        results = read_json(path)
+        seconds = results.get("data", {}).get("seconds", {})
+        parts = ", ".join(f"{role} {length:.0f} s" for role, length in seconds.items() if length)
+        print(f"#### {path.stem}, budget {results['budget']}, seed {results['seed']} ({parts})\n")
+        print("\n".join([*parameters(results), "", *errors(results), ""]))
+
+
+if __name__ == "__main__":
+    main()
