@@ -207,7 +207,8 @@ def cell(value: Cell) -> str:
         return "–"
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return number(value) if isinstance(value, float) else str(value)
+    # a per cent sign stays beside its number
+    return number(value) if isinstance(value, float) else str(value).replace(" %", "\u00a0%")
 
 
 def is_number(value: Cell) -> bool:
