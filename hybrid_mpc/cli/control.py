@@ -53,7 +53,8 @@ def control(
     adapt: Annotated[
         bool,
         typer.Option(
-            "--adapt", help="--guard, with a backup that learns what has become of mass and friction."
+            "--adapt",
+            help="--guard, and a backup that learns what has become of mass and friction (scenario's causes).",
         ),
     ] = False,
     gif: Annotated[bool, typer.Option("--gif/--no-gif", help="Draw moving pictures.")] = True,

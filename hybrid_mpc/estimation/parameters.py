@@ -50,8 +50,8 @@ def with_parameter_states(
         most: Largest factor; the smallest is one over it. Default 4.
 
     Raises:
-        InputError: If the model does not know its parameters or has further states than positions and velocities, a
-            parameter is unknown, or ``most`` is not above 1.
+        InputError: If the model does not know its parameters, has further states than positions and velocities, or
+            inputs that act later; if a parameter is unknown, or ``most`` is not above 1.
 
     Source: Simon, *Optimal State Estimation*, 2006, section 13.4 (parameter estimation).
 
@@ -188,6 +188,11 @@ def _check_model(model: HybridModel) -> None:
         raise InputError(
             f"parameter states: model {model.name} has {model.n_x} states, its prior {n_q} accelerations; only "
             "positions and velocities are dealt with, no lags"
+        )
+    if model.waiting:
+        raise InputError(
+            f"parameter states: the inputs of model {model.name} act later; parameters as states are for "
+            "models without a delay"
         )
 
 

@@ -173,27 +173,38 @@ def _free_run(
 
 
 def _pushed(
-    layout: Layout, memory: ca.MX, still: ca.MX, x: ca.MX, h: ca.MX, u: ca.MX
+    layout: Layout, memory: ca.MX, still: ca.MX, x: ca.MX, h: ca.MX, u: ca.MX, rest_speed: float, spans: ca.DM
 ) -> tuple[ca.MX, ca.MX, ca.MX]:
-    """Speed and travel ``(n_q,)`` that the change of the input since the sensors' last step would have caused, and the
-    input then.
+    """Speed and travel ``(n_q,)`` that the input should have caused since the sensors' last step, and the input then.
 
     An estimator takes a frozen sensor for a standing machine, and an unknown load for what holds it; the controller
-    pulls, and nothing moves. A load that is there cancels, for the input's change alone counts, and only beyond
-    ``HELD_SHARE`` of its range. The model is asked only then, for it costs two evaluations.
+    pulls, and nothing moves. What counts is what both the input's change since then and the input itself, beyond
+    friction, would do: a load that is there is no change, and a machine that has braked is left with no pull. The model
+    is asked only beyond ``HELD_SHARE`` of the input's range, for it costs four evaluations.
     """
     model, n_q = layout.model, layout.n_q
     first = layout.one_step + n_q
     speed, travel, before = ca.vertsplit(
         memory[first : layout.averaged], [0, n_q, 2 * n_q, 2 * n_q + model.n_u]
     )
-    before = ca.if_else(still, before, u)
-    spans = ca.DM([HELD_SHARE * (s.upper - s.lower) for s in model.inputs])
-    strong = ca.logic_and(still, ca.mmax(ca.fabs(u - before) - spans) > 0)
+    if model.waiting:  # the oldest of the inputs on their way is the one that has begun to act
+        u = h[: model.n_u]
+    before = ca.if_else(ca.logic_and(still, ca.mmin(_known(before))), before, u)
+    strong = ca.logic_and(still, ca.mmax(ca.fabs(u - before) - HELD_SHARE * spans) > 0)
     sizes = {"x": model.n_x, "h": model.n_h, "u": model.n_u, "before": model.n_u}
     sym = [ca.MX.sym(name, size) for name, size in sizes.items()]
-    change = model.xdot(*sym[:3])[n_q:] - model.xdot(*sym[:2], sym[3])[n_q:]
-    asked = ca.Function("asked", sym, [ca.densify(change)])
+    position, hidden = sym[0][:n_q], sym[1]
+    rates = rest_speed * ca.DM.ones(n_q)
+    back, forth, was_back, was_forth = (
+        model.xdot(ca.vertcat(position, rate), hidden, pull)[n_q:]
+        for pull in sym[2:]
+        for rate in (-rates, rates)
+    )
+    mean, friction = 0.5 * (back + forth), ca.fmax(0, 0.5 * (back - forth))
+    alone = ca.sign(mean) * ca.fmax(0, ca.fabs(mean) - friction)
+    change = mean - 0.5 * (was_back + was_forth)
+    both = ca.sign(alone) * ca.fmin(ca.fabs(alone), ca.fabs(change)) * (alone * change > 0)
+    asked = ca.Function("asked", sym, [ca.densify(both)])
     none = ca.Function("none", sym, [ca.DM.zeros(n_q)])
     push = ca.Function.if_else("push", asked, none)(strong, x, h, u, before)
     speed = ca.if_else(strong, speed + model.dt * push, 0)
@@ -206,12 +217,12 @@ def _known(values: ca.MX) -> ca.MX:
     return ca.fabs(values) < np.inf
 
 
-def reading_function(layout: Layout, rest_speed: float) -> ca.Function:
+def reading_function(layout: Layout, rest_speed: float, spans: Array) -> ca.Function:
     """``(memory, x_prev, h_prev, u_prev, y, judged) -> (memory_next, numbers)``.
 
     The numbers: balances of model and measurement, violation, residual ``(n_q)``, travel ``(n_q)``, speed ``(n_q)``
     and input ``(n_u)`` at the centre; with free runs the sums of each. ``judged`` says of each run whether its window
-    is full.
+    is full. ``spans`` ``(n_u,)`` are the ranges of the inputs.
     """
     model, window, n_q = layout.model, layout.window, layout.n_q
     n_u, dt, row = model.n_u, model.dt, layout.row
@@ -239,7 +250,7 @@ def reading_function(layout: Layout, rest_speed: float) -> ca.Function:
     moved = x_next[:n_q] - x[:n_q]
     ahead = memory[layout.one_step : layout.one_step + n_q] + moved * (ca.fabs(moved) > rest_speed * dt)
     travel = ca.if_else(ca.logic_and(y == y_before, _known(ahead)), ahead, 0)
-    pushed = _pushed(layout, memory, ca.mmin(y == y_before), x, h, u)
+    pushed = _pushed(layout, memory, ca.mmin(y == y_before), x, h, u, rest_speed, ca.DM(spans))
     shown = ca.if_else(pushed[1] > ca.fabs(travel), pushed[1], travel)
     violation = ca.fabs(balances[0] - balances[1])
     averaged = memory[layout.averaged : layout.runs]

@@ -54,7 +54,7 @@ class EnergyMonitor:
     an estimate creeps on, and the sensor rightly stands still. A sensor that freezes near rest is taken for a standing
     machine by the estimator, and by a controller for one that needs a stronger pull: so what the change of the
     input since the last step of the sensors would have moved counts as well, once it is more than a quarter of the
-    input's plausible range (none without a range). A machine that is blocked looks the same.
+    input's range and the model says that it moves. A machine that is blocked looks the same.
 
     A missing (NaN) measurement gives NaN readings until it has left the window. The level is the mean of
     the finite ones of the last ``average`` violations, NaN (and no alarm) while fewer than half are finite.
@@ -69,6 +69,9 @@ class EnergyMonitor:
         free_run: Length [s] of the model's free runs. Default 0: none.
         resolution: Step of each sensor ``(n_y,)``. Default: unknown, then there is no test for freezing.
         detector: Detector of scaled residuals. Default: none.
+        input_range: Range ``(n_u,)`` of each input, largest less smallest, for the test for freezing near rest.
+            Default: that of the model's signals; there is no such test for an input without bounds,
+            and hardly one with wide ones.
         history: Time [s] over which :func:`~hybrid_mpc.monitor.diagnosis.diagnose` looks back. Default 0: not at all.
 
     Raises:
@@ -105,6 +108,7 @@ class EnergyMonitor:
         resolution: ArrayLike | None = None,
         detector: Detector | None = None,
         history: float = 0.0,
+        input_range: ArrayLike | None = None,
     ) -> None:
         _check(window, average, rest_speed)
         check_model(model)
@@ -118,7 +122,7 @@ class EnergyMonitor:
         self._resolution = _positive(resolution, model.n_y)
         if detector is not None:
             detector.check(model.n_y, bool(self.layout.length), model.dt)
-        self._function = reading_function(self.layout, rest_speed)
+        self._function = reading_function(self.layout, rest_speed, _spans(model, input_range))
         self._ins = [np.zeros(self._function.size1_in(i)) for i in range(6)]
         self._outs = [np.zeros(self._function.size1_out(i)) for i in range(2)]
         self._sizes = tuple(values.size for values in self._ins[1:5])
@@ -261,6 +265,15 @@ def _positive(resolution: ArrayLike | None, n_y: int) -> tuple[float, ...]:
     if steps.shape != (n_y,) or not (np.all(np.isfinite(steps)) and np.all(steps > 0)):
         raise InputError(f"energy monitor: resolution needs {n_y} positive steps of the sensors, got {steps}")
     return tuple(steps.tolist())
+
+
+def _spans(model: HybridModel, given: ArrayLike | None) -> Array:
+    if given is None:
+        return np.array([s.upper - s.lower for s in model.inputs])
+    spans = np.asarray(given, dtype=float).ravel()
+    if spans.shape != (model.n_u,) or not np.all(spans > 0):
+        raise InputError(f"energy monitor: input_range needs {model.n_u} positive ranges, got {spans}")
+    return spans
 
 
 def _check(window: int, average: int, rest_speed: float) -> None:

@@ -32,6 +32,7 @@ def guard_monitor(
     calibration: Calibration | Detector | None = None,
     *,
     resolution: ArrayLike | None = None,
+    input_range: ArrayLike | None = None,
     diagnose: bool = False,
 ) -> EnergyMonitor:
     """The energy monitor with everything: short window, free runs, freeze test, detector, history.
@@ -42,6 +43,8 @@ def guard_monitor(
         model: Model whose outputs are its positions.
         calibration: With a detector, or the detector itself. Default: none, e.g. to learn one.
         resolution: Step of each sensor ``(n_y,)``. Default: unknown, no test for freezing.
+        input_range: Range ``(n_u,)`` of each input that the controller has, for the same test. Default: that of the
+            model's signals.
         diagnose: Whether to keep a history for :class:`~hybrid_mpc.monitor.Diagnoser`. Default: no.
 
     Raises:
@@ -63,6 +66,7 @@ def guard_monitor(
         average=max(1, round(AVERAGE_S / model.dt)),
         free_run=length,
         resolution=resolution,
+        input_range=input_range,
         detector=detector,
         history=HISTORY_S if diagnose else 0.0,
     )

@@ -24,7 +24,7 @@ from hybrid_mpc.pipeline.contenders import CONTENDERS, ORACLES, build
 from hybrid_mpc.pipeline.control_noise import find_noise
 from hybrid_mpc.pipeline.faulted_loops import stored_detector
 from hybrid_mpc.pipeline.guards import REACTIONS, RESTING, adaptable, make_adaptive_guard
-from hybrid_mpc.pipeline.loops import make_monitor, sensor_steps
+from hybrid_mpc.pipeline.loops import freezing, make_monitor
 from hybrid_mpc.scenario import ControlSpec, Scenario, Task
 
 Array = NDArray[np.float64]
@@ -86,8 +86,8 @@ class ControlSettings:
         others = [name for name in self.controllers if CONTENDERS[name].model != "hybrid"]
         if self.guard and others:
             raise InputError(
-                f"the guard watches with the hybrid, controller {others[0]} has another model; with --guard give "
-                "--controller hybrid_observer or hybrid alone"
+                f"the guard watches with the hybrid, controller {others[0]} has another model; with --guard or --adapt "
+                "give --controller hybrid_observer or hybrid alone"
             )
         if self.seeds < 1 or self.seed < 0:
             raise InputError(f"seeds must be 1 or more and seed not negative, got {self.seeds}, {self.seed}")
@@ -288,7 +288,7 @@ def watch(job: Job, task: Task, name: str) -> tuple[EnergyMonitor | None, Guard 
     if not job.settings.guard:
         return (make_monitor(models["hybrid"], None) if CONTENDERS[name].model == "hybrid" else None), None
     detector = stored_detector(job.artifact)
-    monitor = guard_monitor(models["hybrid"], detector, resolution=sensor_steps(control))
+    monitor = guard_monitor(models["hybrid"], detector, **freezing(control))
     if job.settings.guard == "rest":
         return monitor, RESTING
     guard = make_adaptive_guard(

@@ -146,7 +146,11 @@ def collected(job: Job, rows: Sequence[dict[str, Any]], times: Mapping[str, Arra
             {"target": f.target, "value": f.value, "start_s": f.start, "end_s": f.end}
             for f in settings.faults
         ],
-        **({"guard": stored_detector(job.artifact).to_dict()} if settings.guard else {}),
+        **(
+            {"guard": stored_detector(job.artifact).to_dict(), "reaction": settings.guard}
+            if settings.guard
+            else {}
+        ),
         "model": {"provenance": dict(job.artifact.provenance)},
         "noise": {"source": job.noise_source, "sigma_x": {k: v.tolist() for k, v in job.noise.items()}},
         "versions": versions(),

@@ -18,7 +18,7 @@ from hybrid_mpc.monitor import Detector, MonitorTrace, guard_monitor
 from hybrid_mpc.monitor.calibration import alarm_intervals
 from hybrid_mpc.pipeline.contenders import build
 from hybrid_mpc.pipeline.guards import RESTING
-from hybrid_mpc.pipeline.loops import sensor_steps
+from hybrid_mpc.pipeline.loops import freezing
 from hybrid_mpc.pipeline.monitor_job import explained
 from hybrid_mpc.pipeline.nominal_loops import CONTENDER, knows
 from hybrid_mpc.scenario import Scenario
@@ -98,7 +98,7 @@ def faulted(
     rows: list[dict[str, Any]] = []
     arrays: dict[str, Array] = {}
     for case in cases(scenario):
-        monitor = guard_monitor(model, detector, resolution=sensor_steps(control), diagnose=diagnose)
+        monitor = guard_monitor(model, detector, **freezing(control), diagnose=diagnose)
         result = simulate(
             scenario.plant(), estimator, controller, task.reference, weight=task.weight, dt=model.dt,
             duration=task.duration, x0=np.array(task.x0), seed=run_seed * 1000 + SEED, monitor=monitor,

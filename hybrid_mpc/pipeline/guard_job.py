@@ -20,7 +20,7 @@ from hybrid_mpc.monitor.standard import DRIFT, SETTLING_S
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.faulted_loops import faulted, kept
 from hybrid_mpc.pipeline.judge import RATES, clean_windows
-from hybrid_mpc.pipeline.loops import make_estimator, make_monitor, sensor_steps
+from hybrid_mpc.pipeline.loops import freezing, make_estimator, make_monitor
 from hybrid_mpc.pipeline.monitor_job import explained
 from hybrid_mpc.pipeline.nominal_loops import CONTENDER, nominal_loops, run_nominal
 from hybrid_mpc.pipeline.parallel import WORKERS, run_jobs
@@ -196,7 +196,7 @@ def _recorded(
         monitor = make_monitor(model, calibration)
     else:
         diagnose = model.parametric is not None
-        monitor = guard_monitor(model, detector, resolution=sensor_steps(control), diagnose=diagnose)
+        monitor = guard_monitor(model, detector, **freezing(control), diagnose=diagnose)
     estimator = make_estimator(model, control, noise(context)[CONTENDER])
     tested = [r for r in context.dataset.whole if clean_windows(context, r, ("test",))]
     found: list[dict[str, Any]] = []

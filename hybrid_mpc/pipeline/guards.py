@@ -77,7 +77,7 @@ def adaptable(model: HybridModel, causes: Mapping[str, Sequence[str]]) -> dict[s
     """Those of the causes that a backup adapts to.
 
     Raises:
-        InputError: If there are none, or the model does not know its parameters.
+        InputError: If there are none, the model does not know its parameters, or its inputs act later.
 
     Example:
         ``adaptable(hybrid, {"mass": ("m", "J"), "motor": ("gain of u",)})`` is ``{"mass": ("m", "J")}``.
@@ -93,8 +93,12 @@ def adaptable(model: HybridModel, causes: Mapping[str, Sequence[str]]) -> dict[s
             f"a guard that adapts needs a model that knows its parameters; model {model.name} is of an artifact of an "
             "earlier version: train it anew"
         )
+    if model.waiting:
+        raise InputError(
+            f"a guard that adapts needs a model whose inputs act at once; those of model {model.name} act later"
+        )
     return {name: names for name, names in groups.items() if not _is_gain(names)} or groups
 
 
 def _is_gain(names: Sequence[str]) -> bool:
-    return all(name.startswith(GAIN) for name in names)
+    return bool(names) and all(name.startswith(GAIN) for name in names)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from time import perf_counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -211,6 +211,19 @@ def sensor_steps(control: ControlSpec) -> tuple[float, ...]:
         [0.003464]
     """
     return tuple(float(np.sqrt(12.0) * sigma) for sigma in control.estimator_sigma)
+
+
+def freezing(control: ControlSpec) -> dict[str, Any]:
+    """What a monitor's test for a frozen sensor needs to know: steps of the sensors, ranges of the inputs.
+
+    Args:
+        control: The control problem.
+
+    Example:
+        ``guard_monitor(model, detector, **freezing(scenario.control))``
+    """
+    ranges = np.subtract(control.u_max, control.u_min)
+    return {"resolution": sensor_steps(control), "input_range": tuple(ranges.tolist())}
 
 
 def time_on_recording(

@@ -59,7 +59,11 @@ class MonitorJob:
         model, stored = self.artifact.models["hybrid"], self.artifact.calibration
         if self.detector is not None:
             known = model.parametric is not None
-            return guard_monitor(model, self.detector, resolution=self.resolution, diagnose=known)
+            control = self.scenario.control
+            ranges = None if control is None else np.subtract(control.u_max, control.u_min)
+            return guard_monitor(
+                model, self.detector, resolution=self.resolution, input_range=ranges, diagnose=known
+            )
         calibration = None if stored is None else Calibration.from_dict(stored)
         return make_monitor(model, calibration)
 

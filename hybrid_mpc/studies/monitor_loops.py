@@ -18,7 +18,7 @@ from hybrid_mpc.closed_loop.guard import Mode
 from hybrid_mpc.closed_loop.simulate import Step
 from hybrid_mpc.estimation.switching import SwitchingFilter
 from hybrid_mpc.files import read_arrays, read_json, write_arrays
-from hybrid_mpc.monitor import METHODS, EnergyMonitor, Judges, guard_monitor, learn_judges
+from hybrid_mpc.monitor import METHODS, Detector, EnergyMonitor, Judges, guard_monitor, learn_judges
 from hybrid_mpc.monitor.calibration import BLOCK_S
 from hybrid_mpc.pipeline.contenders import build
 from hybrid_mpc.pipeline.control_job import selected_tasks
@@ -108,6 +108,12 @@ class _Loops:
             self._made[name, horizon] = build(name, self._scenario, self._artifact, control, self._noise)
         return self._made[name, horizon]
 
+    def _monitor(
+        self, detector: Detector | None = None, resolution: tuple[float, ...] | None = None
+    ) -> EnergyMonitor:
+        ranges = np.subtract(self._control.u_max, self._control.u_min)
+        return guard_monitor(self._model, detector, resolution=resolution, input_range=ranges)
+
     def _nominal(self, plans: tuple[LoopPlan, ...]) -> list[Trace]:
         estimator, controller = self._parts(CONTROLLER, self._study.horizon)
         assert isinstance(estimator, SwitchingFilter)
@@ -115,7 +121,7 @@ class _Loops:
         dt = self._model.dt
         loops = [Loop(p.reference(self._task.reference), p.seed, p.faults(dt)) for p in plans]
         return run_together(
-            self._scenario.plant(), estimator, controller, guard_monitor(self._model), loops,
+            self._scenario.plant(), estimator, controller, self._monitor(), loops,
             round(plans[0].duration / dt),
         )  # fmt: skip
 
@@ -140,7 +146,7 @@ class _Loops:
         return result, Trace(*(np.array(c, dtype=np.float64) for c in zip(*rows, strict=True)))
 
     def _fault(self, plan: LoopPlan) -> dict[str, Any]:
-        result, trace = self._simulated(plan, guard_monitor(self._model))
+        result, trace = self._simulated(plan, self._monitor())
         found = fault_figures(
             self._study, self.judges, trace, round(plan.onset(self._model.dt) / self._model.dt)
         )
@@ -148,7 +154,7 @@ class _Loops:
 
     def _guarded(self, plan: LoopPlan, arm: str) -> dict[str, Any]:
         detector = self.judges.detector_at(self._study.rates[0])
-        monitor = guard_monitor(self._model, detector, resolution=self.judges.resolution)
+        monitor = self._monitor(detector, self.judges.resolution)
         result, _ = self._simulated(plan, monitor, self._guard(arm))
         onset = plan.onset(self._model.dt)
         early = sum(switch.t < onset for switch in result.switches)
@@ -241,7 +247,7 @@ def loop_figures(result: ClosedLoopResult, control: ControlSpec) -> dict[str, An
         result: The loop.
         control: Its limits.
     """
-    over = {"u": np.abs(result.u) - np.maximum(np.abs(control.u_min), np.abs(control.u_max))}
+    over = {"u": np.maximum(result.u - np.array(control.u_max), np.array(control.u_min) - result.u)}
     if control.x_min is not None and control.x_max is not None:
         beyond = np.maximum(result.x - np.array(control.x_max), np.array(control.x_min) - result.x)
         over |= {f"x{i}": column for i, column in enumerate(beyond.T)}

@@ -13,6 +13,8 @@ from hybrid_mpc.files import read_json, write_json
 from hybrid_mpc.monitor import Judges
 from hybrid_mpc.pipeline.context import Progress, Silent
 from hybrid_mpc.pipeline.deploy import versions
+from hybrid_mpc.pipeline.guards import adaptable
+from hybrid_mpc.scenario import load_scenario
 from hybrid_mpc.studies.configuration import Study
 from hybrid_mpc.studies.engines import Engine, make_engine
 from hybrid_mpc.studies.log import RunLog, rows
@@ -54,7 +56,8 @@ def run_monitor_study(
         What ``out/results.json`` holds; beside it are ``report.html``, ``table.md`` and the figures.
 
     Raises:
-        InputError: For bad input, too little nominal data for the rates, or if every job has failed.
+        InputError: For bad input, a model without parameters or a scenario without causes to adapt to, too little
+            nominal data for the rates, or if every job has failed.
 
     Example:
         >>> results = run_monitor_study(monitor_study("runs/golf"), "studies/monitor")  # doctest: +SKIP
@@ -72,6 +75,9 @@ def run_monitor_study(
         "models": models, "runs": study.size, "versions": versions(),
     }  # fmt: skip
     say.finish(f"{study.size} jobs")
+    if study.guard_seeds:
+        causes = load_scenario(study.scenario).causes
+        adaptable(load_artifact(Path(model.folder)).models["hybrid"], causes)  # or the last loops would fail
     engine = make_engine(MonitorRunner(study, model, str(out.resolve())), workers, None)
     try:
         open_folder(out, note)

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.closed_loop.faults import Fault
 from hybrid_mpc.scenario import ControlSpec, Task
+from scenarios.references import faded_sines, quintic
 
 Array = NDArray[np.float64]
 
@@ -37,7 +38,7 @@ def sine_reference(t: Array) -> Array:
         >>> sine_reference(np.zeros(1)).tolist()
         [[0.0, 0.0]]
     """
-    return _waves(t, ((0.4, 0.5), (0.15, 1.2)))
+    return faded_sines(t, ((0.4, 0.5), (0.15, 1.2)), fade_s=0.5)
 
 
 def swing_reference(t: Array) -> Array:
@@ -47,7 +48,7 @@ def swing_reference(t: Array) -> Array:
         >>> swing_reference(np.zeros(1)).tolist()
         [[0.0, 0.0]]
     """
-    return _waves(t, ((0.3, 0.5),))
+    return faded_sines(t, ((0.3, 0.5),), fade_s=0.5)
 
 
 def step_reference(t: Array) -> Array:
@@ -60,23 +61,8 @@ def step_reference(t: Array) -> Array:
     index = np.clip(np.floor(t / STEP_TIME + 1e-9).astype(int), 0, len(STEPS) - 1)
     before = np.array(STEPS)[np.maximum(index - 1, 0)]
     rise = np.array(STEPS)[index] - before
-    share, slope = _quintic((t - index * STEP_TIME) / MOVE_TIME)
+    share, slope = quintic((t - index * STEP_TIME) / MOVE_TIME)
     return np.column_stack([before + rise * share, rise * slope / MOVE_TIME])
-
-
-def _waves(t: Array, waves: tuple[tuple[float, float], ...]) -> Array:
-    """Sum of sinusoids of amplitudes [rad] and frequencies [Hz], faded in over 0.5 s, and its derivative."""
-    fade, slope = _quintic(t / 0.5)
-    parts = [(a, 2 * np.pi * f) for a, f in waves]
-    wave = sum((a * np.sin(w * t) for a, w in parts), np.zeros_like(t))
-    rate = sum((a * w * np.cos(w * t) for a, w in parts), np.zeros_like(t))
-    return np.column_stack([fade * wave, 2 * slope * wave + fade * rate])
-
-
-def _quintic(s: Array) -> tuple[Array, Array]:
-    """From 0 to 1 while ``s`` does, with slope and curvature zero at both ends; and its slope."""
-    s = np.clip(s, 0.0, 1.0)
-    return s**3 * (10 - 15 * s + 6 * s**2), 30 * s**2 * (1 - s) ** 2
 
 
 TASKS = (

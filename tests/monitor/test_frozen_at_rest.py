@@ -2,15 +2,28 @@
 
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
-from monitor_parts import DT, Estimate, Exact, J, pendulum, simulate
+from monitor_parts import DT, Estimate, J, pendulum
 
+from hybrid_mpc.delayed import with_input_delay
+from hybrid_mpc.errors import InputError
 from hybrid_mpc.monitor import EnergyMonitor
 from hybrid_mpc.signals import Signal
 
 STEP, LIMIT = 1e-3, 1.0
 """Step of the sensor [rad]; input from -1 to 1 N m, a quarter of that is 0.5 N m."""
+
+
+def jacobian(model):
+    """``with_jacobian`` of a model that has none."""
+    x, h, u = ca.MX.sym("x", model.n_x), ca.MX.sym("h", model.n_h), ca.MX.sym("u", model.n_u)
+    ahead = ca.vertcat(*model.step(x, h, u))
+    slopes = ca.jacobian(ahead, ca.vertcat(x, h)), ca.jacobian(ahead, u)
+    return ca.Function(
+        "with_jacobian", [x, h, u], [ahead[: model.n_x], ahead[model.n_x :], *map(ca.densify, slopes)]
+    )
 
 
 def monitor(limit=LIMIT):
@@ -61,16 +74,64 @@ def test_it_stays_frozen_without_input_until_the_sensor_moves():
     assert frozen(u, y, monitor()) == list(range(52, 80))
 
 
-def test_a_machine_that_moves_is_never_taken_for_one():
-    run = simulate(600, kind="steps")
-    limit = float(np.abs(run.u).max())
-    run = replace(run, y=STEP * np.round(run.y / STEP))
-    estimator, watching = Exact(run), monitor(limit)
-    state, estimate = watching.initial(), estimator.start(run.y[0], 0.0)
-    for k in range(1, len(run.t)):
-        estimate = estimator.update(estimate, run.y[k], run.u[k - 1])
-        state, reading = watching.update(state, run.y[k], run.u[k - 1], estimate)
-        assert not reading.frozen, k
+def moved(u, model, x0=(0.0, 0.0)):
+    """States under the inputs, and what the sensor says of them."""
+    x, h = [np.array(x0)], [np.zeros(model.n_h)]
+    for value in u[:-1]:
+        step = model.step(x[-1], h[-1], value)
+        x.append(step[0].full().ravel())
+        h.append(step[1].full().ravel())
+    x, h = np.array(x), np.array(h)
+    return x, h, STEP * np.round(x[:, 0] / STEP)
+
+
+def exactly_watched(u, model, watching):
+    """Where a healthy machine, exactly known, is called frozen."""
+    x, h, y = moved(u, model)
+    state, found = watching.initial(), []
+    for k in range(len(u)):
+        u_prev = u[k - 1 : k] if k else np.zeros(1)
+        state, reading = watching.update(state, y[k : k + 1], u_prev, Estimate(x[k], h[k], np.zeros(1)))
+        found.append(reading.frozen)
+    return np.flatnonzero(found).tolist(), y
+
+
+@pytest.mark.parametrize("pull", [0.52, 0.8])
+def test_a_machine_that_has_braked_to_rest_is_none(pull):
+    """A cart without friction or weight: the sensor's last step falls in the braking, then nothing pulls any more."""
+    cart = replace(pendulum(friction=0.0, mgl=0.0), inputs=(Signal("tau", "N m", -LIMIT, LIMIT),))
+    u = np.concatenate([np.full(20, pull), np.full(20, -pull), np.zeros(60)])
+    found, y = exactly_watched(u, cart, EnergyMonitor(cart, window=5, average=1, resolution=[STEP]))
+    assert found == []
+    assert np.ptp(y[41:]) == 0.0  # it stands: there was something to be mistaken in
+
+
+@pytest.mark.parametrize("periods", [1, 1.5, 4])
+def test_an_input_on_its_way_has_moved_nothing_yet(periods):
+    cart = replace(pendulum(friction=0.0, mgl=0.0), inputs=(Signal("tau", "N m", -LIMIT, LIMIT),))
+    late = with_input_delay(replace(cart, with_jacobian=jacobian(cart)), periods * DT)
+    u = np.concatenate([np.zeros(20), np.full(20, 0.8), np.full(20, -0.8), np.zeros(40)])
+    watching = EnergyMonitor(late, window=5, average=1, resolution=[STEP])
+    assert exactly_watched(u, late, watching)[0] == []
+    # and frozen all the same it is found
+    still = watching.initial()
+    seen = []
+    for k in range(40):
+        waiting = np.array([0.8 if k > 20 + i else 0.0 for i in range(late.waiting)][::-1])
+        u_prev = np.array([0.8 if k > 20 else 0.0])
+        still, reading = watching.update(
+            still, np.zeros(1), u_prev, Estimate(np.zeros(2), waiting, np.zeros(1))
+        )
+        seen.append(reading.frozen)
+    assert any(seen)
+
+
+def test_the_range_can_be_given():
+    free = EnergyMonitor(pendulum(), window=5, average=1, resolution=[STEP], input_range=[2 * LIMIT])
+    u, y = pulling(0.1, 0.7)
+    assert frozen(u, y, free) == frozen(u, y, monitor())
+    with pytest.raises(InputError, match="input_range needs 1 positive"):
+        EnergyMonitor(pendulum(), window=5, average=1, input_range=[0.0])
 
 
 def test_a_missing_estimate_or_sample_begins_anew():
@@ -78,7 +139,7 @@ def test_a_missing_estimate_or_sample_begins_anew():
     watching, found = monitor(), []
     state = watching.initial()
     for k in range(100):
-        x = np.array([y[k], np.nan if 50 <= k < 55 else 0.0])
+        x = np.full(2, np.nan) if 50 <= k < 55 else np.array([y[k], 0.0])
         y_k = np.array([np.nan]) if k == 60 else y[k : k + 1]
         u_prev = u[k - 1 : k] if k else np.zeros(1)
         state, reading = watching.update(state, y_k, u_prev, Estimate(x, np.zeros(0), np.zeros(1)))

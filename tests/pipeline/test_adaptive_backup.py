@@ -1,6 +1,7 @@
 """The guard that adapts, made of a scenario's control problem: what it adapts to, what it refuses, that it pays."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ CONTROL = ControlSpec(
     20, q=(300.0, 1.0), r=(0.05,), r_delta=(0.05,), u_min=(-6.0,), u_max=(6.0,), estimator_sigma=(1e-4,)
 )
 CAUSES = {"mass": ("J", "mgl"), "friction": ("gamma",), "motor": ("gain of u",)}
+LATE = SimpleNamespace(parametric=pendulum().parametric, waiting=1, name="late")
 SIGMA_X = np.array([1e-5, 1e-3])
 
 
@@ -70,5 +72,9 @@ def test_what_it_needs():
         make_adaptive_guard(pendulum(), pendulum(), CONTROL, SIGMA_X, {})
     with pytest.raises(InputError, match="knows its parameters"):
         adaptable(replace(pendulum(), parametric=None), CAUSES)
+    with pytest.raises(InputError, match="act later"):
+        adaptable(LATE, CAUSES)
+    with pytest.raises(InputError, match="'typo' is empty"):
+        make_adaptive_guard(pendulum(), pendulum(), CONTROL, SIGMA_X, {"typo": (), "mass": ("J",)})
     with pytest.raises(InputError, match="weight"):
         make_adaptive_guard(pendulum(), pendulum(), CONTROL, SIGMA_X, {"mass": ("weight",)})

@@ -129,6 +129,7 @@ def test_a_guarded_loop_lets_go_of_a_frozen_sensor(call, run_folder, tmp_path):
     results = json.loads((tmp_path / "guarded" / "results.json").read_text())
     assert results["controllers"] == ["hybrid_observer"]  # what the guard watches, where none is named
     assert Detector.from_dict(results["guard"]) == detector
+    assert results["reaction"] == "rest"
     (loop,) = results["loops"]
     assert loop["guard"]["switches"][0]["after"] == "REST"
     assert 1.5 <= loop["guard"]["alarms"][0]["start_s"] < 2.0  # in motion: three steps are predicted at once
