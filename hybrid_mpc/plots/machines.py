@@ -37,6 +37,7 @@ def benchmark_run(
     unit: str,
     scale: float,
     title: str = "",
+    names: Mapping[str, str] | None = None,
 ) -> Figure:
     """A free run over a recording: output, errors, inputs, and the errors' course over the whole run.
 
@@ -50,6 +51,7 @@ def benchmark_run(
         unit: Unit of the errors.
         scale: Errors' units in an SI unit.
         title: Title. Default: none.
+        names: How models are to be called in the legend, where not as everywhere. Default: none.
 
     Returns:
         The figure. The first 20 s of a longer run are drawn; the last row has all of it.
@@ -75,10 +77,9 @@ def benchmark_run(
     column[0].plot(t[near], y[near], **(line_style("measured") | {"linewidth": 2.2, "alpha": 0.85}))
     room = 0.3 * max(float(np.ptp(y[near])), 1e-9)
     for name, run in runs.items():
-        column[0].plot(t[near], run[near], **line_style(name))
-        column[1].plot(
-            t[near], scale * (run - y)[near], color=colour(name), linewidth=1.0, label=name_of(name)
-        )
+        label = (names or {}).get(name, name_of(name))
+        column[0].plot(t[near], run[near], **(line_style(name) | {"label": label}))
+        column[1].plot(t[near], scale * (run - y)[near], color=colour(name), linewidth=1.0, label=label)
         at, course = _course(t, scale * (run - y))
         column[-1].plot(at, course, color=colour(name), linewidth=1.4)
     column[0].set_ylim(y[near].min() - room, y[near].max() + room)  # a model that runs away flattens no other

@@ -28,6 +28,8 @@ def draw(
     from hybrid_mpc.plots.machines import benchmark_run
     from hybrid_mpc.plots.style import save
 
+    kind, _, mean = results["model"]["hybrid"].partition(" ")
+    chosen = "fitted prior" if kind == "phy" else kind.upper() + (", mean" if mean else "")
     made, prior, spec = [], scenario.prior(), benchmark_of(scenario)
     for file, parts in runs.items():
         run = max(parts, key=lambda part: len(part.t))
@@ -39,7 +41,7 @@ def draw(
         figure = benchmark_run(
             run.t, run.y[:, 0], {name: y[:, 0] for name, y in shown.items()}, run.u,
             output=prior.outputs[0], inputs=prior.inputs, unit=spec.unit, scale=spec.scale,
-            title=f"{scenario.title}: free run over {file}",
+            title=f"{scenario.title}: free run over {file}", names={"hybrid": f"hybrid ({chosen})"},
         )  # fmt: skip
         made.append(save(figure, out / "figures" / f"{Path(file).stem}.png"))
     return made

@@ -1,0 +1,72 @@
+"""A sensor that freezes at any moment: ``python benchmarks/guard_freeze.py --study DIR --model DIR [--seeds 40]``.
+
+Loops of the study ``monitor`` (``hybrid-mpc study run monitor --model DIR --out DIR``, its thresholds and its seeds) in
+which the encoder freezes on the sinusoidal task, with the guard that rests. Printed: when the input is taken away after
+the freeze [s], motion or not, and which loops leave a limit.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import argparse
+import math
+from pathlib import Path
+
+import numpy as np
+
+from hybrid_mpc.artifact import load_artifact
+from hybrid_mpc.closed_loop import simulate
+from hybrid_mpc.files import read_json
+from hybrid_mpc.monitor import Judges, guard_monitor
+from hybrid_mpc.pipeline import find_noise, make_controller, make_estimator
+from hybrid_mpc.pipeline.guards import RESTING
+from hybrid_mpc.pipeline.loops import freezing
+from hybrid_mpc.studies.monitor_loops import loop_figures
+from hybrid_mpc.studies.monitor_plan import SEEDS, LoopPlan
+from scenarios.golf_robot import scenario
+from scenarios.golf_robot.tasks import CONTROL, sine_reference
+
+RATE, FAULT_S = 0.25, 7.5
+
+
+def main() -> None:
+    """Print a line a loop, then what they come to."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--study", type=Path, required=True, help="folder of the study")
+    parser.add_argument("--model", type=Path, required=True, help="artifact of a run, in its folder")
+    parser.add_argument("--seeds", type=int, default=40)
+    given = parser.parse_args()
+    artifact = load_artifact(given.model)
+    hybrid, prior = artifact.models["hybrid"], artifact.models["prior"]
+    noise, _ = find_noise(scenario, artifact, given.model, ("hybrid_observer",), 0, None)
+    judges = Judges.from_dict(read_json(given.study / "judges.json"))
+    told = {**freezing(CONTROL), "resolution": judges.resolution}
+    monitor = guard_monitor(hybrid, judges.detector_at(RATE), **told)
+    parts = (
+        make_estimator(hybrid, CONTROL, np.asarray(noise["hybrid_observer"])),
+        make_controller(hybrid, prior, CONTROL),
+    )
+    after, beyond = [], []
+    for i in range(given.seeds):
+        plan = LoopPlan("encoder_freeze", "task", SEEDS["fault"] + i, FAULT_S)
+        result = simulate(
+            scenario.plant(), *parts, plan.reference(sine_reference), dt=hybrid.dt, duration=FAULT_S, x0=np.zeros(2),
+            seed=plan.seed, monitor=monitor, faults=plan.faults(hybrid.dt), guard=RESTING,
+        )  # fmt: skip
+        times = [s.t - plan.onset(hybrid.dt) for s in result.switches if s.after.name == "REST"]
+        after.append(times[0] if times else math.inf)
+        excess = loop_figures(result, CONTROL)["excess"]
+        beyond.append(any(value > 0 for value in excess.values()))
+        print(
+            f"{plan.seed}: {after[-1]:.2f} s, beyond its limits: {'yes' if beyond[-1] else 'no'}", flush=True
+        )
+    print(
+        f"median {np.median(after):.2f} s, largest {max(after):.2f} s; {sum(beyond)} of {len(beyond)} leave a limit"
+    )
+
+
+if __name__ == "__main__":
+    main()
