@@ -92,6 +92,9 @@ def benchmark_run(
     for i, signal in enumerate(inputs):
         column[2 + i].plot(t[near], u[near, i], color=INK, linewidth=0.9, drawstyle="steps-post")
         column[2 + i].set_ylabel(axis_label(signal))
+        size = max(float(np.abs(u[near, i]).max()), 1e-9)
+        if np.ptp(u[near, i]) < 1e-6 * size:  # a constant input is drawn as one, not its rounding
+            column[2 + i].set_ylim(float(u[near, i].mean()) - size, float(u[near, i].mean()) + size)
     for ax in column:
         ax.margins(x=0)
     column[-2].set_xlabel("time [s]")
