@@ -2,8 +2,8 @@
 
 A recording's samples are taken for evenly spaced. Where one came late, the measured angle jumps, and a free run is off
 from there on until the disk has forgotten. Such a jump is told from a model error by its size: the second difference
-of a free run's error over the period squared is an acceleration, and one above 60 rad/s^2 (2 V, the whole of what
-multisines ask for) from one period to the next is none of the disk's. The model is that of ``hybrid-mpc benchmark
+of a free run's error over the period squared is an acceleration, and one above 60 rad/s^2 (that of 2 V) within one
+period is taken for none of the disk's. The model is that of ``hybrid-mpc benchmark
 unbalanced_disk --data FILE.npz --out DIR``. Printed: slips in each part of the recording, and the errors of the free
 runs over the validation and held-back pieces, as they are and without the 5 s after each slip.
 """

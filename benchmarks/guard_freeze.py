@@ -1,8 +1,9 @@
-"""A sensor that freezes at any moment: ``python benchmarks/guard_freeze.py --study DIR --model DIR [--seeds 40]``.
+"""A sensor that freezes 1.5 to 3.5 s into a loop: ``python benchmarks/guard_freeze.py --study DIR --model DIR``.
 
 Loops of the study ``monitor`` (``hybrid-mpc study run monitor --model DIR --out DIR``, its thresholds and its seeds) in
-which the encoder freezes on the sinusoidal task, with the guard that rests. Printed: when the input is taken away after
-the freeze [s], motion or not, and which loops leave a limit.
+which the encoder freezes on the sinusoidal task, with the guard that rests. Printed: how long after the freeze the
+input is taken away [s], whether or not the club moved at that moment, and which loops leave a limit. ``--seeds``:
+default 40, the study's.
 """
 
 from __future__ import annotations

@@ -83,8 +83,10 @@ def benchmark_run(
         at, course = _course(t, scale * (run - y))
         column[-1].plot(at, course, color=colour(name), linewidth=1.4)
     column[0].set_ylim(y[near].min() - room, y[near].max() + room)  # a model that runs away flattens no other
-    best = min(float(np.abs(scale * (run - y)).max()) for run in runs.values())
-    column[1].set_ylim(-1.5 * best, 1.5 * best) if best > 0 else None
+    worst = [float(np.abs(scale * (run - y)[near]).max()) for run in runs.values()]
+    best = min((value for value in worst if np.isfinite(value)), default=0.0)
+    if best > 0:
+        column[1].set_ylim(-1.5 * best, 1.5 * best)
     column[-1].set_yscale("log")
     column[0].set_ylabel(axis_label(output))
     column[1].set_ylabel(f"error [{unit}]")
