@@ -51,9 +51,14 @@ class BenchmarkSpec:
         piece: Length [s] of the pieces that long training recordings are cut into. Default: 25 s.
         cycle: Roles of these pieces, again and again in order of time, where a recording's parts are not alike and
             its last ones would not be a fair sample. Default: none, the data specification splits.
+        valid_every: Of several training files every so many-th, in the order of their names, validates from its first
+            sample to its last, and the others train as wholes. For short runs: the last second of a run that was
+            trained on is no sample of a free run over another one. Fewer files than that are split by the data
+            specification. Default: zero, never.
 
     Raises:
-        InputError: If a length, the scale or the delay is out of its range, or a cycle lacks a role that is needed.
+        InputError: If a length, the scale or the delay is out of its range, a cycle lacks a role that is needed, or
+            both ``cycle`` and ``valid_every`` are given.
 
     Example:
         >>> BenchmarkSpec({}, unit="mm", scale=1e3).length is None
@@ -67,6 +72,7 @@ class BenchmarkSpec:
     length: float | None = None
     piece: float = 25.0
     cycle: tuple[str, ...] = ()
+    valid_every: int = 0
 
     def __post_init__(self) -> None:
         if not (self.scale > 0 and self.piece > 0 and (self.length is None or self.length > 0)):
@@ -77,6 +83,11 @@ class BenchmarkSpec:
         if self.cycle and not {"train", "valid"} <= set(self.cycle) <= {"train", "valid", "test"}:
             raise InputError(
                 f"benchmark specification: cycle needs 'train' and 'valid', and may have 'test'; got {self.cycle}"
+            )
+        if self.valid_every and (self.valid_every < 2 or self.cycle):
+            raise InputError(
+                f"benchmark specification: valid_every must be 2 or more (or 0 for never), and there must be no cycle "
+                f"beside it; got {self.valid_every} and cycle {self.cycle}"
             )
         if self.largest_delay < 0:
             raise InputError(

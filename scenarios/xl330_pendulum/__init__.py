@@ -39,7 +39,6 @@ scenario = Scenario(
         max_gap=0.03,
         smoothing=0.06,
         warm_up=0.1,
-        # every run by its order of time: what follows the first 4.5 s chooses, and no run of the gain left out is used
         fractions=(0.75, 0.25, 0.0),
     ),
     benchmark=BenchmarkSpec(
@@ -51,5 +50,6 @@ scenario = Scenario(
                 32, 4, teacher_steps=500, free_run_steps=2000, horizon=250, batch=32, decay=1000.0
             ),
         },
+        valid_every=3,
     ),
 )

@@ -196,7 +196,13 @@ def _made(
         role: sum(len(t.t) for t in part) * dt
         for role, part in (("train", data.train), ("valid", data.valid), ("held_back", data.held_back))
     }
-    return model, {"data": {"files": data.dataset.files, "hash": data.dataset.hash, "seconds": seconds}}
+    notes = {
+        "files": data.dataset.files,
+        "hash": data.dataset.hash,
+        "seconds": seconds,
+        "validated_on": [piece.name for piece in data.valid],
+    }
+    return model, {"data": notes}
 
 
 def _physics(scenario: Scenario, data: Recordings, out: Path, progress: Progress) -> Physics:

@@ -60,7 +60,8 @@ def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
         InputError: If a file is bad, or no piece is left for training or validation.
     """
     prior, spec = scenario.prior(), benchmark_of(scenario)
-    needed: tuple[Role, ...] = () if spec.cycle else ("train", "valid")
+    uncut = 0 < spec.valid_every <= len(paths)
+    needed: tuple[Role, ...] = () if spec.cycle or uncut else ("train", "valid")
     dataset = load_trajectories(
         paths, scenario.data, outputs=prior.outputs, inputs=prior.inputs, needed=needed
     )
@@ -73,9 +74,32 @@ def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
                 "training and validation need; give longer ones"
             )
     else:
-        parts = [p for t in dataset.trajectories for p in pieces(t, spec.piece)]
+        runs = whole_runs(dataset, spec.valid_every) if uncut else dataset.trajectories
+        parts = [p for t in runs for p in pieces(t, spec.piece)]
     train, valid, held = (tuple(p for p in parts if p.role == role) for role in ("train", "valid", "test"))
+    if not (train and valid):
+        cut = "; ".join(f"{c.file} {c.start:g} to {c.end:g} s: {c.why}" for c in dataset.cuts)
+        raise InputError(f"nothing is left to {'validate on' if train else 'train on'}; give longer recordings ({cut})")
     return Recordings(train, valid, held, dataset)
+
+
+def whole_runs(dataset: Dataset, every: int) -> tuple[Trajectory, ...]:
+    """All recordings uncut, those of every so many-th file as validation; a gap stays a cut.
+
+    Example:
+        >>> z = np.zeros((2, 1))
+        >>> runs = [Trajectory(name, "", 0.1, z[:, 0], z, z, z, z) for name in ("c", "a", "b", "c#2")]
+        >>> data = Dataset((), tuple(runs), (), ("c.csv", "a.csv", "b.csv"), (), "")
+        >>> [(t.name, t.role) for t in whole_runs(data, 3)]
+        [('c', 'valid'), ('a', 'train'), ('b', 'train'), ('c#2', 'valid')]
+    """
+    stems = sorted(Path(file).stem for file in dataset.files)
+    chosen = set(stems[every - 1 :: every])
+    found = []
+    for t in dataset.whole:
+        stem = t.name if t.name in stems else t.name.rpartition("#")[0]
+        found.append(replace(t, role="valid" if stem in chosen else "train"))
+    return tuple(found)
 
 
 def read_test(scenario: Scenario, path: Path) -> tuple[Trajectory, ...]:
