@@ -20,6 +20,7 @@ class BenchmarkBudget:
         horizon: Most scored periods of a free run in training.
         batch: Windows a step. Default: 32.
         decay: Weight decay times the number of training samples. Default: that of the training.
+        anchors: Weight of fading corrections where nothing was measured: see ``TrainingSettings``. Default: zero.
 
     Example:
         >>> BenchmarkBudget(hidden=16, networks=2, teacher_steps=100, free_run_steps=200, horizon=40).batch
@@ -33,6 +34,7 @@ class BenchmarkBudget:
     horizon: int
     batch: int = 32
     decay: float = 300.0
+    anchors: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -137,6 +137,8 @@ class Budget:
         tasks: Names of the tasks to run. Default: all.
         decay: Weight decay times the number of training samples. The less data, the more of it is needed to
             keep a network from learning their noise; large recordings do not notice the default.
+        anchors: Weight of fading corrections where nothing was measured: see ``TrainingSettings``. For a machine
+            whose tasks go where its recordings do not. Default: zero, none.
     """
 
     hidden: int
@@ -147,6 +149,7 @@ class Budget:
     decay: float = 300.0
     oracle_seeds: int = 1
     tasks: tuple[str, ...] | None = None
+    anchors: float = 0.0
 
 
 DEFAULT_BUDGETS: Mapping[str, Budget] = {
@@ -176,6 +179,8 @@ class Scenario:
         causes: What may break, by name: the prior's parameters (or ``"gain of <input>"``) that change together then,
             for :class:`~hybrid_mpc.monitor.Diagnoser`. Default: each by itself.
         benchmark: How ``hybrid-mpc benchmark`` judges the machine on recordings; default: not at all.
+        beyond_recordings: Whether tasks go where no recording was. A network knows nothing there, so the filters on the
+            hybrid then assume no less process noise than those on the prior; see also ``Budget.anchors``. Default: no.
 
     Example:
         >>> import numpy as np
@@ -199,6 +204,7 @@ class Scenario:
     experiment: Experiment | None = None
     causes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     benchmark: BenchmarkSpec | None = None
+    beyond_recordings: bool = False
 
 
 def registered_scenarios() -> dict[str, str]:

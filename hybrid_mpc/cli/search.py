@@ -28,8 +28,8 @@ def search(
     vary: Annotated[
         list[str] | None,
         typer.Option(
-            help="NAME or NAME=LOW:HIGH of hidden, learning_rate, free_run_learning_rate, decay, batch, horizon; may "
-            "be repeated. Default: the first four."
+            help="NAME or NAME=LOW:HIGH of hidden, learning_rate, free_run_learning_rate, decay, batch, horizon, "
+            "anchors; may be repeated. Default: the first four."
         ),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of data, trainings and search.", min=0)] = 0,

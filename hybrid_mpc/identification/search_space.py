@@ -23,6 +23,7 @@ USUAL: Mapping[str, tuple[float, float]] = {
     "decay": (10.0, 30000.0),
     "batch": (8, 128),
     "horizon": (20, 100),
+    "anchors": (0.3, 300.0),
 }
 """Bounds of a setting that is searched without bounds of its own."""
 
@@ -40,6 +41,7 @@ class SearchSpace:
         batch: Windows a step, whole numbers. Default: not searched; twice the batch is twice the work.
         horizon: Most scored periods of a free-run window, whole numbers. Default: not searched; twice the
             horizon is twice the work.
+        anchors: Weight of fading corrections where nothing was measured. Default: not searched.
 
     Raises:
         InputError: If nothing is searched, or bounds are not positive, not rising, or not whole where they must be.
@@ -55,6 +57,7 @@ class SearchSpace:
     decay: tuple[float, float] | None = (10.0, 30000.0)
     batch: tuple[int, int] | None = None
     horizon: tuple[int, int] | None = None
+    anchors: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         for field in fields(self):

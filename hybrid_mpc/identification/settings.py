@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -55,10 +56,14 @@ class TrainingSettings:
         prior_parameters: ``"fixed"`` at their fitted values, or ``"trained"`` along within their bounds, each
             network its own (:mod:`~hybrid_mpc.identification.prior_stack`). The energy balance that trains and
             judges keeps the fitted values.
+        anchors: Weight, beside the objectives in units of their bounds, of the mean square of the correction (in its
+            own scale) in states that no recording comes near (:mod:`~hybrid_mpc.identification.anchors`). An rnn has
+            no prior to fall back on and ignores it. Default: zero, none.
 
     Raises:
-        InputError: If a name is not known, there is no objective, weights do not fit the objectives, or an rnn is
-            to train the prior that it does not have.
+        InputError: If a name is not known, there is no objective, weights do not fit the objectives, an rnn is to
+            train the prior that it does not have, or anchors are negative or asked of the literal form, whose network
+            gives the whole derivative and corrects nothing.
 
     Example:
         >>> TrainingSettings("mopgrnn", 16, 4, 100, 100, seed=0, warm=10).objectives
@@ -86,6 +91,7 @@ class TrainingSettings:
     energy: Reading = "stage"
     fused: bool = False
     prior_parameters: PriorParameters = "fixed"
+    anchors: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("objectives", "weights"):  # lists, where they come from a file
@@ -105,6 +111,12 @@ class TrainingSettings:
             )
         if self.kind == "rnn" and self.prior_parameters == "trained":
             raise InputError("an rnn has no prior to train along; leave prior_parameters 'fixed'")
+        if not 0 <= self.anchors < math.inf:
+            raise InputError(f"anchors must be a weight of 0 or more, got {self.anchors}")
+        if self.anchors and self.form == "literal":
+            raise InputError(
+                "the literal form corrects no prior, so it cannot be anchored to it; leave anchors 0"
+            )
 
     @property
     def use_prior(self) -> bool:

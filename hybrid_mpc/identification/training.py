@@ -38,6 +38,7 @@ def train(
     First teacher forcing (the paper's training), then free runs with back-propagation through the
     integrator. All kinds get the same steps, batches and data. A network whose gradient is no number skips
     that update; after several in a row it stops with its best weights, and ``Trained.faults`` says what for.
+    With ``settings.anchors`` corrections fade where no training trajectory comes near.
 
     Args:
         prior: The fitted prior.
@@ -76,6 +77,8 @@ def _key(
     settings = asdict(s)
     if s.prior_parameters == "fixed":
         del settings["prior_parameters"]  # the key is then that of trainings that could do nothing else
+    if not s.anchors:
+        del settings["anchors"]  # likewise
     digest = hashlib.sha256(json.dumps([settings, prior.values], sort_keys=True).encode())
     for trajectory in (*training, *validation):
         digest.update(np.ascontiguousarray(trajectory.x).tobytes())

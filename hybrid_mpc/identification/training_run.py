@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.identification.anchors import BATCH, anchor_penalty, make_anchors
 from hybrid_mpc.identification.combination import Combination, combine
 from hybrid_mpc.identification.dataset import (
     Windows,
@@ -65,6 +66,8 @@ class TrainingRun:
         self.fixed = self.windows.take(torch.linspace(0, len(windows) - 1, 64).round().long().unique())
         prior = prior if device == "cpu" else copy.deepcopy(prior)  # the prior given stays where it is
         self.physics = StackedPrior(prior, s.networks) if s.prior_parameters == "trained" else None
+        anchored = bool(s.anchors) and s.use_prior
+        self.anchors = make_anchors(prior, training, s.seed).to(self.device) if anchored else None
         step = step_for(prior, stack_for(prior, s), self.scaling, dt, s, self.physics)
         self.step = step.to(self.device)
         self.weights = dict(self.step.network.named_parameters())
@@ -113,6 +116,9 @@ class TrainingRun:
         batch = self.windows.take(torch.tensor(rng.integers(len(self.windows), size=s.batch)))
         losses = self._losses(batch, s.objectives if s.kind == "mopgrnn" else s.objectives[:1])
         value = self.index.value(losses) if s.kind == "mopgrnn" else losses[:, 0] / self.index.bounds[:, 0]
+        if self.anchors is not None:
+            index = torch.tensor(rng.integers(self.anchors.x.shape[1], size=BATCH))
+            value = value + s.anchors * anchor_penalty(self.step, self.anchors.take(index))
         self.optimizer.zero_grad()
         value.sum().backward()
         finite = self._clip()

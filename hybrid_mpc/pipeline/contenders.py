@@ -52,6 +52,8 @@ CONTENDERS: Mapping[str, Contender] = {
 """Baselines: the fitted prior without and with disturbance observer; the hybrid likewise; two oracles on the
 plant's own equations, one with the same measurements through the same kind of estimator, one with the truth."""
 ORACLES = ("oracle", "oracle_state")
+LEAST_NOISE: Mapping[str, str] = {"hybrid": "prior", "hybrid_observer": "prior_observer"}
+"""Whose process noise is the least that a contender has, where tasks go beyond the recordings."""
 
 
 def build(
@@ -96,7 +98,7 @@ def noise_of(
     """Process noise of every contender that estimates, each by maximum likelihood on the same recordings.
 
     Args:
-        scenario: The machine.
+        scenario: The machine; where its tasks go beyond the recordings a hybrid has no less than its prior.
         artifact: Prior and hybrid.
         control: Input range and sensor noise.
         recordings: Training recordings with smoothed states.
@@ -107,8 +109,12 @@ def noise_of(
     errors = {name: process_noise(model, recordings) for name, model in artifact.models.items()}
     # the plant's own equations err by nothing but the smoothing: start from the better model's errors
     errors["oracle"] = errors["hybrid"]
-    return {
+    found = {
         name: tuned_noise(models[c.model], control, errors[c.model], recordings, observer=c.observer)
         for name, c in CONTENDERS.items()
         if c.model in models and not c.truth
     }
+    if scenario.beyond_recordings:
+        for hybrid, prior in LEAST_NOISE.items():
+            found[hybrid] = np.maximum(found[hybrid], found[prior])
+    return found

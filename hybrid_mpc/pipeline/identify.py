@@ -232,6 +232,7 @@ def training_settings(context: Context, kind: str) -> TrainingSettings:
         seed=context.settings.seed,
         warm=context.warm,
         decay=b.decay,
+        anchors=b.anchors,
     )
     return replace(settings, **context.settings.network())
 

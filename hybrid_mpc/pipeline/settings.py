@@ -13,7 +13,7 @@ from hybrid_mpc.files import digest, read_json, write_json
 
 FILE = "run.json"
 WHOLE = ("hidden", "networks", "teacher_steps", "free_run_steps", "horizon", "validation_horizon", "batch")
-NETWORK = (*WHOLE, "decay", "learning_rates")
+NETWORK = (*WHOLE, "decay", "learning_rates", "anchors")
 """What a file of network settings may hold: arguments of ``identification.TrainingSettings``."""
 
 
@@ -90,7 +90,7 @@ def read_network(path: Path) -> dict[str, Any]:
         numbers = value if name == "learning_rates" and isinstance(value, list) else [value]
         kinds = (int,) if name in WHOLE else (int, float)
         good = all(isinstance(v, kinds) and not isinstance(v, bool) and math.isfinite(v) for v in numbers)
-        positive = good and all(v > 0 or (v == 0 and name == "decay") for v in numbers)
+        positive = good and all(v > 0 or (v == 0 and name in ("decay", "anchors")) for v in numbers)
         if not positive or (name == "learning_rates" and len(numbers) != 4):
             needed = "a whole number of 1 or more" if name in WHOLE else "a number of 0 or more"
             needed = "four positive numbers" if name == "learning_rates" else needed

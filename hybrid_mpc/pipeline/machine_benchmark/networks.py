@@ -37,6 +37,7 @@ def settings_of(kind: str, budget: BenchmarkBudget, *, seed: int, warm: int) -> 
         horizon=budget.horizon,
         batch=budget.batch,
         decay=budget.decay,
+        anchors=budget.anchors,
         objectives=("position", "energy"),
         fused=True,
     )

@@ -79,7 +79,9 @@ def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
     train, valid, held = (tuple(p for p in parts if p.role == role) for role in ("train", "valid", "test"))
     if not (train and valid):
         cut = "; ".join(f"{c.file} {c.start:g} to {c.end:g} s: {c.why}" for c in dataset.cuts)
-        raise InputError(f"nothing is left to {'validate on' if train else 'train on'}; give longer recordings ({cut})")
+        raise InputError(
+            f"nothing is left to {'validate on' if train else 'train on'}; give longer recordings ({cut})"
+        )
     return Recordings(train, valid, held, dataset)
 
 
