@@ -55,7 +55,7 @@ def test_what_was_measured_has_no_weight_and_what_lies_far_off_has(data, anchors
 
 
 def test_an_angle_counts_all_the_way_round_and_a_full_turn_is_no_distance(data):
-    shifted = [replace(t, x=t.x + [2 * np.pi, 0.0]) for t in data[0]]
+    shifted = [replace(t, x=t.x + np.array([2 * np.pi, 0.0])) for t in data[0]]
     one, two = (make_anchors(PRIOR, part, seed=0).weight for part in (data[0], shifted))
     torch.testing.assert_close(one, two, rtol=0, atol=1e-9)
 

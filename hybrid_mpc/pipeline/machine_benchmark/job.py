@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from hybrid_mpc.files import digest, read_json, write_json
 from hybrid_mpc.identification.settings import KINDS
 from hybrid_mpc.pipeline.context import Progress, Silent
 from hybrid_mpc.pipeline.deploy import versions
+from hybrid_mpc.pipeline.machine_benchmark.choice import IN_MOTION, candidate_errors, recommended
 from hybrid_mpc.pipeline.machine_benchmark.free_runs import MODELS, Run, figures_of, run_freely, warm_samples
 from hybrid_mpc.pipeline.machine_benchmark.networks import settings_of, train_all
 from hybrid_mpc.pipeline.machine_benchmark.physics import Physics, fit_physics, smoothed
@@ -27,11 +29,6 @@ from hybrid_mpc.pipeline.machine_benchmark.store import BenchmarkModel, load_mod
 from hybrid_mpc.scenario import Scenario, load_scenario
 
 SCHEMA = 1
-IN_MOTION = 0.1
-"""Least length [s] that is given of a validation piece: it begins in motion, while a recording that gives less (EMPS,
-20 ms) begins at rest, and two samples tell no speed beside an unknown acceleration."""
-CANDIDATES = ("phy", "pgrnn", "mopgrnn", "pgrnn mean", "mopgrnn mean")
-"""What ``hybrid`` may be: the one with the least error on the validation pieces."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +149,7 @@ def describe(model: BenchmarkModel, scenario: Scenario) -> dict[str, Any]:
         "delay_s": model.physics.delay,
         "smoother": {"sigma": model.physics.sigma, "walk": model.physics.walk},
         "hybrid": model.hybrid,
-        "validation": {"unit": spec.unit, "rmse": dict(model.validation)},
+        "validation": {"unit": spec.unit, "rmse": dict(model.validation), "long_rmse": dict(model.long)},
         "networks": {kind: trained.validation for kind, trained in model.networks.items()},
         "faults": {kind: [asdict(f) for f in trained.faults] for kind, trained in model.networks.items()},
     }
@@ -183,14 +180,12 @@ def _made(
         on_progress=progress.update,
     )
     progress.finish("")
-    prior = scenario.prior(physics.fit.values)
-    known = max(warm_up, IN_MOTION)
-    runs = run_freely(prior, physics, networks, data.valid, warm_up=known, length=spec.length)
-    validation = {
-        name: figures_of(runs, name, unit=spec.unit, scale=spec.scale)["rmse"] for name in runs[0].y_hat
-    }
-    hybrid = min(CANDIDATES, key=lambda name: validation[name])
-    model = BenchmarkModel(scenario.name, dt, physics, networks, hybrid, validation)
+    errors = partial(candidate_errors, scenario, physics, networks)
+    validation = errors(data.valid, max(warm_up, IN_MOTION))
+    long = errors(data.long, warm_up) if data.long else {}
+    model = BenchmarkModel(
+        scenario.name, dt, physics, networks, recommended(validation, long), validation, long
+    )
     save_model(out / "model", model)
     seconds = {
         role: sum(len(t.t) for t in part) * dt
@@ -285,4 +280,4 @@ def table(results: dict[str, Any]) -> list[str]:
     return [*lines, f"hybrid: {results['model']['hybrid']}"]
 
 
-__all__ = ["BenchmarkSettings", "benchmark", "describe", "table", "CANDIDATES", "KINDS"]
+__all__ = ["BenchmarkSettings", "benchmark", "describe", "table", "KINDS"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,6 +14,8 @@ from hybrid_mpc.data_spec import Role
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.scenario import Scenario
 
+LONGEST = 60.0
+"""Most seconds of a recording in :attr:`Recordings.long`: a model that drifts shows it by then."""
 SCORED = 50
 """Fewest periods of a piece after its warm-up."""
 
@@ -26,12 +28,16 @@ class Recordings:
         train: Pieces that are fitted and trained on.
         valid: Pieces that choose; nothing is fitted to them.
         held_back: Pieces that neither fit nor choose; may be none.
+        long: Recordings that were split in order of time, from their first sample to where validation ends, at most
+            a minute: runs as long as those that judge. Most of them was trained on, so they tell drift and not how
+            good a model is.
         dataset: The files as they were read.
     """
 
     train: tuple[Trajectory, ...]
     valid: tuple[Trajectory, ...]
     held_back: tuple[Trajectory, ...]
+    long: tuple[Trajectory, ...]
     dataset: Dataset
 
 
@@ -82,7 +88,49 @@ def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
         raise InputError(
             f"nothing is left to {'validate on' if train else 'train on'}; give longer recordings ({cut})"
         )
-    return Recordings(train, valid, held, dataset)
+    in_order = not (spec.cycle or uncut)
+    long = until_validated(dataset, scenario.data.windows) if in_order else ()
+    return Recordings(train, valid, held, long, dataset)
+
+
+def until_validated(dataset: Dataset, windows: Container[str]) -> tuple[Trajectory, ...]:
+    """Recordings that were split in order of time, each from its first sample to where its validation ends.
+
+    Args:
+        dataset: Recordings and their pieces.
+        windows: Stems of files whose pieces are named windows; what lies between these may be anything.
+
+    Example:
+        >>> t = 0.1 * np.arange(10)
+        >>> z, x = np.zeros((10, 1)), np.zeros((10, 2))
+        >>> whole = Trajectory("run", "", 0.1, t, z, z, x, x)
+        >>> pieces = (whole.part(t < 0.45, "run", "train"), whole.part((t > 0.45) & (t < 0.75), "run#2", "valid"))
+        >>> data = Dataset(pieces, (whole,), (), ("run.csv",), (), "")
+        >>> [(run.role, len(run.t)) for run in until_validated(data, ())], until_validated(data, {"run"})
+        ([('valid', 8)], ())
+    """
+    found = []
+    for whole in dataset.whole:
+        ends = [
+            piece.t[-1]
+            for piece in dataset.by_role("valid")
+            if _stem(piece.name) == _stem(whole.name) and whole.t[0] <= piece.t[-1] <= whole.t[-1]
+        ]
+        if ends and _stem(whole.name) not in windows:
+            end = min(max(ends), whole.t[0] + LONGEST)
+            found.append(whole.part(whole.t <= end, whole.name, "valid"))
+    return tuple(found)
+
+
+def _stem(name: str) -> str:
+    """Stem of the file that a piece is from: pieces after the first end in # and their number.
+
+    Example:
+        >>> _stem("run#12"), _stem("run"), _stem("take#a")
+        ('run', 'run', 'take#a')
+    """
+    stem, _, number = name.rpartition("#")
+    return stem if number.isdigit() and stem else name
 
 
 def whole_runs(dataset: Dataset, every: int) -> tuple[Trajectory, ...]:
@@ -99,8 +147,7 @@ def whole_runs(dataset: Dataset, every: int) -> tuple[Trajectory, ...]:
     chosen = set(stems[every - 1 :: every])
     found = []
     for t in dataset.whole:
-        stem = t.name if t.name in stems else t.name.rpartition("#")[0]
-        found.append(replace(t, role="valid" if stem in chosen else "train"))
+        found.append(replace(t, role="valid" if _stem(t.name) in chosen else "train"))
     return tuple(found)
 
 

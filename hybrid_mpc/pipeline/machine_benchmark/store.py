@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ class BenchmarkModel:
         networks: Trained networks by kind.
         hybrid: The model that validation recommends, e.g. ``"mopgrnn mean"``.
         validation: Error of every candidate on the validation pieces [unit of the benchmark].
+        long: The same over whole recordings, most of which was trained on; empty where none was split in order of time.
     """
 
     scenario: str
@@ -38,6 +39,7 @@ class BenchmarkModel:
     networks: Mapping[str, Trained]
     hybrid: str
     validation: Mapping[str, float]
+    long: Mapping[str, float] = field(default_factory=dict)
 
 
 def save_model(folder: Path, model: BenchmarkModel) -> None:
@@ -53,6 +55,7 @@ def save_model(folder: Path, model: BenchmarkModel) -> None:
             "physics": asdict(model.physics),
             "hybrid": model.hybrid,
             "validation": dict(model.validation),
+            "long": dict(model.long),
         },
     )
 
@@ -78,8 +81,10 @@ def load_model(folder: Path, scenario: str) -> BenchmarkModel:
         raise InputError(f"{folder} holds a model of {note['scenario']}, not of {scenario}")
     physics = physics_of(note["physics"])
     networks: dict[str, Trained] = {kind: load_trained(folder, kind) for kind in KINDS}
-    validation = {name: float(value) for name, value in note["validation"].items()}
-    return BenchmarkModel(note["scenario"], note["dt"], physics, networks, note["hybrid"], validation)
+    validation, long = (
+        {name: float(value) for name, value in note.get(key, {}).items()} for key in ("validation", "long")
+    )
+    return BenchmarkModel(note["scenario"], note["dt"], physics, networks, note["hybrid"], validation, long)
 
 
 def physics_of(plain: Mapping[str, Any]) -> Physics:
