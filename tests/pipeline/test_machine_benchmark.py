@@ -1,15 +1,18 @@
 """``hybrid-mpc benchmark`` on a machine that is simulated here, and what it refuses."""
 
 import json
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 
+from hybrid_mpc.benchmark_spec import BenchmarkBudget, BenchmarkSpec
 from hybrid_mpc.data import write_csv
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identification.dataset import cut_windows
 from hybrid_mpc.pipeline.machine_benchmark import networks
+from hybrid_mpc.pipeline.machine_benchmark.choice import recommended
 from hybrid_mpc.pipeline.machine_benchmark.free_runs import figures_of, run_freely
 from hybrid_mpc.pipeline.machine_benchmark.job import BenchmarkSettings, benchmark
 from hybrid_mpc.pipeline.machine_benchmark.physics import fit_physics, shifted
@@ -161,13 +164,79 @@ def test_nothing_after_the_warm_up_is_known_to_a_free_run(machine, made, tmp_pat
     assert not np.allclose(found[0].y, found[1].y)
 
 
-def test_the_recommended_model_is_the_best_on_the_validation_part(made):
+def test_the_recommended_model_is_best_on_validation_and_on_runs_of_full_length(made):
     _, results, _ = made
-    validation = results["model"]["validation"]["rmse"]
-    candidates = {
-        name: v for name, v in validation.items() if "rnn" not in name.split() and name != "rnn mean"
-    }
-    assert results["model"]["hybrid"] == min(candidates, key=candidates.get)
+    validation, long = (results["model"]["validation"][key] for key in ("rmse", "long_rmse"))
+    names = ("phy", "pgrnn", "mopgrnn", "pgrnn mean", "mopgrnn mean")
+    worse = {n: max(part[n] / part["phy"] for part in (validation, long)) for n in names}
+    assert results["model"]["hybrid"] == min(worse, key=worse.get)
+
+
+@pytest.mark.parametrize("name", ["pgrnn", "mopgrnn mean"])
+def test_a_network_that_drifts_or_diverges_is_not_recommended(name):
+    short = {"phy": 2.0, "pgrnn": 1.4, "mopgrnn": 1.9, "pgrnn mean": 1.5, "mopgrnn mean": 1.8} | {name: 1.0}
+    assert recommended(short, {}) == name
+    for long in (2.1, float("inf")):
+        assert recommended(short, {**dict.fromkeys(short, 1.5), "phy": 2.0, name: long}) != name
+    # where the prior itself diverges on long runs, what does not is better, and what does too is worse
+    assert recommended(short, {**dict.fromkeys(short, float("inf")), name: 1.0}) == name
+    assert recommended(short, dict.fromkeys(short, float("inf"))) == "phy"
+
+
+def test_runs_of_full_length_end_where_validation_does(machine):
+    scenario = load_scenario(str(machine[0]))
+    data = read_training(scenario, [machine[1]])
+    (long,) = data.long
+    assert (long.t[0], long.t[-1]) == (
+        0.0,
+        pytest.approx(60.0),
+    )  # a minute of the 80 s that are not held back
+    (short,) = read_training(scenario, [machine[2]]).long
+    assert short.t[-1] == pytest.approx(data_end(machine[2], scenario))
+
+
+def data_end(file, scenario):
+    """Last time [s] of a file's validation part."""
+    return max(piece.t[-1] for piece in read_training(scenario, [file]).valid)
+
+
+def test_every_so_many_th_file_validates_as_a_whole(machine):
+    scenario = load_scenario(str(machine[0]))
+    scenario = replace(scenario, benchmark=replace(scenario.benchmark, valid_every=2))
+    data = read_training(scenario, [machine[1], machine[2]])  # by name: test.csv, train.csv
+    assert {p.name.split(".")[0] for p in data.train} == {"test"}
+    assert {p.name.split(".")[0] for p in data.valid} == {"train"}
+    assert (
+        sum(len(p.t) for p in data.valid) == 5 * 199
+    )  # all of it in pieces; the last sample's input has no end
+    assert (data.held_back, data.long) == ((), ())
+    alone = read_training(scenario, [machine[1]])  # too few files: parts in order of time
+    assert len(alone.train) == 3
+    assert alone.held_back
+
+
+def test_files_that_gaps_leave_nothing_of_are_named(machine, tmp_path):
+    scenario = load_scenario(str(machine[0]))
+    scenario = replace(scenario, benchmark=replace(scenario.benchmark, valid_every=2))
+    gap = recording(tmp_path / "z_gap.csv", seed=3, seconds=3.0)
+    lines = gap.read_text().splitlines()
+    gap.write_text("\n".join(lines[:15] + lines[19:]) + "\n")
+    with pytest.raises(InputError, match=r"nothing is left to validate on.*z_gap\.csv"):
+        read_training(scenario, [machine[1], gap])
+
+
+@pytest.mark.parametrize(
+    "given", [{"valid_every": 1}, {"valid_every": -3}, {"valid_every": 2, "cycle": ("train", "valid")}]
+)
+def test_a_bad_choice_of_validating_files_is_refused(given):
+    with pytest.raises(InputError, match="valid_every must be 2 or more"):
+        BenchmarkSpec({}, **given)
+
+
+def test_networks_are_trained_with_what_the_budget_says():
+    budget = BenchmarkBudget(4, 2, teacher_steps=5, free_run_steps=5, horizon=10, decay=7.0, anchors=3.0)
+    settings = networks.settings_of("pgrnn", budget, seed=1, warm=4)
+    assert (settings.decay, settings.anchors, settings.seed, settings.warm) == (7.0, 3.0, 1, 4)
 
 
 def test_a_model_made_before_gives_the_same_figures_and_an_interrupted_run_goes_on(machine, made, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 from hybrid_mpc.data.trajectories import Trajectory
@@ -56,6 +57,9 @@ def recommended(validation: Mapping[str, float], long: Mapping[str, float]) -> s
     """
 
     def worse(name: str) -> float:
-        return max(part[name] / part["phy"] for part in (validation, long) if part)
+        over_prior = [
+            1.0 if name == "phy" else part[name] / part["phy"] for part in (validation, long) if part
+        ]
+        return max(math.inf if math.isnan(v) else v for v in over_prior)  # NaN: both have diverged
 
     return min(CANDIDATES, key=worse)
