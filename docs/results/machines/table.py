@@ -42,13 +42,16 @@ def digits(value: float) -> str:
 def errors(results: dict[str, Any]) -> list[str]:
     """Free runs: a row a test file, the validation part first."""
     unit = results["model"]["validation"]["unit"]
-    known = results["model"]["validation"]["rmse"]
+    validation = results["model"]["validation"]
+    known, long = validation["rmse"], validation.get("long_rmse", {})
     chosen = results["model"]["hybrid"]
     lines = [
         f"| free runs [{unit}] | {' | '.join(MODELS)} | hybrid / phy |",
         "| --- |" + " ---: |" * (len(MODELS) + 1),
     ]
     rows = {"validation": {**known, "hybrid": known[chosen]}}
+    if long:
+        rows |= {"whole recordings, mostly trained on": {**long, "hybrid": long[chosen]}}
     rows |= {name: {m: f[m]["rmse"] for m in MODELS} for name, f in results["test"].items()}
     for name, row in rows.items():
         cells = [digits(row[m]) for m in MODELS]
