@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -36,6 +37,22 @@ class BenchmarkBudget:
     decay: float = 300.0
     anchors: float = 0.0
 
+    def __post_init__(self) -> None:
+        check_anchors(self.anchors)
+
+
+def check_anchors(weight: float) -> None:
+    """Refuse a weight of anchors that is none.
+
+    Raises:
+        InputError: If it is negative or not finite.
+
+    Example:
+        >>> check_anchors(10.0)
+    """
+    if not 0 <= weight < math.inf:
+        raise InputError(f"anchors must be a weight of 0 or more, got {weight}")
+
 
 @dataclass(frozen=True)
 class BenchmarkSpec:
@@ -55,8 +72,8 @@ class BenchmarkSpec:
             its last ones would not be a fair sample. Default: none, the data specification splits.
         valid_every: Of several training files every so many-th, in the order of their names, validates from its first
             sample to its last, and the others train as wholes. For short runs: the last second of a run that was
-            trained on is no sample of a free run over another one. Fewer files than that are split by the data
-            specification. Default: zero, never.
+            trained on is no sample of a free run over another one. Nothing is held back then, and the files must
+            not have windows in the data specification. Fewer files than that are split by it. Default: zero, never.
 
     Raises:
         InputError: If a length, the scale or the delay is out of its range, a cycle lacks a role that is needed, or

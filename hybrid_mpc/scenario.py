@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.benchmark_spec import BenchmarkSpec
+from hybrid_mpc.benchmark_spec import BenchmarkSpec, check_anchors
 from hybrid_mpc.data_spec import DataSpec
 from hybrid_mpc.errors import InputError
 
@@ -150,6 +150,9 @@ class Budget:
     oracle_seeds: int = 1
     tasks: tuple[str, ...] | None = None
     anchors: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_anchors(self.anchors)
 
 
 DEFAULT_BUDGETS: Mapping[str, Budget] = {

@@ -32,6 +32,8 @@ FOLLOWED = 10
 COUNTED = 20
 HELD = 5
 """Periods that an input is held; each is one that was recorded."""
+AWAY = 10.0
+"""Ranges beyond the measured one of a state that is no angle at which a run ends: a prior may run away."""
 NEAR = 0.1
 """Distance from measured states at which an anchor has 0.63 of its weight: each state over its root mean square in the
 recordings, an angle by sine and cosine."""
@@ -44,8 +46,8 @@ class Anchors:
     Args:
         x: States ``(FOLLOWED + COUNTED, n, n_x)`` [SI].
         u: Inputs ``(FOLLOWED + COUNTED, n, n_u)`` [SI].
-        weight: ``(FOLLOWED + COUNTED, n)``: 0 where the recordings were, 1 far from them; 0 beyond the measured range
-            of a state that is no angle.
+        weight: ``(FOLLOWED + COUNTED, n)``: 0 at a recorded sample, 1 far from all of them; 0 beyond the measured
+            range of a state that is no angle.
     """
 
     x: Tensor
@@ -89,9 +91,8 @@ def make_anchors(prior: Prior, training: Sequence[Trajectory], seed: int) -> Anc
     start = rng.uniform(np.where(angles, -np.pi, low), np.where(angles, np.pi, high), (RUNS, x.shape[1]))
     length = FOLLOWED + COUNTED
     inputs = u[rng.integers(len(u), size=(-(-length // HELD), RUNS))].repeat(HELD, axis=0)[:length]
-    states = _prior_runs(prior, training[0].dt, start, inputs)
-    finite = np.isfinite(states).all((0, 2))
-    states, inputs = states[:, finite], inputs[:, finite]
+    far = np.where(angles, np.inf, AWAY * (high - low))
+    states = _prior_runs(prior, training[0].dt, start, inputs, (low - far, high + far))
     places = _Places(angles, np.sqrt(np.mean(x**2, axis=0)).clip(1e-9))
     distance, _ = cKDTree(places(x)).query(places(states.reshape(-1, x.shape[1])))
     weight = 1.0 - np.exp(-((distance.reshape(states.shape[:2]) / NEAR) ** 2))
@@ -100,7 +101,7 @@ def make_anchors(prior: Prior, training: Sequence[Trajectory], seed: int) -> Anc
 
 
 def anchor_penalty(step: RecurrentStep, anchors: Anchors) -> Tensor:
-    """Mean square of the correction over its scale where nothing was measured, a value per network."""
+    """Mean over all anchors of weight times squared correction over its scale, a value per network."""
     stack = cast(StackedNetwork, step.network)
     features = step.stacked_features(anchors.x, anchors.u)
     out, _ = stack.sequence(features, stack.initial(anchors.x.shape[1]))
@@ -108,14 +109,17 @@ def anchor_penalty(step: RecurrentStep, anchors: Anchors) -> Tensor:
     return (weight * out[FOLLOWED:].square()).mean(dim=(0, 2, 3))
 
 
-def _prior_runs(prior: Prior, dt: float, start: Array, inputs: Array) -> Array:
-    """States ``(n, RUNS, n_x)`` of the prior alone; a run that leaves all bounds ends in infinity or NaN."""
+def _prior_runs(prior: Prior, dt: float, start: Array, inputs: Array, bounds: tuple[Array, Array]) -> Array:
+    """States ``(n, RUNS, n_x)`` of the prior alone; a run that would leave the bounds stays where it is."""
     step, none = PriorStep(prior, dt), torch.zeros(len(start), 0, dtype=torch.float64)
+    low, high = (torch.tensor(bound) for bound in bounds)
     x, states = torch.tensor(start), []
     with torch.no_grad():
         for u in torch.tensor(inputs):
             states.append(x)
-            x, _ = step(x, none, u)
+            x_next, _ = step(x, none, u)
+            within = ((x_next >= low) & (x_next <= high) & x_next.isfinite()).all(-1, keepdim=True)
+            x = torch.where(within, x_next, x)
     return torch.stack(states).numpy()
 
 

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import optuna
@@ -212,10 +213,15 @@ def _identity(
     return {
         "data": data.hexdigest(),
         "prior": digest([type(prior).__name__, prior.values]),
-        "base settings": digest(asdict(base)),
-        "space": digest(asdict(space)),
+        "base settings": digest(_without_default(base)),
+        "space": digest(_without_default(space)),
         "seed": digest(seed),
     }
+
+
+def _without_default(settings: TrainingSettings | SearchSpace) -> dict[str, Any]:
+    """As plain data; without anchors, where there are none, as in searches from before there were any."""
+    return {name: value for name, value in asdict(settings).items() if name != "anchors" or value}
 
 
 def _finished(study: optuna.Study) -> list[FrozenTrial]:

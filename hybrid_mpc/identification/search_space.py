@@ -41,7 +41,8 @@ class SearchSpace:
         batch: Windows a step, whole numbers. Default: not searched; twice the batch is twice the work.
         horizon: Most scored periods of a free-run window, whole numbers. Default: not searched; twice the
             horizon is twice the work.
-        anchors: Weight of fading corrections where nothing was measured. Default: not searched.
+        anchors: Weight of fading corrections where nothing was measured. Default: not searched. Zero, none, is on no
+            logarithmic scale: whoever has none compares with a search without them.
 
     Raises:
         InputError: If nothing is searched, or bounds are not positive, not rising, or not whole where they must be.

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
+from hybrid_mpc.benchmark_spec import check_anchors
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identification.cells import Cell
 from hybrid_mpc.identification.combination import CombinationName
@@ -56,9 +56,11 @@ class TrainingSettings:
         prior_parameters: ``"fixed"`` at their fitted values, or ``"trained"`` along within their bounds, each
             network its own (:mod:`~hybrid_mpc.identification.prior_stack`). The energy balance that trains and
             judges keeps the fitted values.
-        anchors: Weight, beside the objectives in units of their bounds, of the mean square of the correction (in its
-            own scale) in states that no recording comes near (:mod:`~hybrid_mpc.identification.anchors`). An rnn has
-            no prior to fall back on and ignores it. Default: zero, none.
+        anchors: Weight of the mean square of the correction (in its own scale) in states that no recording comes near
+            (:mod:`~hybrid_mpc.identification.anchors`), so that the prior stands alone there, with its parameters as
+            they are trained along if they are. It stands beside the objectives in units of their bounds; these fall
+            as the training goes on. Validation, which keeps the best weights, does not know it. An rnn has no prior
+            to fall back on and ignores it. Default: zero, none.
 
     Raises:
         InputError: If a name is not known, there is no objective, weights do not fit the objectives, an rnn is to
@@ -111,8 +113,7 @@ class TrainingSettings:
             )
         if self.kind == "rnn" and self.prior_parameters == "trained":
             raise InputError("an rnn has no prior to train along; leave prior_parameters 'fixed'")
-        if not 0 <= self.anchors < math.inf:
-            raise InputError(f"anchors must be a weight of 0 or more, got {self.anchors}")
+        check_anchors(self.anchors)
         if self.anchors and self.form == "literal":
             raise InputError(
                 "the literal form corrects no prior, so it cannot be anchored to it; leave anchors 0"

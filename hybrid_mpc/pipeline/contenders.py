@@ -114,7 +114,25 @@ def noise_of(
         for name, c in CONTENDERS.items()
         if c.model in models and not c.truth
     }
+    return no_surer_than_prior(scenario, found)
+
+
+def no_surer_than_prior(scenario: Scenario, noise: Mapping[str, Array]) -> dict[str, Array]:
+    """Process noise by contender; where tasks go beyond the recordings a hybrid has no less than its prior.
+
+    Args:
+        scenario: The machine.
+        noise: What suits the recordings.
+
+    Example:
+        >>> from scenarios.unbalanced_disk import scenario
+        >>> noise = {"prior": np.array([2.0, 5.0]), "hybrid": np.array([1.0, 7.0])}
+        >>> no_surer_than_prior(scenario, noise)["hybrid"].tolist()
+        [2.0, 7.0]
+    """
+    found = dict(noise)
     if scenario.beyond_recordings:
         for hybrid, prior in LEAST_NOISE.items():
-            found[hybrid] = np.maximum(found[hybrid], found[prior])
+            if hybrid in found and prior in found:
+                found[hybrid] = np.maximum(found[hybrid], found[prior])
     return found

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.artifact import Artifact
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_json
-from hybrid_mpc.pipeline.contenders import CONTENDERS, ORACLES, noise_of
+from hybrid_mpc.pipeline.contenders import CONTENDERS, ORACLES, no_surer_than_prior, noise_of
 from hybrid_mpc.scenario import Scenario
 
 Array = NDArray[np.float64]
@@ -50,7 +50,8 @@ def find_noise(
         n_x = artifact.models["prior"].n_x
         try:
             noise = {k: np.asarray(v, dtype=float) for k, v in read_json(path)["sigma_x"].items()}
-            ok = all(noise[name].shape == (n_x,) and np.all(noise[name] >= 0) for name in needed)
+            fit = {name: v.shape == (n_x,) and bool(np.all(v >= 0)) for name, v in noise.items()}
+            ok = all(fit[name] for name in needed) and all(fit.values())
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise InputError(
                 f"{path}: no process noise sigma_x for {', '.join(needed)} in it ({error}); --noise needs "
@@ -59,7 +60,7 @@ def find_noise(
         if not ok:
             raise InputError(f"{path}: sigma_x must hold {n_x} numbers that are not negative")
         names = path.parent.parent.name, path.parent.name, path.name
-        return noise, "/".join(name for name in names if name)
+        return no_surer_than_prior(scenario, noise), "/".join(name for name in names if name)
     if not needed:
         return {}, "no filter"
     if not any(name in ORACLES for name in needed):

@@ -137,10 +137,11 @@ def fit_and_smooth(
 def training_stage(context: Context) -> None:
     """Train the networks of every kind, two kinds side by side."""
     from hybrid_mpc.identification.training import KINDS
+    from hybrid_mpc.pipeline.trained_files import is_trained
 
     folder = context.out / "checkpoints" / "training"
     values = context.result("prior")["values"]
-    todo = [kind for kind in reversed(KINDS) if not (folder / f"{kind}.json").is_file()]
+    todo = [k for k in reversed(KINDS) if not is_trained(folder, training_settings(context, k))]
     jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
         kind: (
             _train_kind,

@@ -39,7 +39,7 @@ class SearchSettings(RunSettings):
         space: What is searched.
 
     Raises:
-        InputError: If there is no such kind.
+        InputError: If there is no such kind, or an rnn is to be anchored to a prior that it does not have.
 
     Example:
         >>> SearchSettings("golf_robot", kind="gru")
@@ -54,6 +54,15 @@ class SearchSettings(RunSettings):
         kinds = [name for name in identify.MODELS if not name.startswith("phy")]
         if self.kind not in kinds:
             raise InputError(f"kind has no {self.kind!r}; there are: {', '.join(kinds)}")
+        if self.kind == "rnn" and self.space.anchors is not None:
+            raise InputError("an rnn has no prior to be anchored to; leave anchors out of what is varied")
+
+    def identity(self) -> dict[str, Any]:
+        """Settings as plain data; without anchors where they are not searched, as in searches from before."""
+        plain = super().identity()
+        if plain["space"]["anchors"] is None:
+            del plain["space"]["anchors"]
+        return plain
 
 
 def run_search(

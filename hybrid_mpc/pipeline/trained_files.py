@@ -6,6 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_arrays, read_json, write_arrays, write_json
 from hybrid_mpc.identification.settings import TrainingSettings
 from hybrid_mpc.identification.step import Scaling
@@ -27,6 +28,28 @@ def save_trained(folder: Path, trained: Trained) -> None:
             "faults": [asdict(fault) for fault in trained.faults],
         },
     )
+
+
+def is_trained(folder: Path, settings: TrainingSettings) -> bool:
+    """Whether a folder holds finished networks of these settings.
+
+    Raises:
+        InputError: If it holds networks of the same kind and other settings.
+
+    Example:
+        >>> is_trained(Path("nowhere"), TrainingSettings("pgrnn", 4, 1, 5, 5, seed=0, warm=2))
+        False
+    """
+    if not (folder / f"{settings.kind}.json").is_file():
+        return False
+    held, own = (asdict(s) for s in (load_trained(folder, settings.kind).settings, settings))
+    changed = [f"{name} {held[name]} instead of {own[name]}" for name in own if held[name] != own[name]]
+    if changed:
+        raise InputError(
+            f"{folder} holds finished networks of other settings ({settings.kind}: {'; '.join(changed)}), from another "
+            "version or scenario; choose another --out"
+        )
+    return True
 
 
 def load_trained(folder: Path, kind: str) -> Trained:

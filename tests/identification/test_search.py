@@ -11,7 +11,7 @@ from simulated_pendulum import TRUTH, Pendulum, record
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identification import search as module
-from hybrid_mpc.identification.search import SearchSpace, search
+from hybrid_mpc.identification.search import SearchSpace, _without_default, search
 from hybrid_mpc.identification.search_space import parsed_space
 from hybrid_mpc.identification.training import TrainingSettings, train
 
@@ -169,6 +169,16 @@ def test_trials_are_counted_in_all_and_a_timeout_ends_after_the_trial(quick, who
     assert core(again) == core(first)
     assert not seen
     assert core(run(data, tmp_path / "search.jsonl", 4)) == core(result)[:4]
+
+
+def test_anchors_are_searched_when_asked_for_and_else_leave_no_trace():
+    space = SearchSpace(
+        hidden=None, learning_rate=None, free_run_learning_rate=None, decay=None, anchors=(1.0, 100.0)
+    )
+    assert space.apply(BASE, {"anchors": 7.0}).anchors == 7.0
+    assert "anchors" not in _without_default(BASE) | _without_default(SPACE)
+    assert _without_default(replace(BASE, anchors=7.0))["anchors"] == 7.0
+    assert _without_default(space)["anchors"] == (1.0, 100.0)
 
 
 def test_a_journal_of_another_search_is_refused_by_what_differs(whole, data):

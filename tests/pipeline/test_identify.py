@@ -1,15 +1,19 @@
 """What a training leaves in the run's folder is read back whole."""
 
+import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from hybrid_mpc.errors import InputError
 from hybrid_mpc.identification import training
 from hybrid_mpc.identification.settings import TrainingSettings
 from hybrid_mpc.identification.step import Scaling
 from hybrid_mpc.identification.trained import Fault, Trained
 from hybrid_mpc.pipeline.identify import _train_kind, load_trained
+from hybrid_mpc.pipeline.trained_files import is_trained, save_trained
 
 
 @pytest.mark.parametrize("faults", [(), (Fault(1, "energy", 30, True),)])
@@ -28,3 +32,30 @@ def test_a_training_is_read_back_as_it_was(faults, tmp_path, monkeypatch):
     np.testing.assert_equal(found.weights["w"], trained.weights["w"])
     np.testing.assert_equal(found.validation, trained.validation)
     np.testing.assert_equal(found.skipped, trained.skipped)
+
+
+@pytest.fixture
+def kept(tmp_path):
+    """Networks of one kind in a folder."""
+    settings = TrainingSettings("pgrnn", 4, 2, 10, 5, seed=3, warm=2, anchors=2.0)
+    one = Trained(
+        settings, Scaling((1.0,), (1.0,), (1.0,), (1.0,)), {"w": np.eye(2)}, np.ones(2), {}, np.zeros(2)
+    )
+    save_trained(tmp_path, one)
+    return tmp_path, settings
+
+
+def test_finished_networks_are_taken_for_their_own_settings_only(kept):
+    folder, settings = kept
+    assert is_trained(folder, settings)
+    assert not is_trained(folder, replace(settings, kind="mopgrnn"))
+    with pytest.raises(InputError, match=r"anchors 2.0 instead of 5.0.*choose another --out"):
+        is_trained(folder, replace(settings, anchors=5.0))
+
+
+def test_networks_from_before_there_were_anchors_are_read(kept):
+    folder, settings = kept
+    note = json.loads((folder / "pgrnn.json").read_text())
+    del note["settings"]["anchors"]
+    (folder / "pgrnn.json").write_text(json.dumps(note))
+    assert is_trained(folder, replace(settings, anchors=0.0))

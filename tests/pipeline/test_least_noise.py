@@ -1,5 +1,6 @@
 """The filters' process noise where tasks go beyond the recordings."""
 
+import json
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -7,6 +8,8 @@ import numpy as np
 import pytest
 
 from hybrid_mpc.pipeline import contenders
+from hybrid_mpc.pipeline.control_noise import find_noise
+from hybrid_mpc.scenario import load_scenario
 from scenarios.golf_robot import scenario
 
 OWN = {"prior": np.array([1e-3, 2e-2]), "hybrid": np.array([4e-4, 3e-2])}
@@ -42,3 +45,19 @@ def test_beyond_them_it_is_no_surer_than_the_prior_state_by_state(noise):
     np.testing.assert_array_equal(found["hybrid_observer"], [2e-3, 6e-2])
     np.testing.assert_array_equal(found["prior"], OWN["prior"])
     np.testing.assert_array_equal(found["prior_observer"], 2 * OWN["prior"])
+
+
+def test_noise_from_a_file_is_raised_too(tmp_path):
+    file = tmp_path / "control.json"
+    file.write_text(json.dumps({"sigma_x": {name: value.tolist() for name, value in OWN.items()}}))
+    artifact = SimpleNamespace(models={"prior": SimpleNamespace(n_x=2)})
+    for beyond, expected in ((False, [4e-4, 3e-2]), (True, [1e-3, 3e-2])):
+        machine = replace(scenario, beyond_recordings=beyond)
+        found, _ = find_noise(machine, artifact, tmp_path, ("hybrid",), 0, file)
+        np.testing.assert_array_equal(found["hybrid"], expected)
+
+
+def test_the_disk_stands_where_no_recording_was():
+    disk = load_scenario("unbalanced_disk")
+    assert disk.beyond_recordings
+    assert all(budget.anchors > 0 for budget in disk.budgets.values())

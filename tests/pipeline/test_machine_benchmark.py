@@ -1,6 +1,7 @@
 """``hybrid-mpc benchmark`` on a machine that is simulated here, and what it refuses."""
 
 import json
+import shutil
 from dataclasses import replace
 from functools import partial
 
@@ -9,6 +10,7 @@ import pytest
 
 from hybrid_mpc.benchmark_spec import BenchmarkBudget, BenchmarkSpec
 from hybrid_mpc.data import write_csv
+from hybrid_mpc.data_spec import Window
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identification.dataset import cut_windows
 from hybrid_mpc.pipeline.machine_benchmark import networks
@@ -17,6 +19,7 @@ from hybrid_mpc.pipeline.machine_benchmark.free_runs import figures_of, run_free
 from hybrid_mpc.pipeline.machine_benchmark.job import BenchmarkSettings, benchmark
 from hybrid_mpc.pipeline.machine_benchmark.physics import fit_physics, shifted
 from hybrid_mpc.pipeline.machine_benchmark.recordings import read_test, read_training
+from hybrid_mpc.pipeline.machine_benchmark.store import load_model
 from hybrid_mpc.scenario import load_scenario
 
 MACHINE = """
@@ -144,8 +147,6 @@ def test_a_test_file_is_judged_after_what_is_given_and_on_nothing_before(machine
 
 
 def test_nothing_after_the_warm_up_is_known_to_a_free_run(machine, made, tmp_path):
-    from hybrid_mpc.pipeline.machine_benchmark.store import load_model
-
     scenario, model = load_scenario(str(machine[0])), load_model(made[0], "cart")
     prior = scenario.prior(model.physics.fit.values)
     lines = machine[2].read_text().splitlines()
@@ -221,8 +222,29 @@ def test_files_that_gaps_leave_nothing_of_are_named(machine, tmp_path):
     gap = recording(tmp_path / "z_gap.csv", seed=3, seconds=3.0)
     lines = gap.read_text().splitlines()
     gap.write_text("\n".join(lines[:15] + lines[19:]) + "\n")
-    with pytest.raises(InputError, match=r"nothing is left to validate on.*z_gap\.csv"):
+    with pytest.raises(InputError, match=r"(?s)nothing is left to validate on.*z_gap\.csv"):
         read_training(scenario, [machine[1], gap])
+
+
+def test_files_with_windows_do_not_validate_as_wholes(machine):
+    scenario = load_scenario(str(machine[0]))
+    windows = {"train": (Window(0.0, 50.0, "train"), Window(51.0, 90.0, "test"))}
+    scenario = replace(
+        scenario,
+        benchmark=replace(scenario.benchmark, valid_every=2),
+        data=replace(scenario.data, windows=windows),
+    )
+    with pytest.raises(InputError, match=r"train\.csv has windows.*leave out one of the two"):
+        read_training(scenario, [machine[1], machine[2]])
+
+
+def test_what_begins_after_a_gap_is_no_run_of_full_length(machine, tmp_path):
+    scenario = load_scenario(str(machine[0]))
+    gap = recording(tmp_path / "gap.csv", seed=4, seconds=50.0)
+    lines = gap.read_text().splitlines()
+    gap.write_text("\n".join(lines[:250] + lines[260:]) + "\n")
+    (long,) = read_training(scenario, [gap]).long
+    assert (long.t[0], long.t[-1] < 25.0) == (0.0, True)
 
 
 @pytest.mark.parametrize(
@@ -317,10 +339,30 @@ def test_what_the_command_refuses(call, machine, tmp_path, words, message):
     assert not (tmp_path / "out" / "results.json").exists()
 
 
+def test_a_folder_whose_pieces_had_other_roles_is_refused(machine, made):
+    scenario, train, _ = machine
+    note = json.loads((made[0] / "benchmark.json").read_text())
+    (made[0] / "benchmark.json").write_text(json.dumps(note | {"pieces": "of another version"}))
+    try:
+        with pytest.raises(InputError, match="pieces differ"):
+            benchmark(BenchmarkSettings(str(scenario), (train,)), made[0])
+    finally:
+        (made[0] / "benchmark.json").write_text(json.dumps(note))
+
+
+def test_a_model_from_before_long_runs_counted_is_read(machine, made, tmp_path):
+    copy = shutil.copytree(made[0] / "model", tmp_path / "model")
+    note = json.loads((copy / "benchmark_model.json").read_text())
+    del note["long"]
+    (copy / "benchmark_model.json").write_text(json.dumps(note))
+    found = load_model(copy, "cart")
+    assert (found.long, found.hybrid) == ({}, made[1]["model"]["hybrid"])
+
+
 def test_a_folder_of_another_benchmark_is_refused(call, machine, made):
     code, _, told = call(machine[0], "--data", machine[2], "--out", made[0])
     assert code == 2
-    assert "other settings (data differ)" in told
+    assert "other settings (data, pieces differ)" in told
     code, _, told = call("golf_robot", "--data", machine[2], "--out", made[0])
     assert code == 2
     assert "has no benchmark" in told

@@ -11,7 +11,7 @@ import pytest
 
 from hybrid_mpc.cli import main
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.identification.search_space import SearchSpace
+from hybrid_mpc.identification.search_space import SearchSpace, parsed_space
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.identify import training_settings
 from hybrid_mpc.pipeline.search_job import SearchSettings, usage
@@ -147,6 +147,26 @@ def test_a_run_without_such_a_file_is_what_it_has_always_been(tmp_path):
     scenario = load_scenario("golf_robot")
     plain = training_settings(Context(RunSettings("golf_robot"), scenario, tmp_path), "mopgrnn")
     assert (plain.hidden, plain.horizon, plain.batch, plain.validation_horizon) == (16, 50, 32, None)
+
+
+def test_a_search_without_anchors_is_what_it_has_always_been():
+    assert "anchors" not in SearchSettings("golf_robot").identity()["space"]
+    assert SearchSettings("golf_robot", space=parsed_space(["anchors"])).identity()["space"]["anchors"] == (
+        0.3,
+        300.0,
+    )
+    with pytest.raises(InputError, match="an rnn has no prior to be anchored to"):
+        SearchSettings("golf_robot", kind="rnn", space=parsed_space(["anchors"]))
+
+
+def test_anchors_reach_the_training_from_budget_and_file(tmp_path):
+    scenario = load_scenario("unbalanced_disk")
+    plain = training_settings(Context(RunSettings("unbalanced_disk"), scenario, tmp_path), "mopgrnn")
+    assert plain.anchors == 10.0
+    path = tmp_path / "settings.json"
+    path.write_text('{"anchors": 0}')
+    settings = RunSettings("unbalanced_disk", network_file=path)
+    assert training_settings(Context(settings, scenario, tmp_path), "mopgrnn").anchors == 0
 
 
 def test_a_run_is_bound_to_the_content_of_its_file(tmp_path):

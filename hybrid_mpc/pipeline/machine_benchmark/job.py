@@ -244,6 +244,9 @@ def _claim(out: Path, settings: BenchmarkSettings, data: Recordings) -> None:
         "data": data.dataset.hash,
         "budget": settings.budget,
         "seed": settings.seed,
+        "pieces": digest(
+            [[p.role, p.name, p.t[0], p.t[-1]] for p in (*data.train, *data.valid, *data.held_back)]
+        ),
     }
     note = out / "benchmark.json"
     if note.is_file():

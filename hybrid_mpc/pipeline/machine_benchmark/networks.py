@@ -12,7 +12,7 @@ from hybrid_mpc.identification.settings import KINDS, TrainingSettings
 from hybrid_mpc.identification.trained import Trained
 from hybrid_mpc.identification.training import train
 from hybrid_mpc.pipeline.parallel import run_jobs
-from hybrid_mpc.pipeline.trained_files import load_trained, save_trained
+from hybrid_mpc.pipeline.trained_files import is_trained, load_trained, save_trained
 from hybrid_mpc.scenario import load_scenario
 
 Report = Callable[[str, int, int, str], None]
@@ -69,7 +69,7 @@ def train_all(
     jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
         kind: (_train, (scenario, dict(values), list(training), list(validation), settings(kind), folder))
         for kind in reversed(KINDS)
-        if not (folder / f"{kind}.json").is_file()
+        if not is_trained(folder, settings(kind))
     }
     run_jobs(jobs, on_progress, workers)
     return {str(kind): load_trained(folder, kind) for kind in KINDS}

@@ -28,9 +28,9 @@ class Recordings:
         train: Pieces that are fitted and trained on.
         valid: Pieces that choose; nothing is fitted to them.
         held_back: Pieces that neither fit nor choose; may be none.
-        long: Recordings that were split in order of time, from their first sample to where validation ends, at most
-            a minute: runs as long as those that judge. Most of them was trained on, so they tell drift and not how
-            good a model is.
+        long: Recordings that were split in order of time and are judged whole, from their first sample to where
+            validation ends, at most a minute. Most or all of them was trained on, so they tell drift and not how good
+            a model is.
         dataset: The files as they were read.
     """
 
@@ -67,6 +67,12 @@ def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
     """
     prior, spec = scenario.prior(), benchmark_of(scenario)
     uncut = 0 < spec.valid_every <= len(paths)
+    named = [path.name for path in paths if path.stem in scenario.data.windows]
+    if uncut and named:
+        raise InputError(
+            f"{named[0]} has windows in the data specification, and the benchmark's valid_every={spec.valid_every} "
+            "gives whole files their roles; leave out one of the two"
+        )
     needed: tuple[Role, ...] = () if spec.cycle or uncut else ("train", "valid")
     dataset = load_trajectories(
         paths, scenario.data, outputs=prior.outputs, inputs=prior.inputs, needed=needed
@@ -84,17 +90,18 @@ def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
         parts = [p for t in runs for p in pieces(t, spec.piece)]
     train, valid, held = (tuple(p for p in parts if p.role == role) for role in ("train", "valid", "test"))
     if not (train and valid):
-        cut = "; ".join(f"{c.file} {c.start:g} to {c.end:g} s: {c.why}" for c in dataset.cuts)
+        cut = "".join(f"\n  {c.file} {c.start:g} to {c.end:g} s: {c.why}" for c in dataset.cuts)
         raise InputError(
-            f"nothing is left to {'validate on' if train else 'train on'}; give longer recordings ({cut})"
+            f"nothing is left to {'validate on' if train else 'train on'}; give longer recordings"
+            + (f". Cut out:{cut}" if cut else "")
         )
-    in_order = not (spec.cycle or uncut)
+    in_order = not (spec.cycle or uncut) and spec.length is None
     long = until_validated(dataset, scenario.data.windows) if in_order else ()
     return Recordings(train, valid, held, long, dataset)
 
 
 def until_validated(dataset: Dataset, windows: Container[str]) -> tuple[Trajectory, ...]:
-    """Recordings that were split in order of time, each from its first sample to where its validation ends.
+    """Recordings that were split in order of time, from the first sample to a gap or where validation ends.
 
     Args:
         dataset: Recordings and their pieces.
@@ -109,28 +116,26 @@ def until_validated(dataset: Dataset, windows: Container[str]) -> tuple[Trajecto
         >>> [(run.role, len(run.t)) for run in until_validated(data, ())], until_validated(data, {"run"})
         ([('valid', 8)], ())
     """
-    found = []
+    stems, found = {Path(file).stem for file in dataset.files}, []
     for whole in dataset.whole:
-        ends = [
-            piece.t[-1]
-            for piece in dataset.by_role("valid")
-            if _stem(piece.name) == _stem(whole.name) and whole.t[0] <= piece.t[-1] <= whole.t[-1]
-        ]
-        if ends and _stem(whole.name) not in windows:
+        # one that begins after a gap begins in motion, and a run that judges does not
+        if whole.name not in stems or whole.name in windows:
+            continue
+        ends = [p.t[-1] for p in dataset.by_role("valid") if _stem(p.name, stems) == whole.name]
+        if ends:
             end = min(max(ends), whole.t[0] + LONGEST)
             found.append(whole.part(whole.t <= end, whole.name, "valid"))
     return tuple(found)
 
 
-def _stem(name: str) -> str:
-    """Stem of the file that a piece is from: pieces after the first end in # and their number.
+def _stem(name: str, stems: Container[str]) -> str:
+    """Stem of the file that a piece is from: later pieces of a file have # and their number after it.
 
     Example:
-        >>> _stem("run#12"), _stem("run"), _stem("take#a")
-        ('run', 'run', 'take#a')
+        >>> _stem("run#12", {"run"}), _stem("run", {"run"}), _stem("take#2", {"take", "take#2"})
+        ('run', 'run', 'take#2')
     """
-    stem, _, number = name.rpartition("#")
-    return stem if number.isdigit() and stem else name
+    return name if name in stems else name.rpartition("#")[0]
 
 
 def whole_runs(dataset: Dataset, every: int) -> tuple[Trajectory, ...]:
@@ -145,10 +150,9 @@ def whole_runs(dataset: Dataset, every: int) -> tuple[Trajectory, ...]:
     """
     stems = sorted(Path(file).stem for file in dataset.files)
     chosen = set(stems[every - 1 :: every])
-    found = []
-    for t in dataset.whole:
-        found.append(replace(t, role="valid" if _stem(t.name) in chosen else "train"))
-    return tuple(found)
+    return tuple(
+        replace(t, role="valid" if _stem(t.name, stems) in chosen else "train") for t in dataset.whole
+    )
 
 
 def read_test(scenario: Scenario, path: Path) -> tuple[Trajectory, ...]:
