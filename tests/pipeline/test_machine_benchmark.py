@@ -2,19 +2,16 @@
 
 import json
 import shutil
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
+from cart import DELAY, TRUE, recording, written
 
-from hybrid_mpc.benchmark_spec import BenchmarkBudget, BenchmarkSpec
-from hybrid_mpc.data import write_csv
-from hybrid_mpc.data_spec import Window
+from hybrid_mpc.benchmark_spec import BenchmarkBudget
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identification.dataset import cut_windows
 from hybrid_mpc.pipeline.machine_benchmark import networks
-from hybrid_mpc.pipeline.machine_benchmark.choice import recommended
 from hybrid_mpc.pipeline.machine_benchmark.free_runs import figures_of, run_freely
 from hybrid_mpc.pipeline.machine_benchmark.job import BenchmarkSettings, benchmark
 from hybrid_mpc.pipeline.machine_benchmark.physics import fit_physics, shifted
@@ -22,62 +19,10 @@ from hybrid_mpc.pipeline.machine_benchmark.recordings import read_test, read_tra
 from hybrid_mpc.pipeline.machine_benchmark.store import load_model
 from hybrid_mpc.scenario import load_scenario
 
-MACHINE = """
-import torch
-from hybrid_mpc.benchmark_spec import BenchmarkBudget, BenchmarkSpec
-from hybrid_mpc.physics import Prior
-from hybrid_mpc.scenario import DataSpec, Scenario
-from hybrid_mpc.signals import Parameter, Signal
-
-
-class Cart(Prior):
-    states = (Signal("s", "m"), Signal("v", "m/s"))
-    inputs = (Signal("F", "N"),)
-    outputs = (states[0],)
-    parameters_spec = (Parameter("k", 1.0, "N/kg/m", 0.2, 9.0), Parameter("d", 0.5, "1/s", 0.0, 2.0))
-
-    def inertia(self, x):
-        return 1.0
-
-    def acceleration(self, x, u):
-        return u - self.k * x[..., 0:1] - self.d * x[..., 1:2]
-
-
-scenario = Scenario(
-    "cart", "A cart", "", prior=Cart,
-    data=DataSpec("t", ("u",), ("s",), dt=0.1, max_gap=0.25, smoothing=0.7, warm_up=1.0, fractions=(0.6, 0.2, 0.2)),
-    benchmark=BenchmarkSpec(
-        {"quick": BenchmarkBudget(4, 2, teacher_steps=5, free_run_steps=5, horizon=10, batch=8)},
-        unit="mm", scale=1e3, largest_delay=0.3, piece=20.0,
-    ),
-)
-"""
-TRUE = {"k": 4.0, "d": 0.6, "cubic": 0.5}
-DELAY = 0.13
-
-
-def recording(path, *, seed, seconds=100.0, k=TRUE["k"]):
-    """The cart with a stiffening spring that no prior knows, its input 0.13 s late, an encoder of 0.1 mm."""
-    rng, n, sub = np.random.default_rng(seed), round(seconds / 0.1), 20
-    u = np.repeat(rng.uniform(-2, 2, n // 5), 5)
-    x, s = np.zeros(2), []
-    for i in range(n * sub):
-        if i % sub == 0:
-            s.append(x[0])
-        late = i - round(DELAY / 0.1 * sub)
-        held = u[late // sub] if late >= 0 else 0.0
-        a = held - k * x[0] - TRUE["cubic"] * x[0] ** 3 - TRUE["d"] * x[1]
-        x = x + 0.1 / sub * np.array([x[1] + 0.5 * 0.1 / sub * a, a])
-    return write_csv(path, {"t": 0.1 * np.arange(n), "u": u, "s": np.round(np.array(s), 4)})
-
 
 @pytest.fixture(scope="module")
 def machine(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("cart")
-    (folder / "cart.py").write_text(MACHINE)
-    train = recording(folder / "train.csv", seed=0)
-    test = recording(folder / "test.csv", seed=1, seconds=40.0)
-    return folder / "cart.py", train, test
+    return written(tmp_path_factory.mktemp("cart"))
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -113,20 +58,6 @@ def test_the_delay_and_the_parameters_are_found(machine):
     assert TRUE["k"] < physics.fit.values["k"] < TRUE["k"] + 0.75
     assert abs(physics.fit.values["d"] - TRUE["d"]) < 0.15
     assert set(physics.fit.standard_errors) == {"k", "d"}
-
-
-def test_roles_do_not_overlap_and_long_recordings_are_cut(machine):
-    scenario = load_scenario(str(machine[0]))
-    data = read_training(scenario, [machine[1]])
-    assert [len(p.t) for p in data.train] == [
-        199,
-        199,
-        199,
-    ]  # 60 s in pieces of 20 s, less the smoothing's distance
-    times = [{round(v, 3) for p in part for v in p.t} for part in (data.train, data.valid, data.held_back)]
-    assert all(times)
-    assert not times[0] & times[1]
-    assert not (times[0] | times[1]) & times[2]
 
 
 def test_a_test_file_is_judged_after_what_is_given_and_on_nothing_before(machine, made):
@@ -171,88 +102,6 @@ def test_the_recommended_model_is_best_on_validation_and_on_runs_of_full_length(
     names = ("phy", "pgrnn", "mopgrnn", "pgrnn mean", "mopgrnn mean")
     worse = {n: max(part[n] / part["phy"] for part in (validation, long)) for n in names}
     assert results["model"]["hybrid"] == min(worse, key=worse.get)
-
-
-@pytest.mark.parametrize("name", ["pgrnn", "mopgrnn mean"])
-def test_a_network_that_drifts_or_diverges_is_not_recommended(name):
-    short = {"phy": 2.0, "pgrnn": 1.4, "mopgrnn": 1.9, "pgrnn mean": 1.5, "mopgrnn mean": 1.8} | {name: 1.0}
-    assert recommended(short, {}) == name
-    for long in (2.1, float("inf")):
-        assert recommended(short, {**dict.fromkeys(short, 1.5), "phy": 2.0, name: long}) != name
-    # where the prior itself diverges on long runs, what does not is better, and what does too is worse
-    assert recommended(short, {**dict.fromkeys(short, float("inf")), name: 1.0}) == name
-    assert recommended(short, dict.fromkeys(short, float("inf"))) == "phy"
-
-
-def test_runs_of_full_length_end_where_validation_does(machine):
-    scenario = load_scenario(str(machine[0]))
-    data = read_training(scenario, [machine[1]])
-    (long,) = data.long
-    assert (long.t[0], long.t[-1]) == (
-        0.0,
-        pytest.approx(60.0),
-    )  # a minute of the 80 s that are not held back
-    (short,) = read_training(scenario, [machine[2]]).long
-    assert short.t[-1] == pytest.approx(data_end(machine[2], scenario))
-
-
-def data_end(file, scenario):
-    """Last time [s] of a file's validation part."""
-    return max(piece.t[-1] for piece in read_training(scenario, [file]).valid)
-
-
-def test_every_so_many_th_file_validates_as_a_whole(machine):
-    scenario = load_scenario(str(machine[0]))
-    scenario = replace(scenario, benchmark=replace(scenario.benchmark, valid_every=2))
-    data = read_training(scenario, [machine[1], machine[2]])  # by name: test.csv, train.csv
-    assert {p.name.split(".")[0] for p in data.train} == {"test"}
-    assert {p.name.split(".")[0] for p in data.valid} == {"train"}
-    assert (
-        sum(len(p.t) for p in data.valid) == 5 * 199
-    )  # all of it in pieces; the last sample's input has no end
-    assert (data.held_back, data.long) == ((), ())
-    alone = read_training(scenario, [machine[1]])  # too few files: parts in order of time
-    assert len(alone.train) == 3
-    assert alone.held_back
-
-
-def test_files_that_gaps_leave_nothing_of_are_named(machine, tmp_path):
-    scenario = load_scenario(str(machine[0]))
-    scenario = replace(scenario, benchmark=replace(scenario.benchmark, valid_every=2))
-    gap = recording(tmp_path / "z_gap.csv", seed=3, seconds=3.0)
-    lines = gap.read_text().splitlines()
-    gap.write_text("\n".join(lines[:15] + lines[19:]) + "\n")
-    with pytest.raises(InputError, match=r"(?s)nothing is left to validate on.*z_gap\.csv"):
-        read_training(scenario, [machine[1], gap])
-
-
-def test_files_with_windows_do_not_validate_as_wholes(machine):
-    scenario = load_scenario(str(machine[0]))
-    windows = {"train": (Window(0.0, 50.0, "train"), Window(51.0, 90.0, "test"))}
-    scenario = replace(
-        scenario,
-        benchmark=replace(scenario.benchmark, valid_every=2),
-        data=replace(scenario.data, windows=windows),
-    )
-    with pytest.raises(InputError, match=r"train\.csv has windows.*leave out one of the two"):
-        read_training(scenario, [machine[1], machine[2]])
-
-
-def test_what_begins_after_a_gap_is_no_run_of_full_length(machine, tmp_path):
-    scenario = load_scenario(str(machine[0]))
-    gap = recording(tmp_path / "gap.csv", seed=4, seconds=50.0)
-    lines = gap.read_text().splitlines()
-    gap.write_text("\n".join(lines[:250] + lines[260:]) + "\n")
-    (long,) = read_training(scenario, [gap]).long
-    assert (long.t[0], long.t[-1] < 25.0) == (0.0, True)
-
-
-@pytest.mark.parametrize(
-    "given", [{"valid_every": 1}, {"valid_every": -3}, {"valid_every": 2, "cycle": ("train", "valid")}]
-)
-def test_a_bad_choice_of_validating_files_is_refused(given):
-    with pytest.raises(InputError, match="valid_every must be 2 or more"):
-        BenchmarkSpec({}, **given)
 
 
 def test_networks_are_trained_with_what_the_budget_says():
