@@ -56,7 +56,7 @@ def errors(results: dict[str, Any]) -> list[str]:
     for name, row in rows.items():
         cells = [digits(row[m]) for m in MODELS]
         lines.append(f"| {name} | {' | '.join(cells)} | {row['hybrid'] / row['phy']:.2f} |")
-    return [*lines, "", f"Recommended by validation: {chosen}."]
+    return [*lines, "", f"Recommended: {chosen}."]
 
 
 def parameters(results: dict[str, Any]) -> list[str]:
