@@ -63,7 +63,8 @@ def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
     """Read training files; long ones are cut into pieces of the benchmark's length.
 
     Raises:
-        InputError: If a file is bad, or no piece is left for training or validation.
+        InputError: If a file is bad, has windows where whole files are to validate, or no piece is left for training or
+            validation.
     """
     prior, spec = scenario.prior(), benchmark_of(scenario)
     uncut = 0 < spec.valid_every <= len(paths)
@@ -77,17 +78,7 @@ def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
     dataset = load_trajectories(
         paths, scenario.data, outputs=prior.outputs, inputs=prior.inputs, needed=needed
     )
-    if spec.cycle:
-        parts = [p for t in dataset.whole for p in in_turn(t, spec, scenario.data.smoothing)]
-        shortest = scenario.data.warm_up + SCORED * scenario.data.dt
-        if any(len(p.t) * p.dt < shortest for p in parts):
-            raise InputError(
-                f"a recording is too short to be cut into {len(spec.cycle)} pieces of {shortest:.3g} s and more, which "
-                "training and validation need; give longer ones"
-            )
-    else:
-        runs = whole_runs(dataset, spec.valid_every) if uncut else dataset.trajectories
-        parts = [p for t in runs for p in pieces(t, spec.piece)]
+    parts = _parts(dataset, scenario, uncut)
     train, valid, held = (tuple(p for p in parts if p.role == role) for role in ("train", "valid", "test"))
     if not (train and valid):
         cut = "".join(f"\n  {c.file} {c.start:g} to {c.end:g} s: {c.why}" for c in dataset.cuts)
@@ -98,6 +89,22 @@ def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
     in_order = not (spec.cycle or uncut) and spec.length is None
     long = until_validated(dataset, scenario.data.windows) if in_order else ()
     return Recordings(train, valid, held, long, dataset)
+
+
+def _parts(dataset: Dataset, scenario: Scenario, uncut: bool) -> list[Trajectory]:
+    """Pieces with roles: by the cycle, by whole files (``uncut``), or as the data specification splits."""
+    spec, data = benchmark_of(scenario), scenario.data
+    if not spec.cycle:
+        runs = whole_runs(dataset, spec.valid_every) if uncut else dataset.trajectories
+        return [p for t in runs for p in pieces(t, spec.piece)]
+    parts = [p for t in dataset.whole for p in in_turn(t, spec, data.smoothing)]
+    shortest = data.warm_up + SCORED * data.dt
+    if any(len(p.t) * p.dt < shortest for p in parts):
+        raise InputError(
+            f"a recording is too short to be cut into {len(spec.cycle)} pieces of {shortest:.3g} s and more, which "
+            "training and validation need; give longer ones"
+        )
+    return parts
 
 
 def until_validated(dataset: Dataset, windows: Container[str]) -> tuple[Trajectory, ...]:
