@@ -10,6 +10,7 @@ from hybrid_mpc.pipeline.contenders import CONTENDERS
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.figures import OBSERVER_TITLES, Figures, draw_all
 from hybrid_mpc.pipeline.guard_report import guard_tables, guard_words
+from hybrid_mpc.pipeline.identify import training_settings
 from hybrid_mpc.pipeline.results import collect
 from hybrid_mpc.plots.style import name_of
 from hybrid_mpc.report import KeyFigure, Report, Section, Table, write_report
@@ -138,6 +139,7 @@ def _notes(context: Context, results: dict[str, Any]) -> dict[str, dict[str, tup
     without = [r["reason"] for r in (tested, *(tested[n] for n in OBSERVERS)) if r and "reason" in r]
     if without:
         after["estimation"] = (f"Not tested: {'; '.join(dict.fromkeys(without))}.",)
+    after["training"] = _anchor_words(training_settings(context, "mopgrnn").anchors)
     warnings = context.result("prior")["warnings"]
     if warnings:
         after["models"] = ("Warnings of the fit: " + "; ".join(warnings) + ".",)
@@ -152,6 +154,17 @@ def _notes(context: Context, results: dict[str, Any]) -> dict[str, dict[str, tup
     if reasons:
         after["analysis"] = tuple(reasons)
     return {"instead": instead, "after": after}
+
+
+def _anchor_words(weight: float) -> tuple[str, ...]:
+    """What the report says of anchors.
+
+    Example:
+        >>> _anchor_words(0.0), len(_anchor_words(10.0))
+        ((), 1)
+    """
+    words = "Corrections were asked to fade where no recording comes near; the prior stands alone there"
+    return (f"{words} (anchors, weight {weight:g}).",) if weight else ()
 
 
 def _dict(value: Any) -> dict[str, Any]:
