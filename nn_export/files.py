@@ -1,0 +1,277 @@
+"""Files read with a limit and written whole or not at all; JSON that holds no traps. Standard library alone."""
+
+from __future__ import annotations
+
+import errno
+import json
+import math
+import os
+import re
+import secrets
+import stat
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, BinaryIO, NoReturn
+
+MAX_DEPTH = 40
+"""Nested levels of JSON that are read: what this library writes has lists of lists of lists at most."""
+MAX_DIGITS = 20
+"""Digits of a whole number that are read: enough for any of 64 bits."""
+MAX_VALUES = 2**21
+"""Commas, colons and brackets in JSON that are read. Each may cost 80 bytes of memory: 160 MiB altogether."""
+LEFTOVER_AGE = 3600.0
+"""Age [s] from which a temporary file is a killed writer's: no file of this library takes minutes to write."""
+
+_KINDS = {
+    stat.S_IFDIR: "is a directory",
+    stat.S_IFIFO: "is a named pipe, not a file",
+    stat.S_IFSOCK: "is a socket, not a file",
+    stat.S_IFCHR: "is a device, not a file",
+    stat.S_IFBLK: "is a device, not a file",
+}
+_UNSYNCED = {errno.EACCES, errno.EINVAL, errno.ENOTSUP, errno.EPERM}
+"""What a file system says that cannot write a folder through, or a folder that may be written but not read."""
+_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
+
+
+def read_bytes(path: Path, limit: int) -> bytes:
+    """Content of a regular file of at most ``limit`` bytes. It never waits and never reads more than that.
+
+    Args:
+        path: The file; links are followed.
+        limit: Most bytes, also of a file that grows while it is read.
+
+    Raises:
+        OSError: If there is no such file, it is none (a folder, a pipe, a device), is longer, or may not be read.
+            ``strerror`` reads well behind ``cannot read PATH: ``.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_bytes(Path(folder) / "a.txt", b"content")
+        ...     print(read_bytes(Path(folder) / "a.txt", 1024))
+        b'content'
+        >>> read_bytes(Path("/"), 1024)
+        Traceback (most recent call last):
+        ...
+        IsADirectoryError: [Errno 21] is a directory: '/'
+    """
+    try:
+        _refuse_kind(os.stat(path), path)  # before it is opened: to open a device may already do something
+    except ValueError as error:  # no name of a file: a null character, half a surrogate pair
+        raise OSError(errno.EINVAL, f"is no name of a file ({error})", str(path)) from error
+    flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+    with os.fdopen(os.open(path, flags), "rb", buffering=0) as file:
+        found = os.fstat(file.fileno())
+        _refuse_kind(found, path)  # another one may have taken its place
+        if hasattr(os, "O_NONBLOCK"):
+            os.set_blocking(file.fileno(), True)
+        if found.st_size > limit:
+            raise OSError(errno.EFBIG, _too_long(found.st_size, limit), str(path))
+        blocks, size = [], 0
+        while block := file.read(min(max(found.st_size - size, 2**16), limit - size) + 1):
+            blocks.append(block)
+            size += len(block)
+            if size > limit:
+                raise OSError(errno.EFBIG, f"grew while it was read: {_too_long(size, limit)}", str(path))
+    return b"".join(blocks)
+
+
+def _refuse_kind(found: os.stat_result, path: Path) -> None:
+    kind = stat.S_IFMT(found.st_mode)
+    if kind != stat.S_IFREG:
+        code = errno.EISDIR if kind == stat.S_IFDIR else errno.EINVAL
+        raise OSError(code, _KINDS.get(kind, "is not a file"), str(path))
+
+
+def _too_long(size: int, limit: int) -> str:
+    texts = [_size(size), _size(limit)]
+    if texts[0] == texts[1]:
+        texts = [f"{size} bytes", f"{limit} bytes"]
+    return f"has {texts[0]}, at most {texts[1]} are read"
+
+
+def _size(count: int) -> str:
+    for power, unit in ((3, "GiB"), (2, "MiB"), (1, "KiB")):
+        if count >= 1024**power:
+            return f"{count / 1024**power:.3g} {unit}"
+    return f"{count} bytes"
+
+
+def parse_json(content: bytes) -> Any:
+    """A JSON text as Python's own types, with all refused that readers disagree on, or that costs without limit.
+
+    Args:
+        content: The text in UTF-8.
+
+    Raises:
+        ValueError: With a short reason, if it is no JSON or no UTF-8, or holds ``NaN`` or ``Infinity``, a number that
+            overflows, a whole number of more than 20 digits, a name twice in one object, half a surrogate pair, more
+            than 40 nested levels, or more than two million values.
+
+    Example:
+        >>> parse_json(b'{"x": [1, 2.5, null]}')
+        {'x': [1, 2.5, None]}
+        >>> parse_json(b'{"x": 1, "x": 2}')
+        Traceback (most recent call last):
+        ...
+        ValueError: 'x' stands twice in one object
+    """
+    if sum(map(content.count, (b",", b":", b"[", b"{"))) > MAX_VALUES:
+        raise ValueError(f"more than {MAX_VALUES} values")
+    try:
+        text = content.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"no UTF-8 text at byte {error.start}") from error
+    try:
+        data = json.loads(
+            text, parse_constant=_constant, parse_float=_float, parse_int=_whole, object_pairs_hook=_object
+        )
+    except RecursionError as error:  # soon: the reader counts its levels
+        raise ValueError(f"nested deeper than {MAX_DEPTH} levels") from error
+    if _too_deep(data):
+        raise ValueError(f"nested deeper than {MAX_DEPTH} levels")
+    if _SURROGATE.search(text):
+        try:
+            json.dumps(data, ensure_ascii=False).encode()
+        except UnicodeEncodeError as error:
+            raise ValueError("half a surrogate pair (\\ud800 to \\udfff), which is no character") from error
+    return data
+
+
+def _constant(text: str) -> NoReturn:
+    raise ValueError(f"{text} is not JSON")
+
+
+def _float(text: str) -> float:
+    value = float(text)
+    if math.isinf(value):
+        raise ValueError(f"{text:.20} is too large a number")
+    return value
+
+
+def _whole(text: str) -> int:
+    if len(text) - text.startswith("-") > MAX_DIGITS:
+        raise ValueError(f"{text:.20}... has more than {MAX_DIGITS} digits")
+    return int(text)
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        seen: set[str] = set()
+        twice = next(name for name, _ in pairs if name in seen or seen.add(name))  # type: ignore[func-returns-value]
+        raise ValueError(f"{twice!r:.60} stands twice in one object")
+    return found
+
+
+def _too_deep(data: Any) -> bool:
+    level = [data]
+    for _ in range(MAX_DEPTH):
+        inner = [v.values() if isinstance(v, dict) else v for v in level if isinstance(v, dict | list)]
+        level = [v for values in inner for v in values]
+        if not level:
+            return False
+    return True
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """A file to write in, which takes the place of ``path`` when the block ends well.
+
+    A reader sees the old file or the new one, whole, also after a kill or a loss of power at any moment, and however
+    many processes write to the same path. An exception within the block leaves the old file. The file lies in the same
+    folder under a hidden name of its own until then; :func:`sweep` removes those that killed writers leave.
+
+    Args:
+        path: The file; its folder is made if missing. A new one may be read by all whom the umask lets.
+
+    Raises:
+        OSError: If the folder cannot be made or written in, or the disk is full.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with replacing(Path(folder) / "new" / "a.txt") as file:
+        ...         _ = file.write(b"content")
+        ...     print([p.name for p in (Path(folder) / "new").iterdir()])
+        ['a.txt']
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(
+        f".{path.name[:50]}.{secrets.token_hex(8)}.part"
+    )  # 50: a name has at most 255 bytes
+    # The mode is given to open, which takes the umask off: to ask for the umask is to change it, for all threads.
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
+    handle = os.open(part, flags, 0o644)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, path)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+    _sync_folder(path.parent)
+
+
+def _sync_folder(folder: Path) -> None:
+    if os.name != "posix":
+        return  # Windows has no such call
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+    except OSError as error:
+        if error.errno not in _UNSYNCED:
+            raise
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all, as :func:`replacing` does.
+
+    Args:
+        path: The file; its folder is made if missing.
+        content: What it is to hold.
+
+    Raises:
+        OSError: As :func:`replacing`.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_bytes(Path(folder) / "a.txt", b"content")
+        ...     print((Path(folder) / "a.txt").read_text())
+        content
+    """
+    with replacing(path) as file:
+        file.write(content)
+
+
+def sweep(folder: Path, age: float = LEFTOVER_AGE) -> None:
+    """Remove the temporary files (``.*.part``) that killed writers left in a folder.
+
+    Args:
+        folder: The folder, without those in it. One that is missing has none.
+        age: Time [s] since they were written to last. Younger ones stay: somebody may be writing. Default: an hour.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = (Path(folder) / ".a.txt.0123.part").write_text("half")
+        ...     sweep(Path(folder))  # too young
+        ...     sweep(Path(folder), age=-1.0)
+        ...     print(list(Path(folder).iterdir()))
+        []
+    """
+    now = time.time()
+    for part in folder.glob(".*.part"):
+        with suppress(FileNotFoundError, PermissionError):  # another sweep was faster; another user's stays
+            found = part.lstat()
+            if stat.S_ISREG(found.st_mode) and now - found.st_mtime > age:
+                part.unlink()
