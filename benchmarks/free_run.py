@@ -65,7 +65,7 @@ def exported(step):
     program = trace_model(step.requires_grad_(False))
     with tempfile.TemporaryDirectory() as folder:
         info = model_info(step.prior, step.dt)
-        save_artifact(Path(folder) / "model", {"hybrid": program}, info, provenance={})
+        save_artifact(Path(folder) / "model", {"hybrid": program}, info)
         model = load_artifact(Path(folder) / "model").models["hybrid"]
     z, u = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("u", model.n_u)
     inline = model.step.is_a("MXFunction")

@@ -35,7 +35,7 @@ def completed(artifact):
     import nn_export
     from hybrid_mpc.identification.export import trace_parametric
 
-    prior = scenario.prior(artifact.provenance["prior_parameters"])
+    prior = scenario.prior(artifact.provenance.prior_parameters)
     return replace(
         model, parameters=prior.values, parametric=nn_export.build(trace_parametric(prior), "parametric")
     )

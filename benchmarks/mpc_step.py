@@ -56,7 +56,7 @@ def hybrid(z: int):
     """That model."""
     program, prior, dt = programs(z), scenario.prior(), scenario.data.dt
     with tempfile.TemporaryDirectory() as folder:
-        save_artifact(Path(folder) / "model", {"hybrid": program}, model_info(prior, dt), provenance={})
+        save_artifact(Path(folder) / "model", {"hybrid": program}, model_info(prior, dt))
         return load_artifact(Path(folder) / "model").models["hybrid"]
 
 

@@ -14,3 +14,16 @@ class InputError(ValueError):
         ...
         hybrid_mpc.errors.InputError: run.csv: no column 'pos_rad'; it has 'time_s', 'angle'. Rename one.
     """
+
+
+class StorageError(InputError):
+    """The file system refused to write: a full disk, a folder in place of a file, no permission.
+
+    Its message says what, where and why. The command line adds what is kept, and how to go on.
+
+    Example:
+        >>> raise StorageError("cannot write run/a.json: No space left on device")
+        Traceback (most recent call last):
+        ...
+        hybrid_mpc.errors.StorageError: cannot write run/a.json: No space left on device
+    """

@@ -1,34 +1,89 @@
-"""Files written whole or not at all."""
+"""Files: written whole or not at all, read as data alone, within limits; folders that one job at a time may hold.
+
+Everything that the library writes goes through :func:`replacing`, and every JSON file and every array of its own that
+it reads through :func:`read_json` and :func:`read_arrays`. What cannot be read is an
+:class:`~hybrid_mpc.errors.InputError`, what cannot be written a :class:`~hybrid_mpc.errors.StorageError`: what, where
+and why.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import io
 import json
 import math
 import os
-from collections.abc import Mapping
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.errors import InputError
+import nn_export.files
+from hybrid_mpc.errors import InputError, StorageError
+from hybrid_mpc.records import plain
+
+MOST_JSON = 16 * 2**20
+"""Largest JSON file [bytes] that is read. A model's own is a few KiB, the longest results are a few hundred."""
+MOST_ARRAYS = 2**30
+"""Largest content [bytes] of a file of arrays, unpacked."""
+MOST_CONTENT = 2**31
+"""Largest recording [bytes] that is read."""
+MOST_MEMBERS = 100_000
+"""Most arrays in a file."""
+HASH, ARRAYS_HASH = "sha256", "arrays_sha256"
+"""Fields of a document that hold hashes: of its content, of the arrays beside it."""
+LOCK = ".lock"
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[IO[bytes]]:
+    """An open binary file that takes the place of ``path`` when the block ends well.
+
+    A kill at any moment, a full disk or a second writer leave the old file or a new one, whole. Folders are made.
+
+    Args:
+        path: The file.
+
+    Raises:
+        StorageError: If it cannot be written.
+
+    Example:
+        >>> path = Path(tempfile.mkdtemp()) / "a.txt"
+        >>> with replacing(path) as file:
+        ...     _ = file.write(b"whole")
+        >>> path.read_text()
+        'whole'
+    """
+    try:
+        with nn_export.files.replacing(path) as file:
+            yield file
+    except OSError as error:
+        raise cannot_write(path, error) from error
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write ``text`` to ``path``; a kill at any moment leaves the old file or the new one."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    part.write_text(text, encoding="utf-8")
-    os.replace(part, path)
+    """Write ``text`` to ``path``, whole or not at all.
+
+    Raises:
+        StorageError: If it cannot be written.
+    """
+    with replacing(path) as file:
+        file.write(text.encode("utf-8"))
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write ``value`` as JSON; infinities and NaN, which JSON does not know, become strings.
+    """Write ``value`` as JSON (see :func:`~hybrid_mpc.records.plain`), whole or not at all.
+
+    Raises:
+        StorageError: If it cannot be written.
 
     Example:
-        >>> import tempfile
         >>> path = Path(tempfile.mkdtemp()) / "a.json"
         >>> write_json(path, {"x": float("inf")}); read_json(path)
         {'x': 'inf'}
@@ -40,72 +95,326 @@ def read_json(path: Path) -> Any:
     """Content of a JSON file.
 
     Raises:
-        InputError: If the file is missing or damaged.
+        InputError: If it is missing, no regular file, larger than 16 MiB, or no JSON.
     """
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise InputError(f"{path} is missing") from error
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        return nn_export.files.parse_json(read_bytes(path, MOST_JSON))
+    except ValueError as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{path} is damaged: {error}") from error
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """The object that a JSON file holds.
+
+    Raises:
+        InputError: If it holds anything else, or as :func:`read_json`.
+    """
+    found = read_json(path)
+    if not isinstance(found, dict):
+        raise InputError(f"{path} is damaged: an object (fields and values) is needed")
+    return found
 
 
 def write_table(path: Path, header: str, table: NDArray[np.float64]) -> None:
     """Write a table ``(n, columns)`` as CSV with six decimals, whole or not at all.
 
+    Raises:
+        StorageError: If it cannot be written.
+
     Example:
-        >>> import tempfile
         >>> path = Path(tempfile.mkdtemp()) / "a.csv"
         >>> write_table(path, "time_s,u_nm", np.array([[0.0, 0.5]])); path.read_text().splitlines()
         ['time_s,u_nm', '0.000000,0.500000']
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    np.savetxt(part, table, "%.6f", delimiter=",", header=header, comments="")
-    os.replace(part, path)
+    with replacing(path) as file:
+        np.savetxt(file, table, "%.6f", delimiter=",", header=header, comments="")
 
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays as ``.npz`` (no pickle), whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    with part.open("wb") as file:
+    """Write arrays as ``.npz`` (no pickle), whole or not at all.
+
+    Raises:
+        StorageError: If it cannot be written.
+    """
+    with replacing(path) as file:
         np.savez_compressed(file, **{name: np.asarray(a) for name, a in arrays.items()})  # type: ignore[arg-type]
-    os.replace(part, path)
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """Arrays of a ``.npz`` file; object arrays are refused.
 
     Raises:
-        InputError: If the file is missing or damaged.
+        InputError: If it is missing, damaged, or unpacks to more than 1 GiB.
     """
+    content = read_bytes(path, MOST_ARRAYS)
     try:
-        with np.load(path, allow_pickle=False) as file:
+        check_npz(content, MOST_ARRAYS)
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
-    except FileNotFoundError as error:
-        raise InputError(f"{path} is missing") from error
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"{path} is damaged: {error}") from error
 
 
-def plain(value: Any) -> Any:
-    """``value`` in JSON's own types: numpy scalars and arrays as numbers and lists, tuples as lists."""
-    if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)
-    if isinstance(value, Path):
-        return str(value)
-    return value
+def write_document(
+    path: Path, value: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]] | None = None
+) -> None:
+    """Write a JSON object with the hash of its content, so that damage is noticed when it is read.
+
+    Args:
+        path: The file, ``.json``.
+        value: The object.
+        arrays: Arrays that belong to it; written before it, beside it as ``.npz``, with their hash in the JSON.
+            Default: none.
+
+    Raises:
+        StorageError: If it cannot be written.
+
+    Example:
+        >>> path = Path(tempfile.mkdtemp()) / "a.json"
+        >>> write_document(path, {"x": 1}, {"y": np.zeros(2)})
+        >>> read_document(path), read_document_arrays(path)["y"]
+        ({'x': 1}, array([0., 0.]))
+    """
+    document = plain(value)
+    if arrays is not None:
+        beside = path.with_suffix(".npz")
+        write_arrays(beside, arrays)
+        document[ARRAYS_HASH] = sha256(beside)
+    write_json(path, {**document, HASH: digest(document)})
+
+
+def read_document(path: Path, remedy: str = "") -> dict[str, Any]:
+    """The object of a file that :func:`write_document` wrote.
+
+    Args:
+        path: The file.
+        remedy: What the user can do where it is damaged. Default: nothing is said.
+
+    Raises:
+        InputError: If it is missing, damaged, or was changed since.
+    """
+    document = _whole(path, remedy)
+    document.pop(ARRAYS_HASH, None)
+    return document
+
+
+def read_document_arrays(path: Path, remedy: str = "") -> dict[str, NDArray[Any]]:
+    """The arrays that belong to a file that :func:`write_document` wrote.
+
+    Args:
+        path: The JSON file.
+        remedy: What the user can do where it is damaged. Default: nothing is said.
+
+    Raises:
+        InputError: If they are missing, damaged, or not those that were written with it.
+    """
+    expected, beside = _whole(path, remedy).get(ARRAYS_HASH), path.with_suffix(".npz")
+    try:
+        if sha256(beside) != expected:
+            raise InputError(f"{beside} is damaged, or does not belong to {path.name}")
+        return read_arrays(beside)
+    except InputError as error:
+        raise type(error)(_with(str(error), remedy)) from error
+
+
+def _whole(path: Path, remedy: str) -> dict[str, Any]:
+    try:
+        document = read_object(path)
+        if document.pop(HASH, None) != digest(document):
+            raise InputError(f"{path} is damaged or was changed by hand: its content is not what was saved")
+    except InputError as error:
+        raise type(error)(_with(str(error), remedy)) from error
+    return document
+
+
+def _with(text: str, remedy: str) -> str:
+    return f"{text}; {remedy}" if remedy else text
+
+
+def check_npz(content: bytes, most: int) -> None:
+    """Refuse a ``.npz`` that holds anything but plain arrays, or unpacks to more than it may, before it is unpacked.
+
+    Args:
+        content: The file.
+        most: Bytes that its arrays may have together.
+
+    Raises:
+        ValueError: If that is so.
+        zipfile.BadZipFile: If it is no archive.
+
+    Example:
+        >>> file = io.BytesIO()
+        >>> np.savez_compressed(file, a=np.zeros(10**6))
+        >>> check_npz(file.getvalue(), most=10**6)
+        Traceback (most recent call last):
+        ...
+        ValueError: its arrays have 8000128 bytes, at most 1000000 are read
+    """
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        members = archive.infolist()
+        if len(members) > MOST_MEMBERS:
+            raise ValueError(f"it has {len(members)} arrays, at most {MOST_MEMBERS} are read")
+        if (size := sum(member.file_size for member in members)) > most:
+            raise ValueError(f"its arrays have {size} bytes, at most {most} are read")
+        for member in members:
+            with archive.open(member) as file:
+                version = np.lib.format.read_magic(file)
+                if version not in _HEADERS:
+                    raise ValueError(f"{member.filename} is of format {version}, which is not read")
+                shape, _, dtype = _HEADERS[version](file)
+            if dtype.hasobject:
+                raise ValueError(f"{member.filename} holds objects, which could run code")
+            if math.prod(shape) * dtype.itemsize > member.file_size or max(shape, default=0) > most:
+                raise ValueError(f"{member.filename} is shorter than its shape {str(shape)[:60]}")
+
+
+_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+
+
+def read_bytes(path: Path, limit: int) -> bytes:
+    """Content of a regular file of at most ``limit`` bytes.
+
+    Raises:
+        InputError: If there is none, or it cannot be read.
+    """
+    try:
+        return nn_export.files.read_bytes(path, limit)
+    except FileNotFoundError as error:
+        raise InputError(f"{path} is missing") from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read {path}: {reason(error)}") from error
+
+
+def reason(error: Exception) -> str:
+    """Why the file system refused something, in words."""
+    if isinstance(error, FileExistsError) and error.filename:
+        return f"{error.filename} is a file where a folder is needed"
+    return str(getattr(error, "strerror", None) or error)
+
+
+def cannot_write(path: Path, error: OSError) -> StorageError:
+    """What to say where ``path`` cannot be written: the place, the reason, and what is left of it."""
+    kept = "the file from before is kept" if _exists(path) else "nothing half-written is left"
+    return StorageError(f"cannot write {path}: {reason(error)}; {kept}")
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError:
+        return False
+
+
+def sha256(path: Path, limit: int = MOST_CONTENT) -> str:
+    """SHA-256 of a regular file's content.
+
+    Raises:
+        InputError: If it cannot be read.
+
+    Example:
+        >>> sha256(Path(tempfile.mkdtemp()) / "none")
+        Traceback (most recent call last):
+        hybrid_mpc.errors.InputError: ... is missing
+    """
+    return hashlib.sha256(read_bytes(path, limit)).hexdigest()
 
 
 def digest(value: Any) -> str:
     """SHA-256 of a value's JSON form."""
     return hashlib.sha256(json.dumps(plain(value), sort_keys=True).encode()).hexdigest()
+
+
+def is_empty(folder: Path) -> bool:
+    """Whether a folder is not there, or holds nothing but what a killed writer or a lock has left.
+
+    Raises:
+        InputError: If it cannot be looked into.
+    """
+    try:
+        return not folder.exists() or (folder.is_dir() and all(_leftover(path) for path in folder.iterdir()))
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot look into {folder}: {reason(error)}") from error
+
+
+def _leftover(path: Path) -> bool:
+    return path.name == LOCK or (path.name.startswith(".") and path.name.endswith(".part"))
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse a folder for results that holds something, or in which nothing can be written.
+
+    Nothing is left behind: a folder that is not there yet is not made.
+
+    Raises:
+        InputError: If it does, or it cannot.
+
+    Example:
+        >>> check_folder(Path(tempfile.mkdtemp()) / "new")
+        >>> check_folder(Path("/dev/null"))
+        Traceback (most recent call last):
+        hybrid_mpc.errors.InputError: /dev/null exists and is no empty folder; choose another --out
+    """
+    if not is_empty(folder):
+        raise InputError(f"{folder} exists and is no empty folder; choose another --out")
+    check_writable(folder)
+
+
+def check_writable(folder: Path) -> None:
+    """Refuse a folder in which nothing can be written; it need not be there yet.
+
+    Raises:
+        InputError: If that is so.
+    """
+    try:
+        if "\0" in str(folder):
+            raise ValueError("its name holds a null character")
+        place = folder.absolute()
+        while not place.exists():  # a name that is too long for the file system raises here
+            place = place.parent
+        with tempfile.TemporaryFile(dir=place) as file:
+            file.write(bytes(4096))
+            file.flush()
+            os.fsync(file.fileno())
+    except (OSError, ValueError) as error:
+        raise StorageError(f"cannot write into {folder}: {reason(error)}; choose another --out") from error
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Hold a folder, which is made if missing, against other jobs; what killed writers have left in it is removed.
+
+    The system lets go of it when the process ends, however it ends.
+
+    Args:
+        folder: The folder.
+
+    Raises:
+        InputError: If another job holds it, or it cannot be written.
+
+    Example:
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> with locked(folder), locked(folder):
+        ...     pass
+        Traceback (most recent call last):
+        hybrid_mpc.errors.InputError: ... is in use: another process works in this folder; wait for it, or choose ...
+    """
+    from filelock import FileLock, Timeout
+
+    lock = FileLock(folder / LOCK, timeout=0)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock.acquire()
+    except Timeout as error:
+        raise InputError(
+            f"{folder} is in use: another process works in this folder; wait for it, or choose another --out"
+        ) from error
+    except OSError as error:
+        raise cannot_write(folder, error) from error
+    try:
+        for place in (folder, *(path for path in folder.rglob("*") if path.is_dir())):
+            nn_export.files.sweep(place, age=-1.0)  # nobody else writes here
+        yield
+    finally:
+        lock.release()

@@ -215,10 +215,48 @@ def registered_scenarios() -> dict[str, str]:
     return {e.name: e.value for e in sorted(entry_points(group="hybrid_mpc.scenarios"), key=lambda e: e.name)}
 
 
+def scenario_of(named: str, where: Path, given: str = "") -> Scenario | None:
+    """The scenario that a file names, of registered ones alone: a name from a file never runs anything.
+
+    Args:
+        named: The name in the file; empty for none.
+        where: The file, for messages.
+        given: What the user himself says, a registered name or a Python file; it is taken first.
+
+    Returns:
+        The scenario; None where neither names one.
+
+    Raises:
+        InputError: If the file's scenario is not registered, or the user's is another one.
+
+    Example:
+        >>> scenario_of("golf_robot", Path("model.json")).name
+        'golf_robot'
+        >>> scenario_of("mine.py", Path("model.json"))
+        Traceback (most recent call last):
+        hybrid_mpc.errors.InputError: model.json names the scenario 'mine.py', which is not registered; if it is \
+yours, give its file: --scenario FILE.py
+    """
+    if given:
+        scenario = load_scenario(given)
+        if named and scenario.name != named:
+            raise InputError(f"{where} was made for scenario {named!r}, not for {scenario.name!r}")
+        return scenario
+    if not named:
+        return None
+    if named not in registered_scenarios():
+        raise InputError(
+            f"{where} names the scenario {named!r}, which is not registered; if it is yours, give its file: "
+            "--scenario FILE.py"
+        )
+    return load_scenario(named)
+
+
 def load_scenario(name_or_path: str) -> Scenario:
     """The scenario of a registered name or of a user's Python file (which defines ``scenario``).
 
-    A scenario file is the user's own program: loading it runs it.
+    A scenario file is the user's own program: loading it runs it. So only what the user has typed himself may come
+    here; for a name that stands in a file there is :func:`scenario_of`.
 
     Raises:
         InputError: If there is no such name or file, the file fails, or defines no ``scenario``.

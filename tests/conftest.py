@@ -70,5 +70,5 @@ def golf_artifact(tmp_path_factory) -> Path:
     steps = {"hybrid": HybridStep(prior, stack.member(0), scaling, 0.02), "prior": PriorStep(prior, 0.02)}
     folder = tmp_path_factory.mktemp("artifact") / "model"
     programs = {name: trace_model(step.requires_grad_(False)) for name, step in steps.items()}
-    save_artifact(folder, programs, model_info(prior, 0.02), provenance={"made": "for tests"})
+    save_artifact(folder, programs, model_info(prior, 0.02))
     return folder

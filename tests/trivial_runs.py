@@ -9,6 +9,7 @@ from pathlib import Path
 from hybrid_mpc.studies import Study, run_study, runner
 from hybrid_mpc.studies.draws import generator
 from hybrid_mpc.studies.loops import run_batch
+from hybrid_mpc.studies.note import ModelNote, NoiseNote
 
 SCENARIO = "golf_robot"
 
@@ -79,7 +80,7 @@ class Here:
         pass
 
 
-NOTE = {"sha256": "0", "provenance": {}, "noise": {"source": "none", "sigma_x": {}}}
+NOTE = ModelNote("0", {}, NoiseNote("none", {}))
 
 if __name__ == "__main__":
     import trivial_runs

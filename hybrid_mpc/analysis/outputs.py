@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from hybrid_mpc.analysis.study import POINTS, Findings, Subject
-from hybrid_mpc.files import plain, write_arrays, write_json, write_text
+from hybrid_mpc.files import write_arrays, write_json, write_text
+from hybrid_mpc.records import plain
 from hybrid_mpc.report import KeyFigure, Report, Section, Table, write_report
 
 MODES = 6

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.artifact import FILE, Artifact, load_artifact
+from hybrid_mpc.artifact import FILE, Artifact, artifact_folder, load_artifact
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import ExtendedKalmanFilter
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.mpc import OCP
-from hybrid_mpc.scenario import ControlSpec, Plant, Scenario, load_scenario
+from hybrid_mpc.scenario import ControlSpec, Plant, Scenario, scenario_of
 from nn_export import Program, load_programs
 
 Array = NDArray[np.float64]
@@ -71,16 +71,6 @@ class Request:
     seed: int = 0
 
 
-def check_out(out: Path) -> None:
-    """Refuse a folder that holds something.
-
-    Raises:
-        InputError: If it does.
-    """
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{out} exists and is no empty folder; choose another --out")
-
-
 def subject_of(request: Request) -> tuple[Subject, tuple[str, ...]]:
     """What is analysed, and in words where it came from.
 
@@ -90,17 +80,10 @@ def subject_of(request: Request) -> tuple[Subject, tuple[str, ...]]:
     Raises:
         InputError: If there is no artifact, the scenario does not fit it, or a recording is bad.
     """
-    folder = request.folder
-    if not (folder / FILE).is_file() and (folder / "model" / FILE).is_file():
-        folder = folder / "model"
-    if not (folder / FILE).is_file():
-        raise InputError(f"{folder} holds no artifact; give model/ of a finished run")
+    folder = artifact_folder(request.folder)
     artifact = load_artifact(folder)
-    named = str(artifact.provenance.get("scenario") or "")
-    name = request.scenario or named
-    scenario = load_scenario(name) if name else None
-    if scenario is not None and named and scenario.name != named:
-        raise InputError(f"{folder} was made for scenario {named}, not for {scenario.name}")
+    scenario = scenario_of(artifact.provenance.scenario, folder / FILE, request.scenario)
+    name = "" if scenario is None else scenario.name
     if scenario is None and request.data:
         raise InputError("--data needs --scenario: only it says which columns are which")
     model = next(iter(artifact.models.values()))

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hybrid_mpc.cli.options import MOST_SEED
+
 if TYPE_CHECKING:
     from hybrid_mpc.analysis.subject import Request
 
@@ -37,15 +39,16 @@ def analyze(
         Path | None,
         typer.Option(help="control.json with the filters' process noise. Default: that of the model's run."),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of what is drawn at random.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of what is drawn at random.", min=0, max=MOST_SEED)] = 0,
 ) -> None:
     """Poles, Bode plots, margins of the control loop and more, as tables, pictures and a page."""
     from hybrid_mpc.analysis.outputs import write_analysis
     from hybrid_mpc.analysis.study import study
-    from hybrid_mpc.analysis.subject import Request, check_out, subject_of
+    from hybrid_mpc.analysis.subject import Request, subject_of
     from hybrid_mpc.cli.progress import make_progress
+    from hybrid_mpc.files import check_folder
 
-    check_out(out)
+    check_folder(out)
     request = Request(model, scenario, tuple(data or ()), speed, noise, seed)
     with make_progress() as progress:
         progress.start("reading the model")

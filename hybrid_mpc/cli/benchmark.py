@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hybrid_mpc.cli.options import ScenarioName
+from hybrid_mpc.cli.options import MOST_SEED, ScenarioName
 
 EXAMPLES = (
     "Examples:\n\n"
@@ -31,7 +31,7 @@ def benchmark(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder to make. Default: runs/MACHINE-benchmark.")] = None,
     budget: Annotated[str, typer.Option(help="Effort: quick or full.")] = "quick",
-    seed: Annotated[int, typer.Option(help="Seed of the networks.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the networks.", min=0, max=MOST_SEED)] = 0,
     refit: Annotated[
         float | None,
         typer.Option(

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hybrid_mpc.cli.options import EmptyFolder, ScenarioName
+from hybrid_mpc.cli.options import MOST_SEED, EmptyFolder, ScenarioName
 from hybrid_mpc.scenario import load_scenario
 
 EXAMPLES = (
@@ -38,7 +38,7 @@ def control(
     ] = None,
     solver: Annotated[str, typer.Option(help="rti, sqp or ipopt.")] = "rti",
     seeds: Annotated[int, typer.Option(help="Loops of each task and controller.", min=1)] = 10,
-    seed: Annotated[int, typer.Option(help="Seed of the loops.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the loops.", min=0, max=MOST_SEED)] = 0,
     fault: Annotated[
         list[str] | None, typer.Option(help="TARGET=VALUE@START:END in every loop; may be repeated.")
     ] = None,
@@ -61,6 +61,7 @@ def control(
 ) -> None:
     """Close the loop around the simulated machine with a trained model, without training anything."""
     from hybrid_mpc.cli.progress import make_progress
+    from hybrid_mpc.files import check_folder
     from hybrid_mpc.pipeline.control_job import (
         DEFAULT_CONTROLLERS,
         GUARDED_CONTROLLERS,
@@ -68,7 +69,7 @@ def control(
         parsed_fault,
         prepared,
     )
-    from hybrid_mpc.pipeline.control_results import check_folder, run_control
+    from hybrid_mpc.pipeline.control_results import run_control
 
     check_folder(out)
     settings = ControlSettings(

@@ -11,9 +11,10 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from hybrid_mpc.cli.options import EmptyFolder, ScenarioName
+from hybrid_mpc.cli.options import MOST_SEED, EmptyFolder, ScenarioName
 from hybrid_mpc.data.differentiation import bandwidth
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import check_folder, write_text
 from hybrid_mpc.scenario import Scenario, load_scenario
 
 EXAMPLES = (
@@ -26,7 +27,7 @@ EXAMPLES = (
 def data(
     scenario: ScenarioName,
     out: EmptyFolder,
-    seed: Annotated[int, typer.Option(help="Seed of the recordings.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the recordings.", min=0, max=MOST_SEED)] = 0,
     budget: Annotated[str, typer.Option(help="Amount: quick or full.")] = "full",
     data_set: Annotated[str, typer.Option("--set", help="Data set of a scenario that has several.")] = "",
 ) -> None:
@@ -67,13 +68,12 @@ def write_data(scenario: Scenario, out: Path, seed: int, budget: str, data_set: 
     several = "data_set" in inspect.signature(make).parameters
     if data_set and not several:
         raise InputError(f"{scenario.name} has one data set only; leave --set {data_set} out")
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{out} exists and is no empty folder; choose another --out")
+    check_folder(out)
     options = {"data_set": data_set} if data_set else {}
     files = make(out, seed, budget, **options)
     command = f"hybrid-mpc data {scenario.name} --out {out.name} --seed {seed} --budget {budget}"
     command += f" --set {data_set}" if data_set else ""
-    (out / "README.md").write_text(readme(scenario, files, command), encoding="utf-8")
+    write_text(out / "README.md", readme(scenario, files, command))
     return files
 
 

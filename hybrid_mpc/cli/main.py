@@ -28,22 +28,23 @@ from hybrid_mpc.cli import run as run_command
 from hybrid_mpc.cli import scenarios as scenarios_command
 from hybrid_mpc.cli import search as search_command
 from hybrid_mpc.cli import study as study_command
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import InputError, StorageError
+from hybrid_mpc.files import reason
 
-CTRL_C = 130
-INTERRUPTED = {
-    "run": "interrupted; finished stages are kept: the same command with --resume goes on",
-    "reproduce": "interrupted; what is done is kept: the same command with --resume goes on",
-    "benchmark": "interrupted; what is fitted and trained is kept: the same command goes on",
-    "control": "interrupted; loops are kept at the end only, there is nothing to resume: the same command starts "
-    "them anew (with another --out if figures lie in it already)",
-    "search": "interrupted; finished trials are kept: the same command with --resume goes on",
-    "study": "interrupted; finished runs are kept: the same command with --resume goes on",
-    "analyze": "interrupted; figures and tables are not complete: the same command with another --out makes them anew",
-    "monitor": "interrupted; tables and pictures are not complete: the same command with another --out makes them anew",
-    "data": "interrupted; the recordings are not complete: the same command with another --out makes them anew",
+BAD_INPUT, CTRL_C = 2, 130
+KEPT = {
+    "run": "finished stages are kept: the same command with --resume goes on",
+    "reproduce": "what is done is kept: the same command with --resume goes on",
+    "benchmark": "what is fitted and trained is kept: the same command goes on",
+    "control": "loops are kept at the end only, there is nothing to resume: the same command starts them anew (with "
+    "another --out if something lies in it already)",
+    "search": "finished trials are kept: the same command with --resume goes on",
+    "study": "finished runs are kept: the same command with --resume goes on",
+    "analyze": "figures and tables are not complete: the same command with another --out makes them anew",
+    "monitor": "tables and pictures are not complete: the same command with another --out makes them anew",
+    "data": "the recordings are not complete: the same command with another --out makes them anew",
 }
-"""What is left after Ctrl-C, by command."""
+"""What is left where a command was ended by Ctrl-C or by the file system."""
 
 app = typer.Typer(
     name="hybrid-mpc",
@@ -85,14 +86,32 @@ def main() -> None:
     errors = Console(stderr=True, soft_wrap=True, highlight=False)
     try:
         app()
+    except StorageError as error:
+        errors.print(f"[bold red]error:[/] {_escape(str(error))}")
+        _say_what_is_kept(errors)
+        sys.exit(BAD_INPUT)
     except InputError as error:
         errors.print(f"[bold red]error:[/] {_escape(str(error))}")
-        sys.exit(2)
+        sys.exit(BAD_INPUT)
+    except BrokenPipeError:  # who read the output, a pager say, has gone
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(BAD_INPUT)
+    except OSError as error:
+        place = f" {error.filename}" if error.filename is not None else ""
+        errors.print(f"[bold red]error:[/] the file system refused{_escape(place)}: {reason(error)}")
+        _say_what_is_kept(errors)
+        sys.exit(BAD_INPUT)
     except SystemExit as stop:
         if stop.code == CTRL_C:  # typer takes the KeyboardInterrupt and says nothing
-            command = next((word for word in sys.argv[1:] if word in INTERRUPTED), "")
-            errors.print(INTERRUPTED.get(command, "interrupted"))
+            errors.print("interrupted")
+            _say_what_is_kept(errors)
         raise
+
+
+def _say_what_is_kept(errors: Console) -> None:
+    command = next((word for word in sys.argv[1:] if word in KEPT), "")
+    if command:
+        errors.print(KEPT[command])
 
 
 def _escape(text: str) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.scenario import load_scenario
+from hybrid_mpc.scenario import scenario_of
 
 if TYPE_CHECKING:
     from hybrid_mpc.monitor import Detector
@@ -48,20 +48,18 @@ def monitor(
     ] = None,
 ) -> None:
     """Say where in recordings the model does not describe the machine, and what would explain it."""
-    from hybrid_mpc.artifact import FILE
-    from hybrid_mpc.files import read_json
-    from hybrid_mpc.pipeline.control_results import check_folder
+    from hybrid_mpc.artifact import FILE, artifact_folder, read_description
+    from hybrid_mpc.files import check_folder
     from hybrid_mpc.pipeline.monitor_job import learn as learn_job
     from hybrid_mpc.pipeline.monitor_job import prepared, watch
 
     check_folder(out)
-    if not scenario:
-        folder = model if (model / FILE).is_file() else model / "model"
-        scenario = str(read_json(folder / FILE).get("provenance", {}).get("scenario", ""))
-        if not scenario:
-            raise InputError(f"{folder / FILE} does not say whose model it is; give --scenario")
+    folder = artifact_folder(model)
+    machine = scenario_of(read_description(folder).provenance.scenario, folder / FILE, scenario)
+    if machine is None:
+        raise InputError(f"{folder / FILE} does not say whose model it is; give --scenario")
     job = prepared(
-        load_scenario(scenario), model, recordings, noise=noise, resolution=tuple(resolution) if resolution else None,
+        machine, folder, recordings, noise=noise, resolution=tuple(resolution) if resolution else None,
         calibration=None if learn else calibration,
     )  # fmt: skip
     if learn:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hybrid_mpc.cli.options import Device
+from hybrid_mpc.cli.options import MOST_SEED, Device
 
 EXAMPLES = (
     "Examples:\n\n"
@@ -30,7 +30,7 @@ def reproduce(
     form: Annotated[
         str, typer.Option(help="hybrid, or literal: the paper's whole derivative and explicit Euler.")
     ] = "hybrid",
-    seed: Annotated[int, typer.Option(help="Seed of data and training.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of data and training.", min=0, max=MOST_SEED)] = 0,
     out: Annotated[
         Path | None, typer.Option(help="Folder to make. Default: runs/reproduce_SCENARIO.")
     ] = None,

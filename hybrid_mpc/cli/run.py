@@ -7,7 +7,15 @@ from typing import Annotated, Any
 
 import typer
 
-from hybrid_mpc.cli.options import Device, InputColumns, OutputColumns, Recordings, ScenarioName, TimeColumn
+from hybrid_mpc.cli.options import (
+    MOST_SEED,
+    Device,
+    InputColumns,
+    OutputColumns,
+    Recordings,
+    ScenarioName,
+    TimeColumn,
+)
 
 EXAMPLES = (
     "Examples:\n\n"
@@ -22,7 +30,9 @@ def run(
     scenario: ScenarioName,
     data: Recordings = None,
     out: Annotated[Path | None, typer.Option(help="Folder to make. Default: runs/SCENARIO.")] = None,
-    seed: Annotated[int, typer.Option(help="Seed of data, training and closed loops.", min=0)] = 0,
+    seed: Annotated[
+        int, typer.Option(help="Seed of data, training and closed loops.", min=0, max=MOST_SEED)
+    ] = 0,
     budget: Annotated[str, typer.Option(help="Effort: quick or full.")] = "quick",
     resume: Annotated[bool, typer.Option("--resume", help="Finish the run that the folder holds.")] = False,
     time_column: TimeColumn = "",

@@ -7,7 +7,14 @@ from typing import Annotated, Any
 
 import typer
 
-from hybrid_mpc.cli.options import InputColumns, OutputColumns, Recordings, ScenarioName, TimeColumn
+from hybrid_mpc.cli.options import (
+    MOST_SEED,
+    InputColumns,
+    OutputColumns,
+    Recordings,
+    ScenarioName,
+    TimeColumn,
+)
 
 EXAMPLES = (
     "Examples:\n\n"
@@ -32,7 +39,7 @@ def search(
             "anchors; may be repeated. Default: the first four."
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of data, trainings and search.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of data, trainings and search.", min=0, max=MOST_SEED)] = 0,
     timeout: Annotated[
         float | None, typer.Option(help="No further training starts after this time [s]. Default: none.")
     ] = None,

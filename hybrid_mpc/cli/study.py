@@ -44,6 +44,12 @@ def run(
         list[str] | None,
         typer.Option(help="Artifact folder or run folder, or LABEL=FOLDER for several; replaces the file's."),
     ] = None,
+    scenario: Annotated[
+        str,
+        typer.Option(
+            help="The machine of a YAML file: a registered name or a .py file; replaces the file's."
+        ),
+    ] = "",
     workers: Annotated[int, typer.Option(help="Processes on this machine.", min=1)] = 2,
     scheduler: Annotated[
         str | None, typer.Option(help="Address of a dask scheduler, tcp://HOST:PORT, in place of processes.")
@@ -77,7 +83,7 @@ def run(
         return
     if budget is not None:
         raise InputError(f"study {study}: only the study monitor has budgets; leave --budget out")
-    wanted = _study(study, _models(model))
+    wanted = _study(study, _models(model), scenario)
     if dry:
         with make_progress() as progress:
             progress.start("timing a few periods of each kind of run")
@@ -167,11 +173,13 @@ def list_ready() -> None:
     )
 
 
-def _study(name: str, models: dict[str, str]) -> Study:
+def _study(name: str, models: dict[str, str], scenario: str) -> Study:
     from hybrid_mpc.studies.files import read_study
     from hybrid_mpc.studies.ready import READY, ready_study
 
     if name in READY:
+        if scenario:
+            raise InputError(f"study {name} has a scenario of its own; leave --scenario out")
         if not models:
             raise InputError(f"study {name} needs a model: --model FOLDER, e.g. model/ of a finished run")
         return ready_study(name, models)
@@ -179,7 +187,9 @@ def _study(name: str, models: dict[str, str]) -> Study:
         raise InputError(
             f"no study {name!r}; ready are: {', '.join((*READY, MONITOR))}. Or give the path of a .yaml file."
         )
-    return read_study(name, **({"models": models} if models else {}))
+    return read_study(
+        name, **({"models": models} if models else {}), **({"scenario": scenario} if scenario else {})
+    )
 
 
 def _models(given: list[str] | None) -> dict[str, str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import math
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.data.sources import Columns, Source, content_of, digest_of
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import write_text
 
 Array = NDArray[np.float64]
 
@@ -65,10 +65,7 @@ def write_csv(path: Path | str, columns: Mapping[str, Array]) -> Path:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(arrays)
     writer.writerows([f"{value + 0.0:.10g}" for value in row] for row in zip(*arrays.values(), strict=True))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    part.write_bytes(text.getvalue().encode())
-    os.replace(part, path)
+    write_text(path, text.getvalue())
     return path
 
 

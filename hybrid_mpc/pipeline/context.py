@@ -13,9 +13,15 @@ import numpy as np
 
 from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import read_arrays, read_json, write_arrays, write_json
+from hybrid_mpc.files import read_document, read_document_arrays, write_document
 from hybrid_mpc.pipeline.settings import RunSettings
 from hybrid_mpc.scenario import Budget, DataSpec, Scenario
+
+STAGES = (
+    "data", "prior", "training", "evaluation", "export", "control", "estimation", "monitor", "guard", "analysis",
+    "report",
+)  # fmt: skip
+"""Stages of the main job in their order; each may read what those before it have left."""
 
 
 class Progress(Protocol):
@@ -129,21 +135,34 @@ class Context:
 
     def save(self, stage: str, result: Mapping[str, Any], arrays: Mapping[str, Any] | None = None) -> None:
         """Keep a stage's result; its JSON is written last and means that the stage is done."""
-        if arrays is not None:
-            write_arrays(self._path(stage, "npz"), arrays)
-        write_json(self._path(stage, "json"), result)
+        write_document(self._path(stage), result, arrays)
 
     def done(self, stage: str) -> bool:
         """Whether a stage's result is there."""
-        return self._path(stage, "json").is_file()
+        return self._path(stage).is_file()
 
     def result(self, stage: str) -> Any:
-        """Result of a stage that is done."""
-        return read_json(self._path(stage, "json"))
+        """Result of a stage that is done.
+
+        Raises:
+            InputError: If its file is damaged; it names the files to delete.
+        """
+        return read_document(self._path(stage), self._remedy(stage))
 
     def arrays(self, stage: str) -> dict[str, Any]:
-        """Arrays of a stage that is done."""
-        return read_arrays(self._path(stage, "npz"))
+        """Arrays of a stage that is done.
 
-    def _path(self, stage: str, ending: str) -> Path:
-        return self.out / "checkpoints" / f"{stage}.{ending}"
+        Raises:
+            InputError: If their file is damaged; it names the files to delete.
+        """
+        return read_document_arrays(self._path(stage), self._remedy(stage))
+
+    def _path(self, stage: str) -> Path:
+        return self.out / "checkpoints" / f"{stage}.json"
+
+    def _remedy(self, stage: str) -> str:
+        later = STAGES[STAGES.index(stage) :] if stage in STAGES else (stage,)
+        return (
+            f"delete what the stage {stage} left and what stands on it ({', '.join(f'{name}.*' for name in later)} in "
+            f"{self.out / 'checkpoints'}), and --resume computes it anew"
+        )

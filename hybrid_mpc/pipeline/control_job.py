@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.artifact import FILE, Artifact, load_artifact
+from hybrid_mpc.artifact import Artifact, artifact_folder, load_artifact
 from hybrid_mpc.closed_loop import ClosedLoopResult, Fault, Guard, simulate
 from hybrid_mpc.closed_loop.faults import check_channels, install
 from hybrid_mpc.closed_loop.simulate import Step
@@ -191,12 +191,7 @@ def prepared(scenario: Scenario, model: Path, settings: ControlSettings, noise: 
     if scenario.oracle is None and (oracles := [c for c in settings.controllers if c in ORACLES]):
         raise InputError(f"scenario {scenario.name} has no oracle; leave --controller {oracles[0]} out")
     tasks = selected_tasks(scenario, settings.tasks)
-    folder = model / "model" if not (model / FILE).is_file() and (model / "model" / FILE).is_file() else model
-    if not (folder / FILE).is_file():
-        state = "holds something else" if folder.is_dir() else "does not exist"
-        raise InputError(
-            f"{folder} {state}; --model needs an artifact folder, such as model/ of a finished run"
-        )
+    folder = artifact_folder(model)
     artifact = load_artifact(folder)
     _check_artifact(scenario, artifact, folder, scenario.control)
     if settings.guard:
@@ -212,8 +207,8 @@ def _check_artifact(scenario: Scenario, artifact: Artifact, folder: Path, contro
     missing = [name for name in ("prior", "hybrid") if name not in artifact.models]
     if missing:
         raise InputError(f"{folder} holds {', '.join(artifact.models)}; needed is a model {missing[0]} too")
-    made_for = artifact.provenance.get("scenario")
-    if made_for is not None and made_for != scenario.name:
+    made_for = artifact.provenance.scenario
+    if made_for and made_for != scenario.name:
         raise InputError(f"{folder} was made for scenario {made_for}, not for {scenario.name}")
     for name, model in artifact.models.items():
         sizes = model.n_x, model.n_u, model.n_y

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +12,19 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.artifact import Artifact
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import read_json
+from hybrid_mpc.files import read_object
 from hybrid_mpc.pipeline.contenders import CONTENDERS, ORACLES, no_surer_than_prior, noise_of
+from hybrid_mpc.records import record
 from hybrid_mpc.scenario import Scenario
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _Noise:
+    """What is read of ``control.json``."""
+
+    sigma_x: Mapping[str, tuple[float, ...]]
 
 
 def find_noise(
@@ -48,17 +56,15 @@ def find_noise(
     path = given if given is not None else beside if beside.is_file() else None
     if path is not None:
         n_x = artifact.models["prior"].n_x
-        try:
-            noise = {k: np.asarray(v, dtype=float) for k, v in read_json(path)["sigma_x"].items()}
-            fit = {name: v.shape == (n_x,) and bool(np.all(v >= 0)) for name, v in noise.items()}
-            ok = all(fit[name] for name in needed) and all(fit.values())
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        held = record(_Noise, {"sigma_x": read_object(path).get("sigma_x")}, str(path)).sigma_x
+        noise = {name: np.asarray(values, dtype=float) for name, values in held.items()}
+        if lacking := [name for name in needed if name not in noise]:
             raise InputError(
-                f"{path}: no process noise sigma_x for {', '.join(needed)} in it ({error}); --noise needs "
+                f"{path}: no process noise sigma_x for {', '.join(lacking)} in it; --noise needs "
                 "checkpoints/control.json of a run"
-            ) from error
-        if not ok:
-            raise InputError(f"{path}: sigma_x must hold {n_x} numbers that are not negative")
+            )
+        if not all(v.shape == (n_x,) and np.all(v >= 0) and np.all(np.isfinite(v)) for v in noise.values()):
+            raise InputError(f"{path}: sigma_x must hold {n_x} finite numbers that are not negative")
         names = path.parent.parent.name, path.parent.name, path.name
         return no_surer_than_prior(scenario, noise), "/".join(name for name in names if name)
     if not needed:
@@ -80,7 +86,7 @@ def _estimated_noise(scenario: Scenario, artifact: Artifact, seed: int) -> Mappi
             f"scenario {scenario.name} makes no data to estimate the filters' process noise on; give "
             "--noise checkpoints/control.json of a run"
         )
-    prior = scenario.prior(artifact.provenance.get("prior_parameters"))
+    prior = scenario.prior(artifact.provenance.prior_parameters)
     with tempfile.TemporaryDirectory() as folder:
         files = scenario.make_data(Path(folder), seed, "quick")
         data = load_trajectories(files, scenario.data, outputs=prior.outputs, inputs=prior.inputs)

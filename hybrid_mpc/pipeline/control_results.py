@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.closed_loop import ClosedLoopResult
 from hybrid_mpc.closed_loop.timing import percentiles
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import write_json
+from hybrid_mpc.files import check_folder, write_json
 from hybrid_mpc.monitor.calibration import alarm_intervals
 from hybrid_mpc.mpc import Source
 from hybrid_mpc.pipeline.control_job import Job, run_loops
@@ -42,7 +41,7 @@ def run_control(job: Job, out: Path, progress: Progress, *, gif: bool = True) ->
         What ``results.json`` holds.
 
     Raises:
-        InputError: If the folder is not empty.
+        InputError: If the folder is not empty, or nothing can be written in it.
     """
     check_folder(out)
     rows: list[dict[str, Any]] = []
@@ -54,24 +53,14 @@ def run_control(job: Job, out: Path, progress: Progress, *, gif: bool = True) ->
         steps.setdefault(name, []).append(result.timing_ms["total"])
         if seed == 0:
             firsts.setdefault(task.name, {})[name] = (result, plans)
-    progress.finish("")
-    progress.start("drawing")
     times = {name: np.concatenate(parts) for name, parts in steps.items()}
-    figures(job, out / "figures", firsts, times, progress, gif)
     results = collected(job, rows, times)
     write_json(out / "results.json", results)
     progress.finish("")
+    progress.start("drawing")
+    figures(job, out / "figures", firsts, times, progress, gif)
+    progress.finish("")
     return results
-
-
-def check_folder(out: Path) -> None:
-    """Refuse a folder that holds something.
-
-    Raises:
-        InputError: If it does.
-    """
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{out} exists and is no empty folder; choose another --out")
 
 
 def row(
@@ -151,7 +140,7 @@ def collected(job: Job, rows: Sequence[dict[str, Any]], times: Mapping[str, Arra
             if settings.guard
             else {}
         ),
-        "model": {"provenance": dict(job.artifact.provenance)},
+        "model": {"provenance": job.artifact.provenance},
         "noise": {"source": job.noise_source, "sigma_x": {k: v.tolist() for k, v in job.noise.items()}},
         "versions": versions(),
         "period_ms": 1e3 * job.artifact.models["prior"].dt,

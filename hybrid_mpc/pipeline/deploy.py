@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc import __version__
-from hybrid_mpc.artifact import Artifact, load_artifact, save_artifact
+from hybrid_mpc.artifact import Artifact, Provenance, load_artifact, save_artifact
 from hybrid_mpc.pipeline.contenders import noise_of
 from hybrid_mpc.pipeline.contest import contest
 from hybrid_mpc.pipeline.context import Context
@@ -51,15 +51,15 @@ def export_stage(context: Context) -> None:
         parities.append(
             check_parity(step, programs[name], info, context.smoothed("train"), seed=settings.seed)
         )
-    provenance = {
-        "scenario": context.scenario.name,
-        "seed": settings.seed,
-        "budget": settings.budget,
-        "data_hash": context.result("data")["hash"],
-        "versions": versions(),
-        "prior_parameters": phy.values,
-        "test_scores": context.result("evaluation")["scores"][DEPLOYED]["best"],
-    }
+    provenance = Provenance(
+        context.scenario.name,
+        settings.seed,
+        settings.budget,
+        context.result("data")["hash"],
+        versions(),
+        phy.values,
+        context.result("evaluation")["scores"][DEPLOYED]["best"],
+    )
     save_artifact(context.out / "model", programs, deployed, provenance=provenance)
     context.save(
         "export",

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.artifact import FILE, Artifact, load_artifact
+from hybrid_mpc.artifact import Artifact, artifact_folder, load_artifact
 from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_json, write_json, write_text
@@ -96,7 +96,7 @@ def prepared(
             f"scenario {scenario.name} defines no control problem, so the estimator knows neither input range nor "
             "sensor noise; give the scenario control=ControlSpec(...)"
         )
-    folder = model if (model / FILE).is_file() else model / "model"
+    folder = artifact_folder(model)
     artifact = load_artifact(folder)
     hybrid = artifact.models["hybrid"]
     if abs(hybrid.dt - scenario.data.dt) > 1e-9:

@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
+import threading
+import time
 import traceback
 from collections.abc import Callable, Mapping
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
+from hybrid_mpc.errors import InputError
+
+WATCH_S = 0.5
+"""How often a worker looks whether its parent is still there."""
 WORKERS = min(2, os.cpu_count() or 1)
 """Processes side by side: the machine this is made for has two cores."""
 
@@ -27,7 +34,8 @@ def run_jobs(
     time, each in a fresh process, so results do not depend on how many run side by side.
 
     Raises:
-        RuntimeError: If a job fails; the message holds its traceback. The other jobs are ended.
+        InputError: If a job raises one: bad input that shows only then.
+        RuntimeError: If a job fails otherwise; the message holds its traceback. In either case the others are ended.
     """
     context = multiprocessing.get_context("spawn")
     waiting, results = list(jobs), {}
@@ -47,6 +55,8 @@ def run_jobs(
                 if kind == "progress":
                     on_progress(name, *value)
                     continue
+                if kind == "input":
+                    raise value[0](value[1])
                 if kind == "error":
                     raise RuntimeError(f"{name} failed:\n{value}")
                 results[name] = value
@@ -56,6 +66,8 @@ def run_jobs(
     finally:
         for _, process in running.values():
             process.terminate()
+        for _, process in running.values():
+            process.join()
     return results
 
 
@@ -72,13 +84,35 @@ def _work(connection: Connection, function: Callable[..., Any], args: tuple[Any,
     def report(done: int, total: int, text: str) -> None:
         connection.send(("progress", (done, total, text)))
 
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    assert parent.pid is not None
+    follow(parent.pid)
     try:
         result = function(*args, report)
     except BrokenPipeError:  # the parent is gone, and with it whoever wanted the result
         return
+    except InputError as error:
+        connection.send(("input", (type(error), str(error))))
     except Exception:  # every failure travels to the parent, which raises it
         connection.send(("error", traceback.format_exc()))
     else:
         connection.send(("result", result))
     finally:
         connection.close()
+
+
+def follow(parent: int) -> None:
+    """Tie a worker to its parent: it leaves Ctrl-C to it, and ends with it, even if the parent was killed.
+
+    Args:
+        parent: The parent's process id.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(WATCH_S)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

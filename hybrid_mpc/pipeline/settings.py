@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import digest, read_json, write_json
+from hybrid_mpc.files import (
+    LOCK,
+    check_writable,
+    digest,
+    is_empty,
+    locked,
+    read_json,
+    read_object,
+    sha256,
+    write_json,
+)
 
 FILE = "run.json"
 WHOLE = ("hidden", "networks", "teacher_steps", "free_run_steps", "horizon", "validation_horizon", "batch")
@@ -54,10 +65,10 @@ class RunSettings:
         Raises:
             InputError: If a file cannot be read or is none of network settings.
         """
-        files = [{"name": path.name, "sha256": _sha256(path)} for path in self.data]
+        files = [{"name": path.name, "sha256": sha256(path)} for path in self.data]
         scenario = self.scenario
         if scenario.endswith(".py") and Path(scenario).is_file():
-            scenario = f"{Path(scenario).name} {_sha256(Path(scenario))}"
+            scenario = f"{Path(scenario).name} {sha256(Path(scenario))}"
         plain = {**asdict(replace(self, data=(), scenario=scenario)), "data": files}
         network = self.network()  # a run without such a file has no word of it
         del plain["network_file"]
@@ -105,38 +116,46 @@ class Identified(Protocol):
         """Settings as plain data."""
 
 
-def open_folder(out: Path, settings: Identified, *, resume: bool) -> None:
-    """Prepare the run's folder and note the settings in it.
+@contextmanager
+def open_folder(out: Path, settings: Identified, *, resume: bool) -> Iterator[None]:
+    """The job's folder while it works: made, held against other processes, the settings noted in it.
+
+    Args:
+        out: The folder.
+        settings: What the job computes.
+        resume: Whether a job of the same settings goes on there.
 
     Raises:
-        InputError: If the folder holds something else, another run, or (without ``resume``) a run.
+        InputError: If the folder holds something else, another job, or (without ``resume``) a job; if another process
+            works in it, or nothing can be written.
     """
     identity = settings.identity()
+    _check(out, identity, resume)
+    check_writable(out)
+    with locked(out):
+        _check(out, identity, resume)  # another process may have been quicker
+        if not (out / FILE).is_file():
+            write_json(out / FILE, {"settings": identity})
+        yield
+
+
+def _check(out: Path, identity: Mapping[str, Any], resume: bool) -> None:
+    """Refuse a folder that holds anything but this job, to be resumed."""
     note = out / FILE
-    if note.is_file():
-        held = read_json(note)
-        if not resume:
-            raise InputError(f"{out} already holds a run; add --resume to finish it, or choose another --out")
-        if digest(held.get("settings")) != digest(identity):
-            before = held["settings"]
-            changed = sorted(
-                k for k in {*identity, *before} if digest(identity.get(k)) != digest(before.get(k))
-            )
-            raise InputError(
-                f"{out} holds a run with other settings ({', '.join(changed)} differ); resume with the same "
-                f"ones or choose another --out"
-            )
+    if not note.is_file():
+        if not is_empty(out):
+            raise InputError(f"{out} exists and holds something else than a run; choose another --out")
+        if resume and not (out / LOCK).is_file():  # a run that ended before its first note leaves the lock
+            raise InputError(f"{out} holds no run to resume; leave --resume out")
         return
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{out} exists and holds something else than a run; choose another --out")
-    if resume:
-        raise InputError(f"{out} holds no run to resume; leave --resume out")
-    out.mkdir(parents=True, exist_ok=True)
-    write_json(note, {"settings": identity})
-
-
-def _sha256(path: Path) -> str:
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from error
+    if not resume:
+        raise InputError(f"{out} already holds a run; add --resume to finish it, or choose another --out")
+    before = read_object(note).get("settings")
+    if not isinstance(before, dict):
+        raise InputError(f"{note} is damaged: no settings in it; choose another --out")
+    changed = sorted(k for k in {*identity, *before} if digest(identity.get(k)) != digest(before.get(k)))
+    if changed:
+        raise InputError(
+            f"{out} holds a run with other settings ({', '.join(changed)} differ); resume with the same "
+            f"ones or choose another --out"
+        )

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import read_arrays, read_json, write_arrays, write_json
+from hybrid_mpc.files import read_document, read_document_arrays, write_document
 from hybrid_mpc.identification.settings import TrainingSettings
 from hybrid_mpc.identification.step import Scaling
 from hybrid_mpc.identification.trained import Fault, Trained
+from hybrid_mpc.records import plain, record
+
+
+@dataclass(frozen=True)
+class _Note:
+    """What stands in the JSON file beside the arrays."""
+
+    settings: TrainingSettings
+    scaling: Scaling
+    faults: tuple[Fault, ...]
 
 
 def save_trained(folder: Path, trained: Trained) -> None:
@@ -19,15 +29,8 @@ def save_trained(folder: Path, trained: Trained) -> None:
     arrays: dict[str, Any] = {f"weights.{n}": v for n, v in trained.weights.items()}
     arrays |= {f"curve.{n}": v for n, v in trained.curve.items()}
     arrays |= {"own.validation": trained.validation, "own.skipped": trained.skipped}
-    write_arrays(folder / f"{kind}.npz", arrays)
-    write_json(
-        folder / f"{kind}.json",
-        {
-            "settings": asdict(trained.settings),
-            "scaling": asdict(trained.scaling),
-            "faults": [asdict(fault) for fault in trained.faults],
-        },
-    )
+    note = _Note(trained.settings, trained.scaling, trained.faults)
+    write_document(folder / f"{kind}.json", plain(note), arrays)
 
 
 def is_trained(folder: Path, settings: TrainingSettings) -> bool:
@@ -58,18 +61,20 @@ def load_trained(folder: Path, kind: str) -> Trained:
     Raises:
         InputError: If a file is missing or damaged.
     """
-    note, arrays = read_json(folder / f"{kind}.json"), read_arrays(folder / f"{kind}.npz")
+    path = folder / f"{kind}.json"
+    remedy = f"delete {kind}.* in {folder}, and the same command trains these networks anew"
+    note = record(_Note, read_document(path, remedy), str(path))
+    arrays = read_document_arrays(path, remedy)
     part: dict[str, dict[str, Any]] = {"weights": {}, "curve": {}, "own": {}}
     for name, value in arrays.items():
         group, _, key = name.partition(".")
         part[group][key] = value
-    note["settings"]["learning_rates"] = tuple(note["settings"]["learning_rates"])
     return Trained(
-        TrainingSettings(**note["settings"]),
-        Scaling(**{name: tuple(v) for name, v in note["scaling"].items()}),
+        note.settings,
+        note.scaling,
         part["weights"],
         part["own"]["validation"],
         part["curve"],
         part["own"]["skipped"],
-        tuple(Fault(**fault) for fault in note.get("faults", ())),
+        note.faults,
     )

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import math
-import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -12,6 +10,7 @@ import numpy as np
 from PIL import Image
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import replacing
 from hybrid_mpc.plots.scene import Draw, Loop, Scene
 from hybrid_mpc.plots.style import Array, checked
 from hybrid_mpc.signals import Signal
@@ -138,9 +137,5 @@ def _write(path: Path, pictures: Iterator[Image.Image], durations: Sequence[int]
     colours[colours.min(axis=1) >= 248] = 255  # Pillow looks colours up coarsely: keep the paper white
     palette.putpalette(colours.ravel().tolist())
     flat = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in frames]
-    buffer = io.BytesIO()
-    flat[0].save(buffer, "GIF", save_all=True, append_images=flat[1:], duration=list(durations), loop=0)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    part.write_bytes(buffer.getvalue())
-    os.replace(part, path)
+    with replacing(path) as file:
+        flat[0].save(file, "GIF", save_all=True, append_images=flat[1:], duration=list(durations), loop=0)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -20,6 +18,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import replacing
 from hybrid_mpc.signals import Signal
 
 Array = NDArray[np.float64]
@@ -275,7 +274,7 @@ def save(figure: Figure, path: str | Path) -> Path:
         The path.
 
     Raises:
-        InputError: If the name does not end in ``.png``.
+        InputError: If the name does not end in ``.png``, or the file cannot be written.
 
     Example:
         >>> import tempfile
@@ -287,13 +286,6 @@ def save(figure: Figure, path: str | Path) -> Path:
     path = Path(path)
     if path.suffix != ".png":
         raise InputError(f"figure {path}: figures are written as PNG; end the name in .png")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=".png")
-    os.close(handle)
-    try:
-        figure.savefig(temporary, format="png", dpi=DPI, facecolor="white", metadata={"Software": None})
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
-    finally:
-        Path(temporary).unlink(missing_ok=True)
+    with replacing(path) as file:
+        figure.savefig(file, format="png", dpi=DPI, facecolor="white", metadata={"Software": None})
     return path

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import base64
-import os
 import re
 import struct
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import write_text
 from hybrid_mpc.plots.style import number
 
 Cell = str | float | int | bool | None
@@ -147,25 +146,18 @@ def write_report(path: str | Path, report: Report) -> Path:
         The path.
 
     Raises:
-        InputError: If a figure is missing or is no PNG.
+        InputError: If a figure is missing or is no PNG, or the page cannot be written.
 
     Example:
         >>> page = Report("Report", "A pendulum", "It swings.", "hybrid-mpc run pendulum")
+        >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     write_report(Path(folder) / "report.html", page).name
         'report.html'
     """
     path = Path(path)
     text = render(report)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=".html")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
-    finally:
-        Path(temporary).unlink(missing_ok=True)
+    write_text(path, text)
     return path
 
 

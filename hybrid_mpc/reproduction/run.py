@@ -68,21 +68,21 @@ def reproduce(
         settings, scenario, experiment, settings.effort(experiment), out, progress or Silent(), workers
     )
     check_device(settings.device)
-    open_folder(out, settings, resume=resume)
-    stages: tuple[tuple[str, Callable[[Work], None]], ...] = (
-        ("recording the machine", record_stage),
-        ("fitting the priors", fit_stage),
-        ("judging the priors", physics_stage),
-        ("training the networks", ensemble_stage),
-    )
-    for title, stage in stages:
-        work.progress.start(title)
-        stage(work)
+    with open_folder(out, settings, resume=resume):
+        stages: tuple[tuple[str, Callable[[Work], None]], ...] = (
+            ("recording the machine", record_stage),
+            ("fitting the priors", fit_stage),
+            ("judging the priors", physics_stage),
+            ("training the networks", ensemble_stage),
+        )
+        for title, stage in stages:
+            work.progress.start(title)
+            stage(work)
+            work.progress.finish("")
+        work.progress.start("writing tables and figures")
+        results = write_outputs(work)
         work.progress.finish("")
-    work.progress.start("writing tables and figures")
-    results = write_outputs(work)
-    work.progress.finish("")
-    return results
+        return results
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,12 @@ from typing import Any, cast
 
 from hybrid_mpc.closed_loop.faults import Fault
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import plain
 from hybrid_mpc.pipeline.contenders import CONTENDERS, ORACLES
 from hybrid_mpc.pipeline.control_job import DEFAULT_CONTROLLERS, SOLVERS, parsed_fault, selected_tasks
+from hybrid_mpc.records import MOST_SEED, known, plain, record
 from hybrid_mpc.scenario import load_scenario
 from hybrid_mpc.studies.draws import Intervals, RandomFaults, factors, generator
 from hybrid_mpc.studies.run_config import RunConfig
-from hybrid_mpc.studies.words import built, known
 
 ESTIMATORS: Mapping[str, tuple[bool, bool] | None] = {
     "own": None,
@@ -30,6 +29,10 @@ ESTIMATORS: Mapping[str, tuple[bool, bool] | None] = {
 MONITORS = ("own", "none", "energy")
 """``own``: what ``hybrid-mpc control`` runs, the uncalibrated energy monitor beside a hybrid; ``energy``: the same with
 the artifact's calibration, so that it alarms."""
+MOST_DRAWS = 1_000_000
+"""Most seeds, and most draws, of a study: all of them are in memory."""
+MOST_HORIZON = 10_000
+"""Longest horizon [periods] of a study: a plan is in memory with its derivatives."""
 AXES = ("models", "tasks", "controllers", "estimators", "solvers", "horizons", "monitors", "faults", "seeds")
 
 
@@ -180,17 +183,19 @@ hybrid, hybrid_observer, oracle, oracle_state
         return factors(self.spans, self.seed, i), *faults
 
     def _check_numbers(self) -> None:
-        for name, value, least in (("draws", self.draws, 1), ("seed", self.seed, 0)):
-            if not isinstance(value, int) or isinstance(value, bool) or value < least:
-                raise InputError(f"study: {name} must be a whole number of at least {least}, got {value!r}")
-        lists: tuple[tuple[str, Sequence[int | None], int], ...] = (
-            ("seeds", self.loop_seeds, 0),
-            ("horizons", [h for h in self.horizons if h is not None], 1),
+        lists: tuple[tuple[str, Sequence[int | None], int, int], ...] = (
+            ("draws", [self.draws], 1, MOST_DRAWS),
+            ("seed", [self.seed], 0, MOST_SEED),
+            ("seeds", self.loop_seeds, 0, MOST_SEED),
+            ("horizons", [h for h in self.horizons if h is not None], 1, MOST_HORIZON),
         )
-        for name, values, least in lists:
+        for name, values, least, most in lists:
             for number in values:
-                if not isinstance(number, int) or isinstance(number, bool) or number < least:
-                    raise InputError(f"study: {name} are whole numbers of at least {least}, got {number!r}")
+                whole = isinstance(number, int) and not isinstance(number, bool)
+                if not whole or not least <= number <= most:  # type: ignore[operator]
+                    raise InputError(
+                        f"study: {name}: whole numbers from {least} to {most} are needed, got {str(number)[:40]}"
+                    )
         for name, span in self.spans:
             if not (isinstance(span, int | float) and 0.0 < span < 1.0):
                 raise InputError(f"study: vary {name}: a share between 0 and 1 is needed, got {span!r}")
@@ -231,13 +236,19 @@ def _normal(s: Study) -> dict[str, Any]:
         raise InputError(f"study: models and vary are mappings (name: value); {error}") from error
     drawn = s.random_faults
     if isinstance(drawn, Mapping):
-        drawn = built(RandomFaults, drawn, "random_faults")
+        drawn = record(RandomFaults, drawn, "random_faults")
     lists: dict[str, Any] = {
         name: _listed(getattr(s, name), name)
         for name in ("tasks", "controllers", "estimators", "solvers", "horizons", "monitors")
     }
-    whole = isinstance(s.seeds, int) and not isinstance(s.seeds, bool)
-    seeds = tuple(range(s.seeds)) if whole else _listed(s.seeds, "seeds")  # type: ignore[arg-type]
+    if isinstance(s.seeds, int) and not isinstance(s.seeds, bool):
+        if not 1 <= s.seeds <= MOST_DRAWS:
+            raise InputError(
+                f"study: seeds: their number must be from 1 to {MOST_DRAWS}, got {str(s.seeds)[:40]}"
+            )
+        seeds: tuple[Any, ...] = tuple(range(s.seeds))
+    else:
+        seeds = _listed(s.seeds, "seeds")
     faults = tuple(_fault_set(entry) for entry in _listed(s.faults, "faults"))
     return {**lists, "models": pairs, "vary": vary, "random_faults": drawn, "seeds": seeds, "faults": faults}
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from hybrid_mpc.closed_loop.faults import SIGNAL_TARGETS, Fault
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.studies.words import built, known
+from hybrid_mpc.records import known, record
 
 LATE = "late"
 """A target beside those of :class:`~hybrid_mpc.closed_loop.Fault`: solves miss their deadline."""
@@ -84,7 +84,7 @@ class RandomFaults:
 
     def __post_init__(self) -> None:
         kinds = tuple(
-            k if isinstance(k, FaultKind) else built(FaultKind, k, f"random_faults.kinds[{i}]")
+            k if isinstance(k, FaultKind) else record(FaultKind, k, f"random_faults.kinds[{i}]")
             for i, k in enumerate(self.kinds)
         )
         object.__setattr__(self, "kinds", kinds)

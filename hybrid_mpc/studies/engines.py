@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import os
-import signal
-import threading
+import re
 import time
 from collections.abc import Callable, Mapping
 from queue import Empty, Queue
 from typing import Any, Protocol
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.pipeline.parallel import follow
 from hybrid_mpc.studies.loops import LoopRunner, run_batch
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 CONNECT_S = 5.0
 """How long a scheduler is waited for."""
+ADDRESS = re.compile(r"(tcp://)?(\[[0-9a-fA-F:]+\]|[A-Za-z0-9_.-]+):[0-9]{1,5}")
+"""Addresses of schedulers that need nothing else to be known."""
 LOOK_S = 2.0
 """How often the workers of a cluster are counted."""
 ALONE_S = 60.0
 """How long a cluster may be without any."""
-WATCH_S = 1.0
-"""How often a worker looks whether its parent is still there."""
-
 Run = Callable[[Any], Mapping[str, Any]]
 Batch = tuple[Any, ...]
 
@@ -237,19 +236,7 @@ def _pool(workers: int) -> Any:
         from joblib.externals.loky import ProcessPoolExecutor
     except ImportError as error:
         raise InputError(f"study: {error}; pip install 'hybrid-mpc[studies]'") from error
-    return ProcessPoolExecutor(workers, env=ONE_THREAD, initializer=_quiet, initargs=(os.getpid(),))
-
-
-def _quiet(parent: int) -> None:
-    """Leave Ctrl-C to the parent, who ends its workers; and end with a parent that was killed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(WATCH_S)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
+    return ProcessPoolExecutor(workers, env=ONE_THREAD, initializer=follow, initargs=(os.getpid(),))
 
 
 def _connected(address: str) -> Any:
@@ -257,6 +244,11 @@ def _connected(address: str) -> Any:
         from distributed import Client
     except ImportError as error:
         raise InputError(f"study: {error}; pip install 'hybrid-mpc[studies]'") from error
+    if not ADDRESS.fullmatch(address):
+        raise InputError(
+            f"study: the scheduler's address must be tcp://HOST:PORT, got {address!r}; for another kind (tls://) "
+            "connect a distributed.Client yourself, and give it to run_study(cluster=...)"
+        )
     try:
         return Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:

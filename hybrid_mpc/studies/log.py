@@ -5,17 +5,22 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import plain
-from hybrid_mpc.studies.lock import hold
+from hybrid_mpc.files import locked
+from hybrid_mpc.records import NUMBERS, plain
+from nn_export.files import parse_json
 
+STATUS = ("done", "failed")
+MOST_LINE = 2**24
+"""Largest row [bytes]: a run's figures, or the traceback of one that failed."""
 SEGMENT_ROWS = 10_000
 """Rows of one file: a study of a million runs has a hundred of them."""
-LOCK = "lock"
 
 
 class RunLog:
@@ -34,22 +39,15 @@ class RunLog:
         >>> import tempfile
         >>> folder = Path(tempfile.mkdtemp())
         >>> with RunLog(folder) as log:
-        ...     log.append([{"id": "a", "cost": 0.1}, {"id": "b", "cost": float("inf")}])
+        ...     log.append([{"id": "a", "status": "done", "cost": cost} for cost in (0.1, float("inf"))])
         >>> [row["cost"] for row in rows(folder)]
         [0.1, inf]
     """
 
     def __init__(self, folder: Path) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
         self._folder = folder
-        self._lock = (folder / LOCK).open("w")
-        try:
-            hold(self._lock)
-        except OSError as error:
-            self._lock.close()
-            raise InputError(
-                f"{folder.parent}: another process is running this study; wait for it"
-            ) from error
+        self._held = ExitStack()
+        self._held.enter_context(locked(folder))
         files = segments(folder)
         self._number = len(files) - 1 if files else 0
         self._rows = _repaired(files[-1]) if files else 0
@@ -66,7 +64,7 @@ class RunLog:
     def close(self) -> None:
         """Let go of the files; the log may be opened again."""
         os.close(self._file)
-        self._lock.close()
+        self._held.close()
 
     def append(self, new: Iterable[Mapping[str, Any]]) -> None:
         """Add rows; on return they are on the disk.
@@ -103,7 +101,7 @@ class RunLog:
 
 def segments(folder: Path) -> list[Path]:
     """Files of a log, in order."""
-    return sorted(folder.glob("[0-9]*.jsonl"))
+    return sorted(path for path in folder.glob("[0-9]*.jsonl") if path.is_file())
 
 
 def rows(folder: Path) -> Iterator[dict[str, Any]]:
@@ -114,25 +112,27 @@ def rows(folder: Path) -> Iterator[dict[str, Any]]:
     """
     for path in segments(folder):
         with path.open("rb") as file:
-            for number, line in enumerate(file, 1):
-                if not line.endswith(b"\n"):
+            for number, line in enumerate(iter(partial(file.readline, MOST_LINE), b""), 1):
+                if not line.endswith(b"\n") and len(line) < MOST_LINE:
                     return
                 yield _parsed(line, path, number)
 
 
 def _parsed(line: bytes, path: Path, number: int) -> dict[str, Any]:
     try:
-        row = json.loads(line)
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        if len(line) == MOST_LINE:
+            raise ValueError(f"longer than {MOST_LINE} bytes")
+        row = parse_json(line)
+        if not (isinstance(row, dict) and isinstance(row.get("id"), str) and row.get("status") in STATUS):
+            raise ValueError("no row of a run: id and status are needed")
+    except ValueError as error:
         raise InputError(
             f"{path}:{number} is damaged ({error}); delete this line, and --resume runs its run again"
         ) from error
-    return {key: _number(value) for key, value in row.items()}
-
-
-def _number(value: Any) -> Any:
-    """Infinities and NaN, which are strings in JSON."""
-    return float(value) if value in ("inf", "-inf", "nan") else value
+    return {
+        key: NUMBERS[value] if isinstance(value, str) and value in NUMBERS else value
+        for key, value in row.items()
+    }
 
 
 def _repaired(path: Path) -> int:

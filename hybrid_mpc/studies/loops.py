@@ -18,19 +18,21 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_mpc.artifact import FILE, Artifact, load_artifact
+from hybrid_mpc.artifact import FILES, Artifact, artifact_folder, load_artifact
 from hybrid_mpc.closed_loop import ClosedLoopResult, simulate
 from hybrid_mpc.closed_loop.faults import check_channels, install
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import write_json
+from hybrid_mpc.files import MOST_CONTENT, read_bytes, write_json
 from hybrid_mpc.monitor.calibration import Calibration
 from hybrid_mpc.pipeline.contenders import CONTENDERS
 from hybrid_mpc.pipeline.control_job import ControlSettings, Job, parts, prepared, selected_tasks
 from hybrid_mpc.pipeline.control_results import row
 from hybrid_mpc.pipeline.loops import make_monitor
+from hybrid_mpc.records import plain
 from hybrid_mpc.scenario import Scenario, Task, load_scenario
 from hybrid_mpc.studies.configuration import Study
 from hybrid_mpc.studies.draws import RandomFaults, varied
+from hybrid_mpc.studies.note import ModelNote, NoiseNote
 from hybrid_mpc.studies.run_config import RunConfig
 
 KEPT_PARTS = 64
@@ -185,8 +187,8 @@ def figures(task: Task, run: RunConfig, result: ClosedLoopResult) -> dict[str, A
 
 
 def load_inputs(
-    study: Study, noise: Path | None = None, held: Mapping[str, Any] | None = None
-) -> tuple[LoopRunner, dict[str, Any]]:
+    study: Study, noise: Path | None = None, held: Mapping[str, ModelNote] | None = None
+) -> tuple[LoopRunner, dict[str, ModelNote]]:
     """Load and check everything that the runs need, before the first.
 
     Args:
@@ -206,22 +208,21 @@ def load_inputs(
     models, notes = [], {}
     settings = ControlSettings(tuple(study.tasks), study.contenders)
     for label, folder in study.folders.items():
-        before = (held or {}).get(label, {}).get("noise")
+        before = held[label].noise if held and label in held else None
         with tempfile.TemporaryDirectory() as place:
             given = noise
             if before is not None:
                 given = Path(place) / "control.json"
-                write_json(given, before)
+                write_json(given, plain(before))
             job = prepared(scenario, folder, settings, given)
-        inner = folder if (folder / FILE).is_file() else folder / "model"
+        inner = artifact_folder(folder)
         if "energy" in study.monitors and job.artifact.calibration is None:
             raise InputError(f"study: monitor energy: {inner} holds no calibration; take monitor own")
-        source = job.noise_source if before is None else before["source"]
+        source = job.noise_source if before is None else before.source
         sigma = {c: tuple(map(float, job.noise[c])) for c in study.contenders if c in job.noise}
         digest = _digest(_files(inner))
         models.append(ModelInput(label, str(inner.resolve()), digest, tuple(sigma.items())))
-        provenance, used = dict(job.artifact.provenance), {"source": source, "sigma_x": sigma}
-        notes[label] = {"sha256": digest, "provenance": provenance, "noise": used}
+        notes[label] = ModelNote(digest, plain(job.artifact.provenance), NoiseNote(source, sigma))
     return LoopRunner(study.scenario, tuple(models)), notes
 
 
@@ -260,7 +261,7 @@ def _late(run: RunConfig) -> Callable[[float], bool]:
 
 
 def _files(folder: Path) -> tuple[tuple[str, bytes], ...]:
-    return tuple((p.name, p.read_bytes()) for p in sorted(folder.iterdir()) if p.is_file())
+    return tuple((name, read_bytes(folder / name, MOST_CONTENT)) for name in sorted(FILES))
 
 
 def _digest(files: Sequence[tuple[str, bytes]]) -> str:

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.closed_loop.faults import Fault
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import digest, plain
+from hybrid_mpc.files import digest
+from hybrid_mpc.records import plain
 
 Array = NDArray[np.float64]
 MOVE_S, HOLD_S = 0.8, 1.3

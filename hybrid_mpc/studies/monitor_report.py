@@ -13,8 +13,8 @@ from hybrid_mpc.monitor import METHODS
 from hybrid_mpc.plots import save
 from hybrid_mpc.plots.detection import delays, method_name, operating_curves
 from hybrid_mpc.report import KeyFigure, Report, Section, Table, write_report
-from hybrid_mpc.scenario import load_scenario
 from hybrid_mpc.studies.monitor_plan import ARMS, CASES
+from hybrid_mpc.studies.note import StudyNote
 
 TITLES = {case.name: case.title for case in CASES}
 NOMINAL_TEXT = (
@@ -37,7 +37,7 @@ GUARD_TEXT = (
 )
 
 
-def write_monitor_report(out: Path, results: Mapping[str, Any], note: Mapping[str, Any]) -> Path:
+def write_monitor_report(out: Path, results: Mapping[str, Any], note: StudyNote) -> Path:
     """Write ``report.html``, ``table.md``, ``delays.png`` and ``roc.png``.
 
     Args:
@@ -57,11 +57,10 @@ def write_monitor_report(out: Path, results: Mapping[str, Any], note: Mapping[st
     ]
     tables = [t for section in sections[:4] for t in section.tables]
     write_text(out / "table.md", "\n\n".join(f"{t.caption}\n\n{markdown(t)}" for t in tables) + "\n")
-    scenario = load_scenario(note["study"]["scenario"])
     report = Report(
-        f"Study {note['study']['name']}", scenario.title, scenario.description,
+        f"Study {note.study['name']}", note.title, note.description,
         f"hybrid-mpc study run monitor --model MODEL --out {out.name}", _head(results), sections,
-        f"hybrid-mpc {note['versions']['hybrid-mpc']}",
+        f"hybrid-mpc {note.versions['hybrid-mpc']}",
     )  # fmt: skip
     return write_report(out / "report.html", report)
 
@@ -202,14 +201,12 @@ def _head(results: Mapping[str, Any]) -> list[KeyFigure]:
     return figures
 
 
-def _setup(results: Mapping[str, Any], note: Mapping[str, Any]) -> Section:
+def _setup(results: Mapping[str, Any], note: StudyNote) -> Section:
     rows = [(key, str(value)) for key, value in results["study"].items()]
     rows += [
         ("learned from", f"{results['learned']['hours']:.3g} h, {results['learned']['blocks']} blocks of 5 s")
     ]
-    rows += [
-        ("jobs", f"{results['jobs']['done']} done, {results['jobs']['failed']} failed, of {note['runs']}")
-    ]
+    rows += [("jobs", f"{results['jobs']['done']} done, {results['jobs']['failed']} failed, of {note.runs}")]
     return Section("Setup", (), (), [Table(("setting", "value"), rows)])
 
 

@@ -12,7 +12,6 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_json, write_json
 from hybrid_mpc.monitor import Judges
 from hybrid_mpc.pipeline.context import Progress, Silent
-from hybrid_mpc.pipeline.deploy import versions
 from hybrid_mpc.pipeline.guards import adaptable
 from hybrid_mpc.scenario import load_scenario
 from hybrid_mpc.studies.configuration import Study
@@ -23,7 +22,8 @@ from hybrid_mpc.studies.monitor_loops import CONTROLLER, JUDGES, LEARNING, PRIOR
 from hybrid_mpc.studies.monitor_plan import LEARN, MonitorJob, MonitorStudy
 from hybrid_mpc.studies.monitor_report import write_monitor_report
 from hybrid_mpc.studies.monitor_results import monitor_results
-from hybrid_mpc.studies.runner import NOTE, RUNS, SCHEMA_VERSION, check_folder, execute, finished, open_folder
+from hybrid_mpc.studies.note import read_note
+from hybrid_mpc.studies.runner import RUNS, check_folder, execute, finished, make_note, open_folder
 
 RESULTS = "results.json"
 KIND = "monitor"
@@ -65,15 +65,12 @@ def run_monitor_study(
     out, say = Path(out), progress or Silent()
     check_folder(out, resume=resume)
     say.start("reading the model, and the filters' noise")
-    held = read_json(out / NOTE)["models"] if resume else None
+    held = read_note(out).models if resume else None
     loops, models = load_inputs(
         Study(study.scenario, study.model, tasks=(study.task,), controllers=(PRIOR, CONTROLLER)), noise, held
     )
     (model,) = loops.models
-    note = {
-        "schema_version": SCHEMA_VERSION, "kind": KIND, "study": study.identity(), "scenario_sha256": None,
-        "models": models, "runs": study.size, "versions": versions(),
-    }  # fmt: skip
+    note = make_note(study.identity(), models, study.size, KIND)
     say.finish(f"{study.size} jobs")
     if study.guard_seeds:
         causes = load_scenario(study.scenario).causes
@@ -103,10 +100,10 @@ def finish(out: Path) -> dict[str, Any]:
     Raises:
         InputError: If nothing has been judged yet.
     """
-    note = read_json(out / NOTE)
+    note = read_note(out)
     done = {row["id"]: row for row in rows(out / RUNS)}
     judges = Judges.from_dict(read_json(out / JUDGES))
-    results = monitor_results(note["study"], judges, list(done.values()))
+    results = monitor_results(note.study, judges, list(done.values()))
     write_json(out / RESULTS, results)
     write_monitor_report(out, results, note)
     return results
@@ -114,7 +111,7 @@ def finish(out: Path) -> dict[str, Any]:
 
 def is_monitor_study(folder: Path) -> bool:
     """Whether a folder holds this study."""
-    return (folder / NOTE).is_file() and read_json(folder / NOTE).get("kind") == KIND
+    return read_note(folder).kind == KIND
 
 
 class _Todo:

@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from hybrid_mpc.records import known
 from hybrid_mpc.studies.configuration import Study
 from hybrid_mpc.studies.draws import FaultKind, RandomFaults
-from hybrid_mpc.studies.words import known
 
 Models = str | Path | Mapping[str, str | Path]
 DEPLOYABLE = ("prior", "prior_observer", "hybrid", "hybrid_observer")

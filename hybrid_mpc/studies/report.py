@@ -14,7 +14,6 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.plots import save
 from hybrid_mpc.plots.style import name_of
 from hybrid_mpc.report import KeyFigure, Report, Section, Table, write_report
-from hybrid_mpc.scenario import load_scenario
 from hybrid_mpc.studies.results import StudyResults
 from hybrid_mpc.studies.runner import duration_text
 
@@ -48,8 +47,7 @@ def write_study_report(results: StudyResults, path: str | Path | None = None) ->
 
 
 def _report(results: StudyResults, folder: Path) -> Report:
-    study, note = results.note["study"], results.note
-    scenario = load_scenario(study["scenario"])
+    study, note = results.note.study, results.note
     sections = [
         _what(results),
         Section("Costs", COST_TEXT, _figure(_distributions, results, folder), [_summary_table(results)]),
@@ -59,9 +57,9 @@ def _report(results: StudyResults, folder: Path) -> Report:
         *_failures(results),
     ]
     return Report(
-        f"Study {study['name']}", scenario.title, scenario.description,
+        f"Study {study['name']}", note.title, note.description,
         f"hybrid-mpc study run {study['name']} --out {results.folder.name}", _head(results), sections,
-        f"hybrid-mpc {note['versions']['hybrid-mpc']}, {note.get('engine', 'not finished')}",
+        f"hybrid-mpc {note.versions['hybrid-mpc']}, {note.engine or 'not finished'}",
     )  # fmt: skip
 
 
@@ -100,10 +98,10 @@ def _head(results: StudyResults) -> list[KeyFigure]:
 
 
 def _what(results: StudyResults) -> Section:
-    study = results.note["study"]
+    study = results.note.study
     defaults: tuple[Any, ...] = (None, [], [None], ["own"], [[]], {})
     rows = [(key, _short(value)) for key, value in study.items() if value not in defaults]
-    rows += [(f"model {k}: noise", m["noise"]["source"]) for k, m in results.note["models"].items()]
+    rows += [(f"model {k}: noise", m.noise.source) for k, m in results.note.models.items()]
     return Section("Configuration", (), (), [Table(("setting", "value"), rows)])
 
 

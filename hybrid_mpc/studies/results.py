@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import read_json
 from hybrid_mpc.pipeline.control_results import interval
+from hybrid_mpc.records import known
 from hybrid_mpc.studies.log import rows
-from hybrid_mpc.studies.table import RESULTS, provenance_of
-from hybrid_mpc.studies.words import known
+from hybrid_mpc.studies.note import StudyNote, note_of, read_note
+from hybrid_mpc.studies.table import RESULTS, intact, provenance_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -37,7 +37,7 @@ class StudyResults:
         >>> import pandas as pd
         >>> runs = [{"controller": c, "seed": s, "cost": v + 0.1 * s, "status": "done"}
         ...     for c, v in (("prior", 2.0), ("hybrid", 1.0)) for s in (0, 1)]
-        >>> results = StudyResults(pd.DataFrame(runs), {}, Path("."))
+        >>> results = StudyResults(pd.DataFrame(runs), StudyNote({}, "", "", {}, 4), Path("."))
         >>> results.summary()[["controller", "mean"]].values.tolist()
         [['prior', 2.05], ['hybrid', 1.05]]
         >>> float(results.paired(base="prior")["difference"].iloc[0])
@@ -45,7 +45,7 @@ class StudyResults:
     """
 
     table: pd.DataFrame
-    note: Mapping[str, Any]
+    note: StudyNote
     folder: Path
 
     @classmethod
@@ -59,14 +59,12 @@ class StudyResults:
         import pyarrow.parquet as pq
 
         folder = Path(folder)
-        if not (folder / "study.json").is_file():
-            raise InputError(f"{folder} holds no study; give the folder that 'study run --out' made")
-        path = folder / RESULTS
-        if path.is_file():
-            table, note = pq.read_table(path).to_pandas(), provenance_of(path)
-        else:
+        note = read_note(folder)
+        if intact(folder / RESULTS):
+            table = pq.read_table(folder / RESULTS).to_pandas()
+            note = note_of(provenance_of(folder / RESULTS), str(folder / RESULTS))
+        else:  # not written yet, or damaged: the log has every row
             table = pd.DataFrame({row["id"]: row for row in rows(folder / "runs")}.values())
-            note = read_json(folder / "study.json")
         if "run" in table:  # they are kept in the order in which they ended
             table = table.sort_values("run", ignore_index=True)
         return cls(table, note, folder)
@@ -79,7 +77,7 @@ class StudyResults:
     @property
     def missing(self) -> int:
         """Runs that have not run yet."""
-        return max(0, int(self.note.get("runs", len(self.table))) - len(self.table))
+        return max(0, self.note.runs - len(self.table))
 
     @property
     def factors(self) -> list[str]:

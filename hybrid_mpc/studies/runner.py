@@ -2,28 +2,29 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import digest, plain, read_json, write_json
+from hybrid_mpc.files import check_writable, digest, is_empty, sha256
 from hybrid_mpc.pipeline.context import Progress, Silent
 from hybrid_mpc.pipeline.deploy import versions
+from hybrid_mpc.records import plain
+from hybrid_mpc.scenario import load_scenario
 from hybrid_mpc.studies.configuration import Study
 from hybrid_mpc.studies.engines import Batch, Engine, Lost, make_engine
 from hybrid_mpc.studies.log import RunLog, rows
 from hybrid_mpc.studies.loops import TIMING, load_inputs
+from hybrid_mpc.studies.note import FILE as NOTE
+from hybrid_mpc.studies.note import ModelNote, StudyNote, read_note, write_note
 from hybrid_mpc.studies.results import StudyResults
-from hybrid_mpc.studies.table import RESULTS, compact
+from hybrid_mpc.studies.table import RESULTS, compact, intact
 
-NOTE = "study.json"
 RUNS = "runs"
-SCHEMA_VERSION = 1
 BATCH_S = 0.5
 """Runs shorter than this are handed to workers several at a time, so that handing over costs little."""
 BATCHES_A_SECOND = 50.0
@@ -74,15 +75,8 @@ def run_study(
     out, say = Path(out), progress or Silent()
     check_folder(out, resume=resume)
     say.start("reading the models, and the filters' noise")
-    run, models = load_inputs(study, noise, read_json(out / NOTE)["models"] if resume else None)
-    note = {
-        "schema_version": SCHEMA_VERSION,
-        "study": study.identity(),
-        "scenario_sha256": _content(study.scenario),
-        "models": models,
-        "runs": study.size,
-        "versions": versions(),
-    }
+    run, models = load_inputs(study, noise, read_note(out).models if resume else None)
+    note = make_note(study.identity(), models, study.size)
     say.finish(f"{study.size} runs")
     engine = make_engine(run, workers, cluster)
     try:
@@ -91,13 +85,13 @@ def run_study(
             done = finished(out, retry_failed)
             say.start("running")
             left = (config for config in study.runs() if config.id not in done)
-            if study.size > len(done):
+            if study.size > len(done) or not intact(out / RESULTS):
                 (out / RESULTS).unlink(missing_ok=True)
             told = execute(left, log, engine, say, study.size - len(done))
             say.finish(told.text)
             if not (out / RESULTS).is_file():
-                made = {"engine": engine.name, "workers_died": told.died}
-                compact(out / RUNS, out / RESULTS, {**read_json(out / NOTE), **made})
+                made = replace(read_note(out), engine=engine.name, workers_died=told.died)
+                compact(out / RUNS, out / RESULTS, plain(made))
     finally:
         engine.close()
     return StudyResults.load(out)
@@ -242,27 +236,51 @@ def check_folder(out: Path, *, resume: bool) -> None:
             raise InputError(
                 f"{out} already holds a study; add --resume to finish it, or choose another --out"
             )
-    elif out.exists() and (not out.is_dir() or {p.name for p in out.iterdir()} - {f"{NOTE}.part"}):
+    elif not is_empty(out):
         raise InputError(f"{out} exists and holds something else than a study; choose another --out")
     elif resume:
         raise InputError(f"{out} holds no study to resume; leave --resume out")
+    check_writable(out)
 
 
-def open_folder(out: Path, note: dict[str, Any]) -> None:
+def make_note(
+    study: Mapping[str, Any], models: Mapping[str, ModelNote], runs: int, kind: str = "loops"
+) -> StudyNote:
+    """What a study is made of.
+
+    Args:
+        study: Its settings as plain data, with its scenario.
+        models: Its models by label.
+        runs: Number of its runs.
+        kind: Kind of study. Default: closed loops of all combinations.
+    """
+    scenario = load_scenario(study["scenario"])
+    return StudyNote(
+        study,
+        scenario.title,
+        scenario.description,
+        models,
+        runs,
+        versions(),
+        kind,
+        _content(study["scenario"]),
+    )
+
+
+def open_folder(out: Path, note: StudyNote) -> None:
     """Note what the folder holds, or compare it with what it holds already."""
-    path = out / NOTE
-    if not path.is_file():
-        write_json(path, note)
+    if not (out / NOTE).is_file():
+        write_note(out, note)
         return
-    held = read_json(path)
-    mine, theirs = note["study"], held["study"]
+    held = read_note(out)
+    mine, theirs = note.study, held.study
     differ = [key for key in mine if key != "name" and digest(theirs.get(key)) != digest(mine[key])]
-    if held.get("scenario_sha256") != note["scenario_sha256"]:
+    if held.scenario_sha256 != note.scenario_sha256:
         differ.append("the content of the scenario's file")
     differ += [
         f"the content of model {label}"
-        for label, model in note["models"].items()
-        if label in held["models"] and plain(held["models"][label])["sha256"] != model["sha256"]
+        for label, model in note.models.items()
+        if label in held.models and held.models[label].sha256 != model.sha256
     ]
     if differ:
         raise InputError(
@@ -273,7 +291,7 @@ def open_folder(out: Path, note: dict[str, Any]) -> None:
 def _content(scenario: str) -> str | None:
     """SHA-256 of a user's scenario file; None for a registered scenario."""
     path = Path(scenario)
-    return hashlib.sha256(path.read_bytes()).hexdigest() if path.suffix == ".py" and path.is_file() else None
+    return sha256(path) if path.suffix == ".py" and path.is_file() else None
 
 
 def finished(out: Path, retry_failed: bool) -> set[str]:

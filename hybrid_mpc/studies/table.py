@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator, Mapping
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import plain
+from hybrid_mpc.files import replacing
+from hybrid_mpc.records import plain
 from hybrid_mpc.studies.log import rows
+from nn_export.files import parse_json
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -31,7 +32,7 @@ def compact(log: Path, path: Path, provenance: Mapping[str, Any]) -> None:
         provenance: Plain data for the file's metadata.
 
     Raises:
-        InputError: If it cannot be written (a full disk); the log is unharmed.
+        StorageError: If it cannot be written (a full disk); the log is unharmed.
     """
     import pyarrow.parquet as pq
 
@@ -43,21 +44,30 @@ def compact(log: Path, path: Path, provenance: Mapping[str, Any]) -> None:
             kinds.setdefault(key, set()).add(type(value))
     schema = _schema(kinds).with_metadata({METADATA: json.dumps(plain(provenance)).encode()})
     kept = (row for i, row in enumerate(rows(log)) if last[row["id"]] == i)
-    part = path.with_name(path.name + ".part")
+    with replacing(path) as file, pq.ParquetWriter(file, schema, compression="zstd") as writer:
+        for group in _groups(kept, GROUP_ROWS):
+            writer.write_table(_table(group, schema))
+
+
+def intact(path: Path) -> bool:
+    """Whether a Parquet file is there and can be read to its end.
+
+    Example:
+        >>> intact(Path("nowhere.parquet"))
+        False
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    if not path.is_file():
+        return False
     try:
-        with part.open("wb") as file:
-            with pq.ParquetWriter(file, schema, compression="zstd") as writer:
-                for group in _groups(kept, GROUP_ROWS):
-                    writer.write_table(_table(group, schema))
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(part, path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise InputError(
-            f"{path}: cannot write ({error.strerror or error}); all runs are kept in {log}. Make room, then the same "
-            "command with --resume goes on"
-        ) from error
+        provenance_of(path)
+        for group in pq.ParquetFile(path).iter_batches():
+            group.validate(full=True)
+    except (InputError, OSError, ValueError, pa.ArrowException):
+        return False
+    return True
 
 
 def provenance_of(path: Path) -> dict[str, Any]:
@@ -75,8 +85,10 @@ def provenance_of(path: Path) -> dict[str, Any]:
         raise InputError(f"{path} is missing or damaged: {error}") from error
     if METADATA not in metadata:
         raise InputError(f"{path} is no table of a study")
-    result: dict[str, Any] = json.loads(metadata[METADATA])
-    return result
+    try:
+        return dict(parse_json(metadata[METADATA]))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path} is damaged: {error}") from error
 
 
 def _schema(kinds: Mapping[str, set[type]]) -> pa.Schema:

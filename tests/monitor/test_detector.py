@@ -8,9 +8,9 @@ import pytest
 from monitor_parts import DT, GAMMA, NOISE, Observer, pendulum, simulate
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import plain
 from hybrid_mpc.monitor import Calibration, Detector, EnergyMonitor, Plausibility, learn_detector, replay
 from hybrid_mpc.monitor.learning import detector_levels
+from hybrid_mpc.records import plain
 
 WINDOW = {"window": 11, "average": 5, "free_run": 0.6}
 

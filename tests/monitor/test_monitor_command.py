@@ -12,6 +12,7 @@ from hybrid_mpc.artifact import set_calibration
 from hybrid_mpc.cli.main import app
 from hybrid_mpc.data import write_csv
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import write_json
 from hybrid_mpc.monitor import Calibration, Detector
 from hybrid_mpc.pipeline.monitor_job import MonitorJob, prepared, watched
 from hybrid_mpc.scenario import load_scenario
@@ -36,7 +37,7 @@ def folder(tmp_path_factory, golf_artifact):
     (out / "control.json").write_text(json.dumps({"sigma_x": {"hybrid_observer": [1e-4, 1e-2]}}))
     # Wide scales: the network of this artifact is untrained, so the prior's own errors are nominal here.
     detector = Detector(DT, ((0.02, 0.01, 0.0, 0.0),), (0.05, 0.1, 0.0, 0.0), 2.0, 15.0, 4.0)
-    (out / "calibration.json").write_text(json.dumps({"detector": detector.to_dict()}))
+    write_json(out / "calibration.json", {"detector": detector.to_dict()})
     return out
 
 

@@ -1,6 +1,5 @@
 """What a training leaves in the run's folder is read back whole."""
 
-import json
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -51,11 +50,3 @@ def test_finished_networks_are_taken_for_their_own_settings_only(kept):
     assert not is_trained(folder, replace(settings, kind="mopgrnn"))
     with pytest.raises(InputError, match=r"anchors 2.0 instead of 5.0.*choose another --out"):
         is_trained(folder, replace(settings, anchors=5.0))
-
-
-def test_networks_from_before_there_were_anchors_are_read(kept):
-    folder, settings = kept
-    note = json.loads((folder / "pgrnn.json").read_text())
-    del note["settings"]["anchors"]
-    (folder / "pgrnn.json").write_text(json.dumps(note))
-    assert is_trained(folder, replace(settings, anchors=0.0))

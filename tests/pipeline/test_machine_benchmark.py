@@ -1,7 +1,6 @@
 """``hybrid-mpc benchmark`` on a machine that is simulated here, and what it refuses."""
 
 import json
-import shutil
 from functools import partial
 
 import numpy as np
@@ -10,6 +9,7 @@ from cart import DELAY, TRUE, recording, written
 
 from hybrid_mpc.benchmark_spec import BenchmarkBudget
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import read_document, write_document
 from hybrid_mpc.identification.dataset import cut_windows
 from hybrid_mpc.pipeline.machine_benchmark import networks
 from hybrid_mpc.pipeline.machine_benchmark.free_runs import figures_of, run_freely
@@ -190,22 +190,13 @@ def test_what_the_command_refuses(call, machine, tmp_path, words, message):
 
 def test_a_folder_whose_pieces_had_other_roles_is_refused(machine, made):
     scenario, train, _ = machine
-    note = json.loads((made[0] / "benchmark.json").read_text())
-    (made[0] / "benchmark.json").write_text(json.dumps(note | {"pieces": "of another version"}))
+    note = read_document(made[0] / "benchmark.json")
+    write_document(made[0] / "benchmark.json", note | {"pieces": "of another version"})
     try:
         with pytest.raises(InputError, match="pieces differ"):
             benchmark(BenchmarkSettings(str(scenario), (train,)), made[0])
     finally:
-        (made[0] / "benchmark.json").write_text(json.dumps(note))
-
-
-def test_a_model_from_before_long_runs_counted_is_read(machine, made, tmp_path):
-    copy = shutil.copytree(made[0] / "model", tmp_path / "model")
-    note = json.loads((copy / "benchmark_model.json").read_text())
-    del note["long"]
-    (copy / "benchmark_model.json").write_text(json.dumps(note))
-    found = load_model(copy, "cart")
-    assert (found.long, found.hybrid) == ({}, made[1]["model"]["hybrid"])
+        write_document(made[0] / "benchmark.json", note)
 
 
 def test_a_folder_of_another_benchmark_is_refused(call, machine, made):

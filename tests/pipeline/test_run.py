@@ -141,7 +141,7 @@ def test_resume_of_a_damaged_checkpoint(call, arguments, finished, tmp_path):
         ("model.json", lambda b: b[: len(b) // 2], "damaged"),
         (
             "model.json",
-            lambda b: b.replace(b'"schema_version": 1', b'"schema_version": 99'),
+            lambda b: b.replace(b'"schema_version": 2', b'"schema_version": 99'),
             "schema version",
         ),
         ("programs.json", lambda b: b[: len(b) // 2], "programs.json"),
@@ -168,7 +168,7 @@ def test_artifact_holds_data_only(finished):
     assert set(artifact.models) == {"hybrid", "prior"}
     assert artifact.models["prior"].n_h == 0
     assert artifact.calibration is not None
-    assert artifact.provenance["data_hash"] == results(finished)["data"]["hash"]
+    assert artifact.provenance.data_hash == results(finished)["data"]["hash"]
 
 
 def test_the_main_job_says_what_its_guard_lacks(finished):

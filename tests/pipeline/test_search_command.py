@@ -173,13 +173,18 @@ def test_a_run_is_bound_to_the_content_of_its_file(tmp_path):
     path = tmp_path / "settings.json"
     path.write_text('{"hidden": 8}')
     settings = RunSettings("golf_robot", network_file=path)
-    open_folder(tmp_path / "run", settings, resume=False)
+    with open_folder(tmp_path / "run", settings, resume=False):
+        pass
     path.write_text('{ "hidden" : 8 }')
-    open_folder(tmp_path / "run", settings, resume=True)
+    with open_folder(tmp_path / "run", settings, resume=True):
+        pass
     path.write_text('{"hidden": 9}')
     for other in (settings, RunSettings("golf_robot")):
-        with pytest.raises(InputError, match="network differ"):
-            open_folder(tmp_path / "run", other, resume=True)
+        with (
+            pytest.raises(InputError, match="network differ"),
+            open_folder(tmp_path / "run", other, resume=True),
+        ):
+            pass
 
 
 def test_the_line_to_use_it():

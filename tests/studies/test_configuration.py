@@ -201,7 +201,7 @@ def test_bad_files(tmp_path, text, told):
     path.write_text(text)
     with pytest.raises(InputError, match=told):
         read_study(path)
-    with pytest.raises(InputError, match="cannot read"):
+    with pytest.raises(InputError, match="is missing"):
         read_study(tmp_path / "none.yaml")
 
 

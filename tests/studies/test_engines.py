@@ -65,8 +65,9 @@ def test_unreachable_scheduler(tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"no dask scheduler at tcp://127\.0\.0\.1:9"):
         run_study(trivial_runs.study(3), tmp_path / "s", cluster="tcp://127.0.0.1:9")
     assert time.monotonic() - begin < 30.0
-    with pytest.raises(InputError, match="no dask scheduler at nonsense"):
-        run_study(trivial_runs.study(3), tmp_path / "s", cluster="nonsense://x")
+    for address in ("nonsense://x", "tls://127.0.0.1:8786", "tcp://", "tcp://[::1"):
+        with pytest.raises(InputError, match="must be tcp://HOST:PORT"):
+            run_study(trivial_runs.study(3), tmp_path / "s", cluster=address)
     assert not (tmp_path / "s").exists()
     with pytest.raises(InputError, match="1 or more"):
         run_study(trivial_runs.study(3), tmp_path / "s", workers=0)
@@ -91,7 +92,7 @@ def test_a_cluster_computes_the_same_and_loses_its_workers(tmp_path, monkeypatch
     study, killer = trivial_runs.study(40), Killer(workers[0])  # both workers are at a run all the time
     far = run_study(study, tmp_path / "far", cluster=address, progress=killer)
     assert killer.killed
-    assert far.note["workers_died"] == 1
+    assert far.note.workers_died == 1
     assert (far.missing, len(far.failed)) == (0, 0)
     assert far.table["id"].is_unique
     assert len(set(far.table["timing_pid"])) == 2
@@ -125,7 +126,7 @@ def test_a_local_worker_that_dies(tmp_path, monkeypatch, how):
     results = run_study(trivial_runs.study(12), tmp_path / "s")
     assert results.missing == 0
     assert results.table["id"].is_unique
-    assert results.note["workers_died"] == {"once": 1, "always": 3}[how]
+    assert results.note.workers_died == {"once": 1, "always": 3}[how]
     if how == "once":
         assert len(results.failed) == 0
     else:

@@ -1,16 +1,12 @@
 """The log of finished runs: durable, whole after a kill, unharmed by a full disk."""
 
 import errno
-import importlib.util
 import json
 import os
-import sys
-import types
 
 import pytest
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.studies import lock
 from hybrid_mpc.studies import log as log_module
 from hybrid_mpc.studies.log import RunLog, rows, segments
 from hybrid_mpc.studies.table import compact, provenance_of
@@ -63,23 +59,6 @@ def test_one_process_at_a_time(tmp_path):
     with RunLog(tmp_path), pytest.raises(InputError, match="another process"):
         RunLog(tmp_path)
     RunLog(tmp_path).close()
-
-
-def test_on_windows_the_first_byte_is_locked(tmp_path, monkeypatch):
-    """Its lock is another module's, stood in for here; the module that this system has is not there."""
-    calls = []
-    windows = types.SimpleNamespace(LK_NBLCK=2, locking=lambda *given: calls.append(given))
-    monkeypatch.setitem(sys.modules, "msvcrt", windows)
-    monkeypatch.setitem(sys.modules, "fcntl", None)
-    monkeypatch.setattr(sys, "platform", "win32")
-    spec = importlib.util.spec_from_file_location("lock_on_windows", lock.__file__)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    with (tmp_path / "lock").open("w") as file:
-        file.write("where it stands is no matter")
-        module.hold(file)
-        assert calls == [(file.fileno(), 2, 1)]
-        assert file.tell() == 0
 
 
 @pytest.mark.parametrize("written", [0, 7, 60])
@@ -141,7 +120,7 @@ def test_a_full_disk_at_the_end_keeps_the_log(tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(InputError, match="all runs are kept"):
+    with pytest.raises(InputError, match="No space left on device; the file from before is kept"):
         compact(tmp_path / "runs", path, {})
     monkeypatch.undo()
     assert path.read_bytes() == b"before"

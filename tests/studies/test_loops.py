@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybrid_mpc.artifact import set_calibration
+from hybrid_mpc.artifact import Provenance, read_description, set_calibration, write_description
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.pipeline.context import Silent
 from hybrid_mpc.pipeline.control_job import ControlSettings, prepared, run_loops
@@ -142,7 +142,7 @@ def test_a_resumed_study_keeps_its_noise(run_folder, tmp_path):
     first = run_study(study, tmp_path / "s", workers=1)
     shutil.rmtree(moved / "checkpoints")  # without it the noise would be estimated, and be another
     again = run_study(study, tmp_path / "s", workers=1, resume=True)
-    assert again.note["models"]["model"]["noise"] == first.note["models"]["model"]["noise"]
+    assert again.note.models["model"].noise == first.note.models["model"].noise
     assert again.table.equals(first.table)
 
 
@@ -174,10 +174,10 @@ def test_what_does_not_fit_is_refused_before_the_first_run(run_folder, golf_arti
     refused("does not exist", tmp_path / "none")
     folder = tmp_path / "model"
     shutil.copytree(golf_artifact, folder)
-    note = json.loads((folder / "model.json").read_text())
-    (folder / "model.json").write_text(json.dumps({**note, "provenance": {"scenario": "torque_pendulum"}}))
+    note = read_description(folder)
+    write_description(folder, replace(note, provenance=Provenance("torque_pendulum")))
     refused("made for scenario torque_pendulum, not for golf_robot", folder)
-    (folder / "model.json").write_text(json.dumps({**note, "calibration": None}))
+    write_description(folder, replace(note, calibration=None))
     (folder.parent / "checkpoints").mkdir()
     (folder.parent / "checkpoints" / "control.json").write_text(json.dumps({"sigma_x": SIGMA}))
     refused("holds no calibration", folder, controllers=["hybrid"], monitors=["energy"])

@@ -9,15 +9,16 @@ from scipy import stats
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.plots import studies as plots
-from hybrid_mpc.studies import StudyResults
+from hybrid_mpc.studies import StudyResults, run_study
+from hybrid_mpc.studies.note import ModelNote, NoiseNote, StudyNote
 from hybrid_mpc.studies.report import write_study_report
+from hybrid_mpc.studies.table import intact
+from tests.trivial_runs import stand_in, study, trivial
 
-NOTE = {
-    "study": {"name": "mine", "scenario": "golf_robot", "faults": [[], [{"target": "x", "value": 1.0}]]},
-    "models": {"model": {"noise": {"source": "a run"}}},
-    "runs": 80,
-    "versions": {"hybrid-mpc": "0"},
-}
+NOTE = StudyNote(
+    {"name": "mine", "scenario": "golf_robot", "faults": [[], [{"target": "x", "value": 1.0}]]},
+    "Golf robot", "It putts.", {"model": ModelNote("0", {}, NoiseNote("a run", {}))}, 80, {"hybrid-mpc": "0"},
+)  # fmt: skip
 
 
 def table(draws=10, seeds=2, shift=0.3, model="model", gain=1.0):
@@ -157,3 +158,18 @@ def test_plots_leave_out_what_is_not_finite():
     ):
         with pytest.raises(InputError, match="no finite"):
             draw(nothing, "cost")
+
+
+def test_a_damaged_table_is_made_of_the_log_again(monkeypatch, tmp_path):
+    """Report, comparison and resumption go on from the log, which has every row."""
+    stand_in(monkeypatch, trivial)
+    whole = run_study(study(6), tmp_path / "s", workers=1)
+    path = tmp_path / "s" / "results.parquet"
+    content = path.read_bytes()
+    for damage in (content[:50], content[: len(content) // 2] + bytes(len(content) // 2), b"", b"PAR1" * 10):
+        path.write_bytes(damage)
+        found = StudyResults.load(tmp_path / "s")
+        assert found.table["cost"].tolist() == whole.table["cost"].tolist()
+    again = run_study(study(6), tmp_path / "s", workers=1, resume=True)
+    assert again.table["cost"].tolist() == whole.table["cost"].tolist()
+    assert intact(path)

@@ -86,7 +86,7 @@ def test_list(call):
     [
         (["plant_variation"], "needs a model"),
         (["plant_variaton", "--model", "m"], "no study 'plant_variaton'"),
-        (["none.yaml"], "cannot read"),
+        (["none.yaml"], "is missing"),
         (["horizon_size", "--model", "a", "--model", "b"], "LABEL=FOLDER"),
         (["horizon_size", "--model", "nowhere"], "does not exist"),
     ],

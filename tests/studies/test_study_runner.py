@@ -15,9 +15,9 @@ import pytest
 import trivial_runs
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import read_json, write_json
 from hybrid_mpc.studies import StudyResults, run_study, runner
 from hybrid_mpc.studies.log import RunLog, rows
+from hybrid_mpc.studies.note import read_note, write_note
 
 ROOT, TESTS = (Path(__file__).parents[i] for i in (2, 1))  # the root first: tests/ has a folder nn_export
 RUNS = 150
@@ -33,8 +33,8 @@ def test_all_runs_and_their_table(here, tmp_path):
     results = run_study(study, tmp_path / "s")
     assert results.table["id"].tolist() == [run.id for run in study.runs()]
     assert (results.missing, len(results.failed)) == (0, 0)
-    assert results.note["study"] == study.identity()
-    assert results.note["engine"] == "here"
+    assert results.note.study == study.identity()
+    assert results.note.engine == "here"
     for run in study.runs():
         assert results.table.set_index("id").loc[run.id, "cost"] == trivial_runs.trivial(run)["cost"]
     with pytest.raises(InputError, match="--resume"):
@@ -84,9 +84,8 @@ def test_the_folder_of_another_study(here, tmp_path):
     run_study(trivial_runs.study(3), tmp_path / "s")
     with pytest.raises(InputError, match=r"another study \(seeds differ\)"):
         run_study(trivial_runs.study(4), tmp_path / "s", resume=True)
-    note = read_json(tmp_path / "s" / "study.json")
-    note["models"]["model"]["sha256"] = "1"
-    write_json(tmp_path / "s" / "study.json", note)
+    note = read_note(tmp_path / "s")
+    write_note(tmp_path / "s", replace(note, models={"model": replace(note.models["model"], sha256="1")}))
     with pytest.raises(InputError, match="content of model model"):
         run_study(trivial_runs.study(3), tmp_path / "s", resume=True)
     machine = tmp_path / "machine.py"
@@ -113,7 +112,9 @@ def test_a_full_disk_stops_the_study_and_it_goes_on_later(here, tmp_path, monkey
 
     def full(file):
         written.append(file)
-        if len(written) == 4:
+        if (
+            len(written) == 3 + 4
+        ):  # after the trial of the folder, its note, and the note's folder: the fourth batch
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         real(file)
 

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import read_json, write_json
-from hybrid_mpc.identification.prior_result import PriorFit
+from hybrid_mpc.files import read_document, write_document
 from hybrid_mpc.identification.settings import KINDS
 from hybrid_mpc.identification.trained import Trained
 from hybrid_mpc.pipeline.machine_benchmark.physics import Physics
 from hybrid_mpc.pipeline.trained_files import load_trained, save_trained
+from hybrid_mpc.records import plain, record
 
 NOTE = "benchmark_model.json"
 SCHEMA = 1
@@ -42,22 +41,25 @@ class BenchmarkModel:
     long: Mapping[str, float] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class _Note:
+    """What stands in the JSON file beside the networks."""
+
+    schema: int
+    scenario: str
+    dt: float
+    physics: Physics
+    hybrid: str
+    validation: Mapping[str, float]
+    long: Mapping[str, float]
+
+
 def save_model(folder: Path, model: BenchmarkModel) -> None:
     """Write a model; the note comes last, so a folder that has it is whole."""
     for trained in model.networks.values():
         save_trained(folder, trained)
-    write_json(
-        folder / NOTE,
-        {
-            "schema": SCHEMA,
-            "scenario": model.scenario,
-            "dt": model.dt,
-            "physics": asdict(model.physics),
-            "hybrid": model.hybrid,
-            "validation": dict(model.validation),
-            "long": dict(model.long),
-        },
-    )
+    note = _Note(SCHEMA, model.scenario, model.dt, model.physics, model.hybrid, model.validation, model.long)
+    write_document(folder / NOTE, plain(note))
 
 
 def load_model(folder: Path, scenario: str) -> BenchmarkModel:
@@ -72,23 +74,15 @@ def load_model(folder: Path, scenario: str) -> BenchmarkModel:
             f"{folder.parent} holds no model of a benchmark; give the folder that 'hybrid-mpc benchmark {scenario} "
             "--data FILE --out DIR' has made"
         )
-    note = read_json(folder / NOTE)
-    if note.get("schema") != SCHEMA:
+    document = read_document(folder / NOTE, "make the benchmark anew")
+    if document.get("schema") != SCHEMA:
         raise InputError(
-            f"{folder / NOTE}: schema {note.get('schema')}, this version reads {SCHEMA}; train anew"
+            f"{folder / NOTE}: schema {document.get('schema')}, this version reads {SCHEMA}; train anew"
         )
-    if note["scenario"] != scenario:
-        raise InputError(f"{folder} holds a model of {note['scenario']}, not of {scenario}")
-    physics = physics_of(note["physics"])
+    note = record(_Note, document, str(folder / NOTE))
+    if note.scenario != scenario:
+        raise InputError(f"{folder} holds a model of {note.scenario}, not of {scenario}")
     networks: dict[str, Trained] = {kind: load_trained(folder, kind) for kind in KINDS}
-    validation, long = (
-        {name: float(value) for name, value in note.get(key, {}).items()} for key in ("validation", "long")
+    return BenchmarkModel(
+        note.scenario, note.dt, note.physics, networks, note.hybrid, note.validation, note.long
     )
-    return BenchmarkModel(note["scenario"], note["dt"], physics, networks, note["hybrid"], validation, long)
-
-
-def physics_of(plain: Mapping[str, Any]) -> Physics:
-    """A :class:`Physics` from its JSON form."""
-    fit = dict(plain["fit"])
-    fit |= {"warnings": tuple(fit["warnings"]), "stages": tuple(fit["stages"])}
-    return Physics(PriorFit(**fit), plain["delay"], tuple(plain["sigma"]), tuple(plain["walk"]))

@@ -1,0 +1,249 @@
+"""Dataclasses to plain data and back: what JSON, YAML and checkpoints hold is checked field by field when read."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import types
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from hybrid_mpc.errors import InputError
+
+T = TypeVar("T")
+NUMBERS = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
+"""How numbers are written that JSON does not know."""
+LARGEST = 2**63
+"""Whole numbers of this size or more are refused: no array, seed or count can hold them."""
+MOST_SEED = 2**31 - 1
+"""Largest seed: a thousand times it, as loops number theirs, still fits 64 bits."""
+MOST_NAMED = 20
+"""So many problems of one file are named; a damaged one may have thousands."""
+
+
+def plain(value: Any) -> Any:
+    """``value`` in JSON's own types.
+
+    Dataclasses and mappings become objects, sequences and arrays lists, paths texts, and numbers that JSON does not
+    know ``"inf"``, ``"-inf"`` and ``"nan"``.
+
+    Example:
+        >>> plain({"x": np.array([1.0, np.inf]), "where": Path("a")})
+        {'x': [1.0, 'inf'], 'where': 'a'}
+    """
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    if isinstance(value, Path):
+        return str(value)
+    return value
+
+
+def record(kind: type[T], data: object, where: str) -> T:
+    """The dataclass ``kind`` from plain data, as :func:`plain` makes it or a user writes it.
+
+    Every field is held against its annotation: numbers, texts, flags, None, ``Literal``, tuples, sequences, mappings
+    with text keys, unions of these, and dataclasses of them. A whole number fits a float; ``"inf"``, ``"-inf"`` and
+    ``"nan"`` are floats too. ``Any`` takes everything.
+
+    Args:
+        kind: The dataclass.
+        data: A mapping of its fields; fields with a default may be left out.
+        where: What is read, for the messages: a file's path, or a part of it.
+
+    Raises:
+        InputError: Naming all fields that are missing, unknown (with the nearest known one) or do not fit.
+
+    Example:
+        >>> from hybrid_mpc.signals import Signal
+        >>> record(Signal, {"name": "q", "unit": "m", "upper": "inf"}, "model.json").label
+        'q [m]'
+        >>> record(Signal, {"nam": "q", "unit": 3}, "model.json")
+        Traceback (most recent call last):
+        hybrid_mpc.errors.InputError: model.json: no field 'nam'; did you mean 'name'? There are: name, unit, lower, \
+upper, periodic; name is missing; unit: a text is needed, got 3
+    """
+    problems: list[str] = []
+    found = _dataclass(kind, data, "", problems)
+    if problems:
+        more = len(problems) - MOST_NAMED
+        raise InputError(
+            f"{where}: " + "; ".join(problems[:MOST_NAMED]) + (f"; and {more} more" if more > 0 else "")
+        )
+    return found
+
+
+def known(word: object, names: Iterable[str], what: str) -> str:
+    """``word`` if it is one of ``names``.
+
+    Args:
+        word: What was given.
+        names: What there is.
+        what: Says what kind of name it is, for the message.
+
+    Raises:
+        InputError: If it is none of them; with the nearest one, and all.
+
+    Example:
+        >>> known("sqq", ("rti", "sqp"), "solver")
+        Traceback (most recent call last):
+        hybrid_mpc.errors.InputError: no solver 'sqq'; did you mean 'sqp'? There are: rti, sqp
+    """
+    names = list(names)
+    if isinstance(word, str) and word in names:
+        return word
+    raise InputError(_unknown(word, names, what))
+
+
+def _unknown(word: object, names: Sequence[str], what: str) -> str:
+    near = difflib.get_close_matches(_short(word).strip("'"), names, n=1, cutoff=0.5)
+    hint = f"did you mean {near[0]!r}? There are" if near else "there are"
+    return f"no {what} {_short(word)}; {hint}: {', '.join(names) or 'none'}"
+
+
+def _short(value: object) -> str:
+    """A value as a message shows it: however large it is, in a few words."""
+    if isinstance(value, Mapping):
+        return f"an object of {len(value)} fields"
+    if isinstance(value, list | tuple):
+        return f"a list of {len(value)}"
+    if isinstance(value, int) and not isinstance(value, bool) and abs(value) >= LARGEST:
+        return "a whole number beyond 64 bits"
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:50]}... ({len(text)} characters)"
+
+
+def _dataclass(kind: type[Any], data: object, where: str, problems: list[str]) -> Any:
+    if isinstance(data, kind):
+        return data
+    head = f"{where}: " if where else ""
+    if not isinstance(data, Mapping):
+        problems.append(f"{head}an object (fields and values) is needed, got {_short(data)}")
+        return None
+    taken = {f.name: f for f in dataclasses.fields(kind) if f.init}
+    hints = get_type_hints(kind)
+    before = len(problems)
+    problems += [head + _unknown(key, list(taken), "field") for key in data if key not in taken]
+    problems += [
+        f"{head}{name} is missing"
+        for name, f in taken.items()
+        if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING and name not in data
+    ]
+    values = {
+        name: _value(hints[name], data[name], f"{where}.{name}" if where else name, problems)
+        for name in taken
+        if name in data
+    }
+    if len(problems) > before:
+        return None
+    try:
+        return kind(**values)
+    except (InputError, OverflowError) as error:  # what the dataclass itself checks
+        problems.append(f"{head}{error}")
+        return None
+
+
+def _value(kind: Any, value: object, where: str, problems: list[str]) -> Any:
+    """``value`` as ``kind``; what does not fit goes into ``problems``."""
+    origin, arms = get_origin(kind), get_args(kind)
+    if kind is Any or kind is object:
+        return value
+    if origin in (Union, types.UnionType):
+        return _union(arms, value, where, problems)
+    if origin is Literal:
+        if any(value == arm and type(value) is type(arm) for arm in arms):
+            return value
+        needed = f"one of {', '.join(repr(arm) for arm in arms)}"
+    elif kind in _SIMPLE:
+        fits, needed = _SIMPLE[kind]
+        if (found := fits(value)) is not None:
+            return found[0]
+    elif dataclasses.is_dataclass(kind):
+        return _dataclass(kind, value, where, problems)  # type: ignore[arg-type]
+    elif origin in (tuple, list, Sequence) or kind in (tuple, list, Sequence):
+        return _sequence(kind, value, where, problems)
+    elif origin in (dict, Mapping) or kind in (dict, Mapping):
+        if isinstance(value, Mapping):
+            inner = arms[1] if arms else Any
+            return {str(k): _value(inner, v, f"{where}.{k}"[:200], problems) for k, v in value.items()}
+        needed = "an object (names and values) is"
+    else:
+        raise TypeError(f"{where}: records know no {kind}")
+    problems.append(
+        f"{where}: {needed if needed.endswith('is') else needed + ' is'} needed, got {_short(value)}"
+    )
+    return None
+
+
+def _union(arms: tuple[Any, ...], value: object, where: str, problems: list[str]) -> Any:
+    tried: list[list[str]] = []
+    for arm in sorted(arms, key=lambda arm: arm is float):  # a whole number stays one where both fit
+        own: list[str] = []
+        found = _value(arm, value, where, own)
+        if not own:
+            return found
+        tried.append(own)
+    likely = max(tried, key=lambda own: own[0].count("."))  # the arm that went deepest says most
+    problems += (
+        likely
+        if len(arms) > 1 and likely[0].count(".") > where.count(".")
+        else [_either(tried, where, value)]
+    )
+    return None
+
+
+def _either(tried: Sequence[Sequence[str]], where: str, value: object) -> str:
+    wanted = [own[0].removeprefix(f"{where}: ").split(" is needed")[0] for own in tried]
+    return f"{where}: {' or '.join(dict.fromkeys(wanted))} is needed, got {_short(value)}"
+
+
+def _sequence(kind: Any, value: object, where: str, problems: list[str]) -> Any:
+    arms, make = get_args(kind), tuple if (get_origin(kind) or kind) is not list else list
+    if not isinstance(value, list | tuple):
+        problems.append(f"{where}: a list is needed, got {_short(value)}")
+        return None
+    fixed = make is tuple and (get_origin(kind) or kind) is tuple and arms and arms[-1] is not Ellipsis
+    if fixed and len(value) != len(arms):
+        problems.append(f"{where}: a list of {len(arms)} is needed, got {_short(value)}")
+        return None
+    kinds = arms if fixed else [arms[0] if arms else Any] * len(value)
+    return make(
+        _value(k, v, f"{where}[{i}]", problems) for i, (k, v) in enumerate(zip(kinds, value, strict=True))
+    )
+
+
+def _float(value: object) -> tuple[float] | None:
+    if isinstance(value, str) and value in NUMBERS:
+        return (NUMBERS[value],)
+    if isinstance(value, float | np.floating):
+        return (float(value),)
+    whole = _int(value)
+    return None if whole is None else (float(whole[0]),)
+
+
+def _int(value: object) -> tuple[int] | None:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        return None
+    number = int(value)
+    return (number,) if abs(number) < LARGEST else None
+
+
+_SIMPLE: Mapping[Any, tuple[Any, str]] = {
+    float: (_float, "a number"),
+    int: (_int, "a whole number"),
+    str: (lambda v: (v,) if isinstance(v, str) else None, "a text"),
+    bool: (lambda v: (v,) if isinstance(v, bool) else None, "true or false"),
+    type(None): (lambda v: (None,) if v is None else None, "null"),
+    Path: (lambda v: (Path(v),) if isinstance(v, str | Path) else None, "a path"),
+}

@@ -1,0 +1,259 @@
+"""Files are written whole or not at all, read within limits, and folders are held by one job at a time."""
+
+import doctest
+import io
+import json
+import os
+import subprocess
+import sys
+import threading
+import zipfile
+
+import numpy as np
+import pytest
+
+import hybrid_mpc.files
+import hybrid_mpc.records
+from hybrid_mpc.errors import InputError, StorageError
+from hybrid_mpc.files import (
+    check_folder,
+    check_npz,
+    check_writable,
+    is_empty,
+    locked,
+    read_arrays,
+    read_document,
+    read_document_arrays,
+    read_json,
+    replacing,
+    write_arrays,
+    write_document,
+    write_json,
+    write_text,
+)
+
+LIMITED = """
+import resource, signal, sys
+from pathlib import Path
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+sys.argv = ["hybrid-mpc", *sys.argv[1:]]
+from hybrid_mpc.cli import main
+main()
+"""
+"""The command line on a disk that is full after 20 kB of any file."""
+
+
+@pytest.mark.parametrize("module", [hybrid_mpc.files, hybrid_mpc.records])
+def test_examples(module):
+    flags = doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL
+    assert doctest.testmod(module, optionflags=flags).failed == 0
+
+
+def test_two_writers_never_damage_what_a_reader_sees(tmp_path):
+    """Every read gives what one of them wrote, whole; a name that both shared gave damaged reads and failed writes."""
+    path, errors = tmp_path / "a.json", []
+    write_json(path, {"who": "first", "x": [0] * 2000})
+
+    def write(who):
+        try:
+            for _ in range(150):
+                write_json(path, {"who": who, "x": [len(who)] * 2000})
+                write_arrays(tmp_path / "a.npz", {"x": np.full(500, len(who))})
+        except Exception as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=write, args=(who,)) for who in ("one", "three")]
+    for thread in threads:
+        thread.start()
+    reads = 0
+    while any(thread.is_alive() for thread in threads):
+        found = read_json(path)
+        assert len(set(found["x"])) == 1
+        reads += 1
+        if (tmp_path / "a.npz").is_file():
+            assert len(set(read_arrays(tmp_path / "a.npz")["x"].tolist())) == 1
+    assert not errors
+    assert reads > 10
+    assert {p.name for p in tmp_path.iterdir()} == {"a.json", "a.npz"}
+
+
+def test_a_block_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
+    path = tmp_path / "a.txt"
+    write_text(path, "before")
+    with pytest.raises(AttributeError), replacing(path) as file:
+        file.write(b"half") and file.no_such_method()
+    assert path.read_text() == "before"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_what_the_file_system_refuses_is_one_clear_line(tmp_path):
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(StorageError, match=r"cannot write .*folder: Is a directory"):
+        write_text(tmp_path / "folder", "x")
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(
+        StorageError, match=r"cannot write .*file/a.json: .*file is a file where a folder is needed"
+    ):
+        write_json(tmp_path / "file" / "a.json", {})
+    with pytest.raises(StorageError, match="File name too long"):
+        write_text(tmp_path / ("x" * 300) / "a.txt", "x")
+    with pytest.raises(InputError, match=r"cannot read .*: is a directory"):
+        read_json(tmp_path / "folder")
+    with pytest.raises(InputError, match="is missing"):
+        read_json(tmp_path / "none.json")
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="named pipe"):
+        read_json(tmp_path / "pipe")
+    with pytest.raises(InputError, match="is a device"):
+        read_json(type(tmp_path)("/dev/zero"))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "{",
+        "[1,]",
+        "nul",
+        '{"a": NaN}',
+        "1e999",
+        "9" * 5000,
+        "[" * 100_000,
+        '"\\ud800"',
+        '{"a": 1, "a": 2}',
+        "\xff",
+    ],
+)
+def test_json_that_is_none(tmp_path, text):
+    path = tmp_path / "a.json"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(InputError, match=r"a.json is damaged"):
+        read_json(path)
+
+
+def npz(**arrays):
+    file = io.BytesIO()
+    np.savez_compressed(file, **arrays)
+    return file.getvalue()
+
+
+def claimed(shape, descr="<f8", content=b""):
+    """An archive of one array whose header claims a shape."""
+    header = f"{{'descr': {descr!r}, 'fortran_order': False, 'shape': {shape}}}".encode()
+    header += b" " * (-(len(header) + 11) % 64) + b"\n"
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("a.npy", b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + content)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"", b"rubbish", npz(a=np.zeros(3))[:-30], npz(a=np.zeros(300_000_000 // 8)), claimed((10**12,)),
+        claimed((10**9, 10**9)), claimed((-1,)), claimed((0, 10**30)), claimed((2,), "|O", b"x" * 16),
+        claimed((2,), "|V99999999999", b"x"), claimed((2,)).replace(b"NUMPY", b"NIMPY"),
+    ],
+)  # fmt: skip
+def test_arrays_that_are_damaged_or_too_large(tmp_path, monkeypatch, content):
+    monkeypatch.setattr(hybrid_mpc.files, "MOST_ARRAYS", 2**27)
+    path = tmp_path / "a.npz"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"a.npz"):
+        read_arrays(path)
+
+
+def test_arrays_within_the_limit_pass():
+    check_npz(npz(a=np.zeros((3, 4)), b=np.float64(2.0), c=np.zeros((0, 5))), 1000)
+
+
+def test_a_document_tells_any_change(tmp_path):
+    path = tmp_path / "a.json"
+    write_document(path, {"dt": 0.02, "inf": float("inf")}, {"x": np.arange(3.0)})
+    assert read_document(path) == {"dt": 0.02, "inf": "inf"}
+    np.testing.assert_array_equal(read_document_arrays(path)["x"], np.arange(3.0))
+    whole = path.read_text()
+    path.write_text(whole.replace("0.02", "0.03"))
+    with pytest.raises(InputError, match=r"changed by hand.*; train anew"):
+        read_document(path, "train anew")
+    path.write_text(whole)
+    write_arrays(path.with_suffix(".npz"), {"x": np.arange(4.0)})
+    with pytest.raises(InputError, match=r"a.npz is damaged, or does not belong to a.json; again"):
+        read_document_arrays(path, "again")
+    path.with_suffix(".npz").unlink()
+    with pytest.raises(InputError, match=r"a.npz is missing; again"):
+        read_document_arrays(path, "again")
+
+
+def test_a_folder_is_held_by_one_process(tmp_path):
+    """And by no one after it was killed; what it had half written is removed by the next."""
+    out = tmp_path / "out"
+    child = subprocess.Popen(
+        [sys.executable, "-c",
+         "import sys, time; from pathlib import Path; from hybrid_mpc.files import locked, replacing\n"
+         "with locked(Path(sys.argv[1])), replacing(Path(sys.argv[1]) / 'sub' / 'a.json') as file:\n"
+         "    file.write(b'half'); print('held', flush=True); time.sleep(60)", str(out)],
+        stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert child.stdout.readline() == "held\n"
+    with pytest.raises(InputError, match="another process works in this folder"), locked(out):
+        pass
+    child.kill()
+    child.wait()
+    assert len(list((out / "sub").glob(".a.json.*.part"))) == 1
+    with locked(out):
+        assert list((out / "sub").iterdir()) == []
+    assert is_empty(tmp_path / "none")
+    (out / "sub").rmdir()
+    assert is_empty(out)
+
+
+def test_a_folder_for_results_is_checked_and_not_made(tmp_path):
+    check_folder(tmp_path / "new" / "deeper")
+    assert not (tmp_path / "new").exists()
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(InputError, match="exists and is no empty folder"):
+        check_folder(tmp_path / "file")
+    with pytest.raises(InputError, match="exists and is no empty folder"):
+        check_folder(tmp_path)
+    for bad in (tmp_path / "file" / "below", tmp_path / ("x" * 300), "/proc/nowhere", "/dev/null/x", "a\0b"):
+        with pytest.raises(InputError, match=r"cannot (write|look) into"):
+            check_folder(type(tmp_path)(bad))
+    with pytest.raises(InputError, match="choose another --out"):
+        check_writable(type(tmp_path)("/proc"))
+
+
+def test_a_full_disk_ends_a_command_with_a_line_and_no_damage(tmp_path):
+    """``data`` writes recordings of more than 20 kB: the first is refused, whole, and the command says so."""
+    command = [
+        sys.executable,
+        "-c",
+        LIMITED,
+        "data",
+        "golf_robot",
+        "--out",
+        str(tmp_path / "out"),
+        "--budget",
+        "quick",
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+    assert "File too large" in done.stderr
+    assert "the same command with another --out" in done.stderr
+    assert not [p for p in (tmp_path / "out").rglob("*") if p.is_file()]
+
+
+def test_results_of_control_are_refused_before_the_loops(call, golf_artifact, tmp_path):
+    (tmp_path / "file").write_text("x")
+    for out in (tmp_path / "file" / "out", "/proc/out"):
+        code, _, message = call("control", "golf_robot", "--model", golf_artifact, "--out", out)
+        assert code == 2
+        assert "cannot" in message
+        assert "choose another --out" in message
+
+
+def test_write_of_plain_text_is_json(tmp_path):
+    write_json(tmp_path / "a.json", {"x": np.float64(1.0), "y": (1, 2)})
+    assert json.loads((tmp_path / "a.json").read_text()) == {"x": 1.0, "y": [1, 2]}
