@@ -11,6 +11,7 @@ from hybrid_mpc.pipeline.context import Context, Progress, Silent
 from hybrid_mpc.pipeline.devices import check_device
 from hybrid_mpc.pipeline.guard_job import guard_stage
 from hybrid_mpc.pipeline.observers import estimation_stage
+from hybrid_mpc.pipeline.preflight import check_scenario
 from hybrid_mpc.pipeline.reporting import report_stage
 from hybrid_mpc.pipeline.settings import RunSettings, open_folder
 from hybrid_mpc.scenario import load_scenario
@@ -55,16 +56,16 @@ def run(
     """
     scenario = load_scenario(settings.scenario)
     context = Context(settings, scenario, out, progress or Silent())
-    context.budget  # noqa: B018  an unknown budget is refused before a folder is made
+    check_scenario(scenario, context.budget)
     identify.check_data(context)
     check_device(settings.device)
-    open_folder(out, settings, resume=resume)
-    for name, title, stage in STAGES:
-        context.progress.start(title)
-        if context.done(name):
-            context.progress.finish("done before")
-            continue
-        stage(context)
-        context.progress.finish("")
+    with open_folder(out, settings, resume=resume):
+        for name, title, stage in STAGES:
+            context.progress.start(title)
+            if context.done(name):
+                context.progress.finish("done before")
+                continue
+            stage(context)
+            context.progress.finish("")
     result: dict[str, Any] = context.result("report")
     return result

@@ -16,6 +16,7 @@ from hybrid_mpc.identification.search_space import SearchSpace
 from hybrid_mpc.pipeline import identify
 from hybrid_mpc.pipeline.context import Context, Progress, Silent
 from hybrid_mpc.pipeline.deploy import versions
+from hybrid_mpc.pipeline.preflight import check_scenario
 from hybrid_mpc.pipeline.settings import RunSettings, open_folder
 from hybrid_mpc.scenario import load_scenario
 
@@ -97,31 +98,34 @@ def run_search(
 
     check_numbers(trials, settings.seed, timeout)
     context = Context(settings, load_scenario(settings.scenario), out, progress or Silent())
-    context.budget  # noqa: B018  an unknown budget is refused before a folder is made
+    check_scenario(context.scenario, context.budget)
     identify.check_data(context)
-    open_folder(out, settings, resume=resume)
-    for name, title, stage in STAGES:
-        context.progress.start(title)
-        if not context.done(name):
-            stage(context)
-        context.progress.finish("")
-    context.progress.start(f"searching, {trials} trials")
-    found = search(
-        context.scenario.prior(context.result("prior")["values"]),
-        context.smoothed("train"),
-        context.smoothed("valid"),
-        identify.training_settings(context, settings.kind),
-        settings.space,
-        trials=trials,
-        storage=out / "search.jsonl",
-        seed=settings.seed,
-        timeout=timeout,
-        on_progress=lambda number, done, total, error: context.progress.update(
-            "trials", number * total + done, trials * total, f"trial {number}: validation E_sim {error:.4g}"
-        ),
-    )
-    context.progress.finish(f"{len(found.trials)} trials")
-    return _write(context, settings, found)
+    with open_folder(out, settings, resume=resume):
+        for name, title, stage in STAGES:
+            context.progress.start(title)
+            if not context.done(name):
+                stage(context)
+            context.progress.finish("")
+        context.progress.start(f"searching, {trials} trials")
+        found = search(
+            context.scenario.prior(context.result("prior")["values"]),
+            context.smoothed("train"),
+            context.smoothed("valid"),
+            identify.training_settings(context, settings.kind),
+            settings.space,
+            trials=trials,
+            storage=out / "search.jsonl",
+            seed=settings.seed,
+            timeout=timeout,
+            on_progress=lambda number, done, total, error: context.progress.update(
+                "trials",
+                number * total + done,
+                trials * total,
+                f"trial {number}: validation E_sim {error:.4g}",
+            ),
+        )
+        context.progress.finish(f"{len(found.trials)} trials")
+        return _write(context, settings, found)
 
 
 def overrides(found: SearchResult, space: SearchSpace) -> dict[str, Any]:

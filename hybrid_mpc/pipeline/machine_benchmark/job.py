@@ -10,7 +10,15 @@ from typing import Any
 
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import digest, read_json, write_json
+from hybrid_mpc.files import (
+    check_writable,
+    digest,
+    is_empty,
+    locked,
+    read_document,
+    write_document,
+    write_json,
+)
 from hybrid_mpc.identification.settings import KINDS
 from hybrid_mpc.pipeline.context import Progress, Silent
 from hybrid_mpc.pipeline.deploy import versions
@@ -25,7 +33,9 @@ from hybrid_mpc.pipeline.machine_benchmark.recordings import (
     read_training,
 )
 from hybrid_mpc.pipeline.machine_benchmark.refit import refitted
-from hybrid_mpc.pipeline.machine_benchmark.store import BenchmarkModel, load_model, physics_of, save_model
+from hybrid_mpc.pipeline.machine_benchmark.store import BenchmarkModel, load_model, save_model
+from hybrid_mpc.pipeline.preflight import check_scenario
+from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import Scenario, load_scenario
 
 SCHEMA = 1
@@ -79,48 +89,51 @@ def benchmark(
     progress, scenario = progress or Silent(), load_scenario(settings.scenario)
     spec = benchmark_of(scenario)
     _check(settings, scenario)
+    check_scenario(scenario)
     tests = {path.name: read_test(scenario, path) for path in settings.test}
-    started = time.monotonic()
-    notes: dict[str, Any] = {}
-    if settings.model is not None:
-        model = load_model(settings.model, scenario.name)
-    else:
-        model, notes = _made(settings, scenario, out, progress)
-    prior = scenario.prior(model.physics.fit.values)
-    if settings.model is None and not tests:
-        held = read_training(scenario, settings.data).held_back
-        tests = {"held back": held} if held else {}
-    progress.start("free runs over the test files")
-    runs: dict[str, list[Run]] = {}
-    test: dict[str, Any] = {}
-    for i, (name, trajectories) in enumerate(tests.items()):
-        progress.update("files", i, len(tests), name)
-        runs[name] = run_freely(
-            prior,
-            model.physics,
-            model.networks,
-            trajectories,
-            warm_up=scenario.data.warm_up,
-            length=spec.length,
-        )
-        test[name] = {m: figures_of(runs[name], m, unit=spec.unit, scale=spec.scale) for m in MODELS}
-        test[name]["hybrid"] = figures_of(runs[name], model.hybrid, unit=spec.unit, scale=spec.scale)
-        if settings.refit is not None:
-            test[name]["refit"] = _changed(scenario, model, trajectories[0], settings.refit)
-        test[name]["scored_s"] = sum(len(run.t) for run in runs[name]) * model.dt
-    progress.finish("")
-    results = {
-        "schema": SCHEMA,
-        "machine": scenario.name,
-        "budget": settings.budget if settings.model is None else None,
-        "seed": settings.seed if settings.model is None else None,
-        **notes,
-        "model": describe(model, scenario),
-        "test": test,
-        "versions": versions(),
-        "timing": {"seconds": time.monotonic() - started},
-    }
-    write_json(out / "results.json", results)
+    check_writable(out)
+    with locked(out):
+        started = time.monotonic()
+        notes: dict[str, Any] = {}
+        if settings.model is not None:
+            model = load_model(settings.model, scenario.name)
+        else:
+            model, notes = _made(settings, scenario, out, progress)
+        prior = scenario.prior(model.physics.fit.values)
+        if settings.model is None and not tests:
+            held = read_training(scenario, settings.data).held_back
+            tests = {"held back": held} if held else {}
+        progress.start("free runs over the test files")
+        runs: dict[str, list[Run]] = {}
+        test: dict[str, Any] = {}
+        for i, (name, trajectories) in enumerate(tests.items()):
+            progress.update("files", i, len(tests), name)
+            runs[name] = run_freely(
+                prior,
+                model.physics,
+                model.networks,
+                trajectories,
+                warm_up=scenario.data.warm_up,
+                length=spec.length,
+            )
+            test[name] = {m: figures_of(runs[name], m, unit=spec.unit, scale=spec.scale) for m in MODELS}
+            test[name]["hybrid"] = figures_of(runs[name], model.hybrid, unit=spec.unit, scale=spec.scale)
+            if settings.refit is not None:
+                test[name]["refit"] = _changed(scenario, model, trajectories[0], settings.refit)
+            test[name]["scored_s"] = sum(len(run.t) for run in runs[name]) * model.dt
+        progress.finish("")
+        results = {
+            "schema": SCHEMA,
+            "machine": scenario.name,
+            "budget": settings.budget if settings.model is None else None,
+            "seed": settings.seed if settings.model is None else None,
+            **notes,
+            "model": describe(model, scenario),
+            "test": test,
+            "versions": versions(),
+            "timing": {"seconds": time.monotonic() - started},
+        }
+        write_json(out / "results.json", results)
     return results, runs
 
 
@@ -204,7 +217,8 @@ def _physics(scenario: Scenario, data: Recordings, out: Path, progress: Progress
     """The fitted prior; a fit that ``out`` holds is not made again."""
     note, spec = out / "checkpoints" / "physics.json", benchmark_of(scenario)
     if note.is_file():
-        return physics_of(read_json(note))
+        held = read_document(note, "delete it, and the same command fits the prior anew")
+        return record(Physics, held, str(note))
     physics = fit_physics(
         scenario.prior,
         data.train,
@@ -214,7 +228,7 @@ def _physics(scenario: Scenario, data: Recordings, out: Path, progress: Progress
         largest_delay=spec.largest_delay,
         on_progress=lambda done, total, text: progress.update("prior", done, total, text),
     )
-    write_json(note, asdict(physics))
+    write_document(note, plain(physics))
     return physics
 
 
@@ -250,7 +264,7 @@ def _claim(out: Path, settings: BenchmarkSettings, data: Recordings) -> None:
     }
     note = out / "benchmark.json"
     if note.is_file():
-        held = read_json(note)
+        held = read_document(note)
         changed = [key for key in own if digest(held.get(key)) != digest(own[key])]
         if changed:
             raise InputError(
@@ -258,9 +272,9 @@ def _claim(out: Path, settings: BenchmarkSettings, data: Recordings) -> None:
                 "on with it, or choose another --out"
             )
         return
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    if not is_empty(out):
         raise InputError(f"{out} exists and holds something else than a benchmark; choose another --out")
-    write_json(note, own)
+    write_document(note, own)
 
 
 def table(results: dict[str, Any]) -> list[str]:

@@ -1,0 +1,216 @@
+"""What is wrong with a scenario is told before any work, all of it at once, whatever it is."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from hybrid_mpc import Budget, ControlSpec, DataSpec, Parameter, Prior, Scenario, Signal
+from hybrid_mpc.closed_loop import Fault
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.pipeline.preflight import check_scenario
+from hybrid_mpc.scenario import Task, load_scenario, registered_scenarios
+
+
+class Pendulum(Prior):
+    states = (Signal("phi", "rad"), Signal("phi_dot", "rad/s"))
+    inputs = (Signal("tau", "N m", -3, 3),)
+    outputs = (Signal("phi", "rad", -7, 7),)
+    parameters_spec = (Parameter("J", 0.1, "kg m^2", 0.05, 0.2), Parameter("mgl", 1.0, "N m", 0.3, 3.0))
+
+    def acceleration(self, x, u):
+        return (u - self.mgl * torch.sin(x[..., :1])) / self.J
+
+    def inertia(self, x):
+        return self.J
+
+
+class Plant:
+    def reset(self, x0, seed):
+        return np.array(x0)
+
+    def step(self, state, u, dt):
+        return state + dt * np.array([state[1], 10 * u[0] - 10 * np.sin(state[0])])
+
+    def measure(self, state, rng):
+        return state[:1]
+
+    def truth(self, state):
+        return state
+
+    def hidden(self, state):
+        return np.zeros(0)
+
+
+DATA = DataSpec("t", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.2, warm_up=0.5)
+CONTROL = ControlSpec(10, (25, 0.25), (1,), (1,), (-1,), (1,), estimator_sigma=(1e-3,))
+TASK = Task("hold", "Hold", 1.0, (0.1, 0.0), lambda t: np.zeros((len(t), 2)))
+GOOD = Scenario(
+    "mine", "Mine", "", prior=Pendulum, data=DATA, control=CONTROL, plant=Plant, tasks=(TASK,),
+    budgets={"quick": Budget(4, 1, 5, 5, 1)},
+)  # fmt: skip
+
+
+def prior(**members):
+    """The scenario with a prior that differs."""
+    return {"prior": type("Changed", (Pendulum,), members)}
+
+
+def control(**fields):
+    return {"control": dataclasses.replace(CONTROL, **fields)}
+
+
+def task(**fields):
+    return {"tasks": (dataclasses.replace(TASK, **fields),)}
+
+
+def plant(**members):
+    return {"plant": type("Changed", (Plant,), members)}
+
+
+def budget(**fields):
+    return {"budgets": {"quick": dataclasses.replace(GOOD.budgets["quick"], **fields)}}
+
+
+def raises(*given):
+    raise KeyError("forgotten")
+
+
+WRONG = {
+    # the prior
+    "raises": (prior(acceleration=raises), ["xdot(x, u) raised KeyError", "forgotten", "test_preflight.py"]),
+    "raises when made": ({"prior": raises}, ["prior raised KeyError"]),
+    "is no prior": ({"prior": lambda values=None: 3}, ["makes a int"]),
+    "ignores its values": ({"prior": lambda values=None: Pendulum({"J": 0.06} if values is None else None)},
+                           ["must take its values over"]),
+    "takes no values": ({"prior": lambda: Pendulum()}, ["prior raised TypeError"]),
+    "returns None": (prior(acceleration=lambda self, x, u: None), ["xdot(x, u) raised"]),
+    "forward returns None": (prior(forward=lambda self, x, u: None), ["must return a tensor, got NoneType", "return"]),
+    "returns numpy": (prior(forward=lambda self, x, u: x.numpy()), ["must return a tensor, got ndarray"]),
+    "returns NaN": (prior(acceleration=lambda self, x, u: u / 0.0 * 0.0), ["xdot(x, u)", "finite"]),
+    "NaN at one side": (prior(acceleration=lambda self, x, u: torch.sqrt(u)), ["finite", "x = ", "u = "]),
+    "returns another shape": (prior(acceleration=lambda self, x, u: (u / self.J).squeeze(-1)), ["xdot(x, u)"]),
+    "returns a state too much": (prior(acceleration=lambda self, x, u: torch.cat([u, u], -1)), ["shape", "(17, 2)"]),
+    "returns one number": (prior(forward=lambda self, x, u: torch.tensor(1.0)), ["must return the shape"]),
+    "mixes the batch": (prior(acceleration=lambda self, x, u: u / self.J - x.mean()), ["in a batch"]),
+    "indexes the batch": (prior(acceleration=lambda self, x, u: u / self.J + x[0, 0]), ["xdot(x, u) raised"]),
+    "float32": (prior(acceleration=lambda self, x, u: (u / self.J).float(),
+                      forward=lambda self, x, u: torch.cat([x[..., 1:], u], -1).float()), ["float64", "float32"]),
+    "float32 buffer": ({"prior": lambda values=None: with_buffer(values)}, ["table must be float64"]),
+    "zero inertia": (prior(inertia=lambda self, x: 0.0 * self.J), ["energy_balance", "inertia(x) must be positive"]),
+    "negative inertia": (prior(inertia=lambda self, x: -self.J), ["inertia(x) must be positive"]),
+    "no inertia": (prior(inertia=Prior.inertia), ["must define inertia"]),
+    "balance of another shape": (prior(energy_balance=lambda self, x, xdot, u: xdot), ["one number a sample"]),
+    "balance that is none": (
+        prior(energy_balance=lambda self, x, xdot, u: (self.J * xdot[..., 1] - u[..., 0]) * x[..., 1]),
+        ["along the prior's own flow", "sign"],
+    ),
+    "output of another shape": (prior(output=lambda self, x, u: x), ["output(x, u)", "(17, 1)"]),
+    "output raises": (prior(output=raises), ["output(x, u) raised KeyError"]),
+    "three states": (prior(states=(*Pendulum.states, Signal("i", "A"))), ["[q, v] in pairs"]),
+    "same names": (prior(states=(Signal("phi", "rad"), Signal("phi", "rad/s"))), ["same name"]),
+    "states that are texts": (prior(states=("phi", "phi_dot")), ["tuple of one Signal or more"]),
+    "an operator that is not exported": (
+        prior(acceleration=lambda self, x, u: torch.special.bessel_j0(x[..., :1]) + u), ["export to CasADi", "bessel"],
+    ),
+    # data
+    "too few columns": ({"data": dataclasses.replace(DATA, inputs=())}, ["0 columns of inputs", "'tau'"]),
+    "too many columns": ({"data": dataclasses.replace(DATA, outputs=("phi", "x"))}, ["2 columns of outputs"]),
+    "unknown cause": ({"causes": {"mass": ("m",)}}, ["no parameter m", "J, mgl"]),
+    # control
+    "horizon 0": (control(horizon=0), ["control: horizon"]),
+    "horizon half": (control(horizon=2.5), ["control: horizon"]),
+    "crossed bounds": (control(u_min=(1,), u_max=(-1,)), ["control:", "u_min"]),
+    "NaN weight": (control(q=(math.nan, 1)), ["control: q"]),
+    "negative weight": (control(r=(-1,)), ["control: "]),
+    "no weight at all": (control(r=(0,), r_delta=(0,)), ["control: "]),
+    "weights of too few": (control(q=(1,)), ["q needs 2 numbers, got 1"]),
+    "bounds of too many": (control(u_min=(-1, -1), u_max=(1, 1)), ["u_min"]),
+    "no estimator_sigma": (control(estimator_sigma=()), ["estimator_sigma needs 1 numbers, got 0"]),
+    "zero estimator_sigma": (control(estimator_sigma=(0.0,)), ["estimator_sigma must be positive"]),
+    "NaN estimator_sigma": (control(estimator_sigma=(math.nan,)), ["estimator_sigma must be positive"]),
+    "zero du_max": (control(du_max=(0,)), ["du_max"]),
+    "crossed states": (control(x_min=(1, -1), x_max=(-1, 1)), ["control"]),
+    "around of one": (control(around=(0.0,)), ["around needs 2 numbers"]),
+    "starts of another shape": (control(starts=(((0.0,),),)), ["control: controller"]),
+    # tasks
+    "no reference for all": (task(reference=lambda t: np.zeros((len(t), 1))), ["task hold: reference", "(50, 2)"]),
+    "reference that raises": (task(reference=raises), ["task hold raised KeyError"]),
+    "reference of NaN": (task(reference=lambda t: np.full((len(t), 2), np.nan)), ["reference is", "finite"]),
+    "negative factors": (task(weight=lambda t: -np.ones((len(t), 2))), ["not be negative"]),
+    "no duration": (task(duration=0.0), ["task hold: duration"]),
+    "endless": (task(duration=math.inf), ["task hold: duration"]),
+    "x0 of one": (task(x0=(0.0,)), ["x0 needs 2"]),
+    "x0 of NaN": (task(x0=(math.nan, 0.0)), ["x0 needs 2"]),
+    "task's own horizon": (task(control=dataclasses.replace(CONTROL, horizon=-3)), ["control of task hold"]),
+    "same tasks": ({"tasks": (TASK, TASK)}, ["two have the same name"]),
+    "fault of a channel": (task(faults=(Fault(0, 1, "input_gain", 0.5, channel=3),)), ["channel 3"]),
+    "fault the plant lacks": (task(faults=(Fault(0, 1, "plant_fire", 0.5),)), ["takes no faults"]),
+    "tasks without control": ({"control": None}, ["no control problem"]),
+    # plant and oracle
+    "plant that raises": (plant(step=raises), ["plant raised KeyError"]),
+    "plant measures all": (plant(measure=lambda self, state, rng: state), ["measure must return the shape (1,)"]),
+    "plant tells less": (plant(truth=lambda self, state: state[:1]), ["truth must return the shape (2,)"]),
+    "plant of NaN": (plant(step=lambda self, s, u, dt: s * np.nan), ["must be finite"]),
+    "oracle that raises": ({"oracle": raises}, ["oracle raised KeyError"]),
+    # budgets
+    "no networks": (budget(networks=0), ["budget quick: networks"]),
+    "half a unit": (budget(hidden=2.5), ["budget quick: hidden"]),
+    "negative decay": (budget(decay=-1.0), ["budget quick: decay"]),
+}  # fmt: skip
+
+
+def with_buffer(values):
+    made = Pendulum(values)
+    made.register_buffer("table", torch.zeros(3))
+    return made
+
+
+@pytest.mark.parametrize("changes", [v for v, _ in WRONG.values()], ids=WRONG)
+@pytest.mark.full
+def test_every_wrong_scenario_is_told(changes):
+    words = next(w for v, w in WRONG.values() if v is changes)
+    with pytest.raises(InputError) as told:
+        check_scenario(dataclasses.replace(GOOD, **changes))
+    for word in words:
+        assert word in str(told.value)
+
+
+def test_all_problems_are_told_at_once():
+    wrong = {
+        **prior(acceleration=lambda self, x, u: None),
+        **control(horizon=0),
+        **budget(networks=0),
+        **task(x0=(0.0,)),
+    }
+    with pytest.raises(InputError) as told:
+        check_scenario(dataclasses.replace(GOOD, **wrong))
+    message = str(told.value)
+    assert "3 problems" in message  # what hangs on the prior (the task's states) cannot be known without one
+    for word in ("xdot", "horizon", "networks"):
+        assert word in message
+
+
+def test_a_good_scenario_passes():
+    check_scenario(GOOD)
+    check_scenario(dataclasses.replace(GOOD, control=None, tasks=(), plant=None))
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", registered_scenarios())
+def test_the_ready_scenarios_pass(name):
+    check_scenario(load_scenario(name))
+
+
+def test_the_command_tells_it_before_it_reads_anything(call, tmp_path):
+    machine = tmp_path / "machine.py"
+    machine.write_text(
+        "from tests.pipeline.test_preflight import GOOD, control\nimport dataclasses\n"
+        "scenario = dataclasses.replace(GOOD, **control(horizon=0))\n"
+    )
+    code, _, message = call("run", machine, "--data", tmp_path / "none.csv", "--out", tmp_path / "out")
+    assert code == 2
+    assert "control: horizon" in message
+    assert not (tmp_path / "out").exists()
