@@ -14,3 +14,16 @@ class InputError(ValueError):
         ...
         hybrid_mpc.errors.InputError: run.csv: no column 'pos_rad'; it has 'time_s', 'angle'. Rename one.
     """
+
+
+class SafeInputError(RuntimeError):
+    """A run on a machine has ended and its actuator did not take the safe input: the last input may still act.
+
+    Raised from the actuator's first failure, behind which stands what had ended the run.
+
+    Example:
+        >>> raise SafeInputError("the safe input could not be handed over: cut the machine's power")
+        Traceback (most recent call last):
+        ...
+        hybrid_mpc.errors.SafeInputError: the safe input could not be handed over: cut the machine's power
+    """
