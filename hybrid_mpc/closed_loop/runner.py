@@ -192,7 +192,7 @@ class Runner:
 
 
 def _checked_safe(given: ArrayLike | None, ocp: OCP) -> Array:
-    u = vector(np.clip(0.0, ocp.u_min, ocp.u_max) if given is None else given, ocp.n_u, "safe_input")
+    u = vector(ocp.rest_input if given is None else given, ocp.n_u, "safe_input")
     if np.any(u < ocp.u_min) or np.any(u > ocp.u_max):
         raise InputError(f"Runner: safe_input {u} is outside the limits {ocp.u_min} to {ocp.u_max}")
     return u
