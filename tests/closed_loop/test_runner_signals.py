@@ -94,13 +94,17 @@ def start(server, tmp_path):
             child.end()
 
 
-@pytest.mark.parametrize(
-    "case",
-    ["running", "warm_up", "first_sample", "first_plan", "in_measure", "in_a_read", "in_actuate", "final_wait",
-     "swallowed"],
+MOMENTS = (
+    "running", "in_measure", "final_wait", "swallowed",
+    "warm_up", "first_sample", "first_plan", "in_a_read", "in_actuate",
 )  # fmt: skip
-@pytest.mark.parametrize("name", ["SIGTERM", "SIGINT", "SIGHUP"])
-def test_a_signal_ends_the_process_after_the_safe_input(start, case, name):
+
+
+@pytest.mark.parametrize(
+    ("name", "case"),
+    [("SIGTERM", case) for case in MOMENTS] + [(n, c) for n in ("SIGINT", "SIGHUP") for c in MOMENTS[:4]],
+)
+def test_a_signal_ends_the_process_after_the_safe_input(start, name, case):
     child = start(case)
     child.until("here")
     child.send(name)
