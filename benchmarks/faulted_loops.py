@@ -176,7 +176,7 @@ def _excess(u, ocp) -> float:
     """Largest violation of a limit of the input or of its change [N m]; at most 0 where all are kept."""
     beyond = [np.max(u - ocp.u_max), np.max(ocp.u_min - u)]
     if ocp.du_max is not None:
-        beyond.append(np.max(np.abs(np.diff(u, axis=0, prepend=0.0)) - ocp.du_max))
+        beyond.append(np.max(np.abs(np.diff(u, axis=0, prepend=ocp.rest_input[None])) - ocp.du_max))
     return float(np.max(beyond))
 
 

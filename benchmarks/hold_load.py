@@ -53,7 +53,7 @@ def swings(error, size: float) -> int:
 
 def one(model, sigma_x, step: float) -> ExtendedKalmanFilter:
     """A filter whose disturbance steps by a share of the input's range a period."""
-    span, sigma_y = CONTROL.u_max[0] - CONTROL.u_min[0], CONTROL.estimator_sigma[0]
+    span, sigma_y = CONTROL.input_range[0], CONTROL.estimator_sigma[0]
     return ExtendedKalmanFilter(
         model, sigma_y=[sigma_y], sigma_x=sigma_x, sigma_d=[step * span], sigma_x0=[sigma_y, 0.1],
         sigma_d0=[FIRST_LOAD * span],

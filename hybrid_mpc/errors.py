@@ -27,3 +27,16 @@ class StorageError(InputError):
         ...
         hybrid_mpc.errors.StorageError: cannot write run/a.json: No space left on device
     """
+
+
+class SafeInputError(RuntimeError):
+    """A run on a machine has ended and its actuator did not take the safe input: the last input may still act.
+
+    Raised from the actuator's first failure, behind which stands what had ended the run.
+
+    Example:
+        >>> raise SafeInputError("the safe input could not be handed over: cut the machine's power")
+        Traceback (most recent call last):
+        ...
+        hybrid_mpc.errors.SafeInputError: the safe input could not be handed over: cut the machine's power
+    """

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.benchmark_spec import BenchmarkSpec, check_anchors
 from hybrid_mpc.data_spec import DataSpec
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.input_limits import at_rest, input_limits
 
 if TYPE_CHECKING:
     from hybrid_mpc.closed_loop.faults import Fault
@@ -58,8 +59,9 @@ class ControlSpec:
         q: Weight of each state's deviation from its reference, ``(n_x,)`` [1/unit^2].
         r: Weight of each input, ``(n_u,)`` [1/unit^2].
         r_delta: Weight of each input change per period, ``(n_u,)`` [1/unit^2].
-        u_min: Lower input bounds ``(n_u,)``.
-        u_max: Upper input bounds ``(n_u,)``.
+        u_min: Lower input bounds ``(n_u,)``, of any sign; finite, since by the range of an input observer, guard and
+            demonstrations know what is much (an :class:`~hybrid_mpc.mpc.OCP` of your own may do without).
+        u_max: Upper input bounds ``(n_u,)``, finite and above ``u_min``.
         du_max: Largest input change per period ``(n_u,)``; default: none.
         estimator_sigma: Standard deviations that the estimator is to assume, ``(n_y,)`` [output units].
         x_min: Soft lower bounds of the states ``(n_x,)``; ``-inf`` for none. Default: none.
@@ -69,6 +71,14 @@ class ControlSpec:
         around: State ``(n_x,)`` near which the machine works, for terminal weight and fallback. Default: zero.
         starts: Inputs, each ``(horizon, n_u)``, from which the first plan is sought besides none, for a task with
             several ways (a swing-up); the cheapest plan is taken. Default: none.
+
+    Raises:
+        InputError: If the inputs' bounds have another number than ``r``, cross, or are not finite.
+
+    Example:
+        >>> heater = ControlSpec(20, (1.0,), (0.1,), (0.1,), u_min=(0.0,), u_max=(5.0,))
+        >>> heater.input_range, heater.rest_input
+        (array([5.]), array([0.]))
     """
 
     horizon: int
@@ -85,6 +95,25 @@ class ControlSpec:
     slack_quadratic: tuple[float, ...] | None = None
     around: tuple[float, ...] | None = None
     starts: tuple[tuple[tuple[float, ...], ...], ...] = ()
+
+    def __post_init__(self) -> None:
+        limits = input_limits(self.u_min, self.u_max, len(self.r))
+        for name, values in zip(("u_min", "u_max"), limits, strict=True):
+            if not np.all(np.isfinite(values)):
+                raise InputError(
+                    f"control: {name} {tuple(values.tolist())} given; finite bounds needed, since the noise of the "
+                    "observer is a share of each input's range. Give what the drive can do."
+                )
+
+    @property
+    def input_range(self) -> Array:
+        """Range ``(n_u,)`` of each input, upper less lower bound."""
+        return np.subtract(self.u_max, self.u_min)
+
+    @property
+    def rest_input(self) -> Array:
+        """Zero, or the bound next to it ``(n_u,)``."""
+        return at_rest(self.u_min, self.u_max)
 
 
 @dataclass(frozen=True)

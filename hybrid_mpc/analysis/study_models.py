@@ -30,7 +30,7 @@ motion at working speed, and the mean along a driven run."""
 FARTHEST = 1e6
 """Zeros farther out belong to a way through the system that begins later: rounding, over the fall of its gain."""
 LEVEL = 0.5
-"""Its size over the input's range."""
+"""Size of the multisine over half the input's range."""
 
 
 def rest(subject: Subject, model: HybridModel) -> tuple[Array, Array]:
@@ -146,7 +146,7 @@ def _zeros(system: Any) -> NDArray[np.complex128]:
 
 
 def drive(subject: Subject, model: HybridModel, seconds: float) -> Array:
-    """A multisine ``(n, n_u)`` of working size."""
+    """A multisine ``(n, n_u)`` of working size around the middle of each input's range."""
     t = np.asarray(model.dt * np.arange(round(seconds / model.dt)), dtype=np.float64)
-    u = multisine(t, LEVEL * float(subject.u_range[0, 1]), 0.1, 1.5)
-    return np.tile(u[:, None], (1, model.n_u))
+    sizes = [(LEVEL * 0.5 * (high - low), 0.5 * (low + high)) for low, high in pairs(subject.u_range)]
+    return np.column_stack([multisine(t, size, 0.1, 1.5, offset=middle) for size, middle in sizes])

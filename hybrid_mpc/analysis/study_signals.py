@@ -40,13 +40,17 @@ def measured_part(subject: Subject) -> Part:
             found[name] = welch_response(pieces, some.dt, length=length)
         source = f"H1 estimate of {len(subject.recordings)} recordings, Hann windows of {length:g} s"
     elif subject.plant is not None:
-        amplitude = LEVEL * float(subject.u_range[0, 1])
-        driven: dict[str, Any] = {"amplitude": amplitude, "band": BAND, "period": PERIOD, "periods": PERIODS}
+        low_u, high_u = subject.u_range[0].tolist()
+        amplitude, bias = LEVEL * 0.5 * (high_u - low_u), 0.5 * (low_u + high_u)
+        driven: dict[str, Any] = {
+            "amplitude": amplitude, "bias": bias, "band": BAND, "period": PERIOD, "periods": PERIODS
+        }  # fmt: skip
         zero = np.zeros(some.n_x)
         found = {"measured": multisine_response(run_plant(subject.plant, zero, some.dt), some.dt, **driven)}
         found |= {name: multisine_response(run_model(m, zero), m.dt, **driven) for name, m in models.items()}
         size, (low, high) = f"{amplitude:g} {some.inputs[0].unit}", BAND
-        source = f"odd multisine of {size}, {low:g} to {high:g} Hz, {PERIODS} periods"
+        around = f" around {bias:g}" if bias else ""
+        source = f"odd multisine of {size}{around}, {low:g} to {high:g} Hz, {PERIODS} periods"
     else:
         raise InputError(
             "there is neither a recording (--data) nor a simulated machine to take a response from"

@@ -15,6 +15,7 @@ from hybrid_mpc.estimation.kalman import ExtendedKalmanFilter
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.mpc import OCP
 from hybrid_mpc.scenario import ControlSpec, Plant, Scenario, scenario_of
+from hybrid_mpc.signals import Signal
 from nn_export import Program, load_programs
 
 Array = NDArray[np.float64]
@@ -120,29 +121,39 @@ def _speed(model: HybridModel, control: ControlSpec | None, given: float | None)
 
 def _range(model: HybridModel, control: ControlSpec | None) -> Array:
     """Working range of the states: the limits of the control problem, else the signals', else a unit."""
-    box = _outer(model)
-    if control is not None and control.x_min is not None and control.x_max is not None:
-        limits = np.column_stack([control.x_min, control.x_max])
-        box = np.where(np.isfinite(limits), limits, box)
-    return box
+    none = np.full(model.n_x, np.inf)
+    lower = -none if control is None or control.x_min is None else np.array(control.x_min, dtype=float)
+    upper = none if control is None or control.x_max is None else np.array(control.x_max, dtype=float)
+    sides = zip(model.states, lower.tolist(), upper.tolist(), strict=True)
+    return np.array([_within(s, _unit(s), low, high) for s, low, high in sides])
 
 
 def _outer(model: HybridModel) -> Array:
     """Whole range of the states: the signals', a turn for an angle that turns, else a unit either way."""
-    rows = []
-    for s in model.states:
-        size = np.pi if s.periodic else 1.0
-        rows.append([s.lower if np.isfinite(s.lower) else -size, s.upper if np.isfinite(s.upper) else size])
-    return np.array(rows)
+    return np.array([_within(s, _unit(s)) for s in model.states])
 
 
 def _inputs(model: HybridModel, control: ControlSpec | None) -> Array:
-    given = None if control is None else np.column_stack([control.u_min, control.u_max]).astype(float)
-    rows = []
-    for i, s in enumerate(model.inputs):
-        low, high = (s.lower, s.upper) if given is None or not np.all(np.isfinite(given[i])) else given[i]
-        rows.append([low if np.isfinite(low) else -1.0, high if np.isfinite(high) else 1.0])
-    return np.array(rows)
+    if control is not None:
+        return np.column_stack([control.u_min, control.u_max]).astype(float)
+    return np.array([_within(s, 1.0) for s in model.inputs])
+
+
+def _unit(signal: Signal) -> float:
+    return np.pi if signal.periodic else 1.0
+
+
+def _within(
+    signal: Signal, size: float, lower: float = -np.inf, upper: float = np.inf
+) -> tuple[float, float]:
+    """The limits of a signal where they are finite, else its own; a side without either ends at ``size``, and at least
+    so far from the other side.
+    """
+    low = lower if np.isfinite(lower) else signal.lower
+    high = upper if np.isfinite(upper) else signal.upper
+    if not np.isfinite(low):
+        low = min(-size, high - size) if np.isfinite(high) else -size
+    return low, high if np.isfinite(high) else max(size, low + size)
 
 
 def _filters(
@@ -154,7 +165,7 @@ def _filters(
 
     names = {"prior": "prior_observer", "hybrid": "hybrid_observer"}
     noise, source = find_noise(scenario, artifact, folder, tuple(names.values()), request.seed, request.noise)
-    span = np.subtract(control.u_max, control.u_min)
+    span = control.input_range
     filters = {}
     for mode, share in (("quiet", QUIET_SHARE), ("jump", JUMP_SHARE)):
         for name, contender in names.items():

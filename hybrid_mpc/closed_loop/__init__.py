@@ -4,6 +4,7 @@ from hybrid_mpc.closed_loop.faults import Fault
 from hybrid_mpc.closed_loop.guard import Guard, Mode, Switch
 from hybrid_mpc.closed_loop.result import ClosedLoopResult
 from hybrid_mpc.closed_loop.runner import Runner
+from hybrid_mpc.closed_loop.safe_end import SafeEnd
 from hybrid_mpc.closed_loop.simulate import Monitor, Reading, simulate
 from hybrid_mpc.closed_loop.timing import Clock, RealClock, RunnerStep, RunReport
 
@@ -19,6 +20,7 @@ __all__ = [
     "RunReport",
     "Runner",
     "RunnerStep",
+    "SafeEnd",
     "Switch",
     "simulate",
 ]

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from hybrid_mpc.closed_loop.guard import Guard, GuardedLoop
 from hybrid_mpc.closed_loop.machine import Previews, fitting
 from hybrid_mpc.closed_loop.simulate import Monitor
-from hybrid_mpc.closed_loop.timing import Clock, RunnerStep, RunReport, make_report
+from hybrid_mpc.closed_loop.timing import CheckedClock, Clock, RunnerStep, RunReport, make_report
 from hybrid_mpc.estimation.delays import filtered
 from hybrid_mpc.estimation.kalman import Estimate, Estimator
 from hybrid_mpc.mpc.safeguard import Decision, SafeController
@@ -50,6 +50,7 @@ class Run:
 
     def __init__(self, parts: Parts, previews: Previews) -> None:
         self._parts, self._previews = parts, previews
+        self._clock = CheckedClock(parts.clock, parts.dt)
         self._guarded = None if parts.guard is None else parts.guard.begin(parts.safe)
         self._control: SafeController | GuardedLoop = self._guarded or parts.safe
         self.k = self._skipped = self._missing = self._late = self._overruns = self._count = 0
@@ -71,17 +72,17 @@ class Run:
         self._estimate = parts.estimator.start(self._first, 0.0)
         self._decision = self._control.initial(self._estimate, None, x_ref, factors)
         self._held.extend([self._decision.u] * (self._held.maxlen or 1))
-        self._start = parts.clock.now()
+        self._start = self._clock.now()
 
     def wait(self) -> None:
         """Until the next period's instant, to hold the last input for a whole one."""
-        self._parts.clock.sleep_until(self._start + self.k * self._parts.dt)
+        self._clock.sleep_until(self._start + self.k * self._parts.dt)
 
     def period(self) -> None:
         """Wait for the period's instant, and do all of it."""
         self.wait()
         parts = self._parts
-        clock, due = parts.clock, self._start + self.k * parts.dt
+        clock, due = self._clock, self._start + self.k * parts.dt
         times = [clock.now()]
         first, t = not self._count, self.k * parts.dt
         y = self._first if first else self._sample()
@@ -125,7 +126,7 @@ class Run:
     def _decided(
         self, previous: Decision, estimate: Estimate, x_ref: Array, factors: Array | None, deadline: float
     ) -> Decision:
-        safe, clock = self._control, self._parts.clock
+        safe, clock = self._control, self._clock
         begin = clock.now()
         # Half of the time left is always tried: else a slow spell would end all solving.
         needed = min(min(self._solves, default=0.0), 0.5 * self._parts.deadline)
@@ -147,7 +148,7 @@ class Run:
     def _go_on(self) -> None:
         """To the next instant on the grid, or the nearest to now if that has long passed."""
         parts = self._parts
-        following = max(self.k + 1, round((parts.clock.now() - self._start) / parts.dt))
+        following = max(self.k + 1, round((self._clock.now() - self._start) / parts.dt))
         skipped = following - self.k - 1
         if skipped > LONG:
             self._estimate = None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Callable
 
@@ -12,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from hybrid_mpc.closed_loop.guard import Guard
 from hybrid_mpc.closed_loop.machine import Preview, Previews
 from hybrid_mpc.closed_loop.run import Parts, Run
+from hybrid_mpc.closed_loop.safe_end import SafeEnd
 from hybrid_mpc.closed_loop.simulate import Monitor, check_models
 from hybrid_mpc.closed_loop.timing import Clock, RealClock, RunnerStep, RunReport
 from hybrid_mpc.errors import InputError
@@ -35,10 +35,14 @@ class Runner:
     is not interrupted. After a long delay the run goes on at the grid's nearest instant; the estimator is led
     through the periods in between without a measurement, with the input that was held.
 
-    Numbers never raise. Whatever ends the run, Ctrl-C and an exception in a callback included, the safe input
-    is handed to the actuator before anything else; the exception is raised on. The input that acts with
-    no delay is assumed to act from the grid's instant on: keep steps short against the period, or declare the
-    delay (:class:`~hybrid_mpc.estimation.DelayCompensation`).
+    Numbers never raise. Whatever ends the run, exceptions in callbacks and signals (Ctrl-C, SIGTERM, SIGHUP, ...)
+    included, the safe input is handed to the actuator before anything else (:class:`SafeEnd`); then the exception is
+    raised on, or the signal has its effect. Signals reach Python's main thread alone: in another thread ``stop`` ends
+    a run. What no program can catch (SIGKILL, a hang in a driver, a power cut) takes a watchdog in the actuator;
+    ``docs/control.md`` has one. ``actuate`` may be broken off by a signal, and is then called with the safe input.
+
+    The input that acts with no delay is assumed to act from the grid's instant on: keep steps short against the
+    period, or declare the delay (:class:`~hybrid_mpc.estimation.DelayCompensation`).
 
     Args:
         measure: ``() -> y (n_y,)``, or None where no sample has come.
@@ -53,7 +57,7 @@ class Runner:
         safe_input: Input ``(n_u,)`` within the limits for the end of the run. Default: zero, or the bound next to it.
         input_delay: Periods after which an input acts, as the estimator knows it; shifts the preview.
         sensor_delay: Periods after which a measurement arrives; pairs it with its input for the monitor.
-        clock: Default: the computer's.
+        clock: Default: the computer's. One that does not wait, stands still, goes back or gives NaN ends the run.
         on_step: Called at the end of every period with a :class:`RunnerStep`; must be short.
         guard: What to do on alarms of the monitor, which it needs. Default: nothing.
         keep: Periods whose rows the report keeps, the last ones. Default 100 000.
@@ -138,8 +142,9 @@ class Runner:
             The statistics and the rows of the last ``keep`` periods.
 
         Raises:
-            InputError: If neither end is given, the duration is not positive and finite, or a callback returns
-                another shape. What a callback raises is raised on, after the safe input.
+            InputError: If neither end is given, the duration is not positive and finite, a callback returns
+                another shape, or the clock is none. What a callback raises is raised on, after the safe input.
+            SafeInputError: If the actuator did not take the safe input.
         """
         n = self._periods(duration, stop)
         dt = self._parts.dt
@@ -148,21 +153,18 @@ class Runner:
         )
         loop = Run(self._parts, previews)
         ended = "duration"
-        try:
+        with SafeEnd(lambda: self._parts.actuate(self.safe_input)) as end:
+            end.check()
             self._warm_up(previews)
             loop.begin()
             while n is None or loop.k < n:
+                end.check()
                 if stop is not None and stop():
                     ended = "stop"
                     break
                 loop.period()
             loop.wait()
-        except BaseException:
-            with contextlib.suppress(Exception):  # the first failure is the one to report
-                self._parts.actuate(self.safe_input)
-            raise
-        self._parts.actuate(self.safe_input)
-        return loop.report(ended)
+        return loop.report(end.cause or ended)
 
     def _periods(self, duration: float | None, stop: Callable[[], bool] | None) -> int | None:
         if duration is None:
@@ -190,7 +192,7 @@ class Runner:
 
 
 def _checked_safe(given: ArrayLike | None, ocp: OCP) -> Array:
-    u = vector(np.clip(0.0, ocp.u_min, ocp.u_max) if given is None else given, ocp.n_u, "safe_input")
+    u = vector(ocp.rest_input if given is None else given, ocp.n_u, "safe_input")
     if np.any(u < ocp.u_min) or np.any(u > ocp.u_max):
         raise InputError(f"Runner: safe_input {u} is outside the limits {ocp.u_min} to {ocp.u_max}")
     return u

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.closed_loop.guard import Switch
 from hybrid_mpc.closed_loop.simulate import Reading
+from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.mpc.safeguard import Decision
@@ -19,6 +21,10 @@ from hybrid_mpc.mpc.safeguard import Decision
 Array = NDArray[np.float64]
 TIMED = ("measure", "estimate", "solve", "actuate", "monitor")
 QUANTILES = {"median": 0.5, "p95": 0.95, "p99": 0.99, "max": 1.0}
+EARLY = 1e-3
+"""Share of a period by which a wait may end early: rounding, and what no controller notices."""
+WAKES = 10
+"""Waits for one instant that may end early, one after the other: a sleep that something woke is slept again."""
 
 
 class Clock(Protocol):
@@ -50,6 +56,57 @@ class RealClock:
         """Sleep; the operating system decides how punctual the return is."""
         while (left := t - time.perf_counter()) > 0:
             time.sleep(left)
+
+
+class CheckedClock:
+    """A clock that is held to its word: a loop on one that stands still would spin for ever.
+
+    Args:
+        clock: The clock.
+        dt: Period [s] of the loop, against which it is judged how early a wait ends.
+
+    Example:
+        >>> class Dead:
+        ...     def now(self):
+        ...         return 7.0
+        ...     def sleep_until(self, t):
+        ...         pass
+        >>> CheckedClock(Dead(), 0.02).sleep_until(7.5)
+        Traceback (most recent call last):
+        ...
+        hybrid_mpc.errors.InputError: clock: sleep_until(7.5) has come back 10 times, at last at 7.0; it must wait
+    """
+
+    def __init__(self, clock: Clock, dt: float) -> None:
+        self._clock, self._early, self._last = clock, EARLY * dt, -math.inf
+
+    def now(self) -> float:
+        """Time [s].
+
+        Raises:
+            InputError: If it is not finite, or before the last one.
+        """
+        t = float(self._clock.now())
+        if not math.isfinite(t):
+            raise InputError(f"clock: now() gives {t}; a finite time [s] needed")
+        if t < self._last:
+            raise InputError(f"clock: now() has gone back from {self._last} to {t}; give one that never does")
+        self._last = t
+        return t
+
+    def sleep_until(self, t: float) -> None:
+        """Wait until ``t`` [s].
+
+        Raises:
+            InputError: If the clock does not wait, or as :meth:`now`.
+        """
+        for _ in range(WAKES):
+            self._clock.sleep_until(t)
+            if self.now() >= t - self._early:
+                return
+        raise InputError(
+            f"clock: sleep_until({t}) has come back {WAKES} times, at last at {self._last}; it must wait"
+        )
 
 
 @dataclass(frozen=True)
@@ -90,7 +147,8 @@ class RunReport:
         late: Periods in which the shifted plan was applied because the solve was, or would have been, late.
         overruns: Periods whose input was applied after their deadline.
         skipped: Periods that did not run at all, since one before them took too long.
-        stopped: ``"duration"`` or ``"stop"``: what ended the run.
+        stopped: What ended the run: ``"duration"``, ``"stop"``, the name of a signal that the program survives
+            (``"SIGTERM"``), or ``"exit"`` of the interpreter.
         t: Times ``(n,)`` [s] on the grid, since the start, of the periods kept.
         y: Measurements ``(n, n_y)``; NaN where there was none.
         u: Inputs ``(n, n_u)``.

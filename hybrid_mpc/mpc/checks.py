@@ -61,18 +61,6 @@ def check_weights(weights: dict[str, Array]) -> None:
         )
 
 
-def input_bounds(u_min: ArrayLike, u_max: ArrayLike, n_u: int) -> tuple[Array, Array]:
-    """Bounds ``(n_u,)`` of the inputs that do not cross."""
-    lower, upper = np.asarray(u_min, dtype=float).ravel(), np.asarray(u_max, dtype=float).ravel()
-    if lower.shape != (n_u,) or upper.shape != (n_u,):
-        raise InputError(f"u_min has {lower.size} and u_max {upper.size} values, {n_u} needed")
-    if not np.all(lower < upper):
-        raise InputError(
-            f"input bounds cross: u_min {lower}, u_max {upper}; every u_min must be below its u_max"
-        )
-    return lower, upper
-
-
 def terminal_matrix(value: ArrayLike, n_x: int) -> Array:
     """A finite, symmetric, positive semi-definite ``(n_x, n_x)`` matrix."""
     if isinstance(value, str):

@@ -14,7 +14,7 @@ from hybrid_mpc.mpc.stages import Linearisation
 Array = NDArray[np.float64]
 
 SHIFT = 1e-5
-"""Step of the difference of two Jacobians, in tolerated deviations (states), half ranges (inputs) and 1 (hidden)."""
+"""Step of the difference of two Jacobians, in tolerated deviations (states), scales of the inputs and 1 (hidden)."""
 FLOOR = 1e-3
 """Least curvature along a direction, as a share of Gauss-Newton's."""
 MATTERS = 0.2
@@ -41,9 +41,8 @@ class StageCurvature:
     def __init__(self, stages: Linearisation, ocp: OCP, n_h: int = 0, soft: SoftRows | None = None) -> None:
         self._n_x, self._n_u, self._n_h = ocp.n_x, ocp.n_u, n_h
         self._soft = soft if ocp.soft else None
-        half = 0.5 * (ocp.u_max - ocp.u_min)
         tolerated = 1 / np.sqrt(np.where(ocp.q > 0, ocp.q, 1.0))
-        self._shift = SHIFT * np.concatenate([tolerated, np.where(np.isfinite(half), half, 1.0)])
+        self._shift = SHIFT * np.concatenate([tolerated, ocp.input_scale])
         self._by_few = stages.slopes(self._shift.size)
         self._group = min(n_h, max(1, AT_ONCE // ocp.horizon))
         self._by_hidden = stages.slopes(self._group, hidden=True) if n_h else None

@@ -68,8 +68,7 @@ class Landscape:
     def __init__(self, inner: CondensedController) -> None:
         self.inner, self.problem = inner, inner.problem
         self.stages = StageCurvature(inner.stages, inner.ocp, inner.model.n_h, inner.problem.soft)
-        half = 0.5 * (inner.ocp.u_max - inner.ocp.u_min)
-        self.metric: Array = np.tile(np.where(np.isfinite(half), half, 1.0) ** -2.0, inner.ocp.horizon)
+        self.metric: Array = np.tile(inner.ocp.input_scale**-2.0, inner.ocp.horizon)
 
     def run(self, z0: Array, u: Array, case: Case) -> Run:
         """The run from ``z0`` on ``u``."""

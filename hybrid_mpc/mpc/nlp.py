@@ -189,8 +189,7 @@ class IpoptController:
         self._step = model.step.map(n)
         z_next = ca.vertcat(*self._step(z[:n_x, :-1], z[n_x:, :-1], u + ca.repmat(d, 1, n)))
         du = u - ca.horzcat(u_prev, u[:, :-1])
-        half = 0.5 * (ocp.u_max - ocp.u_min)
-        self._u_scale = np.where(np.isfinite(half), half, 1.0)
+        self._u_scale = ocp.input_scale
         rows = [Rows(z[:, 0] - z0, 0.0, 0.0, 1.0), Rows(z[:, 1:] - z_next, 0.0, 0.0, 1.0)]
         if ocp.du_max is not None:
             limit = np.tile(ocp.du_max, n)

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.input_limits import at_rest, input_limits
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.mpc.checks import (
     block_lengths,
     check_weights,
     diagonal,
-    input_bounds,
     is_stage_cost,
     terminal_matrix,
     whole,
@@ -59,8 +59,8 @@ class OCP:
         u_max: Upper bounds ``(n_u,)``; ``inf`` for none.
         du_max: Largest change per period ``(n_u,)``, positive. Default: none.
         terminal: ``"riccati"``, or a symmetric positive semi-definite ``(n_x, n_x)`` matrix ``P``.
-        working_point: ``(x, u)`` at which ``"riccati"`` linearises the model. Default: zero. With a steep
-            friction law take a moving point (see :func:`hybrid_mpc.riccati.lqr`).
+        working_point: ``(x, u)`` at which ``"riccati"`` linearises the model. Default: zero, the input within its
+            limits. With a steep friction law take a moving point (see :func:`hybrid_mpc.riccati.lqr`).
         x_min: Soft lower bounds of the states ``(n_x,)``; ``-inf`` for none. Default: none.
         x_max: Soft upper bounds of the states ``(n_x,)``; ``inf`` for none. Default: none.
         slack_linear: Penalties ``(n_x,)`` [cost/s/unit], not negative. Default: ``1000 sqrt(q)``.
@@ -128,7 +128,7 @@ class OCP:
         n_x, n_u = q_v.size, r_v.size
         weights = {"q": q_v, "r": r_v, "r_delta": vector(r_delta, n_u, "r_delta")}
         check_weights(weights)
-        lower, upper = input_bounds(u_min, u_max, n_u)
+        lower, upper = input_limits(u_min, u_max, n_u)
         if du_max is not None:
             du_max = vector(du_max, n_u, "du_max")
             if not np.all(du_max > 0):
@@ -175,6 +175,27 @@ class OCP:
     def n_p(self) -> int:
         """Number of parameters of the economic stage cost; references have ``n_x + n_p`` columns."""
         return int(self.economic.numel_in(2)) if self.economic is not None and self.economic.n_in() > 2 else 0
+
+    @property
+    def rest_input(self) -> Array:
+        """Zero, or the limit next to it ``(n_u,)``: what is held where nothing else is known.
+
+        Example:
+            >>> OCP(5, [1.0], [1.0], [0.0], [2.0], [9.0]).rest_input
+            array([2.])
+        """
+        return at_rest(self.u_min, self.u_max)
+
+    @property
+    def input_scale(self) -> Array:
+        """Sizes ``(n_u,)`` by which solvers scale the inputs: half the range, or, without one, what weights tolerate.
+
+        Example:
+            >>> OCP(5, [1.0], [0.3, 3.0], [0.1, 1.0], [0.0, 0.0], [8.0, np.inf]).input_scale
+            array([4. , 0.5])
+        """
+        half = 0.5 * (self.u_max - self.u_min)
+        return np.where(np.isfinite(half), half, 1.0 / np.sqrt(self.r + self.r_delta))
 
     @property
     def starts(self) -> NDArray[np.int64]:
@@ -262,7 +283,7 @@ class OCP:
         if not isinstance(self.terminal, str):
             return self.terminal
         n_x = self.n_x
-        x, u = self.working_point if self.working_point is not None else (np.zeros(n_x), np.zeros(self.n_u))
+        x, u = self.working_point if self.working_point is not None else (np.zeros(n_x), self.rest_input)
         a, b, _ = linearisation(
             model, vector(x, n_x, "working_point x"), vector(u, self.n_u, "working_point u")
         )

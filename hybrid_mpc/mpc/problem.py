@@ -134,7 +134,7 @@ class Problem:
             InputError: If ``u`` has another shape or is not finite.
         """
         n, ocp = self.ocp.horizon, self.ocp
-        start = np.zeros((n, ocp.n_u)) if u is None else np.asarray(u, dtype=float)
+        start = np.tile(ocp.rest_input, (n, 1)) if u is None else np.asarray(u, dtype=float)
         if start.shape != (n, ocp.n_u) or not np.all(np.isfinite(start)):
             raise InputError(f"u: finite values of shape {(n, ocp.n_u)} needed, got {start}")
         plan = np.clip(start, ocp.u_min, ocp.u_max)

@@ -88,8 +88,8 @@ class InputQP:
     """``min 1/2 s'Hs + g's + penalties`` over input steps ``s`` within the limits of inputs and changes.
 
     Where the problem has move blocks, the unknowns are the blocks' inputs; all that comes in and goes out is
-    by period. Inputs are scaled by half their range, soft bounds by half theirs, and the Hessian by its diagonal. The
-    solvers (DAQP, through ``casadi.conic``) are built once; :meth:`solve` checks their answer whatever
+    by period. Inputs are scaled by :attr:`OCP.input_scale`, soft bounds by half their range, the Hessian by its
+    diagonal. The solvers (DAQP, through ``casadi.conic``) are built once; :meth:`solve` checks their answer whatever
     status they report. Soft bounds cost time only where they act: the QP is first solved without them, and an
     answer that keeps them all is the answer with them, since its penalty is zero. Else it is solved again
     with a slack for each of the few bounds that are violated most; an answer that keeps the others is the
@@ -111,9 +111,8 @@ class InputQP:
     def __init__(self, ocp: OCP, soft: SoftRows | None = None, dt: float = 1.0) -> None:
         self._starts, n_u = ocp.starts, ocp.n_u
         n = self._starts.size * n_u
-        half_range = 0.5 * (ocp.u_max - ocp.u_min)
         self._ocp, self._dt, self._n = ocp, dt, n
-        self._scale = np.tile(np.where(np.isfinite(half_range), half_range, 1.0), self._starts.size)
+        self._scale = np.tile(ocp.input_scale, self._starts.size)
         rows = np.eye(n) - np.eye(n, k=-n_u) if ocp.du_max is not None else np.zeros((0, n))
         self._rows = rows * self._scale / self._scale[:, None] if len(rows) else rows
         self._solver = _daqp(n, len(rows))

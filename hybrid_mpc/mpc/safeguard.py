@@ -60,7 +60,7 @@ class SafeController:
         fallback: Model, usually the fitted prior, whose LQR takes over. Default: none, then zero follows.
         max_age: Periods a plan may be followed without a successful solve.
         working_point: ``(x, u)`` at which the fallback is linearised; see :func:`hybrid_mpc.riccati.lqr`.
-            Default: the problem's own, else zero.
+            Default: the problem's own, else zero, the input within its limits.
         first: Controller that makes the first plan, before the loop starts; an
             :class:`~hybrid_mpc.mpc.SQPController` converges it. Default: ``controller``.
 
@@ -105,9 +105,9 @@ class SafeController:
                     f"fallback {fallback.name} has {fallback.n_x} states and {fallback.n_u} inputs, "
                     f"the problem {ocp.n_x} and {ocp.n_u}"
                 )
-            point = working_point if working_point is not None else ocp.working_point
-            zero = np.zeros(ocp.n_x), np.zeros(ocp.n_u)
-            feedback = lqr(fallback, *zero, ocp.q, ocp.r + ocp.r_delta, working_point=point)
+            rest = np.zeros(ocp.n_x), ocp.rest_input
+            point = working_point or ocp.working_point or rest
+            feedback = lqr(fallback, *rest, ocp.q, ocp.r + ocp.r_delta, working_point=point)
             self._gain = feedback.gain[:, : ocp.n_x]
             self._late = feedback.gain[:, ocp.n_x : ocp.n_x + fallback.waiting]
             self._fallback = _equilibrium_input(fallback)
@@ -141,7 +141,7 @@ class SafeController:
             InputError: If ``u`` has another size or is not finite, or another shape does not fit.
         """
         ocp = self._controller.ocp
-        held = np.clip(np.zeros(ocp.n_u) if u is None else vector(u, ocp.n_u, "u"), ocp.u_min, ocp.u_max)
+        held = ocp.rest_input if u is None else np.clip(vector(u, ocp.n_u, "u"), ocp.u_min, ocp.u_max)
         plan = self._controller.initial(estimate, np.tile(held, (ocp.horizon, 1)))
         if reference is not None:
             solution = self._first.solve(plan, estimate, reference, weight)

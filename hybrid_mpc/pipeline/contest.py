@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from hybrid_mpc.artifact import Artifact, load_artifact
 from hybrid_mpc.closed_loop import ClosedLoopResult, simulate
 from hybrid_mpc.closed_loop.simulate import Step
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.input_limits import share_used
 from hybrid_mpc.pipeline.contenders import CONTENDERS, ORACLES, build
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.loops import make_monitor
@@ -167,7 +168,7 @@ def _seeds(name: str, scenario: Scenario, seeds: int, oracle_seeds: int) -> int:
 
 
 def limits_used(control: ControlSpec, r: ClosedLoopResult) -> dict[str, float]:
-    """Largest share of each limit that a loop used: 1 is the limit, more a violation.
+    """Largest share of the way from rest to each limit that a loop used: 1 is the limit, more a violation.
 
     Args:
         control: The problem with the limits.
@@ -176,20 +177,16 @@ def limits_used(control: ControlSpec, r: ClosedLoopResult) -> dict[str, float]:
     Returns:
         ``u``, and ``du`` and ``x[i]`` where there are such limits [-].
     """
-    used = {"u": _share(r.u, control.u_min, control.u_max)}
+    used = {"u": share_used(r.u, control.u_min, control.u_max)}
     if control.du_max is not None:
-        used["du"] = float(np.max(np.abs(np.diff(r.u, axis=0, prepend=0.0)) / np.array(control.du_max)))
-    for i in range(r.x.shape[1]):
-        low, high = (np.inf if v is None else abs(v[i]) for v in (control.x_min, control.x_max))
-        if np.isfinite(min(low, high)):
-            used[f"x[{i}]"] = _share(r.x[:, i], -low, high)
+        du = np.diff(r.u, axis=0, prepend=control.rest_input[None])
+        used["du"] = float(np.max(np.abs(du) / np.array(control.du_max)))
+    n_x = r.x.shape[1]
+    lower = np.full(n_x, -np.inf) if control.x_min is None else np.array(control.x_min)
+    upper = np.full(n_x, np.inf) if control.x_max is None else np.array(control.x_max)
+    for i in np.flatnonzero(np.isfinite(lower) | np.isfinite(upper)):
+        used[f"x[{i}]"] = share_used(r.x[:, i], lower[i], upper[i])
     return used
-
-
-def _share(values: Array, low: ArrayLike, high: ArrayLike) -> float:
-    """Largest of values over their limit, of the limit's own sign."""
-    low, high = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
-    return float(np.max(np.where(values > 0, values / high, values / low)))
 
 
 def _row(task: Task, control: ControlSpec, name: str, seed: int, r: ClosedLoopResult) -> dict[str, Any]:

@@ -59,7 +59,7 @@ def make_adaptive_guard(
     """
     groups = adaptable(model, causes)
     adaptive = with_parameter_states(model, groups)
-    span = np.subtract(control.u_max, control.u_min)
+    span = control.input_range
     plain = make_ocp(prior, control)
     ocp = OCP.from_spec(control, plain.terminal_weight(model), plain.working_point)
     backup = SafeController(

@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 RATES = (1.0, 2.0, 5.0, 10.0)
 """False alarms an hour on nominal data: the first that the data are long enough for."""
 LOAD_SHARE = 0.2
-"""Unknown load of the demonstration, as a share of the largest input."""
+"""Unknown load of the demonstration, as a share of half the input's range."""
 MARGIN = 1.5
 """Where nominal data are too short for a rate: threshold over the highest nominal level."""
 
@@ -83,7 +83,7 @@ def _load_loop(
     """The first task with an unknown constant load from its middle on: does the monitor see it?"""
     task, prior = context.scenario.tasks[0], load_artifact(context.out / "model").models["prior"]
     assert context.scenario.plant is not None
-    start, load = 0.5 * task.duration, LOAD_SHARE * control.u_max[0]
+    start, load = 0.5 * task.duration, unknown_load(control)
     result = simulate(
         context.scenario.plant(),
         make_estimator(model, control, sigma_x),
@@ -103,6 +103,16 @@ def _load_loop(
         "task": task.name, "load": load, "start_s": start, "delay_s": delay,
         "false_alarms": len(alarm_intervals(before, model.dt)),
     }, result  # fmt: skip
+
+
+def unknown_load(control: ControlSpec) -> float:
+    """Load of the demonstration at the first input [input unit].
+
+    Example:
+        >>> unknown_load(ControlSpec(9, (1.0,), (1.0,), (1.0,), u_min=(-5.0,), u_max=(0.0,)))
+        0.5
+    """
+    return LOAD_SHARE * float(0.5 * control.input_range[0])
 
 
 def clean_windows(

@@ -102,7 +102,7 @@ def make_estimator(
             f"control: estimator_sigma needs {model.n_y} standard deviations of the outputs, "
             f"got {control.estimator_sigma}"
         )
-    span = np.subtract(control.u_max, control.u_min)
+    span = control.input_range
     first = np.concatenate([control.estimator_sigma, np.full(model.n_x - model.n_y, 0.1)])
 
     def filter_of(scale: float, step: float | None) -> ExtendedKalmanFilter:
@@ -165,7 +165,7 @@ def make_ocp(prior: HybridModel, control: ControlSpec) -> OCP:
 
 
 def working_point(model: HybridModel, control: ControlSpec) -> tuple[Array, Array]:
-    """``(x, u)`` in motion at the position zero, or where the problem says: speeds of the size ``1 / sqrt(q)``.
+    """``(x, u)`` in motion at the position zero, or where the problem says: speeds of ``1 / sqrt(q)``, no input.
 
     Args:
         model: The model, state ``[q, v]``.
@@ -178,7 +178,7 @@ def working_point(model: HybridModel, control: ControlSpec) -> tuple[Array, Arra
     half = model.n_x // 2
     weights = np.asarray(control.q[half:], dtype=float)
     x[half:] = 1.0 / np.sqrt(np.where(weights > 0, weights, 1.0))
-    return x, np.zeros(model.n_u)
+    return x, control.rest_input
 
 
 def make_monitor(model: HybridModel, calibration: Calibration | None) -> EnergyMonitor:
@@ -222,8 +222,7 @@ def freezing(control: ControlSpec) -> dict[str, Any]:
     Example:
         ``guard_monitor(model, detector, **freezing(scenario.control))``
     """
-    ranges = np.subtract(control.u_max, control.u_min)
-    return {"resolution": sensor_steps(control), "input_range": tuple(ranges.tolist())}
+    return {"resolution": sensor_steps(control), "input_range": tuple(control.input_range.tolist())}
 
 
 def time_on_recording(

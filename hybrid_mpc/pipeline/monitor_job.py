@@ -60,7 +60,7 @@ class MonitorJob:
         if self.detector is not None:
             known = model.parametric is not None
             control = self.scenario.control
-            ranges = None if control is None else np.subtract(control.u_max, control.u_min)
+            ranges = None if control is None else control.input_range
             return guard_monitor(
                 model, self.detector, resolution=self.resolution, input_range=ranges, diagnose=known
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -65,7 +66,7 @@ def closed_loops(
         results: Closed loop by controller (``"prior"``, ``"hybrid"``, ``"oracle"``).
         states: Signals of ``x``.
         inputs: Signals of ``u``.
-        limits: Lower and upper bounds of the inputs. Default: none drawn.
+        limits: Lower and upper bounds of the inputs, drawn where finite. Default: none drawn.
 
     Returns:
         The figure; the error row shows the positions only.
@@ -109,7 +110,7 @@ def closed_loops(
     for i, signal in enumerate(inputs):
         ax = column[n_x + n_q + i]
         ax.set_ylabel(axis_label(signal))
-        for bound in (limits[0][i], limits[1][i]) if limits is not None else ():
+        for bound in filter(math.isfinite, (limits[0][i], limits[1][i]) if limits is not None else ()):
             ax.axhline(bound, color=INK, linestyle=":", linewidth=1.1, label="input limits")
     column[-1].set_xlabel("time [s]")
     for ax in column:

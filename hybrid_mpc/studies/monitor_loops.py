@@ -111,7 +111,7 @@ class _Loops:
     def _monitor(
         self, detector: Detector | None = None, resolution: tuple[float, ...] | None = None
     ) -> EnergyMonitor:
-        ranges = np.subtract(self._control.u_max, self._control.u_min)
+        ranges = self._control.input_range
         return guard_monitor(self._model, detector, resolution=resolution, input_range=ranges)
 
     def _nominal(self, plans: tuple[LoopPlan, ...]) -> list[Trace]:
@@ -248,8 +248,10 @@ def loop_figures(result: ClosedLoopResult, control: ControlSpec) -> dict[str, An
         control: Its limits.
     """
     over = {"u": np.maximum(result.u - np.array(control.u_max), np.array(control.u_min) - result.u)}
-    if control.x_min is not None and control.x_max is not None:
-        beyond = np.maximum(result.x - np.array(control.x_max), np.array(control.x_min) - result.x)
+    if control.x_min is not None or control.x_max is not None:
+        lower = -np.inf if control.x_min is None else np.array(control.x_min)
+        upper = np.inf if control.x_max is None else np.array(control.x_max)
+        beyond = np.maximum(result.x - upper, lower - result.x)
         over |= {f"x{i}": column for i, column in enumerate(beyond.T)}
     if control.du_max is not None:
         over["du"] = np.abs(np.diff(result.u, axis=0)) - np.array(control.du_max)

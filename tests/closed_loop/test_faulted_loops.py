@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hybrid_mpc.mpc import OCP
+
 PATH = Path(__file__).parents[2] / "benchmarks" / "faulted_loops.py"
 
 
@@ -61,9 +63,9 @@ def test_a_loop_that_fails_is_counted(bench, golf_artifact):
 
 
 def test_limits_are_looked_at(bench):
-    class Limits:
-        u_min, u_max, du_max = np.array([-0.5]), np.array([0.5]), np.array([0.25])
-
-    assert bench._excess(np.array([[0.25], [0.5], [0.3]]), Limits) <= 0.0
-    assert bench._excess(np.array([[0.25], [0.6]]), Limits) == pytest.approx(0.1)
-    assert bench._excess(np.array([[0.3], [0.3]]), Limits) == pytest.approx(0.05)
+    ocp = OCP(5, [1.0], [1.0], [0.0], [-0.5], [0.5], du_max=[0.25])
+    assert bench._excess(np.array([[0.25], [0.5], [0.3]]), ocp) <= 0.0
+    assert bench._excess(np.array([[0.25], [0.6]]), ocp) == pytest.approx(0.1)
+    assert bench._excess(np.array([[0.3], [0.3]]), ocp) == pytest.approx(0.05)
+    beside_zero = OCP(5, [1.0], [1.0], [0.0], [2.0], [4.0], du_max=[0.25])
+    assert bench._excess(np.array([[2.0], [2.25]]), beside_zero) <= 0.0  # from rest on, which is 2

@@ -193,11 +193,14 @@ def test_in_real_time():
 
 def test_the_example_of_the_page_runs(capsys):
     page = (Path(__file__).parents[2] / "docs" / "control.md").read_text()
-    (block,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     names: dict[str, object] = {}
-    exec(block, names)
+    exec(blocks[0], names)
     report = names["report"]
     assert report.periods + report.skipped == 100
     assert "'median'" in capsys.readouterr().out
     # A double integrator under MPC for 2 s; other load on the computer may cost periods, so only roughly.
     assert abs(names["cart"]["q"] - 0.2) < 0.1
+    exec(blocks[1], names)  # the actuator with a watchdog
+    assert [names["watchdog"](k, 3.0) for k in (7, 8, 8, 8, 8, 9)] == [3.0, 3.0, 3.0, 3.0, 0.0, 0.0]
+    assert len(blocks) == 2

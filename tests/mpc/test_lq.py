@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 from lq_oracle import constraints, lq_plan, residuals
-from online_models import random_linear
+from online_models import linear_model, random_linear
 from scipy.linalg import block_diag
 from scipy.optimize import minimize
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
-from hybrid_mpc.mpc import OCP, CondensedController, Status
+from hybrid_mpc.mpc import OCP, CondensedController, IpoptController, SQPController, Status
 from hybrid_mpc.riccati import dare
 
 INF = np.inf
@@ -202,3 +202,38 @@ def test_bad_input_is_refused(change, words):
 
     with pytest.raises(InputError, match=words):
         use()
+
+
+SOLVERS = [CondensedController, SQPController, IpoptController]
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [(-1, 2), (0, 2), (-2, 0), (0.5, 2), (-2, -0.5),
+     (-0.5, INF), (-INF, 0.5), (0, INF), (-INF, 0), (0.5, INF), (-INF, INF)],
+    ids=str,
+)  # fmt: skip
+@pytest.mark.parametrize(
+    ("solver", "size"),
+    # IPOPT gets its unknowns as they are, and takes inputs of a millionth for zero.
+    [(solver, size) for solver in SOLVERS for size in (1.0, 1e5, 1e-6) if (solver, size) != (IpoptController, 1e-6)],
+)  # fmt: skip
+@pytest.mark.parametrize("du_max", [None, 0.6])
+def test_limits_of_any_sign_in_units_of_any_size(limits, solver, size, du_max):
+    _, a, b, c = random_linear(3, n_x=3, n_u=2)
+    b, lower, upper = b / size, *([bound * size] * 2 for bound in limits)
+    change = None if du_max is None else [du_max * size] * 2
+    weights = np.array([0.3, 0.5]) / size**2, np.array([0.1, 0.1]) / size**2
+    model, ocp = linear_model(a, b, c), OCP(8, [1.0, 2.0, 3.0], *weights, lower, upper, change)
+    e, reference, controller = (
+        estimate_of(model, np.array([3.0, -2.0, 1.0])),
+        np.zeros((9, 3)),
+        solver(model, ocp),
+    )
+    first = controller.initial(e)
+    np.testing.assert_array_equal(first.u, np.tile(np.clip(0.0, lower, upper), (8, 1)))
+    found = controller.solve(first, e, reference)
+    want = lq_plan(a, b, ocp, model.dt, ocp.terminal_weight(model), e.x, np.zeros(2), reference, first.u[0])
+    assert found.status.ok
+    # NNLS, which the oracle stands on, ends at about 1e-9; IPOPT relaxes bounds by 1e-8 and ends at 1e-5 near them.
+    np.testing.assert_allclose(found.u / size, want / size, atol=1e-5 if solver is IpoptController else 1e-8)

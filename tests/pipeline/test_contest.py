@@ -93,6 +93,21 @@ def test_limits_are_shares_of_the_side_that_they_bound():
     assert most_used(rows)["a"]["prior"]["u"] == 0.9
 
 
+@pytest.mark.parametrize(
+    ("u_min", "u_max", "u", "shares"),
+    [(0.0, 5.0, [0.0, 2.5, 0.0], (0.5, 0.625)), (-5.0, 0.0, [0.0, -2.5, 0.0], (0.5, 0.625)),
+     (2.0, 5.0, [2.0, 3.5, 2.0], (0.5, 0.375)), (-5.0, -2.0, [-2.0, -3.5, -2.0], (0.5, 0.375))],
+)  # fmt: skip
+def test_limits_beside_zero_are_used_from_rest_on(u_min, u_max, u, shares):
+    control = replace(
+        GOLF.control, u_min=(u_min,), u_max=(u_max,), du_max=(4.0,), x_min=None, x_max=(2.0, np.inf)
+    )
+    used = limits_used(
+        control, SimpleNamespace(u=np.array(u)[:, None], x=np.array([[1.0, 9.0], [-7.0, 0.0]]))
+    )
+    assert used == pytest.approx({"u": shares[0], "du": shares[1], "x[0]": 0.5})
+
+
 def test_tasks_are_found_by_name():
     assert tasks_of(GOLF, None) == GOLF.tasks
     assert [t.name for t in tasks_of(GOLF, ("stroke_3", "track_sine"))] == ["stroke_3", "track_sine"]

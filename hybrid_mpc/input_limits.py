@@ -1,0 +1,64 @@
+"""Limits of inputs and states, of any sign, on one side or both: what is checked of them, and measured by them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybrid_mpc.errors import InputError
+
+Array = NDArray[np.float64]
+
+
+def input_limits(u_min: ArrayLike, u_max: ArrayLike, n_u: int) -> tuple[Array, Array]:
+    """Limits ``(n_u,)`` of the inputs that do not cross; ``-inf`` and ``inf`` for none.
+
+    Raises:
+        InputError: If there is another number of them, one is NaN, or a lower one is not below its upper one.
+
+    Example:
+        >>> input_limits((0.0,), (5.0,), 1)
+        (array([0.]), array([5.]))
+    """
+    lower, upper = np.asarray(u_min, dtype=float).ravel(), np.asarray(u_max, dtype=float).ravel()
+    if lower.shape != (n_u,) or upper.shape != (n_u,):
+        raise InputError(f"u_min has {lower.size} and u_max {upper.size} values, {n_u} needed")
+    if not np.all(lower < upper):
+        raise InputError(
+            f"input bounds cross: u_min {lower}, u_max {upper}; every u_min must be below its u_max"
+        )
+    return lower, upper
+
+
+def at_rest(lower: ArrayLike, upper: ArrayLike) -> Array:
+    """Zero where the limits ``(n,)`` let it be, else the limit next to it: what is applied where nothing is known.
+
+    Example:
+        >>> at_rest([-1.0, 2.0, -5.0], [1.0, 3.0, -4.0])
+        array([ 0.,  2., -4.])
+    """
+    return np.asarray(np.clip(0.0, lower, upper))
+
+
+def share_used(values: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> float:
+    """Largest share that values ``(m, n)`` use of the way from rest to a limit ``(n,)``: 1 at the limit, more beyond.
+
+    A limit at rest itself leaves no way: beyond it the whole range is the measure, and counts from 1 on. Where there
+    is no range either, anything beyond is infinitely much.
+
+    Example:
+        >>> share_used([[0.1], [-0.4]], [-0.5], [0.5]), share_used([[0.0], [1.0]], [0.0], [4.0])
+        (0.8, 0.25)
+        >>> share_used([[2.0], [2.5]], [2.0], [4.0]), share_used([[-1.0]], [0.0], [4.0])
+        (0.25, 1.25)
+        >>> share_used([[-3.0]], [-np.inf], [np.inf]), share_used([[-3.0]], [0.0], [np.inf])
+        (0.0, inf)
+    """
+    value, low, high = (np.asarray(v, dtype=float) for v in (values, lower, upper))
+    rest, span = at_rest(low, high), high - low
+    shares = []
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for way, room in ((value - rest, high - rest), (rest - value, rest - low)):
+            beyond = np.where(way > 0, 1.0 + way / np.where(np.isfinite(span), span, 0.0), 0.0)
+            shares.append(np.where(room > 0, way / room, beyond))
+    return float(np.max(shares))

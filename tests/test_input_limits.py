@@ -1,0 +1,217 @@
+"""Limits of inputs of any sign, on one side, both or none: loops, figures, tables, refusals."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from online_models import PendulumPlant, linear_model, pendulum_model
+
+from hybrid_mpc.analysis.study_models import drive
+from hybrid_mpc.analysis.study_signals import measured_part
+from hybrid_mpc.analysis.subject import _inputs, _outer, _range
+from hybrid_mpc.closed_loop import Guard, Mode, simulate
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimation import TrueState
+from hybrid_mpc.input_limits import share_used
+from hybrid_mpc.mpc import OCP, CondensedController, Limits, SafeController
+from hybrid_mpc.pipeline.contest import limits_used
+from hybrid_mpc.pipeline.judge import unknown_load
+from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_monitor, working_point
+from hybrid_mpc.plots.loops import Loop, closed_loops
+from hybrid_mpc.scenario import ControlSpec
+from hybrid_mpc.signals import Signal
+from hybrid_mpc.studies.monitor_loops import loop_figures
+
+INF = np.inf
+FINITE = {
+    "both signs": (-1.0, 2.0),
+    "from zero": (0.0, 2.0),
+    "to zero": (-2.0, 0.0),
+    "positive": (0.5, 2.0),
+    "negative": (-2.0, -0.5),
+}
+OPEN = {
+    "below": (-0.5, INF),
+    "above": (-INF, 0.5),
+    "from zero on": (0.0, INF),
+    "up to zero": (-INF, 0.0),
+    "positive on": (0.5, INF),
+    "none": (-INF, INF),
+}
+CONTROL = ControlSpec(10, (30.0, 1.0), (0.05,), (0.05,), (-1.0,), (2.0,), (0.5,), estimator_sigma=(1e-3,))
+
+
+@pytest.mark.parametrize("limits", FINITE.values(), ids=FINITE.keys())
+def test_a_whole_loop_with_its_figures(limits):
+    control = replace(CONTROL, u_min=limits[:1], u_max=limits[1:], x_min=(-1.0, -9.0))
+    model, prior = pendulum_model(z=2), pendulum_model()
+    rest = np.clip(0.0, *limits)
+    estimator = make_estimator(model, control, np.array([1e-3, 1e-2]))
+    controller = make_controller(model, prior, control)
+    assert controller.controller.ocp.rest_input == rest
+    result = simulate(
+        PendulumPlant(), estimator, controller, lambda t: np.tile([0.3, 0.0], (len(t), 1)), dt=0.02,
+        duration=1.0, x0=[0.0, 0.0], seed=0, monitor=make_monitor(model, None),
+    )  # fmt: skip
+    assert np.all(np.isfinite(result.x_hat))
+    assert result.source.count("MPC") > 0.9 * len(result.source)
+    assert np.all((result.u >= limits[0]) & (result.u <= limits[1]))
+    used = limits_used(control, SimpleNamespace(u=result.u, x=result.x))
+    assert set(used) == {"u", "du", "x[0]", "x[1]"}
+    assert all(np.isfinite(share) for share in used.values())
+    # A limit is 1, and the QPs keep them to rounding.
+    assert 0 <= used["u"] <= 1 + 1e-9
+    assert 0 < used["du"] <= 1 + 1e-9
+    excess = loop_figures(result, control)["excess"]
+    assert excess["u"] == 0.0
+    assert excess["x0"] == max(0.0, -1.0 - result.x[:, 0].min())
+    assert working_point(model, control)[1] == rest
+    assert unknown_load(control) == pytest.approx(0.1 * (limits[1] - limits[0]))
+
+
+@pytest.mark.parametrize(
+    ("values", "limits", "share"),
+    [
+        ([0.0, 0.0], (0.0, 5.0), 0.0),
+        ([0.0, 2.0], (0.0, 5.0), 0.4),
+        ([0.0, -2.0], (-5.0, 0.0), 0.4),
+        ([0.0, -1.0], (0.0, 5.0), 1.2),
+        ([0.0, 1.0], (-5.0, 0.0), 1.2),
+        ([2.0, 3.0], (2.0, 4.0), 0.5),
+        ([2.0, 1.0], (2.0, 4.0), 1.5),
+        ([2.0, 5.0], (2.0, 4.0), 1.5),
+        ([-2.0, -3.0], (-4.0, -2.0), 0.5),
+        ([0.0, -0.1], (-0.2, 0.5), 0.5),
+        ([0.0, -0.1], (-0.2, INF), 0.5),
+        ([0.0, 9.0], (-0.2, INF), 0.0),
+        ([0.0, 9.0], (0.0, INF), 0.0),
+        ([0.0, -1e-9], (0.0, INF), INF),
+        ([7.0, -9.0], (-INF, INF), 0.0),
+    ],
+)
+def test_shares_are_of_the_way_from_rest_to_a_limit(values, limits, share):
+    with np.errstate(all="raise"):
+        assert share_used(np.array(values)[:, None], limits[:1], limits[1:]) == pytest.approx(share)
+
+
+@pytest.mark.parametrize("mode", [Mode.REST, Mode.LIMITED, Mode.FALLBACK])
+def test_a_guard_keeps_to_limits_beside_zero(mode):
+    model = pendulum_model()
+    ocp = OCP(10, (30.0, 1.0), [0.05], [0.05], [0.5], [2.0])
+    safe = SafeController(CondensedController(model, ocp), model)
+    guarded = Guard(mode, limits=Limits([-INF], [1.0])).begin(safe)
+    estimate, reference = TrueState(model).start([0.5, 0.0]), np.zeros((11, 2))
+    decision = guarded.initial(estimate, None, reference)
+    assert decision.u == 0.5
+    guarded.watched(0.0, SimpleNamespace(alarm=True))
+    guarded.measured(0.02, np.array([0.5]), decision.u)
+    assert guarded.mode is mode
+    for _ in range(3):
+        decision = guarded.decide(decision, estimate, reference)
+        assert 0.5 <= decision.u <= 1.0
+
+
+@pytest.mark.parametrize("limits", (FINITE | OPEN).values(), ids=(FINITE | OPEN).keys())
+def test_figures_draw_the_limits_that_there_are(limits):
+    t, x, u = np.array([0.0, 0.1]), np.zeros((2, 2)), np.full((2, 1), np.clip(0.0, *limits))
+    figure = closed_loops(
+        "Rest", t, x, {"prior": Loop(t, x, u)}, states=(Signal("q", "m"), Signal("v", "m/s")),
+        inputs=(Signal("F", "N"),), limits=(limits[:1], limits[1:]),
+    )  # fmt: skip
+    drawn = [line.get_ydata()[0] for line in figure.axes[-1].lines if line.get_label() == "input limits"]
+    assert drawn == [bound for bound in limits if np.isfinite(bound)]
+    assert np.all(np.isfinite(figure.axes[-1].get_ylim()))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"u_max": (INF,)}, r"control: u_max \(inf,\) given; finite bounds needed"),
+        ({"u_min": (-INF,)}, r"control: u_min \(-inf,\) given"),
+        ({"u_min": (0.0,), "u_max": (INF,)}, "control: u_max"),
+        ({"u_min": (np.nan,)}, "u_min"),
+        ({"u_min": (2.0,)}, "cross"),  # equal to u_max
+        ({"u_min": (3.0,)}, "cross"),
+        ({"u_min": (-1.0, -1.0)}, "u_min has 2 and u_max 1 values, 1 needed"),
+    ],
+)
+def test_a_scenarios_limits_are_checked_when_it_is_made(change, words):
+    with pytest.raises(InputError, match=words):
+        replace(CONTROL, **change)
+
+
+def test_a_scenario_without_a_finite_range_ends_before_anything_is_computed(call, tmp_path):
+    path = tmp_path / "heater.py"
+    path.write_text(
+        "from hybrid_mpc import ControlSpec, DataSpec, Scenario\n"
+        "data = DataSpec('time_s', ('u',), ('y',), dt=0.1, max_gap=0.5, smoothing=0.1, warm_up=0.5)\n"
+        "control = ControlSpec(9, (1.0,), (1.0,), (1.0,), (0.0,), (float('inf'),), estimator_sigma=(1.0,))\n"
+        "scenario = Scenario('heater', 'Heater', '', prior=lambda values=None: 1 / 0, data=data, control=control)\n"
+    )
+    code, _, told = call("run", path, "--data", tmp_path / "none.csv", "--out", tmp_path / "out")
+    assert code == 2
+    assert "heater.py:3" in told
+    assert "u_max" in told
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("signal", "inside"),
+    [
+        ((-INF, INF), (-1.0, 1.0)),
+        ((0.0, INF), (0.0, 1.0)),
+        ((2.0, INF), (2.0, 3.0)),
+        ((-INF, -2.0), (-3.0, -2.0)),
+        ((-INF, 0.5), (-1.0, 0.5)),
+        ((290.0, 310.0), (290.0, 310.0)),
+    ],
+)
+def test_ranges_that_are_analysed_never_cross(signal, inside):
+    one = Signal("T", "K", *signal)
+    model = SimpleNamespace(states=(one, one), inputs=(one,), n_x=2)
+    np.testing.assert_array_equal(_outer(model), [inside, inside])
+    np.testing.assert_array_equal(_inputs(model, None), [inside])
+    np.testing.assert_array_equal(_range(model, None), [inside, inside])
+
+
+def test_working_ranges_take_each_limit_that_there_is():
+    one = Signal("T", "K", -4.0)
+    model = SimpleNamespace(states=(one, one), inputs=(one,), n_x=2)
+    control = replace(CONTROL, u_min=(0.0,), u_max=(5.0,), x_min=(2.0, -INF), x_max=None)
+    np.testing.assert_array_equal(_range(model, control), [(2.0, 3.0), (-4.0, 1.0)])
+    np.testing.assert_array_equal(_inputs(model, control), [(0.0, 5.0)])
+
+
+def test_a_study_drives_inputs_within_their_ranges():
+    subject = SimpleNamespace(u_range=np.array([(0.0, 5.0), (-4.0, 0.0), (-1.0, 1.0)]))
+    u = drive(subject, SimpleNamespace(dt=0.02, n_u=3), 30.0)
+    np.testing.assert_allclose(u.max(axis=0) - u.min(axis=0), 0.5 * np.array([5.0, 4.0, 2.0]), rtol=0.1)
+    np.testing.assert_allclose(u.mean(axis=0), [2.5, -2.0, 0.0], atol=0.05)
+    assert np.all((u >= [0.0, -4.0, -1.0]) & (u <= [5.0, 0.0, 1.0]))
+
+
+def test_a_machine_is_driven_within_its_inputs_range():
+    class Lag:
+        def __init__(self):
+            self.inputs = []
+
+        def reset(self, x0, seed):
+            return x0.copy()
+
+        def step(self, state, u, dt):
+            self.inputs.append(float(u[0]))
+            return a @ state + b @ u
+
+        def measure(self, state, rng):
+            return state[1:]
+
+    a, b = np.array([[0.9, 0.0], [0.3, 0.7]]), np.array([[0.1], [0.0]])
+    model, plant = linear_model(a, b, [[0.0, 1.0]], dt=0.1), Lag()
+    subject = SimpleNamespace(
+        models={"prior": model}, recordings=(), plant=plant, u_range=np.array([(2.0, 6.0)])
+    )
+    result, _ = measured_part(subject)
+    assert (min(plant.inputs), max(plant.inputs)) == pytest.approx((3.0, 5.0), abs=0.2)
+    assert result["source"].startswith("odd multisine of 1 - around 4, ")
+    assert result["prior"]["largest_relative_error"] < 1e-6  # the model is the machine
