@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hybrid_mpc.data.trajectories import Trajectory
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import digest, read_json, write_json
 from hybrid_mpc.identification.settings import KINDS
 from hybrid_mpc.pipeline.context import Progress, Silent
@@ -79,17 +79,21 @@ def benchmark(
     progress, scenario = progress or Silent(), load_scenario(settings.scenario)
     spec = benchmark_of(scenario)
     _check(settings, scenario)
-    tests = {path.name: read_test(scenario, path) for path in settings.test}
+    data, tests, doubts = _read(settings, scenario)
+    for doubt in doubts:
+        progress.warn(doubt)
     started = time.monotonic()
     notes: dict[str, Any] = {}
-    if settings.model is not None:
+    if data is None:
+        assert settings.model is not None
         model = load_model(settings.model, scenario.name)
     else:
-        model, notes = _made(settings, scenario, out, progress)
+        model, notes = _made(settings, scenario, data, out, progress)
+    for warning in model.physics.fit.warnings:
+        progress.warn(f"fit of the prior: {warning}")
     prior = scenario.prior(model.physics.fit.values)
-    if settings.model is None and not tests:
-        held = read_training(scenario, settings.data).held_back
-        tests = {"held back": held} if held else {}
+    if data is not None and not tests and data.held_back:
+        tests = {"held back": data.held_back}
     progress.start("free runs over the test files")
     runs: dict[str, list[Run]] = {}
     test: dict[str, Any] = {}
@@ -115,6 +119,7 @@ def benchmark(
         "budget": settings.budget if settings.model is None else None,
         "seed": settings.seed if settings.model is None else None,
         **notes,
+        "warnings": doubts,
         "model": describe(model, scenario),
         "test": test,
         "versions": versions(),
@@ -155,11 +160,33 @@ def describe(model: BenchmarkModel, scenario: Scenario) -> dict[str, Any]:
     }
 
 
+def _read(
+    settings: BenchmarkSettings, scenario: Scenario
+) -> tuple[Recordings | None, dict[str, tuple[Trajectory, ...]], list[str]]:
+    """Training files if there are to be some, test files by name, and what is doubtful about them."""
+    data: Recordings | None = None
+    tests: dict[str, tuple[Trajectory, ...]] = {}
+    problems: list[str] = []
+    doubts: list[str] = []
+    if settings.model is None:
+        try:
+            data = read_training(scenario, settings.data)
+            doubts += [str(finding) for finding in data.dataset.findings]
+        except InputError as error:
+            problems += error.problems
+    for path in settings.test:
+        try:
+            tests[path.name] = read_test(scenario, path, doubts.append)
+        except InputError as error:
+            problems += error.problems
+    refuse(problems)
+    return data, tests, list(dict.fromkeys(doubts))
+
+
 def _made(
-    settings: BenchmarkSettings, scenario: Scenario, out: Path, progress: Progress
+    settings: BenchmarkSettings, scenario: Scenario, data: Recordings, out: Path, progress: Progress
 ) -> tuple[BenchmarkModel, dict[str, Any]]:
     """Fit and train, or take what ``out`` holds of it; and what is known of the data."""
-    data = read_training(scenario, settings.data)
     _claim(out, settings, data)
     spec, warm_up, dt = benchmark_of(scenario), scenario.data.warm_up, scenario.data.dt
     progress.start("fitting the prior")
