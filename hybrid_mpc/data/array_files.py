@@ -214,6 +214,7 @@ def _reader(
                     f"{row} {bad[0] + first}, column {shown(name)} is {column[bad[0]]:g}, not a finite number "
                     f"({len(bad)} such). Delete the row (longer gaps are cut out) or repair the value."
                 )
+        values[~np.isfinite(values)] = np.nan
         return Columns(values, row, range(first, first + len(values)), tuple(found))
 
     return read

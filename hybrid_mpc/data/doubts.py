@@ -183,12 +183,12 @@ def _patience(tables: Sequence[Table], j: int, spec: DataSpec) -> float:
 def _stuck(table: Table, name: str, signal: Signal, y: Array, still: Sequence[Still]) -> list[Finding]:
     """Clipped at the largest and smallest value, and frozen anywhere else."""
     found: list[Finding] = []
-    rest = list(still)
-    for word, value in (("largest", y.max()), ("smallest", y.min())):
-        there = [s for s in rest if y[s.first] == value and np.ptp(y) > 0]
-        rest = [s for s in rest if s not in there]
+    largest, smallest = (y.max(), y.min()) if np.ptp(y) > 0 else (np.inf, -np.inf)
+    for word, value in (("largest", largest), ("smallest", smallest)):
+        there = [s for s in still if y[s.first] == value]
         if there:
             found.append(_clipped(table, name, signal, y, there, word))
+    rest = [s for s in still if y[s.first] not in (largest, smallest)]
     if rest:
         found.append(_frozen(table, name, signal, y, rest))
     return sorted(found, key=lambda finding: finding.start)

@@ -254,9 +254,9 @@ def _table(
             if name in spec.units:
                 values[:, j] *= factor(name, spec.units[name], signal)
     t = values[:, 0]
-    if np.isfinite(t).all():
+    if (np.abs(t) <= ABSURD).all():  # what is not is told with the ranges, or as no number
         problems += _time_problems(t, columns, spec, path.stem)
-    clean = not problems
+    clean = not problems and bool((np.abs(values) <= ABSURD).all())
     for j, (signal, name) in enumerate(zip(signals, names, strict=True)):
         note = ""
         turn = turn_of(signal) if clean and j >= split else None
@@ -323,7 +323,7 @@ def _range_problems(signal: Signal, name: str, column: Array, columns: Columns, 
         if len(bad) > 1
         else ""
     )
-    unit = likely_unit(column[np.isfinite(column)], signal)
+    unit = likely_unit(column[~np.isnan(column)], signal)
     hint = (
         f" In {unit} it would be plausible: say units={{{name!r}: {unit!r}}} in the DataSpec." if unit else ""
     )

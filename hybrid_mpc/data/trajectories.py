@@ -158,7 +158,8 @@ def load_trajectories(
             problems.append(f"{table.path}: {error}")
             segments.append([])
     findings = doubts_of(tables, segments, spec, outputs=outputs, states=states)
-    problems += [f"{finding}" for finding in findings if finding.refused]
+    paths_of = {table.path.name: table.path for table in tables}
+    problems += [f"{paths_of[finding.file]}: {finding.message}" for finding in findings if finding.refused]
     refuse(problems)
     _check_roles(trajectories, cuts, spec, needed)
     return Dataset(

@@ -72,7 +72,7 @@ def likely_unit(column: NDArray[np.float64], signal: Signal) -> str:
     unit, keeps to the range and fills a hundredth of it at least: a value of 1e300 is in no unit.
 
     Args:
-        column: The numbers ``(m,)``, finite, ``m > 0``.
+        column: The numbers ``(m,)``; what is not finite is in no unit.
         signal: What the column is.
 
     Example:
@@ -81,7 +81,7 @@ def likely_unit(column: NDArray[np.float64], signal: Signal) -> str:
         ('deg', '')
     """
     limit = max(abs(signal.lower), abs(signal.upper))
-    largest = float(np.abs(column).max())
+    largest = float(np.abs(column).max(initial=0.0))
     beyond = float(((column < signal.lower) | (column > signal.upper)).mean())
     if beyond < SHARE or not BEYOND * limit < largest < math.inf:
         return ""

@@ -222,11 +222,11 @@ def test_nothing_is_doubted_about_real_recordings(machine):
         assert load_trajectories([file], scenario.data, **given).findings == ()
 
 
-def test_nothing_is_doubted_about_simulated_recordings(tmp_path):
-    from scenarios.golf_robot.data import make_data
-
-    scenario = load_scenario("golf_robot")
+@pytest.mark.full
+@pytest.mark.parametrize("machine", ["golf_robot", "unbalanced_disk", "pendulum"])
+def test_nothing_is_doubted_about_simulated_recordings(tmp_path, machine):
+    scenario = load_scenario(machine)
     prior = scenario.prior()
-    files = make_data(tmp_path, 0, "quick")
+    files = scenario.make_data(tmp_path, 0, "quick")
     given = {"outputs": prior.outputs, "inputs": prior.inputs, "states": prior.states}
     assert load_trajectories(files, scenario.data, **given).findings == ()
