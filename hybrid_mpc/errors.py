@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 
 class InputError(ValueError):
     """Bad input of the user: a file, a field, a setting. The command line answers it with exit code 2.
 
-    Its message names what was given (file, row, field), what is needed, and a remedy.
+    Its message names what was given (file, row, field), what is needed, and a remedy; ``problems`` are the single ones
+    where there are several.
 
     Example:
         >>> raise InputError("run.csv: no column 'pos_rad'; it has 'time_s', 'angle'. Rename one.")
@@ -14,6 +17,46 @@ class InputError(ValueError):
         ...
         hybrid_mpc.errors.InputError: run.csv: no column 'pos_rad'; it has 'time_s', 'angle'. Rename one.
     """
+
+    _problems: tuple[str, ...] = ()
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What is wrong, one by one."""
+        return self._problems or (str(self),)
+
+
+SHOWN = 20
+"""Most problems that one message lists; the others are counted."""
+
+
+def refuse(problems: Sequence[str]) -> None:
+    """Raise one error that names all problems, so that they are mended in one go; none is no error.
+
+    Args:
+        problems: Each as a message of its own: what was given, what is needed, a remedy.
+
+    Raises:
+        InputError: If there is a problem.
+
+    Example:
+        >>> refuse([])
+        >>> refuse(["a.csv: is empty. Record it again.", "b.csv: is empty. Record it again."])
+        Traceback (most recent call last):
+        ...
+        hybrid_mpc.errors.InputError: 2 problems:
+          a.csv: is empty. Record it again.
+          b.csv: is empty. Record it again.
+    """
+    told = list(dict.fromkeys(problems))
+    if not told:
+        return
+    if len(told) == 1:
+        raise InputError(told[0])
+    more = [f"and {len(told) - SHOWN} more"] if len(told) > SHOWN else []
+    error = InputError("\n  ".join([f"{len(told)} problems:", *told[:SHOWN], *more]))
+    error._problems = tuple(told)
+    raise error
 
 
 class StorageError(InputError):

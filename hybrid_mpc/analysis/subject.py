@@ -185,5 +185,7 @@ def _recordings(
         return ()
     from hybrid_mpc.data.trajectories import load_trajectories
 
-    found = load_trajectories(request.data, scenario.data, outputs=model.outputs, inputs=model.inputs)
+    found = load_trajectories(
+        request.data, scenario.data, outputs=model.outputs, inputs=model.inputs, states=model.states
+    )
     return tuple((piece.u[:, 0], piece.y[:, 0], piece.x[0]) for piece in found.whole)

@@ -62,6 +62,8 @@ def monitor(
         machine, folder, recordings, noise=noise, resolution=tuple(resolution) if resolution else None,
         calibration=None if learn else calibration,
     )  # fmt: skip
+    for finding in job.data.findings:
+        print(f"warning: {finding}")
     if learn:
         found = learn_job(job, learn, out)
         print(

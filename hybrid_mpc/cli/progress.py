@@ -48,6 +48,12 @@ class Bars:
             self._parts[key] = self._bars.add_task(f"  {key}", total=total, text="")
         self._bars.update(self._parts[key], completed=done, total=total, text=text)
 
+    def warn(self, text: str) -> None:
+        """A line above the bars."""
+        self._bars.console.print(
+            f"warning: {text}", style="yellow", markup=False, highlight=False, soft_wrap=True
+        )
+
     def finish(self, text: str) -> None:
         """Complete the stage and its parts."""
         for task in self._parts.values():
@@ -83,6 +89,10 @@ class Lines:
         if now - self._last >= LINE_EVERY_S:
             self._last = now
             print(f"  {key}: {done}/{total} {text}", flush=True)
+
+    def warn(self, text: str) -> None:
+        """A line of its own."""
+        print(f"  warning: {text}", flush=True)
 
     def finish(self, text: str) -> None:
         """How long the stage took."""

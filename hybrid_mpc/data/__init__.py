@@ -14,6 +14,7 @@ from hybrid_mpc.data.differentiators import (
     LocalPolynomial,
     differentiate,
 )
+from hybrid_mpc.data.doubts import Finding
 from hybrid_mpc.data.excitation import chirp, multisine, prbs, sinusoid, steps
 from hybrid_mpc.data.excitation_check import Excitation, check_excitation, excitation_of
 from hybrid_mpc.data.low_pass import SmoothingSpline, ZeroPhaseFilter, gcv_cutoff
@@ -23,7 +24,7 @@ from hybrid_mpc.data.trajectories import Cut, Dataset, Trajectory, load_trajecto
 
 __all__ = [
     "Table", "read_table", "read_tables", "read_csv", "write_csv",
-    "Cut", "Dataset", "Trajectory", "load_trajectories",
+    "Cut", "Dataset", "Finding", "Trajectory", "load_trajectories",
     "Derivatives", "local_polynomial", "causal_derivatives", "noise_gain", "bandwidth",
     "differentiate", "Differentiator", "gcv_cutoff",
     "LocalPolynomial", "SmoothingSpline", "ZeroPhaseFilter", "CausalPolynomial",

@@ -3,52 +3,119 @@
 from __future__ import annotations
 
 import io
+import math
 import warnings
+import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib import format as npy
 from numpy.typing import NDArray
 from scipy.io import loadmat
 from scipy.io.matlab import MatlabObject, MatlabOpaque, MatReadWarning
 
 from hybrid_mpc.data.mat_structure import check_structure, version
-from hybrid_mpc.data.sources import Columns, Source, content_of, digest_of
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.data.sources import Columns, Source, budget_of, content_of, digest_of, megabytes, shown
+from hybrid_mpc.errors import InputError, refuse
 
 Array = NDArray[np.float64]
 Lookup = Callable[[str], NDArray[Any]]
+MEMBERS = 10_000
+"""Most members of a ``.npz`` file."""
+HEADER = 10_100
+"""Bytes of an array's begin that hold its header: numpy reads none of more than 10 000 characters [byte]."""
+
+
+def check_npz(content: bytes, budget: int, names: Sequence[str] | None = None) -> None:
+    """Check what an archive of arrays declares before any array is decompressed.
+
+    Args:
+        content: The ``.npz`` file.
+        budget: Most bytes of numbers in these arrays, each counted as 8 of them at least [byte].
+        names: Arrays that are to be read. Default: all; others may hold anything.
+
+    Raises:
+        ValueError: If there are too many members, one is packed in a way that numpy does not pack, is no array, or
+            holds another number of bytes than its shape declares, or they are larger than the budget.
+        zipfile.BadZipFile: If it is no archive, or a damaged one.
+        KeyError: If there is no array of such a name.
+
+    Example:
+        >>> file = io.BytesIO()
+        >>> np.savez(file, t=np.zeros(1000))
+        >>> check_npz(file.getvalue(), 8000)
+        >>> check_npz(file.getvalue(), 7999)
+        Traceback (most recent call last):
+        ...
+        ValueError: its arrays take 0.008 MB, more than the 0.007999 MB that are read
+    """
+    if content.count(b"PK\x01\x02") > MEMBERS:  # the mark of an entry in the list of members
+        raise ValueError(f"it has more than {MEMBERS} members")
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        members = archive.namelist()
+        wanted = members if names is None else [n if n in members else f"{n}.npy" for n in names]
+        size = sum(_declared(archive, name) for name in wanted)
+    if size > budget:
+        raise ValueError(
+            f"its arrays take {megabytes(size)}, more than the {megabytes(budget)} that are read"
+        )
+
+
+def _declared(archive: zipfile.ZipFile, name: str) -> int:
+    """Bytes that an array takes by its header, each number counted as 8 of them at least [byte]."""
+    member = archive.getinfo(name)
+    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"member {shown(name)} is packed in another way than numpy's")
+    with archive.open(member) as file:
+        begin = io.BytesIO(file.read(HEADER))
+    read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}.get(npy.read_magic(begin))
+    if read is None:
+        raise ValueError(f"member {shown(name)} is no array of numbers")
+    shape, _, dtype = read(begin)
+    if dtype.hasobject:  # which are refused when they are to be read
+        return member.file_size
+    count = math.prod(shape)
+    if min(shape, default=0) < 0 or begin.tell() + count * dtype.itemsize != member.file_size:
+        raise ValueError(
+            f"member {shown(name)} declares the shape {shown(str(shape))} of {dtype.str} and holds "
+            f"{member.file_size} bytes"
+        )
+    return count * max(8, dtype.itemsize)
 
 
 def npz_source(path: Path) -> Source:
     """Open a ``.npz`` file of named vectors; object arrays (pickles) are refused, not loaded.
 
     Raises:
-        InputError: If the file is missing, empty, damaged or no ``.npz``.
+        InputError: If the file is missing, no regular file, too large, empty, damaged or no ``.npz``.
     """
     content = content_of(path)
+    if content.startswith(npy.MAGIC_PREFIX):
+        raise InputError(
+            f"{path}: is no .npz file but one array without a name. Write named vectors with numpy.savez(file, "
+            "name=vector, ...)."
+        )
     try:
+        check_npz(content, 0, ())
         file = np.load(io.BytesIO(content), allow_pickle=False)
     except Exception as error:  # a damaged archive raises nearly anything
         raise InputError(
             f"{path}: is no .npz file or damaged ({_line(error)}). Write it with numpy.savez(file, name=vector, ...)."
         ) from error
-    if isinstance(file, np.ndarray):
-        raise InputError(
-            f"{path}: holds one array without a name. Write named vectors with numpy.savez(file, name=vector, ...)."
-        )
 
     def lookup(name: str) -> NDArray[Any]:
         try:
+            check_npz(content, budget_of(content), (name,))
             return np.asarray(file[name])
         except Exception as error:
             raise InputError(
-                f"{path}: column {name!r} cannot be read ({_line(error)}). Save it as a vector of numbers; objects are "
-                "refused, since loading them could run code."
+                f"{path}: column {shown(name)} cannot be read ({_line(error)}). Save it as a vector of numbers, large "
+                "ones with numpy.savez and not packed; objects are refused, since loading them could run code."
             ) from error
 
-    return Source(path, digest_of(content), tuple(file.files), _reader(path, lookup, "index", 0))
+    return Source(path, digest_of(content), tuple(file.files), _reader(path, content, lookup, "index", 0))
 
 
 def mat_source(path: Path) -> Source:
@@ -64,18 +131,18 @@ def mat_source(path: Path) -> Source:
             f"save('{path.name}', ..., '-v7')."
         )
     try:
-        check_structure(content)
+        check_structure(content, budget_of(content))
         with warnings.catch_warnings():
             warnings.simplefilter("error", MatReadWarning)  # two variables of one name, for one
             variables = loadmat(io.BytesIO(content), struct_as_record=True)
     except Exception as error:  # a damaged file raises nearly anything
         raise InputError(
-            f"{path}: is no .mat file or damaged ({_line(error)}). Save it again in MATLAB with "
-            f"save('{path.name}', ..., '-v7')."
+            f"{path}: is no .mat file, damaged or too large ({_line(error)}). Save it again in MATLAB with "
+            f"save('{path.name}', ..., '-v7'), large vectors with '-v6'."
         ) from error
     vectors, note = _fields({name: v for name, v in variables.items() if not name.startswith("__")})
     return Source(
-        path, digest_of(content), tuple(vectors), _reader(path, vectors.__getitem__, "row", 1), note
+        path, digest_of(content), tuple(vectors), _reader(path, content, vectors.__getitem__, "row", 1), note
     )
 
 
@@ -110,27 +177,45 @@ def _unread(value: Any) -> str:
     return "" if isinstance(value, np.ndarray) else "sparse matrices"
 
 
-def _reader(path: Path, lookup: Lookup, row: str, first: int) -> Callable[[Sequence[str]], Columns]:
+def _reader(
+    path: Path, content: bytes, lookup: Lookup, row: str, first: int
+) -> Callable[[Sequence[str]], Columns]:
     """A source's ``read``: vectors of one length; a single number as the time is the sampling time."""
 
     def read(names: Sequence[str]) -> Columns:
-        columns = [_vector(path, name, lookup(name)) for name in names]
+        columns: list[Array] = []
+        problems: list[str] = []
+        left = budget_of(content)
+        for name in names:
+            try:
+                array = lookup(name)
+                left -= 8 * array.size
+                if left < 0:
+                    raise InputError(
+                        f"{path}: its columns take more than the {megabytes(budget_of(content))} of numbers that are "
+                        "read from a file of this length. Save it unpacked, or split the recording."
+                    )
+                columns.append(_vector(path, name, array))
+            except InputError as error:
+                problems += error.problems
+        refuse(problems)
         if columns[0].size == 1 and len(columns) > 1:
             columns[0] = _uniform(path, names[0], columns[0].item(), len(columns[1]))
         lengths = dict(zip(names, map(len, columns), strict=True))
         if len(set(lengths.values())) > 1:
-            told = ", ".join(f"{name!r} {length}" for name, length in lengths.items())
+            told = ", ".join(f"{shown(name)} {length}" for name, length in lengths.items())
             raise InputError(f"{path}: columns differ in length: {told}. Save vectors of one length.")
         values = np.column_stack(columns)
-        bad = np.argwhere(~np.isfinite(values))
-        if len(bad):
-            k, j = bad[0]
-            raise InputError(
-                f"{path}: {row} {k + first}, column {names[j]!r} is {values[k, j]:g}, not a finite number "
-                f"({int((~np.isfinite(values[:, j])).sum())} such). Delete the row (longer gaps are cut out) or "
-                "repair the value."
-            )
-        return Columns(values, row, range(first, first + len(values)))
+        found = []
+        for name, column in zip(names, values.T, strict=True):
+            bad = np.flatnonzero(~np.isfinite(column))
+            if len(bad):
+                found.append(
+                    f"{row} {bad[0] + first}, column {shown(name)} is {column[bad[0]]:g}, not a finite number "
+                    f"({len(bad)} such). Delete the row (longer gaps are cut out) or repair the value."
+                )
+        values[~np.isfinite(values)] = np.nan
+        return Columns(values, row, range(first, first + len(values)), tuple(found))
 
     return read
 
@@ -139,12 +224,12 @@ def _vector(path: Path, name: str, array: NDArray[Any]) -> Array:
     if array.dtype.kind not in "biuf":
         what = {"c": "complex numbers", "U": "text", "S": "text", "M": "dates"}.get(array.dtype.kind)
         raise InputError(
-            f"{path}: column {name!r} holds {what or 'cells or other objects'}, not real numbers. "
+            f"{path}: column {shown(name)} holds {what or 'cells or other objects'}, not real numbers. "
             "Save it as a vector of numbers."
         )
     if array.size and sum(length != 1 for length in array.shape) > 1:
         raise InputError(
-            f"{path}: column {name!r} has the shape {array.shape}, not that of a vector. Save each of its columns "
+            f"{path}: column {shown(name)} has the shape {array.shape}, not that of a vector. Save each of its columns "
             "under a name of its own."
         )
     return np.asarray(array, dtype=np.float64).ravel()
@@ -153,8 +238,8 @@ def _vector(path: Path, name: str, array: NDArray[Any]) -> Array:
 def _uniform(path: Path, name: str, dt: float, m: int) -> Array:
     if not (np.isfinite(dt) and dt > 0):
         raise InputError(
-            f"{path}: column {name!r} is the single number {dt:g}; as a sampling time [s] it must be positive. Give "
-            "that, or a vector of time stamps."
+            f"{path}: column {shown(name)} is the single number {dt:g}; as a sampling time [s] it must be positive. "
+            "Give that, or a vector of time stamps."
         )
     return dt * np.arange(m, dtype=np.float64)
 

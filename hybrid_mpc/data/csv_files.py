@@ -2,37 +2,43 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from array import array
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.data.sources import Columns, Source, content_of, digest_of
+from hybrid_mpc.data.sources import LARGEST, Columns, Source, content_of, digest_of, megabytes, shown
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import write_text
 
 Array = NDArray[np.float64]
+Row = tuple[int, list[str]]
+LONGEST_ROW = 2**20
+"""Most bytes of a row [byte]: ten thousand columns of a hundred characters."""
 
 
 def csv_source(path: Path) -> Source:
     """Open a CSV file: comma, decimal point, first line the header, UTF-8.
 
     Raises:
-        InputError: If the file is missing, empty, no UTF-8 text or no table.
+        InputError: If the file is missing, no regular file, too large, empty, no UTF-8 text or no table.
     """
-    content = content_of(path)
-    header, rows = _rows(path, content)
+    text = _Text(path)
+    content = content_of(path, text.check)
+    text.finish()
+    header_row, header = next(_rows(path, content), (1, []))
+    names = [name.strip() for name in header]
 
-    def read(names: Sequence[str]) -> Columns:
-        places = [header.index(name) for name in names]
-        values = np.array([[_number(path, header, line, row, j) for j in places] for line, row in rows])
-        return Columns(values.reshape(len(rows), len(places)), "row", [line for line, _ in rows])
+    def read(wanted: Sequence[str]) -> Columns:
+        return _columns(path, _rows(path, content), (header_row, names), wanted)
 
-    return Source(path, digest_of(content), tuple(header), read)
+    return Source(path, digest_of(content), tuple(names), read)
 
 
 def write_csv(path: Path | str, columns: Mapping[str, Array]) -> Path:
@@ -69,42 +75,112 @@ def write_csv(path: Path | str, columns: Mapping[str, Array]) -> Path:
     return path
 
 
-def _rows(path: Path, content: bytes) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Header and ``(row number, cells)``; blank lines are skipped but counted."""
+class _Text:
+    """Whether bytes are UTF-8 text with rows of a bearable length, told piece by piece."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._decoder = codecs.getincrementaldecoder("utf-8")()
+        self._row, self._length = 1, 0
+
+    def check(self, piece: bytes) -> None:
+        """Look at the next piece of the file.
+
+        Raises:
+            InputError: If it is no text, or a row is too long.
+        """
+        codes = np.frombuffer(piece, dtype=np.uint8)
+        ends = np.flatnonzero((codes == ord("\n")) | (codes == ord("\r")))
+        lengths = np.diff(ends, prepend=-1 - self._length)
+        rest = len(piece) - 1 - int(ends[-1]) if len(ends) else self._length + len(piece)
+        if max(int(lengths.max(initial=0)), rest) > LONGEST_ROW:
+            raise InputError(
+                f"{self._path}: has a row of more than {megabytes(LONGEST_ROW)}. Write one line a sample, with "
+                "the columns that are needed."
+            )
+        self._decode(piece)
+        self._row, self._length = self._row + piece.count(b"\n"), rest
+
+    def finish(self) -> None:
+        """Nothing follows.
+
+        Raises:
+            InputError: If the text ends within a character.
+        """
+        self._decode(b"", last=True)
+
+    def _decode(self, piece: bytes, last: bool = False) -> None:
+        try:
+            self._decoder.decode(piece, last)
+        except UnicodeDecodeError as error:
+            row = self._row + error.object[: error.start].count(b"\n")
+            raise InputError(
+                f"{self._path}: row {row} is no UTF-8 text. Export the table as CSV (UTF-8), or name the file .npz or "
+                ".mat if it is one; unpack it if it is packed."
+            ) from error
+
+
+def _rows(path: Path, content: bytes) -> Iterator[Row]:
+    """Number and cells of each row; blank ones are skipped but counted."""
+    reader = csv.reader(io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline=""))
     try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        row = content[: error.start].count(b"\n") + 1
-        raise InputError(
-            f"{path}: row {row} is no UTF-8 text. Export the table as CSV (UTF-8), or name the file .npz or "
-            ".mat if it is one."
-        ) from error
-    reader = csv.reader(io.StringIO(text, newline=""))
-    try:
-        rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+        for row in reader:
+            if any(cell.strip() for cell in row):
+                yield reader.line_num, row
     except csv.Error as error:
         raise InputError(f"{path}: row {reader.line_num}: {error}. Export the table as plain CSV.") from error
-    header = [name.strip() for name in rows[0][1]] if rows else []
-    for line, cells in rows[1:]:
-        if len(cells) != len(header):
-            raise InputError(
-                f"{path}: row {line} has {len(cells)} cells, the header (row {rows[0][0]}) has "
-                f"{len(header)}. "
-                "Separate cells by commas, write decimals with a point, and complete or delete the row."
-            )
-    return header, rows[1:]
 
 
-def _number(path: Path, header: list[str], line: int, row: list[str], place: int) -> float:
-    cell = row[place].strip()
+def _columns(
+    path: Path, rows: Iterator[Row], header: tuple[int, list[str]], wanted: Sequence[str]
+) -> Columns:
+    """Numbers of the wanted columns; a row of another length than the header is an error of the whole file."""
+    names = header[1]
+    next(rows, None)
+    places = [names.index(name) for name in wanted]
+    columns, numbers = [array("d") for _ in places], array("q")
+    bad: list[tuple[int, str, int] | None] = [None] * len(places)
+    unequal: tuple[int, int, int] | None = None
+    most = LARGEST // 8 // (len(places) + 1)
+    for line, cells in rows:
+        if len(cells) != len(names):
+            unequal = (unequal[0], unequal[1], unequal[2] + 1) if unequal else (line, len(cells), 1)
+            continue
+        if len(numbers) == most:
+            raise InputError(f"{path}: has more than {most} rows, more than are read. Split the recording.")
+        numbers.append(line)
+        for j, place in enumerate(places):
+            value = _number(cells[place])
+            columns[j].append(value)
+            if value != value:
+                first = bad[j]
+                bad[j] = (first[0], first[1], first[2] + 1) if first else (line, cells[place].strip(), 1)
+    if unequal:
+        line, count, times = unequal
+        raise InputError(
+            f"{path}: row {line} has {count} cells, the header (row {header[0]}) has {len(names)}"
+            f"{f' ({times} such rows)' if times > 1 else ''}. "
+            "Separate cells by commas, write decimals with a point, and complete or delete the row."
+        )
+    values = np.column_stack([np.array(column) for column in columns])
+    problems = tuple(_told(name, *one) for name, one in zip(wanted, bad, strict=True) if one)
+    return Columns(values, "row", numbers, problems)
+
+
+def _number(cell: str) -> float:
+    """The number in a cell; NaN for what is no finite one."""
     try:
-        value = math.nan if "_" in cell else float(cell)
+        value = float(cell)
     except ValueError:
-        value = math.nan
-    if math.isfinite(value):
-        return value
-    what = f"is {cell!r}, not a finite number" if cell else "is empty"
-    raise InputError(
-        f"{path}: row {line}, column {header[place]!r} {what}. Delete the row (longer gaps are cut out) "
-        "or repair the value."
+        return math.nan
+    return value if math.isfinite(value) and "_" not in cell else math.nan
+
+
+def _told(name: str, line: int, cell: str, count: int) -> str:
+    """What is wrong with a column that has other cells than numbers."""
+    what = f"is {shown(cell)}, not a finite number" if cell else "is empty"
+    such = f" ({count} such rows)" if count > 1 else ""
+    return (
+        f"row {line}, column {shown(name)} {what}{such}. Delete the row (longer gaps are cut out) or repair "
+        "the value."
     )

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.data.spectra import hann_spectrum
 from hybrid_mpc.data.trajectories import Trajectory
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.signals import Signal
 
 Array = NDArray[np.float64]
@@ -108,12 +108,12 @@ def check_excitation(
         >>> print(check_excitation([run], parameters=5)[0])
         input 1 has 1 line (0.5 Hz), 5 parameters of a linear model need 3. Add a multisine, a chirp or steps.
     """
-    found = excitation_of(trajectories, inputs)
+    found, problems = excitation_of(trajectories, inputs), []
     names = ", ".join(dict.fromkeys(piece.name.split("#")[0] for piece in trajectories))
     for j, one in enumerate(found):
         if one.spread <= NOTHING * _size([piece.u[:, j] for piece in trajectories], inputs, j):
             level = trajectories[0].u[0, j]
-            raise InputError(
+            problems.append(
                 f"{names}: the input {one.name} is {level:g} throughout; what it does cannot be learned. Add a "
                 "recording in which it moves, or check that the DataSpec names the right column."
             )
@@ -121,10 +121,11 @@ def check_excitation(
         every = np.concatenate([piece.y[:, j] for piece in trajectories])
         if float(every.std()) <= NOTHING * _size([every], outputs, j):
             name = outputs[j].name if j < len(outputs) else f"output {j + 1}"
-            raise InputError(
+            problems.append(
                 f"{names}: the output {name} is {every[0]:g} throughout: the machine never moved. Excite it harder "
                 "than its friction, or check that the DataSpec names the right column."
             )
+    refuse(problems)
     need = -(-parameters // 2)
     return tuple(_too_few(one, parameters, need) for one in found if len(one.lines) < need)
 

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import difflib
 import hashlib
-from collections.abc import Callable, Sequence
+import os
+import stat
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +20,21 @@ from hybrid_mpc.errors import InputError
 Array = NDArray[np.float64]
 ENDINGS = (".csv", ".npz", ".mat")
 """Formats with a reader of their own; any other ending is read as CSV."""
+LARGEST = 2**31
+"""Most bytes of a file, and of the numbers in it [byte]: three columns at 1 kHz for a day."""
+SMALL = 2**26
+"""Bytes of numbers that any file may hold [byte], however well they are compressed: 8 million numbers."""
+PACKED = 20
+"""Beyond ``SMALL``, most bytes of numbers for one byte of a file. Recorded motions are compressed to a tenth at best; a
+thousand to one is what zeros, and bombs, come to."""
+CHUNK = 2**20
+"""Bytes of a file that are looked at in one go [byte]."""
+LISTED = 30
+"""Most names that a message lists."""
+COMPARED = 1000
+"""Most names among which a message looks for one that is nearly right."""
+LONGEST = 40
+"""Most characters of a name or cell that a message shows."""
 
 
 class MissingColumn(InputError):
@@ -24,17 +43,20 @@ class MissingColumn(InputError):
 
 @dataclass(frozen=True)
 class Columns:
-    """Numbers of some columns, all finite.
+    """Numbers of some columns.
 
     Args:
-        values: ``(m, n)``, a column for each name asked for.
+        values: ``(m, n)``, a column for each name asked for; NaN where there is no finite number.
         row: What the file's own tools call a row: ``"row"`` or ``"index"``.
         numbers: Number of each row, ``m`` of them, as those tools count.
+        problems: What is wrong with single columns, each with place and remedy, without the file's name. Default: all
+            numbers are finite.
     """
 
     values: Array
     row: str
     numbers: Sequence[int]
+    problems: tuple[str, ...] = ()
 
     def place(self, k: int) -> str:
         """Where sample ``k`` stands in the file, e.g. ``"row 12"``."""
@@ -69,7 +91,7 @@ class Source:
         count = self.header.count(name)
         if count == 1:
             return name
-        there = ", ".join(repr(column) for column in self.header) or "none"
+        there = listed(self.header)
         if count > 1:
             raise InputError(
                 f"{self.path}: column {name!r} appears {count} times in {there}. Rename all but one."
@@ -79,10 +101,10 @@ class Source:
             return fields[0]
         if fields:
             raise InputError(
-                f"{self.path}: column {name!r} may be {' or '.join(map(repr, fields))}. "
+                f"{self.path}: column {name!r} may be {' or '.join(map(shown, fields[:LISTED]))}. "
                 "Name it whole in the scenario's DataSpec."
             )
-        near = difflib.get_close_matches(name, self.header, n=1)
+        near = difflib.get_close_matches(name, [c for c in self.header[:COMPARED] if len(c) < LONGEST], n=1)
         hint = f" Did you mean {near[0]!r}?" if near else ""
         raise MissingColumn(
             f"{self.path}: no column {name!r}; it has {there}.{hint} "
@@ -90,26 +112,109 @@ class Source:
         )
 
 
-def content_of(path: Path) -> bytes:
+def content_of(path: Path, check: Callable[[bytes], None] | None = None) -> bytes:
     """The file's bytes, at least one of which says something.
 
+    Only a regular file is read: nothing else says how long it is, and a pipe or a device may never end. It is opened
+    without waiting.
+
+    Args:
+        path: The file.
+        check: Called with one piece of at most ``CHUNK`` after the other before anything is kept; it raises where the
+            rest is not worth reading. Default: no check.
+
     Raises:
-        InputError: If it is missing, cannot be read or is empty.
+        InputError: If it is missing, no regular file, too large, cannot be read or is empty.
     """
     try:
-        content = path.read_bytes()
+        with _regular(path) as (file, size):
+            left = size
+            while check is not None and left > 0 and (piece := file.read(min(CHUNK, left))):
+                check(piece)
+                left -= len(piece)
+            file.seek(0)
+            content = file.read(size)  # what is written to it by now is left for the next time
     except FileNotFoundError:
-        files = path.parent.iterdir() if path.parent.is_dir() else ()
-        near = sorted(p.name for p in files if p.suffix.lower() in ENDINGS)
-        there = f"; that folder has: {', '.join(near)}" if near else ""
-        raise InputError(f"{path}: there is no such file{there}. Check the path given with --data.") from None
-    except OSError as error:
         raise InputError(
-            f"{path}: cannot be read ({error.strerror}). Give a readable CSV, npz or mat file."
-        ) from error
-    if not content.strip():
+            f"{path}: there is no such file{_beside(path)}. Check the path given with --data."
+        ) from None
+    except (OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        why = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{path}: cannot be read ({why}). Give a readable CSV, npz or mat file.") from error
+    if not content or content.isspace():
         raise InputError(f"{path}: the file is empty. It needs a header line and rows of numbers.")
     return content
+
+
+@contextmanager
+def _regular(path: Path) -> Iterator[tuple[BinaryIO, int]]:
+    """A regular file that is not too large, opened, and its length [byte]."""
+    with open(
+        path, "rb", opener=lambda name, flags: os.open(name, flags | getattr(os, "O_NONBLOCK", 0))
+    ) as file:
+        status = os.fstat(file.fileno())
+        if not stat.S_ISREG(status.st_mode):
+            raise InputError(
+                f"{path}: is no regular file (a pipe or device, say). Save the recording as a file and give that."
+            )
+        if status.st_size > LARGEST:
+            raise InputError(
+                f"{path}: has {megabytes(status.st_size)}, more than the {megabytes(LARGEST)} that are read. Split the "
+                "recording, or leave out columns that are not needed."
+            )
+        yield file, status.st_size
+
+
+def _beside(path: Path) -> str:
+    """What recordings the folder of a missing one has, for a message."""
+    try:
+        near = sorted(p.name for p in path.parent.iterdir() if p.suffix.lower() in ENDINGS)
+    except OSError:
+        return ""
+    return f"; that folder has: {', '.join(near[:LISTED])}" if near else ""
+
+
+def budget_of(content: bytes) -> int:
+    """Bytes of numbers that a file of this content may hold [byte].
+
+    Example:
+        >>> budget_of(bytes(100)) == SMALL, budget_of(bytes(10_000_000)) == 200_000_000
+        (True, True)
+    """
+    return min(LARGEST, max(SMALL, PACKED * len(content)))
+
+
+def megabytes(size: int) -> str:
+    """A number of bytes for a message.
+
+    Example:
+        >>> megabytes(2_500_000)
+        '2.5 MB'
+    """
+    return f"{size / 1e6:.4g} MB"
+
+
+def shown(text: str) -> str:
+    """A name or cell in quotes for a message, cut where it is long.
+
+    Example:
+        >>> shown("phi"), shown(50 * "9")
+        ("'phi'", "'9999999999999999999999999999999999999999' (50 characters)")
+    """
+    return repr(text) if len(text) <= LONGEST else f"{text[:LONGEST]!r} ({len(text)} characters)"
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names in quotes for a message, the first of many.
+
+    Example:
+        >>> listed(["t", "phi"]), listed([])
+        ("'t', 'phi'", 'none')
+    """
+    more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
+    return ", ".join(shown(name) for name in names[:LISTED]) + more or "none"
 
 
 def digest_of(content: bytes) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,15 +11,18 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.data.array_files import mat_source, npz_source
 from hybrid_mpc.data.csv_files import csv_source
+from hybrid_mpc.data.doubts import Finding, unwrapped, wrapped
 from hybrid_mpc.data.sources import Columns, MissingColumn, Source
-from hybrid_mpc.data.units import factor
+from hybrid_mpc.data.units import factor, likely_unit, turn_of
 from hybrid_mpc.data_spec import DataSpec
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.signals import Signal
 
 Array = NDArray[np.float64]
 MIN_SCORED = 10
 """Fewest samples after the warm-up that make a piece worth a free run."""
+ABSURD = 1e100
+"""No machine has a value beyond: its square, and the square of that, could not be computed with."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +35,8 @@ class Table:
         sha256: SHA-256 of the file's bytes, in hexadecimal.
         t: Time stamps ``(m,)`` [s], strictly increasing.
         u: Inputs ``(m, n_u)``, held from each time stamp to the next.
-        y: Measured outputs ``(m, n_y)``.
+        y: Measured outputs ``(m, n_y)``; those of periodic signals count on.
+        findings: What reading had to change: angles that were wrapped. Default: nothing.
     """
 
     name: str
@@ -41,6 +45,7 @@ class Table:
     t: Array
     u: Array
     y: Array
+    findings: tuple[Finding, ...] = ()
 
     @property
     def dt(self) -> float:
@@ -53,7 +58,8 @@ def read_table(
 ) -> Table:
     """Read one recording, whose ending tells its format, and check what would mislead an identification.
 
-    Columns that ``spec`` does not name are ignored; ``spec.units`` are turned into the signals' own.
+    Columns that ``spec`` does not name are ignored; ``spec.units`` are turned into the signals' own. An angle that
+    jumps by full turns is made to count on if its signal is ``periodic``.
 
     ==========  ========================================================================================
     ``.npz``    named vectors (``numpy.savez``); objects are refused
@@ -75,10 +81,10 @@ def read_table(
 
     Raises:
         InputError: If the file or a column is missing, a cell is no finite number, columns differ in length,
-            time stamps repeat or decrease, values are implausible, the sampling is coarser than
-            ``max_gap`` throughout, or there are fewer samples than a window or the warm-up needs. Rows
-            are counted from 1 as an editor or MATLAB shows them (in CSV the header is row 1), the
-            indices of ``.npz`` from 0.
+            time stamps repeat or decrease, values are implausible, an angle jumps by full turns and its signal is
+            not ``periodic``, the sampling is coarser than ``max_gap`` throughout, or there are fewer samples than
+            a window or the warm-up needs; all that is wrong is told at once. Rows are counted from 1 as an
+            editor or MATLAB shows them (in CSV the header is row 1), the indices of ``.npz`` from 0.
 
     Example:
         >>> import tempfile
@@ -91,7 +97,7 @@ def read_table(
         >>> table.name, round(float(table.t[-1]), 6), round(float(table.y[0, 0]), 6)
         ('run', 3.9, 1.570796)
     """
-    return _table(source_of(Path(path)), spec, outputs, inputs)
+    return _only(_tables([(Path(path), source_of)], spec, outputs, inputs))
 
 
 def read_csv(
@@ -110,7 +116,7 @@ def read_csv(
         >>> table.name, table.y.shape
         ('run', (40, 1))
     """
-    return _table(csv_source(Path(path)), spec, outputs, inputs)
+    return _only(_tables([(Path(path), csv_source)], spec, outputs, inputs))
 
 
 def read_tables(
@@ -128,42 +134,99 @@ def read_tables(
         >>> read_tables([], spec, outputs=[Signal("y", "rad")], inputs=[Signal("u", "N m")])
         []
     """
-    own = {
-        path: replace(spec, inputs=spec.inputs_of.get(path.stem, spec.inputs)) for path in map(Path, paths)
-    }
-    try:
-        tables = [read_table(path, own[path], outputs=outputs, inputs=inputs) for path in map(Path, paths)]
-    except MissingColumn as error:
-        raise InputError(f"{error}{_unequal(own)}") from None
-    stems = [table.name for table in tables]
-    if len(set(stems)) < len(stems):
-        raise InputError(
-            f"two recordings have the same file stem: {', '.join(sorted(stems))}. Give each file once, or "
-            "rename one: pieces and windows are named by the stem."
-        )
+    tables, problems = checked_tables(paths, spec, outputs=outputs, inputs=inputs)
+    refuse(problems)
     return tables
 
 
-def _unequal(specs: Mapping[Path, DataSpec]) -> str:
-    """Columns that some of the recordings have and others lack, for a message; nothing if there are none."""
+def checked_tables(
+    paths: Sequence[Path | str], spec: DataSpec, *, outputs: Sequence[Signal], inputs: Sequence[Signal]
+) -> tuple[list[Table], list[str]]:
+    """The recordings of one run that can be read, and all problems of the others.
+
+    Args:
+        paths: The files.
+        spec: As in :func:`read_tables`.
+        outputs: Signals of ``spec.outputs``.
+        inputs: Signals of ``spec.inputs``.
+    """
+    tables, problems = _tables([(Path(path), source_of) for path in paths], spec, outputs, inputs)
+    stems = [Path(path).stem for path in paths]
+    if len(set(stems)) < len(stems):
+        problems.append(
+            f"two recordings have the same file stem: {', '.join(sorted(stems))}. Give each file once, or "
+            "rename one: pieces and windows are named by the stem."
+        )
+    return tables, problems
+
+
+def _tables(
+    files: Sequence[tuple[Path, Callable[[Path], Source]]],
+    spec: DataSpec,
+    outputs: Sequence[Signal],
+    inputs: Sequence[Signal],
+) -> tuple[list[Table], list[str]]:
+    """Tables of the files that can be read, and the problems of the others."""
+    _check_columns(spec, outputs, inputs)
+    tables: list[Table] = []
+    problems: list[str] = []
     there: dict[str, list[str]] = {}
     missing: dict[str, list[str]] = {}
-    for path, spec in specs.items():
-        for name in (spec.time, *spec.inputs, *spec.outputs):
-            try:
-                source_of(path).find(name)
-                there.setdefault(name, []).append(path.name)
-            except MissingColumn:
-                missing.setdefault(name, []).append(path.name)
-            except InputError:
-                pass  # a fault of its own, told when its turn comes
+    for path, opened in files:
+        own = replace(spec, inputs=spec.inputs_of.get(path.stem, spec.inputs))
+        try:
+            source = opened(path)
+            names, lacking = _found(source, own, there, missing)
+            problems += lacking
+            if not lacking:
+                tables.append(_table(source, own, names, outputs, inputs))
+        except InputError as error:
+            problems += error.problems
+    differ = _unequal(there, missing)
+    return tables, [*([differ] if differ else []), *problems]
+
+
+def _only(read: tuple[list[Table], list[str]]) -> Table:
+    """The one table that was read."""
+    refuse(read[1])
+    return read[0][0]
+
+
+def _check_columns(spec: DataSpec, outputs: Sequence[Signal], inputs: Sequence[Signal]) -> None:
+    if len(spec.outputs) != len(outputs) or len(spec.inputs) != len(inputs):
+        raise InputError(
+            f"data specification: {len(spec.inputs)} input and {len(spec.outputs)} output columns for a "
+            f"prior with {len(inputs)} inputs and {len(outputs)} outputs; "
+            "name one column for each, in its order"
+        )
+
+
+def _found(
+    source: Source, spec: DataSpec, there: dict[str, list[str]], missing: dict[str, list[str]]
+) -> tuple[list[str], list[str]]:
+    """Full names of the columns, and what is wrong with those that have none; notes what is there and what is not."""
+    names, problems = [], []
+    for name in (spec.time, *spec.inputs, *spec.outputs):
+        try:
+            names.append(source.find(name))
+            there.setdefault(name, []).append(source.path.name)
+        except MissingColumn as error:
+            problems.append(str(error))
+            missing.setdefault(name, []).append(source.path.name)
+        except InputError as error:
+            problems.append(str(error))
+    return names, problems
+
+
+def _unequal(there: Mapping[str, Sequence[str]], missing: Mapping[str, Sequence[str]]) -> str:
+    """Columns that some of the recordings have and others lack, for a message; nothing if there are none."""
     lines = "".join(
         f"\n  {name!r} is in {', '.join(there[name])} and not in {', '.join(files)}"
         for name, files in missing.items()
         if name in there
     )
-    remedy = " All need those that the DataSpec names; inputs_of names other inputs for single recordings:"
-    return f" Columns differ between the recordings.{remedy}{lines}" if lines else ""
+    remedy = "All need those that the DataSpec names; inputs_of names other inputs for single recordings:"
+    return f"Columns differ between the recordings. {remedy}{lines}" if lines else ""
 
 
 def source_of(path: Path) -> Source:
@@ -175,73 +238,97 @@ def source_of(path: Path) -> Source:
     return {".npz": npz_source, ".mat": mat_source}.get(path.suffix.lower(), csv_source)(path)
 
 
-def _table(source: Source, spec: DataSpec, outputs: Sequence[Signal], inputs: Sequence[Signal]) -> Table:
+def _table(
+    source: Source, spec: DataSpec, found: Sequence[str], outputs: Sequence[Signal], inputs: Sequence[Signal]
+) -> Table:
+    """The table of columns that are all there; every check is made, and what fails is told together."""
     path = source.path
-    if len(spec.outputs) != len(outputs) or len(spec.inputs) != len(inputs):
-        raise InputError(
-            f"data specification: {len(spec.inputs)} input and {len(spec.outputs)} output columns for a "
-            f"prior with {len(inputs)} inputs and {len(outputs)} outputs; "
-            "name one column for each, in its order"
-        )
     names = (spec.time, *spec.inputs, *spec.outputs)
     signals = (Signal("time", "s"), *inputs, *outputs)
-    columns = source.read([source.find(name) for name in names])
-    values = columns.values
-    for j, (name, signal) in enumerate(zip(names, signals, strict=True)):
-        if name in spec.units:
-            values[:, j] *= factor(name, spec.units[name], signal)
-    t, split = values[:, 0], 1 + len(inputs)
-    _check_time(path, t, columns, spec)
-    for signal, name, column in zip(signals[1:], names[1:], values[:, 1:].T, strict=True):
-        _check_range(path, signal, name, column, columns)
-    return Table(path.stem, path, source.sha256, t, values[:, 1:split], values[:, split:])
+    columns = source.read(found)
+    values, split = columns.values, 1 + len(inputs)
+    problems = list(columns.problems)
+    findings: list[Finding] = []
+    with np.errstate(over="ignore"):  # what overflows is out of its range
+        for j, (name, signal) in enumerate(zip(names, signals, strict=True)):
+            if name in spec.units:
+                values[:, j] *= factor(name, spec.units[name], signal)
+    t = values[:, 0]
+    if (np.abs(t) <= ABSURD).all():  # what is not is told with the ranges, or as no number
+        problems += _time_problems(t, columns, spec, path.stem)
+    clean = not problems and bool((np.abs(values) <= ABSURD).all())
+    for j, (signal, name) in enumerate(zip(signals, names, strict=True)):
+        note = ""
+        turn = turn_of(signal) if clean and j >= split else None
+        if turn is not None:
+            angle, jumps = unwrapped(t, values[:, j], turn, spec.max_gap)
+            if len(jumps):
+                findings.append(wrapped(path.name, name, signal, t, values[:, j], jumps))
+            if len(jumps) and signal.periodic:
+                values[:, j] = angle
+                note = f", with {len(jumps)} jumps of a full turn taken out"
+        problems += _range_problems(signal, name, values[:, j], columns, note)
+    problems += [finding.message for finding in findings if finding.refused]
+    refuse([f"{path}: {problem}" for problem in problems])
+    return Table(path.stem, path, source.sha256, t, values[:, 1:split], values[:, split:], tuple(findings))
 
 
-def _check_time(path: Path, t: Array, columns: Columns, spec: DataSpec) -> None:
+def _time_problems(t: Array, columns: Columns, spec: DataSpec, stem: str) -> list[str]:
+    """What is wrong with the time stamps, which are finite."""
     if len(t) < 2:
-        raise InputError(f"{path}: {len(t)} row(s) of numbers; a recording needs many. Record it again.")
+        return [f"{len(t)} row(s) of numbers; a recording needs many. Record it again."]
     steps = np.diff(t)
     if (steps <= 0).any():
         k = int(np.argmax(steps <= 0))
         what = "repeats" if steps[k] == 0 else "decreases"
-        raise InputError(
-            f"{path}: {columns.place(k + 1)}, column {spec.time!r}: time {what} ({t[k]:g} s, then "
-            f"{t[k + 1]:g} s). Time stamps must increase: delete the repeated rows or split "
-            "the file into recordings."
-        )
+        such = int((steps <= 0).sum())
+        return [
+            f"{columns.place(k + 1)}, column {spec.time!r}: time {what} ({t[k]:g} s, then {t[k + 1]:g} s"
+            f"{f'; {such} such rows' if such > 1 else ''}). Time stamps must increase: delete the repeated rows or "
+            "split the file into recordings."
+        ]
+    problems = []
     if steps.min() > spec.max_gap * (1 + 1e-6):
-        raise InputError(
-            f"{path}: sampling is {np.median(steps):g} s, declared max_gap is {spec.max_gap:g} s: every step "
+        problems.append(
+            f"sampling is {np.median(steps):g} s, declared max_gap is {spec.max_gap:g} s: every step "
             f"is a gap. Record faster, raise max_gap, or check that column {spec.time!r} is in seconds "
             "(DataSpec.units names another unit)."
         )
     need = spec.warm_up + MIN_SCORED * spec.dt
     length = float(t[-1] - t[0])
     if length < need:
-        raise InputError(
-            f"{path}: {len(t)} samples over {length:g} s are fewer than the {need:g} s that the warm-up "
+        problems.append(
+            f"{len(t)} samples over {length:g} s are fewer than the {need:g} s that the warm-up "
             f"({spec.warm_up:g} s) and {MIN_SCORED} periods need. Give a longer recording, or check that "
             f"column {spec.time!r} is in seconds (DataSpec.units names another unit)."
         )
-    for window in spec.windows.get(path.stem, ()):
-        if window.start < t[0] - spec.dt or window.end > t[-1] + spec.dt:
-            raise InputError(
-                f"{path}: the {window.role} window {window.start:g} to {window.end:g} s is not within the "
-                f"recording ({t[0]:g} to {t[-1]:g} s). Give the whole recording or change the window."
-            )
+    problems += [
+        f"the {window.role} window {window.start:g} to {window.end:g} s is not within the "
+        f"recording ({t[0]:g} to {t[-1]:g} s). Give the whole recording or change the window."
+        for window in spec.windows.get(stem, ())
+        if window.start < t[0] - spec.dt or window.end > t[-1] + spec.dt
+    ]
+    return problems
 
 
-def _check_range(path: Path, signal: Signal, name: str, column: Array, columns: Columns) -> None:
-    bad = (column < signal.lower) | (column > signal.upper)
-    if not bad.any():
-        return
-    k = int(np.argmax(bad))
-    hint = ""
-    limit = max(abs(signal.lower), abs(signal.upper))
-    if signal.unit in ("rad", "rad/s") and np.abs(column).max() > 4 * limit:
-        hint = f" It looks like degrees: say units={{{name!r}: 'deg'}} in the DataSpec."
-    raise InputError(
-        f"{path}: {columns.place(k)}, column {name!r}: {column[k]:g} is outside the plausible range "
-        f"{signal.lower:g} to {signal.upper:g} {signal.unit} of {signal.name} ({int(bad.sum())} such rows)."
-        f"{hint} Check unit and sign, or widen the range of the signal in the scenario's prior."
+def _range_problems(signal: Signal, name: str, column: Array, columns: Columns, note: str) -> list[str]:
+    """What is wrong with values that are there but implausible."""
+    lower, upper = max(signal.lower, -ABSURD), min(signal.upper, ABSURD)
+    bad = np.flatnonzero((column < lower) | (column > upper))  # NaN is neither, and told before
+    if not len(bad):
+        return []
+    first, worst = int(bad[0]), int(bad[np.argmax(np.abs(column[bad]))])
+    such = (
+        f" ({len(bad)} such rows, the largest {column[worst]:g} in {columns.place(worst)})"
+        if len(bad) > 1
+        else ""
     )
+    unit = likely_unit(column[~np.isnan(column)], signal)
+    hint = (
+        f" In {unit} it would be plausible: say units={{{name!r}: {unit!r}}} in the DataSpec." if unit else ""
+    )
+    return [
+        f"{columns.place(first)}, column {name!r}: {column[first]:g} is outside the plausible range "
+        f"{lower:g} to {upper:g} {signal.unit} of {signal.name}{note}{such}."
+        f"{hint} Check unit and sign, repair the rows, or widen the range of the signal in the scenario's prior."
+    ]

@@ -14,15 +14,20 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from hybrid_mpc.data.differentiation import local_polynomial, window_samples
-from hybrid_mpc.data.tables import MIN_SCORED, Table, read_tables
+from hybrid_mpc.data.doubts import Finding, doubts_of
+from hybrid_mpc.data.tables import MIN_SCORED, Table, checked_tables
 from hybrid_mpc.data_spec import DataSpec, Role, Window
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import SHOWN, InputError, refuse
 from hybrid_mpc.signals import Signal
 
 Array = NDArray[np.float64]
 ROLES: tuple[Role, ...] = ("train", "valid", "test")
 TINY = 1e-6
 """Tolerance [s] of comparisons between time stamps; far below any sampling time, above rounding."""
+UNEVEN = 20.0
+"""Times the median distance of the time stamps that the mean one may be: smoothing works on the median."""
+WORK = 2e10
+"""Most products of smoothing, samples times those in a window: half a minute."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +80,7 @@ class Dataset:
         files: File names, in the order given.
         sha256: SHA-256 of each file, in the same order.
         hash: One hash of all files' names and contents; it does not depend on their order or folder.
+        findings: What is doubtful about the recordings (:func:`~hybrid_mpc.data.doubts.doubts_of`). Default: nothing.
     """
 
     trajectories: tuple[Trajectory, ...]
@@ -83,6 +89,7 @@ class Dataset:
     files: tuple[str, ...]
     sha256: tuple[str, ...]
     hash: str
+    findings: tuple[Finding, ...] = ()
 
     def by_role(self, role: Role) -> tuple[Trajectory, ...]:
         """The trajectories of one role, in order."""
@@ -95,6 +102,7 @@ def load_trajectories(
     *,
     outputs: tuple[Signal, ...],
     inputs: tuple[Signal, ...],
+    states: Sequence[Signal] = (),
     needed: Sequence[Role] = ROLES,
 ) -> Dataset:
     """Read recordings, cut them at gaps, smooth and differentiate, resample to ``spec.dt``, give roles.
@@ -109,15 +117,19 @@ def load_trajectories(
         spec: Columns, ``dt``, ``max_gap``, ``smoothing``, ``warm_up`` [s] and the split.
         outputs: Signals of the prior's outputs (positions).
         inputs: Signals of the prior's inputs.
+        states: Signals of the prior's states ``[q, v, ...]``, for the plausible ranges of the speeds. Default: speeds
+            are not checked.
         needed: Roles that must not be empty. Default: all three.
 
     Returns:
-        The data set; it has at least one trajectory of each role that is needed.
+        The data set; it has at least one trajectory of each role that is needed. What is doubtful about the recordings
+        stands in its ``findings``.
 
     Raises:
-        InputError: If a recording is bad (see :func:`~hybrid_mpc.data.tables.read_table`), columns
-            differ between recordings, windows of different roles overlap, a role gets no trajectory, or
-            the sampling is too coarse for ``smoothing``.
+        InputError: If recordings are bad (see :func:`~hybrid_mpc.data.tables.read_table`), columns
+            differ between recordings, windows of different roles overlap, a role gets no trajectory,
+            the sampling is too coarse or too uneven for ``smoothing``, or the speeds are beyond all that is
+            plausible. It names all that is wrong with all files.
 
     Example:
         >>> import tempfile
@@ -134,22 +146,30 @@ def load_trajectories(
     if not paths:
         raise InputError("no recordings given; name at least one file with --data")
     _check_windows(spec)
-    tables = read_tables(paths, spec, outputs=outputs, inputs=inputs)
+    tables, problems = checked_tables(paths, spec, outputs=outputs, inputs=inputs)
     trajectories: list[Trajectory] = []
-    whole: list[Trajectory] = []
+    segments: list[list[Trajectory]] = []
     cuts: list[Cut] = []
     for table in tables:
-        segments = list(_segments(table, spec, cuts))
-        whole += segments
-        trajectories += _pieces(table, segments, spec, cuts)
+        try:
+            segments.append(list(_segments(table, spec, cuts)))
+            trajectories += _pieces(table, segments[-1], spec, cuts)
+        except InputError as error:
+            problems.append(f"{table.path}: {error}")
+            segments.append([])
+    findings = doubts_of(tables, segments, spec, outputs=outputs, states=states)
+    paths_of = {table.path.name: table.path for table in tables}
+    problems += [f"{paths_of[finding.file]}: {finding.message}" for finding in findings if finding.refused]
+    refuse(problems)
     _check_roles(trajectories, cuts, spec, needed)
     return Dataset(
         trajectories=tuple(trajectories),
-        whole=tuple(whole),
+        whole=tuple(segment for own in segments for segment in own),
         cuts=tuple(cuts),
         files=tuple(table.path.name for table in tables),
         sha256=tuple(table.sha256 for table in tables),
         hash=_hash(tables),
+        findings=findings,
     )
 
 
@@ -160,6 +180,7 @@ def _segments(table: Table, spec: DataSpec, cuts: list[Cut]) -> Iterator[Traject
         why = f"gap of {table.t[k + 1] - table.t[k]:.4g} s is longer than max_gap {spec.max_gap:g} s"
         cuts.append(Cut(table.path.name, float(table.t[k]), float(table.t[k + 1]), why))
     samples = window_samples(spec.smoothing, table.dt)
+    _check_sampling(table, samples, spec)
     shortest = max((samples - 1) * table.dt, (_fewest(spec) - 1) * spec.dt) + spec.dt
     number = 0
     for rows in np.split(np.arange(len(table.t)), gaps + 1):
@@ -169,6 +190,22 @@ def _segments(table: Table, spec: DataSpec, cuts: list[Cut]) -> Iterator[Traject
             continue
         number += 1
         yield _resample(table, rows, spec, _numbered(table.name, number))
+
+
+def _check_sampling(table: Table, samples: int, spec: DataSpec) -> None:
+    """Refuse sampling that smoothing would take gigabytes or minutes for."""
+    steps = np.diff(table.t)
+    mean = float(steps[steps <= spec.max_gap * (1 + 1e-6)].mean())
+    if mean > UNEVEN * table.dt:
+        raise InputError(
+            f"sampling is uneven: the time stamps are {table.dt:.3g} s apart in the median and {mean:.3g} s in "
+            "the mean. Record at one rate, or check the time stamps."
+        )
+    if samples * len(table.t) * mean / table.dt > WORK:
+        raise InputError(
+            f"smoothing of {spec.smoothing:g} s holds {samples} of {len(table.t)} samples, too many to work "
+            f"with. The model's period is {spec.dt:g} s: give every tenth or hundredth row, or split the recording."
+        )
 
 
 def _resample(table: Table, rows: NDArray[np.intp], spec: DataSpec, name: str) -> Trajectory:
@@ -271,7 +308,8 @@ def _check_roles(
 ) -> None:
     missing = [role for role in needed if all(piece.role != role for piece in trajectories)]
     if missing:
-        dropped = "".join(f"\n  {cut.file} {cut.start:g} to {cut.end:g} s: {cut.why}" for cut in cuts)
+        dropped = "".join(f"\n  {cut.file} {cut.start:g} to {cut.end:g} s: {cut.why}" for cut in cuts[:SHOWN])
+        dropped += f"\n  and {len(cuts) - SHOWN} more" if len(cuts) > SHOWN else ""
         raise InputError(
             f"no piece of {_fewest(spec) * spec.dt:g} s or more is left for {' and '.join(missing)}. "
             "Give more or longer recordings, or change windows, fractions or max_gap in the DataSpec."

@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.signals import Signal
 
@@ -24,6 +27,12 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "W": {"mW": 1e-3, "kW": 1e3},
 }
 """For each unit of a signal the units a recording may have, as multiples of it."""
+FILLED = 0.01
+"""Share of a signal's range that a column would have to fill in another unit for that unit to be proposed."""
+SHARE = 0.05
+"""Share of the samples beyond the range from which on a unit is proposed: a wrong unit is wrong in all rows."""
+BEYOND = 4.0
+"""Times the range's limit that a column must reach for a wrong unit to be proposed: less may be a wrong range."""
 
 
 def factor(column: str, unit: str | float, signal: Signal) -> float:
@@ -54,3 +63,41 @@ def factor(column: str, unit: str | float, signal: Signal) -> float:
             f"data specification: factor {unit} of column {column!r} to {signal.label} must be finite and not zero"
         )
     return float(unit)
+
+
+def likely_unit(column: NDArray[np.float64], signal: Signal) -> str:
+    """Unit in which a column that leaves its signal's plausible range would be plausible; empty if there is none.
+
+    It speaks only of a column that is beyond the range in many rows, far beyond (``BEYOND``), and that, in the other
+    unit, keeps to the range and fills a hundredth of it at least: a value of 1e300 is in no unit.
+
+    Args:
+        column: The numbers ``(m,)``; what is not finite is in no unit.
+        signal: What the column is.
+
+    Example:
+        >>> phi = Signal("phi", "rad", -3.2, 3.2)
+        >>> likely_unit(np.array([0.0, 90.0, -120.0]), phi), likely_unit(np.array([0.0, 1e307]), phi)
+        ('deg', '')
+    """
+    limit = max(abs(signal.lower), abs(signal.upper))
+    largest = float(np.abs(column).max(initial=0.0))
+    beyond = float(((column < signal.lower) | (column > signal.upper)).mean())
+    if beyond < SHARE or not BEYOND * limit < largest < math.inf:
+        return ""
+    for unit, size in UNITS.get(signal.unit, {}).items():
+        low, high = size * float(column.min()), size * float(column.max())
+        if size * largest >= FILLED * limit and signal.lower <= low and high <= signal.upper:
+            return unit
+    return ""
+
+
+def turn_of(signal: Signal) -> float | None:
+    """A full turn in the signal's unit; None if the signal is no angle.
+
+    Example:
+        >>> turn_of(Signal("phi", "deg")), turn_of(Signal("q", "m"))
+        (360.0, None)
+    """
+    radians = {"rad": 1.0, **UNITS["rad"]}.get(signal.unit)
+    return None if radians is None else TURN / radians

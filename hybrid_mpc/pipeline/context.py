@@ -33,6 +33,9 @@ class Progress(Protocol):
     def update(self, key: str, done: int, total: int, text: str) -> None:
         """Part ``key`` of the stage has done ``done`` of ``total``."""
 
+    def warn(self, text: str) -> None:
+        """Something that the user should know of, and that stops nothing."""
+
     def finish(self, text: str) -> None:
         """The stage is done."""
 
@@ -44,6 +47,9 @@ class Silent:
         """Ignored."""
 
     def update(self, key: str, done: int, total: int, text: str) -> None:
+        """Ignored."""
+
+    def warn(self, text: str) -> None:
         """Ignored."""
 
     def finish(self, text: str) -> None:
@@ -96,7 +102,9 @@ class Context:
         made = self.out / "data"
         files = list(self.settings.data) or sorted(made.glob("*.csv")) or sorted(made.glob("*.npz"))
         prior = self.scenario.prior()
-        return load_trajectories(files, self.spec, outputs=prior.outputs, inputs=prior.inputs)
+        return load_trajectories(
+            files, self.spec, outputs=prior.outputs, inputs=prior.inputs, states=prior.states
+        )
 
     def trajectories(self, role: str) -> list[Trajectory]:
         """Trajectories of one role."""

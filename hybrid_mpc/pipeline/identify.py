@@ -32,7 +32,7 @@ MODELS = ("phy_nominal", "phy", "rnn", "pgrnn", "mopgrnn")
 def check_data(context: Context) -> None:
     """Read the user's recordings before anything is written: bad ones leave no folder behind."""
     if context.settings.data:
-        _excitation(context)  # reads, checks and keeps the recordings
+        doubts(context)  # reads, checks and keeps the recordings
     elif context.scenario.make_data is None:
         raise InputError(
             f"scenario {context.scenario.name} is a real machine: give its recordings with --data FILE.csv "
@@ -41,12 +41,12 @@ def check_data(context: Context) -> None:
 
 
 def data_stage(context: Context) -> None:
-    """Take the user's recordings, or let a simulated machine make its own, and note what is in them."""
+    """Take the user's recordings, or let a simulated machine make its own; note what is in them, and all doubts."""
     if not context.settings.data:
         assert context.scenario.make_data is not None
         context.progress.update("files", 0, 1, "recording the simulated machine")
         context.scenario.make_data(context.out / "data", context.settings.seed, context.settings.budget)
-    dataset, warnings = context.dataset, _excitation(context)
+    dataset, warnings = context.dataset, doubts(context)
     roles = ("train", "valid", "test")
     context.save(
         "data",
@@ -59,16 +59,29 @@ def data_stage(context: Context) -> None:
             "warnings": list(warnings),
         },
     )
+    for warning in warnings:
+        context.progress.warn(warning)
 
 
-def _excitation(context: Context) -> tuple[str, ...]:
-    """What the training recordings leave in doubt; an input that does nothing is refused."""
+def doubts(context: Context) -> tuple[str, ...]:
+    """What is doubtful about the recordings, and what the training ones do not excite; some of it is refused.
+
+    Args:
+        context: The run.
+
+    Raises:
+        InputError: If a recording is bad, an input does nothing in those for training, or an output.
+    """
+    found = tuple(str(finding) for finding in context.dataset.findings)
     prior = context.scenario.prior()
     free = sum(not p.fixed for p in prior.parameters_spec)
     train = context.trajectories("train")
     if not train:  # the prior's fit says so
-        return ()
-    return check_excitation(train, inputs=prior.inputs, outputs=prior.outputs, parameters=free)
+        return found
+    return (
+        *found,
+        *check_excitation(train, inputs=prior.inputs, outputs=prior.outputs, parameters=free),
+    )
 
 
 def prior_stage(context: Context) -> None:
@@ -95,6 +108,8 @@ def prior_stage(context: Context) -> None:
         "smoother": {"sigma": smoother.sigma, "walk": smoother.walk},
     }
     context.save("prior", {**asdict(fit), **notes}, arrays)
+    for warning in fit.warnings:
+        context.progress.warn(f"fit of the prior: {warning}")
 
 
 def fit_and_smooth(

@@ -29,3 +29,5 @@ def prior_with_delay(context: Context) -> None:
     }
     arrays = {f"{t.name}/{key}": getattr(t, key) for t in every for key in ("x", "xdot")}
     context.save("prior", {**asdict(physics.fit), **notes}, arrays)
+    for warning in physics.fit.warnings:
+        context.progress.warn(f"fit of the prior: {warning}")

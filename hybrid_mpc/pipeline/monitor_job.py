@@ -104,7 +104,9 @@ def prepared(
             f"the model's period is {hybrid.dt} s, scenario {scenario.name} resamples to {scenario.data.dt} s"
         )
     spec = replace(scenario.data, windows={})  # all of a recording is watched
-    data = load_trajectories(recordings, spec, outputs=hybrid.outputs, inputs=hybrid.inputs)
+    data = load_trajectories(
+        recordings, spec, outputs=hybrid.outputs, inputs=hybrid.inputs, states=hybrid.states
+    )
     sigma, _ = find_noise(scenario, artifact, folder, ("hybrid_observer",), 0, noise)
     stored = artifact.calibration if calibration is None else read_json(calibration)
     detector = None if stored is None else stored.get("detector")
@@ -167,6 +169,7 @@ def watch(job: MonitorJob, out: Path) -> dict[str, Any]:
         save(figure, out / f"{name}.png")
     result = {
         "recordings": rows,
+        "warnings": [str(finding) for finding in job.data.findings],
         "gaps": [cut._asdict() for cut in job.data.cuts if "gap" in cut.why],
         "detector": None if job.detector is None else job.detector.to_dict(),
         "thresholds": None if job.monitor.calibration is None else job.monitor.calibration.to_dict(),

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.closed_loop.faults import check_channels, install
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.scenario import Budget, ControlSpec, Plant, Scenario, Task
@@ -82,10 +82,7 @@ def check_scenario(scenario: Scenario, budget: Budget | None = None) -> None:
         model = _check_export(report, scenario, prior)
     _check_control(report, scenario, prior, model)
     _check_plant(report, scenario, prior, model)
-    if report.problems:
-        many = f"{len(report.problems)} problems" if len(report.problems) > 1 else "a problem"
-        lines = "".join(f"\n  - {text}" for text in report.problems)
-        raise InputError(f"scenario {scenario.name} has {many}:{lines}")
+    refuse([f"scenario {scenario.name}: {text}" for text in report.problems])
 
 
 def _check_prior(report: _Report, scenario: Scenario) -> Prior | None:

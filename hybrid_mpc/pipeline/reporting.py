@@ -139,6 +139,8 @@ def _notes(context: Context, results: dict[str, Any]) -> dict[str, dict[str, tup
     without = [r["reason"] for r in (tested, *(tested[n] for n in OBSERVERS)) if r and "reason" in r]
     if without:
         after["estimation"] = (f"Not tested: {'; '.join(dict.fromkeys(without))}.",)
+    if results["data"]["details"]["warnings"]:
+        after["data"] = tuple(f"Warning: {text}" for text in results["data"]["details"]["warnings"])
     after["training"] = _anchor_words(training_settings(context, "mopgrnn").anchors)
     warnings = context.result("prior")["warnings"]
     if warnings:
@@ -192,7 +194,7 @@ def _data_table(results: dict[str, Any]) -> Table:
         for c, why in zip(data["cuts"], data["details"]["why_cut"], strict=True)
     ]
     caption = f"{len(data['files'])} files; content hash {data['hash'][:16]}."
-    return Table(("part", "length [s]"), rows, " ".join([caption, *data["details"]["warnings"]]))
+    return Table(("part", "length [s]"), rows, caption)
 
 
 def _prior_table(context: Context) -> Table:

@@ -163,6 +163,7 @@ def _write(context: Context, settings: SearchSettings, found: SearchResult) -> d
     from hybrid_mpc.plots import search as plots
 
     out, space, best = context.out, settings.space, overrides(found, settings.space)
+    data = context.result("data")
     rows = [_plain(row) for row in found.trials]
     results = {
         "schema": "hybrid-mpc search",
@@ -174,7 +175,7 @@ def _write(context: Context, settings: SearchSettings, found: SearchResult) -> d
         "space": {name: space.bounds(name) for name in space.names},
         "base_settings": asdict(identify.training_settings(context, settings.kind)),
         "versions": versions(),
-        "data": {"hash": context.result("data")["hash"]},
+        "data": {"hash": data["hash"], "warnings": data.get("warnings", [])},  # older searches have none
         "base_value": found.base,
         "best": _plain(found.best),
         "settings": best,

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.data.trajectories import Dataset, Trajectory
 from hybrid_mpc.reproduction.claims import Claim
 
 
@@ -53,7 +53,8 @@ class Experiment:
         figure: Name of the paper's figure, e.g. ``"Fig. 3"``.
         data_sets: Title of each data set by its name. Validation and test runs are the same in all of them.
         most: Training runs that there are.
-        runs: ``(data set, seed, folder) -> trajectories`` of all roles in order; files go into ``folder``.
+        runs: ``(data set, seed, folder) -> trajectories`` of all roles in order, or the data set that recordings were
+            read as, whose findings are told; files go into ``folder``.
         measured: True: the states are not measured. Then the prior is fitted to every amount of training data
             anew, and its equations smooth them. False: states are exact and the prior is taken as it is.
         shown: Name of the test run that is drawn (the paper's Fig. 6).
@@ -69,7 +70,7 @@ class Experiment:
     figure: str
     data_sets: Mapping[str, str]
     most: int
-    runs: Callable[[str, int, Path], Sequence[Trajectory]]
+    runs: Callable[[str, int, Path], Sequence[Trajectory] | Dataset]
     measured: bool
     shown: str
     efforts: Mapping[str, Effort]

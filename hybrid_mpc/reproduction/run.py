@@ -9,7 +9,7 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.data.trajectories import Dataset, Trajectory
 from hybrid_mpc.files import read_arrays, read_json
 from hybrid_mpc.pipeline.context import Progress, Silent
 from hybrid_mpc.pipeline.devices import check_device
@@ -123,13 +123,27 @@ class Work:
         return round(self.scenario.data.warm_up / self.scenario.data.dt)
 
     @cached_property
-    def recorded(self) -> dict[str, list[Trajectory]]:
-        """All trajectories of each data set; the same seed makes the same ones."""
-        sets: dict[str, list[Trajectory]] = {}
+    def sets(self) -> dict[str, Sequence[Trajectory] | Dataset]:
+        """What the experiment gives for each data set; the same seed makes the same."""
+        sets: dict[str, Sequence[Trajectory] | Dataset] = {}
         for i, name in enumerate(self.experiment.data_sets):
             self.progress.update("data sets", i, len(self.experiment.data_sets), name)
-            sets[name] = list(self.experiment.runs(name, self.settings.seed, self.out / "data" / name))
+            sets[name] = self.experiment.runs(name, self.settings.seed, self.out / "data" / name)
         return sets
+
+    @cached_property
+    def recorded(self) -> dict[str, list[Trajectory]]:
+        """All trajectories of each data set."""
+        return {
+            name: list(found.trajectories if isinstance(found, Dataset) else found)
+            for name, found in self.sets.items()
+        }
+
+    @property
+    def doubts(self) -> list[str]:
+        """What is doubtful about the recordings."""
+        read = [found.findings for found in self.sets.values() if isinstance(found, Dataset)]
+        return list(dict.fromkeys(str(finding) for findings in read for finding in findings))
 
     def trajectories(self, data_set: str, role: str, most: int) -> list[Trajectory]:
         """The first trajectories of a role, as they were recorded."""
@@ -202,9 +216,9 @@ class Work:
         return [Row.of(row) for job in found for row in job.get("rows", ())]
 
     def notes(self) -> list[str]:
-        """What was left out, and why."""
+        """What is doubtful about the recordings, and what was left out, and why."""
         missing = missing_for_sindy()
-        return [WITHOUT_SINDY.format(missing)] if missing else []
+        return [*self.doubts, *([WITHOUT_SINDY.format(missing)] if missing else [])]
 
     def done(self, key: str) -> bool:
         """Whether a job has left its files."""
@@ -235,7 +249,8 @@ class Work:
 
 def record_stage(work: Work) -> None:
     """Make the recordings, again if the reproduction was interrupted: the same seed makes the same ones."""
-    work.recorded  # noqa: B018  made and kept
+    for doubt in work.doubts:
+        work.progress.warn(doubt)
 
 
 def fit_stage(work: Work) -> None:
@@ -250,6 +265,9 @@ def fit_stage(work: Work) -> None:
             (work.settings.scenario, train, valid, work.effort.fit, work.folder / key),
         )
     work.run(jobs)
+    for key in jobs:
+        for warning in read_json(work.folder / f"{key}.json")["warnings"]:
+            work.progress.warn(f"{key}: {warning}")
 
 
 def physics_stage(work: Work) -> None:

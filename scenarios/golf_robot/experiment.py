@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from hybrid_mpc.data.trajectories import Trajectory, load_trajectories
+from hybrid_mpc.data.trajectories import Dataset, load_trajectories
 from hybrid_mpc.data_spec import DataSpec
 from hybrid_mpc.reproduction.claims import Claim, above, below, level, narrower, ordered, steady
 from hybrid_mpc.reproduction.experiment import Effort, Experiment
 from scenarios.golf_robot.data import SIZES, make_data, windows
-from scenarios.golf_robot.nominal import INPUTS, OUTPUTS
+from scenarios.golf_robot.nominal import INPUTS, OUTPUTS, STATES
 
 FIGURE = "paper, Fig. 5 ({}) and its text"
 GOAL = "goal of this project, ({})"
@@ -26,10 +26,10 @@ DATA = DataSpec(
 """How the recordings are read, here and by the main job."""
 
 
-def runs(data_set: str, seed: int, folder: Path) -> list[Trajectory]:
+def runs(data_set: str, seed: int, folder: Path) -> Dataset:
     """All recordings of a data set; their files go into ``folder``."""
     files = make_data(folder, seed, "full", data_set=data_set)
-    return list(load_trajectories(files, DATA, outputs=OUTPUTS, inputs=INPUTS).trajectories)
+    return load_trajectories(files, DATA, outputs=OUTPUTS, inputs=INPUTS, states=STATES)
 
 
 def claims(data_set: str, rnn: float, pgrnn: float, mopgrnn: float) -> tuple[Claim, ...]:

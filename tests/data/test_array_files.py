@@ -76,14 +76,14 @@ def test_a_single_number_as_time_is_the_sampling_time(tmp_path, kind):
         ("phi", 11.0, "column 'phi': 11 is outside the plausible range -10 to 10 rad"),
         ("time_s", 0.1, "column 'time_s': time repeats"),
         ("time_s", 0.05, "column 'time_s': time decreases"),
-        ("phi", 90.0, "units={'phi': 'deg'}"),
+        ("phi", 1e307, "column 'phi': 1e\\+307 is outside the plausible range -10 to 10 rad of phi. Check"),
     ],
 )
 def test_a_bad_number_is_named_as_the_files_own_tools_count(tmp_path, kind, name, value, match):
     columns = {key: column.copy() for key, column in GOOD.items()}
     columns[name][11] = value
     word, first = FIRST[kind]
-    refused(wrote(tmp_path, kind, columns), rf"{word} {11 + first}, {match}" if "=" not in match else match)
+    refused(wrote(tmp_path, kind, columns), rf"{word} {11 + first}, {match}")
 
 
 def test_bad_columns(tmp_path, kind):
@@ -168,7 +168,7 @@ def test_bytes_that_crash_loadmat_are_refused_before_it(tmp_path):
     savemat(text, {"t": T, "note": "ab"})
     whole = text.getvalue()
     assert version(whole) == "5"
-    check_structure(whole)
+    check_structure(whole, 10**6)
     path = tmp_path / "run.mat"
     size = whole.index(b"note") - 16  # the number of bytes of its dimensions
     for place, value in ((145, 255), (176, 0), (177, 255), (size, 0), (size, 14)):

@@ -49,7 +49,11 @@ def test_round_trip_and_same_bytes(tmp_path):
         ("abc", r"row 12, column 'phi' is 'abc'"),
         ("", r"row 12, column 'phi' is empty"),
         ("11", r"row 12, column 'phi': 11 is outside .* -10 to 10 rad"),
-        ("90", r"degrees"),
+        ("1e307", r"row 12, column 'phi': 1e\+307 is outside .* -10 to 10 rad of phi\. Check"),
+        (
+            "90",
+            r"row 12, column 'phi': 90 is outside .* -10 to 10 rad of phi\. Check",
+        ),  # one row is no wrong unit
     ],
 )
 def test_bad_cell_is_named_by_row_and_column(tmp_path, cell, match):
@@ -57,6 +61,50 @@ def test_bad_cell_is_named_by_row_and_column(tmp_path, cell, match):
     cells = rows[11].split(",")
     rows[11] = ",".join([*cells[:2], cell, *cells[3:]])
     refused(tmp_path, rows, match)
+
+
+def test_a_unit_is_proposed_where_it_would_explain_the_column(tmp_path):
+    write = lambda phi: write_csv(tmp_path / "run.csv", {**GOOD, "phi": phi}).read_text()  # noqa: E731
+    degrees = np.rad2deg(np.sin(3 * T))
+    refused(tmp_path, write(degrees), r"In deg it would be plausible: say units=\{'phi': 'deg'\}")
+    absurd = np.where(np.arange(60) == 40, 1e307, degrees)
+    refused(tmp_path, write(absurd), r"the largest 1e\+307 in row 42\)\. Check unit")  # in no unit
+    refused(
+        tmp_path,
+        write(12 * np.sin(3 * T)),
+        r"of phi \(\d+ such rows, the largest 1\d.* in row \d+\)\. Check unit",
+    )
+    refused(tmp_path, write(1e7 * np.sin(3 * T)), r"in row \d+\)\. Check unit")
+
+
+def test_an_absurd_value_is_named_where_its_signal_has_no_range(tmp_path):
+    columns = {**GOOD, "phi": np.where(np.arange(60) == 40, -1e307, np.sin(T))}
+    path = write_csv(tmp_path / "run.csv", columns)
+    free = {"outputs": (Signal("phi", "rad"),), "inputs": (Signal("torque", "N m"),)}
+    with pytest.raises(
+        InputError, match=r"row 42, column 'phi': -1e\+307 is outside the plausible range -1e\+100"
+    ):
+        read_csv(path, SPEC, **free)
+    write_csv(path, {**columns, "phi": np.sin(T), "time_s": np.where(np.arange(60) == 59, 1e307, T)})
+    with pytest.raises(InputError, match=r"row 61, column 'time_s': 1e\+307"):
+        read_csv(path, SPEC, **free)
+
+
+def test_all_that_is_wrong_with_a_file_is_told_at_once(tmp_path):
+    rows = lines(tmp_path)
+    rows[5] = "0.04,broken,0.1,0"
+    rows[11], rows[12] = "0.1,0.9,nan,0", "0.11,0.9,,0"
+    rows[20] = "0.19,77,0.1,0"
+    refused(
+        tmp_path,
+        rows,
+        r"3 problems:\n.*row 6, column 'tau' is 'broken'(.|\n)*row 12, column 'phi' is 'nan'.*\(2 such rows\)(.|\n)*"
+        r"row 21, column 'tau': 77 is outside",
+    )
+    refused(
+        tmp_path, ["time_s,ta,ph,note", *rows[1:]], r"2 problems:\n.*no column 'tau'.*\n.*no column 'phi'"
+    )
+    refused(tmp_path, [*rows[:5], "1,2", "1,2", *rows[7:]], r"row 6 has 2 cells, .* has 4 \(2 such rows\)")
 
 
 def test_bad_files(tmp_path):

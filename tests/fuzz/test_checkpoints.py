@@ -5,17 +5,14 @@ import shutil
 
 import pytest
 
-from hybrid_mpc.pipeline.context import STAGES
-from tests.fuzz.forked import command, refused
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.pipeline.context import STAGES, Context
+from hybrid_mpc.pipeline.settings import RunSettings
+from hybrid_mpc.scenario import load_scenario
+from tests.fuzz.forked import command
 from tests.pipeline.conftest import arguments, finished, machine
 
 __all__ = ["arguments", "finished", "machine"]  # fixtures
-READ_BY = {
-    "data": "export", "prior": "training", "training/pgrnn": "training", "training/mopgrnn": "training",
-    "evaluation": "export", "control": "estimation", "monitor": "guard", "guard": "report", "estimation": "report",
-    "analysis": "report",
-}  # fmt: skip
-"""Checkpoints, and a stage that reads each of them before it has computed much."""
 
 
 def damages(content, rng):
@@ -30,30 +27,56 @@ def damages(content, rng):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("name", READ_BY)
-def test_damage_is_named(arguments, finished, tmp_path, name):
+def test_damage_of_any_checkpoint_is_named(finished, tmp_path):
+    """Whatever is damaged: the file is named, and what to delete, before anything is computed on top of it."""
     out = shutil.copytree(finished, tmp_path / "run")
-    folder = out / "checkpoints"
-    for stage in STAGES[STAGES.index(READ_BY[name]) :]:
-        if stage != name:
-            (folder / f"{stage}.json").unlink()
-    for ending in ("json", "npz"):
-        path = folder / f"{name}.{ending}"
-        if not path.is_file():
+    context = Context(RunSettings("golf_robot"), load_scenario("golf_robot"), out)
+    tried, rng = 0, random.Random(0)
+    for path in sorted((out / "checkpoints").rglob("*.*")):
+        stage = str(path.relative_to(out / "checkpoints").with_suffix(""))
+        read = {".json": context.result, ".npz": context.arrays}.get(path.suffix)
+        if read is None:
             continue
+        read(stage)
         content = path.read_bytes()
-        for what, damaged in damages(content, random.Random(name)):
-            if damaged == content:
-                continue
-            path.write_bytes(damaged)
-            ended = command(*arguments, "--out", out, "--resume")
-            assert path.name in ended.told or path.with_suffix(".json").name in ended.told, (
-                f"{name}, {what}:\n{ended.told}"
-            )
-            assert "delete" in ended.told, f"{name}, {what}:\n{ended.told}"
-            assert ended.code == 2, f"{name}, {what}:\n{ended.told}"
-            assert "Traceback" not in ended.told, f"{name}, {what}:\n{ended.told}"
+        for what, damaged in damages(content, rng):
+            if damaged != content:
+                path.write_bytes(damaged)
+                with pytest.raises(InputError, match=r"delete .*--resume computes it anew") as told:
+                    read(stage)
+                assert path.stem in str(told.value), what
+                tried += 1
+        path.unlink()
+        with pytest.raises(InputError, match="is missing"):
+            read(stage)
         path.write_bytes(content)
+    assert tried >= 67
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", ["prior.npz", "training/mopgrnn.json", "evaluation.json"])
+def test_a_run_that_is_resumed_on_damage_says_so(arguments, finished, tmp_path, name):
+    out = shutil.copytree(finished, tmp_path / "run")
+    for stage in (
+        "report",
+        "analysis",
+        "guard",
+        "monitor",
+        "estimation",
+        "control",
+        "export",
+        "evaluation",
+        "training",
+    ):
+        if not name.startswith(f"{stage}."):
+            (out / "checkpoints" / f"{stage}.json").unlink(missing_ok=True)
+    path = out / "checkpoints" / name
+    path.write_bytes(path.read_bytes()[:-20])
+    ended = command(*arguments, "--out", out, "--resume")
+    assert ended.code == 2, ended.told
+    assert path.name in ended.told or path.stem in ended.told
+    assert "delete" in ended.told
+    assert "Traceback" not in ended.told
 
 
 @pytest.mark.full
@@ -93,4 +116,3 @@ def test_names_of_stages_are_those_of_the_job():
     from hybrid_mpc.pipeline.run import STAGES as WITH_FUNCTIONS
 
     assert tuple(name for name, _, _ in WITH_FUNCTIONS) == STAGES
-    assert refused

@@ -18,16 +18,20 @@ GOOD = {
 }  # fmt: skip
 ODD = [
     None, True, "on", "", "no such", -1, 10**30, 1e308, float("inf"), float("nan"), 2.5, [], [[]], {}, [None], [True],
-    [10**30], [-1], ["a", "a"], {"a": None}, {"a": {"b": "c"}}, "2024-01-01", "1:30", [{"target": 5}], "x" * 5000, 10**9,
+    [10**30], [-1], ["a", "a"], {"a": None}, {"a": {"b": "c"}}, "2024-01-01", "1:30", [{"target": 5}], "x" * 5000,
+    10**9,
 ]  # fmt: skip
 RAW = {
-    "nothing": "", "a text": "hello", "a list": "- 1\n- 2\n", "tabs": "a:\t- b\n\tc: d", "a tag": "a: !!python/object:os.x {}",
-    "applied": "scenario: !!python/object/apply:os.system ['touch executed']", "an alias": "a: &x [1]\nb: *x\n",
-    "laughs": "a: &a [x, x]\nb: &b [*a, *a]\nc: &c [*b, *b]\n", "twice": "seeds: 1\nseeds: 2\n", "deep": "[" * 30_000,
-    "deep mapping": "a: " + "{a: " * 5000, "long": "seeds: [" + "1, " * 40_000 + "]", "control": "a: \x07", "a file": "../x",
-    "a script": "scenario: trap.py\nmodels: model\n", "merge": "<<: {seeds: 3}\nscenario: golf_robot\nmodels: m\n",
+    "nothing": "", "a text": "hello", "a list": "- 1\n- 2\n", "tabs": "a:\t- b\n\tc: d",
+    "a tag": "a: !!python/object:os.x {}", "an alias": "a: &x [1]\nb: *x\n", "a file": "../x",
+    "applied": "scenario: !!python/object/apply:os.system ['touch executed']",
+    "laughs": "a: &a [x, x]\nb: &b [*a, *a]\nc: &c [*b, *b]\n", "twice": "seeds: 1\nseeds: 2\n",
+    "deep": "[" * 30_000, "deep mapping": "a: " + "{a: " * 5000, "long": "seeds: [" + "1, " * 40_000 + "]",
+    "control": "a: \x07", "a script": "scenario: trap.py\nmodels: model\n",
+    "merge": "<<: {seeds: 3}\nscenario: golf_robot\nmodels: m\n",
     "a date": "scenario: golf_robot\nmodels: m\nname: 2024-01-01\nseeds: 2024-01-01\n",
-    "unknown": "scenario: golf_robot\nmodels: m\nhorizon: 5\n", "a number as a key": "1: 2\nscenario: golf_robot\nmodels: m\n",
+    "unknown": "scenario: golf_robot\nmodels: m\nhorizon: 5\n",
+    "a number as a key": "1: 2\nscenario: golf_robot\nmodels: m\n",
 }  # fmt: skip
 
 

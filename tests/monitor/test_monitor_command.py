@@ -115,3 +115,36 @@ def test_an_alarm_is_explained_once(folder, golf_artifact):
     trace, alarms = watched(job, job.data.whole[1])
     assert len(alarms) == len(trace.intervals())
     assert all(alarm["diagnosis"] for alarm in alarms)
+
+
+def test_a_frozen_sensor_is_told_and_watched_all_the_same(folder, golf_artifact, tmp_path):
+    rows = np.genfromtxt(folder / "pushed.csv", delimiter=",", names=True)
+    rows["phi_rad"][300:360] = rows["phi_rad"][300]
+    columns = {name: rows[name] for name in ("time_s", "u_nm", "phi_rad")}
+    write_csv(tmp_path / "pushed.csv", columns)
+    calibration = str(folder / "calibration.json")
+    (tmp_path / "control.json").write_text((folder / "control.json").read_text())
+    done = command(tmp_path, golf_artifact, tmp_path / "out", "--calibration", calibration)
+    assert done.exit_code == 0, done.output
+    found = json.loads((tmp_path / "out" / "monitor.json").read_text())
+    (warning,) = found["warnings"]
+    assert warning.startswith("pushed.csv: column 'phi_rad' repeats")
+    assert f"warning: {warning}" in done.output
+    # 10 samples are missing before: the stretch begins at sample 310
+    start = 310 * DT
+    assert any(
+        start < alarm["start_s"] < start + 60 * DT + 0.5
+        for row in found["recordings"]
+        for alarm in row["alarms"]
+    )
+
+
+def test_a_wrapped_angle_is_refused_where_the_model_knows_no_turns(folder, golf_artifact, tmp_path):
+    """The golf robot's angle is no periodic signal; an estimator takes a jump of a turn for a blow."""
+    t = DT * np.arange(600)
+    phi = (2.0 * t + np.pi) % (2 * np.pi) - np.pi
+    write_csv(tmp_path / "pushed.csv", {"time_s": t, "u_nm": np.sin(t), "phi_rad": phi})
+    (tmp_path / "control.json").write_text((folder / "control.json").read_text())
+    done = command(tmp_path, golf_artifact, tmp_path / "out")
+    assert isinstance(done.exception, InputError)
+    assert "jumps 4 times by about a full turn" in str(done.exception)

@@ -40,12 +40,14 @@ def write(path: Path, columns: dict[str, np.ndarray]) -> Path:
 
 @pytest.fixture(scope="session")
 def machine(tmp_path_factory) -> Path:
-    """Folder with ``my_machine.py`` (the README's lines) and two recordings."""
+    """Folder with ``my_machine.py`` (the README's lines) and two recordings, one with ten samples that repeat."""
     folder = tmp_path_factory.mktemp("machine")
     blocks = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
     (folder / "my_machine.py").write_text(blocks[0] + TINY)
     for i, name in enumerate(("monday", "tuesday")):
-        write(folder / f"{name}.csv", recording(i))
+        columns = recording(i)
+        columns["phi_rad"][600 : 600 + 10 * i] = columns["phi_rad"][600]
+        write(folder / f"{name}.csv", columns)
     return folder
 
 
@@ -67,4 +69,5 @@ def finished(arguments, tmp_path_factory) -> Path:
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "report.html" in done.stdout
+    (out.parent / "told.txt").write_text(done.stdout)
     return out

@@ -70,7 +70,7 @@ def still(lines):
         (no_column, ["bad.csv", "tau_nm", "torque"]),
         (short, ["bad.csv", "s"]),
         (coarse, ["bad.csv", "max_gap"]),
-        (degrees, ["bad.csv", "phi", "degrees"]),
+        (degrees, ["bad.csv", "phi", "In deg it would be plausible", "units={'phi_rad': 'deg'}"]),
         (empty, ["bad.csv", "empty"]),
         (idle, ["bad", "tau", "0.1 throughout"]),
         (still, ["bad", "phi", "never moved"]),

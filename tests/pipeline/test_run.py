@@ -40,6 +40,14 @@ def test_folder_holds_what_the_readme_says(finished):
     assert {"recordings.png", "training.png", "errors.png", "step_times.png", "poles.png"} <= names
 
 
+def test_doubts_about_recordings_reach_terminal_results_and_report(finished):
+    (warning,) = results(finished)["data"]["details"]["warnings"]
+    assert "tuesday.csv: column 'phi_rad' repeats" in warning
+    page = (finished / "report.html").read_text()
+    assert "Warning: tuesday.csv: column" in page
+    assert f"warning: {warning}" in (finished.parent / "told.txt").read_text()
+
+
 def test_the_fitted_prior_beats_the_nominal_one(finished):
     # the machine's parameters are 10 to 20 % off the README's nominal ones, and it has dry friction
     rmse = results(finished)["identification"]["rmse_rad"]

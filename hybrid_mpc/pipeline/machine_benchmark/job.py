@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hybrid_mpc.data.trajectories import Trajectory
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import (
     check_writable,
     digest,
@@ -87,53 +87,69 @@ def benchmark(
         InputError: If a file, the model, the budget or the folder does not fit.
     """
     progress, scenario = progress or Silent(), load_scenario(settings.scenario)
-    spec = benchmark_of(scenario)
     _check(settings, scenario)
     check_scenario(scenario)
-    tests = {path.name: read_test(scenario, path) for path in settings.test}
+    data, tests, doubts = _read(settings, scenario)
+    for doubt in doubts:
+        progress.warn(doubt)
     check_writable(out)
     with locked(out):
-        started = time.monotonic()
-        notes: dict[str, Any] = {}
-        if settings.model is not None:
-            model = load_model(settings.model, scenario.name)
-        else:
-            model, notes = _made(settings, scenario, out, progress)
-        prior = scenario.prior(model.physics.fit.values)
-        if settings.model is None and not tests:
-            held = read_training(scenario, settings.data).held_back
-            tests = {"held back": held} if held else {}
-        progress.start("free runs over the test files")
-        runs: dict[str, list[Run]] = {}
-        test: dict[str, Any] = {}
-        for i, (name, trajectories) in enumerate(tests.items()):
-            progress.update("files", i, len(tests), name)
-            runs[name] = run_freely(
-                prior,
-                model.physics,
-                model.networks,
-                trajectories,
-                warm_up=scenario.data.warm_up,
-                length=spec.length,
-            )
-            test[name] = {m: figures_of(runs[name], m, unit=spec.unit, scale=spec.scale) for m in MODELS}
-            test[name]["hybrid"] = figures_of(runs[name], model.hybrid, unit=spec.unit, scale=spec.scale)
-            if settings.refit is not None:
-                test[name]["refit"] = _changed(scenario, model, trajectories[0], settings.refit)
-            test[name]["scored_s"] = sum(len(run.t) for run in runs[name]) * model.dt
-        progress.finish("")
-        results = {
-            "schema": SCHEMA,
-            "machine": scenario.name,
-            "budget": settings.budget if settings.model is None else None,
-            "seed": settings.seed if settings.model is None else None,
-            **notes,
-            "model": describe(model, scenario),
-            "test": test,
-            "versions": versions(),
-            "timing": {"seconds": time.monotonic() - started},
-        }
-        write_json(out / "results.json", results)
+        return _made_and_judged(settings, scenario, data, tests, doubts, out, progress)
+
+
+def _made_and_judged(
+    settings: BenchmarkSettings,
+    scenario: Scenario,
+    data: Recordings | None,
+    tests: dict[str, tuple[Trajectory, ...]],
+    doubts: list[str],
+    out: Path,
+    progress: Progress,
+) -> tuple[dict[str, Any], dict[str, list[Run]]]:
+    spec, started = benchmark_of(scenario), time.monotonic()
+    notes: dict[str, Any] = {}
+    if data is None:
+        assert settings.model is not None
+        model = load_model(settings.model, scenario.name)
+    else:
+        model, notes = _made(settings, scenario, data, out, progress)
+    for warning in model.physics.fit.warnings:
+        progress.warn(f"fit of the prior: {warning}")
+    prior = scenario.prior(model.physics.fit.values)
+    if data is not None and not tests and data.held_back:
+        tests = {"held back": data.held_back}
+    progress.start("free runs over the test files")
+    runs: dict[str, list[Run]] = {}
+    test: dict[str, Any] = {}
+    for i, (name, trajectories) in enumerate(tests.items()):
+        progress.update("files", i, len(tests), name)
+        runs[name] = run_freely(
+            prior,
+            model.physics,
+            model.networks,
+            trajectories,
+            warm_up=scenario.data.warm_up,
+            length=spec.length,
+        )
+        test[name] = {m: figures_of(runs[name], m, unit=spec.unit, scale=spec.scale) for m in MODELS}
+        test[name]["hybrid"] = figures_of(runs[name], model.hybrid, unit=spec.unit, scale=spec.scale)
+        if settings.refit is not None:
+            test[name]["refit"] = _changed(scenario, model, trajectories[0], settings.refit)
+        test[name]["scored_s"] = sum(len(run.t) for run in runs[name]) * model.dt
+    progress.finish("")
+    results = {
+        "schema": SCHEMA,
+        "machine": scenario.name,
+        "budget": settings.budget if settings.model is None else None,
+        "seed": settings.seed if settings.model is None else None,
+        **notes,
+        "warnings": doubts,
+        "model": describe(model, scenario),
+        "test": test,
+        "versions": versions(),
+        "timing": {"seconds": time.monotonic() - started},
+    }
+    write_json(out / "results.json", results)
     return results, runs
 
 
@@ -168,11 +184,33 @@ def describe(model: BenchmarkModel, scenario: Scenario) -> dict[str, Any]:
     }
 
 
+def _read(
+    settings: BenchmarkSettings, scenario: Scenario
+) -> tuple[Recordings | None, dict[str, tuple[Trajectory, ...]], list[str]]:
+    """Training files if there are to be some, test files by name, and what is doubtful about them."""
+    data: Recordings | None = None
+    tests: dict[str, tuple[Trajectory, ...]] = {}
+    problems: list[str] = []
+    doubts: list[str] = []
+    if settings.model is None:
+        try:
+            data = read_training(scenario, settings.data)
+            doubts += [str(finding) for finding in data.dataset.findings]
+        except InputError as error:
+            problems += error.problems
+    for path in settings.test:
+        try:
+            tests[path.name] = read_test(scenario, path, doubts.append)
+        except InputError as error:
+            problems += error.problems
+    refuse(problems)
+    return data, tests, list(dict.fromkeys(doubts))
+
+
 def _made(
-    settings: BenchmarkSettings, scenario: Scenario, out: Path, progress: Progress
+    settings: BenchmarkSettings, scenario: Scenario, data: Recordings, out: Path, progress: Progress
 ) -> tuple[BenchmarkModel, dict[str, Any]]:
     """Fit and train, or take what ``out`` holds of it; and what is known of the data."""
-    data = read_training(scenario, settings.data)
     _claim(out, settings, data)
     spec, warm_up, dt = benchmark_of(scenario), scenario.data.warm_up, scenario.data.dt
     progress.start("fitting the prior")

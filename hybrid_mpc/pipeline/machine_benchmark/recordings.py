@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -76,7 +76,7 @@ def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
         )
     needed: tuple[Role, ...] = () if spec.cycle or uncut else ("train", "valid")
     dataset = load_trajectories(
-        paths, scenario.data, outputs=prior.outputs, inputs=prior.inputs, needed=needed
+        paths, scenario.data, outputs=prior.outputs, inputs=prior.inputs, states=prior.states, needed=needed
     )
     parts = _parts(dataset, scenario, uncut)
     train, valid, held = (tuple(p for p in parts if p.role == role) for role in ("train", "valid", "test"))
@@ -162,20 +162,31 @@ def whole_runs(dataset: Dataset, every: int) -> tuple[Trajectory, ...]:
     )
 
 
-def read_test(scenario: Scenario, path: Path) -> tuple[Trajectory, ...]:
+def read_test(
+    scenario: Scenario, path: Path, warn: Callable[[str], None] = lambda text: None
+) -> tuple[Trajectory, ...]:
     """A test file as whole runs, one for each side of a gap; windows known for a file's name are not looked at.
+
+    Args:
+        scenario: The machine.
+        path: The file.
+        warn: Takes what is doubtful about it. Default: nobody does.
 
     Raises:
         InputError: If the file is bad or nothing of it is long enough.
     """
     prior = scenario.prior()
     spec = replace(scenario.data, windows={})
-    whole = load_trajectories([path], spec, outputs=prior.outputs, inputs=prior.inputs, needed=()).whole
-    if not whole:
+    dataset = load_trajectories(
+        [path], spec, outputs=prior.outputs, inputs=prior.inputs, states=prior.states, needed=()
+    )
+    if not dataset.whole:
         raise InputError(
             f"{path}: no part is long enough for a free run after {spec.warm_up:g} s that are given"
         )
-    return whole
+    for finding in dataset.findings:
+        warn(str(finding))
+    return dataset.whole
 
 
 def in_turn(trajectory: Trajectory, spec: BenchmarkSpec, distance: float) -> tuple[Trajectory, ...]:

@@ -1,0 +1,232 @@
+"""What is doubtful about recordings: told where it is, and nothing told where all is well."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybrid_mpc.data import load_trajectories, read_table, write_csv
+from hybrid_mpc.data_spec import DataSpec
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.scenario import load_scenario
+from hybrid_mpc.signals import Signal
+
+RECORDINGS = Path(__file__).parents[3] / "shared" / "data"
+SPEC = DataSpec("t", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.2)
+PHI, PHI_DOT = Signal("phi", "rad", -80, 80), Signal("phi_dot", "rad/s", -20, 20)
+SIGNALS = {"outputs": (PHI,), "inputs": (Signal("tau", "N m"),), "states": (PHI, PHI_DOT)}
+FREE = {**SIGNALS, "states": ()}
+TURNS = {**SIGNALS, "outputs": (replace(PHI, periodic=True),)}
+T = np.arange(0, 20, 0.01)
+TAU = np.sin(1.3 * T) + 0.5 * np.sign(np.sin(0.9 * T))
+SWING = 1.2 * np.sin(1.3 * T) + 0.4 * np.sin(3.1 * T)
+NOISE = 2e-4 * np.random.default_rng(0).standard_normal(len(T))
+STEP = 2 * np.pi / 4096
+
+
+def quantised(y):
+    return STEP * np.round(y / STEP)
+
+
+def findings(tmp_path, phi, tau=TAU, signals=SIGNALS, name="run", spec=SPEC, t=T):
+    file = write_csv(tmp_path / f"{name}.csv", {"t": t, "tau": tau, "phi": phi})
+    return load_trajectories([file], spec, **signals).findings
+
+
+SENSORS = {"encoder": quantised, "noisy": lambda y: y + NOISE, "exact": np.copy}
+
+
+@pytest.fixture(params=SENSORS)
+def sensor(request):
+    return SENSORS[request.param]
+
+
+def test_sound_sensors_are_not_doubted(tmp_path, sensor):
+    assert findings(tmp_path, sensor(SWING)) == ()
+    # rest, where an encoder repeats itself for long, between a stop and a start by friction
+    still = 1.2 * np.cos(np.minimum(2 * T, 3 * np.pi)) + 0.6 * np.cos(np.clip(2 * T - 24, 0, None))
+    assert findings(tmp_path, sensor(still), tau=np.where(np.abs(T - 8) < 4, 0.1, TAU)) == ()
+
+
+def test_a_very_coarse_encoder_is_not_doubted(tmp_path):
+    coarse = lambda y: np.round(y, 1)  # noqa: E731
+    assert findings(tmp_path, coarse(SWING)) == ()
+    assert findings(tmp_path, coarse(0.1 * SWING)) == ()  # some steps of the sensor in all
+
+
+def test_a_sensor_slower_than_its_recording_is_not_doubted(tmp_path):
+    assert findings(tmp_path, np.repeat(SWING[::8], 8)) == ()
+
+
+def test_frozen_sensors(tmp_path, sensor):
+    phi = sensor(SWING)
+    phi[500:620] = phi[500]
+    phi[900:930] = phi[900]
+    (one,) = findings(tmp_path, phi, signals=FREE)  # where it ends its speed is beyond all bounds, too
+    assert (one.kind, one.file, one.channel, one.count, one.refused) == (
+        "frozen",
+        "run.csv",
+        "phi",
+        150,
+        False,
+    )
+    assert one.start == 5.0
+    for words in (
+        "run.csv: column 'phi' repeats",
+        "from 5 to 6.19 s, 120 samples (1 more such stretch, 150",
+        "delete",
+    ):
+        assert words in str(one)
+
+
+def test_a_sensor_that_stops_at_rest_is_told_by_the_inputs(tmp_path):
+    """It never moves again, so nothing is abrupt: the inputs go on as before."""
+    resting = quantised(SWING * np.clip((10 - T) / 3, 0, 1) ** 2)  # comes to rest at 10 s
+    (one,) = findings(tmp_path, resting)
+    assert (one.kind, "while the inputs move as they do elsewhere" in one.message) == ("frozen", True)
+    assert one.start == pytest.approx(10.0, abs=0.3)
+    assert findings(tmp_path, resting, tau=np.where(T > 9.5, 0.2 * TAU, TAU)) == ()  # too little to move it
+    # a file that stands still from its begin to its end, among others that move
+    good = write_csv(tmp_path / "good.csv", {"t": T, "tau": TAU, "phi": quantised(SWING)})
+    dead = write_csv(tmp_path / "dead.csv", {"t": T, "tau": TAU, "phi": 0 * T + 0.3})
+    found = load_trajectories([good, dead], SPEC, **SIGNALS).findings
+    assert [(one.kind, one.file, one.count) for one in found] == [("frozen", "dead.csv", len(T))]
+
+
+def test_clipped_sensors(tmp_path, sensor):
+    phi = np.clip(sensor(SWING), -2.0, 1.0)
+    (one,) = findings(tmp_path, phi)
+    assert (one.kind, one.channel, one.count) == ("clipped", "phi", int((phi == 1.0).sum()))
+    assert one.start == pytest.approx(T[np.argmax(phi == 1.0)])
+    for words in ("stands at its largest value, 1 rad", "clipped", "against a stop"):
+        assert words in str(one)
+    both = findings(tmp_path, np.clip(sensor(SWING), -0.8, 1.0))
+    assert [one.message.split("its ")[1].split(" ")[0] for one in both] == ["largest", "smallest"]
+
+
+def test_wrapped_angles_count_on_where_the_signal_is_periodic(tmp_path):
+    turning = 3.0 * T + 0.8 * np.sin(2 * T)  # ten turns
+    wrapped = (turning + np.pi) % (2 * np.pi) - np.pi
+    jumps = int((np.abs(np.diff(wrapped)) > np.pi).sum())
+    (one,) = findings(tmp_path, wrapped, signals=TURNS)
+    assert (one.kind, one.count, one.refused) == ("wrapped", jumps, False)
+    assert one.start == pytest.approx(T[1 + np.argmax(np.abs(np.diff(wrapped)) > np.pi)])
+    assert f"jumps {jumps} times by about a full turn" in str(one)
+    file = tmp_path / "run.csv"
+    read = read_table(file, SPEC, outputs=TURNS["outputs"], inputs=TURNS["inputs"])
+    np.testing.assert_allclose(read.y[:, 0], turning, atol=1e-8)  # ten digits in the file
+    # the same in degrees, and from 0 to 360
+    spec = replace(SPEC, units={"phi": "deg"})
+    (same,) = findings(tmp_path, np.rad2deg(turning) % 360, signals=TURNS, spec=spec)
+    assert same.kind == "wrapped"
+    with pytest.raises(
+        InputError, match=r"run.csv: column 'phi' jumps \d+ times .* Declare Signal.*periodic=True"
+    ):
+        findings(tmp_path, wrapped)
+    near = replace(PHI, periodic=True, lower=-8, upper=8)
+    with pytest.raises(
+        InputError, match=r"8\.\d+ is outside .* of phi, with \d+ jumps of a full turn taken out"
+    ):
+        findings(tmp_path, wrapped, signals={**TURNS, "outputs": (near,)})
+
+
+def test_angles_that_count_on_are_left_as_they_are(tmp_path):
+    fast = {**TURNS, "outputs": (Signal("phi", "rad", periodic=True),), "states": ()}
+    t = T[::2]
+    for speed in (1.0, 2 * np.pi / 0.02):  # a whole turn from sample to sample
+        phi = speed * t + 0.1 * np.sin(t)
+        spec = replace(SPEC, smoothing=0.2)
+        assert findings(tmp_path, phi, t=t, tau=TAU[::2], signals=fast, spec=spec) == ()
+        read = read_table(tmp_path / "run.csv", SPEC, outputs=fast["outputs"], inputs=fast["inputs"])
+        np.testing.assert_allclose(read.y[:, 0], phi, rtol=1e-9)
+    # an angle that trembles about where it is wrapped, and one that jumps by a turn over a gap in time
+    upright = np.pi + 0.01 * np.sin(9 * T)
+    (one,) = findings(tmp_path, (upright + np.pi) % (2 * np.pi) - np.pi, signals=TURNS)
+    assert one.kind == "wrapped"
+    np.testing.assert_allclose(
+        np.ptp(load_trajectories([tmp_path / "run.csv"], SPEC, **TURNS).whole[0].y), 0.02, rtol=1e-2
+    )
+    gap = np.r_[T[:900], T[1000:]]
+    assert (
+        findings(
+            tmp_path, np.where(gap < 9.5, SWING[0] + gap, gap - 6.28), t=gap, tau=np.sin(gap), signals=TURNS
+        )
+        == ()
+    )
+
+
+def test_a_length_is_no_angle(tmp_path):
+    slider = {**SIGNALS, "outputs": (Signal("q", "m"),), "states": ()}
+    jumping = np.where(T % 4 < 2, 0.0, 2 * np.pi) + SWING * 0.1
+    assert [one.kind for one in findings(tmp_path, jumping, signals=slider) if one.kind == "wrapped"] == []
+
+
+def test_speeds_beyond_what_is_plausible(tmp_path):
+    spike = SWING + NOISE
+    spike[700:703] += 3.0
+    (one,) = findings(tmp_path, spike)
+    assert (one.kind, one.channel, one.refused) == ("speed", "phi", False)
+    assert 6.9 < one.start < 7.1
+    assert 0 < one.count < 10
+    for words in ("reaches", "rad/s at", "-20 to 20 rad/s", "unit is wrong", "DataSpec.units"):
+        assert words in str(one)
+    # degrees that a wide range of the position lets pass
+    with pytest.raises(
+        InputError, match=r"run.csv: column 'phi', differentiated, reaches .* so is its mean, .*\(rms\)"
+    ):
+        findings(tmp_path, np.rad2deg(SWING), signals={**SIGNALS, "outputs": (Signal("phi", "rad"),)})
+    other = (PHI, Signal("n", "rpm", -1, 1))  # no rate of a radian: nothing to compare with
+    assert findings(tmp_path, SWING + NOISE, signals={**SIGNALS, "states": other}) == ()
+
+
+def test_all_files_are_told_at_once(tmp_path):
+    wrapped = (3.0 * T + np.pi) % (2 * np.pi) - np.pi
+    files = [
+        write_csv(tmp_path / "a.csv", {"t": T, "tau": TAU, "phi": wrapped}),
+        write_csv(tmp_path / "b.csv", {"t": T, "tau": TAU, "phi": np.where(T == 5.0, 99.0, SWING)}),
+        write_csv(tmp_path / "c.csv", {"t": T[::-1], "tau": TAU, "phi": SWING}),
+        tmp_path / "d.csv",
+        write_csv(tmp_path / "e.csv", {"t": T, "tau": TAU, "phi": SWING}),
+        write_csv(tmp_path / "f.csv", {"t": T, "tau": TAU, "phi": 0.9 * np.rad2deg(SWING)}),
+    ]
+    with pytest.raises(InputError) as caught:
+        load_trajectories(files, SPEC, **SIGNALS)
+    told = caught.value.problems
+    words = ("a.csv: column 'phi' jumps", "b.csv: row 502", "c.csv: row 3", "d.csv: there is no such file",
+             "f.csv: row")  # fmt: skip
+    assert len(told) == len(words)
+    for problem, start in zip(told, words, strict=True):
+        assert start in problem
+        assert problem in str(caught.value)
+
+
+REAL = {
+    "unbalanced_disk": "unbalanced_disk/*.npz",
+    "emps": "emps/*.mat",
+    "xl330_pendulum": "xl330_pendulum/*.csv",
+    "torque_pendulum": "torque_pendulum/*.csv",
+}
+
+
+@pytest.mark.skipif(not RECORDINGS.is_dir(), reason="the real recordings are not on this machine")
+@pytest.mark.parametrize("machine", REAL)
+def test_nothing_is_doubted_about_real_recordings(machine):
+    files = sorted(RECORDINGS.glob(REAL[machine]))
+    assert files
+    scenario = load_scenario(machine)
+    prior = scenario.prior()
+    given = {"outputs": prior.outputs, "inputs": prior.inputs, "states": prior.states, "needed": ()}
+    assert load_trajectories(files, scenario.data, **given).findings == ()
+    for file in files:  # alone, too
+        assert load_trajectories([file], scenario.data, **given).findings == ()
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("machine", ["golf_robot", "unbalanced_disk", "pendulum"])
+def test_nothing_is_doubted_about_simulated_recordings(tmp_path, machine):
+    scenario = load_scenario(machine)
+    prior = scenario.prior()
+    files = scenario.make_data(tmp_path, 0, "quick")
+    given = {"outputs": prior.outputs, "inputs": prior.inputs, "states": prior.states}
+    assert load_trajectories(files, scenario.data, **given).findings == ()
