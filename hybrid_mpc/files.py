@@ -17,11 +17,12 @@ import os
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 import nn_export.files
@@ -36,6 +37,8 @@ MOST_CONTENT = 2**31
 """Largest recording [bytes] that is read."""
 MOST_MEMBERS = 100_000
 """Most arrays in a file."""
+HEADER = 10_100
+"""Bytes of an array's begin that hold its header: numpy reads none of more than 10 000 characters [byte]."""
 HASH, ARRAYS_HASH = "sha256", "arrays_sha256"
 """Fields of a document that hold hashes: of its content, of the arrays beside it."""
 LOCK = ".lock"
@@ -233,44 +236,61 @@ def _with(text: str, remedy: str) -> str:
     return f"{text}; {remedy}" if remedy else text
 
 
-def check_npz(content: bytes, most: int) -> None:
-    """Refuse a ``.npz`` that holds anything but plain arrays, or unpacks to more than it may, before it is unpacked.
+def check_npz(content: bytes, budget: int, names: Sequence[str] | None = None) -> None:
+    """Check what an archive of arrays declares before any array is decompressed.
 
     Args:
-        content: The file.
-        most: Bytes that its arrays may have together.
+        content: The ``.npz`` file.
+        budget: Most bytes of numbers in these arrays, each counted as 8 of them at least [byte].
+        names: Arrays that are to be read. Default: all; others may hold anything.
 
     Raises:
-        ValueError: If that is so.
-        zipfile.BadZipFile: If it is no archive.
+        ValueError: If there are too many members, one is packed in a way that numpy does not pack, is no array, or
+            holds another number of bytes than its shape declares, or they are larger than the budget.
+        zipfile.BadZipFile: If it is no archive, or a damaged one.
+        KeyError: If there is no array of such a name.
 
     Example:
         >>> file = io.BytesIO()
-        >>> np.savez_compressed(file, a=np.zeros(10**6))
-        >>> check_npz(file.getvalue(), most=10**6)
+        >>> np.savez(file, t=np.zeros(1000))
+        >>> check_npz(file.getvalue(), 8000)
+        >>> check_npz(file.getvalue(), 7999)
         Traceback (most recent call last):
         ...
-        ValueError: its arrays have 8000128 bytes, at most 1000000 are read
+        ValueError: its arrays take 0.008 MB, more than the 0.007999 MB that are read
     """
+    if content.count(b"PK\x01\x02") > MOST_MEMBERS:  # the mark of an entry in the list of members
+        raise ValueError(f"it has more than {MOST_MEMBERS} members")
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        members = archive.infolist()
-        if len(members) > MOST_MEMBERS:
-            raise ValueError(f"it has {len(members)} arrays, at most {MOST_MEMBERS} are read")
-        if (size := sum(member.file_size for member in members)) > most:
-            raise ValueError(f"its arrays have {size} bytes, at most {most} are read")
-        for member in members:
-            with archive.open(member) as file:
-                version = np.lib.format.read_magic(file)
-                if version not in _HEADERS:
-                    raise ValueError(f"{member.filename} is of format {version}, which is not read")
-                shape, _, dtype = _HEADERS[version](file)
-            if dtype.hasobject:
-                raise ValueError(f"{member.filename} holds objects, which could run code")
-            if math.prod(shape) * dtype.itemsize > member.file_size or max(shape, default=0) > most:
-                raise ValueError(f"{member.filename} is shorter than its shape {str(shape)[:60]}")
+        members = archive.namelist()
+        wanted = members if names is None else [n if n in members else f"{n}.npy" for n in names]
+        size = sum(_declared(archive, name) for name in wanted)
+    if size > budget:
+        raise ValueError(
+            f"its arrays take {size / 1e6:.4g} MB, more than the {budget / 1e6:.4g} MB that are read"
+        )
 
 
-_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+def _declared(archive: zipfile.ZipFile, name: str) -> int:
+    """Bytes that an array takes by its header, each number counted as 8 of them at least [byte]."""
+    member = archive.getinfo(name)
+    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"member {name[:80]!r} is packed in another way than numpy's")
+    with archive.open(member) as file:
+        begin = io.BytesIO(file.read(HEADER))
+    read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}.get(npy.read_magic(begin))
+    if read is None:
+        raise ValueError(f"member {name[:80]!r} is no array of numbers")
+    shape, _, dtype = read(begin)
+    if dtype.hasobject:  # which are refused when they are to be read
+        return member.file_size
+    count = math.prod(shape)
+    if min(shape, default=0) < 0 or begin.tell() + count * dtype.itemsize != member.file_size:
+        raise ValueError(
+            f"member {name[:80]!r} declares the shape {str(shape)[:60]} ({len(str(shape))} characters) of {dtype.str} and holds "
+            f"{member.file_size} bytes"
+        )
+    return count * max(8, dtype.itemsize)
 
 
 def read_bytes(path: Path, limit: int) -> bytes:

@@ -152,7 +152,7 @@ def claimed(shape, descr="<f8", content=b""):
     "content",
     [
         b"", b"rubbish", npz(a=np.zeros(3))[:-30], npz(a=np.zeros(300_000_000 // 8)), claimed((10**12,)),
-        claimed((10**9, 10**9)), claimed((-1,)), claimed((0, 10**30)), claimed((2,), "|O", b"x" * 16),
+        claimed((10**9, 10**9)), claimed((-1,)), claimed((0, 10**30), content=b"x"), claimed((2,), "|O", b"x" * 16),
         claimed((2,), "|V99999999999", b"x"), claimed((2,)).replace(b"NUMPY", b"NIMPY"),
     ],
 )  # fmt: skip

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import io
-import math
 import warnings
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,70 +17,10 @@ from scipy.io.matlab import MatlabObject, MatlabOpaque, MatReadWarning
 from hybrid_mpc.data.mat_structure import check_structure, version
 from hybrid_mpc.data.sources import Columns, Source, budget_of, content_of, digest_of, megabytes, shown
 from hybrid_mpc.errors import InputError, refuse
+from hybrid_mpc.files import check_npz
 
 Array = NDArray[np.float64]
 Lookup = Callable[[str], NDArray[Any]]
-MEMBERS = 10_000
-"""Most members of a ``.npz`` file."""
-HEADER = 10_100
-"""Bytes of an array's begin that hold its header: numpy reads none of more than 10 000 characters [byte]."""
-
-
-def check_npz(content: bytes, budget: int, names: Sequence[str] | None = None) -> None:
-    """Check what an archive of arrays declares before any array is decompressed.
-
-    Args:
-        content: The ``.npz`` file.
-        budget: Most bytes of numbers in these arrays, each counted as 8 of them at least [byte].
-        names: Arrays that are to be read. Default: all; others may hold anything.
-
-    Raises:
-        ValueError: If there are too many members, one is packed in a way that numpy does not pack, is no array, or
-            holds another number of bytes than its shape declares, or they are larger than the budget.
-        zipfile.BadZipFile: If it is no archive, or a damaged one.
-        KeyError: If there is no array of such a name.
-
-    Example:
-        >>> file = io.BytesIO()
-        >>> np.savez(file, t=np.zeros(1000))
-        >>> check_npz(file.getvalue(), 8000)
-        >>> check_npz(file.getvalue(), 7999)
-        Traceback (most recent call last):
-        ...
-        ValueError: its arrays take 0.008 MB, more than the 0.007999 MB that are read
-    """
-    if content.count(b"PK\x01\x02") > MEMBERS:  # the mark of an entry in the list of members
-        raise ValueError(f"it has more than {MEMBERS} members")
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        members = archive.namelist()
-        wanted = members if names is None else [n if n in members else f"{n}.npy" for n in names]
-        size = sum(_declared(archive, name) for name in wanted)
-    if size > budget:
-        raise ValueError(
-            f"its arrays take {megabytes(size)}, more than the {megabytes(budget)} that are read"
-        )
-
-
-def _declared(archive: zipfile.ZipFile, name: str) -> int:
-    """Bytes that an array takes by its header, each number counted as 8 of them at least [byte]."""
-    member = archive.getinfo(name)
-    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise ValueError(f"member {shown(name)} is packed in another way than numpy's")
-    with archive.open(member) as file:
-        begin = io.BytesIO(file.read(HEADER))
-    read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}.get(npy.read_magic(begin))
-    if read is None:
-        raise ValueError(f"member {shown(name)} is no array of numbers")
-    shape, _, dtype = read(begin)
-    if dtype.hasobject:  # which are refused when they are to be read
-        return member.file_size
-    count = math.prod(shape)
-    if min(shape, default=0) < 0 or begin.tell() + count * dtype.itemsize != member.file_size:
-        raise ValueError(
-            f"member {shown(name)} declares the shape {shown(str(shape))} of {dtype.str} and holds "
-            f"{member.file_size} bytes"
-        )
-    return count * max(8, dtype.itemsize)
 
 
 def npz_source(path: Path) -> Source:
