@@ -35,7 +35,7 @@ MOST_ARRAYS = 2**30
 """Largest content [bytes] of a file of arrays, unpacked."""
 MOST_CONTENT = 2**31
 """Largest recording [bytes] that is read."""
-MOST_MEMBERS = 100_000
+MOST_MEMBERS = 10_000
 """Most arrays in a file."""
 HEADER = 10_100
 """Bytes of an array's begin that hold its header: numpy reads none of more than 10 000 characters [byte]."""
@@ -287,8 +287,8 @@ def _declared(archive: zipfile.ZipFile, name: str) -> int:
     count = math.prod(shape)
     if min(shape, default=0) < 0 or begin.tell() + count * dtype.itemsize != member.file_size:
         raise ValueError(
-            f"member {name[:80]!r} declares the shape {str(shape)[:60]} ({len(str(shape))} characters) of {dtype.str} and holds "
-            f"{member.file_size} bytes"
+            f"member {name[:80]!r} declares the shape {str(shape)[:60]}... ({len(str(shape))} characters) of "
+            f"{dtype.str} and holds {member.file_size} bytes"
         )
     return count * max(8, dtype.itemsize)
 

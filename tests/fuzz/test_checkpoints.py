@@ -57,17 +57,7 @@ def test_damage_of_any_checkpoint_is_named(finished, tmp_path):
 @pytest.mark.parametrize("name", ["prior.npz", "training/mopgrnn.json", "evaluation.json"])
 def test_a_run_that_is_resumed_on_damage_says_so(arguments, finished, tmp_path, name):
     out = shutil.copytree(finished, tmp_path / "run")
-    for stage in (
-        "report",
-        "analysis",
-        "guard",
-        "monitor",
-        "estimation",
-        "control",
-        "export",
-        "evaluation",
-        "training",
-    ):
+    for stage in STAGES[STAGES.index("training") :]:
         if not name.startswith(f"{stage}."):
             (out / "checkpoints" / f"{stage}.json").unlink(missing_ok=True)
     path = out / "checkpoints" / name
