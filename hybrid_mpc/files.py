@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 import nn_export.files
 from hybrid_mpc.errors import InputError, StorageError
-from hybrid_mpc.records import plain
+from hybrid_mpc.records import plain, shown
 
 MOST_JSON = 16 * 2**20
 """Largest JSON file [bytes] that is read. A model's own is a few KiB, the longest results are a few hundred."""
@@ -287,8 +287,8 @@ def _declared(archive: zipfile.ZipFile, name: str) -> int:
     count = math.prod(shape)
     if min(shape, default=0) < 0 or begin.tell() + count * dtype.itemsize != member.file_size:
         raise ValueError(
-            f"member {name[:80]!r} declares the shape {str(shape)[:60]}... ({len(str(shape))} characters) of "
-            f"{dtype.str} and holds {member.file_size} bytes"
+            f"member {name[:80]!r} declares the shape {shown(str(shape))} of {dtype.str} and holds "
+            f"{member.file_size} bytes"
         )
     return count * max(8, dtype.itemsize)
 

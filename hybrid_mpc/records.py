@@ -21,6 +21,8 @@ LARGEST = 2**63
 """Whole numbers of this size or more are refused: no array, seed or count can hold them."""
 MOST_SEED = 2**31 - 1
 """Largest seed: a thousand times it, as loops number theirs, still fits 64 bits."""
+LONGEST = 40
+"""Characters of a text that a message shows."""
 MOST_NAMED = 20
 """So many problems of one file are named; a damaged one may have thousands."""
 
@@ -120,8 +122,20 @@ def _short(value: object) -> str:
         return f"a list of {len(value)}"
     if isinstance(value, int) and not isinstance(value, bool) and abs(value) >= LARGEST:
         return "a whole number beyond 64 bits"
+    if isinstance(value, str):
+        return shown(value)
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:50]}... ({len(text)} characters)"
+
+
+def shown(text: str) -> str:
+    """A text in quotes for a message, cut where it is long.
+
+    Example:
+        >>> shown("phi"), shown(50 * "9")
+        ("'phi'", "'9999999999999999999999999999999999999999' (50 characters)")
+    """
+    return repr(text) if len(text) <= LONGEST else f"{text[:LONGEST]!r} ({len(text)} characters)"
 
 
 def _dataclass(kind: type[Any], data: object, where: str, problems: list[str]) -> Any:

@@ -15,9 +15,10 @@ from scipy.io import loadmat
 from scipy.io.matlab import MatlabObject, MatlabOpaque, MatReadWarning
 
 from hybrid_mpc.data.mat_structure import check_structure, version
-from hybrid_mpc.data.sources import Columns, Source, budget_of, content_of, digest_of, megabytes, shown
+from hybrid_mpc.data.sources import Columns, Source, budget_of, content_of, digest_of, megabytes
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import check_npz
+from hybrid_mpc.records import shown
 
 Array = NDArray[np.float64]
 Lookup = Callable[[str], NDArray[Any]]

@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.data.sources import LARGEST, Columns, Source, content_of, digest_of, megabytes, shown
+from hybrid_mpc.data.sources import LARGEST, Columns, Source, content_of, digest_of, megabytes
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import write_text
+from hybrid_mpc.records import shown
 
 Array = NDArray[np.float64]
 Row = tuple[int, list[str]]

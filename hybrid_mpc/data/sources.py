@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.records import LONGEST, shown
 
 Array = NDArray[np.float64]
 ENDINGS = (".csv", ".npz", ".mat")
@@ -33,8 +34,6 @@ LISTED = 30
 """Most names that a message lists."""
 COMPARED = 1000
 """Most names among which a message looks for one that is nearly right."""
-LONGEST = 40
-"""Most characters of a name or cell that a message shows."""
 
 
 class MissingColumn(InputError):
@@ -194,16 +193,6 @@ def megabytes(size: int) -> str:
         '2.5 MB'
     """
     return f"{size / 1e6:.4g} MB"
-
-
-def shown(text: str) -> str:
-    """A name or cell in quotes for a message, cut where it is long.
-
-    Example:
-        >>> shown("phi"), shown(50 * "9")
-        ("'phi'", "'9999999999999999999999999999999999999999' (50 characters)")
-    """
-    return repr(text) if len(text) <= LONGEST else f"{text[:LONGEST]!r} ({len(text)} characters)"
 
 
 def listed(names: Sequence[str]) -> str:

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 STEP = "timing_step_median_ms"
+NEEDED = ("cost", "task", "controller", "share_MPC", "timing_cpu_s", STEP)
+"""Columns that the report is made of, beside those that a study may have."""
 SHOWN_FAILURES = 20
 
 
@@ -41,6 +43,10 @@ def write_study_report(results: StudyResults, path: str | Path | None = None) ->
     """
     if len(results.table) == len(results.failed):
         raise InputError(f"{results.folder}: no run has been done yet, there is nothing to report")
+    if lacking := [column for column in NEEDED if column not in results.table]:
+        raise InputError(
+            f"{results.folder}: its rows have no {', '.join(lacking)}; another version wrote them"
+        )
     with tempfile.TemporaryDirectory() as folder:
         report = _report(results, Path(folder))
         return write_report(path or results.folder / "report.html", report)
