@@ -13,6 +13,7 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import MOST_CONTENT, read_bytes
 
 STUDY = "hybrid-mpc search"
 
@@ -65,7 +66,7 @@ def open_study(storage: Path, identity: Mapping[str, str]) -> optuna.Study:
 def _mend(storage: Path) -> None:
     """Cut off a line that a kill left unfinished."""
     if storage.is_file():
-        content = storage.read_bytes()
+        content = read_bytes(storage, MOST_CONTENT)
         whole = content.rfind(b"\n") + 1
         if whole < len(content):
             os.truncate(storage, whole)

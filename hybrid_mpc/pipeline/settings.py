@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -24,6 +23,11 @@ from hybrid_mpc.files import (
 
 FILE = "run.json"
 WHOLE = ("hidden", "networks", "teacher_steps", "free_run_steps", "horizon", "validation_horizon", "batch")
+MOST = {
+    "hidden": 4096, "networks": 1024, "teacher_steps": 10**8, "free_run_steps": 10**8, "horizon": 10**5,
+    "validation_horizon": 10**6, "batch": 10**6, "decay": 1e12, "learning_rates": 1.0, "anchors": 1e12,
+}  # fmt: skip
+"""Largest values: a file of settings must not ask for more memory than a machine has."""
 NETWORK = (*WHOLE, "decay", "learning_rates", "anchors")
 """What a file of network settings may hold: arguments of ``identification.TrainingSettings``."""
 
@@ -100,12 +104,12 @@ def read_network(path: Path) -> dict[str, Any]:
     for name, value in held.items():
         numbers = value if name == "learning_rates" and isinstance(value, list) else [value]
         kinds = (int,) if name in WHOLE else (int, float)
-        good = all(isinstance(v, kinds) and not isinstance(v, bool) and math.isfinite(v) for v in numbers)
+        good = all(isinstance(v, kinds) and not isinstance(v, bool) and abs(v) <= MOST[name] for v in numbers)
         positive = good and all(v > 0 or (v == 0 and name in ("decay", "anchors")) for v in numbers)
         if not positive or (name == "learning_rates" and len(numbers) != 4):
-            needed = "a whole number of 1 or more" if name in WHOLE else "a number of 0 or more"
-            needed = "four positive numbers" if name == "learning_rates" else needed
-            raise InputError(f"{path}: {name} is {value!r}; it must be {needed}")
+            needed = f"a whole number from 1 to {MOST[name]}" if name in WHOLE else "a number of 0 or more"
+            needed = "four positive numbers of at most 1" if name == "learning_rates" else needed
+            raise InputError(f"{path}: {name} is {str(value)[:40]}; it must be {needed}")
     return {name: tuple(v) if isinstance(v, list) else v for name, v in held.items()}
 
 
