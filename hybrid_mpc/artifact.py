@@ -47,6 +47,7 @@ class ModelInfo:
         outputs: Signals of y.
         parameters: Values [SI] of the prior's parameters by name. Default: unknown.
         input_delay: Time [s] from a command to the input that the programs take. Default: none.
+        time_unit: The machine's second [s], see :class:`~hybrid_mpc.model.HybridModel`. Default 1.
     """
 
     dt: float
@@ -55,6 +56,7 @@ class ModelInfo:
     outputs: tuple[Signal, ...]
     parameters: Mapping[str, float] = field(default_factory=dict)
     input_delay: float = 0.0
+    time_unit: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -103,6 +105,7 @@ def save_artifact(
         "calibration": calibration,
         "provenance": provenance or {},
         **({"input_delay_s": info.input_delay} if info.input_delay else {}),
+        **({"time_unit_s": info.time_unit} if info.time_unit != 1.0 else {}),
     }
     write_json(folder / FILE, description)
 
@@ -125,7 +128,8 @@ def load_artifact(folder: Path) -> Artifact:
         signals = {r: tuple(_signal_in(s) for s in description[r]) for r in ("states", "inputs", "outputs")}
         parameters = {str(k): float(v) for k, v in description.get("parameters", {}).items()}
         delay = float(description.get("input_delay_s", 0.0))
-        info = ModelInfo(float(description["dt_s"]), **signals, parameters=parameters, input_delay=delay)
+        unit = float(description.get("time_unit_s", 1.0))
+        info = ModelInfo(float(description["dt_s"]), **signals, parameters=parameters, input_delay=delay, time_unit=unit)
         names = [str(name) for name in description["models"]]
         calibration, provenance = description["calibration"], description["provenance"]
     except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -151,8 +155,9 @@ def build_model(name: str, programs: Mapping[str, nn_export.Program], info: Mode
         parametric = nn_export.build(programs[f"{name}/{PARAMETRIC}"], PARAMETRIC)
         known = {"parameters": info.parameters, "parametric": parametric}
     model = HybridModel(
-        name, info.dt, info.states, info.inputs, info.outputs, **functions, side_by_side=many, **known
-    )
+        name, info.dt, info.states, info.inputs, info.outputs, **functions, side_by_side=many, **known,
+        time_unit=info.time_unit,
+    )  # fmt: skip
     return with_input_delay(model, info.input_delay) if info.input_delay else model
 
 
