@@ -129,7 +129,9 @@ def load_artifact(folder: Path) -> Artifact:
         parameters = {str(k): float(v) for k, v in description.get("parameters", {}).items()}
         delay = float(description.get("input_delay_s", 0.0))
         unit = float(description.get("time_unit_s", 1.0))
-        info = ModelInfo(float(description["dt_s"]), **signals, parameters=parameters, input_delay=delay, time_unit=unit)
+        info = ModelInfo(
+            float(description["dt_s"]), **signals, parameters=parameters, input_delay=delay, time_unit=unit
+        )
         names = [str(name) for name in description["models"]]
         calibration, provenance = description["calibration"], description["provenance"]
     except (KeyError, TypeError, ValueError, AttributeError) as error:

@@ -55,7 +55,7 @@ def noise_of(recordings: Sequence[Outputs]) -> Array:
 
 
 def speeds_of(recording: Outputs, dt: float, half: int, order: int = 1) -> Array:
-    """Speeds ``(m, n_y)`` from cubics through ``2 half + 1`` samples each, at their centres; ``order`` 2: accelerations.
+    """Speeds ``(m, n_y)`` at the centres of cubics through ``2 half + 1`` samples each; accelerations with ``order`` 2.
 
     Args:
         recording: Positions.
@@ -72,7 +72,9 @@ def speeds_of(recording: Outputs, dt: float, half: int, order: int = 1) -> Array
     window = 2 * half + 1
     if len(recording.y) < window:
         return np.zeros((0, recording.y.shape[1]))
-    found = savgol_filter(recording.y, window, 3, deriv=order, delta=dt, axis=0)[half : len(recording.y) - half]
+    found = savgol_filter(recording.y, window, 3, deriv=order, delta=dt, axis=0)[
+        half : len(recording.y) - half
+    ]
     return np.asarray(found[np.isfinite(found).all(axis=1)])
 
 

@@ -22,7 +22,9 @@ def dilated(k):
 
     class Dilated(Pendulum):
         parameters_spec = tuple(
-            replace(p, **{name: getattr(p, name) * k ** POWERS[p.name] for name in ("value", "lower", "upper")})
+            replace(
+                p, **{name: getattr(p, name) * k ** POWERS[p.name] for name in ("value", "lower", "upper")}
+            )
             for p in Pendulum.parameters_spec
         )
 

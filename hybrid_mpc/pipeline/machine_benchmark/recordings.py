@@ -30,8 +30,8 @@ class Recordings:
         valid: Pieces that choose; nothing is fitted to them.
         held_back: Pieces that neither fit nor choose; may be none.
         long: Recordings that were split in order of time and are judged whole, from their first sample to where
-            validation ends, at most a minute (of the machine's own seconds). Most or all of them was trained on, so they tell drift and not how good
-            a model is.
+            validation ends, at most a minute (of the machine's own seconds). Most or all of them was trained on, so
+            they tell drift and not how good a model is.
         dataset: The files as they were read.
     """
 
