@@ -274,18 +274,28 @@ def _check_roles(
         dropped = "".join(f"\n  {cut.file} {cut.start:g} to {cut.end:g} s: {cut.why}" for cut in cuts)
         raise InputError(
             f"no piece of {_fewest(spec) * spec.dt:g} s or more is left for {' and '.join(missing)}. "
-            "Give more or longer recordings, or change windows, fractions or max_gap in the DataSpec."
+            "Give more or longer recordings, or change windows, fractions or max_gap in the DataSpec; a recording without "
+            f"gaps that is split by fractions needs {_splittable(spec):.3g} s."
             + (f" Cut out:{dropped}" if dropped else "")
         )
 
 
+def _splittable(spec: DataSpec) -> float:
+    """Length [s] of a recording whose parts by fractions are all long enough."""
+    used = [fraction for fraction in spec.fractions if fraction > 0]
+    distances = [0.0, *(spec.smoothing for _ in used[1:])]
+    pieces = zip(used, distances, strict=True)
+    return max(((_fewest(spec) + 1) * spec.dt + distance) / fraction for fraction, distance in pieces)
+
+
 def _fewest(spec: DataSpec) -> int:
-    """Fewest samples of a piece: the warm-up and a handful to score."""
-    return int(np.ceil(spec.warm_up / spec.dt - TINY)) + MIN_SCORED
+    """Fewest samples of a piece: the warm-up, a handful to score, and those whose acting input a delay hides."""
+    return int(np.ceil(spec.warm_up / spec.dt - TINY)) + MIN_SCORED + int(np.ceil(spec.largest_delay / spec.dt))
 
 
 def _too_short(need: float, spec: DataSpec) -> str:
-    return f"shorter than the {need:.4g} s that warm-up ({spec.warm_up:g} s) and smoothing need"
+    delay = f", largest delay ({spec.largest_delay:g} s)" if spec.largest_delay else ""
+    return f"shorter than the {need:.4g} s that warm-up ({spec.warm_up:g} s){delay} and smoothing need"
 
 
 def _numbered(stem: str, number: int) -> str:

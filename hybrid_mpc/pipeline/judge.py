@@ -16,7 +16,7 @@ from hybrid_mpc.model import HybridModel
 from hybrid_mpc.monitor.calibration import Calibration, alarm_intervals, calibrate, with_residual
 from hybrid_mpc.monitor.lengths import block_seconds
 from hybrid_mpc.monitor.replay import along, judge, replay
-from hybrid_mpc.monitor.rest import rest_speeds
+from hybrid_mpc.monitor.rest import REST_SPEED, rest_speeds
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_monitor, working_point
 from hybrid_mpc.riccati import hidden_fixed_point
@@ -62,11 +62,12 @@ def monitor_stage(context: Context) -> None:
     model = load_artifact(context.out / "model").models["hybrid"]
     sigma_x = np.array(context.result("control")["sigma_x"]["hybrid_observer"])
     whole = context.dataset.whole
+    known: dict[str, Any] = {}  # the rest speeds, and what hinders the calibration
     try:
-        rest = nominal_rest(context, model)
+        known["rest_speed"] = nominal_rest(context, model)
     except InputError as short:
-        context.save("monitor", {"reason": f"the monitor could not be calibrated: {short}"}, {})
-        return
+        known["reason"] = f"the monitor could not be calibrated: {short}"
+    rest = known.get("rest_speed", (REST_SPEED,))
     power, residual, traces = [], [], []
     # the estimator of the closed loops; the monitor ignores its disturbance estimate
     watching, estimator = make_monitor(model, None, rest_speed=rest), make_estimator(model, control, sigma_x)
@@ -82,9 +83,10 @@ def monitor_stage(context: Context) -> None:
             *(_calibrate(levels, model, context.dataset.hash, rest) for levels in (power, residual))
         )
     except InputError as none:
-        reason = f"the monitor could not be calibrated: {none}"
-        set_calibration(context.out / "model", Calibration.without(reason, rest).to_dict())
-        context.save("monitor", {"reason": reason, "rest_speed": rest, "recordings": covered}, {})
+        known.setdefault("reason", f"the monitor could not be calibrated: {none}")
+    if "reason" in known:
+        set_calibration(context.out / "model", Calibration.without(known["reason"], rest).to_dict())
+        context.save("monitor", {**known, "recordings": covered}, {})
         return
     set_calibration(context.out / "model", calibration.to_dict())
     alarms, arrays, clean = [], {}, {"seconds": 0.0, "alarms": 0, "test_seconds": 0.0, "test_alarms": 0}
