@@ -274,8 +274,8 @@ def _check_roles(
         dropped = "".join(f"\n  {cut.file} {cut.start:g} to {cut.end:g} s: {cut.why}" for cut in cuts)
         raise InputError(
             f"no piece of {_fewest(spec) * spec.dt:g} s or more is left for {' and '.join(missing)}. "
-            "Give more or longer recordings, or change windows, fractions or max_gap in the DataSpec; a recording without "
-            f"gaps that is split by fractions needs {_splittable(spec):.3g} s."
+            "Give more or longer recordings, or change windows, fractions or max_gap in the DataSpec; a recording "
+            f"without gaps that is split by fractions needs {_splittable(spec):.3g} s."
             + (f" Cut out:{dropped}" if dropped else "")
         )
 
@@ -290,7 +290,9 @@ def _splittable(spec: DataSpec) -> float:
 
 def _fewest(spec: DataSpec) -> int:
     """Fewest samples of a piece: the warm-up, a handful to score, and those whose acting input a delay hides."""
-    return int(np.ceil(spec.warm_up / spec.dt - TINY)) + MIN_SCORED + int(np.ceil(spec.largest_delay / spec.dt))
+    return (
+        int(np.ceil(spec.warm_up / spec.dt - TINY)) + MIN_SCORED + int(np.ceil(spec.largest_delay / spec.dt))
+    )
 
 
 def _too_short(need: float, spec: DataSpec) -> str:

@@ -37,7 +37,9 @@ def test_the_rest_speed_of_a_small_axis_is_a_twentieth_of_its_own(strokes):
 def test_of_a_slow_one_it_is_no_less_than_what_its_sensor_makes_of_standing():
     """1 mm/s, 60 s from end to end and back; resolution 1 um, then 0.1 mm."""
     t = 0.02 * np.arange(12_000)
-    exact = np.column_stack([6e-2 / (2 * np.pi) * np.sin(2 * np.pi * t / 60.0), 1e-3 * np.cos(2 * np.pi * t / 60.0)])
+    exact = np.column_stack(
+        [6e-2 / (2 * np.pi) * np.sin(2 * np.pi * t / 60.0), 1e-3 * np.cos(2 * np.pi * t / 60.0)]
+    )
 
     def measured(step):
         return Run(t, step * np.round(exact[:, :1] / step), 0 * t[:, None], exact)
@@ -47,7 +49,9 @@ def test_of_a_slow_one_it_is_no_less_than_what_its_sensor_makes_of_standing():
     fine, coarse = (rest_speeds([measured(s)], Axis(0.02, time_unit=unit).model())[0] for s in (1e-6, 1e-4))
     assert fine == pytest.approx(5e-5, rel=0.05)
     # of standing still over 3 s such a sensor makes speeds, three deviations of which are not passed
-    standing = Run(t, measured(1e-4).y[:1] + 1e-4 * np.random.default_rng(0).choice([-0.5, 0.5], (12_000, 1)), 0, 0)
+    standing = Run(
+        t, measured(1e-4).y[:1] + 1e-4 * np.random.default_rng(0).choice([-0.5, 0.5], (12_000, 1)), 0, 0
+    )
     monitor = guard_monitor(Axis(0.02, time_unit=unit).model(), rest_speed=coarse)
     noise = noise_of([standing])[0]
     assert coarse >= 5e-5
@@ -80,7 +84,9 @@ def test_the_rule_is_right_on_all_machines(name, tmp_path):
     (rest,) = rest_speeds(known, Axis(scenario.data.dt).model())
     low, high = MACHINES[name]
     assert low < rest < high
-    if name in FRICTION_SPEED:  # the smoothed step has risen to 99 % (tanh 2.65), so what is held at rest can be told
+    if (
+        name in FRICTION_SPEED
+    ):  # the smoothed step has risen to 99 % (tanh 2.65), so what is held at rest can be told
         assert rest > 2.65 * FRICTION_SPEED[name]
 
 

@@ -25,7 +25,7 @@ from hybrid_mpc.pipeline.settings import RunSettings
 from hybrid_mpc.report.schema import SCHEMA, _check
 from hybrid_mpc.scenario import ControlSpec, Scenario
 
-AXIS = '''
+AXIS = """
 from hybrid_mpc import Prior, Parameter, Signal
 
 
@@ -39,7 +39,7 @@ class Axis(Prior):
 
     def inertia(self, x):
         return self.m
-'''
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,10 +84,22 @@ def context(machine, samples, out, warm_up):
     room = {}
     exec(machine.source, room)
     spec = DataSpec(
-        "t", ("F",), ("q",), dt=machine.dt, max_gap=2.5 * machine.dt, smoothing=10 * machine.dt, warm_up=warm_up
+        "t",
+        ("F",),
+        ("q",),
+        dt=machine.dt,
+        max_gap=2.5 * machine.dt,
+        smoothing=10 * machine.dt,
+        warm_up=warm_up,
     )
     control = ControlSpec(
-        20, q=(1.0, 1.0), r=(1.0,), r_delta=(1.0,), u_min=(-2.0,), u_max=(2.0,), estimator_sigma=(machine.noise,)
+        20,
+        q=(1.0, 1.0),
+        r=(1.0,),
+        r_delta=(1.0,),
+        u_min=(-2.0,),
+        u_max=(2.0,),
+        estimator_sigma=(machine.noise,),
     )
     scenario = Scenario("axis", "An axis", "", prior=room["Axis"], data=spec, control=control)
     for i, n in enumerate(samples):
@@ -172,10 +184,14 @@ def test_the_guard_copes_without_a_calibration(short):
     assert guard_tables({"guard": told}) == []
     assert guard_words({"guard": told})[0].startswith("No detector could be learned")
     captions = [caption for *_, caption in guard_figures(short)]
-    assert captions == ["The recording run0, of which test data come, by the monitor, which has no thresholds to judge by."]
+    assert captions == [
+        "The recording run0, of which test data come, by the monitor, which has no thresholds to judge by."
+    ]
     artifact = load_artifact(short.out / "model")
     assert stored_calibration(artifact).threshold_w is None
-    with pytest.raises(InputError, match="holds no detector"):  # what control --guard says before its first loop
+    with pytest.raises(
+        InputError, match="holds no detector"
+    ):  # what control --guard says before its first loop
         stored_detector(artifact)
 
 
