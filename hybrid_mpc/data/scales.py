@@ -20,8 +20,9 @@ COARSEST = 20
 then two of them."""
 SHORTEST = 5
 """Half the samples of the first window in which accelerations are looked for: ten periods."""
-NOISY = 0.5
-"""Share of noise in the power of the acceleration from which on the window is too short to tell."""
+NOISY = 0.02
+"""Share of noise in the power of the acceleration from which on the window is too short to tell: the steps of a coarse
+sensor are no white noise, and up to half of what they make would pass for motion."""
 
 
 class Outputs(Protocol):

@@ -82,3 +82,10 @@ def test_on_the_simulated_machines_a_second_is_a_second(name, tmp_path):
     files = scenario.make_data(tmp_path, 0, "quick")
     data = load_trajectories(files, scenario.data, outputs=prior.outputs, inputs=prior.inputs)
     assert time_unit(data.by_role("train"), scenario.data.dt) == 1.0
+
+
+def test_the_steps_of_a_coarse_sensor_are_no_motion():
+    """0.1 mm at 1 mm/s, five samples a step: no white noise, and up to half of it would pass for swings of a second."""
+    exact = sinusoid(60.0, 0.02, n=12_000, size=6e-2 / (2 * np.pi)).y
+    coarse = Outputs(1e-4 * np.round(exact / 1e-4))
+    assert time_scale([coarse], 0.02) == pytest.approx(60.0, rel=0.1)
