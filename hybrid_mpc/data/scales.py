@@ -15,9 +15,9 @@ FASTEST, SLOWEST = 0.25, 4.0
 """Time scales [s] between which a machine's second is a second. The lengths of the library that are written in seconds
 (free runs that a fit goes through, the monitor's windows, blocks of false alarms) were argued and tried on machines of
 0.5 s (unbalanced disk) to 2 s (torque pendulum, :func:`time_scale`); half and twice that are left to either side."""
-COARSEST = 20
+COARSEST = 10
 """Fewest periods in a machine's second: its shortest length, the tenth of a second that the guard averages over, is
-then two of them."""
+then one of them."""
 SHORTEST = 5
 """Half the samples of the first window in which accelerations are looked for: ten periods."""
 NOISY = 0.02
@@ -126,7 +126,7 @@ def time_unit(recordings: Sequence[Outputs], dt: float) -> float:
     """The machine's second [s]: what every length that the library writes in seconds is counted in.
 
     1 s for a machine whose :func:`time_scale` lies between 0.25 and 4 s. A slower one has so much longer a second, a
-    faster one so much shorter, to two digits; at least 20 periods, so that no length holds too few samples.
+    faster one so much shorter, to two digits; at least 10 periods, so that no length holds too few samples.
 
     Args:
         recordings: Recordings of positions in motion, e.g. the training ones.

@@ -63,7 +63,7 @@ def learn_detector(
         trusted: Whether the data are known to be nominal, as simulated ones are: then a block that stands out is one
             of theirs. Default: no; they are refused.
         time_unit: The machine's second [s], the model's. Default 1.
-        block_s: Length of a block [s]. Default: 5 of the machine's seconds, 100 periods at least; shorter where there
+        block_s: Length of a block [s]. Default: 5 of the machine's seconds, 50 periods at least; shorter where there
             is little data, and a higher rate is enough.
 
     Raises:

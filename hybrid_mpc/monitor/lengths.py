@@ -41,7 +41,7 @@ def half_window(length: float, model: HybridModel) -> int:
 
 
 def block_seconds(dt: float, time_unit: float = 1.0) -> float:
-    """Length [s] of a block: of ``BLOCK_S`` of the machine's seconds, which are no fewer than 20 periods.
+    """Length [s] of a block: of ``BLOCK_S`` of the machine's seconds, which are no fewer than 10 periods.
 
     Args:
         dt: Period [s].
@@ -49,6 +49,6 @@ def block_seconds(dt: float, time_unit: float = 1.0) -> float:
 
     Example:
         >>> block_seconds(0.02), block_seconds(0.02, 10.0), block_seconds(2.0)
-        (5.0, 50.0, 200.0)
+        (5.0, 50.0, 100.0)
     """
     return BLOCK_S * max(time_unit, COARSEST * dt)

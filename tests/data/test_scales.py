@@ -54,7 +54,7 @@ def test_the_fastest_output_decides():
         (1.0, 0.02, 1.0), (0.25, 0.01, 1.0), (4.0, 0.02, 1.0),  # a second is a second
         (40.0, 0.02, 10.0), (600.0, 2.0, 150.0),  # so many times slower than 4 s
         (0.025, 1e-4, 0.1), (0.01, 1e-4, 0.04),  # so many times faster than 0.25 s
-        (1.0, 0.1, 2.0), (100.0, 2.0, 40.0),  # at least 20 periods
+        (1.0, 0.1, 1.0), (1.0, 0.2, 2.0), (60.0, 2.0, 20.0),  # at least 10 periods
     ],
 )  # fmt: skip
 def test_the_unit_of_time(period, dt, unit):

@@ -4,16 +4,19 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
 from linear_axes import Axis
-from monitor_parts import Exact, Run
+from monitor_parts import Estimate, Exact, Run
 
 from hybrid_mpc.data import load_trajectories, noise_of, time_unit
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import plain
+from hybrid_mpc.model import HybridModel
 from hybrid_mpc.monitor import Calibration, Detector, EnergyMonitor, guard_monitor, replay, rest_speeds
 from hybrid_mpc.scenario import load_scenario
+from hybrid_mpc.signals import Signal
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
 FIVE_CM = Axis(0.01, mass=2.0, viscous=10.0, dry=0.1)
@@ -149,3 +152,53 @@ def test_bad_input_speaks(strokes):
         rest_speeds([still], model)
     with pytest.raises(InputError, match="1 positive speeds"):
         EnergyMonitor(model, window=5, average=1, rest_speed=[0.1, 0.1])
+
+
+def two_joints(push=(0.0, 0.0)):
+    """Two joints with coupled inertia: an angle with 0.2 N m of dry friction, and a slide with 0.1 N."""
+    x, h, u, w = ca.MX.sym("x", 4), ca.MX.sym("h", 0), ca.MX.sym("u", 2), ca.MX.sym("w", 4)
+    inertia = ca.DM([[2.0, 0.5], [0.5, 1.0]])
+
+    def force(x):
+        dry = ca.vertcat(0.2 * ca.tanh(x[2] / 1e-3), 0.1 * ca.tanh(x[3] / 1e-5))
+        return u + ca.DM(push) - ca.DM([0.3, 5.0]) * x[2:] - dry
+
+    def rhs(x):
+        return ca.vertcat(x[2:], ca.solve(inertia, force(x)))
+
+    names = [Signal("phi", "rad"), Signal("q", "m"), Signal("phi_dot", "rad/s"), Signal("v", "m/s")]
+    return HybridModel(
+        "joints", 0.02, tuple(names), (Signal("tau", "N m"), Signal("F", "N")), tuple(names[:2]),
+        step=ca.Function("step", [x, h, u], [x + 0.02 * rhs(x), h]),
+        xdot=ca.Function("xdot", [x, h, u], [rhs(x)]),
+        output=ca.Function("output", [x, u], [x[:2]]),
+        energy_balance=ca.Function("energy", [x, w, u], [ca.dot(x[2:], inertia @ w[2:] - force(x))]),
+    )  # fmt: skip
+
+
+class Resting(Exact):
+    """Knows that two joints stand."""
+
+    def _at(self):
+        return Estimate(self.run.x[self.k], np.zeros(0), np.zeros(2))
+
+    def start(self, y, t):
+        self.k = 0
+        return self._at()
+
+    def update(self, estimate, y, u_prev):
+        self.k += 1
+        return self._at()
+
+
+@pytest.mark.parametrize(
+    ("pull", "excess"), [((0.15, -0.08), (0.0, 0.0)), ((0.5, 0.0), (0.3, 0.0)), ((0.0, -0.3), (0.0, -0.2))]
+)
+def test_each_of_two_coupled_joints_has_a_rest_speed_and_a_dead_band_of_its_own(pull, excess):
+    n = 60
+    run = Run(0.02 * np.arange(n), np.zeros((n, 2)), np.tile(pull, (n, 1)), np.zeros((n, 4)))
+    monitor = EnergyMonitor(two_joints(), window=11, average=5, rest_speed=[0.1, 1e-3])
+    assert monitor.rest_speed == (0.1, 1e-3)
+    trace = replay(monitor, Resting(run), run)
+    # the machine stands, so that what nobody holds is unexplained, with its sign
+    np.testing.assert_allclose(trace.numbers[-1, 3:5], -np.array(excess), atol=1e-9)

@@ -51,7 +51,7 @@ def test_a_detector_is_learned_and_finds_a_fault_at_any_period(dt, swing):
     plain, n = axis(dt, swing), 3600
     runs = [plain.run(plain.swings(swing, n, seed=s), noise=noise, seed=s) for s in range(2)]
     unit = time_unit(runs, dt)
-    assert unit >= 20 * dt * 0.95  # to two digits
+    assert unit >= 10 * dt * 0.95  # to two digits
     model = axis(dt, swing, unit).model()
     rest = rest_speeds(runs, model)
     assert rest[0] < 0.2 * speed
