@@ -289,15 +289,12 @@ def _splittable(spec: DataSpec) -> float:
 
 
 def _fewest(spec: DataSpec) -> int:
-    """Fewest samples of a piece: the warm-up, a handful to score, and those whose acting input a delay hides."""
-    return (
-        int(np.ceil(spec.warm_up / spec.dt - TINY)) + MIN_SCORED + int(np.ceil(spec.largest_delay / spec.dt))
-    )
+    """Fewest samples of a piece: the warm-up and a handful to score."""
+    return int(np.ceil(spec.warm_up / spec.dt - TINY)) + MIN_SCORED
 
 
 def _too_short(need: float, spec: DataSpec) -> str:
-    delay = f", largest delay ({spec.largest_delay:g} s)" if spec.largest_delay else ""
-    return f"shorter than the {need:.4g} s that warm-up ({spec.warm_up:g} s){delay} and smoothing need"
+    return f"shorter than the {need:.4g} s that warm-up ({spec.warm_up:g} s) and smoothing need"
 
 
 def _numbered(stem: str, number: int) -> str:

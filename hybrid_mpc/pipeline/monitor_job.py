@@ -110,9 +110,7 @@ def prepared(
             f"the model's period is {hybrid.dt} s, scenario {scenario.name} resamples to {scenario.data.dt} s"
         )
     # all of a recording is watched: nothing warms up, and no part of it has a role
-    spec = replace(
-        scenario.data, windows={}, warm_up=scenario.data.dt, largest_delay=0.0, fractions=(1.0, 0.0, 0.0)
-    )
+    spec = replace(scenario.data, windows={}, warm_up=scenario.data.dt, fractions=(1.0, 0.0, 0.0))
     data = load_trajectories(recordings, spec, outputs=hybrid.outputs, inputs=hybrid.inputs, needed=())
     if not data.whole:
         cut = "; ".join(f"{c.file} {c.start:g} to {c.end:g} s: {c.why}" for c in data.cuts)
