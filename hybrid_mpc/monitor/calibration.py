@@ -41,7 +41,7 @@ class Calibration:
         detector: Detector of scaled residuals, learned from nominal data. Default: none.
         plausibility: What is ordinary in the training data, for bounds in the plan. Default: none.
         rest_speed: Speeds ``(n_q,)`` [unit of v] below which friction may stick, or one for all: what every monitor of
-            this model is to take. Default 0.2, that of artifacts which hold none.
+            this model is to take. Default 0.2, that of artifacts which hold none; None where no recording told them.
 
     Raises:
         InputError: If ``0 < release_w <= threshold_w`` does not hold, or not so for the residual.
@@ -63,12 +63,14 @@ class Calibration:
     residual_release: float | None = None
     detector: Detector | None = None
     plausibility: Plausibility | None = None
-    rest_speed: tuple[float, ...] = (REST_SPEED,)
+    rest_speed: tuple[float, ...] | None = (REST_SPEED,)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "rest_speed", tuple(np.ravel(self.rest_speed).astype(float).tolist()))
-        if not min(self.rest_speed, default=0.0) > 0:
-            raise InputError(f"calibration: rest speeds must be positive, got {self.rest_speed}")
+        if self.rest_speed is not None:
+            rest = tuple(np.ravel(self.rest_speed).astype(float).tolist())
+            object.__setattr__(self, "rest_speed", rest)
+            if not min(rest, default=0.0) > 0:
+                raise InputError(f"calibration: rest speeds must be positive, got {rest}")
         if not _ordered(self.residual_release, self.residual_threshold):
             raise InputError(
                 "calibration: need 0 < residual_release <= residual_threshold, or neither; got "
@@ -81,18 +83,19 @@ class Calibration:
             )
 
     @classmethod
-    def without(cls, reason: str, rest_speed: Sequence[float] = (REST_SPEED,)) -> Calibration:
+    def without(cls, reason: str, rest_speed: Sequence[float] | None = None) -> Calibration:
         """A calibration without thresholds: what is known where none could be found.
 
         Args:
             reason: Why not.
-            rest_speed: Speeds below which friction may stick.
+            rest_speed: Speeds below which friction may stick. Default: not known either.
 
         Example:
             >>> Calibration.without("2 s of data").threshold_w is None
             True
         """
-        return cls(None, None, 0.0, 0, 0.0, reason, rest_speed=tuple(rest_speed))
+        rest = None if rest_speed is None else tuple(rest_speed)
+        return cls(None, None, 0.0, 0, 0.0, reason, rest_speed=rest)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dictionary for JSON; what is not there has no field in it, as in earlier versions."""

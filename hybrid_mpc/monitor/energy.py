@@ -128,8 +128,8 @@ class EnergyMonitor:
         self.model, self.window, self.average = model, window, average
         self.calibration, self.detector = calibration, detector
         if rest_speed is None:
-            known = [part.rest_speed for part in (detector, calibration) if part is not None]
-            rest_speed = known[0] if known else REST_SPEED
+            held = (part.rest_speed for part in (detector, calibration) if part is not None)
+            rest_speed = next((rest for rest in held if rest is not None), REST_SPEED)
         self.rest_speed = checked_rest(rest_speed, model.n_x // 2, "energy monitor")
         self._resolution = _positive(resolution, model.n_y)
         if detector is not None:

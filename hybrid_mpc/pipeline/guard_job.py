@@ -60,12 +60,13 @@ def guard_stage(context: Context) -> None:
         return
     artifact = load_artifact(context.out / "model")
     model, calibration = artifact.models["hybrid"], run_calibration(context)
-    data = _nominal_data(context, artifact, control, calibration.rest_speed)
+    rest = calibration.rest_speed or (REST_SPEED,)
+    data = _nominal_data(context, artifact, control, rest)
     result: dict[str, Any] = {"source": data.source, "loops": data.loops}
     found: dict[str, Any] = {}
     try:
         found["detector"] = learned(
-            data.runs, model.dt, model.n_y, data.data_hash, rest_speed=calibration.rest_speed,
+            data.runs, model.dt, model.n_y, data.data_hash, rest_speed=rest,
             time_unit=model.time_unit,
         )  # fmt: skip
     except InputError as none:

@@ -16,7 +16,7 @@ from hybrid_mpc.model import HybridModel
 from hybrid_mpc.monitor.calibration import Calibration, alarm_intervals, calibrate, with_residual
 from hybrid_mpc.monitor.lengths import block_seconds
 from hybrid_mpc.monitor.replay import along, judge, replay
-from hybrid_mpc.monitor.rest import REST_SPEED, rest_speeds
+from hybrid_mpc.monitor.rest import rest_speeds
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_monitor, working_point
 from hybrid_mpc.riccati import hidden_fixed_point
@@ -67,7 +67,7 @@ def monitor_stage(context: Context) -> None:
         known["rest_speed"] = nominal_rest(context, model)
     except InputError as short:
         known["reason"] = f"the monitor could not be calibrated: {short}"
-    rest = known.get("rest_speed", (REST_SPEED,))
+    rest = known.get("rest_speed")
     power, residual, traces = [], [], []
     # the estimator of the closed loops; the monitor ignores its disturbance estimate
     watching, estimator = make_monitor(model, None, rest_speed=rest), make_estimator(model, control, sigma_x)
@@ -80,7 +80,10 @@ def monitor_stage(context: Context) -> None:
     covered = [{"file": r.name, **t.coverage(model.dt)} for r, t in zip(whole, traces, strict=True)]
     try:
         calibration = with_residual(
-            *(_calibrate(levels, model, context.dataset.hash, rest) for levels in (power, residual))
+            *(
+                _calibrate(levels, model, context.dataset.hash, watching.rest_speed)
+                for levels in (power, residual)
+            )
         )
     except InputError as none:
         known.setdefault("reason", f"the monitor could not be calibrated: {none}")
@@ -123,8 +126,7 @@ def run_calibration(context: Context) -> Calibration:
     found = context.result("monitor")
     if "calibration" in found:
         return Calibration.from_dict(found["calibration"])
-    known = {"rest_speed": found["rest_speed"]} if "rest_speed" in found else {}
-    return Calibration.without(found["reason"], **known)
+    return Calibration.without(found["reason"], found.get("rest_speed"))
 
 
 def _load_loop(

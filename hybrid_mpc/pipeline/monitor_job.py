@@ -132,7 +132,7 @@ def stored_calibration(artifact: Artifact) -> Calibration | None:
 
 
 def stored_rest(artifact: Artifact) -> tuple[float, ...] | None:
-    """The rest speeds that every monitor of an artifact's models takes; None if it holds no calibration."""
+    """The rest speeds that every monitor of an artifact's models takes; None if no recording told them yet."""
     calibration = stored_calibration(artifact)
     return None if calibration is None else calibration.rest_speed
 
