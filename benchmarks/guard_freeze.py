@@ -23,7 +23,7 @@ from hybrid_mpc.closed_loop import simulate
 from hybrid_mpc.files import read_json
 from hybrid_mpc.monitor import Judges, guard_monitor
 from hybrid_mpc.pipeline import find_noise, make_controller, make_estimator
-from hybrid_mpc.pipeline.guards import RESTING
+from hybrid_mpc.pipeline.guards import make_resting_guard
 from hybrid_mpc.pipeline.loops import freezing
 from hybrid_mpc.studies.monitor_loops import loop_figures
 from hybrid_mpc.studies.monitor_plan import SEEDS, LoopPlan
@@ -55,7 +55,7 @@ def main() -> None:
         plan = LoopPlan("encoder_freeze", "task", SEEDS["fault"] + i, FAULT_S)
         result = simulate(
             scenario.plant(), *parts, plan.reference(sine_reference), dt=hybrid.dt, duration=FAULT_S, x0=np.zeros(2),
-            seed=plan.seed, monitor=monitor, faults=plan.faults(hybrid.dt), guard=RESTING,
+            seed=plan.seed, monitor=monitor, faults=plan.faults(hybrid.dt), guard=make_resting_guard(hybrid),
         )  # fmt: skip
         times = [s.t - plan.onset(hybrid.dt) for s in result.switches if s.after.name == "REST"]
         after.append(times[0] if times else math.inf)

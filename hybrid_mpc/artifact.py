@@ -52,6 +52,7 @@ class ModelInfo:
         outputs: Signals of y.
         parameters: Values [SI] of the prior's parameters by name. Default: unknown.
         input_delay: Time [s] from a command to the input that the programs take. Default: none.
+        time_unit: The machine's second [s], see :class:`~hybrid_mpc.model.HybridModel`. Default 1.
     """
 
     dt: float
@@ -60,6 +61,7 @@ class ModelInfo:
     outputs: tuple[Signal, ...]
     parameters: Mapping[str, float] = field(default_factory=dict)
     input_delay: float = 0.0
+    time_unit: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,7 @@ class Description:
         outputs: Signals of y.
         parameters: Values [SI] of the prior's parameters by name.
         input_delay_s: Time [s] from a command to the input that the programs take.
+        time_unit_s: The machine's second [s], see :attr:`HybridModel.time_unit`.
         calibration: Calibration of the monitor in plain form, or None.
         provenance: What the models were made from.
 
@@ -113,12 +116,15 @@ class Description:
     outputs: tuple[Signal, ...]
     parameters: Mapping[str, float]
     input_delay_s: float
+    time_unit_s: float
     calibration: Mapping[str, Any] | None
     provenance: Provenance
 
     def __post_init__(self) -> None:
         if not 0 < self.dt_s < math.inf:
             raise InputError(f"dt_s: a positive number of seconds is needed, got {self.dt_s}")
+        if not 0 < self.time_unit_s < math.inf:
+            raise InputError(f"time_unit_s: a positive number of seconds is needed, got {self.time_unit_s}")
         if not 0 <= self.input_delay_s < math.inf:
             raise InputError(f"input_delay_s: a number of seconds is needed, got {self.input_delay_s}")
         if not 0 < len(set(self.models)) == len(self.models) <= MOST_MODELS:
@@ -168,7 +174,7 @@ def save_artifact(
         folder,
         Description(
             tuple(programs), sha256(folder / "programs.json"), info.dt, info.states, info.inputs, info.outputs,
-            info.parameters, info.input_delay, calibration, provenance or Provenance(),
+            info.parameters, info.input_delay, info.time_unit, calibration, provenance or Provenance(),
         ),
     )  # fmt: skip
 
@@ -233,7 +239,7 @@ def load_artifact(folder: Path) -> Artifact:
         InputError: If a file is missing, damaged, of another schema, or does not fit the others.
     """
     d = read_description(folder)
-    info = ModelInfo(d.dt_s, d.states, d.inputs, d.outputs, d.parameters, d.input_delay_s)
+    info = ModelInfo(d.dt_s, d.states, d.inputs, d.outputs, d.parameters, d.input_delay_s, d.time_unit_s)
     if sha256(folder / "programs.json") != d.programs_sha256:
         raise InputError(
             f"{folder}: programs.json is not the one that {FILE} was saved with; take the folder from its run again"
@@ -259,6 +265,7 @@ def build_model(name: str, programs: Mapping[str, nn_export.Program], info: Mode
         parametric = nn_export.build(programs[f"{name}/{PARAMETRIC}"], PARAMETRIC)
         known = {"parameters": info.parameters, "parametric": parametric}
     model = HybridModel(
-        name, info.dt, info.states, info.inputs, info.outputs, **functions, side_by_side=many, **known
-    )
+        name, info.dt, info.states, info.inputs, info.outputs, **functions, side_by_side=many, **known,
+        time_unit=info.time_unit,
+    )  # fmt: skip
     return with_input_delay(model, info.input_delay) if info.input_delay else model

@@ -45,6 +45,8 @@ class HybridModel:
             ``parameters``, as an input. Default: none; then nobody can tell what broke.
         waiting: Leading entries of ``h`` that are inputs on their way to the machine, the oldest first; ``xdot``,
             ``energy_balance`` and ``parametric`` then take the input that acts. Default 0: none waits.
+        time_unit: The machine's second [s] (:func:`~hybrid_mpc.data.time_unit`): what the lengths of monitor and guard
+            are counted in. Default 1.
 
     Raises:
         InputError: If the functions' shapes do not fit the signals.
@@ -77,10 +79,12 @@ class HybridModel:
     parameters: Mapping[str, float] = field(default_factory=dict)
     parametric: ca.Function | None = None
     waiting: int = 0
+    time_unit: float = 1.0
 
     def __post_init__(self) -> None:
-        if not self.dt > 0:
-            raise InputError(f"model {self.name}: dt must be positive, got {self.dt}")
+        for name in ("dt", "time_unit"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"model {self.name}: {name} must be positive, got {getattr(self, name)}")
         x, u, y = (self.n_x, 1), (self.n_u, 1), (len(self.outputs), 1)
         h = (self.n_h, 1)
         _check(self.name, "step", self.step, [x, h, u], [x, h])

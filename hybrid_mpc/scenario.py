@@ -64,6 +64,9 @@ class ControlSpec:
         u_max: Upper input bounds ``(n_u,)``, finite and above ``u_min``.
         du_max: Largest input change per period ``(n_u,)``; default: none.
         estimator_sigma: Standard deviations that the estimator is to assume, ``(n_y,)`` [output units].
+        first_speed_sigma: Standard deviations of the speeds at the estimator's start, ``(n_x - n_y,)`` [state units].
+            Default: ``sqrt(2) estimator_sigma / dt``, what the first two samples tell: a start at rest then counts as
+            much as they do, and after five samples of a start in motion it has 5 % of the weight.
         x_min: Soft lower bounds of the states ``(n_x,)``; ``-inf`` for none. Default: none.
         x_max: Soft upper bounds of the states ``(n_x,)``; ``inf`` for none. Default: none.
         slack_linear: Linear penalties of their violation ``(n_x,)``. Default: that of :class:`~hybrid_mpc.mpc.OCP`.
@@ -95,6 +98,7 @@ class ControlSpec:
     slack_quadratic: tuple[float, ...] | None = None
     around: tuple[float, ...] | None = None
     starts: tuple[tuple[tuple[float, ...], ...], ...] = ()
+    first_speed_sigma: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         limits = input_limits(self.u_min, self.u_max, len(self.r))

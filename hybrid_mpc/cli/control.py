@@ -117,11 +117,13 @@ def summary(results: dict[str, Any]) -> list[str]:
 def _guarded(row: dict[str, Any]) -> list[str]:
     """What the guard of one loop saw and did."""
     found = row["guard"]
+    blind = found["not_judged_s"]
+    dark = f"; not judged: {blind:.2f} s" if blind else ""
     if not found["alarms"]:
-        return [f"guard, {row['task']}, seed {row['seed']}: no alarm"]
+        return [f"guard, {row['task']}, seed {row['seed']}: no alarm{dark}"]
     when = ", ".join(f"{a['start_s']:.2f} to {a['end_s']:.2f} s" for a in found["alarms"])
     modes = "".join(f"; {s['after'].lower()} from {s['t_s']:.2f} s on" for s in found["switches"])
-    return [f"guard, {row['task']}, seed {row['seed']}: alarm {when}{modes}"]
+    return [f"guard, {row['task']}, seed {row['seed']}: alarm {when}{modes}{dark}"]
 
 
 def _number(value: float | None, sign: str = "") -> str:

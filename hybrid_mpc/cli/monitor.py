@@ -11,7 +11,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.scenario import scenario_of
 
 if TYPE_CHECKING:
-    from hybrid_mpc.monitor import Detector
+    from hybrid_mpc.pipeline.monitor_job import MonitorJob
 
 EXAMPLES = (
     "Examples:\n\n"
@@ -47,8 +47,12 @@ def monitor(
         typer.Option(help="control.json with the filter's noise. Default: that of the model's run."),
     ] = None,
 ) -> None:
-    """Say where in recordings the model does not describe the machine, and what would explain it."""
+    """Say where in recordings the model does not describe the machine, and what would explain it.
+
+    Exit code 1 if nothing of a recording could be judged.
+    """
     from hybrid_mpc.artifact import FILE, artifact_folder, read_description
+    from hybrid_mpc.cli.progress import make_progress
     from hybrid_mpc.files import check_folder
     from hybrid_mpc.pipeline.monitor_job import learn as learn_job
     from hybrid_mpc.pipeline.monitor_job import prepared, watch
@@ -65,24 +69,36 @@ def monitor(
     for finding in job.data.findings:
         print(f"warning: {finding}")
     if learn:
-        found = learn_job(job, learn, out)
+        with make_progress() as progress:
+            found = learn_job(job, learn, out, progress)
         print(
             f"learned from {60 * found.hours:.1f} min, for {found.false_alarms_per_hour:g} false alarms an hour"
         )
         print(f"detector: {(out / 'calibration.json').resolve()}")
         return
-    print(watching(job.detector))
-    for line in summary(watch(job, out)):
+    print(watching(job))
+    with make_progress() as progress:
+        results = watch(job, out, progress)
+    for line in summary(results):
         print(line)
     print(f"results: {(out / 'monitor.json').resolve()}")
+    if any(not row["judged_s"] for row in results["recordings"]):
+        raise typer.Exit(1)
 
 
-def watching(detector: Detector | None) -> str:
+def watching(job: MonitorJob) -> str:
     """What decides on alarms, in a line.
 
     Args:
-        detector: The job's.
+        job: The job.
     """
+    detector, calibration = job.detector, job.monitor.calibration
+    if detector is None and (calibration is None or calibration.threshold_w is None):
+        why = f" ({calibration.method.rstrip('.')})" if calibration is not None else ""
+        return (
+            f"the artifact holds no detector and no thresholds{why}: nothing alarms but a monitor that cannot judge "
+            "(see --learn)"
+        )
     if detector is None:
         return "watched with the artifact's thresholds of violation and residual; it holds no detector (see --learn)"
     return (
@@ -100,7 +116,9 @@ def summary(results: dict[str, Any]) -> list[str]:
     lines = []
     for row in results["recordings"]:
         n = len(row["alarms"])
-        lines.append(f"{row['recording']}: {row['seconds']:.1f} s, {n} alarm{'' if n == 1 else 's'}")
+        lines.append(
+            f"{row['recording']}: {row['seconds']:.1f} s, {n} alarm{'' if n == 1 else 's'}{_blind(row)}"
+        )
         for alarm in row["alarms"]:
             why = f": {alarm['diagnosis']}" if alarm["diagnosis"] else ""
             lines.append(f"  {alarm['start_s']:.2f} to {alarm['end_s']:.2f} s{why}")
@@ -108,4 +126,21 @@ def summary(results: dict[str, Any]) -> list[str]:
         f"gap in {cut['file']}: {cut['start']:.2f} to {cut['end']:.2f} s, {cut['why']}"
         for cut in results["gaps"]
     ]
+    lines += [
+        f"not watched in {cut['file']}: {cut['start']:.2f} to {cut['end']:.2f} s, {cut['why']}"
+        for cut in results["not_watched"]
+    ]
     return lines
+
+
+def _blind(row: dict[str, Any]) -> str:
+    """What of a recording was not judged, and why."""
+    why = {
+        "warm_up_s": "warm-up",
+        "missing_s": "samples are missing",
+        "not_finite_s": "model or estimator gives no finite number",
+    }
+    told = ", ".join(f"{row[key]:.2f} s {words}" for key, words in why.items() if row[key])
+    if not row["judged_s"]:
+        return f"; NOTHING COULD BE JUDGED: {told}"
+    return f"; not judged: {told}" if told else ""

@@ -83,6 +83,10 @@ def summary(results: dict[str, object]) -> list[str]:
             lines.append(
                 f"closed loop, {name:8} cost {loop['cost']:.4g}, tracking {loop['tracking_rmse_rad']:.4g} rad"
             )
+    monitor = results["monitor"]
+    assert isinstance(monitor, dict)
+    if monitor["alarms"] is None:
+        lines.append(f"energy monitor: {monitor['reason']}")
     lines += guard_lines(results["guard"])
     return lines
 

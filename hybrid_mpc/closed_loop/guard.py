@@ -67,9 +67,12 @@ class Guard:
 
     A frozen sensor and a machine at rest look alike: in ``REST`` the guard stays there until the sensor moves.
 
+    A monitor that judges nothing for longer than its windows (``reading.blind``: samples are missing, or model or
+    estimator gives no number) has failed: that is no quiet, and asks for ``on_model`` as a doubt of the model does.
+
     Args:
-        on_model: Mode where the model does not describe the machine. Default: ``LIMITED`` or ``BACKUP``, whichever
-            there is something for, else ``FALLBACK``.
+        on_model: Mode where the model does not describe the machine, or nobody can say whether it does. Default:
+            ``LIMITED`` or ``BACKUP``, whichever there is something for, else ``FALLBACK``.
         on_sensor: Mode where the sensor is frozen (``reading.frozen``). Default ``REST``.
         limits: Bounds of the inputs in every mode but ``NORMAL``. Default: the problem's own.
         backup: Controller of ``BACKUP``; a bare one is guarded without fallback.
@@ -238,7 +241,9 @@ class GuardedLoop:
         if self._frozen == t or t - self._frozen < guard.quiet - TINY:
             wanted, why = guard.on_sensor, "the sensor repeats itself while motion is predicted"
         elif self._in_doubt(t):
-            wanted, why = guard.on_model, "the model does not describe the machine"
+            blind = getattr(reading, "blind", False)
+            said = "the monitor cannot judge" if blind else "the model does not describe the machine"
+            wanted, why = guard.on_model, said
         else:
             wanted, why = Mode.NORMAL, f"no alarm for {guard.quiet:g} s"
         back = wanted < self._mode

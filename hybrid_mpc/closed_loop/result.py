@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -45,6 +45,7 @@ class ClosedLoopResult:
         level: Alarm level ``(n,)`` [W]; NaN without a monitor.
         alarm: ``(n,)``, True while the monitor alarms.
         switches: Changes of the guard's mode, in their order. Default: none.
+        judged: ``(n,)``, True where the monitor could judge the period. Default: unknown.
 
     Example:
         >>> one = np.ones((2, 1))
@@ -72,6 +73,7 @@ class ClosedLoopResult:
     level: Array
     alarm: NDArray[np.bool_]
     switches: tuple[Switch, ...] = ()
+    judged: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     @property
     def mode(self) -> tuple[str, ...]:

@@ -266,5 +266,6 @@ class _Record:
             violation=np.array([np.nan if r is None else r.violation_w for r in readings]),
             level=np.array([np.nan if r is None else r.level_w for r in readings]),
             alarm=np.array([r is not None and bool(r.alarm) for r in readings]),
+            judged=np.array([r is not None and not getattr(r, "verdict", 0) for r in readings]),
             switches=() if guarded is None else tuple(guarded.switches),
         )

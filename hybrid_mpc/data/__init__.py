@@ -18,6 +18,7 @@ from hybrid_mpc.data.doubts import Finding
 from hybrid_mpc.data.excitation import chirp, multisine, prbs, sinusoid, steps
 from hybrid_mpc.data.excitation_check import Excitation, check_excitation, excitation_of
 from hybrid_mpc.data.low_pass import SmoothingSpline, ZeroPhaseFilter, gcv_cutoff
+from hybrid_mpc.data.scales import noise_of, time_scale, time_unit
 from hybrid_mpc.data.spectra import crest_factor, hann_spectrum, line_spectrum
 from hybrid_mpc.data.tables import Table, read_csv, read_table, read_tables
 from hybrid_mpc.data.trajectories import Cut, Dataset, Trajectory, load_trajectories
@@ -30,4 +31,5 @@ __all__ = [
     "LocalPolynomial", "SmoothingSpline", "ZeroPhaseFilter", "CausalPolynomial",
     "sinusoid", "chirp", "steps", "multisine", "prbs", "crest_factor", "line_spectrum", "hann_spectrum",
     "Excitation", "excitation_of", "check_excitation",
+    "noise_of", "time_scale", "time_unit",
 ]  # fmt: skip

@@ -312,9 +312,18 @@ def _check_roles(
         dropped += f"\n  and {len(cuts) - SHOWN} more" if len(cuts) > SHOWN else ""
         raise InputError(
             f"no piece of {_fewest(spec) * spec.dt:g} s or more is left for {' and '.join(missing)}. "
-            "Give more or longer recordings, or change windows, fractions or max_gap in the DataSpec."
+            "Give more or longer recordings, or change windows, fractions or max_gap in the DataSpec; a recording "
+            f"without gaps that is split by fractions needs {_splittable(spec):.3g} s."
             + (f" Cut out:{dropped}" if dropped else "")
         )
+
+
+def _splittable(spec: DataSpec) -> float:
+    """Length [s] of a recording whose parts by fractions are all long enough."""
+    used = [fraction for fraction in spec.fractions if fraction > 0]
+    distances = [0.0, *(spec.smoothing for _ in used[1:])]
+    pieces = zip(used, distances, strict=True)
+    return max(((_fewest(spec) + 1) * spec.dt + distance) / fraction for fraction, distance in pieces)
 
 
 def _fewest(spec: DataSpec) -> int:

@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hybrid_mpc.buffered import BufferedFunction
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.riccati import hidden_fixed_point, vector
@@ -67,7 +68,7 @@ class ExtendedKalmanFilter:
     The input disturbance ``d`` is a random walk; a network's hidden state carries no noise of its own, it
     follows the state. Hidden states that are parameters do
     (:func:`~hybrid_mpc.estimation.with_parameter_states`). On a linear model this is the Kalman filter. No method
-    changes the object.
+    changes what the object gives; not for several threads at once (it reuses its buffers).
 
     A prediction that is not finite, or whose deviation is a million times the largest one given here, is
     lost (an unstable model without measurements for long, an absurd one): the next measurement starts anew.
@@ -120,7 +121,7 @@ class ExtendedKalmanFilter:
         variance_y = _variance(sigma_y, n_y, "sigma_y")
         if not np.all(variance_y > 0):
             raise InputError(f"sigma_y must be positive, got {np.asarray(sigma_y)}")
-        self._model = model
+        self._model, self._sizes = model, (n_x, n_h, n_u, n_y)
         self._noise_y = variance_y
         self._noise = np.concatenate(
             [_variance(sigma_x, n_x, "sigma_x"), hidden, _variance(sigma_d, n_u, "sigma_d")]
@@ -129,7 +130,8 @@ class ExtendedKalmanFilter:
             [_variance(sigma_x0, n_x, "sigma_x0"), hidden0, _variance(sigma_d0, n_u, "sigma_d0")]
         )
         self._lost = LOST * max(np.max(v) for v in (self._noise, self._first, self._noise_y))
-        self._output = _output_with_jacobian(model)
+        assert model.with_jacobian is not None
+        self._step, self._output = map(BufferedFunction, (model.with_jacobian, _output_with_jacobian(model)))
 
     @property
     def model(self) -> HybridModel:
@@ -161,8 +163,8 @@ class ExtendedKalmanFilter:
         x, u = np.zeros(model.n_x), np.zeros(model.n_u)
         target = np.asarray(y, dtype=float).ravel()
         for _ in range(20):  # Newton; one step if the outputs are linear in the state
-            y_hat, c_x, _ = (m.full() for m in self._output(x, u))
-            error = np.where(np.isfinite(target), target - y_hat.ravel(), 0.0)
+            y_hat, c_x, _ = self._measured(x, u)
+            error = np.where(np.isfinite(target), target - y_hat, 0.0)
             if not np.all(np.isfinite(c_x)) or np.max(np.abs(error)) < 1e-12:
                 break
             x = x + np.linalg.pinv(c_x) @ error
@@ -173,17 +175,18 @@ class ExtendedKalmanFilter:
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
     def predict(self, estimate: Estimate, u: ArrayLike) -> Estimate:
         """Estimate one period later with the input ``u`` ``(n_u,)`` held."""
-        model = self._model
-        n_z = model.n_x + model.n_h
-        assert model.with_jacobian is not None
-        held = np.asarray(u, dtype=float).ravel() + estimate.d
-        x, h, a, b = (m.full() for m in model.with_jacobian(estimate.x, estimate.h, held))
-        f = np.eye(n_z + model.n_u)
-        f[:n_z, :n_z], f[:n_z, n_z:] = a, b
+        (n_x, n_h, n_u, n_y), step = self._sizes, self._step
+        n_z = n_x + n_h
+        step.inputs[0][:], step.inputs[1][:] = estimate.x, estimate.h
+        step.inputs[2][:] = np.asarray(u, dtype=float).ravel() + estimate.d
+        step()
+        x, h, a, b = step.outputs  # of the next call; what is kept of them is copied
+        f = np.eye(n_z + n_u)
+        f[:n_z, :n_z], f[:n_z, n_z:] = a.reshape(n_z, n_z).T, b.reshape(n_u, n_z).T
         p = f @ estimate.P @ f.T
         p.flat[:: p.shape[0] + 1] += self._noise
-        empty = np.full(model.n_y, np.nan)
-        return Estimate(estimate.t + model.dt, x.ravel(), h.ravel(), estimate.d, p, empty, float("nan"))
+        empty = np.full(n_y, np.nan)
+        return Estimate(estimate.t + self._model.dt, x.copy(), h.copy(), estimate.d, p, empty, float("nan"))
 
     def correct(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> Estimate:
         """Estimate after the measurement ``y`` ``(n_y,)``, in Joseph form.
@@ -204,15 +207,15 @@ class ExtendedKalmanFilter:
         Source of the likelihood: Schweppe, *Evaluation of likelihood functions for Gaussian signals*, IEEE
         T-IT 11 (1965).
         """
-        model = self._model
+        n_x, n_h, _, n_y = self._sizes
         y = np.asarray(y, dtype=float).ravel()
         seen = np.isfinite(y)
         if not seen.any():
             return estimate, 0.0
         held = estimate.d if u is None else np.asarray(u, dtype=float).ravel() + estimate.d
-        y_hat, c_x, c_u = (m.full() for m in self._output(estimate.x, held))
-        c = np.hstack([c_x, np.zeros((model.n_y, model.n_h)), c_u])
-        innovation = np.where(seen, y - y_hat.ravel(), np.nan)
+        y_hat, c_x, c_u = self._measured(estimate.x, held)
+        c = np.hstack([c_x, np.zeros((n_y, n_h)), c_u])
+        innovation = np.where(seen, y - y_hat, np.nan)
         p, step, nis, size = estimate.P, np.zeros(c.shape[1]), 0.0, 0.0
         for i in np.flatnonzero(seen):  # one by one is exact, since the noises are independent
             pc = p @ c[i]
@@ -221,7 +224,7 @@ class ExtendedKalmanFilter:
             i_kc = np.eye(step.size) - np.outer(gain, c[i])
             p = i_kc @ p @ i_kc.T + self._noise_y[i] * np.outer(gain, gain)
             step, nis, size = step + gain * error, nis + float(error / s * error), size + float(np.log(s))
-        n_x, n_z = model.n_x, model.n_x + model.n_h
+        n_z = n_x + n_h
         x, h, d = estimate.x + step[:n_x], estimate.h + step[n_x:n_z], estimate.d + step[n_z:]
         after = Estimate(estimate.t, x, h, d, 0.5 * (p + p.T), innovation, nis)
         return after, -0.5 * (nis + size)
@@ -234,7 +237,7 @@ class ExtendedKalmanFilter:
             u: Input ``(n_u,)`` of the output equation. Default: zero.
         """
         held = estimate.d if u is None else np.asarray(u, dtype=float).ravel() + estimate.d
-        _, c_x, c_u = (m.full() for m in self._output(estimate.x, held))
+        _, c_x, c_u = self._measured(estimate.x, held)
         c = np.hstack([c_x, np.zeros((self._model.n_y, self._model.n_h)), c_u])
         s: Array = c @ estimate.P @ c.T + np.diag(self._noise_y)
         return 0.5 * (s + s.T)
@@ -248,6 +251,14 @@ class ExtendedKalmanFilter:
         if self.lost(predicted) and np.any(np.isfinite(np.asarray(y, dtype=float))):
             return self.start(y, predicted.t)
         return self.correct(predicted, y, u_prev)
+
+    def _measured(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
+        """Output ``(n_y,)`` and its Jacobians by state and input, to be used before the next call."""
+        (n_x, _, n_u, n_y), output = self._sizes, self._output
+        output.inputs[0][:], output.inputs[1][:] = x, u
+        output()
+        y, c_x, c_u = output.outputs
+        return y, c_x.reshape(n_x, n_y).T, c_u.reshape(n_u, n_y).T
 
     def run(self, y: ArrayLike, u: ArrayLike, t: float = 0.0) -> list[Estimate]:
         """Estimates along a measured past, e.g. to warm up.

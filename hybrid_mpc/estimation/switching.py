@@ -106,7 +106,12 @@ class SwitchingFilter:
         Raises:
             InputError: If the estimate is not one of this class.
         """
-        before = self._own(estimate)
+        modes, probability = self._predicted(self._own(estimate), u)
+        return _together(modes, probability, np.full(self.model.n_y, np.nan), float("nan"))
+
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
+    def _predicted(self, before: SwitchingEstimate, u: ArrayLike) -> tuple[list[Estimate], Array]:
+        """Estimate of each filter one period later, and the filters' probabilities ``(m,)``."""
         joint = before.probability[:, None] * self._transition
         after = joint.sum(axis=0)
         share = joint / np.where(after > 0, after, 1.0)
@@ -116,8 +121,7 @@ class SwitchingFilter:
             f.predict(_mixed(before.modes, share[:, j]), u) if after[j] > 0 else f.predict(before.modes[j], u)
             for j, f in enumerate(self._filters)
         ]
-        empty = np.full(self.model.n_y, np.nan)
-        return _together(modes, after, empty, float("nan"))
+        return modes, after
 
     def correct(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> SwitchingEstimate:
         """Estimate after the measurement ``y`` ``(n_y,)``; see :meth:`ExtendedKalmanFilter.correct`.
@@ -135,14 +139,21 @@ class SwitchingFilter:
         before = self._own(estimate)
         if not np.any(np.isfinite(np.asarray(y, dtype=float))):
             return before, 0.0
-        found = [f.assess(e, y, u) for f, e in zip(self._filters, before.modes, strict=True)]
+        return self._assessed(before.modes, before.probability, y, u)
+
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
+    def _assessed(
+        self, predicted: Sequence[Estimate], probability: Array, y: ArrayLike, u: ArrayLike | None
+    ) -> tuple[SwitchingEstimate, float]:
+        """Estimate after a measurement of which something is there, and its log-likelihood."""
+        found = [f.assess(e, y, u) for f, e in zip(self._filters, predicted, strict=True)]
         likelihood = np.array([value for _, value in found])
         largest = float(np.max(np.where(np.isfinite(likelihood), likelihood, -np.inf)))
-        weight = before.probability * np.exp(np.where(np.isfinite(likelihood), likelihood, -np.inf) - largest)
+        weight = probability * np.exp(np.where(np.isfinite(likelihood), likelihood, -np.inf) - largest)
         if not np.sum(weight) > 0:  # absurd to every filter: it says nothing of the modes
-            weight, largest = before.probability, -np.inf
+            weight, largest = probability, -np.inf
         modes, share = [e for e, _ in found], weight / weight.sum()
-        innovation = before.probability @ np.stack([e.innovation for e in modes])
+        innovation = probability @ np.stack([e.innovation for e in modes])
         nis = float(share @ np.array([e.nis for e in modes]))
         return _together(modes, share, innovation, nis), largest + float(np.log(weight.sum()))
 
@@ -155,11 +166,12 @@ class SwitchingFilter:
 
         A lost prediction is dropped: the estimate starts anew from ``y`` if any of it is finite.
         """
-        predicted = self.predict(estimate, u_prev)
-        lost = any(f.lost(e) for f, e in zip(self._filters, predicted.modes, strict=True))
-        if lost and np.any(np.isfinite(np.asarray(y, dtype=float))):
-            return self.start(y, predicted.t)
-        return self.correct(predicted, y, u_prev)
+        modes, probability = self._predicted(self._own(estimate), u_prev)
+        if not np.any(np.isfinite(np.asarray(y, dtype=float))):
+            return _together(modes, probability, np.full(self.model.n_y, np.nan), float("nan"))
+        if any(f.lost(e) for f, e in zip(self._filters, modes, strict=True)):
+            return self.start(y, modes[0].t)
+        return self._assessed(modes, probability, y, u_prev)[0]
 
     def _own(self, estimate: Estimate) -> SwitchingEstimate:
         if not isinstance(estimate, SwitchingEstimate) or len(estimate.modes) != len(self._filters):
@@ -173,7 +185,10 @@ def _mixed(modes: Sequence[Estimate], share: Array) -> Estimate:
     z = np.stack([np.concatenate([e.x, e.h, e.d]) for e in modes])
     mean = share @ z
     off = z - mean
-    p = np.tensordot(share, np.stack([e.P for e in modes]), 1) + (off * share[:, None]).T @ off
+    variances = np.stack([e.P for e in modes])
+    p = (share @ variances.reshape(len(share), -1)).reshape(variances.shape[1:]) + (
+        off * share[:, None]
+    ).T @ off
     n_x, n_z = first.x.size, first.x.size + first.h.size
     empty = np.full(first.innovation.size, np.nan)
     return Estimate(first.t, mean[:n_x], mean[n_x:n_z], mean[n_z:], p, empty, float("nan"))

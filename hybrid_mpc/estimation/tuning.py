@@ -14,6 +14,8 @@ from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
 
 Array = NDArray[np.float64]
+ROUNDING = 1e-9
+"""Share of a state's size below which a model's error is rounding: no filter is to believe itself more exact."""
 
 
 class Recording(Protocol):
@@ -78,7 +80,9 @@ def process_noise(model: HybridModel, recordings: Sequence[Known], most: int = 4
         raise InputError(
             "process noise: no recording with at least two samples given; pass training recordings"
         )
-    return np.maximum(np.sqrt(np.mean(np.square(errors), axis=0)), 1e-9)
+    sizes = np.sqrt(np.mean(np.square(np.concatenate([r.x for r in recordings])), axis=0))
+    least = ROUNDING * np.where(sizes > 0, sizes, 1.0)
+    return np.maximum(np.sqrt(np.mean(np.square(errors), axis=0)), least)
 
 
 def log_likelihood(estimator: Assessor, recording: Recording, skip: int = 25) -> float:

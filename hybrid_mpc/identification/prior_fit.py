@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hybrid_mpc.data import scales
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identification.dataset import Windows, cut_windows
@@ -19,17 +20,17 @@ from hybrid_mpc.identification.prior_swarm import SwarmSettings, particle_swarm
 from hybrid_mpc.physics import Prior
 
 STAGES = ((0.5, 20), (2.0, 10), (5.0, 6))
-"""Lengths [s] of the free runs that are fitted, from short (convex) to long (what is judged), each with
-its most evaluations: the long ones start near their optimum."""
+"""Lengths [the machine's seconds, :func:`~hybrid_mpc.data.time_unit`] of the free runs that are fitted, from short
+(convex) to long (what is judged), each with its most evaluations: the long ones start near their optimum."""
 MAX_WINDOWS = 48
 METHODS = ("equation_error", "output_error", "multiple_shooting", "particle_swarm")
 """What :func:`fit_prior` can do."""
 DEFAULT_METHODS = ("equation_error", "output_error")
 SWARM_SECONDS = 2.0
 SWARM_WINDOWS = 24
-"""The swarm simulates every set of parameters over so many free runs of at most this length."""
+"""The swarm simulates every set of parameters over so many free runs of at most this length [the machine's seconds]."""
 SEGMENT = 0.5
-"""Length [s] of a segment of multiple shooting: that of the first free runs."""
+"""Length [the machine's seconds] of a segment of multiple shooting: that of the first free runs."""
 Candidate: TypeAlias = tuple[str, NDArray[np.float64], Any]
 """Name of a stage, its parameters over their nominal sizes, and the Jacobian that its confidence comes from."""
 
@@ -43,6 +44,7 @@ def fit_prior(
     before: PriorFit | None = None,
     methods: Sequence[str] = DEFAULT_METHODS,
     swarm: SwarmSettings | None = None,
+    time_unit: float | None = None,
     on_progress: Callable[[int, int, str], None] = lambda done, total, text: None,
 ) -> PriorFit:
     """Fit by each of the methods; the best of all on free runs of the validation trajectories wins.
@@ -54,6 +56,9 @@ def fit_prior(
     output error and shooting start from the best so far. Residuals are the states' errors over their spread in the
     data, with exact derivatives (forward mode through the integrator). A prior without free parameters stays as it is.
 
+    The lengths are in the machine's seconds (:func:`~hybrid_mpc.data.time_unit`): they are seconds on machines that
+    swing in 0.25 to 4 s, and longer or shorter on slower or faster ones.
+
     Args:
         make: Prior class or factory ``(values=None) -> Prior``.
         train: Training trajectories.
@@ -64,6 +69,7 @@ def fit_prior(
             search again). Default: all lengths, from the nominal ones.
         methods: Some of ``METHODS``. Default: equation error and output error.
         swarm: Effort of the particle swarm. Default: 24 particles, 40 generations.
+        time_unit: The machine's second [s]. Default: that of the training trajectories.
         on_progress: ``(done, total, text)`` after every stage.
 
     Raises:
@@ -72,18 +78,20 @@ def fit_prior(
     """
     _check_methods(methods)
     fit = ParameterFit(make, dt)
-    stages = [s for s in STAGES if _fits(train, s[0], dt)] or [(_shortest(train, dt), 20)]
+    unit = scales.time_unit(train, dt) if time_unit is None else time_unit
+    stages = [(unit * length, most) for length, most in STAGES]
+    stages = [s for s in stages if _fits(train, s[0], dt)] or [(_shortest(train, dt), 20)]
     lengths = [s for s, _ in stages]
-    judge = _sample(
-        cut_windows(valid or train, 0, round(_longest(valid or train, lengths) / dt), round(0.5 / dt))
-    )
+    longest = scales.periods(_longest(valid or train, lengths), dt)
+    judge = _sample(cut_windows(valid or train, 0, longest, scales.periods(unit * STAGES[0][0], dt)))
     if not fit.free:
         row = {"stage": "nominal", "validation_error": fit.judge(fit.nominal, judge)}
         return PriorFit(fit.prior.values, {}, (), (row,))
     candidates: list[Candidate]
     if before is None:
         candidates = [("nominal", fit.nominal, None)]
-        candidates += _first_searches(fit, train, methods, swarm or SwarmSettings(), lengths, on_progress)
+        found = _first_searches(fit, train, methods, swarm or SwarmSettings(), lengths, unit, on_progress)
+        candidates += found
     else:
         candidates = [("the fit before", fit.scaled(before.values), None)]
         stages, methods = _again(before, stages, methods)
@@ -91,13 +99,13 @@ def fit_prior(
         stages = []
     for i, (length, evaluations) in enumerate(stages):
         on_progress(i, len(stages), f"output error over {length:g} s")
-        windows = _sample(cut_windows(train, 0, round(length / dt), max(1, round(length / dt / 4))))
+        windows = _sample(cut_windows(train, 0, scales.periods(length, dt), scales.periods(length / 4, dt)))
         start = min(candidates, key=lambda c: fit.judge(c[1], windows))[1]
         theta, jacobian = fit.output_error(start, windows, evaluations)
         candidates.append((f"output error {length:g} s", theta, jacobian))
     if "multiple_shooting" in methods:
         on_progress(len(stages), len(stages) + 1, "multiple shooting")
-        candidates.append(_shooting(fit, train, candidates, min(SEGMENT, *lengths)))
+        candidates.append(_shooting(fit, train, candidates, min(unit * SEGMENT, *lengths)))
     on_progress(len(stages), len(stages), "done")
     return _winner(fit, candidates, judge, before)
 
@@ -127,13 +135,14 @@ def _first_searches(
     methods: Sequence[str],
     swarm: SwarmSettings,
     lengths: Sequence[float],
+    unit: float,
     on_progress: Callable[[int, int, str], None],
 ) -> list[Candidate]:
     """What needs no start: the particle swarm and the equation error."""
     found: list[Candidate] = []
     if "particle_swarm" in methods:
-        length = max((s for s in lengths if s <= SWARM_SECONDS), default=min(lengths))
-        periods = round(length / fit.dt)
+        length = max((s for s in lengths if s <= unit * SWARM_SECONDS), default=min(lengths))
+        periods = scales.periods(length, fit.dt)
         windows = _sample(cut_windows(train, 0, periods, max(1, periods // 4)), SWARM_WINDOWS)
         theta = particle_swarm(
             fit, windows, swarm, lambda done, total: on_progress(done, total, "particle swarm")
@@ -149,7 +158,7 @@ def _shooting(
     fit: ParameterFit, train: Sequence[Trajectory], candidates: Sequence[Candidate], length: float
 ) -> Candidate:
     """Multiple shooting over segments of ``length`` [s] from the candidate that is best on them."""
-    segments = cut_segments(train, max(1, round(length / fit.dt)))
+    segments = cut_segments(train, scales.periods(length, fit.dt))
     start = min(candidates, key=lambda c: fit.judge(c[1], segments.windows))[1]
     return (f"multiple shooting {length:g} s", *multiple_shooting(fit, start, segments))
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
+from hybrid_mpc.data import scales
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.identification.step import required_substeps, rk4
 from hybrid_mpc.physics import Prior
@@ -20,7 +21,8 @@ Array = NDArray[np.float64]
 SWEEPS = 5
 """Linearisations along the smoothed trajectory; the last ones change it by far less than the noise."""
 DECADES = (-2.0, 6.0)
-"""Range searched for the ratio of walk to sigma [1/s^2]: from a prior that is right to data that jump."""
+"""Range searched for the ratio of walk to sigma [1/s^2, in the machine's seconds]: from a prior that is right to data
+that jump."""
 IGNORANCE = 1e4
 """Standard deviation of the start in units of what the noise makes of it, seen over one period."""
 SAMPLE = 12
@@ -130,7 +132,9 @@ class Smoother:
         return smooth, (squares, logs)
 
 
-def fit_smoother(prior: Prior, trajectories: Sequence[Trajectory], dt: float) -> Smoother:
+def fit_smoother(
+    prior: Prior, trajectories: Sequence[Trajectory], dt: float, *, time_unit: float | None = None
+) -> Smoother:
     """Smoother whose noise and walk make the measurements most likely.
 
     The ratio of walk to noise is searched, the noise's scale follows in closed form. Several outputs keep
@@ -140,13 +144,14 @@ def fit_smoother(prior: Prior, trajectories: Sequence[Trajectory], dt: float) ->
         prior: The fitted prior.
         trajectories: Recordings; at most ``SAMPLE`` of them, evenly chosen, are used.
         dt: Period [s].
+        time_unit: The machine's second [s]. Default: that of the trajectories.
     """
+    unit = scales.time_unit(trajectories, dt) if time_unit is None else time_unit
     chosen = sorted(
         set(np.linspace(0, len(trajectories) - 1, min(SAMPLE, len(trajectories))).round().astype(int))
     )
     sample = [trajectories[i] for i in chosen]
-    third = np.concatenate([np.diff(t.y, 3, axis=0) for t in sample])
-    sigma = np.maximum(np.std(third, axis=0) / math.sqrt(20.0), 1e-12)  # white noise of one gives sqrt(20)
+    sigma = np.maximum(scales.noise_of(sample), 1e-12)
     count = sum((len(t.t) - 3) * t.y.shape[1] for t in sample)
 
     def at(ratio: float, scale: float = 1.0) -> Smoother:
@@ -157,7 +162,8 @@ def fit_smoother(prior: Prior, trajectories: Sequence[Trajectory], dt: float) ->
         squares, logs = at(ratio).innovations(sample)
         return count * math.log(squares / count) + logs
 
-    best = float(minimize_scalar(cost, bounds=DECADES, method="bounded", options={"xatol": 0.05}).x)
+    bounds = [decade - 2.0 * math.log10(unit) for decade in DECADES]
+    best = float(minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 0.05}).x)
     return at(best, math.sqrt(at(best).innovations(sample)[0] / count))
 
 

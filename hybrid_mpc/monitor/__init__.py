@@ -20,14 +20,17 @@ from hybrid_mpc.monitor.plausibility import (
     plan_distance,
     region_bound,
 )
-from hybrid_mpc.monitor.reading import MonitorReading, MonitorState
+from hybrid_mpc.monitor.reading import MonitorReading, MonitorState, Verdict
 from hybrid_mpc.monitor.replay import MonitorTrace, judge, replay
+from hybrid_mpc.monitor.rest import rest_speeds
 from hybrid_mpc.monitor.standard import guard_monitor, learn_from
 
 __all__ = [
     "EnergyMonitor",
     "MonitorState",
     "MonitorReading",
+    "Verdict",
+    "rest_speeds",
     "Detector",
     "learn_detector",
     "METHODS",

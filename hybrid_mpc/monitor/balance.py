@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -128,26 +129,48 @@ def inertia_of(model: HybridModel, x: ca.MX, u: ca.MX) -> ca.MX:
     return ca.graph_substitute(ca.vertcat(*rows), [a], [ca.MX.zeros(n_q)])
 
 
-def _residual(
-    model: HybridModel, a_measured: ca.MX, a_model: ca.MX, x: ca.MX, h: ca.MX, u: ca.MX, rest_speed: float
-) -> ca.MX:
-    """Force ``(n_q,)`` that the model does not explain; near rest, what friction could not hold either.
+def _near_rest(
+    model: HybridModel, position: ca.MX, h: ca.MX, u: ca.MX, rest: ca.DM
+) -> tuple[ca.MX, ca.MX, ca.MX]:
+    """What a model says of slow motion: its mean acceleration there, and by how much dry friction and damping slow it.
 
-    The model's two accelerations near rest are half the monitor's work, so they are left out at speed.
+    Half the difference of the accelerations back and forth is ``D(s) = jump + damping s``: dry friction, which is fully
+    there at the rest speed, and what grows with the speed. So ``2 D(s) - D(2 s)`` is what dry friction can hold at
+    rest, and what damps is no part of it.
+
+    Returns:
+        The mean ``(n_q,)`` of back and forth at the rest speed, ``D`` there, and ``2 D(s) - D(2 s)``.
+    """
+    n_q = model.n_x // 2
+    (back, forth), (faster_back, faster_forth) = (
+        [model.xdot(ca.vertcat(position, sign * speed), h, u)[n_q:] for sign in (-1, 1)]
+        for speed in (rest, 2 * rest)
+    )
+    slowed = 0.5 * (back - forth)
+    return 0.5 * (back + forth), slowed, 2 * slowed - 0.5 * (faster_back - faster_forth)
+
+
+def _residual(
+    model: HybridModel, a_measured: ca.MX, a_model: ca.MX, x: ca.MX, h: ca.MX, u: ca.MX, rest: ca.DM
+) -> ca.MX:
+    """Force ``(n_q,)`` that the model does not explain; near rest, what dry friction could not hold either.
+
+    The model's accelerations near rest are half the monitor's work, so they are left out at speed.
     """
     n_q = model.n_x // 2
     sizes = {"e": n_q, "a": n_q, "x": model.n_x, "h": model.n_h, "u": model.n_u}
     sym = [ca.MX.sym(name, size) for name, size in sizes.items()]
     error, measured, state, hidden, held_input = sym
-    inertia, speed = inertia_of(model, state, held_input), rest_speed * ca.DM.ones(n_q)
-    back, forth = (model.xdot(ca.vertcat(state[:n_q], s), hidden, held_input)[n_q:] for s in (-speed, speed))
-    friction = ca.fmax(0, 0.5 * inertia @ (back - forth))
-    held = inertia @ (measured - 0.5 * (back + forth))  # friction of either direction taken out
+    inertia, speed = inertia_of(model, state, held_input), state[n_q:]
+    mean, slowed, jump = _near_rest(model, state[:n_q], hidden, held_input, rest)
+    friction = ca.fmax(0, inertia @ jump)
+    damping = (inertia @ slowed - friction) * speed / rest  # between joints it counts as each joint's own
+    held = inertia @ (measured - mean) + damping  # friction of either direction taken out
     held = ca.sign(held) * ca.fmax(0, ca.fabs(held) - friction)
-    near = ca.fmax(0, ca.fmin(1, 2 - ca.fabs(state[n_q:]) / rest_speed))
+    near = ca.fmax(0, ca.fmin(1, 2 - ca.fabs(speed) / rest))
     slow = ca.Function("slow", sym, [ca.densify(near * held + (1 - near) * (inertia @ error))])
     fast = ca.Function("fast", sym, [ca.densify(inertia @ error)])
-    at_speed = ca.mmin(ca.fabs(x[n_q:])) >= 2 * rest_speed
+    at_speed = ca.mmin(ca.fabs(x[n_q:]) / rest) >= 2
     choice = ca.Function.if_else("residual", fast, slow)
     return choice(at_speed, a_measured - a_model, a_measured, x, h, u)
 
@@ -173,14 +196,14 @@ def _free_run(
 
 
 def _pushed(
-    layout: Layout, memory: ca.MX, still: ca.MX, x: ca.MX, h: ca.MX, u: ca.MX, rest_speed: float, spans: ca.DM
+    layout: Layout, memory: ca.MX, still: ca.MX, x: ca.MX, h: ca.MX, u: ca.MX, rest: ca.DM, spans: ca.DM
 ) -> tuple[ca.MX, ca.MX, ca.MX]:
     """Speed and travel ``(n_q,)`` that the input should have caused since the sensors' last step, and the input then.
 
     An estimator takes a frozen sensor for a standing machine, and an unknown load for what holds it; the controller
     pulls, and nothing moves. What counts is what both the input's change since then and the input itself, beyond
     friction, would do: a load that is there is no change, and a machine that has braked is left with no pull. The model
-    is asked only beyond ``HELD_SHARE`` of the input's range, for it costs four evaluations.
+    is asked only beyond ``HELD_SHARE`` of the input's range, for it costs six evaluations.
     """
     model, n_q = layout.model, layout.n_q
     first = layout.one_step + n_q
@@ -193,16 +216,11 @@ def _pushed(
     strong = ca.logic_and(still, ca.mmax(ca.fabs(u - before) - HELD_SHARE * spans) > 0)
     sizes = {"x": model.n_x, "h": model.n_h, "u": model.n_u, "before": model.n_u}
     sym = [ca.MX.sym(name, size) for name, size in sizes.items()]
-    position, hidden = sym[0][:n_q], sym[1]
-    rates = rest_speed * ca.DM.ones(n_q)
-    back, forth, was_back, was_forth = (
-        model.xdot(ca.vertcat(position, rate), hidden, pull)[n_q:]
-        for pull in sym[2:]
-        for rate in (-rates, rates)
+    (mean, _, jump), (earlier, _, _) = (
+        _near_rest(model, sym[0][:n_q], sym[1], pull, rest) for pull in sym[2:]
     )
-    mean, friction = 0.5 * (back + forth), ca.fmax(0, 0.5 * (back - forth))
-    alone = ca.sign(mean) * ca.fmax(0, ca.fabs(mean) - friction)
-    change = mean - 0.5 * (was_back + was_forth)
+    alone = ca.sign(mean) * ca.fmax(0, ca.fabs(mean) - ca.fmax(0, jump))
+    change = mean - earlier
     both = ca.sign(alone) * ca.fmin(ca.fabs(alone), ca.fabs(change)) * (alone * change > 0)
     asked = ca.Function("asked", sym, [ca.densify(both)])
     none = ca.Function("none", sym, [ca.DM.zeros(n_q)])
@@ -217,14 +235,15 @@ def _known(values: ca.MX) -> ca.MX:
     return ca.fabs(values) < np.inf
 
 
-def reading_function(layout: Layout, rest_speed: float, spans: Array) -> ca.Function:
+def reading_function(layout: Layout, rest_speed: Sequence[float], spans: Array) -> ca.Function:
     """``(memory, x_prev, h_prev, u_prev, y, judged) -> (memory_next, numbers)``.
 
     The numbers: balances of model and measurement, violation, residual ``(n_q)``, travel ``(n_q)``, speed ``(n_q)``
     and input ``(n_u)`` at the centre; with free runs the sums of each. ``judged`` says of each run whether its window
-    is full. ``spans`` ``(n_u,)`` are the ranges of the inputs.
+    is full. ``rest_speed`` ``(n_q,)`` are the speeds below which friction may stick, ``spans`` ``(n_u,)`` the ranges of
+    the inputs.
     """
-    model, window, n_q = layout.model, layout.window, layout.n_q
+    model, window, n_q, rest = layout.model, layout.window, layout.n_q, ca.DM(list(rest_speed))
     n_u, dt, row = model.n_u, model.dt, layout.row
     position, velocity, acceleration, kernel, slope = weights(window, dt)
     memory = ca.MX.sym("memory", layout.size)
@@ -243,14 +262,14 @@ def reading_function(layout: Layout, rest_speed: float, spans: Array) -> ca.Func
     u_mean = row_grid[2 * n_q :, :] @ ca.DM(0.5 * dt * (kernel[:-1] + kernel[1:]))
     state = ca.vertcat(q + y, v)
     balances = [model.energy_balance(state, ca.vertcat(v, a), u_mean) for a in (a_model, a_measured)]
-    residual = _residual(model, a_measured, a_model, state, h, u_mean, rest_speed)
+    residual = _residual(model, a_measured, a_model, state, h, u_mean, rest)
     # What is predicted while the sensor repeats itself; a missing sample or estimate begins anew. Where friction may
     # stick nothing counts: there an estimate creeps that does not know of it.
     y_before = memory[(window - 1) * n_q : window * n_q]
     moved = x_next[:n_q] - x[:n_q]
-    ahead = memory[layout.one_step : layout.one_step + n_q] + moved * (ca.fabs(moved) > rest_speed * dt)
+    ahead = memory[layout.one_step : layout.one_step + n_q] + moved * (ca.fabs(moved) > rest * dt)
     travel = ca.if_else(ca.logic_and(y == y_before, _known(ahead)), ahead, 0)
-    pushed = _pushed(layout, memory, ca.mmin(y == y_before), x, h, u, rest_speed, ca.DM(spans))
+    pushed = _pushed(layout, memory, ca.mmin(y == y_before), x, h, u, rest, ca.DM(spans))
     shown = ca.if_else(pushed[1] > ca.fabs(travel), pushed[1], travel)
     violation = ca.fabs(balances[0] - balances[1])
     averaged = memory[layout.averaged : layout.runs]

@@ -7,18 +7,21 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.monitor.detector import Detector
+from hybrid_mpc.monitor.lengths import BLOCK_S
 from hybrid_mpc.monitor.plausibility import Plausibility
+from hybrid_mpc.monitor.rest import REST_SPEED
 
 Array = NDArray[np.float64]
-BLOCK_S = 5.0
 MIN_BLOCKS = 30
 MAX_EXTRAPOLATION = 20.0
 LATER: Mapping[str, Any] = {"detector": Detector, "plausibility": Plausibility}
-"""Fields that calibrations of earlier versions lack."""
+"""Parts that a calibration may lack."""
+ADDED = ("rest_speed",)
+"""Further fields that calibrations of earlier versions lack."""
 
 
 @dataclass(frozen=True)
@@ -26,17 +29,19 @@ class Calibration:
     """Thresholds of the alarm and what they come from.
 
     Args:
-        threshold_w: Level [W] above which the alarm starts.
-        release_w: Level [W] below which it ends; at most ``threshold_w``.
+        threshold_w: Level [W] above which the alarm starts; None where none could be found: then no level alarms.
+        release_w: Level [W] below which it ends; at most ``threshold_w``; None with it.
         false_alarms_per_hour: Wanted rate on nominal data [1/h].
         n_samples: Finite levels used.
         hours: Their duration [h].
-        method: How the threshold was found.
+        method: How the threshold was found, or why not.
         data_hash: Hash of the nominal data.
         residual_threshold: Residual level [N m or N] above which the alarm starts too. Default: never.
         residual_release: Residual level [N m or N] below which that ends.
         detector: Detector of scaled residuals, learned from nominal data. Default: none.
         plausibility: What is ordinary in the training data, for bounds in the plan. Default: none.
+        rest_speed: Speeds ``(n_q,)`` [unit of v] below which friction may stick, or one for all: what every monitor of
+            this model is to take. Default 0.2, that of artifacts which hold none; None where no recording told them.
 
     Raises:
         InputError: If ``0 < release_w <= threshold_w`` does not hold, or not so for the residual.
@@ -47,8 +52,8 @@ class Calibration:
         True
     """
 
-    threshold_w: float
-    release_w: float
+    threshold_w: float | None
+    release_w: float | None
     false_alarms_per_hour: float
     n_samples: int
     hours: float
@@ -58,19 +63,39 @@ class Calibration:
     residual_release: float | None = None
     detector: Detector | None = None
     plausibility: Plausibility | None = None
+    rest_speed: tuple[float, ...] | None = (REST_SPEED,)
 
     def __post_init__(self) -> None:
-        residual = self.residual_release, self.residual_threshold
-        if residual != (None, None) and not (None not in residual and 0 < residual[0] <= residual[1]):  # type: ignore[operator]
+        if self.rest_speed is not None:
+            rest = tuple(np.ravel(self.rest_speed).astype(float).tolist())
+            object.__setattr__(self, "rest_speed", rest)
+            if not min(rest, default=0.0) > 0:
+                raise InputError(f"calibration: rest speeds must be positive, got {rest}")
+        if not _ordered(self.residual_release, self.residual_threshold):
             raise InputError(
                 "calibration: need 0 < residual_release <= residual_threshold, or neither; got "
-                f"{residual[0]} and {residual[1]}"
+                f"{self.residual_release} and {self.residual_threshold}"
             )
-        if not 0 < self.release_w <= self.threshold_w:
+        if not _ordered(self.release_w, self.threshold_w):
             raise InputError(
-                "calibration: need 0 < release_w <= threshold_w [W], "
+                "calibration: need 0 < release_w <= threshold_w [W], or neither; "
                 f"got {self.release_w} and {self.threshold_w}"
             )
+
+    @classmethod
+    def without(cls, reason: str, rest_speed: Sequence[float] | None = None) -> Calibration:
+        """A calibration without thresholds: what is known where none could be found.
+
+        Args:
+            reason: Why not.
+            rest_speed: Speeds below which friction may stick. Default: not known either.
+
+        Example:
+            >>> Calibration.without("2 s of data").threshold_w is None
+            True
+        """
+        rest = None if rest_speed is None else tuple(rest_speed)
+        return cls(None, None, 0.0, 0, 0.0, reason, rest_speed=rest)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dictionary for JSON; what is not there has no field in it, as in earlier versions."""
@@ -90,11 +115,9 @@ class Calibration:
         Raises:
             InputError: If a field is missing or unknown.
         """
-        names = {f.name for f in fields(cls)}
-        if set(values) | set(LATER) != names:
-            raise InputError(
-                f"calibration: got fields {sorted(values)}, it needs {sorted(names - set(LATER))}"
-            )
+        names, may_lack = {f.name for f in fields(cls)}, {*LATER, *ADDED}
+        if set(values) | may_lack != names:
+            raise InputError(f"calibration: got fields {sorted(values)}, it needs {sorted(names - may_lack)}")
         found = {name: kind.from_dict(values[name]) for name, kind in LATER.items() if values.get(name)}
         return cls(**{**values, **found})
 
@@ -105,14 +128,14 @@ def calibrate(
     *,
     false_alarms_per_hour: float = 1.0,
     data_hash: str = "",
-    floor_w: float = 1e-6,
     block_s: float = BLOCK_S,
+    rest_speed: ArrayLike = REST_SPEED,
 ) -> Calibration:
     """Threshold that nominal levels pass upwards at the wanted rate.
 
-    The largest level in blocks of 5 s follows a Gumbel distribution with location and scale from its first
-    two L-moments; the threshold has exceedance probability ``1 - exp(-rate * 5 s)`` in a block, that is,
-    ``location + scale * -log(rate * 5 s)``. The alarm is released at half the threshold, but not below
+    The largest level in a block follows a Gumbel distribution with location and scale from its first
+    two L-moments; the threshold has exceedance probability ``1 - exp(-rate * block)`` in a block, that is,
+    ``location + scale * -log(rate * block)``. The alarm is released at half the threshold, but not below
     the nominal 95 % quantile (or it would hang), nor above the threshold.
 
     Args:
@@ -120,12 +143,13 @@ def calibrate(
         dt: Sample period [s].
         false_alarms_per_hour: Wanted rate [1/h]; default 1.
         data_hash: Hash of the data, kept in the result.
-        floor_w: Smallest threshold [W]: below it lies rounding. Default 1e-6.
-        block_s: Length of a block [s]; much longer than what one sample does to the next. Default 5.
+        block_s: Length of a block [s]; much longer than what one sample does to the next. Default 5; of a machine with
+            another second five of these (:func:`~hybrid_mpc.monitor.lengths.block_seconds`).
+        rest_speed: That of the monitor which made the levels (``monitor.rest_speed``). Default 0.2, as the monitor's.
 
     Raises:
         InputError: If ``dt``, the block or the rate is not positive, more alarms are wanted than one in two blocks,
-            or there is too little data: 30 blocks, and one twentieth of the mean time between alarms.
+            there is too little data (30 blocks, and one twentieth of the mean time between alarms), or it is zero.
 
     Source: Coles (2001), An Introduction to Statistical Modeling of Extreme Values, ch. 3;
     Hosking (1990) for the L-moments.
@@ -155,11 +179,19 @@ def calibrate(
             "Record more, or ask for a higher rate."
         )
     location, scale = gumbel(maxima)
-    threshold = max(location - scale * float(np.log(rate)), floor_w)
+    threshold = location - scale * float(np.log(rate))
+    if not threshold > 0:
+        raise InputError(
+            "calibration: the nominal levels are zero throughout, so nothing tells how large an ordinary one is; "
+            "record the machine in motion"
+        )
     release = min(max(0.5 * threshold, float(np.quantile(finite, 0.95))), threshold)
     hours = finite.size * dt / 3600.0
     method = f"Gumbel tail of maxima in blocks of {block_s:g} s (L-moments), {maxima.size} blocks"
-    return Calibration(threshold, release, false_alarms_per_hour, finite.size, hours, method, data_hash)
+    return Calibration(
+        threshold, release, false_alarms_per_hour, finite.size, hours, method, data_hash,
+        rest_speed=tuple(np.ravel(rest_speed).tolist()),
+    )  # fmt: skip
 
 
 def with_residual(power: Calibration, residual: Calibration) -> Calibration:
@@ -207,6 +239,13 @@ def alarm_intervals(
     edges = np.diff(on)
     firsts, lasts = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
     return [(float(start + a * dt), float(start + b * dt)) for a, b in zip(firsts, lasts, strict=True)]
+
+
+def _ordered(release: float | None, threshold: float | None) -> bool:
+    """Whether both are None, or ``0 < release <= threshold``."""
+    if release is None or threshold is None:
+        return release is threshold
+    return 0 < release <= threshold
 
 
 def block_maxima(levels: Sequence[Array], size: int) -> tuple[Array, Array]:

@@ -9,18 +9,18 @@ from types import MappingProxyType
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.monitor.calibration import BLOCK_S, MAX_EXTRAPOLATION, MIN_BLOCKS, block_maxima, gumbel
+from hybrid_mpc.monitor.calibration import MAX_EXTRAPOLATION, MIN_BLOCKS, block_maxima, gumbel
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.energy import FROZEN_STEPS
 from hybrid_mpc.monitor.learning import detector_levels, learn_detector
-from hybrid_mpc.monitor.standard import DRIFT, SETTLING_S
+from hybrid_mpc.monitor.lengths import SETTLING_S, WINDOW_S, block_seconds
+from hybrid_mpc.monitor.rest import REST_SPEED
+from hybrid_mpc.monitor.standard import DRIFT
 
 Array = NDArray[np.float64]
-WINDOW_S = 0.2
-"""Window [s] over which the baselines average."""
 RELEASE = 0.5
 METHODS: Mapping[str, Mapping[str, float]] = MappingProxyType(
     {
@@ -34,9 +34,10 @@ METHODS: Mapping[str, Mapping[str, float]] = MappingProxyType(
 """By method the parts that alarm, each with its share of the wanted rate; 0 for one whose threshold is fixed.
 
 ``guard``: sums of scaled residual forces, power of the free runs, freeze test. ``level``: the averaged one-step
-violation alone. ``innovation_chi2``: normalised innovation squared, averaged over 0.2 s, what a chi-square test looks
-at; its threshold is learned too, for the innovations of a switching filter are not white. ``innovation_rms``: root mean
-square of the output's residual over 0.2 s. ``guard_or_innovation``: either, each at half the rate.
+violation alone. ``innovation_chi2``: normalised innovation squared, averaged over the guard's window, what a
+chi-square test looks at; its threshold is learned too, for the innovations of a switching filter are not white.
+``innovation_rms``: root mean square of the output's residual over that window. ``guard_or_innovation``: either, each
+at half the rate.
 """
 
 
@@ -66,10 +67,10 @@ class Judges:
 
     Args:
         detector: Scales of residual forces and power; its thresholds are set by the wanted rate.
-        tails: By part location and scale of the Gumbel tail of its maxima in blocks of 5 s.
+        tails: By part location and scale of the Gumbel tail of its maxima in blocks (:attr:`block_s`).
         resolution: Step of each sensor ``(n_y,)``.
         hours: Nominal data learned from [h].
-        blocks: Blocks of 5 s among them.
+        blocks: Blocks among them.
 
     Example:
         >>> tails = {"forces": (3.0, 0.5), "power": (2.0, 0.4)}
@@ -84,24 +85,34 @@ class Judges:
     hours: float = 0.0
     blocks: int = 0
 
+    @property
+    def block_s(self) -> float:
+        """Length of a block [s]."""
+        return block_seconds(self.detector.dt, self.detector.time_unit)
+
+    @property
+    def settling(self) -> int:
+        """Samples at the beginning of a loop that are not judged."""
+        return round(SETTLING_S * self.detector.time_unit / self.detector.dt)
+
     def threshold(self, part: str, rate: float) -> float:
         """Level that a part passes at that rate [1/h] on nominal data; 1 for the freeze test, a share already."""
         if part == "freeze":
             return 1.0
         location, scale = self.tails[part]
-        return max(location - scale * math.log(rate * BLOCK_S / 3600.0), 1e-12)
+        return max(location - scale * math.log(rate * self.block_s / 3600.0), 1e-12)
 
     def detector_at(self, rate: float) -> Detector:
         """The detector with thresholds for that rate [1/h] in all, half of it for each alarm."""
         force, power = (self.threshold(part, 0.5 * rate) for part in ("forces", "power"))
         return replace(
             self.detector, force_threshold=force, energy_threshold=power, false_alarms_per_hour=rate,
-            method=f"Gumbel tail of maxima in blocks of {BLOCK_S:g} s",
+            method=f"Gumbel tail of maxima in blocks of {self.block_s:g} s",
         )  # fmt: skip
 
     def levels(self, trace: TraceLike) -> dict[str, Array]:
         """Level ``(n,)`` of each part along a loop; zero where it says nothing, and while the estimator settles."""
-        dt, n_q = self.detector.dt, len(self.resolution)
+        n_q, window = len(self.resolution), WINDOW_S * self.detector.time_unit / self.detector.dt
         forces, power = detector_levels(self.detector, trace.numbers)
         travel = np.abs(trace.numbers[:, 3 + n_q : 3 + 2 * n_q]) / (FROZEN_STEPS * np.array(self.resolution))
         squares = (trace.innovation**2).sum(axis=1)
@@ -110,12 +121,12 @@ class Judges:
             "power": power,
             "freeze": travel.max(axis=1),
             "level": trace.level_w,
-            "innovation_chi2": _averaged(trace.nis, dt),
-            "innovation_rms": np.sqrt(_averaged(squares, dt)),
+            "innovation_chi2": _averaged(trace.nis, window),
+            "innovation_rms": np.sqrt(_averaged(squares, window)),
         }
         result = {name: np.nan_to_num(level) for name, level in found.items()}
         for level in result.values():
-            level[: round(SETTLING_S / dt)] = 0.0
+            level[: self.settling] = 0.0
         return result
 
     def score(self, levels: Mapping[str, Array], method: str, rate: float) -> Array:
@@ -138,7 +149,7 @@ class Judges:
                 on |= levels[part] > 1.0
             elif part != "power":
                 on |= held(levels[part], self.threshold(part, share * rate))
-        on[: round(SETTLING_S / self.detector.dt)] = False
+        on[: self.settling] = False
         return on
 
     def _detected(self, numbers: Array, rate: float) -> NDArray[np.bool_]:
@@ -175,6 +186,8 @@ def learn_judges(
     resolution: Sequence[float],
     *,
     rate: float = 1.0,
+    rest_speed: ArrayLike = REST_SPEED,
+    time_unit: float = 1.0,
     data_hash: str = "",
 ) -> Judges:
     """All methods from nominal loops, for wanted rates of false alarms down to ``rate``.
@@ -183,29 +196,32 @@ def learn_judges(
     known to be nominal, so a block that stands out is no reason to refuse them.
 
     Args:
-        traces: Nominal loops; the first second of each is left out.
+        traces: Nominal loops; the first of the machine's seconds of each is left out.
         dt: Period [s].
         resolution: Step of each sensor ``(n_y,)``.
         rate: Smallest wanted rate [1/h]; default 1.
+        rest_speed: That of the monitor which watched them (``monitor.rest_speed``). Default 0.2, as the monitor's.
+        time_unit: The machine's second [s], the model's. Default 1.
         data_hash: Hash of the data, kept in the detector.
 
     Raises:
         InputError: If there is too little data for the rate, or no motion.
     """
-    skipped = round(SETTLING_S / dt)
+    skipped, block_s = round(SETTLING_S * time_unit / dt), block_seconds(dt, time_unit)
     runs = [trace.numbers[skipped:] for trace in traces]
     share = min(s for parts in METHODS.values() for s in parts.values() if s)
-    needed = max(MIN_BLOCKS, math.ceil(3600.0 / (share * rate * BLOCK_S * MAX_EXTRAPOLATION)))
-    size = round(BLOCK_S / dt)
+    needed = max(MIN_BLOCKS, math.ceil(3600.0 / (share * rate * block_s * MAX_EXTRAPOLATION)))
+    size = round(block_s / dt)
     blocks = sum(len(run) // size for run in runs)
     if blocks < needed:
         raise InputError(
-            f"learn_judges: {blocks * BLOCK_S / 60:.1f} min of nominal loops in whole blocks of {BLOCK_S:g} s; a rate "
-            f"of {rate:g}/h, of which a part gets {share:g}, needs {needed * BLOCK_S / 60:.1f} min"
+            f"learn_judges: {blocks * block_s / 60:.1f} min of nominal loops in whole blocks of {block_s:g} s; a rate "
+            f"of {rate:g}/h, of which a part gets {share:g}, needs {needed * block_s / 60:.1f} min"
         )
     detector = learn_detector(
-        runs, dt, len(resolution), drift=DRIFT, false_alarms_per_hour=rate, data_hash=data_hash, trusted=True
-    )
+        runs, dt, len(resolution), drift=DRIFT, false_alarms_per_hour=rate, rest_speed=rest_speed,
+        data_hash=data_hash, trusted=True, time_unit=time_unit,
+    )  # fmt: skip
     hours = sum(len(run) for run in runs) * dt / 3600.0
     judges = Judges(detector, {}, tuple(resolution), hours, blocks)
     levels = [judges.levels(trace) for trace in traces]
@@ -229,6 +245,6 @@ def held(level: Array, threshold: float, release: float = RELEASE) -> NDArray[np
     return np.asarray((places >= 0) & (state[np.maximum(places, 0)] == 1))
 
 
-def _averaged(values: Array, dt: float) -> Array:
-    n = max(round(WINDOW_S / dt), 1)
+def _averaged(values: Array, window: float) -> Array:
+    n = max(round(window), 1)
     return np.convolve(np.nan_to_num(values), np.ones(n) / n)[: len(values)]

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.monitor.lengths import SHORTEST_S
+from hybrid_mpc.monitor.rest import REST_SPEED, checked_rest
 
 Array = NDArray[np.float64]
 CAP = 1.5
 """A sum goes no higher than so many thresholds: what has passed is soon forgotten."""
-SHORTEST_S = 0.08
-"""Accumulated times of a free run below this say little."""
 TERMS = 4
 """Terms of a scale: constant, squared speed, squared input, and rest (force) or one over the time (energy)."""
 
@@ -39,7 +39,7 @@ class Detector:
     """Cumulative sums of scaled residual forces, and a threshold on the scaled power of the free runs.
 
     A nominal residual grows with speed, input and near rest. Its variance is learned as
-    ``a_0 + a_1 |v|^2 + a_2 |u|^2 + a_3 / (1 + |v|^2 / rest_speed^2)`` with coefficients that are not negative, and
+    ``a_0 + a_1 |v|^2 + a_2 |u|^2 + a_3 / (1 + |v / rest_speed|^2)`` with coefficients that are not negative, and
     ``z`` is the residual over its deviation. ``g = max(0, g + |z| - drift)``, upwards and downwards apart, rises under
     a lasting departure above ``drift`` and falls otherwise: the sooner over its threshold, the larger the departure.
     The energy of a free run, over the time it was accumulated in, has the last term ``a_3 / time``; it is an average
@@ -53,12 +53,14 @@ class Detector:
         force_threshold: Sum [deviations] above which the force's alarm starts.
         energy_threshold: Scaled power above which the energy's alarm starts; infinite without free runs.
         release: Share of the threshold at which an alarm ends.
-        rest_speed: Speed [unit of v] of the scale's term at rest.
+        rest_speed: Speeds ``(n_q,)`` [unit of v] below which friction may stick, or one for all; also of the scale's
+            term at rest. Default 0.2, that of detectors which hold none.
         false_alarms_per_hour: Wanted rate on nominal data [1/h].
         hours: Duration of the nominal data [h].
         interval: 5 % and 95 % of a block bootstrap of the thresholds: ``(force low, high, energy low, high)``.
         method: How the thresholds were found.
         data_hash: Hash of the nominal data.
+        time_unit: The machine's second [s] that the monitor's lengths were counted in. Default 1.
 
     Raises:
         InputError: If a number is not as said.
@@ -83,12 +85,13 @@ class Detector:
     force_threshold: float
     energy_threshold: float = math.inf
     release: float = 0.5
-    rest_speed: float = 0.2
+    rest_speed: tuple[float, ...] = (REST_SPEED,)
     false_alarms_per_hour: float = math.nan
     hours: float = 0.0
     interval: tuple[float, ...] = ()
     method: str = ""
     data_hash: str = ""
+    time_unit: float = 1.0
 
     def __post_init__(self) -> None:
         wrong = [row for row in (*self.force, self.energy or (1.0,) * TERMS) if not _fit(row)]
@@ -96,9 +99,11 @@ class Detector:
             raise InputError(
                 f"detector: scales need {TERMS} numbers each, not negative, not all 0; got {wrong}"
             )
-        if not (self.dt > 0 and self.rest_speed > 0 and 0 <= self.drift < math.inf and 0 < self.release <= 1):
+        rest = checked_rest(self.rest_speed, len(self.force), "detector")
+        object.__setattr__(self, "rest_speed", rest)
+        if not (self.dt > 0 and self.time_unit > 0 and 0 <= self.drift < math.inf and 0 < self.release <= 1):
             raise InputError(
-                f"detector: dt {self.dt} and rest_speed {self.rest_speed} must be positive, drift {self.drift} not "
+                f"detector: dt {self.dt} and time_unit {self.time_unit} must be positive, drift {self.drift} not "
                 f"negative, release {self.release} within 0 to 1"
             )
         if not (self.force_threshold > 0 and self.energy_threshold > 0):
@@ -109,11 +114,18 @@ class Detector:
         """State before the first sample."""
         return DetectorState((0.0,) * (2 * len(self.force)), (False, False))
 
-    def check(self, n_q: int, free_runs: bool, dt: float | None = None) -> None:
+    @property
+    def shortest(self) -> float:
+        """Accumulated time [s] of a free run from which on it counts."""
+        return SHORTEST_S * self.time_unit
+
+    def check(
+        self, n_q: int, free_runs: bool, dt: float | None = None, time_unit: float | None = None
+    ) -> None:
         """Refuse a monitor that this detector was not learned for.
 
         Raises:
-            InputError: If it has another number of forces, no free runs to judge, or another period.
+            InputError: If it has another number of forces, no free runs to judge, another period or unit of time.
         """
         if len(self.force) != n_q:
             raise InputError(f"detector: learned for {len(self.force)} forces, the model has {n_q}")
@@ -125,11 +137,21 @@ class Detector:
             raise InputError(
                 f"detector: learned at a period of {self.dt} s, the model's is {dt} s; learn it anew"
             )
+        if time_unit is not None and abs(time_unit - self.time_unit) > 1e-9 * self.time_unit:
+            raise InputError(
+                f"detector: its lengths count in a machine's second of {self.time_unit:g} s, the model's in "
+                f"{time_unit:g} s; learn it anew"
+            )
 
     def deviations(self, v2: Array, u2: Array) -> Array:
-        """Standard deviations ``(n, n_q)`` of nominal residual forces at squared speeds and inputs ``(n,)``."""
-        terms = np.column_stack([np.ones(len(v2)), v2, u2, 1.0 / (1.0 + v2 / self.rest_speed**2)])
-        return np.asarray(np.sqrt(terms @ np.array(self.force).T))
+        """Standard deviations ``(n, n_q)`` of nominal residual forces.
+
+        Args:
+            v2: Squared speed of each degree of freedom ``(n, n_q)``; ``(n,)`` where there is one.
+            u2: Squared length of the inputs ``(n,)``.
+        """
+        squares = np.asarray(v2, dtype=np.float64).reshape(len(u2), -1)
+        return np.asarray(np.sqrt(force_terms(squares, u2, self.rest_speed) @ np.array(self.force).T))
 
     def update(
         self, state: DetectorState, numbers: Sequence[float]
@@ -146,12 +168,13 @@ class Detector:
         n = len(self.force)
         end = 3 + 3 * n
         stop = len(numbers) - 4 if self.energy else len(numbers)
-        v2 = u2 = 0.0
-        for v in numbers[3 + 2 * n : end]:
+        v2 = u2 = slow = 0.0
+        for v, rest in zip(numbers[3 + 2 * n : end], self.rest_speed, strict=True):
             v2 += v * v
+            slow += v * v / rest**2
         for u in numbers[end:stop]:
             u2 += u * u
-        near = 1.0 / (1.0 + v2 / self.rest_speed**2)
+        near = 1.0 / (1.0 + slow)
         most, drift, sums, largest = CAP * self.force_threshold, self.drift, list(state.sums), 0.0
         for i, (a0, a1, a2, a3) in enumerate(self.force):
             z = numbers[3 + i] / math.sqrt(a0 + a1 * v2 + a2 * u2 + a3 * near)
@@ -169,7 +192,7 @@ class Detector:
     def _power(self, numbers: Sequence[float]) -> float:
         """Mean power of the older free run over its deviation, from energy, squared speed and input, and time."""
         energy, v2, u2, seconds = numbers
-        if not (seconds >= SHORTEST_S and energy == energy):
+        if not (seconds >= self.shortest and energy == energy):
             return 0.0
         a0, a1, a2, a3 = self.energy
         v2, u2 = v2 / seconds, u2 / seconds
@@ -201,9 +224,23 @@ class Detector:
             given["force"] = tuple(tuple(map(float, row)) for row in given["force"])
             given["energy"] = tuple(map(float, given["energy"]))
             given["interval"] = tuple(map(float, given.get("interval", ())))
+            if "rest_speed" in given:  # one number in earlier versions
+                given["rest_speed"] = tuple(np.ravel(given["rest_speed"]).astype(float).tolist())
             return cls(**given)
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"detector: damaged: {type(error).__name__} {error}") from error
+
+
+def force_terms(v2: Array, u2: Array, rest_speed: Sequence[float]) -> Array:
+    """What the variance of a nominal residual force is linear in, ``(n, 4)``.
+
+    Args:
+        v2: Squared speed of each degree of freedom ``(n, n_q)``.
+        u2: Squared length of the inputs ``(n,)``.
+        rest_speed: Speeds ``(n_q,)`` below which friction may stick.
+    """
+    slow = (v2 / np.array(rest_speed) ** 2).sum(axis=1)
+    return np.column_stack([np.ones(len(v2)), v2.sum(axis=1), u2, 1.0 / (1.0 + slow)])
 
 
 def _fit(row: Sequence[float]) -> bool:

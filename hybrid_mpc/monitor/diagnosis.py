@@ -134,9 +134,10 @@ class Diagnoser:
         rows = state.memory[layout.rows :].reshape(layout.history, layout.history_row)
         rows = rows[-min(layout.history, max(round(min(since, 1e6) / layout.model.dt), 1)) :]
         v = rows[:, layout.n_q : 2 * layout.n_q]
-        used = np.isfinite(rows).all(axis=1) & (np.abs(v).min(axis=1) > 2 * self._monitor.rest_speed)
+        moving = (np.abs(v) > 2 * np.array(self._monitor.rest_speed)).all(axis=1)
+        used = np.isfinite(rows).all(axis=1) & moving
         x, u, residual = np.split(rows[used], [2 * layout.n_q, 2 * layout.n_q + layout.model.n_u], axis=1)
-        sigma = detector.deviations((x[:, layout.n_q :] ** 2).sum(axis=1), (u**2).sum(axis=1))
+        sigma = detector.deviations(x[:, layout.n_q :] ** 2, (u**2).sum(axis=1))
         size = np.mean(residual**2, axis=0) if len(residual) else 0.0
         sigma = np.sqrt(sigma**2 + TOLERANCE**2 * size)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,8 @@ from hybrid_mpc.model import HybridModel
 from hybrid_mpc.monitor.balance import Layout, check_model, reading_function
 from hybrid_mpc.monitor.calibration import Calibration
 from hybrid_mpc.monitor.detector import Detector
-from hybrid_mpc.monitor.reading import QUIET, EstimateLike, MonitorReading, MonitorState
+from hybrid_mpc.monitor.reading import QUIET, EstimateLike, MonitorReading, MonitorState, Verdict
+from hybrid_mpc.monitor.rest import REST_SPEED, checked_rest
 
 Array = NDArray[np.float64]
 FROZEN_STEPS = 3.0
@@ -37,11 +39,11 @@ class EnergyMonitor:
     ``a_model`` is a mean over each period's own step, so a model error acts as it would in a prediction.
     The other terms of each single balance are taken at the centre, not averaged.
 
-    At rest the violation is zero, whatever the forces do. Beside it stands the residual force
-    ``M (a_measured - a_model)`` with the inertia ``M`` that the energy balance holds. Near rest friction may
-    be anything up to ``F``, half the jump of the model's acceleration times ``M`` between ``-rest_speed``
-    and ``rest_speed``: only what exceeds this dead band counts there; it closes linearly up to twice the
-    speed. So a hand that holds the machine still shows, and sticking friction does not.
+    At rest the violation is zero, whatever the forces do. Beside it stands the residual force ``M (a_measured -
+    a_model)`` with the inertia ``M`` that the energy balance holds. Near rest dry friction may be anything up to
+    ``F``, half the jump of the model's acceleration at zero speed times ``M``, told from what damps at ``rest_speed``
+    and twice that: only what exceeds this dead band counts there; it closes linearly up to twice the speed. So a hand
+    that holds the machine still shows, and sticking friction does not.
 
     The one step starts from an estimate that has followed the measurements, and so has half forgotten what went
     wrong. With ``free_run`` the model also runs on its own, from ``(x_hat, h)`` of up to so long ago under the
@@ -56,16 +58,21 @@ class EnergyMonitor:
     input since the last step of the sensors would have moved counts as well, once it is more than a quarter of the
     input's range and the model says that it moves. A machine that is blocked looks the same.
 
-    A missing (NaN) measurement gives NaN readings until it has left the window. The level is the mean of
-    the finite ones of the last ``average`` violations, NaN (and no alarm) while fewer than half are finite.
-    Positions must count on through full turns. Not for several threads at once (it reuses its buffers).
+    A missing (NaN) measurement gives NaN readings until it has left the window. The level is the mean of the finite
+    ones of the last ``average`` violations, NaN (and no alarm) while fewer than half are finite. Each reading says
+    whether it judged and if not, why (``verdict``). A monitor that has judged nothing for longer than ``window`` and
+    ``average`` together is ``blind``, and that is an alarm: nobody knows how the machine is. Positions must count on
+    through full turns. Not for several threads at once (it reuses its buffers).
 
     Args:
         model: Model whose outputs are its positions ``q`` (state ``[q, v]``).
         window: Samples in the local polynomial, odd, at least 5.
         average: Samples in the moving average of the level.
         calibration: Thresholds of the alarm. Default: none, then there is no alarm from the levels.
-        rest_speed: Speed [unit of v] below which friction may stick. Default 0.2.
+        rest_speed: Speeds ``(n_q,)`` [unit of v] below which friction may stick, or one for all: what
+            :func:`~hybrid_mpc.monitor.rest_speeds` finds in recordings. Default: the detector's, else the
+            calibration's, else 0.2, which suits angles in rad/s and was every machine's before rest speeds were
+            learned.
         free_run: Length [s] of the model's free runs. Default 0: none.
         resolution: Step of each sensor ``(n_y,)``. Default: unknown, then there is no test for freezing.
         detector: Detector of scaled residuals. Default: none.
@@ -75,8 +82,9 @@ class EnergyMonitor:
         history: Time [s] over which :func:`~hybrid_mpc.monitor.diagnosis.diagnose` looks back. Default 0: not at all.
 
     Raises:
-        InputError: If the window or average is unfit, a free run is no longer than two windows, the outputs are not
-            the positions, the energy balance says nothing, or the model cannot say what a history needs.
+        InputError: If the window, the average or a rest speed is unfit, a free run is no longer than two windows, the
+            outputs are not the positions, the energy balance says nothing, or the model cannot say what a history
+            needs.
 
     Source: energy balance and violation of the paper (energy objective, powers in W); Savitzky and Golay
     (1964) for the polynomial; Peano kernel theorem for the weighting.
@@ -103,14 +111,14 @@ class EnergyMonitor:
         window: int,
         average: int,
         calibration: Calibration | None = None,
-        rest_speed: float = 0.2,
+        rest_speed: ArrayLike | None = None,
         free_run: float = 0.0,
         resolution: ArrayLike | None = None,
         detector: Detector | None = None,
         history: float = 0.0,
         input_range: ArrayLike | None = None,
     ) -> None:
-        _check(window, average, rest_speed)
+        _check(window, average)
         check_model(model)
         self.layout = Layout(model, window, average, round(free_run / model.dt), round(history / model.dt))
         if free_run and self.layout.length < 2 * window:
@@ -118,11 +126,15 @@ class EnergyMonitor:
                 f"energy monitor: a free run of {free_run} s given; two windows, {2 * window * model.dt:g} s, needed"
             )
         self.model, self.window, self.average = model, window, average
-        self.calibration, self.detector, self.rest_speed = calibration, detector, rest_speed
+        self.calibration, self.detector = calibration, detector
+        if rest_speed is None:
+            held = (part.rest_speed for part in (detector, calibration) if part is not None)
+            rest_speed = next((rest for rest in held if rest is not None), REST_SPEED)
+        self.rest_speed = checked_rest(rest_speed, model.n_x // 2, "energy monitor")
         self._resolution = _positive(resolution, model.n_y)
         if detector is not None:
-            detector.check(model.n_y, bool(self.layout.length), model.dt)
-        self._function = reading_function(self.layout, rest_speed, _spans(model, input_range))
+            detector.check(model.n_y, bool(self.layout.length), model.dt, model.time_unit)
+        self._function = reading_function(self.layout, self.rest_speed, _spans(model, input_range))
         self._ins = [np.zeros(self._function.size1_in(i)) for i in range(6)]
         self._outs = [np.zeros(self._function.size1_out(i)) for i in range(2)]
         self._sizes = tuple(values.size for values in self._ins[1:5])
@@ -190,16 +202,30 @@ class EnergyMonitor:
         found, scores, detected = state.detector, (), False
         if self.detector is not None:
             found, scores, detected = self.detector.update(found, numbers)
-        alarm = alarms[0] or alarms[1] or frozen or detected
-        return MonitorState(memory, x, h, alarms, left, found, frozen), MonitorReading(
+        seen = min(state.seen + 1, self.window)
+        missing = not math.isfinite(sum(y.tolist()) + (sum(u_prev.tolist()) if state.seen else 0.0))
+        whole = 0 if missing else min(state.whole + 1, self.window)
+        verdict = self._verdict(numbers[2 : 3 + n_q], seen, whole)
+        dark = state.dark + 1 if verdict else 0
+        blind = dark > self.window + self.average
+        alarm = alarms[0] or alarms[1] or frozen or detected or blind
+        return MonitorState(memory, x, h, alarms, left, found, frozen, seen, whole, dark), MonitorReading(
             numbers[0], numbers[1], numbers[2], level, self._outs[1][3 : 3 + n_q].copy(), residual_level, alarm,
-            energy, seconds, frozen, scores, tuple(numbers),
+            energy, seconds, frozen, scores, tuple(numbers), verdict, blind,
         )  # fmt: skip
+
+    def _verdict(self, readings: Sequence[float], seen: int, whole: int) -> Verdict:
+        """Whether violation and residual force are numbers; and if not, what hinders."""
+        if math.isfinite(sum(readings)):
+            return Verdict.JUDGED
+        if seen < self.window:
+            return Verdict.WARM_UP
+        return Verdict.MISSING if whole < self.window else Verdict.NOT_FINITE
 
     def alarms(self, level: float, residual_level: float, were_on: tuple[bool, bool]) -> tuple[bool, bool]:
         """Whether power and residual alarm at these levels [W], [N m], after having been on or not."""
         c = self.calibration
-        if c is None:
+        if c is None or c.threshold_w is None or c.release_w is None:
             return QUIET
         power = level > (c.release_w if were_on[0] else c.threshold_w)
         if c.residual_threshold is None or c.residual_release is None:
@@ -276,9 +302,7 @@ def _spans(model: HybridModel, given: ArrayLike | None) -> Array:
     return spans
 
 
-def _check(window: int, average: int, rest_speed: float) -> None:
-    if not rest_speed > 0:
-        raise InputError(f"energy monitor: rest_speed must be positive, got {rest_speed}")
+def _check(window: int, average: int) -> None:
     if window < 5 or window % 2 == 0:
         raise InputError(f"energy monitor: window must be an odd number of at least 5 samples, got {window}")
     if average < 1:

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model import HybridModel
-from hybrid_mpc.monitor.calibration import BLOCK_S
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.learning import learn_detector
+from hybrid_mpc.monitor.lengths import SETTLING_S
 from hybrid_mpc.monitor.replay import EstimatorLike, MonitorTrace, TrajectoryLike, replay
-from hybrid_mpc.monitor.standard import DRIFT, SETTLING_S, guard_monitor
+from hybrid_mpc.monitor.rest import rest_speeds
+from hybrid_mpc.monitor.standard import DRIFT, guard_monitor
 
 Array = NDArray[np.float64]
 TINY = 1e-6
@@ -73,8 +74,10 @@ class HeldOut:
 
     @property
     def highest(self) -> tuple[float, float]:
-        """Largest shares of the thresholds, forces and power, in clean windows but for their first second."""
-        settled = settled_windows(self.trace.t, self.clean)
+        """Largest shares of the thresholds, forces and power, in clean windows but for their first second (the
+        machine's).
+        """
+        settled = settled_windows(self.trace.t, self.clean, SETTLING_S * self.detector.time_unit)
         scores = self.trace.scores[settled]
         return (float(scores[:, 0].max()), float(scores[:, 1].max())) if len(scores) else (0.0, 0.0)
 
@@ -90,13 +93,14 @@ def leave_one_out(
     *,
     false_alarms_per_hour: float = 1.0,
     resolution: ArrayLike | None = None,
-    block_s: float = BLOCK_S,
+    rest_speed: ArrayLike | None = None,
+    block_s: float | None = None,
     data_hash: str = "",
 ) -> list[HeldOut]:
     """Judge each recording with a detector learned from the clean windows of all others.
 
     Every recording is replayed as a whole, as it would have run online: what happens between the windows is in the
-    monitor's memory when the next one begins. Nothing is learned from the first second of a window.
+    monitor's memory when the next one begins. Nothing is learned from the first of the machine's seconds of a window.
 
     Args:
         model: The model. What it was trained on it has seen, whatever the detector has.
@@ -105,6 +109,8 @@ def leave_one_out(
         windows: Where nothing but the input acted on the machine, ``(start, end)`` [s] by name.
         false_alarms_per_hour: Wanted rate [1/h]; default 1. Little data ask for more.
         resolution: Step of each sensor ``(n_y,)``. Default: unknown, no test for freezing.
+        rest_speed: Speeds ``(n_q,)`` below which friction may stick. Default: what
+            :func:`~hybrid_mpc.monitor.rest_speeds` finds in all clean windows.
         block_s: Length of a block [s] of the extreme values; see :func:`~hybrid_mpc.monitor.learning.learn_detector`.
         data_hash: Hash of the recordings, kept in the detectors.
 
@@ -119,16 +125,25 @@ def leave_one_out(
         raise InputError(
             f"leave_one_out: no clean windows given for {unknown}; name them, or leave these out"
         )
-    monitor = guard_monitor(model, resolution=resolution)
+    clean = [clean_samples(np.asarray(r.t, dtype=np.float64), windows[_stem(r)]) for r in recordings]
+    if rest_speed is None:
+        undisturbed = [
+            _Outputs(y) for r, c in zip(recordings, clean, strict=True) for y in _stretches(r.y, c)
+        ]
+        rest_speed = rest_speeds(undisturbed, model)
+    monitor = guard_monitor(model, resolution=resolution, rest_speed=rest_speed)
     traces = [replay(monitor, estimator, r) for r in recordings]
-    clean = [clean_samples(trace.t, windows[_stem(r)]) for trace, r in zip(traces, recordings, strict=True)]
+    settled = [
+        settled_windows(trace.t, c, SETTLING_S * model.time_unit)
+        for trace, c in zip(traces, clean, strict=True)
+    ]
     found = []
     for r, trace, inside in zip(recordings, traces, clean, strict=True):
         others = [i for i, other in enumerate(recordings) if _stem(other) != _stem(r)]
         detector = learn_detector(
-            [run for i in others for run in _runs(traces[i], clean[i])], model.dt, model.n_y, drift=DRIFT,
-            false_alarms_per_hour=false_alarms_per_hour, rest_speed=monitor.rest_speed, data_hash=data_hash,
-            block_s=block_s,
+            [run for i in others for run in _stretches(traces[i].numbers, settled[i])], model.dt, model.n_y,
+            drift=DRIFT, false_alarms_per_hour=false_alarms_per_hour, rest_speed=monitor.rest_speed,
+            data_hash=data_hash, time_unit=model.time_unit, block_s=block_s,
         )  # fmt: skip
         found.append(HeldOut(r.name, detector, judged(detector, trace), inside))
     return found
@@ -139,15 +154,18 @@ def judged(detector: Detector, trace: MonitorTrace) -> MonitorTrace:
 
     Args:
         detector: The detector.
-        trace: What a monitor with free runs said; its frozen sensors remain alarms.
+        trace: What a monitor with free runs said; its frozen sensors, and where it was blind, remain alarms.
     """
     state, scores, alarm = detector.initial(), [], []
     for numbers in trace.numbers.tolist():
-        state, score, on = detector.update(state, numbers)
+        state, score, detected = detector.update(state, numbers)
         scores.append(score)
-        alarm.append(on)
-    frozen: Any = trace.frozen if trace.frozen.size else False
-    return replace(trace, scores=np.array(scores), alarm=np.array(alarm, dtype=bool) | frozen)
+        alarm.append(detected)
+    on = np.array(alarm, dtype=bool)
+    for own in (trace.frozen, trace.blind):
+        if own.size:
+            on |= own
+    return replace(trace, scores=np.array(scores), alarm=on)
 
 
 def clean_samples(t: Array, windows: Sequence[tuple[float, float]]) -> NDArray[np.bool_]:
@@ -163,8 +181,13 @@ def clean_samples(t: Array, windows: Sequence[tuple[float, float]]) -> NDArray[n
     return inside
 
 
-def settled_windows(t: Array, clean: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The clean samples but for the first second of each window, in which the monitor remembers what was before it.
+def settled_windows(t: Array, clean: NDArray[np.bool_], settling: float = SETTLING_S) -> NDArray[np.bool_]:
+    """The clean samples but for the beginning of each window, in which the monitor remembers what was before it.
+
+    Args:
+        t: Times ``(n,)`` [s].
+        clean: True within the windows ``(n,)``.
+        settling: Length [s] of what is left out. Default 1; of a machine with another second, one of these.
 
     Example:
         >>> settled_windows(np.array([0.0, 0.5, 1.0, 1.5]), np.array([True, True, True, False])).tolist()
@@ -173,16 +196,22 @@ def settled_windows(t: Array, clean: NDArray[np.bool_]) -> NDArray[np.bool_]:
     begun, settled = float("nan"), np.zeros(len(t), dtype=bool)
     for k, inside in enumerate(clean):
         begun = float("nan") if not inside else t[k] if begun != begun else begun
-        settled[k] = inside and t[k] >= begun + SETTLING_S - TINY
+        settled[k] = inside and t[k] >= begun + settling - TINY
     return settled
 
 
-def _runs(trace: MonitorTrace, clean: NDArray[np.bool_]) -> list[Array]:
-    """The numbers of each settled window."""
-    settled = settled_windows(trace.t, clean)
-    cuts = np.flatnonzero(np.diff(settled.astype(int))) + 1
-    pieces = zip(np.split(trace.numbers, cuts), np.split(settled, cuts), strict=True)
-    return [numbers for numbers, inside in pieces if inside.any()]
+@dataclass(frozen=True)
+class _Outputs:
+    """Positions ``y`` of a stretch."""
+
+    y: Array
+
+
+def _stretches(rows: Array, kept: NDArray[np.bool_]) -> list[Array]:
+    """The rows of each stretch that is kept."""
+    cuts = np.flatnonzero(np.diff(kept.astype(int))) + 1
+    pieces = zip(np.split(rows, cuts), np.split(kept, cuts), strict=True)
+    return [part for part, inside in pieces if inside.any()]
 
 
 def _stem(recording: NamedRecording) -> str:

@@ -7,12 +7,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import nnls
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.monitor.calibration import BLOCK_S, block_maxima, calibrate, gumbel
-from hybrid_mpc.monitor.detector import SHORTEST_S, Detector
+from hybrid_mpc.monitor.calibration import block_maxima, calibrate, gumbel
+from hybrid_mpc.monitor.detector import Detector, force_terms
+from hybrid_mpc.monitor.lengths import BLOCK_S, SHORTEST_S, block_seconds
+from hybrid_mpc.monitor.rest import REST_SPEED, checked_rest
 
 Array = NDArray[np.float64]
 ROUNDS = 5
@@ -20,7 +22,7 @@ FLOOR = 1e-3
 """Smallest constant of a variance, as a share of its mean: a scale must not vanish where the data were quiet."""
 BOOTSTRAPS = 200
 NEIGHBOURS = 6
-"""Blocks of 5 s that are drawn together: half a minute, longer than what one motion does to the next."""
+"""Blocks that are drawn together: half a minute of blocks of 5 s, longer than what one motion does to the next."""
 ODD = 1e-4
 """A largest block less probable than this under the rest of its own kind is no nominal one."""
 
@@ -33,11 +35,12 @@ def learn_detector(
     free_runs: bool = True,
     drift: float = 1.0,
     false_alarms_per_hour: float = 1.0,
-    rest_speed: float = 0.2,
+    rest_speed: ArrayLike = REST_SPEED,
     data_hash: str = "",
     seed: int = 0,
     trusted: bool = False,
-    block_s: float = BLOCK_S,
+    time_unit: float = 1.0,
+    block_s: float | None = None,
 ) -> Detector:
     """A detector from nominal readings.
 
@@ -53,12 +56,15 @@ def learn_detector(
         free_runs: Whether the numbers hold free runs. Default: yes.
         drift: See :class:`~hybrid_mpc.monitor.detector.Detector`. Default 1.
         false_alarms_per_hour: Wanted rate [1/h]; default 1.
-        rest_speed: Speed [unit of v] of the scale's term at rest.
+        rest_speed: Speeds ``(n_q,)`` [unit of v] below which friction may stick, or one for all: those of the monitor
+            that made the numbers (``monitor.rest_speed``). Default 0.2, that of a monitor which was given none.
         data_hash: Hash of the data, kept in the result.
         seed: Of the bootstrap.
         trusted: Whether the data are known to be nominal, as simulated ones are: then a block that stands out is one
             of theirs. Default: no; they are refused.
-        block_s: Length of a block [s]. Default 5; shorter where there is little data, and a higher rate is enough.
+        time_unit: The machine's second [s], the model's. Default 1.
+        block_s: Length of a block [s]. Default: 5 of the machine's seconds, 50 periods at least; shorter where there
+            is little data, and a higher rate is enough.
 
     Raises:
         InputError: If there is too little data for the rate, no motion, or an alarm in what should be nominal.
@@ -81,17 +87,27 @@ def learn_detector(
         )
     rows = np.concatenate([np.asarray(run, dtype=np.float64) for run in runs])
     end = rows.shape[1] - (4 if free_runs else 0)
-    v2, u2 = (rows[:, 3 + 2 * n_q : 3 + 3 * n_q] ** 2).sum(1), (rows[:, 3 + 3 * n_q : end] ** 2).sum(1)
-    features = np.column_stack([np.ones(len(rows)), v2, u2, 1.0 / (1.0 + v2 / rest_speed**2)])
+    rest, block_s = checked_rest(rest_speed, n_q, "learn_detector"), block_s or block_seconds(dt, time_unit)
+    v2, u2 = rows[:, 3 + 2 * n_q : 3 + 3 * n_q] ** 2, (rows[:, 3 + 3 * n_q : end] ** 2).sum(1)
+    features = force_terms(v2, u2, rest)
     force = tuple(_scale(features, rows[:, 3 + i], f"force {i}") for i in range(n_q))
     energy: tuple[float, ...] = ()
     if free_runs:
         energy_j, v2, u2, seconds = rows[:, -4:].T
-        long = seconds >= SHORTEST_S
+        long = seconds >= SHORTEST_S * time_unit
         time = np.where(long, seconds, np.inf)
         features = np.column_stack([np.ones(len(rows)), v2 / time, u2 / time, 1.0 / time])
         energy = _scale(features[long], (energy_j / time)[long], "power of the free runs")
-    raw = Detector(dt, force, energy, drift, 1e300, 1e300 if free_runs else math.inf, rest_speed=rest_speed)
+    raw = Detector(
+        dt,
+        force,
+        energy,
+        drift,
+        1e300,
+        1e300 if free_runs else math.inf,
+        rest_speed=rest,
+        time_unit=time_unit,
+    )
     levels = [detector_levels(raw, run) for run in runs]
     rate = false_alarms_per_hour / (2 if free_runs else 1)
     rng = np.random.default_rng(seed)
@@ -169,6 +185,7 @@ def _threshold(
         location, scale = gumbel(sample)
         found.append(location - scale * log_rate)
     low, high = np.quantile(found, [0.05, 0.95])
+    assert fit.threshold_w is not None
     return fit.threshold_w, (float(low), float(high))
 
 

@@ -31,6 +31,8 @@ SETTLED = 2
 """Periods that the hidden state is led through at ``(x, u)``, as a plan's ``(x, u)`` says nothing of the past. Each
 costs time in the plan. In nominal loops of the golf robot two came closest to what the true hidden state says
 (correlation 0.86; 0.70, 0.81, 0.84, 0.77, 0.71 for 0, 1, 3, 4, 5)."""
+ROUNDING = 1e-6
+"""Share of the power that moves the machine below which an ordinary excess is rounding."""
 LEAST = 1e-3
 """Smallest ordinary size that an excess is measured by, as a share of the median one."""
 STRENGTH = 10.0
@@ -151,13 +153,13 @@ def learn_plausibility(
     distance = np.einsum("ni,ij,nj->n", off, precision, off)
     v = x[:, n_q : 2 * n_q]
     deviations = [float(np.sqrt(np.mean(np.sum(s**2, axis=1)))) for s in (v, u)]
-    smooth = (max(SMOOTH * deviations[0], 1e-9), max(SMOOTH * deviations[1], 1e-9))
+    smooth = (SMOOTH * deviations[0] or 1.0, SMOOTH * deviations[1] or 1.0)
     size = np.abs(balance_function(model).map(len(z))(x.T, u.T).full().ravel())
     features = np.column_stack([np.ones(len(z)), _numbers(v, smooth[0]), _numbers(u, smooth[1])])
     chosen = np.unique(np.linspace(0, len(z) - 1, min(MOST, len(z))).round().astype(int))
     terms = _quantile_regression(features[chosen], size[chosen], quantile)
     usual = features @ terms
-    tolerance = max(float(np.median(usual)), 1e-6)
+    tolerance = max(float(np.median(usual)), ROUNDING * _moving_power(model, x, u))
     reach = reach_of(size / np.maximum(usual, LEAST * tolerance), quantile)
     return Plausibility(
         quantile, tuple(map(float, terms)), smooth, tuple(map(float, z.mean(axis=0))),
@@ -239,6 +241,16 @@ def _symbols(model: HybridModel, ordinary: Plausibility) -> tuple[ca.MX, ca.MX]:
             f"{model.n_x} and {model.n_u}"
         )
     return ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
+
+
+def _moving_power(model: HybridModel, x: Array, u: Array) -> float:
+    """Root mean square of ``v' M a`` [W], what the model's own acceleration takes; at least the smallest number."""
+    state, held, h = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u), ca.MX.zeros(model.n_h)
+    rate = model.xdot(state, h, held)
+    standing = ca.vertcat(rate[: model.n_x // 2], ca.MX.zeros(model.n_x - model.n_x // 2))
+    power = model.energy_balance(state, rate, held) - model.energy_balance(state, standing, held)
+    found = ca.Function("power", [state, held], [ca.densify(power)]).map(len(x))(x.T, u.T).full()
+    return float(np.sqrt(np.mean(found**2))) or float(np.finfo(float).tiny)
 
 
 def _scalar(f: ca.Function) -> ca.Function:

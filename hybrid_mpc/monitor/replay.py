@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +12,15 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.monitor.calibration import alarm_intervals
 from hybrid_mpc.monitor.energy import EnergyMonitor
-from hybrid_mpc.monitor.reading import MonitorReading, MonitorState
+from hybrid_mpc.monitor.reading import SECONDS, MonitorReading, MonitorState
 
 Array = NDArray[np.float64]
+REPORTED = 500
+"""Samples from one report of the progress to the next."""
+NUMBERS = "dE_model_w", "dE_measured_w", "violation_w", "level_w", "residual_level", "energy_j", "energy_s"
+FLAGS = "alarm", "frozen", "blind", "verdict"
+WIDE = "scores", "numbers"
+"""Fields of a reading that a trace holds: a number, a flag, or several numbers a sample."""
 
 
 class EstimatorLike(Protocol):
@@ -43,17 +49,22 @@ class TrajectoryLike(Protocol):
         """Inputs."""
 
 
+Recording = TypeVar("Recording", bound=TrajectoryLike)
+
+
 @dataclass(frozen=True)
 class MonitorTrace:
     """Readings over time, all ``(n,)``; see :class:`~hybrid_mpc.monitor.reading.MonitorReading`.
 
-    ``scores`` are ``(n, 2)`` and ``numbers`` ``(n, columns)``; without a detector there are no scores. ``state`` is the
-    monitor's after the last sample.
+    ``scores`` are ``(n, 2)`` and ``numbers`` ``(n, columns)``; without a detector there are no scores. ``verdict`` are
+    the values of :class:`~hybrid_mpc.monitor.Verdict`. ``state`` is the monitor's after the last sample.
 
     Example:
         >>> z = np.zeros(3)
-        >>> MonitorTrace(np.arange(3.0), z, z, z, z, z, np.array([False, True, True])).intervals()
-        [(1.0, 2.0)]
+        >>> on, why = np.array([False, True, True]), np.array([1, 0, 0])
+        >>> trace = MonitorTrace(np.arange(3.0), z, z, z, z, z, on, verdict=why)
+        >>> trace.intervals(), trace.coverage(0.5)
+        ([(1.0, 2.0)], {'judged_s': 1.0, 'warm_up_s': 0.5, 'missing_s': 0.0, 'not_finite_s': 0.0})
     """
 
     t: Array
@@ -69,10 +80,20 @@ class MonitorTrace:
     scores: Array = field(default_factory=lambda: np.zeros((0, 2)))
     numbers: Array = field(default_factory=lambda: np.zeros((0, 0)))
     state: MonitorState | None = None
+    verdict: NDArray[np.int_] = field(default_factory=lambda: np.zeros(0, dtype=int))
+    blind: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     def intervals(self) -> list[tuple[float, float]]:
         """Alarms as ``(first, last)`` [s] in the recording's own time."""
         return [(float(self.t[int(a)]), float(self.t[int(b)])) for a, b in alarm_intervals(self.alarm, 1.0)]
+
+    def coverage(self, dt: float) -> dict[str, float]:
+        """Seconds that were judged, and those that were not, by reason.
+
+        Args:
+            dt: Period [s].
+        """
+        return {name: float(np.sum(self.verdict == why)) * dt for why, name in SECONDS.items()}
 
 
 def replay(
@@ -80,6 +101,8 @@ def replay(
     estimator: EstimatorLike,
     trajectory: TrajectoryLike,
     on_reading: Callable[[int, MonitorState, MonitorReading], None] | None = None,
+    *,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> MonitorTrace:
     """Feed a recording to the estimator and the monitor, sample by sample.
 
@@ -88,6 +111,7 @@ def replay(
         estimator: With ``start(y, t)`` and ``update(estimate, y, u_prev)``.
         trajectory: With ``t`` (n,), ``y`` (n, n_y), ``u`` (n, n_u) on the model's grid.
         on_reading: Called with each sample's number, the state after it and its reading. Default: none.
+        on_progress: Called with ``(done, total)`` samples every so often. Default: none.
 
     Raises:
         InputError: If the recording is empty, its lengths differ, or its period is not the model's.
@@ -98,22 +122,75 @@ def replay(
     t, y, u = (np.asarray(a, dtype=np.float64) for a in (trajectory.t, trajectory.y, trajectory.u))
     _check(t, y, u, monitor.model.dt)
     state, estimate = monitor.initial(), estimator.start(y[0], float(t[0]))
-    readings = []
+    rows = _Rows(t.size)
     for k in range(t.size):
+        if k % REPORTED == 0:
+            on_progress(k, t.size)
         u_prev = u[k - 1] if k else np.full(monitor.model.n_u, np.nan)
         if k:
             estimate = estimator.update(estimate, y[k], u_prev)
         state, reading = monitor.update(state, y[k], u_prev, estimate)
-        readings.append(reading)
+        rows.add(k, reading)
         if on_reading is not None:
             on_reading(k, state, reading)
-    names = "dE_model_w", "dE_measured_w", "violation_w", "level_w", "residual_level", "energy_j", "energy_s"
-    columns: dict[str, Any] = {name: np.array([getattr(r, name) for r in readings]) for name in names}
-    for name in ("alarm", "frozen"):
-        columns[name] = np.array([getattr(r, name) for r in readings], dtype=bool)
-    scores = np.array([r.scores for r in readings], dtype=np.float64)
-    numbers = np.array([r.numbers for r in readings], dtype=np.float64)
-    return MonitorTrace(t, **columns, scores=scores, numbers=numbers, state=state)
+    on_progress(t.size, t.size)
+    return rows.trace(t, state)
+
+
+class _Rows:
+    """The columns of a trace while they are filled; made with the first reading, whose width they take.
+
+    Args:
+        n: Samples.
+    """
+
+    def __init__(self, n: int) -> None:
+        self._n, self._columns = n, {name: np.zeros(n) for name in NUMBERS}
+        self._flags = {name: np.zeros(n, dtype=int if name == "verdict" else bool) for name in FLAGS}
+        self._wide: dict[str, Array] = {}
+
+    def add(self, k: int, reading: MonitorReading) -> None:
+        """Take the reading of sample ``k``."""
+        for columns in (self._columns, self._flags):
+            for name, column in columns.items():
+                column[k] = getattr(reading, name)
+        for name in WIDE:
+            values = getattr(reading, name)
+            if not k:
+                self._wide[name] = np.zeros((self._n, len(values)))
+            self._wide[name][k] = values
+
+    def trace(self, t: Array, state: MonitorState) -> MonitorTrace:
+        """All of it."""
+        columns: dict[str, Any] = {**self._columns, **self._flags, **self._wide}
+        return MonitorTrace(t, **columns, state=state)
+
+
+def along(
+    recordings: Sequence[Recording], report: Callable[[str, int, int, str], None]
+) -> Iterator[tuple[Recording, Callable[[int, int], None]]]:
+    """Recordings one after the other, each with what a replay tells its progress.
+
+    Args:
+        recordings: The recordings.
+        report: ``(key, done, total, text)`` with the samples of all of them.
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> runs = [SimpleNamespace(t=np.zeros(n), name=name) for n, name in ((30, "a"), (10, "b"))]
+        >>> for run, say in along(runs, print): say(5, len(run.t))
+        recordings 5 40 samples, a
+        recordings 35 40 samples, b
+    """
+    total, before = sum(len(r.t) for r in recordings), 0
+    for r in recordings:
+        name, start = getattr(r, "name", ""), before
+
+        def say(done: int, own: int, name: str = name, start: int = start) -> None:
+            report("recordings", start + done, total, f"samples, {name}")
+
+        yield r, say
+        before += len(r.t)
 
 
 def judge(monitor: EnergyMonitor, trace: MonitorTrace) -> MonitorTrace:
@@ -132,7 +209,8 @@ def judge(monitor: EnergyMonitor, trace: MonitorTrace) -> MonitorTrace:
     for level, residual in zip(trace.level_w, trace.residual_level, strict=True):
         on = monitor.alarms(float(level), float(residual), on)
         alarm.append(any(on))
-    return replace(trace, alarm=np.array(alarm, dtype=bool))
+    blind: Any = trace.blind if trace.blind.size else False
+    return replace(trace, alarm=np.array(alarm, dtype=bool) | blind)
 
 
 def _check(t: Array, y: Array, u: Array, dt: float) -> None:

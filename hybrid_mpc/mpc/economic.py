@@ -6,8 +6,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hybrid_mpc.buffered import BufferedFunction
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.mpc.buffered import BufferedFunction
 from hybrid_mpc.mpc.ocp import OCP
 
 Array = NDArray[np.float64]

@@ -9,10 +9,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hybrid_mpc.buffered import BufferedFunction
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
-from hybrid_mpc.mpc.buffered import BufferedFunction
 from hybrid_mpc.mpc.economic import EconomicCost
 from hybrid_mpc.mpc.limits import Limits
 from hybrid_mpc.mpc.ocp import OCP

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.mpc.buffered import BufferedFunction
+from hybrid_mpc.buffered import BufferedFunction
 from hybrid_mpc.mpc.limits import Limits
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.soft import SoftRows

@@ -10,9 +10,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_mpc.buffered import BufferedFunction
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model import HybridModel
-from hybrid_mpc.mpc.buffered import BufferedFunction
 from nn_export import compile_function
 from nn_export.errors import CompileError
 

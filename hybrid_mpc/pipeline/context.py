@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_document, read_document_arrays, write_document
@@ -105,6 +106,11 @@ class Context:
         return load_trajectories(
             files, self.spec, outputs=prior.outputs, inputs=prior.inputs, states=prior.states
         )
+
+    @cached_property
+    def time_unit(self) -> float:
+        """The machine's second [s], of the training recordings; see :func:`~hybrid_mpc.data.time_unit`."""
+        return time_unit(self.trajectories("train"), self.spec.dt)
 
     def trajectories(self, role: str) -> list[Trajectory]:
         """Trajectories of one role."""

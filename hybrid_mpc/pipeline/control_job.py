@@ -23,8 +23,9 @@ from hybrid_mpc.mpc import OCP, Controller, IpoptController, SafeController, SQP
 from hybrid_mpc.pipeline.contenders import CONTENDERS, ORACLES, build
 from hybrid_mpc.pipeline.control_noise import find_noise
 from hybrid_mpc.pipeline.faulted_loops import stored_detector
-from hybrid_mpc.pipeline.guards import REACTIONS, RESTING, adaptable, make_adaptive_guard
+from hybrid_mpc.pipeline.guards import REACTIONS, adaptable, make_adaptive_guard, make_resting_guard
 from hybrid_mpc.pipeline.loops import freezing, make_monitor
+from hybrid_mpc.pipeline.monitor_job import stored_rest
 from hybrid_mpc.scenario import ControlSpec, Scenario, Task
 
 Array = NDArray[np.float64]
@@ -281,11 +282,13 @@ def watch(job: Job, task: Task, name: str) -> tuple[EnergyMonitor | None, Guard 
     control, models = task.control or job.scenario.control, job.artifact.models
     assert control is not None
     if not job.settings.guard:
-        return (make_monitor(models["hybrid"], None) if CONTENDERS[name].model == "hybrid" else None), None
+        if CONTENDERS[name].model != "hybrid":
+            return None, None
+        return make_monitor(models["hybrid"], None, rest_speed=stored_rest(job.artifact)), None
     detector = stored_detector(job.artifact)
     monitor = guard_monitor(models["hybrid"], detector, **freezing(control))
     if job.settings.guard == "rest":
-        return monitor, RESTING
+        return monitor, make_resting_guard(models["hybrid"])
     guard = make_adaptive_guard(
         models["hybrid"], models["prior"], control, job.noise[name], job.scenario.causes
     )

@@ -72,6 +72,7 @@ def row(
         alarms = alarm_intervals(result.alarm, result.dt)
         watched["guard"] = {
             "alarms": [{"start_s": a, "end_s": b} for a, b in alarms],
+            "not_judged_s": float(np.sum(~result.judged)) * result.dt,
             "switches": switches(result),
         }
     return {

@@ -43,7 +43,7 @@ def export_stage(context: Context) -> None:
         "prior": PriorStep(phy, dt),
     }
     info = model_info(phy, dt)
-    deployed = replace(info, input_delay=context.delay)
+    deployed = replace(info, input_delay=context.delay, time_unit=context.time_unit)
     programs, parities = {}, []
     for i, (name, step) in enumerate(steps.items()):
         context.progress.update("models", i, len(steps), name)

@@ -17,7 +17,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.monitor import Detector, MonitorTrace, guard_monitor
 from hybrid_mpc.monitor.calibration import alarm_intervals
 from hybrid_mpc.pipeline.contenders import build
-from hybrid_mpc.pipeline.guards import RESTING
+from hybrid_mpc.pipeline.guards import make_resting_guard
 from hybrid_mpc.pipeline.loops import freezing
 from hybrid_mpc.pipeline.monitor_job import explained
 from hybrid_mpc.pipeline.nominal_loops import CONTENDER, knows
@@ -102,7 +102,7 @@ def faulted(
         result = simulate(
             scenario.plant(), estimator, controller, task.reference, weight=task.weight, dt=model.dt,
             duration=task.duration, x0=np.array(task.x0), seed=run_seed * 1000 + SEED, monitor=monitor,
-            guard=RESTING, faults=(*task.faults, Fault(start, math.inf, case.target, case.value)),
+            guard=make_resting_guard(model), faults=(*task.faults, Fault(start, math.inf, case.target, case.value)),
         )  # fmt: skip
         # The estimator is deterministic: over the record it says again what it said in the loop.
         trace, alarms = explained(monitor, estimator, Samples(result.t, result.y, result.u), scenario.causes)

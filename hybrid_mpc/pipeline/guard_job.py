@@ -8,18 +8,21 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2
 
 from hybrid_mpc.artifact import Artifact, load_artifact, set_calibration
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.model import HybridModel
 from hybrid_mpc.monitor import Calibration, Detector, guard_monitor, learn_detector, learn_plausibility
-from hybrid_mpc.monitor.calibration import BLOCK_S, MAX_EXTRAPOLATION, MIN_BLOCKS
-from hybrid_mpc.monitor.replay import replay
-from hybrid_mpc.monitor.standard import DRIFT, SETTLING_S
+from hybrid_mpc.monitor.calibration import MAX_EXTRAPOLATION, MIN_BLOCKS
+from hybrid_mpc.monitor.lengths import BLOCK_S, SETTLING_S, block_seconds, seconds
+from hybrid_mpc.monitor.replay import along, replay
+from hybrid_mpc.monitor.rest import REST_SPEED
+from hybrid_mpc.monitor.standard import DRIFT
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.faulted_loops import faulted, kept
-from hybrid_mpc.pipeline.judge import RATES, clean_windows
+from hybrid_mpc.pipeline.judge import RATES, clean_windows, run_calibration
 from hybrid_mpc.pipeline.loops import freezing, make_estimator, make_monitor
 from hybrid_mpc.pipeline.monitor_job import explained
 from hybrid_mpc.pipeline.nominal_loops import CONTENDER, nominal_loops, run_nominal
@@ -56,12 +59,16 @@ def guard_stage(context: Context) -> None:
         context.save("guard", {"reason": reason}, {})
         return
     artifact = load_artifact(context.out / "model")
-    model = artifact.models["hybrid"]
-    data = _nominal_data(context, artifact, control)
+    model, calibration = artifact.models["hybrid"], run_calibration(context)
+    rest = calibration.rest_speed or (REST_SPEED,)
+    data = _nominal_data(context, artifact, control, rest)
     result: dict[str, Any] = {"source": data.source, "loops": data.loops}
     found: dict[str, Any] = {}
     try:
-        found["detector"] = learned(data.runs, model.dt, model.n_y, data.data_hash)
+        found["detector"] = learned(
+            data.runs, model.dt, model.n_y, data.data_hash, rest_speed=rest,
+            time_unit=model.time_unit,
+        )  # fmt: skip
     except InputError as none:
         result["reason"] = f"no detector could be learned from {data.source}: {none}"
     try:
@@ -70,7 +77,6 @@ def guard_stage(context: Context) -> None:
         )
     except InputError as none:
         result["plausibility_reason"] = str(none)
-    calibration = Calibration.from_dict(context.result("monitor")["calibration"])
     set_calibration(context.out / "model", replace(calibration, **found).to_dict())
     result |= {name: part.to_dict() for name, part in found.items()}
     detector: Detector | None = found.get("detector")
@@ -85,14 +91,26 @@ def guard_stage(context: Context) -> None:
     context.save("guard", result, arrays)
 
 
-def learned(runs: Sequence[Array], dt: float, n_q: int, data_hash: str) -> Detector:
+def learned(
+    runs: Sequence[Array],
+    dt: float,
+    n_q: int,
+    data_hash: str,
+    *,
+    rest_speed: ArrayLike = REST_SPEED,
+    time_unit: float = 1.0,
+) -> Detector:
     """The detector for the lowest of the rates 1, 2, 5 and 10 an hour that the data are long enough for.
+
+    Of a machine with another second (:func:`~hybrid_mpc.data.time_unit`) they are 1, 2, 5 and 10 in 3600 of these.
 
     Args:
         runs: Reading numbers of nominal runs, each ``(n, columns)``.
         dt: Period [s].
         n_q: Degrees of freedom.
         data_hash: Hash of the data.
+        rest_speed: That of the monitor which made the numbers. Default 0.2, as the monitor's.
+        time_unit: The machine's second [s], the model's. Default 1.
 
     Raises:
         InputError: If they are too short for any of them (it says how much is needed), or hold an alarm.
@@ -102,21 +120,27 @@ def learned(runs: Sequence[Array], dt: float, n_q: int, data_hash: str) -> Detec
         Traceback (most recent call last):
         hybrid_mpc.errors.InputError: 1.0 min in whole blocks of 5 s are too little: 10 false alarms an hour need ...
     """
-    size = max(round(BLOCK_S / dt), 1)
-    blocks = sum(len(run) // size for run in runs)
+    block_s = block_seconds(dt, time_unit)
+    blocks = _whole_blocks(runs, block_s, dt)
     for rate in RATES:
         if blocks >= blocks_needed(rate):
-            return learn_detector(runs, dt, n_q, drift=DRIFT, false_alarms_per_hour=rate, data_hash=data_hash)
-    least, most = (blocks_needed(rate) * BLOCK_S / 60 for rate in (RATES[-1], RATES[0]))
+            return learn_detector(
+                runs, dt, n_q, drift=DRIFT, false_alarms_per_hour=rate / time_unit, rest_speed=rest_speed,
+                data_hash=data_hash, time_unit=time_unit,
+            )  # fmt: skip
+    least, most = (blocks_needed(rate) * block_s / 60 for rate in (RATES[-1], RATES[0]))
     raise InputError(
-        f"{blocks * BLOCK_S / 60:.1f} min in whole blocks of {BLOCK_S:g} s are too little: {RATES[-1]:g} false alarms "
-        f"an hour need {least:g} min, {RATES[0]:g} an hour {most:g} min; record the machine for longer and learn with "
-        "hybrid-mpc monitor MODEL NOMINAL.csv --learn RATE"
+        f"{blocks * block_s / 60:.1f} min in whole blocks of {block_s:g} s are too little: {RATES[-1] / time_unit:g} "
+        f"false alarms an hour need {least:g} min, {RATES[0] / time_unit:g} an hour {most:g} min; record the machine "
+        "for longer and learn with hybrid-mpc monitor MODEL NOMINAL.csv --learn RATE"
     )
 
 
 def blocks_needed(rate: float) -> int:
-    """Blocks of 5 s that a rate of false alarms [1/h] needs, half of it for either of the detector's two alarms.
+    """Blocks that a rate of false alarms needs, half of it for either of the detector's two alarms.
+
+    Args:
+        rate: Wanted false alarms in 3600 of the machine's seconds, of which a block has five.
 
     Example:
         >>> [blocks_needed(rate) for rate in (1.0, 2.0, 10.0)]
@@ -125,33 +149,43 @@ def blocks_needed(rate: float) -> int:
     return max(MIN_BLOCKS, int(np.ceil(3600.0 / (0.5 * rate * BLOCK_S * MAX_EXTRAPOLATION) - 1e-9)))
 
 
+def _whole_blocks(runs: Sequence[Array], block_s: float, dt: float) -> int:
+    """Whole blocks of ``block_s`` [s] in all runs."""
+    size = max(round(block_s / dt), 1)
+    return sum(len(run) // size for run in runs)
+
+
 def noise(context: Context) -> dict[str, Array]:
     """Process noise of the run's filters by contender."""
     return {name: np.array(values) for name, values in context.result("control")["sigma_x"].items()}
 
 
-def _nominal_data(context: Context, artifact: Artifact, control: ControlSpec) -> NominalData:
+def _nominal_data(
+    context: Context, artifact: Artifact, control: ControlSpec, rest: tuple[float, ...]
+) -> NominalData:
     """Loops of the simulated machine, like those that the guard will watch; else undisturbed recordings."""
     scenario = context.scenario
     if scenario.plant is not None and any(not task.faults for task in scenario.tasks):
         return _from_loops(context)
     model = artifact.models["hybrid"]
-    monitor, estimator = guard_monitor(model), make_estimator(model, control, noise(context)[CONTENDER])
-    whole, numbers = context.dataset.whole, []
-    for i, recording in enumerate(whole):
-        context.progress.update("nominal data", i, len(whole), f"replay of {recording.name}")
-        numbers.append(replay(monitor, estimator, recording).numbers)
+    monitor = guard_monitor(model, rest_speed=rest)
+    estimator = make_estimator(model, control, noise(context)[CONTENDER])
+    whole = context.dataset.whole
+    numbers = [
+        replay(monitor, estimator, recording, on_progress=say).numbers
+        for recording, say in along(whole, context.progress.update)
+    ]
 
     def inside(roles: tuple[str, ...]) -> list[Array]:
         return [
-            rows[_settled(recording.t, start, end)]
+            rows[_settled(recording.t, start, end, model)]
             for recording, rows in zip(whole, numbers, strict=True)
             for start, end in clean_windows(context, recording, roles)
         ]
 
-    runs, size = inside(HELD), max(round(BLOCK_S / model.dt), 1)
+    runs, block_s = inside(HELD), block_seconds(model.dt, model.time_unit)
     source = "recordings that nothing was trained on"
-    if sum(len(run) // size for run in runs) < blocks_needed(RATES[-1]):
+    if _whole_blocks(runs, block_s, model.dt) < blocks_needed(RATES[-1]):
         runs = inside((*HELD, "train"))
         source = (
             "undisturbed recordings, also those of the training, which the model fits better than new ones"
@@ -159,9 +193,9 @@ def _nominal_data(context: Context, artifact: Artifact, control: ControlSpec) ->
     return NominalData(runs, source, context.dataset.hash)
 
 
-def _settled(t: Array, start: float, end: float) -> NDArray[np.bool_]:
+def _settled(t: Array, start: float, end: float, model: HybridModel) -> NDArray[np.bool_]:
     """The samples of a stretch whose readings hold nothing from before it."""
-    return np.asarray((t >= start + SETTLING_S) & (t <= end))
+    return np.asarray((t >= start + seconds(SETTLING_S, model)) & (t <= end))
 
 
 def _from_loops(context: Context) -> NominalData:
@@ -190,7 +224,10 @@ def _recorded(
     detector: Detector | None,
     calibration: Calibration,
 ) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Recordings with test windows, watched by the guard's monitor, or without detector by that of the thresholds."""
+    """Recordings with test windows, watched by the guard's monitor, or without detector by that of the thresholds.
+
+    Without either the readings are kept and nothing but a blind monitor alarms.
+    """
     model = artifact.models["hybrid"]
     if detector is None:
         monitor = make_monitor(model, calibration)
@@ -201,22 +238,21 @@ def _recorded(
     tested = [r for r in context.dataset.whole if clean_windows(context, r, ("test",))]
     found: list[dict[str, Any]] = []
     arrays: dict[str, Array] = {}
-    seconds, starts = 0.0, 0
-    for i, recording in enumerate(tested):
-        context.progress.update("test recordings", i, len(tested), recording.name)
-        trace, alarms = explained(monitor, estimator, recording, context.scenario.causes)
+    watched, starts = 0.0, 0
+    for recording, say in along(tested, context.progress.update):
+        trace, alarms = explained(monitor, estimator, recording, context.scenario.causes, say)
         found += [{"file": recording.name, **alarm} for alarm in alarms]
         edges = np.diff(trace.alarm.astype(int), prepend=0) == 1
         for window in clean_windows(context, recording, ("test",)):
-            inside = _settled(recording.t, *window)
-            seconds += float(inside.sum() * model.dt)
+            inside = _settled(recording.t, *window, model)
+            watched += float(inside.sum() * model.dt)
             starts += int((edges & inside).sum())
         if not arrays or (alarms and not arrays["recorded/alarm"].any()):  # one is shown, best with an alarm
             arrays = kept("recorded", trace, recording.y)
             shown = recording.name
-    result: dict[str, Any] = {"test": {"seconds": seconds, "alarms": starts, "list": found}}
-    if seconds > 0:
-        result["test"]["at_most_per_hour"] = 0.5 * float(chi2.ppf(0.95, 2 * starts + 2)) / (seconds / 3600)
+    result: dict[str, Any] = {"test": {"seconds": watched, "alarms": starts, "list": found}}
+    if watched > 0:
+        result["test"]["at_most_per_hour"] = 0.5 * float(chi2.ppf(0.95, 2 * starts + 2)) / (watched / 3600)
     if arrays:
         result["shown"] = shown
     return result, arrays

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.faulted_loops import read_trace
+from hybrid_mpc.pipeline.judge import RATES, run_calibration
 from hybrid_mpc.plots.monitor_trace import overview
 from hybrid_mpc.report import Table
 
@@ -96,12 +97,14 @@ def guard_words(results: dict[str, Any]) -> tuple[str, ...]:
     if guard["data_hash"] is None:
         words = [f"{guard['reason'][0].upper()}{guard['reason'][1:]}."]
     else:
-        rate = guard["false_alarms_per_hour"]
+        rate, wanted = guard["false_alarms_per_hour"], RATES[0] / details["detector"].get("time_unit", 1.0)
         words = [f"The detector was learned from {details['source']}."]
-        if rate > 1:
+        if rate > wanted:
+            alarms = "one false alarm" if wanted == 1 else f"{wanted:g} false alarms"
             words[0] += (
-                f" They are too short for one false alarm an hour, so the thresholds are for {rate:g}; a longer run "
-                "(budget full), or recordings of the machine with hybrid-mpc monitor --learn 1, give better ones."
+                f" They are too short for {alarms} an hour, so the thresholds are for {rate:g}; a longer run "
+                f"(budget full), or recordings of the machine with hybrid-mpc monitor --learn {wanted:g}, give better "
+                "ones."
             )
         test = details["test"]
         if test["seconds"] > 0:
@@ -154,13 +157,16 @@ def guard_figures(context: Context) -> Iterator[tuple[str, str, Figure, str]]:
     if "faults" not in found:
         shown, limits = found["shown"], {}
         if "detector" not in found:
-            stored = context.result("monitor")["calibration"]
-            limits = {"violation": stored["threshold_w"], "residual": stored["residual_threshold"]}
+            stored = run_calibration(context)
+            known = {"violation": stored.threshold_w, "residual": stored.residual_threshold}
+            limits = {name: limit for name, limit in known.items() if limit is not None}
         figure = overview(
             read_trace(arrays, "recorded"), arrays["recorded/y"], output=output, force_unit=unit,
             thresholds=limits, title=shown,
         )  # fmt: skip
         by = "learned detector" if "detector" in found else "thresholds of the section before"
+        if not (limits or "detector" in found):
+            by = "monitor, which has no thresholds to judge by"
         yield (
             "guard",
             "guard_recorded",

@@ -14,18 +14,31 @@ from hybrid_mpc.model import HybridModel
 from hybrid_mpc.mpc.condensed import CondensedController
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.safeguard import SafeController
-from hybrid_mpc.pipeline.loops import FIRST_LOAD, QUIET_SHARE, first_controller, make_ocp
+from hybrid_mpc.pipeline.loops import FIRST_LOAD, QUIET_SHARE, first_controller, first_deviations, make_ocp
 from hybrid_mpc.scenario import ControlSpec
 
 Array = NDArray[np.float64]
 REACTIONS = ("rest", "adapt")
 """What ``hybrid-mpc control --guard`` and ``--adapt`` do."""
-RESTING = Guard(Mode.NORMAL, Mode.REST)
-"""Records where the model does not describe the machine, and takes the input away where the sensor is frozen."""
+DWELL_S, QUIET_S = 0.5, 1.0
+"""A guard's shortest time in a mode, and the time without alarm before it goes back [the machine's seconds]."""
 PATIENCE_S = 0.8
-"""A push of 0.2 s raised alarms for up to 0.7 s, through the monitor's windows and what the observer makes of it; a
-backup that takes it for a heavier machine costs more than it saves (docs/energy-guard.md)."""
+"""[The machine's seconds.] A push of 0.2 s raised alarms for up to 0.7 s, through the monitor's windows and what the
+observer makes of it; a backup that takes it for a heavier machine costs more than it saves (docs/energy-guard.md)."""
 GAIN = "gain of "
+
+
+def make_resting_guard(model: HybridModel) -> Guard:
+    """A guard that records where the model does not describe the machine, and rests where the sensor is frozen.
+
+    Args:
+        model: The model, whose unit of time its times are in.
+
+    Example:
+        ``simulate(..., monitor=monitor, guard=make_resting_guard(hybrid))``
+    """
+    unit = model.time_unit
+    return Guard(Mode.NORMAL, Mode.REST, dwell=DWELL_S * unit, quiet=QUIET_S * unit)
 
 
 def make_adaptive_guard(
@@ -35,7 +48,7 @@ def make_adaptive_guard(
     sigma_x: Array,
     causes: Mapping[str, Sequence[str]],
     *,
-    patience: float = PATIENCE_S,
+    patience: float | None = None,
 ) -> Guard:
     """A guard whose backup estimates what has become of the prior's parameters, and plans with it.
 
@@ -49,7 +62,7 @@ def make_adaptive_guard(
         sigma_x: Process noise ``(n_x,)`` per period of the model's estimator.
         causes: Parameters that change together, by name, as a scenario's ``causes``. Gains of inputs are left out
             where there are other causes: a weaker motor is a heavier machine, but for its friction.
-        patience: Time [s] for which the model must have been in doubt. Default 0.8.
+        patience: Time [s] for which the model must have been in doubt. Default: 0.8 of the machine's seconds.
 
     Raises:
         InputError: If there are no causes, the model does not know its parameters, or one of them is unknown.
@@ -65,12 +78,15 @@ def make_adaptive_guard(
     backup = SafeController(
         CondensedController(adaptive, ocp), prior, first=first_controller(adaptive, ocp, control)
     )
-    first = [*control.estimator_sigma, *np.full(model.n_x - model.n_y, 0.1)]
+    first, unit = first_deviations(model, control), model.time_unit
     estimator = parameter_filter(
         adaptive, len(groups), sigma_y=control.estimator_sigma, sigma_x=sigma_x, sigma_x0=first,
         sigma_d=QUIET_SHARE * span, sigma_d0=FIRST_LOAD * span,
     )  # fmt: skip
-    return Guard(Mode.BACKUP, Mode.REST, backup=backup, backup_estimator=estimator, patience=patience)
+    return Guard(
+        Mode.BACKUP, Mode.REST, backup=backup, backup_estimator=estimator, dwell=DWELL_S * unit, quiet=QUIET_S * unit,
+        patience=PATIENCE_S * unit if patience is None else patience,
+    )  # fmt: skip
 
 
 def adaptable(model: HybridModel, causes: Mapping[str, Sequence[str]]) -> dict[str, tuple[str, ...]]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hybrid_mpc.data.excitation_check import check_excitation
+from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.late_prior import prior_with_delay
@@ -138,12 +139,13 @@ def fit_and_smooth(
     from hybrid_mpc.identification.smoothing import fit_smoother
 
     fit: PriorFit | None = None
+    unit = time_unit(train, dt)
     for title in ROUNDS:
         fit = fit_prior(
-            make, train, valid, dt=dt, before=fit, methods=methods or DEFAULT_METHODS,
+            make, train, valid, dt=dt, before=fit, methods=methods or DEFAULT_METHODS, time_unit=unit,
             on_progress=lambda done, total, text, key=title: on_progress(key, done, total, text),  # type: ignore[misc]
         )  # fmt: skip
-        smoother = fit_smoother(make(fit.values), [*train, *valid], dt)
+        smoother = fit_smoother(make(fit.values), [*train, *valid], dt, time_unit=unit)
         train, valid = smoother.smooth(train), smoother.smooth(valid)
     assert fit is not None
     return fit, smoother, list(train), list(valid)

@@ -14,7 +14,9 @@ from hybrid_mpc.closed_loop.simulate import simulate
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.monitor.calibration import Calibration, alarm_intervals, calibrate, with_residual
-from hybrid_mpc.monitor.replay import judge, replay
+from hybrid_mpc.monitor.lengths import block_seconds
+from hybrid_mpc.monitor.replay import along, judge, replay
+from hybrid_mpc.monitor.rest import rest_speeds
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_monitor, working_point
 from hybrid_mpc.riccati import hidden_fixed_point
@@ -25,15 +27,33 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 RATES = (1.0, 2.0, 5.0, 10.0)
-"""False alarms an hour on nominal data: the first that the data are long enough for."""
+"""False alarms an hour (of the machine's seconds, see :func:`rates`) on nominal data: the first that the data are long
+enough for."""
+NOMINAL = ("train", "valid", "nominal")
+"""Roles of what the monitor is calibrated on."""
 LOAD_SHARE = 0.2
 """Unknown load of the demonstration, as a share of half the input's range."""
 MARGIN = 1.5
 """Where nominal data are too short for a rate: threshold over the highest nominal level."""
 
 
+def rates(model: HybridModel) -> tuple[float, ...]:
+    """The rates of ``RATES`` on the machine of a model [1/h].
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> rates(SimpleNamespace(time_unit=10.0))
+        (0.1, 0.2, 0.5, 1.0)
+    """
+    return tuple(rate / model.time_unit for rate in RATES)
+
+
 def monitor_stage(context: Context) -> None:
-    """Calibrate on training and validation stretches, then replay the monitor over whole recordings."""
+    """Calibrate on training and validation stretches, then replay the monitor over whole recordings.
+
+    Where nothing can be calibrated the result holds the reason and no calibration; the artifact then keeps the rest
+    speeds alone.
+    """
     control = context.scenario.control
     if control is None:
         reason = "the monitor's estimator needs the scenario's control problem (input range, sensor noise)"
@@ -42,18 +62,35 @@ def monitor_stage(context: Context) -> None:
     model = load_artifact(context.out / "model").models["hybrid"]
     sigma_x = np.array(context.result("control")["sigma_x"]["hybrid_observer"])
     whole = context.dataset.whole
+    known: dict[str, Any] = {}  # the rest speeds, and what hinders the calibration
+    try:
+        known["rest_speed"] = nominal_rest(context, model)
+    except InputError as short:
+        known["reason"] = f"the monitor could not be calibrated: {short}"
+    rest = known.get("rest_speed")
     power, residual, traces = [], [], []
-    for i, recording in enumerate(whole):
-        context.progress.update("recordings", i, len(whole), f"replay of {recording.name}")
-        # the estimator of the closed loops; the monitor ignores its disturbance estimate
-        trace = replay(make_monitor(model, None), make_estimator(model, control, sigma_x), recording)
+    # the estimator of the closed loops; the monitor ignores its disturbance estimate
+    watching, estimator = make_monitor(model, None, rest_speed=rest), make_estimator(model, control, sigma_x)
+    for recording, say in along(whole, context.progress.update):
+        trace = replay(watching, estimator, recording, on_progress=say)
         traces.append(trace)
-        nominal = _inside(context, recording, ("train", "valid", "nominal"))
+        nominal = _inside(context, recording, NOMINAL)
         power.append(np.where(nominal, trace.level_w, np.nan))
         residual.append(np.where(nominal, trace.residual_level, np.nan))
-    calibration = with_residual(
-        *(_calibrate(levels, model.dt, context.dataset.hash) for levels in (power, residual))
-    )
+    covered = [{"file": r.name, **t.coverage(model.dt)} for r, t in zip(whole, traces, strict=True)]
+    try:
+        calibration = with_residual(
+            *(
+                _calibrate(levels, model, context.dataset.hash, watching.rest_speed)
+                for levels in (power, residual)
+            )
+        )
+    except InputError as none:
+        known.setdefault("reason", f"the monitor could not be calibrated: {none}")
+    if "reason" in known:
+        set_calibration(context.out / "model", Calibration.without(known["reason"], rest).to_dict())
+        context.save("monitor", {**known, "recordings": covered}, {})
+        return
     set_calibration(context.out / "model", calibration.to_dict())
     alarms, arrays, clean = [], {}, {"seconds": 0.0, "alarms": 0, "test_seconds": 0.0, "test_alarms": 0}
     for recording, levels in zip(whole, traces, strict=True):
@@ -68,13 +105,28 @@ def monitor_stage(context: Context) -> None:
             # one that a disturbance raised before the stretch may end in it: what counts is where it starts
             starts = np.diff(trace.alarm.astype(int), prepend=0) == 1
             clean[f"{prefix}alarms"] += int((starts & inside).sum())
-    result = {"calibration": calibration.to_dict(), "alarms": alarms, "clean": clean}
+    result = {
+        "calibration": calibration.to_dict(), "alarms": alarms, "clean": clean, "recordings": covered,
+    }  # fmt: skip
     if context.scenario.plant is not None and context.scenario.tasks:
         result["load"], loop = _load_loop(context, model, calibration, control, sigma_x)
         arrays |= {
             f"load/{key}": getattr(loop, key) for key in ("t", "violation", "level", "alarm", "x", "u")
         }
     context.save("monitor", result, arrays)
+
+
+def nominal_rest(context: Context, model: HybridModel) -> tuple[float, ...]:
+    """Rest speeds of a run's machine, from its undisturbed training and validation recordings."""
+    return rest_speeds([t for t in context.dataset.trajectories if t.role in NOMINAL], model)
+
+
+def run_calibration(context: Context) -> Calibration:
+    """What stage monitor found: thresholds and rest speeds, or rest speeds alone, with the reason."""
+    found = context.result("monitor")
+    if "calibration" in found:
+        return Calibration.from_dict(found["calibration"])
+    return Calibration.without(found["reason"], found.get("rest_speed"))
 
 
 def _load_loop(
@@ -133,24 +185,34 @@ def _inside(context: Context, recording: Trajectory, roles: tuple[str, ...]) -> 
     return inside
 
 
-def _calibrate(levels: list[Array], dt: float, data_hash: str) -> Calibration:
+def _calibrate(
+    levels: list[Array], model: HybridModel, data_hash: str, rest: tuple[float, ...]
+) -> Calibration:
     """One of the two alarms: by extreme values for half the lowest of ``RATES`` that the data can carry; for
     none of them, by a margin.
+
+    Raises:
+        InputError: If no level is a number, or none is above zero.
     """
-    for rate in RATES:
+    block_s = block_seconds(model.dt, model.time_unit)
+    for rate in rates(model):
         try:
-            return calibrate(levels, dt, false_alarms_per_hour=0.5 * rate, data_hash=data_hash)
+            return calibrate(
+                levels, model.dt, false_alarms_per_hour=0.5 * rate, data_hash=data_hash, block_s=block_s,
+                rest_speed=rest,
+            )  # fmt: skip
         except InputError as too_short:
             why = str(too_short)
     finite = np.concatenate(levels)
     finite = finite[np.isfinite(finite)]
-    if finite.size == 0:
-        raise InputError(f"the monitor has no nominal level to be calibrated on; {why}")
+    if not (finite.size and finite.max() > 0):
+        nothing = "no level above zero" if finite.size else "no level that is a number"
+        raise InputError(f"there is {nothing} in the undisturbed recordings; {why}")
     threshold = MARGIN * float(finite.max())
     release = min(max(0.5 * threshold, float(np.quantile(finite, 0.95))), threshold)
     method = f"{MARGIN} x the highest nominal level, for no rate can be told from so little data ({why})"
-    hours = finite.size * dt / 3600.0
-    return Calibration(threshold, release, 0.5 * RATES[-1], finite.size, hours, method, data_hash)
+    hours, rate = finite.size * model.dt / 3600.0, 0.5 * rates(model)[-1]
+    return Calibration(threshold, release, rate, finite.size, hours, method, data_hash, rest_speed=rest)
 
 
 def analysis_stage(context: Context) -> None:
@@ -176,7 +238,7 @@ def analysis_stage(context: Context) -> None:
             systems["moving"] = linearize(model, moving, u, hidden_fixed_point(model, moving, u))
             result["working_speed"] = moving[model.n_x // 2 :].tolist()
         for point, system in systems.items():
-            omega = np.geomspace(0.1, np.pi / model.dt, 300)
+            omega = np.geomspace(0.1 / model.time_unit, np.pi / model.dt, 300)
             response = frequency_response(system, omega)
             arrays[f"{name}/{point}/omega"] = omega
             arrays[f"{name}/{point}/magnitude"] = response.magnitude[0, 0]

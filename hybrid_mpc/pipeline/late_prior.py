@@ -7,7 +7,8 @@ from dataclasses import asdict
 from hybrid_mpc.pipeline.context import Context
 
 DELAY_RUNS = 5.0
-"""Longest free runs [s] that parameters and delay are fitted to: a swing near the top multiplies every error."""
+"""Longest free runs [the machine's seconds] that parameters and delay are fitted to: a swing near the top multiplies
+every error."""
 
 
 def prior_with_delay(context: Context) -> None:
@@ -17,7 +18,7 @@ def prior_with_delay(context: Context) -> None:
     make, spec = context.scenario.prior, context.spec
     train, valid, test = (context.trajectories(role) for role in ("train", "valid", "test"))
     physics = fit_physics(
-        make, train, valid, dt=spec.dt, length=DELAY_RUNS, largest_delay=spec.largest_delay,
+        make, train, valid, dt=spec.dt, length=DELAY_RUNS * context.time_unit, largest_delay=spec.largest_delay,
         on_progress=lambda done, total, text: context.progress.update("free runs", done, total, text),
     )  # fmt: skip
     every = smoothed(make, physics, [*train, *valid, *test], spec.dt)

@@ -7,7 +7,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import ExtendedKalmanFilter
@@ -16,6 +16,7 @@ from hybrid_mpc.estimation.tuning import most_likely
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.monitor.calibration import Calibration
 from hybrid_mpc.monitor.energy import EnergyMonitor
+from hybrid_mpc.monitor.lengths import LEVEL_S, half_window, samples
 from hybrid_mpc.mpc.best_of import BestOf
 from hybrid_mpc.mpc.condensed import CondensedController
 from hybrid_mpc.mpc.ocp import OCP
@@ -47,9 +48,6 @@ SCALES = (1.0, 3.0)
 TUNED_PERIODS = 500
 TUNED_RECORDINGS = 3
 """So many periods of so many training recordings decide."""
-
-MONITOR_WINDOW_S = 0.3
-"""Window [s] of the monitor's derivative and of the average that makes its level."""
 
 
 def tuned_noise(
@@ -92,18 +90,12 @@ def make_estimator(
         observer: Whether it estimates an unknown load at the input. Default: yes.
 
     Raises:
-        InputError: If ``estimator_sigma`` has another number of outputs.
+        InputError: If ``estimator_sigma`` or ``first_speed_sigma`` does not fit the model.
 
     Example:
         ``make_estimator(model, scenario.control, process_noise(model, train))``
     """
-    if len(control.estimator_sigma) != model.n_y:
-        raise InputError(
-            f"control: estimator_sigma needs {model.n_y} standard deviations of the outputs, "
-            f"got {control.estimator_sigma}"
-        )
-    span = control.input_range
-    first = np.concatenate([control.estimator_sigma, np.full(model.n_x - model.n_y, 0.1)])
+    first, span = first_deviations(model, control), control.input_range
 
     def filter_of(scale: float, step: float | None) -> ExtendedKalmanFilter:
         return ExtendedKalmanFilter(
@@ -119,6 +111,38 @@ def make_estimator(
         return filter_of(1.0, None)
     modes = filter_of(1.0, QUIET_SHARE), filter_of(SLIP, QUIET_SHARE), filter_of(1.0, JUMP_SHARE)
     return SwitchingFilter(modes, SWITCHES)
+
+
+def first_deviations(model: HybridModel, control: ControlSpec) -> Array:
+    """Standard deviations ``(n_x,)`` of the state at the estimator's start: at rest where the sensors say.
+
+    Args:
+        model: The model.
+        control: Sensor noise, and how uncertain the first speeds are.
+
+    Raises:
+        InputError: If ``estimator_sigma`` or ``first_speed_sigma`` does not fit the model.
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> spec = ControlSpec(9, (1.0, 1.0), (1.0,), (1.0,), (-1.0,), (1.0,), estimator_sigma=(5e-4,))
+        >>> first_deviations(SimpleNamespace(n_x=2, n_y=1, dt=0.02), spec).round(4).tolist()
+        [0.0005, 0.0354]
+    """
+    n, sigma = model.n_x - model.n_y, control.estimator_sigma
+    if len(sigma) != model.n_y:
+        raise InputError(
+            f"control: estimator_sigma needs {model.n_y} standard deviations of the outputs, got {sigma}"
+        )
+    speeds = control.first_speed_sigma
+    if speeds is None:
+        differenced = np.sqrt(2.0) * np.array(sigma) / model.dt
+        speeds = tuple(differenced if n == model.n_y else np.full(n, differenced.max()))
+    if len(speeds) != n:
+        raise InputError(
+            f"control: first_speed_sigma needs {n} standard deviations of what is not measured, got {speeds}"
+        )
+    return np.array([*sigma, *speeds], dtype=np.float64)
 
 
 def make_controller(
@@ -169,34 +193,41 @@ def working_point(model: HybridModel, control: ControlSpec) -> tuple[Array, Arra
 
     Args:
         model: The model, state ``[q, v]``.
-        control: The control problem; a speed without weight is 1.
+        control: The control problem; a speed without weight is what crosses the position's own acceptable deviation
+            ``1 / sqrt(q)`` within the horizon.
 
     Example:
         ``x, u = working_point(models["prior"], scenario.control)``
     """
     x = np.zeros(model.n_x) if control.around is None else np.array(control.around, dtype=float)
     half = model.n_x // 2
-    weights = np.asarray(control.q[half:], dtype=float)
-    x[half:] = 1.0 / np.sqrt(np.where(weights > 0, weights, 1.0))
+    far, fast = (
+        np.where(q > 0, 1.0 / np.sqrt(np.where(q > 0, q, 1.0)), 0.0)
+        for q in (np.asarray(part, dtype=float) for part in (control.q[:half], control.q[half:]))
+    )
+    x[half:] = np.where(fast > 0, fast, np.resize(far, fast.size) / (control.horizon * model.dt))
     return x, control.rest_input
 
 
-def make_monitor(model: HybridModel, calibration: Calibration | None) -> EnergyMonitor:
-    """The energy monitor with its default window: about 0.3 s for the derivative and for the level.
+def make_monitor(
+    model: HybridModel, calibration: Calibration | None, *, rest_speed: ArrayLike | None = None
+) -> EnergyMonitor:
+    """The energy monitor with its default window: about 0.3 s (the machine's) for the derivative and for the level.
 
     Args:
         model: The model that is held against the machine.
         calibration: Its thresholds; None: its levels raise no alarm.
+        rest_speed: Speeds ``(n_q,)`` below which friction may stick. Default: the calibration's.
 
     Example:
         ``make_monitor(artifact.models["hybrid"], None)``
     """
-    half = max(2, round(0.5 * MONITOR_WINDOW_S / model.dt))
     return EnergyMonitor(
         model,
-        window=2 * half + 1,
-        average=max(1, round(MONITOR_WINDOW_S / model.dt)),
+        window=2 * half_window(LEVEL_S, model) + 1,
+        average=samples(LEVEL_S, model),
         calibration=calibration,
+        rest_speed=rest_speed,
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,16 +15,23 @@ from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_json, write_json, write_text
 from hybrid_mpc.monitor import Calibration, Detector, Diagnoser, EnergyMonitor, MonitorTrace, guard_monitor
-from hybrid_mpc.monitor.replay import EstimatorLike, TrajectoryLike, replay
+from hybrid_mpc.monitor.lengths import HISTORY_S, samples
+from hybrid_mpc.monitor.reading import Verdict
+from hybrid_mpc.monitor.replay import EstimatorLike, TrajectoryLike, along, replay
 from hybrid_mpc.monitor.standard import learn_from
+from hybrid_mpc.pipeline.context import Progress, Silent
 from hybrid_mpc.pipeline.control_noise import find_noise
 from hybrid_mpc.pipeline.loops import make_estimator, make_monitor, sensor_steps
 from hybrid_mpc.scenario import Scenario
 
 Array = NDArray[np.float64]
-DIAGNOSED_S = 2.0
-"""An alarm is explained so long after its start, or at its end: by then the history holds nothing older."""
 FROZEN = "the sensor repeats itself while motion is predicted"
+BLIND = {
+    Verdict.WARM_UP: "nothing can be judged: the monitor's window is not full",
+    Verdict.MISSING: "nothing can be judged: samples are missing",
+    Verdict.NOT_FINITE: "nothing can be judged: model or estimator gives no finite number",
+}
+"""What is said of an alarm that the monitor raises because it is blind."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +63,7 @@ class MonitorJob:
     @property
     def monitor(self) -> EnergyMonitor:
         """The guard's monitor where there is a detector, else that of the main job with the artifact's thresholds."""
-        model, stored = self.artifact.models["hybrid"], self.artifact.calibration
+        model = self.artifact.models["hybrid"]
         if self.detector is not None:
             known = model.parametric is not None
             control = self.scenario.control
@@ -64,8 +71,7 @@ class MonitorJob:
             return guard_monitor(
                 model, self.detector, resolution=self.resolution, input_range=ranges, diagnose=known
             )
-        calibration = None if stored is None else Calibration.from_dict(stored)
-        return make_monitor(model, calibration)
+        return make_monitor(model, stored_calibration(self.artifact))
 
 
 def prepared(
@@ -103,10 +109,14 @@ def prepared(
         raise InputError(
             f"the model's period is {hybrid.dt} s, scenario {scenario.name} resamples to {scenario.data.dt} s"
         )
-    spec = replace(scenario.data, windows={})  # all of a recording is watched
+    # all of a recording is watched: nothing warms up, and no part of it has a role
+    spec = replace(scenario.data, windows={}, warm_up=scenario.data.dt, fractions=(1.0, 0.0, 0.0))
     data = load_trajectories(
-        recordings, spec, outputs=hybrid.outputs, inputs=hybrid.inputs, states=hybrid.states
+        recordings, spec, outputs=hybrid.outputs, inputs=hybrid.inputs, states=hybrid.states, needed=()
     )
+    if not data.whole:
+        cut = "; ".join(f"{c.file} {c.start:g} to {c.end:g} s: {c.why}" for c in data.cuts)
+        raise InputError(f"no part of the recordings is long enough to be watched: {cut}")
     sigma, _ = find_noise(scenario, artifact, folder, ("hybrid_observer",), 0, noise)
     stored = artifact.calibration if calibration is None else read_json(calibration)
     detector = None if stored is None else stored.get("detector")
@@ -118,43 +128,64 @@ def prepared(
     return MonitorJob(scenario, artifact, data, np.asarray(sigma["hybrid_observer"]), resolution, found)
 
 
-def learn(job: MonitorJob, rate: float, out: Path) -> Detector:
+def stored_calibration(artifact: Artifact) -> Calibration | None:
+    """The calibration that an artifact holds; None if it holds none."""
+    return None if artifact.calibration is None else Calibration.from_dict(artifact.calibration)
+
+
+def stored_rest(artifact: Artifact) -> tuple[float, ...] | None:
+    """The rest speeds that every monitor of an artifact's models takes; None if no recording told them yet."""
+    calibration = stored_calibration(artifact)
+    return None if calibration is None else calibration.rest_speed
+
+
+def learn(job: MonitorJob, rate: float, out: Path, progress: Progress | None = None) -> Detector:
     """Learn a detector from the job's recordings, in which nothing may be wrong; writes ``calibration.json``.
 
     Args:
         job: The job.
         rate: Wanted false alarms an hour.
         out: Folder.
+        progress: Where to report; default: nowhere.
     """
-    model = job.artifact.models["hybrid"]
+    model, say = job.artifact.models["hybrid"], progress or Silent()
+    say.start("replaying the recordings")
     detector = learn_from(
-        model, job.estimator, job.data.whole, false_alarms_per_hour=rate, data_hash=job.data.hash
-    )
+        model, job.estimator, job.data.whole, false_alarms_per_hour=rate, rest_speed=stored_rest(job.artifact),
+        data_hash=job.data.hash, report=say.update,
+    )  # fmt: skip
+    say.finish("")
     write_json(out / "calibration.json", {"detector": detector.to_dict()})
     return detector
 
 
-def watch(job: MonitorJob, out: Path) -> dict[str, Any]:
+def watch(job: MonitorJob, out: Path, progress: Progress | None = None) -> dict[str, Any]:
     """Replay the monitor over each recording: ``NAME.csv`` and ``NAME.png``, and last ``monitor.json``.
 
     Args:
         job: The job.
         out: Folder.
+        progress: Where to report; default: nowhere.
+
+    Returns:
+        What ``monitor.json`` holds: of each recording its alarms, and how much of it was judged and how much not, by
+        reason.
     """
     from hybrid_mpc.plots import save
     from hybrid_mpc.plots.monitor_trace import overview
 
-    rows, output = [], job.artifact.models["hybrid"].outputs[0]
-    for recording in job.data.whole:
-        trace, alarms = watched(job, recording)
-        rows.append({"recording": recording.name, "seconds": len(trace.t) * recording.dt, "alarms": alarms})
+    rows, output, tell = [], job.artifact.models["hybrid"].outputs[0], progress or Silent()
+    tell.start("replaying the recordings")
+    for recording, say in along(job.data.whole, tell.update):
+        trace, alarms = watched(job, recording, say)
+        length = {"seconds": len(trace.t) * recording.dt, **trace.coverage(recording.dt)}
+        rows.append({"recording": recording.name, **length, "alarms": alarms})
         name = recording.name.replace("#", "_")
         write_text(out / f"{name}.csv", table(trace, recording, job.artifact.models["hybrid"].outputs))
         limits, calibration = {}, job.monitor.calibration
         if calibration is not None:
-            limits["violation"] = calibration.threshold_w
-            if calibration.residual_threshold is not None:
-                limits["residual"] = calibration.residual_threshold
+            found = {"violation": calibration.threshold_w, "residual": calibration.residual_threshold}
+            limits = {name: limit for name, limit in found.items() if limit is not None}
         notes = [(a["start_s"], a["diagnosis"]) for a in alarms if a["diagnosis"]]
         unit = {"rad": "N m", "m": "N"}.get(output.unit, "SI")
         figure = overview(
@@ -167,10 +198,12 @@ def watch(job: MonitorJob, out: Path) -> dict[str, Any]:
             title=name,
         )
         save(figure, out / f"{name}.png")
+    tell.finish("")
     result = {
         "recordings": rows,
         "warnings": [str(finding) for finding in job.data.findings],
         "gaps": [cut._asdict() for cut in job.data.cuts if "gap" in cut.why],
+        "not_watched": [cut._asdict() for cut in job.data.cuts if "gap" not in cut.why],
         "detector": None if job.detector is None else job.detector.to_dict(),
         "thresholds": None if job.monitor.calibration is None else job.monitor.calibration.to_dict(),
         "data_hash": job.data.hash,
@@ -179,9 +212,11 @@ def watch(job: MonitorJob, out: Path) -> dict[str, Any]:
     return result
 
 
-def watched(job: MonitorJob, recording: Trajectory) -> tuple[MonitorTrace, list[dict[str, Any]]]:
+def watched(
+    job: MonitorJob, recording: Trajectory, on_progress: Callable[[int, int], None] = lambda done, total: None
+) -> tuple[MonitorTrace, list[dict[str, Any]]]:
     """Trace of a recording, and its alarms with what explains them (empty where nothing can say)."""
-    return explained(job.monitor, job.estimator, recording, job.scenario.causes)
+    return explained(job.monitor, job.estimator, recording, job.scenario.causes, on_progress)
 
 
 def explained(
@@ -189,6 +224,7 @@ def explained(
     estimator: EstimatorLike,
     recording: TrajectoryLike,
     causes: Mapping[str, tuple[str, ...]],
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[MonitorTrace, list[dict[str, Any]]]:
     """Replay a monitor, and say of each alarm what explains it.
 
@@ -197,6 +233,7 @@ def explained(
         estimator: The estimator of the closed loops.
         recording: On the model's grid.
         causes: What may break, see :class:`~hybrid_mpc.monitor.Diagnoser`. Empty: each parameter by itself.
+        on_progress: ``(done, total)`` samples.
 
     Returns:
         The trace, and ``{start_s, end_s, diagnosis}`` of each alarm; no diagnosis where nothing can say.
@@ -204,6 +241,7 @@ def explained(
     can = monitor.layout.history and monitor.detector is not None
     diagnoser = Diagnoser(monitor, causes or None) if can else None
     dt, last = monitor.model.dt, len(recording.t) - 1
+    later = samples(HISTORY_S, monitor.model)  # by then the history holds nothing from before the alarm
     texts: dict[int, str] = {}
     began: list[int] = []
 
@@ -215,13 +253,15 @@ def explained(
         start = began[-1]
         if reading.frozen:
             texts[start] = FROZEN
-        due = not reading.alarm or k == start + round(DIAGNOSED_S / dt) or k == last
+        elif reading.blind:
+            texts.setdefault(start, BLIND[reading.verdict])
+        due = not reading.alarm or k == start + later or k == last
         if due and diagnoser is not None and start not in texts:
             texts[start] = diagnoser.diagnose(state, (k - start) * dt).text
         if not reading.alarm:
             began.append(-1)
 
-    trace = replay(monitor, estimator, recording, look)
+    trace = replay(monitor, estimator, recording, look, on_progress=on_progress)
     alarms = [
         {"start_s": float(trace.t[a]), "end_s": end, "diagnosis": texts.get(a, "")}
         for a, (_, end) in zip([k for k in began if k >= 0], trace.intervals(), strict=True)
@@ -246,7 +286,11 @@ def table(trace: MonitorTrace, recording: Trajectory, outputs: Sequence[Any]) ->
         columns[name] = getattr(trace, name)
     if trace.scores.size:
         columns |= {"force_score": trace.scores[:, 0], "power_score": trace.scores[:, 1]}
+    columns |= {"judged": (trace.verdict == Verdict.JUDGED).astype(int)}
     columns |= {"frozen": trace.frozen.astype(int), "alarm": trace.alarm.astype(int)}
-    lines = [",".join(columns)]
-    lines += [",".join(f"{v:.9g}" for v in row) for row in zip(*columns.values(), strict=True)]
+    row = ",".join(["%.9g"] * len(columns))
+    lines = [
+        ",".join(columns),
+        *(row % tuple(values) for values in np.column_stack([*columns.values()]).tolist()),
+    ]
     return "\n".join(lines) + "\n"

@@ -17,16 +17,17 @@ from hybrid_mpc.closed_loop.faults import install
 from hybrid_mpc.closed_loop.simulate import Step
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.monitor import guard_monitor
-from hybrid_mpc.monitor.calibration import BLOCK_S
-from hybrid_mpc.monitor.standard import SETTLING_S
+from hybrid_mpc.monitor.lengths import SETTLING_S, block_seconds, samples
 from hybrid_mpc.pipeline.contenders import build
+from hybrid_mpc.pipeline.monitor_job import stored_rest
 from hybrid_mpc.scenario import Budget, Scenario, Task, load_scenario
 
 Array = NDArray[np.float64]
 CONTENDER = "hybrid_observer"
 """The controller that the guard is for."""
 BLOCKS = 9
-"""Whole blocks of 5 s in a loop. Four such loops carry two false alarms an hour, eight carry one."""
+"""Whole blocks (of five of the machine's seconds) in a loop. Four such loops carry two false alarms an hour, eight
+carry one."""
 FEWEST, MOST = 4, 16
 """Loops: two for each seed of the budget, within these."""
 FIRST_SEED = 500
@@ -34,8 +35,10 @@ FIRST_SEED = 500
 SMALLEST = 0.6
 """Every time round, the reference is scaled by a factor drawn from here to 1: no two rounds are alike."""
 RETURN_S = 1.0
+"""Shortest way back to the reference's beginning [the machine's seconds]."""
 AGEING, DRIFT_S = (1.0, 1.1, 0.9), 30.0
-"""Where the plant knows it, friction drifts to these shares, in turn: ageing, of which the guard is to say nothing."""
+"""Where the plant knows it, friction drifts to these shares, in turn, within so many of the machine's seconds:
+ageing, of which the guard is to say nothing."""
 
 
 @dataclass(frozen=True)
@@ -92,13 +95,14 @@ def knows(scenario: Scenario, target: str) -> bool:
     return True
 
 
-def repeated(task: Task, dt: float, shares: Array) -> Task:
+def repeated(task: Task, dt: float, shares: Array, time_unit: float = 1.0) -> Task:
     """The task over and over: to its end, back to its beginning along a quintic, and again.
 
     Args:
         task: A task; its reference is asked for within its duration alone.
         dt: Period [s]; a round takes whole periods, since weights may be of single instants.
         shares: Factor ``(m,)`` on the distance from the reference's beginning, a round each.
+        time_unit: The machine's second [s]: the way back takes one at least. Default 1.
 
     Returns:
         The task of ``m`` rounds.
@@ -114,7 +118,7 @@ def repeated(task: Task, dt: float, shares: Array) -> Task:
     first, last = rows[0], rows[-1]
     fastest = np.abs(rows[:, n_q : 2 * n_q]).max(axis=0)
     far = np.abs(last - first)[:n_q] / np.maximum(fastest, 1e-9)  # a quintic's top speed is 15/8 of its mean
-    back = max(RETURN_S, 2.0 * float(far.max(initial=0.0)) if np.all(fastest > 0) else 0.0)
+    back = max(RETURN_S * time_unit, 2.0 * float(far.max(initial=0.0)) if np.all(fastest > 0) else 0.0)
     period = (length + math.ceil(back / dt - 1e-9)) * dt
     curve = [
         _quintic(first[i], last[i], first[n_q + i], last[n_q + i], period - length * dt) for i in range(n_q)
@@ -189,11 +193,11 @@ def run_nominal(
     control, model = task.control or scenario.control, artifact.models["hybrid"]
     assert scenario.plant is not None
     assert control is not None
-    settling = round(SETTLING_S / model.dt)
-    periods = settling + BLOCKS * max(round(BLOCK_S / model.dt), 1)
+    settling, unit = samples(SETTLING_S, model), model.time_unit
+    periods = settling + BLOCKS * max(round(block_seconds(model.dt, unit) / model.dt), 1)
     seconds, rng = periods * model.dt, np.random.default_rng([run_seed, loop.seed])
-    many = repeated(task, model.dt, rng.uniform(SMALLEST, 1.0, math.ceil(seconds / task.duration)))
-    drift = (Fault(0.0, math.inf, "plant_friction", loop.friction, ramp=DRIFT_S),)
+    many = repeated(task, model.dt, rng.uniform(SMALLEST, 1.0, math.ceil(seconds / task.duration)), unit)
+    drift = (Fault(0.0, math.inf, "plant_friction", loop.friction, ramp=DRIFT_S * unit),)
     numbers: list[tuple[float, ...]] = []
 
     def on_step(step: Step) -> None:
@@ -205,7 +209,8 @@ def run_nominal(
     result = simulate(
         scenario.plant(), estimator, controller, many.reference, weight=many.weight, dt=model.dt,
         duration=seconds, x0=np.array(task.x0), seed=run_seed * 1000 + loop.seed,
-        monitor=guard_monitor(model), faults=drift if loop.friction != 1.0 else (), on_step=on_step,
+        monitor=guard_monitor(model, rest_speed=stored_rest(artifact)),
+        faults=drift if loop.friction != 1.0 else (), on_step=on_step,
     )  # fmt: skip
     kept = {"numbers": np.array(numbers)[settling:], "y": result.y, "u": result.u}
     told = {"task": loop.task, "seed": loop.seed, "friction": loop.friction}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hybrid_mpc.files import write_json
@@ -148,6 +149,9 @@ def _notes(context: Context, results: dict[str, Any]) -> dict[str, dict[str, tup
     if results["monitor"]["alarms"] is not None:
         method = results["monitor"]["details"]["calibration"]["method"]
         after["monitor"] = (_monitor_words(context, results), f"Calibration: {method}.")
+    else:
+        after["monitor"] = (f"No alarms here: {results['monitor']['reason'].rstrip('.')}.",)
+    after["monitor"] += coverage_words(results["monitor"]["details"].get("recordings", ()))
     after["guard"] = guard_words(results)
     points = results["analysis"]["details"]
     reasons = [
@@ -184,6 +188,25 @@ def _monitor_words(context: Context, results: dict[str, Any]) -> str:
         return words
     seen = "never" if load["delay_s"] is None else f"after {load['delay_s']:.2f} s"
     return f"{words} The unknown load in the closed loop was reported {seen}."
+
+
+def coverage_words(recordings: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+    """What the monitor could not judge, in a sentence; nothing if that is but the warm-up.
+
+    Args:
+        recordings: Of each the seconds that were judged and that were not, by reason.
+
+    Example:
+        >>> coverage_words([{"judged_s": 4.0, "warm_up_s": 0.3, "missing_s": 0.0, "not_finite_s": 2.0}])
+        ('Not judged: 2 s in which model or estimator gave no finite number.',)
+    """
+    why = {
+        "missing_s": "with missing samples",
+        "not_finite_s": "in which model or estimator gave no finite number",
+    }
+    sums = {key: sum(float(row[key]) for row in recordings) for key in why}
+    told = [f"{sums[key]:.3g} s {words}" for key, words in why.items() if sums[key] > 0]
+    return (f"Not judged: {', '.join(told)}.",) if told else ()
 
 
 def _data_table(results: dict[str, Any]) -> Table:

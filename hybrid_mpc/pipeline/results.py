@@ -245,17 +245,20 @@ def _timing(context: Context) -> dict[str, Any]:
 
 def _monitor(context: Context) -> dict[str, Any]:
     monitor = context.result("monitor")
+    # how much of each recording was judged, and how much not; runs of earlier versions did not count it
+    covered = {"recordings": monitor["recordings"]} if "recordings" in monitor else {}
     if "reason" in monitor:
         return {
             **dict.fromkeys(("threshold_w", "false_alarms_per_hour", "alarms")),
             "reason": monitor["reason"],
+            "details": covered,
         }
     clean = monitor["clean"]
     return {
         "threshold_w": monitor["calibration"]["threshold_w"],
         "false_alarms_per_hour": clean["alarms"] / (clean["seconds"] / 3600.0),
         "alarms": monitor["alarms"],
-        "details": {"calibration": monitor["calibration"], "clean": clean},
+        "details": {"calibration": monitor["calibration"], "clean": clean, **covered},
     }
 
 

@@ -19,10 +19,11 @@ from hybrid_mpc.closed_loop.simulate import Step
 from hybrid_mpc.estimation.switching import SwitchingFilter
 from hybrid_mpc.files import read_arrays, read_json, write_arrays
 from hybrid_mpc.monitor import METHODS, Detector, EnergyMonitor, Judges, guard_monitor, learn_judges
-from hybrid_mpc.monitor.calibration import BLOCK_S
+from hybrid_mpc.monitor.rest import REST_SPEED
 from hybrid_mpc.pipeline.contenders import build
 from hybrid_mpc.pipeline.control_job import selected_tasks
-from hybrid_mpc.pipeline.guards import RESTING, make_adaptive_guard
+from hybrid_mpc.pipeline.guards import make_adaptive_guard, make_resting_guard
+from hybrid_mpc.pipeline.monitor_job import stored_rest
 from hybrid_mpc.scenario import ControlSpec, Task, load_scenario
 from hybrid_mpc.studies.lockstep import Loop, Trace, run_together
 from hybrid_mpc.studies.loops import ModelInput
@@ -30,8 +31,8 @@ from hybrid_mpc.studies.monitor_plan import FAULT, GUARD, LEARN, LoopPlan, Monit
 
 Array = NDArray[np.float64]
 JUDGES, LEARNING = "judges.json", "learning"
-MOVING = 0.3
-"""True speed [rad/s or m/s] above which time counts towards a delay."""
+MOVING = 1.5
+"""True speed, in rest speeds, above which time counts towards a delay."""
 WITHIN_S = 1.0
 """Time in motion [s] within which the ROC counts a fault as found."""
 CONTROLLER, PRIOR = "hybrid_observer", "prior_observer"
@@ -112,7 +113,10 @@ class _Loops:
         self, detector: Detector | None = None, resolution: tuple[float, ...] | None = None
     ) -> EnergyMonitor:
         ranges = self._control.input_range
-        return guard_monitor(self._model, detector, resolution=resolution, input_range=ranges)
+        rest = stored_rest(self._artifact) if detector is None else None
+        return guard_monitor(
+            self._model, detector, resolution=resolution, input_range=ranges, rest_speed=rest
+        )
 
     def _nominal(self, plans: tuple[LoopPlan, ...]) -> list[Trace]:
         estimator, controller = self._parts(CONTROLLER, self._study.horizon)
@@ -166,7 +170,7 @@ class _Loops:
 
     def _guard(self, arm: str) -> Guard:
         if arm == "rest":
-            return RESTING
+            return make_resting_guard(self._model)
         if arm == "backup":
             estimator, controller = self._parts(PRIOR)
             return Guard(Mode.BACKUP, Mode.REST, backup=controller, backup_estimator=estimator)
@@ -193,7 +197,7 @@ def nominal_figures(study: MonitorStudy, judges: Judges, trace: Trace) -> dict[s
         trace: The loop.
     """
     dt, levels = judges.detector.dt, judges.levels(trace)
-    size = round(BLOCK_S / dt)
+    size = round(judges.block_s / dt)
     counts: dict[str, dict[str, int]] = {}
     for rate in study.rates:
         alarms = {m: judges.alarm(levels, trace, m, rate) for m in METHODS}
@@ -218,7 +222,8 @@ def fault_figures(study: MonitorStudy, judges: Judges, trace: Trace, onset: int)
         onset: First sample of the fault.
     """
     dt, levels = judges.detector.dt, judges.levels(trace)
-    moved: Array = np.cumsum(trace.speed[onset:] > MOVING) * np.float64(dt)
+    moving = MOVING * max(judges.detector.rest_speed)
+    moved: Array = np.cumsum(trace.speed[onset:] > moving) * np.float64(dt)
     delays: dict[str, dict[str, float]] = {}
     early: dict[str, dict[str, bool]] = {}
     for rate in study.rates:
@@ -265,13 +270,13 @@ def write_learning(path: Path, traces: list[Trace]) -> None:
     write_arrays(path, arrays)
 
 
-def learn(study: MonitorStudy, paths: list[Path], dt: float) -> Judges:
+def learn(study: MonitorStudy, paths: list[Path], artifact: Artifact) -> Judges:
     """Thresholds of all methods from the nominal loops in these files.
 
     Args:
         study: The study.
         paths: Files of :func:`write_learning`.
-        dt: Period [s].
+        artifact: The models that ran in them.
 
     Raises:
         InputError: If a file is missing, or there is too little data.
@@ -283,4 +288,8 @@ def learn(study: MonitorStudy, paths: list[Path], dt: float) -> Judges:
             fields: Mapping[str, Any] = {name: arrays[f"{name}_{i}"] for name in Trace.__dataclass_fields__}
             traces.append(Trace(**fields))
             hashed.update(traces[-1].numbers.tobytes())
-    return learn_judges(traces, dt, study.resolution, rate=min(study.rates), data_hash=hashed.hexdigest())
+    model, rest = artifact.models["hybrid"], stored_rest(artifact)
+    return learn_judges(
+        traces, model.dt, study.resolution, rate=min(study.rates), rest_speed=REST_SPEED if rest is None else rest,
+        time_unit=model.time_unit, data_hash=hashed.hexdigest(),
+    )  # fmt: skip

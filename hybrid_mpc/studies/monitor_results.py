@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.monitor import METHODS, Judges
-from hybrid_mpc.monitor.calibration import BLOCK_S
+from hybrid_mpc.monitor.lengths import BLOCK_S
 from hybrid_mpc.studies.monitor_plan import ARMS, CASES, FAULT, GUARD, NOMINAL
 
 Array = NDArray[np.float64]
@@ -42,7 +42,10 @@ def monitor_results(study: Mapping[str, Any], judges: Judges, rows: Rows) -> dic
         "nominal_hours": sum(loop["seconds"] for loop in loops) / 3600,
         "false_alarms": {rate: {m: false_alarms(loops, rate, m) for m in METHODS} for rate in rates},
         "delays": {rate: {c.name: _delays(of[FAULT], rate, c.name) for c in CASES} for rate in rates},
-        "roc": {c.name: {m: roc(loops, _case(of[FAULT], c.name), m) for m in METHODS} for c in CASES},
+        "roc": {
+            c.name: {m: roc(loops, _case(of[FAULT], c.name), m, judges.block_s) for m in METHODS}
+            for c in CASES
+        },
         "guard": {c.name: _guard(_case(of[FAULT], c.name), _case(of[GUARD], c.name)) for c in CASES},
     }
 
@@ -151,15 +154,16 @@ def wilson(count: int, n: int) -> tuple[float, float]:
     return max(0.0, (middle - half) / scale), min(1.0, (middle + half) / scale)
 
 
-def roc(loops: Rows, faulted: Rows, method: str) -> dict[str, list[float]]:
+def roc(loops: Rows, faulted: Rows, method: str, block_s: float = BLOCK_S) -> dict[str, list[float]]:
     """Share of faults found within a second against false alarms an hour, as all thresholds grow together.
 
-    A false alarm is a block of 5 s whose largest score passes.
+    A false alarm is a block whose largest score passes.
 
     Args:
         loops: Nominal loops with the largest scores of their ``blocks``.
         faulted: Faulted loops with their largest ``scores`` soon after the onset.
         method: Name of the method.
+        block_s: Length of a block [s]. Default 5.
 
     Returns:
         ``factor`` of the thresholds, ``per_hour`` and ``found``, in descending order of false alarms.
@@ -178,7 +182,7 @@ def roc(loops: Rows, faulted: Rows, method: str) -> dict[str, list[float]]:
     passed = np.sort(blocks)[blocks.size - ranks]  # so many blocks pass just below these
     top = max(blocks.max(), scores.max())
     factors = np.array([*(passed * (1 - 1e-9)), blocks.max(), top])
-    hours = blocks.size * BLOCK_S / 3600
+    hours = blocks.size * block_s / 3600
     return {
         "factor": factors.tolist(),
         "per_hour": [float((blocks > f).sum() / hours) for f in factors],

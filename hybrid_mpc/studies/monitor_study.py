@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from hybrid_mpc.artifact import load_artifact
+from hybrid_mpc.artifact import Artifact, load_artifact
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_json, write_json
 from hybrid_mpc.monitor import Judges
@@ -84,7 +84,7 @@ def run_monitor_study(
             first = [job for job in jobs if job.kind == LEARN]
             todo.run("nominal loops to learn from", first)
             if not (out / JUDGES).is_file():
-                _learn(study, out, first, load_artifact(Path(model.folder)).models["hybrid"].dt)
+                _learn(study, out, first, load_artifact(Path(model.folder)))
             todo.run("nominal, faulted and guarded loops", [job for job in jobs if job.kind != LEARN])
     finally:
         engine.close()
@@ -128,7 +128,7 @@ class _Todo:
         self._say.finish(told.text if left else "done before")
 
 
-def _learn(study: MonitorStudy, out: Path, jobs: list[MonitorJob], dt: float) -> None:
+def _learn(study: MonitorStudy, out: Path, jobs: list[MonitorJob], artifact: Artifact) -> None:
     failed = [row for row in rows(out / RUNS) if row["kind"] == LEARN and row["status"] == "failed"]
     paths = [out / LEARNING / f"{job.id}.npz" for job in jobs]
     if failed and not all(path.is_file() for path in paths):
@@ -136,5 +136,5 @@ def _learn(study: MonitorStudy, out: Path, jobs: list[MonitorJob], dt: float) ->
             f"{out}: a nominal loop to learn from has failed: {failed[-1]['error'].strip().splitlines()[-1]}; "
             "--resume --retry-failed runs it again"
         )
-    write_json(out / JUDGES, learn(study, paths, dt).to_dict())
+    write_json(out / JUDGES, learn(study, paths, artifact).to_dict())
     shutil.rmtree(out / LEARNING)

@@ -29,6 +29,7 @@ CONTROL = ControlSpec(
     u_max=(0.5,),
     du_max=(0.25,),
     estimator_sigma=(0.5e-3,),
+    first_speed_sigma=(0.1,),
     x_min=(-0.85, -2.5),
     x_max=(0.85, 2.5),
 )

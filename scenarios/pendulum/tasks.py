@@ -22,6 +22,7 @@ CONTROL = ControlSpec(
     u_min=(-20.0,),
     u_max=(20.0,),
     estimator_sigma=(1e-4,),
+    first_speed_sigma=(0.1,),
 )
 
 STEPS = (0.0, 0.5, -0.4, 0.6, 0.0)

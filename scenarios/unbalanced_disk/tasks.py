@@ -30,6 +30,7 @@ CONTROL = ControlSpec(
     u_max=(PEAK,),
     # encoder step 0.0031416 rad / sqrt(12), rounded up
     estimator_sigma=(0.001,),
+    first_speed_sigma=(0.1,),
 )
 UPRIGHT = replace(CONTROL, around=(pi, 0.0))
 

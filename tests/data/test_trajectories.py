@@ -1,3 +1,4 @@
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -176,3 +177,20 @@ def test_roles_that_are_not_needed_may_be_empty(tmp_path):
         load_trajectories([file], whole, **signals)
     data = load_trajectories([file], whole, **signals, needed=("train", "valid"))
     assert [piece.role for piece in data.trajectories] == ["train", "valid"]
+
+
+def test_too_short_a_recording_is_told_how_long_one_must_be(tmp_path):
+    """By the default shares of 60, 20 and 20 %; a sample more than said is enough, two less are not."""
+    spec = DataSpec("t", ("u",), ("y",), dt=0.02, max_gap=0.05, smoothing=0.2, warm_up=0.5)
+
+    def read(seconds):
+        t = 0.02 * np.arange(round(seconds / 0.02) + 1)
+        file = write_csv(tmp_path / f"run{len(t)}.csv", {"t": t, "u": np.sin(t), "y": np.cos(t)})
+        return load_trajectories([file], spec, outputs=(Signal("y", "m"),), inputs=(Signal("u", "N"),))
+
+    with pytest.raises(InputError, match=r"split by fractions needs (\S+) s") as short:
+        read(2.0)
+    needed = float(re.search(r"needs (\S+) s", str(short.value))[1])
+    assert {t.role for t in read(needed + 0.02).trajectories} == {"train", "valid", "test"}
+    with pytest.raises(InputError, match=r"no piece of 0\.7 s"):
+        read(needed - 0.2)

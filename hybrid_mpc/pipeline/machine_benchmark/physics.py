@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.identification.lags import delayed
 from hybrid_mpc.identification.prior_long_runs import OutputErrorFit, Runs, cut_runs
@@ -17,7 +18,7 @@ from hybrid_mpc.identification.smoothing import Smoother, fit_smoother
 from hybrid_mpc.physics import Prior
 
 STAGES = ((1.0, 15, 48), (5.0, 10, 48))
-"""Free runs from polynomially smoothed states: length [s], most simulations, most runs."""
+"""Free runs from polynomially smoothed states: length [the machine's seconds], most simulations, most runs."""
 LAST = (12, 40)
 """The last stage's, over the benchmark's own length from states that the fitted prior has smoothed."""
 NONE = 0.05
@@ -71,9 +72,10 @@ def fit_physics(
         on_progress: ``(done, total, text)``.
     """
     fit = OutputErrorFit(make, dt, largest_delay)
-    theta, total = fit.nominal, len(STAGES) + 1
+    theta, total, unit = fit.nominal, len(STAGES) + 1, time_unit(train, dt)
     found: list[tuple[str, Any, Any]] = []
-    for i, (seconds, evaluations, most) in enumerate(STAGES):
+    for i, (own_seconds, evaluations, most) in enumerate(STAGES):
+        seconds = unit * own_seconds
         if _periods(train, min(seconds, length), dt, fit.lead) < 2:
             continue
         on_progress(i, total, f"free runs of {min(seconds, length):g} s")

@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_mpc.benchmark_spec import BenchmarkSpec
+from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
 from hybrid_mpc.data_spec import Role
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.scenario import Scenario
 
 LONGEST = 60.0
-"""Most seconds of a recording in :attr:`Recordings.long`: a model that drifts shows it by then."""
+"""Most of a recording in :attr:`Recordings.long` [the machine's seconds]: a model that drifts shows it by then."""
 SCORED = 50
 """Fewest periods of a piece after its warm-up."""
 
@@ -29,8 +30,8 @@ class Recordings:
         valid: Pieces that choose; nothing is fitted to them.
         held_back: Pieces that neither fit nor choose; may be none.
         long: Recordings that were split in order of time and are judged whole, from their first sample to where
-            validation ends, at most a minute. Most or all of them was trained on, so they tell drift and not how good
-            a model is.
+            validation ends, at most a minute (of the machine's own seconds). Most or all of them was trained on, so
+            they tell drift and not how good a model is.
         dataset: The files as they were read.
     """
 
@@ -124,13 +125,14 @@ def until_validated(dataset: Dataset, windows: Container[str]) -> tuple[Trajecto
         ([('valid', 8)], ())
     """
     stems, found = {Path(file).stem for file in dataset.files}, []
+    longest = LONGEST * time_unit(dataset.whole, dataset.whole[0].dt) if dataset.whole else 0.0
     for whole in dataset.whole:
         # one that begins after a gap begins in motion, and a run that judges does not
         if whole.name not in stems or whole.name in windows:
             continue
         ends = [p.t[-1] for p in dataset.by_role("valid") if _stem(p.name, stems) == whole.name]
         if ends:
-            end = min(max(ends), whole.t[0] + LONGEST)
+            end = min(max(ends), whole.t[0] + longest)
             found.append(whole.part(whole.t <= end, whole.name, "valid"))
     return tuple(found)
 

@@ -1,0 +1,184 @@
+"""What recordings say of a machine's own scales: the noise of its sensors, its time scale, its unit of time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import savgol_coeffs, savgol_filter
+
+Array = NDArray[np.float64]
+FASTEST, SLOWEST = 0.25, 4.0
+"""Time scales [s] between which a machine's second is a second. The lengths of the library that are written in seconds
+(free runs that a fit goes through, the monitor's windows, blocks of false alarms) were argued and tried on machines of
+0.5 s (unbalanced disk) to 2 s (torque pendulum, :func:`time_scale`); half and twice that are left to either side."""
+COARSEST = 10
+"""Fewest periods in a machine's second: its shortest length, the tenth of a second that the guard averages over, is
+then one of them."""
+SHORTEST = 5
+"""Half the samples of the first window in which accelerations are looked for: ten periods."""
+NOISY = 0.02
+"""Share of noise in the power of the acceleration from which on the window is too short to tell: the steps of a coarse
+sensor are no white noise, and up to half of what they make would pass for motion."""
+
+
+class Outputs(Protocol):
+    """A recording on a uniform grid."""
+
+    @property
+    def y(self) -> Array:
+        """Measured outputs ``(n, n_y)``; positions."""
+
+
+def noise_of(recordings: Sequence[Outputs]) -> Array:
+    """Standard deviation ``(n_y,)`` of the sensors' noise and steps, from third differences [output units].
+
+    White noise of 1 gives third differences of sqrt(20). What the machine itself does in three periods counts as noise
+    too, so the number is at most too large.
+
+    Args:
+        recordings: At least one; shorter ones than four samples say nothing, and neither do samples that are missing.
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> y = np.sin(0.01 * np.arange(5000)) + np.random.default_rng(0).normal(scale=1e-3, size=5000)
+        >>> noise_of([SimpleNamespace(y=y[:, None])]).round(4)
+        array([0.001])
+    """
+    third = np.concatenate([np.diff(r.y, 3, axis=0) for r in recordings])
+    third = third[np.isfinite(third).all(axis=1)]
+    if not len(third):
+        return np.zeros(recordings[0].y.shape[1])
+    return np.asarray(np.std(third, axis=0) / math.sqrt(20.0))
+
+
+def speeds_of(recording: Outputs, dt: float, half: int, order: int = 1) -> Array:
+    """Speeds ``(m, n_y)`` at the centres of cubics through ``2 half + 1`` samples each; accelerations with ``order`` 2.
+
+    Args:
+        recording: Positions.
+        dt: Period [s].
+        half: Samples to either side of a centre.
+        order: 1 for speeds (default), 2 for accelerations.
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> run = SimpleNamespace(y=(0.1 * np.arange(30.0)[:, None]) ** 2)
+        >>> speeds_of(run, 0.1, 3)[:2].ravel().round(6).tolist()  # of t^2 at 0.3 and 0.4 s
+        [0.6, 0.8]
+    """
+    window = 2 * half + 1
+    if len(recording.y) < window:
+        return np.zeros((0, recording.y.shape[1]))
+    found = savgol_filter(recording.y, window, 3, deriv=order, delta=dt, axis=0)[
+        half : len(recording.y) - half
+    ]
+    return np.asarray(found[np.isfinite(found).all(axis=1)])
+
+
+def speed_gain(dt: float, half: int, order: int = 1) -> float:
+    """Standard deviation of such a speed [1/s] (acceleration [1/s^2]) per unit of white noise in the samples.
+
+    Example:
+        >>> round(speed_gain(0.02, 5), 1)
+        12.3
+    """
+    return float(np.linalg.norm(savgol_coeffs(2 * half + 1, 3, deriv=order, delta=dt)))
+
+
+def time_scale(recordings: Sequence[Outputs], dt: float) -> float:
+    """Time [s] of one swing of the machine: ``2 pi`` times its root mean square speed over that of its acceleration.
+
+    For a sinusoid it is the period; a drive that mostly cruises is as slow as its ramps. Noise is taken off: its power
+    follows from third differences, and the window is doubled until the acceleration stands out of it. Of several
+    outputs the fastest decides.
+
+    Args:
+        recordings: Recordings of positions in motion.
+        dt: Their period [s].
+
+    Returns:
+        The time; NaN where nothing stands out of the noise.
+
+    Source: the mean rate at which a Gaussian process crosses its mean; Rice, *Mathematical analysis of random noise*,
+    Bell System Technical Journal 24 (1945).
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> t = 0.02 * np.arange(5000)
+        >>> noise = np.random.default_rng(0).normal(scale=1e-6, size=5000)
+        >>> slow = SimpleNamespace(y=(1e-3 * np.sin(2 * np.pi * t / 30.0) + noise)[:, None])
+        >>> 27.0 < time_scale([slow], 0.02) < 33.0
+        True
+    """
+    if not recordings:
+        return math.nan
+    sigma = noise_of(recordings)
+    found = [_time_scale(recordings, dt, i, float(s)) for i, s in enumerate(sigma)]
+    known = [value for value in found if math.isfinite(value)]
+    return min(known) if known else math.nan
+
+
+def time_unit(recordings: Sequence[Outputs], dt: float) -> float:
+    """The machine's second [s]: what every length that the library writes in seconds is counted in.
+
+    1 s for a machine whose :func:`time_scale` lies between 0.25 and 4 s. A slower one has so much longer a second, a
+    faster one so much shorter, to two digits; at least 10 periods, so that no length holds too few samples.
+
+    Args:
+        recordings: Recordings of positions in motion, e.g. the training ones.
+        dt: Their period [s].
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> phase = np.linspace(0.0, 60.0, 3000)
+        >>> swings = SimpleNamespace(y=np.sin(phase)[:, None])  # 314 samples a swing
+        >>> [time_unit([swings], dt) for dt in (1e-4, 0.01, 2.0)]  # swings of 0.03, 3 and 628 s
+        [0.13, 1.0, 160.0]
+    """
+    scale = time_scale(recordings, dt)
+    unit = scale / min(max(scale, FASTEST), SLOWEST) if math.isfinite(scale) else 1.0
+    return float(f"{max(unit, COARSEST * dt):.2g}")
+
+
+def periods(seconds: float, dt: float, fewest: int = 1) -> int:
+    """Whole periods of a length, at least ``fewest``.
+
+    Args:
+        seconds: Length [s].
+        dt: Period [s].
+        fewest: Least number. Default 1.
+
+    Example:
+        >>> periods(0.5, 0.02), periods(0.5, 2.0)
+        (25, 1)
+    """
+    return max(fewest, round(seconds / dt))
+
+
+def _time_scale(recordings: Sequence[Outputs], dt: float, i: int, sigma: float) -> float:
+    """Time scale of one output; NaN where its acceleration never stands out of the noise."""
+    half, longest = SHORTEST, max(len(r.y) for r in recordings)
+    while 2 * half + 1 <= longest:
+        speed, acceleration = (
+            [speeds_of(_Column(r.y[:, i : i + 1]), dt, half, order) for r in recordings] for order in (1, 2)
+        )
+        v = np.concatenate([part - part.mean() for part in speed if len(part)] or [np.zeros((0, 1))])
+        a = np.concatenate(acceleration)
+        noise = [sigma * speed_gain(dt, half, order) for order in (1, 2)]
+        power = float(np.mean(a**2)) if len(a) else 0.0
+        if power > 0 and noise[1] ** 2 < NOISY * power:
+            moved = max(float(np.mean(v**2)) - noise[0] ** 2, 0.0)
+            return 2 * math.pi * math.sqrt(moved / (power - noise[1] ** 2))
+        half *= 2
+    return math.nan
+
+
+class _Column:
+    """One output of a recording."""
+
+    def __init__(self, y: Array) -> None:
+        self.y = y

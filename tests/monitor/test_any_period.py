@@ -1,0 +1,90 @@
+"""Monitor, guard and detector on axes whose periods are 0.1 ms, 1 ms, 2 s or an hour."""
+
+import numpy as np
+import pytest
+from linear_axes import Axis, kalman
+
+from hybrid_mpc.data import time_unit
+from hybrid_mpc.monitor import Diagnoser, guard_monitor, learn_detector, replay, rest_speeds
+from hybrid_mpc.monitor.lengths import SETTLING_S, block_seconds, samples, seconds
+from hybrid_mpc.pipeline.guards import make_resting_guard
+from hybrid_mpc.pipeline.loops import make_monitor
+
+TODAY = {
+    "golf_robot": 0.02,
+    "torque_pendulum": 0.02,
+    "unbalanced_disk": 0.025,
+    "pendulum": 0.01,
+    "emps": 0.01,
+}
+
+
+@pytest.mark.parametrize(("name", "dt"), TODAY.items())
+def test_today_s_lengths_are_what_they_were(name, dt):
+    """Written out as before there was a machine's second."""
+    model = Axis(dt).model()
+    half = max(2, round(0.5 * 0.2 / dt))
+    guard, main = guard_monitor(model, diagnose=True), make_monitor(model, None)
+    assert guard.window == 2 * half + 1
+    assert guard.average == max(1, round(0.1 / dt))
+    assert guard.layout.length == round(max(0.6, 2 * (2 * half + 1) * dt) / dt)
+    assert guard.layout.history == round(2.0 / dt)
+    assert main.window == 2 * max(2, round(0.5 * 0.3 / dt)) + 1
+    assert main.average == max(1, round(0.3 / dt))
+    assert samples(SETTLING_S, model) == round(1.0 / dt)
+    assert block_seconds(dt) == 5.0
+    resting = make_resting_guard(model)
+    assert (resting.dwell, resting.quiet) == (0.5, 1.0)
+
+
+def axis(dt, swing, unit=1.0, speed=0.1, push=0.0, viscous=1.0):
+    """An axis that 1 N swings at ``speed`` [m/s] in a time ``swing`` [s]; half of the force goes into damping."""
+    damping = 0.5 / speed
+    return Axis(dt, mass=swing / (2 * np.pi) * damping, viscous=viscous * damping, push=push, time_unit=unit)
+
+
+@pytest.mark.parametrize(
+    ("dt", "swing"), [(1e-4, 5e-3), (1e-3, 0.05), (2.0, 120.0), (3600.0, 2e5)], ids=lambda v: f"{v:g}"
+)
+def test_a_detector_is_learned_and_finds_a_fault_at_any_period(dt, swing):
+    speed, noise = 0.1, 1e-5 * 0.1 * swing
+    plain, n = axis(dt, swing), 3600
+    runs = [plain.run(plain.swings(swing, n, seed=s), noise=noise, seed=s) for s in range(2)]
+    unit = time_unit(runs, dt)
+    assert unit >= 10 * dt * 0.95  # to two digits
+    model = axis(dt, swing, unit).model()
+    rest = rest_speeds(runs, model)
+    assert rest[0] < 0.2 * speed
+    monitor, estimator = guard_monitor(model, rest_speed=rest), kalman(model, noise, speed)
+    skipped = samples(SETTLING_S, model)
+    numbers = [replay(monitor, estimator, run).numbers[skipped:] for run in runs]
+    # little data: short blocks, and an alarm in five of them, each of the two alarms in ten
+    block = 100 * dt
+    detector = learn_detector(
+        numbers, dt, 1, false_alarms_per_hour=0.2 * 3600.0 / block, rest_speed=rest, time_unit=unit, trusted=True,
+        block_s=block,
+    )  # fmt: skip
+    assert detector.hours * 3600 == pytest.approx(2 * (n - skipped) * dt)
+    # a push of a tenth of the force from the middle of another run on
+    pushed = plain.run(
+        plain.swings(swing, 800, seed=7), noise=noise, seed=7, fault=axis(dt, swing, push=0.1), at=400
+    )
+    armed = guard_monitor(model, detector, resolution=[3.5 * noise], diagnose=True)
+    trace = replay(armed, estimator, pushed)
+    assert trace.alarm[400:].any()
+    first = np.flatnonzero(trace.alarm[400:])[0]
+    assert first * dt < 2 * swing
+    assert (trace.verdict[armed.window - 1 :] == 0).all()
+    # what explains it is looked for in whole windows; a push is none of the parameters
+    assert Diagnoser(armed).diagnose(trace.state).text
+
+
+def test_the_main_monitor_runs_at_any_period():
+    for dt, swing in ((1e-4, 5e-3), (3600.0, 2e5)):
+        plain = axis(dt, swing)
+        run = plain.run(plain.swings(swing, 600))
+        model = axis(dt, swing, time_unit([run], dt)).model()
+        monitor = make_monitor(model, None, rest_speed=rest_speeds([run], model))
+        trace = replay(monitor, kalman(model, 1e-9, 0.1), run)
+        assert np.isfinite(trace.level_w[monitor.window + monitor.average :]).all()
+        assert seconds(0.3, model) >= 5 * dt
