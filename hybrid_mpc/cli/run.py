@@ -17,6 +17,8 @@ from hybrid_mpc.cli.options import (
     TimeColumn,
 )
 
+INCOMPLETE = 1
+"""Exit code of a run whose report lacks a part."""
 EXAMPLES = (
     "Examples:\n\n"
     "  hybrid-mpc run golf_robot --out runs/golf\n\n"
@@ -44,8 +46,12 @@ def run(
     ] = None,
     device: Device = "cpu",
 ) -> None:
-    """Fit the prior, train, export, close the loop, monitor, learn the guard, analyse, and write a report."""
+    """Fit the prior, train, export, close the loop, monitor, learn the guard, analyse, and write a report.
+
+    Exit code 1 if a stage after the export could not run; the report then says why.
+    """
     from hybrid_mpc.cli.progress import make_progress
+    from hybrid_mpc.pipeline.context import failed_stages
     from hybrid_mpc.pipeline.run import run as run_job
     from hybrid_mpc.pipeline.settings import RunSettings
 
@@ -66,6 +72,10 @@ def run(
     for line in summary(results):
         print(line)
     print(f"report: {(folder / 'report.html').resolve()}")
+    if failed := failed_stages(folder):
+        for stage, why in failed.items():
+            print(f"stage {stage} could not run: {why}")
+        raise typer.Exit(INCOMPLETE)
 
 
 def summary(results: dict[str, object]) -> list[str]:

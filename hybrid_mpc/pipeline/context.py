@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
@@ -151,6 +152,21 @@ class Context:
         """Keep a stage's result; its JSON is written last and means that the stage is done."""
         write_document(self._path(stage), result, arrays)
 
+    def fail(self, stage: str, why: str) -> None:
+        """Note that a stage could not run, and why: those after it go on without, and the report says so."""
+        self.save(stage, {"reason": why, "failed": True}, {})
+
+    def sigma_x(self, contender: str) -> NDArray[np.float64]:
+        """Process noise ``(n_x,)`` of a contender's filter, which stage control has found.
+
+        Raises:
+            InputError: If that stage could not run.
+        """
+        control = self.result("control")
+        if "sigma_x" not in control:
+            raise InputError(f"the filters have no process noise, for {control['reason']}")
+        return np.array(control["sigma_x"][contender])
+
     def done(self, stage: str) -> bool:
         """Whether a stage's result is there."""
         return self._path(stage).is_file()
@@ -180,3 +196,21 @@ class Context:
             f"delete what the stage {stage} left and what stands on it ({', '.join(f'{name}.*' for name in later)} in "
             f"{self.out / 'checkpoints'}), and --resume computes it anew"
         )
+
+
+def failed_stages(out: Path) -> dict[str, str]:
+    """Why stages of a run could not run, by stage; empty where all did.
+
+    Args:
+        out: The run's folder.
+
+    Raises:
+        InputError: If a checkpoint is damaged.
+
+    Example:
+        >>> failed_stages(Path("nowhere"))
+        {}
+    """
+    paths = {stage: out / "checkpoints" / f"{stage}.json" for stage in STAGES}
+    found = {stage: read_document(path) for stage, path in paths.items() if path.is_file()}
+    return {stage: str(result["reason"]) for stage, result in found.items() if result.get("failed")}

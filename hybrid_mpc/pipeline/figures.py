@@ -273,6 +273,8 @@ def _worth_showing(context: Context) -> list[Any]:
 
 def _analysis(context: Context) -> Any:
     result, arrays = context.result("analysis"), context.arrays("analysis")
+    if "reason" in result:
+        return
     colours = {"prior": "phy", "hybrid": "mopgrnn"}
     poles = {c: np.array([complex(*z) for z in result[n]["rest"]["poles"]]) for n, c in colours.items()}
     yield (

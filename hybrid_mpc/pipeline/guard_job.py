@@ -157,7 +157,8 @@ def _whole_blocks(runs: Sequence[Array], block_s: float, dt: float) -> int:
 
 def noise(context: Context) -> dict[str, Array]:
     """Process noise of the run's filters by contender."""
-    return {name: np.array(values) for name, values in context.result("control")["sigma_x"].items()}
+    names = context.result("control").get("sigma_x", {CONTENDER: None})
+    return {name: context.sigma_x(name) for name in names}
 
 
 def _nominal_data(

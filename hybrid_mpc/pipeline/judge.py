@@ -60,7 +60,7 @@ def monitor_stage(context: Context) -> None:
         context.save("monitor", {"reason": reason}, {})
         return
     model = load_artifact(context.out / "model").models["hybrid"]
-    sigma_x = np.array(context.result("control")["sigma_x"]["hybrid_observer"])
+    sigma_x = context.sigma_x("hybrid_observer")
     whole = context.dataset.whole
     known: dict[str, Any] = {}  # the rest speeds, and what hinders the calibration
     try:

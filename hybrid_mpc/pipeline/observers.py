@@ -31,13 +31,12 @@ def estimation_stage(context: Context) -> None:
         context.save("estimation", {"reason": reason}, {})
         return
     models = load_artifact(context.out / "model").models
-    sigma_x = context.result("control")["sigma_x"]
     parts = judged_parts(context.trajectories("test"))
     result: dict[str, Any] = {"recordings": [{"name": p.name, "samples": len(p.t)} for p in parts]}
     arrays: dict[str, Any] = {}
     for i, name in enumerate(OBSERVERS):
         context.progress.update("observers", i, len(OBSERVERS), name)
-        estimator = make_estimator(models[CONTENDERS[name].model], control, np.array(sigma_x[name]))
+        estimator = make_estimator(models[CONTENDERS[name].model], control, context.sigma_x(name))
         try:
             found = consistency(estimator, parts)
         except InputError as too_short:

@@ -154,6 +154,8 @@ def _notes(context: Context, results: dict[str, Any]) -> dict[str, dict[str, tup
     after["monitor"] += coverage_words(results["monitor"]["details"].get("recordings", ()))
     after["guard"] = guard_words(results)
     points = results["analysis"]["details"]
+    if "reason" in results["analysis"]:
+        instead["analysis"] = (f"There is no analysis here: {results['analysis']['reason'].rstrip('.')}.",)
     reasons = [
         f"{m}: {points[m]['fixed_point_reason']}" for m in points if "fixed_point_reason" in _dict(points[m])
     ]
@@ -321,7 +323,7 @@ def _alarm_table(results: dict[str, Any]) -> Table | None:
 
 def _pole_table(results: dict[str, Any]) -> Table:
     rows = []
-    for model, points in results["analysis"]["details"].items():
+    for model, points in results["analysis"]["details"].items():  # empty where the stage could not run
         if not isinstance(points, dict):
             continue
         for point, a in points.items():

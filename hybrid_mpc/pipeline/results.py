@@ -264,6 +264,9 @@ def _monitor(context: Context) -> dict[str, Any]:
 
 def _analysis(context: Context) -> dict[str, Any]:
     analysis = context.result("analysis")
+    if "reason" in analysis:
+        none = dict.fromkeys(("eigenvalues", "stabilisable", "detectable"))
+        return {**none, "reason": analysis["reason"], "details": {}}
     hybrid = analysis["hybrid"]["rest"]
     return {
         "eigenvalues": hybrid["poles"],

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from hybrid_mpc.errors import InputError, StorageError
 from hybrid_mpc.pipeline import deploy, identify, judge
 from hybrid_mpc.pipeline.context import Context, Progress, Silent
 from hybrid_mpc.pipeline.devices import check_device
@@ -30,6 +31,9 @@ STAGES: tuple[tuple[str, str, Callable[[Context], None]], ...] = (
     ("report", "writing the report", report_stage),
 )
 
+OPTIONAL = ("control", "estimation", "monitor", "guard", "analysis")
+"""Stages without which there is still a model, and a report on it: one that cannot run leaves its reason there."""
+
 
 def run(
     settings: RunSettings, out: Path, *, resume: bool = False, progress: Progress | None = None
@@ -37,7 +41,8 @@ def run(
     """Run the main job into the folder ``out`` and return what stands in its ``results.json``.
 
     Every stage leaves a checkpoint in ``out/checkpoints``; a run that was interrupted, at any point, is
-    finished by ``resume=True`` and then equals one that was not.
+    finished by ``resume=True`` and then equals one that was not. A stage after the export that cannot run (a monitor
+    for which the recordings are too short, say) costs its own part of the report, which then has the reason.
 
     Args:
         settings: What to compute.
@@ -50,6 +55,7 @@ def run(
 
     Raises:
         InputError: For any bad input; nothing half-written is left behind that a later run would trip over.
+        StorageError: If something cannot be written; finished stages are kept.
 
     Example:
         >>> results = run(RunSettings("golf_robot"), Path("out"))  # doctest: +SKIP
@@ -65,7 +71,15 @@ def run(
             if context.done(name):
                 context.progress.finish("done before")
                 continue
-            stage(context)
+            try:
+                stage(context)
+            except StorageError:
+                raise
+            except InputError as error:  # what was found before is worth a report
+                if name not in OPTIONAL:
+                    raise
+                context.fail(name, str(error))
+                context.progress.warn(f"stage {name} could not run: {error}")
             context.progress.finish("")
     result: dict[str, Any] = context.result("report")
     return result
