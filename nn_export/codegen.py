@@ -21,7 +21,7 @@ import casadi as ca
 import numpy as np
 
 from nn_export.c_program import main_program
-from nn_export.errors import CompileError
+from nn_export.errors import CompileError, last_line
 
 _SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 _LINK = {"win32": ["-shared"], "darwin": ["-dynamiclib", "-fPIC"]}.get(
@@ -96,7 +96,7 @@ def compile_function(
         return ca.external(function.name(), str(library.resolve()))
     except RuntimeError as error:
         raise CompileError(
-            f"{library} cannot be loaded: {_last(error)}; remove it or choose another folder"
+            f"{library} cannot be loaded: {last_line(error)}; remove it or choose another folder"
         ) from error
 
 
@@ -182,7 +182,7 @@ def _source(functions: list[ca.Function]) -> str:
             generator.add(f)
         text: str = generator.dump()
     except RuntimeError as error:
-        raise CompileError(f"{functions[0].name()} cannot be written as C: {_last(error)}") from error
+        raise CompileError(f"{functions[0].name()} cannot be written as C: {last_line(error)}") from error
     if kinds := sorted(set(re.findall("#error Code generation not supported for (.*)", text))):
         raise CompileError(
             f"{functions[0].name()} cannot be written as C: CasADi has no C for {', '.join(kinds)}; leave "
@@ -232,7 +232,3 @@ def _build(source: str, cache: Path, key: str, command: list[str], timeout: floa
         final = cache / f"{key}-{digest}{_SUFFIX}"
         os.replace(library, final)
     return final
-
-
-def _last(error: Exception) -> str:
-    return str(error).strip().splitlines()[-1]

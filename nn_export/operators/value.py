@@ -18,14 +18,13 @@ import numpy as np
 from nn_export.errors import ShapeError
 
 Shape = tuple[int, ...]
-MAX_ELEMENTS = 2**24  # of one value: 128 MiB
 
 
 def matrix_shape(shape: Shape) -> tuple[int, int]:
     """Rows and columns of the matrix that holds a tensor of this shape.
 
     Raises:
-        ShapeError: If more than two axes are longer than one, or there are more than 2**24 elements.
+        ShapeError: If more than two axes are longer than one.
 
     Example:
         >>> matrix_shape((1, 3)), matrix_shape((4, 1, 2)), matrix_shape(()), matrix_shape((0,))
@@ -41,15 +40,10 @@ def matrix_shape(shape: Shape) -> tuple[int, int]:
 def layout(shape: Shape) -> tuple[int, int]:
     """As :func:`matrix_shape`, for tensors inside a graph, which may have more axes.
 
-    Raises:
-        ShapeError: If there are more than 2**24 elements.
-
     Example:
         >>> layout((4, 1, 2)), layout((4, 3, 2))
         ((4, 2), (12, 2))
     """
-    if math.prod(shape) > MAX_ELEMENTS:
-        raise ShapeError(f"a value of shape {shape} is too large: at most {MAX_ELEMENTS} elements")
     kept = [n for n in shape if n != 1]
     if len(kept) > 2:
         return math.prod(kept[:-1]), kept[-1]
