@@ -111,7 +111,7 @@ def load_programs(folder: str | Path, limits: Limits | None = None) -> dict[str,
         where = f"{path / PROGRAMS}: programs.{name:.80}"
         if not isinstance(entry, dict) or set(entry) != {"program", "weights"}:
             raise ProgramError(f"{where}: expected the fields program and weights; save it again")
-        tables[name], stand_ins = _weights(entry["weights"], shapes, f"{where}.weights")
+        tables[name], stand_ins = _weights(entry["weights"], shapes, f"{where}.weights", budget)
         result[name] = from_json(entry["program"], stand_ins, where)
         budget.add(result[name], f"{where}: ")
     given = document.pop("sha256", None)
@@ -162,7 +162,7 @@ def _operators(programs: Mapping[str, Any]) -> int:
 
 
 def _weights(
-    table: Any, shapes: dict[str, Shape], where: str
+    table: Any, shapes: dict[str, Shape], where: str, budget: Budget
 ) -> tuple[dict[str, str], dict[str, np.ndarray]]:
     """The arrays' names in the file, and stand-ins of their shapes that take no memory.
 
@@ -176,6 +176,7 @@ def _weights(
         if not isinstance(entry, dict) or set(entry) != {"tensor", "shape"}:
             raise ProgramError(f"{place}: expected the fields tensor and shape; save it again")
         key, shape = entry["tensor"], shape_of(entry["shape"], f"{place}.shape")
+        budget.spend(place, elements=product(shape))
         if not isinstance(key, str) or shapes.setdefault(key, shape) != shape:
             raise ProgramError(f"{place}: {WEIGHTS} has no such array; save the programs again")
         keys[name], stand_ins[name] = key, np.broadcast_to(np.float64(0.0), shape)

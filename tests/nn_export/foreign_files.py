@@ -197,6 +197,8 @@ def crafted():
             {"p": program([], X, (2,), x=(2,))}, {f"w{k}": ("t", (1000, 1000)) for k in range(5000)},
             {"t": np.zeros((1000, 1000))}),
         "a weight that is not there": files({"p": program([], X, (2,), x=(2,))}, {"w": ("t", (2,))}),
+        "a weight of 2**62 numbers": files(
+            {"p": program([], X, (2,), x=(2,))}, {"w": ("t", (2**31 - 1, 2**31 - 1))}, {"t": np.zeros(2)}),
         "a weight of nothing": files(
             {"p": program([], X, (2,), x=(2,))}, {"w": ("t", (0, big))}, {"t": np.zeros((0, big))}),
         **{f"shape {shape}": shaped(shape) for shape in (
