@@ -17,8 +17,8 @@ Array = NDArray[np.float64]
 TINY = 1e-9
 """Share of a period below which a delay's rest counts as none."""
 MOST_WAITING = 1000
-"""Inputs that may wait: an estimator can still work with matrices of a thousand rows. It is 10 s of one input at 100 Hz;
-a delay for which more would wait is a slip in its unit, or a damaged file."""
+"""Inputs that may wait: an estimator can still work with matrices of a thousand rows. It is 10 s of one input at 100
+Hz; a delay for which more would wait is a slip in its unit, or a damaged file."""
 
 
 def with_input_delay(model: HybridModel, delay: float) -> HybridModel:
