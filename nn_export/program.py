@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 Shape = tuple[int, ...]
 _KINDS = ("input", "weight", "node")
+_HOLDERS = (dict, list, tuple)
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ class Program:
                     f"node {node.name:.80}: operator {node.op:.80} is unknown to this version of nn_export; "
                     "update nn_export or export the module again"
                 )
-            for reference in references([node.args, node.kwargs]):
+            for reference in references((node.args, node.kwargs)):
                 if reference not in known:
                     raise ProgramError(
                         f"node {node.name:.80}: {reference[0]} {reference[1]!r:.80} is not defined"
@@ -149,15 +150,24 @@ class Program:
 
 def references(data: Any) -> list[tuple[str, str]]:
     """All references within arguments, as (kind, name)."""
+    found: list[tuple[str, str]] = []
+    _collect(data, found)
+    return found
+
+
+def _collect(data: Any, found: list[tuple[str, str]]) -> None:
     if isinstance(data, dict):
         if len(data) == 1:
             kind, name = next(iter(data.items()))
             if kind in _KINDS and isinstance(name, str):
-                return [(kind, name)]
-        data = list(data.values())
-    if isinstance(data, (list, tuple)):
-        return [r for value in data if isinstance(value, (dict, list, tuple)) for r in references(value)]
-    return []
+                found.append((kind, name))
+                return
+        data = data.values()
+    elif not isinstance(data, _HOLDERS):
+        return
+    for value in data:
+        if isinstance(value, _HOLDERS):
+            _collect(value, found)
 
 
 def to_json(program: Program) -> dict[str, Any]:

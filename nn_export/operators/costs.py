@@ -15,8 +15,8 @@ from math import ceil
 from typing import Any, NamedTuple
 
 from nn_export.operators import elementwise
+from nn_export.operators.value import broadcast_shape
 
-Shape = Sequence[int]
 HUGE = 2**62
 """Where products stop: more than any limit, and far from numbers of a million digits."""
 NUMBER = 8  # bytes
@@ -87,29 +87,6 @@ def product(lengths: Iterable[int]) -> int:
     return total
 
 
-def broadcast(shapes: Sequence[Shape]) -> tuple[int, ...]:
-    """The shape to which tensors are repeated together.
-
-    Raises:
-        ValueError: If they cannot be.
-
-    Example:
-        >>> broadcast([(3, 1), (4,)])
-        (3, 4)
-    """
-    longest = max(shapes, key=len, default=())
-    result = list(longest)
-    for given in shapes:
-        if given is longest:
-            continue
-        for i in range(1, len(given) + 1):
-            if result[-i] == 1:
-                result[-i] = given[-i]
-            elif given[-i] not in (1, result[-i]):
-                raise ValueError(f"shapes {[tuple(s) for s in shapes]} cannot be broadcast together")
-    return tuple(result)
-
-
 def _moved(out: int, given: int, nodes: int = 12, times: int = 1) -> Cost:
     """``out`` elements chosen among ``given``, some times."""
     return Cost(max(out, given), times * 2 * NUMBER * out, times * (2 * given + MOVE * out), nodes)
@@ -137,7 +114,7 @@ def _together(tensors: Sequence[Tensor], nodes: int) -> Cost:
     n = tensors[0].size if tensors else 1
     for t in tensors:
         if t.shape != tensors[0].shape:
-            result = broadcast([t.shape for t in tensors])
+            result = broadcast_shape([t.shape for t in tensors])
             n = product(result)
             own = Cost(n, NUMBER * n, n * nodes, nodes)
             return _sum(own, *[_spread(n, t) for t in tensors if t.shape != result])
@@ -195,7 +172,7 @@ def _index_select(out: int, self: Tensor, dim: int, index: Tensor) -> Cost:
 
 def _indexed(self: Tensor, indices: Sequence[Tensor | None]) -> int:
     """Elements at the positions that index tensors give."""
-    together = product(broadcast([i.shape for i in indices if i is not None]))
+    together = product(broadcast_shape([i.shape for i in indices if i is not None]))
     whole = [i is None for i in indices] + [True] * (len(self.shape) - len(indices))
     return together * product(n for n, kept in zip(self.shape, whole, strict=False) if kept)
 
@@ -427,7 +404,7 @@ def _trilinear(
         for axis in sorted(axes):
             lengths.insert(axis if axis >= 0 else len(lengths) + 1 + axis, 1)
         shapes.append(lengths)
-    n = product(broadcast(shapes))
+    n = product(broadcast_shape(shapes))
     whole = Tensor((n,), n, False)
     moved = _moved(n, max(i1.size, i2.size, i3.size), 48, times=6)
     return _sum(moved, _reduced(12)(out, whole))

@@ -9,6 +9,7 @@ array of positions.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -128,6 +129,28 @@ def from_matrix(mx: ca.MX, shape: Shape) -> Value:
     mx = mx if mx.is_dense() else ca.densify(mx)
     positions = np.arange(mx.numel()).reshape(mx.shape, order="F")
     return Value(shape, arrange(mx, positions.reshape(shape).reshape(layout(shape))))
+
+
+def broadcast_shape(shapes: Sequence[Sequence[int]]) -> Shape:
+    """The shape to which tensors are repeated together, by the rules of torch.
+
+    Raises:
+        ValueError: If they cannot be.
+
+    Example:
+        >>> broadcast_shape([(3, 1), (4,)])
+        (3, 4)
+    """
+    if all(shape == shapes[0] for shape in shapes[1:]):
+        return tuple(shapes[0]) if shapes else ()
+    result = [1] * max(map(len, shapes))
+    for shape in shapes:
+        for i in range(1, len(shape) + 1):
+            if result[-i] == 1:
+                result[-i] = shape[-i]
+            elif shape[-i] not in (1, result[-i]):
+                raise ValueError(f"shapes {[tuple(s) for s in shapes]} cannot be broadcast together")
+    return tuple(result)
 
 
 def broadcast(value: Value, shape: Shape) -> Value:

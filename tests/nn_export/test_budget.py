@@ -29,7 +29,7 @@ from nn_export import (
 from nn_export.budget import _BOUND, EACH_PROGRAM, Budget, total
 from nn_export.operators import OPERATORS, PLAIN, elementwise, recurrent
 from nn_export.operators.costs import COSTS, Tensor, product
-from nn_export.operators.value import Value, constant, layout
+from nn_export.operators.value import Value, broadcast_shape, constant, layout
 from nn_export.pieces import operations
 
 
@@ -165,6 +165,18 @@ def test_what_is_built_is_within_what_was_counted(name, inputs):
     assert operations(function) <= cost.work
     assert max(function.instruction_MX(k).numel() for k in instructions or [0]) <= cost.elements
     assert 8 * sum(function.numel_out(i) for i in range(function.n_out())) <= cost.memory
+
+
+@settings(max_examples=200, deadline=None, derandomize=True, database=None)
+@given(shapes=st.lists(st.lists(st.integers(0, 3), max_size=4).map(tuple), max_size=4))
+def test_shapes_are_broadcast_as_in_numpy(shapes):
+    try:
+        expected = np.broadcast_shapes(*shapes)
+    except ValueError:
+        with pytest.raises(ValueError, match="cannot be broadcast"):
+            broadcast_shape(shapes)
+    else:
+        assert broadcast_shape(shapes) == expected
 
 
 SHAPES = st.lists(st.integers(0, 3), max_size=3).map(tuple)
