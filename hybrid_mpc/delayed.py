@@ -16,6 +16,9 @@ from hybrid_mpc.model import HybridModel, ManyPoints, SideBySide
 Array = NDArray[np.float64]
 TINY = 1e-9
 """Share of a period below which a delay's rest counts as none."""
+MOST_WAITING = 1000
+"""Inputs that may wait: an estimator can still work with matrices of a thousand rows. It is 10 s of one input at 100
+Hz; a delay for which more would wait is a slip in its unit, or a damaged file."""
 
 
 def with_input_delay(model: HybridModel, delay: float) -> HybridModel:
@@ -28,10 +31,10 @@ def with_input_delay(model: HybridModel, delay: float) -> HybridModel:
 
     Args:
         model: The model without delay.
-        delay: Of the input [s], positive.
+        delay: Of the input [s], positive; at most :data:`MOST_WAITING` inputs (periods times inputs) may wait.
 
     Raises:
-        InputError: If the delay is not positive, or the model has inputs that wait already.
+        InputError: If the delay is not positive or too long, or the model has inputs that wait already.
 
     Example:
         >>> from hybrid_mpc.signals import Signal
@@ -45,9 +48,16 @@ def with_input_delay(model: HybridModel, delay: float) -> HybridModel:
     """
     if not (delay > 0 and math.isfinite(delay)):
         raise InputError(f"model {model.name}: the input's delay must be positive, got {delay} s")
+    periods = delay / model.dt
+    if not periods * model.n_u <= MOST_WAITING:
+        raise InputError(
+            f"model {model.name}: an input's delay of {delay:g} s is {periods:.4g} periods of {model.dt:g} s, so that "
+            f"{periods * model.n_u:.4g} inputs would wait, at most {MOST_WAITING} can; give it in seconds, or take a "
+            "model of a longer period"
+        )
     if model.waiting:
         raise InputError(f"model {model.name} has inputs that wait already; give the one without delay")
-    queue = _Queue(delay / model.dt, model.n_u)
+    queue = _Queue(periods, model.n_u)
     x, u = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
     h = ca.MX.sym("h", queue.size + model.n_h)
     waiting = ca.vertcat(h[: queue.size], u)

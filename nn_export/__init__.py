@@ -7,6 +7,7 @@ and numpy only.
 
 from typing import TYPE_CHECKING, Any
 
+from nn_export.budget import Limits
 from nn_export.build import build
 from nn_export.codegen import CFiles, compile_function, generate_c
 from nn_export.errors import ExportError, ProgramError
@@ -39,6 +40,7 @@ __all__ = [
     "Program",
     "Node",
     "Port",
+    "Limits",
     "save_programs",
     "load_programs",
     "ExportError",

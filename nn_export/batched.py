@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nn_export.errors import DerivativeError, ExportError
+from nn_export.errors import DerivativeError, ExportError, last_line
 
 MAX_WALK = 3000
 """Scalar operations up to which a function is also kept as torch operators."""
@@ -215,7 +215,7 @@ def _derivative(f: ca.Function, *, forward: bool) -> ca.Function:
         values = derivative.call([*inputs, *f.call(inputs), *seeds])
     except RuntimeError as error:
         raise DerivativeError(
-            f"{f.name()} has no derivative ({str(error).strip().splitlines()[-1]}); give the CasADi function one, "
+            f"{f.name()} has no derivative ({last_line(error)}); give the CasADi function one, "
             "e.g. by the option custom_jacobian or enable_fd"
         ) from error
     results = [ca.project(v, s) for v, s in zip(values, theirs if forward else ours, strict=True)]

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import casadi as ca
-import numpy as np
 
-from nn_export.errors import ProgramError, ShapeError
+from nn_export.budget import Budget, Limits, place, resolve
+from nn_export.errors import ProgramError, ShapeError, last_line
 from nn_export.operators import OPERATORS, PLAIN, recurrent
-from nn_export.operators.value import Value, constant, layout, matrix_shape
+from nn_export.operators.value import Value, constant, matrix_shape
 from nn_export.pieces import Pieces
 from nn_export.program import Node, Program
 
@@ -29,7 +30,9 @@ def valid_name(name: str) -> bool:
     return _IDENTIFIER.fullmatch(name) is not None and name not in ("null", "jac", "hess")
 
 
-def build(program: Program, name: str | None = None, *, plain: bool = False) -> ca.Function:
+def build(
+    program: Program, name: str | None = None, *, plain: bool = False, limits: Limits | None = None
+) -> ca.Function:
     """The program as a CasADi function of MX with the program's names.
 
     A tensor of shape (n,) becomes n x 1, (r, c) becomes r x c; axes of size 1 are dropped.
@@ -40,13 +43,14 @@ def build(program: Program, name: str | None = None, *, plain: bool = False) -> 
         plain: One graph of matrices, all derivatives by CasADi. Default: each recurrent cell is a call of a
             function that brings its exact Jacobian, and small parts between are scalar code: both values
             and derivatives are faster.
+        limits: What it may cost; more is refused before anything is built. Default: :class:`nn_export.Limits`.
 
     Returns:
         Function with dense inputs and outputs.
 
     Raises:
-        ProgramError: If an operator gets arguments it does not know, or a result has another shape than
-            the program says: the message names the node and the line of the module.
+        ProgramError: If it would cost more than the limits, an operator gets arguments it does not know, or a result
+            has another shape than the program says: the message names the node and the line of the module.
 
     Example:
         >>> from nn_export import Node, Port
@@ -55,25 +59,40 @@ def build(program: Program, name: str | None = None, *, plain: bool = False) -> 
         Function(program:(x[2])->(y[2]) MXFunction)
     """
     name = "program" if name is None else name
-    outputs = [p.name for p in program.outputs]
-    if plain:
-        symbols, values = graph(program, PLAIN)
-        return function(name, symbols, [v.mx for v in values], program, outputs)
-    pieces = Pieces()
-    symbols, values = graph(program, {**OPERATORS, **recurrent.table(pieces.cell)}, pieces)
-    return function(name, symbols, pieces.evaluate([v.mx for v in values]), program, outputs)
+    outputs, budget = [p.name for p in program.outputs], Budget(limits)
+    with named(name):
+        if plain:
+            symbols, values = graph(program, PLAIN, budget)
+            return function(name, symbols, [v.mx for v in values], program, outputs)
+        pieces = Pieces()
+        symbols, values = graph(program, {**OPERATORS, **recurrent.table(pieces.cell)}, budget, pieces)
+        return function(name, symbols, pieces.evaluate([v.mx for v in values]), program, outputs)
+
+
+@contextmanager
+def named(name: str) -> Iterator[None]:
+    """CasADi's errors, and a lack of memory, as errors of the program.
+
+    Raises:
+        ProgramError: Instead of what CasADi raises.
+    """
+    try:
+        yield
+    except (RuntimeError, MemoryError) as error:
+        raise ProgramError(f"{name}: CasADi cannot build it: {last_line(error)}") from error
 
 
 def graph(
-    program: Program, table: Mapping[str, Callable[..., Any]], pieces: Pieces | None = None
+    program: Program, table: Mapping[str, Callable[..., Any]], budget: Budget, pieces: Pieces | None = None
 ) -> tuple[list[ca.MX], list[Value]]:
     """Symbols of the inputs and values of the outputs, with the operators of a table.
 
-    The pieces, if given, are told the inputs before the first operator.
+    The program must be within the budget. The pieces, if given, are told the inputs before the first operator.
 
     Raises:
         ProgramError: As :func:`build`.
     """
+    budget.add(program)
     values: dict[tuple[str, str], Any] = {}
     symbols = []
     for port in program.inputs:
@@ -84,13 +103,12 @@ def graph(
         if pieces is not None and symbols[-1].numel():
             pieces.add(symbols[-1], symbols[-1])
     for weight, array in program.weights.items():
-        layout(np.shape(array))
         values["weight", weight] = constant(array)
     for node in program.nodes:
         values["node", node.name] = _evaluate(node, values, table)
     results = []
     for port in program.outputs:
-        value = _resolve(port.source, values)
+        value = resolve(port.source, values)
         _size(f"output {port.name}", port.shape)
         if not isinstance(value, Value) or value.shape != port.shape:
             raise ProgramError(
@@ -126,30 +144,18 @@ def _size(what: str, shape: tuple[int, ...]) -> tuple[int, int]:
 
 
 def _evaluate(node: Node, values: dict[tuple[str, str], Any], table: Mapping[str, Callable[..., Any]]) -> Any:
-    where = f"node {node.name} ({node.op})" + (f" from {node.line}" if node.line else "")
     try:
-        for shape in node.shapes:
-            layout(shape)
-        args, kwargs = _resolve(node.args, values), _resolve(node.kwargs, values)
+        args, kwargs = resolve(node.args, values), resolve(node.kwargs, values)
         result = table[node.op](*args, **kwargs)
         given = tuple(v.shape for v in (result if isinstance(result, tuple) else (result,)))
     except ShapeError as error:
-        raise ShapeError(f"{where}: {error}") from error
+        raise ShapeError(f"{place(node)}: {error}") from error
     except (TypeError, ValueError, LookupError, AttributeError, ArithmeticError, RuntimeError) as error:
-        raise ProgramError(f"{where}: arguments that nn_export does not know: {error}") from error
+        raise ProgramError(f"{place(node)}: arguments that nn_export does not know: {error}") from error
     except (NotImplementedError, MemoryError) as error:
-        raise ProgramError(f"{where}: cannot be built: {error}") from error
+        raise ProgramError(f"{place(node)}: cannot be built: {error}") from error
     if given != node.shapes:
-        raise ProgramError(f"{where}: gives shapes {given}, the program says {node.shapes}; export again")
+        raise ProgramError(
+            f"{place(node)}: gives shapes {given}, the program says {node.shapes}; export again"
+        )
     return result
-
-
-def _resolve(data: Any, values: dict[tuple[str, str], Any]) -> Any:
-    if isinstance(data, dict):
-        if len(data) != 1:
-            return {key: _resolve(value, values) for key, value in data.items()}
-        key, value = next(iter(data.items()))
-        if key == "float":
-            return float(value)
-        return values[key, value] if (key, value) in values else {key: _resolve(value, values)}
-    return [_resolve(item, values) for item in data] if isinstance(data, list) else data

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
 from typing import Any, Generic, TypeVar
 
 import casadi as ca
 
+from nn_export.budget import Budget
 from nn_export.operators import cells
+from nn_export.operators.costs import HUGE, NUMBER
 from nn_export.pieces import operations
 
 SCALAR_LIMIT = 50_000
@@ -19,9 +22,14 @@ Known = TypeVar("Known")
 
 
 class Chain(ABC, Generic[Known]):
-    """The cuts of a graph: cells in order, each with its arguments; then what is known of their outputs."""
+    """The cuts of a graph: cells in order, each with its arguments; then what is known of their outputs.
 
-    def __init__(self) -> None:
+    Args:
+        budget: What all that is made here is taken off.
+    """
+
+    def __init__(self, budget: Budget) -> None:
+        self.budget = budget
         self._cells: list[tuple[list[ca.MX], cells.Kind, ca.MX, cells.State, cells.Weights]] = []
         self._known: dict[str, Known] = {}
 
@@ -64,6 +72,21 @@ class Chain(ABC, Generic[Known]):
             known |= dict(zip(rest, results, strict=True))
         return [known[k] for k in range(len(targets))]
 
+    def spend(self, symbols: list[ca.MX], slopes: Iterable[Mapping[str, Any]]) -> None:
+        """Take off what the Jacobians of a cell's results cost, by all that its arguments depend on.
+
+        Raises:
+            ProgramError: If there is not as much left.
+        """
+        widths = {name: slope.shape[1] for by_name in slopes for name, slope in by_name.items()}
+        size = sum(symbol.numel() for symbol in symbols)
+        self.budget.spend(
+            f"the Jacobian of {symbols[0].name()} by {', '.join(widths)!s:.80}",
+            elements=size * max(widths.values(), default=0),
+            memory=NUMBER * size * sum(widths.values()),
+            nodes=24 * len(widths) * len(symbols),
+        )
+
     @abstractmethod
     def _constant(self, target: ca.MX) -> Known:
         """A value without slopes."""
@@ -96,11 +119,26 @@ class Piece:
     blocks: list[list[Any]]
 
 
-def differentiated(symbols: list[ca.MX], targets: list[ca.MX]) -> Piece:
-    """Expressions with their Jacobians, as scalar code where they are small."""
+def differentiated(symbols: list[ca.MX], targets: list[ca.MX], budget: Budget) -> Piece:
+    """Expressions with their Jacobians, as scalar code where they are small.
+
+    Raises:
+        ProgramError: If the budget does not hold them.
+    """
     piece = ca.Function("piece", symbols, targets)
     rows, columns = _edges(targets), _edges(symbols)
-    scalar = operations(piece) * min(rows[-1], columns[-1]) <= SCALAR_LIMIT
+    sweeps = min(rows[-1], columns[-1])
+    count = operations(piece)
+    scalar = count * sweeps <= SCALAR_LIMIT
+    # A scalar operation of a sweep takes a tenth of the time of a node, an operation on matrices half of it.
+    made = count * sweeps / 10 if scalar else piece.n_instructions() * (sweeps + 8) / 2
+    budget.spend(
+        f"a Jacobian of {rows[-1]} values by {columns[-1]}",
+        elements=rows[-1] * columns[-1],
+        memory=NUMBER * rows[-1] * columns[-1],
+        work=int(min(count * sweeps, HUGE)),
+        nodes=int(made) + 8 * len(targets) * len(symbols),
+    )
     inner: list[Any] = [(ca.SX if scalar else ca.MX).sym("v", *s.shape) for s in symbols]
     values = piece.call(inner, True, False)
     whole = ca.jacobian(ca.veccat(*values), ca.veccat(*inner))

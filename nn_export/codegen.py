@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import atexit
 import hashlib
 import os
 import platform
 import re
 import shlex
 import shutil
+import stat
 import subprocess
 import sys
 import tempfile
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -21,7 +24,7 @@ import casadi as ca
 import numpy as np
 
 from nn_export.c_program import main_program
-from nn_export.errors import CompileError
+from nn_export.errors import CompileError, last_line
 
 _SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 _LINK = {"win32": ["-shared"], "darwin": ["-dynamiclib", "-fPIC"]}.get(
@@ -41,8 +44,8 @@ def compile_function(
     """The same function as compiled C.
 
     The library is cached under a hash of the C text, the compiler, its version and the flags; a cached file
-    whose own hash does not fit is made again. Any number of processes may compile at once: a library appears
-    under its name complete or not at all.
+    whose own hash does not fit, or that others own or may write, is made again. Any number of processes may compile at
+    once: a library appears under its name complete or not at all.
 
     Args:
         function: Any function that CasADi can write as C.
@@ -50,7 +53,9 @@ def compile_function(
             the result cannot be differentiated. For second derivatives compile the function that
             has them as outputs.
         folder: Folder of the libraries, made if missing. Default: ``nn_export`` in the user's cache folder
-            (``XDG_CACHE_HOME``, else ``~/.cache``). It holds code that will be run: share it with nobody.
+            (``XDG_CACHE_HOME``, else ``~/.cache``). It holds code that will be run: share it with nobody. A default
+            folder that is not this user's alone (another owner, rights of others, a link) is left alone: libraries
+            then last as long as the process, and a ``RuntimeWarning`` says why.
         compiler: Command. Default: the variable ``CC``, else the first of ``cc``, ``gcc``, ``clang``.
         flags: Options of the compiler. Default: ``-O3``, which any machine of the same architecture can run;
             ``-march=native`` binds to this one.
@@ -62,7 +67,7 @@ def compile_function(
 
     Raises:
         CompileError: If CasADi cannot write the function as C, the compiler fails or takes too long, or the
-            compiler named does not exist; if others may write into the folder.
+            compiler named does not exist; if the folder named is another user's, a link, or others may write there.
 
     Example:
         >>> x = ca.MX.sym("x")
@@ -85,18 +90,13 @@ def compile_function(
         functions += [function.jacobian(), function.forward(1), function.reverse(1)]
     source = _source(functions)
     key = _key(source, command, flags)
-    cache = _cache_folder() if folder is None else Path(folder)
-    cache.mkdir(parents=True, exist_ok=True, mode=0o700)
-    if os.name == "posix" and cache.stat().st_mode & 0o002:
-        raise CompileError(
-            f"{cache}: anyone may write there, so anyone's code could be run; chmod o-w or take another"
-        )
-    library = _cached(cache, key) or _build(source, cache, key, [*command, *flags], timeout)
+    place = _cache_folder() if folder is None else _named_folder(Path(folder))
+    library = _cached(place, key) or _build(source, place, key, [*command, *flags], timeout)
     try:
         return ca.external(function.name(), str(library.resolve()))
     except RuntimeError as error:
         raise CompileError(
-            f"{library} cannot be loaded: {_last(error)}; remove it or choose another folder"
+            f"{library} cannot be loaded: {last_line(error)}; remove it or choose another folder"
         ) from error
 
 
@@ -182,7 +182,7 @@ def _source(functions: list[ca.Function]) -> str:
             generator.add(f)
         text: str = generator.dump()
     except RuntimeError as error:
-        raise CompileError(f"{functions[0].name()} cannot be written as C: {_last(error)}") from error
+        raise CompileError(f"{functions[0].name()} cannot be written as C: {last_line(error)}") from error
     if kinds := sorted(set(re.findall("#error Code generation not supported for (.*)", text))):
         raise CompileError(
             f"{functions[0].name()} cannot be written as C: CasADi has no C for {', '.join(kinds)}; leave "
@@ -199,21 +199,83 @@ def _key(source: str, command: list[str], flags: Sequence[str]) -> str:
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
 
 
+def _named_folder(folder: Path) -> Path:
+    """A folder that the user named, made if missing."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    except OSError as error:
+        raise CompileError(f"{folder} cannot be made: {error.strerror}; take another folder") from error
+    if reason := _distrust(folder, stat.S_ISDIR, 0o022):
+        raise CompileError(
+            f"{folder}: {reason}, so somebody else's code could be run; take a folder of your own, chmod 700"
+        )
+    return folder
+
+
 def _cache_folder() -> Path:
-    given = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
-    return (Path(given) if given else Path.home() / ".cache") / "nn_export"
+    """The user's cache folder, made if missing; one of this process if that is not the user's alone."""
+    given = Path(os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or "")
+    try:
+        folder = (given if given.is_absolute() else Path.home() / ".cache") / "nn_export"
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        reason = _distrust(folder, stat.S_ISDIR, 0o077)
+    except (OSError, RuntimeError) as error:  # no home, or one that cannot be written
+        reason = str(error)
+    if not reason:
+        return folder
+    first = _process_folder.cache_info().currsize == 0
+    folder = _process_folder()
+    if first:
+        warnings.warn(
+            f"no cache of compiled functions: {reason}; they are kept in {folder} as long as this process lasts. Make "
+            "the folder yours alone (chmod 700), or name another",
+            RuntimeWarning,
+            stacklevel=3,  # the caller of compile_function
+        )
+    return folder
 
 
-def _cached(cache: Path, key: str) -> Path | None:
-    """The library of a key, if one is there whose name carries its own hash."""
-    for path in cache.glob(f"{key}-*{_SUFFIX}"):
+@cache
+def _process_folder() -> Path:
+    """A folder that nobody else may enter, removed with the process that makes it."""
+    folder, owner = Path(tempfile.mkdtemp(prefix="nn_export-")), os.getpid()
+    atexit.register(lambda: shutil.rmtree(folder, ignore_errors=True) if os.getpid() == owner else None)
+    return folder
+
+
+def _distrust(path: Path, kind: Callable[[int], bool], rights: int) -> str:
+    """Why others could have put code into a file or folder; empty if they could not.
+
+    Args:
+        path: The file or folder.
+        kind: What it must be, e.g. ``stat.S_ISDIR``.
+        rights: Rights of group and others that are too many.
+    """
+    if os.name != "posix":
+        return ""
+    found = path.lstat()
+    if not kind(found.st_mode):
+        return f"{path} is a link" if stat.S_ISLNK(found.st_mode) else f"{path} is not what it should be"
+    if found.st_uid != os.geteuid():
+        return f"{path} belongs to another user (number {found.st_uid})"
+    if found.st_mode & rights:
+        who = "anyone" if found.st_mode & rights & 0o007 else "its group"
+        return f"{who} may {'write' if found.st_mode & 0o022 else 'look'} there ({path})"
+    return ""
+
+
+def _cached(folder: Path, key: str) -> Path | None:
+    """The library of a key, if the user has one there whose name carries its own hash."""
+    for path in folder.glob(f"{key}-*{_SUFFIX}"):
+        if _distrust(path, stat.S_ISREG, 0o022):
+            continue
         if path.stem == f"{key}-{hashlib.sha256(path.read_bytes()).hexdigest()[:16]}":
             return path
     return None
 
 
-def _build(source: str, cache: Path, key: str, command: list[str], timeout: float) -> Path:
-    with tempfile.TemporaryDirectory(dir=cache, prefix=".build-") as work:
+def _build(source: str, folder: Path, key: str, command: list[str], timeout: float) -> Path:
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".build-") as work:
         text, library = Path(work) / "compiled.c", Path(work) / f"library{_SUFFIX}"
         text.write_text(source)
         words = [*command, *_LINK, "-o", str(library), str(text), "-lm"]
@@ -229,10 +291,7 @@ def _build(source: str, cache: Path, key: str, command: list[str], timeout: floa
         with library.open("rb+") as file:
             digest = hashlib.sha256(file.read()).hexdigest()[:16]
             os.fsync(file.fileno())
-        final = cache / f"{key}-{digest}{_SUFFIX}"
+        library.chmod(0o700)  # whatever the umask: others are to have no part in it
+        final = folder / f"{key}-{digest}{_SUFFIX}"
         os.replace(library, final)
     return final
-
-
-def _last(error: Exception) -> str:
-    return str(error).strip().splitlines()[-1]

@@ -53,3 +53,13 @@ class DerivativeError(ExportError):
 
 class CompileError(ExportError):
     """A function could not be written as C, or the C compiler failed; its message is included."""
+
+
+def last_line(error: BaseException) -> str:
+    r"""What CasADi says in the end, behind the places in its own source; the error's kind if it says nothing.
+
+    Example:
+        >>> last_line(RuntimeError("Error in Function::Function at function.cpp:285:\n std::bad_alloc"))
+        'std::bad_alloc'
+    """
+    return (str(error).strip().splitlines() or [type(error).__name__])[-1].strip()

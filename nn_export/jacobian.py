@@ -13,15 +13,22 @@ from typing import Any
 
 import casadi as ca
 
-from nn_export.build import function, graph
+from nn_export.budget import Budget, Limits
+from nn_export.build import function, graph, named
 from nn_export.chain import Chain, Piece, differentiated
 from nn_export.errors import ProgramError
 from nn_export.operators import OPERATORS, cells, recurrent
+from nn_export.operators.costs import NUMBER
+from nn_export.operators.value import Value
 from nn_export.program import Program
 
 
 def with_jacobian(
-    program: Program, blocks: Mapping[str, Sequence[str]] | None = None, name: str | None = None
+    program: Program,
+    blocks: Mapping[str, Sequence[str]] | None = None,
+    name: str | None = None,
+    *,
+    limits: Limits | None = None,
 ) -> ca.Function:
     """The program's outputs followed by their Jacobians.
 
@@ -30,6 +37,7 @@ def with_jacobian(
         blocks: For each Jacobian its name and the inputs it is by, e.g. ``{"A": ("x", "h"), "B": ("u",)}``.
             Default: one, ``"jacobian"``, by all inputs.
         name: Name of the function. Default: ``"with_jacobian"``.
+        limits: What it may cost with its Jacobians. Default: :class:`nn_export.Limits`.
 
     Returns:
         Function of the program's inputs. Its outputs are the program's and the dense Jacobians: of all
@@ -37,7 +45,8 @@ def with_jacobian(
         as in ``casadi.jacobian``.
 
     Raises:
-        ProgramError: If an input named is not the program's, or as :func:`nn_export.build`.
+        ProgramError: If an input named is not the program's, the Jacobians would cost more than the limits, or as
+            :func:`nn_export.build`.
 
     Example:
         >>> from nn_export import Node, Port
@@ -51,17 +60,36 @@ def with_jacobian(
     blocks = {"jacobian": inputs} if blocks is None else blocks
     if unknown := sorted({i for names in blocks.values() for i in names} - set(inputs)):
         raise ProgramError(f"no inputs {', '.join(unknown)}; the program has {', '.join(inputs)}")
-    chain = _Chain()
-    symbols, outputs = graph(program, {**OPERATORS, **recurrent.table(chain.cell)})
-    sizes = {name: symbol.numel() for name, symbol in zip(inputs, symbols, strict=True)}
-    for symbol in (s for s in symbols if s.numel()):  # CasADi has no empty symbols
-        chain.add(symbol, _Known(symbol, {symbol.name(): ca.MX.eye(symbol.numel())}))
-    chain.settle()
-    results = chain.derive([v.mx for v in outputs])
-    stacked = [_stack(results, {i: sizes[i] for i in names}) for names in blocks.values()]
-    names = [*(port.name for port in program.outputs), *blocks]
-    values = [known.value for known in results]
-    return function(name or "with_jacobian", symbols, [*values, *stacked], program, names)
+    name = name or "with_jacobian"
+    with named(name):
+        chain = _Chain(budget := Budget(limits))
+        symbols, outputs = graph(program, {**OPERATORS, **recurrent.table(chain.cell)}, budget)
+        sizes = {name: symbol.numel() for name, symbol in zip(inputs, symbols, strict=True)}
+        spend_results(budget, outputs, blocks, sizes)
+        budget.spend("the slopes of the inputs", memory=4 * NUMBER * sum(sizes.values()))  # sparse identities
+        for symbol in (s for s in symbols if s.numel()):  # CasADi has no empty symbols
+            chain.add(symbol, _Known(symbol, {symbol.name(): ca.MX.eye(symbol.numel())}))
+        chain.settle()
+        results = chain.derive([v.mx for v in outputs])
+        stacked = [_stack(results, {i: sizes[i] for i in names}) for names in blocks.values()]
+        names = [*(port.name for port in program.outputs), *blocks]
+        values = [known.value for known in results]
+        return function(name, symbols, [*values, *stacked], program, names)
+
+
+def spend_results(
+    budget: Budget, outputs: Sequence[Value], blocks: Mapping[str, Sequence[str]], sizes: Mapping[str, int]
+) -> None:
+    """Take off what the dense Jacobians of all outputs cost.
+
+    Raises:
+        ProgramError: If there is not as much left.
+    """
+    rows = sum(v.mx.numel() for v in outputs)
+    for block, names in blocks.items():
+        count = rows * sum(sizes[name] for name in names)
+        nodes = 8 * len(outputs) * len(names)
+        budget.spend(f"the Jacobian {block}", elements=count, memory=NUMBER * count, nodes=nodes)
 
 
 @dataclass(frozen=True)
@@ -79,7 +107,8 @@ class _Chain(Chain[_Known]):
         return _Known(target, {})
 
     def _piece(self, symbols: list[ca.MX], targets: list[ca.MX], arguments: list[_Known]) -> list[_Known]:
-        values, jacobians = _evaluated(differentiated(symbols, targets), [a.value for a in arguments])
+        piece = differentiated(symbols, targets, self.budget)
+        values, jacobians = _evaluated(piece, [a.value for a in arguments])
         known = []
         for value, row in zip(values, jacobians, strict=True):
             slopes: dict[str, ca.MX] = {}
@@ -93,6 +122,7 @@ class _Chain(Chain[_Known]):
     def _after(
         self, symbols: list[ca.MX], kind: cells.Kind, x: _Known, state: list[_Known], w: cells.Weights
     ) -> list[_Known]:
+        self.spend(symbols, [x.slopes, *(s.slopes for s in state)])
         at = kind.step(x.value, tuple(s.value for s in state), w)
         gates = len(at.slopes[0].by_input)
         slopes: list[dict[str, ca.MX]] = [{} for _ in at.state]

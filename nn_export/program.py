@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from nn_export.errors import ProgramError
 
+if TYPE_CHECKING:
+    from nn_export.budget import Limits
+    from nn_export.operators.costs import Cost
+
 Shape = tuple[int, ...]
 _KINDS = ("input", "weight", "node")
+_HOLDERS = (dict, list, tuple)
 
 
 @dataclass(frozen=True)
@@ -74,6 +78,9 @@ class Program:
         weights: float64 arrays by name, e.g. ``"cell.weight_ih"``.
         metadata: Versions of the tools that made it.
 
+    Attributes:
+        known_cost: What it costs, once :mod:`nn_export.budget` has settled that.
+
     Raises:
         ProgramError: If a name is used twice, a reference leads nowhere or forward, or an operator is
             unknown.
@@ -89,6 +96,7 @@ class Program:
     nodes: tuple[Node, ...]
     weights: dict[str, np.ndarray] = field(default_factory=dict)
     metadata: dict[str, str] = field(default_factory=dict)
+    known_cost: Cost | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         from nn_export.operators import OPERATORS
@@ -99,19 +107,21 @@ class Program:
         for node in self.nodes:
             if node.op not in OPERATORS:
                 raise ProgramError(
-                    f"node {node.name}: operator {node.op} is unknown to this version of nn_export; "
+                    f"node {node.name:.80}: operator {node.op:.80} is unknown to this version of nn_export; "
                     "update nn_export or export the module again"
                 )
-            for reference in references([node.args, node.kwargs]):
+            for reference in references((node.args, node.kwargs)):
                 if reference not in known:
-                    raise ProgramError(f"node {node.name}: {reference[0]} {reference[1]!r} is not defined")
+                    raise ProgramError(
+                        f"node {node.name:.80}: {reference[0]} {reference[1]!r:.80} is not defined"
+                    )
             if ("node", node.name) in known:
-                raise ProgramError(f"node {node.name}: its name is used twice")
+                raise ProgramError(f"node {node.name:.80}: its name is used twice")
             known.add(("node", node.name))
         for port in self.outputs:
             found = list(references(port.source))
             if len(found) != 1 or found[0] not in known:
-                raise ProgramError(f"output {port.name}: its source {port.source} is not defined")
+                raise ProgramError(f"output {port.name:.80}: its source {port.source!s:.80} is not defined")
 
     def save(self, folder: str | Path) -> None:
         """Write ``programs.json`` and ``weights.safetensors`` into the folder (made if missing)."""
@@ -120,15 +130,19 @@ class Program:
         save_programs(folder, {"program": self})
 
     @staticmethod
-    def load(folder: str | Path) -> Program:
+    def load(folder: str | Path, limits: Limits | None = None) -> Program:
         """The only program of a folder.
 
+        Args:
+            folder: As in :func:`nn_export.load_programs`.
+            limits: As there.
+
         Raises:
-            ProgramError: If the files are damaged or hold several programs.
+            ProgramError: If the files are damaged, cost more than the limits or hold several programs.
         """
         from nn_export.storage import load_programs
 
-        programs = load_programs(folder)
+        programs = load_programs(folder, limits)
         if len(programs) != 1:
             raise ProgramError(f"{folder}: holds {sorted(programs)}; use load_programs and choose one")
         return next(iter(programs.values()))
@@ -136,14 +150,24 @@ class Program:
 
 def references(data: Any) -> list[tuple[str, str]]:
     """All references within arguments, as (kind, name)."""
-    if isinstance(data, Mapping):
-        if len(data) == 1 and next(iter(data)) in _KINDS:
+    found: list[tuple[str, str]] = []
+    _collect(data, found)
+    return found
+
+
+def _collect(data: Any, found: list[tuple[str, str]]) -> None:
+    if isinstance(data, dict):
+        if len(data) == 1:
             kind, name = next(iter(data.items()))
-            return [(kind, str(name))]
-        return [r for value in data.values() for r in references(value)]
-    if isinstance(data, list | tuple):
-        return [r for value in data for r in references(value)]
-    return []
+            if kind in _KINDS and isinstance(name, str):
+                found.append((kind, name))
+                return
+        data = data.values()
+    elif not isinstance(data, _HOLDERS):
+        return
+    for value in data:
+        if isinstance(value, _HOLDERS):
+            _collect(value, found)
 
 
 def to_json(program: Program) -> dict[str, Any]:
@@ -185,9 +209,9 @@ def from_json(data: Any, weights: dict[str, np.ndarray], where: str) -> Program:
 
 
 def _fields(data: Any, types: Mapping[str, type], where: str) -> dict[str, Any]:
-    if not isinstance(data, dict) or set(data) != set(types):
+    if not isinstance(data, dict) or data.keys() != types.keys():
         given = sorted(data) if isinstance(data, dict) else type(data).__name__
-        raise ProgramError(f"{where}: expected the fields {sorted(types)}, got {given}; export again")
+        raise ProgramError(f"{where}: expected the fields {sorted(types)}, got {given!s:.200}; export again")
     for name, kind in types.items():
         if not isinstance(data[name], kind):
             raise ProgramError(
@@ -202,10 +226,13 @@ def shape_of(data: Any, where: str) -> Shape:
     Raises:
         ProgramError: If it is none.
     """
-    whole = isinstance(data, list) and all(type(n) is int and 0 <= n < 2**31 for n in data)
-    if not whole or len(data) > 16 or math.prod(data) > 2**31:
-        raise ProgramError(f"{where}: {data!r:.60} is no shape; export the module again")
-    return tuple(data)
+    if isinstance(data, list) and len(data) <= 16:
+        for n in data:
+            if type(n) is not int or not 0 <= n < 2**31:
+                break
+        else:
+            return tuple(data)
+    raise ProgramError(f"{where}: {data!r:.60} is no shape; export the module again")
 
 
 def _port(data: Any, where: str, output: bool) -> Port:
@@ -214,10 +241,12 @@ def _port(data: Any, where: str, output: bool) -> Port:
     return Port(d["name"], shape_of(d["shape"], f"{where}.shape"), d.get("source"))
 
 
+_NODE = {"name": str, "op": str, "args": list, "kwargs": dict, "shapes": list, "line": str}
+
+
 def _node(data: Any, where: str) -> Node:
-    kinds = {"name": str, "op": str, "args": list, "kwargs": dict, "shapes": list, "line": str}
-    d = _fields(data, kinds, where)
-    shapes = tuple(shape_of(s, f"{where}.shapes") for s in d["shapes"])
+    d = _fields(data, _NODE, where)
+    shapes = tuple([shape_of(s, where) for s in d["shapes"]])
     return Node(d["name"], d["op"], d["args"], d["kwargs"], shapes, d["line"])
 
 

@@ -16,11 +16,14 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from nn_export.build import graph
+from nn_export.budget import Budget, Limits
+from nn_export.build import graph, named
 from nn_export.chain import Chain, differentiated
 from nn_export.columns import CellColumns, Results, Slope, Slot, Sum, matrices
 from nn_export.errors import ProgramError, ShapeError
+from nn_export.jacobian import spend_results
 from nn_export.operators import OPERATORS, cells, recurrent
+from nn_export.operators.costs import NUMBER
 from nn_export.program import Program
 from nn_export.vectorised import OnArrays, vectorised
 
@@ -34,6 +37,7 @@ class SideBySide:
         program: What :func:`nn_export.trace` made or :func:`nn_export.load_programs` read.
         n: Number of points.
         blocks: The Jacobians, as in :func:`nn_export.with_jacobian`. Those by few inputs are faster than all.
+        limits: What it may cost at one point. Default: :class:`nn_export.Limits`.
 
     Raises:
         ProgramError: As :func:`nn_export.with_jacobian`, or if ``n < 1``.
@@ -47,7 +51,14 @@ class SideBySide:
         ((3, 2), (3, 2, 2), [[1.0, 0.0], [0.0, 0.42]])
     """
 
-    def __init__(self, program: Program, n: int, blocks: Mapping[str, Sequence[str]] | None = None) -> None:
+    def __init__(
+        self,
+        program: Program,
+        n: int,
+        blocks: Mapping[str, Sequence[str]] | None = None,
+        *,
+        limits: Limits | None = None,
+    ) -> None:
         if n < 1:
             raise ProgramError(f"n = {n} points given; at least 1 needed")
         inputs = [port.name for port in program.inputs]
@@ -55,26 +66,35 @@ class SideBySide:
         wanted = {name for names in blocks.values() for name in names}
         if unknown := sorted(wanted - set(inputs)):
             raise ProgramError(f"no inputs {', '.join(unknown)}; the program has {', '.join(inputs)}")
-        chain = _Chain(n)
-        symbols, outputs = graph(program, {**OPERATORS, **recurrent.table(chain.cell)})
-        targets, sizes = [v.mx for v in outputs], dict(zip(inputs, (s.numel() for s in symbols), strict=True))
-        self._inputs = [np.zeros((size, n)) for size in sizes.values()]
-        for symbol, name, buffer in zip(symbols, inputs, self._inputs, strict=True):
-            if buffer.size:
-                chain.add(symbol, _Known(buffer, {name: np.eye(len(buffer))} if name in wanted else {}))
-        places = _places(targets, blocks, sizes)
-        chain.promise({(hash(targets[t]), name): slot for (t, name), slot in reversed(places)})
-        chain.settle()
-        results = chain.derive(targets)
-        self._steps = chain.steps
-        self._values = [known.value for known in results]
-        self._fill: list[tuple[Slot, Slope]] = []
-        for (t, name), place in places:
-            slope = results[t].slopes.get(name, np.zeros(place.shape))
-            if slope is not place:
-                self._fill.append((place, slope))
-        rows = sum(target.numel() for target in targets)
-        self._shapes = {b: (n, rows, sum(sizes[i] for i in names)) for b, names in blocks.items()}
+        with named(f"{n} points"):
+            chain = _Chain(n, budget := Budget(limits))
+            symbols, outputs = graph(program, {**OPERATORS, **recurrent.table(chain.cell)}, budget)
+            targets, sizes = (
+                [v.mx for v in outputs],
+                dict(zip(inputs, (s.numel() for s in symbols), strict=True)),
+            )
+            spend_results(budget, outputs, blocks, sizes)
+            for name in wanted:
+                budget.spend(
+                    f"the slope of {name}", elements=sizes[name] ** 2, memory=NUMBER * sizes[name] ** 2
+                )
+            self._inputs = [np.zeros((size, n)) for size in sizes.values()]
+            for symbol, name, buffer in zip(symbols, inputs, self._inputs, strict=True):
+                if buffer.size:
+                    chain.add(symbol, _Known(buffer, {name: np.eye(len(buffer))} if name in wanted else {}))
+            places = _places(targets, blocks, sizes)
+            chain.promise({(hash(targets[t]), name): slot for (t, name), slot in reversed(places)})
+            chain.settle()
+            results = chain.derive(targets)
+            self._steps = chain.steps
+            self._values = [known.value for known in results]
+            self._fill: list[tuple[Slot, Slope]] = []
+            for (t, name), place in places:
+                slope = results[t].slopes.get(name, np.zeros(place.shape))
+                if slope is not place:
+                    self._fill.append((place, slope))
+            rows = sum(target.numel() for target in targets)
+            self._shapes = {b: (n, rows, sum(sizes[i] for i in names)) for b, names in blocks.items()}
 
     @np.errstate(all="ignore")  # what overflows is the caller's to look at, as in CasADi
     def __call__(self, *points: Array) -> tuple[Array, ...]:
@@ -130,8 +150,8 @@ def _places(
 class _Chain(Chain[_Known]):
     """Values and slopes in arrays, and the steps that fill them."""
 
-    def __init__(self, n: int) -> None:
-        super().__init__()
+    def __init__(self, n: int, budget: Budget) -> None:
+        super().__init__(budget)
         self._n = n
         self._promised: dict[tuple[int, str], Slot] = {}
         self.steps: list[Callable[[Results], None]] = []
@@ -149,7 +169,7 @@ class _Chain(Chain[_Known]):
         return _Known(np.repeat(column, self._n, axis=1), {})
 
     def _piece(self, symbols: list[ca.MX], targets: list[ca.MX], arguments: list[_Known]) -> list[_Known]:
-        piece = differentiated(symbols, targets)
+        piece = differentiated(symbols, targets, self.budget)
         values = [np.zeros((t.numel(), self._n)) for t in targets]
         expressions = [ca.densify(ca.vec(v)) for v in piece.values]
         raw: list[Array] = []
@@ -171,7 +191,9 @@ class _Chain(Chain[_Known]):
                 for name, slope in argument.slopes.items():
                     terms.setdefault(name, Sum()).add(factor, slope)
             sums.append({name: (target, term) for name, term in terms.items()})
-        function = vectorised(ca.Function("piece", piece.inner, expressions), self._n)
+        single = ca.Function("piece", piece.inner, expressions)
+        self.budget.spend("a piece at many points", nodes=single.n_instructions())
+        function = vectorised(single, self._n)
         evaluate = OnArrays(function, [a.value for a in arguments], [*values, *raw])
 
         def step(results: Results) -> None:
@@ -195,6 +217,7 @@ class _Chain(Chain[_Known]):
     def _after(
         self, symbols: list[ca.MX], kind: cells.Kind, x: _Known, state: list[_Known], w: cells.Weights
     ) -> list[_Known]:
+        self.spend(symbols, [x.slopes, *(s.slopes for s in state)])
         cell = CellColumns(kind, x.value, [s.value for s in state], matrices(w))
         known = []
         for k, symbol in enumerate(symbols):

@@ -4,24 +4,25 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
-import os
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from nn_export.budget import Budget, Limits
 from nn_export.errors import ProgramError
-from nn_export.program import Program, dumps, from_json, shape_of, to_json
+from nn_export.files import parse_json, read_bytes, write_bytes
+from nn_export.operators.costs import NUMBER, product
+from nn_export.program import Program, Shape, dumps, from_json, shape_of, to_json
 
 FORMAT = "nn_export programs"
 SCHEMA = 2
 PROGRAMS, WEIGHTS = "programs.json", "weights.safetensors"
-MAX_JSON = 64 * 2**20  # bytes
-MAX_WEIGHTS = 2**30  # bytes
-MAX_DEPTH = 40  # of nested JSON: arguments are lists of lists at most
+HEADER, HEADER_EACH = (
+    4096,
+    400,
+)  # bytes of a weights file beside the numbers, and beside the name of each array
 
 
 def save_programs(folder: str | Path, programs: Mapping[str, Program]) -> None:
@@ -73,23 +74,26 @@ def save_programs(folder: str | Path, programs: Mapping[str, Program]) -> None:
     except (TypeError, ValueError, RecursionError) as error:
         raise ProgramError(f"a program holds something that JSON has no form for: {error}") from error
     path = Path(folder)
-    path.mkdir(parents=True, exist_ok=True)
-    _write(path / WEIGHTS, blob)
-    _write(path / PROGRAMS, text.encode())
+    write_bytes(path / WEIGHTS, blob)
+    write_bytes(path / PROGRAMS, text.encode())
 
 
-def load_programs(folder: str | Path) -> dict[str, Program]:
+def load_programs(folder: str | Path, limits: Limits | None = None) -> dict[str, Program]:
     """Read what :func:`save_programs` wrote. Nothing in the files is executed.
+
+    What the programs would cost is settled from the JSON alone: a small file may ask for any amount of memory and time.
 
     Args:
         folder: Folder with ``programs.json`` and ``weights.safetensors``.
+        limits: What all programs together may cost; the same are to be given to :func:`nn_export.build`. Default:
+            :class:`nn_export.Limits`.
 
     Returns:
         Programs by name.
 
     Raises:
-        ProgramError: If a file is missing, damaged, foreign, larger than 64 MiB (JSON) or 1 GiB
-            (weights), of another schema version, or changed since it was saved.
+        ProgramError: If a file is missing, damaged, foreign, of another schema version, or changed since it was saved;
+            if the programs would cost more than the limits.
 
     Example:
         >>> load_programs("/nowhere")
@@ -97,22 +101,28 @@ def load_programs(folder: str | Path) -> dict[str, Program]:
         ...
         nn_export.errors.ProgramError: /nowhere/programs.json: no such file; save the programs there first
     """
-    path = Path(folder)
-    document = _document(path / PROGRAMS)
-    tensors = _tensors(path / WEIGHTS, str(document["weights"]["sha256"]))
-    result = {}
+    path, budget = Path(folder), Budget(limits)
+    document = _document(path / PROGRAMS, budget.limits.json_bytes)
+    result: dict[str, Program] = {}
+    tables: dict[str, dict[str, str]] = {}
+    shapes: dict[str, Shape] = {}
+    budget.check_count(_operators(document["programs"]), f"{path / PROGRAMS}: ")
     for name, entry in document["programs"].items():
-        where = f"{path / PROGRAMS}: programs.{name}"
+        where = f"{path / PROGRAMS}: programs.{name:.80}"
         if not isinstance(entry, dict) or set(entry) != {"program", "weights"}:
             raise ProgramError(f"{where}: expected the fields program and weights; save it again")
-        weights = _weights(entry["weights"], tensors, f"{where}.weights")
-        result[name] = from_json(entry["program"], weights, where)
+        tables[name], stand_ins = _weights(entry["weights"], shapes, f"{where}.weights", budget)
+        result[name] = from_json(entry["program"], stand_ins, where)
+        budget.add(result[name], f"{where}: ")
     given = document.pop("sha256", None)
     if given != _content_hash(document):
         raise ProgramError(
             f"{path / PROGRAMS}: its content is not what was saved (field sha256): damaged or changed by hand; "
             "save the programs again"
         )
+    tensors = _tensors(path / WEIGHTS, document["weights"]["sha256"], shapes)
+    for name, program in result.items():
+        program.weights.update({weight: tensors[key] for weight, key in tables[name].items()})
     return result
 
 
@@ -122,30 +132,14 @@ def _content_hash(document: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _weights(table: Any, tensors: dict[str, np.ndarray], where: str) -> dict[str, np.ndarray]:
-    if not isinstance(table, dict):
-        raise ProgramError(f"{where}: expected a table; save the programs again")
-    weights = {}
-    for name, entry in table.items():
-        if not isinstance(entry, dict) or set(entry) != {"tensor", "shape"}:
-            raise ProgramError(f"{where}.{name}: expected the fields tensor and shape; save it again")
-        array = tensors.get(entry["tensor"]) if isinstance(entry["tensor"], str) else None
-        if array is None or array.shape != shape_of(entry["shape"], f"{where}.{name}.shape"):
-            raise ProgramError(f"{where}.{name}: {WEIGHTS} has no such array; save the programs again")
-        weights[name] = array
-    return weights
-
-
-def _document(path: Path) -> dict[str, Any]:
+def _document(path: Path, limit: int) -> dict[str, Any]:
     remedy = "save the programs again or restore the file"
     try:
-        document = json.loads(_read(path, MAX_JSON), parse_constant=_refuse, parse_float=_finite)
-    except (ValueError, RecursionError) as error:
-        if isinstance(error, ProgramError):
-            raise
+        document = parse_json(_content(path, limit))
+    except ProgramError:
+        raise
+    except ValueError as error:
         raise ProgramError(f"{path}: not readable as JSON ({error!s:.80}); {remedy}") from error
-    if _too_deep(document):
-        raise ProgramError(f"{path}: nested deeper than {MAX_DEPTH} levels; {remedy}")
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise ProgramError(f"{path}: field format is not {FORMAT!r}; this file was not written by nn_export")
     if document.get("schema") != SCHEMA:
@@ -154,16 +148,50 @@ def _document(path: Path) -> dict[str, Any]:
             "update nn_export or export again"
         )
     weights, programs = document.get("weights"), document.get("programs")
-    if not isinstance(weights, dict) or "sha256" not in weights or not isinstance(programs, dict):
+    sha256 = weights.get("sha256") if isinstance(weights, dict) else None
+    if not isinstance(sha256, str) or not isinstance(programs, dict):
         raise ProgramError(f"{path}: field weights.sha256 or programs is missing; {remedy}")
     return document
 
 
-def _tensors(path: Path, sha256: str) -> dict[str, np.ndarray]:
+def _operators(programs: Mapping[str, Any]) -> int:
+    """How many operators there are, as far as can be seen without reading them."""
+    inner = [entry.get("program") for entry in programs.values() if isinstance(entry, dict)]
+    nodes = [program.get("nodes") for program in inner if isinstance(program, dict)]
+    return sum(len(n) for n in nodes if isinstance(n, list))
+
+
+def _weights(
+    table: Any, shapes: dict[str, Shape], where: str, budget: Budget
+) -> tuple[dict[str, str], dict[str, np.ndarray]]:
+    """The arrays' names in the file, and stand-ins of their shapes that take no memory.
+
+    ``shapes`` collects the shapes by the arrays' names.
+    """
+    if not isinstance(table, dict):
+        raise ProgramError(f"{where}: expected a table; save the programs again")
+    keys, stand_ins = {}, {}
+    for name, entry in table.items():
+        place = f"{where}.{name:.80}"
+        if not isinstance(entry, dict) or set(entry) != {"tensor", "shape"}:
+            raise ProgramError(f"{place}: expected the fields tensor and shape; save it again")
+        key, shape = entry["tensor"], shape_of(entry["shape"], f"{place}.shape")
+        budget.spend(place, elements=product(shape))
+        if not isinstance(key, str) or shapes.setdefault(key, shape) != shape:
+            raise ProgramError(f"{place}: {WEIGHTS} has no such array; save the programs again")
+        keys[name], stand_ins[name] = key, np.broadcast_to(np.float64(0.0), shape)
+    return keys, stand_ins
+
+
+def _tensors(path: Path, sha256: str, shapes: Mapping[str, Shape]) -> dict[str, np.ndarray]:
+    """The arrays of the weights file, which is not read if it holds more than these and their names."""
     from safetensors import SafetensorError
     from safetensors.numpy import load
 
-    blob = _read(path, MAX_WEIGHTS)
+    names = HEADER + sum(
+        HEADER_EACH + 6 * len(key) for key in shapes
+    )  # at most six bytes a character: "\u1234"
+    blob = _content(path, sum(NUMBER * product(shape) for shape in shapes.values()) + names)
     if hashlib.sha256(blob).hexdigest() != sha256:
         raise ProgramError(
             f"{path}: its hash is not the one in {PROGRAMS} (field weights.sha256): damaged, truncated or of "
@@ -173,53 +201,19 @@ def _tensors(path: Path, sha256: str) -> dict[str, np.ndarray]:
         tensors: dict[str, np.ndarray] = load(blob)
     except (SafetensorError, ValueError, KeyError) as error:
         raise ProgramError(f"{path}: no safetensors file ({error}); save the programs again") from error
+    for key, shape in shapes.items():
+        if key not in tensors or tensors[key].shape != shape:
+            raise ProgramError(f"{path}: no array {key:.80} of shape {shape}; save the programs again")
     for name, array in tensors.items():
         if array.dtype != np.float64:
             raise ProgramError(f"{path}: {name} is {array.dtype}, float64 is needed; save the programs again")
     return tensors
 
 
-def _refuse(name: str) -> Any:
-    raise ValueError(f"{name} is not JSON")
-
-
-def _finite(text: str) -> float:
-    if math.isinf(value := float(text)):
-        raise ValueError(f"{text:.20} is too large")
-    return value
-
-
-def _too_deep(data: Any) -> bool:
-    level = [data]
-    for _ in range(MAX_DEPTH):
-        inner = [v.values() if isinstance(v, dict) else v for v in level if isinstance(v, dict | list)]
-        level = [v for values in inner for v in values]
-        if not level:
-            return False
-    return True
-
-
-def _read(path: Path, limit: int) -> bytes:
-    if not path.is_file():
-        raise ProgramError(f"{path}: no such file; save the programs there first")
-    size = path.stat().st_size
-    if size > limit:
-        raise ProgramError(f"{path}: {size} bytes, at most {limit} are read; it is no file of nn_export")
+def _content(path: Path, limit: int) -> bytes:
     try:
-        return path.read_bytes()
+        return read_bytes(path, limit)
+    except FileNotFoundError as error:
+        raise ProgramError(f"{path}: no such file; save the programs there first") from error
     except OSError as error:
-        raise ProgramError(f"{path}: cannot be read ({error}); check its permissions") from error
-
-
-def _write(path: Path, data: bytes) -> None:
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+        raise ProgramError(f"cannot read {path}: {error.strerror or error}") from error

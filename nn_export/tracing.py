@@ -14,6 +14,7 @@ import casadi as ca
 import torch
 from torch.utils import _pytree as pytree
 
+from nn_export.budget import Limits
 from nn_export.build import build, valid_name
 from nn_export.convert import convert
 from nn_export.errors import ControlFlowError, ExportError, SignatureError, TraceError
@@ -90,6 +91,7 @@ def to_casadi(
     input_names: Sequence[str] | None = None,
     output_names: Sequence[str] | None = None,
     name: str | None = None,
+    limits: Limits | None = None,
 ) -> ca.Function:
     """A torch module as a CasADi function: :func:`trace`, then :func:`build`.
 
@@ -99,6 +101,7 @@ def to_casadi(
         input_names: As in :func:`trace`.
         output_names: As in :func:`trace`.
         name: Name of the function. Default: the class of the module.
+        limits: As in :func:`build`.
 
     Raises:
         ExportError: One of the named errors of :func:`trace` and :func:`build`.
@@ -108,7 +111,7 @@ def to_casadi(
         Function(GRUCell:(input[3],hx[4])->(h_next[4]) MXFunction)
     """
     program = trace(module, example_inputs, input_names=input_names, output_names=output_names)
-    return build(program, name if name is not None else _identifier(type(module).__name__))
+    return build(program, name if name is not None else _identifier(type(module).__name__), limits=limits)
 
 
 def float64_copy(module: torch.nn.Module) -> torch.nn.Module:

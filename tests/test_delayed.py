@@ -9,7 +9,7 @@ import pytest
 from online_models import pendulum_model
 
 from hybrid_mpc.artifact import FILE, load_artifact, save_artifact
-from hybrid_mpc.delayed import with_input_delay
+from hybrid_mpc.delayed import MOST_WAITING, with_input_delay
 from hybrid_mpc.errors import InputError
 
 DT = 0.02
@@ -96,6 +96,16 @@ def test_what_cannot_be_is_refused():
         replace(model, waiting=1)
 
 
+def test_a_delay_of_too_many_periods_is_refused_at_once():
+    model = pendulum_model(dt=DT)
+    for periods in (MOST_WAITING + 1, 1e9, 1e308):
+        with pytest.raises(
+            InputError, match=f"inputs would wait, at most {MOST_WAITING} can; give it in seconds"
+        ):
+            with_input_delay(model, periods * DT)
+    assert with_input_delay(model, MOST_WAITING * DT).waiting == MOST_WAITING
+
+
 def test_an_artifact_keeps_the_delay(tmp_path):
     from hybrid_mpc.identification.export import model_info, trace_model
     from hybrid_mpc.identification.step import PriorStep
@@ -103,7 +113,7 @@ def test_an_artifact_keeps_the_delay(tmp_path):
 
     prior = PendulumPrior()
     programs, info = {"prior": trace_model(PriorStep(prior, 0.01))}, model_info(prior, 0.01)
-    for name, delay in (("none", 0.0), ("late", 0.0125)):
+    for name, delay in (("none", 0.0), ("late", 0.0125), ("years", 1e9)):
         save_artifact(tmp_path / name, programs, replace(info, input_delay=delay))
     assert json.loads((tmp_path / "none" / FILE).read_text())["input_delay_s"] == 0.0
     at_once, late = (load_artifact(tmp_path / name).models["prior"] for name in ("none", "late"))
@@ -111,3 +121,7 @@ def test_an_artifact_keeps_the_delay(tmp_path):
     x, u = np.array([0.2, 0.1]), np.array([4.0, 8.0, 9.0])  # the last one comes too late for this period
     np.testing.assert_array_equal(step(late, x, u[:2], u[2])[0], step(at_once, x, [], 0.25 * 4 + 0.75 * 8)[0])
     assert step(late, x, u[:2], u[2])[1].tolist() == [8.0, 9.0]
+    with pytest.raises(
+        InputError, match=r"1e\+09 s is 1e\+11 periods of 0.01 s, so that 1e\+11 inputs would wait"
+    ):
+        load_artifact(tmp_path / "years")

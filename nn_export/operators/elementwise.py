@@ -6,9 +6,8 @@ import math
 from collections.abc import Callable
 
 import casadi as ca
-import numpy as np
 
-from nn_export.operators.value import Value, broadcast, layout, lift
+from nn_export.operators.value import Value, broadcast, broadcast_shape, layout, lift
 
 Number = Value | float
 Operator = Callable[..., Value]
@@ -21,11 +20,11 @@ def apply(f: Callable[..., ca.MX], *args: Number) -> Value:
     ``vector + sum(vector)`` wrongly unless the sum is repeated explicitly (a test shows it).
     """
     values = [lift(a) for a in args]
-    shape = tuple(int(n) for n in np.broadcast_shapes(*(v.shape for v in values)))
+    shape = broadcast_shape([v.shape for v in values])
     if 0 in shape:
         return Value(shape, ca.MX.zeros(*layout(shape)))
     size = layout(shape)
-    parts = [v.mx if _number(v.mx) else broadcast(v, shape).mx for v in values]
+    parts = [v.mx if v.shape == shape or _number(v.mx) else broadcast(v, shape).mx for v in values]
     mx = f(*parts)
     return Value(shape, mx if mx.shape == size else ca.repmat(mx, *size))
 

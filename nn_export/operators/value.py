@@ -9,6 +9,7 @@ array of positions.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,14 +19,13 @@ import numpy as np
 from nn_export.errors import ShapeError
 
 Shape = tuple[int, ...]
-MAX_ELEMENTS = 2**24  # of one value: 128 MiB
 
 
 def matrix_shape(shape: Shape) -> tuple[int, int]:
     """Rows and columns of the matrix that holds a tensor of this shape.
 
     Raises:
-        ShapeError: If more than two axes are longer than one, or there are more than 2**24 elements.
+        ShapeError: If more than two axes are longer than one.
 
     Example:
         >>> matrix_shape((1, 3)), matrix_shape((4, 1, 2)), matrix_shape(()), matrix_shape((0,))
@@ -41,15 +41,10 @@ def matrix_shape(shape: Shape) -> tuple[int, int]:
 def layout(shape: Shape) -> tuple[int, int]:
     """As :func:`matrix_shape`, for tensors inside a graph, which may have more axes.
 
-    Raises:
-        ShapeError: If there are more than 2**24 elements.
-
     Example:
         >>> layout((4, 1, 2)), layout((4, 3, 2))
         ((4, 2), (12, 2))
     """
-    if math.prod(shape) > MAX_ELEMENTS:
-        raise ShapeError(f"a value of shape {shape} is too large: at most {MAX_ELEMENTS} elements")
     kept = [n for n in shape if n != 1]
     if len(kept) > 2:
         return math.prod(kept[:-1]), kept[-1]
@@ -134,6 +129,28 @@ def from_matrix(mx: ca.MX, shape: Shape) -> Value:
     mx = mx if mx.is_dense() else ca.densify(mx)
     positions = np.arange(mx.numel()).reshape(mx.shape, order="F")
     return Value(shape, arrange(mx, positions.reshape(shape).reshape(layout(shape))))
+
+
+def broadcast_shape(shapes: Sequence[Sequence[int]]) -> Shape:
+    """The shape to which tensors are repeated together, by the rules of torch.
+
+    Raises:
+        ValueError: If they cannot be.
+
+    Example:
+        >>> broadcast_shape([(3, 1), (4,)])
+        (3, 4)
+    """
+    if all(shape == shapes[0] for shape in shapes[1:]):
+        return tuple(shapes[0]) if shapes else ()
+    result = [1] * max(map(len, shapes))
+    for shape in shapes:
+        for i in range(1, len(shape) + 1):
+            if result[-i] == 1:
+                result[-i] = shape[-i]
+            elif shape[-i] not in (1, result[-i]):
+                raise ValueError(f"shapes {[tuple(s) for s in shapes]} cannot be broadcast together")
+    return tuple(result)
 
 
 def broadcast(value: Value, shape: Shape) -> Value:

@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
 import warnings
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import pytest
 import torch
 from torch import nn
 
-from nn_export import build, compile_function, generate_c, trace, unroll, with_jacobian
+from nn_export import build, codegen, compile_function, generate_c, trace, unroll, with_jacobian
 from nn_export.errors import CompileError
 
 needs_compiler = pytest.mark.skipif(not shutil.which("cc"), reason="no C compiler on this machine")
@@ -141,6 +142,120 @@ def test_the_cache_lies_in_the_users_folder(program, monkeypatch, tmp_path):
     assert len(list((tmp_path / "nn_export").iterdir())) == 1
     if os.name == "posix":
         assert (tmp_path / "nn_export").stat().st_mode & 0o077 == 0  # nobody else may put code there
+
+
+def square(folder=None):
+    """A compiled function of three, with the warnings of it."""
+    x = ca.MX.sym("x")
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        compiled = compile_function(ca.Function("square", [x], [x * x]), folder=folder, flags=["-O0"])
+    return float(compiled(3)), [str(w.message) for w in seen]
+
+
+@pytest.fixture
+def cache(monkeypatch, tmp_path):
+    """The user's cache folder, and a process that has made none of its own yet."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    codegen._process_folder.cache_clear()
+    yield tmp_path / "nn_export"
+    codegen._process_folder.cache_clear()
+
+
+def of_another(path):
+    """As if somebody else had made it."""
+    if os.geteuid():
+        pytest.skip("only root can give files away")
+    os.chown(path, 65534, 65534)
+
+
+def linked(path):
+    elsewhere = path.with_name("elsewhere")
+    path.rename(elsewhere)
+    path.symlink_to(elsewhere)
+
+
+ALTERED = [
+    (of_another, "belongs to another user"),
+    (linked, "is a link"),
+    (lambda path: path.chmod(0o777), "anyone may write there"),
+    (lambda path: path.chmod(0o770), "its group may write there"),
+]
+IDS = ["owner", "link", "open to all", "open to the group"]
+
+
+@needs_compiler
+@pytest.mark.skipif(os.name != "posix", reason="rights are POSIX's here")
+@pytest.mark.parametrize(("alter", "reason"), [*ALTERED, (lambda path: path.chmod(0o755), "anyone may look there")],
+                         ids=[*IDS, "readable"])  # fmt: skip
+def test_a_cache_that_is_not_the_users_alone_is_left_alone(cache, alter, reason):
+    cache.mkdir()
+    alter(cache)
+    before = sorted(os.listdir(cache))
+    value, seen = square()
+    assert value == 9
+    (text,) = seen
+    assert reason in text
+    assert square() == (9, [])  # one warning, not one each time
+    assert sorted(os.listdir(cache)) == before
+    (own,) = cache.parent.glob("nn_export-*")
+    assert own.stat().st_mode & 0o777 == 0o700
+    assert str(own) in text
+    assert len(list(own.glob("*.so"))) == 1
+
+
+@needs_compiler
+@pytest.mark.skipif(os.name != "posix", reason="rights are POSIX's here")
+@pytest.mark.parametrize(("alter", "reason"), ALTERED, ids=IDS)
+def test_a_folder_that_is_named_must_be_the_users(tmp_path, alter, reason):
+    (tmp_path / "named").mkdir(mode=0o700)
+    alter(tmp_path / "named")
+    with pytest.raises(CompileError, match=reason):
+        square(tmp_path / "named")
+    assert not list((tmp_path / "named").iterdir())
+
+
+@needs_compiler
+@pytest.mark.skipif(os.name != "posix", reason="rights are POSIX's here")
+@pytest.mark.parametrize(("alter", "reason"), ALTERED, ids=IDS)
+def test_a_library_that_others_could_have_written_is_not_loaded(tmp_path, alter, reason):
+    square(tmp_path)
+    (library,) = tmp_path.glob("*.so")
+    assert library.stat().st_mode & 0o777 == 0o700
+    made = library.stat().st_mtime_ns
+    alter(library)
+    assert square(tmp_path)[0] == 9
+    now = library.lstat()
+    assert now.st_mtime_ns > made
+    assert (now.st_uid, now.st_mode & 0o777) == (os.geteuid(), 0o700)
+    assert not library.is_symlink()
+
+
+@needs_compiler
+@pytest.mark.skipif(os.name != "posix", reason="pipes are POSIX's here")
+def test_a_pipe_in_the_cache_is_not_waited_for(tmp_path):
+    square(tmp_path)
+    (library,) = tmp_path.glob("*.so")
+    library.unlink()
+    os.mkfifo(library)
+    assert square(tmp_path)[0] == 9
+
+
+@needs_compiler
+def test_without_a_home_libraries_last_as_long_as_the_process(cache, monkeypatch):
+    cache.write_text("a file where the folder should be")
+    value, seen = square()
+    assert (value, len(seen)) == (9, 1)
+    code = "from test_codegen import square; from nn_export import codegen; square(); print(codegen._process_folder())"
+    paths = f"{Path(__file__).parents[2]}:{Path(__file__).parent}"
+    environment = {**os.environ, "PYTHONPATH": paths}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    folder = Path(done.stdout.strip())
+    assert folder.name.startswith("nn_export-")
+    assert not folder.exists()
 
 
 class Callback(ca.Callback):

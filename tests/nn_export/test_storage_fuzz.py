@@ -1,7 +1,9 @@
-"""Files that are damaged, truncated, foreign or too large: the named error, or the identical program."""
+"""Files that are damaged, truncated, foreign, too large or too costly: the named error, or the identical program."""
 
 import contextlib
 import json
+import os
+import random
 import subprocess
 import sys
 import tempfile
@@ -11,11 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from foreign_files import crafted, mutated, places, signed, write
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
-from nn_export import ExportError, Program, ProgramError, build, storage, trace
+from nn_export import ExportError, Limits, Program, ProgramError, build, save_programs, trace
 from nn_export.program import to_json
 
 FILES = ("programs.json", "weights.safetensors")
@@ -99,22 +102,6 @@ VALUES = st.recursive(
 )
 
 
-def places(data):
-    """All containers of a JSON document with their keys."""
-    items = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ()
-    found = []
-    for key, value in items:
-        found += [(data, key), *places(value)]
-    return found
-
-
-def signed(document):
-    """A foreign file may well carry a right hash."""
-    document.pop("sha256", None)
-    document["sha256"] = storage._content_hash(document)
-    return json.dumps(document).encode()
-
-
 @settings(max_examples=150, deadline=None, derandomize=True)
 @given(where=st.floats(0, 1, exclude_max=True), value=VALUES)
 def test_foreign_content_is_refused_by_name_or_builds(where, value):
@@ -141,10 +128,39 @@ def test_deep_nesting(depth):
 def test_oversized_files_are_not_read(tmp_path, name):
     for file, data in saved()[1].items():
         (tmp_path / file).write_bytes(data)
-    limit = {"programs.json": storage.MAX_JSON, "weights.safetensors": storage.MAX_WEIGHTS}[name]
     with (tmp_path / name).open("rb+") as file:
-        file.truncate(limit + 1)  # sparse: takes no space on the disk
-    with pytest.raises(ProgramError, match=f"{name}: {limit + 1} bytes"):
+        file.truncate(2**40)  # sparse: takes no space on the disk
+    with pytest.raises(ProgramError, match=f"cannot read .*{name}: has 1.02e\\+03 GiB, at most"):
+        Program.load(tmp_path)
+    (tmp_path / name).write_bytes(saved()[1][name])
+    limits = Limits(json_bytes=100)
+    with pytest.raises(ProgramError, match=r"programs.json: has .* KiB, at most 100 bytes"):
+        Program.load(tmp_path, limits)
+
+
+def _fifo(path):
+    os.mkfifo(path)  # nobody writes: a plain open would wait for ever
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs POSIX files")
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (Path.mkdir, "is a directory"),
+        (_fifo, "is a named pipe"),
+        (lambda path: path.symlink_to("/dev/zero"), "is a device"),
+        (lambda path: path.symlink_to(path.name), "symbolic link"),
+        (lambda path: None, "no such file"),
+    ],
+    ids=["folder", "pipe", "zeros", "loop", "nothing"],
+)
+def test_what_is_no_file_is_named(tmp_path, name, make, words):
+    for file, data in saved()[1].items():
+        (tmp_path / file).write_bytes(data)
+    (tmp_path / name).unlink()
+    make(tmp_path / name)
+    with pytest.raises(ProgramError, match=f"{name}: .*{words}"):
         Program.load(tmp_path)
 
 
@@ -186,3 +202,64 @@ def test_loading_executes_nothing_and_writes_nothing(tmp_path):
     # Every other audited event (exec, compile, import, dlopen, subprocess, unpickling) would be listed too.
     assert set(done.stdout.split()) <= {"open", "object.__getattr__"}
     assert "open" in done.stdout.split()
+
+
+def judged(tmp_path, cases, *steps):
+    """What comes of loading (and building) each case in a process with 1.5 GiB, by name."""
+    names = write(tmp_path, cases)
+    worker = Path(__file__).with_name("foreign_files.py")
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    environment["PYTHONPATH"] = str(Path(__file__).parents[2])
+    command = [sys.executable, str(worker), str(tmp_path), *steps]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=3600)
+    assert done.returncode == 0, done.stderr[-2000:]
+    outcomes = dict(zip(names, map(json.loads, done.stdout.splitlines()), strict=True))
+    assert not [(name, o["error"]) for name, o in outcomes.items() if "error" in o]
+    return outcomes
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of a process are Linux's here")
+def test_small_files_that_ask_for_gigabytes_or_minutes_are_refused_at_once(tmp_path):
+    outcomes = judged(tmp_path, crafted(), "load", "build")
+    assert not [name for name, o in outcomes.items() if not o["refused"]]
+    # A second on a machine of today, and twice that where others work too. 230 MB of the memory are casadi and numpy.
+    assert {name: o["seconds"] for name, o in outcomes.items() if sum(o["seconds"].values()) > 2.0} == {}
+    assert max(o["peak"] for o in outcomes.values()) < 500e6
+    # Every other audited event (exec, compile, import, dlopen, subprocess, unpickling) would be listed too.
+    assert {event for o in outcomes.values() for event in o["events"]} <= {"open", "object.__getattr__"}
+
+
+def material():
+    """Programs to be changed: every operator of the table, a recurrent network, the model of above."""
+    from test_operators import NAMES, Setup
+
+    programs = {name: Setup(name, inputs).program for name in NAMES for inputs in (True, False)}
+    return {**programs, "model": saved()[0]}
+
+
+def changed(folder, count, seed):
+    """Programs with numbers, references and operators changed at random."""
+    rng, cases, documents = random.Random(seed), {}, {}
+    for name, program in material().items():
+        save_programs(folder / "material", {name: program})
+        documents[name] = {file: (folder / "material" / file).read_bytes() for file in FILES}
+    for k in range(count):
+        name = rng.choice(sorted(documents))
+        document = mutated(json.loads(documents[name]["programs.json"]), rng)
+        cases[f"{k} {name}"] = {**documents[name], "programs.json": document}
+    return cases
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of a process are Linux's here")
+@pytest.mark.parametrize(
+    ("count", "seed"), [(150, 0), *(pytest.param(2000, seed, marks=pytest.mark.full) for seed in range(1, 6))]
+)
+def test_changed_programs_are_refused_by_name_or_build_soon(tmp_path_factory, tmp_path, count, seed):
+    cases = changed(tmp_path_factory.mktemp("saved"), count, seed)
+    outcomes = judged(tmp_path, cases, "load", "build", "with_jacobian", "side_by_side")
+    assert sum(bool(o["refused"]) for o in outcomes.values()) > count // 4  # the others do something else
+    assert sum(not o["refused"] for o in outcomes.values()) > count // 50
+    # Refused before anything is built: within a second. What is within the limits may take some ten seconds.
+    assert {name: o for name, o in outcomes.items() if o["seconds"]["load"] > 1.0} == {}
+    assert {name: o for name, o in outcomes.items() if sum(o["seconds"].values()) > 30.0} == {}
+    assert max(o["peak"] for o in outcomes.values()) < 1.5e9
