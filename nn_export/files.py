@@ -60,25 +60,50 @@ def read_bytes(path: Path, limit: int) -> bytes:
         ...
         IsADirectoryError: [Errno 21] is a directory: '/'
     """
+    with opened(path, limit) as (file, length):
+        blocks, size = [], 0
+        while block := file.read(min(max(length - size, 2**16), limit - size) + 1):
+            blocks.append(block)
+            size += len(block)
+            if size > limit:
+                raise OSError(errno.EFBIG, f"grew while it was read: {_too_long(size, limit)}", str(path))
+    return b"".join(blocks)
+
+
+@contextmanager
+def opened(path: Path, limit: int) -> Iterator[tuple[BinaryIO, int]]:
+    """A regular file of at most ``limit`` bytes, opened for reading without waiting, and its length [byte].
+
+    Only a regular file says how long it is; a pipe or a device may never end.
+
+    Args:
+        path: The file; links are followed.
+        limit: Most bytes.
+
+    Raises:
+        OSError: As :func:`read_bytes`.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_bytes(Path(folder) / "a.txt", b"content")
+        ...     with opened(Path(folder) / "a.txt", 1024) as (file, length):
+        ...         print(length, file.read(3))
+        7 b'con'
+    """
     try:
         _refuse_kind(os.stat(path), path)  # before it is opened: to open a device may already do something
     except ValueError as error:  # no name of a file: a null character, half a surrogate pair
         raise OSError(errno.EINVAL, f"is no name of a file ({error})", str(path)) from error
     flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-    with os.fdopen(os.open(path, flags), "rb", buffering=0) as file:
+    with os.fdopen(os.open(path, flags), "rb") as file:
         found = os.fstat(file.fileno())
         _refuse_kind(found, path)  # another one may have taken its place
         if hasattr(os, "O_NONBLOCK"):
             os.set_blocking(file.fileno(), True)
         if found.st_size > limit:
             raise OSError(errno.EFBIG, _too_long(found.st_size, limit), str(path))
-        blocks, size = [], 0
-        while block := file.read(min(max(found.st_size - size, 2**16), limit - size) + 1):
-            blocks.append(block)
-            size += len(block)
-            if size > limit:
-                raise OSError(errno.EFBIG, f"grew while it was read: {_too_long(size, limit)}", str(path))
-    return b"".join(blocks)
+        yield file, found.st_size
 
 
 def _refuse_kind(found: os.stat_result, path: Path) -> None:

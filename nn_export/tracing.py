@@ -15,9 +15,9 @@ import torch
 from torch.utils import _pytree as pytree
 
 from nn_export.budget import Limits
-from nn_export.build import build, valid_name
 from nn_export.convert import convert
 from nn_export.errors import ControlFlowError, ExportError, SignatureError, TraceError
+from nn_export.graph import build, valid_name
 from nn_export.program import Port, Program
 
 # Kept whole: their decompositions lose structure, or derivatives at the far ends.

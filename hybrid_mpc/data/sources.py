@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import difflib
+import errno
 import hashlib
-import os
-import stat
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
+import nn_export.files
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.records import LONGEST, shown
 
@@ -126,7 +124,7 @@ def content_of(path: Path, check: Callable[[bytes], None] | None = None) -> byte
         InputError: If it is missing, no regular file, too large, cannot be read or is empty.
     """
     try:
-        with _regular(path) as (file, size):
+        with nn_export.files.opened(path, LARGEST) as (file, size):
             left = size
             while check is not None and left > 0 and (piece := file.read(min(CHUNK, left))):
                 check(piece)
@@ -137,33 +135,18 @@ def content_of(path: Path, check: Callable[[bytes], None] | None = None) -> byte
         raise InputError(
             f"{path}: there is no such file{_beside(path)}. Check the path given with --data."
         ) from None
-    except (OSError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        why = error.strerror if isinstance(error, OSError) else error
-        raise InputError(f"{path}: cannot be read ({why}). Give a readable CSV, npz or mat file.") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}). {_instead(error)}") from error
     if not content or content.isspace():
         raise InputError(f"{path}: the file is empty. It needs a header line and rows of numbers.")
     return content
 
 
-@contextmanager
-def _regular(path: Path) -> Iterator[tuple[BinaryIO, int]]:
-    """A regular file that is not too large, opened, and its length [byte]."""
-    with open(
-        path, "rb", opener=lambda name, flags: os.open(name, flags | getattr(os, "O_NONBLOCK", 0))
-    ) as file:
-        status = os.fstat(file.fileno())
-        if not stat.S_ISREG(status.st_mode):
-            raise InputError(
-                f"{path}: is no regular file (a pipe or device, say). Save the recording as a file and give that."
-            )
-        if status.st_size > LARGEST:
-            raise InputError(
-                f"{path}: has {megabytes(status.st_size)}, more than the {megabytes(LARGEST)} that are read. Split the "
-                "recording, or leave out columns that are not needed."
-            )
-        yield file, status.st_size
+def _instead(error: OSError) -> str:
+    """What to do about it."""
+    if error.errno == errno.EFBIG:
+        return "Split the recording, or leave out columns that are not needed."
+    return "Give a readable CSV, npz or mat file."
 
 
 def _beside(path: Path) -> str:

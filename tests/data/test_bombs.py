@@ -72,21 +72,23 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path, ending):
     pipe = tmp_path / f"pipe.{ending}"
     os.mkfifo(pipe)
     done = []
-    reader = threading.Thread(target=lambda: done.append(refused(pipe, "no regular file")), daemon=True)
+    reader = threading.Thread(
+        target=lambda: done.append(refused(pipe, "cannot be read .is a named pipe, not a file")), daemon=True
+    )
     reader.start()
     reader.join(10.0)
     assert done == [None], "opening a pipe waited for a writer, or was not refused"
     device = tmp_path / f"zero.{ending}"
     device.symlink_to("/dev/zero")
-    refused(device, "no regular file")
+    refused(device, "cannot be read .is a device, not a file")
     folder = tmp_path / f"folder.{ending}"
     folder.mkdir()
-    refused(folder, "cannot be read .Is a directory")
+    refused(folder, "cannot be read .is a directory")
     loop = tmp_path / f"loop.{ending}"
     loop.symlink_to(loop)
     refused(loop, "cannot be read .Too many levels")
     refused(tmp_path / f"{5000 * 'a'}.{ending}", "cannot be read .File name too long")
-    refused(tmp_path / f"a\0b.{ending}", "cannot be read .embedded null byte")
+    refused(tmp_path / f"a\0b.{ending}", "cannot be read .is no name of a file .embedded null byte")
     refused(tmp_path / "none" / f"run.{ending}", "there is no such file. Check")
     refused(Path(f"/proc/self/clear_refs.{ending}") / "x", "there is no such file")
     empty = tmp_path / f"empty.{ending}"
