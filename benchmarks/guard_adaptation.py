@@ -27,8 +27,9 @@ from scipy.stats import t as student
 from hybrid_mpc.artifact import load_artifact
 from hybrid_mpc.closed_loop import simulate
 from hybrid_mpc.files import read_json, write_json
-from hybrid_mpc.monitor import Detector, guard_monitor
+from hybrid_mpc.monitor import guard_monitor
 from hybrid_mpc.pipeline import make_adaptive_guard, make_controller, make_estimator
+from hybrid_mpc.pipeline.monitor_job import read_detector
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.faults import CAUSES
 from scenarios.golf_robot.tasks import CONTROL
@@ -169,7 +170,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="JSON file to write")
     given = parser.parse_args()
     noise = json.loads(given.noise.read_text())["sigma_x"]
-    detector = Detector.from_dict(read_json(given.detector)["detector"])
+    detector = read_detector(given.detector)
     arms = Arms(load_artifact(given.model), noise, detector)
     if given.time:
         print(json.dumps(times(arms), indent=1))

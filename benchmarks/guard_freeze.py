@@ -25,6 +25,7 @@ from hybrid_mpc.monitor import Judges, guard_monitor
 from hybrid_mpc.pipeline import find_noise, make_controller, make_estimator
 from hybrid_mpc.pipeline.guards import make_resting_guard
 from hybrid_mpc.pipeline.loops import freezing
+from hybrid_mpc.records import record
 from hybrid_mpc.studies.monitor_loops import loop_figures
 from hybrid_mpc.studies.monitor_plan import SEEDS, LoopPlan
 from scenarios.golf_robot import scenario
@@ -43,7 +44,7 @@ def main() -> None:
     artifact = load_artifact(given.model)
     hybrid, prior = artifact.models["hybrid"], artifact.models["prior"]
     noise, _ = find_noise(scenario, artifact, given.model, ("hybrid_observer",), 0, None)
-    judges = Judges.from_dict(read_json(given.study / "judges.json"))
+    judges = record(Judges, read_json(given.study / "judges.json"), "judges.json")
     told = {**freezing(CONTROL), "resolution": judges.resolution}
     monitor = guard_monitor(hybrid, judges.detector_at(RATE), **told)
     parts = (

@@ -33,6 +33,7 @@ from hybrid_mpc.files import read_json, write_json
 from hybrid_mpc.monitor import Plausibility, excess_bound, learn_plausibility, region_bound
 from hybrid_mpc.mpc import OCP, CondensedController, SafeController, SQPController
 from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_ocp
+from hybrid_mpc.records import record
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.tasks import CONTROL
 
@@ -151,7 +152,7 @@ def main() -> None:
     ordinary = learned(given, artifact, noise, say)
     say(f"{ordinary.samples} samples, terms {ordinary.terms}, reach {ordinary.reach:.3f}")
     kept = read_json(given.out) if given.out is not None and given.out.is_file() else {}
-    same = bool(kept) and Plausibility.from_dict(kept["plausibility"]) == ordinary
+    same = bool(kept) and record(Plausibility, kept["plausibility"], "") == ordinary
     loops = kept["loops"] if same else []
     rows = {(r["task"], r["seed"], r["arm"]): r for r in loops if r["seconds"] == given.seconds}
     rig, arms = Rig(artifact, noise, ordinary), ["free", *(a for a in given.arms if a != "free")]
@@ -163,7 +164,7 @@ def main() -> None:
             rows[key] = {"task": key[0], "seed": seed, "arm": key[2], "seconds": given.seconds, **found}
             say(f"{key}: {found}")
             if given.out is not None:
-                write_json(given.out, {"plausibility": ordinary.to_dict(), "loops": list(rows.values())})
+                write_json(given.out, {"plausibility": ordinary, "loops": list(rows.values())})
     for line in table(rows, arms):
         print(line)
 

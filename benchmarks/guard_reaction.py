@@ -23,10 +23,11 @@ from guard_loops import DT, fault_plans
 from hybrid_mpc.artifact import load_artifact
 from hybrid_mpc.closed_loop import Guard, simulate
 from hybrid_mpc.closed_loop.guard import Mode
-from hybrid_mpc.files import read_json, write_json
-from hybrid_mpc.monitor import Detector, guard_monitor
+from hybrid_mpc.files import write_json
+from hybrid_mpc.monitor import guard_monitor
 from hybrid_mpc.mpc import Limits
 from hybrid_mpc.pipeline import make_controller, make_estimator
+from hybrid_mpc.pipeline.monitor_job import read_detector
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.tasks import CONTROL
 
@@ -95,7 +96,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="JSON file to write")
     given = parser.parse_args()
     artifact, noise = load_artifact(given.model), json.loads(given.noise.read_text())["sigma_x"]
-    arms = Arms(artifact, noise, Detector.from_dict(read_json(given.detector)["detector"]))
+    arms = Arms(artifact, noise, read_detector(given.detector))
     result = {"reaction": reactions(arms, given.seeds, lambda text: print(text, flush=True))}
     print("| fault | " + " | ".join(arms.guards) + " |\n| --- |" + " ---: |" * len(arms.guards))
     for case, row in result["reaction"].items():

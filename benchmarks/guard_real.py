@@ -25,6 +25,7 @@ from hybrid_mpc.data.trajectories import load_trajectories
 from hybrid_mpc.files import read_json, write_json
 from hybrid_mpc.monitor.held_out import HeldOut, leave_one_out
 from hybrid_mpc.pipeline.loops import make_estimator
+from hybrid_mpc.records import plain
 from scenarios.torque_pendulum import scenario
 
 CLEAN = {
@@ -72,7 +73,7 @@ def row_of(found: HeldOut, dt: float) -> dict:
         "outside_s": float((~found.clean).sum() * dt),
         "alarms_outside": found.outside,
         "share_outside": float(found.trace.alarm[~found.clean].mean()) if not found.clean.all() else None,
-        "detector": found.detector.to_dict(),
+        "detector": plain(found.detector),
     }
 
 

@@ -14,6 +14,7 @@ from hybrid_mpc.delayed import with_input_delay
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_document, read_object, sha256, write_document
 from hybrid_mpc.model import HybridModel
+from hybrid_mpc.monitor.calibration import Calibration
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.signals import Signal
 
@@ -101,7 +102,7 @@ class Description:
         parameters: Values [SI] of the prior's parameters by name.
         input_delay_s: Time [s] from a command to the input that the programs take.
         time_unit_s: The machine's second [s], see :attr:`HybridModel.time_unit`.
-        calibration: Calibration of the monitor in plain form, or None.
+        calibration: Calibration of the energy monitor, or None.
         provenance: What the models were made from.
 
     Raises:
@@ -117,7 +118,7 @@ class Description:
     parameters: Mapping[str, float]
     input_delay_s: float
     time_unit_s: float
-    calibration: Mapping[str, Any] | None
+    calibration: Calibration | None
     provenance: Provenance
 
     def __post_init__(self) -> None:
@@ -139,13 +140,13 @@ class Artifact:
 
     Args:
         models: Deployed models.
-        calibration: Calibration of the energy monitor in plain form, or None.
+        calibration: Calibration of the energy monitor, or None.
         provenance: What the models were made from.
         input_delay: Delay [s] that the models hold. Default: none.
     """
 
     models: Mapping[str, HybridModel]
-    calibration: Mapping[str, Any] | None
+    calibration: Calibration | None
     provenance: Provenance
     input_delay: float = 0.0
 
@@ -155,7 +156,7 @@ def save_artifact(
     programs: Mapping[str, Mapping[str, nn_export.Program]],
     info: ModelInfo,
     *,
-    calibration: Mapping[str, Any] | None = None,
+    calibration: Calibration | None = None,
     provenance: Provenance | None = None,
 ) -> None:
     """Write models to ``folder``: ``programs.json``, ``weights.safetensors`` and, last, ``model.json``.
@@ -179,7 +180,7 @@ def save_artifact(
     )  # fmt: skip
 
 
-def set_calibration(folder: Path, calibration: Mapping[str, Any]) -> None:
+def set_calibration(folder: Path, calibration: Calibration) -> None:
     """Put the monitor's calibration into an artifact.
 
     Raises:

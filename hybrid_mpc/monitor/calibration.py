@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,10 +17,6 @@ from hybrid_mpc.monitor.rest import REST_SPEED
 Array = NDArray[np.float64]
 MIN_BLOCKS = 30
 MAX_EXTRAPOLATION = 20.0
-LATER: Mapping[str, Any] = {"detector": Detector, "plausibility": Plausibility}
-"""Parts that a calibration may lack."""
-ADDED = ("rest_speed",)
-"""Further fields that calibrations of earlier versions lack."""
 
 
 @dataclass(frozen=True)
@@ -41,14 +36,15 @@ class Calibration:
         detector: Detector of scaled residuals, learned from nominal data. Default: none.
         plausibility: What is ordinary in the training data, for bounds in the plan. Default: none.
         rest_speed: Speeds ``(n_q,)`` [unit of v] below which friction may stick, or one for all: what every monitor of
-            this model is to take. Default 0.2, that of artifacts which hold none; None where no recording told them.
+            this model is to take. Default 0.2; None where no recording told them.
 
     Raises:
         InputError: If ``0 < release_w <= threshold_w`` does not hold, or not so for the residual.
 
     Example:
         >>> c = Calibration(0.2, 0.1, 1.0, 1000, 0.1, "by hand")
-        >>> Calibration.from_dict(c.to_dict()) == c
+        >>> from hybrid_mpc.records import plain, record
+        >>> record(Calibration, plain(c), "model.json") == c
         True
     """
 
@@ -96,30 +92,6 @@ class Calibration:
         """
         rest = None if rest_speed is None else tuple(rest_speed)
         return cls(None, None, 0.0, 0, 0.0, reason, rest_speed=rest)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain dictionary for JSON; what is not there has no field in it, as in earlier versions."""
-        values = asdict(replace(self, detector=None, plausibility=None))
-        for name in LATER:
-            part = getattr(self, name)
-            if part is None:
-                del values[name]
-            else:
-                values[name] = part.to_dict()
-        return values
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Calibration:
-        """Calibration from :meth:`to_dict`'s dictionary.
-
-        Raises:
-            InputError: If a field is missing or unknown.
-        """
-        names, may_lack = {f.name for f in fields(cls)}, {*LATER, *ADDED}
-        if set(values) | may_lack != names:
-            raise InputError(f"calibration: got fields {sorted(values)}, it needs {sorted(names - may_lack)}")
-        found = {name: kind.from_dict(values[name]) for name, kind in LATER.items() if values.get(name)}
-        return cls(**{**values, **found})
 
 
 def calibrate(

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -85,6 +85,11 @@ class Judges:
     hours: float = 0.0
     blocks: int = 0
 
+    def __post_init__(self) -> None:
+        known = {part for parts in METHODS.values() for part in parts} - {"freeze"}
+        if not set(self.tails) <= known:
+            raise InputError(f"judges: tails of {sorted(self.tails)}, known are {sorted(known)}")
+
     @property
     def block_s(self) -> float:
         """Length of a block [s]."""
@@ -159,25 +164,6 @@ class Judges:
             state, _, alarm = detector.update(state, row)
             found.append(alarm)
         return np.array(found, dtype=bool)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain dictionary for JSON."""
-        return {
-            "detector": self.detector.to_dict(), "tails": {k: list(v) for k, v in self.tails.items()},
-            "resolution": list(self.resolution), "hours": self.hours, "blocks": self.blocks,
-        }  # fmt: skip
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Judges:
-        """Judges from :meth:`to_dict`'s dictionary.
-
-        Raises:
-            InputError: If the detector in it is damaged.
-        """
-        tails = {name: (float(a), float(b)) for name, (a, b) in values["tails"].items()}
-        detector = Detector.from_dict(values["detector"])
-        resolution = tuple(float(r) for r in values["resolution"])
-        return cls(detector, tails, resolution, float(values["hours"]), int(values["blocks"]))
 
 
 def learn_judges(

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -197,38 +196,6 @@ class Detector:
         a0, a1, a2, a3 = self.energy
         v2, u2 = v2 / seconds, u2 / seconds
         return abs(energy) / seconds / math.sqrt(a0 + a1 * v2 + a2 * u2 + a3 / seconds)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain dictionary for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Detector:
-        """Detector from :meth:`to_dict`'s dictionary, read back from JSON too.
-
-        Raises:
-            InputError: If a field is unknown or a needed one is missing.
-
-        Example:
-            >>> detector = Detector(0.02, ((0.01, 0.0, 0.0, 0.0),), (), 0.5, 4.0)
-            >>> Detector.from_dict(detector.to_dict()).force_threshold
-            4.0
-        """
-        names = {f.name for f in fields(cls)}
-        if not set(values) <= names:
-            raise InputError(f"detector: unknown fields {sorted(set(values) - names)}")
-        given: dict[str, Any] = {
-            k: float(v) if v in ("inf", "nan") else v for k, v in values.items()
-        }  # JSON's stand-ins
-        try:
-            given["force"] = tuple(tuple(map(float, row)) for row in given["force"])
-            given["energy"] = tuple(map(float, given["energy"]))
-            given["interval"] = tuple(map(float, given.get("interval", ())))
-            if "rest_speed" in given:  # one number in earlier versions
-                given["rest_speed"] = tuple(np.ravel(given["rest_speed"]).astype(float).tolist())
-            return cls(**given)
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f"detector: damaged: {type(error).__name__} {error}") from error
 
 
 def force_terms(v2: Array, u2: Array, rest_speed: Sequence[float]) -> Array:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
-from typing import Any, Protocol
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
 
 import casadi as ca
 import numpy as np
@@ -98,23 +98,6 @@ class Plausibility:
             )
         if not 1 <= self.reach < np.inf:
             raise InputError(f"plausibility: reach must be at least 1 and finite, got {self.reach}")
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain dictionary for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Plausibility:
-        """Plausibility from :meth:`to_dict`'s dictionary; earlier versions had no ``reach``.
-
-        Raises:
-            InputError: If a field is missing or unknown.
-        """
-        names = {f.name for f in fields(cls)}
-        if set(values) | {"reach"} != names:
-            raise InputError(f"plausibility: got fields {sorted(values)}, it needs {sorted(names)}")
-        rows = {name: tuple(values[name]) for name in ("terms", "smooth", "mean")}
-        return cls(**{**values, **rows, "precision": tuple(tuple(row) for row in values["precision"])})
 
 
 def learn_plausibility(

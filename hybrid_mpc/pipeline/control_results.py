@@ -18,6 +18,7 @@ from hybrid_mpc.mpc import Source
 from hybrid_mpc.pipeline.control_job import Job, run_loops
 from hybrid_mpc.pipeline.deploy import versions
 from hybrid_mpc.pipeline.faulted_loops import stored_detector, switches
+from hybrid_mpc.records import plain
 from hybrid_mpc.scenario import Task
 
 if TYPE_CHECKING:
@@ -137,7 +138,7 @@ def collected(job: Job, rows: Sequence[dict[str, Any]], times: Mapping[str, Arra
             for f in settings.faults
         ],
         **(
-            {"guard": stored_detector(job.artifact).to_dict(), "reaction": settings.guard}
+            {"guard": plain(stored_detector(job.artifact)), "reaction": settings.guard}
             if settings.guard
             else {}
         ),

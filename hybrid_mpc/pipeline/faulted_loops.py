@@ -142,13 +142,13 @@ def stored_detector(artifact: Artifact, folder: Path | None = None) -> Detector:
     Raises:
         InputError: If there is none.
     """
-    found = (artifact.calibration or {}).get("detector")
-    if not found:
+    found = None if artifact.calibration is None else artifact.calibration.detector
+    if found is None:
         raise InputError(
             f"{folder or 'the artifact'} holds no detector for the guard: an earlier version made it, or its run had "
             "too little nominal data (its report says why); run the main job again"
         )
-    return Detector.from_dict(found)
+    return found
 
 
 def kept(name: str, trace: MonitorTrace, y: Array) -> dict[str, Array]:

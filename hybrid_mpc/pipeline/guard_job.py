@@ -27,6 +27,7 @@ from hybrid_mpc.pipeline.loops import freezing, make_estimator, make_monitor
 from hybrid_mpc.pipeline.monitor_job import explained
 from hybrid_mpc.pipeline.nominal_loops import CONTENDER, nominal_loops, run_nominal
 from hybrid_mpc.pipeline.parallel import WORKERS, run_jobs
+from hybrid_mpc.records import plain
 from hybrid_mpc.scenario import ControlSpec
 
 Array = NDArray[np.float64]
@@ -77,8 +78,8 @@ def guard_stage(context: Context) -> None:
         )
     except InputError as none:
         result["plausibility_reason"] = str(none)
-    set_calibration(context.out / "model", replace(calibration, **found).to_dict())
-    result |= {name: part.to_dict() for name, part in found.items()}
+    set_calibration(context.out / "model", replace(calibration, **found))
+    result |= {name: plain(part) for name, part in found.items()}
     detector: Detector | None = found.get("detector")
     recorded, arrays = _recorded(context, artifact, control, detector, calibration)
     result |= recorded

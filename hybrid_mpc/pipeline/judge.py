@@ -19,6 +19,7 @@ from hybrid_mpc.monitor.replay import along, judge, replay
 from hybrid_mpc.monitor.rest import rest_speeds
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_monitor, working_point
+from hybrid_mpc.records import plain, record
 from hybrid_mpc.riccati import hidden_fixed_point
 from hybrid_mpc.scenario import ControlSpec
 
@@ -88,10 +89,10 @@ def monitor_stage(context: Context) -> None:
     except InputError as none:
         known.setdefault("reason", f"the monitor could not be calibrated: {none}")
     if "reason" in known:
-        set_calibration(context.out / "model", Calibration.without(known["reason"], rest).to_dict())
+        set_calibration(context.out / "model", Calibration.without(known["reason"], rest))
         context.save("monitor", {**known, "recordings": covered}, {})
         return
-    set_calibration(context.out / "model", calibration.to_dict())
+    set_calibration(context.out / "model", calibration)
     alarms, arrays, clean = [], {}, {"seconds": 0.0, "alarms": 0, "test_seconds": 0.0, "test_alarms": 0}
     for recording, levels in zip(whole, traces, strict=True):
         trace = judge(make_monitor(model, calibration), levels)
@@ -106,7 +107,7 @@ def monitor_stage(context: Context) -> None:
             starts = np.diff(trace.alarm.astype(int), prepend=0) == 1
             clean[f"{prefix}alarms"] += int((starts & inside).sum())
     result = {
-        "calibration": calibration.to_dict(), "alarms": alarms, "clean": clean, "recordings": covered,
+        "calibration": plain(calibration), "alarms": alarms, "clean": clean, "recordings": covered,
     }  # fmt: skip
     if context.scenario.plant is not None and context.scenario.tasks:
         result["load"], loop = _load_loop(context, model, calibration, control, sigma_x)
@@ -125,7 +126,7 @@ def run_calibration(context: Context) -> Calibration:
     """What stage monitor found: thresholds and rest speeds, or rest speeds alone, with the reason."""
     found = context.result("monitor")
     if "calibration" in found:
-        return Calibration.from_dict(found["calibration"])
+        return record(Calibration, found["calibration"], "checkpoints/monitor.json")
     return Calibration.without(found["reason"], found.get("rest_speed"))
 
 

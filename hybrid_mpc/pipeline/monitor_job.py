@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from hybrid_mpc.artifact import Artifact, artifact_folder, load_artifact
 from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import read_json, write_json, write_text
-from hybrid_mpc.monitor import Calibration, Detector, Diagnoser, EnergyMonitor, MonitorTrace, guard_monitor
+from hybrid_mpc.files import read_object, write_json, write_text
+from hybrid_mpc.monitor import Detector, Diagnoser, EnergyMonitor, MonitorTrace, guard_monitor
 from hybrid_mpc.monitor.lengths import HISTORY_S, samples
 from hybrid_mpc.monitor.reading import Verdict
 from hybrid_mpc.monitor.replay import EstimatorLike, TrajectoryLike, along, replay
@@ -22,6 +22,7 @@ from hybrid_mpc.monitor.standard import learn_from
 from hybrid_mpc.pipeline.context import Progress, Silent
 from hybrid_mpc.pipeline.control_noise import find_noise
 from hybrid_mpc.pipeline.loops import make_estimator, make_monitor, sensor_steps
+from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import Scenario
 
 Array = NDArray[np.float64]
@@ -71,7 +72,7 @@ class MonitorJob:
             return guard_monitor(
                 model, self.detector, resolution=self.resolution, input_range=ranges, diagnose=known
             )
-        return make_monitor(model, stored_calibration(self.artifact))
+        return make_monitor(model, self.artifact.calibration)
 
 
 def prepared(
@@ -118,25 +119,30 @@ def prepared(
         cut = "; ".join(f"{c.file} {c.start:g} to {c.end:g} s: {c.why}" for c in data.cuts)
         raise InputError(f"no part of the recordings is long enough to be watched: {cut}")
     sigma, _ = find_noise(scenario, artifact, folder, ("hybrid_observer",), 0, noise)
-    stored = artifact.calibration if calibration is None else read_json(calibration)
-    detector = None if stored is None else stored.get("detector")
-    if calibration is not None and detector is None:
-        raise InputError(f"{calibration} holds no detector; make it with hybrid-mpc monitor ... --learn 1")
-    found = None if detector is None else Detector.from_dict(detector)
+    if calibration is not None:
+        found: Detector | None = read_detector(calibration)
+    else:
+        found = None if artifact.calibration is None else artifact.calibration.detector
     if found is not None and resolution is None:
         resolution = sensor_steps(scenario.control)
     return MonitorJob(scenario, artifact, data, np.asarray(sigma["hybrid_observer"]), resolution, found)
 
 
-def stored_calibration(artifact: Artifact) -> Calibration | None:
-    """The calibration that an artifact holds; None if it holds none."""
-    return None if artifact.calibration is None else Calibration.from_dict(artifact.calibration)
+def read_detector(path: Path) -> Detector:
+    """The detector in a ``calibration.json`` that :func:`learn` wrote.
+
+    Raises:
+        InputError: If it cannot be read or holds none.
+    """
+    stored = read_object(path)
+    if stored.get("detector") is None:
+        raise InputError(f"{path} holds no detector; make it with hybrid-mpc monitor ... --learn 1")
+    return record(Detector, stored["detector"], f"{path}: detector")
 
 
 def stored_rest(artifact: Artifact) -> tuple[float, ...] | None:
     """The rest speeds that every monitor of an artifact's models takes; None if no recording told them yet."""
-    calibration = stored_calibration(artifact)
-    return None if calibration is None else calibration.rest_speed
+    return None if artifact.calibration is None else artifact.calibration.rest_speed
 
 
 def learn(job: MonitorJob, rate: float, out: Path, progress: Progress | None = None) -> Detector:
@@ -155,7 +161,7 @@ def learn(job: MonitorJob, rate: float, out: Path, progress: Progress | None = N
         data_hash=job.data.hash, report=say.update,
     )  # fmt: skip
     say.finish("")
-    write_json(out / "calibration.json", {"detector": detector.to_dict()})
+    write_json(out / "calibration.json", {"detector": plain(detector)})
     return detector
 
 
@@ -204,8 +210,8 @@ def watch(job: MonitorJob, out: Path, progress: Progress | None = None) -> dict[
         "warnings": [str(finding) for finding in job.data.findings],
         "gaps": [cut._asdict() for cut in job.data.cuts if "gap" in cut.why],
         "not_watched": [cut._asdict() for cut in job.data.cuts if "gap" not in cut.why],
-        "detector": None if job.detector is None else job.detector.to_dict(),
-        "thresholds": None if job.monitor.calibration is None else job.monitor.calibration.to_dict(),
+        "detector": plain(job.detector),
+        "thresholds": plain(job.monitor.calibration),
         "data_hash": job.data.hash,
     }
     write_json(out / "monitor.json", result)

@@ -23,7 +23,6 @@ from hybrid_mpc.closed_loop import ClosedLoopResult, simulate
 from hybrid_mpc.closed_loop.faults import check_channels, install
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import MOST_CONTENT, read_bytes, write_json
-from hybrid_mpc.monitor.calibration import Calibration
 from hybrid_mpc.pipeline.contenders import CONTENDERS
 from hybrid_mpc.pipeline.control_job import ControlSettings, Job, parts, prepared, selected_tasks
 from hybrid_mpc.pipeline.control_results import row
@@ -252,7 +251,7 @@ def _monitor(run: RunConfig, artifact: Artifact) -> Any:
         return None
     calibration = None
     if run.monitor == "energy" and artifact.calibration is not None:
-        calibration = Calibration.from_dict(artifact.calibration)
+        calibration = artifact.calibration
     return make_monitor(artifact.models["hybrid"], calibration)
 
 

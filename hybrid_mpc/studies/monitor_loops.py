@@ -24,6 +24,7 @@ from hybrid_mpc.pipeline.contenders import build
 from hybrid_mpc.pipeline.control_job import selected_tasks
 from hybrid_mpc.pipeline.guards import make_adaptive_guard, make_resting_guard
 from hybrid_mpc.pipeline.monitor_job import stored_rest
+from hybrid_mpc.records import record
 from hybrid_mpc.scenario import ControlSpec, Task, load_scenario
 from hybrid_mpc.studies.lockstep import Loop, Trace, run_together
 from hybrid_mpc.studies.loops import ModelInput
@@ -88,7 +89,7 @@ class _Loops:
     def judges(self) -> Judges:
         """What was learned, read when first needed."""
         if self._judges is None:
-            self._judges = Judges.from_dict(read_json(self._folder / JUDGES))
+            self._judges = record(Judges, read_json(self._folder / JUDGES), str(self._folder / JUDGES))
         return self._judges
 
     def run(self, job: MonitorJob) -> dict[str, Any]:

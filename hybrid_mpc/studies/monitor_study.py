@@ -13,6 +13,7 @@ from hybrid_mpc.files import read_json, write_json
 from hybrid_mpc.monitor import Judges
 from hybrid_mpc.pipeline.context import Progress, Silent
 from hybrid_mpc.pipeline.guards import adaptable
+from hybrid_mpc.records import record
 from hybrid_mpc.scenario import load_scenario
 from hybrid_mpc.studies.configuration import Study
 from hybrid_mpc.studies.engines import Engine, make_engine
@@ -102,7 +103,7 @@ def finish(out: Path) -> dict[str, Any]:
     """
     note = read_note(out)
     done = {row["id"]: row for row in rows(out / RUNS)}
-    judges = Judges.from_dict(read_json(out / JUDGES))
+    judges = record(Judges, read_json(out / JUDGES), str(out / JUDGES))
     results = monitor_results(note.study, judges, list(done.values()))
     write_json(out / RESULTS, results)
     write_monitor_report(out, results, note)
@@ -136,5 +137,5 @@ def _learn(study: MonitorStudy, out: Path, jobs: list[MonitorJob], artifact: Art
             f"{out}: a nominal loop to learn from has failed: {failed[-1]['error'].strip().splitlines()[-1]}; "
             "--resume --retry-failed runs it again"
         )
-    write_json(out / JUDGES, learn(study, paths, artifact).to_dict())
+    write_json(out / JUDGES, learn(study, paths, artifact))
     shutil.rmtree(out / LEARNING)

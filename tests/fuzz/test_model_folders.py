@@ -6,9 +6,13 @@ import os
 import random
 import shutil
 
+import numpy as np
 import pytest
 
+from hybrid_mpc.artifact import set_calibration
 from hybrid_mpc.files import HASH, digest
+from hybrid_mpc.monitor import Calibration, Detector
+from hybrid_mpc.monitor.plausibility import Plausibility
 from tests.fuzz.forked import cheap, command, refused
 
 ODD = [
@@ -106,6 +110,55 @@ def test_fields_that_do_not_fit(folder, whole, tmp_path, seed):
         assert not mark.exists()
         count += 1
     assert count > 40
+
+
+def detector_and_thresholds():
+    detector = Detector(0.02, ((1e-4, 1e-4, 0.0, 1e-4),), (), 0.5, 4.0, rest_speed=(0.2,))
+    ordinary = Plausibility(0.99, (1.0,) * 5, (0.1, 0.1), (0.0,) * 3, np.eye(3).tolist(), 4.0, 1.0)
+    return Calibration(0.2, 0.1, 1.0, 1000, 0.1, "by hand", "", 0.2, 0.1, detector, ordinary, (0.2,))
+
+
+@pytest.fixture
+def watched(folder, tmp_path):
+    """An artifact with a calibration of all parts, a recording and a filter's noise."""
+    set_calibration(folder, detector_and_thresholds())
+    t = 0.02 * np.arange(300)
+    table = np.column_stack([t, np.sin(2 * t), 0.1 * np.cos(3 * t)])
+    np.savetxt(tmp_path / "run.csv", table, delimiter=",", header="time_s,phi_rad,u_nm", comments="")
+    (tmp_path / "noise.json").write_text(json.dumps({"sigma_x": {"hybrid_observer": [1e-3, 1e-2]}}))
+
+    def words(out):
+        return ["monitor", folder, tmp_path / "run.csv", "--scenario", "golf_robot", "--noise",
+                tmp_path / "noise.json", "--out", tmp_path / out]  # fmt: skip
+
+    return words
+
+
+def test_a_good_calibration_is_watched_with(watched):
+    ended = command(*watched("out"))
+    assert ended.code == 0, ended.told
+    assert "watched with a detector" in ended.told
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("seed", range(2))
+def test_calibrations_that_do_not_fit(watched, folder, seed):
+    """Numbers that fit may be watched with, however odd; all else is refused."""
+    document = json.loads((folder / "model.json").read_text())
+    document.pop(HASH)
+    rng, paths = random.Random(seed), [p for p in places(document) if p[:1] == ("calibration",)]
+    refusals = 0
+    for i in range(60):
+        path, new = rng.choice(paths), rng.choice([*ODD, ...])
+        odd = changed(document, path, new)
+        (folder / "model.json").write_text(json.dumps({**odd, HASH: digest(odd)}))
+        ended, what = command(*watched(f"out{i}")), f"{path}: {str(new)[:80]}"
+        if ended.code == 2:
+            refused(ended, what)
+            refusals += 1
+        assert ended.code is not None, f"{what}:\n{ended.told}"
+        assert "Traceback" not in ended.told, f"{what}:\n{ended.told}"
+    assert refusals > 30
 
 
 @pytest.mark.full

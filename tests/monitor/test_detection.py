@@ -9,6 +9,7 @@ import pytest
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.monitor.detection import METHODS, Judges, held, learn_judges
+from hybrid_mpc.records import plain, record
 
 DT, STEP, RATE = 0.02, 1.5e-3, 2.5
 PERIODS = 9_000  # 180 s: 35 blocks of 5 s after the first second
@@ -73,7 +74,7 @@ def test_score_passes_one_where_a_part_passes_its_threshold(judges):
 
 
 def test_round_trip(judges):
-    again = Judges.from_dict(json.loads(json.dumps(judges.to_dict())))
+    again = record(Judges, json.loads(json.dumps(plain(judges))), "")
     assert again.threshold("power", 3.0) == judges.threshold("power", 3.0)
     assert again.detector.force == judges.detector.force
 

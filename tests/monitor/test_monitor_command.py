@@ -14,7 +14,8 @@ from hybrid_mpc.data import write_csv
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import write_json
 from hybrid_mpc.monitor import Calibration, Detector
-from hybrid_mpc.pipeline.monitor_job import MonitorJob, prepared, watched
+from hybrid_mpc.pipeline.monitor_job import MonitorJob, prepared, read_detector, watched
+from hybrid_mpc.records import plain
 from hybrid_mpc.scenario import load_scenario
 from scenarios.golf_robot.rig import Rig
 
@@ -37,7 +38,7 @@ def folder(tmp_path_factory, golf_artifact):
     (out / "control.json").write_text(json.dumps({"sigma_x": {"hybrid_observer": [1e-4, 1e-2]}}))
     # Wide scales: the network of this artifact is untrained, so the prior's own errors are nominal here.
     detector = Detector(DT, ((0.02, 0.01, 0.0, 0.0),), (0.05, 0.1, 0.0, 0.0), 2.0, 15.0, 4.0)
-    write_json(out / "calibration.json", {"detector": detector.to_dict()})
+    write_json(out / "calibration.json", {"detector": plain(detector)})
     return out
 
 
@@ -73,9 +74,9 @@ def test_it_says_where_and_writes_what_it_saw(folder, golf_artifact, tmp_path):
 
 def test_the_artifact_s_own_detector_needs_no_option(folder, golf_artifact, tmp_path):
     model = shutil.copytree(golf_artifact, tmp_path / "model")
-    detector = Detector.from_dict(json.loads((folder / "calibration.json").read_text())["detector"])
+    detector = read_detector(folder / "calibration.json")
     detector = replace(detector, false_alarms_per_hour=2.0, hours=0.05, data_hash="0123456789abcdef0123")
-    set_calibration(model, Calibration(9.0, 9.0, 1.0, 1, 1.0, "by hand", detector=detector).to_dict())
+    set_calibration(model, Calibration(9.0, 9.0, 1.0, 1, 1.0, "by hand", detector=detector))
     done = command(folder, model, tmp_path / "out")
     assert done.exit_code == 0, done.output
     told = "watched with a detector for 2 false alarms an hour, learned from 3.0 min (hash 0123456789abcdef)"

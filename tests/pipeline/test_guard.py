@@ -18,6 +18,7 @@ from hybrid_mpc.pipeline.guard_job import guard_stage, learned
 from hybrid_mpc.pipeline.guard_report import guard_figures, guard_results, guard_tables, guard_words
 from hybrid_mpc.pipeline.nominal_loops import NominalLoop, repeated, run_nominal
 from hybrid_mpc.pipeline.settings import RunSettings
+from hybrid_mpc.records import plain, record
 from hybrid_mpc.report.schema import SCHEMA, _check
 from hybrid_mpc.scenario import load_scenario
 from scenarios.golf_robot.rig import Rig
@@ -100,8 +101,8 @@ def test_the_artifact_keeps_detector_and_plausibility(golf_artifact, tmp_path):
     unit = Plausibility(
         0.99, (1.0,) * 5, (0.1, 0.1), (0.0,) * 3, tuple(map(tuple, np.eye(3).tolist())), 4.0, 1.0
     )
-    set_calibration(folder, replace(CALIBRATION, detector=detector, plausibility=unit).to_dict())
-    found = Calibration.from_dict(load_artifact(folder).calibration)
+    set_calibration(folder, replace(CALIBRATION, detector=detector, plausibility=unit))
+    found = load_artifact(folder).calibration
     assert found.detector == detector
     assert found.detector.data_hash == "hash of the data"
     assert found.plausibility == unit
@@ -126,7 +127,7 @@ def context(golf_artifact, tmp_path_factory):
     smooth = {f"{t.name}/{key}": getattr(t, key) for t in made.trajectories("train") for key in ("x", "xdot")}
     made.save("prior", {}, smooth)
     made.save("control", {"sigma_x": SIGMA}, {})
-    made.save("monitor", {"calibration": CALIBRATION.to_dict()}, {})
+    made.save("monitor", {"calibration": plain(CALIBRATION)}, {})
     for i, loop in enumerate(nominal_loops.nominal_loops(scenario, made.budget)):
         arrays = {"numbers": numbers(nominal_loops.BLOCKS, i), "y": np.full((9, 1), i), "u": np.zeros((9, 1))}
         made.save(loop.stage, {"task": loop.task, "seed": loop.seed, "seconds": 46.0}, arrays)
@@ -145,8 +146,8 @@ def resumed(context):
 
 
 def test_the_stage_learns_from_what_is_kept_and_fills_the_artifact(context, resumed):
-    stored = Calibration.from_dict(load_artifact(context.out / "model").calibration)
-    assert stored.detector == Detector.from_dict(resumed["detector"])
+    stored = load_artifact(context.out / "model").calibration
+    assert stored.detector == record(Detector, resumed["detector"], "")
     assert stored.detector.false_alarms_per_hour == 2.0
     assert re.fullmatch("[0-9a-f]{64}", stored.detector.data_hash)
     assert stored.threshold_w == CALIBRATION.threshold_w
@@ -188,7 +189,7 @@ def test_without_a_detector_the_recording_is_shown_and_how_much_is_missing(conte
     _check({"guard": group}, type(SCHEMA)({"guard": SCHEMA.keys["guard"]}), "", {})
     assert group["false_alarms_per_hour"] is None
     assert "10 false alarms an hour need 2.5 min" in group["reason"]  # of 24 s
-    assert load_artifact(out / "model").calibration.get("detector") is None
+    assert load_artifact(out / "model").calibration.detector is None
     assert guard_words({"guard": group})[0].startswith(
         "No detector could be learned from undisturbed recordings"
     )

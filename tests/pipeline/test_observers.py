@@ -50,7 +50,7 @@ def test_too_short_recordings_are_a_reason(monkeypatch, tmp_path):
     monkeypatch.setattr(observers, "make_estimator", lambda model, control, sigma: make_ekf(model))
     context = SimpleNamespace(
         scenario=SimpleNamespace(control=object()), out=tmp_path,
-        result=lambda stage: {"sigma_x": {name: [1e-3, 1e-2] for name in observers.OBSERVERS}},
+        sigma_x=lambda name: np.array([1e-3, 1e-2]),
         trajectories=lambda role: [recording("short", 60)],
         progress=SimpleNamespace(update=lambda *words: None),
         save=lambda *given: kept.update({given[0]: given[1:]}),

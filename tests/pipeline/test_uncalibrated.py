@@ -1,13 +1,12 @@
 """Stages monitor and guard on linear axes: slow ones are calibrated, and where nothing can be, the run goes on."""
 
-import dataclasses
-import json
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from hybrid_mpc.artifact import load_artifact, save_artifact
+from hybrid_mpc.artifact import load_artifact, read_description, save_artifact, write_description
 from hybrid_mpc.cli.main import app
 from hybrid_mpc.data import write_csv
 from hybrid_mpc.data_spec import DataSpec
@@ -19,7 +18,7 @@ from hybrid_mpc.pipeline.figures import _monitor as monitor_figures
 from hybrid_mpc.pipeline.guard_job import guard_stage
 from hybrid_mpc.pipeline.guard_report import guard_figures, guard_results, guard_tables, guard_words
 from hybrid_mpc.pipeline.judge import monitor_stage
-from hybrid_mpc.pipeline.monitor_job import stored_calibration, stored_rest
+from hybrid_mpc.pipeline.monitor_job import stored_rest
 from hybrid_mpc.pipeline.results import _monitor as monitor_results
 from hybrid_mpc.pipeline.settings import RunSettings
 from hybrid_mpc.report.schema import SCHEMA, _check
@@ -42,7 +41,7 @@ class Axis(Prior):
 """
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Machine:
     """An axis: period [s], top speed [m/s], swing [s], sensor noise [m]; 1 N swings it, 0.1 N of it is dry friction."""
 
@@ -107,7 +106,7 @@ def context(machine, samples, out, warm_up):
     made = Context(RunSettings("axis"), scenario, out)
     prior = scenario.prior()
     programs = trace_model(PriorStep(prior, machine.dt).requires_grad_(False))
-    info = dataclasses.replace(model_info(prior, machine.dt), time_unit=made.time_unit)
+    info = replace(model_info(prior, machine.dt), time_unit=made.time_unit)
     save_artifact(out / "model", {"hybrid": programs, "prior": programs}, info)
     noise = [machine.noise, 1e-3 * machine.speed]
     made.save("control", {"sigma_x": {"hybrid_observer": noise, "prior_observer": noise}}, {})
@@ -188,7 +187,7 @@ def test_the_guard_copes_without_a_calibration(short):
         "The recording run0, of which test data come, by the monitor, which has no thresholds to judge by."
     ]
     artifact = load_artifact(short.out / "model")
-    assert stored_calibration(artifact).threshold_w is None
+    assert artifact.calibration.threshold_w is None
     assert stored_rest(artifact) is None  # a detector that is learned later takes it from its own recordings
     with pytest.raises(
         InputError, match="holds no detector"
@@ -198,18 +197,18 @@ def test_the_guard_copes_without_a_calibration(short):
 
 @pytest.mark.parametrize("stored", ["without thresholds", "none"])
 def test_the_command_watches_with_an_artifact_without_calibration(short, tmp_path, monkeypatch, stored):
-    description = json.loads((short.out / "model" / "model.json").read_text())
+    description = read_description(short.out / "model")
     if stored == "none":
-        write_json(short.out / "model" / "model.json", {**description, "calibration": None})
+        write_description(short.out / "model", replace(description, calibration=None))
     noise = tmp_path / "control.json"
     write_json(noise, {"sigma_x": short.result("control")["sigma_x"]})
     write_csv(tmp_path / "long.csv", QUICK.recording(5, 900))
-    monkeypatch.setattr("hybrid_mpc.cli.monitor.load_scenario", lambda name: short.scenario)
+    monkeypatch.setattr("hybrid_mpc.cli.monitor.scenario_of", lambda *given: short.scenario)
     done = CliRunner().invoke(
         app, ["monitor", str(short.out / "model"), str(tmp_path / "long.csv"), "--scenario", "axis",
               "--noise", str(noise), "--out", str(tmp_path / "out")],
     )  # fmt: skip
-    write_json(short.out / "model" / "model.json", description)
+    write_description(short.out / "model", description)
     assert done.exit_code == 0, done.output
     assert "the artifact holds no detector and no thresholds" in done.output
     warm_up = 2 * round(0.15 * short.time_unit / QUICK.dt) * QUICK.dt
