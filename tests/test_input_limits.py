@@ -5,12 +5,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from closed_loop_parts import Told
 from online_models import PendulumPlant, linear_model, pendulum_model
 
 from hybrid_mpc.analysis.study_models import drive
 from hybrid_mpc.analysis.study_signals import measured_part
 from hybrid_mpc.analysis.subject import _inputs, _outer, _range
-from hybrid_mpc.closed_loop import Guard, Mode, simulate
+from hybrid_mpc.closed_loop import Guard, Loop, Mode, simulate
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation import TrueState
 from hybrid_mpc.input_limits import share_used
@@ -18,7 +19,7 @@ from hybrid_mpc.mpc import OCP, CondensedController, Limits, SafeController
 from hybrid_mpc.pipeline.contest import limits_used
 from hybrid_mpc.pipeline.judge import unknown_load
 from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_monitor, working_point
-from hybrid_mpc.plots.loops import Loop, closed_loops
+from hybrid_mpc.plots.loops import Motion, closed_loops
 from hybrid_mpc.scenario import ControlSpec
 from hybrid_mpc.signals import Signal
 from hybrid_mpc.studies.monitor_loops import loop_figures
@@ -100,23 +101,21 @@ def test_a_guard_keeps_to_limits_beside_zero(mode):
     model = pendulum_model()
     ocp = OCP(10, (30.0, 1.0), [0.05], [0.05], [0.5], [2.0])
     safe = SafeController(CondensedController(model, ocp), model)
-    guarded = Guard(mode, limits=Limits([-INF], [1.0])).begin(safe)
-    estimate, reference = TrueState(model).start([0.5, 0.0]), np.zeros((11, 2))
-    decision = guarded.initial(estimate, None, reference)
-    assert decision.u == 0.5
-    guarded.watched(0.0, SimpleNamespace(alarm=True))
-    guarded.measured(0.02, np.array([0.5]), decision.u)
-    assert guarded.mode is mode
-    for _ in range(3):
-        decision = guarded.decide(decision, estimate, reference)
-        assert 0.5 <= decision.u <= 1.0
+    guard = Guard(mode, limits=Limits([-INF], [1.0]))
+    told = Loop(TrueState(model), safe, monitor=Told([(0, 99)]), guard=guard)
+    truth = [0.5, 0.0]
+    told.start([0.5], truth=truth)
+    for _ in range(4):
+        u = told.step([0.5], truth=truth)
+        assert told.state.guard.mode is mode
+        assert 0.5 <= u <= 1.0
 
 
 @pytest.mark.parametrize("limits", (FINITE | OPEN).values(), ids=(FINITE | OPEN).keys())
 def test_figures_draw_the_limits_that_there_are(limits):
     t, x, u = np.array([0.0, 0.1]), np.zeros((2, 2)), np.full((2, 1), np.clip(0.0, *limits))
     figure = closed_loops(
-        "Rest", t, x, {"prior": Loop(t, x, u)}, states=(Signal("q", "m"), Signal("v", "m/s")),
+        "Rest", t, x, {"prior": Motion(t, x, u)}, states=(Signal("q", "m"), Signal("v", "m/s")),
         inputs=(Signal("F", "N"),), limits=(limits[:1], limits[1:]),
     )  # fmt: skip
     drawn = [line.get_ydata()[0] for line in figure.axes[-1].lines if line.get_label() == "input limits"]

@@ -2,10 +2,11 @@
 
 from hybrid_mpc.closed_loop.faults import Fault
 from hybrid_mpc.closed_loop.guard import Guard, Mode, Switch
+from hybrid_mpc.closed_loop.loop import Loop, LoopState, Monitor, Reading
 from hybrid_mpc.closed_loop.result import ClosedLoopResult
 from hybrid_mpc.closed_loop.runner import Runner
 from hybrid_mpc.closed_loop.safe_end import SafeEnd
-from hybrid_mpc.closed_loop.simulate import Monitor, Reading, simulate
+from hybrid_mpc.closed_loop.simulate import simulate
 from hybrid_mpc.closed_loop.timing import Clock, RealClock, RunnerStep, RunReport
 
 __all__ = [
@@ -13,6 +14,8 @@ __all__ = [
     "ClosedLoopResult",
     "Fault",
     "Guard",
+    "Loop",
+    "LoopState",
     "Mode",
     "Monitor",
     "Reading",

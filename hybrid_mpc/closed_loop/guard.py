@@ -5,17 +5,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate, Estimator
+from hybrid_mpc.mpc.condensing import Prepared
 from hybrid_mpc.mpc.limits import Limits
 from hybrid_mpc.mpc.problem import Controller
 from hybrid_mpc.mpc.safeguard import Decision, SafeController, Source
-from hybrid_mpc.mpc.solution import Solution, Status
+from hybrid_mpc.mpc.solution import Status
 
 Array = NDArray[np.float64]
 TINY = 1e-9
@@ -136,156 +137,157 @@ class Guard:
         for name, value in zip(self.__dataclass_fields__, values, strict=True):
             object.__setattr__(self, name, value)
 
-    def begin(self, safe: SafeController) -> GuardedLoop:
-        """The guarded controller of one run.
 
-        Args:
-            safe: The loop's own controller.
-
-        Raises:
-            InputError: If the backup has another problem or period.
-        """
-        if self.backup is not None and self.backup_estimator is not None:
-            _check_alike(safe.controller, self.backup.controller, self.backup_estimator)
-        return GuardedLoop(self, safe)
-
-
-class GuardedLoop:
-    """A controller that changes with the guard's mode; unlike the guard it remembers, for one run.
-
-    To a loop it is a :class:`~hybrid_mpc.mpc.SafeController` that is told in addition what was measured
-    (:meth:`measured`, before it decides) and what the monitor said (:meth:`watched`, after it).
+@dataclass(frozen=True)
+class GuardState:
+    """What a guard remembers from one period to the next.
 
     Args:
-        guard: The policy.
-        safe: The loop's own controller.
+        mode: The mode that decides now.
+        wanted: The mode of the next period.
+        why: Why it is wanted, in words.
+        since: Time [s] from which the mode decides.
+        alarm: Time [s] of the last alarm.
+        doubt: Time [s] at which the present row of alarms began.
+        frozen: Time [s] at which the sensor was last seen frozen.
+        backup: Estimate of the backup's estimator; None without one, and before the first sample.
+        planner: Whose plan the last one is: ``"controller"``, ``"backup"`` or nobody's (at rest).
+        switches: Changes of the mode until now.
     """
 
-    def __init__(self, guard: Guard, safe: SafeController) -> None:
-        self._guard, self._safe = guard, safe
-        self._mode = self._next = Mode.NORMAL
-        self._made: tuple[Solution | None, SafeController] = None, safe
-        self._since, self._why = 0.0, ""
-        self._alarm = self._frozen = -math.inf
-        self._doubt = -math.inf
-        self._estimate: Estimate | None = None
-        self.switches: list[Switch] = []
+    mode: Mode = Mode.NORMAL
+    wanted: Mode = Mode.NORMAL
+    why: str = ""
+    since: float = 0.0
+    alarm: float = -math.inf
+    doubt: float = -math.inf
+    frozen: float = -math.inf
+    backup: Estimate | None = None
+    planner: Literal["controller", "backup", "nobody"] = "controller"
+    switches: tuple[Switch, ...] = ()
 
-    @property
-    def controller(self) -> Controller:
-        """The controller of the normal mode."""
-        return self._safe.controller
 
-    @property
-    def mode(self) -> Mode:
-        """The present mode."""
-        return self._mode
+class GuardedController:
+    """A controller that changes with the guard's mode. Pure: what it remembers is a :class:`GuardState`.
 
-    def initial(
-        self,
-        estimate: Estimate,
-        u: Array | None = None,
-        reference: Array | None = None,
-        weight: Array | None = None,
-    ) -> Decision:
-        """As :meth:`SafeController.initial`."""
-        return self._own(self._safe.initial(estimate, u, reference, weight), self._safe)
+    Args:
+        safe: The loop's own controller.
+        guard: What to do on alarms. Default: nothing; the mode stays normal.
 
-    def measured(self, t: float, y: Array, u_prev: Array) -> None:
-        """A sample ``y`` ``(n_y,)`` at ``t`` with ``u_prev`` held before it; the mode asked for begins now."""
-        if self._next is not self._mode:
-            self.switches.append(Switch(t, self._mode, self._next, self._why))
-            self._mode, self._since = self._next, t
-        estimator = self._guard.backup_estimator
+    Raises:
+        InputError: If the backup has another problem or period.
+    """
+
+    def __init__(self, safe: SafeController, guard: Guard | None = None) -> None:
+        self.safe, self.guard = safe, guard
+        if guard is not None and guard.backup is not None and guard.backup_estimator is not None:
+            _check_alike(safe.controller, guard.backup.controller, guard.backup_estimator)
+
+    def measured(self, state: GuardState, t: float, y: Array, u_prev: Array) -> GuardState:
+        """State with a sample ``y`` ``(n_y,)`` at ``t``, ``u_prev`` held before it; the mode wanted begins now."""
+        if state.wanted is not state.mode:
+            switch = Switch(t, state.mode, state.wanted, state.why)
+            state = replace(state, mode=state.wanted, since=t, switches=(*state.switches, switch))
+        estimator = None if self.guard is None else self.guard.backup_estimator
         if estimator is None:
-            return
-        if self._estimate is None:
-            self._estimate = estimator.start(y, t)
-        else:
-            self._estimate = estimator.update(self._estimate, y, u_prev)
+            return state
+        known = state.backup
+        return replace(
+            state, backup=estimator.start(y, t) if known is None else estimator.update(known, y, u_prev)
+        )
 
     def decide(
-        self, previous: Decision, estimate: Estimate, reference: Array, weight: Array | None = None,
-        *, limits: Limits | None = None,
-    ) -> Decision:  # fmt: skip
+        self, state: GuardState, previous: Decision, estimate: Estimate, reference: Array,
+        weight: Array | None = None, *, prepared: Prepared | None = None,
+    ) -> tuple[Decision, GuardState]:  # fmt: skip
         """The input to hold from now on, by the mode's controller; see :meth:`SafeController.decide`."""
-        mode, bounds = self._mode, self._bounds(limits)
+        mode, bounds = state.mode, self._bounds(state)
         if mode is Mode.REST:
-            return self._rest(previous, bounds)
-        safe, known = self._active(estimate)
-        before = self._handed(previous, safe, known)
+            return self._rest(previous, bounds), replace(state, planner="nobody")
+        safe, known = self._active(state, estimate)
+        before, state = self._handed(state, previous, safe, known)
         if mode is Mode.FALLBACK:
             decision = safe.late(replace(before, age=USED_UP), known, reference, limits=bounds)
-            return self._own(replace(decision, status=Status.INITIAL, age=0), safe)
-        return self._own(safe.decide(before, known, reference, weight, limits=bounds), safe)
+            return replace(decision, status=Status.INITIAL, age=0), state
+        return safe.decide(before, known, reference, weight, limits=bounds, prepared=prepared), state
 
     def late(
-        self, previous: Decision, estimate: Estimate, reference: Array, *, limits: Limits | None = None
-    ) -> Decision:
+        self, state: GuardState, previous: Decision, estimate: Estimate, reference: Array
+    ) -> tuple[Decision, GuardState]:
         """The input where a solve has not come in time; see :meth:`SafeController.late`."""
-        if self._mode is Mode.REST:
-            return self._rest(previous, self._bounds(limits))
-        safe, known = self._active(estimate)
-        before = self._handed(previous, safe, known)
-        return self._own(safe.late(before, known, reference, limits=self._bounds(limits)), safe)
+        bounds = self._bounds(state)
+        if state.mode is Mode.REST:
+            return self._rest(previous, bounds), replace(state, planner="nobody")
+        safe, known = self._active(state, estimate)
+        before, state = self._handed(state, previous, safe, known)
+        return safe.late(before, known, reference, limits=bounds), state
 
-    def watched(self, t: float, reading: Any) -> None:
-        """What the monitor said of the period at ``t``; decides on the next period's mode."""
-        guard = self._guard
+    def prepare(self, state: GuardState, decision: Decision, weight: Array | None) -> Prepared | None:
+        """What of the next solve can be done now; None where there is no such part, or another's plan is taken over."""
+        if state.wanted in (Mode.FALLBACK, Mode.REST):
+            return None
+        safe = self._backup if state.wanted is Mode.BACKUP and state.backup is not None else self.safe
+        return safe.prepare(decision, weight) if self._planner(safe) == state.planner else None
+
+    def watched(self, state: GuardState, t: float, reading: Any) -> GuardState:
+        """State with what the monitor said of the period at ``t``; it decides on the next period's mode."""
+        guard = self.guard
+        if guard is None:
+            return state
+        alarm, doubt, frozen = state.alarm, state.doubt, state.frozen
         if reading.alarm:
-            if t - self._alarm >= guard.quiet - TINY:
-                self._doubt = t
-            self._alarm = t
+            if t - alarm >= guard.quiet - TINY:
+                doubt = t
+            alarm = t
         if getattr(reading, "frozen", False):
-            self._frozen = t
-        if self._frozen == t or t - self._frozen < guard.quiet - TINY:
+            frozen = t
+        on = alarm == t or t - alarm < guard.quiet - TINY
+        if frozen == t or t - frozen < guard.quiet - TINY:
             wanted, why = guard.on_sensor, "the sensor repeats itself while motion is predicted"
-        elif self._in_doubt(t):
+        elif on and alarm - doubt >= guard.patience - TINY:
             blind = getattr(reading, "blind", False)
             said = "the monitor cannot judge" if blind else "the model does not describe the machine"
             wanted, why = guard.on_model, said
         else:
             wanted, why = Mode.NORMAL, f"no alarm for {guard.quiet:g} s"
-        back = wanted < self._mode
-        if back and t - self._since < guard.dwell - TINY:
-            wanted = self._mode
-        self._next, self._why = wanted, why
+        if wanted < state.mode and t - state.since < guard.dwell - TINY:
+            wanted = state.mode
+        return replace(state, wanted=wanted, why=why, alarm=alarm, doubt=doubt, frozen=frozen)
 
-    def _in_doubt(self, t: float) -> bool:
-        """True while alarms come that have come for the time of patience."""
-        on = self._alarm == t or t - self._alarm < self._guard.quiet - TINY
-        return on and self._alarm - self._doubt >= self._guard.patience - TINY
+    @property
+    def _backup(self) -> SafeController:
+        own = None if self.guard is None else self.guard.backup
+        return self.safe if own is None else own
 
-    def _active(self, estimate: Estimate) -> tuple[SafeController, Estimate]:
-        backup = self._guard.backup
-        if self._mode is Mode.BACKUP and backup is not None and self._estimate is not None:
-            return backup, self._estimate
-        return self._safe, estimate
+    def _planner(self, safe: SafeController) -> Literal["controller", "backup"]:
+        return "controller" if safe is self.safe else "backup"
 
-    def _bounds(self, limits: Limits | None) -> Limits | None:
-        own = None if self._mode is Mode.NORMAL else self._guard.limits
-        return limits if own is None else own
+    def _active(self, state: GuardState, estimate: Estimate) -> tuple[SafeController, Estimate]:
+        if state.mode is Mode.BACKUP and state.backup is not None:
+            return self._backup, state.backup
+        return self.safe, estimate
 
-    def _own(self, decision: Decision, safe: SafeController) -> Decision:
-        """Notes whose plan this is."""
-        self._made = decision.solution, safe
-        return decision
+    def _bounds(self, state: GuardState) -> Limits | None:
+        return None if state.mode is Mode.NORMAL or self.guard is None else self.guard.limits
 
-    def _handed(self, previous: Decision, safe: SafeController, estimate: Estimate) -> Decision:
+    def _handed(
+        self, state: GuardState, previous: Decision, safe: SafeController, estimate: Estimate
+    ) -> tuple[Decision, GuardState]:
         """The decision before as one of ``safe``'s: its plan's inputs, run through the model of ``safe``."""
-        plan, owner = self._made
-        if plan is previous.solution and owner is safe:
-            return previous
+        planner = self._planner(safe)
+        if planner == state.planner:
+            return previous, state
         u = np.vstack([previous.solution.u[1:], previous.solution.u[-1:]])
         finite = replace(
             estimate, **{name: np.nan_to_num(getattr(estimate, name)) for name in ("x", "h", "d")}
         )
         following = safe.controller.initial(finite, u).delayed(previous.u)
-        return Decision(previous.u, previous.source, following, Status.INITIAL, 0)
+        decision = Decision(previous.u, previous.source, following, Status.INITIAL, 0)
+        return decision, replace(state, planner=planner)
 
     def _rest(self, previous: Decision, limits: Limits | None) -> Decision:
         """No input, as soon as ``du_max`` lets it be none."""
-        ocp = self._safe.controller.ocp
+        ocp = self.safe.controller.ocp
         u = ocp.saturate(np.zeros(ocp.n_u), previous.u, limits)
         plan = replace(previous.solution, u=np.tile(u, (ocp.horizon, 1)))
         return Decision(u, Source.ZERO, plan, Status.INITIAL, 0)

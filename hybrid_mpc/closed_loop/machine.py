@@ -38,9 +38,6 @@ class Machine:
         self, plant: Plant, x0: Array, seed: int, n_y: int, faults: Sequence[Fault], dt: float,
         sensor_delay: int, input_delay: int,
     ) -> None:  # fmt: skip
-        for name, delay in (("sensor_delay", sensor_delay), ("input_delay", input_delay)):
-            if int(delay) != delay or delay < 0:
-                raise InputError(f"{name}: a whole number of periods needed, not negative; got {delay}")
         self._plant, self._n_y, self._faults, self._dt = plant, n_y, faults, dt
         self._rng = np.random.default_rng(seed)
         self.state = plant.reset(x0, seed)

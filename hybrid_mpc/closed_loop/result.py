@@ -39,7 +39,7 @@ class ClosedLoopResult:
         status: Name of the :class:`~hybrid_mpc.mpc.Status` of each solve.
         stage_cost: Stage cost ``(n,)`` per second on the true state and the input that acts on it, with the
             weight factors of that instant and without penalties of soft bounds.
-        timing_ms: Durations ``(n,)`` [ms] of ``estimate``, ``solve``, ``monitor`` and ``total``. The only
+        timing_ms: Durations ``(n,)`` [ms] of ``estimate``, ``solve``, ``monitor``, ``prepare`` and ``total``. The only
             field in which two runs may differ.
         violation: Energy violation ``(n,)`` [W]; NaN without a monitor.
         level: Alarm level ``(n,)`` [W]; NaN without a monitor.

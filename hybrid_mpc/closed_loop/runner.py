@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.closed_loop.guard import Guard
-from hybrid_mpc.closed_loop.machine import Preview, Previews
+from hybrid_mpc.closed_loop.loop import Loop, Monitor
+from hybrid_mpc.closed_loop.machine import Preview
 from hybrid_mpc.closed_loop.run import Parts, Run
 from hybrid_mpc.closed_loop.safe_end import SafeEnd
-from hybrid_mpc.closed_loop.simulate import Monitor, check_models
-from hybrid_mpc.closed_loop.timing import Clock, RealClock, RunnerStep, RunReport
+from hybrid_mpc.closed_loop.timing import CheckedClock, Clock, RealClock, RunnerStep, RunReport
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation.delays import filtered, sees_truth
+from hybrid_mpc.estimation.delays import sees_truth
 from hybrid_mpc.estimation.kalman import Estimator
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.problem import Controller
@@ -28,8 +28,9 @@ Array = NDArray[np.float64]
 class Runner:
     """Steps estimator, controller and monitor against a machine's sensors and actuators, in real time.
 
-    Before the clock starts, while the machine rests: the first sample, and the first plan from it. Each period:
-    wait for its instant, measure, estimate, decide, actuate, then monitor. A missing sample leaves
+    It drives a :class:`~hybrid_mpc.closed_loop.Loop`. Before the clock starts, while the machine rests: the first
+    sample, and plan and input from it. Each period: wait for its instant, measure, estimate, decide, actuate, then what
+    the loop leaves until after the input (monitor, preparation of the next solve). A missing sample leaves
     the prediction. A solve that comes back after the deadline is dropped, and one that cannot be in time any more
     is not begun: the shifted plan is applied (:meth:`~hybrid_mpc.mpc.SafeController.late`). A solve that has begun
     is not interrupted. After a long delay the run goes on at the grid's nearest instant; the estimator is led
@@ -91,40 +92,25 @@ class Runner:
         keep: int = 100_000,
         guard: Guard | None = None,
     ) -> None:
-        safe = controller if isinstance(controller, SafeController) else SafeController(controller)
-        ocp, dt = safe.controller.ocp, estimator.model.dt
-        check_models(estimator.model, safe.controller.model)
         if sees_truth(estimator):
             raise InputError("Runner: a machine does not tell its true state; give a filter, not TrueState")
-        if abs(safe.controller.model.dt - dt) > 1e-9 * dt:
-            raise InputError(
-                f"Runner: the estimator's period is {dt} s, the controller's "
-                f"{safe.controller.model.dt} s; they must agree"
-            )
+        dt = estimator.model.dt
         due = dt if deadline is None else float(deadline)
         if not 0 < due <= dt * (1 + 1e-9):
             raise InputError(f"Runner: deadline must lie within the period of {dt} s, got {deadline} s")
-        delays = _whole(input_delay, "input_delay"), _whole(sensor_delay, "sensor_delay")
-        if guard is not None and monitor is None:
-            raise InputError("Runner: a guard acts on a monitor's alarms; give monitor= as well")
         if keep < 1:
             raise InputError(f"Runner: keep must be 1 or more periods, got {keep}")
-        self._ocp, self._reference, self._weight, self._horizon = ocp, reference, weight, horizon
-        self._safe_input = _checked_safe(safe_input, ocp)
-        self._parts = Parts(
-            measure,
-            actuate,
-            estimator,
-            safe,
-            monitor,
-            guard,
-            dt,
-            due,
-            *delays,
-            clock or RealClock(),
-            on_step,
-            keep,
-        )
+        self._clock = clock or RealClock()
+        self._parts = Parts(measure, actuate, due, on_step, keep)
+
+        def make(end: float, now: Callable[[], float]) -> Loop:
+            return Loop(
+                estimator, controller, monitor=monitor, reference=reference, weight=weight, guard=guard,
+                horizon=horizon, end=end, input_delay=input_delay, sensor_delay=sensor_delay, now=now,
+            )  # fmt: skip
+
+        self._dt, self._make = dt, make
+        self._safe_input = _checked_safe(safe_input, make(math.inf, self._clock.now).ocp)
 
     @property
     def safe_input(self) -> Array:
@@ -147,48 +133,34 @@ class Runner:
             SafeInputError: If the actuator did not take the safe input.
         """
         n = self._periods(duration, stop)
-        dt = self._parts.dt
-        previews = Previews(
-            self._reference, self._weight, self._ocp, self._horizon, dt, math.inf if n is None else n * dt
-        )
-        loop = Run(self._parts, previews)
+        clock = CheckedClock(self._clock, self._dt)
+        loop = self._make(math.inf if n is None else n * self._dt, clock.now)
+        run = Run(self._parts, loop, clock)
         ended = "duration"
         with SafeEnd(lambda: self._parts.actuate(self.safe_input)) as end:
             end.check()
-            self._warm_up(previews)
-            loop.begin()
-            while n is None or loop.k < n:
+            loop.warm_up()
+            run.begin()
+            while n is None or run.k < n:
                 end.check()
                 if stop is not None and stop():
                     ended = "stop"
                     break
-                loop.period()
-            loop.wait()
-        return loop.report(end.cause or ended)
+                run.period()
+            run.wait()
+        return run.report(end.cause or ended)
 
     def _periods(self, duration: float | None, stop: Callable[[], bool] | None) -> int | None:
         if duration is None:
             if stop is None:
                 raise InputError("Runner: give a duration [s], or a function stop() that ends the run")
             return None
-        dt = self._parts.dt
+        dt = self._dt
         if not (math.isfinite(duration) and round(duration / dt) >= 1):
             raise InputError(
                 f"Runner: duration {duration} s given; at least one period of {dt} s, and finite, needed"
             )
         return round(duration / dt)
-
-    def _warm_up(self, previews: Previews) -> None:
-        """Everything once before the clock runs, since first calls are slow; nothing remembers it."""
-        parts, y = self._parts, np.zeros(self._parts.estimator.model.n_y)
-        x_ref, factors = previews(parts.input_delay * parts.dt)
-        estimate = parts.estimator.start(y)
-        for _ in range(2):
-            decision = parts.safe.decide(parts.safe.initial(estimate), estimate, x_ref, factors)
-            parts.safe.late(decision, estimate, x_ref)
-            estimate = parts.estimator.update(estimate, y, decision.u)
-        if parts.monitor is not None:
-            parts.monitor.update(parts.monitor.initial(), y, decision.u, filtered(estimate))
 
 
 def _checked_safe(given: ArrayLike | None, ocp: OCP) -> Array:
@@ -196,9 +168,3 @@ def _checked_safe(given: ArrayLike | None, ocp: OCP) -> Array:
     if np.any(u < ocp.u_min) or np.any(u > ocp.u_max):
         raise InputError(f"Runner: safe_input {u} is outside the limits {ocp.u_min} to {ocp.u_max}")
     return u
-
-
-def _whole(delay: int, name: str) -> int:
-    if int(delay) != delay or delay < 0:
-        raise InputError(f"Runner: {name}: a whole number of periods needed, not negative; got {delay}")
-    return int(delay)

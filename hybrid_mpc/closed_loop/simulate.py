@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from time import perf_counter
-from typing import Any, Protocol
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.closed_loop.faults import Fault, check_channels, install
-from hybrid_mpc.closed_loop.guard import Guard, GuardedLoop
+from hybrid_mpc.closed_loop.guard import Guard, Switch
+from hybrid_mpc.closed_loop.loop import TIMED, Loop, Monitor, Reading, preview_of
 from hybrid_mpc.closed_loop.machine import Machine, Preview, Previews, fitting
 from hybrid_mpc.closed_loop.result import ClosedLoopResult
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation.delays import filtered, sees_truth
 from hybrid_mpc.estimation.kalman import Estimate, Estimator
-from hybrid_mpc.model import HybridModel
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.problem import Controller
 from hybrid_mpc.mpc.safeguard import Decision, SafeController
@@ -26,32 +24,6 @@ from hybrid_mpc.riccati import vector
 from hybrid_mpc.scenario import Plant
 
 Array = NDArray[np.float64]
-
-
-class Reading(Protocol):
-    """What a monitor says of one period."""
-
-    @property
-    def violation_w(self) -> float:
-        """Energy violation [W]."""
-
-    @property
-    def level_w(self) -> float:
-        """Level above which it counts [W]."""
-
-    @property
-    def alarm(self) -> bool:
-        """True while the monitor alarms."""
-
-
-class Monitor(Protocol):
-    """Watches a loop; pure, its memory is the state it returns."""
-
-    def initial(self) -> Any:
-        """State before the first period."""
-
-    def update(self, state: Any, y: Array, u_prev: Array, estimate: Estimate) -> tuple[Any, Reading]:
-        """State and reading after the measurement ``y``, with ``u_prev`` held before it."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +43,7 @@ def simulate(
     plant: Plant,
     estimator: Estimator,
     controller: SafeController | Controller,
-    reference: Preview,
+    reference: Preview | ArrayLike,
     *,
     dt: float,
     duration: float,
@@ -90,10 +62,8 @@ def simulate(
 ) -> ClosedLoopResult:
     """Run a plant under control; deterministic except for the recorded durations.
 
-    Before the first step the controller makes its first plan (:meth:`~hybrid_mpc.mpc.SafeController.initial`).
-    At ``t_k``: measure ``y_k``; estimate with ``y_k`` and ``u_{k-1}``; solve ``u_k``; monitor; hold ``u_k``.
-    No time passes between measuring and holding but the delays given. Input faults act behind the
-    controller, which is not told.
+    It drives a :class:`~hybrid_mpc.closed_loop.Loop` on a virtual clock. No time passes between measuring and
+    holding but the delays given. Input faults act behind the controller, which is not told.
 
     The preview reaches beyond the end of the run: reference and weight are asked for those times too. Where
     they are not finite there (a recording that ends), their last value within the run is held.
@@ -106,8 +76,7 @@ def simulate(
         plant: The machine.
         estimator: Filter, or :class:`~hybrid_mpc.estimation.TrueState`, which is handed the truth, undelayed.
         controller: A :class:`~hybrid_mpc.mpc.SafeController`; a bare controller is guarded without fallback.
-        reference: ``t (n,) -> x_ref (n, n_x)``, previewed over the horizon; with ``n_p`` more columns where the
-            economic stage cost has parameters (:meth:`~hybrid_mpc.mpc.Controller.solve`).
+        reference: ``t (n,) -> x_ref (n, n_x)`` or a set-point; see :class:`~hybrid_mpc.closed_loop.Loop`.
         dt: Period [s]; must be the models' own.
         duration: Length [s], rounded to whole periods.
         x0: Initial state ``(n_x,)``.
@@ -135,69 +104,46 @@ def simulate(
         result = simulate(plant, ekf, controller, task.reference, weight=task.weight, dt=0.02,
                           duration=task.duration, x0=task.x0, seed=0)
     """
-    safe = controller if isinstance(controller, SafeController) else SafeController(controller)
-    ocp, model = safe.controller.ocp, estimator.model
-    check_models(model, safe.controller.model)
-    n = _periods(dt, duration, model.dt, safe.controller.model.dt)
+    loop = Loop(
+        estimator, controller, monitor=monitor, reference=reference, weight=weight, guard=guard, horizon=horizon,
+        end=_end(dt, duration, estimator.model.dt), input_delay=input_delay, sensor_delay=sensor_delay,
+    )  # fmt: skip
+    ocp, model, n = loop.ocp, loop.model, round(duration / dt)
     plant, faults = install(plant, faults)
     check_channels(faults, model.n_y, ocp.n_u)
     cost = _checked_cost(ocp, ocp if stage_cost is None else stage_cost)
-    previews = Previews(reference, weight, ocp, horizon, dt, n * dt)
+    previews = Previews(preview_of(reference, ocp), weight, ocp, horizon, dt, n * dt)
     machine = Machine(
         plant, vector(x0, ocp.n_x, "x0"), seed, model.n_y, faults, dt, sensor_delay, input_delay
     )
-    guarded = _guarded(guard, safe, monitor)
-    control = safe if guarded is None else guarded
-    estimate: Estimate | None = None
-    decision: Decision | None = None
-    memory = monitor.initial() if monitor is not None else None
     record = _Record(dt)
     for k in range(n):
         t = k * dt
         x = fitting(plant.truth(machine.state), ocp.n_x, "the plant's truth")
         y = machine.measure(t)
-        seen = np.concatenate([x, plant.hidden(machine.state)]) if sees_truth(estimator) else y
-        x_ref, factors = previews(t + input_delay * dt)
-        if estimate is None or decision is None:  # the machine still rests: this is no part of a step
-            estimate = estimator.start(seen, t)
-            decision = control.initial(estimate, None, x_ref, factors)
-            machine.rest(decision.u)
-            clock = [perf_counter()]
+        truth = np.concatenate([x, plant.hidden(machine.state)])
+        in_time = None if late is None else partial(_is_in_time, late, t)
+        if k == 0:
+            loop.start(y, truth=truth, in_time=in_time)
+            machine.rest(loop.state.held[0])
         else:
-            clock = [perf_counter()]
-            estimate = estimator.update(estimate, seen, decision.u)
-        if guarded is not None:
-            guarded.measured(t, y, decision.u)
-        clock.append(perf_counter())
-        if late is not None and late(t):
-            decision = control.late(decision, estimate, x_ref)
-        else:
-            decision = control.decide(decision, estimate, x_ref, factors)
-        clock.append(perf_counter())
-        reading = None
-        if monitor is not None:
-            memory, reading = monitor.update(memory, y, machine.held_at_measurement(), filtered(estimate))
-            if guarded is not None:
-                guarded.watched(t, reading)
-        clock.append(perf_counter())
-        u, u_prev = machine.command(decision.u)
-        if input_delay:
-            x_ref, factors = previews(t)
+            loop.step(y, truth=truth, in_time=in_time)
+        u, u_prev = machine.command(loop.decision.u)
+        loop.finish()
+        x_ref, factors = previews(t) if input_delay else loop.previewed
         now_factors = 1.0 if factors is None else factors[0]
         with np.errstate(over="ignore", invalid="ignore"):  # an absurd reference costs infinitely much
             stage = float(cost.stage_cost(x, u, x_ref[0, : x.size], u - u_prev, now_factors))
-        step = Step(k, t, x, y, estimate, decision, reading)
-        record.add(step, x_ref[0, : x.size], stage, np.diff(clock) * 1e3)
+        step = Step(k, t, x, y, loop.estimate, loop.decision, loop.reading)
+        record.add(step, x_ref[0, : x.size], stage, loop.spent)
         if on_step is not None:
             on_step(step)
         machine.advance(t)
-    return record.result(guarded)
+    return record.result(loop.switches)
 
 
-def _guarded(guard: Guard | None, safe: SafeController, monitor: object | None) -> GuardedLoop | None:
-    if guard is not None and monitor is None:
-        raise InputError("a guard acts on a monitor's alarms; give monitor= as well")
-    return None if guard is None else guard.begin(safe)
+def _is_in_time(late: Callable[[float], bool], t: float) -> bool:
+    return not late(t)
 
 
 def _checked_cost(ocp: OCP, cost: OCP) -> OCP:
@@ -208,30 +154,19 @@ def _checked_cost(ocp: OCP, cost: OCP) -> OCP:
     return cost
 
 
-def check_models(estimated: HybridModel, controlled: HybridModel) -> None:
-    """Refuse an estimator and a controller whose models have other sizes.
+def _end(dt: float, duration: float, period: float) -> float:
+    """End of the run [s].
 
     Raises:
-        InputError: With both models' sizes.
+        InputError: If a time is not finite, the period another than the models', or the run shorter than one.
     """
-    sizes = [(m.n_x, m.n_h, m.n_u) for m in (estimated, controlled)]
-    if sizes[0] != sizes[1]:
-        raise InputError(
-            f"the estimator's model {estimated.name} has (n_x, n_h, n_u) = {sizes[0]}, "
-            f"the controller's model {controlled.name} {sizes[1]}; give both the same model"
-        )
-
-
-def _periods(dt: float, duration: float, *periods: float) -> int:
     if not (math.isfinite(duration) and math.isfinite(dt) and dt > 0):
         raise InputError(f"dt and duration must be finite and dt positive; got {dt} s and {duration} s")
-    for period in periods:
-        if not abs(dt - period) <= 1e-9 * period:
-            raise InputError(f"dt = {dt} s given, a model's period is {period} s; they must agree")
-    n = round(duration / dt)
-    if n < 1:
+    if not abs(dt - period) <= 1e-9 * period:
+        raise InputError(f"dt = {dt} s given, a model's period is {period} s; they must agree")
+    if round(duration / dt) < 1:
         raise InputError(f"duration {duration} s is shorter than one period of {dt} s")
-    return n
+    return round(duration / dt) * dt
 
 
 class _Record:
@@ -239,16 +174,15 @@ class _Record:
 
     def __init__(self, dt: float) -> None:
         self._dt = dt
-        self._rows: list[tuple[Step, Array, float, Array]] = []
+        self._rows: list[tuple[Step, Array, float, Mapping[str, float]]] = []
 
-    def add(self, step: Step, reference: Array, stage: float, spent: Array) -> None:
+    def add(self, step: Step, reference: Array, stage: float, spent: Mapping[str, float]) -> None:
         self._rows.append((step, reference, stage, spent))
 
-    def result(self, guarded: GuardedLoop | None) -> ClosedLoopResult:
+    def result(self, switches: tuple[Switch, ...]) -> ClosedLoopResult:
         steps = [row[0] for row in self._rows]
         readings = [step.reading for step in steps]
-        spent = np.array([row[3] for row in self._rows])
-        timing = {name: spent[:, i] for i, name in enumerate(("estimate", "solve", "monitor"))}
+        timing = {name: 1e3 * np.array([row[3][name] for row in self._rows]) for name in TIMED}
         return ClosedLoopResult(
             dt=self._dt,
             t=np.array([step.t for step in steps]),
@@ -262,10 +196,10 @@ class _Record:
             source=tuple(step.decision.source.name for step in steps),
             status=tuple(step.decision.status.name for step in steps),
             stage_cost=np.array([row[2] for row in self._rows]),
-            timing_ms={**timing, "total": spent.sum(axis=1)},
+            timing_ms={**timing, "total": np.sum(list(timing.values()), axis=0)},
             violation=np.array([np.nan if r is None else r.violation_w for r in readings]),
             level=np.array([np.nan if r is None else r.level_w for r in readings]),
             alarm=np.array([r is not None and bool(r.alarm) for r in readings]),
             judged=np.array([r is not None and not getattr(r, "verdict", 0) for r in readings]),
-            switches=() if guarded is None else tuple(guarded.switches),
+            switches=switches,
         )

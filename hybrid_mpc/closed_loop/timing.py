@@ -12,14 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.closed_loop.guard import Switch
-from hybrid_mpc.closed_loop.simulate import Reading
+from hybrid_mpc.closed_loop.loop import Reading
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.mpc.safeguard import Decision
 
 Array = NDArray[np.float64]
-TIMED = ("measure", "estimate", "solve", "actuate", "monitor")
+TIMED = ("measure", "estimate", "solve", "actuate", "monitor", "prepare")
+"""What of a period is timed, in this order: the input is out after ``actuate``."""
 QUANTILES = {"median": 0.5, "p95": 0.95, "p99": 0.99, "max": 1.0}
 EARLY = 1e-3
 """Share of a period by which a wait may end early: rounding, and what no controller notices."""
@@ -122,7 +123,7 @@ class RunnerStep:
         reading: What the monitor says, or None.
         lateness: Begin of the period after its instant on the grid [s].
         applied: Instant after the grid's at which the input had been handed over [s].
-        spent: Durations [s] of measure, estimate, solve, actuate, monitor.
+        spent: Durations [s] by the names of ``TIMED``.
     """
 
     k: int
@@ -133,7 +134,7 @@ class RunnerStep:
     reading: Reading | None
     lateness: float
     applied: float
-    spent: tuple[float, ...]
+    spent: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -157,7 +158,7 @@ class RunReport:
         status: Name of the :class:`~hybrid_mpc.mpc.Status` of each solve.
         lateness_ms: Begin of each period after its instant on the grid ``(n,)`` [ms].
         applied_ms: Instant after the grid's at which each input had been handed over ``(n,)`` [ms].
-        timing_ms: Durations ``(n,)`` [ms]: ``measure``, ``estimate``, ``solve``, ``actuate``, ``monitor``.
+        timing_ms: Durations ``(n,)`` [ms]: ``measure``, ``estimate``, ``solve``, ``actuate``, ``monitor``, ``prepare``.
         alarm: ``(n,)``, True while the monitor alarms.
         switches: Changes of the guard's mode in the whole run. Default: none.
     """
@@ -208,7 +209,6 @@ def make_report(
         stopped: See there.
         switches: See there.
     """
-    ms = 1e3 * np.array([s.spent for s in steps]).reshape(len(steps), len(TIMED))
     return RunReport(
         periods, sources, missing, late, overruns, skipped, stopped,
         t=np.array([s.t for s in steps]),
@@ -219,7 +219,7 @@ def make_report(
         status=tuple(s.decision.status.name for s in steps),
         lateness_ms=1e3 * np.array([s.lateness for s in steps]),
         applied_ms=1e3 * np.array([s.applied for s in steps]),
-        timing_ms={name: ms[:, i] for i, name in enumerate(TIMED)},
+        timing_ms={name: 1e3 * np.array([s.spent[name] for s in steps]) for name in TIMED},
         alarm=np.array([s.reading is not None and bool(s.reading.alarm) for s in steps], dtype=bool),
         switches=switches,
     )  # fmt: skip

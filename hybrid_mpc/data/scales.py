@@ -8,7 +8,6 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import savgol_coeffs, savgol_filter
 
 Array = NDArray[np.float64]
 FASTEST, SLOWEST = 0.25, 4.0
@@ -73,6 +72,8 @@ def speeds_of(recording: Outputs, dt: float, half: int, order: int = 1) -> Array
     window = 2 * half + 1
     if len(recording.y) < window:
         return np.zeros((0, recording.y.shape[1]))
+    from scipy.signal import savgol_filter  # slow to import, and monitors import this module
+
     found = savgol_filter(recording.y, window, 3, deriv=order, delta=dt, axis=0)[
         half : len(recording.y) - half
     ]
@@ -86,6 +87,8 @@ def speed_gain(dt: float, half: int, order: int = 1) -> float:
         >>> round(speed_gain(0.02, 5), 1)
         12.3
     """
+    from scipy.signal import savgol_coeffs
+
     return float(np.linalg.norm(savgol_coeffs(2 * half + 1, 3, deriv=order, delta=dt)))
 
 

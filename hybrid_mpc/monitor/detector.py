@@ -149,7 +149,7 @@ class Detector:
             v2: Squared speed of each degree of freedom ``(n, n_q)``; ``(n,)`` where there is one.
             u2: Squared length of the inputs ``(n,)``.
         """
-        squares = np.asarray(v2, dtype=np.float64).reshape(len(u2), -1)
+        squares = np.asarray(v2, dtype=np.float64).reshape(len(u2), len(self.force))
         return np.asarray(np.sqrt(force_terms(squares, u2, self.rest_speed) @ np.array(self.force).T))
 
     def update(

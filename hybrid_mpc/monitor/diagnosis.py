@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model import HybridModel
@@ -214,7 +214,7 @@ def explained(
         text: str, causes: tuple[Change, ...], others: tuple[Change, ...], misfit: float, freedom: float
     ) -> Diagnosis:
         freedom = max(freedom, 1.0)
-        p = float(chi2.sf(misfit, freedom))
+        p = float(chdtrc(freedom, misfit))
         return Diagnosis(
             text,
             causes,

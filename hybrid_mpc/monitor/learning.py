@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import nnls
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.monitor.calibration import block_maxima, calibrate, gumbel
@@ -156,6 +155,8 @@ def _scale(features: Array, values: Array, what: str) -> tuple[float, ...]:
         raise InputError(
             f"learn_detector: the {what} is zero or missing throughout; record the machine in motion"
         )
+    from scipy.optimize import nnls  # slow to import, and a running monitor does without
+
     floor = FLOOR * float(np.mean(squares))
     spread = np.full(squares.size, float(np.mean(squares)))
     found = np.zeros(features.shape[1])

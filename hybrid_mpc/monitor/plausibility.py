@@ -9,7 +9,6 @@ from typing import Protocol
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linprog
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model import HybridModel
@@ -273,6 +272,8 @@ def _quantile_regression(features: Array, values: Array, quantile: float) -> Arr
     n, m = features.shape
     cost = np.concatenate([np.zeros(m), np.full(n, quantile), np.full(n, 1.0 - quantile)])
     equality = np.hstack([features, np.eye(n), -np.eye(n)])
+    from scipy.optimize import linprog  # slow to import, and a running monitor does without
+
     found = linprog(cost, A_eq=equality, b_eq=values, bounds=(0, None), method="highs")
     if not found.success:
         raise InputError(f"plausibility: the quantile could not be fitted: {found.message}")

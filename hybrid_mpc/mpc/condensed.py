@@ -197,8 +197,13 @@ class CondensedController:
         self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,
         *, limits: Limits | None = None,
     ) -> Solution:  # fmt: skip
-        """:meth:`prepare` and :meth:`feedback`, linearised anew ``iterations`` times."""
-        prepared = self.prepare(previous, weight)
+        """:meth:`prepare` and :meth:`finish`."""
+        return self.finish(self.prepare(previous, weight), estimate, reference, limits)
+
+    def finish(
+        self, prepared: Prepared, estimate: Estimate, reference: Array, limits: Limits | None = None
+    ) -> Solution:
+        """:meth:`feedback`, then linearised anew until there have been ``iterations``; arguments as there."""
         solution = self.feedback(prepared, estimate, reference, limits)
         for i in range(1, self._iterations):
             if not solution.status.ok:

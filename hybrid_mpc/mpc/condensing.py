@@ -90,7 +90,9 @@ class Condenser:
         self._newest[self._stages, self._stages] = b.transpose(0, 2, 1)
         for before, a, after in zip(self._before, a_t[1:], self._after, strict=True):
             np.dot(before, a, out=after)
-        return self._states.reshape(self._shape)
+        return np.array(self._states, order="C").reshape(
+            self._shape
+        )  # what is prepared outlives the next call
 
     @property
     def by_inputs(self) -> Array:

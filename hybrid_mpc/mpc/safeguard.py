@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.model import HybridModel
+from hybrid_mpc.mpc.condensed import CondensedController
+from hybrid_mpc.mpc.condensing import Prepared
 from hybrid_mpc.mpc.limits import Limits
 from hybrid_mpc.mpc.problem import Controller
 from hybrid_mpc.mpc.solution import Solution, Status
@@ -27,6 +29,7 @@ class Source(Enum):
     PLAN = "the previous plan, shifted: the solve failed"
     FALLBACK = "the stabilising feedback on the prior: the solve failed and the plan is used up"
     ZERO = "zero within the limits: nothing else was finite"
+    MANUAL = "the operator"
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,7 @@ class SafeController:
             raise InputError(f"max_age must not be negative, got {max_age}")
         ocp = controller.ocp
         self._controller, self._max_age = controller, max_age
+        self._rti = controller if isinstance(controller, CondensedController) else None
         self._first = controller if first is None else first
         _check_first(self._first, controller)
         self._fallback = None
@@ -150,7 +154,7 @@ class SafeController:
 
     def decide(
         self, previous: Decision, estimate: Estimate, reference: Array, weight: Array | None = None,
-        *, limits: Limits | None = None,
+        *, limits: Limits | None = None, prepared: Prepared | None = None,
     ) -> Decision:  # fmt: skip
         """The input to hold from now on.
 
@@ -161,13 +165,29 @@ class SafeController:
             weight: Factors on ``q`` ``(m, n_x)``, as the reference. Default: 1.
             limits: Bounds of the inputs for this period, e.g. those of a guard; where ``du_max`` does not let the
                 input be within them at once, it goes there as fast as it may. Default: the problem's own.
+            prepared: What :meth:`prepare` made of ``previous`` and ``weight``. Default: it is made now.
         """
-        solution = self._controller.solve(previous.solution, estimate, reference, weight, limits=limits)
+        if prepared is not None and self._rti is not None:
+            solution = self._rti.finish(prepared, estimate, reference, limits)
+        else:
+            solution = self._controller.solve(previous.solution, estimate, reference, weight, limits=limits)
         if solution.status.ok:
             u = self._controller.ocp.saturate(solution.u[0], previous.u, limits)
             plan = replace(solution, u=np.vstack([u[None], solution.u[1:]]))
             return Decision(u, Source.MPC, plan, solution.status, 0)
         return self._without(previous, estimate, reference, solution, limits)
+
+    def prepare(self, previous: Decision, weight: Array | None = None) -> Prepared | None:
+        """The part of the next :meth:`decide` that needs no measurement, to be done while the input acts.
+
+        Args:
+            previous: The decision that the next one goes on from.
+            weight: Factors on ``q`` ``(m, n_x)`` of the next period. Default: 1.
+
+        Returns:
+            The linearisation, condensed; None for a solver without such a part.
+        """
+        return None if self._rti is None else self._rti.prepare(previous.solution, weight)
 
     def late(
         self, previous: Decision, estimate: Estimate, reference: Array, *, limits: Limits | None = None

@@ -181,7 +181,7 @@ def figures(
         assert control is not None
         limits, first = (control.u_min, control.u_max), firsts[task.name]
         some = next(iter(first.values()))[0]
-        drawn = {name: loops.Loop(r.t, r.x, r.u) for name, (r, _) in first.items()}
+        drawn = {name: loops.Motion(r.t, r.x, r.u) for name, (r, _) in first.items()}
         figure = loops.closed_loops(
             task.title, some.t, some.reference, drawn, states=model.states, inputs=model.inputs, limits=limits
         )

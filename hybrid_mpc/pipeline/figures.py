@@ -120,7 +120,7 @@ def _loops(context: Context) -> Any:
     for task in tasks_of(scenario, context.budget.tasks):
         names = {short: n for short, n in REPORTED.items() if f"{task.name}/{n}/t" in arrays}
         results = {
-            short: loops.Loop(*(arrays[f"{task.name}/{n}/{key}"] for key in ("t", "x", "u")))
+            short: loops.Motion(*(arrays[f"{task.name}/{n}/{key}"] for key in ("t", "x", "u")))
             for short, n in names.items()
         }
         control = task.control or scenario.control

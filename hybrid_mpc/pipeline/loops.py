@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hybrid_mpc.closed_loop.loop import Loop
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import ExtendedKalmanFilter
 from hybrid_mpc.estimation.switching import SwitchingFilter
@@ -263,20 +263,17 @@ def time_on_recording(
     trajectory: Trajectory,
     most: int,
 ) -> Array:
-    """Durations [ms] of estimate, solve and monitor on at most ``most`` recorded samples, without a plant.
+    """Durations [ms] of a loop's steps on at most ``most`` recorded samples, without a plant.
 
-    The controller is asked to hold the rest position from wherever the recording is; the estimator is told
-    the recorded input, not the controller's.
+    The controller is asked to hold the rest position from wherever the recording is; the loop is told
+    that the recorded input acted, not its own.
     """
-    ocp = controller.controller.ocp
-    target = np.zeros((ocp.horizon + 1, ocp.n_x))
-    estimate = estimator.start(trajectory.y[0])
-    decision, state = controller.initial(estimate), monitor.initial()
+    loop = Loop(estimator, controller, monitor=monitor)
+    loop.start(trajectory.y[0])
     durations = []
     for k in range(1, min(most, len(trajectory.t))):
-        begin = perf_counter()
-        estimate = estimator.update(estimate, trajectory.y[k], trajectory.u[k - 1])
-        decision = controller.decide(decision, estimate, target)
-        state, _ = monitor.update(state, trajectory.y[k], trajectory.u[k - 1], estimate)
-        durations.append(1e3 * (perf_counter() - begin))
+        loop.finish()
+        loop.step(trajectory.y[k], applied=trajectory.u[k - 1])
+        loop.finish()
+        durations.append(1e3 * sum(loop.spent.values()))
     return np.array(durations)

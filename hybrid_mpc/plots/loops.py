@@ -29,7 +29,7 @@ from hybrid_mpc.signals import Signal
 
 
 @dataclass(frozen=True)
-class Loop:
+class Motion:
     """One closed loop as a figure needs it.
 
     Args:
@@ -38,7 +38,7 @@ class Loop:
         u: Inputs ``(n, n_u)``, held between samples.
 
     Example:
-        >>> Loop(np.zeros(1), np.zeros((1, 2)), np.zeros((1, 1))).x.shape
+        >>> Motion(np.zeros(1), np.zeros((1, 2)), np.zeros((1, 1))).x.shape
         (1, 2)
     """
 
@@ -51,7 +51,7 @@ def closed_loops(
     title: str,
     t: Array,
     reference: Array,
-    results: Mapping[str, Loop],
+    results: Mapping[str, Motion],
     *,
     states: Sequence[Signal],
     inputs: Sequence[Signal],
@@ -77,7 +77,7 @@ def closed_loops(
     Example:
         >>> t, x, u = np.array([0.0, 0.1]), np.zeros((2, 2)), np.zeros((2, 1))
         >>> states, inputs = (Signal("q", "m"), Signal("v", "m/s")), (Signal("F", "N"),)
-        >>> figure = closed_loops("Rest", t, x, {"prior": Loop(t, x, u)}, states=states, inputs=inputs)
+        >>> figure = closed_loops("Rest", t, x, {"prior": Motion(t, x, u)}, states=states, inputs=inputs)
         >>> len(figure.axes)
         4
     """

@@ -27,7 +27,7 @@ Reference = Callable[[Array], Array]
 
 
 @dataclass(frozen=True)
-class Loop:
+class NominalLoop:
     """A loop to run.
 
     Args:
@@ -171,7 +171,7 @@ def run_together(
     switching: SwitchingFilter,
     safe: SafeController,
     monitor: EnergyMonitor,
-    loops: Sequence[Loop],
+    loops: Sequence[NominalLoop],
     periods: int,
 ) -> list[Trace]:
     """Run loops side by side; each is what :func:`~hybrid_mpc.closed_loop.simulate` runs from rest, to rounding.

@@ -26,7 +26,7 @@ from hybrid_mpc.pipeline.guards import make_adaptive_guard, make_resting_guard
 from hybrid_mpc.pipeline.monitor_job import stored_rest
 from hybrid_mpc.records import record
 from hybrid_mpc.scenario import ControlSpec, Task, load_scenario
-from hybrid_mpc.studies.lockstep import Loop, Trace, run_together
+from hybrid_mpc.studies.lockstep import NominalLoop, Trace, run_together
 from hybrid_mpc.studies.loops import ModelInput
 from hybrid_mpc.studies.monitor_plan import FAULT, GUARD, LEARN, LoopPlan, MonitorJob, MonitorStudy
 
@@ -124,7 +124,7 @@ class _Loops:
         assert isinstance(estimator, SwitchingFilter)
         assert self._scenario.plant is not None
         dt = self._model.dt
-        loops = [Loop(p.reference(self._task.reference), p.seed, p.faults(dt)) for p in plans]
+        loops = [NominalLoop(p.reference(self._task.reference), p.seed, p.faults(dt)) for p in plans]
         return run_together(
             self._scenario.plant(), estimator, controller, self._monitor(), loops,
             round(plans[0].duration / dt),

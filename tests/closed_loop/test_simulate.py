@@ -49,7 +49,7 @@ def test_the_record_has_a_row_for_every_period(model, safe):
     np.testing.assert_array_equal(result.x[0], [0.1, 0.0])
     assert np.all(np.isnan(result.violation))  # there is no monitor
     assert not result.alarm.any()
-    parts = [result.timing_ms[name] for name in ("estimate", "solve", "monitor")]
+    parts = [result.timing_ms[name] for name in ("estimate", "solve", "monitor", "prepare")]
     np.testing.assert_allclose(result.timing_ms["total"], np.sum(parts, axis=0), rtol=1e-12)
 
 

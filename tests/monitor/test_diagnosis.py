@@ -71,6 +71,8 @@ def test_nothing_is_nothing():
 
 def test_little_motion_says_so():
     assert "too little motion" in seen(pendulum(push=0.2), n=40).text
+    monitor = EnergyMonitor(pendulum(), window=11, average=5, detector=DETECTOR, history=4.0)
+    assert "too little motion" in Diagnoser(monitor).diagnose(monitor.initial()).text  # not one sample
 
 
 def test_what_the_motion_does_not_tell_apart_is_named():

@@ -188,5 +188,5 @@ def test_the_main_job_says_what_its_guard_lacks(finished):
     assert "Energy guard" in page
     assert "No detector could be learned" in page
     stored = load_artifact(finished / "model").calibration
-    assert "detector" not in stored
-    assert stored["plausibility"]["samples"] > 200
+    assert stored.detector is None
+    assert stored.plausibility.samples > 200

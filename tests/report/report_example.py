@@ -96,7 +96,7 @@ def loop_figure():
     reference = swing(t, 0.5)
     how = {"prior": 0.10, "hybrid": 0.03, "oracle": 0.01}
     results = {
-        name: loops.Loop(t, swing(t, 0.5, late=late), np.clip(0.3 * np.sin(2.4 * t + late), -0.25, 0.25))
+        name: loops.Motion(t, swing(t, 0.5, late=late), np.clip(0.3 * np.sin(2.4 * t + late), -0.25, 0.25))
         for name, late in how.items()
     }
     return loops.closed_loops(

@@ -16,7 +16,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.monitor import METHODS, Detector, Judges, guard_monitor
 from hybrid_mpc.pipeline.loops import make_controller, make_estimator
 from hybrid_mpc.studies import monitor_study as room
-from hybrid_mpc.studies.lockstep import Loop, run_together
+from hybrid_mpc.studies.lockstep import NominalLoop, run_together
 from hybrid_mpc.studies.monitor_plan import CASES, LoopPlan, MonitorStudy, monitor_study
 from hybrid_mpc.studies.monitor_results import roc
 from scenarios.golf_robot import scenario
@@ -31,7 +31,7 @@ def test_loops_together_are_loops_alone(golf_artifact):
     controller = make_controller(hybrid, models["prior"], control)
     reference, monitor = scenario.tasks[0].reference, guard_monitor(hybrid)
     drift = LoopPlan("drift_up", "task", 0, 0.3).faults(0.02)
-    plans = [Loop(reference, 4), Loop(lambda t: -reference(t), 5, drift)]
+    plans = [NominalLoop(reference, 4), NominalLoop(lambda t: -reference(t), 5, drift)]
     together = run_together(scenario.plant(), estimator, controller, monitor, plans, periods)
     for plan, trace in zip(plans, together, strict=True):
         seen = []
