@@ -79,7 +79,7 @@ def main() -> None:
             if task.name in given.task
             for seed in range(given.seeds)
         ]
-        for part in ("estimate", "solve", "monitor", "total"):
+        for part in ("estimate", "solve", "monitor", "prepare", "total"):
             spent = np.concatenate([loop[part] for loop in loops])
             row = {key: float(np.percentile(spent, share)) for key, share in SHARES.items()}
             rows.append({"estimator": kind, "part": part, "periods": spent.size, **row})
