@@ -106,7 +106,7 @@ def scalar_size(f: ca.Function) -> float:
     Example:
         >>> a, b = ca.MX.sym("a", 3, 4), ca.MX.sym("b", 4)
         >>> scalar_size(ca.Function("f", [a, b], [a @ b]))
-        24.0
+        27.0
     """
     if not f.is_a("MXFunction"):
         return float(f.n_instructions()) if f.is_a("SXFunction") else 0.0
