@@ -133,12 +133,12 @@ def test_a_cart_is_brought_to_what_its_limits_allow(carts, limits):
         result = simulate(
             Track(model.step), make_estimator(model, machine, np.array([1e-5, 1e-4])),
             make_controller(model, model, control), lambda t, place=place: np.tile([place, 0.0], (len(t), 1)),
-            dt=model.dt, duration=8.0, x0=[0.0, 0.0], seed=0,
+            dt=model.dt, duration=14.0, x0=[0.0, 0.0], seed=0,
         )  # fmt: skip
         assert set(result.source) == {"MPC"}
         assert np.all((result.u >= limits[0]) & (result.u <= limits[1]))
-        # 30 mm: the weight of the input pulls a little, and a start against the limit swings on for a while
-        assert abs(result.x[-10:, 0].mean() - np.clip(place, *limits)) < 0.03
+        # Against a limit the cart swings out freely, in 2 pi s; 30 mm: and the weight of the input pulls a little.
+        assert abs(result.x[-63:, 0].mean() - np.clip(place, *limits)) < 0.03
 
 
 @pytest.mark.parametrize(
