@@ -141,7 +141,7 @@ class Loops:
         if (name, control) not in self._built:
             model = self.models[name]
             self._built[name, control] = (
-                make_estimator(model, control, np.array(SIGMA_X)),
+                make_estimator(model, scenario, np.array(SIGMA_X), control),
                 make_controller(model, self.models["prior"], control),
             )
         return self._built[name, control]

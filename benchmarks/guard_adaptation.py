@@ -31,7 +31,6 @@ from hybrid_mpc.monitor import guard_monitor
 from hybrid_mpc.pipeline import make_adaptive_guard, make_controller, make_estimator
 from hybrid_mpc.pipeline.monitor_job import read_detector
 from scenarios.golf_robot import scenario
-from scenarios.golf_robot.faults import CAUSES
 from scenarios.golf_robot.tasks import CONTROL
 
 CASES = ("none", "friction_x2", "mass_+50", "mass_+20", "motor_-20", "push")
@@ -46,10 +45,10 @@ class Arms:
     def __init__(self, artifact, noise, detector) -> None:
         hybrid, prior = artifact.models["hybrid"], artifact.models["prior"]
         sigma_x = np.array(noise["hybrid_observer"])
-        self.estimator = make_estimator(hybrid, CONTROL, sigma_x)
+        self.estimator = make_estimator(hybrid, scenario, sigma_x)
         self.controller = make_controller(hybrid, prior, CONTROL)
         self.monitor = guard_monitor(hybrid, detector, resolution=[RESOLUTION])
-        self.guard = make_adaptive_guard(hybrid, prior, CONTROL, sigma_x, CAUSES)
+        self.guard = make_adaptive_guard(hybrid, prior, scenario, sigma_x)
         self.adaptive, self.filter = self.guard.backup, self.guard.backup_estimator
 
     def run(self, plan: Plan, arm: str):
@@ -66,7 +65,7 @@ def figures(plan: Plan, result) -> dict:
     """What counts of a loop; costs before the fault, in the half second after it, and later."""
     onset = round(plan.onset / DT)
     parts = np.split(DT * result.stage_cost, [onset, onset + 25])
-    beyond = np.maximum(np.abs(result.x) - np.array(CONTROL.x_max), 0.0).max(axis=0)
+    beyond = np.maximum(np.abs(result.x) - CONTROL.x_max, 0.0).max(axis=0)
     return {
         "cost": result.cost,
         "before": float(parts[0].sum()),

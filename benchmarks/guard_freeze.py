@@ -45,10 +45,10 @@ def main() -> None:
     hybrid, prior = artifact.models["hybrid"], artifact.models["prior"]
     noise, _ = find_noise(scenario, artifact, given.model, ("hybrid_observer",), 0, None)
     judges = record(Judges, read_json(given.study / "judges.json"), "judges.json")
-    told = {**freezing(CONTROL), "resolution": judges.resolution}
+    told = {**freezing(scenario, CONTROL), "resolution": judges.resolution}
     monitor = guard_monitor(hybrid, judges.detector_at(RATE), **told)
     parts = (
-        make_estimator(hybrid, CONTROL, np.asarray(noise["hybrid_observer"])),
+        make_estimator(hybrid, scenario, np.asarray(noise["hybrid_observer"])),
         make_controller(hybrid, prior, CONTROL),
     )
     after, beyond = [], []

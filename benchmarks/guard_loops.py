@@ -11,7 +11,7 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -92,9 +92,9 @@ class Loops:
 
     def __init__(self, artifact: Artifact, sigma_x, keep: Path | None, say=print) -> None:
         self._models, self._keep, self._say = artifact.models, keep, say
-        self._control = replace(CONTROL, x_min=(-0.85, -2.5), x_max=(0.85, 2.5))
+        self._control = CONTROL.changed(x_min=(-0.85, -2.5), x_max=(0.85, 2.5))
         hybrid = self._models["hybrid"]
-        self._estimator = make_estimator(hybrid, self._control, np.asarray(sigma_x))
+        self._estimator = make_estimator(hybrid, scenario, np.asarray(sigma_x))
         self._controller = make_controller(hybrid, self._models["prior"], self._control)
 
     def run(self, plan: Plan) -> dict:

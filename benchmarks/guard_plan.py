@@ -31,7 +31,7 @@ from hybrid_mpc.closed_loop import simulate
 from hybrid_mpc.data.trajectories import load_trajectories
 from hybrid_mpc.files import read_json, write_json
 from hybrid_mpc.monitor import Plausibility, excess_bound, learn_plausibility, region_bound
-from hybrid_mpc.mpc import OCP, CondensedController, SafeController, SQPController
+from hybrid_mpc.mpc import CondensedController, SafeController, SQPController
 from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_ocp
 from hybrid_mpc.records import record
 from scenarios.golf_robot import scenario
@@ -43,11 +43,7 @@ ARMS = ("free", "bounds", "quantile", "excess", "region")
 
 def bounded(hybrid, prior, soft) -> SafeController:
     """The main job's controller with soft bounds."""
-    c = CONTROL
-    ocp = OCP(
-        c.horizon, c.q, c.r, c.r_delta, c.u_min, c.u_max, c.du_max, "riccati", make_ocp(prior, c).working_point,
-        c.x_min, c.x_max, soft=soft,
-    )  # fmt: skip
+    ocp = make_ocp(prior, CONTROL).changed(soft=soft)
     return SafeController(CondensedController(hybrid, ocp), prior, first=SQPController(hybrid, ocp))
 
 
@@ -56,7 +52,7 @@ class Rig:
 
     def __init__(self, artifact, sigma_x, ordinary) -> None:
         hybrid, prior = artifact.models["hybrid"], artifact.models["prior"]
-        self.estimator = make_estimator(hybrid, CONTROL, sigma_x)
+        self.estimator = make_estimator(hybrid, scenario, sigma_x)
         bounds = excess_bound(hybrid, ordinary), region_bound(hybrid, ordinary)
         self.bounds = [b.expression.map(CONTROL.horizon) for b in bounds]
         self.upper = [b.upper[:, None] for b in bounds]

@@ -41,7 +41,7 @@ class Arms:
 
     def __init__(self, artifact, noise, detector) -> None:
         hybrid, prior = artifact.models["hybrid"], artifact.models["prior"]
-        self.estimator = make_estimator(hybrid, CONTROL, np.array(noise["hybrid_observer"]))
+        self.estimator = make_estimator(hybrid, scenario, np.array(noise["hybrid_observer"]))
         self.controller = make_controller(hybrid, prior, CONTROL)
         self.monitor = guard_monitor(hybrid, detector, resolution=[RESOLUTION])
         limits = Limits([-TIGHT], [TIGHT])
@@ -62,7 +62,7 @@ class Arms:
 
 def figures(result) -> dict:
     """What counts of a loop."""
-    beyond = np.maximum(np.abs(result.x) - np.array(CONTROL.x_max), 0.0).max(axis=0)
+    beyond = np.maximum(np.abs(result.x) - CONTROL.x_max, 0.0).max(axis=0)
     slew = float(np.abs(np.diff(result.u, axis=0)).max())
     return {
         "cost": result.cost,

@@ -56,7 +56,7 @@ def read(folder: Path, model):
 def judge(model, sigma_x, data, rate: float = RATE) -> list[HeldOut]:
     """Every recording, by the detector of the others."""
     return leave_one_out(
-        model, make_estimator(model, scenario.control, np.asarray(sigma_x)), data.whole, CLEAN,
+        model, make_estimator(model, scenario, np.asarray(sigma_x)), data.whole, CLEAN,
         false_alarms_per_hour=rate, resolution=[RESOLUTION], block_s=BLOCK_S, data_hash=data.hash,
     )  # fmt: skip
 

@@ -53,7 +53,7 @@ def swings(error, size: float) -> int:
 
 def one(model, sigma_x, step: float) -> ExtendedKalmanFilter:
     """A filter whose disturbance steps by a share of the input's range a period."""
-    span, sigma_y = CONTROL.input_range[0], CONTROL.estimator_sigma[0]
+    span, sigma_y = CONTROL.input_range[0], scenario.sensor_sigma[0]
     return ExtendedKalmanFilter(
         model, sigma_y=[sigma_y], sigma_x=sigma_x, sigma_d=[step * span], sigma_x0=[sigma_y, 0.1],
         sigma_d0=[FIRST_LOAD * span],
@@ -66,7 +66,7 @@ def held(
     """Figures of one loop."""
     model = models[name]
     noise = np.array(sigma_x)
-    estimator = make_estimator(model, CONTROL, noise) if step is None else one(model, noise, step)
+    estimator = make_estimator(model, scenario, noise) if step is None else one(model, noise, step)
     result = simulate(
         scenario.plant(), estimator, make_controller(model, models["prior"], CONTROL),
         lambda t: np.tile([angle, 0.0], (len(t), 1)), dt=DT, duration=seconds, x0=np.array([angle, 0.0]), seed=seed,

@@ -67,8 +67,10 @@ def main() -> None:
     noise = json.loads(given.noise.read_text())["sigma_x"] if given.noise else {}
     sigma_x = np.array(noise.get("hybrid_observer", SIGMA_X))
     kinds = {
-        "switching": lambda control: make_estimator(models["hybrid"], control, sigma_x),
-        "single": lambda control: make_estimator(models["hybrid"], control, sigma_x, observer=False),
+        "switching": lambda control: make_estimator(models["hybrid"], scenario, sigma_x, control),
+        "single": lambda control: make_estimator(
+            models["hybrid"], scenario, sigma_x, control, observer=False
+        ),
     }
     rows = []
     print("| estimator | part | median | 95 % | 99 % | largest |\n| --- | --- | ---: | ---: | ---: | ---: |")

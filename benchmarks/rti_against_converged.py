@@ -64,7 +64,7 @@ def looped(models, task, name: str, sigma_x, seeds, finer: int = 1) -> list[dict
     for seed in seeds:
         begin = perf_counter()
         result = simulate(
-            rig(finer), make_estimator(model, control, np.array(sigma_x)), safe, task.reference,
+            rig(finer), make_estimator(model, scenario, np.array(sigma_x), control), safe, task.reference,
             weight=task.weight, dt=model.dt, duration=task.duration, x0=np.array(task.x0), seed=seed,
             faults=task.faults,
         )  # fmt: skip

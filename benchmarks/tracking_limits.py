@@ -62,7 +62,7 @@ def costs(models: dict[str, HybridModel], name: str, kind: str, noise, task, see
     estimator = (
         TrueX(model)
         if kind == "truth"
-        else make_estimator(model, control, np.array(noise[key]), observer=kind == "observer")
+        else make_estimator(model, scenario, np.array(noise[key]), control, observer=kind == "observer")
     )
     controller = make_controller(model, models["prior"], control)
     return [

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 from hybrid_mpc.data_spec import DataSpec, Window
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.scenario import Budget, ControlSpec, Scenario, Task
+from hybrid_mpc.scenario import Budget, Scenario, Task
 from hybrid_mpc.signals import Parameter, Signal
 
 if TYPE_CHECKING:
+    from hybrid_mpc.mpc.ocp import OCP
     from hybrid_mpc.physics import Prior
 
 try:
@@ -20,8 +21,8 @@ except PackageNotFoundError:  # a source tree that was never installed
     __version__ = "0+unknown"
 
 __all__ = [
+    "OCP",
     "Budget",
-    "ControlSpec",
     "DataSpec",
     "InputError",
     "Parameter",
@@ -39,4 +40,8 @@ def __getattr__(name: str) -> Any:
         from hybrid_mpc.physics import Prior
 
         return Prior
+    if name == "OCP":  # and casadi by whoever states a problem
+        from hybrid_mpc.mpc.ocp import OCP
+
+        return OCP
     raise AttributeError(f"module 'hybrid_mpc' has no attribute {name!r}")

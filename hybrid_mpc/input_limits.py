@@ -14,13 +14,14 @@ def input_limits(u_min: ArrayLike, u_max: ArrayLike, n_u: int) -> tuple[Array, A
     """Limits ``(n_u,)`` of the inputs that do not cross; ``-inf`` and ``inf`` for none.
 
     Raises:
-        InputError: If there is another number of them, one is NaN, or a lower one is not below its upper one.
+        InputError: If there is another number of them, one is NaN or no number, or a lower one is not below its upper
+            one.
 
     Example:
         >>> input_limits((0.0,), (5.0,), 1)
         (array([0.]), array([5.]))
     """
-    lower, upper = np.asarray(u_min, dtype=float).ravel(), np.asarray(u_max, dtype=float).ravel()
+    lower, upper = numbers(u_min, "u_min"), numbers(u_max, "u_max")
     if lower.shape != (n_u,) or upper.shape != (n_u,):
         raise InputError(f"u_min has {lower.size} and u_max {upper.size} values, {n_u} needed")
     if not np.all(lower < upper):
@@ -28,6 +29,22 @@ def input_limits(u_min: ArrayLike, u_max: ArrayLike, n_u: int) -> tuple[Array, A
             f"input bounds cross: u_min {lower}, u_max {upper}; every u_min must be below its u_max"
         )
     return lower, upper
+
+
+def numbers(values: ArrayLike, name: str) -> Array:
+    """Numbers in a row ``(n,)``, a copy; infinite ones and NaN too.
+
+    Raises:
+        InputError: If they are no numbers.
+
+    Example:
+        >>> numbers((1, 2), "q")
+        array([1., 2.])
+    """
+    try:
+        return np.array(values, dtype=float).ravel()
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: numbers needed, got {values!r}") from error
 
 
 def at_rest(lower: ArrayLike, upper: ArrayLike) -> Array:

@@ -1,10 +1,15 @@
-"""Dataclasses to plain data and back: what JSON, YAML and checkpoints hold is checked field by field when read."""
+"""Dataclasses to plain data and back: what JSON, YAML and checkpoints hold is checked field by field when read.
+
+Expressions (CasADi functions of scalar operations) are written as programs of ``nn_export``, operators and numbers, and
+built again when they are read: nothing in the data can execute.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
 import math
+import sys
 import types
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -31,7 +36,10 @@ def plain(value: Any) -> Any:
     """``value`` in JSON's own types.
 
     Dataclasses and mappings become objects, sequences and arrays lists, paths texts, and numbers that JSON does not
-    know ``"inf"``, ``"-inf"`` and ``"nan"``.
+    know ``"inf"``, ``"-inf"`` and ``"nan"``. A CasADi function becomes the program that it states.
+
+    Raises:
+        InputError: If a CasADi function cannot be stated as a program, with what hinders it.
 
     Example:
         >>> plain({"x": np.array([1.0, np.inf]), "where": Path("a")})
@@ -49,15 +57,33 @@ def plain(value: Any) -> Any:
         return str(value)
     if isinstance(value, Path):
         return str(value)
+    if type(value) is _function():
+        return _stated(value)
     return value
+
+
+def _function() -> Any:
+    """The type of expressions; where casadi is not loaded there are none."""
+    casadi = sys.modules.get("casadi")
+    return None if casadi is None else casadi.Function
+
+
+def _stated(function: Any) -> Any:
+    from nn_export import ExportError, program_of
+    from nn_export.program import to_json
+
+    try:
+        return to_json(program_of(function))
+    except ExportError as error:
+        raise InputError(f"an expression that is to be written: {error}") from error
 
 
 def record(kind: type[T], data: object, where: str) -> T:
     """The dataclass ``kind`` from plain data, as :func:`plain` makes it or a user writes it.
 
-    Every field is held against its annotation: numbers, texts, flags, None, ``Literal``, tuples, sequences, mappings
-    with text keys, unions of these, and dataclasses of them. A whole number fits a float; ``"inf"``, ``"-inf"`` and
-    ``"nan"`` are floats too. ``Any`` takes everything.
+    Every field is held against its annotation: numbers, texts, flags, None, ``Literal``, tuples, sequences, arrays,
+    mappings with text keys, expressions, unions of these, and dataclasses of them. A whole number fits a float;
+    ``"inf"``, ``"-inf"`` and ``"nan"`` are floats too. ``Any`` takes everything.
 
     Args:
         kind: The dataclass.
@@ -183,6 +209,12 @@ def _value(kind: Any, value: object, where: str, problems: list[str]) -> Any:
         fits, needed = _SIMPLE[kind]
         if (found := fits(value)) is not None:
             return found[0]
+    elif origin is np.ndarray:
+        if (array := _array(value)) is not None:
+            return array
+        needed = "numbers in a list, or in lists of the same length,"
+    elif kind is _function():
+        return _expression(value, where, problems)
     elif dataclasses.is_dataclass(kind):
         return _dataclass(kind, value, where, problems)  # type: ignore[arg-type]
     elif origin in (tuple, list, Sequence) or kind in (tuple, list, Sequence):
@@ -235,6 +267,38 @@ def _sequence(kind: Any, value: object, where: str, problems: list[str]) -> Any:
     return make(
         _value(k, v, f"{where}[{i}]", problems) for i, (k, v) in enumerate(zip(kinds, value, strict=True))
     )
+
+
+def _array(value: object) -> Any:
+    """Lists of numbers as an array; None where they are none, or differ in length."""
+    if isinstance(value, np.ndarray):
+        return value.astype(np.float64) if value.dtype.kind in "iuf" else None
+    if not isinstance(value, list | tuple) or not value:
+        return np.zeros(0) if isinstance(value, list | tuple) else None
+    if not isinstance(value[0], list | tuple):
+        numbers = [_float(v) for v in value]
+        return None if None in numbers else np.array([found[0] for found in numbers if found is not None])
+    parts = [_array(v) for v in value if isinstance(v, list | tuple)]
+    fit = [part for part in parts if part is not None and part.shape == getattr(parts[0], "shape", None)]
+    return np.stack(fit) if len(fit) == len(value) else None
+
+
+def _expression(value: object, where: str, problems: list[str]) -> Any:
+    """A CasADi function from the program that it states, in scalar code."""
+    from nn_export import ExportError, build
+    from nn_export.program import from_json
+
+    if type(value) is _function():
+        return value
+    try:
+        return build(from_json(value, {}, "program")).expand()
+    except ExportError as error:
+        problems.append(f"{where}: {error}")
+    except RuntimeError as error:  # an operator that CasADi has for matrices alone
+        problems.append(
+            f"{where}: a program of scalar operators is needed: {str(error).strip().splitlines()[-1]}"
+        )
+    return None
 
 
 def _float(value: object) -> tuple[float] | None:

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import LinAlgError, solve_discrete_are
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.input_limits import numbers
 from hybrid_mpc.model import HybridModel
 
 Array = NDArray[np.float64]
@@ -55,6 +55,8 @@ def dare(a: ArrayLike, b: ArrayLike, q: ArrayLike, r: ArrayLike) -> tuple[Array,
         >>> round(float(p[0, 0]), 6), round(float(k[0, 0]), 6)
         (1.618034, 0.618034)
     """
+    from scipy.linalg import solve_discrete_are  # takes longer to import than all else that problems need
+
     a, b, q, r = (np.atleast_2d(np.asarray(m, dtype=float)) for m in (a, b, q, r))
     hint = "check the pair (A, B), give every undamped state a positive q and every input a positive r"
     if not all(np.all(np.isfinite(m)) for m in (a, b, q, r)):
@@ -63,7 +65,7 @@ def dare(a: ArrayLike, b: ArrayLike, q: ArrayLike, r: ArrayLike) -> tuple[Array,
         p = solve_discrete_are(a, b, q, r)
         p = 0.5 * (p + p.T)
         k = np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a)
-    except (LinAlgError, ValueError) as error:
+    except (np.linalg.LinAlgError, ValueError) as error:
         raise InputError(f"the Riccati equation has no stabilising solution ({error}); {hint}") from error
     radius = float(np.max(np.abs(np.linalg.eigvals(a - b @ k))))
     if not radius < 1.0:
@@ -156,13 +158,13 @@ def vector(value: ArrayLike, size: int, name: str) -> Array:
     """``value`` as a finite float vector ``(size,)``.
 
     Raises:
-        InputError: If it has another size or holds a NaN or an infinite value.
+        InputError: If it has another size or holds a NaN, an infinite value or what is no number.
 
     Example:
         >>> vector([1, 2], 2, "q")
         array([1., 2.])
     """
-    array = np.asarray(value, dtype=float).ravel()
+    array = numbers(value, name)
     if array.shape != (size,):
         raise InputError(f"{name}: {array.size} values given, {size} needed")
     if not np.all(np.isfinite(array)):

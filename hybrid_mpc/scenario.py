@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from hybrid_mpc.benchmark_spec import BenchmarkSpec, check_anchors
 from hybrid_mpc.data_spec import DataSpec
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.input_limits import at_rest, input_limits
 
 if TYPE_CHECKING:
     from hybrid_mpc.closed_loop.faults import Fault
     from hybrid_mpc.closed_loop.result import ClosedLoopResult
     from hybrid_mpc.model import HybridModel
+    from hybrid_mpc.mpc.ocp import OCP
     from hybrid_mpc.physics import Prior
     from hybrid_mpc.reproduction.experiment import Experiment
 
@@ -48,76 +48,6 @@ class Plant(Protocol):
 
     def hidden(self, state: Any) -> Array:
         """True internal states ``(n_h,)`` in the order of the scenario's oracle model (may be empty)."""
-
-
-@dataclass(frozen=True)
-class ControlSpec:
-    """The optimal control problem that all controllers of a scenario share.
-
-    Args:
-        horizon: Number of model periods in the horizon.
-        q: Weight of each state's deviation from its reference, ``(n_x,)`` [1/unit^2].
-        r: Weight of each input, ``(n_u,)`` [1/unit^2].
-        r_delta: Weight of each input change per period, ``(n_u,)`` [1/unit^2].
-        u_min: Lower input bounds ``(n_u,)``, of any sign; finite, since by the range of an input observer, guard and
-            demonstrations know what is much (an :class:`~hybrid_mpc.mpc.OCP` of your own may do without).
-        u_max: Upper input bounds ``(n_u,)``, finite and above ``u_min``.
-        du_max: Largest input change per period ``(n_u,)``; default: none.
-        estimator_sigma: Standard deviations that the estimator is to assume, ``(n_y,)`` [output units].
-        first_speed_sigma: Standard deviations of the speeds at the estimator's start, ``(n_x - n_y,)`` [state units].
-            Default: ``sqrt(2) estimator_sigma / dt``, what the first two samples tell: a start at rest then counts as
-            much as they do, and after five samples of a start in motion it has 5 % of the weight.
-        x_min: Soft lower bounds of the states ``(n_x,)``; ``-inf`` for none. Default: none.
-        x_max: Soft upper bounds of the states ``(n_x,)``; ``inf`` for none. Default: none.
-        slack_linear: Linear penalties of their violation ``(n_x,)``. Default: that of :class:`~hybrid_mpc.mpc.OCP`.
-        slack_quadratic: Quadratic penalties ``(n_x,)``, positive. Default: that of the OCP.
-        around: State ``(n_x,)`` near which the machine works, for terminal weight and fallback. Default: zero.
-        starts: Inputs, each ``(horizon, n_u)``, from which the first plan is sought besides none, for a task with
-            several ways (a swing-up); the cheapest plan is taken. Default: none.
-
-    Raises:
-        InputError: If the inputs' bounds have another number than ``r``, cross, or are not finite.
-
-    Example:
-        >>> heater = ControlSpec(20, (1.0,), (0.1,), (0.1,), u_min=(0.0,), u_max=(5.0,))
-        >>> heater.input_range, heater.rest_input
-        (array([5.]), array([0.]))
-    """
-
-    horizon: int
-    q: tuple[float, ...]
-    r: tuple[float, ...]
-    r_delta: tuple[float, ...]
-    u_min: tuple[float, ...]
-    u_max: tuple[float, ...]
-    du_max: tuple[float, ...] | None = None
-    estimator_sigma: tuple[float, ...] = ()
-    x_min: tuple[float, ...] | None = None
-    x_max: tuple[float, ...] | None = None
-    slack_linear: tuple[float, ...] | None = None
-    slack_quadratic: tuple[float, ...] | None = None
-    around: tuple[float, ...] | None = None
-    starts: tuple[tuple[tuple[float, ...], ...], ...] = ()
-    first_speed_sigma: tuple[float, ...] | None = None
-
-    def __post_init__(self) -> None:
-        limits = input_limits(self.u_min, self.u_max, len(self.r))
-        for name, values in zip(("u_min", "u_max"), limits, strict=True):
-            if not np.all(np.isfinite(values)):
-                raise InputError(
-                    f"control: {name} {tuple(values.tolist())} given; finite bounds needed, since the noise of the "
-                    "observer is a share of each input's range. Give what the drive can do."
-                )
-
-    @property
-    def input_range(self) -> Array:
-        """Range ``(n_u,)`` of each input, upper less lower bound."""
-        return np.subtract(self.u_max, self.u_min)
-
-    @property
-    def rest_input(self) -> Array:
-        """Zero, or the bound next to it ``(n_u,)``."""
-        return at_rest(self.u_min, self.u_max)
 
 
 @dataclass(frozen=True)
@@ -151,7 +81,7 @@ class Task:
     x0: tuple[float, ...]
     reference: Callable[[Array], Array]
     weight: Callable[[Array], Array] | None = None
-    control: ControlSpec | None = None
+    control: OCP | None = None
     faults: tuple[Fault, ...] = ()
     figures: Callable[[ClosedLoopResult], dict[str, float]] | None = None
 
@@ -207,7 +137,13 @@ class Scenario:
         make_data: ``(folder, seed, budget name) -> CSV or npz paths`` for a simulated machine; default: none.
         plant: ``() -> Plant``; default: none (then there is no closed loop, only timing).
         oracle: ``(dt) -> HybridModel`` with the plant's own equations, its hidden states as ``h``.
-        control: The optimal control problem; default: none.
+        control: The control problem that all controllers share; default: none.
+        sensor_sigma: Standard deviations of the sensors ``(n_y,)`` [output units], as estimators assume them. Needed
+            where there is a control problem.
+        first_sigma: Standard deviations of the states that are not measured ``(n_x - n_y,)`` [state units] at the
+            estimator's start. Default: ``sqrt(2) sensor_sigma / dt``, what the first two samples tell of speeds: a
+            start at rest then counts as much as they do, and after five samples of a start in motion it has 5 % of the
+            weight.
         tasks: Closed-loop tasks.
         budgets: Effort by name.
         draw: ``x (n_x,) -> polylines (m, 2) [m]`` of the machine, for moving pictures; default: none.
@@ -233,7 +169,9 @@ class Scenario:
     make_data: Callable[[Path, int, str], list[Path]] | None = None
     plant: Callable[[], Plant] | None = None
     oracle: Callable[[float], HybridModel] | None = None
-    control: ControlSpec | None = None
+    control: OCP | None = None
+    sensor_sigma: tuple[float, ...] = ()
+    first_sigma: tuple[float, ...] | None = None
     tasks: tuple[Task, ...] = ()
     budgets: Mapping[str, Budget] = field(default_factory=lambda: DEFAULT_BUDGETS)
     draw: Callable[[Array], Sequence[Array]] | None = None

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from nn_export.codegen import CFiles, compile_function, generate_c
     from nn_export.comparison import ParityReport, parity
     from nn_export.errors import ExportError, ProgramError
+    from nn_export.expressions import program_of
     from nn_export.graph import build
     from nn_export.horizon import fold, unroll
     from nn_export.jacobian import with_jacobian
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 __all__ = [
     "to_casadi",
     "trace",
+    "program_of",
     "build",
     "with_jacobian",
     "SideBySide",
@@ -50,6 +52,7 @@ _MODULES = {
     "codegen": ("CFiles", "compile_function", "generate_c"),
     "comparison": ("ParityReport", "parity"),
     "errors": ("ExportError", "ProgramError"),
+    "expressions": ("program_of",),
     "graph": ("build",),
     "horizon": ("fold", "unroll"),
     "jacobian": ("with_jacobian",),

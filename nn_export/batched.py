@@ -17,7 +17,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nn_export.errors import DerivativeError, ExportError, last_line
+from nn_export.errors import (
+    DerivativeError,
+    ExportError,
+    ProgramError,
+    UnsupportedOperatorError,
+    last_line,
+)
+from nn_export.expressions import Step, scalar_steps
 
 MAX_WALK = 3000
 """Scalar operations up to which a function is also kept as torch operators."""
@@ -85,32 +92,14 @@ class Batched:
         return self.walk(args) if many and self.steps is not None else self._run(args, samples)
 
     @cached_property
-    def steps(self) -> list[tuple[Any, ...]] | None:
+    def steps(self) -> list[Step] | None:
         """The scalar operations of the function; None if it has too many, or others than torch has."""
-        if (
-            _size(self.function) > 4 * MAX_WALK
-        ):  # an estimate, before a dense network is written out in scalars
-            return None
         try:
-            f = self.function.expand()
-        except RuntimeError:  # calls what has no scalar form: solvers, external code, tables
+            steps = scalar_steps(self.function, MAX_WALK)
+        except (ProgramError, UnsupportedOperatorError):
             return None
-        if f.n_instructions() > MAX_WALK:
-            return None
-        steps: list[tuple[Any, ...]] = []
-        for k in range(f.n_instructions()):
-            code, i, o = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
-            if code == ca.OP_CONST:
-                steps.append(("const", f.instruction_constant(k), o[0]))
-            elif code == ca.OP_INPUT:
-                steps.append(("input", i, o[0]))
-            elif code == ca.OP_OUTPUT:
-                steps.append(("output", o, i[0]))
-            elif code in OPERATORS:
-                steps.append((code, i, o[0]))
-            else:
-                return None
-        return steps
+        known = {ca.OP_CONST, ca.OP_INPUT, ca.OP_OUTPUT, *OPERATORS}
+        return steps if all(step.code in known for step in steps) else None
 
     def walk(self, args: list[Tensor]) -> list[Tensor]:
         """The same, by torch operators.
@@ -126,15 +115,15 @@ class Batched:
         columns, shape = [a.unbind(-1) for a in args], args[0].shape[:-1]
         slots: dict[int, Any] = {}
         results: list[list[Any]] = [[None] * self.function.nnz_out(i) for i in range(self.function.n_out())]
-        for code, i, o in self.steps:
-            if code == "const":
-                slots[o] = i
-            elif code == "input":
-                slots[o] = columns[i[0]][i[1]]
-            elif code == "output":
-                results[i[0]][i[1]] = slots[o]
+        for step in self.steps:
+            if step.code == ca.OP_CONST:
+                slots[step.given] = step.taken[0]
+            elif step.code == ca.OP_INPUT:
+                slots[step.given] = columns[step.taken[0]][step.taken[1]]
+            elif step.code == ca.OP_OUTPUT:
+                results[step.given[0]][step.given[1]] = slots[step.taken[0]]
             else:
-                slots[o] = OPERATORS[code](*(slots[j] for j in i))
+                slots[step.given] = OPERATORS[step.code](*(slots[j] for j in step.taken))
         return [_joined(values, shape, args[0]) for values in results]
 
     def _run(self, args: list[Tensor], samples: int) -> list[Tensor]:
@@ -187,20 +176,6 @@ def _joined(values: list[Any], shape: torch.Size, like: Tensor) -> Tensor:
     return torch.stack(
         [v.expand(shape) if isinstance(v, Tensor) else like.new_full(shape, v) for v in values], -1
     )
-
-
-def _size(f: ca.Function) -> float:
-    """Scalar operations, about."""
-    if not f.is_a("MXFunction"):
-        return float(f.n_instructions()) if f.is_a("SXFunction") else 0.0
-    total = 0.0
-    for k in range(f.n_instructions()):
-        code = f.instruction_id(k)
-        if code not in (ca.OP_INPUT, ca.OP_OUTPUT):
-            node = f.instruction_MX(k)
-            inner = 2.0 * node.dep(1).size2() if code == ca.OP_MTIMES else 1.0
-            total += _size(node.which_function()) if code == ca.OP_CALL else node.nnz() * inner
-    return total
 
 
 def _derivative(f: ca.Function, *, forward: bool) -> ca.Function:

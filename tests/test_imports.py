@@ -108,7 +108,7 @@ from hybrid_mpc.scenario import load_scenario
 artifact, scenario = load_artifact(Path(sys.argv[1])), load_scenario("golf_robot")
 model, prior, task = artifact.models["hybrid"], artifact.models["prior"], scenario.tasks[0]
 result = simulate(
-    scenario.plant(), make_estimator(model, scenario.control, np.array([1e-4, 1e-2])),
+    scenario.plant(), make_estimator(model, scenario, np.array([1e-4, 1e-2])),
     make_controller(model, prior, scenario.control), task.reference,
     dt=model.dt, duration=2.0, x0=np.array(task.x0), seed=0, monitor=make_monitor(model, None))
 assert "torch" not in sys.modules

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import cart
 import numpy as np
 import pytest
 from closed_loop_parts import Told
@@ -15,12 +16,15 @@ from hybrid_mpc.closed_loop import Guard, Loop, Mode, simulate
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation import TrueState
 from hybrid_mpc.input_limits import share_used
+from hybrid_mpc.monitor import guard_monitor
 from hybrid_mpc.mpc import OCP, CondensedController, Limits, SafeController
 from hybrid_mpc.pipeline.contest import limits_used
+from hybrid_mpc.pipeline.guards import make_resting_guard
 from hybrid_mpc.pipeline.judge import unknown_load
-from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_monitor, working_point
+from hybrid_mpc.pipeline.loops import freezing, make_controller, make_estimator, working_point
+from hybrid_mpc.pipeline.preflight import check_scenario
 from hybrid_mpc.plots.loops import Motion, closed_loops
-from hybrid_mpc.scenario import ControlSpec
+from hybrid_mpc.scenario import Scenario, load_scenario
 from hybrid_mpc.signals import Signal
 from hybrid_mpc.studies.monitor_loops import loop_figures
 
@@ -40,20 +44,28 @@ OPEN = {
     "positive on": (0.5, INF),
     "none": (-INF, INF),
 }
-CONTROL = ControlSpec(10, (30.0, 1.0), (0.05,), (0.05,), (-1.0,), (2.0,), (0.5,), estimator_sigma=(1e-3,))
+CONTROL = OCP(10, (30.0, 1.0), (0.05,), (0.05,), (-1.0,), (2.0,), (0.5,))
+TOLERATED = 2 / np.sqrt(0.1)
+"""What stands for the input's range where it has none: both ways of what the weights tolerate."""
+MACHINE = Scenario("pendulum", "", "", prior=pendulum_model, data=None, control=CONTROL, sensor_sigma=(1e-3,))
 
 
-@pytest.mark.parametrize("limits", FINITE.values(), ids=FINITE.keys())
+@pytest.mark.parametrize("limits", (FINITE | OPEN).values(), ids=(FINITE | OPEN).keys())
 def test_a_whole_loop_with_its_figures(limits):
-    control = replace(CONTROL, u_min=limits[:1], u_max=limits[1:], x_min=(-1.0, -9.0))
+    control = CONTROL.changed(u_min=limits[:1], u_max=limits[1:], x_min=(-1.0, -9.0))
+    machine = replace(MACHINE, control=control)
+    span = limits[1] - limits[0]
+    span = span if np.isfinite(span) else TOLERATED
+    assert control.input_range == pytest.approx(span)
     model, prior = pendulum_model(z=2), pendulum_model()
     rest = np.clip(0.0, *limits)
-    estimator = make_estimator(model, control, np.array([1e-3, 1e-2]))
+    estimator = make_estimator(model, machine, np.array([1e-3, 1e-2]))
     controller = make_controller(model, prior, control)
     assert controller.controller.ocp.rest_input == rest
     result = simulate(
         PendulumPlant(), estimator, controller, lambda t: np.tile([0.3, 0.0], (len(t), 1)), dt=0.02,
-        duration=1.0, x0=[0.0, 0.0], seed=0, monitor=make_monitor(model, None),
+        duration=1.0, x0=[0.0, 0.0], seed=0, guard=make_resting_guard(model),
+        monitor=guard_monitor(model, **freezing(machine, control)),
     )  # fmt: skip
     assert np.all(np.isfinite(result.x_hat))
     assert result.source.count("MPC") > 0.9 * len(result.source)
@@ -68,7 +80,66 @@ def test_a_whole_loop_with_its_figures(limits):
     assert excess["u"] == 0.0
     assert excess["x0"] == max(0.0, -1.0 - result.x[:, 0].min())
     assert working_point(model, control)[1] == rest
-    assert unknown_load(control) == pytest.approx(0.1 * (limits[1] - limits[0]))
+    assert unknown_load(control) == pytest.approx(0.1 * span)
+
+
+class Track:
+    """The cart of ``cart.py`` as its prior has it, with a sensor of 0.1 mm."""
+
+    def __init__(self, step):
+        self._step = step
+
+    def reset(self, x0, seed):
+        return np.asarray(x0, dtype=float)
+
+    def step(self, state, u, dt):
+        return self._step(state, [], u)[0].full().ravel()
+
+    def measure(self, state, rng):
+        return state[:1] + 1e-4 * rng.normal(size=1)
+
+    def truth(self, state):
+        return state
+
+    def hidden(self, state):
+        return np.zeros(0)
+
+
+@pytest.fixture(scope="module")
+def carts(tmp_path_factory):
+    """The scenario of the cart, and its prior as a deployed model."""
+    from hybrid_mpc.artifact import build_model
+    from hybrid_mpc.identification.export import model_info, trace_model
+    from hybrid_mpc.identification.step import PriorStep
+
+    path = tmp_path_factory.mktemp("cart") / "cart.py"
+    path.write_text(cart.MACHINE)
+    scenario = load_scenario(str(path))
+    prior = scenario.prior()
+    programs = trace_model(PriorStep(prior, scenario.data.dt).requires_grad_(False))
+    return scenario, build_model(
+        "prior", {f"prior/{name}": p for name, p in programs.items()}, model_info(prior, scenario.data.dt)
+    )
+
+
+@pytest.mark.parametrize("limits", (FINITE | OPEN).values(), ids=(FINITE | OPEN).keys())
+def test_a_cart_is_brought_to_what_its_limits_allow(carts, limits):
+    scenario, model = carts
+    control = OCP(20, (400.0, 1.0), (1e-3,), (0.1,), limits[:1], limits[1:])
+    machine = replace(scenario, control=control, sensor_sigma=(1e-4,))
+    if limits == OPEN["none"]:
+        check_scenario(machine)
+    # At rest the spring of 1 N/m holds what pushes: a place of so many metres takes so many newtons.
+    for place in (0.7, -0.7):
+        result = simulate(
+            Track(model.step), make_estimator(model, machine, np.array([1e-5, 1e-4])),
+            make_controller(model, model, control), lambda t, place=place: np.tile([place, 0.0], (len(t), 1)),
+            dt=model.dt, duration=14.0, x0=[0.0, 0.0], seed=0,
+        )  # fmt: skip
+        assert set(result.source) == {"MPC"}
+        assert np.all((result.u >= limits[0]) & (result.u <= limits[1]))
+        # Against a limit the cart swings out freely, in 2 pi s; 30 mm: and the weight of the input pulls a little.
+        assert abs(result.x[-63:, 0].mean() - np.clip(place, *limits)) < 0.03
 
 
 @pytest.mark.parametrize(
@@ -126,10 +197,8 @@ def test_figures_draw_the_limits_that_there_are(limits):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"u_max": (INF,)}, r"control: u_max \(inf,\) given; finite bounds needed"),
-        ({"u_min": (-INF,)}, r"control: u_min \(-inf,\) given"),
-        ({"u_min": (0.0,), "u_max": (INF,)}, "control: u_max"),
         ({"u_min": (np.nan,)}, "u_min"),
+        ({"u_max": ("full",)}, "u_max: numbers needed"),
         ({"u_min": (2.0,)}, "cross"),  # equal to u_max
         ({"u_min": (3.0,)}, "cross"),
         ({"u_min": (-1.0, -1.0)}, "u_min has 2 and u_max 1 values, 1 needed"),
@@ -137,15 +206,15 @@ def test_figures_draw_the_limits_that_there_are(limits):
 )
 def test_a_scenarios_limits_are_checked_when_it_is_made(change, words):
     with pytest.raises(InputError, match=words):
-        replace(CONTROL, **change)
+        CONTROL.changed(**change)
 
 
-def test_a_scenario_without_a_finite_range_ends_before_anything_is_computed(call, tmp_path):
+def test_a_scenario_whose_limits_cross_ends_before_anything_is_computed(call, tmp_path):
     path = tmp_path / "heater.py"
     path.write_text(
-        "from hybrid_mpc import ControlSpec, DataSpec, Scenario\n"
+        "from hybrid_mpc import OCP, DataSpec, Scenario\n"
         "data = DataSpec('time_s', ('u',), ('y',), dt=0.1, max_gap=0.5, smoothing=0.1, warm_up=0.5)\n"
-        "control = ControlSpec(9, (1.0,), (1.0,), (1.0,), (0.0,), (float('inf'),), estimator_sigma=(1.0,))\n"
+        "control = OCP(9, (1.0,), (1.0,), (1.0,), (5.0,), (0.0,))\n"
         "scenario = Scenario('heater', 'Heater', '', prior=lambda values=None: 1 / 0, data=data, control=control)\n"
     )
     code, _, told = call("run", path, "--data", tmp_path / "none.csv", "--out", tmp_path / "out")
@@ -177,9 +246,11 @@ def test_ranges_that_are_analysed_never_cross(signal, inside):
 def test_working_ranges_take_each_limit_that_there_is():
     one = Signal("T", "K", -4.0)
     model = SimpleNamespace(states=(one, one), inputs=(one,), n_x=2)
-    control = replace(CONTROL, u_min=(0.0,), u_max=(5.0,), x_min=(2.0, -INF), x_max=None)
+    control = CONTROL.changed(u_min=(0.0,), u_max=(5.0,), x_min=(2.0, -INF), x_max=None)
     np.testing.assert_array_equal(_range(model, control), [(2.0, 3.0), (-4.0, 1.0)])
     np.testing.assert_array_equal(_inputs(model, control), [(0.0, 5.0)])
+    above = control.changed(u_max=(INF,))  # the signal has no upper bound either: what the weights tolerate
+    np.testing.assert_allclose(_inputs(model, above), [(0.0, TOLERATED / 2)])
 
 
 def test_a_study_drives_inputs_within_their_ranges():

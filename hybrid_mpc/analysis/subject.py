@@ -14,7 +14,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import ExtendedKalmanFilter
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.mpc import OCP
-from hybrid_mpc.scenario import ControlSpec, Plant, Scenario, scenario_of
+from hybrid_mpc.scenario import Plant, Scenario, scenario_of
 from hybrid_mpc.signals import Signal
 from nn_export import Program, load_programs
 
@@ -107,7 +107,7 @@ def subject_of(request: Request) -> tuple[Subject, tuple[str, ...]]:
     return subject, tuple(notes)
 
 
-def _speed(model: HybridModel, control: ControlSpec | None, given: float | None) -> Array:
+def _speed(model: HybridModel, control: OCP | None, given: float | None) -> Array:
     n_v = model.n_x - model.n_x // 2
     if given is not None:
         if not (np.isfinite(given) and given > 0):
@@ -115,15 +115,14 @@ def _speed(model: HybridModel, control: ControlSpec | None, given: float | None)
         return np.full(n_v, given)
     if control is None:
         return np.ones(n_v)
-    weights = np.asarray(control.q[model.n_x // 2 :], dtype=float)
+    weights = control.q[model.n_x // 2 :]
     return 1.0 / np.sqrt(np.where(weights > 0, weights, 1.0))
 
 
-def _range(model: HybridModel, control: ControlSpec | None) -> Array:
+def _range(model: HybridModel, control: OCP | None) -> Array:
     """Working range of the states: the limits of the control problem, else the signals', else a unit."""
     none = np.full(model.n_x, np.inf)
-    lower = -none if control is None or control.x_min is None else np.array(control.x_min, dtype=float)
-    upper = none if control is None or control.x_max is None else np.array(control.x_max, dtype=float)
+    lower, upper = (-none, none) if control is None else (control.x_min, control.x_max)
     sides = zip(model.states, lower.tolist(), upper.tolist(), strict=True)
     return np.array([_within(s, _unit(s), low, high) for s, low, high in sides])
 
@@ -133,10 +132,11 @@ def _outer(model: HybridModel) -> Array:
     return np.array([_within(s, _unit(s)) for s in model.states])
 
 
-def _inputs(model: HybridModel, control: ControlSpec | None) -> Array:
-    if control is not None:
-        return np.column_stack([control.u_min, control.u_max]).astype(float)
-    return np.array([_within(s, 1.0) for s in model.inputs])
+def _inputs(model: HybridModel, control: OCP | None) -> Array:
+    if control is None:
+        return np.array([_within(s, 1.0) for s in model.inputs])
+    sides = zip(model.inputs, control.input_scale, control.u_min, control.u_max, strict=True)
+    return np.array([_within(s, size, low, high) for s, size, low, high in sides])
 
 
 def _unit(signal: Signal) -> float:
@@ -157,7 +157,7 @@ def _within(
 
 
 def _filters(
-    request: Request, scenario: Scenario, artifact: Artifact, control: ControlSpec, folder: Path
+    request: Request, scenario: Scenario, artifact: Artifact, control: OCP, folder: Path
 ) -> tuple[dict[tuple[str, str], ExtendedKalmanFilter], str]:
     """The observers of the closed loops: while nothing happens, and in the periods after a load came or went."""
     from hybrid_mpc.pipeline.control_noise import find_noise
@@ -170,9 +170,9 @@ def _filters(
     for mode, share in (("quiet", QUIET_SHARE), ("jump", JUMP_SHARE)):
         for name, contender in names.items():
             model = artifact.models[name]
-            first = np.concatenate([control.estimator_sigma, np.full(model.n_x - model.n_y, 0.1)])
+            first = np.concatenate([scenario.sensor_sigma, np.full(model.n_x - model.n_y, 0.1)])
             filters[name, mode] = ExtendedKalmanFilter(
-                model, sigma_y=np.array(control.estimator_sigma), sigma_x=noise[contender], sigma_d=share * span,
+                model, sigma_y=np.array(scenario.sensor_sigma), sigma_x=noise[contender], sigma_d=share * span,
                 sigma_x0=first, sigma_d0=FIRST_LOAD * span,
             )  # fmt: skip
     return filters, source

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.input_limits import numbers
+from hybrid_mpc.riccati import vector
 
 Array = NDArray[np.float64]
 
@@ -25,13 +27,31 @@ def whole(value: object) -> bool:
 
 def diagonal(values: ArrayLike, name: str) -> Array:
     """Weights as a vector; a matrix is refused."""
-    try:
-        array = np.asarray(values, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: numbers needed, got {values!r}") from error
-    if array.ndim > 1 and max(array.shape) < array.size:
-        raise InputError(f"{name}: shape {array.shape} given; needed: the diagonal alone, a weight each")
-    return array.ravel()
+    array = numbers(values, name)
+    shape = np.shape(values)
+    if len(shape) > 1 and max(shape) < array.size:
+        raise InputError(f"{name}: shape {shape} given; needed: the diagonal alone, a weight each")
+    return array
+
+
+def plans(values: Sequence[ArrayLike], horizon: int, n_u: int) -> tuple[Array, ...]:
+    """Input plans, each a finite ``(horizon, n_u)``."""
+    found = []
+    for i, value in enumerate(values):
+        array = numbers(value, f"starts[{i}]").reshape(np.shape(value))
+        if array.shape != (horizon, n_u) or not np.all(np.isfinite(array)):
+            raise InputError(
+                f"starts[{i}]: shape {array.shape} given; needed: a finite plan of the inputs ({horizon}, {n_u})"
+            )
+        found.append(array)
+    return tuple(found)
+
+
+def point(value: object, n_x: int, n_u: int) -> tuple[Array, Array]:
+    """A state ``(n_x,)`` and an input ``(n_u,)``, finite."""
+    if not isinstance(value, tuple | list) or len(value) != 2:
+        raise InputError(f"working_point: {value!r} given; needed: (x, u), a state and an input")
+    return vector(value[0], n_x, "working_point x"), vector(value[1], n_u, "working_point u")
 
 
 def is_stage_cost(f: object) -> bool:
@@ -65,7 +85,7 @@ def terminal_matrix(value: ArrayLike, n_x: int) -> Array:
     """A finite, symmetric, positive semi-definite ``(n_x, n_x)`` matrix."""
     if isinstance(value, str):
         raise InputError(f"terminal: {value!r} given; needed: 'riccati' or an ({n_x}, {n_x}) matrix")
-    matrix = np.asarray(value, dtype=float)
+    matrix = numbers(value, "terminal").reshape(np.shape(value))
     if matrix.shape != (n_x, n_x) or not np.all(np.isfinite(matrix)) or not np.allclose(matrix, matrix.T):
         raise InputError(
             f"terminal: shape {matrix.shape} given; needed: a finite symmetric ({n_x}, {n_x}) matrix"

@@ -194,7 +194,7 @@ class IpoptController:
         if ocp.du_max is not None:
             limit = np.tile(ocp.du_max, n)
             rows.append(Rows(du, -limit, limit, np.tile(self._u_scale, n)))
-        inside = [int(k) for k in np.setdiff1d(np.arange(n), ocp.starts)]
+        inside = [int(k) for k in np.setdiff1d(np.arange(n), ocp.block_starts)]
         if inside:  # move blocks
             rows.append(Rows(du[:, inside], 0.0, 0.0, np.tile(self._u_scale, len(inside))))
         rows += self._soft_rows(u, z, s)

@@ -1,11 +1,12 @@
-"""The optimal control problem as plain data."""
+"""The control problem as plain data: the only one there is, of a scenario, of a task, of every solver."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from dataclasses import fields as dataclass_fields
 from functools import cached_property
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -13,24 +14,29 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.input_limits import at_rest, input_limits
-from hybrid_mpc.model import HybridModel
 from hybrid_mpc.mpc.checks import (
     block_lengths,
     check_weights,
     diagonal,
     is_stage_cost,
+    plans,
+    point,
     terminal_matrix,
     whole,
 )
+from hybrid_mpc.mpc.contents import fixed, number_content, same_expression
 from hybrid_mpc.mpc.limits import Limits
 from hybrid_mpc.mpc.soft import SoftBound, state_bounds
+from hybrid_mpc.records import known
 from hybrid_mpc.riccati import dare, linearisation, vector
-from hybrid_mpc.scenario import ControlSpec
+
+if TYPE_CHECKING:
+    from hybrid_mpc.model import HybridModel
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class OCP:
     """A quadratic tracking problem with bounded inputs and softly bounded states.
 
@@ -50,6 +56,11 @@ class OCP:
     default, 1,000 times what the tolerated deviation ``1 / sqrt(q)`` costs, is far above it for weights by
     Bryson's rule; weight factors of more than 100 ask for larger penalties.
 
+    A problem is plain data: :func:`hybrid_mpc.records.plain` makes JSON of it, its expressions as programs
+    (:func:`nn_export.program_of`), and ``record(OCP, data, where)`` reads it. Two problems are equal if their numbers
+    are and their expressions state the same program; their arrays cannot be written into.
+    :meth:`changed` makes one that differs.
+
     Args:
         horizon: N, number of model periods.
         q: Weights of the states ``(n_x,)``, not negative.
@@ -59,8 +70,10 @@ class OCP:
         u_max: Upper bounds ``(n_u,)``; ``inf`` for none.
         du_max: Largest change per period ``(n_u,)``, positive. Default: none.
         terminal: ``"riccati"``, or a symmetric positive semi-definite ``(n_x, n_x)`` matrix ``P``.
-        working_point: ``(x, u)`` at which ``"riccati"`` linearises the model. Default: zero, the input within its
-            limits. With a steep friction law take a moving point (see :func:`hybrid_mpc.riccati.lqr`).
+        working_point: ``(x, u)`` near which the machine works, at which ``"riccati"`` and a fallback linearise the
+            model. With a steep friction law take a moving point (see :func:`hybrid_mpc.riccati.lqr`). Default: zero,
+            the input within its limits; the loops of a scenario take a moving one
+            (:func:`hybrid_mpc.pipeline.make_ocp`).
         x_min: Soft lower bounds of the states ``(n_x,)``; ``-inf`` for none. Default: none.
         x_max: Soft upper bounds of the states ``(n_x,)``; ``inf`` for none. Default: none.
         slack_linear: Penalties ``(n_x,)`` [cost/s/unit], not negative. Default: ``1000 sqrt(q)``.
@@ -76,14 +89,20 @@ class OCP:
             as flat; ``sqp`` and ``ipopt`` know its curvature. With ``(x, u, p) -> scalar`` references have
             ``n_p`` more columns, the values of ``p``: prices, or the outputs' reference
             (:func:`~hybrid_mpc.mpc.output_cost`). Default: none.
+        starts: Input plans, each ``(horizon, n_u)``, from which the first plan of a loop is sought besides none, for a
+            task with several ways (a swing-up); the cheapest plan is taken. Default: none.
 
     Raises:
         InputError: If shapes do not fit, bounds cross, a weight is negative or not finite, or the blocks'
             lengths do not sum to the horizon.
 
     Example:
-        >>> OCP(20, (1.0, 0.1), (0.1,), (0.0,), (-1.0,), (1.0,)).q
-        array([1. , 0.1])
+        >>> from hybrid_mpc.records import plain, record
+        >>> heater = OCP(20, (1.0, 0.1), (0.1,), (0.0,), u_min=(0.0,), u_max=(5.0,))
+        >>> heater.q, heater.rest_input
+        (array([1. , 0.1]), array([0.]))
+        >>> record(OCP, plain(heater), "ocp.json") == heater
+        True
     """
 
     horizon: int
@@ -94,14 +113,15 @@ class OCP:
     u_max: Array
     du_max: Array | None = None
     terminal: Array | Literal["riccati"] = "riccati"
-    working_point: tuple[ArrayLike, ArrayLike] | None = None
+    working_point: tuple[Array, Array] | None = None
     x_min: Array = field(default_factory=lambda: np.zeros(0))
     x_max: Array = field(default_factory=lambda: np.zeros(0))
-    slack_linear: Array = field(default_factory=lambda: np.zeros(0))
-    slack_quadratic: Array = field(default_factory=lambda: np.zeros(0))
+    slack_linear: Array | None = None
+    slack_quadratic: Array | None = None
     soft: tuple[SoftBound, ...] = ()
     blocks: tuple[int, ...] | None = None
     economic: ca.Function | None = None
+    starts: tuple[Array, ...] = ()
 
     def __init__(
         self,
@@ -121,6 +141,7 @@ class OCP:
         soft: Sequence[SoftBound] = (),
         blocks: Sequence[int] | None = None,
         economic: ca.Function | None = None,
+        starts: Sequence[ArrayLike] = (),
     ) -> None:
         if not whole(horizon) or horizon < 1:
             raise InputError(f"horizon must be a whole number of periods, at least 1; got {horizon}")
@@ -135,31 +156,56 @@ class OCP:
                 raise InputError(f"du_max must be positive, got {du_max}; leave it out for no limit")
         if not (isinstance(terminal, str) and terminal == "riccati"):
             terminal = terminal_matrix(terminal, n_x)
-        fields = {"horizon": int(horizon), **weights, "u_min": lower, "u_max": upper, "du_max": du_max}
-        names = "x_min", "x_max", "slack_linear", "slack_quadratic"
-        states = state_bounds(q_v, x_min, x_max, slack_linear, slack_quadratic)
-        bounds = dict(zip(names, states, strict=True))
-        others = {"terminal": terminal, "working_point": working_point, "soft": tuple(soft)}
+        low, up, linear, quadratic = state_bounds(q_v, x_min, x_max, slack_linear, slack_quadratic)
         if wrong := [bound for bound in soft if not isinstance(bound, SoftBound)]:
             raise InputError(f"soft: {wrong[0]!r} given; needed: SoftBound(expression, lower, upper, ...)")
         if economic is not None and not is_stage_cost(economic):
             raise InputError(f"economic: {economic} given; needed: a function (x, u) or (x, u, p) -> scalar")
-        lengths = {"blocks": None if blocks is None else block_lengths(blocks, int(horizon))}
-        for name, value in {**fields, **bounds, **others, **lengths, "economic": economic}.items():
+        fields = {
+            "horizon": int(horizon), **weights, "u_min": lower, "u_max": upper, "du_max": du_max, "terminal": terminal,
+            "working_point": None if working_point is None else point(working_point, n_x, n_u),
+            "x_min": low, "x_max": up,
+            "slack_linear": None if slack_linear is None else linear,
+            "slack_quadratic": None if slack_quadratic is None else quadratic,
+            "soft": tuple(soft), "blocks": None if blocks is None else block_lengths(blocks, int(horizon)),
+            "economic": economic, "starts": plans(starts, int(horizon), n_u),
+        }  # fmt: skip
+        for name, value in fields.items():
+            for array in value if isinstance(value, tuple) else (value,):
+                if isinstance(array, np.ndarray):
+                    fixed(array)
             object.__setattr__(self, name, value)
 
-    @classmethod
-    def from_spec(
-        cls,
-        spec: ControlSpec,
-        terminal: ArrayLike | Literal["riccati"] = "riccati",
-        working_point: tuple[ArrayLike, ArrayLike] | None = None,
-    ) -> OCP:
-        """The problem of a scenario's :class:`~hybrid_mpc.scenario.ControlSpec`."""
-        return cls(
-            spec.horizon, spec.q, spec.r, spec.r_delta, spec.u_min, spec.u_max, spec.du_max, terminal,
-            working_point, spec.x_min, spec.x_max, spec.slack_linear, spec.slack_quadratic,
-        )  # fmt: skip
+    def changed(self, **fields: Any) -> OCP:
+        """The same problem but for some fields, which are given and checked as to a new one.
+
+        Raises:
+            InputError: If there is no such field, or the problem would be wrong.
+
+        Example:
+            >>> ocp = OCP(20, [1.0], [0.1], [0.0], [-1.0], [1.0])
+            >>> ocp.changed(horizon=30, u_max=[2.0]).u_max
+            array([2.])
+            >>> ocp.changed(horizn=30)
+            Traceback (most recent call last):
+            hybrid_mpc.errors.InputError: no field of a control problem 'horizn'; did you mean 'horizon'? There are: \
+horizon, q, r, r_delta, u_min, u_max, du_max, terminal, working_point, x_min, x_max, slack_linear, slack_quadratic, \
+soft, blocks, economic, starts
+        """
+        names = [field.name for field in dataclass_fields(self)]
+        for name in fields:
+            known(name, names, "field of a control problem")
+        return replace(self, **fields)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, OCP):
+            return NotImplemented
+        return number_content(self) == number_content(other) and same_expression(
+            self.economic, other.economic
+        )
+
+    def __hash__(self) -> int:
+        return hash(number_content(self))
 
     @property
     def n_x(self) -> int:
@@ -187,6 +233,26 @@ class OCP:
         return at_rest(self.u_min, self.u_max)
 
     @property
+    def penalties(self) -> tuple[Array, Array]:
+        """Linear and quadratic penalties of the states' bounds, the defaults filled in, ``(n_x,)`` each.
+
+        Example:
+            >>> OCP(5, [4.0], [1.0], [0.0], [-9.0], [9.0], x_max=[1.0]).penalties
+            (array([2000.]), array([4000.]))
+        """
+        return state_bounds(self.q, self.x_min, self.x_max, self.slack_linear, self.slack_quadratic)[2:]
+
+    @property
+    def input_range(self) -> Array:
+        """By what an input is much or little ``(n_u,)``: its range, or, without one, twice what weights tolerate.
+
+        Example:
+            >>> OCP(5, [1.0], [0.3, 3.0], [0.1, 1.0], [0.0, 0.0], [8.0, np.inf]).input_range
+            array([8., 1.])
+        """
+        return 2.0 * self.input_scale
+
+    @property
     def input_scale(self) -> Array:
         """Sizes ``(n_u,)`` by which solvers scale the inputs: half the range, or, without one, what weights tolerate.
 
@@ -198,7 +264,7 @@ class OCP:
         return np.where(np.isfinite(half), half, 1.0 / np.sqrt(self.r + self.r_delta))
 
     @property
-    def starts(self) -> NDArray[np.int64]:
+    def block_starts(self) -> NDArray[np.int64]:
         """First period of every move block; all periods where there are none."""
         lengths = self.blocks if self.blocks is not None else (1,) * self.horizon
         return np.cumsum((0, *lengths[:-1]))
@@ -211,7 +277,7 @@ class OCP:
             >>> ocp.held(np.arange(4.0)[:, None]).ravel()
             array([0., 1., 1., 1.])
         """
-        return u if self.blocks is None else np.repeat(u[self.starts], self.blocks, axis=0)
+        return u if self.blocks is None else np.repeat(u[self.block_starts], self.blocks, axis=0)
 
     def stage_cost(self, x: Array, u: Array, x_ref: Array, du: Array, weight: Array | float = 1.0) -> Array:
         """Stage cost ``(...)`` per second of states ``(..., n_x)`` and inputs ``(..., n_u)``.
@@ -243,7 +309,7 @@ class OCP:
         lower, upper = (np.clip(v, self.u_min, self.u_max) for v in (limits.u_min, limits.u_max))
         if self.du_max is None:
             return np.broadcast_to(lower, shape), np.broadcast_to(upper, shape)
-        change = np.arange(1.0, self.starts.size + 1)[:, None] * self.du_max
+        change = np.arange(1.0, self.block_starts.size + 1)[:, None] * self.du_max
         rows = np.minimum(lower, u_prev + change), np.maximum(upper, u_prev - change)
         own = (np.clip(row, self.u_min, self.u_max) for row in rows)
         lower, upper = (row if self.blocks is None else np.repeat(row, self.blocks, axis=0) for row in own)
@@ -284,9 +350,7 @@ class OCP:
             return self.terminal
         n_x = self.n_x
         x, u = self.working_point if self.working_point is not None else (np.zeros(n_x), self.rest_input)
-        a, b, _ = linearisation(
-            model, vector(x, n_x, "working_point x"), vector(u, self.n_u, "working_point u")
-        )
+        a, b, _ = linearisation(model, x, u)
         q = np.diag(np.concatenate([self.q, np.zeros(model.n_h)]) * model.dt)
         p, _ = dare(a, b, q, np.diag(self.r + self.r_delta) * model.dt)
         if not model.n_h:

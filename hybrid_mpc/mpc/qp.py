@@ -109,7 +109,7 @@ class InputQP:
     """
 
     def __init__(self, ocp: OCP, soft: SoftRows | None = None, dt: float = 1.0) -> None:
-        self._starts, n_u = ocp.starts, ocp.n_u
+        self._starts, n_u = ocp.block_starts, ocp.n_u
         n = self._starts.size * n_u
         self._ocp, self._dt, self._n = ocp, dt, n
         self._scale = np.tile(ocp.input_scale, self._starts.size)

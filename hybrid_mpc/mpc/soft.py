@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.buffered import BufferedFunction
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.input_limits import numbers
+from hybrid_mpc.mpc.contents import fixed, number_content, same_expression
 
 if TYPE_CHECKING:
     from hybrid_mpc.mpc.ocp import OCP
@@ -20,7 +22,7 @@ PENALTY = 1e3
 """Default penalty of a bound's violation, in multiples of what the tolerated deviation ``1 / sqrt(q)`` costs."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SoftBound:
     """``lower <= expression(x, u) <= upper`` in every period of the horizon, as a penalty on its violation.
 
@@ -28,6 +30,9 @@ class SoftBound:
     multiplier of the hard bound (cost per second and unit by which the bound is moved) the penalty is exact:
     where the bound can be kept, the plan is that of the hard bound; where it cannot, the plan violates it as
     little as the cost makes worth while, and there is always a plan.
+
+    Two bounds are equal if their numbers are and their expressions state the same program, as
+    :class:`~hybrid_mpc.mpc.OCP` says.
 
     Args:
         expression: ``(x, u) -> e``, a column of ``n_e``.
@@ -62,13 +67,27 @@ class SoftBound:
         linear: ArrayLike,
         quadratic: ArrayLike,
     ) -> None:
-        if (expression.n_in(), expression.n_out()) != (2, 1) or expression.size2_out(0) != 1:
+        if (
+            not isinstance(expression, ca.Function)
+            or (expression.n_in(), expression.n_out()) != (2, 1)
+            or expression.size2_out(0) != 1
+        ):
             raise InputError(f"soft bound: {expression} given; needed: a function (x, u) -> column")
         n = int(expression.size1_out(0))
         arrays = _checked("soft bound", n, lower, upper, linear, quadratic)
         object.__setattr__(self, "expression", expression)
         for name, value in zip(("lower", "upper", "linear", "quadratic"), arrays, strict=True):
-            object.__setattr__(self, name, value)
+            object.__setattr__(self, name, fixed(value))
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, SoftBound):
+            return NotImplemented
+        return number_content(self) == number_content(other) and same_expression(
+            self.expression, other.expression
+        )
+
+    def __hash__(self) -> int:
+        return hash(number_content(self))
 
 
 def state_bounds(
@@ -96,8 +115,10 @@ def state_bounds(
 def _checked(
     what: str, n: int, lower: ArrayLike, upper: ArrayLike, linear: ArrayLike, quadratic: ArrayLike
 ) -> tuple[Array, Array, Array, Array]:
-    low, up, lin, quad = (np.asarray(v, dtype=float).ravel() for v in (lower, upper, linear, quadratic))
-    for name, value in (("lower", low), ("upper", up), ("linear", lin), ("quadratic", quad)):
+    given = {"lower": lower, "upper": upper, "linear": linear, "quadratic": quadratic}
+    arrays = {name: numbers(value, f"{what}: {name}") for name, value in given.items()}
+    low, up, lin, quad = arrays.values()
+    for name, value in arrays.items():
         if value.shape != (n,):
             raise InputError(f"{what}: {name} has {value.size} values, {n} needed")
     if not np.all(low < up):
@@ -138,7 +159,7 @@ class SoftRows:
         chosen = self._states
         self._functions = [_expression(bound, ocp.n_x, ocp.n_u).map(n) for bound in ocp.soft]
         self._buffered = [BufferedFunction(f) for f in self._functions]
-        parts = [(ocp.x_min, ocp.x_max, ocp.slack_linear, ocp.slack_quadratic)]
+        parts = [(ocp.x_min, ocp.x_max, *ocp.penalties)]
         columns = [[np.tile(v[chosen], n) for v in parts[0]]]
         columns += [[np.tile(v, n) for v in (b.lower, b.upper, b.linear, b.quadratic)] for b in ocp.soft]
         self.lower, self.upper, self.linear, self.quadratic = (

@@ -149,7 +149,7 @@ class SQPController:
         if self.ocp.du_max is None:
             return self.ocp.held(np.clip(u, lower, upper))
         rows = u.copy()
-        for start in self.ocp.starts:
+        for start in self.ocp.block_starts:
             u_prev = np.clip(self.ocp.saturate(u[start], u_prev), lower[start], upper[start])
             rows[start] = u_prev
         return self.ocp.held(rows)

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from hybrid_mpc.artifact import Artifact
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation import TrueState, process_noise
-from hybrid_mpc.mpc import BestOf, CondensedController, SafeController, SQPController
+from hybrid_mpc.mpc import OCP, BestOf, CondensedController, SafeController, SQPController
 from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_ocp, tuned_noise
-from hybrid_mpc.scenario import ControlSpec, Scenario
+from hybrid_mpc.scenario import Scenario
 
 if TYPE_CHECKING:
     from hybrid_mpc.data.trajectories import Trajectory
@@ -57,7 +57,7 @@ LEAST_NOISE: Mapping[str, str] = {"hybrid": "prior", "hybrid_observer": "prior_o
 
 
 def build(
-    name: str, scenario: Scenario, artifact: Artifact, control: ControlSpec, noise: Mapping[str, Array]
+    name: str, scenario: Scenario, artifact: Artifact, control: OCP, noise: Mapping[str, Array]
 ) -> tuple[Any, SafeController]:
     """Estimator and controller of a contender.
 
@@ -76,7 +76,7 @@ def build(
     c, prior = CONTENDERS[name], artifact.models["prior"]
     if c.model != "oracle":
         model = artifact.models[c.model]
-        estimator = make_estimator(model, control, noise[name], observer=c.observer)
+        estimator = make_estimator(model, scenario, noise[name], control, observer=c.observer)
         return estimator, make_controller(model, prior, control)
     if scenario.oracle is None:
         raise InputError(f"scenario {scenario.name} has no oracle")
@@ -84,23 +84,20 @@ def build(
     ocp = make_ocp(prior, control)
     rivals = [CondensedController(artifact.models[m], ocp) for m in ("prior", "hybrid")]
     best = BestOf(SQPController(model, ocp, iterations=ORACLE_ITERATIONS), rivals=rivals, most=1)
-    starts = [np.array(start, dtype=float) for start in control.starts]
-    first = BestOf(SQPController(model, ocp, iterations=FIRST_ITERATIONS), starts=starts, rivals=rivals)
+    first = BestOf(SQPController(model, ocp, iterations=FIRST_ITERATIONS), starts=ocp.starts, rivals=rivals)
     safe = SafeController(best, prior, first=first)
     if c.truth:
         return TrueState(model), safe
-    return make_estimator(model, control, noise[name], observer=c.observer), safe
+    return make_estimator(model, scenario, noise[name], control, observer=c.observer), safe
 
 
-def noise_of(
-    scenario: Scenario, artifact: Artifact, control: ControlSpec, recordings: Sequence[Trajectory]
-) -> dict[str, Array]:
+def noise_of(scenario: Scenario, artifact: Artifact, recordings: Sequence[Trajectory]) -> dict[str, Array]:
     """Process noise of every contender that estimates, each by maximum likelihood on the same recordings.
 
     Args:
-        scenario: The machine; where its tasks go beyond the recordings a hybrid has no less than its prior.
+        scenario: The machine, its sensors' noise and input range; where its tasks go beyond the recordings a hybrid has
+            no less than its prior.
         artifact: Prior and hybrid.
-        control: Input range and sensor noise.
         recordings: Training recordings with smoothed states.
     """
     models = dict(artifact.models)
@@ -110,7 +107,7 @@ def noise_of(
     # the plant's own equations err by nothing but the smoothing: start from the better model's errors
     errors["oracle"] = errors["hybrid"]
     found = {
-        name: tuned_noise(models[c.model], control, errors[c.model], recordings, observer=c.observer)
+        name: tuned_noise(models[c.model], scenario, errors[c.model], recordings, observer=c.observer)
         for name, c in CONTENDERS.items()
         if c.model in models and not c.truth
     }

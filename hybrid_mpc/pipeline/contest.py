@@ -15,11 +15,12 @@ from hybrid_mpc.closed_loop import ClosedLoopResult, simulate
 from hybrid_mpc.closed_loop.simulate import Step
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.input_limits import share_used
+from hybrid_mpc.mpc import OCP
 from hybrid_mpc.pipeline.contenders import CONTENDERS, ORACLES, build
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.loops import make_monitor
 from hybrid_mpc.pipeline.parallel import WORKERS, run_jobs
-from hybrid_mpc.scenario import Budget, ControlSpec, Scenario, Task, load_scenario
+from hybrid_mpc.scenario import Budget, Scenario, Task, load_scenario
 
 Array = NDArray[np.float64]
 TIMED = ("prior_observer", "hybrid_observer")
@@ -82,7 +83,7 @@ def parts_of(scenario: Scenario, budget: Budget) -> list[Part]:
 
 
 def contest(
-    context: Context, artifact: Artifact, control: ControlSpec, noise: Mapping[str, Array]
+    context: Context, artifact: Artifact, control: OCP, noise: Mapping[str, Array]
 ) -> tuple[list[dict[str, Any]], dict[str, Array]]:
     """Run all loops; the timed ones alone, the others side by side in processes.
 
@@ -167,7 +168,7 @@ def _seeds(name: str, scenario: Scenario, seeds: int, oracle_seeds: int) -> int:
     return 0 if scenario.oracle is None else (oracle_seeds if name == "oracle" else min(1, oracle_seeds // 2))
 
 
-def limits_used(control: ControlSpec, r: ClosedLoopResult) -> dict[str, float]:
+def limits_used(control: OCP, r: ClosedLoopResult) -> dict[str, float]:
     """Largest share of the way from rest to each limit that a loop used: 1 is the limit, more a violation.
 
     Args:
@@ -180,16 +181,13 @@ def limits_used(control: ControlSpec, r: ClosedLoopResult) -> dict[str, float]:
     used = {"u": share_used(r.u, control.u_min, control.u_max)}
     if control.du_max is not None:
         du = np.diff(r.u, axis=0, prepend=control.rest_input[None])
-        used["du"] = float(np.max(np.abs(du) / np.array(control.du_max)))
-    n_x = r.x.shape[1]
-    lower = np.full(n_x, -np.inf) if control.x_min is None else np.array(control.x_min)
-    upper = np.full(n_x, np.inf) if control.x_max is None else np.array(control.x_max)
-    for i in np.flatnonzero(np.isfinite(lower) | np.isfinite(upper)):
-        used[f"x[{i}]"] = share_used(r.x[:, i], lower[i], upper[i])
+        used["du"] = float(np.max(np.abs(du) / control.du_max))
+    for i in np.flatnonzero(np.isfinite(control.x_min) | np.isfinite(control.x_max)):
+        used[f"x[{i}]"] = share_used(r.x[:, i], control.x_min[i], control.x_max[i])
     return used
 
 
-def _row(task: Task, control: ControlSpec, name: str, seed: int, r: ClosedLoopResult) -> dict[str, Any]:
+def _row(task: Task, control: OCP, name: str, seed: int, r: ClosedLoopResult) -> dict[str, Any]:
     return {
         "task": task.name,
         "controller": name,

@@ -26,7 +26,7 @@ from hybrid_mpc.pipeline.faulted_loops import stored_detector
 from hybrid_mpc.pipeline.guards import REACTIONS, adaptable, make_adaptive_guard, make_resting_guard
 from hybrid_mpc.pipeline.loops import freezing, make_monitor
 from hybrid_mpc.pipeline.monitor_job import stored_rest
-from hybrid_mpc.scenario import ControlSpec, Scenario, Task
+from hybrid_mpc.scenario import Scenario, Task
 
 Array = NDArray[np.float64]
 DEFAULT_CONTROLLERS = ("prior_observer", "hybrid_observer")
@@ -199,12 +199,12 @@ def prepared(scenario: Scenario, model: Path, settings: ControlSettings, noise: 
         stored_detector(artifact, folder)
     if settings.guard == "adapt":
         adaptable(artifact.models["hybrid"], scenario.causes)
-    check_channels(install(scenario.plant(), settings.faults)[1], len(scenario.control.estimator_sigma), 1)
+    check_channels(install(scenario.plant(), settings.faults)[1], len(scenario.sensor_sigma), 1)
     found = find_noise(scenario, artifact, folder, settings.controllers, settings.seed, noise)
     return Job(scenario, artifact, tasks, settings, *found)
 
 
-def _check_artifact(scenario: Scenario, artifact: Artifact, folder: Path, control: ControlSpec) -> None:
+def _check_artifact(scenario: Scenario, artifact: Artifact, folder: Path, control: OCP) -> None:
     missing = [name for name in ("prior", "hybrid") if name not in artifact.models]
     if missing:
         raise InputError(f"{folder} holds {', '.join(artifact.models)}; needed is a model {missing[0]} too")
@@ -213,7 +213,7 @@ def _check_artifact(scenario: Scenario, artifact: Artifact, folder: Path, contro
         raise InputError(f"{folder} was made for scenario {made_for}, not for {scenario.name}")
     for name, model in artifact.models.items():
         sizes = model.n_x, model.n_u, model.n_y
-        needed = len(control.q), len(control.r), len(control.estimator_sigma)
+        needed = control.n_x, control.n_u, len(scenario.sensor_sigma)
         if sizes != needed:
             raise InputError(
                 f"{folder}: model {name} has (states, inputs, outputs) = {sizes}, scenario {scenario.name} {needed}"
@@ -286,12 +286,10 @@ def watch(job: Job, task: Task, name: str) -> tuple[EnergyMonitor | None, Guard 
             return None, None
         return make_monitor(models["hybrid"], None, rest_speed=stored_rest(job.artifact)), None
     detector = stored_detector(job.artifact)
-    monitor = guard_monitor(models["hybrid"], detector, **freezing(control))
+    monitor = guard_monitor(models["hybrid"], detector, **freezing(job.scenario, control))
     if job.settings.guard == "rest":
         return monitor, make_resting_guard(models["hybrid"])
-    guard = make_adaptive_guard(
-        models["hybrid"], models["prior"], control, job.noise[name], job.scenario.causes
-    )
+    guard = make_adaptive_guard(models["hybrid"], models["prior"], job.scenario, job.noise[name], control)
     return monitor, guard
 
 

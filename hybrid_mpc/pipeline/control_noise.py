@@ -93,4 +93,4 @@ def _estimated_noise(scenario: Scenario, artifact: Artifact, seed: int) -> Mappi
     train = [t for t in data.trajectories if t.role == "train"]
     delay = artifact.input_delay
     smoother = fit_smoother(prior, shifted(train, delay), scenario.data.dt)
-    return noise_of(scenario, artifact, scenario.control, with_states(train, smoother, delay))
+    return noise_of(scenario, artifact, with_states(train, smoother, delay))

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from hybrid_mpc import __version__
 from hybrid_mpc.artifact import Artifact, Provenance, load_artifact, save_artifact
+from hybrid_mpc.mpc import OCP
 from hybrid_mpc.pipeline.contenders import noise_of
 from hybrid_mpc.pipeline.contest import contest
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_monitor, time_on_recording
-from hybrid_mpc.scenario import ControlSpec
 
 Array = NDArray[np.float64]
 DEPLOYED = "mopgrnn"
@@ -78,7 +78,7 @@ def control_stage(context: Context) -> None:
             "control", {"reason": f"scenario {context.scenario.name} defines no control problem"}, {}
         )
         return
-    noise = noise_of(context.scenario, artifact, control, context.commanded("train"))
+    noise = noise_of(context.scenario, artifact, context.commanded("train"))
     if context.scenario.plant is None:
         _only_timing(context, artifact, control, noise)
     else:
@@ -86,10 +86,10 @@ def control_stage(context: Context) -> None:
         context.save("control", {"loops": rows, "sigma_x": noise}, arrays)
 
 
-def _only_timing(context: Context, artifact: Artifact, control: ControlSpec, noise: dict[str, Array]) -> None:
+def _only_timing(context: Context, artifact: Artifact, control: OCP, noise: dict[str, Array]) -> None:
     model = artifact.models["hybrid"]
     controller = make_controller(model, artifact.models["prior"], control)
-    estimator = make_estimator(model, control, noise["hybrid_observer"])
+    estimator = make_estimator(model, context.scenario, noise["hybrid_observer"])
     whole = context.dataset.whole
     most = max(2, TIMED_PERIODS // len(whole))
     durations = []

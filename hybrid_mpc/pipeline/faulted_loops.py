@@ -98,7 +98,7 @@ def faulted(
     rows: list[dict[str, Any]] = []
     arrays: dict[str, Array] = {}
     for case in cases(scenario):
-        monitor = guard_monitor(model, detector, **freezing(control), diagnose=diagnose)
+        monitor = guard_monitor(model, detector, **freezing(scenario, control), diagnose=diagnose)
         result = simulate(
             scenario.plant(), estimator, controller, task.reference, weight=task.weight, dt=model.dt,
             duration=task.duration, x0=np.array(task.x0), seed=run_seed * 1000 + SEED, monitor=monitor,

@@ -20,6 +20,7 @@ from hybrid_mpc.monitor.lengths import BLOCK_S, SETTLING_S, block_seconds, secon
 from hybrid_mpc.monitor.replay import along, replay
 from hybrid_mpc.monitor.rest import REST_SPEED
 from hybrid_mpc.monitor.standard import DRIFT
+from hybrid_mpc.mpc import OCP
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.faulted_loops import faulted, kept
 from hybrid_mpc.pipeline.judge import RATES, clean_windows, run_calibration
@@ -28,7 +29,6 @@ from hybrid_mpc.pipeline.monitor_job import explained
 from hybrid_mpc.pipeline.nominal_loops import CONTENDER, nominal_loops, run_nominal
 from hybrid_mpc.pipeline.parallel import WORKERS, run_jobs
 from hybrid_mpc.records import plain
-from hybrid_mpc.scenario import ControlSpec
 
 Array = NDArray[np.float64]
 HELD = ("valid", "nominal")
@@ -162,16 +162,14 @@ def noise(context: Context) -> dict[str, Array]:
     return {name: context.sigma_x(name) for name in names}
 
 
-def _nominal_data(
-    context: Context, artifact: Artifact, control: ControlSpec, rest: tuple[float, ...]
-) -> NominalData:
+def _nominal_data(context: Context, artifact: Artifact, control: OCP, rest: tuple[float, ...]) -> NominalData:
     """Loops of the simulated machine, like those that the guard will watch; else undisturbed recordings."""
     scenario = context.scenario
     if scenario.plant is not None and any(not task.faults for task in scenario.tasks):
         return _from_loops(context)
     model = artifact.models["hybrid"]
     monitor = guard_monitor(model, rest_speed=rest)
-    estimator = make_estimator(model, control, noise(context)[CONTENDER])
+    estimator = make_estimator(model, context.scenario, noise(context)[CONTENDER])
     whole = context.dataset.whole
     numbers = [
         replay(monitor, estimator, recording, on_progress=say).numbers
@@ -222,7 +220,7 @@ def _from_loops(context: Context) -> NominalData:
 def _recorded(
     context: Context,
     artifact: Artifact,
-    control: ControlSpec,
+    control: OCP,
     detector: Detector | None,
     calibration: Calibration,
 ) -> tuple[dict[str, Any], dict[str, Array]]:
@@ -235,8 +233,8 @@ def _recorded(
         monitor = make_monitor(model, calibration)
     else:
         diagnose = model.parametric is not None
-        monitor = guard_monitor(model, detector, **freezing(control), diagnose=diagnose)
-    estimator = make_estimator(model, control, noise(context)[CONTENDER])
+        monitor = guard_monitor(model, detector, **freezing(context.scenario, control), diagnose=diagnose)
+    estimator = make_estimator(model, context.scenario, noise(context)[CONTENDER])
     tested = [r for r in context.dataset.whole if clean_windows(context, r, ("test",))]
     found: list[dict[str, Any]] = []
     arrays: dict[str, Array] = {}

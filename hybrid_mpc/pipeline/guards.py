@@ -15,7 +15,7 @@ from hybrid_mpc.mpc.condensed import CondensedController
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.safeguard import SafeController
 from hybrid_mpc.pipeline.loops import FIRST_LOAD, QUIET_SHARE, first_controller, first_deviations, make_ocp
-from hybrid_mpc.scenario import ControlSpec
+from hybrid_mpc.scenario import Scenario
 
 Array = NDArray[np.float64]
 REACTIONS = ("rest", "adapt")
@@ -44,9 +44,9 @@ def make_resting_guard(model: HybridModel) -> Guard:
 def make_adaptive_guard(
     model: HybridModel,
     prior: HybridModel,
-    control: ControlSpec,
+    scenario: Scenario,
     sigma_x: Array,
-    causes: Mapping[str, Sequence[str]],
+    control: OCP | None = None,
     *,
     patience: float | None = None,
 ) -> Guard:
@@ -58,29 +58,32 @@ def make_adaptive_guard(
     Args:
         model: The model that the normal controller plans with; it must know its parameters.
         prior: The fitted prior, for terminal weight and fallback.
-        control: The control problem.
+        scenario: The machine: its sensors' noise, and as ``causes`` the parameters that change together, by name. Gains
+            of inputs are left out where there are other causes: a weaker motor is a heavier machine, but for its
+            friction.
         sigma_x: Process noise ``(n_x,)`` per period of the model's estimator.
-        causes: Parameters that change together, by name, as a scenario's ``causes``. Gains of inputs are left out
-            where there are other causes: a weaker motor is a heavier machine, but for its friction.
+        control: The control problem. Default: the scenario's.
         patience: Time [s] for which the model must have been in doubt. Default: 0.8 of the machine's seconds.
 
     Raises:
-        InputError: If there are no causes, the model does not know its parameters, or one of them is unknown.
+        InputError: If there are no causes or no control problem, the model does not know its parameters, or one of
+            them is unknown.
 
     Example:
-        ``make_adaptive_guard(hybrid, prior, scenario.control, sigma_x, scenario.causes)``
+        ``make_adaptive_guard(hybrid, prior, scenario, sigma_x)``
     """
-    groups = adaptable(model, causes)
+    groups = adaptable(model, scenario.causes)
     adaptive = with_parameter_states(model, groups)
+    control = scenario.control if control is None else control
+    if control is None:
+        raise InputError(f"a guard that adapts needs a control problem; scenario {scenario.name} has none")
     span = control.input_range
     plain = make_ocp(prior, control)
-    ocp = OCP.from_spec(control, plain.terminal_weight(model), plain.working_point)
-    backup = SafeController(
-        CondensedController(adaptive, ocp), prior, first=first_controller(adaptive, ocp, control)
-    )
-    first, unit = first_deviations(model, control), model.time_unit
+    ocp = plain.changed(terminal=plain.terminal_weight(model))
+    backup = SafeController(CondensedController(adaptive, ocp), prior, first=first_controller(adaptive, ocp))
+    first, unit = first_deviations(model, scenario), model.time_unit
     estimator = parameter_filter(
-        adaptive, len(groups), sigma_y=control.estimator_sigma, sigma_x=sigma_x, sigma_x0=first,
+        adaptive, len(groups), sigma_y=scenario.sensor_sigma, sigma_x=sigma_x, sigma_x0=first,
         sigma_d=QUIET_SHARE * span, sigma_d0=FIRST_LOAD * span,
     )  # fmt: skip
     return Guard(

@@ -17,11 +17,11 @@ from hybrid_mpc.monitor.calibration import Calibration, alarm_intervals, calibra
 from hybrid_mpc.monitor.lengths import block_seconds
 from hybrid_mpc.monitor.replay import along, judge, replay
 from hybrid_mpc.monitor.rest import rest_speeds
+from hybrid_mpc.mpc import OCP
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_monitor, working_point
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.riccati import hidden_fixed_point
-from hybrid_mpc.scenario import ControlSpec
 
 if TYPE_CHECKING:
     from hybrid_mpc.data.trajectories import Trajectory
@@ -71,7 +71,10 @@ def monitor_stage(context: Context) -> None:
     rest = known.get("rest_speed")
     power, residual, traces = [], [], []
     # the estimator of the closed loops; the monitor ignores its disturbance estimate
-    watching, estimator = make_monitor(model, None, rest_speed=rest), make_estimator(model, control, sigma_x)
+    watching, estimator = (
+        make_monitor(model, None, rest_speed=rest),
+        make_estimator(model, context.scenario, sigma_x),
+    )
     for recording, say in along(whole, context.progress.update):
         trace = replay(watching, estimator, recording, on_progress=say)
         traces.append(trace)
@@ -131,7 +134,7 @@ def run_calibration(context: Context) -> Calibration:
 
 
 def _load_loop(
-    context: Context, model: HybridModel, calibration: Calibration, control: ControlSpec, sigma_x: Array
+    context: Context, model: HybridModel, calibration: Calibration, control: OCP, sigma_x: Array
 ) -> tuple[dict[str, Any], ClosedLoopResult]:
     """The first task with an unknown constant load from its middle on: does the monitor see it?"""
     task, prior = context.scenario.tasks[0], load_artifact(context.out / "model").models["prior"]
@@ -139,7 +142,7 @@ def _load_loop(
     start, load = 0.5 * task.duration, unknown_load(control)
     result = simulate(
         context.scenario.plant(),
-        make_estimator(model, control, sigma_x),
+        make_estimator(model, context.scenario, sigma_x),
         make_controller(model, prior, control),
         task.reference,
         weight=task.weight,
@@ -158,11 +161,11 @@ def _load_loop(
     }, result  # fmt: skip
 
 
-def unknown_load(control: ControlSpec) -> float:
+def unknown_load(control: OCP) -> float:
     """Load of the demonstration at the first input [input unit].
 
     Example:
-        >>> unknown_load(ControlSpec(9, (1.0,), (1.0,), (1.0,), u_min=(-5.0,), u_max=(0.0,)))
+        >>> unknown_load(OCP(9, [1.0], [1.0], [1.0], u_min=[-5.0], u_max=[0.0]))
         0.5
     """
     return LOAD_SHARE * float(0.5 * control.input_range[0])

@@ -22,7 +22,7 @@ from hybrid_mpc.mpc.condensed import CondensedController
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.safeguard import SafeController
 from hybrid_mpc.mpc.sqp import SQPController
-from hybrid_mpc.scenario import ControlSpec
+from hybrid_mpc.scenario import Scenario
 
 if TYPE_CHECKING:
     from hybrid_mpc.data.trajectories import Trajectory
@@ -51,19 +51,19 @@ TUNED_RECORDINGS = 3
 
 
 def tuned_noise(
-    model: HybridModel, control: ControlSpec, base: Array, recordings: Sequence[Trajectory], *, observer: bool
+    model: HybridModel, scenario: Scenario, base: Array, recordings: Sequence[Trajectory], *, observer: bool
 ) -> Array:
     """Process noise ``(n_x,)``: ``base`` times the scale under which undisturbed recordings are most likely.
 
     Args:
         model: The model to estimate with.
-        control: Input range and sensor noise.
+        scenario: Sensor noise, and the control problem's input range.
         base: Its one-period errors, see :func:`~hybrid_mpc.estimation.process_noise`.
         recordings: Training recordings.
         observer: Whether the estimator follows an unknown load.
 
     Example:
-        ``tuned_noise(model, scenario.control, process_noise(model, train), train, observer=True)``
+        ``tuned_noise(model, scenario, process_noise(model, train), train, observer=True)``
     """
     places = np.linspace(0, len(recordings) - 1, min(TUNED_RECORDINGS, len(recordings))).round().astype(int)
     parts = [
@@ -71,12 +71,17 @@ def tuned_noise(
         for i in dict.fromkeys(places.tolist())
     ]
     return base * most_likely(
-        lambda s: make_estimator(model, control, s * base, observer=observer), parts, SCALES
+        lambda s: make_estimator(model, scenario, s * base, observer=observer), parts, SCALES
     )
 
 
 def make_estimator(
-    model: HybridModel, control: ControlSpec, sigma_x: Array, *, observer: bool = True
+    model: HybridModel,
+    scenario: Scenario,
+    sigma_x: Array,
+    control: OCP | None = None,
+    *,
+    observer: bool = True,
 ) -> ExtendedKalmanFilter | SwitchingFilter:
     """The estimator that all controllers share, tuned by the model's own one-period errors.
 
@@ -85,22 +90,28 @@ def make_estimator(
 
     Args:
         model: The model to estimate with.
-        control: Input range and sensor noise.
+        scenario: The machine, whose sensors' noise it assumes.
         sigma_x: Process noise ``(n_x,)`` per period, see :func:`~hybrid_mpc.estimation.process_noise`.
+        control: The control problem, by whose ``input_range`` a load is small or large. Default: the scenario's.
         observer: Whether it estimates an unknown load at the input. Default: yes.
 
     Raises:
-        InputError: If ``estimator_sigma`` or ``first_speed_sigma`` does not fit the model.
+        InputError: If ``sensor_sigma`` or ``first_sigma`` does not fit the model, or there is no control problem.
 
     Example:
-        ``make_estimator(model, scenario.control, process_noise(model, train))``
+        ``make_estimator(model, scenario, process_noise(model, train))``
     """
-    first, span = first_deviations(model, control), control.input_range
+    control = scenario.control if control is None else control
+    if control is None:
+        raise InputError(
+            f"scenario {scenario.name} has no control problem, so no input range; give control=OCP(...)"
+        )
+    first, span = first_deviations(model, scenario), control.input_range
 
     def filter_of(scale: float, step: float | None) -> ExtendedKalmanFilter:
         return ExtendedKalmanFilter(
             model,
-            sigma_y=np.array(control.estimator_sigma),
+            sigma_y=np.array(scenario.sensor_sigma),
             sigma_x=scale * sigma_x,
             sigma_d=None if step is None else step * span,
             sigma_x0=first,
@@ -113,40 +124,35 @@ def make_estimator(
     return SwitchingFilter(modes, SWITCHES)
 
 
-def first_deviations(model: HybridModel, control: ControlSpec) -> Array:
+def first_deviations(model: HybridModel, scenario: Scenario) -> Array:
     """Standard deviations ``(n_x,)`` of the state at the estimator's start: at rest where the sensors say.
 
     Args:
         model: The model.
-        control: Sensor noise, and how uncertain the first speeds are.
+        scenario: Sensor noise, and how uncertain is at first what is not measured.
 
     Raises:
-        InputError: If ``estimator_sigma`` or ``first_speed_sigma`` does not fit the model.
+        InputError: If ``sensor_sigma`` or ``first_sigma`` does not fit the model.
 
     Example:
         >>> from types import SimpleNamespace
-        >>> spec = ControlSpec(9, (1.0, 1.0), (1.0,), (1.0,), (-1.0,), (1.0,), estimator_sigma=(5e-4,))
-        >>> first_deviations(SimpleNamespace(n_x=2, n_y=1, dt=0.02), spec).round(4).tolist()
+        >>> machine = SimpleNamespace(sensor_sigma=(5e-4,), first_sigma=None)
+        >>> first_deviations(SimpleNamespace(n_x=2, n_y=1, dt=0.02), machine).round(4).tolist()
         [0.0005, 0.0354]
     """
-    n, sigma = model.n_x - model.n_y, control.estimator_sigma
+    n, sigma, others = model.n_x - model.n_y, scenario.sensor_sigma, scenario.first_sigma
     if len(sigma) != model.n_y:
-        raise InputError(
-            f"control: estimator_sigma needs {model.n_y} standard deviations of the outputs, got {sigma}"
-        )
-    speeds = control.first_speed_sigma
-    if speeds is None:
+        raise InputError(f"sensor_sigma needs {model.n_y} standard deviations of the outputs, got {sigma}")
+    if others is None:
         differenced = np.sqrt(2.0) * np.array(sigma) / model.dt
-        speeds = tuple(differenced if n == model.n_y else np.full(n, differenced.max()))
-    if len(speeds) != n:
-        raise InputError(
-            f"control: first_speed_sigma needs {n} standard deviations of what is not measured, got {speeds}"
-        )
-    return np.array([*sigma, *speeds], dtype=np.float64)
+        others = tuple(differenced if n == model.n_y else np.full(n, differenced.max()))
+    if len(others) != n:
+        raise InputError(f"first_sigma needs {n} standard deviations of what is not measured, got {others}")
+    return np.array([*sigma, *others], dtype=np.float64)
 
 
 def make_controller(
-    model: HybridModel, prior: HybridModel, control: ControlSpec, *, iterations: int = 1
+    model: HybridModel, prior: HybridModel, control: OCP, *, iterations: int = 1
 ) -> SafeController:
     """The condensed real-time iteration of a model behind the safeguards that stand on the prior.
 
@@ -163,18 +169,17 @@ def make_controller(
     """
     ocp = make_ocp(prior, control)
     rti = CondensedController(model, ocp, iterations=iterations)
-    return SafeController(rti, prior, first=first_controller(model, ocp, control))
+    return SafeController(rti, prior, first=first_controller(model, ocp))
 
 
-def first_controller(model: HybridModel, ocp: OCP, control: ControlSpec) -> SQPController | BestOf:
-    """What makes the first plan: SQP, from each of the control problem's starts where it names some."""
+def first_controller(model: HybridModel, ocp: OCP) -> SQPController | BestOf:
+    """What makes the first plan: SQP, from each of the problem's starts where it names some."""
     sqp = SQPController(model, ocp)
-    starts = [np.array(start, dtype=float) for start in control.starts]
-    return BestOf(sqp, starts=starts) if starts else sqp
+    return BestOf(sqp, starts=ocp.starts) if ocp.starts else sqp
 
 
-def make_ocp(prior: HybridModel, control: ControlSpec) -> OCP:
-    """The problem of a control specification; terminal weight (and the fallback) at a working speed.
+def make_ocp(prior: HybridModel, control: OCP) -> OCP:
+    """The problem with a working point: terminal weight (and the fallback) are linearised in motion if it names none.
 
     At rest the slope of dry friction would pass for strong damping.
 
@@ -185,25 +190,26 @@ def make_ocp(prior: HybridModel, control: ControlSpec) -> OCP:
     Example:
         ``CondensedController(models["hybrid"], make_ocp(models["prior"], scenario.control))``
     """
-    return OCP.from_spec(control, working_point=working_point(prior, control))
+    return control.changed(working_point=working_point(prior, control))
 
 
-def working_point(model: HybridModel, control: ControlSpec) -> tuple[Array, Array]:
-    """``(x, u)`` in motion at the position zero, or where the problem says: speeds of ``1 / sqrt(q)``, no input.
+def working_point(model: HybridModel, control: OCP) -> tuple[Array, Array]:
+    """``(x, u)`` that the problem names, else in motion at the position zero: speeds of ``1 / sqrt(q)``, no input.
 
     Args:
-        model: The model, state ``[q, v]``.
+        model: The model, state ``[q, v]`` if the problem names no point.
         control: The control problem; a speed without weight is what crosses the position's own acceptable deviation
             ``1 / sqrt(q)`` within the horizon.
 
     Example:
         ``x, u = working_point(models["prior"], scenario.control)``
     """
-    x = np.zeros(model.n_x) if control.around is None else np.array(control.around, dtype=float)
-    half = model.n_x // 2
+    if control.working_point is not None:
+        return control.working_point
+    x, half = np.zeros(model.n_x), model.n_x // 2
     far, fast = (
         np.where(q > 0, 1.0 / np.sqrt(np.where(q > 0, q, 1.0)), 0.0)
-        for q in (np.asarray(part, dtype=float) for part in (control.q[:half], control.q[half:]))
+        for q in (control.q[:half], control.q[half:])
     )
     x[half:] = np.where(fast > 0, fast, np.resize(far, fast.size) / (control.horizon * model.dt))
     return x, control.rest_input
@@ -231,29 +237,35 @@ def make_monitor(
     )
 
 
-def sensor_steps(control: ControlSpec) -> tuple[float, ...]:
+def sensor_steps(sensor_sigma: Sequence[float]) -> tuple[float, ...]:
     """Steps of the sensors, at most: what an even error within a step makes the deviation that filters assume.
 
     A real one may be finer; then a frozen sensor is found a little later.
 
+    Args:
+        sensor_sigma: Standard deviations of the sensors, as a scenario's.
+
     Example:
-        >>> spec = ControlSpec(9, (1.0,), (1.0,), (1.0,), (-1.0,), (1.0,), estimator_sigma=(0.001,))
-        >>> [round(step, 6) for step in sensor_steps(spec)]
+        >>> [round(step, 6) for step in sensor_steps((0.001,))]
         [0.003464]
     """
-    return tuple(float(np.sqrt(12.0) * sigma) for sigma in control.estimator_sigma)
+    return tuple(float(np.sqrt(12.0) * sigma) for sigma in sensor_sigma)
 
 
-def freezing(control: ControlSpec) -> dict[str, Any]:
+def freezing(scenario: Scenario, control: OCP) -> dict[str, Any]:
     """What a monitor's test for a frozen sensor needs to know: steps of the sensors, ranges of the inputs.
 
     Args:
+        scenario: The machine with its sensors.
         control: The control problem.
 
     Example:
-        ``guard_monitor(model, detector, **freezing(scenario.control))``
+        ``guard_monitor(model, detector, **freezing(scenario, scenario.control))``
     """
-    return {"resolution": sensor_steps(control), "input_range": tuple(control.input_range.tolist())}
+    return {
+        "resolution": sensor_steps(scenario.sensor_sigma),
+        "input_range": tuple(control.input_range.tolist()),
+    }
 
 
 def time_on_recording(

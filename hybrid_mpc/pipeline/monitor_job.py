@@ -58,8 +58,7 @@ class MonitorJob:
     @property
     def estimator(self) -> Any:
         """The estimator of the closed loops."""
-        assert self.scenario.control is not None
-        return make_estimator(self.artifact.models["hybrid"], self.scenario.control, self.sigma_x)
+        return make_estimator(self.artifact.models["hybrid"], self.scenario, self.sigma_x)
 
     @property
     def monitor(self) -> EnergyMonitor:
@@ -100,8 +99,8 @@ def prepared(
     """
     if scenario.control is None:
         raise InputError(
-            f"scenario {scenario.name} defines no control problem, so the estimator knows neither input range nor "
-            "sensor noise; give the scenario control=ControlSpec(...)"
+            f"scenario {scenario.name} defines no control problem, so the estimator knows no input range; give the "
+            "scenario control=OCP(...)"
         )
     folder = artifact_folder(model)
     artifact = load_artifact(folder)
@@ -124,7 +123,7 @@ def prepared(
     else:
         found = None if artifact.calibration is None else artifact.calibration.detector
     if found is not None and resolution is None:
-        resolution = sensor_steps(scenario.control)
+        resolution = sensor_steps(scenario.sensor_sigma)
     return MonitorJob(scenario, artifact, data, np.asarray(sigma["hybrid_observer"]), resolution, found)
 
 

@@ -36,7 +36,7 @@ def estimation_stage(context: Context) -> None:
     arrays: dict[str, Any] = {}
     for i, name in enumerate(OBSERVERS):
         context.progress.update("observers", i, len(OBSERVERS), name)
-        estimator = make_estimator(models[CONTENDERS[name].model], control, context.sigma_x(name))
+        estimator = make_estimator(models[CONTENDERS[name].model], context.scenario, context.sigma_x(name))
         try:
             found = consistency(estimator, parts)
         except InputError as too_short:

@@ -17,7 +17,7 @@ from hybrid_mpc.closed_loop.faults import check_channels, install
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.mpc.ocp import OCP
-from hybrid_mpc.scenario import Budget, ControlSpec, Plant, Scenario, Task
+from hybrid_mpc.scenario import Budget, Plant, Scenario, Task
 from hybrid_mpc.signals import Signal
 
 if TYPE_CHECKING:
@@ -267,47 +267,64 @@ def _check_control(
     control = scenario.control
     if control is None:
         if scenario.tasks:
-            report.add("tasks: there is no control problem to run them with; give control=ControlSpec(...)")
+            report.add("tasks: there is no control problem to run them with; give control=OCP(...)")
         return
-    _check_spec(report, "control", control, prior, model)
+    _check_sensors(report, scenario, prior)
+    _check_problem(report, scenario, "control", control, prior, model)
     built = {_structure(control)}
     for task in scenario.tasks:
         if task.control is not None:  # a controller is built once for all that differ in numbers alone
             new = _structure(task.control) not in built
             built.add(_structure(task.control))
-            _check_spec(report, f"control of task {task.name}", task.control, prior, model if new else None)
+            what = f"control of task {task.name}"
+            _check_problem(report, scenario, what, task.control, prior, model if new else None)
 
 
-def _structure(control: ControlSpec) -> tuple[Any, ...]:
-    return control.horizon, control.du_max is None, control.x_min is None, control.x_max is None
+def _structure(control: Any) -> tuple[Any, ...]:
+    """What tells controllers apart that are built differently; a problem that is none is told on its own."""
+    if not isinstance(control, OCP):
+        return ()
+    return control.horizon, control.du_max is None, tuple(np.isfinite([control.x_min, control.x_max]).ravel())
 
 
-def _check_spec(
-    report: _Report, what: str, control: ControlSpec, prior: Prior | None, model: HybridModel | None
+def _check_sensors(report: _Report, scenario: Scenario, prior: Prior | None) -> None:
+    if prior is None:
+        return
+    n_y, n_x = len(prior.outputs), len(prior.states)
+    for name, needed in (("sensor_sigma", n_y), ("first_sigma", n_x - n_y)):
+        values = getattr(scenario, name)
+        if values is None:
+            continue
+        if len(values) != needed:
+            report.add(f"{name} needs {needed} numbers, got {len(values)}: {values}")
+        if not all(math.isfinite(s) and s > 0 for s in values):
+            report.add(f"{name} must be positive and finite, got {values}")
+
+
+def _check_problem(
+    report: _Report,
+    scenario: Scenario,
+    what: str,
+    control: OCP,
+    prior: Prior | None,
+    model: HybridModel | None,
 ) -> None:
     from hybrid_mpc.pipeline.loops import make_controller, make_estimator
 
     before = len(report.problems)
-    with report.part(what):
-        OCP.from_spec(control)
+    if not isinstance(control, OCP):
+        report.add(f"{what}: OCP(...) needed, got {control!r:.60}")
+        return
     if prior is None:
         return
-    sizes = {
-        "q": len(prior.states), "r": len(prior.inputs), "r_delta": len(prior.inputs), "u_min": len(prior.inputs),
-        "u_max": len(prior.inputs), "estimator_sigma": len(prior.outputs),
-    }  # fmt: skip
-    for name, size in sizes.items():
+    for name, size in {"q": len(prior.states), "r": len(prior.inputs)}.items():
         values = getattr(control, name)
         if len(values) != size:
             report.add(f"{what}: {name} needs {size} numbers, got {len(values)}: {values}")
-    if not all(math.isfinite(s) and s > 0 for s in control.estimator_sigma):
-        report.add(f"{what}: estimator_sigma must be positive and finite, got {control.estimator_sigma}")
-    if control.around is not None and len(control.around) != len(prior.states):
-        report.add(f"{what}: around needs {len(prior.states)} numbers, got {len(control.around)}")
     if model is None or len(report.problems) > before:
         return
     with report.part(f"{what}: estimator"):
-        estimator = make_estimator(model, control, np.ones(model.n_x))
+        estimator = make_estimator(model, scenario, np.ones(model.n_x), control)
         estimate = estimator.update(
             estimator.start(np.zeros(model.n_y)), np.zeros(model.n_y), np.zeros(model.n_u)
         )

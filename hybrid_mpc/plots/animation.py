@@ -32,7 +32,7 @@ def animate(
     fps: float = 25,
     position: Signal | None = None,
     inputs: Sequence[Signal] | None = None,
-    limits: tuple[Sequence[float], Sequence[float]] | None = None,
+    limits: tuple[Sequence[float] | Array, Sequence[float] | Array] | None = None,
     reference: Array | None = None,
 ) -> Path:
     """Write a closed loop as GIF that plays in real time: the machine, its planned motion, its input.

@@ -55,7 +55,7 @@ def closed_loops(
     *,
     states: Sequence[Signal],
     inputs: Sequence[Signal],
-    limits: tuple[Sequence[float], Sequence[float]] | None = None,
+    limits: tuple[Sequence[float] | Array, Sequence[float] | Array] | None = None,
 ) -> Figure:
     """The same task under each controller: states with their reference, tracking error, inputs.
 

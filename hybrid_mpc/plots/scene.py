@@ -49,7 +49,7 @@ class Scene:
         title: str,
         position: Signal,
         inputs: Sequence[Signal],
-        limits: tuple[Sequence[float], Sequence[float]] | None,
+        limits: tuple[Sequence[float] | Array, Sequence[float] | Array] | None,
         reference: Array | None,
     ) -> None:
         self._loop = loop

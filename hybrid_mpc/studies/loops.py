@@ -235,7 +235,7 @@ def _check_plant(scenario: Scenario, study: Study) -> None:
         sets.append(study.random_faults.examples())
     for faults in sets:
         outside = install(plant, faults)[1]
-        check_channels(outside, len(scenario.control.estimator_sigma), len(scenario.control.u_min))
+        check_channels(outside, len(scenario.sensor_sigma), scenario.control.n_u)
 
 
 def _with_horizon(task: Task, scenario: Scenario, horizon: int | None) -> Task:
@@ -243,7 +243,7 @@ def _with_horizon(task: Task, scenario: Scenario, horizon: int | None) -> Task:
         return task
     control = task.control or scenario.control
     assert control is not None
-    return replace(task, control=replace(control, horizon=horizon))
+    return replace(task, control=control.changed(horizon=horizon))
 
 
 def _monitor(run: RunConfig, artifact: Artifact) -> Any:

@@ -20,12 +20,13 @@ from hybrid_mpc.estimation.switching import SwitchingFilter
 from hybrid_mpc.files import read_arrays, read_json, write_arrays
 from hybrid_mpc.monitor import METHODS, Detector, EnergyMonitor, Judges, guard_monitor, learn_judges
 from hybrid_mpc.monitor.rest import REST_SPEED
+from hybrid_mpc.mpc import OCP
 from hybrid_mpc.pipeline.contenders import build
 from hybrid_mpc.pipeline.control_job import selected_tasks
 from hybrid_mpc.pipeline.guards import make_adaptive_guard, make_resting_guard
 from hybrid_mpc.pipeline.monitor_job import stored_rest
 from hybrid_mpc.records import record
-from hybrid_mpc.scenario import ControlSpec, Task, load_scenario
+from hybrid_mpc.scenario import Task, load_scenario
 from hybrid_mpc.studies.lockstep import NominalLoop, Trace, run_together
 from hybrid_mpc.studies.loops import ModelInput
 from hybrid_mpc.studies.monitor_plan import FAULT, GUARD, LEARN, LoopPlan, MonitorJob, MonitorStudy
@@ -80,7 +81,7 @@ class _Loops:
         self._made: dict[Any, Any] = {}
 
     @property
-    def _control(self) -> ControlSpec:
+    def _control(self) -> OCP:
         control = self._task.control or self._scenario.control
         assert control is not None
         return control
@@ -106,7 +107,7 @@ class _Loops:
 
     def _parts(self, name: str, horizon: int | None = None) -> Any:
         if (name, horizon) not in self._made:
-            control = self._control if horizon is None else replace(self._control, horizon=horizon)
+            control = self._control if horizon is None else self._control.changed(horizon=horizon)
             self._made[name, horizon] = build(name, self._scenario, self._artifact, control, self._noise)
         return self._made[name, horizon]
 
@@ -177,9 +178,7 @@ class _Loops:
             return Guard(Mode.BACKUP, Mode.REST, backup=controller, backup_estimator=estimator)
         if arm not in self._made:
             prior, sigma_x = self._artifact.models["prior"], self._noise[CONTROLLER]
-            self._made[arm] = make_adaptive_guard(
-                self._model, prior, self._control, sigma_x, self._scenario.causes
-            )
+            self._made[arm] = make_adaptive_guard(self._model, prior, self._scenario, sigma_x, self._control)
         guard: Guard = self._made[arm]
         return guard
 
@@ -246,21 +245,19 @@ def _delay(alarm: NDArray[np.bool_], moved: Array) -> float:
     return float(moved[places[0]]) if places.size else float("inf")
 
 
-def loop_figures(result: ClosedLoopResult, control: ControlSpec) -> dict[str, Any]:
+def loop_figures(result: ClosedLoopResult, control: OCP) -> dict[str, Any]:
     """Cost of a loop, and by how much it left its limits.
 
     Args:
         result: The loop.
         control: Its limits.
     """
-    over = {"u": np.maximum(result.u - np.array(control.u_max), np.array(control.u_min) - result.u)}
-    if control.x_min is not None or control.x_max is not None:
-        lower = -np.inf if control.x_min is None else np.array(control.x_min)
-        upper = np.inf if control.x_max is None else np.array(control.x_max)
-        beyond = np.maximum(result.x - upper, lower - result.x)
+    over = {"u": np.maximum(result.u - control.u_max, control.u_min - result.u)}
+    if np.any(np.isfinite([control.x_min, control.x_max])):
+        beyond = np.maximum(result.x - control.x_max, control.x_min - result.x)
         over |= {f"x{i}": column for i, column in enumerate(beyond.T)}
     if control.du_max is not None:
-        over["du"] = np.abs(np.diff(result.u, axis=0)) - np.array(control.du_max)
+        over["du"] = np.abs(np.diff(result.u, axis=0)) - control.du_max
     excess = {name: max(0.0, float(values.max())) for name, values in over.items()}
     return {"cost": result.cost, "excess": excess}
 

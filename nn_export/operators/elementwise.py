@@ -217,6 +217,7 @@ def _table() -> dict[str, Operator]:
         "logical_or.default": ca.logic_or, "logical_xor.default": lambda a, b: (a != 0) != (b != 0),
         "bitwise_xor.Tensor": lambda a, b: (a != 0) != (b != 0), "fmax.default": _fmax,
         "fmin.default": _fmin, "xlogy.Tensor": _xlogy, "ldexp.Tensor": _ldexp,
+        "copysign.Tensor": ca.copysign,
     }  # fmt: skip
     comparisons: dict[str, Callable[[ca.MX, ca.MX], ca.MX]] = {
         "gt": lambda a, b: a > b, "ge": lambda a, b: a >= b, "lt": lambda a, b: a < b,

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.closed_loop.faults import Fault
 from hybrid_mpc.closed_loop.result import ClosedLoopResult
-from hybrid_mpc.scenario import ControlSpec, Task
+from hybrid_mpc.mpc import OCP
+from hybrid_mpc.scenario import Task
 from scenarios.references import faded_sines
 
 Array = NDArray[np.float64]
 
 # Bryson's rule: one over the square of the largest deviation that is tolerable: 10 mrad (7 mm at the head),
 # 0.25 rad/s, 0.25 N m of change per period. Torque itself is no deviation where the reference needs it; its
-# weight (5 N m) only keeps the problem regular. In a stroke effort counts: 0.5 N m. The encoder's sigma:
-# quantisation (0.44 mrad) and noise. Limits: the drive's peak torque and slew, the angle the frame leaves
-# free, a safe speed.
-CONTROL = ControlSpec(
+# weight (5 N m) only keeps the problem regular. In a stroke effort counts: 0.5 N m. Limits: the
+# drive's peak torque and slew, the angle the frame leaves free, a safe speed.
+CONTROL = OCP(
     horizon=50,
     q=(1e4, 16.0),
     r=(0.04,),
@@ -28,22 +27,20 @@ CONTROL = ControlSpec(
     u_min=(-0.5,),
     u_max=(0.5,),
     du_max=(0.25,),
-    estimator_sigma=(0.5e-3,),
-    first_speed_sigma=(0.1,),
     x_min=(-0.85, -2.5),
     x_max=(0.85, 2.5),
 )
 # Strokes look 1.6 s ahead, swing faster, in a narrower frame, and may pull the torque up in one period. The penalty of
 # their limits must outweigh the impact's.
-HARD_STROKE = replace(
-    CONTROL, horizon=80, r=(4.0,), r_delta=(4.0,), du_max=None, x_min=(-0.8, -5.0), x_max=(0.8, 5.0),
+HARD_STROKE = CONTROL.changed(
+    horizon=80, r=(4.0,), r_delta=(4.0,), du_max=None, x_min=(-0.8, -5.0), x_max=(0.8, 5.0),
     slack_linear=(1e6, 1e5),
 )  # fmt: skip
 # The fastest of the moves reaches 1.41 rad/s: the limit of a careful commissioning acts, and hardly costs.
-SLOW = replace(CONTROL, x_min=(-0.85, -1.4), x_max=(0.85, 1.4))
+SLOW = CONTROL.changed(x_min=(-0.85, -1.4), x_max=(0.85, 1.4))
 # A drive that is spared: the torque of a load that comes at once takes more than a period to build up.
-GENTLE = replace(CONTROL, du_max=(0.1,))
-PUTT = replace(HARD_STROKE, u_min=(-0.2,), u_max=(0.2,))
+GENTLE = CONTROL.changed(du_max=(0.1,))
+PUTT = HARD_STROKE.changed(u_min=(-0.2,), u_max=(0.2,))
 
 IMPACT = 1.6
 """Time [s] of the impact: as long as the strokes' horizon, so that the first plan ends in it."""
@@ -173,7 +170,7 @@ def _crossing(t: Array, x: Array) -> tuple[float, float]:
     return float(t[0] + h * root), float(cubic.deriv()(root)) / h
 
 
-def _stroke_task(speed: float, control: ControlSpec) -> Task:
+def _stroke_task(speed: float, control: OCP) -> Task:
     fastest = speed in (max(PUTTS), max(HARD_STROKES))
     reference, weight = stroke(speed, LONG_FOLLOW_THROUGH if fastest else FOLLOW_THROUGH)
     kind = "Putt" if control is PUTT else "Hard stroke"

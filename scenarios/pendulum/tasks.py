@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.closed_loop.faults import Fault
-from hybrid_mpc.scenario import ControlSpec, Task
+from hybrid_mpc.mpc import OCP
+from hybrid_mpc.scenario import Task
 from scenarios.references import faded_sines, quintic
 
 Array = NDArray[np.float64]
@@ -14,15 +15,13 @@ Array = NDArray[np.float64]
 # Bryson's rule: one over the square of the largest deviation that is tolerable: 10 mrad, 0.5 rad/s, 5 N m of change per
 # period. Torque that a reference needs is no deviation; its weight (100 N m) only keeps the problem regular. Half a
 # second ahead is five of the pendulum's time constants (2 m l^2 / d = 96 ms). 20 N m is what the data reach.
-CONTROL = ControlSpec(
+CONTROL = OCP(
     horizon=50,
     q=(1e4, 4.0),
     r=(1e-4,),
     r_delta=(0.04,),
     u_min=(-20.0,),
     u_max=(20.0,),
-    estimator_sigma=(1e-4,),
-    first_speed_sigma=(0.1,),
 )
 
 STEPS = (0.0, 0.5, -0.4, 0.6, 0.0)

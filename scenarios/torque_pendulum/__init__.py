@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 from hybrid_mpc.benchmark_spec import BenchmarkBudget, BenchmarkSpec
 from hybrid_mpc.data_spec import DataSpec, Window
-from hybrid_mpc.scenario import Budget, ControlSpec, Scenario
+from hybrid_mpc.mpc import OCP
+from hybrid_mpc.scenario import Budget, Scenario
 
 if TYPE_CHECKING:
     from hybrid_mpc.physics import Prior
@@ -77,7 +78,7 @@ scenario = Scenario(
         free_run=1.0,
         inputs_of={"ddp_closed_loop": ("tau_meas_Nm",), "dircol_closed_loop": ("tau_meas_Nm",)},
     ),
-    control=ControlSpec(
+    control=OCP(
         horizon=50,
         # Bryson: 1 / (largest acceptable deviation)^2: 0.2 rad, 2 rad/s, 0.9 N m, 0.5 N m a period
         q=(25.0, 0.25),
@@ -85,10 +86,10 @@ scenario = Scenario(
         r_delta=(4.0,),
         u_min=(-0.9,),
         u_max=(0.9,),
-        # encoder step 0.0029 rad / sqrt(12), doubled for backlash and vibration
-        estimator_sigma=(0.0017,),
-        first_speed_sigma=(0.1,),
     ),
+    # encoder step 0.0029 rad / sqrt(12), doubled for backlash and vibration
+    sensor_sigma=(0.0017,),
+    first_sigma=(0.1,),
     # Eight seconds of training: few steps, much decay. Chosen on sac_0p9Nm and ilqr_0p9Nm, of which nothing
     # is trained on (docs/results): 300, 1500, 3000, 6000 gave 1.2, 0.8, 0.8, 0.7 of the prior's error there.
     budgets={

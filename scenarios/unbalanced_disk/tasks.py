@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import pi
 
 import numpy as np
@@ -10,7 +9,8 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.closed_loop.faults import Fault
 from hybrid_mpc.closed_loop.result import ClosedLoopResult
-from hybrid_mpc.scenario import ControlSpec, Task
+from hybrid_mpc.mpc import OCP
+from hybrid_mpc.scenario import Task
 from scenarios.references import faded_sines
 from scenarios.unbalanced_disk.nominal import DT
 
@@ -21,18 +21,16 @@ PEAK = 3.0
 # Bryson's rule: one over the square of the largest deviation that is tolerable: 50 mrad, 1 rad/s, 2 V of change per
 # period. Voltage that a reference needs is no deviation; its weight (10 V) only keeps the problem regular. A second
 # ahead is twelve of the upright disk's time constants (1 / w_0 = 86 ms).
-CONTROL = ControlSpec(
+CONTROL = OCP(
     horizon=40,
     q=(400.0, 1.0),
     r=(0.01,),
     r_delta=(0.25,),
     u_min=(-PEAK,),
     u_max=(PEAK,),
-    # encoder step 0.0031416 rad / sqrt(12), rounded up
-    estimator_sigma=(0.001,),
-    first_speed_sigma=(0.1,),
 )
-UPRIGHT = replace(CONTROL, around=(pi, 0.0))
+# At the top, at the tolerated speed: at rest the slope of dry friction would pass for strong damping.
+UPRIGHT = CONTROL.changed(working_point=((pi, 1.0), (0.0,)))
 
 UP_AT = 1.5
 """Time [s] from which the swing-up asks the disk to stand upright: as long as its horizon."""
@@ -61,7 +59,7 @@ def pumps(horizon: int) -> tuple[tuple[tuple[float, ...], ...], ...]:
 
 
 # In the swing voltage counts (3 V); the penalty of being elsewhere begins when the disk is to stand.
-SWING = replace(UPRIGHT, horizon=round(UP_AT / DT), r=(0.11,), starts=pumps(round(UP_AT / DT)))
+SWING = UPRIGHT.changed(horizon=round(UP_AT / DT), r=(0.11,), starts=pumps(round(UP_AT / DT)))
 
 
 def upright(t: Array) -> Array:

@@ -92,7 +92,7 @@ def test_a_torque_nobody_told_of_is_found_in_a_clean_window(model, data, found):
     recording = next(r for r in data.whole if r.name == "energy_shaping_1p5Nm")
     start = recording.part(recording.t < 4.0, recording.name, recording.role)
     pushed = replace(start, u=start.u - 0.3 * ((start.t > 1.0) & (start.t < 2.0))[:, None])
-    trace = replay(guard_monitor(model), make_estimator(model, scenario.control, np.array(SIGMA_X)), pushed)
+    trace = replay(guard_monitor(model), make_estimator(model, scenario, np.array(SIGMA_X)), pushed)
     (first, _), *_ = judged(found["energy_shaping_1p5Nm"].detector, trace).intervals()
     # While it acts: read half a window late, and at this torque 0.25 N m are three deviations, two of which count as 0.
     assert 1.0 < first < 2.0

@@ -77,7 +77,7 @@ def soft_plan(a, b, ocp, dt, terminal, z0, d, reference, u_prev, weight=None):
     m, by_u = (np.stack([g(e) - g0 for e in np.eye(n)], axis=1) for g, g0 in ((f, r0), (x, x0)))
     opti = ca.Opti()
     u, s = opti.variable(n), opti.variable(x0.size)
-    linear, quadratic = (np.tile(v, ocp.horizon) * dt for v in (ocp.slack_linear, ocp.slack_quadratic))
+    linear, quadratic = (np.tile(v, ocp.horizon) * dt for v in ocp.penalties)
     opti.minimize(ca.sumsqr(m @ u + r0) + ca.dot(linear, s) + ca.dot(quadratic, s**2))
     g, h = constraints(ocp, u_prev)
     opti.subject_to(g @ u <= h)

@@ -5,7 +5,6 @@ from online_models import pendulum_model, random_linear
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.mpc import OCP
 from hybrid_mpc.riccati import dare
-from hybrid_mpc.scenario import ControlSpec
 
 GOOD = {
     "horizon": 10, "q": [1.0, 0.1], "r": [0.1], "r_delta": [0.0], "u_min": [-1.0], "u_max": [2.0],
@@ -46,13 +45,6 @@ GOOD = {
 def test_bad_problems_are_refused(change, words):
     with pytest.raises(InputError, match=words):
         OCP(**{**GOOD, **change})
-
-
-def test_from_spec_takes_every_field():
-    spec = ControlSpec(7, (1.0, 2.0), (3.0,), (4.0,), (-5.0,), (6.0,), (0.5,))
-    ocp = OCP.from_spec(spec)
-    got = ocp.horizon, *ocp.q, *ocp.r, *ocp.r_delta, *ocp.u_min, *ocp.u_max, *ocp.du_max
-    assert got == (7, 1.0, 2.0, 3.0, 4.0, -5.0, 6.0, 0.5)
 
 
 def test_stage_cost_by_hand_and_over_a_batch():

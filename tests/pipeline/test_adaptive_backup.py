@@ -10,14 +10,16 @@ from monitor_parts import MGL, J, pendulum
 
 from hybrid_mpc.closed_loop import Mode
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.mpc import OCP
 from hybrid_mpc.pipeline import make_adaptive_guard, make_controller, make_estimator
 from hybrid_mpc.pipeline.guards import adaptable
-from hybrid_mpc.scenario import ControlSpec
+from hybrid_mpc.scenario import Scenario
 
-CONTROL = ControlSpec(
-    20, q=(300.0, 1.0), r=(0.05,), r_delta=(0.05,), u_min=(-6.0,), u_max=(6.0,), estimator_sigma=(1e-4,)
-)
+CONTROL = OCP(20, q=(300.0, 1.0), r=(0.05,), r_delta=(0.05,), u_min=(-6.0,), u_max=(6.0,))
 CAUSES = {"mass": ("J", "mgl"), "friction": ("gamma",), "motor": ("gain of u",)}
+SCENARIO = Scenario(
+    "pendulum", "", "", prior=pendulum, data=None, control=CONTROL, sensor_sigma=(1e-4,), causes=CAUSES
+)
 LATE = SimpleNamespace(parametric=pendulum().parametric, waiting=1, name="late")
 SIGMA_X = np.array([1e-5, 1e-3])
 
@@ -51,8 +53,8 @@ def test_gains_are_left_to_the_mass():
 
 def test_it_switches_once_the_alarm_has_lasted_and_pays():
     model = pendulum()
-    guard = make_adaptive_guard(model, model, CONTROL, SIGMA_X, CAUSES, patience=0.2)
-    safe, estimator = make_controller(model, model, CONTROL), make_estimator(model, CONTROL, SIGMA_X)
+    guard = make_adaptive_guard(model, model, SCENARIO, SIGMA_X, patience=0.2)
+    safe, estimator = make_controller(model, model, CONTROL), make_estimator(model, SCENARIO, SIGMA_X)
     plain, guarded = (
         run(
             model, safe, plant=Heavy(), estimator=estimator, monitor=Told([(5, 10**9)]), guard=g, duration=3.0
@@ -68,13 +70,18 @@ def test_it_switches_once_the_alarm_has_lasted_and_pays():
 
 
 def test_what_it_needs():
+    def made(**changes):
+        return make_adaptive_guard(pendulum(), pendulum(), replace(SCENARIO, **changes), SIGMA_X)
+
     with pytest.raises(InputError, match="needs causes"):
-        make_adaptive_guard(pendulum(), pendulum(), CONTROL, SIGMA_X, {})
+        made(causes={})
+    with pytest.raises(InputError, match="scenario pendulum has none"):
+        made(control=None)
     with pytest.raises(InputError, match="knows its parameters"):
         adaptable(replace(pendulum(), parametric=None), CAUSES)
     with pytest.raises(InputError, match="act later"):
         adaptable(LATE, CAUSES)
     with pytest.raises(InputError, match="'typo' is empty"):
-        make_adaptive_guard(pendulum(), pendulum(), CONTROL, SIGMA_X, {"typo": (), "mass": ("J",)})
+        made(causes={"typo": (), "mass": ("J",)})
     with pytest.raises(InputError, match="weight"):
-        make_adaptive_guard(pendulum(), pendulum(), CONTROL, SIGMA_X, {"mass": ("weight",)})
+        made(causes={"mass": ("weight",)})

@@ -85,8 +85,7 @@ def test_the_monitor_alarms_at_once_with_the_old_model(machines):
     model = build_model("prior", {f"prior/{n}": p for n, p in trace_model(step).items()}, info)
     sigma = np.array([1e-4, 2e-2])
     clean, changed = (
-        replay(make_monitor(model, None), make_estimator(model, scenario.control, sigma), t)
-        for t in (before, after)
+        replay(make_monitor(model, None), make_estimator(model, scenario, sigma), t) for t in (before, after)
     )
     levels = (clean.level_w, clean.residual_level)
     calibration = with_residual(*(calibrate([v], 0.02, false_alarms_per_hour=30.0) for v in levels))

@@ -1,7 +1,6 @@
 """What the closed loops of a run are summed up to, and what they are made of."""
 
 import shutil
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -78,8 +77,8 @@ def test_rows_become_tables():
 
 
 def test_limits_are_shares_of_the_side_that_they_bound():
-    control = replace(
-        GOLF.control, u_min=(-0.2,), u_max=(0.5,), du_max=(0.4,), x_min=(-1.0, -np.inf), x_max=(2.0, np.inf)
+    control = GOLF.control.changed(
+        u_min=(-0.2,), u_max=(0.5,), du_max=(0.4,), x_min=(-1.0, -np.inf), x_max=(2.0, np.inf)
     )
     loop = SimpleNamespace(
         u=np.array([[0.1], [0.25], [-0.1]]), x=np.array([[0.5, 9.0], [-0.75, 0.0], [1.0, 0.0]])
@@ -99,8 +98,8 @@ def test_limits_are_shares_of_the_side_that_they_bound():
      (2.0, 5.0, [2.0, 3.5, 2.0], (0.5, 0.375)), (-5.0, -2.0, [-2.0, -3.5, -2.0], (0.5, 0.375))],
 )  # fmt: skip
 def test_limits_beside_zero_are_used_from_rest_on(u_min, u_max, u, shares):
-    control = replace(
-        GOLF.control, u_min=(u_min,), u_max=(u_max,), du_max=(4.0,), x_min=None, x_max=(2.0, np.inf)
+    control = GOLF.control.changed(
+        u_min=(u_min,), u_max=(u_max,), du_max=(4.0,), x_min=None, x_max=(2.0, np.inf)
     )
     used = limits_used(
         control, SimpleNamespace(u=np.array(u)[:, None], x=np.array([[1.0, 9.0], [-7.0, 0.0]]))

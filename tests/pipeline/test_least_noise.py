@@ -22,13 +22,13 @@ def noise(monkeypatch):
     monkeypatch.setattr(
         contenders,
         "tuned_noise",
-        lambda model, control, base, recordings, observer: (2 if observer else 1) * base,
+        lambda model, scenario, base, recordings, observer: (2 if observer else 1) * base,
     )
     artifact = SimpleNamespace(models={"prior": "prior", "hybrid": "hybrid"})
 
     def found(beyond):
         machine = replace(scenario, oracle=None, beyond_recordings=beyond)
-        return contenders.noise_of(machine, artifact, machine.control, [])
+        return contenders.noise_of(machine, artifact, [])
 
     return found
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from hybrid_mpc import Budget, ControlSpec, DataSpec, Parameter, Prior, Scenario, Signal
+from hybrid_mpc import OCP, Budget, DataSpec, Parameter, Prior, Scenario, Signal
 from hybrid_mpc.closed_loop import Fault
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.pipeline.preflight import check_scenario
@@ -45,10 +45,10 @@ class Plant:
 
 
 DATA = DataSpec("t", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.2, warm_up=0.5)
-CONTROL = ControlSpec(10, (25, 0.25), (1,), (1,), (-1,), (1,), estimator_sigma=(1e-3,))
+CONTROL = OCP(10, (25, 0.25), (1,), (1,), (-1,), (1,))
 TASK = Task("hold", "Hold", 1.0, (0.1, 0.0), lambda t: np.zeros((len(t), 2)))
 GOOD = Scenario(
-    "mine", "Mine", "", prior=Pendulum, data=DATA, control=CONTROL, plant=Plant, tasks=(TASK,),
+    "mine", "Mine", "", prior=Pendulum, data=DATA, control=CONTROL, sensor_sigma=(1e-3,), plant=Plant, tasks=(TASK,),
     budgets={"quick": Budget(4, 1, 5, 5, 1)},
 )  # fmt: skip
 
@@ -59,7 +59,7 @@ def prior(**members):
 
 
 def control(**fields):
-    return lambda: {"control": dataclasses.replace(CONTROL, **fields)}
+    return lambda: {"control": CONTROL.changed(**fields)}
 
 
 def task(**fields):
@@ -124,21 +124,29 @@ WRONG = {
     "too many columns": (field(data=dataclasses.replace(DATA, outputs=("phi", "x"))), ["2 columns of outputs"]),
     "unknown cause": (field(causes={"mass": ("m",)}), ["no parameter m", "J, mgl"]),
     # control
-    "horizon 0": (control(horizon=0), ["control: horizon"]),
-    "horizon half": (control(horizon=2.5), ["control: horizon"]),
+    "horizon 0": (control(horizon=0), ["horizon must be a whole number of periods"]),
+    "horizon half": (control(horizon=2.5), ["horizon must be a whole number of periods"]),
     "crossed bounds": (control(u_min=(1,), u_max=(-1,)), ["input bounds cross", "u_min"]),
-    "NaN weight": (control(q=(math.nan, 1)), ["control: q"]),
-    "negative weight": (control(r=(-1,)), ["control: "]),
-    "no weight at all": (control(r=(0,), r_delta=(0,)), ["control: "]),
-    "weights of too few": (control(q=(1,)), ["q needs 2 numbers, got 1"]),
+    "NaN weight": (control(q=(math.nan, 1)), ["q: weights must be finite and not negative"]),
+    "negative weight": (control(r=(-1,)), ["r: weights must be finite and not negative"]),
+    "no weight at all": (control(r=(0,), r_delta=(0,)), ["every input needs a positive weight"]),
+    "weights of too few": (
+        field(control=OCP(10, (25,), (1,), (1,), (-1,), (1,))), ["control: q needs 2 numbers, got 1"]
+    ),
+    "inputs of too many": (
+        field(control=OCP(10, (25, 1), (1, 1), (1, 1), (-1, -1), (1, 1))), ["control: r needs 1 numbers, got 2"]
+    ),
     "bounds of too many": (control(u_min=(-1, -1), u_max=(1, 1)), ["u_min"]),
-    "no estimator_sigma": (control(estimator_sigma=()), ["estimator_sigma needs 1 numbers, got 0"]),
-    "zero estimator_sigma": (control(estimator_sigma=(0.0,)), ["estimator_sigma must be positive"]),
-    "NaN estimator_sigma": (control(estimator_sigma=(math.nan,)), ["estimator_sigma must be positive"]),
+    "a problem that is none": (field(control={"horizon": 10}), ["control: OCP(...) needed, got {'horizon': 10}"]),
+    "a field there is not": (control(horizn=9), ["'horizn'; did you mean 'horizon'?"]),
+    "no sensor_sigma": (field(sensor_sigma=()), ["sensor_sigma needs 1 numbers, got 0"]),
+    "zero sensor_sigma": (field(sensor_sigma=(0.0,)), ["sensor_sigma must be positive"]),
+    "NaN sensor_sigma": (field(sensor_sigma=(math.nan,)), ["sensor_sigma must be positive"]),
+    "first_sigma of all": (field(first_sigma=(1e-3, 0.1)), ["first_sigma needs 1 numbers, got 2"]),
     "zero du_max": (control(du_max=(0,)), ["du_max"]),
-    "crossed states": (control(x_min=(1, -1), x_max=(-1, 1)), ["control"]),
-    "around of one": (control(around=(0.0,)), ["around needs 2 numbers"]),
-    "starts of another shape": (control(starts=(((0.0,),),)), ["control: controller"]),
+    "crossed states": (control(x_min=(1, -1), x_max=(-1, 1)), ["state bounds cross"]),
+    "working point of one": (control(working_point=((0.0,), (0.0,))), ["working_point x: 1 values given, 2 needed"]),
+    "starts of another shape": (control(starts=(((0.0,),),)), ["starts[0]: shape (1, 1) given", "(10, 1)"]),
     # tasks
     "no reference for all": (task(reference=lambda t: np.zeros((len(t), 1))), ["task hold: reference", "(50, 2)"]),
     "reference that raises": (task(reference=raises), ["task hold raised KeyError"]),
@@ -148,7 +156,9 @@ WRONG = {
     "endless": (task(duration=math.inf), ["task hold: duration"]),
     "x0 of one": (task(x0=(0.0,)), ["x0 needs 2"]),
     "x0 of NaN": (task(x0=(math.nan, 0.0)), ["x0 needs 2"]),
-    "task's own horizon": (task(control=dataclasses.replace(CONTROL, horizon=-3)), ["control of task hold"]),
+    "task's own weights": (
+        task(control=OCP(10, (25,), (1,), (1,), (-1,), (1,))), ["control of task hold: q needs 2 numbers"]
+    ),
     "same tasks": (field(tasks=(TASK, TASK)), ["two have the same name"]),
     "fault of a channel": (task(faults=(Fault(0, 1, "input_gain", 0.5, channel=3),)), ["channel 3"]),
     "fault the plant lacks": (task(faults=(Fault(0, 1, "plant_fire", 0.5),)), ["takes no faults"]),
@@ -185,7 +195,7 @@ def test_every_wrong_scenario_is_told(changes):
 def test_all_problems_are_told_at_once():
     wrong = {
         **prior(acceleration=lambda self, x, u: None)(),
-        **control(horizon=0)(),
+        **field(sensor_sigma=())(),
         **budget(networks=0)(),
         **task(x0=(0.0,))(),
     }
@@ -193,7 +203,7 @@ def test_all_problems_are_told_at_once():
         check_scenario(dataclasses.replace(GOOD, **wrong))
     message = str(told.value)
     assert "3 problems" in message  # what hangs on the prior (the task's states) cannot be known without one
-    for word in ("xdot", "horizon", "networks"):
+    for word in ("xdot", "sensor_sigma", "networks"):
         assert word in message
 
 
@@ -216,5 +226,6 @@ def test_the_command_tells_it_before_it_reads_anything(call, tmp_path):
     )
     code, _, message = call("run", machine, "--data", tmp_path / "none.csv", "--out", tmp_path / "out")
     assert code == 2
-    assert "control: horizon" in message
+    assert "horizon must be a whole number of periods, at least 1; got 0" in message
+    assert "machine.py:3" in message
     assert not (tmp_path / "out").exists()

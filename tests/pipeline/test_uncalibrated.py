@@ -12,6 +12,7 @@ from hybrid_mpc.data import write_csv
 from hybrid_mpc.data_spec import DataSpec
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import write_json
+from hybrid_mpc.mpc import OCP
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.faulted_loops import stored_detector
 from hybrid_mpc.pipeline.figures import _monitor as monitor_figures
@@ -22,7 +23,7 @@ from hybrid_mpc.pipeline.monitor_job import stored_rest
 from hybrid_mpc.pipeline.results import _monitor as monitor_results
 from hybrid_mpc.pipeline.settings import RunSettings
 from hybrid_mpc.report.schema import SCHEMA, _check
-from hybrid_mpc.scenario import ControlSpec, Scenario
+from hybrid_mpc.scenario import Scenario
 
 AXIS = """
 from hybrid_mpc import Prior, Parameter, Signal
@@ -91,16 +92,17 @@ def context(machine, samples, out, warm_up):
         smoothing=10 * machine.dt,
         warm_up=warm_up,
     )
-    control = ControlSpec(
+    control = OCP(
         20,
         q=(1.0, 1.0),
         r=(1.0,),
         r_delta=(1.0,),
         u_min=(-2.0,),
         u_max=(2.0,),
-        estimator_sigma=(machine.noise,),
     )
-    scenario = Scenario("axis", "An axis", "", prior=room["Axis"], data=spec, control=control)
+    scenario = Scenario(
+        "axis", "An axis", "", prior=room["Axis"], data=spec, control=control, sensor_sigma=(machine.noise,)
+    )
     for i, n in enumerate(samples):
         write_csv(out / "data" / f"run{i}.csv", machine.recording(i, n))
     made = Context(RunSettings("axis"), scenario, out)

@@ -9,9 +9,8 @@ from hybrid_mpc.closed_loop import Fault, simulate
 from hybrid_mpc.closed_loop.faults import install
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.mpc.condensed import CondensedController
-from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.safeguard import SafeController
-from hybrid_mpc.pipeline.loops import make_estimator, working_point
+from hybrid_mpc.pipeline.loops import make_estimator, make_ocp
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.faults import catalogue, fault_case
 from scenarios.golf_robot.rig import Rig
@@ -60,9 +59,9 @@ def linear_model():
 @pytest.fixture(scope="module")
 def loop():
     model, control = linear_model(), scenario.control
-    ocp = OCP.from_spec(control, working_point=working_point(model, control))
-    safe = SafeController(CondensedController(model, replace(ocp, horizon=20)), model)
-    ekf = make_estimator(model, control, np.array([1e-3, 3e-2]))
+    ocp = make_ocp(model, control)
+    safe = SafeController(CondensedController(model, ocp.changed(horizon=20)), model)
+    ekf = make_estimator(model, scenario, np.array([1e-3, 3e-2]))
 
     def run(faults=(), rig=None):
         plant, rest = install(rig or Rig(QUIET), faults)

@@ -149,7 +149,7 @@ def models(tmp_path_factory):
 
 
 def loop(model, task, duration, **options):
-    parts = make_estimator(model, task.control, NOISE), make_controller(model, model, task.control)
+    parts = make_estimator(model, scenario, NOISE, task.control), make_controller(model, model, task.control)
     return simulate(
         DiskPlant(),
         *parts,
@@ -166,7 +166,7 @@ def loop(model, task, duration, **options):
 def test_the_prior_swings_the_plant_up(models):
     task = TASKS["swing_up"]
     # one start and a short hold keep the test quick; the task has twelve starts and 4 s
-    task = replace(task, control=replace(task.control, starts=task.control.starts[:1]))
+    task = replace(task, control=task.control.changed(starts=task.control.starts[:1]))
     result = loop(models["late"], task, 2.6)
     assert np.abs(result.u).max() <= PEAK
     assert task.figures(result)["up_at_s"] <= UP_AT

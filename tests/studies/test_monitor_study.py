@@ -27,7 +27,7 @@ SMALL = MonitorStudy("golf_robot", "nowhere", nominal_hours=0.5, seeds=3, guard_
 def test_loops_together_are_loops_alone(golf_artifact):
     models = load_artifact(golf_artifact).models
     hybrid, control, periods = models["hybrid"], scenario.control, 12
-    estimator = make_estimator(hybrid, control, np.array([1e-4, 2e-2]))
+    estimator = make_estimator(hybrid, scenario, np.array([1e-4, 2e-2]))
     controller = make_controller(hybrid, models["prior"], control)
     reference, monitor = scenario.tasks[0].reference, guard_monitor(hybrid)
     drift = LoopPlan("drift_up", "task", 0, 0.3).faults(0.02)
