@@ -43,7 +43,7 @@ def main() -> None:
     given = parser.parse_args()
     artifact = load_artifact(given.model)
     hybrid, prior = artifact.models["hybrid"], artifact.models["prior"]
-    noise, _ = find_noise(scenario, artifact, given.model, ("hybrid_observer",), 0, None)
+    noise, _ = find_noise(scenario, artifact, ("hybrid_observer",), 0, None)
     judges = record(Judges, read_json(given.study / "judges.json"), "judges.json")
     told = {**freezing(scenario, CONTROL), "resolution": judges.resolution}
     monitor = guard_monitor(hybrid, judges.detector_at(RATE), **told)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_mpc.artifact import Artifact
+from hybrid_mpc.artifact import Kit
 from hybrid_mpc.closed_loop import simulate
 from hybrid_mpc.files import read_arrays, write_arrays
 from hybrid_mpc.pipeline.loops import make_controller, make_estimator
@@ -90,7 +90,7 @@ def fault_plans(cases, seeds: int, seed: int) -> list[Plan]:
 class Loops:
     """Runs loops, or reads those that lie in a folder."""
 
-    def __init__(self, artifact: Artifact, sigma_x, keep: Path | None, say=print) -> None:
+    def __init__(self, artifact: Kit, sigma_x, keep: Path | None, say=print) -> None:
         self._models, self._keep, self._say = artifact.models, keep, say
         self._control = CONTROL.changed(x_min=(-0.85, -2.5), x_max=(0.85, 2.5))
         hybrid = self._models["hybrid"]

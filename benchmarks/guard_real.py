@@ -22,7 +22,7 @@ import numpy as np
 
 from hybrid_mpc.artifact import load_artifact
 from hybrid_mpc.data.trajectories import load_trajectories
-from hybrid_mpc.files import read_json, write_json
+from hybrid_mpc.files import write_json
 from hybrid_mpc.monitor.held_out import HeldOut, leave_one_out
 from hybrid_mpc.pipeline.loops import make_estimator
 from hybrid_mpc.records import plain
@@ -119,7 +119,7 @@ def main() -> None:
     parser.add_argument("--pictures", type=Path, help="folder for a figure of each recording")
     given = parser.parse_args()
     artifact = load_artifact(given.model / "model")
-    noise = read_json(given.model / "checkpoints" / "control.json")["sigma_x"]
+    noise = artifact.loop.process_noise
     result = {}
     for name in given.models:
         model = artifact.models[name]

@@ -1,8 +1,11 @@
 """hybrid-mpc: measurements and an ODE in, a guarded real-time nonlinear MPC out.
 
-What a user's own machine is written with stands here; everything else is imported from its room.
+``import hybrid_mpc as hm``: what a machine is written with (``hm.Prior``, ``hm.Scenario``, ``hm.OCP`` ...), the job
+(``hm.run``), and what its result is used with (``hm.load``, ``hm.Loop``, ``hm.simulate``, ``hm.Runner`` ...). Each name
+is imported when it is used: torch by who writes a prior or trains, casadi by who states a problem or runs a loop.
 """
 
+import importlib
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +15,16 @@ from hybrid_mpc.scenario import Budget, Scenario, Task
 from hybrid_mpc.signals import Parameter, Signal
 
 if TYPE_CHECKING:
+    from hybrid_mpc.artifact import Kit, load
+    from hybrid_mpc.closed_loop.faults import Fault
+    from hybrid_mpc.closed_loop.guard import Guard
+    from hybrid_mpc.closed_loop.loop import Loop
+    from hybrid_mpc.closed_loop.runner import Runner
+    from hybrid_mpc.closed_loop.simulate import simulate
     from hybrid_mpc.mpc.ocp import OCP
     from hybrid_mpc.physics import Prior
+    from hybrid_mpc.pipeline.run import run
+    from hybrid_mpc.pipeline.settings import RunSettings
 
 try:
     __version__ = version("hybrid-mpc")
@@ -24,24 +35,40 @@ __all__ = [
     "OCP",
     "Budget",
     "DataSpec",
+    "Fault",
+    "Guard",
     "InputError",
+    "Kit",
+    "Loop",
     "Parameter",
     "Prior",
+    "RunSettings",
+    "Runner",
     "Scenario",
     "Signal",
     "Task",
     "Window",
     "__version__",
+    "load",
+    "run",
+    "simulate",
 ]
+_HOME = {
+    "Fault": "closed_loop.faults",
+    "Guard": "closed_loop.guard",
+    "Kit": "artifact",
+    "Loop": "closed_loop.loop",
+    "OCP": "mpc.ocp",
+    "Prior": "physics",
+    "RunSettings": "pipeline.settings",
+    "Runner": "closed_loop.runner",
+    "load": "artifact",
+    "run": "pipeline.run",
+    "simulate": "closed_loop.simulate",
+}
 
 
 def __getattr__(name: str) -> Any:
-    if name == "Prior":  # torch is loaded by whoever writes a prior, and by nobody else
-        from hybrid_mpc.physics import Prior
-
-        return Prior
-    if name == "OCP":  # and casadi by whoever states a problem
-        from hybrid_mpc.mpc.ocp import OCP
-
-        return OCP
-    raise AttributeError(f"module 'hybrid_mpc' has no attribute {name!r}")
+    if name not in _HOME:
+        raise AttributeError(f"module 'hybrid_mpc' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"hybrid_mpc.{_HOME[name]}"), name)

@@ -7,7 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 import nn_export
 from hybrid_mpc.delayed import with_input_delay
@@ -15,8 +18,16 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_document, read_object, sha256, write_document
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.monitor.calibration import Calibration
-from hybrid_mpc.records import plain, record
+from hybrid_mpc.mpc.ocp import OCP
+from hybrid_mpc.records import known, plain, record
 from hybrid_mpc.signals import Signal
+
+if TYPE_CHECKING:
+    from hybrid_mpc.closed_loop.guard import Guard
+    from hybrid_mpc.estimation.kalman import ExtendedKalmanFilter
+    from hybrid_mpc.estimation.switching import SwitchingFilter
+    from hybrid_mpc.monitor.energy import EnergyMonitor
+    from hybrid_mpc.mpc.safeguard import SafeController
 
 SCHEMA_VERSION = 2
 FILE = "model.json"
@@ -89,6 +100,33 @@ class Provenance:
 
 
 @dataclass(frozen=True)
+class LoopSettings:
+    """What loops on a folder's models need beside them.
+
+    Args:
+        control: Control problems by task; under ``""`` the one of all tasks that have none of their own. Default: none.
+        sensor_sigma: Standard deviations of the sensors ``(n_y,)`` [output units], as estimators assume them.
+        first_sigma: Those of what is not measured ``(n_x - n_y,)`` at an estimator's start. Default: by the sensors'.
+        process_noise: Standard deviations per period ``(n_x,)`` [state units] by model, and by model with ``_observer``
+            behind it where the estimator follows an unknown load.
+        causes: What may break, by name: the parameters that change together then.
+        safe_input: Input ``(n_u,)`` that the machine is left with. Default: zero, or the limit next to it.
+    """
+
+    control: Mapping[str, OCP] = field(default_factory=dict)
+    sensor_sigma: tuple[float, ...] = ()
+    first_sigma: tuple[float, ...] | None = None
+    process_noise: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    causes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    safe_input: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        sigmas = self.sensor_sigma, self.first_sigma or (), *self.process_noise.values()
+        if not all(0 <= sigma < math.inf for values in sigmas for sigma in values):
+            raise InputError("loop: standard deviations must be finite and not negative")
+
+
+@dataclass(frozen=True)
 class Description:
     """What ``model.json`` holds beside its schema version and its hash.
 
@@ -104,6 +142,7 @@ class Description:
         time_unit_s: The machine's second [s], see :attr:`HybridModel.time_unit`.
         calibration: Calibration of the energy monitor, or None.
         provenance: What the models were made from.
+        loop: Control problems, noise and what else loops need. Default: nothing.
 
     Raises:
         InputError: If a number or the models' names cannot be.
@@ -120,6 +159,7 @@ class Description:
     time_unit_s: float
     calibration: Calibration | None
     provenance: Provenance
+    loop: LoopSettings = field(default_factory=LoopSettings)
 
     def __post_init__(self) -> None:
         if not 0 < self.dt_s < math.inf:
@@ -135,20 +175,176 @@ class Description:
 
 
 @dataclass(frozen=True)
-class Artifact:
-    """Models by name (``"hybrid"``, ``"prior"``), the monitor's calibration and the provenance.
+class Kit:
+    """A loaded artifact: models, and estimator, controller, monitor and guard that are made from them.
 
     Args:
-        models: Deployed models.
+        models: Deployed models by name (``"hybrid"``, ``"prior"``).
         calibration: Calibration of the energy monitor, or None.
         provenance: What the models were made from.
         input_delay: Delay [s] that the models hold. Default: none.
+        loop: Control problems, noise and what else loops need. Default: nothing.
+
+    Example: the whole way from a folder to a loop::
+
+        kit = hm.load("runs/mine")
+        loop = hm.Loop(kit.observer(), kit.controller(), monitor=kit.monitor(), reference=[0.5, 0.0])
     """
 
     models: Mapping[str, HybridModel]
     calibration: Calibration | None
     provenance: Provenance
     input_delay: float = 0.0
+    loop: LoopSettings = field(default_factory=LoopSettings)
+
+    @property
+    def name(self) -> str:
+        """Name of the machine's scenario."""
+        return self.provenance.scenario
+
+    @property
+    def sensor_sigma(self) -> tuple[float, ...]:
+        """Standard deviations of the sensors ``(n_y,)`` [output units]."""
+        return self.loop.sensor_sigma
+
+    @property
+    def first_sigma(self) -> tuple[float, ...] | None:
+        """Standard deviations of what is not measured at an estimator's start; None: by the sensors'."""
+        return self.loop.first_sigma
+
+    @property
+    def causes(self) -> Mapping[str, tuple[str, ...]]:
+        """What may break, by name: the parameters that change together then."""
+        return self.loop.causes
+
+    @property
+    def control(self) -> OCP | None:
+        """The control problem of all tasks that have none of their own; None: there is none."""
+        return self.loop.control.get("")
+
+    @property
+    def safe_input(self) -> NDArray[np.float64]:
+        """Input ``(n_u,)`` that the machine is left with, whatever ends a loop."""
+        given = self.loop.safe_input
+        return self.problem().rest_input if given is None else np.array(given, dtype=np.float64)
+
+    def problem(self, task: str = "") -> OCP:
+        """The control problem of a task.
+
+        Args:
+            task: Its name; without a problem of its own it has the common one. Default: the common one.
+
+        Raises:
+            InputError: If the folder holds none.
+        """
+        found = self.loop.control.get(task, self.control)
+        if found is None:
+            raise InputError(
+                f"{self._whose} was saved without a control problem: define one in the scenario (control=OCP(...)) "
+                "and run it again"
+            )
+        return found
+
+    def observer(
+        self, model: str = "hybrid", *, task: str = "", load: bool = True
+    ) -> ExtendedKalmanFilter | SwitchingFilter:
+        """The estimator of a model's state, hidden state and, with ``load``, an unknown load at its inputs.
+
+        Args:
+            model: Name of the model. Default: the hybrid.
+            task: Whose control problem tells what a large load is. Default: the common one.
+            load: Whether it follows a load: without, a steady one leaves an offset. Default: yes.
+
+        Raises:
+            InputError: If there is no such model, no control problem, or no noise for this estimator.
+
+        Example:
+            ``hm.load("runs/mine").observer()``
+        """
+        from hybrid_mpc.pipeline.loops import make_estimator
+
+        held, key = self._model(model), f"{model}_observer" if load else model
+        if key not in self.loop.process_noise:
+            raise InputError(
+                f"{self._whose} was saved without process noise for {key}; run the scenario again (its stage control "
+                "estimates it)"
+            )
+        sigma = np.array(self.loop.process_noise[key])
+        return make_estimator(held, self, sigma, self.problem(task), observer=load)
+
+    def controller(self, model: str = "hybrid", *, task: str = "", iterations: int = 1) -> SafeController:
+        """The MPC of a model with its safeguards, which stand on the prior.
+
+        Args:
+            model: Name of the model that plans. Default: the hybrid.
+            task: Whose control problem it solves. Default: the common one.
+            iterations: Linearisations a period. Default: one.
+
+        Raises:
+            InputError: If there is no such model or no control problem.
+
+        Example:
+            ``hm.load("runs/mine").controller()``
+        """
+        from hybrid_mpc.pipeline.loops import make_controller
+
+        return make_controller(
+            self._model(model), self._model("prior"), self.problem(task), iterations=iterations
+        )
+
+    def monitor(self, model: str = "hybrid") -> EnergyMonitor:
+        """The energy monitor with what the run has learned: its detector, else thresholds, else no alarm.
+
+        Args:
+            model: Name of the model that is held against the machine. Default: the hybrid.
+
+        Raises:
+            InputError: If there is no such model.
+
+        Example:
+            ``hm.load("runs/mine").monitor()``
+        """
+        from hybrid_mpc.monitor import guard_monitor
+        from hybrid_mpc.pipeline.loops import freezing, make_monitor
+
+        held, found = self._model(model), self.calibration
+        if found is None or found.detector is None or self.control is None:
+            return make_monitor(held, found)
+        return guard_monitor(held, found.detector, **freezing(self, self.control))
+
+    def guard(self, *, adapt: bool = False, task: str = "") -> Guard:
+        """What a loop does on alarms: no input while the sensor is frozen; the rest is recorded, or adapted to.
+
+        Args:
+            adapt: Whether a backup takes over that estimates what has become of the prior's parameters, once an alarm
+                has lasted. Default: no.
+            task: Whose control problem the backup solves. Default: the common one.
+
+        Raises:
+            InputError: If a backup is asked for and its model, noise or causes are missing.
+
+        Example:
+            ``simulate(..., monitor=kit.monitor(), guard=kit.guard())``
+        """
+        from hybrid_mpc.pipeline.guards import make_adaptive_guard, make_resting_guard
+
+        if not adapt:
+            return make_resting_guard(self._model("hybrid"))
+        noise = self.loop.process_noise.get("hybrid_observer")
+        if noise is None:
+            raise InputError(
+                "a guard that adapts needs the process noise of hybrid_observer; run the scenario again"
+            )
+        return make_adaptive_guard(
+            self._model("hybrid"), self._model("prior"), self, np.array(noise), self.problem(task)
+        )
+
+    @property
+    def _whose(self) -> str:
+        return f"the model of scenario {self.name or '(unnamed)'}"
+
+    def _model(self, name: str) -> HybridModel:
+        return self.models[known(name, self.models, "model")]
 
 
 def save_artifact(
@@ -158,6 +354,7 @@ def save_artifact(
     *,
     calibration: Calibration | None = None,
     provenance: Provenance | None = None,
+    loop: LoopSettings | None = None,
 ) -> None:
     """Write models to ``folder``: ``programs.json``, ``weights.safetensors`` and, last, ``model.json``.
 
@@ -167,6 +364,10 @@ def save_artifact(
         info: Period and signals, the same for all models.
         calibration: Calibration of the monitor.
         provenance: What the models were made from.
+        loop: What loops need beside the models.
+
+    Raises:
+        InputError: If an expression of a control problem cannot be stated as a program.
     """
     folder.mkdir(parents=True, exist_ok=True)
     flat = {f"{model}/{name}": p for model, functions in programs.items() for name, p in functions.items()}
@@ -176,6 +377,7 @@ def save_artifact(
         Description(
             tuple(programs), sha256(folder / "programs.json"), info.dt, info.states, info.inputs, info.outputs,
             info.parameters, info.input_delay, info.time_unit, calibration, provenance or Provenance(),
+            loop or LoopSettings(),
         ),
     )  # fmt: skip
 
@@ -187,6 +389,21 @@ def set_calibration(folder: Path, calibration: Calibration) -> None:
         InputError: If the folder holds none, or cannot be written.
     """
     write_description(folder, replace(read_description(folder), calibration=calibration))
+
+
+def set_process_noise(folder: Path, noise: Mapping[str, ArrayLike]) -> None:
+    """Put the process noise of the estimators into an artifact.
+
+    Args:
+        folder: The artifact.
+        noise: Standard deviations per period ``(n_x,)``, see :class:`LoopSettings`.
+
+    Raises:
+        InputError: If the folder holds none, or cannot be written.
+    """
+    description = read_description(folder)
+    values = {name: tuple(np.asarray(sigma, dtype=float).tolist()) for name, sigma in noise.items()}
+    write_description(folder, replace(description, loop=replace(description.loop, process_noise=values)))
 
 
 def write_description(folder: Path, description: Description) -> None:
@@ -233,7 +450,7 @@ def read_description(folder: Path) -> Description:
     return record(Description, document, str(path))
 
 
-def load_artifact(folder: Path) -> Artifact:
+def load_artifact(folder: Path) -> Kit:
     """Models of an artifact folder, built as CasADi functions.
 
     Raises:
@@ -252,7 +469,22 @@ def load_artifact(folder: Path) -> Artifact:
         raise InputError(f"{folder}: programs.json lacks {error}, which {FILE} names") from error
     except nn_export.ExportError as error:
         raise InputError(f"{folder}: {error}") from error
-    return Artifact(models, d.calibration, d.provenance, d.input_delay_s)
+    return Kit(models, d.calibration, d.provenance, d.input_delay_s, d.loop)
+
+
+def load(folder: str | Path) -> Kit:
+    """What a run has left for controllers: models, and all that loops on them need.
+
+    Args:
+        folder: The run's folder, or its ``model``.
+
+    Raises:
+        InputError: If there is none, or a file is missing, damaged, of another schema, or does not fit the others.
+
+    Example:
+        ``kit = hm.load("runs/mine")``
+    """
+    return load_artifact(artifact_folder(Path(folder)))
 
 
 def build_model(name: str, programs: Mapping[str, nn_export.Program], info: ModelInfo) -> HybridModel:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.artifact import FILE, Artifact, artifact_folder, load_artifact
+from hybrid_mpc.artifact import FILE, Kit, artifact_folder, load_artifact
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import ExtendedKalmanFilter
 from hybrid_mpc.model import HybridModel
@@ -157,14 +157,14 @@ def _within(
 
 
 def _filters(
-    request: Request, scenario: Scenario, artifact: Artifact, control: OCP, folder: Path
+    request: Request, scenario: Scenario, artifact: Kit, control: OCP, folder: Path
 ) -> tuple[dict[tuple[str, str], ExtendedKalmanFilter], str]:
     """The observers of the closed loops: while nothing happens, and in the periods after a load came or went."""
     from hybrid_mpc.pipeline.control_noise import find_noise
     from hybrid_mpc.pipeline.loops import FIRST_LOAD, JUMP_SHARE, QUIET_SHARE
 
     names = {"prior": "prior_observer", "hybrid": "hybrid_observer"}
-    noise, source = find_noise(scenario, artifact, folder, tuple(names.values()), request.seed, request.noise)
+    noise, source = find_noise(scenario, artifact, tuple(names.values()), request.seed, request.noise)
     span = control.input_range
     filters = {}
     for mode, share in (("quiet", QUIET_SHARE), ("jump", JUMP_SHARE)):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.artifact import Artifact
+from hybrid_mpc.artifact import Kit
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation import TrueState, process_noise
 from hybrid_mpc.mpc import OCP, BestOf, CondensedController, SafeController, SQPController
@@ -57,7 +57,7 @@ LEAST_NOISE: Mapping[str, str] = {"hybrid": "prior", "hybrid_observer": "prior_o
 
 
 def build(
-    name: str, scenario: Scenario, artifact: Artifact, control: OCP, noise: Mapping[str, Array]
+    name: str, scenario: Scenario, artifact: Kit, control: OCP, noise: Mapping[str, Array]
 ) -> tuple[Any, SafeController]:
     """Estimator and controller of a contender.
 
@@ -91,7 +91,7 @@ def build(
     return make_estimator(model, scenario, noise[name], control, observer=c.observer), safe
 
 
-def noise_of(scenario: Scenario, artifact: Artifact, recordings: Sequence[Trajectory]) -> dict[str, Array]:
+def noise_of(scenario: Scenario, artifact: Kit, recordings: Sequence[Trajectory]) -> dict[str, Array]:
     """Process noise of every contender that estimates, each by maximum likelihood on the same recordings.
 
     Args:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.artifact import Artifact, load_artifact
+from hybrid_mpc.artifact import Kit, load_artifact
 from hybrid_mpc.closed_loop import ClosedLoopResult, simulate
 from hybrid_mpc.closed_loop.simulate import Step
 from hybrid_mpc.errors import InputError
@@ -83,7 +83,7 @@ def parts_of(scenario: Scenario, budget: Budget) -> list[Part]:
 
 
 def contest(
-    context: Context, artifact: Artifact, control: OCP, noise: Mapping[str, Array]
+    context: Context, artifact: Kit, control: OCP, noise: Mapping[str, Array]
 ) -> tuple[list[dict[str, Any]], dict[str, Array]]:
     """Run all loops; the timed ones alone, the others side by side in processes.
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.artifact import Artifact, artifact_folder, load_artifact
+from hybrid_mpc.artifact import Kit, artifact_folder, load_artifact
 from hybrid_mpc.closed_loop import ClosedLoopResult, Fault, Guard, simulate
 from hybrid_mpc.closed_loop.faults import check_channels, install
 from hybrid_mpc.closed_loop.simulate import Step
@@ -163,7 +163,7 @@ class Job:
     """
 
     scenario: Scenario
-    artifact: Artifact
+    artifact: Kit
     tasks: tuple[Task, ...]
     settings: ControlSettings
     noise: Mapping[str, Array]
@@ -200,11 +200,11 @@ def prepared(scenario: Scenario, model: Path, settings: ControlSettings, noise: 
     if settings.guard == "adapt":
         adaptable(artifact.models["hybrid"], scenario.causes)
     check_channels(install(scenario.plant(), settings.faults)[1], len(scenario.sensor_sigma), 1)
-    found = find_noise(scenario, artifact, folder, settings.controllers, settings.seed, noise)
+    found = find_noise(scenario, artifact, settings.controllers, settings.seed, noise)
     return Job(scenario, artifact, tasks, settings, *found)
 
 
-def _check_artifact(scenario: Scenario, artifact: Artifact, folder: Path, control: OCP) -> None:
+def _check_artifact(scenario: Scenario, artifact: Kit, folder: Path, control: OCP) -> None:
     missing = [name for name in ("prior", "hybrid") if name not in artifact.models]
     if missing:
         raise InputError(f"{folder} holds {', '.join(artifact.models)}; needed is a model {missing[0]} too")

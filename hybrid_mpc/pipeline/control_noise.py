@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.artifact import Artifact
+from hybrid_mpc.artifact import Kit
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_object
 from hybrid_mpc.pipeline.contenders import CONTENDERS, ORACLES, no_surer_than_prior, noise_of
@@ -29,8 +29,7 @@ class _Noise:
 
 def find_noise(
     scenario: Scenario,
-    artifact: Artifact,
-    folder: Path,
+    artifact: Kit,
     controllers: Sequence[str],
     seed: int,
     given: Path | None,
@@ -40,22 +39,24 @@ def find_noise(
     Args:
         scenario: The machine.
         artifact: Prior and hybrid.
-        folder: Where the artifact lies; if in the folder of a run, that run's noise is taken.
         controllers: Names of contenders.
         seed: Seed of the recordings that the machine makes where there is no run.
-        given: ``control.json`` of a run, which is taken first.
+        given: ``control.json`` of a run, which is taken first. Default: what the artifact holds.
 
     Raises:
-        InputError: If the file does not hold what is needed, or there is neither a file nor a way to make data.
+        InputError: If the file does not hold what is needed, or there is no noise and no way to make data.
 
     Example:
-        ``noise, source = find_noise(scenario, artifact, Path("runs/golf/model"), ("hybrid_observer",), 0, None)``
+        ``noise, source = find_noise(scenario, hm.load("runs/golf"), ("hybrid_observer",), 0, None)``
     """
     needed = [name for name in controllers if not CONTENDERS[name].truth]
-    beside = folder.resolve().parent / "checkpoints" / "control.json"
-    path = given if given is not None else beside if beside.is_file() else None
-    if path is not None:
-        n_x = artifact.models["prior"].n_x
+    n_x = artifact.models["prior"].n_x
+    if given is None and (own := artifact.loop.process_noise) and set(needed) <= set(own):
+        return no_surer_than_prior(
+            scenario, {name: np.array(own[name]) for name in needed}
+        ), "the model's own"
+    if given is not None:
+        path = given
         held = record(_Noise, {"sigma_x": read_object(path).get("sigma_x")}, str(path)).sigma_x
         noise = {name: np.asarray(values, dtype=float) for name, values in held.items()}
         if lacking := [name for name in needed if name not in noise]:
@@ -76,7 +77,7 @@ def find_noise(
     )
 
 
-def _estimated_noise(scenario: Scenario, artifact: Artifact, seed: int) -> Mapping[str, Array]:
+def _estimated_noise(scenario: Scenario, artifact: Kit, seed: int) -> Mapping[str, Array]:
     from hybrid_mpc.data.trajectories import load_trajectories
     from hybrid_mpc.identification.smoothing import fit_smoother
     from hybrid_mpc.pipeline.machine_benchmark.physics import shifted, with_states

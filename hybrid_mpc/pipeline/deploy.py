@@ -10,12 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc import __version__
-from hybrid_mpc.artifact import Artifact, Provenance, load_artifact, save_artifact
+from hybrid_mpc.artifact import (
+    Kit,
+    LoopSettings,
+    Provenance,
+    load_artifact,
+    save_artifact,
+    set_process_noise,
+)
 from hybrid_mpc.mpc import OCP
 from hybrid_mpc.pipeline.contenders import noise_of
 from hybrid_mpc.pipeline.contest import contest
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_monitor, time_on_recording
+from hybrid_mpc.scenario import Scenario
 
 Array = NDArray[np.float64]
 DEPLOYED = "mopgrnn"
@@ -60,7 +68,9 @@ def export_stage(context: Context) -> None:
         phy.values,
         context.result("evaluation")["scores"][DEPLOYED]["best"],
     )
-    save_artifact(context.out / "model", programs, deployed, provenance=provenance)
+    save_artifact(
+        context.out / "model", programs, deployed, provenance=provenance, loop=loop_settings(context.scenario)
+    )
     context.save(
         "export",
         {
@@ -68,6 +78,22 @@ def export_stage(context: Context) -> None:
             "jacobian_max_abs_error": max(p.jacobian_max_abs_error for p in parities),
         },
     )
+
+
+def loop_settings(scenario: Scenario) -> LoopSettings:
+    """What a scenario's loops need beside the models; their process noise is estimated later.
+
+    Args:
+        scenario: The machine.
+
+    Example:
+        >>> from scenarios.golf_robot import scenario
+        >>> sorted(loop_settings(scenario).control)[:2]
+        ['', 'track_limits']
+    """
+    problems = {"": scenario.control} | {task.name: task.control for task in scenario.tasks}
+    given = {name: problem for name, problem in problems.items() if problem is not None}
+    return LoopSettings(given, scenario.sensor_sigma, scenario.first_sigma, causes=dict(scenario.causes))
 
 
 def control_stage(context: Context) -> None:
@@ -79,6 +105,7 @@ def control_stage(context: Context) -> None:
         )
         return
     noise = noise_of(context.scenario, artifact, context.commanded("train"))
+    set_process_noise(context.out / "model", noise)
     if context.scenario.plant is None:
         _only_timing(context, artifact, control, noise)
     else:
@@ -86,7 +113,7 @@ def control_stage(context: Context) -> None:
         context.save("control", {"loops": rows, "sigma_x": noise}, arrays)
 
 
-def _only_timing(context: Context, artifact: Artifact, control: OCP, noise: dict[str, Array]) -> None:
+def _only_timing(context: Context, artifact: Kit, control: OCP, noise: dict[str, Array]) -> None:
     model = artifact.models["hybrid"]
     controller = make_controller(model, artifact.models["prior"], control)
     estimator = make_estimator(model, context.scenario, noise["hybrid_observer"])

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.artifact import Artifact
+from hybrid_mpc.artifact import Kit
 from hybrid_mpc.closed_loop import ClosedLoopResult, Fault, simulate
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.monitor import Detector, MonitorTrace, guard_monitor
@@ -73,7 +73,7 @@ def cases(scenario: Scenario) -> tuple[Case, ...]:
 
 
 def faulted(
-    scenario: Scenario, artifact: Artifact, noise: Mapping[str, Array], detector: Detector, run_seed: int
+    scenario: Scenario, artifact: Kit, noise: Mapping[str, Array], detector: Detector, run_seed: int
 ) -> tuple[list[dict[str, Any]], dict[str, Array]]:
     """A loop of each case on the first tracking task, in which something breaks from the middle on.
 
@@ -136,7 +136,7 @@ def switches(result: ClosedLoopResult) -> list[dict[str, Any]]:
     ]
 
 
-def stored_detector(artifact: Artifact, folder: Path | None = None) -> Detector:
+def stored_detector(artifact: Kit, folder: Path | None = None) -> Detector:
     """The detector that the main job left in an artifact.
 
     Raises:

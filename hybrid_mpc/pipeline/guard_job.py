@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2
 
-from hybrid_mpc.artifact import Artifact, load_artifact, set_calibration
+from hybrid_mpc.artifact import Kit, load_artifact, set_calibration
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.monitor import Calibration, Detector, guard_monitor, learn_detector, learn_plausibility
@@ -162,7 +162,7 @@ def noise(context: Context) -> dict[str, Array]:
     return {name: context.sigma_x(name) for name in names}
 
 
-def _nominal_data(context: Context, artifact: Artifact, control: OCP, rest: tuple[float, ...]) -> NominalData:
+def _nominal_data(context: Context, artifact: Kit, control: OCP, rest: tuple[float, ...]) -> NominalData:
     """Loops of the simulated machine, like those that the guard will watch; else undisturbed recordings."""
     scenario = context.scenario
     if scenario.plant is not None and any(not task.faults for task in scenario.tasks):
@@ -219,7 +219,7 @@ def _from_loops(context: Context) -> NominalData:
 
 def _recorded(
     context: Context,
-    artifact: Artifact,
+    artifact: Kit,
     control: OCP,
     detector: Detector | None,
     calibration: Calibration,

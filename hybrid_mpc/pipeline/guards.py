@@ -14,8 +14,14 @@ from hybrid_mpc.model import HybridModel
 from hybrid_mpc.mpc.condensed import CondensedController
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.safeguard import SafeController
-from hybrid_mpc.pipeline.loops import FIRST_LOAD, QUIET_SHARE, first_controller, first_deviations, make_ocp
-from hybrid_mpc.scenario import Scenario
+from hybrid_mpc.pipeline.loops import (
+    FIRST_LOAD,
+    QUIET_SHARE,
+    Machine,
+    first_controller,
+    first_deviations,
+    make_ocp,
+)
 
 Array = NDArray[np.float64]
 REACTIONS = ("rest", "adapt")
@@ -44,7 +50,7 @@ def make_resting_guard(model: HybridModel) -> Guard:
 def make_adaptive_guard(
     model: HybridModel,
     prior: HybridModel,
-    scenario: Scenario,
+    scenario: Machine,
     sigma_x: Array,
     control: OCP | None = None,
     *,

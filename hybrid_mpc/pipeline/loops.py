@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,7 +22,6 @@ from hybrid_mpc.mpc.condensed import CondensedController
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.safeguard import SafeController
 from hybrid_mpc.mpc.sqp import SQPController
-from hybrid_mpc.scenario import Scenario
 
 if TYPE_CHECKING:
     from hybrid_mpc.data.trajectories import Trajectory
@@ -50,8 +49,32 @@ TUNED_RECORDINGS = 3
 """So many periods of so many training recordings decide."""
 
 
+class Machine(Protocol):
+    """What estimators and guards assume of a machine: a scenario, or a loaded artifact."""
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+
+    @property
+    def sensor_sigma(self) -> tuple[float, ...]:
+        """Standard deviations of the sensors ``(n_y,)``."""
+
+    @property
+    def first_sigma(self) -> tuple[float, ...] | None:
+        """Those of what is not measured at an estimator's start; None: by the sensors'."""
+
+    @property
+    def control(self) -> OCP | None:
+        """The control problem."""
+
+    @property
+    def causes(self) -> Mapping[str, tuple[str, ...]]:
+        """What may break, by name."""
+
+
 def tuned_noise(
-    model: HybridModel, scenario: Scenario, base: Array, recordings: Sequence[Trajectory], *, observer: bool
+    model: HybridModel, scenario: Machine, base: Array, recordings: Sequence[Trajectory], *, observer: bool
 ) -> Array:
     """Process noise ``(n_x,)``: ``base`` times the scale under which undisturbed recordings are most likely.
 
@@ -77,7 +100,7 @@ def tuned_noise(
 
 def make_estimator(
     model: HybridModel,
-    scenario: Scenario,
+    scenario: Machine,
     sigma_x: Array,
     control: OCP | None = None,
     *,
@@ -124,7 +147,7 @@ def make_estimator(
     return SwitchingFilter(modes, SWITCHES)
 
 
-def first_deviations(model: HybridModel, scenario: Scenario) -> Array:
+def first_deviations(model: HybridModel, scenario: Machine) -> Array:
     """Standard deviations ``(n_x,)`` of the state at the estimator's start: at rest where the sensors say.
 
     Args:
@@ -252,7 +275,7 @@ def sensor_steps(sensor_sigma: Sequence[float]) -> tuple[float, ...]:
     return tuple(float(np.sqrt(12.0) * sigma) for sigma in sensor_sigma)
 
 
-def freezing(scenario: Scenario, control: OCP) -> dict[str, Any]:
+def freezing(scenario: Machine, control: OCP) -> dict[str, Any]:
     """What a monitor's test for a frozen sensor needs to know: steps of the sensors, ranges of the inputs.
 
     Args:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.artifact import Artifact, artifact_folder, load_artifact
+from hybrid_mpc.artifact import Kit, artifact_folder, load_artifact
 from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_object, write_json, write_text
@@ -49,7 +49,7 @@ class MonitorJob:
     """
 
     scenario: Scenario
-    artifact: Artifact
+    artifact: Kit
     data: Dataset
     sigma_x: Array
     resolution: tuple[float, ...] | None = None
@@ -117,7 +117,7 @@ def prepared(
     if not data.whole:
         cut = "; ".join(f"{c.file} {c.start:g} to {c.end:g} s: {c.why}" for c in data.cuts)
         raise InputError(f"no part of the recordings is long enough to be watched: {cut}")
-    sigma, _ = find_noise(scenario, artifact, folder, ("hybrid_observer",), 0, noise)
+    sigma, _ = find_noise(scenario, artifact, ("hybrid_observer",), 0, noise)
     if calibration is not None:
         found: Detector | None = read_detector(calibration)
     else:
@@ -139,7 +139,7 @@ def read_detector(path: Path) -> Detector:
     return record(Detector, stored["detector"], f"{path}: detector")
 
 
-def stored_rest(artifact: Artifact) -> tuple[float, ...] | None:
+def stored_rest(artifact: Kit) -> tuple[float, ...] | None:
     """The rest speeds that every monitor of an artifact's models takes; None if no recording told them yet."""
     return None if artifact.calibration is None else artifact.calibration.rest_speed
 

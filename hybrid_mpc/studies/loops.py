@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_mpc.artifact import FILES, Artifact, artifact_folder, load_artifact
+from hybrid_mpc.artifact import FILES, Kit, artifact_folder, load_artifact
 from hybrid_mpc.closed_loop import ClosedLoopResult, simulate
 from hybrid_mpc.closed_loop.faults import check_channels, install
 from hybrid_mpc.errors import InputError
@@ -97,7 +97,7 @@ class _Loops:
         self.alone = Lock()
         self._scenario = load_scenario(runner.scenario)
         self._inputs = {m.label: m for m in runner.models}
-        self._artifacts: dict[str, Artifact] = {}
+        self._artifacts: dict[str, Kit] = {}
         self._parts: OrderedDict[tuple[object, ...], tuple[Any, Any]] = OrderedDict()
 
     def run(self, run: RunConfig) -> dict[str, Any]:
@@ -118,12 +118,12 @@ class _Loops:
         shown = figures(task, run, result) | {"hidden_units": artifact.models["hybrid"].n_h}
         return shown | {f"{TIMING}setup_s": ready - begin, f"{TIMING}run_s": perf_counter() - ready}
 
-    def _artifact(self, label: str) -> Artifact:
+    def _artifact(self, label: str) -> Kit:
         if label not in self._artifacts:
             self._artifacts[label] = load_artifact(_local_folder(self._inputs[label]))
         return self._artifacts[label]
 
-    def _made(self, run: RunConfig, task: Task, artifact: Artifact) -> tuple[Any, Any]:
+    def _made(self, run: RunConfig, task: Task, artifact: Kit) -> tuple[Any, Any]:
         key = (run.model, run.controller, run.solver, task.control or self._scenario.control)
         if key not in self._parts:
             noise = {name: np.array(sigma) for name, sigma in self._inputs[run.model].noise}
@@ -246,7 +246,7 @@ def _with_horizon(task: Task, scenario: Scenario, horizon: int | None) -> Task:
     return replace(task, control=control.changed(horizon=horizon))
 
 
-def _monitor(run: RunConfig, artifact: Artifact) -> Any:
+def _monitor(run: RunConfig, artifact: Kit) -> Any:
     if run.monitor == "none" or CONTENDERS[run.controller].model != "hybrid":
         return None
     calibration = None

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from hybrid_mpc.artifact import Artifact, load_artifact
+from hybrid_mpc.artifact import Kit, load_artifact
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_json, write_json
 from hybrid_mpc.monitor import Judges
@@ -129,7 +129,7 @@ class _Todo:
         self._say.finish(told.text if left else "done before")
 
 
-def _learn(study: MonitorStudy, out: Path, jobs: list[MonitorJob], artifact: Artifact) -> None:
+def _learn(study: MonitorStudy, out: Path, jobs: list[MonitorJob], artifact: Kit) -> None:
     failed = [row for row in rows(out / RUNS) if row["kind"] == LEARN and row["status"] == "failed"]
     paths = [out / LEARNING / f"{job.id}.npz" for job in jobs]
     if failed and not all(path.is_file() for path in paths):

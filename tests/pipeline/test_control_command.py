@@ -8,7 +8,13 @@ from functools import partial
 import numpy as np
 import pytest
 
-from hybrid_mpc.artifact import Provenance, read_description, set_calibration, write_description
+from hybrid_mpc.artifact import (
+    Provenance,
+    read_description,
+    set_calibration,
+    set_process_noise,
+    write_description,
+)
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.monitor import Calibration, Detector
 from hybrid_mpc.pipeline.control_job import (
@@ -36,8 +42,7 @@ def run_folder(golf_artifact, tmp_path_factory):
     """A run's folder as far as the command looks at it."""
     folder = tmp_path_factory.mktemp("run")
     shutil.copytree(golf_artifact, folder / "model")
-    (folder / "checkpoints").mkdir()
-    (folder / "checkpoints" / "control.json").write_text(json.dumps({"sigma_x": SIGMA}))
+    set_process_noise(folder / "model", SIGMA)
     return folder
 
 
@@ -55,7 +60,7 @@ def test_loops_of_two_controllers(call, run_folder, tmp_path):
     assert "hybrid_observer" in told
     results = json.loads((out / "results.json").read_text())
     assert (results["schema"], results["solver"]) == ("hybrid-mpc control", "rti")
-    assert results["noise"]["source"].endswith("checkpoints/control.json")
+    assert results["noise"]["source"] == "the model's own"
     assert [(r["controller"], r["seed"]) for r in results["loops"]] == [
         ("prior", 0), ("prior", 1), ("hybrid_observer", 0), ("hybrid_observer", 1),
     ]  # fmt: skip

@@ -53,7 +53,7 @@ def test_noise_from_a_file_is_raised_too(tmp_path):
     artifact = SimpleNamespace(models={"prior": SimpleNamespace(n_x=2)})
     for beyond, expected in ((False, [4e-4, 3e-2]), (True, [1e-3, 3e-2])):
         machine = replace(scenario, beyond_recordings=beyond)
-        found, _ = find_noise(machine, artifact, tmp_path, ("hybrid",), 0, file)
+        found, _ = find_noise(machine, artifact, ("hybrid",), 0, file)
         np.testing.assert_array_equal(found["hybrid"], expected)
 
 

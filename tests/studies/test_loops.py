@@ -1,14 +1,20 @@
 """A run of a study is a loop of ``hybrid-mpc control``; what a study adds to it acts."""
 
-import json
 import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from hybrid_mpc.artifact import Provenance, read_description, set_calibration, write_description
+from hybrid_mpc.artifact import (
+    Provenance,
+    read_description,
+    set_calibration,
+    set_process_noise,
+    write_description,
+)
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.monitor import Calibration
 from hybrid_mpc.pipeline.context import Silent
 from hybrid_mpc.pipeline.control_job import ControlSettings, prepared, run_loops
 from hybrid_mpc.scenario import load_scenario
@@ -26,13 +32,20 @@ def run_folder(golf_artifact, tmp_path_factory):
     """A run's folder as far as studies look at it, with a calibration."""
     folder = tmp_path_factory.mktemp("run")
     shutil.copytree(golf_artifact, folder / "model")
-    (folder / "checkpoints").mkdir()
-    (folder / "checkpoints" / "control.json").write_text(json.dumps({"sigma_x": SIGMA}))
-    calibration = {
-        "threshold_w": 1e-9, "release_w": 1e-10, "false_alarms_per_hour": 1.0, "n_samples": 10, "hours": 1.0,
-        "method": "for tests: alarms at once", "data_hash": "", "residual_threshold": 1e9, "residual_release": 1e8,
-    }  # fmt: skip
-    set_calibration(folder / "model", calibration)
+    set_process_noise(folder / "model", SIGMA)
+    set_calibration(
+        folder / "model",
+        Calibration(
+            1e-9,
+            1e-10,
+            1.0,
+            10,
+            1.0,
+            "for tests: alarms at once",
+            residual_threshold=1e9,
+            residual_release=1e8,
+        ),
+    )
     return folder
 
 
@@ -178,8 +191,7 @@ def test_what_does_not_fit_is_refused_before_the_first_run(run_folder, golf_arti
     write_description(folder, replace(note, provenance=Provenance("torque_pendulum")))
     refused("made for scenario torque_pendulum, not for golf_robot", folder)
     write_description(folder, replace(note, calibration=None))
-    (folder.parent / "checkpoints").mkdir()
-    (folder.parent / "checkpoints" / "control.json").write_text(json.dumps({"sigma_x": SIGMA}))
+    set_process_noise(folder, SIGMA)
     refused("holds no calibration", folder, controllers=["hybrid"], monitors=["energy"])
     with pytest.raises(InputError, match="has no plant"):
         load_inputs(Study("torque_pendulum", run_folder, seeds=1))

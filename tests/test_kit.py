@@ -1,0 +1,159 @@
+"""What a run leaves for controllers: everything in one folder, and nothing else is read."""
+
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import hybrid_mpc as hm
+from hybrid_mpc.artifact import (
+    LoopSettings,
+    read_description,
+    set_calibration,
+    set_process_noise,
+    write_description,
+)
+from hybrid_mpc.closed_loop import Fault, Mode, simulate
+from hybrid_mpc.estimation import ExtendedKalmanFilter, SwitchingFilter
+from hybrid_mpc.monitor import Calibration, Detector
+from hybrid_mpc.mpc import SoftBound
+from hybrid_mpc.pipeline.deploy import loop_settings
+from hybrid_mpc.pipeline.loops import make_controller, make_estimator
+from hybrid_mpc.scenario import load_scenario
+
+README = Path(__file__).parents[1] / "README.md"
+GOLF = load_scenario("golf_robot")
+NOISE = {name: [1e-4, 1e-2] for name in ("prior", "prior_observer", "hybrid", "hybrid_observer")}
+DETECTOR = Detector(
+    0.02, ((1e-4, 1e-4, 0.0, 1e-4),), (1e-5, 0.0, 0.0, 1e-5), 2.0, 4.0, 4.0, rest_speed=(0.2,)
+)
+CALIBRATION = Calibration(0.2, 0.1, 1.0, 1000, 0.1, "by hand", "", 0.2, 0.1, DETECTOR, rest_speed=(0.2,))
+
+
+@pytest.fixture(scope="module")
+def run(golf_artifact, tmp_path_factory):
+    """The folder of a run, as far as loops read it."""
+    folder = tmp_path_factory.mktemp("run")
+    model = shutil.copytree(golf_artifact, folder / "model")
+    write_description(model, replace(read_description(model), loop=loop_settings(GOLF)))
+    set_process_noise(model, NOISE)
+    set_calibration(model, CALIBRATION)
+    return folder
+
+
+def closed(estimator, controller, **options):
+    task = GOLF.tasks[0]
+    return simulate(
+        GOLF.plant(), estimator, controller, task.reference, dt=0.02, duration=1.0, x0=np.array(task.x0),
+        seed=3, **options,
+    )  # fmt: skip
+
+
+def test_loops_of_the_folder_are_those_of_the_scenario(run):
+    kit = hm.load(str(run))
+    models = kit.models
+    want = closed(
+        make_estimator(models["hybrid"], GOLF, np.array(NOISE["hybrid_observer"])),
+        make_controller(models["hybrid"], models["prior"], GOLF.control),
+    )
+    found = closed(kit.observer(), kit.controller())
+    np.testing.assert_array_equal(found.u, want.u)
+    np.testing.assert_array_equal(found.d, want.d)
+
+
+def test_every_part_is_made_from_the_folder(run, tmp_path):
+    """The folder alone, elsewhere: no checkpoint beside it, no scenario."""
+    kit = hm.load(shutil.copytree(run / "model", tmp_path / "elsewhere"))
+    assert isinstance(kit.observer(), SwitchingFilter)
+    assert isinstance(kit.observer("prior", load=False), ExtendedKalmanFilter)
+    assert kit.controller("prior").controller.model.n_h == 0
+    assert kit.monitor().detector == DETECTOR
+    assert kit.guard(adapt=True).on_model is Mode.BACKUP
+    assert (kit.name, kit.causes) == ("", GOLF.causes)
+    np.testing.assert_array_equal(kit.safe_input, [0.0])
+    limited = next(task for task in GOLF.tasks if task.control is not None)
+    assert kit.problem(limited.name) == limited.control
+    assert kit.problem("another") == GOLF.control
+    assert kit.controller(task=limited.name).controller.ocp.u_max == limited.control.u_max
+
+
+def test_a_guarded_loop(run):
+    kit = hm.load(run)
+    result = closed(
+        kit.observer(), kit.controller(), monitor=kit.monitor(), guard=kit.guard(),
+        faults=[Fault(0.4, 0.8, "measurement_freeze")],
+    )  # fmt: skip
+    assert [s.after for s in result.switches][:1] == [Mode.REST]
+
+
+def test_the_lines_of_the_readme(run, monkeypatch):
+    """They are run as they stand, around the simulated machine."""
+    blocks = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.S)
+    lines = next(b for b in blocks if "hm.load(" in b) + next(b for b in blocks if "loop.step(" in b)
+    plant, rng = GOLF.plant(), np.random.default_rng(0)
+    machine = {"state": plant.reset(np.zeros(2), 0), "left": 150, "u": np.zeros(1)}
+
+    def wait():
+        machine["state"] = plant.step(machine["state"], machine["u"], 0.02)
+
+    def running():
+        machine["left"] -= 1
+        return machine["left"] >= 0
+
+    monkeypatch.chdir(run.parent)
+    names = {
+        "read": lambda: plant.measure(machine["state"], rng), "write": lambda u: machine.update(u=u), "wait": wait,
+        "running": running,
+    }  # fmt: skip
+    exec(lines.replace('"runs/mine"', repr(run.name)), names)
+    assert names["loop"].state.k == 150
+    # 3 s of a step to 0.5 rad with a random network: within a tenth of it
+    assert plant.truth(machine["state"])[0] == pytest.approx(0.5, abs=0.05)
+
+
+def test_expressions_go_along(run, tmp_path):
+    x, u = ca.MX.sym("x", 2), ca.MX.sym("u")
+    power = SoftBound(ca.Function("power", [x, u], [u * x[1]]), [-1.0], [1.0], [10.0], [10.0])
+    price = ca.Function("price", [x, u], [ca.tanh(u * x[1]) ** 2])
+    model = shutil.copytree(run / "model", tmp_path / "model")
+    problem = GOLF.control.changed(soft=(power,), economic=price)
+    note = read_description(model)
+    write_description(model, replace(note, loop=replace(note.loop, control={"": problem})))
+    assert hm.load(model).problem() == problem
+
+
+@pytest.mark.parametrize(
+    ("change", "use", "told"),
+    [
+        ({"control": {}}, lambda kit: kit.controller(), "saved without a control problem"),
+        ({"process_noise": {}}, lambda kit: kit.observer(), "without process noise for hybrid_observer"),
+        ({"process_noise": {}}, lambda kit: kit.guard(adapt=True), "needs the process noise"),
+        ({"causes": {}}, lambda kit: kit.guard(adapt=True), "needs causes"),
+        ({}, lambda kit: kit.observer("hybird"), "did you mean 'hybrid'"),
+        ({"sensor_sigma": (1.0, 1.0)}, lambda kit: kit.observer(), "needs 1 standard deviations"),
+    ],
+)
+def test_what_is_missing_is_named(run, tmp_path, change, use, told):
+    model = shutil.copytree(run / "model", tmp_path / "model")
+    note = read_description(model)
+    write_description(model, replace(note, loop=replace(note.loop, **change)))
+    with pytest.raises(hm.InputError, match=told):
+        use(hm.load(model))
+
+
+def test_impossible_settings_are_refused():
+    with pytest.raises(hm.InputError, match="not negative"):
+        LoopSettings(process_noise={"prior": (-1.0,)})
+    with pytest.raises(hm.InputError, match="does not exist"):
+        hm.load("nowhere")
+
+
+def test_public_names_are_there():
+    for name in hm.__all__:
+        assert getattr(hm, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = hm.nothing
