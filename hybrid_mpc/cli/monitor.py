@@ -44,7 +44,7 @@ def monitor(
     ] = None,
     noise: Annotated[
         Path | None,
-        typer.Option(help="control.json with the filter's noise. Default: that of the model's run."),
+        typer.Option(help="control.json with the filter's noise. Default: what the model's folder holds."),
     ] = None,
 ) -> None:
     """Say where in recordings the model does not describe the machine, and what would explain it.
