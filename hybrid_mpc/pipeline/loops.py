@@ -281,7 +281,7 @@ def time_on_recording(
     the recorded input, not the controller's.
     """
     ocp = controller.controller.ocp
-    target = np.zeros((ocp.horizon + 1, ocp.n_x))
+    target = np.zeros((ocp.horizon + 1, ocp.n_x + ocp.n_p))
     estimate = estimator.start(trajectory.y[0])
     decision, state = controller.initial(estimate), monitor.initial()
     durations = []
