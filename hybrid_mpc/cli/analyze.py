@@ -37,7 +37,9 @@ def analyze(
     ] = None,
     noise: Annotated[
         Path | None,
-        typer.Option(help="control.json with the filters' process noise. Default: what the model's folder holds."),
+        typer.Option(
+            help="control.json with the filters' process noise. Default: what the model's folder holds."
+        ),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of what is drawn at random.", min=0, max=MOST_SEED)] = 0,
 ) -> None:

@@ -44,7 +44,9 @@ def control(
     ] = None,
     noise: Annotated[
         Path | None,
-        typer.Option(help="control.json with the filters' process noise. Default: what the model's folder holds."),
+        typer.Option(
+            help="control.json with the filters' process noise. Default: what the model's folder holds."
+        ),
     ] = None,
     guard: Annotated[
         bool,

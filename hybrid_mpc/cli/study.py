@@ -63,7 +63,9 @@ def run(
     ] = False,
     noise: Annotated[
         Path | None,
-        typer.Option(help="control.json with the filters' process noise. Default: what each model's folder holds."),
+        typer.Option(
+            help="control.json with the filters' process noise. Default: what each model's folder holds."
+        ),
     ] = None,
     budget: Annotated[
         str | None, typer.Option(help="Size of the study monitor: full (default) or quick.")

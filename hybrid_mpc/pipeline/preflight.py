@@ -288,14 +288,12 @@ def _structure(control: Any) -> tuple[Any, ...]:
 
 
 def _check_sensors(report: _Report, scenario: Scenario, prior: Prior | None) -> None:
-    if prior is None:
-        return
-    n_y, n_x = len(prior.outputs), len(prior.states)
+    n_y, n_x = (0, 0) if prior is None else (len(prior.outputs), len(prior.states))
     for name, needed in (("sensor_sigma", n_y), ("first_sigma", n_x - n_y)):
         values = getattr(scenario, name)
         if values is None:
             continue
-        if len(values) != needed:
+        if prior is not None and len(values) != needed:
             report.add(f"{name} needs {needed} numbers, got {len(values)}: {values}")
         if not all(math.isfinite(s) and s > 0 for s in values):
             report.add(f"{name} must be positive and finite, got {values}")
@@ -330,7 +328,8 @@ def _check_problem(
         )
     with report.part(f"{what}: controller"):
         controller = make_controller(model, model, control)
-        controller.decide(controller.initial(estimate), estimate, np.zeros((control.horizon + 1, model.n_x)))
+        reference = np.zeros((control.horizon + 1, control.n_x + control.n_p))
+        controller.decide(controller.initial(estimate), estimate, reference)
 
 
 def _check_plant(report: _Report, scenario: Scenario, prior: Prior | None, model: HybridModel | None) -> None:
@@ -375,13 +374,16 @@ def _check_task(task: Task, scenario: Scenario, prior: Prior, plant: Plant | Non
     if len(task.x0) != n_x or not all(math.isfinite(v) for v in task.x0):
         raise InputError(f"x0 needs {n_x} finite numbers, got {task.x0}")
     t = np.arange(0.0, task.duration, dt)
-    for name, preview in (("reference", task.reference), ("weight", task.weight)):
+    control = task.control or scenario.control
+    n_p = control.n_p if isinstance(control, OCP) else 0
+    for name, preview, columns in (("reference", task.reference, n_x + n_p), ("weight", task.weight, n_x)):
         if preview is None:
             continue
         values = np.asarray(preview(t))
-        if values.shape[:1] != (len(t),) or values.ndim != 2 or values.shape[1] < n_x:
+        if values.shape != (len(t), columns):
             raise InputError(
-                f"{name} must return the shape {(len(t), n_x)} for {len(t)} times, got {values.shape}"
+                f"{name} must return the shape {(len(t), columns)} for {len(t)} times, got {values.shape}"
+                + (f"; the last {n_p} for the economic cost's parameters" if columns > n_x else "")
             )
         if not np.all(np.isfinite(values)):
             k = int(np.argmax(~np.isfinite(values).all(axis=1)))

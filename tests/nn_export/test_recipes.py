@@ -10,7 +10,7 @@ def test_the_recipes_run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     blocks = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.DOTALL | re.MULTILINE)
-    assert len(blocks) == 5  # the introduction, three recipes, limits
+    assert len(blocks) == 6  # the introduction, three recipes, expressions, limits
     namespace = {}
     for block in blocks:
         exec(compile(block, str(PAGE), "exec"), namespace)
@@ -18,6 +18,7 @@ def test_the_recipes_run(tmp_path, monkeypatch, capsys):
     assert "Hessian-vector products" in printed
     assert "(1, 20)" in printed
     assert "Prior:(x[2],u)->(output[2])" in printed
+    assert "\n0.6\n" in printed  # the power
     assert "program:(input[2100])->(output[2000])" in printed
     assert (tmp_path / "c_code" / "Step_test.c").is_file()
     report = namespace["parity"](namespace["module"], namespace["step"], n=10)

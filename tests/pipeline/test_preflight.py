@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+import casadi as ca
 import numpy as np
 import pytest
 import torch
@@ -195,7 +196,7 @@ def test_every_wrong_scenario_is_told(changes):
 def test_all_problems_are_told_at_once():
     wrong = {
         **prior(acceleration=lambda self, x, u: None)(),
-        **field(sensor_sigma=())(),
+        **field(sensor_sigma=(0.0,))(),
         **budget(networks=0)(),
         **task(x0=(0.0,))(),
     }
@@ -205,6 +206,19 @@ def test_all_problems_are_told_at_once():
     assert "3 problems" in message  # what hangs on the prior (the task's states) cannot be known without one
     for word in ("xdot", "sensor_sigma", "networks"):
         assert word in message
+
+
+def test_a_problem_with_prices_asks_for_them_in_the_reference():
+    x, u, p = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("p")
+    priced = dataclasses.replace(
+        GOOD, control=CONTROL.changed(economic=ca.Function("f", [x, u, p], [p * u**2]))
+    )
+    with pytest.raises(
+        InputError, match=r"\(50, 3\) for 50 times, got \(50, 2\); the last 1 for the economic"
+    ):
+        check_scenario(priced)
+    told = dataclasses.replace(TASK, reference=lambda t: np.ones((len(t), 3)))
+    check_scenario(dataclasses.replace(priced, tasks=(told,)))
 
 
 def test_a_good_scenario_passes():
