@@ -29,7 +29,7 @@ from time import perf_counter
 
 import numpy as np
 
-from hybrid_mpc.artifact import load_artifact, save_artifact
+from hybrid_mpc.artifact import load, save_artifact
 from hybrid_mpc.closed_loop import Fault, simulate
 from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_monitor
 from scenarios.golf_robot import scenario
@@ -132,7 +132,7 @@ class Loops:
     """Models, filters and controllers of the loops, built once for all."""
 
     def __init__(self, folder: Path | None) -> None:
-        artifact = load_artifact(folder or _nominal(Path(tempfile.mkdtemp()) / "model"))
+        artifact = load(folder or _nominal(Path(tempfile.mkdtemp()) / "model"))
         self.models, self._built = artifact.models, {}
 
     def parts(self, name: str, task):

@@ -27,7 +27,7 @@ import casadi as ca
 import numpy as np
 import torch
 
-from hybrid_mpc.artifact import load_artifact, save_artifact
+from hybrid_mpc.artifact import load, save_artifact
 from hybrid_mpc.identification.export import model_info, trace_model
 from hybrid_mpc.identification.networks import StackedGRU
 from hybrid_mpc.identification.step import HybridStep, Scaling, n_features
@@ -66,7 +66,7 @@ def exported(step):
     with tempfile.TemporaryDirectory() as folder:
         info = model_info(step.prior, step.dt)
         save_artifact(Path(folder) / "model", {"hybrid": program}, info)
-        model = load_artifact(Path(folder) / "model").models["hybrid"]
+        model = load(Path(folder) / "model").models["hybrid"]
     z, u = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("u", model.n_u)
     inline = model.step.is_a("MXFunction")
     after = model.step.call([z[: model.n_x], z[model.n_x :], u], inline, False)

@@ -24,7 +24,7 @@ import numpy as np
 from guard_loops import DT, Plan
 from scipy.stats import t as student
 
-from hybrid_mpc.artifact import load_artifact
+from hybrid_mpc import load
 from hybrid_mpc.closed_loop import simulate
 from hybrid_mpc.files import read_json, write_json
 from hybrid_mpc.monitor import guard_monitor
@@ -170,7 +170,7 @@ def main() -> None:
     given = parser.parse_args()
     noise = json.loads(given.noise.read_text())["sigma_x"]
     detector = read_detector(given.detector)
-    arms = Arms(load_artifact(given.model), noise, detector)
+    arms = Arms(load(given.model), noise, detector)
     if given.time:
         print(json.dumps(times(arms), indent=1))
         return

@@ -21,7 +21,7 @@ from types import SimpleNamespace
 import numpy as np
 from guard_loops import DT, FAULTS, Loops, fault_plans, read_noise
 
-from hybrid_mpc.artifact import load_artifact
+from hybrid_mpc import load
 from hybrid_mpc.files import read_json
 from hybrid_mpc.monitor import Detector, Diagnoser, guard_monitor
 from scenarios.golf_robot import scenario
@@ -66,7 +66,7 @@ def main() -> None:
     parser.add_argument("--after", type=float, nargs="+", default=(0.5, 1.2, 2.2))
     parser.add_argument("--keep", type=Path, help="folder of the loops")
     given = parser.parse_args()
-    artifact = load_artifact(given.model)
+    artifact = load(given.model)
     monitor = guard_monitor(
         completed(artifact), Detector.from_dict(read_json(given.detector)["detector"]), diagnose=True
     )

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_mpc.artifact import load_artifact
+from hybrid_mpc import load
 from hybrid_mpc.closed_loop import simulate
 from hybrid_mpc.files import read_json
 from hybrid_mpc.monitor import Judges, guard_monitor
@@ -41,7 +41,7 @@ def main() -> None:
     parser.add_argument("--model", type=Path, required=True, help="artifact of a run, in its folder")
     parser.add_argument("--seeds", type=int, default=40)
     given = parser.parse_args()
-    artifact = load_artifact(given.model)
+    artifact = load(given.model)
     hybrid, prior = artifact.models["hybrid"], artifact.models["prior"]
     noise, _ = find_noise(scenario, artifact, ("hybrid_observer",), 0, None)
     judges = record(Judges, read_json(given.study / "judges.json"), "judges.json")

@@ -26,7 +26,7 @@ import numpy as np
 from guard_loops import DT, Loops, Plan, nominal_plans, read_noise
 from scipy.stats import t as student
 
-from hybrid_mpc.artifact import load_artifact
+from hybrid_mpc import load
 from hybrid_mpc.closed_loop import simulate
 from hybrid_mpc.data.trajectories import load_trajectories
 from hybrid_mpc.files import read_json, write_json
@@ -144,7 +144,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="JSON file to write")
     given = parser.parse_args()
     say = lambda text: print(text, flush=True)  # noqa: E731
-    artifact, noise = load_artifact(given.model), read_noise(given.noise)
+    artifact, noise = load(given.model), read_noise(given.noise)
     ordinary = learned(given, artifact, noise, say)
     say(f"{ordinary.samples} samples, terms {ordinary.terms}, reach {ordinary.reach:.3f}")
     kept = read_json(given.out) if given.out is not None and given.out.is_file() else {}

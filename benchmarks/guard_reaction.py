@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from guard_loops import DT, fault_plans
 
-from hybrid_mpc.artifact import load_artifact
+from hybrid_mpc import load
 from hybrid_mpc.closed_loop import Guard, simulate
 from hybrid_mpc.closed_loop.guard import Mode
 from hybrid_mpc.files import write_json
@@ -95,7 +95,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3, help="loops of each fault and arm")
     parser.add_argument("--out", type=Path, help="JSON file to write")
     given = parser.parse_args()
-    artifact, noise = load_artifact(given.model), json.loads(given.noise.read_text())["sigma_x"]
+    artifact, noise = load(given.model), json.loads(given.noise.read_text())["sigma_x"]
     arms = Arms(artifact, noise, read_detector(given.detector))
     result = {"reaction": reactions(arms, given.seeds, lambda text: print(text, flush=True))}
     print("| fault | " + " | ".join(arms.guards) + " |\n| --- |" + " ---: |" * len(arms.guards))

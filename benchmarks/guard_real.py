@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_mpc.artifact import load_artifact
+from hybrid_mpc import load
 from hybrid_mpc.data.trajectories import load_trajectories
 from hybrid_mpc.files import write_json
 from hybrid_mpc.monitor.held_out import HeldOut, leave_one_out
@@ -118,7 +118,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="JSON file to write")
     parser.add_argument("--pictures", type=Path, help="folder for a figure of each recording")
     given = parser.parse_args()
-    artifact = load_artifact(given.model / "model")
+    artifact = load(given.model / "model")
     noise = artifact.loop.process_noise
     result = {}
     for name in given.models:

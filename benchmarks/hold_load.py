@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_mpc.artifact import load_artifact
+import hybrid_mpc as hm
 from hybrid_mpc.closed_loop import Fault, simulate
 from hybrid_mpc.estimation import ExtendedKalmanFilter
 from hybrid_mpc.pipeline.loops import FIRST_LOAD, make_controller, make_estimator
@@ -99,7 +99,7 @@ def main() -> None:
     )
     parser.add_argument("--out", type=Path, help="JSON file to write")
     given = parser.parse_args()
-    models, rows = load_artifact(given.model).models, []
+    models, rows = hm.load(given.model).models, []
     noise = json.loads(given.noise.read_text())["sigma_x"] if given.noise else {}
     print("| model | angle [rad] | load [N m] | largest error [counts] | swings | torque range [N m] |")
     print("| --- | ---: | ---: | ---: | ---: | ---: |")

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_mpc.artifact import load_artifact
+from hybrid_mpc import load
 from hybrid_mpc.closed_loop import simulate
 from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_monitor
 from scenarios.golf_robot import scenario
@@ -35,7 +35,7 @@ SHARES = {"median": 50, "p95": 95, "p99": 99, "max": 100}
 def models_of(folder: Path | None):
     """Prior and hybrid of an artifact, or with random weights."""
     if folder is not None:
-        return load_artifact(folder).models
+        return load(folder).models
     from mpc_step import hybrid
 
     model = hybrid(32)

@@ -19,7 +19,7 @@ from time import process_time
 
 import numpy as np
 
-from hybrid_mpc.artifact import load_artifact
+from hybrid_mpc import load
 from hybrid_mpc.monitor import Detector, guard_monitor
 from hybrid_mpc.pipeline.loops import make_monitor
 
@@ -91,7 +91,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--out", type=Path, help="JSON file to write")
     given = parser.parse_args()
-    result = measured(load_artifact(given.model).models["hybrid"], given.rounds)
+    result = measured(load(given.model).models["hybrid"], given.rounds)
     print("| monitor | median | largest | CasADi |\n| --- | ---: | ---: | ---: |")
     for name, row in result.items():
         print(f"| {name} | " + " | ".join(f"{v:.1f}" for v in row.values()) + " |")

@@ -31,7 +31,7 @@ import casadi as ca
 import numpy as np
 import torch
 
-from hybrid_mpc.artifact import load_artifact, save_artifact
+from hybrid_mpc.artifact import load, save_artifact
 from hybrid_mpc.estimation.kalman import Estimate
 from hybrid_mpc.identification.export import model_info, trace_model
 from hybrid_mpc.identification.networks import GRUNetwork
@@ -57,7 +57,7 @@ def hybrid(z: int):
     program, prior, dt = programs(z), scenario.prior(), scenario.data.dt
     with tempfile.TemporaryDirectory() as folder:
         save_artifact(Path(folder) / "model", {"hybrid": program}, model_info(prior, dt))
-        return load_artifact(Path(folder) / "model").models["hybrid"]
+        return load(Path(folder) / "model").models["hybrid"]
 
 
 def problem(n: int, **limits) -> OCP:

@@ -26,7 +26,7 @@ from time import perf_counter
 import numpy as np
 from scipy import stats
 
-from hybrid_mpc.artifact import load_artifact
+from hybrid_mpc import load
 from hybrid_mpc.closed_loop import simulate
 from hybrid_mpc.mpc import CondensedController, IpoptController, SafeController, SQPController
 from hybrid_mpc.pipeline.loops import make_estimator, make_ocp
@@ -108,7 +108,7 @@ def main() -> None:
     parser.add_argument("--finer", type=int, default=1, help="times the encoder's counts, then without noise")
     parser.add_argument("--out", type=Path, help="JSON file to write")
     given = parser.parse_args()
-    models, rows = load_artifact(given.model).models, []
+    models, rows = load(given.model).models, []
     noise = json.loads(given.noise.read_text())["sigma_x"] if given.noise else {}
     sigma_x = noise.get("hybrid_observer", SIGMA_X)
     print("| task | J rti | against | seeds | ratio of means | range | solve [ms] |")

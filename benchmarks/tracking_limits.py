@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_mpc.artifact import load_artifact
+from hybrid_mpc import load
 from hybrid_mpc.closed_loop import simulate
 from hybrid_mpc.estimation import Estimate, TrueState
 from hybrid_mpc.model import HybridModel
@@ -84,7 +84,7 @@ def main() -> None:
     parser.add_argument("--task", nargs="+", default=["track_sine", "track_step"])
     parser.add_argument("--seeds", type=int, default=5)
     given = parser.parse_args()
-    models, noise = load_artifact(given.model).models, json.loads(given.noise.read_text())["sigma_x"]
+    models, noise = load(given.model).models, json.loads(given.noise.read_text())["sigma_x"]
     seeds = range(FIRST_SEED, FIRST_SEED + given.seeds)
     print("| task | model | true state | filter | filter with observer |\n| --- | --- | ---: | ---: | ---: |")
     for task in (t for t in scenario.tasks if t.name in given.task):

@@ -450,12 +450,21 @@ def read_description(folder: Path) -> Description:
     return record(Description, document, str(path))
 
 
-def load_artifact(folder: Path) -> Kit:
-    """Models of an artifact folder, built as CasADi functions.
+def load(folder: str | Path) -> Kit:
+    """What a run has left for controllers: models, and all that loops on them need.
+
+    Nothing in the folder is executed: models are operators and numbers, built as CasADi functions.
+
+    Args:
+        folder: The run's folder, or its ``model``.
 
     Raises:
-        InputError: If a file is missing, damaged, of another schema, or does not fit the others.
+        InputError: If there is none, or a file is missing, damaged, of another schema, or does not fit the others.
+
+    Example:
+        ``kit = hm.load("runs/mine")``
     """
+    folder = artifact_folder(Path(folder))
     d = read_description(folder)
     info = ModelInfo(d.dt_s, d.states, d.inputs, d.outputs, d.parameters, d.input_delay_s, d.time_unit_s)
     if sha256(folder / "programs.json") != d.programs_sha256:
@@ -470,21 +479,6 @@ def load_artifact(folder: Path) -> Kit:
     except nn_export.ExportError as error:
         raise InputError(f"{folder}: {error}") from error
     return Kit(models, d.calibration, d.provenance, d.input_delay_s, d.loop)
-
-
-def load(folder: str | Path) -> Kit:
-    """What a run has left for controllers: models, and all that loops on them need.
-
-    Args:
-        folder: The run's folder, or its ``model``.
-
-    Raises:
-        InputError: If there is none, or a file is missing, damaged, of another schema, or does not fit the others.
-
-    Example:
-        ``kit = hm.load("runs/mine")``
-    """
-    return load_artifact(artifact_folder(Path(folder)))
 
 
 def build_model(name: str, programs: Mapping[str, nn_export.Program], info: ModelInfo) -> HybridModel:

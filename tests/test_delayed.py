@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from online_models import pendulum_model
 
-from hybrid_mpc.artifact import FILE, load_artifact, save_artifact
+from hybrid_mpc.artifact import FILE, load, save_artifact
 from hybrid_mpc.delayed import MOST_WAITING, with_input_delay
 from hybrid_mpc.errors import InputError
 
@@ -116,7 +116,7 @@ def test_an_artifact_keeps_the_delay(tmp_path):
     for name, delay in (("none", 0.0), ("late", 0.0125), ("years", 1e9)):
         save_artifact(tmp_path / name, programs, replace(info, input_delay=delay))
     assert json.loads((tmp_path / "none" / FILE).read_text())["input_delay_s"] == 0.0
-    at_once, late = (load_artifact(tmp_path / name).models["prior"] for name in ("none", "late"))
+    at_once, late = (load(tmp_path / name).models["prior"] for name in ("none", "late"))
     assert (at_once.waiting, late.waiting) == (0, 2)
     x, u = np.array([0.2, 0.1]), np.array([4.0, 8.0, 9.0])  # the last one comes too late for this period
     np.testing.assert_array_equal(step(late, x, u[:2], u[2])[0], step(at_once, x, [], 0.25 * 4 + 0.75 * 8)[0])
@@ -124,4 +124,4 @@ def test_an_artifact_keeps_the_delay(tmp_path):
     with pytest.raises(
         InputError, match=r"1e\+09 s is 1e\+11 periods of 0.01 s, so that 1e\+11 inputs would wait"
     ):
-        load_artifact(tmp_path / "years")
+        load(tmp_path / "years")

@@ -101,11 +101,11 @@ class Refuse:
 sys.meta_path.insert(0, Refuse())
 import numpy as np
 from pathlib import Path
-from hybrid_mpc.artifact import load_artifact
+from hybrid_mpc import load
 from hybrid_mpc.closed_loop.simulate import simulate
 from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_monitor
 from hybrid_mpc.scenario import load_scenario
-artifact, scenario = load_artifact(Path(sys.argv[1])), load_scenario("golf_robot")
+artifact, scenario = load(Path(sys.argv[1])), load_scenario("golf_robot")
 model, prior, task = artifact.models["hybrid"], artifact.models["prior"], scenario.tasks[0]
 result = simulate(
     scenario.plant(), make_estimator(model, scenario, np.array([1e-4, 1e-2])),

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.artifact import FILE, Kit, artifact_folder, load_artifact
+from hybrid_mpc.artifact import FILE, Kit, artifact_folder, load
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import ExtendedKalmanFilter
 from hybrid_mpc.model import HybridModel
@@ -82,7 +82,7 @@ def subject_of(request: Request) -> tuple[Subject, tuple[str, ...]]:
         InputError: If there is no artifact, the scenario does not fit it, or a recording is bad.
     """
     folder = artifact_folder(request.folder)
-    artifact = load_artifact(folder)
+    artifact = load(folder)
     scenario = scenario_of(artifact.provenance.scenario, folder / FILE, request.scenario)
     name = "" if scenario is None else scenario.name
     if scenario is None and request.data:

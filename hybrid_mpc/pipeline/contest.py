@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.artifact import Kit, load_artifact
+from hybrid_mpc.artifact import Kit, load
 from hybrid_mpc.closed_loop import ClosedLoopResult, simulate
 from hybrid_mpc.closed_loop.simulate import Step
 from hybrid_mpc.errors import InputError
@@ -224,7 +224,7 @@ def loops(
         report: Called with ``(done, total, text)`` as the loops go on.
         on_plan: Called with the planned states ``(N + 1, n_x)`` of every period. Default: none.
     """
-    scenario, artifact = load_scenario(scenario_name), load_artifact(folder)
+    scenario, artifact = load_scenario(scenario_name), load(folder)
     (task,) = tasks_of(scenario, (task_name,))
     assert scenario.plant is not None
     control = task.control or scenario.control

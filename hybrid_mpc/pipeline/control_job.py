@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.artifact import Kit, artifact_folder, load_artifact
+from hybrid_mpc.artifact import Kit, artifact_folder, load
 from hybrid_mpc.closed_loop import ClosedLoopResult, Fault, Guard, simulate
 from hybrid_mpc.closed_loop.faults import check_channels, install
 from hybrid_mpc.closed_loop.simulate import Step
@@ -193,7 +193,7 @@ def prepared(scenario: Scenario, model: Path, settings: ControlSettings, noise: 
         raise InputError(f"scenario {scenario.name} has no oracle; leave --controller {oracles[0]} out")
     tasks = selected_tasks(scenario, settings.tasks)
     folder = artifact_folder(model)
-    artifact = load_artifact(folder)
+    artifact = load(folder)
     _check_artifact(scenario, artifact, folder, scenario.control)
     if settings.guard:
         stored_detector(artifact, folder)

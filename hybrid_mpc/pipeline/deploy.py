@@ -14,7 +14,7 @@ from hybrid_mpc.artifact import (
     Kit,
     LoopSettings,
     Provenance,
-    load_artifact,
+    load,
     save_artifact,
     set_process_noise,
 )
@@ -98,7 +98,7 @@ def loop_settings(scenario: Scenario) -> LoopSettings:
 
 def control_stage(context: Context) -> None:
     """Closed loops of every task with prior, hybrid and oracle; or only timing where there is no plant."""
-    artifact, control = load_artifact(context.out / "model"), context.scenario.control
+    artifact, control = load(context.out / "model"), context.scenario.control
     if control is None:
         context.save(
             "control", {"reason": f"scenario {context.scenario.name} defines no control problem"}, {}

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2
 
-from hybrid_mpc.artifact import Kit, load_artifact, set_calibration
+from hybrid_mpc.artifact import Kit, load, set_calibration
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.monitor import Calibration, Detector, guard_monitor, learn_detector, learn_plausibility
@@ -59,7 +59,7 @@ def guard_stage(context: Context) -> None:
         reason = "the guard's estimator needs the scenario's control problem (input range, sensor noise)"
         context.save("guard", {"reason": reason}, {})
         return
-    artifact = load_artifact(context.out / "model")
+    artifact = load(context.out / "model")
     model, calibration = artifact.models["hybrid"], run_calibration(context)
     rest = calibration.rest_speed or (REST_SPEED,)
     data = _nominal_data(context, artifact, control, rest)

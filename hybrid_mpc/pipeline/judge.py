@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.artifact import load_artifact, set_calibration
+from hybrid_mpc.artifact import load, set_calibration
 from hybrid_mpc.closed_loop.faults import Fault
 from hybrid_mpc.closed_loop.result import ClosedLoopResult
 from hybrid_mpc.closed_loop.simulate import simulate
@@ -60,7 +60,7 @@ def monitor_stage(context: Context) -> None:
         reason = "the monitor's estimator needs the scenario's control problem (input range, sensor noise)"
         context.save("monitor", {"reason": reason}, {})
         return
-    model = load_artifact(context.out / "model").models["hybrid"]
+    model = load(context.out / "model").models["hybrid"]
     sigma_x = context.sigma_x("hybrid_observer")
     whole = context.dataset.whole
     known: dict[str, Any] = {}  # the rest speeds, and what hinders the calibration
@@ -137,9 +137,9 @@ def _load_loop(
     context: Context, model: HybridModel, calibration: Calibration, control: OCP, sigma_x: Array
 ) -> tuple[dict[str, Any], ClosedLoopResult]:
     """The first task with an unknown constant load from its middle on: does the monitor see it?"""
-    task, prior = context.scenario.tasks[0], load_artifact(context.out / "model").models["prior"]
+    task, prior = context.scenario.tasks[0], load(context.out / "model").models["prior"]
     assert context.scenario.plant is not None
-    start, load = 0.5 * task.duration, unknown_load(control)
+    start, added = 0.5 * task.duration, unknown_load(control)
     result = simulate(
         context.scenario.plant(),
         make_estimator(model, context.scenario, sigma_x),
@@ -151,12 +151,12 @@ def _load_loop(
         x0=np.array(task.x0),
         seed=context.settings.seed,
         monitor=make_monitor(model, calibration),
-        faults=(Fault(start, task.duration, "input_offset", load),),
+        faults=(Fault(start, task.duration, "input_offset", added),),
     )
     before, after = result.alarm[result.t < start], np.flatnonzero(result.alarm & (result.t >= start))
     delay = float(result.t[after[0]] - start) if after.size else None
     return {
-        "task": task.name, "load": load, "start_s": start, "delay_s": delay,
+        "task": task.name, "load": added, "start_s": start, "delay_s": delay,
         "false_alarms": len(alarm_intervals(before, model.dt)),
     }, result  # fmt: skip
 
@@ -223,7 +223,7 @@ def analysis_stage(context: Context) -> None:
     """Linearise prior and hybrid at rest and at working speed; poles, PBH tests, frequency responses."""
     from hybrid_mpc.analysis import analyze, fixed_point, frequency_response, linearize
 
-    artifact = load_artifact(context.out / "model")
+    artifact = load(context.out / "model")
     result: dict[str, Any] = {}
     arrays: dict[str, Any] = {}
     for i, (name, model) in enumerate(artifact.models.items()):

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.artifact import Kit, artifact_folder, load_artifact
+from hybrid_mpc.artifact import Kit, artifact_folder, load
 from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_object, write_json, write_text
@@ -103,7 +103,7 @@ def prepared(
             "scenario control=OCP(...)"
         )
     folder = artifact_folder(model)
-    artifact = load_artifact(folder)
+    artifact = load(folder)
     hybrid = artifact.models["hybrid"]
     if abs(hybrid.dt - scenario.data.dt) > 1e-9:
         raise InputError(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.artifact import load_artifact
+from hybrid_mpc.artifact import load
 from hybrid_mpc.closed_loop import Fault, simulate
 from hybrid_mpc.closed_loop.faults import install
 from hybrid_mpc.closed_loop.simulate import Step
@@ -188,7 +188,7 @@ def run_nominal(
     Returns:
         Task, seed, friction, length [s] and cost; arrays ``numbers`` (the first second left out), ``y``, ``u``.
     """
-    scenario, artifact = load_scenario(scenario_name), load_artifact(folder)
+    scenario, artifact = load_scenario(scenario_name), load(folder)
     task = next(t for t in scenario.tasks if t.name == loop.task)
     control, model = task.control or scenario.control, artifact.models["hybrid"]
     assert scenario.plant is not None

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hybrid_mpc.artifact import load_artifact
+from hybrid_mpc.artifact import load
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.consistency import Consistency, consistency
 from hybrid_mpc.pipeline.contenders import CONTENDERS
@@ -30,7 +30,7 @@ def estimation_stage(context: Context) -> None:
         reason = "the observers need the scenario's control problem (input range, sensor noise)"
         context.save("estimation", {"reason": reason}, {})
         return
-    models = load_artifact(context.out / "model").models
+    models = load(context.out / "model").models
     parts = judged_parts(context.trajectories("test"))
     result: dict[str, Any] = {"recordings": [{"name": p.name, "samples": len(p.t)} for p in parts]}
     arrays: dict[str, Any] = {}

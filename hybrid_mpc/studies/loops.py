@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_mpc.artifact import FILES, Kit, artifact_folder, load_artifact
+from hybrid_mpc.artifact import FILES, Kit, artifact_folder, load
 from hybrid_mpc.closed_loop import ClosedLoopResult, simulate
 from hybrid_mpc.closed_loop.faults import check_channels, install
 from hybrid_mpc.errors import InputError
@@ -120,7 +120,7 @@ class _Loops:
 
     def _artifact(self, label: str) -> Kit:
         if label not in self._artifacts:
-            self._artifacts[label] = load_artifact(_local_folder(self._inputs[label]))
+            self._artifacts[label] = load(_local_folder(self._inputs[label]))
         return self._artifacts[label]
 
     def _made(self, run: RunConfig, task: Task, artifact: Kit) -> tuple[Any, Any]:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.artifact import Kit, load_artifact
+from hybrid_mpc.artifact import Kit, load
 from hybrid_mpc.closed_loop import ClosedLoopResult, Guard, simulate
 from hybrid_mpc.closed_loop.guard import Mode
 from hybrid_mpc.closed_loop.simulate import Step
@@ -72,7 +72,7 @@ class _Loops:
     def __init__(self, runner: MonitorRunner) -> None:
         self._study, self._folder = runner.study, Path(runner.folder)
         self._scenario = load_scenario(runner.study.scenario)
-        self._artifact: Kit = load_artifact(Path(runner.model.folder))
+        self._artifact: Kit = load(Path(runner.model.folder))
         self._noise = {name: np.array(sigma) for name, sigma in runner.model.noise}
         (self._task,) = selected_tasks(self._scenario, (runner.study.task,))
         self._task = plain_task(self._task)

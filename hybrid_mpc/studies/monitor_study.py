@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from hybrid_mpc.artifact import Kit, load_artifact
+from hybrid_mpc.artifact import Kit, load
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_json, write_json
 from hybrid_mpc.monitor import Judges
@@ -75,7 +75,7 @@ def run_monitor_study(
     say.finish(f"{study.size} jobs")
     if study.guard_seeds:
         causes = load_scenario(study.scenario).causes
-        adaptable(load_artifact(Path(model.folder)).models["hybrid"], causes)  # or the last loops would fail
+        adaptable(load(Path(model.folder)).models["hybrid"], causes)  # or the last loops would fail
     engine = make_engine(MonitorRunner(study, model, str(out.resolve())), workers, None)
     try:
         open_folder(out, note)
@@ -85,7 +85,7 @@ def run_monitor_study(
             first = [job for job in jobs if job.kind == LEARN]
             todo.run("nominal loops to learn from", first)
             if not (out / JUDGES).is_file():
-                _learn(study, out, first, load_artifact(Path(model.folder)))
+                _learn(study, out, first, load(Path(model.folder)))
             todo.run("nominal, faulted and guarded loops", [job for job in jobs if job.kind != LEARN])
     finally:
         engine.close()

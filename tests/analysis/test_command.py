@@ -14,6 +14,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 import hybrid_mpc.analysis
+from hybrid_mpc import load
 from hybrid_mpc.analysis import run_model
 from hybrid_mpc.analysis.outputs import write_analysis
 from hybrid_mpc.analysis.study import study
@@ -21,7 +22,6 @@ from hybrid_mpc.analysis.study_loops import loops_part
 from hybrid_mpc.analysis.study_signals import measured_part
 from hybrid_mpc.analysis.subject import Request, Subject, subject_of
 from hybrid_mpc.analysis.toolbox import control_toolbox
-from hybrid_mpc.artifact import load_artifact
 from hybrid_mpc.cli.main import app
 from hybrid_mpc.closed_loop import simulate
 from hybrid_mpc.data import write_csv
@@ -36,7 +36,7 @@ PARTS = ("equilibria", "friction", "linear", "measured", "schedule", "loops", "m
 
 @pytest.fixture(scope="module")
 def prior_alone(golf_artifact):
-    artifact = load_artifact(golf_artifact)
+    artifact = load(golf_artifact)
     return Subject(
         {"prior": artifact.models["prior"]}, load_programs(golf_artifact), np.array([[-0.85, 0.85], [-2.5, 2.5]]),
         np.array([[-0.5, 0.5]]), np.array([0.25]), plant=scenario.plant(),

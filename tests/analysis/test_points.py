@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from online_models import linear_model, pendulum_model
 
+from hybrid_mpc import load
 from hybrid_mpc.analysis import (
     equilibria,
     fixed_point,
@@ -16,7 +17,6 @@ from hybrid_mpc.analysis import (
     linearize_along,
     linearize_secant,
 )
-from hybrid_mpc.artifact import load_artifact
 from hybrid_mpc.errors import InputError
 from scenarios.golf_robot.nominal import GEAR
 from scenarios.golf_robot.nominal import PARAMETERS as GOLF
@@ -27,7 +27,7 @@ REGION = [(-4.0, 4.0), (-2.0, 2.0)]
 
 @pytest.fixture(scope="module")
 def golf(golf_artifact):
-    return load_artifact(golf_artifact).models
+    return load(golf_artifact).models
 
 
 def golf_slopes(phi, v):

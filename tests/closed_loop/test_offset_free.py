@@ -10,7 +10,7 @@ import pytest
 from closed_loop_parts import POINT, hold, make_ekf, run, sine
 from online_models import PendulumPlant, pendulum_model
 
-from hybrid_mpc.artifact import load_artifact
+from hybrid_mpc import load
 from hybrid_mpc.closed_loop import Fault
 from hybrid_mpc.estimation import DelayCompensation
 from hybrid_mpc.mpc import OCP, CondensedController, SafeController
@@ -82,7 +82,7 @@ def bench():
 
 
 def test_with_stiction_a_load_is_held_within_the_dead_zone(bench, golf_artifact):
-    models = load_artifact(golf_artifact).models
+    models = load(golf_artifact).models
     row = bench.held(models, "prior", 0.3, -0.08, seconds=10.0)
     # The load alone moves the club by u 4 / (m g a) = 0.13 rad = 86 counts; two are the goal (docs/control.md).
     assert row["largest_error_counts"] < 2.0

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from monitor_parts import DT, J, pendulum, simulate
 
-from hybrid_mpc.artifact import load_artifact
+from hybrid_mpc import load
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation import parameter_factors, parameter_filter, parameter_states, with_parameter_states
 from hybrid_mpc.model import HybridModel
@@ -18,7 +18,7 @@ GROUPS = {"mass": ("m", "J"), "friction": ("d", "mu")}
 
 @pytest.fixture(scope="module")
 def golf(golf_artifact):
-    return load_artifact(golf_artifact).models["hybrid"]
+    return load(golf_artifact).models["hybrid"]
 
 
 @pytest.fixture(scope="module")

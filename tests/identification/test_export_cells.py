@@ -5,7 +5,7 @@ import pytest
 import torch
 from simulated_pendulum import DT, Pendulum, record
 
-from hybrid_mpc.artifact import load_artifact, save_artifact
+from hybrid_mpc.artifact import load, save_artifact
 from hybrid_mpc.identification.dataset import cut_windows, literal_scaling_of, scaling_of
 from hybrid_mpc.identification.export import check_parity, model_info, trace_model
 from hybrid_mpc.identification.settings import TrainingSettings
@@ -43,7 +43,7 @@ def test_every_cell_exports_at_rounding(cell, form):
 def test_a_saved_model_runs_freely_like_torch(cell, tmp_path):
     step = model(cell, "literal", "rnn")
     save_artifact(tmp_path, {"m": trace_model(step)}, model_info(step.prior, DT))
-    saved = load_artifact(tmp_path).models["m"]
+    saved = load(tmp_path).models["m"]
     assert saved.n_h == step.network.n_h
     x, h = torch.tensor(RUN.x[0]), torch.zeros(step.network.n_h, dtype=torch.float64)
     x_own, h_own = RUN.x[0], np.zeros(step.network.n_h)

@@ -6,7 +6,7 @@ import torch
 from simulated_pendulum import DT, TRUTH, Pendulum, record
 
 import nn_export
-from hybrid_mpc.artifact import load_artifact, save_artifact
+from hybrid_mpc.artifact import load, save_artifact
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identification.evaluation import free_runs, score
 from hybrid_mpc.identification.export import model_info, trace_model
@@ -97,7 +97,7 @@ def test_the_exported_model_carries_it_at_rounding(runs, trained, tmp_path):
     prior = Pendulum(TRUTH)
     step, output, info = PriorStep(prior, DT), trained.model(prior), model_info(prior, DT)
     save_artifact(tmp_path, {"g": trace_model(step, output), "plain": trace_model(step)}, info)
-    models = load_artifact(tmp_path).models
+    models = load(tmp_path).models
     report = nn_export.parity(
         output, models["g"].output, (torch.zeros(2).double(), torch.zeros(1).double()), seed=0
     )

@@ -7,7 +7,7 @@ import pytest
 from monitor_parts import DT, GAMMA, MGL, NOISE, Observer, pendulum, simulate
 from monitor_parts import J as INERTIA
 
-from hybrid_mpc.artifact import load_artifact, save_artifact
+from hybrid_mpc.artifact import load, save_artifact
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.monitor import Detector, Diagnoser, EnergyMonitor
 
@@ -86,11 +86,11 @@ def test_what_the_motion_does_not_tell_apart_is_named():
 
 
 def test_the_artifact_brings_what_it_needs_and_old_ones_say_what_is_missing(golf_artifact, tmp_path):
-    model = load_artifact(golf_artifact).models["hybrid"]
+    model = load(golf_artifact).models["hybrid"]
     assert set(model.parameters) >= {"J", "d", "mu"}
     x, u = [0.3, 0.8], [0.05]
     values = np.array(list(model.parameters.values()))
-    prior = load_artifact(golf_artifact).models["prior"]
+    prior = load(golf_artifact).models["prior"]
     # the same program traced twice, once with its parameters inside: the same operations
     np.testing.assert_allclose(
         model.parametric(x, u, values).full(), prior.xdot(x, [], u)[1:].full(), rtol=1e-13
@@ -113,13 +113,13 @@ def test_an_artifact_without_the_program_still_loads(golf_artifact, tmp_path):
     from hybrid_mpc.artifact import ModelInfo
 
     programs = nn_export.load_programs(golf_artifact)
-    model = load_artifact(golf_artifact).models["prior"]
+    model = load(golf_artifact).models["prior"]
     info = ModelInfo(model.dt, model.states, model.inputs, model.outputs)
     kept = {
         n.split("/")[1]: p for n, p in programs.items() if n.startswith("prior/") and "parametric" not in n
     }
     save_artifact(tmp_path / "old", {"prior": kept}, info)
-    assert load_artifact(tmp_path / "old").models["prior"].parametric is None
+    assert load(tmp_path / "old").models["prior"].parametric is None
 
 
 def test_bad_input_speaks():

@@ -113,9 +113,9 @@ def test_it_survives_json(ordinary):
 
 
 def test_a_hidden_state_is_settled(golf_artifact):
-    from hybrid_mpc.artifact import load_artifact
+    from hybrid_mpc import load
 
-    model = load_artifact(golf_artifact).models["hybrid"]
+    model = load(golf_artifact).models["hybrid"]
     rng = np.random.default_rng(0)
     found = learn_plausibility(model, [Data(rng.normal(size=(300, 2)), 0.1 * rng.normal(size=(300, 1)))])
     bound = excess_bound(model, found)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hybrid_mpc.artifact import load_artifact
+from hybrid_mpc import load
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.pipeline.contenders import CONTENDERS, ORACLES
 from hybrid_mpc.pipeline.contest import _seeds, contest, limits_used, parts_of, tasks_of
@@ -151,7 +151,7 @@ def test_a_contest_that_was_killed_goes_on_from_what_it_kept(golf_artifact, tmp_
     scenario = load_scenario(str(file))
     context = Context(RunSettings(str(file)), scenario, out)
     noise = {name: np.array([1e-4, 1e-2]) for name in CONTENDERS}
-    artifact = load_artifact(out / "model")
+    artifact = load(out / "model")
     rows, arrays = contest(context, artifact, scenario.control, noise)
     assert [(r["controller"], r["seed"]) for r in rows] == [
         (name, seed) for name in sorted(set(CONTENDERS) - set(ORACLES)) for seed in (0, 1)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybrid_mpc.artifact import load_artifact, set_calibration
+from hybrid_mpc.artifact import load, set_calibration
 from hybrid_mpc.closed_loop import Fault
 from hybrid_mpc.data import write_csv
 from hybrid_mpc.errors import InputError
@@ -102,7 +102,7 @@ def test_the_artifact_keeps_detector_and_plausibility(golf_artifact, tmp_path):
         0.99, (1.0,) * 5, (0.1, 0.1), (0.0,) * 3, tuple(map(tuple, np.eye(3).tolist())), 4.0, 1.0
     )
     set_calibration(folder, replace(CALIBRATION, detector=detector, plausibility=unit))
-    found = load_artifact(folder).calibration
+    found = load(folder).calibration
     assert found.detector == detector
     assert found.detector.data_hash == "hash of the data"
     assert found.plausibility == unit
@@ -146,7 +146,7 @@ def resumed(context):
 
 
 def test_the_stage_learns_from_what_is_kept_and_fills_the_artifact(context, resumed):
-    stored = load_artifact(context.out / "model").calibration
+    stored = load(context.out / "model").calibration
     assert stored.detector == record(Detector, resumed["detector"], "")
     assert stored.detector.false_alarms_per_hour == 2.0
     assert re.fullmatch("[0-9a-f]{64}", stored.detector.data_hash)
@@ -189,7 +189,7 @@ def test_without_a_detector_the_recording_is_shown_and_how_much_is_missing(conte
     _check({"guard": group}, type(SCHEMA)({"guard": SCHEMA.keys["guard"]}), "", {})
     assert group["false_alarms_per_hour"] is None
     assert "10 false alarms an hour need 2.5 min" in group["reason"]  # of 24 s
-    assert load_artifact(out / "model").calibration.detector is None
+    assert load(out / "model").calibration.detector is None
     assert guard_words({"guard": group})[0].startswith(
         "No detector could be learned from undisturbed recordings"
     )

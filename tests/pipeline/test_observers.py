@@ -45,7 +45,7 @@ def test_too_short_recordings_are_a_reason(monkeypatch, tmp_path):
 
     model, kept = pendulum_model(), {}
     monkeypatch.setattr(
-        observers, "load_artifact", lambda folder: SimpleNamespace(models={"prior": model, "hybrid": model})
+        observers, "load", lambda folder: SimpleNamespace(models={"prior": model, "hybrid": model})
     )
     monkeypatch.setattr(observers, "make_estimator", lambda model, control, sigma: make_ekf(model))
     context = SimpleNamespace(

@@ -12,7 +12,7 @@ import time
 import numpy as np
 import pytest
 
-from hybrid_mpc.artifact import load_artifact
+from hybrid_mpc import load
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.report.schema import validate_results
 
@@ -166,13 +166,13 @@ def test_damaged_artifact_is_refused(golf_artifact, tmp_path, file, damage, word
     else:
         (tmp_path / file).write_bytes(damage((tmp_path / file).read_bytes()))
     with pytest.raises(InputError, match=re.escape(words)):
-        load_artifact(tmp_path)
+        load(tmp_path)
 
 
 def test_artifact_holds_data_only(finished):
     names = {path.name for path in (finished / "model").iterdir()}
     assert names == {"model.json", "programs.json", "weights.safetensors"}
-    artifact = load_artifact(finished / "model")
+    artifact = load(finished / "model")
     assert set(artifact.models) == {"hybrid", "prior"}
     assert artifact.models["prior"].n_h == 0
     assert artifact.calibration is not None
@@ -187,6 +187,6 @@ def test_the_main_job_says_what_its_guard_lacks(finished):
     page = (finished / "report.html").read_text()
     assert "Energy guard" in page
     assert "No detector could be learned" in page
-    stored = load_artifact(finished / "model").calibration
+    stored = load(finished / "model").calibration
     assert stored.detector is None
     assert stored.plausibility.samples > 200

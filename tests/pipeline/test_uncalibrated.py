@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from hybrid_mpc.artifact import load_artifact, read_description, save_artifact, write_description
+from hybrid_mpc.artifact import load, read_description, save_artifact, write_description
 from hybrid_mpc.cli.main import app
 from hybrid_mpc.data import write_csv
 from hybrid_mpc.data_spec import DataSpec
@@ -141,7 +141,7 @@ def test_an_axis_of_millimetres_a_second_is_calibrated(slow):
     # what dry friction may hold is 0.1 N: a residual that is always within the dead band would leave a threshold of 0
     assert 0 < found["calibration"]["residual_threshold"] < 0.5
     assert group("monitor", monitor_results(slow))["threshold_w"] > 0
-    model = load_artifact(slow.out / "model").models["hybrid"]
+    model = load(slow.out / "model").models["hybrid"]
     assert model.time_unit == slow.time_unit > 5.0
     covered = found["recordings"][0]
     assert covered["judged_s"] > 500
@@ -149,7 +149,7 @@ def test_an_axis_of_millimetres_a_second_is_calibrated(slow):
 
 
 def test_monitor_and_guard_take_the_same_rest_speed(slow):
-    artifact = load_artifact(slow.out / "model")
+    artifact = load(slow.out / "model")
     (rest,) = slow.result("monitor")["calibration"]["rest_speed"]
     assert stored_rest(artifact) == (rest,)
     # 17 min are too little for the slowest rate of so slow a machine
@@ -188,7 +188,7 @@ def test_the_guard_copes_without_a_calibration(short):
     assert captions == [
         "The recording run0, of which test data come, by the monitor, which has no thresholds to judge by."
     ]
-    artifact = load_artifact(short.out / "model")
+    artifact = load(short.out / "model")
     assert artifact.calibration.threshold_w is None
     assert stored_rest(artifact) is None  # a detector that is learned later takes it from its own recordings
     with pytest.raises(

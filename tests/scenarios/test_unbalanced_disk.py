@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from hybrid_mpc.artifact import load_artifact, save_artifact
+from hybrid_mpc.artifact import load, save_artifact
 from hybrid_mpc.closed_loop import simulate
 from hybrid_mpc.data import load_trajectories
 from hybrid_mpc.errors import InputError
@@ -144,7 +144,7 @@ def models(tmp_path_factory):
     for name, delay in (("late", DELAY), ("at once", 0.0)):
         folder = tmp_path_factory.mktemp("model")
         save_artifact(folder, programs, replace(model_info(prior, DT), input_delay=delay))
-        made[name] = load_artifact(folder).models["prior"]
+        made[name] = load(folder).models["prior"]
     return made
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trivial_runs
 
-from hybrid_mpc.artifact import load_artifact
+from hybrid_mpc import load
 from hybrid_mpc.cli import main
 from hybrid_mpc.closed_loop import simulate
 from hybrid_mpc.closed_loop.faults import install
@@ -25,7 +25,7 @@ SMALL = MonitorStudy("golf_robot", "nowhere", nominal_hours=0.5, seeds=3, guard_
 
 
 def test_loops_together_are_loops_alone(golf_artifact):
-    models = load_artifact(golf_artifact).models
+    models = load(golf_artifact).models
     hybrid, control, periods = models["hybrid"], scenario.control, 12
     estimator = make_estimator(hybrid, scenario, np.array([1e-4, 2e-2]))
     controller = make_controller(hybrid, models["prior"], control)
@@ -104,7 +104,7 @@ def stand_in(monkeypatch):
     monkeypatch.setattr(
         room, "load_inputs", lambda *given: (SimpleNamespace(models=[SimpleNamespace(folder="")]), {})
     )
-    monkeypatch.setattr(room, "load_artifact", lambda folder: SimpleNamespace(models={"hybrid": model}))
+    monkeypatch.setattr(room, "load", lambda folder: SimpleNamespace(models={"hybrid": model}))
     monkeypatch.setattr(room, "make_engine", lambda *given: trivial_runs.Here(run))
 
     def learn(study, paths, dt):
