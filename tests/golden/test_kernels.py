@@ -56,7 +56,8 @@ def test_sqp_converges_to_the_same_plans(m):
 
 def test_terminal_weights(m):
     for name, problem in m.data["problems"].items():
-        held({name: m.terminal_weight(name)}, {name: np.array(problem["terminal"])}, TERMINAL)
+        # as one signal: its entries are of one quadratic form
+        held({name: m.terminal_weight(name).ravel()}, {name: np.ravel(problem["terminal"])}, TERMINAL)
 
 
 @pytest.mark.parametrize("kind", ["guard", "level"])
