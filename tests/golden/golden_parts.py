@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import t as student
 
 import nn_export
-from hybrid_mpc.artifact import ModelInfo, build_model, load_artifact
+from hybrid_mpc.artifact import ModelInfo, build_model, load
 from hybrid_mpc.closed_loop import Fault, Guard, Mode, Runner, simulate
 from hybrid_mpc.estimation import (
     DelayCompensation,
@@ -202,7 +202,7 @@ def machine(name):
 
 def artifact_of(folder):
     """Models by name and calibration as the library's own reader finds them in an artifact's folder."""
-    found = load_artifact(folder)
+    found = load(folder)
     return found.models, found.calibration
 
 

@@ -121,7 +121,7 @@ RUNNER = {
 
 def freeze(name, run):
     """The folder of a machine from a finished run: programs, weights, plain numbers, references."""
-    from hybrid_mpc.artifact import load_artifact, read_description, write_description
+    from hybrid_mpc.artifact import load, read_description, write_description
     from hybrid_mpc.files import sha256
     from hybrid_mpc.pipeline.contenders import no_surer_than_prior
     from hybrid_mpc.pipeline.loops import first_controller, freezing, make_estimator, make_monitor, make_ocp
@@ -129,7 +129,7 @@ def freeze(name, run):
 
     folder, run = HERE / name, Path(run)
     folder.mkdir(exist_ok=True)
-    scenario, artifact = load_scenario(name), load_artifact(run / "model")
+    scenario, artifact = load_scenario(name), load(run / "model")
     description = read_description(run / "model")
     shutil.copy(run / "model" / "weights.safetensors", folder)
     programs = json.loads((run / "model" / "programs.json").read_text())
