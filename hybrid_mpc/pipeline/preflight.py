@@ -284,7 +284,9 @@ def _structure(control: Any) -> tuple[Any, ...]:
     """What tells controllers apart that are built differently; a problem that is none is told on its own."""
     if not isinstance(control, OCP):
         return ()
-    return control.horizon, control.du_max is None, tuple(np.isfinite([control.x_min, control.x_max]).ravel())
+    bounded = tuple(np.isfinite([control.x_min, control.x_max]).ravel())
+    expressions = control.soft, id(control.economic)
+    return control.horizon, control.blocks, control.du_max is None, bounded, expressions, len(control.starts)
 
 
 def _check_sensors(report: _Report, scenario: Scenario, prior: Prior | None) -> None:
