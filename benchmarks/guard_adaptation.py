@@ -1,4 +1,4 @@
-"""What a backup that adapts is worth: ``python benchmarks/guard_adaptation.py --model DIR --noise control.json
+"""What a backup that adapts is worth: ``python benchmarks/guard_adaptation.py --model DIR
 --detector calibration.json [--seeds 8] [--first 720] [--cases ...] [--arms ...] [--keep DIR] [--out FILE.json]``.
 
 The golf robot's rig on the sinusoidal task, 6 s, a fault from 1.5 to 3.5 s on to the end (guard_loops.py), the same
@@ -158,7 +158,6 @@ def main() -> None:
     """Print a table; write JSON where asked."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--model", type=Path, required=True, help="artifact folder with prior and hybrid")
-    parser.add_argument("--noise", type=Path, required=True, help="control.json of a run: process noise")
     parser.add_argument("--detector", type=Path, required=True, help="JSON file with a field 'detector'")
     parser.add_argument("--cases", nargs="+", default=CASES, help="faults")
     parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS), help="controllers beside off")
@@ -168,9 +167,9 @@ def main() -> None:
     parser.add_argument("--time", action="store_true", help="processor time of a period instead")
     parser.add_argument("--out", type=Path, help="JSON file to write")
     given = parser.parse_args()
-    noise = json.loads(given.noise.read_text())["sigma_x"]
     detector = read_detector(given.detector)
-    arms = Arms(load(given.model), noise, detector)
+    kit = load(given.model)
+    arms = Arms(kit, kit.loop.process_noise, detector)
     if given.time:
         print(json.dumps(times(arms), indent=1))
         return

@@ -1,4 +1,4 @@
-"""What the diagnosis says of known faults: ``python benchmarks/guard_causes.py --model DIR --noise control.json
+"""What the diagnosis says of known faults: ``python benchmarks/guard_causes.py --model DIR
 --detector FILE.json [--seeds 3] [--after 0.5 1.2 2.2] [--keep DIR]``.
 
 Loops of guard_loops.py, replayed; what the diagnosis says so long [s] after the onset, of its whole history and of
@@ -19,11 +19,11 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
-from guard_loops import DT, FAULTS, Loops, fault_plans, read_noise
+from guard_loops import DT, FAULTS, Loops, fault_plans, noise_of
 
 from hybrid_mpc import load
-from hybrid_mpc.files import read_json
-from hybrid_mpc.monitor import Detector, Diagnoser, guard_monitor
+from hybrid_mpc.monitor import Diagnoser, guard_monitor
+from hybrid_mpc.pipeline.monitor_job import read_detector
 from scenarios.golf_robot import scenario
 
 
@@ -58,21 +58,16 @@ def main() -> None:
     """Print what is said."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--model", type=Path, required=True, help="artifact folder with prior and hybrid")
-    parser.add_argument(
-        "--noise", type=Path, required=True, help="control.json of a run: process noise of the filter"
-    )
     parser.add_argument("--detector", type=Path, required=True, help="JSON file with a field 'detector'")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--after", type=float, nargs="+", default=(0.5, 1.2, 2.2))
     parser.add_argument("--keep", type=Path, help="folder of the loops")
     given = parser.parse_args()
     artifact = load(given.model)
-    monitor = guard_monitor(
-        completed(artifact), Detector.from_dict(read_json(given.detector)["detector"]), diagnose=True
-    )
+    monitor = guard_monitor(completed(artifact), read_detector(given.detector), diagnose=True)
     diagnoser, loops = (
         Diagnoser(monitor, scenario.causes),
-        Loops(artifact, read_noise(given.noise), given.keep),
+        Loops(artifact, noise_of(artifact), given.keep),
     )
     for plan in fault_plans(FAULTS, given.seeds, 500):
         for text in said(monitor, diagnoser, loops.run(plan), plan.onset, given.after):

@@ -10,7 +10,6 @@ import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -116,6 +115,6 @@ class Loops:
         return arrays
 
 
-def read_noise(path: Path):
-    """Process noise of the hybrid's filter from a run's ``control.json``."""
-    return np.array(json.loads(path.read_text())["sigma_x"]["hybrid_observer"])
+def noise_of(kit):
+    """Process noise of the hybrid's filter."""
+    return np.array(kit.loop.process_noise["hybrid_observer"])

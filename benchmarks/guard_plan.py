@@ -1,4 +1,4 @@
-"""What bounds to the ordinary cost in a plan: ``python benchmarks/guard_plan.py --model DIR --noise control.json
+"""What bounds to the ordinary cost in a plan: ``python benchmarks/guard_plan.py --model DIR
 --data RUN/data/train_*.csv [--seeds 6] [--seconds 10] [--arms bounds] [--out FILE.json]``.
 
 Nominal loops of the golf robot's rig on two tasks, sines and steps to random levels (guard_loops.py), the same seeds
@@ -23,7 +23,7 @@ from time import process_time
 from types import SimpleNamespace
 
 import numpy as np
-from guard_loops import DT, Loops, Plan, nominal_plans, read_noise
+from guard_loops import DT, Loops, Plan, noise_of, nominal_plans
 from scipy.stats import t as student
 
 from hybrid_mpc import load
@@ -134,7 +134,6 @@ def main() -> None:
     """Print a table; write JSON where asked."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--model", type=Path, required=True, help="artifact folder with prior and hybrid")
-    parser.add_argument("--noise", type=Path, required=True, help="control.json of a run")
     parser.add_argument("--data", type=Path, nargs="+", default=[], help="training recordings")
     parser.add_argument("--minutes", type=float, default=0.0, help="learn from so much of nominal loops")
     parser.add_argument("--keep", type=Path, help="folder of nominal loops")
@@ -144,7 +143,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="JSON file to write")
     given = parser.parse_args()
     say = lambda text: print(text, flush=True)  # noqa: E731
-    artifact, noise = load(given.model), read_noise(given.noise)
+    artifact = load(given.model)
+    noise = noise_of(artifact)
     ordinary = learned(given, artifact, noise, say)
     say(f"{ordinary.samples} samples, terms {ordinary.terms}, reach {ordinary.reach:.3f}")
     kept = read_json(given.out) if given.out is not None and given.out.is_file() else {}

@@ -1,4 +1,4 @@
-"""What a guard's reaction is worth: ``python benchmarks/guard_reaction.py --model DIR --noise control.json
+"""What a guard's reaction is worth: ``python benchmarks/guard_reaction.py --model DIR
 --detector calibration.json [--seeds 3] [--out FILE.json]``.
 
 The golf robot's rig on the sinusoidal task, 6 s, a fault from 1.5 to 3.5 s on (guard_loops.py), the same seeds without
@@ -14,7 +14,6 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import argparse
-import json
 from pathlib import Path
 
 import numpy as np
@@ -88,15 +87,12 @@ def main() -> None:
     """Print a table; write JSON where asked."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--model", type=Path, required=True, help="artifact folder with prior and hybrid")
-    parser.add_argument(
-        "--noise", type=Path, required=True, help="control.json of a run: process noise of the filters"
-    )
     parser.add_argument("--detector", type=Path, required=True, help="JSON file with a field 'detector'")
     parser.add_argument("--seeds", type=int, default=3, help="loops of each fault and arm")
     parser.add_argument("--out", type=Path, help="JSON file to write")
     given = parser.parse_args()
-    artifact, noise = load(given.model), json.loads(given.noise.read_text())["sigma_x"]
-    arms = Arms(artifact, noise, read_detector(given.detector))
+    artifact = load(given.model)
+    arms = Arms(artifact, artifact.loop.process_noise, read_detector(given.detector))
     result = {"reaction": reactions(arms, given.seeds, lambda text: print(text, flush=True))}
     print("| fault | " + " | ".join(arms.guards) + " |\n| --- |" + " ---: |" * len(arms.guards))
     for case, row in result["reaction"].items():

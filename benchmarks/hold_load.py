@@ -1,4 +1,4 @@
-"""How still does the golf robot hold a load: ``python benchmarks/hold_load.py --model DIR --noise control.json``.
+"""How still does the golf robot hold a load: ``python benchmarks/hold_load.py --model DIR``.
 
 Options: ``--seeds 3`` (loops a hold, the table shows the worst), ``--seconds 60`` (the second half is judged),
 ``--names prior``, ``--step 0.005`` (in place of the switching filter one filter, whose disturbance may step by this
@@ -90,7 +90,6 @@ def main() -> None:
     """Print a table; write JSON where asked."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--model", type=Path, required=True, help="artifact folder")
-    parser.add_argument("--noise", type=Path, help="control.json of a run: process noise of the filters")
     parser.add_argument("--seeds", type=int, default=1, help="loops a hold")
     parser.add_argument("--seconds", type=float, default=60.0, help="length of a loop")
     parser.add_argument("--names", nargs="+", default=["hybrid", "prior"], help="models")
@@ -99,8 +98,8 @@ def main() -> None:
     )
     parser.add_argument("--out", type=Path, help="JSON file to write")
     given = parser.parse_args()
-    models, rows = hm.load(given.model).models, []
-    noise = json.loads(given.noise.read_text())["sigma_x"] if given.noise else {}
+    kit, rows = hm.load(given.model), []
+    models, noise = kit.models, kit.loop.process_noise
     print("| model | angle [rad] | load [N m] | largest error [counts] | swings | torque range [N m] |")
     print("| --- | ---: | ---: | ---: | ---: | ---: |")
     for name in given.names:

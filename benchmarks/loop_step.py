@@ -1,6 +1,6 @@
 """How long a whole period of the closed loop takes: estimator, controller and monitor.
 
-``python benchmarks/loop_step.py [--model DIR] [--noise control.json] [--task NAME ...] [--seeds 2] [--out FILE.json]``.
+``python benchmarks/loop_step.py [--model DIR] [--task NAME ...] [--seeds 2] [--out FILE.json]``.
 The golf robot's loops with the hybrid, as ``hybrid-mpc control`` runs them: switching filter (three extended Kalman
 filters over states, hidden states and disturbance), ``rti`` at the scenario's horizon behind its safeguards, energy
 monitor. Wall clock of every period but the first of a loop [ms]: median, 95 %, 99 %, largest, of the parts and of the
@@ -33,13 +33,14 @@ SHARES = {"median": 50, "p95": 95, "p99": 99, "max": 100}
 
 
 def models_of(folder: Path | None):
-    """Prior and hybrid of an artifact, or with random weights."""
+    """Prior and hybrid of an artifact, or with random weights; and the process noise of their filters, if known."""
     if folder is not None:
-        return load(folder).models
+        kit = load(folder)
+        return kit.models, kit.loop.process_noise
     from mpc_step import hybrid
 
     model = hybrid(32)
-    return {"prior": scenario.oracle(model.dt) if scenario.oracle else model, "hybrid": model}
+    return {"prior": scenario.oracle(model.dt) if scenario.oracle else model, "hybrid": model}, {}
 
 
 def looped(models, task, estimator, seed: int) -> dict[str, np.ndarray]:
@@ -58,13 +59,11 @@ def main() -> None:
     """Print a table; write JSON where asked."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--model", type=Path, help="artifact folder")
-    parser.add_argument("--noise", type=Path, help="control.json of a run: process noise of the filters")
     parser.add_argument("--task", nargs="+", default=TASKS, choices=[t.name for t in scenario.tasks])
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--out", type=Path, help="JSON file to write")
     given = parser.parse_args()
-    models = models_of(given.model)
-    noise = json.loads(given.noise.read_text())["sigma_x"] if given.noise else {}
+    models, noise = models_of(given.model)
     sigma_x = np.array(noise.get("hybrid_observer", SIGMA_X))
     kinds = {
         "switching": lambda control: make_estimator(models["hybrid"], scenario, sigma_x, control),

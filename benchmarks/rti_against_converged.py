@@ -1,6 +1,6 @@
 """What one real-time iteration a period costs in closed loop: rti against converged sqp and ipopt.
 
-``python benchmarks/rti_against_converged.py --model DIR [--noise control.json] [--task NAME ...] [--seeds 5]
+``python benchmarks/rti_against_converged.py --model DIR [--task NAME ...] [--seeds 5]
 [--solver sqp ...] [--ipopt-seeds 1] [--out FILE.json]``. The golf robot's tasks under the hybrid's observer and
 controller; the cost is that of the rig's true state. All solvers have the same problem, estimator, sensor noise (seed
 by seed), first plan (converged) and safeguards; only what happens within a period differs: one linearisation
@@ -100,7 +100,6 @@ def main() -> None:
     """Print a table; write JSON where asked."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--model", type=Path, required=True, help="artifact folder")
-    parser.add_argument("--noise", type=Path, help="control.json of a run: process noise of the filters")
     parser.add_argument("--task", nargs="+", default=TASKS, choices=[t.name for t in scenario.tasks])
     parser.add_argument("--solver", nargs="*", default=["sqp"], choices=[s for s in SOLVERS if s != "rti"])
     parser.add_argument("--seeds", type=int, default=5)
@@ -108,8 +107,8 @@ def main() -> None:
     parser.add_argument("--finer", type=int, default=1, help="times the encoder's counts, then without noise")
     parser.add_argument("--out", type=Path, help="JSON file to write")
     given = parser.parse_args()
-    models, rows = load(given.model).models, []
-    noise = json.loads(given.noise.read_text())["sigma_x"] if given.noise else {}
+    kit, rows = load(given.model), []
+    models, noise = kit.models, kit.loop.process_noise
     sigma_x = noise.get("hybrid_observer", SIGMA_X)
     print("| task | J rti | against | seeds | ratio of means | range | solve [ms] |")
     print("| --- | ---: | --- | ---: | ---: | --- | ---: |")

@@ -1,6 +1,6 @@
 """What limits tracking: prediction or estimation? Prior and hybrid on estimates of different quality.
 
-``python benchmarks/tracking_limits.py --model DIR --noise control.json [--task NAME ...] [--seeds 5]``. The golf
+``python benchmarks/tracking_limits.py --model DIR [--task NAME ...] [--seeds 5]``. The golf
 robot's tasks under the controllers of the main job; only the estimate changes: the plant's true state (the model's
 hidden state run along it), the filter without observer, and with it. What is left with the true state is what the model
 predicts wrongly; what comes on top is the estimate. Printed: mean costs and their standard deviations over the seeds,
@@ -14,7 +14,6 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import argparse
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -78,13 +77,11 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--model", type=Path, required=True, help="artifact folder")
-    parser.add_argument(
-        "--noise", type=Path, required=True, help="control.json of a run: process noise of the filters"
-    )
     parser.add_argument("--task", nargs="+", default=["track_sine", "track_step"])
     parser.add_argument("--seeds", type=int, default=5)
     given = parser.parse_args()
-    models, noise = load(given.model).models, json.loads(given.noise.read_text())["sigma_x"]
+    kit = load(given.model)
+    models, noise = kit.models, kit.loop.process_noise
     seeds = range(FIRST_SEED, FIRST_SEED + given.seeds)
     print("| task | model | true state | filter | filter with observer |\n| --- | --- | ---: | ---: | ---: |")
     for task in (t for t in scenario.tasks if t.name in given.task):

@@ -1,5 +1,6 @@
 """Shared material of the tests."""
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -46,6 +47,17 @@ def call(monkeypatch, capsys):
         return code, told.out, told.err.replace("\n", " ")
 
     return run
+
+
+@pytest.fixture(scope="session")
+def noisy_artifact(golf_artifact, tmp_path_factory) -> Path:
+    """The same, with the process noise of its filters, as a run leaves it."""
+    from hybrid_mpc.artifact import set_process_noise
+
+    folder = shutil.copytree(golf_artifact, tmp_path_factory.mktemp("noisy") / "model")
+    names = ("prior", "prior_observer", "hybrid", "hybrid_observer")
+    set_process_noise(folder, dict.fromkeys(names, (1e-4, 1e-2)))
+    return folder
 
 
 @pytest.fixture(scope="session")

@@ -59,16 +59,13 @@ class Request:
         scenario: Name or file. Default: the one that the artifact names; without any there are no loops.
         data: Recordings.
         speed: Working speed. Default: that of the scenario's weights, else 1.
-        noise: ``control.json`` with the filters' process noise. Default: that of the artifact's run, else estimated on
-            recordings that the scenario makes.
-        seed: Of these recordings.
+        seed: Of the recordings that the scenario makes to estimate the filters' noise on, if the artifact holds none.
     """
 
     folder: Path
     scenario: str = ""
     data: tuple[Path, ...] = ()
     speed: float | None = None
-    noise: Path | None = None
     seed: int = 0
 
 
@@ -164,7 +161,7 @@ def _filters(
     from hybrid_mpc.pipeline.loops import FIRST_LOAD, JUMP_SHARE, QUIET_SHARE
 
     names = {"prior": "prior_observer", "hybrid": "hybrid_observer"}
-    noise, source = find_noise(scenario, artifact, tuple(names.values()), request.seed, request.noise)
+    noise, source = find_noise(scenario, artifact, tuple(names.values()), request.seed)
     span = control.input_range
     filters = {}
     for mode, share in (("quiet", QUIET_SHARE), ("jump", JUMP_SHARE)):

@@ -35,12 +35,6 @@ def analyze(
     speed: Annotated[
         float | None, typer.Option(help="Size of the motions that friction is linearised for [units of v].")
     ] = None,
-    noise: Annotated[
-        Path | None,
-        typer.Option(
-            help="control.json with the filters' process noise. Default: what the model's folder holds."
-        ),
-    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of what is drawn at random.", min=0, max=MOST_SEED)] = 0,
 ) -> None:
     """Poles, Bode plots, margins of the control loop and more, as tables, pictures and a page."""
@@ -51,7 +45,7 @@ def analyze(
     from hybrid_mpc.files import check_folder
 
     check_folder(out)
-    request = Request(model, scenario, tuple(data or ()), speed, noise, seed)
+    request = Request(model, scenario, tuple(data or ()), speed, seed)
     with make_progress() as progress:
         progress.start("reading the model")
         subject, notes = subject_of(request)
@@ -77,6 +71,5 @@ def command(request: Request, out: Path) -> str:
     words += [f"--scenario {request.scenario}"] if request.scenario else []
     words += [f"--data {path.name}" for path in request.data]
     words += [f"--speed {request.speed:g}"] if request.speed is not None else []
-    words += [f"--noise {request.noise.name}"] if request.noise is not None else []
     words += [f"--seed {request.seed}"] if request.seed else []
     return " ".join(words)

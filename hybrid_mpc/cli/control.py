@@ -42,12 +42,6 @@ def control(
     fault: Annotated[
         list[str] | None, typer.Option(help="TARGET=VALUE@START:END in every loop; may be repeated.")
     ] = None,
-    noise: Annotated[
-        Path | None,
-        typer.Option(
-            help="control.json with the filters' process noise. Default: what the model's folder holds."
-        ),
-    ] = None,
     guard: Annotated[
         bool,
         typer.Option("--guard", help="Watch with the model's detector; no input while the sensor is frozen."),
@@ -85,7 +79,7 @@ def control(
     )
     with make_progress() as progress:
         progress.start("reading the model, and the filters' noise")
-        job = prepared(load_scenario(scenario), model, settings, noise)
+        job = prepared(load_scenario(scenario), model, settings)
         progress.finish(job.noise_source)
         results = run_control(job, out, progress, gif=gif)
     for line in summary(results):

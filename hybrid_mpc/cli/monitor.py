@@ -42,10 +42,6 @@ def monitor(
             help="Step of a sensor [its unit]; once for each: test for freezing. Default: by its noise."
         ),
     ] = None,
-    noise: Annotated[
-        Path | None,
-        typer.Option(help="control.json with the filter's noise. Default: what the model's folder holds."),
-    ] = None,
 ) -> None:
     """Say where in recordings the model does not describe the machine, and what would explain it.
 
@@ -63,7 +59,7 @@ def monitor(
     if machine is None:
         raise InputError(f"{folder / FILE} does not say whose model it is; give --scenario")
     job = prepared(
-        machine, folder, recordings, noise=noise, resolution=tuple(resolution) if resolution else None,
+        machine, folder, recordings, resolution=tuple(resolution) if resolution else None,
         calibration=None if learn else calibration,
     )  # fmt: skip
     for finding in job.data.findings:

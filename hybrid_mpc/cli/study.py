@@ -61,12 +61,6 @@ def run(
     dry: Annotated[
         bool, typer.Option("--dry-run", help="Say how many runs there are, and how long they take.")
     ] = False,
-    noise: Annotated[
-        Path | None,
-        typer.Option(
-            help="control.json with the filters' process noise. Default: what each model's folder holds."
-        ),
-    ] = None,
     budget: Annotated[
         str | None, typer.Option(help="Size of the study monitor: full (default) or quick.")
     ] = None,
@@ -81,7 +75,7 @@ def run(
             raise InputError(
                 "study monitor runs in processes of this machine, and has no dry run; leave these out"
             )
-        _run_monitor(_models(model), budget or "full", out, workers, resume, retry_failed, noise)
+        _run_monitor(_models(model), budget or "full", out, workers, resume, retry_failed)
         return
     if budget is not None:
         raise InputError(f"study {study}: only the study monitor has budgets; leave --budget out")
@@ -89,13 +83,13 @@ def run(
     if dry:
         with make_progress() as progress:
             progress.start("timing a few periods of each kind of run")
-            plan = dry_run(wanted, workers=workers, noise=noise)
+            plan = dry_run(wanted, workers=workers)
             progress.finish("")
         print("\n".join(_plan(plan, workers)))
         return
     with make_progress() as progress:
         results = run_study(
-            wanted, out, workers=workers, cluster=scheduler, resume=resume, retry_failed=retry_failed, noise=noise,
+            wanted, out, workers=workers, cluster=scheduler, resume=resume, retry_failed=retry_failed,
             progress=progress,
         )  # fmt: skip
     _tell(results)
@@ -110,7 +104,6 @@ def _run_monitor(
     workers: int,
     resume: bool,
     retry_failed: bool,
-    noise: Path | None,
 ) -> None:
     from hybrid_mpc.cli.progress import make_progress
     from hybrid_mpc.studies.monitor_plan import monitor_study
@@ -123,7 +116,7 @@ def _run_monitor(
     with make_progress() as progress:
         wanted = monitor_study(next(iter(models.values())), budget)
         results = run_monitor_study(
-            wanted, out, workers=workers, resume=resume, retry_failed=retry_failed, noise=noise, progress=progress,
+            wanted, out, workers=workers, resume=resume, retry_failed=retry_failed, progress=progress,
         )  # fmt: skip
     print((out / "table.md").read_text(encoding="utf-8"))
     print(f"report: {(out / 'report.html').resolve()}")

@@ -170,19 +170,21 @@ class Job:
     noise_source: str
 
 
-def prepared(scenario: Scenario, model: Path, settings: ControlSettings, noise: Path | None = None) -> Job:
+def prepared(
+    scenario: Scenario, model: Path, settings: ControlSettings, noise: Mapping[str, Array] | None = None
+) -> Job:
     """Load and check everything before the first loop.
 
     Args:
         scenario: The machine.
         model: Artifact folder, or the folder of the run that holds it as ``model``.
         settings: What to run.
-        noise: ``control.json`` of a run. Default: that of the run that the model lies in; without one the process
-            noise is estimated on recordings that the scenario makes (budget quick, the settings' seed).
+        noise: Process noise by contender. Default: the artifact's; where it holds none, it is estimated on recordings
+            that the scenario makes (budget quick, the settings' seed).
 
     Raises:
         InputError: If the scenario has nothing to run, the folder holds no artifact, the artifact belongs to another
-            machine, or a task, fault or noise file does not fit.
+            machine, or a task or fault does not fit.
     """
     if scenario.plant is None or scenario.control is None or not scenario.tasks:
         lacks = (
@@ -200,8 +202,11 @@ def prepared(scenario: Scenario, model: Path, settings: ControlSettings, noise: 
     if settings.guard == "adapt":
         adaptable(artifact.models["hybrid"], scenario.causes)
     check_channels(install(scenario.plant(), settings.faults)[1], len(scenario.sensor_sigma), 1)
-    found = find_noise(scenario, artifact, settings.controllers, settings.seed, noise)
-    return Job(scenario, artifact, tasks, settings, *found)
+    if noise is None:
+        noise, source = find_noise(scenario, artifact, settings.controllers, settings.seed)
+    else:
+        source = "given"
+    return Job(scenario, artifact, tasks, settings, noise, source)
 
 
 def _check_artifact(scenario: Scenario, artifact: Kit, folder: Path, control: OCP) -> None:

@@ -79,7 +79,6 @@ def prepared(
     model: Path,
     recordings: Sequence[Path],
     *,
-    noise: Path | None = None,
     resolution: tuple[float, ...] | None = None,
     calibration: Path | None = None,
 ) -> MonitorJob:
@@ -89,7 +88,6 @@ def prepared(
         scenario: The machine.
         model: Artifact folder, or the folder of the run that holds it as ``model``.
         recordings: CSV, ``.npz`` or ``.mat`` files.
-        noise: ``control.json`` of a run. Default: as ``hybrid-mpc control`` finds it.
         resolution: Step of each sensor. Default: with a detector what the filters' assumed noise comes to, as in the
             main job.
         calibration: ``calibration.json`` with a detector. Default: the artifact's, if it has one.
@@ -117,7 +115,7 @@ def prepared(
     if not data.whole:
         cut = "; ".join(f"{c.file} {c.start:g} to {c.end:g} s: {c.why}" for c in data.cuts)
         raise InputError(f"no part of the recordings is long enough to be watched: {cut}")
-    sigma, _ = find_noise(scenario, artifact, ("hybrid_observer",), 0, noise)
+    sigma, _ = find_noise(scenario, artifact, ("hybrid_observer",), 0)
     if calibration is not None:
         found: Detector | None = read_detector(calibration)
     else:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 from hybrid_mpc.scenario import load_scenario
 from hybrid_mpc.studies.configuration import Study
@@ -36,7 +35,6 @@ def dry_run(
     study: Study,
     *,
     workers: int = 2,
-    noise: Path | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Plan:
     """Check a study as far as running it would, and expect its time from a few periods of each kind of run.
@@ -44,7 +42,6 @@ def dry_run(
     Args:
         study: The study.
         workers: Processes that it is to run in.
-        noise: As for :func:`~hybrid_mpc.studies.run_study`.
         say: Told what is timed.
 
     Raises:
@@ -53,7 +50,7 @@ def dry_run(
     Example: ``dry_run(study, workers=2).seconds``
     """
     scenario = load_scenario(study.scenario)
-    run, _ = load_inputs(study, noise)
+    run, _ = load_inputs(study)
     dt, lengths = scenario.data.dt, {task.name: task.duration for task in scenario.tasks}
     tasks = list(dict.fromkeys(r.task for r in _first_runs(study)))
     period: dict[tuple[Kind, str], float] = {}

@@ -22,7 +22,7 @@ from hybrid_mpc.artifact import FILES, Kit, artifact_folder, load
 from hybrid_mpc.closed_loop import ClosedLoopResult, simulate
 from hybrid_mpc.closed_loop.faults import check_channels, install
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import MOST_CONTENT, read_bytes, write_json
+from hybrid_mpc.files import MOST_CONTENT, read_bytes
 from hybrid_mpc.pipeline.contenders import CONTENDERS
 from hybrid_mpc.pipeline.control_job import ControlSettings, Job, parts, prepared, selected_tasks
 from hybrid_mpc.pipeline.control_results import row
@@ -186,14 +186,12 @@ def figures(task: Task, run: RunConfig, result: ClosedLoopResult) -> dict[str, A
 
 
 def load_inputs(
-    study: Study, noise: Path | None = None, held: Mapping[str, ModelNote] | None = None
+    study: Study, held: Mapping[str, ModelNote] | None = None
 ) -> tuple[LoopRunner, dict[str, ModelNote]]:
     """Load and check everything that the runs need, before the first.
 
     Args:
         study: The study.
-        noise: ``control.json`` of a run with the filters' process noise. Default: that of the run in whose folder a
-            model lies; where there is none, it is estimated.
         held: Notes of the models of a study that is resumed: their noise is taken. Default: none.
 
     Returns:
@@ -208,12 +206,8 @@ def load_inputs(
     settings = ControlSettings(tuple(study.tasks), study.contenders)
     for label, folder in study.folders.items():
         before = held[label].noise if held and label in held else None
-        with tempfile.TemporaryDirectory() as place:
-            given = noise
-            if before is not None:
-                given = Path(place) / "control.json"
-                write_json(given, plain(before))
-            job = prepared(scenario, folder, settings, given)
+        known = None if before is None else {name: np.array(v) for name, v in before.sigma_x.items()}
+        job = prepared(scenario, folder, settings, known)
         inner = artifact_folder(folder)
         if "energy" in study.monitors and job.artifact.calibration is None:
             raise InputError(f"study: monitor energy: {inner} holds no calibration; take monitor own")

@@ -37,7 +37,6 @@ def run_monitor_study(
     workers: int = 2,
     resume: bool = False,
     retry_failed: bool = False,
-    noise: Path | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Run the study into a folder and return its results.
@@ -50,7 +49,6 @@ def run_monitor_study(
         workers: Processes.
         resume: Finish the study that ``out`` holds.
         retry_failed: Run those jobs again that have failed.
-        noise: ``control.json`` of a run with the filters' process noise. Default: that of the model's run.
         progress: Where to report; default: nowhere.
 
     Returns:
@@ -68,7 +66,7 @@ def run_monitor_study(
     say.start("reading the model, and the filters' noise")
     held = read_note(out).models if resume else None
     loops, models = load_inputs(
-        Study(study.scenario, study.model, tasks=(study.task,), controllers=(PRIOR, CONTROLLER)), noise, held
+        Study(study.scenario, study.model, tasks=(study.task,), controllers=(PRIOR, CONTROLLER)), held
     )
     (model,) = loops.models
     note = make_note(study.identity(), models, study.size, KIND)

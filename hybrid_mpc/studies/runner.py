@@ -44,7 +44,6 @@ def run_study(
     cluster: Any = None,
     resume: bool = False,
     retry_failed: bool = False,
-    noise: Path | None = None,
     progress: Progress | None = None,
 ) -> StudyResults:
     """Run a study into a folder and return its results.
@@ -60,7 +59,6 @@ def run_study(
         cluster: Address of a dask scheduler or a ``distributed.Client``, in place of processes. Default: none.
         resume: Finish the study that ``out`` holds.
         retry_failed: Run those again that have failed.
-        noise: ``control.json`` of a run with the filters' process noise. Default: that of each model's run.
         progress: Where to report; default: nowhere.
 
     Returns:
@@ -75,7 +73,7 @@ def run_study(
     out, say = Path(out), progress or Silent()
     check_folder(out, resume=resume)
     say.start("reading the models, and the filters' noise")
-    run, models = load_inputs(study, noise, read_note(out).models if resume else None)
+    run, models = load_inputs(study, read_note(out).models if resume else None)
     note = make_note(study.identity(), models, study.size)
     say.finish(f"{study.size} runs")
     engine = make_engine(run, workers, cluster)

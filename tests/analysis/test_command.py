@@ -5,6 +5,7 @@ import doctest
 import importlib
 import json
 import pkgutil
+import shutil
 import sys
 from dataclasses import replace
 
@@ -22,6 +23,7 @@ from hybrid_mpc.analysis.study_loops import loops_part
 from hybrid_mpc.analysis.study_signals import measured_part
 from hybrid_mpc.analysis.subject import Request, Subject, subject_of
 from hybrid_mpc.analysis.toolbox import control_toolbox
+from hybrid_mpc.artifact import set_process_noise
 from hybrid_mpc.cli.main import app
 from hybrid_mpc.closed_loop import simulate
 from hybrid_mpc.data import write_csv
@@ -32,6 +34,13 @@ from nn_export import load_programs
 from scenarios.golf_robot import scenario
 
 PARTS = ("equilibria", "friction", "linear", "measured", "schedule", "loops", "memory", "sensitivity")
+
+
+def noisy(model, tmp_path):
+    """A copy of an artifact whose filters' noise is known."""
+    folder = shutil.copytree(model, tmp_path / "model")
+    set_process_noise(folder, {name: [1e-4, 2e-2] for name in ("prior_observer", "hybrid_observer")})
+    return folder
 
 
 @pytest.fixture(scope="module")
@@ -78,13 +87,10 @@ def test_recordings_are_taken_before_the_simulated_machine(golf_artifact, prior_
     u = multisine(t, 0.25, 0.1, 2.0, period=20.0)
     phi = run_model(model, [0.0, 0.0])(u)
     file = write_csv(tmp_path / "run.csv", {"time_s": t, "u_nm": u, "phi_rad": phi})
-    noise = tmp_path / "control.json"
-    noise.write_text(
-        json.dumps({"sigma_x": {n: [1e-4, 2e-2] for n in ("prior_observer", "hybrid_observer")}})
-    )
-    subject, notes = subject_of(Request(golf_artifact, "golf_robot", (file,), noise=noise))
+    folder = noisy(golf_artifact, tmp_path)
+    subject, notes = subject_of(Request(folder, "golf_robot", (file,)))
     assert len(subject.recordings) == 1
-    assert "control.json" in notes[1]
+    assert "the model's own" in notes[1]
     assert set(subject.filters) == {(m, f) for m in ("prior", "hybrid") for f in ("quiet", "jump")}
     result, curves = measured_part(replace(prior_alone, recordings=subject.recordings))
     # The "machine" is the model itself, but for its first speed, which is smoothed from the recording.
@@ -118,18 +124,12 @@ def test_what_does_not_fit_is_refused(golf_artifact, tmp_path):
 
 @pytest.mark.full
 def test_the_command_analyses_prior_and_hybrid_with_their_loops(golf_artifact, tmp_path):
-    noise = tmp_path / "run" / "checkpoints" / "control.json"
-    noise.parent.mkdir(parents=True)
-    sigma = {name: [1e-4, 2e-2] for name in ("prior_observer", "hybrid_observer")}
-    noise.write_text(json.dumps({"sigma_x": sigma}))
     out = tmp_path / "out"
     arguments = [
         "analyze",
-        str(golf_artifact),
+        str(noisy(golf_artifact, tmp_path)),
         "--scenario",
         "golf_robot",
-        "--noise",
-        str(noise),
         "--out",
         str(out),
     ]
@@ -145,11 +145,8 @@ def test_the_command_analyses_prior_and_hybrid_with_their_loops(golf_artifact, t
 
 @pytest.mark.full
 def test_the_delay_that_the_margins_allow_is_the_delay_that_the_rig_stands(golf_artifact, tmp_path):
-    noise = tmp_path / "control.json"
-    noise.write_text(
-        json.dumps({"sigma_x": {n: [1e-4, 2e-2] for n in ("prior_observer", "hybrid_observer")}})
-    )
-    subject, _ = subject_of(Request(golf_artifact, "golf_robot", noise=noise))
+    folder = noisy(golf_artifact, tmp_path)
+    subject, _ = subject_of(Request(folder, "golf_robot"))
     filters = {key: f for key, f in subject.filters.items() if key[0] == "prior"}
     subject = replace(subject, models={"prior": subject.models["prior"]}, filters=filters)
     loops, _ = loops_part(subject, {"prior": (np.zeros(2), np.zeros(0))})

@@ -9,7 +9,7 @@ import shutil
 import numpy as np
 import pytest
 
-from hybrid_mpc.artifact import set_calibration
+from hybrid_mpc.artifact import set_calibration, set_process_noise
 from hybrid_mpc.files import HASH, digest
 from hybrid_mpc.monitor import Calibration, Detector
 from hybrid_mpc.monitor.plausibility import Plausibility
@@ -125,11 +125,10 @@ def watched(folder, tmp_path):
     t = 0.02 * np.arange(300)
     table = np.column_stack([t, np.sin(2 * t), 0.1 * np.cos(3 * t)])
     np.savetxt(tmp_path / "run.csv", table, delimiter=",", header="time_s,phi_rad,u_nm", comments="")
-    (tmp_path / "noise.json").write_text(json.dumps({"sigma_x": {"hybrid_observer": [1e-3, 1e-2]}}))
+    set_process_noise(folder, {"hybrid_observer": [1e-3, 1e-2]})
 
     def words(out):
-        return ["monitor", folder, tmp_path / "run.csv", "--scenario", "golf_robot", "--noise",
-                tmp_path / "noise.json", "--out", tmp_path / out]  # fmt: skip
+        return ["monitor", folder, tmp_path / "run.csv", "--scenario", "golf_robot", "--out", tmp_path / out]
 
     return words
 

@@ -126,13 +126,12 @@ def recordings(tmp_path_factory):
         t = 0.02 * np.arange(n)
         phi = 0.3 * np.sin(2 * np.pi * 0.6 * t)
         write_csv(out / f"{name}.csv", {"time_s": t, "u_nm": 0.1 * np.sin(3 * t), "phi_rad": phi})
-    (out / "control.json").write_text(json.dumps({"sigma_x": {"hybrid_observer": [1e-4, 1e-2]}}))
     return out
 
 
 def command(recordings, model, out, *names):
     files = [str(recordings / f"{name}.csv") for name in names]
-    options = ["--scenario", "golf_robot", "--noise", str(recordings / "control.json"), "--out", str(out)]
+    options = ["--scenario", "golf_robot", "--out", str(out)]
     return CliRunner().invoke(app, ["monitor", str(model), *files, *options])
 
 
@@ -140,7 +139,7 @@ def diverging(folder):
     """An artifact whose network's correction is beyond all numbers."""
     import torch
 
-    from hybrid_mpc.artifact import save_artifact
+    from hybrid_mpc.artifact import LoopSettings, save_artifact
     from hybrid_mpc.identification.export import model_info, trace_model
     from hybrid_mpc.identification.networks import StackedGRU
     from hybrid_mpc.identification.step import HybridStep, PriorStep, Scaling, n_features
@@ -153,7 +152,8 @@ def diverging(folder):
     scaling = Scaling(x=(0.5, 1.5), u=(0.2,), acceleration=(5.0,), correction=(0.5,))
     steps = {"hybrid": HybridStep(prior, stack.member(0), scaling, 0.02), "prior": PriorStep(prior, 0.02)}
     programs = {name: trace_model(step.requires_grad_(False)) for name, step in steps.items()}
-    save_artifact(folder, programs, model_info(prior, 0.02))
+    loop = LoopSettings(process_noise={"hybrid_observer": (1e-4, 1e-2)})
+    save_artifact(folder, programs, model_info(prior, 0.02), loop=loop)
     return folder
 
 
@@ -170,9 +170,9 @@ def test_the_command_fails_where_nothing_could_be_judged(recordings, tmp_path):
 
 
 def test_a_recording_of_a_second_is_watched_and_the_replay_shows_how_far_it_is(
-    recordings, golf_artifact, tmp_path
+    recordings, noisy_artifact, tmp_path
 ):
-    done = command(recordings, golf_artifact, tmp_path / "out", "short", "long")
+    done = command(recordings, noisy_artifact, tmp_path / "out", "short", "long")
     assert done.exit_code == 0, done.output
     assert "short: 1.0 s, 0 alarms; not judged: 0.32 s warm-up" in done.output  # a window of 17 samples
     assert "replaying the recordings ..." in done.output
@@ -181,7 +181,7 @@ def test_a_recording_of_a_second_is_watched_and_the_replay_shows_how_far_it_is(
     assert first.endswith(",0,0,0")
 
 
-def test_one_too_short_for_any_window_is_refused_with_what_it_needs(recordings, golf_artifact, tmp_path):
-    done = command(recordings, golf_artifact, tmp_path / "out", "tiny")
+def test_one_too_short_for_any_window_is_refused_with_what_it_needs(recordings, noisy_artifact, tmp_path):
+    done = command(recordings, noisy_artifact, tmp_path / "out", "tiny")
     assert isinstance(done.exception, InputError)
     assert "8 samples" in str(done.exception)

@@ -23,7 +23,7 @@ DT = 0.02
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory, golf_artifact):
+def folder(tmp_path_factory, noisy_artifact):
     """A recording in which the club is pushed from 8 s on, with a gap before; noise and a detector by hand."""
     out = tmp_path_factory.mktemp("monitor")
     rig, rng, n = Rig(), np.random.default_rng(0), 600
@@ -35,7 +35,6 @@ def folder(tmp_path_factory, golf_artifact):
     kept = (np.arange(n) < 100) | (np.arange(n) >= 110)
     columns = {"time_s": DT * np.arange(n), "u_nm": u, "phi_rad": np.array(phi)}
     write_csv(out / "pushed.csv", {name: values[kept] for name, values in columns.items()})
-    (out / "control.json").write_text(json.dumps({"sigma_x": {"hybrid_observer": [1e-4, 1e-2]}}))
     # Wide scales: the network of this artifact is untrained, so the prior's own errors are nominal here.
     detector = Detector(DT, ((0.02, 0.01, 0.0, 0.0),), (0.05, 0.1, 0.0, 0.0), 2.0, 15.0, 4.0)
     write_json(out / "calibration.json", {"detector": plain(detector)})
@@ -52,11 +51,13 @@ def command(folder, model, out, *more):
         "--out",
         str(out),
     ]
-    return CliRunner().invoke(app, [*arguments, "--noise", str(folder / "control.json"), *more])
+    return CliRunner().invoke(app, [*arguments, *more])
 
 
-def test_it_says_where_and_writes_what_it_saw(folder, golf_artifact, tmp_path):
-    done = command(folder, golf_artifact, tmp_path / "out", "--calibration", str(folder / "calibration.json"))
+def test_it_says_where_and_writes_what_it_saw(folder, noisy_artifact, tmp_path):
+    done = command(
+        folder, noisy_artifact, tmp_path / "out", "--calibration", str(folder / "calibration.json")
+    )
     assert done.exit_code == 0, done.output
     found = json.loads((tmp_path / "out" / "monitor.json").read_text())
     first, second = found["recordings"]
@@ -72,8 +73,8 @@ def test_it_says_where_and_writes_what_it_saw(folder, golf_artifact, tmp_path):
     assert (tmp_path / "out" / "pushed_2.png").stat().st_size > 10_000
 
 
-def test_the_artifact_s_own_detector_needs_no_option(folder, golf_artifact, tmp_path):
-    model = shutil.copytree(golf_artifact, tmp_path / "model")
+def test_the_artifact_s_own_detector_needs_no_option(folder, noisy_artifact, tmp_path):
+    model = shutil.copytree(noisy_artifact, tmp_path / "model")
     detector = read_detector(folder / "calibration.json")
     detector = replace(detector, false_alarms_per_hour=2.0, hours=0.05, data_hash="0123456789abcdef0123")
     set_calibration(model, Calibration(9.0, 9.0, 1.0, 1, 1.0, "by hand", detector=detector))
@@ -86,30 +87,30 @@ def test_the_artifact_s_own_detector_needs_no_option(folder, golf_artifact, tmp_
     assert (
         8.0 <= found["recordings"][1]["alarms"][0]["start_s"] < 9.0
     )  # as with the same detector from a file
-    without = command(folder, golf_artifact, tmp_path / "without")
+    without = command(folder, noisy_artifact, tmp_path / "without")
     assert "holds no detector" in without.output
 
 
-def test_too_little_nominal_data_says_how_much_is_needed(folder, golf_artifact, tmp_path):
-    done = command(folder, golf_artifact, tmp_path / "out", "--learn", "1")
+def test_too_little_nominal_data_says_how_much_is_needed(folder, noisy_artifact, tmp_path):
+    done = command(folder, noisy_artifact, tmp_path / "out", "--learn", "1")
     assert isinstance(done.exception, InputError)
     assert "false alarms an hour need" in str(done.exception)
 
 
-def test_bad_input_speaks(folder, golf_artifact, tmp_path):
+def test_bad_input_speaks(folder, noisy_artifact, tmp_path):
     (tmp_path / "empty.json").write_text("{}")
-    done = command(folder, golf_artifact, tmp_path / "out", "--calibration", str(tmp_path / "empty.json"))
+    done = command(folder, noisy_artifact, tmp_path / "out", "--calibration", str(tmp_path / "empty.json"))
     assert "holds no detector" in str(done.exception)
     files, scenario = [folder / "pushed.csv"], load_scenario("golf_robot")
     with pytest.raises(InputError, match="no control problem"):
-        prepared(replace(scenario, control=None), golf_artifact, files)
+        prepared(replace(scenario, control=None), noisy_artifact, files)
     with pytest.raises(InputError, match=r"resamples to 0\.01 s"):
-        prepared(replace(scenario, data=replace(scenario.data, dt=0.01)), golf_artifact, files)
+        prepared(replace(scenario, data=replace(scenario.data, dt=0.01)), noisy_artifact, files)
 
 
-def test_an_alarm_is_explained_once(folder, golf_artifact):
+def test_an_alarm_is_explained_once(folder, noisy_artifact):
     job = prepared(
-        load_scenario("golf_robot"), golf_artifact, [folder / "pushed.csv"], noise=folder / "control.json",
+        load_scenario("golf_robot"), noisy_artifact, [folder / "pushed.csv"],
         calibration=folder / "calibration.json",
     )  # fmt: skip
     assert isinstance(job, MonitorJob)
@@ -118,14 +119,13 @@ def test_an_alarm_is_explained_once(folder, golf_artifact):
     assert all(alarm["diagnosis"] for alarm in alarms)
 
 
-def test_a_frozen_sensor_is_told_and_watched_all_the_same(folder, golf_artifact, tmp_path):
+def test_a_frozen_sensor_is_told_and_watched_all_the_same(folder, noisy_artifact, tmp_path):
     rows = np.genfromtxt(folder / "pushed.csv", delimiter=",", names=True)
     rows["phi_rad"][300:360] = rows["phi_rad"][300]
     columns = {name: rows[name] for name in ("time_s", "u_nm", "phi_rad")}
     write_csv(tmp_path / "pushed.csv", columns)
     calibration = str(folder / "calibration.json")
-    (tmp_path / "control.json").write_text((folder / "control.json").read_text())
-    done = command(tmp_path, golf_artifact, tmp_path / "out", "--calibration", calibration)
+    done = command(tmp_path, noisy_artifact, tmp_path / "out", "--calibration", calibration)
     assert done.exit_code == 0, done.output
     found = json.loads((tmp_path / "out" / "monitor.json").read_text())
     (warning,) = found["warnings"]
@@ -140,12 +140,11 @@ def test_a_frozen_sensor_is_told_and_watched_all_the_same(folder, golf_artifact,
     )
 
 
-def test_a_wrapped_angle_is_refused_where_the_model_knows_no_turns(folder, golf_artifact, tmp_path):
+def test_a_wrapped_angle_is_refused_where_the_model_knows_no_turns(folder, noisy_artifact, tmp_path):
     """The golf robot's angle is no periodic signal; an estimator takes a jump of a turn for a blow."""
     t = DT * np.arange(600)
     phi = (2.0 * t + np.pi) % (2 * np.pi) - np.pi
     write_csv(tmp_path / "pushed.csv", {"time_s": t, "u_nm": np.sin(t), "phi_rad": phi})
-    (tmp_path / "control.json").write_text((folder / "control.json").read_text())
-    done = command(tmp_path, golf_artifact, tmp_path / "out")
+    done = command(tmp_path, noisy_artifact, tmp_path / "out")
     assert isinstance(done.exception, InputError)
     assert "jumps 4 times by about a full turn" in str(done.exception)

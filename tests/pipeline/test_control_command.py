@@ -155,7 +155,6 @@ def test_a_guarded_loop_lets_go_of_a_frozen_sensor(call, run_folder, tmp_path):
         (["--fault", "plant_fire=1@1"], ["plant_fire", "plant_friction"]),
         (["--fault", "input_gain=lots"], ["input_gain=lots", "TARGET=VALUE@START:END"]),
         (["--fault", "input_gain=0.5@2:1"], ["interval"]),
-        (["--noise", "nowhere.json"], ["nowhere.json is missing"]),
         (["--seeds", "0"], ["seeds"]),
     ],
 )
@@ -200,7 +199,7 @@ def test_a_model_of_another_machine(call, run_folder, tmp_path):
 @pytest.mark.parametrize(
     ("change", "told"),
     [("plant=None", "has no plant"), ("control=None", "has no control problem"), ("tasks=()", "has no task"),
-     ("make_data=None", "--noise"), ("oracle=None", "has no oracle")],
+     ("make_data=None", "holds no process noise"), ("oracle=None", "has no oracle")],
 )  # fmt: skip
 def test_scenarios_without_what_is_needed(call, golf_artifact, tmp_path, change, told):
     path = tmp_path / "machine.py"
@@ -211,15 +210,11 @@ def test_scenarios_without_what_is_needed(call, golf_artifact, tmp_path, change,
     assert told in error
 
 
-def test_bad_noise_files(call, run_folder, tmp_path):
-    bad = tmp_path / "control.json"
-    for content in ({}, {"sigma_x": {"prior": [1, 2]}}, {"sigma_x": 3}, {"sigma_x": {"prior_observer": "x"}}):
-        bad.write_text(json.dumps(content))
-        code, _, error = call("golf_robot", "--model", run_folder, "--noise", bad, "--out", tmp_path / "o")
-        assert (code, "sigma_x" in error) == (2, True), content
-    bad.write_text(json.dumps({"sigma_x": {**SIGMA, "prior_observer": [1e-3]}}))
-    code, _, error = call("golf_robot", "--model", run_folder, "--noise", bad, "--out", tmp_path / "o")
-    assert (code, "2 finite numbers" in error) == (2, True)
+def test_noise_that_does_not_fit(call, run_folder, tmp_path):
+    folder = shutil.copytree(run_folder / "model", tmp_path / "model")
+    set_process_noise(folder, {**SIGMA, "prior_observer": [1e-3]})
+    code, _, error = call("golf_robot", "--model", folder, "--out", tmp_path / "o")
+    assert (code, "must be 2 numbers" in error) == (2, True)
 
 
 def test_the_folder_must_be_empty(call, run_folder, tmp_path):

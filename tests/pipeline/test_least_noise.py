@@ -1,12 +1,12 @@
 """The filters' process noise where tasks go beyond the recordings."""
 
-import json
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from hybrid_mpc.artifact import LoopSettings
 from hybrid_mpc.pipeline import contenders
 from hybrid_mpc.pipeline.control_noise import find_noise
 from hybrid_mpc.scenario import load_scenario
@@ -47,13 +47,12 @@ def test_beyond_them_it_is_no_surer_than_the_prior_state_by_state(noise):
     np.testing.assert_array_equal(found["prior_observer"], 2 * OWN["prior"])
 
 
-def test_noise_from_a_file_is_raised_too(tmp_path):
-    file = tmp_path / "control.json"
-    file.write_text(json.dumps({"sigma_x": {name: value.tolist() for name, value in OWN.items()}}))
-    artifact = SimpleNamespace(models={"prior": SimpleNamespace(n_x=2)})
+def test_noise_of_an_artifact_is_raised_too():
+    loop = LoopSettings(process_noise={name: tuple(value) for name, value in OWN.items()})
+    artifact = SimpleNamespace(models={"prior": SimpleNamespace(n_x=2)}, loop=loop)
     for beyond, expected in ((False, [4e-4, 3e-2]), (True, [1e-3, 3e-2])):
         machine = replace(scenario, beyond_recordings=beyond)
-        found, _ = find_noise(machine, artifact, ("hybrid",), 0, file)
+        found, _ = find_noise(machine, artifact, ("hybrid",), 0)
         np.testing.assert_array_equal(found["hybrid"], expected)
 
 

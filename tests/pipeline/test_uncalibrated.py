@@ -11,7 +11,6 @@ from hybrid_mpc.cli.main import app
 from hybrid_mpc.data import write_csv
 from hybrid_mpc.data_spec import DataSpec
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import write_json
 from hybrid_mpc.mpc import OCP
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.faulted_loops import stored_detector
@@ -202,13 +201,11 @@ def test_the_command_watches_with_an_artifact_without_calibration(short, tmp_pat
     description = read_description(short.out / "model")
     if stored == "none":
         write_description(short.out / "model", replace(description, calibration=None))
-    noise = tmp_path / "control.json"
-    write_json(noise, {"sigma_x": short.result("control")["sigma_x"]})
     write_csv(tmp_path / "long.csv", QUICK.recording(5, 900))
     monkeypatch.setattr("hybrid_mpc.cli.monitor.scenario_of", lambda *given: short.scenario)
     done = CliRunner().invoke(
         app, ["monitor", str(short.out / "model"), str(tmp_path / "long.csv"), "--scenario", "axis",
-              "--noise", str(noise), "--out", str(tmp_path / "out")],
+              "--out", str(tmp_path / "out")],
     )  # fmt: skip
     write_description(short.out / "model", description)
     assert done.exit_code == 0, done.output

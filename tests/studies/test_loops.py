@@ -153,10 +153,12 @@ def test_a_resumed_study_keeps_its_noise(run_folder, tmp_path):
     shutil.copytree(run_folder, moved)
     study = Study("golf_robot", moved, tasks=["track_sine"], controllers=["prior"], seeds=2, duration=SHORT)
     first = run_study(study, tmp_path / "s", workers=1)
-    shutil.rmtree(moved / "checkpoints")  # without it the noise would be estimated, and be another
     again = run_study(study, tmp_path / "s", workers=1, resume=True)
     assert again.note.models["model"].noise == first.note.models["model"].noise
     assert again.table.equals(first.table)
+    set_process_noise(moved / "model", {name: [1e-3, 1e-1] for name in SIGMA})  # another one is another model
+    with pytest.raises(InputError, match="content of model model differ"):
+        run_study(study, tmp_path / "s", workers=1, resume=True)
 
 
 def test_dry_run_counts_and_times(run_folder):
