@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from hybrid_mpc.artifact import load, read_description, save_artifact, write_description
+from hybrid_mpc.artifact import load, read_description, save_artifact, set_process_noise, write_description
 from hybrid_mpc.cli.main import app
 from hybrid_mpc.data import write_csv
 from hybrid_mpc.data_spec import DataSpec
@@ -110,6 +110,7 @@ def context(machine, samples, out, warm_up):
     info = replace(model_info(prior, machine.dt), time_unit=made.time_unit)
     save_artifact(out / "model", {"hybrid": programs, "prior": programs}, info)
     noise = [machine.noise, 1e-3 * machine.speed]
+    set_process_noise(out / "model", {"hybrid_observer": noise})
     made.save("control", {"sigma_x": {"hybrid_observer": noise, "prior_observer": noise}}, {})
     train = made.trajectories("train")
     made.save("prior", {}, {f"{t.name}/{key}": getattr(t, key) for t in train for key in ("x", "xdot")})
