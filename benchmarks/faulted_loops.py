@@ -30,8 +30,8 @@ from time import perf_counter
 import numpy as np
 
 from hybrid_mpc.artifact import load, save_artifact
+from hybrid_mpc.assembly import make_controller, make_estimator, make_monitor
 from hybrid_mpc.closed_loop import Fault, simulate
-from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_monitor
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.faults import catalogue
 

@@ -18,13 +18,11 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_mpc import load
+from hybrid_mpc import find_noise, load, make_controller, make_estimator
+from hybrid_mpc.assembly import freezing, make_resting_guard
 from hybrid_mpc.closed_loop import simulate
 from hybrid_mpc.files import read_json
 from hybrid_mpc.monitor import Judges, guard_monitor
-from hybrid_mpc.pipeline import find_noise, make_controller, make_estimator
-from hybrid_mpc.pipeline.guards import make_resting_guard
-from hybrid_mpc.pipeline.loops import freezing
 from hybrid_mpc.records import record
 from hybrid_mpc.studies.monitor_loops import loop_figures
 from hybrid_mpc.studies.monitor_plan import SEEDS, LoopPlan

@@ -21,10 +21,10 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_mpc import load
+from hybrid_mpc.assembly import make_estimator
 from hybrid_mpc.data.trajectories import load_trajectories
 from hybrid_mpc.files import write_json
 from hybrid_mpc.monitor.held_out import HeldOut, leave_one_out
-from hybrid_mpc.pipeline.loops import make_estimator
 from hybrid_mpc.records import plain
 from scenarios.torque_pendulum import scenario
 

@@ -21,8 +21,8 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_mpc import load
+from hybrid_mpc.assembly import make_controller, make_estimator, make_monitor
 from hybrid_mpc.closed_loop import simulate
-from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_monitor
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.tasks import CONTROL
 

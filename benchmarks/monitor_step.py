@@ -20,8 +20,8 @@ from time import process_time
 import numpy as np
 
 from hybrid_mpc import load
+from hybrid_mpc.assembly import make_monitor
 from hybrid_mpc.monitor import Detector, guard_monitor
-from hybrid_mpc.pipeline.loops import make_monitor
 
 SAMPLES = 300
 

@@ -27,9 +27,9 @@ import numpy as np
 from scipy import stats
 
 from hybrid_mpc import load
+from hybrid_mpc.assembly import make_estimator, make_ocp
 from hybrid_mpc.closed_loop import simulate
 from hybrid_mpc.mpc import CondensedController, IpoptController, SafeController, SQPController
-from hybrid_mpc.pipeline.loops import make_estimator, make_ocp
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.tasks import CONTROL
 

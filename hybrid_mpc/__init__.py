@@ -16,11 +16,22 @@ from hybrid_mpc.signals import Parameter, Signal
 
 if TYPE_CHECKING:
     from hybrid_mpc.artifact import Kit, load
+    from hybrid_mpc.assembly import (
+        make_adaptive_guard,
+        make_controller,
+        make_estimator,
+        make_monitor,
+        make_ocp,
+        make_resting_guard,
+        tuned_noise,
+        working_point,
+    )
     from hybrid_mpc.closed_loop.faults import Fault
     from hybrid_mpc.closed_loop.guard import Guard
     from hybrid_mpc.closed_loop.loop import Loop
     from hybrid_mpc.closed_loop.runner import Runner
     from hybrid_mpc.closed_loop.simulate import simulate
+    from hybrid_mpc.job.contenders import find_noise
     from hybrid_mpc.mpc.ocp import OCP
     from hybrid_mpc.physics import Prior
     from hybrid_mpc.pipeline.run import run
@@ -49,9 +60,18 @@ __all__ = [
     "Task",
     "Window",
     "__version__",
+    "find_noise",
     "load",
+    "make_adaptive_guard",
+    "make_controller",
+    "make_estimator",
+    "make_monitor",
+    "make_ocp",
+    "make_resting_guard",
     "run",
     "simulate",
+    "tuned_noise",
+    "working_point",
 ]
 _HOME = {
     "Fault": "closed_loop.faults",
@@ -62,9 +82,18 @@ _HOME = {
     "Prior": "physics",
     "RunSettings": "pipeline.settings",
     "Runner": "closed_loop.runner",
+    "find_noise": "job.contenders",
     "load": "artifact",
+    "make_adaptive_guard": "assembly",
+    "make_controller": "assembly",
+    "make_estimator": "assembly",
+    "make_monitor": "assembly",
+    "make_ocp": "assembly",
+    "make_resting_guard": "assembly",
     "run": "pipeline.run",
     "simulate": "closed_loop.simulate",
+    "tuned_noise": "assembly",
+    "working_point": "assembly",
 }
 
 

@@ -261,7 +261,7 @@ class Kit:
         Example:
             ``hm.load("runs/mine").observer()``
         """
-        from hybrid_mpc.pipeline.loops import make_estimator
+        from hybrid_mpc.assembly import make_estimator
 
         held, key = self._model(model), f"{model}_observer" if load else model
         if key not in self.loop.process_noise:
@@ -286,7 +286,7 @@ class Kit:
         Example:
             ``hm.load("runs/mine").controller()``
         """
-        from hybrid_mpc.pipeline.loops import make_controller
+        from hybrid_mpc.assembly import make_controller
 
         return make_controller(
             self._model(model), self._model("prior"), self.problem(task), iterations=iterations
@@ -304,8 +304,8 @@ class Kit:
         Example:
             ``hm.load("runs/mine").monitor()``
         """
+        from hybrid_mpc.assembly import freezing, make_monitor
         from hybrid_mpc.monitor import guard_monitor
-        from hybrid_mpc.pipeline.loops import freezing, make_monitor
 
         held, found = self._model(model), self.calibration
         if found is None or found.detector is None or self.control is None:
@@ -326,7 +326,7 @@ class Kit:
         Example:
             ``simulate(..., monitor=kit.monitor(), guard=kit.guard())``
         """
-        from hybrid_mpc.pipeline.guards import make_adaptive_guard, make_resting_guard
+        from hybrid_mpc.assembly import make_adaptive_guard, make_resting_guard
 
         if not adapt:
             return make_resting_guard(self._model("hybrid"))

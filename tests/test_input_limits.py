@@ -12,6 +12,7 @@ from online_models import PendulumPlant, linear_model, pendulum_model
 from hybrid_mpc.analysis.study_models import drive
 from hybrid_mpc.analysis.study_signals import measured_part
 from hybrid_mpc.analysis.subject import _inputs, _outer, _range
+from hybrid_mpc.assembly import freezing, make_controller, make_estimator, make_resting_guard, working_point
 from hybrid_mpc.closed_loop import Guard, Loop, Mode, simulate
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation import TrueState
@@ -19,9 +20,7 @@ from hybrid_mpc.input_limits import share_used
 from hybrid_mpc.monitor import guard_monitor
 from hybrid_mpc.mpc import OCP, CondensedController, Limits, SafeController
 from hybrid_mpc.pipeline.contest import limits_used
-from hybrid_mpc.pipeline.guards import make_resting_guard
 from hybrid_mpc.pipeline.judge import unknown_load
-from hybrid_mpc.pipeline.loops import freezing, make_controller, make_estimator, working_point
 from hybrid_mpc.pipeline.preflight import check_scenario
 from hybrid_mpc.plots.loops import Motion, closed_loops
 from hybrid_mpc.scenario import Scenario, load_scenario

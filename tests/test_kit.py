@@ -17,12 +17,12 @@ from hybrid_mpc.artifact import (
     set_process_noise,
     write_description,
 )
+from hybrid_mpc.assembly import make_controller, make_estimator
 from hybrid_mpc.closed_loop import Fault, Mode, simulate
 from hybrid_mpc.estimation import ExtendedKalmanFilter, SwitchingFilter
 from hybrid_mpc.monitor import Calibration, Detector
 from hybrid_mpc.mpc import SoftBound
 from hybrid_mpc.pipeline.deploy import loop_settings
-from hybrid_mpc.pipeline.loops import make_controller, make_estimator
 from hybrid_mpc.scenario import load_scenario
 
 README = Path(__file__).parents[1] / "README.md"

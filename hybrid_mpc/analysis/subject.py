@@ -91,7 +91,7 @@ def subject_of(request: Request) -> tuple[Subject, tuple[str, ...]]:
     ocp: OCP | None = None
     filters: dict[tuple[str, str], ExtendedKalmanFilter] = {}
     if scenario is not None and control is not None and {"prior", "hybrid"} <= set(artifact.models):
-        from hybrid_mpc.pipeline.loops import make_ocp
+        from hybrid_mpc.assembly import make_ocp
 
         ocp = make_ocp(artifact.models["prior"], control)
         filters, source = _filters(request, scenario, artifact, control, folder)
@@ -157,8 +157,8 @@ def _filters(
     request: Request, scenario: Scenario, artifact: Kit, control: OCP, folder: Path
 ) -> tuple[dict[tuple[str, str], ExtendedKalmanFilter], str]:
     """The observers of the closed loops: while nothing happens, and in the periods after a load came or went."""
-    from hybrid_mpc.pipeline.control_noise import find_noise
-    from hybrid_mpc.pipeline.loops import FIRST_LOAD, JUMP_SHARE, QUIET_SHARE
+    from hybrid_mpc.assembly import FIRST_LOAD, JUMP_SHARE, QUIET_SHARE
+    from hybrid_mpc.job.contenders import find_noise
 
     names = {"prior": "prior_observer", "hybrid": "hybrid_observer"}
     noise, source = find_noise(scenario, artifact, tuple(names.values()), request.seed)

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.artifact import Kit, load
+from hybrid_mpc.assembly import make_monitor
 from hybrid_mpc.closed_loop import ClosedLoopResult, simulate
 from hybrid_mpc.closed_loop.simulate import Step
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.input_limits import share_used
+from hybrid_mpc.job.contenders import CONTENDERS, ORACLES, build
 from hybrid_mpc.mpc import OCP
-from hybrid_mpc.pipeline.contenders import CONTENDERS, ORACLES, build
 from hybrid_mpc.pipeline.context import Context
-from hybrid_mpc.pipeline.loops import make_monitor
 from hybrid_mpc.pipeline.parallel import WORKERS, run_jobs
 from hybrid_mpc.scenario import Budget, Scenario, Task, load_scenario
 

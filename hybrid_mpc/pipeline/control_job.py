@@ -13,18 +13,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.artifact import Kit, artifact_folder, load
+from hybrid_mpc.assembly import (
+    REACTIONS,
+    adaptable,
+    freezing,
+    make_adaptive_guard,
+    make_monitor,
+    make_resting_guard,
+)
 from hybrid_mpc.closed_loop import ClosedLoopResult, Fault, Guard, simulate
 from hybrid_mpc.closed_loop.faults import check_channels, install
 from hybrid_mpc.closed_loop.simulate import Step
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.job.contenders import CONTENDERS, ORACLES, build, find_noise
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.monitor import EnergyMonitor, guard_monitor
 from hybrid_mpc.mpc import OCP, Controller, IpoptController, SafeController, SQPController
-from hybrid_mpc.pipeline.contenders import CONTENDERS, ORACLES, build
-from hybrid_mpc.pipeline.control_noise import find_noise
 from hybrid_mpc.pipeline.faulted_loops import stored_detector
-from hybrid_mpc.pipeline.guards import REACTIONS, adaptable, make_adaptive_guard, make_resting_guard
-from hybrid_mpc.pipeline.loops import freezing, make_monitor
 from hybrid_mpc.pipeline.monitor_job import stored_rest
 from hybrid_mpc.scenario import Scenario, Task
 

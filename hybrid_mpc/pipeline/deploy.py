@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 from dataclasses import replace
 from importlib.metadata import version
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +19,18 @@ from hybrid_mpc.artifact import (
     save_artifact,
     set_process_noise,
 )
-from hybrid_mpc.mpc import OCP
-from hybrid_mpc.pipeline.contenders import noise_of
+from hybrid_mpc.assembly import make_controller, make_estimator, make_monitor
+from hybrid_mpc.closed_loop.loop import Loop
+from hybrid_mpc.estimation import ExtendedKalmanFilter, SwitchingFilter
+from hybrid_mpc.job.contenders import noise_of
+from hybrid_mpc.monitor import EnergyMonitor
+from hybrid_mpc.mpc import OCP, SafeController
 from hybrid_mpc.pipeline.contest import contest
 from hybrid_mpc.pipeline.context import Context
-from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_monitor, time_on_recording
 from hybrid_mpc.scenario import Scenario
+
+if TYPE_CHECKING:
+    from hybrid_mpc.data.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 DEPLOYED = "mopgrnn"
@@ -126,3 +133,26 @@ def _only_timing(context: Context, artifact: Kit, control: OCP, noise: dict[str,
         durations.append(time_on_recording(controller, estimator, monitor, recording, most))
     reason = f"scenario {context.scenario.name} has no plant to close the loop with"
     context.save("control", {"reason": reason, "sigma_x": noise}, {"step_ms": np.concatenate(durations)})
+
+
+def time_on_recording(
+    controller: SafeController,
+    estimator: ExtendedKalmanFilter | SwitchingFilter,
+    monitor: EnergyMonitor,
+    trajectory: Trajectory,
+    most: int,
+) -> Array:
+    """Durations [ms] of a loop's steps on at most ``most`` recorded samples, without a plant.
+
+    The controller is asked to hold the rest position from wherever the recording is; the loop is told
+    that the recorded input acted, not its own.
+    """
+    loop = Loop(estimator, controller, monitor=monitor)
+    loop.start(trajectory.y[0])
+    durations = []
+    for k in range(1, min(most, len(trajectory.t))):
+        loop.finish()
+        loop.step(trajectory.y[k], applied=trajectory.u[k - 1])
+        loop.finish()
+        durations.append(1e3 * sum(loop.spent.values()))
+    return np.array(durations)

@@ -12,13 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.artifact import Kit
+from hybrid_mpc.assembly import freezing, make_resting_guard
 from hybrid_mpc.closed_loop import ClosedLoopResult, Fault, simulate
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.job.contenders import build
 from hybrid_mpc.monitor import Detector, MonitorTrace, guard_monitor
 from hybrid_mpc.monitor.calibration import alarm_intervals
-from hybrid_mpc.pipeline.contenders import build
-from hybrid_mpc.pipeline.guards import make_resting_guard
-from hybrid_mpc.pipeline.loops import freezing
 from hybrid_mpc.pipeline.monitor_job import explained
 from hybrid_mpc.pipeline.nominal_loops import CONTENDER, knows
 from hybrid_mpc.scenario import Scenario

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.artifact import load, set_calibration
+from hybrid_mpc.assembly import make_controller, make_estimator, make_monitor, working_point
 from hybrid_mpc.closed_loop.faults import Fault
 from hybrid_mpc.closed_loop.result import ClosedLoopResult
 from hybrid_mpc.closed_loop.simulate import simulate
@@ -19,7 +20,6 @@ from hybrid_mpc.monitor.replay import along, judge, replay
 from hybrid_mpc.monitor.rest import rest_speeds
 from hybrid_mpc.mpc import OCP
 from hybrid_mpc.pipeline.context import Context
-from hybrid_mpc.pipeline.loops import make_controller, make_estimator, make_monitor, working_point
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.riccati import hidden_fixed_point
 

@@ -11,17 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.artifact import Kit, artifact_folder, load
+from hybrid_mpc.assembly import make_estimator, make_monitor, sensor_steps
 from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_object, write_json, write_text
+from hybrid_mpc.job.contenders import find_noise
 from hybrid_mpc.monitor import Detector, Diagnoser, EnergyMonitor, MonitorTrace, guard_monitor
 from hybrid_mpc.monitor.lengths import HISTORY_S, samples
 from hybrid_mpc.monitor.reading import Verdict
 from hybrid_mpc.monitor.replay import EstimatorLike, TrajectoryLike, along, replay
 from hybrid_mpc.monitor.standard import learn_from
 from hybrid_mpc.pipeline.context import Progress, Silent
-from hybrid_mpc.pipeline.control_noise import find_noise
-from hybrid_mpc.pipeline.loops import make_estimator, make_monitor, sensor_steps
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import Scenario
 

@@ -16,9 +16,9 @@ from hybrid_mpc.closed_loop import Fault, simulate
 from hybrid_mpc.closed_loop.faults import install
 from hybrid_mpc.closed_loop.simulate import Step
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.job.contenders import build
 from hybrid_mpc.monitor import guard_monitor
 from hybrid_mpc.monitor.lengths import SETTLING_S, block_seconds, samples
-from hybrid_mpc.pipeline.contenders import build
 from hybrid_mpc.pipeline.monitor_job import stored_rest
 from hybrid_mpc.scenario import Budget, Scenario, Task, load_scenario
 

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hybrid_mpc.artifact import load
+from hybrid_mpc.assembly import make_estimator
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.consistency import Consistency, consistency
-from hybrid_mpc.pipeline.contenders import CONTENDERS
+from hybrid_mpc.job.contenders import CONTENDERS
 from hybrid_mpc.pipeline.context import Context
-from hybrid_mpc.pipeline.loops import make_estimator
 from hybrid_mpc.report.schema import OBSERVERS
 
 if TYPE_CHECKING:

@@ -309,7 +309,7 @@ def _check_problem(
     prior: Prior | None,
     model: HybridModel | None,
 ) -> None:
-    from hybrid_mpc.pipeline.loops import make_controller, make_estimator
+    from hybrid_mpc.assembly import make_controller, make_estimator
 
     before = len(report.problems)
     if not isinstance(control, OCP):

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hybrid_mpc.files import write_json
-from hybrid_mpc.pipeline.contenders import CONTENDERS
+from hybrid_mpc.job.contenders import CONTENDERS
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.figures import OBSERVER_TITLES, Figures, draw_all
 from hybrid_mpc.pipeline.guard_report import guard_tables, guard_words

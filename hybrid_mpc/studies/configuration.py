@@ -12,7 +12,7 @@ from typing import Any, cast
 
 from hybrid_mpc.closed_loop.faults import Fault
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.pipeline.contenders import CONTENDERS, ORACLES
+from hybrid_mpc.job.contenders import CONTENDERS, ORACLES
 from hybrid_mpc.pipeline.control_job import DEFAULT_CONTROLLERS, SOLVERS, parsed_fault, selected_tasks
 from hybrid_mpc.records import MOST_SEED, known, plain, record
 from hybrid_mpc.scenario import load_scenario

@@ -19,14 +19,14 @@ from typing import Any
 import numpy as np
 
 from hybrid_mpc.artifact import FILES, Kit, artifact_folder, load
+from hybrid_mpc.assembly import make_monitor
 from hybrid_mpc.closed_loop import ClosedLoopResult, simulate
 from hybrid_mpc.closed_loop.faults import check_channels, install
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import MOST_CONTENT, read_bytes
-from hybrid_mpc.pipeline.contenders import CONTENDERS
+from hybrid_mpc.job.contenders import CONTENDERS
 from hybrid_mpc.pipeline.control_job import ControlSettings, Job, parts, prepared, selected_tasks
 from hybrid_mpc.pipeline.control_results import row
-from hybrid_mpc.pipeline.loops import make_monitor
 from hybrid_mpc.records import plain
 from hybrid_mpc.scenario import Scenario, Task, load_scenario
 from hybrid_mpc.studies.configuration import Study

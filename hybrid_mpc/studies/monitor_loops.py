@@ -13,17 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.artifact import Kit, load
+from hybrid_mpc.assembly import make_adaptive_guard, make_resting_guard
 from hybrid_mpc.closed_loop import ClosedLoopResult, Guard, simulate
 from hybrid_mpc.closed_loop.guard import Mode
 from hybrid_mpc.closed_loop.simulate import Step
 from hybrid_mpc.estimation.switching import SwitchingFilter
 from hybrid_mpc.files import read_arrays, read_json, write_arrays
+from hybrid_mpc.job.contenders import build
 from hybrid_mpc.monitor import METHODS, Detector, EnergyMonitor, Judges, guard_monitor, learn_judges
 from hybrid_mpc.monitor.rest import REST_SPEED
 from hybrid_mpc.mpc import OCP
-from hybrid_mpc.pipeline.contenders import build
 from hybrid_mpc.pipeline.control_job import selected_tasks
-from hybrid_mpc.pipeline.guards import make_adaptive_guard, make_resting_guard
 from hybrid_mpc.pipeline.monitor_job import stored_rest
 from hybrid_mpc.records import record
 from hybrid_mpc.scenario import Task, load_scenario

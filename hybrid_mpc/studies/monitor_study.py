@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from hybrid_mpc.artifact import Kit, load
+from hybrid_mpc.assembly import adaptable
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_json, write_json
 from hybrid_mpc.monitor import Judges
 from hybrid_mpc.pipeline.context import Progress, Silent
-from hybrid_mpc.pipeline.guards import adaptable
 from hybrid_mpc.records import record
 from hybrid_mpc.scenario import load_scenario
 from hybrid_mpc.studies.configuration import Study

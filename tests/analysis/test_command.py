@@ -24,12 +24,12 @@ from hybrid_mpc.analysis.study_signals import measured_part
 from hybrid_mpc.analysis.subject import Request, Subject, subject_of
 from hybrid_mpc.analysis.toolbox import control_toolbox
 from hybrid_mpc.artifact import set_process_noise
+from hybrid_mpc.assembly import make_controller
 from hybrid_mpc.cli.main import app
 from hybrid_mpc.closed_loop import simulate
 from hybrid_mpc.data import write_csv
 from hybrid_mpc.data.excitation import multisine
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.pipeline.loops import make_controller
 from nn_export import load_programs
 from scenarios.golf_robot import scenario
 

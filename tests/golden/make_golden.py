@@ -122,9 +122,9 @@ RUNNER = {
 def freeze(name, run):
     """The folder of a machine from a finished run: programs, weights, plain numbers, references."""
     from hybrid_mpc.artifact import load, read_description, write_description
+    from hybrid_mpc.assembly import first_controller, freezing, make_estimator, make_monitor, make_ocp
     from hybrid_mpc.files import sha256
-    from hybrid_mpc.pipeline.contenders import no_surer_than_prior
-    from hybrid_mpc.pipeline.loops import first_controller, freezing, make_estimator, make_monitor, make_ocp
+    from hybrid_mpc.job.contenders import no_surer_than_prior
     from hybrid_mpc.scenario import load_scenario
 
     folder, run = HERE / name, Path(run)

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from linear_axes import Axis, kalman
 
+from hybrid_mpc.assembly import make_monitor, make_resting_guard
 from hybrid_mpc.data import time_unit
 from hybrid_mpc.monitor import Diagnoser, guard_monitor, learn_detector, replay, rest_speeds
 from hybrid_mpc.monitor.lengths import SETTLING_S, block_seconds, samples, seconds
-from hybrid_mpc.pipeline.guards import make_resting_guard
-from hybrid_mpc.pipeline.loops import make_monitor
 
 TODAY = {
     "golf_robot": 0.02,

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hybrid_mpc.assembly import make_estimator
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.monitor.held_out import clean_samples, judged, leave_one_out, settled_windows
 from hybrid_mpc.monitor.replay import replay
 from hybrid_mpc.monitor.standard import guard_monitor
-from hybrid_mpc.pipeline.loops import make_estimator
 from scenarios.torque_pendulum import scenario
 
 ROOT = Path(__file__).parents[2]

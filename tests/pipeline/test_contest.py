@@ -8,7 +8,7 @@ import pytest
 
 from hybrid_mpc import load
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.pipeline.contenders import CONTENDERS, ORACLES
+from hybrid_mpc.job.contenders import CONTENDERS, ORACLES
 from hybrid_mpc.pipeline.contest import _seeds, contest, limits_used, parts_of, tasks_of
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.results import gap_closed, loop_table, summary, task_figures

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from hybrid_mpc.artifact import LoopSettings
-from hybrid_mpc.pipeline import contenders
-from hybrid_mpc.pipeline.control_noise import find_noise
+from hybrid_mpc.job import contenders
+from hybrid_mpc.job.contenders import find_noise
 from hybrid_mpc.scenario import load_scenario
 from scenarios.golf_robot import scenario
 

@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from hybrid_mpc.assembly import make_estimator, make_ocp
 from hybrid_mpc.closed_loop import Fault, simulate
 from hybrid_mpc.closed_loop.faults import install
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.mpc.condensed import CondensedController
 from hybrid_mpc.mpc.safeguard import SafeController
-from hybrid_mpc.pipeline.loops import make_estimator, make_ocp
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.faults import catalogue, fault_case
 from scenarios.golf_robot.rig import Rig

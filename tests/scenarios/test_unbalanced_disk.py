@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from hybrid_mpc.artifact import load, save_artifact
+from hybrid_mpc.assembly import make_controller, make_estimator
 from hybrid_mpc.closed_loop import simulate
 from hybrid_mpc.data import load_trajectories
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identification.export import model_info, trace_model
 from hybrid_mpc.identification.step import PriorStep
-from hybrid_mpc.pipeline.loops import make_controller, make_estimator
 from hybrid_mpc.scenario import load_scenario
 from scenarios.unbalanced_disk import data, scenario
 from scenarios.unbalanced_disk.dynamics import DiskParameters

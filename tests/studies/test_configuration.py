@@ -8,7 +8,7 @@ import pytest
 
 from hybrid_mpc.closed_loop import Fault
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.pipeline.contenders import CONTENDERS
+from hybrid_mpc.job.contenders import CONTENDERS
 from hybrid_mpc.studies import FaultKind, RandomFaults, RunConfig, Study
 from hybrid_mpc.studies.draws import generator, varied
 from hybrid_mpc.studies.files import read_study

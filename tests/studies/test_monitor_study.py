@@ -9,12 +9,12 @@ import pytest
 import trivial_runs
 
 from hybrid_mpc import load
+from hybrid_mpc.assembly import make_controller, make_estimator
 from hybrid_mpc.cli import main
 from hybrid_mpc.closed_loop import simulate
 from hybrid_mpc.closed_loop.faults import install
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.monitor import METHODS, Detector, Judges, guard_monitor
-from hybrid_mpc.pipeline.loops import make_controller, make_estimator
 from hybrid_mpc.studies import monitor_study as room
 from hybrid_mpc.studies.lockstep import NominalLoop, run_together
 from hybrid_mpc.studies.monitor_plan import CASES, LoopPlan, MonitorStudy, monitor_study

@@ -1,0 +1,1 @@
+"""Jobs: closed loops from a specification to a row, and the engine that runs them."""
