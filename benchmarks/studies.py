@@ -26,16 +26,16 @@ from time import perf_counter, process_time
 import numpy as np
 
 from hybrid_mpc.pipeline.context import Silent
-from hybrid_mpc.studies import RunConfig, Study, run_study
+from hybrid_mpc.studies import LoopSpec, Study, run_study
 from hybrid_mpc.studies.engines import DaskEngine, LocalEngine
+from hybrid_mpc.studies.inputs import TIMING, load_inputs
 from hybrid_mpc.studies.log import RunLog, rows, segments
-from hybrid_mpc.studies.loops import TIMING, load_inputs
 from hybrid_mpc.studies.results import StudyResults
 from hybrid_mpc.studies.runner import execute
 from hybrid_mpc.studies.table import compact
 
 
-def nothing(config: RunConfig) -> dict:
+def nothing(config: LoopSpec) -> dict:
     """A run of a usual number of figures that computes none; with its process' memory."""
     values = np.random.default_rng(config.noise_seed).random(20).tolist()  # as hard to compress as real ones
     figures = {f"figure_{i}": value for i, value in enumerate(values)}

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from hybrid_mpc.closed_loop.runner import Runner
     from hybrid_mpc.closed_loop.simulate import simulate
     from hybrid_mpc.job.contenders import find_noise
+    from hybrid_mpc.job.loops import Bench, LoopRow, LoopSpec
     from hybrid_mpc.mpc.ocp import OCP
     from hybrid_mpc.physics import Prior
     from hybrid_mpc.pipeline.run import run
@@ -44,6 +45,7 @@ except PackageNotFoundError:  # a source tree that was never installed
 
 __all__ = [
     "OCP",
+    "Bench",
     "Budget",
     "DataSpec",
     "Fault",
@@ -51,6 +53,8 @@ __all__ = [
     "InputError",
     "Kit",
     "Loop",
+    "LoopRow",
+    "LoopSpec",
     "Parameter",
     "Prior",
     "RunSettings",
@@ -74,10 +78,13 @@ __all__ = [
     "working_point",
 ]
 _HOME = {
+    "Bench": "job.loops",
     "Fault": "closed_loop.faults",
     "Guard": "closed_loop.guard",
     "Kit": "artifact",
     "Loop": "closed_loop.loop",
+    "LoopRow": "job.loops",
+    "LoopSpec": "job.loops",
     "OCP": "mpc.ocp",
     "Prior": "physics",
     "RunSettings": "pipeline.settings",

@@ -18,6 +18,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_document, read_object, sha256, write_document
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.monitor.calibration import Calibration
+from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.records import known, plain, record
 from hybrid_mpc.signals import Signal
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from hybrid_mpc.estimation.switching import SwitchingFilter
     from hybrid_mpc.monitor.energy import EnergyMonitor
     from hybrid_mpc.mpc.safeguard import SafeController
+    from hybrid_mpc.scenario import Scenario
 
 SCHEMA_VERSION = 2
 FILE = "model.json"
@@ -228,6 +230,61 @@ class Kit:
         given = self.loop.safe_input
         return self.problem().rest_input if given is None else np.array(given, dtype=np.float64)
 
+    @property
+    def rest_speed(self) -> tuple[float, ...] | None:
+        """Speeds ``(n_q,)`` below which friction may stick, as recordings tell; None if they do not tell."""
+        return None if self.calibration is None else self.calibration.rest_speed
+
+    def detector(self) -> Detector:
+        """The detector that the guard listens to.
+
+        Raises:
+            InputError: If the folder holds none.
+        """
+        found = None if self.calibration is None else self.calibration.detector
+        if found is None:
+            raise InputError(
+                f"{self._whose} holds no detector for the guard: an earlier version made it, or its run had too little "
+                "nominal data (its report says why); run the main job again"
+            )
+        return found
+
+    def noise(self, estimator: str) -> NDArray[np.float64]:
+        """Process noise ``(n_x,)`` per period [state units] of an estimator.
+
+        Args:
+            estimator: Name of the model, with ``_observer`` behind it where an unknown load is followed.
+
+        Raises:
+            InputError: If the folder holds none for it, or it is of another size.
+        """
+        if estimator not in self.loop.process_noise:
+            raise InputError(
+                f"{self._whose} was saved without process noise for {estimator}; run the scenario again (its stage "
+                "control estimates it)"
+            )
+        sigma, n_x = np.array(self.loop.process_noise[estimator]), next(iter(self.models.values())).n_x
+        if sigma.shape != (n_x,):
+            raise InputError(f"the model's process noise of {estimator} must be {n_x} numbers; train it anew")
+        return sigma
+
+    def with_noise(self, noise: Mapping[str, ArrayLike]) -> Kit:
+        """The kit with other process noise.
+
+        Args:
+            noise: By estimator, see :meth:`noise`.
+        """
+        return replace(self, loop=replace(self.loop, process_noise=_tuples(noise)))
+
+    def on(self, scenario: Scenario) -> Kit:
+        """The kit with a scenario's control problems, sensors and causes, as the scenario now states them.
+
+        Args:
+            scenario: The machine.
+        """
+        stated = loop_settings(scenario, self.loop.process_noise)
+        return replace(self, loop=replace(stated, safe_input=self.loop.safe_input))
+
     def problem(self, task: str = "") -> OCP:
         """The control problem of a task.
 
@@ -264,24 +321,21 @@ class Kit:
         from hybrid_mpc.assembly import make_estimator
 
         held, key = self._model(model), f"{model}_observer" if load else model
-        if key not in self.loop.process_noise:
-            raise InputError(
-                f"{self._whose} was saved without process noise for {key}; run the scenario again (its stage control "
-                "estimates it)"
-            )
-        sigma = np.array(self.loop.process_noise[key])
-        return make_estimator(held, self, sigma, self.problem(task), observer=load)
+        return make_estimator(held, self, self.noise(key), self.problem(task), observer=load)
 
-    def controller(self, model: str = "hybrid", *, task: str = "", iterations: int = 1) -> SafeController:
+    def controller(
+        self, model: str = "hybrid", *, task: str = "", solver: str = "rti", iterations: int = 1
+    ) -> SafeController:
         """The MPC of a model with its safeguards, which stand on the prior.
 
         Args:
             model: Name of the model that plans. Default: the hybrid.
             task: Whose control problem it solves. Default: the common one.
-            iterations: Linearisations a period. Default: one.
+            solver: ``"rti"``, ``"sqp"`` or ``"ipopt"``.
+            iterations: Linearisations a period of ``rti``. Default: one.
 
         Raises:
-            InputError: If there is no such model or no control problem.
+            InputError: If there is no such model or solver, or no control problem.
 
         Example:
             ``hm.load("runs/mine").controller()``
@@ -289,7 +343,7 @@ class Kit:
         from hybrid_mpc.assembly import make_controller
 
         return make_controller(
-            self._model(model), self._model("prior"), self.problem(task), iterations=iterations
+            self._model(model), self._model("prior"), self.problem(task), solver=solver, iterations=iterations
         )
 
     def monitor(self, model: str = "hybrid") -> EnergyMonitor:
@@ -330,13 +384,12 @@ class Kit:
 
         if not adapt:
             return make_resting_guard(self._model("hybrid"))
-        noise = self.loop.process_noise.get("hybrid_observer")
-        if noise is None:
-            raise InputError(
-                "a guard that adapts needs the process noise of hybrid_observer; run the scenario again"
-            )
         return make_adaptive_guard(
-            self._model("hybrid"), self._model("prior"), self, np.array(noise), self.problem(task)
+            self._model("hybrid"),
+            self._model("prior"),
+            self,
+            self.noise("hybrid_observer"),
+            self.problem(task),
         )
 
     @property
@@ -382,6 +435,27 @@ def save_artifact(
     )  # fmt: skip
 
 
+def loop_settings(
+    scenario: Scenario, process_noise: Mapping[str, tuple[float, ...]] | None = None
+) -> LoopSettings:
+    """What a scenario's loops need beside the models.
+
+    Args:
+        scenario: The machine.
+        process_noise: By estimator. Default: none; it is estimated later.
+
+    Example:
+        >>> from scenarios.golf_robot import scenario
+        >>> sorted(loop_settings(scenario).control)[:2]
+        ['', 'track_limits']
+    """
+    problems = {"": scenario.control} | {task.name: task.control for task in scenario.tasks}
+    given = {name: problem for name, problem in problems.items() if problem is not None}
+    return LoopSettings(
+        given, scenario.sensor_sigma, scenario.first_sigma, dict(process_noise or {}), dict(scenario.causes)
+    )
+
+
 def set_calibration(folder: Path, calibration: Calibration) -> None:
     """Put the monitor's calibration into an artifact.
 
@@ -402,8 +476,13 @@ def set_process_noise(folder: Path, noise: Mapping[str, ArrayLike]) -> None:
         InputError: If the folder holds none, or cannot be written.
     """
     description = read_description(folder)
-    values = {name: tuple(np.asarray(sigma, dtype=float).tolist()) for name, sigma in noise.items()}
-    write_description(folder, replace(description, loop=replace(description.loop, process_noise=values)))
+    write_description(
+        folder, replace(description, loop=replace(description.loop, process_noise=_tuples(noise)))
+    )
+
+
+def _tuples(noise: Mapping[str, ArrayLike]) -> dict[str, tuple[float, ...]]:
+    return {name: tuple(np.asarray(sigma, dtype=float).tolist()) for name, sigma in noise.items()}
 
 
 def write_description(folder: Path, description: Description) -> None:

@@ -20,9 +20,11 @@ from hybrid_mpc.monitor.energy import EnergyMonitor
 from hybrid_mpc.monitor.lengths import LEVEL_S, half_window, samples
 from hybrid_mpc.mpc.best_of import BestOf
 from hybrid_mpc.mpc.condensed import CondensedController
+from hybrid_mpc.mpc.nlp import IpoptController
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.safeguard import SafeController
 from hybrid_mpc.mpc.sqp import SQPController
+from hybrid_mpc.records import known
 
 if TYPE_CHECKING:
     from hybrid_mpc.data.trajectories import Trajectory
@@ -50,8 +52,6 @@ TUNED_RECORDINGS = 3
 """So many periods of so many training recordings decide."""
 
 
-REACTIONS = ("rest", "adapt")
-"""What ``hybrid-mpc control --guard`` and ``--adapt`` do."""
 DWELL_S, QUIET_S = 0.5, 1.0
 """A guard's shortest time in a mode, and the time without alarm before it goes back [the machine's seconds]."""
 PATIENCE_S = 0.8
@@ -185,23 +185,36 @@ def first_deviations(model: HybridModel, scenario: Machine) -> Array:
     return np.array([*sigma, *others], dtype=np.float64)
 
 
-def make_controller(
-    model: HybridModel, prior: HybridModel, control: OCP, *, iterations: int = 1
-) -> SafeController:
-    """The condensed real-time iteration of a model behind the safeguards that stand on the prior.
+SOLVERS = ("rti", "sqp", "ipopt")
+"""The condensed real-time iteration; sequential quadratic programs to convergence; the same by IPOPT."""
 
-    Its first plan, made before the loop starts, is converged, from every start that the control problem names.
+
+def make_controller(
+    model: HybridModel, prior: HybridModel, control: OCP, *, solver: str = "rti", iterations: int = 1
+) -> SafeController:
+    """A model's controller behind the safeguards that stand on the prior.
+
+    The first plan of ``rti``, made before the loop starts, is converged, from every start that the control problem
+    names.
 
     Args:
         model: The model to plan with.
         prior: The fitted prior, for terminal weight and fallback.
         control: The control problem.
-        iterations: Linearisations a period. Default: one.
+        solver: Name in :data:`SOLVERS`.
+        iterations: Linearisations a period of ``rti``. Default: one.
+
+    Raises:
+        InputError: If there is no such solver.
 
     Example:
         ``make_controller(models["hybrid"], models["prior"], scenario.control)``
     """
     ocp = make_ocp(prior, control)
+    if known(solver, SOLVERS, "solver") == "sqp":
+        return SafeController(SQPController(model, ocp), prior)
+    if solver == "ipopt":
+        return SafeController(IpoptController(model, ocp), prior)
     rti = CondensedController(model, ocp, iterations=iterations)
     return SafeController(rti, prior, first=first_controller(model, ocp))
 

@@ -9,7 +9,8 @@ from online_models import PendulumPlant, pendulum_model
 
 from hybrid_mpc.closed_loop import Runner, simulate
 from hybrid_mpc.estimation import ExtendedKalmanFilter
-from hybrid_mpc.mpc import OCP, CondensedController, SafeController
+from hybrid_mpc.job.loops import LoopRow
+from hybrid_mpc.mpc import OCP, CondensedController, SafeController, Source
 
 DT = 0.02
 POINT = [0.0, 1.0], [0.0]
@@ -25,6 +26,16 @@ def make_safe(model, *, horizon=20, bound=6.0, du_max=None, q=(300.0, 1.0), r=0.
     limit = None if du_max is None else [du_max]
     ocp = OCP(horizon, q, [r], [0.05], [-bound], [bound], limit, working_point=POINT)
     return SafeController(CondensedController(model, ocp), pendulum_model())
+
+
+def loop_row(task="a", controller="prior", seed=0, cost=1.0, **fields):
+    """The row of a loop in which nothing happened."""
+    none = {
+        "tracking_rmse": {"phi [rad]": 0.0}, "largest_x": {}, "largest_u": {}, "limits": {}, "excess": {},
+        "sources": {s.name: float(s is Source.MPC) for s in Source}, "figures": {}, "alarms": (), "alarm_share": 0.0,
+        "largest_level": None, "not_judged_s": 0.0, "switches": (), "timing_ms": {}, "seconds": 1.0,
+    }  # fmt: skip
+    return LoopRow(task, controller, seed, cost=cost, **{**none, **fields})
 
 
 def sine(t, amplitude=0.5, omega=2.0):

@@ -17,15 +17,14 @@ from hybrid_mpc.closed_loop import Guard, Loop, Mode, simulate
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation import TrueState
 from hybrid_mpc.input_limits import share_used
+from hybrid_mpc.job.loops import excess, limits_used
 from hybrid_mpc.monitor import guard_monitor
 from hybrid_mpc.mpc import OCP, CondensedController, Limits, SafeController
-from hybrid_mpc.pipeline.contest import limits_used
 from hybrid_mpc.pipeline.judge import unknown_load
 from hybrid_mpc.pipeline.preflight import check_scenario
 from hybrid_mpc.plots.loops import Motion, closed_loops
 from hybrid_mpc.scenario import Scenario, load_scenario
 from hybrid_mpc.signals import Signal
-from hybrid_mpc.studies.monitor_loops import loop_figures
 
 INF = np.inf
 FINITE = {
@@ -75,9 +74,9 @@ def test_a_whole_loop_with_its_figures(limits):
     # A limit is 1, and the QPs keep them to rounding.
     assert 0 <= used["u"] <= 1 + 1e-9
     assert 0 < used["du"] <= 1 + 1e-9
-    excess = loop_figures(result, control)["excess"]
-    assert excess["u"] == 0.0
-    assert excess["x0"] == max(0.0, -1.0 - result.x[:, 0].min())
+    left = excess(control, result, model)
+    assert left[model.inputs[0].label] == 0.0
+    assert left[model.states[0].label] == max(0.0, -1.0 - result.x[:, 0].min())
     assert working_point(model, control)[1] == rest
     assert unknown_load(control) == pytest.approx(0.1 * span)
 

@@ -131,7 +131,11 @@ def test_expressions_go_along(run, tmp_path):
     [
         ({"control": {}}, lambda kit: kit.controller(), "saved without a control problem"),
         ({"process_noise": {}}, lambda kit: kit.observer(), "without process noise for hybrid_observer"),
-        ({"process_noise": {}}, lambda kit: kit.guard(adapt=True), "needs the process noise"),
+        (
+            {"process_noise": {}},
+            lambda kit: kit.guard(adapt=True),
+            "without process noise for hybrid_observer",
+        ),
         ({"causes": {}}, lambda kit: kit.guard(adapt=True), "needs causes"),
         ({}, lambda kit: kit.observer("hybird"), "did you mean 'hybrid'"),
         ({"sensor_sigma": (1.0, 1.0)}, lambda kit: kit.observer(), "needs 1 standard deviations"),

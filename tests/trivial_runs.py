@@ -8,7 +8,7 @@ from pathlib import Path
 
 from hybrid_mpc.studies import Study, run_study, runner
 from hybrid_mpc.studies.draws import generator
-from hybrid_mpc.studies.loops import run_batch
+from hybrid_mpc.studies.inputs import run_batch
 from hybrid_mpc.studies.note import ModelNote, NoiseNote
 
 SCENARIO = "golf_robot"

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.artifact import FILE, Kit, artifact_folder, load
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import ExtendedKalmanFilter
+from hybrid_mpc.estimation.switching import SwitchingFilter
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.mpc import OCP
 from hybrid_mpc.scenario import Plant, Scenario, scenario_of
@@ -85,16 +86,18 @@ def subject_of(request: Request) -> tuple[Subject, tuple[str, ...]]:
     if scenario is None and request.data:
         raise InputError("--data needs --scenario: only it says which columns are which")
     model = next(iter(artifact.models.values()))
-    control = scenario.control if scenario is not None else None
+    if scenario is not None:
+        artifact = artifact.on(scenario)
+    control = artifact.control
     speed = _speed(model, control, request.speed)
-    notes = [f"scenario {name}" if name else "no scenario: no loops, no response of a machine"]
+    notes = [f"scenario {name}" if name else "no scenario: no response of a machine"]
     ocp: OCP | None = None
     filters: dict[tuple[str, str], ExtendedKalmanFilter] = {}
-    if scenario is not None and control is not None and {"prior", "hybrid"} <= set(artifact.models):
+    if control is not None and {"prior", "hybrid"} <= set(artifact.models):
         from hybrid_mpc.assembly import make_ocp
 
         ocp = make_ocp(artifact.models["prior"], control)
-        filters, source = _filters(request, scenario, artifact, control, folder)
+        filters, source = _filters(request, scenario, artifact)
         notes.append(f"filters' noise: {source}")
     subject = Subject(
         artifact.models, load_programs(folder), _range(model, control), _inputs(model, control), speed, ocp, filters,
@@ -154,24 +157,23 @@ def _within(
 
 
 def _filters(
-    request: Request, scenario: Scenario, artifact: Kit, control: OCP, folder: Path
+    request: Request, scenario: Scenario | None, kit: Kit
 ) -> tuple[dict[tuple[str, str], ExtendedKalmanFilter], str]:
     """The observers of the closed loops: while nothing happens, and in the periods after a load came or went."""
-    from hybrid_mpc.assembly import FIRST_LOAD, JUMP_SHARE, QUIET_SHARE
-    from hybrid_mpc.job.contenders import find_noise
+    from hybrid_mpc.assembly import MODES
 
-    names = {"prior": "prior_observer", "hybrid": "hybrid_observer"}
-    noise, source = find_noise(scenario, artifact, tuple(names.values()), request.seed)
-    span = control.input_range
+    source = "the model's own"
+    if scenario is not None:
+        from hybrid_mpc.job.contenders import find_noise
+
+        noise, source = find_noise(scenario, kit, ("prior_observer", "hybrid_observer"), request.seed)
+        kit = kit.with_noise(noise)
     filters = {}
-    for mode, share in (("quiet", QUIET_SHARE), ("jump", JUMP_SHARE)):
-        for name, contender in names.items():
-            model = artifact.models[name]
-            first = np.concatenate([scenario.sensor_sigma, np.full(model.n_x - model.n_y, 0.1)])
-            filters[name, mode] = ExtendedKalmanFilter(
-                model, sigma_y=np.array(scenario.sensor_sigma), sigma_x=noise[contender], sigma_d=share * span,
-                sigma_x0=first, sigma_d0=FIRST_LOAD * span,
-            )  # fmt: skip
+    for mode in ("quiet", "jump"):
+        for name in ("prior", "hybrid"):
+            switching = kit.observer(name)
+            assert isinstance(switching, SwitchingFilter)
+            filters[name, mode] = switching.filters[MODES.index(mode)]
     return filters, source
 
 

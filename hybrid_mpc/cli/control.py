@@ -79,7 +79,7 @@ def control(
     )
     with make_progress() as progress:
         progress.start("reading the model, and the filters' noise")
-        job = prepared(load_scenario(scenario), model, settings)
+        job = prepared(load_scenario(scenario), model, settings, named=scenario)
         progress.finish(job.noise_source)
         results = run_control(job, out, progress, gif=gif)
     for line in summary(results):
@@ -93,15 +93,18 @@ def summary(results: dict[str, Any]) -> list[str]:
     Args:
         results: What results.json holds.
     """
-    lines = [f"{'task':16} {'controller':16} {'cost':>10} {'95 %':>10} {'RMSE [rad]':>11} {'solved':>8}"]
+    first = next(iter(results["loops"][0]["tracking_rmse"]))
+    width = max(len(first) + 5, 11)
+    head = f"{'RMSE ' + first:>{width}}"
+    lines = [f"{'task':16} {'controller':16} {'cost':>10} {'95 %':>10} {head} {'solved':>8}"]
     for task, row in results["summary"].items():
         for name, cell in row.items():
-            cost, rmse = cell["cost"], cell["tracking_rmse_rad"]["mean"]
+            cost, rmse = cell["cost"], cell["tracking_rmse"][first]["mean"]
             lines.append(
                 f"{task:16} {name:16} {_number(cost['mean']):>10} {_number(cost['ci95'], '±'):>10} "
-                f"{_number(rmse):>11} {100 * cell['sources']['MPC']:>6.1f} %"
+                f"{_number(rmse):>{width}} {100 * cell['sources']['MPC']:>6.1f} %"
             )
-    lines += [line for row in results["loops"] if "guard" in row for line in _guarded(row)]
+    lines += [line for row in results["loops"] if results["reaction"] for line in _guarded(row)]
     for name, times in results["step_ms"].items():
         lines.append(
             f"a step of {name}: median {times['median']:.2f} ms, 99 % within {times['p99']:.2f} ms, period "
@@ -112,13 +115,12 @@ def summary(results: dict[str, Any]) -> list[str]:
 
 def _guarded(row: dict[str, Any]) -> list[str]:
     """What the guard of one loop saw and did."""
-    found = row["guard"]
-    blind = found["not_judged_s"]
+    blind = row["not_judged_s"]
     dark = f"; not judged: {blind:.2f} s" if blind else ""
-    if not found["alarms"]:
+    if not row["alarms"]:
         return [f"guard, {row['task']}, seed {row['seed']}: no alarm{dark}"]
-    when = ", ".join(f"{a['start_s']:.2f} to {a['end_s']:.2f} s" for a in found["alarms"])
-    modes = "".join(f"; {s['after'].lower()} from {s['t_s']:.2f} s on" for s in found["switches"])
+    when = ", ".join(f"{a['start_s']:.2f} to {a['end_s']:.2f} s" for a in row["alarms"])
+    modes = "".join(f"; {s['after'].lower()} from {s['t_s']:.2f} s on" for s in row["switches"])
     return [f"guard, {row['task']}, seed {row['seed']}: alarm {when}{modes}{dark}"]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -83,15 +84,17 @@ def summary(results: dict[str, object]) -> list[str]:
     identification, control = results["identification"], results["control"]
     assert isinstance(identification, dict)
     assert isinstance(control, dict)
-    lines = ["free runs on unseen data:    E_sim      RMSE [rad]   energy violation [W]"]
+    known = [errors for errors in identification["rmse"].values() if isinstance(errors, dict)]
+    signal = next(iter(known[0])) if known else "output"
+    lines = [f"free runs on unseen data:    E_sim      RMSE {signal}   energy violation [W]"]
     for name, e_sim in identification["e_sim_s"].items():
-        rmse, energy = identification["rmse_rad"][name], identification["energy_violation_w"][name]
-        lines.append(f"  {name:22} {_number(e_sim)} {_number(rmse)} {_number(energy)}")
+        rmse, balance = identification["rmse"][name], identification["balance_violation"][name]
+        lines.append(f"  {name:22} {_number(e_sim)} {_number(rmse)} {_number(balance)}")
     for name in ("prior", "hybrid", "oracle"):
         loop = control[name]
         if loop["cost"] is not None:
             lines.append(
-                f"closed loop, {name:8} cost {loop['cost']:.4g}, tracking {loop['tracking_rmse_rad']:.4g} rad"
+                f"closed loop, {name:8} cost {loop['cost']:.4g}, tracking {tracking(loop['tracking_rmse'])}"
             )
     monitor = results["monitor"]
     assert isinstance(monitor, dict)
@@ -99,6 +102,21 @@ def summary(results: dict[str, object]) -> list[str]:
         lines.append(f"energy monitor: {monitor['reason']}")
     lines += guard_lines(results["guard"])
     return lines
+
+
+def tracking(errors: Mapping[str, float]) -> str:
+    """The first tracking error with its signal's unit.
+
+    Args:
+        errors: By signal with unit.
+
+    Example:
+        >>> tracking({"phi [rad]": 0.01234, "phi_dot [rad/s]": 0.5})
+        'phi 0.01234 rad'
+    """
+    label, value = next(iter(errors.items()))
+    name, _, unit = label.partition(" ")
+    return f"{name} {value:.4g} {unit.strip('[]')}"
 
 
 def guard_lines(guard: Any) -> list[str]:
@@ -120,4 +138,6 @@ def guard_lines(guard: Any) -> list[str]:
 
 
 def _number(value: object) -> str:
+    if isinstance(value, Mapping):
+        value = next(iter(value.values()))
     return f"{value:12.4g}" if isinstance(value, float) else f"{value!s:>12}"

@@ -46,6 +46,9 @@ class ClosedLoopResult:
         alarm: ``(n,)``, True while the monitor alarms.
         switches: Changes of the guard's mode, in their order. Default: none.
         judged: ``(n,)``, True where the monitor could judge the period. Default: unknown.
+        innovation: Innovations of the estimator ``(n, n_y)`` [output units]; NaN where it had none. Default: unknown.
+        nis: Normalised innovations squared ``(n,)`` [-]; NaN where there was none. Default: unknown.
+        numbers: The monitor's readings as numbers ``(n, columns)``, from which detectors are learned. Default: none.
 
     Example:
         >>> one = np.ones((2, 1))
@@ -74,6 +77,9 @@ class ClosedLoopResult:
     alarm: NDArray[np.bool_]
     switches: tuple[Switch, ...] = ()
     judged: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    innovation: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    nis: Array = field(default_factory=lambda: np.zeros(0))
+    numbers: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def mode(self) -> tuple[str, ...]:

@@ -6,17 +6,21 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.closed_loop.faults import Fault, check_channels, install
-from hybrid_mpc.closed_loop.guard import Guard, Switch
+from hybrid_mpc.closed_loop.guard import Guard
 from hybrid_mpc.closed_loop.loop import TIMED, Loop, Monitor, Reading, preview_of
 from hybrid_mpc.closed_loop.machine import Machine, Preview, Previews, fitting
 from hybrid_mpc.closed_loop.result import ClosedLoopResult
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimation.bank import FilterBank
 from hybrid_mpc.estimation.kalman import Estimate, Estimator
+from hybrid_mpc.estimation.switching import SwitchingFilter
+from hybrid_mpc.model import HybridModel
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.problem import Controller
 from hybrid_mpc.mpc.safeguard import Decision, SafeController
@@ -104,42 +108,206 @@ def simulate(
         result = simulate(plant, ekf, controller, task.reference, weight=task.weight, dt=0.02,
                           duration=task.duration, x0=task.x0, seed=0)
     """
-    loop = Loop(
-        estimator, controller, monitor=monitor, reference=reference, weight=weight, guard=guard, horizon=horizon,
-        end=_end(dt, duration, estimator.model.dt), input_delay=input_delay, sensor_delay=sensor_delay,
+    run = Simulation(
+        plant, estimator, controller, reference, dt=dt, duration=duration, x0=x0, seed=seed, weight=weight,
+        horizon=horizon, monitor=monitor, faults=faults, stage_cost=stage_cost, on_step=on_step,
+        sensor_delay=sensor_delay, input_delay=input_delay, late=late, guard=guard,
     )  # fmt: skip
-    ocp, model, n = loop.ocp, loop.model, round(duration / dt)
-    plant, faults = install(plant, faults)
-    check_channels(faults, model.n_y, ocp.n_u)
-    cost = _checked_cost(ocp, ocp if stage_cost is None else stage_cost)
-    previews = Previews(preview_of(reference, ocp), weight, ocp, horizon, dt, n * dt)
-    machine = Machine(
-        plant, vector(x0, ocp.n_x, "x0"), seed, model.n_y, faults, dt, sensor_delay, input_delay
-    )
-    record = _Record(dt)
-    for k in range(n):
-        t = k * dt
-        x = fitting(plant.truth(machine.state), ocp.n_x, "the plant's truth")
-        y = machine.measure(t)
-        truth = np.concatenate([x, plant.hidden(machine.state)])
-        in_time = None if late is None else partial(_is_in_time, late, t)
-        if k == 0:
-            loop.start(y, truth=truth, in_time=in_time)
+    for _ in range(run.periods):
+        run.measure()
+        run.go_on()
+    return run.result()
+
+
+class Simulation:
+    """A plant in a loop, a period at a time: what :func:`simulate` drives, and what drives several side by side.
+
+    Args: as :func:`simulate`.
+
+    Example: ``run = Simulation(plant, ekf, controller, [0.0, 0.0], dt=0.02, duration=1.0, x0=[0.0, 0.0], seed=0)``
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        estimator: Estimator,
+        controller: SafeController | Controller,
+        reference: Preview | ArrayLike,
+        *,
+        dt: float,
+        duration: float,
+        x0: ArrayLike,
+        seed: int,
+        weight: Preview | None = None,
+        horizon: int | None = None,
+        monitor: Monitor | None = None,
+        faults: Sequence[Fault] = (),
+        stage_cost: OCP | None = None,
+        on_step: Callable[[Step], None] | None = None,
+        sensor_delay: int = 0,
+        input_delay: int = 0,
+        late: Callable[[float], bool] | None = None,
+        guard: Guard | None = None,
+    ) -> None:
+        self.loop = loop = Loop(
+            estimator, controller, monitor=monitor, reference=reference, weight=weight, guard=guard, horizon=horizon,
+            end=_end(dt, duration, estimator.model.dt), input_delay=input_delay, sensor_delay=sensor_delay,
+        )  # fmt: skip
+        ocp, model = loop.ocp, loop.model
+        self.periods, self._dt, self._k = round(duration / dt), dt, 0
+        self._plant, faults = install(plant, faults)
+        check_channels(faults, model.n_y, ocp.n_u)
+        self._cost = _checked_cost(ocp, ocp if stage_cost is None else stage_cost)
+        end = self.periods * dt
+        acting = Previews(preview_of(reference, ocp), weight, ocp, horizon, dt, end)
+        self._acting = acting if input_delay else None
+        rest = vector(x0, ocp.n_x, "x0")
+        self._machine = Machine(self._plant, rest, seed, model.n_y, faults, dt, sensor_delay, input_delay)
+        self._late, self._on_step = late, on_step
+        self._rows: list[_Row] = []
+        self._x, self.y = rest, np.full(model.n_y, np.nan)
+
+    @property
+    def held(self) -> Array:
+        """Input ``(n_u,)`` that the controller has given for the period before the one in hand."""
+        return self.loop.decision.u
+
+    def measure(self) -> Array:
+        """The sample ``(n_y,)`` of the period that begins."""
+        self._x = fitting(self._plant.truth(self._machine.state), self.loop.ocp.n_x, "the plant's truth")
+        self.y = self._machine.measure(self._k * self._dt)
+        return self.y
+
+    def go_on(self) -> None:
+        """Decide on the sample, hold the input for a period, and note what happened."""
+        loop, machine, t = self.loop, self._machine, self._k * self._dt
+        truth = np.concatenate([self._x, self._plant.hidden(machine.state)])
+        in_time = None if self._late is None else partial(_is_in_time, self._late, t)
+        if self._k == 0:
+            loop.start(self.y, truth=truth, in_time=in_time)
             machine.rest(loop.state.held[0])
         else:
-            loop.step(y, truth=truth, in_time=in_time)
+            loop.step(self.y, truth=truth, in_time=in_time)
         u, u_prev = machine.command(loop.decision.u)
         loop.finish()
-        x_ref, factors = previews(t) if input_delay else loop.previewed
+        x_ref, factors = loop.previewed if self._acting is None else self._acting(t)
         now_factors = 1.0 if factors is None else factors[0]
         with np.errstate(over="ignore", invalid="ignore"):  # an absurd reference costs infinitely much
-            stage = float(cost.stage_cost(x, u, x_ref[0, : x.size], u - u_prev, now_factors))
-        step = Step(k, t, x, y, loop.estimate, loop.decision, loop.reading)
-        record.add(step, x_ref[0, : x.size], stage, loop.spent)
-        if on_step is not None:
-            on_step(step)
+            stage = float(
+                self._cost.stage_cost(self._x, u, x_ref[0, : self._x.size], u - u_prev, now_factors)
+            )
+        step = Step(self._k, t, self._x, self.y, loop.estimate, loop.decision, loop.reading)
+        self._rows.append(_row(step, x_ref[0, : self._x.size].copy(), stage, loop.spent))
+        if self._on_step is not None:
+            self._on_step(step)
         machine.advance(t)
-    return record.result(loop.switches)
+        self._k += 1
+
+    def result(self) -> ClosedLoopResult:
+        """The record of the periods until now."""
+        rows = self._rows
+        readings = [row.reading for row in rows]
+        timing = {name: 1e3 * np.array([row.spent[name] for row in rows]) for name in TIMED}
+        return ClosedLoopResult(
+            dt=self._dt,
+            **{name: np.array([getattr(row, name) for row in rows]) for name in COLUMNS},
+            source=tuple(row.source for row in rows),
+            status=tuple(row.status for row in rows),
+            timing_ms={**timing, "total": np.sum(list(timing.values()), axis=0)},
+            violation=np.array([np.nan if r is None else r.violation_w for r in readings]),
+            level=np.array([np.nan if r is None else r.level_w for r in readings]),
+            alarm=np.array([r is not None and bool(r.alarm) for r in readings]),
+            judged=np.array([r is not None and not getattr(r, "verdict", 0) for r in readings]),
+            switches=self.loop.switches,
+            numbers=np.array([getattr(r, "numbers", ()) for r in readings], dtype=np.float64),
+        )
+
+
+def simulate_together(
+    estimator: Estimator, make: Sequence[Callable[[Estimator], Simulation]]
+) -> list[Simulation]:
+    """Run simulations of one estimator and length side by side; each is what it is alone, to rounding.
+
+    Switching filters go through each operation together, which is quicker; other estimators take turns.
+
+    Args:
+        estimator: The estimator of all.
+        make: Makes each simulation with the estimator that it is handed.
+
+    Returns:
+        The simulations at their end.
+
+    Example: ``simulate_together(ekf, [lambda e, s=s: Simulation(plant, e, mpc, ref, seed=s, ...) for s in range(9)])``
+    """
+    if not isinstance(estimator, SwitchingFilter):
+        runs = [one(estimator) for one in make]
+        for run in runs:
+            for _ in range(run.periods):
+                run.measure()
+                run.go_on()
+        return runs
+    told = [_Told(estimator.model) for _ in make]
+    runs = [one(each) for one, each in zip(make, told, strict=True)]
+    bank = None
+    for _ in range(runs[0].periods):
+        y = np.array([run.measure() for run in runs])
+        if bank is None:
+            bank = FilterBank(estimator, y)
+            estimates = bank.estimates(np.full_like(y, np.nan), np.full(len(y), np.nan))
+        else:
+            estimates = bank.update(y, np.array([run.held for run in runs]))
+        for run, each, estimate in zip(runs, told, estimates, strict=True):
+            each.estimate = estimate
+            run.go_on()
+    return runs
+
+
+class _Told:
+    """An estimator whose estimates come from a bank of filters."""
+
+    def __init__(self, model: HybridModel) -> None:
+        self.model = model
+        self.estimate: Estimate | None = None
+
+    def start(self, y: ArrayLike, t: float = 0.0) -> Estimate:
+        assert self.estimate is not None
+        return self.estimate
+
+    def update(self, estimate: Estimate, y: ArrayLike, u: ArrayLike) -> Estimate:
+        assert self.estimate is not None
+        return self.estimate
+
+
+class _Row(NamedTuple):
+    """What is kept of a period; plans and covariances, which a long run has no room for, are not."""
+
+    t: float
+    x: Array
+    y: Array
+    u: Array
+    x_hat: Array
+    h: Array
+    d: Array
+    reference: Array
+    stage_cost: float
+    innovation: Array
+    nis: float
+    source: str
+    status: str
+    reading: Reading | None
+    spent: Mapping[str, float]
+
+
+COLUMNS = _Row._fields[:11]
+"""Those that are numbers."""
+
+
+def _row(step: Step, reference: Array, stage: float, spent: Mapping[str, float]) -> _Row:
+    e, d = step.estimate, step.decision
+    return _Row(
+        step.t, step.x, step.y, d.u, e.x, e.h, e.d, reference, stage, e.innovation, e.nis, d.source.name,
+        d.status.name, step.reading, spent,
+    )  # fmt: skip
 
 
 def _is_in_time(late: Callable[[float], bool], t: float) -> bool:
@@ -167,39 +335,3 @@ def _end(dt: float, duration: float, period: float) -> float:
     if round(duration / dt) < 1:
         raise InputError(f"duration {duration} s is shorter than one period of {dt} s")
     return round(duration / dt) * dt
-
-
-class _Record:
-    """Collects the rows of one simulation."""
-
-    def __init__(self, dt: float) -> None:
-        self._dt = dt
-        self._rows: list[tuple[Step, Array, float, Mapping[str, float]]] = []
-
-    def add(self, step: Step, reference: Array, stage: float, spent: Mapping[str, float]) -> None:
-        self._rows.append((step, reference, stage, spent))
-
-    def result(self, switches: tuple[Switch, ...]) -> ClosedLoopResult:
-        steps = [row[0] for row in self._rows]
-        readings = [step.reading for step in steps]
-        timing = {name: 1e3 * np.array([row[3][name] for row in self._rows]) for name in TIMED}
-        return ClosedLoopResult(
-            dt=self._dt,
-            t=np.array([step.t for step in steps]),
-            x=np.array([step.x for step in steps]),
-            y=np.array([step.y for step in steps]),
-            u=np.array([step.decision.u for step in steps]),
-            x_hat=np.array([step.estimate.x for step in steps]),
-            h=np.array([step.estimate.h for step in steps]),
-            d=np.array([step.estimate.d for step in steps]),
-            reference=np.array([row[1] for row in self._rows]),
-            source=tuple(step.decision.source.name for step in steps),
-            status=tuple(step.decision.status.name for step in steps),
-            stage_cost=np.array([row[2] for row in self._rows]),
-            timing_ms={**timing, "total": np.sum(list(timing.values()), axis=0)},
-            violation=np.array([np.nan if r is None else r.violation_w for r in readings]),
-            level=np.array([np.nan if r is None else r.level_w for r in readings]),
-            alarm=np.array([r is not None and bool(r.alarm) for r in readings]),
-            judged=np.array([r is not None and not getattr(r, "verdict", 0) for r in readings]),
-            switches=switches,
-        )

@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,9 @@ from hybrid_mpc.artifact import Kit
 from hybrid_mpc.assembly import make_controller, make_estimator, make_ocp, tuned_noise
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation import TrueState, process_noise
+from hybrid_mpc.estimation.kalman import Estimator
 from hybrid_mpc.mpc import OCP, BestOf, CondensedController, SafeController, SQPController
+from hybrid_mpc.records import known
 from hybrid_mpc.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -59,38 +61,36 @@ LEAST_NOISE: Mapping[str, str] = {"hybrid": "prior", "hybrid_observer": "prior_o
 
 
 def build(
-    name: str, scenario: Scenario, artifact: Kit, control: OCP, noise: Mapping[str, Array]
-) -> tuple[Any, SafeController]:
+    name: str, scenario: Scenario, kit: Kit, control: OCP, *, solver: str = "rti"
+) -> tuple[Estimator, SafeController]:
     """Estimator and controller of a contender.
 
     Args:
         name: Name in :data:`CONTENDERS`.
         scenario: The machine, with its oracle if that is asked for.
-        artifact: Prior and hybrid.
+        kit: Prior and hybrid, and the process noise of the contender's filter.
         control: The task's control problem.
-        noise: Process noise by contender, see :func:`noise_of`.
+        solver: Name in :data:`~hybrid_mpc.assembly.SOLVERS`; oracles have their own.
 
     Raises:
-        InputError: If there is no such contender, or the scenario has no oracle.
+        InputError: If there is no such contender, the scenario has no oracle, or the kit no noise.
     """
-    if name not in CONTENDERS:
-        raise InputError(f"no controller {name!r}; there are: {', '.join(CONTENDERS)}")
-    c, prior = CONTENDERS[name], artifact.models["prior"]
+    c, prior = CONTENDERS[known(name, CONTENDERS, "controller")], kit.models["prior"]
     if c.model != "oracle":
-        model = artifact.models[c.model]
-        estimator = make_estimator(model, scenario, noise[name], control, observer=c.observer)
-        return estimator, make_controller(model, prior, control)
+        model = kit.models[c.model]
+        estimator = make_estimator(model, kit, kit.noise(name), control, observer=c.observer)
+        return estimator, make_controller(model, prior, control, solver=solver)
     if scenario.oracle is None:
         raise InputError(f"scenario {scenario.name} has no oracle")
     model = scenario.oracle(prior.dt)
     ocp = make_ocp(prior, control)
-    rivals = [CondensedController(artifact.models[m], ocp) for m in ("prior", "hybrid")]
+    rivals = [CondensedController(kit.models[m], ocp) for m in ("prior", "hybrid")]
     best = BestOf(SQPController(model, ocp, iterations=ORACLE_ITERATIONS), rivals=rivals, most=1)
     first = BestOf(SQPController(model, ocp, iterations=FIRST_ITERATIONS), starts=ocp.starts, rivals=rivals)
     safe = SafeController(best, prior, first=first)
     if c.truth:
         return TrueState(model), safe
-    return make_estimator(model, scenario, noise[name], control, observer=c.observer), safe
+    return make_estimator(model, kit, kit.noise(name), control, observer=c.observer), safe
 
 
 def noise_of(scenario: Scenario, artifact: Kit, recordings: Sequence[Trajectory]) -> dict[str, Array]:
@@ -158,12 +158,9 @@ def find_noise(
         ``noise, source = find_noise(scenario, hm.load("runs/golf"), ("hybrid_observer",), 0)``
     """
     needed = [name for name in controllers if not CONTENDERS[name].truth]
-    own = {name: np.array(values) for name, values in artifact.loop.process_noise.items()}
-    if set(needed) <= set(own):
-        n_x = artifact.models["prior"].n_x
-        if wrong := [name for name in needed if own[name].shape != (n_x,)]:
-            raise InputError(f"the model's process noise of {wrong[0]} must be {n_x} numbers; train it anew")
-        return no_surer_than_prior(scenario, own), "the model's own"
+    held = artifact.loop.process_noise
+    if set(needed) <= set(held):
+        return no_surer_than_prior(scenario, {name: artifact.noise(name) for name in held}), "the model's own"
     if not needed:
         return {}, "no filter"
     if not any(name in ORACLES for name in needed):

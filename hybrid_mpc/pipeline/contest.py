@@ -1,48 +1,31 @@
-"""The closed loops of a scenario: every task under every contender, several seeds each."""
+"""The closed loops of a run: every task under every contender, several seeds each."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.artifact import Kit, load
-from hybrid_mpc.assembly import make_monitor
-from hybrid_mpc.closed_loop import ClosedLoopResult, simulate
+from hybrid_mpc.artifact import load
 from hybrid_mpc.closed_loop.simulate import Step
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.input_limits import share_used
-from hybrid_mpc.job.contenders import CONTENDERS, ORACLES, build
-from hybrid_mpc.mpc import OCP
+from hybrid_mpc.job.contenders import CONTENDERS, ORACLES
+from hybrid_mpc.job.loops import Bench, LoopRow, LoopSpec, tasks_of
 from hybrid_mpc.pipeline.context import Context
+from hybrid_mpc.pipeline.control_job import MODEL
 from hybrid_mpc.pipeline.parallel import WORKERS, run_jobs
+from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import Budget, Scenario, Task, load_scenario
 
 Array = NDArray[np.float64]
 TIMED = ("prior_observer", "hybrid_observer")
 """Contenders whose first seed runs alone on the machine, so that the durations of its steps count."""
 SHOWN = ("t", "x", "u", "reference")
-
-
-def tasks_of(scenario: Scenario, names: tuple[str, ...] | None) -> tuple[Task, ...]:
-    """The scenario's tasks of these names, all for None.
-
-    Raises:
-        InputError: If there is no task of a name.
-    """
-    if names is None:
-        return scenario.tasks
-    known = {task.name: task for task in scenario.tasks}
-    missing = [name for name in names if name not in known]
-    if missing:
-        raise InputError(
-            f"scenario {scenario.name}: no task {', '.join(missing)}; there are: {', '.join(known)}"
-        )
-    return tuple(known[name] for name in names)
+"""What is kept of the first seed, to be drawn."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +49,17 @@ class Part:
         """Name of its checkpoint."""
         return f"loops/{self.task.name}-{self.controller}-{self.seeds[0]}"
 
+    def specs(self, scenario: str, run_seed: int) -> list[LoopSpec]:
+        """Its loops."""
+        first = (*SHOWN, "step_ms", "plans") if self.timed else SHOWN
+        return [
+            LoopSpec(
+                scenario, MODEL, self.task.name, self.controller, seed=seed, run_seed=run_seed,
+                keep=first if seed == 0 else (),
+            )
+            for seed in self.seeds
+        ]  # fmt: skip
+
 
 def parts_of(scenario: Scenario, budget: Budget) -> list[Part]:
     """All loops of a budget, in the order in which they run: the timed ones, then the slow ones first."""
@@ -82,83 +76,34 @@ def parts_of(scenario: Scenario, budget: Budget) -> list[Part]:
     return parts
 
 
-def contest(
-    context: Context, artifact: Kit, control: OCP, noise: Mapping[str, Array]
-) -> tuple[list[dict[str, Any]], dict[str, Array]]:
-    """Run all loops; the timed ones alone, the others side by side in processes.
+def contest(context: Context) -> list[LoopRow]:
+    """Run all loops on the run's model; the timed ones alone, the others side by side in processes.
 
     Every part is kept as it ends; what a run that was killed has kept is not run again.
 
     Args:
-        context: The run.
-        artifact: Prior and hybrid.
-        control: The scenario's control problem; a task may have its own.
-        noise: Process noise by contender.
+        context: The run; its artifact holds the filters' process noise.
 
     Returns:
-        One row a loop (task, controller, seed, cost, tracking error, share of solved steps, the task's own
-        figures), and arrays: time series of the first seed, durations of the timed steps.
+        The rows by task, controller and seed; of the first seed with ``SHOWN``, of a timed one with ``step_ms`` and
+        ``plans``.
     """
-    parts = parts_of(context.scenario, context.budget)
-    common = context.settings.scenario, context.out / "model", dict(noise), context.settings.seed
+    parts, settings = parts_of(context.scenario, context.budget), context.settings
+    common = settings.scenario, context.out / "model"
     missing = [part for part in parts if not context.done(part.stage)]
     timed = [part for part in missing if part.timed]
     for i, part in enumerate(timed):
         context.progress.update("timed loops", i, len(timed), f"{part.task.name}, {part.controller}")
-        context.save(part.stage, *_kept(*common, part.task.name, part.controller, part.seeds, True))
+        keep(context, part.stage, run_specs(*common, part.specs(settings.scenario, settings.seed)))
     jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
-        part.stage: (_kept, (*common, part.task.name, part.controller, part.seeds, False))
+        part.stage: (run_specs, (*common, part.specs(settings.scenario, settings.seed)))
         for part in missing
         if not part.timed
     }
-    run_jobs(jobs, context.progress.update, WORKERS, lambda stage, kept: context.save(stage, *kept))
-    rows: list[dict[str, Any]] = []
-    arrays: dict[str, Array] = {}
-    for part in parts:
-        rows += context.result(part.stage)["rows"]
-        arrays |= context.arrays(part.stage)
+    run_jobs(jobs, context.progress.update, WORKERS, lambda stage, rows: keep(context, stage, rows))
+    rows = [row for part in parts for row in kept(context, part.stage)]
     order = [task.name for task in tasks_of(context.scenario, context.budget.tasks)]
-    return sorted(rows, key=lambda r: (order.index(r["task"]), r["controller"], r["seed"])), arrays
-
-
-def _kept(
-    scenario_name: str,
-    folder: Path,
-    noise: Mapping[str, Array],
-    run_seed: int,
-    task_name: str,
-    name: str,
-    seeds: tuple[int, ...],
-    timed: bool,
-    report: Callable[[int, int, str], None] = lambda done, total, text: None,
-) -> tuple[dict[str, Any], dict[str, Array]]:
-    """What is kept of the loops of a part: a row each, and time series of the first seed."""
-    scenario = load_scenario(scenario_name)
-    (task,) = tasks_of(scenario, (task_name,))
-    control = task.control or scenario.control
-    assert control is not None
-    plans: list[Array] = []
-    results = loops(
-        scenario_name,
-        folder,
-        noise,
-        run_seed,
-        task_name,
-        name,
-        seeds,
-        report,
-        plans.append if timed else None,
-    )
-    rows = [_row(task, control, name, seed, r) for seed, r in zip(seeds, results, strict=True)]
-    arrays: dict[str, Array] = {}
-    if seeds[0] == 0:
-        arrays |= {f"{task_name}/{name}/{key}": getattr(results[0], key) for key in SHOWN}
-    if timed:
-        arrays |= {
-            f"{task_name}/{name}/step_ms": results[0].timing_ms["total"],
-            f"{task_name}/{name}/plans": np.stack(plans),
-        }
-    return {"rows": rows}, arrays
+    return sorted(rows, key=lambda row: (order.index(row.task), row.controller, row.seed))
 
 
 def _seeds(name: str, scenario: Scenario, seeds: int, oracle_seeds: int) -> int:
@@ -168,85 +113,75 @@ def _seeds(name: str, scenario: Scenario, seeds: int, oracle_seeds: int) -> int:
     return 0 if scenario.oracle is None else (oracle_seeds if name == "oracle" else min(1, oracle_seeds // 2))
 
 
-def limits_used(control: OCP, r: ClosedLoopResult) -> dict[str, float]:
-    """Largest share of the way from rest to each limit that a loop used: 1 is the limit, more a violation.
-
-    Args:
-        control: The problem with the limits.
-        r: The loop; states are the plant's true ones.
-
-    Returns:
-        ``u``, and ``du`` and ``x[i]`` where there are such limits [-].
-    """
-    used = {"u": share_used(r.u, control.u_min, control.u_max)}
-    if control.du_max is not None:
-        du = np.diff(r.u, axis=0, prepend=control.rest_input[None])
-        used["du"] = float(np.max(np.abs(du) / control.du_max))
-    for i in np.flatnonzero(np.isfinite(control.x_min) | np.isfinite(control.x_max)):
-        used[f"x[{i}]"] = share_used(r.x[:, i], control.x_min[i], control.x_max[i])
-    return used
-
-
-def _row(task: Task, control: OCP, name: str, seed: int, r: ClosedLoopResult) -> dict[str, Any]:
-    return {
-        "task": task.name,
-        "controller": name,
-        "seed": seed,
-        "cost": r.cost,
-        "tracking_rmse_rad": r.tracking_rmse,
-        "solved": r.source.count("MPC") / len(r.source),
-        "limits": limits_used(control, r),
-        "figures": task.figures(r) if task.figures is not None else {},
-    }
-
-
-def loops(
-    scenario_name: str,
+def run_specs(
+    scenario: str,
     folder: Path,
-    noise: Mapping[str, Array],
-    run_seed: int,
-    task_name: str,
-    name: str,
-    seeds: tuple[int, ...],
+    specs: list[LoopSpec],
     report: Callable[[int, int, str], None] = lambda done, total, text: None,
-    on_plan: Callable[[Array], None] | None = None,
-) -> list[ClosedLoopResult]:
-    """Loops of one task and contender; all contenders share problem, period, horizon and safeguards.
+) -> list[LoopRow]:
+    """Rows of loops on a run's own model.
 
     Args:
-        scenario_name: Name or path of the scenario.
+        scenario: Name or path of the scenario.
         folder: The artifact.
-        noise: Process noise by contender.
-        run_seed: Seed of the run.
-        task_name: Task.
-        name: Contender.
-        seeds: Numbers of the loops; same number, same sensor noise for every contender.
+        specs: The loops.
         report: Called with ``(done, total, text)`` as the loops go on.
-        on_plan: Called with the planned states ``(N + 1, n_x)`` of every period. Default: none.
     """
-    scenario, artifact = load_scenario(scenario_name), load(folder)
-    (task,) = tasks_of(scenario, (task_name,))
-    assert scenario.plant is not None
-    control = task.control or scenario.control
-    assert control is not None
-    estimator, controller = build(name, scenario, artifact, control, noise)
-    dt = artifact.models["prior"].dt
-    periods, results = round(task.duration / dt), []
+    bench, rows = _bench(scenario, folder, (folder / "model.json").stat().st_mtime_ns), []
+    dt = bench.kits[MODEL].models["prior"].dt
+    lengths = [round(bench.task(spec).duration / dt) for spec in specs]
+    for i, spec in enumerate(specs):
+        before = sum(lengths[:i])
 
-    def on_step(step: Step, i: int) -> None:
-        if on_plan is not None:
-            on_plan(step.decision.solution.x)
-        if step.k % 50 == 0:
-            report(i * periods + step.k, len(seeds) * periods, "periods")
+        def on_step(step: Step, before: int = before) -> None:
+            if step.k % 50 == 0:
+                report(before + step.k, sum(lengths), "periods")
 
-    for i, seed in enumerate(seeds):
-        results.append(
-            simulate(
-                scenario.plant(), estimator, controller, task.reference, weight=task.weight,
-                dt=dt, duration=task.duration, x0=np.array(task.x0), seed=run_seed * 1000 + seed,
-                monitor=make_monitor(artifact.models["hybrid"], None) if CONTENDERS[name].model == "hybrid" else None,
-                faults=task.faults,
-                on_step=lambda step, i=i: on_step(step, i),  # type: ignore[misc]
-            )
-        )  # fmt: skip
-    return results
+        rows.append(bench.run(spec, on_step=on_step)[0])
+    return rows
+
+
+@lru_cache(maxsize=1)
+def _bench(scenario: str, folder: Path, changed: int) -> Bench:
+    """A bench with a run's model, as the folder was when it ``changed``."""
+    return Bench(load_scenario(scenario), {MODEL: load(folder)})
+
+
+def keep(context: Context, stage: str, rows: list[LoopRow]) -> None:
+    """Write rows as a checkpoint.
+
+    Args:
+        context: The run.
+        stage: Name of the checkpoint.
+        rows: The loops.
+    """
+    context.save(stage, {"rows": [plain(replace(row, arrays={})) for row in rows]}, arrays_of(rows))
+
+
+def kept(context: Context, stage: str) -> list[LoopRow]:
+    """Rows that :func:`keep` wrote.
+
+    Args:
+        context: The run.
+        stage: Name of the checkpoint.
+
+    Raises:
+        InputError: If the checkpoint is damaged.
+    """
+    rows = [record(LoopRow, row, f"checkpoints/{stage}.json") for row in context.result(stage)["rows"]]
+    arrays = context.arrays(stage)
+    return [replace(row, arrays=_own(arrays, row)) for row in rows]
+
+
+def arrays_of(rows: list[LoopRow]) -> dict[str, Array]:
+    """The arrays of rows by ``task/controller/seed/name``."""
+    return {f"{_place(row)}/{name}": values for row in rows for name, values in row.arrays.items()}
+
+
+def _own(arrays: Mapping[str, Array], row: LoopRow) -> dict[str, Array]:
+    start = f"{_place(row)}/"
+    return {key.removeprefix(start): values for key, values in arrays.items() if key.startswith(start)}
+
+
+def _place(row: LoopRow) -> str:
+    return f"{row.task}/{row.controller}/{row.seed}"

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hybrid_mpc.artifact import Kit, load
 from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
 from hybrid_mpc.errors import InputError
@@ -156,16 +156,10 @@ class Context:
         """Note that a stage could not run, and why: those after it go on without, and the report says so."""
         self.save(stage, {"reason": why, "failed": True}, {})
 
-    def sigma_x(self, contender: str) -> NDArray[np.float64]:
-        """Process noise ``(n_x,)`` of a contender's filter, which stage control has found.
-
-        Raises:
-            InputError: If that stage could not run.
-        """
-        control = self.result("control")
-        if "sigma_x" not in control:
-            raise InputError(f"the filters have no process noise, for {control['reason']}")
-        return np.array(control["sigma_x"][contender])
+    @property
+    def kit(self) -> Kit:
+        """The run's artifact as it is now, with the control problems that the scenario now states."""
+        return load(self.out / "model").on(self.scenario)
 
     def done(self, stage: str) -> bool:
         """Whether a stage's result is there."""

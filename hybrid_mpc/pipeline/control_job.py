@@ -7,40 +7,27 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.artifact import Kit, artifact_folder, load
-from hybrid_mpc.assembly import (
-    REACTIONS,
-    adaptable,
-    freezing,
-    make_adaptive_guard,
-    make_monitor,
-    make_resting_guard,
-)
-from hybrid_mpc.closed_loop import ClosedLoopResult, Fault, Guard, simulate
-from hybrid_mpc.closed_loop.faults import check_channels, install
+from hybrid_mpc.assembly import SOLVERS, adaptable
+from hybrid_mpc.closed_loop import ClosedLoopResult, Fault
 from hybrid_mpc.closed_loop.simulate import Step
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.job.contenders import CONTENDERS, ORACLES, build, find_noise
-from hybrid_mpc.model import HybridModel
-from hybrid_mpc.monitor import EnergyMonitor, guard_monitor
-from hybrid_mpc.mpc import OCP, Controller, IpoptController, SafeController, SQPController
-from hybrid_mpc.pipeline.faulted_loops import stored_detector
-from hybrid_mpc.pipeline.monitor_job import stored_rest
+from hybrid_mpc.job.contenders import CONTENDERS, ORACLES, find_noise
+from hybrid_mpc.job.loops import Bench, LoopRow, LoopSpec, check_complete, check_faults
+from hybrid_mpc.mpc import OCP
 from hybrid_mpc.scenario import Scenario, Task
 
 Array = NDArray[np.float64]
 DEFAULT_CONTROLLERS = ("prior_observer", "hybrid_observer")
 GUARDED_CONTROLLERS = ("hybrid_observer",)
-SOLVERS: Mapping[str, Callable[[HybridModel, OCP], Controller] | None] = {
-    "rti": None,  # what the contenders are built with
-    "sqp": lambda model, ocp: SQPController(model, ocp),
-    "ipopt": lambda model, ocp: IpoptController(model, ocp),
-}
+MODEL = "model"
+"""Label of the model on the bench."""
+REACTIONS = ("rest", "adapt")
+"""What ``hybrid-mpc control --guard`` and ``--adapt`` do."""
 
 
 @dataclass(frozen=True)
@@ -159,24 +146,45 @@ class Job:
     """A scenario and an artifact that fit each other, and what to run.
 
     Args:
-        scenario: The machine, with plant and control problem.
-        artifact: Prior and hybrid.
+        bench: The machine and its model.
+        named: Registered name of the scenario, or path of its file.
         tasks: The tasks.
         settings: What to run.
-        noise: Process noise by contender.
-        noise_source: Where that came from, in words.
+        noise_source: Where the filters' process noise came from, in words.
     """
 
-    scenario: Scenario
-    artifact: Kit
+    bench: Bench
+    named: str
     tasks: tuple[Task, ...]
     settings: ControlSettings
-    noise: Mapping[str, Array]
     noise_source: str
+
+    @property
+    def scenario(self) -> Scenario:
+        """The machine."""
+        return self.bench.scenario
+
+    @property
+    def kit(self) -> Kit:
+        """The artifact, with the filters' process noise."""
+        return self.bench.kits[MODEL]
+
+    def spec(self, task: Task, controller: str, seed: int) -> LoopSpec:
+        """One of its loops; the first of a task and controller keeps its plans."""
+        s = self.settings
+        return LoopSpec(
+            self.named, MODEL, task.name, controller, s.solver, monitor="guard" if s.guard else "own", faults=s.faults,
+            seed=seed, run_seed=s.seed, guard=s.guard, keep=("plans",) if seed == 0 else (),
+        )  # fmt: skip
 
 
 def prepared(
-    scenario: Scenario, model: Path, settings: ControlSettings, noise: Mapping[str, Array] | None = None
+    scenario: Scenario,
+    model: Path,
+    settings: ControlSettings,
+    noise: Mapping[str, Array] | None = None,
+    *,
+    named: str = "",
 ) -> Job:
     """Load and check everything before the first loop.
 
@@ -186,32 +194,30 @@ def prepared(
         settings: What to run.
         noise: Process noise by contender. Default: the artifact's; where it holds none, it is estimated on recordings
             that the scenario makes (budget quick, the settings' seed).
+        named: Registered name of the scenario, or path of its file. Default: its own name.
 
     Raises:
         InputError: If the scenario has nothing to run, the folder holds no artifact, the artifact belongs to another
             machine, or a task or fault does not fit.
     """
-    if scenario.plant is None or scenario.control is None or not scenario.tasks:
-        lacks = (
-            "plant" if scenario.plant is None else "control problem" if scenario.control is None else "task"
-        )
-        raise InputError(f"scenario {scenario.name} has no {lacks}: there is no loop to close in simulation")
+    check_complete(scenario)
     if scenario.oracle is None and (oracles := [c for c in settings.controllers if c in ORACLES]):
         raise InputError(f"scenario {scenario.name} has no oracle; leave --controller {oracles[0]} out")
-    tasks = selected_tasks(scenario, settings.tasks)
-    folder = artifact_folder(model)
-    artifact = load(folder)
-    _check_artifact(scenario, artifact, folder, scenario.control)
+    tasks, folder = selected_tasks(scenario, settings.tasks), artifact_folder(model)
+    kit = load(folder)
+    assert scenario.control is not None
+    _check_artifact(scenario, kit, folder, scenario.control)
     if settings.guard:
-        stored_detector(artifact, folder)
+        kit.detector()
     if settings.guard == "adapt":
-        adaptable(artifact.models["hybrid"], scenario.causes)
-    check_channels(install(scenario.plant(), settings.faults)[1], len(scenario.sensor_sigma), 1)
+        adaptable(kit.models["hybrid"], scenario.causes)
+    check_faults(scenario, settings.faults)
     if noise is None:
-        noise, source = find_noise(scenario, artifact, settings.controllers, settings.seed)
+        noise, source = find_noise(scenario, kit, settings.controllers, settings.seed)
     else:
         source = "given"
-    return Job(scenario, artifact, tasks, settings, noise, source)
+    bench = Bench(scenario, {MODEL: kit.with_noise(noise)})
+    return Job(bench, named or scenario.name, tasks, settings, source)
 
 
 def _check_artifact(scenario: Scenario, artifact: Kit, folder: Path, control: OCP) -> None:
@@ -232,7 +238,7 @@ def _check_artifact(scenario: Scenario, artifact: Kit, folder: Path, control: OC
 
 def run_loops(
     job: Job, report: Callable[[str, int, int, str], None]
-) -> Iterator[tuple[Task, str, int, ClosedLoopResult, Array]]:
+) -> Iterator[tuple[LoopRow, ClosedLoopResult]]:
     """All loops one after the other, alone on the machine, so that the durations of their steps count.
 
     Args:
@@ -240,76 +246,22 @@ def run_loops(
         report: Called with ``(task, done, total, text)`` as the loops go on.
 
     Yields:
-        Task, controller, number of the loop, its record, and the planned states ``(n, N + 1, n_x)``.
+        The row of each, the first of a task and controller with its ``plans``, and its record.
     """
-    settings, dt = job.settings, job.artifact.models["prior"].dt
+    settings, dt = job.settings, job.kit.models["prior"].dt
     for task in job.tasks:
         periods = round(task.duration / dt)
         total = len(settings.controllers) * settings.seeds * periods
         for i, name in enumerate(settings.controllers):
-            made, watched = parts(job, task, name), watch(job, task, name)
             for seed in range(settings.seeds):
                 done = (i * settings.seeds + seed) * periods
                 say = partial(_report, report, task.name, done, total, f"{name}, seed {seed}")
-                yield task, name, seed, *_loop(job, task, seed, made, watched, say)
+                yield job.bench.run(job.spec(task, name, seed), on_step=say)
         report(task.name, total, total, "")
 
 
 def _report(
-    report: Callable[[str, int, int, str], None], key: str, done: int, total: int, text: str, k: int
+    report: Callable[[str, int, int, str], None], key: str, done: int, total: int, text: str, step: Step
 ) -> None:
-    if k % 25 == 0:
-        report(key, done + k, total, text)
-
-
-def _loop(
-    job: Job,
-    task: Task,
-    seed: int,
-    made: tuple[Any, SafeController],
-    watched: tuple[Any, Guard | None],
-    say: Callable[[int], None],
-) -> tuple[ClosedLoopResult, Array]:
-    """One loop, and its plans ``(n, N + 1, n_x)``."""
-    plans: list[Array] = []
-
-    def on_step(step: Step) -> None:
-        plans.append(step.decision.solution.x)
-        say(step.k)
-
-    assert job.scenario.plant is not None
-    monitor, guard = watched
-    result = simulate(
-        job.scenario.plant(), *made, task.reference, weight=task.weight, dt=job.artifact.models["prior"].dt,
-        duration=task.duration, x0=np.array(task.x0), seed=job.settings.seed * 1000 + seed,
-        monitor=monitor, guard=guard, faults=(*task.faults, *job.settings.faults), on_step=on_step,
-    )  # fmt: skip
-    return result, np.stack(plans)
-
-
-def watch(job: Job, task: Task, name: str) -> tuple[EnergyMonitor | None, Guard | None]:
-    """Monitor and guard of a contender for a task, as far as they are asked for."""
-    control, models = task.control or job.scenario.control, job.artifact.models
-    assert control is not None
-    if not job.settings.guard:
-        if CONTENDERS[name].model != "hybrid":
-            return None, None
-        return make_monitor(models["hybrid"], None, rest_speed=stored_rest(job.artifact)), None
-    detector = stored_detector(job.artifact)
-    monitor = guard_monitor(models["hybrid"], detector, **freezing(job.scenario, control))
-    if job.settings.guard == "rest":
-        return monitor, make_resting_guard(models["hybrid"])
-    guard = make_adaptive_guard(models["hybrid"], models["prior"], job.scenario, job.noise[name], control)
-    return monitor, guard
-
-
-def parts(job: Job, task: Task, name: str) -> tuple[Any, SafeController]:
-    """Estimator and controller of a contender for a task, with the solver that is asked for."""
-    control = task.control or job.scenario.control
-    assert control is not None
-    estimator, safe = build(name, job.scenario, job.artifact, control, job.noise)
-    make = SOLVERS[job.settings.solver]
-    if make is None:
-        return estimator, safe
-    inner = safe.controller
-    return estimator, SafeController(make(inner.model, inner.ocp), job.artifact.models["prior"])
+    if step.k % 25 == 0:
+        report(key, done + step.k, total, text)

@@ -13,21 +13,19 @@ from numpy.typing import NDArray
 from hybrid_mpc import __version__
 from hybrid_mpc.artifact import (
     Kit,
-    LoopSettings,
     Provenance,
-    load,
+    loop_settings,
     save_artifact,
     set_process_noise,
 )
-from hybrid_mpc.assembly import make_controller, make_estimator, make_monitor
+from hybrid_mpc.assembly import make_monitor
 from hybrid_mpc.closed_loop.loop import Loop
 from hybrid_mpc.estimation import ExtendedKalmanFilter, SwitchingFilter
 from hybrid_mpc.job.contenders import noise_of
 from hybrid_mpc.monitor import EnergyMonitor
-from hybrid_mpc.mpc import OCP, SafeController
-from hybrid_mpc.pipeline.contest import contest
+from hybrid_mpc.mpc import SafeController
+from hybrid_mpc.pipeline.contest import contest, keep
 from hybrid_mpc.pipeline.context import Context
-from hybrid_mpc.scenario import Scenario
 
 if TYPE_CHECKING:
     from hybrid_mpc.data.trajectories import Trajectory
@@ -87,52 +85,30 @@ def export_stage(context: Context) -> None:
     )
 
 
-def loop_settings(scenario: Scenario) -> LoopSettings:
-    """What a scenario's loops need beside the models; their process noise is estimated later.
-
-    Args:
-        scenario: The machine.
-
-    Example:
-        >>> from scenarios.golf_robot import scenario
-        >>> sorted(loop_settings(scenario).control)[:2]
-        ['', 'track_limits']
-    """
-    problems = {"": scenario.control} | {task.name: task.control for task in scenario.tasks}
-    given = {name: problem for name, problem in problems.items() if problem is not None}
-    return LoopSettings(given, scenario.sensor_sigma, scenario.first_sigma, causes=dict(scenario.causes))
-
-
 def control_stage(context: Context) -> None:
     """Closed loops of every task with prior, hybrid and oracle; or only timing where there is no plant."""
-    artifact, control = load(context.out / "model"), context.scenario.control
-    if control is None:
-        context.save(
-            "control", {"reason": f"scenario {context.scenario.name} defines no control problem"}, {}
-        )
+    folder, scenario = context.out / "model", context.scenario
+    if scenario.control is None:
+        context.save("control", {"reason": f"scenario {scenario.name} defines no control problem"}, {})
         return
-    noise = noise_of(context.scenario, artifact, context.commanded("train"))
-    set_process_noise(context.out / "model", noise)
-    if context.scenario.plant is None:
-        _only_timing(context, artifact, control, noise)
+    noise = noise_of(scenario, context.kit, context.commanded("train"))
+    set_process_noise(folder, noise)
+    if scenario.plant is None:
+        _only_timing(context, context.kit)
     else:
-        rows, arrays = contest(context, artifact, control, noise)
-        context.save("control", {"loops": rows, "sigma_x": noise}, arrays)
+        keep(context, "control", contest(context))
 
 
-def _only_timing(context: Context, artifact: Kit, control: OCP, noise: dict[str, Array]) -> None:
-    model = artifact.models["hybrid"]
-    controller = make_controller(model, artifact.models["prior"], control)
-    estimator = make_estimator(model, context.scenario, noise["hybrid_observer"])
+def _only_timing(context: Context, kit: Kit) -> None:
     whole = context.dataset.whole
     most = max(2, TIMED_PERIODS // len(whole))
-    durations = []
+    controller, estimator, durations = kit.controller(), kit.observer(), []
     for i, recording in enumerate(whole):
         context.progress.update("recordings", i, len(whole), f"timing on {recording.name}")
-        monitor = make_monitor(model, None)
+        monitor = make_monitor(kit.models["hybrid"], None)
         durations.append(time_on_recording(controller, estimator, monitor, recording, most))
     reason = f"scenario {context.scenario.name} has no plant to close the loop with"
-    context.save("control", {"reason": reason, "sigma_x": noise}, {"step_ms": np.concatenate(durations)})
+    context.save("control", {"reason": reason}, {"step_ms": np.concatenate(durations)})
 
 
 def time_on_recording(

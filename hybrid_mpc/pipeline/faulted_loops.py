@@ -5,21 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.artifact import Kit
-from hybrid_mpc.assembly import freezing, make_resting_guard
-from hybrid_mpc.closed_loop import ClosedLoopResult, Fault, simulate
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.job.contenders import build
-from hybrid_mpc.monitor import Detector, MonitorTrace, guard_monitor
+from hybrid_mpc.assembly import freezing
+from hybrid_mpc.closed_loop import Fault
+from hybrid_mpc.job.loops import Bench, LoopSpec
+from hybrid_mpc.monitor import MonitorTrace, guard_monitor
 from hybrid_mpc.monitor.calibration import alarm_intervals
+from hybrid_mpc.pipeline.contest import MODEL
 from hybrid_mpc.pipeline.monitor_job import explained
 from hybrid_mpc.pipeline.nominal_loops import CONTENDER, knows
+from hybrid_mpc.records import plain
 from hybrid_mpc.scenario import Scenario
 
 Array = NDArray[np.float64]
@@ -72,40 +71,39 @@ def cases(scenario: Scenario) -> tuple[Case, ...]:
 
 
 def faulted(
-    scenario: Scenario, artifact: Kit, noise: Mapping[str, Array], detector: Detector, run_seed: int
+    bench: Bench, named: str, run_seed: int, causes: Mapping[str, tuple[str, ...]]
 ) -> tuple[list[dict[str, Any]], dict[str, Array]]:
     """A loop of each case on the first tracking task, in which something breaks from the middle on.
 
     Args:
-        scenario: The machine, with plant and tasks.
-        artifact: Prior and hybrid.
-        noise: Process noise by contender.
-        detector: What the guard listens to.
+        bench: The machine and its model, with the detector that the guard listens to.
+        named: Name or path of the scenario.
         run_seed: Seed of the run.
+        causes: What may break, by name.
 
     Returns:
         A row each: what breaks and when, ``delay_s`` to the alarm (None: never), what the diagnosis says, false alarms
         before, changes of the guard's mode; and the traces for the report, see :func:`read_trace`.
     """
+    scenario, kit = bench.scenario, bench.kits[MODEL]
+    model, dt = kit.models["hybrid"], kit.models["hybrid"].dt
     task = next((t for t in scenario.tasks if not t.faults and t.weight is None), scenario.tasks[0])
-    control, model = task.control or scenario.control, artifact.models["hybrid"]
-    assert scenario.plant is not None
-    assert control is not None
-    start = model.dt * round(0.5 * task.duration / model.dt)
-    estimator, controller = build(CONTENDER, scenario, artifact, control, noise)
-    diagnose = model.parametric is not None
+    start = dt * round(0.5 * task.duration / dt)
+    detects = freezing(kit, kit.problem(task.name))
+    monitor = guard_monitor(model, kit.detector(), **detects, diagnose=model.parametric is not None)
     rows: list[dict[str, Any]] = []
     arrays: dict[str, Array] = {}
     for case in cases(scenario):
-        monitor = guard_monitor(model, detector, **freezing(scenario, control), diagnose=diagnose)
-        result = simulate(
-            scenario.plant(), estimator, controller, task.reference, weight=task.weight, dt=model.dt,
-            duration=task.duration, x0=np.array(task.x0), seed=run_seed * 1000 + SEED, monitor=monitor,
-            guard=make_resting_guard(model), faults=(*task.faults, Fault(start, math.inf, case.target, case.value)),
+        fault = Fault(start, math.inf, case.target, case.value)
+        spec = LoopSpec(
+            named, MODEL, task.name, CONTENDER, monitor="guard", guard="rest", seed=SEED, run_seed=run_seed,
+            faults=(fault,),
         )  # fmt: skip
+        row, result = bench.run(spec, monitor=monitor)
         # The estimator is deterministic: over the record it says again what it said in the loop.
-        trace, alarms = explained(monitor, estimator, Samples(result.t, result.y, result.u), scenario.causes)
-        rows.append({**_told(case, task.name, start, trace, alarms), "switches": switches(result)})
+        samples = Samples(result.t, result.y, result.u)
+        trace, alarms = explained(monitor, bench.parts(spec)[0], samples, causes)
+        rows.append({**_told(case, task.name, start, trace, alarms), "switches": plain(row.switches)})
         arrays |= kept(case.name, trace, result.y)
     return rows, arrays
 
@@ -126,28 +124,6 @@ def _told(
         "diagnosis": seen[0]["diagnosis"] if seen else "",
         "false_alarms": len(alarm_intervals(trace.alarm[trace.t < start - 1e-9], 1.0)),
     }
-
-
-def switches(result: ClosedLoopResult) -> list[dict[str, Any]]:
-    """Changes of the guard's mode in a loop, as plain data."""
-    return [
-        {"t_s": s.t, "before": s.before.name, "after": s.after.name, "why": s.why} for s in result.switches
-    ]
-
-
-def stored_detector(artifact: Kit, folder: Path | None = None) -> Detector:
-    """The detector that the main job left in an artifact.
-
-    Raises:
-        InputError: If there is none.
-    """
-    found = None if artifact.calibration is None else artifact.calibration.detector
-    if found is None:
-        raise InputError(
-            f"{folder or 'the artifact'} holds no detector for the guard: an earlier version made it, or its run had "
-            "too little nominal data (its report says why); run the main job again"
-        )
-    return found
 
 
 def kept(name: str, trace: MonitorTrace, y: Array) -> dict[str, Array]:

@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 
 from hybrid_mpc.identification.training import KINDS
-from hybrid_mpc.pipeline.contest import tasks_of
+from hybrid_mpc.job.loops import tasks_of
+from hybrid_mpc.job.table import summaries
+from hybrid_mpc.pipeline.contest import kept
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.guard_report import guard_figures
 from hybrid_mpc.pipeline.identify import MODELS, load_trained
 from hybrid_mpc.pipeline.judge import clean_windows
-from hybrid_mpc.pipeline.results import REPORTED, loop_table, step_times, summary
+from hybrid_mpc.pipeline.results import REPORTED, step_times
 from hybrid_mpc.plots import analysis, animation, data, estimation, fit, loops, monitor, save, tasks, training
 from hybrid_mpc.report.schema import OBSERVERS
 
@@ -102,8 +104,9 @@ def _free_runs(context: Context) -> Any:
         for m in KINDS
         if all(np.isfinite(float(n[k])) for n in scores[m]["networks"] for k in keys)
     }
+    metrics = {**fit.METRICS, "rmse_rad": f"free-run RMSE [{context.scenario.prior().outputs[0].unit}]"}
     yield (
-        "free_run", "errors", fit.errors_bar(finite, spread=spread),
+        "free_run", "errors", fit.errors_bar(finite, spread=spread, metrics=metrics),
         "Errors over all unseen pieces; whiskers: standard deviation over the networks of a kind.",
     )  # fmt: skip
 
@@ -113,22 +116,19 @@ def _finite(value: Any) -> float | None:
 
 
 def _loops(context: Context) -> Any:
-    arrays, scenario = context.arrays("control"), context.scenario
+    scenario = context.scenario
     if "reason" in context.result("control") or scenario.control is None:
         return
-    prior = scenario.prior()
+    prior, drawn = scenario.prior(), [row for row in kept(context, "control") if row.arrays]
     for task in tasks_of(scenario, context.budget.tasks):
-        names = {short: n for short, n in REPORTED.items() if f"{task.name}/{n}/t" in arrays}
-        results = {
-            short: loops.Motion(*(arrays[f"{task.name}/{n}/{key}"] for key in ("t", "x", "u")))
-            for short, n in names.items()
-        }
+        own = {row.controller: row.arrays for row in drawn if row.task == task.name}
+        names = {short: n for short, n in REPORTED.items() if n in own}
         control = task.control or scenario.control
         figure = loops.closed_loops(
             task.title,
-            arrays[f"{task.name}/{names['hybrid']}/t"],
-            arrays[f"{task.name}/{names['hybrid']}/reference"],
-            results,
+            own[names["hybrid"]]["t"],
+            own[names["hybrid"]]["reference"],
+            {short: loops.Motion(*(own[n][key] for key in ("t", "x", "u"))) for short, n in names.items()},
             states=prior.states,
             inputs=prior.inputs,
             limits=(control.u_min, control.u_max),
@@ -138,16 +138,16 @@ def _loops(context: Context) -> Any:
 
 def _overview(context: Context) -> Any:
     """Costs of all contenders, errors of the strokes."""
-    control = context.result("control")
-    if "reason" in control:
+    if "reason" in context.result("control"):
         return
+    rows = kept(context, "control")
     table = {
-        task: {name: (float(np.mean(cell["cost"])), summary(cell)["cost_ci95"]) for name, cell in row.items()}
-        for task, row in loop_table(control["loops"]).items()
+        task: {name: (cell.cost.mean, cell.cost.ci95) for name, cell in cells.items()}
+        for task, cells in summaries(rows).items()
     }
     if any("oracle" in row for row in table.values()):
         finite = {
-            task: {n: (mean, np.nan if half is None else half) for n, (mean, half) in row.items()}
+            task: {n: (_number(mean), _number(half)) for n, (mean, half) in row.items()}
             for task, row in table.items()
         }
         yield (
@@ -159,9 +159,9 @@ def _overview(context: Context) -> Any:
             ),
         )
     strokes = [
-        {"controller": r["controller"], **{k: _finite(v) for k, v in r["figures"].items()}}
-        for r in control["loops"]
-        if r["figures"]
+        {"controller": row.controller, **{k: _finite(v) for k, v in row.figures.items()}}
+        for row in rows
+        if row.figures
     ]
     if strokes and all({"speed_error_rel", "timing_error_s"} <= set(row) for row in strokes):
         yield (
@@ -172,15 +172,23 @@ def _overview(context: Context) -> Any:
         )
 
 
+def _number(value: float | None) -> float:
+    return np.nan if value is None else value
+
+
 def _moving(context: Context) -> list[tuple[Path, str]]:
     """One loop of the hybrid as a moving picture, with what it planned at every instant."""
-    arrays, scenario = context.arrays("control"), context.scenario
+    scenario = context.scenario
     if scenario.draw is None or scenario.control is None or "reason" in context.result("control"):
         return []
     run = tasks_of(scenario, context.budget.tasks)
     task = next((t for t in run if t.weight is not None), run[0])
     control, prior = task.control or scenario.control, scenario.prior()
-    own = {k: arrays[f"{task.name}/{REPORTED['hybrid']}/{k}"] for k in ("t", "x", "u", "plans")}
+    own = next(
+        row.arrays
+        for row in kept(context, "control")
+        if (row.task, row.controller) == (task.name, REPORTED["hybrid"]) and "plans" in row.arrays
+    )
     path = animation.animate(
         context.out / "figures" / f"{task.name}.gif", own["t"], own["x"], own["plans"], dt=context.spec.dt,
         draw=scenario.draw, u=own["u"], title=task.title, position=prior.states[0], inputs=prior.inputs,

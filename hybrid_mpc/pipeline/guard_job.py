@@ -11,22 +11,24 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2
 
-from hybrid_mpc.artifact import Kit, load, set_calibration
-from hybrid_mpc.assembly import freezing, make_estimator, make_monitor
+from hybrid_mpc.artifact import Kit, set_calibration
+from hybrid_mpc.assembly import freezing, make_monitor
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.job.loops import Bench
 from hybrid_mpc.model import HybridModel
-from hybrid_mpc.monitor import Calibration, Detector, guard_monitor, learn_detector, learn_plausibility
+from hybrid_mpc.monitor import Detector, guard_monitor, learn_detector, learn_plausibility
 from hybrid_mpc.monitor.calibration import MAX_EXTRAPOLATION, MIN_BLOCKS
-from hybrid_mpc.monitor.lengths import BLOCK_S, SETTLING_S, block_seconds, seconds
+from hybrid_mpc.monitor.lengths import BLOCK_S, SETTLING_S, block_seconds, samples, seconds
 from hybrid_mpc.monitor.replay import along, replay
 from hybrid_mpc.monitor.rest import REST_SPEED
 from hybrid_mpc.monitor.standard import DRIFT
-from hybrid_mpc.mpc import OCP
+from hybrid_mpc.pipeline.contest import MODEL, keep, run_specs
+from hybrid_mpc.pipeline.contest import kept as rows_of
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.faulted_loops import faulted, kept
 from hybrid_mpc.pipeline.judge import RATES, clean_windows, run_calibration
 from hybrid_mpc.pipeline.monitor_job import explained
-from hybrid_mpc.pipeline.nominal_loops import CONTENDER, nominal_loops, run_nominal
+from hybrid_mpc.pipeline.nominal_loops import nominal_loops, stage_of
 from hybrid_mpc.pipeline.parallel import WORKERS, run_jobs
 from hybrid_mpc.records import plain
 
@@ -54,15 +56,15 @@ class NominalData:
 
 def guard_stage(context: Context) -> None:
     """Learn detector and plausibility, put them into the artifact, and try them on faults and test recordings."""
-    control = context.scenario.control
-    if control is None:
+    scenario, folder = context.scenario, context.out / "model"
+    if scenario.control is None:
         reason = "the guard's estimator needs the scenario's control problem (input range, sensor noise)"
         context.save("guard", {"reason": reason}, {})
         return
-    artifact = load(context.out / "model")
-    model, calibration = artifact.models["hybrid"], run_calibration(context)
+    kit = context.kit
+    model, calibration = kit.models["hybrid"], run_calibration(context)
     rest = calibration.rest_speed or (REST_SPEED,)
-    data = _nominal_data(context, artifact, control, rest)
+    data = _nominal_data(context, kit, rest)
     result: dict[str, Any] = {"source": data.source, "loops": data.loops}
     found: dict[str, Any] = {}
     try:
@@ -78,16 +80,15 @@ def guard_stage(context: Context) -> None:
         )
     except InputError as none:
         result["plausibility_reason"] = str(none)
-    set_calibration(context.out / "model", replace(calibration, **found))
+    set_calibration(folder, replace(calibration, **found))
     result |= {name: plain(part) for name, part in found.items()}
-    detector: Detector | None = found.get("detector")
-    recorded, arrays = _recorded(context, artifact, control, detector, calibration)
+    kit, detector = context.kit, found.get("detector")
+    recorded, arrays = _recorded(context, kit, detector)
     result |= recorded
-    if detector is not None and context.scenario.plant is not None and context.scenario.tasks:
+    if detector is not None and scenario.plant is not None and scenario.tasks:
         context.progress.update("faults", 0, 1, "loops in which something breaks")
-        result["faults"], more = faulted(
-            context.scenario, artifact, noise(context), detector, context.settings.seed
-        )
+        bench, s = Bench(scenario, {MODEL: kit}), context.settings
+        result["faults"], more = faulted(bench, s.scenario, s.seed, scenario.causes)
         arrays |= more
     context.save("guard", result, arrays)
 
@@ -156,20 +157,12 @@ def _whole_blocks(runs: Sequence[Array], block_s: float, dt: float) -> int:
     return sum(len(run) // size for run in runs)
 
 
-def noise(context: Context) -> dict[str, Array]:
-    """Process noise of the run's filters by contender."""
-    names = context.result("control").get("sigma_x", {CONTENDER: None})
-    return {name: context.sigma_x(name) for name in names}
-
-
-def _nominal_data(context: Context, artifact: Kit, control: OCP, rest: tuple[float, ...]) -> NominalData:
+def _nominal_data(context: Context, kit: Kit, rest: tuple[float, ...]) -> NominalData:
     """Loops of the simulated machine, like those that the guard will watch; else undisturbed recordings."""
-    scenario = context.scenario
+    scenario, model = context.scenario, kit.models["hybrid"]
     if scenario.plant is not None and any(not task.faults for task in scenario.tasks):
-        return _from_loops(context)
-    model = artifact.models["hybrid"]
-    monitor = guard_monitor(model, rest_speed=rest)
-    estimator = make_estimator(model, context.scenario, noise(context)[CONTENDER])
+        return _from_loops(context, model)
+    monitor, estimator = guard_monitor(model, rest_speed=rest), kit.observer()
     whole = context.dataset.whole
     numbers = [
         replay(monitor, estimator, recording, on_progress=say).numbers
@@ -198,43 +191,53 @@ def _settled(t: Array, start: float, end: float, model: HybridModel) -> NDArray[
     return np.asarray((t >= start + seconds(SETTLING_S, model)) & (t <= end))
 
 
-def _from_loops(context: Context) -> NominalData:
-    wanted = nominal_loops(context.scenario, context.budget)
-    common = context.settings.scenario, context.out / "model", noise(context), context.settings.seed
+def _from_loops(context: Context, model: HybridModel) -> NominalData:
+    settings = context.settings
+    wanted = nominal_loops(
+        context.scenario, context.budget, model, named=settings.scenario, run_seed=settings.seed
+    )
     jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
-        loop.stage: (run_nominal, (*common, loop)) for loop in wanted if not context.done(loop.stage)
+        stage_of(spec): (run_specs, (settings.scenario, context.out / "model", [spec]))
+        for spec in wanted
+        if not context.done(stage_of(spec))
     }
-    run_jobs(jobs, context.progress.update, WORKERS, lambda stage, kept: context.save(stage, *kept))
-    told, runs, content = [], [], hashlib.sha256()
-    for loop in wanted:
-        kept = context.arrays(loop.stage)
-        told.append(context.result(loop.stage))
-        runs.append(kept["numbers"])
+    run_jobs(jobs, context.progress.update, WORKERS, lambda stage, rows: keep(context, stage, rows))
+    content, runs = hashlib.sha256(), []
+    told: list[dict[str, Any]] = []
+    for spec in wanted:
+        (row,) = rows_of(context, stage_of(spec))
+        friction = spec.faults[0].value if spec.faults else 1.0
+        told.append(
+            {
+                "task": row.task,
+                "seed": row.seed,
+                "friction": friction,
+                "seconds": row.seconds,
+                "cost": row.cost,
+            }
+        )
+        runs.append(row.arrays["numbers"][samples(SETTLING_S, model) :])
         for name in ("y", "u"):
-            content.update(np.ascontiguousarray(kept[name], dtype="<f8").tobytes())
+            content.update(np.ascontiguousarray(row.arrays[name], dtype="<f8").tobytes())
     minutes = sum(row["seconds"] for row in told) / 60
     source = f"{len(told)} loops of the simulated machine under the hybrid MPC, {minutes:.1f} min"
     return NominalData(runs, source, content.hexdigest(), tuple(told))
 
 
 def _recorded(
-    context: Context,
-    artifact: Kit,
-    control: OCP,
-    detector: Detector | None,
-    calibration: Calibration,
+    context: Context, kit: Kit, detector: Detector | None
 ) -> tuple[dict[str, Any], dict[str, Array]]:
     """Recordings with test windows, watched by the guard's monitor, or without detector by that of the thresholds.
 
     Without either the readings are kept and nothing but a blind monitor alarms.
     """
-    model = artifact.models["hybrid"]
+    model = kit.models["hybrid"]
     if detector is None:
-        monitor = make_monitor(model, calibration)
+        monitor = make_monitor(model, kit.calibration)
     else:
         diagnose = model.parametric is not None
-        monitor = guard_monitor(model, detector, **freezing(context.scenario, control), diagnose=diagnose)
-    estimator = make_estimator(model, context.scenario, noise(context)[CONTENDER])
+        monitor = guard_monitor(model, detector, **freezing(kit, kit.problem()), diagnose=diagnose)
+    estimator = kit.observer()
     tested = [r for r in context.dataset.whole if clean_windows(context, r, ("test",))]
     found: list[dict[str, Any]] = []
     arrays: dict[str, Array] = {}

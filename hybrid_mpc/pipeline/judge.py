@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.artifact import load, set_calibration
-from hybrid_mpc.assembly import make_controller, make_estimator, make_monitor, working_point
+from hybrid_mpc.artifact import Kit, set_calibration
+from hybrid_mpc.assembly import make_monitor, working_point
 from hybrid_mpc.closed_loop.faults import Fault
 from hybrid_mpc.closed_loop.result import ClosedLoopResult
-from hybrid_mpc.closed_loop.simulate import simulate
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.job.loops import Bench, LoopSpec
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.monitor.calibration import Calibration, alarm_intervals, calibrate, with_residual
 from hybrid_mpc.monitor.lengths import block_seconds
 from hybrid_mpc.monitor.replay import along, judge, replay
 from hybrid_mpc.monitor.rest import rest_speeds
 from hybrid_mpc.mpc import OCP
+from hybrid_mpc.pipeline.contest import MODEL
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.riccati import hidden_fixed_point
@@ -55,13 +57,12 @@ def monitor_stage(context: Context) -> None:
     Where nothing can be calibrated the result holds the reason and no calibration; the artifact then keeps the rest
     speeds alone.
     """
-    control = context.scenario.control
-    if control is None:
+    if context.scenario.control is None:
         reason = "the monitor's estimator needs the scenario's control problem (input range, sensor noise)"
         context.save("monitor", {"reason": reason}, {})
         return
-    model = load(context.out / "model").models["hybrid"]
-    sigma_x = context.sigma_x("hybrid_observer")
+    kit = context.kit
+    model = kit.models["hybrid"]
     whole = context.dataset.whole
     known: dict[str, Any] = {}  # the rest speeds, and what hinders the calibration
     try:
@@ -71,10 +72,7 @@ def monitor_stage(context: Context) -> None:
     rest = known.get("rest_speed")
     power, residual, traces = [], [], []
     # the estimator of the closed loops; the monitor ignores its disturbance estimate
-    watching, estimator = (
-        make_monitor(model, None, rest_speed=rest),
-        make_estimator(model, context.scenario, sigma_x),
-    )
+    watching, estimator = make_monitor(model, None, rest_speed=rest), kit.observer()
     for recording, say in along(whole, context.progress.update):
         trace = replay(watching, estimator, recording, on_progress=say)
         traces.append(trace)
@@ -113,7 +111,7 @@ def monitor_stage(context: Context) -> None:
         "calibration": plain(calibration), "alarms": alarms, "clean": clean, "recordings": covered,
     }  # fmt: skip
     if context.scenario.plant is not None and context.scenario.tasks:
-        result["load"], loop = _load_loop(context, model, calibration, control, sigma_x)
+        result["load"], loop = _load_loop(context, replace(kit, calibration=calibration))
         arrays |= {
             f"load/{key}": getattr(loop, key) for key in ("t", "violation", "level", "alarm", "x", "u")
         }
@@ -133,31 +131,21 @@ def run_calibration(context: Context) -> Calibration:
     return Calibration.without(found["reason"], found.get("rest_speed"))
 
 
-def _load_loop(
-    context: Context, model: HybridModel, calibration: Calibration, control: OCP, sigma_x: Array
-) -> tuple[dict[str, Any], ClosedLoopResult]:
+def _load_loop(context: Context, kit: Kit) -> tuple[dict[str, Any], ClosedLoopResult]:
     """The first task with an unknown constant load from its middle on: does the monitor see it?"""
-    task, prior = context.scenario.tasks[0], load(context.out / "model").models["prior"]
-    assert context.scenario.plant is not None
-    start, added = 0.5 * task.duration, unknown_load(control)
-    result = simulate(
-        context.scenario.plant(),
-        make_estimator(model, context.scenario, sigma_x),
-        make_controller(model, prior, control),
-        task.reference,
-        weight=task.weight,
-        dt=model.dt,
-        duration=task.duration,
-        x0=np.array(task.x0),
-        seed=context.settings.seed,
-        monitor=make_monitor(model, calibration),
+    task, settings = context.scenario.tasks[0], context.settings
+    start, added = 0.5 * task.duration, unknown_load(kit.problem())
+    spec = LoopSpec(
+        settings.scenario, MODEL, task.name, "hybrid_observer", monitor="energy", seed=settings.seed,
         faults=(Fault(start, task.duration, "input_offset", added),),
-    )
+    )  # fmt: skip
+    calm = replace(task, faults=(), control=None)
+    result = Bench(context.scenario, {MODEL: kit}).run(spec, task=calm)[1]
     before, after = result.alarm[result.t < start], np.flatnonzero(result.alarm & (result.t >= start))
     delay = float(result.t[after[0]] - start) if after.size else None
     return {
         "task": task.name, "load": added, "start_s": start, "delay_s": delay,
-        "false_alarms": len(alarm_intervals(before, model.dt)),
+        "false_alarms": len(alarm_intervals(before, result.dt)),
     }, result  # fmt: skip
 
 
@@ -223,7 +211,7 @@ def analysis_stage(context: Context) -> None:
     """Linearise prior and hybrid at rest and at working speed; poles, PBH tests, frequency responses."""
     from hybrid_mpc.analysis import analyze, fixed_point, frequency_response, linearize
 
-    artifact = load(context.out / "model")
+    artifact = context.kit
     result: dict[str, Any] = {}
     arrays: dict[str, Any] = {}
     for i, (name, model) in enumerate(artifact.models.items()):

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.artifact import Kit, artifact_folder, load
-from hybrid_mpc.assembly import make_estimator, make_monitor, sensor_steps
+from hybrid_mpc.assembly import make_monitor, sensor_steps
 from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_object, write_json, write_text
@@ -40,38 +40,32 @@ class MonitorJob:
     """What ``hybrid-mpc monitor`` needs.
 
     Args:
-        scenario: The machine: columns, period, input range, sensor noise.
-        artifact: Prior and hybrid.
+        kit: Prior and hybrid, and the process noise of their filters.
         data: The recordings.
-        sigma_x: Process noise of the hybrid's filter ``(n_x,)``.
         resolution: Step of each sensor, or None.
         detector: Detector, or None for the artifact's thresholds.
     """
 
-    scenario: Scenario
-    artifact: Kit
+    kit: Kit
     data: Dataset
-    sigma_x: Array
     resolution: tuple[float, ...] | None = None
     detector: Detector | None = None
 
     @property
-    def estimator(self) -> Any:
+    def estimator(self) -> EstimatorLike:
         """The estimator of the closed loops."""
-        return make_estimator(self.artifact.models["hybrid"], self.scenario, self.sigma_x)
+        return self.kit.observer()
 
     @property
     def monitor(self) -> EnergyMonitor:
         """The guard's monitor where there is a detector, else that of the main job with the artifact's thresholds."""
-        model = self.artifact.models["hybrid"]
+        model = self.kit.models["hybrid"]
         if self.detector is not None:
-            known = model.parametric is not None
-            control = self.scenario.control
-            ranges = None if control is None else control.input_range
+            known, ranges = model.parametric is not None, self.kit.problem().input_range
             return guard_monitor(
                 model, self.detector, resolution=self.resolution, input_range=ranges, diagnose=known
             )
-        return make_monitor(model, self.artifact.calibration)
+        return make_monitor(model, self.kit.calibration)
 
 
 def prepared(
@@ -101,8 +95,8 @@ def prepared(
             "scenario control=OCP(...)"
         )
     folder = artifact_folder(model)
-    artifact = load(folder)
-    hybrid = artifact.models["hybrid"]
+    kit = load(folder).on(scenario)
+    hybrid = kit.models["hybrid"]
     if abs(hybrid.dt - scenario.data.dt) > 1e-9:
         raise InputError(
             f"the model's period is {hybrid.dt} s, scenario {scenario.name} resamples to {scenario.data.dt} s"
@@ -115,14 +109,14 @@ def prepared(
     if not data.whole:
         cut = "; ".join(f"{c.file} {c.start:g} to {c.end:g} s: {c.why}" for c in data.cuts)
         raise InputError(f"no part of the recordings is long enough to be watched: {cut}")
-    sigma, _ = find_noise(scenario, artifact, ("hybrid_observer",), 0)
+    kit = kit.with_noise(find_noise(scenario, kit, ("hybrid_observer",), 0)[0])
     if calibration is not None:
         found: Detector | None = read_detector(calibration)
     else:
-        found = None if artifact.calibration is None else artifact.calibration.detector
+        found = None if kit.calibration is None else kit.calibration.detector
     if found is not None and resolution is None:
         resolution = sensor_steps(scenario.sensor_sigma)
-    return MonitorJob(scenario, artifact, data, np.asarray(sigma["hybrid_observer"]), resolution, found)
+    return MonitorJob(kit, data, resolution, found)
 
 
 def read_detector(path: Path) -> Detector:
@@ -137,11 +131,6 @@ def read_detector(path: Path) -> Detector:
     return record(Detector, stored["detector"], f"{path}: detector")
 
 
-def stored_rest(artifact: Kit) -> tuple[float, ...] | None:
-    """The rest speeds that every monitor of an artifact's models takes; None if no recording told them yet."""
-    return None if artifact.calibration is None else artifact.calibration.rest_speed
-
-
 def learn(job: MonitorJob, rate: float, out: Path, progress: Progress | None = None) -> Detector:
     """Learn a detector from the job's recordings, in which nothing may be wrong; writes ``calibration.json``.
 
@@ -151,10 +140,10 @@ def learn(job: MonitorJob, rate: float, out: Path, progress: Progress | None = N
         out: Folder.
         progress: Where to report; default: nowhere.
     """
-    model, say = job.artifact.models["hybrid"], progress or Silent()
+    model, say = job.kit.models["hybrid"], progress or Silent()
     say.start("replaying the recordings")
     detector = learn_from(
-        model, job.estimator, job.data.whole, false_alarms_per_hour=rate, rest_speed=stored_rest(job.artifact),
+        model, job.estimator, job.data.whole, false_alarms_per_hour=rate, rest_speed=job.kit.rest_speed,
         data_hash=job.data.hash, report=say.update,
     )  # fmt: skip
     say.finish("")
@@ -177,14 +166,14 @@ def watch(job: MonitorJob, out: Path, progress: Progress | None = None) -> dict[
     from hybrid_mpc.plots import save
     from hybrid_mpc.plots.monitor_trace import overview
 
-    rows, output, tell = [], job.artifact.models["hybrid"].outputs[0], progress or Silent()
+    rows, output, tell = [], job.kit.models["hybrid"].outputs[0], progress or Silent()
     tell.start("replaying the recordings")
     for recording, say in along(job.data.whole, tell.update):
         trace, alarms = watched(job, recording, say)
         length = {"seconds": len(trace.t) * recording.dt, **trace.coverage(recording.dt)}
         rows.append({"recording": recording.name, **length, "alarms": alarms})
         name = recording.name.replace("#", "_")
-        write_text(out / f"{name}.csv", table(trace, recording, job.artifact.models["hybrid"].outputs))
+        write_text(out / f"{name}.csv", table(trace, recording, job.kit.models["hybrid"].outputs))
         limits, calibration = {}, job.monitor.calibration
         if calibration is not None:
             found = {"violation": calibration.threshold_w, "residual": calibration.residual_threshold}
@@ -219,7 +208,7 @@ def watched(
     job: MonitorJob, recording: Trajectory, on_progress: Callable[[int, int], None] = lambda done, total: None
 ) -> tuple[MonitorTrace, list[dict[str, Any]]]:
     """Trace of a recording, and its alarms with what explains them (empty where nothing can say)."""
-    return explained(job.monitor, job.estimator, recording, job.scenario.causes, on_progress)
+    return explained(job.monitor, job.estimator, recording, job.kit.causes, on_progress)
 
 
 def explained(

@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hybrid_mpc.artifact import load
-from hybrid_mpc.assembly import make_estimator
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.consistency import Consistency, consistency
 from hybrid_mpc.job.contenders import CONTENDERS
@@ -30,13 +28,13 @@ def estimation_stage(context: Context) -> None:
         reason = "the observers need the scenario's control problem (input range, sensor noise)"
         context.save("estimation", {"reason": reason}, {})
         return
-    models = load(context.out / "model").models
+    kit = context.kit
     parts = judged_parts(context.trajectories("test"))
     result: dict[str, Any] = {"recordings": [{"name": p.name, "samples": len(p.t)} for p in parts]}
     arrays: dict[str, Any] = {}
     for i, name in enumerate(OBSERVERS):
         context.progress.update("observers", i, len(OBSERVERS), name)
-        estimator = make_estimator(models[CONTENDERS[name].model], context.scenario, context.sigma_x(name))
+        estimator = kit.observer(CONTENDERS[name].model, load=CONTENDERS[name].observer)
         try:
             found = consistency(estimator, parts)
         except InputError as too_short:

@@ -76,13 +76,14 @@ def _report(context: Context, results: dict[str, Any], figures: Figures) -> Repo
 
 def _summary(context: Context, results: dict[str, Any]) -> list[KeyFigure]:
     identification, timing = results["identification"], results["timing"]
-    rmse = identification["rmse_rad"]
+    output = context.scenario.prior().outputs[0]
+    rmse = {m: _first(value) for m, value in identification["rmse"].items() if m in MODELS}
     ratio = identification["details"]["hybrid_over_phy"]
     e_sim = identification["e_sim_s"]
     summary = [
         KeyFigure(
-            "Free-run error (RMSE) of the hybrid on unseen data", rmse["mopgrnn"], "rad",
-            f"fitted prior: {_text(rmse['phy'])} rad", _verdict(ratio["rmse_rad"], 1.0),
+            "Free-run error (RMSE) of the hybrid on unseen data", rmse["mopgrnn"], output.unit,
+            f"fitted prior: {_text(rmse['phy'])} {output.unit}", _verdict(ratio["rmse"], 1.0),
         ),
         KeyFigure(
             "Simulation error E_sim of the hybrid", e_sim["mopgrnn"], "s",
@@ -234,14 +235,21 @@ def _prior_table(context: Context) -> Table:
 
 
 def _score_table(results: dict[str, Any]) -> Table:
-    groups = [results["identification"][key] for key in ("e_sim_s", "rmse_rad", "energy_violation_w")]
+    found = results["identification"]
+    groups = [{m: _first(found[key][m]) for m in MODELS} for key in ("e_sim_s", "rmse", "balance_violation")]
+    unit = next((k for m in MODELS for k in found["rmse"][m] or ()), "[-]").partition(" ")[2]
     base = [group["phy"] for group in groups]
     rows = [
         (name_of(m), *(g[m] for g in groups), *(_percent(g[m], b) for g, b in zip(groups, base, strict=True)))
         for m in MODELS
     ]
-    columns = ("model", "E_sim [s]", "RMSE [rad]", "violation [W]", "E_sim", "RMSE", "violation")
+    columns = ("model", "E_sim [s]", f"RMSE {unit}", "violation [W]", "E_sim", "RMSE", "violation")
     return Table(columns, rows, "Free runs on unseen data; the last columns against the fitted prior.")
+
+
+def _first(value: Any) -> float | None:
+    """The first number of an object by name, or the number itself."""
+    return next(iter(value.values())) if isinstance(value, Mapping) else value
 
 
 def _percent(value: float | None, base: float | None) -> str:
@@ -280,8 +288,10 @@ def _control_table(results: dict[str, Any]) -> Table | None:
 def _cost(cell: dict[str, Any] | None) -> str:
     if cell is None:
         return "–"
-    half = cell["cost_ci95"]
-    return f"{cell['cost']:.3g}" + (f" ± {half:.1g}" if half is not None else "")
+    mean, half = cell["cost"]["mean"], cell["cost"]["ci95"]
+    if mean is None:
+        return "diverged"
+    return f"{mean:.3g}" + (f" ± {half:.1g}" if half is not None else "")
 
 
 def _gap(gap: dict[str, Any]) -> str:

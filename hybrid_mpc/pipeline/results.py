@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from hybrid_mpc.job.loops import LoopRow
+from hybrid_mpc.job.table import by_task, summaries
+from hybrid_mpc.pipeline.contest import kept
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.deploy import versions
 from hybrid_mpc.pipeline.guard_report import guard_results
+from hybrid_mpc.records import plain
 from hybrid_mpc.report.schema import CONTROLLERS, MODELS, OBSERVERS, SCHEMA, SCHEMA_VERSION, validate_results
 
-LOOP_FIGURES = ("cost", "tracking_rmse_rad")
+LOOP_FIGURES = ("cost", "tracking_rmse")
+ENERGY = "energy [W]"
+"""Name of the only balance that there is so far, with the unit of its rate."""
 BASELINES = ("prior", "prior_observer")
 REPORTED = {"prior": "prior_observer", "hybrid": "hybrid_observer", "oracle": "oracle"}
 """Contenders behind the three names of the schema: all with the same kind of estimator."""
@@ -53,15 +59,20 @@ def collect(context: Context) -> dict[str, Any]:
 
 def _identification(context: Context) -> dict[str, Any]:
     scores, prior = context.result("evaluation")["scores"], context.result("prior")
-    figures: dict[str, Any] = {}
-    for key in ("e_sim_s", "rmse_rad", "energy_violation_w"):
-        group: dict[str, Any] = {}
-        for name in MODELS:
-            value = float(scores[name]["best"][key])
-            group[name] = value if math.isfinite(value) else None
-            if not math.isfinite(value):
-                group[f"{name}_reason"] = "a free run diverged"
-        figures[key] = group
+    output = context.scenario.prior().outputs[0].label
+    own = {
+        key: {name: _finite(scores[name]["best"][found]) for name in MODELS}
+        for key, found in (
+            ("e_sim_s", "e_sim_s"),
+            ("rmse", "rmse_rad"),
+            ("balance_violation", "energy_violation_w"),
+        )
+    }
+    figures = {
+        "e_sim_s": _or_reason(own["e_sim_s"]),
+        "rmse": _or_reason(own["rmse"], output),
+        "balance_violation": _or_reason(own["balance_violation"], ENERGY),
+    }
     details = {
         "prior_parameters": {
             k: prior[k] for k in ("values", "standard_errors", "nominal", "warnings", "stages")
@@ -72,13 +83,21 @@ def _identification(context: Context) -> dict[str, Any]:
             for stem in context.result("evaluation")["by_file"]["phy"]
         },
         "smoother": prior["smoother"],
-        "hybrid_over_phy": {
-            key: _ratio(figures[key]["mopgrnn"], figures[key]["phy"]) for key in ("e_sim_s", "rmse_rad")
-        },
+        "hybrid_over_phy": {key: _ratio(own[key]["mopgrnn"], own[key]["phy"]) for key in ("e_sim_s", "rmse")},
     }
     if network := context.settings.network():  # what replaced the budget's
         details["network_settings"] = network
     return {**figures, "details": details}
+
+
+def _or_reason(values: Mapping[str, float | None], label: str = "") -> dict[str, Any]:
+    """Values by model, under a label where one is given; those that are none with their reason."""
+    group: dict[str, Any] = {}
+    for name, value in values.items():
+        group[name] = {label: value} if label and value is not None else value
+        if value is None:
+            group[f"{name}_reason"] = "a free run diverged"
+    return group
 
 
 def _finite(value: float) -> float | None:
@@ -96,92 +115,55 @@ def _control(context: Context) -> dict[str, Any]:
             name: dict.fromkeys(LOOP_FIGURES) | {"reason": control["reason"]} for name in CONTROLLERS
         }
         return {**groups, "gap_closed": None, "gap_closed_reason": control["reason"]}
-    table = loop_table(control["loops"])
+    rows = kept(context, "control")
+    table, found = by_task(rows), summaries(rows)
     out: dict[str, Any] = {}
     for name, contender in REPORTED.items():
-        rows = [row[contender] for row in table.values() if contender in row]
-        if rows:
+        own = [cells[contender] for cells in found.values() if contender in cells]
+        loops = [row for row in rows if row.controller == contender]
+        if own:
+            costs = [cell.cost.mean for cell in own]
             out[name] = {
-                "cost": float(sum(np.mean(r["cost"]) for r in rows)),
-                "tracking_rmse_rad": float(np.sqrt(np.mean([np.mean(np.square(r["rmse"])) for r in rows]))),
+                "cost": None if None in costs else float(sum(c for c in costs if c is not None)),
+                "tracking_rmse": {
+                    signal: _root_mean_square([row.tracking_rmse[signal] for row in loops])
+                    for signal in loops[0].tracking_rmse
+                },
             }
+            if None in costs:
+                out[name]["cost_reason"] = "a loop diverged"
         else:
             out[name] = dict.fromkeys(LOOP_FIGURES) | {"reason": "the scenario has no oracle"}
-    gaps = {task: gap_closed(row) for task, row in table.items()}
+    gaps = {task: gap_closed(cells) for task, cells in table.items()}
     defined = [gap for gap, _ in gaps.values() if gap is not None]
     out["gap_closed"] = float(np.mean(defined)) if defined else None
     if not defined:
         out["gap_closed_reason"] = "; ".join(dict.fromkeys(why for _, why in gaps.values()))
-    tasks = {task: {name: summary(r) for name, r in row.items()} for task, row in table.items()}
-    names = dict.fromkeys(r["controller"] for r in control["loops"])
-    solved = {
-        n: float(np.mean([r["solved"] for r in control["loops"] if r["controller"] == n])) for n in names
-    }
     details = {
-        "tasks": tasks,
+        "tasks": plain(found),
         "gap_closed_by_task": {
             t: {"value": gap, **({"reason": why} if why else {})} for t, (gap, why) in gaps.items()
         },
-        "figures": task_figures(control["loops"]),
-        "share_of_solved_steps": solved,
-        "limits_used": limits_used(control["loops"]),
     }
     return {**out, "details": details}
 
 
-def limits_used(loops: list[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
-    """Largest share of each limit that any loop used, ``[task][controller][limit]``; see ``contest.limits_used``."""
-    out: dict[str, dict[str, dict[str, float]]] = {}
-    for row in loops:
-        cell = out.setdefault(row["task"], {}).setdefault(row["controller"], {})
-        for key, share in row["limits"].items():
-            cell[key] = max(float(share), cell.get(key, 0.0))
-    return out
+def _root_mean_square(values: Sequence[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
-def loop_table(loops: list[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, list[float]]]]:
-    """Costs and tracking errors ``table[task][controller]``, one entry a seed."""
-    table: dict[str, dict[str, dict[str, list[float]]]] = {}
-    for row in loops:
-        cell = table.setdefault(row["task"], {}).setdefault(row["controller"], {"cost": [], "rmse": []})
-        cell["cost"].append(float(row["cost"]))
-        cell["rmse"].append(float(row["tracking_rmse_rad"]))
-    return table
-
-
-def task_figures(loops: list[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float | None]]]:
-    """Mean absolute value over the seeds of each task's own figures, ``[task][controller][figure]``."""
-    out: dict[str, dict[str, dict[str, float | None]]] = {}
-    for row in loops:
-        for key in row["figures"]:
-            same = [r for r in loops if (r["task"], r["controller"]) == (row["task"], row["controller"])]
-            values = [abs(float(r["figures"][key])) for r in same]  # "inf" after a round through JSON
-            mean = _finite(float(np.mean(values)))
-            out.setdefault(row["task"], {}).setdefault(row["controller"], {})[f"mean_abs_{key}"] = mean
-    return out
-
-
-def summary(cell: Mapping[str, list[float]]) -> dict[str, float | None]:
-    """Mean and half width of the 95 % interval over seeds (Student's t; null for one seed)."""
-    from scipy.stats import t as student
-
-    cost, n = np.array(cell["cost"]), len(cell["cost"])
-    half = float(student.ppf(0.975, n - 1) * cost.std(ddof=1) / np.sqrt(n)) if n > 1 else None
-    return {"cost": float(cost.mean()), "cost_ci95": half, "tracking_rmse_rad": float(np.mean(cell["rmse"]))}
-
-
-def gap_closed(row: Mapping[str, Mapping[str, list[float]]]) -> tuple[float | None, str]:
+def gap_closed(cells: Mapping[str, Sequence[LoopRow]]) -> tuple[float | None, str]:
     """Share of the distance from the better baseline to the measuring oracle that the hybrid covers in a task.
 
     The baselines are the fitted prior with and without disturbance observer; the hybrid is the one with it. None,
     with a reason, where the distance is below twice its standard error; one seed has no standard error.
 
     Args:
-        row: ``[controller]["cost"]``, one entry a seed.
+        cells: Loops by contender.
     """
-    if "oracle" not in row:
+    if "oracle" not in cells:
         return None, "the scenario has no oracle"
-    costs = {name: np.array(cell["cost"]) for name, cell in row.items()}
+    costs = {name: np.array([row.cost for row in rows]) for name, rows in cells.items()}
     baseline = min((costs[n] for n in BASELINES if n in costs), key=lambda c: float(c.mean()))
     hybrid, oracle = costs[REPORTED["hybrid"]], costs["oracle"]
     if min(len(baseline), len(oracle)) < 2:
@@ -214,15 +196,16 @@ def _keys(*path: str) -> tuple[str, ...]:
 
 def step_times(context: Context) -> dict[str, Any]:
     """Durations [ms] of whole controller steps by controller."""
-    arrays, times = context.arrays("control"), {}
+    arrays = context.arrays("control")
     if "step_ms" in arrays:
         return {"hybrid": arrays["step_ms"]}
-    for name in ("prior", "hybrid"):
-        key_of = REPORTED[name]
-        own = [v for key, v in arrays.items() if key.split("/")[1] == key_of and key.endswith("/step_ms")]
-        if own:
-            times[name] = np.concatenate(own)
-    return times
+    if "reason" in context.result("control"):
+        return {}
+    timed = [row for row in kept(context, "control") if "step_ms" in row.arrays]
+    own = {
+        n: [r.arrays["step_ms"] for r in timed if r.controller == REPORTED[n]] for n in ("prior", "hybrid")
+    }
+    return {name: np.concatenate(times) for name, times in own.items() if times}
 
 
 def _timing(context: Context) -> dict[str, Any]:
@@ -249,13 +232,13 @@ def _monitor(context: Context) -> dict[str, Any]:
     covered = {"recordings": monitor["recordings"]} if "recordings" in monitor else {}
     if "reason" in monitor:
         return {
-            **dict.fromkeys(("threshold_w", "false_alarms_per_hour", "alarms")),
+            **dict.fromkeys(("threshold", "false_alarms_per_hour", "alarms")),
             "reason": monitor["reason"],
             "details": covered,
         }
     clean = monitor["clean"]
     return {
-        "threshold_w": monitor["calibration"]["threshold_w"],
+        "threshold": {ENERGY: monitor["calibration"]["threshold_w"]},
         "false_alarms_per_hour": clean["alarms"] / (clean["seconds"] / 3600.0),
         "alarms": monitor["alarms"],
         "details": {"calibration": monitor["calibration"], "clean": clean, **covered},

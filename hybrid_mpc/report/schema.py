@@ -9,7 +9,7 @@ from typing import Any
 
 from hybrid_mpc.errors import InputError
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 MODELS = ("phy_nominal", "phy", "rnn", "pgrnn", "mopgrnn")
 CONTROLLERS = ("prior", "hybrid", "oracle")
 OBSERVERS = ("prior_observer", "hybrid_observer")
@@ -53,6 +53,10 @@ def _is_count(value: Any) -> bool:
 
 def _is_text(value: Any) -> bool:
     return isinstance(value, str) and bool(value.strip())
+
+
+def _is_named(value: Any) -> bool:
+    return _is_text(value) and value.endswith("]") and " [" in value
 
 
 def _is_interval(value: Any) -> bool:
@@ -102,7 +106,16 @@ _COUNT = Leaf("a whole number, zero or above", _is_count)
 _SHARE = Leaf("a number between 0 and 1", lambda v: _is_number(v) and 0 <= v <= 1)
 _TRUTH = Leaf("true or false", lambda v: isinstance(v, bool))
 _INTERVALS = "a list of {file, start_s, end_s} with start_s <= end_s"
+_SIZES = Leaf(
+    "an object of finite numbers, zero or above, by name with unit",
+    lambda v: (
+        isinstance(v, Mapping)
+        and bool(v)
+        and all(_is_named(k) and _is_number(x) and x >= 0 for k, x in v.items())
+    ),
+)
 _PER_MODEL = Group(dict.fromkeys(MODELS, _SIZE))
+_SIZES_PER_MODEL = Group(dict.fromkeys(MODELS, _SIZES))
 
 SCHEMA = Group(
     {
@@ -125,12 +138,12 @@ SCHEMA = Group(
             nullable=False,
         ),
         "identification": Group(
-            {"e_sim_s": _PER_MODEL, "rmse_rad": _PER_MODEL, "energy_violation_w": _PER_MODEL}
+            {"e_sim_s": _PER_MODEL, "rmse": _SIZES_PER_MODEL, "balance_violation": _SIZES_PER_MODEL}
         ),
         "export": Group({"parity_max_abs_error": _SIZE, "jacobian_max_abs_error": _SIZE}),
         "control": Group(
             {
-                **{name: Group({"cost": _number(), "tracking_rmse_rad": _SIZE}) for name in CONTROLLERS},
+                **{name: Group({"cost": _number(), "tracking_rmse": _SIZES}) for name in CONTROLLERS},
                 "gap_closed": _number(),
             }
         ),
@@ -156,7 +169,7 @@ SCHEMA = Group(
         ),
         "monitor": Group(
             {
-                "threshold_w": _SIZE,
+                "threshold": _SIZES,
                 "false_alarms_per_hour": _SIZE,
                 "alarms": Leaf(_INTERVALS, _list_of(_is_interval)),
             }

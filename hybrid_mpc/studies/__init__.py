@@ -3,13 +3,13 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from hybrid_mpc.job.loops import LoopSpec, varied
 from hybrid_mpc.studies.configuration import Study
-from hybrid_mpc.studies.draws import FaultKind, RandomFaults, varied
+from hybrid_mpc.studies.draws import FaultKind, RandomFaults
 from hybrid_mpc.studies.dry_run import Plan, dry_run
 from hybrid_mpc.studies.files import read_study
 from hybrid_mpc.studies.ready import ready_study
 from hybrid_mpc.studies.results import StudyResults
-from hybrid_mpc.studies.run_config import RunConfig
 from hybrid_mpc.studies.runner import run_study
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ __all__ = [
     "FaultKind",
     "Plan",
     "RandomFaults",
-    "RunConfig",
+    "LoopSpec",
     "Study",
     "StudyResults",
     "dry_run",

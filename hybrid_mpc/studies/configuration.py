@@ -10,14 +10,15 @@ from itertools import count, product
 from pathlib import Path
 from typing import Any, cast
 
+from hybrid_mpc.assembly import SOLVERS
 from hybrid_mpc.closed_loop.faults import Fault
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.job.contenders import CONTENDERS, ORACLES
-from hybrid_mpc.pipeline.control_job import DEFAULT_CONTROLLERS, SOLVERS, parsed_fault, selected_tasks
+from hybrid_mpc.job.loops import Intervals, LoopSpec
+from hybrid_mpc.pipeline.control_job import DEFAULT_CONTROLLERS, parsed_fault, selected_tasks
 from hybrid_mpc.records import MOST_SEED, known, plain, record
 from hybrid_mpc.scenario import load_scenario
-from hybrid_mpc.studies.draws import Intervals, RandomFaults, factors, generator
-from hybrid_mpc.studies.run_config import RunConfig
+from hybrid_mpc.studies.draws import RandomFaults, factors, generator
 
 ESTIMATORS: Mapping[str, tuple[bool, bool] | None] = {
     "own": None,
@@ -151,7 +152,7 @@ hybrid, hybrid_observer, oracle, oracle_state
         """Number of runs."""
         return math.prod(self.axes.values())
 
-    def runs(self) -> Iterator[RunConfig]:
+    def runs(self) -> Iterator[LoopSpec]:
         """The runs, those with the same controller next to each other; none is kept, so there may be millions."""
         tasks = [t.name for t in selected_tasks(load_scenario(self.scenario), self.tasks)]
         drawn = [self._drawn(i) for i in range(self.draws)]
@@ -162,9 +163,9 @@ hybrid, hybrid_observer, oracle, oracle_state
         for model, task, contender, solver, horizon, monitor, faults in outer:
             for draw, (parameters, some, late) in enumerate(drawn):
                 for seed in self.loop_seeds:
-                    yield RunConfig(
+                    yield LoopSpec(
                         self.scenario, model, task, contender, solver, horizon, monitor,
-                        faults, some, late, parameters, draw, seed, self.duration, next(number),
+                        faults, some, late, parameters, draw, seed, self.duration, number=next(number),
                     )  # fmt: skip
 
     def identity(self) -> dict[str, Any]:

@@ -5,18 +5,18 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from hybrid_mpc.closed_loop.faults import SIGNAL_TARGETS, Fault
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.job.loops import Intervals
 from hybrid_mpc.records import known, record
 
 LATE = "late"
 """A target beside those of :class:`~hybrid_mpc.closed_loop.Fault`: solves miss their deadline."""
-Intervals = tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
@@ -151,39 +151,6 @@ def factors(vary: Sequence[tuple[str, float]], seed: int, draw: int) -> tuple[tu
     return tuple(
         (name, float(1.0 + span * generator(seed, draw, name).uniform(-1.0, 1.0))) for name, span in vary
     )
-
-
-def varied(plant: Any, factors: Sequence[tuple[str, float]]) -> Any:
-    """The plant with some of its parameters multiplied.
-
-    Args:
-        plant: A dataclass with a dataclass ``parameters``, or with parameters of its own.
-        factors: Parameters and factors; may be empty.
-
-    Raises:
-        InputError: If the plant is no dataclass, or has no number of that name.
-
-    Example:
-        >>> from scenarios.golf_robot.rig import Rig
-        >>> round(varied(Rig(), [("m", 1.1)]).parameters.m, 5)
-        0.58806
-    """
-    if not factors:
-        return plant
-    inner = getattr(plant, "parameters", None)
-    holder = inner if is_dataclass(inner) else plant
-    if not is_dataclass(holder) or isinstance(holder, type):
-        raise InputError(
-            f"the plant {type(plant).__name__} has no parameters to vary: it must be a dataclass, or have one "
-            "named 'parameters'"
-        )
-    numbers = [f.name for f in fields(holder) if f.init and isinstance(getattr(holder, f.name), float)]
-    changed = {
-        known(name, numbers, f"parameter of {type(holder).__name__}"): getattr(holder, name) * factor
-        for name, factor in factors
-    }
-    other = replace(holder, **changed)
-    return replace(plant, parameters=other) if holder is inner else other
 
 
 def _span(

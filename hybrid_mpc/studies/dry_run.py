@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from hybrid_mpc.job.loops import LoopSpec
 from hybrid_mpc.scenario import load_scenario
 from hybrid_mpc.studies.configuration import Study
-from hybrid_mpc.studies.loops import TIMING, load_inputs
-from hybrid_mpc.studies.run_config import RunConfig
+from hybrid_mpc.studies.inputs import TIMING, load_inputs
 
 PROBE_PERIODS = 20
 Kind = tuple[object, ...]
@@ -66,14 +66,14 @@ def dry_run(
     return Plan(study.size, study.axes, each * sum(kinds.values()) / workers, kinds)
 
 
-def _kind(run: RunConfig) -> Kind:
+def _kind(run: LoopSpec) -> Kind:
     return run.model, run.controller, run.solver, run.horizon
 
 
-def _first_runs(study: Study) -> list[RunConfig]:
+def _first_runs(study: Study) -> list[LoopSpec]:
     """One run of each kind and task."""
     small = replace(study, draws=1, seeds=study.loop_seeds[:1], faults=study.fault_sets[:1])
-    kinds: dict[tuple[Kind, str], RunConfig] = {}
+    kinds: dict[tuple[Kind, str], LoopSpec] = {}
     for run in small.runs():
         kinds.setdefault((_kind(run), run.task), run)
     return list(kinds.values())

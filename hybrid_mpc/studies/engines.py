@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.pipeline.parallel import follow
-from hybrid_mpc.studies.loops import LoopRunner, run_batch
+from hybrid_mpc.studies.inputs import LoopRunner, run_batch
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 CONNECT_S = 5.0

@@ -13,22 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.artifact import Kit, load
-from hybrid_mpc.assembly import make_adaptive_guard, make_resting_guard
-from hybrid_mpc.closed_loop import ClosedLoopResult, Guard, simulate
-from hybrid_mpc.closed_loop.guard import Mode
-from hybrid_mpc.closed_loop.simulate import Step
-from hybrid_mpc.estimation.switching import SwitchingFilter
+from hybrid_mpc.closed_loop import ClosedLoopResult
 from hybrid_mpc.files import read_arrays, read_json, write_arrays
-from hybrid_mpc.job.contenders import build
+from hybrid_mpc.job.loops import Bench, LoopSpec
 from hybrid_mpc.monitor import METHODS, Detector, EnergyMonitor, Judges, guard_monitor, learn_judges
 from hybrid_mpc.monitor.rest import REST_SPEED
-from hybrid_mpc.mpc import OCP
-from hybrid_mpc.pipeline.control_job import selected_tasks
-from hybrid_mpc.pipeline.monitor_job import stored_rest
+from hybrid_mpc.pipeline.control_job import MODEL, selected_tasks
 from hybrid_mpc.records import record
 from hybrid_mpc.scenario import Task, load_scenario
-from hybrid_mpc.studies.lockstep import NominalLoop, Trace, run_together
-from hybrid_mpc.studies.loops import ModelInput
+from hybrid_mpc.studies.inputs import ModelInput
 from hybrid_mpc.studies.monitor_plan import FAULT, GUARD, LEARN, LoopPlan, MonitorJob, MonitorStudy
 
 Array = NDArray[np.float64]
@@ -67,24 +60,16 @@ def _loops(runner: MonitorRunner) -> _Loops:
 
 
 class _Loops:
-    """Models and controllers of a process."""
+    """The bench of a process."""
 
     def __init__(self, runner: MonitorRunner) -> None:
         self._study, self._folder = runner.study, Path(runner.folder)
-        self._scenario = load_scenario(runner.study.scenario)
-        self._artifact: Kit = load(Path(runner.model.folder))
-        self._noise = {name: np.array(sigma) for name, sigma in runner.model.noise}
-        (self._task,) = selected_tasks(self._scenario, (runner.study.task,))
-        self._task = plain_task(self._task)
-        self._model = self._artifact.models["hybrid"]
+        kit = load(Path(runner.model.folder)).with_noise(dict(runner.model.noise))
+        self._bench = Bench(load_scenario(runner.study.scenario), {MODEL: kit})
+        self._kit = self._bench.kits[MODEL]
+        self._task = plain_task(selected_tasks(self._bench.scenario, (runner.study.task,))[0])
+        self._dt = self._kit.models["hybrid"].dt
         self._judges: Judges | None = None
-        self._made: dict[Any, Any] = {}
-
-    @property
-    def _control(self) -> OCP:
-        control = self._task.control or self._scenario.control
-        assert control is not None
-        return control
 
     @property
     def judges(self) -> Judges:
@@ -105,82 +90,78 @@ class _Loops:
         shown = [nominal_figures(self._study, self.judges, t) for t in traces]
         return {"loops": [{"case": p.case, **f} for p, f in zip(job.plans, shown, strict=True)]}
 
-    def _parts(self, name: str, horizon: int | None = None) -> Any:
-        if (name, horizon) not in self._made:
-            control = self._control if horizon is None else self._control.changed(horizon=horizon)
-            self._made[name, horizon] = build(name, self._scenario, self._artifact, control, self._noise)
-        return self._made[name, horizon]
+    def _spec(self, plan: LoopPlan, arm: str = "", horizon: int | None = None) -> LoopSpec:
+        reaction = {"backup": "prior"}.get(arm, arm)
+        return LoopSpec(
+            self._study.scenario, MODEL, self._task.name, CONTROLLER, horizon=horizon, monitor="readings",
+            faults=plan.faults(self._dt), seed=plan.seed, guard=reaction,
+        )  # fmt: skip
 
-    def _monitor(
-        self, detector: Detector | None = None, resolution: tuple[float, ...] | None = None
-    ) -> EnergyMonitor:
-        ranges = self._control.input_range
-        rest = stored_rest(self._artifact) if detector is None else None
+    def _follows(self, plan: LoopPlan) -> Task:
+        return replace(
+            self._task, reference=plan.reference(self._task.reference), duration=plan.duration,
+            x0=(0.0,) * self._kit.models["hybrid"].n_x, figures=None,
+        )  # fmt: skip
+
+    def _monitor(self, detector: Detector | None = None) -> EnergyMonitor:
+        rest = self._kit.rest_speed if detector is None else None
+        steps = None if detector is None else self.judges.resolution
+        ranges = self._kit.problem(self._task.name).input_range
         return guard_monitor(
-            self._model, detector, resolution=resolution, input_range=ranges, rest_speed=rest
+            self._kit.models["hybrid"], detector, resolution=steps, input_range=ranges, rest_speed=rest
         )
 
     def _nominal(self, plans: tuple[LoopPlan, ...]) -> list[Trace]:
-        estimator, controller = self._parts(CONTROLLER, self._study.horizon)
-        assert isinstance(estimator, SwitchingFilter)
-        assert self._scenario.plant is not None
-        dt = self._model.dt
-        loops = [NominalLoop(p.reference(self._task.reference), p.seed, p.faults(dt)) for p in plans]
-        return run_together(
-            self._scenario.plant(), estimator, controller, self._monitor(), loops,
-            round(plans[0].duration / dt),
-        )  # fmt: skip
-
-    def _simulated(
-        self, plan: LoopPlan, monitor: EnergyMonitor, guard: Guard | None = None
-    ) -> tuple[ClosedLoopResult, Trace]:
-        estimator, controller = self._parts(CONTROLLER)
-        assert self._scenario.plant is not None
-        dt, rows, half = self._model.dt, [], self._model.n_x // 2
-
-        def keep(step: Step) -> None:
-            r, e, speed = step.reading, step.estimate, np.abs(step.x[half:]).max()
-            rows.append(
-                (getattr(r, "numbers", ()), step.reading and step.reading.level_w, e.innovation, e.nis, speed)
-            )
-
-        result = simulate(
-            self._scenario.plant(), estimator, controller, plan.reference(self._task.reference), dt=dt,
-            duration=plan.duration, x0=np.zeros(self._model.n_x), seed=plan.seed, monitor=monitor,
-            faults=plan.faults(dt), guard=guard, on_step=keep,
-        )  # fmt: skip
-        return result, Trace(*(np.array(c, dtype=np.float64) for c in zip(*rows, strict=True)))
+        specs = [self._spec(plan, horizon=self._study.horizon) for plan in plans]
+        follow = [self._follows(plan) for plan in plans]
+        found = self._bench.run_together(specs, tasks=follow, monitor=self._monitor())
+        return [trace_of(result) for _, result in found]
 
     def _fault(self, plan: LoopPlan) -> dict[str, Any]:
-        result, trace = self._simulated(plan, self._monitor())
-        found = fault_figures(
-            self._study, self.judges, trace, round(plan.onset(self._model.dt) / self._model.dt)
-        )
-        return {**found, **loop_figures(result, self._control)}
+        row, result = self._bench.run(self._spec(plan), task=self._follows(plan), monitor=self._monitor())
+        onset = round(plan.onset(self._dt) / self._dt)
+        found = fault_figures(self._study, self.judges, trace_of(result), onset)
+        return {**found, "cost": row.cost, "excess": dict(row.excess)}
 
     def _guarded(self, plan: LoopPlan, arm: str) -> dict[str, Any]:
-        detector = self.judges.detector_at(self._study.rates[0])
-        monitor = self._monitor(detector, self.judges.resolution)
-        result, _ = self._simulated(plan, monitor, self._guard(arm))
-        onset = plan.onset(self._model.dt)
-        early = sum(switch.t < onset for switch in result.switches)
+        monitor = self._monitor(self.judges.detector_at(self._study.rates[0]))
+        row, _ = self._bench.run(self._spec(plan, arm), task=self._follows(plan), monitor=monitor)
+        early = sum(switch.t_s < plan.onset(self._dt) for switch in row.switches)
         return {
-            **loop_figures(result, self._control),
-            "switches": len(result.switches),
+            "cost": row.cost,
+            "excess": dict(row.excess),
+            "switches": len(row.switches),
             "early_switches": early,
         }
 
-    def _guard(self, arm: str) -> Guard:
-        if arm == "rest":
-            return make_resting_guard(self._model)
-        if arm == "backup":
-            estimator, controller = self._parts(PRIOR)
-            return Guard(Mode.BACKUP, Mode.REST, backup=controller, backup_estimator=estimator)
-        if arm not in self._made:
-            prior, sigma_x = self._artifact.models["prior"], self._noise[CONTROLLER]
-            self._made[arm] = make_adaptive_guard(self._model, prior, self._scenario, sigma_x, self._control)
-        guard: Guard = self._made[arm]
-        return guard
+
+@dataclass(frozen=True)
+class Trace:
+    """What detectors see of a loop of n periods.
+
+    Args:
+        numbers: ``MonitorReading.numbers`` ``(n, columns)``.
+        level_w: Averaged one-step violation ``(n,)`` [W].
+        innovation: Innovations of the filter ``(n, n_y)`` [output units]; NaN in the first row.
+        nis: Normalised innovations squared ``(n,)``; NaN in the first.
+        speed: Largest true speed ``(n,)`` of the degrees of freedom [rad/s or m/s].
+    """
+
+    numbers: Array
+    level_w: Array
+    innovation: Array
+    nis: Array
+    speed: Array
+
+
+def trace_of(result: ClosedLoopResult) -> Trace:
+    """What detectors see of a loop.
+
+    Args:
+        result: Its record.
+    """
+    speed = np.abs(result.x[:, result.x.shape[1] // 2 :]).max(axis=1)
+    return Trace(result.numbers, result.level, result.innovation, result.nis, speed)
 
 
 def plain_task(task: Task) -> Task:
@@ -245,23 +226,6 @@ def _delay(alarm: NDArray[np.bool_], moved: Array) -> float:
     return float(moved[places[0]]) if places.size else float("inf")
 
 
-def loop_figures(result: ClosedLoopResult, control: OCP) -> dict[str, Any]:
-    """Cost of a loop, and by how much it left its limits.
-
-    Args:
-        result: The loop.
-        control: Its limits.
-    """
-    over = {"u": np.maximum(result.u - control.u_max, control.u_min - result.u)}
-    if np.any(np.isfinite([control.x_min, control.x_max])):
-        beyond = np.maximum(result.x - control.x_max, control.x_min - result.x)
-        over |= {f"x{i}": column for i, column in enumerate(beyond.T)}
-    if control.du_max is not None:
-        over["du"] = np.abs(np.diff(result.u, axis=0)) - control.du_max
-    excess = {name: max(0.0, float(values.max())) for name, values in over.items()}
-    return {"cost": result.cost, "excess": excess}
-
-
 def write_learning(path: Path, traces: list[Trace]) -> None:
     """Keep what is learned from."""
     arrays = {f"{name}_{i}": value for i, t in enumerate(traces) for name, value in vars(t).items()}
@@ -286,7 +250,7 @@ def learn(study: MonitorStudy, paths: list[Path], artifact: Kit) -> Judges:
             fields: Mapping[str, Any] = {name: arrays[f"{name}_{i}"] for name in Trace.__dataclass_fields__}
             traces.append(Trace(**fields))
             hashed.update(traces[-1].numbers.tobytes())
-    model, rest = artifact.models["hybrid"], stored_rest(artifact)
+    model, rest = artifact.models["hybrid"], artifact.rest_speed
     return learn_judges(
         traces, model.dt, study.resolution, rate=min(study.rates), rest_speed=REST_SPEED if rest is None else rest,
         time_unit=model.time_unit, data_hash=hashed.hexdigest(),

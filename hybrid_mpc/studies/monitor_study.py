@@ -17,8 +17,8 @@ from hybrid_mpc.records import record
 from hybrid_mpc.scenario import load_scenario
 from hybrid_mpc.studies.configuration import Study
 from hybrid_mpc.studies.engines import Engine, make_engine
+from hybrid_mpc.studies.inputs import load_inputs
 from hybrid_mpc.studies.log import RunLog, rows
-from hybrid_mpc.studies.loops import load_inputs
 from hybrid_mpc.studies.monitor_loops import CONTROLLER, JUDGES, LEARNING, PRIOR, MonitorRunner, learn
 from hybrid_mpc.studies.monitor_plan import LEARN, MonitorJob, MonitorStudy
 from hybrid_mpc.studies.monitor_report import write_monitor_report

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.pipeline.control_results import interval
+from hybrid_mpc.job.table import interval
 from hybrid_mpc.records import known
 from hybrid_mpc.studies.log import rows
 from hybrid_mpc.studies.note import StudyNote, note_of, read_note
@@ -229,13 +229,10 @@ def _groups(table: pd.DataFrame, by: Sequence[str]) -> Any:
 
 def _interval(values: Any) -> tuple[float, float]:
     """Mean and half width of its 95 % interval; NaN where there is none."""
-    numbers = np.asarray(values, dtype=float)
-    if numbers.size == 0:
-        return math.nan, math.nan
-    found = interval(numbers.tolist())
+    found = interval(np.asarray(values, dtype=float).tolist())
     return (
-        math.nan if found["mean"] is None else found["mean"],
-        math.nan if found["ci95"] is None else found["ci95"],
+        math.nan if found.mean is None else found.mean,
+        math.nan if found.ci95 is None else found.ci95,
     )
 
 

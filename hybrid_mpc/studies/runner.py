@@ -17,8 +17,8 @@ from hybrid_mpc.records import plain
 from hybrid_mpc.scenario import load_scenario
 from hybrid_mpc.studies.configuration import Study
 from hybrid_mpc.studies.engines import Batch, Engine, Lost, make_engine
+from hybrid_mpc.studies.inputs import TIMING, load_inputs
 from hybrid_mpc.studies.log import RunLog, rows
-from hybrid_mpc.studies.loops import TIMING, load_inputs
 from hybrid_mpc.studies.note import FILE as NOTE
 from hybrid_mpc.studies.note import ModelNote, StudyNote, read_note, write_note
 from hybrid_mpc.studies.results import StudyResults

@@ -1,18 +1,21 @@
 """What the closed loops of a run are summed up to, and what they are made of."""
 
 import shutil
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from closed_loop_parts import loop_row
 
-from hybrid_mpc import load
+from hybrid_mpc.artifact import set_process_noise
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.job.contenders import CONTENDERS, ORACLES
-from hybrid_mpc.pipeline.contest import _seeds, contest, limits_used, parts_of, tasks_of
+from hybrid_mpc.job.loops import limits_used, tasks_of
+from hybrid_mpc.job.table import by_task, interval, summaries
+from hybrid_mpc.pipeline.contest import TIMED, _seeds, contest, parts_of
 from hybrid_mpc.pipeline.context import Context
-from hybrid_mpc.pipeline.results import gap_closed, loop_table, summary, task_figures
-from hybrid_mpc.pipeline.results import limits_used as most_used
+from hybrid_mpc.pipeline.results import gap_closed
 from hybrid_mpc.pipeline.settings import RunSettings
 from hybrid_mpc.scenario import load_scenario
 
@@ -20,20 +23,23 @@ GOLF = load_scenario("golf_robot")
 
 
 def cells(**costs):
-    return {name: {"cost": list(values), "rmse": [0.0] * len(values)} for name, values in costs.items()}
+    return {
+        name: [loop_row(controller=name, seed=i, cost=cost) for i, cost in enumerate(values)]
+        for name, values in costs.items()
+    }
 
 
 def test_gap_is_measured_from_the_better_baseline():
-    row = cells(
+    found = cells(
         prior=[3.0, 3.0],
         prior_observer=[2.0, 2.0],
         hybrid=[0.0, 0.0],
         hybrid_observer=[1.25, 1.25],
         oracle=[1.0, 1.0],
     )
-    assert gap_closed(row) == (pytest.approx(0.75), "")
-    row["hybrid_observer"]["cost"] = [2.5, 2.5]  # worse than the baseline shows as a negative share
-    assert gap_closed(row)[0] == pytest.approx(-0.5)
+    assert gap_closed(found) == (pytest.approx(0.75), "")
+    found |= cells(hybrid_observer=[2.5, 2.5])  # worse than the baseline shows as a negative share
+    assert gap_closed(found)[0] == pytest.approx(-0.5)
 
 
 def test_gap_needs_a_baseline_and_an_oracle_that_differ():
@@ -51,29 +57,36 @@ def test_gap_needs_a_baseline_and_an_oracle_that_differ():
     )
 
 
-def test_summary_has_student_s_interval_and_none_for_one_seed():
+def test_an_interval_is_student_s_and_none_for_one_value():
     # n = 2: t(0.975, 1) = 12.706, standard error 0.5
-    assert summary(cells(prior=[1.0, 2.0])["prior"])["cost_ci95"] == pytest.approx(12.706 * 0.5, rel=1e-4)
-    assert summary(cells(prior=[1.0])["prior"])["cost_ci95"] is None
+    assert interval([1.0, 2.0]).ci95 == pytest.approx(12.706 * 0.5, rel=1e-4)
+    assert interval([1.0]).ci95 is None
+    assert interval([1.0, np.inf]) == interval([np.inf, np.nan])  # neither has a mean
+    assert interval([]).mean is None
 
 
 def test_rows_become_tables():
     rows = [
-        {
-            "task": "a",
-            "controller": "prior",
-            "cost": c,
-            "tracking_rmse_rad": 0.1,
-            "figures": {"speed_error_rel": e},
-        }
-        for c, e in ((1.0, -0.02), (3.0, 0.04))
+        loop_row(
+            seed=i,
+            cost=c,
+            tracking_rmse={"phi [rad]": 0.1},
+            figures={"speed_error_rel": e},
+            limits={"u": 0.5 + i},
+        )
+        for i, (c, e) in enumerate(((1.0, -0.02), (3.0, 0.04)))
     ]
-    assert loop_table(rows)["a"]["prior"] == {"cost": [1.0, 3.0], "rmse": [0.1, 0.1]}
-    assert task_figures(rows)["a"]["prior"]["mean_abs_speed_error_rel"] == pytest.approx(0.03)
-    rows[0]["figures"]["speed_error_rel"] = (
-        "inf"  # as JSON holds it: a stroke that never came is not averaged away
-    )
-    assert task_figures(rows)["a"]["prior"]["mean_abs_speed_error_rel"] is None
+    assert [r.cost for r in by_task(rows)["a"]["prior"]] == [1.0, 3.0]
+    found = summaries(rows)["a"]["prior"]
+    assert (found.cost.mean, found.cost.n) == (2.0, 2)
+    assert found.tracking_rmse["phi [rad]"].mean == pytest.approx(0.1)
+    assert found.figures["speed_error_rel"].mean == pytest.approx(0.01)
+    assert found.mean_abs_figures["speed_error_rel"].mean == pytest.approx(0.03)
+    assert found.sources["MPC"] == 1.0
+    assert found.limits == {"u": 1.5}
+    # a stroke that never came is not averaged away
+    lost = [rows[0], replace(rows[1], figures={"speed_error_rel": np.inf})]
+    assert summaries(lost)["a"]["prior"].mean_abs_figures["speed_error_rel"].mean is None
 
 
 def test_limits_are_shares_of_the_side_that_they_bound():
@@ -85,11 +98,6 @@ def test_limits_are_shares_of_the_side_that_they_bound():
     )
     used = limits_used(control, loop)
     assert used == {"u": pytest.approx(0.5), "du": pytest.approx(0.875), "x[0]": pytest.approx(0.75)}
-    rows = [
-        {"task": "a", "controller": "prior", "limits": used},
-        {"task": "a", "controller": "prior", "limits": {"u": 0.9}},
-    ]
-    assert most_used(rows)["a"]["prior"]["u"] == 0.9
 
 
 @pytest.mark.parametrize(
@@ -150,10 +158,9 @@ def test_a_contest_that_was_killed_goes_on_from_what_it_kept(golf_artifact, tmp_
     shutil.copytree(golf_artifact, out / "model")
     scenario = load_scenario(str(file))
     context = Context(RunSettings(str(file)), scenario, out)
-    noise = {name: np.array([1e-4, 1e-2]) for name in CONTENDERS}
-    artifact = load(out / "model")
-    rows, arrays = contest(context, artifact, scenario.control, noise)
-    assert [(r["controller"], r["seed"]) for r in rows] == [
+    set_process_noise(out / "model", {name: np.array([1e-4, 1e-2]) for name in CONTENDERS})
+    rows = contest(context)
+    assert [(r.controller, r.seed) for r in rows] == [
         (name, seed) for name in sorted(set(CONTENDERS) - set(ORACLES)) for seed in (0, 1)
     ]
     kept = sorted((out / "checkpoints" / "loops").glob("*.json"))
@@ -161,11 +168,14 @@ def test_a_contest_that_was_killed_goes_on_from_what_it_kept(golf_artifact, tmp_
     for lost in kept[1::3]:  # as a kill in between leaves them: arrays perhaps, but no JSON
         lost.unlink()
     stamps = {path: path.stat().st_mtime_ns for path in kept if path.exists()}
-    again, arrays_again = contest(context, artifact, scenario.control, noise)
-    assert again == rows
-    assert arrays.keys() == arrays_again.keys()
-    for key in arrays:
-        if not key.endswith("step_ms"):
-            np.testing.assert_array_equal(arrays[key], arrays_again[key])
+    again = contest(context)
+    untimed = [[replace(r, timing_ms={}) for r in found] for found in (rows, again)]
+    assert untimed[0] == untimed[1]
+    for one, other in zip(rows, again, strict=True):
+        assert one.arrays.keys() == other.arrays.keys()
+        assert ("plans" in one.arrays) == (one.controller in TIMED and one.seed == 0)
+        for key in one.arrays:
+            if key != "step_ms":
+                np.testing.assert_array_equal(one.arrays[key], other.arrays[key])
     assert all(path.is_file() for path in kept)
     assert stamps == {path: path.stat().st_mtime_ns for path in stamps}

@@ -40,7 +40,7 @@ def test_a_stage_that_cannot_run_leaves_its_reason_and_a_report(
     assert failed_stages(out)[name] == f"no {name} on Sundays"
     assert f"no {name} on Sundays" in (out / "report.html").read_text()
     results = json.loads((out / "results.json").read_text())
-    assert results["identification"]["rmse_rad"]["mopgrnn"] is not None
+    assert results["identification"]["rmse"]["mopgrnn"] is not None
 
 
 def test_a_stage_that_later_ones_need_ends_the_run(call, arguments, finished, tmp_path, monkeypatch):

@@ -3,20 +3,24 @@
 import re
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from closed_loop_parts import loop_row
 
-from hybrid_mpc.artifact import load, set_calibration
+from hybrid_mpc.artifact import load, set_calibration, set_process_noise
 from hybrid_mpc.closed_loop import Fault
 from hybrid_mpc.data import write_csv
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.job.loops import Bench
+from hybrid_mpc.job.rounds import repeated
 from hybrid_mpc.monitor import Calibration, Detector, Plausibility
 from hybrid_mpc.pipeline import guard_job, nominal_loops
+from hybrid_mpc.pipeline.contest import keep, kept
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.guard_job import guard_stage, learned
 from hybrid_mpc.pipeline.guard_report import guard_figures, guard_results, guard_tables, guard_words
-from hybrid_mpc.pipeline.nominal_loops import NominalLoop, repeated, run_nominal
 from hybrid_mpc.pipeline.settings import RunSettings
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.report.schema import SCHEMA, _check
@@ -26,6 +30,7 @@ from scenarios.golf_robot.rig import Rig
 GOLF = load_scenario("golf_robot")
 DT, BLOCK = 0.02, 250
 SIGMA = {"hybrid_observer": [1e-4, 2e-2]}
+MODEL = SimpleNamespace(dt=DT, time_unit=1.0)
 CALIBRATION = Calibration(0.5, 0.25, 5.0, 100, 0.1, "by hand", "", 0.4, 0.2)
 
 
@@ -70,29 +75,32 @@ def test_a_repeated_task_has_no_jump(name):
 
 
 def test_loops_are_nominal_and_age_where_the_plant_can():
-    quick = nominal_loops.nominal_loops(GOLF, GOLF.budgets["quick"])
+    quick = nominal_loops.nominal_loops(GOLF, GOLF.budgets["quick"], MODEL)
     assert len(quick) * nominal_loops.BLOCKS >= guard_job.blocks_needed(2.0)
-    full = nominal_loops.nominal_loops(GOLF, GOLF.budgets["full"])
+    full = nominal_loops.nominal_loops(GOLF, GOLF.budgets["full"], MODEL)
     assert len(full) * nominal_loops.BLOCKS >= guard_job.blocks_needed(1.0)
-    assert {loop.friction for loop in quick} == {0.9, 1.0, 1.1}
+    assert {fault.value for loop in quick for fault in loop.faults} == {0.9, 1.1}
+    assert any(not loop.faults for loop in quick)
     pendulum = load_scenario("pendulum")  # whose plant has no faults
-    assert {loop.friction for loop in nominal_loops.nominal_loops(pendulum, pendulum.budgets["quick"])} == {
-        1.0
-    }
+    assert not any(
+        loop.faults for loop in nominal_loops.nominal_loops(pendulum, pendulum.budgets["quick"], MODEL)
+    )
     broken = tuple(replace(t, faults=(Fault(0.0, 1.0, "input_gain", 0.5),)) for t in GOLF.tasks)
     with pytest.raises(InputError, match="every task brings a fault"):
-        nominal_loops.nominal_loops(replace(GOLF, tasks=broken), GOLF.budgets["quick"])
+        nominal_loops.nominal_loops(replace(GOLF, tasks=broken), GOLF.budgets["quick"], MODEL)
 
 
 def test_a_nominal_loop_is_what_the_guard_would_read(golf_artifact, monkeypatch):
     monkeypatch.setattr(nominal_loops, "BLOCKS", 1)
-    noise = {name: np.array(values) for name, values in SIGMA.items()}
-    told, kept = run_nominal("golf_robot", golf_artifact, noise, 0, NominalLoop("track_sine", 500, 1.1))
-    assert kept["numbers"].shape == (BLOCK, 11)
-    assert np.isfinite(kept["numbers"]).all()
-    assert len(kept["y"]) == BLOCK + 50  # the first second is no part of the readings
-    assert told["seconds"] == pytest.approx(6.0)
-    assert told["cost"] < 100.0  # it follows the task; a club that hangs still costs 1e4 x 0.1 rad^2 x 6 s
+    bench = Bench(GOLF, {"model": load(golf_artifact).with_noise(SIGMA)})
+    spec = nominal_loops.nominal_loops(GOLF, GOLF.budgets["quick"], MODEL)[1]
+    assert (spec.task, spec.faults[0].value) == ("track_step", 1.1)
+    row, _ = bench.run(spec)
+    assert row.arrays["numbers"].shape == (BLOCK + 50, 11)
+    assert np.isfinite(row.arrays["numbers"][50:]).all()  # the first second is no part of the readings
+    assert len(row.arrays["y"]) == BLOCK + 50
+    assert row.seconds == pytest.approx(6.0)
+    assert row.cost < 100.0  # it follows the task; a club that hangs still costs 1e4 x 0.1 rad^2 x 6 s
 
 
 def test_the_artifact_keeps_detector_and_plausibility(golf_artifact, tmp_path):
@@ -126,11 +134,13 @@ def context(golf_artifact, tmp_path_factory):
     made = Context(RunSettings("golf_robot"), scenario, out)
     smooth = {f"{t.name}/{key}": getattr(t, key) for t in made.trajectories("train") for key in ("x", "xdot")}
     made.save("prior", {}, smooth)
-    made.save("control", {"sigma_x": SIGMA}, {})
+    set_process_noise(out / "model", SIGMA)
     made.save("monitor", {"calibration": plain(CALIBRATION)}, {})
-    for i, loop in enumerate(nominal_loops.nominal_loops(scenario, made.budget)):
-        arrays = {"numbers": numbers(nominal_loops.BLOCKS, i), "y": np.full((9, 1), i), "u": np.zeros((9, 1))}
-        made.save(loop.stage, {"task": loop.task, "seed": loop.seed, "seconds": 46.0}, arrays)
+    for i, spec in enumerate(nominal_loops.nominal_loops(scenario, made.budget, MODEL)):
+        read = np.vstack([np.full((50, 11), np.nan), numbers(nominal_loops.BLOCKS, i)])  # a second settles
+        arrays = {"numbers": read, "y": np.full((9, 1), i), "u": np.zeros((9, 1))}
+        row = loop_row(spec.task, spec.controller, spec.seed, seconds=46.0, arrays=arrays)
+        keep(made, nominal_loops.stage_of(spec), [row])
     return made
 
 
@@ -153,12 +163,11 @@ def test_the_stage_learns_from_what_is_kept_and_fills_the_artifact(context, resu
     assert stored.threshold_w == CALIBRATION.threshold_w
     assert stored.plausibility.data_hash == context.dataset.hash
     assert stored.plausibility.samples == sum(len(t.t) for t in context.trajectories("train"))
-    arrays = context.arrays(nominal_loops.nominal_loops(context.scenario, context.budget)[0].stage)
-    other = arrays | {"y": arrays["y"] + 1}
-    context.save("guard/track_sine-500", context.result("guard/track_sine-500"), other)
-    changed = guard_job._from_loops(context).data_hash
-    context.save("guard/track_sine-500", context.result("guard/track_sine-500"), arrays)
-    assert guard_job._from_loops(context).data_hash == stored.detector.data_hash != changed
+    (row,) = kept(context, "guard/track_sine-500")
+    keep(context, "guard/track_sine-500", [replace(row, arrays=row.arrays | {"y": row.arrays["y"] + 1})])
+    changed = guard_job._from_loops(context, MODEL).data_hash
+    keep(context, "guard/track_sine-500", [row])
+    assert guard_job._from_loops(context, MODEL).data_hash == stored.detector.data_hash != changed
 
 
 def test_the_faulted_loops_are_told(context, resumed):

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hybrid_mpc.artifact import LoopSettings
+from hybrid_mpc.artifact import Kit, LoopSettings, Provenance
 from hybrid_mpc.job import contenders
 from hybrid_mpc.job.contenders import find_noise
 from hybrid_mpc.scenario import load_scenario
@@ -49,7 +49,7 @@ def test_beyond_them_it_is_no_surer_than_the_prior_state_by_state(noise):
 
 def test_noise_of_an_artifact_is_raised_too():
     loop = LoopSettings(process_noise={name: tuple(value) for name, value in OWN.items()})
-    artifact = SimpleNamespace(models={"prior": SimpleNamespace(n_x=2)}, loop=loop)
+    artifact = Kit({"prior": SimpleNamespace(n_x=2)}, None, Provenance(), loop=loop)
     for beyond, expected in ((False, [4e-4, 3e-2]), (True, [1e-3, 3e-2])):
         machine = replace(scenario, beyond_recordings=beyond)
         found, _ = find_noise(machine, artifact, ("hybrid",), 0)

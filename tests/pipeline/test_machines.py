@@ -46,8 +46,9 @@ def test_golf_robot(tmp_path):
 def test_torque_pendulum_on_the_real_recordings(tmp_path):
     data = [word for name in FILES for word in ("--data", RECORDINGS / f"{name}.csv")]
     results = job(tmp_path / "run", "torque_pendulum", *data)
-    rmse = results["identification"]["rmse_rad"]
-    assert rmse["phy"] < rmse["phy_nominal"]
+    rmse = results["identification"]["rmse"]
+    (signal,) = rmse["phy"]
+    assert rmse["phy"][signal] < rmse["phy_nominal"][signal]
     fitted = results["identification"]["details"]["prior_parameters"]["values"]
     assert 0.75 < fitted["k_u"] < 0.95  # true torque is probably 1/1.2 of the commanded one
     alarms = results["monitor"]["alarms"]

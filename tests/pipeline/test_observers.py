@@ -39,18 +39,14 @@ def test_without_a_control_problem_there_is_a_reason():
     assert arrays == {}
 
 
-def test_too_short_recordings_are_a_reason(monkeypatch, tmp_path):
+def test_too_short_recordings_are_a_reason():
     from closed_loop_parts import make_ekf
     from online_models import pendulum_model
 
     model, kept = pendulum_model(), {}
-    monkeypatch.setattr(
-        observers, "load", lambda folder: SimpleNamespace(models={"prior": model, "hybrid": model})
-    )
-    monkeypatch.setattr(observers, "make_estimator", lambda model, control, sigma: make_ekf(model))
     context = SimpleNamespace(
-        scenario=SimpleNamespace(control=object()), out=tmp_path,
-        sigma_x=lambda name: np.array([1e-3, 1e-2]),
+        scenario=SimpleNamespace(control=object()),
+        kit=SimpleNamespace(observer=lambda model_name, load: make_ekf(model)),
         trajectories=lambda role: [recording("short", 60)],
         progress=SimpleNamespace(update=lambda *words: None),
         save=lambda *given: kept.update({given[0]: given[1:]}),

@@ -50,8 +50,9 @@ def test_doubts_about_recordings_reach_terminal_results_and_report(finished):
 
 def test_the_fitted_prior_beats_the_nominal_one(finished):
     # the machine's parameters are 10 to 20 % off the README's nominal ones, and it has dry friction
-    rmse = results(finished)["identification"]["rmse_rad"]
-    assert rmse["phy"] < 0.7 * rmse["phy_nominal"]
+    rmse = results(finished)["identification"]["rmse"]
+    (signal,) = rmse["phy"]
+    assert rmse["phy"][signal] < 0.7 * rmse["phy_nominal"][signal]
     fitted = results(finished)["identification"]["details"]["prior_parameters"]["values"]
     assert fitted["mgl"] == pytest.approx(
         1.1, rel=0.05

@@ -13,12 +13,10 @@ from hybrid_mpc.data_spec import DataSpec
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.mpc import OCP
 from hybrid_mpc.pipeline.context import Context
-from hybrid_mpc.pipeline.faulted_loops import stored_detector
 from hybrid_mpc.pipeline.figures import _monitor as monitor_figures
 from hybrid_mpc.pipeline.guard_job import guard_stage
 from hybrid_mpc.pipeline.guard_report import guard_figures, guard_results, guard_tables, guard_words
 from hybrid_mpc.pipeline.judge import monitor_stage
-from hybrid_mpc.pipeline.monitor_job import stored_rest
 from hybrid_mpc.pipeline.results import _monitor as monitor_results
 from hybrid_mpc.pipeline.settings import RunSettings
 from hybrid_mpc.report.schema import SCHEMA, _check
@@ -110,8 +108,7 @@ def context(machine, samples, out, warm_up):
     info = replace(model_info(prior, machine.dt), time_unit=made.time_unit)
     save_artifact(out / "model", {"hybrid": programs, "prior": programs}, info)
     noise = [machine.noise, 1e-3 * machine.speed]
-    set_process_noise(out / "model", {"hybrid_observer": noise})
-    made.save("control", {"sigma_x": {"hybrid_observer": noise, "prior_observer": noise}}, {})
+    set_process_noise(out / "model", {"hybrid_observer": noise, "prior_observer": noise})
     train = made.trajectories("train")
     made.save("prior", {}, {f"{t.name}/{key}": getattr(t, key) for t in train for key in ("x", "xdot")})
     return made
@@ -140,7 +137,7 @@ def test_an_axis_of_millimetres_a_second_is_calibrated(slow):
     assert 0.03 * top < rest < 0.07 * top
     # what dry friction may hold is 0.1 N: a residual that is always within the dead band would leave a threshold of 0
     assert 0 < found["calibration"]["residual_threshold"] < 0.5
-    assert group("monitor", monitor_results(slow))["threshold_w"] > 0
+    assert group("monitor", monitor_results(slow))["threshold"]["energy [W]"] > 0
     model = load(slow.out / "model").models["hybrid"]
     assert model.time_unit == slow.time_unit > 5.0
     covered = found["recordings"][0]
@@ -151,7 +148,7 @@ def test_an_axis_of_millimetres_a_second_is_calibrated(slow):
 def test_monitor_and_guard_take_the_same_rest_speed(slow):
     artifact = load(slow.out / "model")
     (rest,) = slow.result("monitor")["calibration"]["rest_speed"]
-    assert stored_rest(artifact) == (rest,)
+    assert artifact.rest_speed == (rest,)
     # 17 min are too little for the slowest rate of so slow a machine
     block = 5 * slow.time_unit
     assert f"in whole blocks of {block:g} s are too little" in guard_results(slow)["reason"]
@@ -190,11 +187,11 @@ def test_the_guard_copes_without_a_calibration(short):
     ]
     artifact = load(short.out / "model")
     assert artifact.calibration.threshold_w is None
-    assert stored_rest(artifact) is None  # a detector that is learned later takes it from its own recordings
+    assert artifact.rest_speed is None  # a detector that is learned later takes it from its own recordings
     with pytest.raises(
         InputError, match="holds no detector"
     ):  # what control --guard says before its first loop
-        stored_detector(artifact)
+        artifact.detector()
 
 
 @pytest.mark.parametrize("stored", ["without thresholds", "none"])

@@ -13,7 +13,7 @@ from hybrid_mpc.report.schema import SCHEMA, Group, validate_results
 
 PER_MODEL = {"phy_nominal": 1.0, "phy": 0.2, "rnn": 0.4, "pgrnn": 0.17, "mopgrnn": 0.15}
 RESULTS = {
-    "schema_version": 3,
+    "schema_version": 4,
     "scenario": "golf_robot",
     "seed": 0,
     "budget": "quick",
@@ -23,12 +23,16 @@ RESULTS = {
         "hash": "sha256:00ff",
         "cuts": [{"file": "a.csv", "start_s": 1.0, "end_s": 1.5}],
     },
-    "identification": {key: dict(PER_MODEL) for key in ("e_sim_s", "rmse_rad", "energy_violation_w")},
+    "identification": {
+        "e_sim_s": dict(PER_MODEL),
+        "rmse": {name: {"phi [rad]": value} for name, value in PER_MODEL.items()},
+        "balance_violation": {name: {"energy [W]": value} for name, value in PER_MODEL.items()},
+    },
     "export": {"parity_max_abs_error": 2e-16, "jacobian_max_abs_error": 1e-15},
     "control": {
-        "prior": {"cost": 3.0, "tracking_rmse_rad": 0.1},
-        "hybrid": {"cost": 2.0, "tracking_rmse_rad": 0.05},
-        "oracle": {"cost": 1.5, "tracking_rmse_rad": 0.04},
+        "prior": {"cost": 3.0, "tracking_rmse": {"phi [rad]": 0.1}},
+        "hybrid": {"cost": 2.0, "tracking_rmse": {"phi [rad]": 0.05}},
+        "oracle": {"cost": 1.5, "tracking_rmse": {"phi [rad]": 0.04}},
         "gap_closed": 0.67,
     },
     "estimation": {
@@ -48,7 +52,7 @@ RESULTS = {
         "period_ms": 20.0,
         "misses": 0,
     },
-    "monitor": {"threshold_w": 0.06, "false_alarms_per_hour": 0.0, "alarms": []},
+    "monitor": {"threshold": {"energy [W]": 0.06}, "false_alarms_per_hour": 0.0, "alarms": []},
     "guard": {
         "false_alarms_per_hour": 2.0,
         "hours": 0.05,
@@ -106,8 +110,8 @@ def test_a_wrong_kind_is_named(path):
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, True, "0.1", -0.1])
 def test_only_finite_numbers_are_errors_of_a_model(value):
-    with pytest.raises(InputError, match=r"identification\.rmse_rad\.phy"):
-        validate_results(put("identification.rmse_rad", PER_MODEL | {"phy": value}))
+    with pytest.raises(InputError, match=r"identification\.e_sim_s\.phy"):
+        validate_results(put("identification.e_sim_s", PER_MODEL | {"phy": value}))
 
 
 def test_null_needs_a_reason():

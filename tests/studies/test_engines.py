@@ -13,7 +13,7 @@ import trivial_runs
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.pipeline.context import Silent
 from hybrid_mpc.studies import StudyResults, engines, run_study
-from hybrid_mpc.studies.loops import TIMING
+from hybrid_mpc.studies.inputs import TIMING
 
 ROOT, TESTS = (
     str(Path(__file__).parents[i]) for i in (2, 1)

@@ -20,7 +20,7 @@ from hybrid_mpc.pipeline.control_job import ControlSettings, prepared, run_loops
 from hybrid_mpc.scenario import load_scenario
 from hybrid_mpc.studies import FaultKind, RandomFaults, Study, run_study
 from hybrid_mpc.studies.dry_run import dry_run
-from hybrid_mpc.studies.loops import TIMING, load_inputs
+from hybrid_mpc.studies.inputs import TIMING, load_inputs
 
 GOLF = load_scenario("golf_robot")
 SIGMA = {name: [1e-4, 2e-2] for name in ("prior", "prior_observer", "hybrid", "hybrid_observer", "oracle")}
@@ -66,7 +66,7 @@ def test_a_run_is_what_control_runs(run_folder):
     settings = ControlSettings(("stroke_4",), ("prior", "hybrid_observer"), "sqp", seeds=2, faults=())
     short = replace(GOLF, tasks=tuple(replace(t, duration=SHORT, figures=None) for t in GOLF.tasks))
     job = prepared(short, run_folder, settings)
-    costs = {(name, seed): r.cost for _, name, seed, r, _ in run_loops(job, lambda *told: None)}
+    costs = {(row.controller, row.seed): r.cost for row, r in run_loops(job, lambda *told: None)}
     study = Study(
         "golf_robot", run_folder, tasks=["stroke_4"], controllers=["prior", "hybrid_observer"], solvers=["sqp"],
         seeds=2, duration=SHORT,

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,14 +10,12 @@ import pytest
 import trivial_runs
 
 from hybrid_mpc import load
-from hybrid_mpc.assembly import make_controller, make_estimator
 from hybrid_mpc.cli import main
-from hybrid_mpc.closed_loop import simulate
 from hybrid_mpc.closed_loop.faults import install
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.monitor import METHODS, Detector, Judges, guard_monitor
+from hybrid_mpc.job.loops import Bench, LoopSpec
+from hybrid_mpc.monitor import METHODS, Detector, Judges
 from hybrid_mpc.studies import monitor_study as room
-from hybrid_mpc.studies.lockstep import NominalLoop, run_together
 from hybrid_mpc.studies.monitor_plan import CASES, LoopPlan, MonitorStudy, monitor_study
 from hybrid_mpc.studies.monitor_results import roc
 from scenarios.golf_robot import scenario
@@ -25,26 +24,38 @@ SMALL = MonitorStudy("golf_robot", "nowhere", nominal_hours=0.5, seeds=3, guard_
 
 
 def test_loops_together_are_loops_alone(golf_artifact):
-    models = load(golf_artifact).models
-    hybrid, control, periods = models["hybrid"], scenario.control, 12
-    estimator = make_estimator(hybrid, scenario, np.array([1e-4, 2e-2]))
-    controller = make_controller(hybrid, models["prior"], control)
-    reference, monitor = scenario.tasks[0].reference, guard_monitor(hybrid)
+    kit = load(golf_artifact).with_noise({"hybrid_observer": np.array([1e-4, 2e-2])})
+    bench, task = (
+        Bench(scenario, {"model": kit}),
+        replace(scenario.tasks[0], duration=12 * 0.02, figures=None),
+    )
     drift = LoopPlan("drift_up", "task", 0, 0.3).faults(0.02)
-    plans = [NominalLoop(reference, 4), NominalLoop(lambda t: -reference(t), 5, drift)]
-    together = run_together(scenario.plant(), estimator, controller, monitor, plans, periods)
-    for plan, trace in zip(plans, together, strict=True):
-        seen = []
-        result = simulate(
-            scenario.plant(), estimator, controller, plan.reference, dt=0.02, duration=periods * 0.02,
-            x0=np.zeros(2), seed=plan.seed, monitor=monitor, faults=plan.faults,
-            on_step=lambda s, seen=seen: seen.append((s.estimate.innovation[0], s.reading.numbers)),
-        )  # fmt: skip
-        innovation, numbers = (np.array(column) for column in zip(*seen, strict=True))
+    specs = [
+        LoopSpec(
+            "golf_robot", "model", task.name, "hybrid_observer", monitor="readings", seed=4 + i, faults=faults
+        )
+        for i, faults in enumerate(((), drift))
+    ]
+    tasks = [task, replace(task, reference=lambda t: -task.reference(t))]
+    together = bench.run_together(specs, tasks=tasks)
+    for spec, follows, (row, side) in zip(specs, tasks, together, strict=True):
+        alone_row, alone = bench.run(spec, task=follows)
         # sums in another order: rounding, grown over twelve periods of a loop that is stable
-        assert np.allclose(trace.innovation[:, 0], innovation, rtol=0, atol=1e-10, equal_nan=True)
-        assert np.allclose(trace.numbers, numbers, rtol=0, atol=1e-8, equal_nan=True)
-        assert np.allclose(trace.speed, np.abs(result.x[:, 1]), rtol=0, atol=1e-10)
+        for name, atol in (
+            ("innovation", 1e-10),
+            ("numbers", 1e-8),
+            ("x", 1e-10),
+            ("u", 1e-8),
+            ("nis", 1e-6),
+        ):
+            found, wanted = getattr(side, name), getattr(alone, name)
+            assert found.shape == wanted.shape
+            assert np.allclose(found, wanted, rtol=0, atol=atol, equal_nan=True), name
+        assert row.cost == pytest.approx(alone_row.cost, rel=1e-9)
+    bare = [replace(spec, controller="hybrid") for spec in specs]  # a filter that does not switch takes turns
+    bench = Bench(scenario, {"model": kit.with_noise({"hybrid": np.array([1e-4, 2e-2])})})
+    for spec, follows, (row, _) in zip(bare, tasks, bench.run_together(bare, tasks=tasks), strict=True):
+        assert row.cost == bench.run(spec, task=follows)[0].cost
 
 
 def test_seeds_are_common_only_where_they_shall_be():

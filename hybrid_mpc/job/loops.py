@@ -1,0 +1,579 @@
+"""One closed-loop run: from its specification to its row, on a bench that holds the machine and its models."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from functools import cached_property, partial
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.artifact import Kit
+from hybrid_mpc.assembly import freezing, make_monitor
+from hybrid_mpc.closed_loop.faults import Fault, check_channels, install
+from hybrid_mpc.closed_loop.guard import Guard, Mode
+from hybrid_mpc.closed_loop.result import ClosedLoopResult
+from hybrid_mpc.closed_loop.simulate import Simulation, Step, simulate_together
+from hybrid_mpc.closed_loop.timing import percentiles
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimation.kalman import Estimator
+from hybrid_mpc.files import digest
+from hybrid_mpc.input_limits import share_used
+from hybrid_mpc.job.contenders import CONTENDERS, build
+from hybrid_mpc.job.rounds import repeated
+from hybrid_mpc.model import HybridModel
+from hybrid_mpc.monitor import EnergyMonitor, guard_monitor
+from hybrid_mpc.monitor.calibration import alarm_intervals
+from hybrid_mpc.mpc import OCP, SafeController, Source
+from hybrid_mpc.records import known
+from hybrid_mpc.scenario import Plant, Scenario, Task
+
+Array = NDArray[np.float64]
+Intervals: TypeAlias = tuple[tuple[float, float], ...]
+MONITORS = ("own", "none", "energy", "readings", "guard")
+"""What watches a hybrid: ``own``: levels without thresholds; ``none``; ``energy``: the model's thresholds, so that it
+alarms; ``readings``: what a detector reads, without one; ``guard``: the model's detector."""
+GUARDS = ("", "rest", "adapt", "prior")
+"""What an alarm does: nothing; a frozen sensor takes the input away; and a backup takes over, which estimates the
+prior's parameters, or which plans with the fitted prior."""
+TIMES = ("total", "solve", "estimate")
+KEPT_PARTS = 64
+"""Controllers that a bench keeps built; runs come ordered by controller, so few are asked for again."""
+
+
+@dataclass(frozen=True)
+class LoopSpec:
+    """One closed loop: all that decides what it computes, but for the content of its model.
+
+    Args:
+        scenario: Registered name or path of a user's file.
+        model: Label of the model on the bench.
+        task: Name of the task.
+        controller: Name of the contender, with its estimator.
+        solver: ``"rti"``, ``"sqp"`` or ``"ipopt"``.
+        horizon: Periods; None for the task's own.
+        monitor: Name in :data:`MONITORS`; without a hybrid there is none.
+        faults: Beside what the task itself brings.
+        drawn_faults: Those that a draw takes at random.
+        late: Intervals [s] in which solves miss their deadline.
+        parameters: Parameters of the plant and their factors.
+        draw: Number of the draw that ``parameters`` and random faults are from.
+        seed: Number of the loop; the same number, the same sensor noise for all that share draw and ``run_seed``.
+        duration: Longest duration [s]; None for the task's own.
+        guard: Name in :data:`GUARDS`.
+        run_seed: Seed of the run that the loop belongs to.
+        rounds: The task is run over and over, with its reference scaled by these factors, one a round. Default: once.
+        keep: Arrays that its row holds: fields of :class:`~hybrid_mpc.closed_loop.ClosedLoopResult`, ``"step_ms"``
+            ``(n,)`` and ``"plans"`` ``(n, N + 1, n_x)``. No part of the run's identity.
+        number: Place in a study, no part of the run's identity.
+
+    Example:
+        >>> spec = LoopSpec("golf_robot", "model", "track_sine", "prior", seed=3)
+        >>> spec.noise_seed, replace(spec, run_seed=2).noise_seed, replace(spec, number=7).id == spec.id
+        (3, 2003, True)
+    """
+
+    scenario: str
+    model: str
+    task: str
+    controller: str
+    solver: str = "rti"
+    horizon: int | None = None
+    monitor: str = "own"
+    faults: tuple[Fault, ...] = ()
+    drawn_faults: tuple[Fault, ...] = ()
+    late: Intervals = ()
+    parameters: tuple[tuple[str, float], ...] = ()
+    draw: int = 0
+    seed: int = 0
+    duration: float | None = None
+    guard: str = ""
+    run_seed: int = 0
+    rounds: tuple[float, ...] = ()
+    keep: tuple[str, ...] = field(default=(), compare=False)
+    number: int = field(default=0, compare=False)
+
+    @cached_property
+    def id(self) -> str:
+        """The first 20 hexadecimal digits of the SHA-256 of the specification's JSON form."""
+        return digest({k: v for k, v in asdict(self).items() if k not in ("number", "keep")})[:20]
+
+    @property
+    def noise_seed(self) -> int:
+        """Seed of plant and sensor noise."""
+        seed = 1000 * self.run_seed + self.seed
+        return seed if self.draw == 0 else int(np.random.SeedSequence([seed, self.draw]).generate_state(1)[0])
+
+    def columns(self) -> dict[str, Any]:
+        """The specification as the columns of a table."""
+        return {
+            "run": self.number,
+            "model": self.model,
+            "task": self.task,
+            "controller": self.controller,
+            "solver": self.solver,
+            "horizon": self.horizon,
+            "monitor": self.monitor,
+            "faults": fault_text(self.faults),
+            "drawn_faults": fault_text(self.drawn_faults, self.late),
+            "draw": self.draw,
+            "seed": self.seed,
+            **{f"factor_{name}": value for name, value in self.parameters},
+        }
+
+
+def fault_text(faults: Sequence[Fault], late: Intervals = ()) -> str:
+    """Faults in the form in which the command line takes them; ``"none"`` for none.
+
+    Example:
+        >>> fault_text([Fault(1.5, np.inf, "plant_friction", 2.0)], late=((1.0, 1.2),))
+        'plant_friction=2@1.5 + late@1:1.2'
+    """
+    parts = []
+    for f in faults:
+        end = "" if np.isinf(f.end) else f":{f.end:g}"
+        more = (f" channel {f.channel}" if f.channel else "") + (f" ramp {f.ramp:g}" if f.ramp else "")
+        parts.append(f"{f.target}={f.value:g}@{f.start:g}{end}{more}")
+    parts += [f"late@{a:g}" + ("" if np.isinf(b) else f":{b:g}") for a, b in late]
+    return " + ".join(parts) or "none"
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A stretch of time.
+
+    Args:
+        start_s: First instant [s].
+        end_s: Last one [s].
+    """
+
+    start_s: float
+    end_s: float
+
+
+@dataclass(frozen=True)
+class ModeChange:
+    """A change of the guard's mode.
+
+    Args:
+        t_s: When [s].
+        before: Name of the mode before.
+        after: Name of the mode from then on.
+        why: What led to it.
+    """
+
+    t_s: float
+    before: str
+    after: str
+    why: str
+
+
+@dataclass(frozen=True)
+class LoopRow:
+    """What is told of a closed loop. Signals are named with their unit, e.g. ``"phi [rad]"``.
+
+    Args:
+        task: Name of the task.
+        controller: Name of the contender.
+        seed: Number of the loop.
+        seconds: Length [s].
+        cost: Closed-loop cost on the plant's true state.
+        tracking_rmse: Root mean square deviation of the true states from their reference, by signal.
+        largest_x: Largest magnitude of the true states, by signal.
+        largest_u: Largest magnitude of the inputs, by signal.
+        limits: Largest share of the way from rest to each limit that was used: 1 is the limit, more a violation.
+        excess: By how much limits were left at most, in their own units: ``u [unit]``, ``du [unit]``, states by signal.
+        sources: Share of periods by what gave the input.
+        figures: The task's own figures.
+        alarms: Alarms of the monitor.
+        alarm_share: Share of periods with an alarm.
+        largest_level: Largest level of the monitor [W]; None without one.
+        not_judged_s: Time in which the monitor could not judge [s].
+        switches: Changes of the guard's mode.
+        timing_ms: ``median, p95, p99, max`` of the durations of ``total``, ``solve`` and ``estimate`` [ms].
+        arrays: What the specification asked to keep. Default: nothing.
+    """
+
+    task: str
+    controller: str
+    seed: int
+    seconds: float
+    cost: float
+    tracking_rmse: Mapping[str, float]
+    largest_x: Mapping[str, float]
+    largest_u: Mapping[str, float]
+    limits: Mapping[str, float]
+    excess: Mapping[str, float]
+    sources: Mapping[str, float]
+    figures: Mapping[str, float]
+    alarms: tuple[Interval, ...]
+    alarm_share: float
+    largest_level: float | None
+    not_judged_s: float
+    switches: tuple[ModeChange, ...]
+    timing_ms: Mapping[str, Mapping[str, float]]
+    arrays: Mapping[str, Array] = field(default_factory=dict, compare=False)
+
+    def columns(self) -> dict[str, Any]:
+        """The row as flat columns of a table, without its arrays; durations begin with ``timing_``."""
+        groups = {
+            "tracking_rmse": self.tracking_rmse, "largest_x": self.largest_x, "largest_u": self.largest_u,
+        }  # fmt: skip
+        return {
+            "cost": self.cost,
+            **{f"{name} {signal}": v for name, by in groups.items() for signal, v in by.items()},
+            **{f"share_{source}": share for source, share in self.sources.items()},
+            **{f"task_{name}": float(value) for name, value in self.figures.items()},
+            "alarm_share": self.alarm_share,
+            "first_alarm_s": self.alarms[0].start_s if self.alarms else float("nan"),
+            "largest_level_w": float("nan") if self.largest_level is None else self.largest_level,
+            **{
+                f"timing_{kind}_{k}_ms": v
+                for kind, name in (("step", "total"), ("solve", "solve"))
+                for k, v in self.timing_ms[name].items()
+            },
+        }
+
+
+class Bench:
+    """What loops run on: a machine, its models, and the controllers that were built for them so far.
+
+    What the scenario says of the control problem and the sensors holds for all models; what was learned is the models'.
+
+    Args:
+        scenario: The machine, with plant, tasks and control problem.
+        kits: Loaded artifacts by label; their process noise is that of the filters.
+
+    Raises:
+        InputError: If the scenario has nothing to run.
+
+    Example:
+        ``row, result = Bench(scenario, {"model": hm.load("runs/golf")}).run(spec)``
+    """
+
+    def __init__(self, scenario: Scenario, kits: Mapping[str, Kit]) -> None:
+        check_complete(scenario)
+        self.scenario = scenario
+        self.kits = {label: kit.on(scenario) for label, kit in kits.items()}
+        self._parts: OrderedDict[tuple[object, ...], tuple[Estimator, SafeController]] = OrderedDict()
+        self._guards: dict[tuple[str, str, str], Guard] = {}
+
+    def task(self, spec: LoopSpec) -> Task:
+        """The task of a specification: its rounds and its duration.
+
+        Raises:
+            InputError: If there is none of that name.
+        """
+        (task,) = tasks_of(self.scenario, (spec.task,))
+        kit = self.kits[spec.model]
+        if spec.rounds:
+            model = kit.models["prior"]
+            task = repeated(task, model.dt, np.array(spec.rounds), model.time_unit)
+        return task if spec.duration is None else replace(task, duration=min(task.duration, spec.duration))
+
+    def problem(self, spec: LoopSpec) -> OCP:
+        """The control problem of a specification."""
+        problem = self.kits[spec.model].problem(spec.task)
+        return problem if spec.horizon is None else problem.changed(horizon=spec.horizon)
+
+    def parts(self, spec: LoopSpec) -> tuple[Estimator, SafeController]:
+        """Estimator and controller of a specification; they remember nothing, so one serves many loops."""
+        kit = self.kits[spec.model]
+        stated = spec.task if spec.task in kit.loop.control else ""
+        key = (spec.model, spec.controller, spec.solver, spec.horizon, stated)
+        if key not in self._parts:
+            self._parts[key] = build(
+                spec.controller, self.scenario, kit, self.problem(spec), solver=spec.solver
+            )
+            if len(self._parts) > KEPT_PARTS:
+                self._parts.popitem(last=False)
+        self._parts.move_to_end(key)
+        return self._parts[key]
+
+    def monitor(self, spec: LoopSpec) -> EnergyMonitor | None:
+        """What watches the loop of a specification.
+
+        Raises:
+            InputError: If the model lacks what the monitor needs.
+        """
+        kit = self.kits[spec.model]
+        if spec.monitor == "none" or CONTENDERS[spec.controller].model != "hybrid":
+            return None
+        hybrid = kit.models["hybrid"]
+        if spec.monitor == "energy":
+            return make_monitor(hybrid, kit.calibration)
+        if spec.monitor == "readings":
+            return guard_monitor(hybrid, rest_speed=kit.rest_speed)
+        if spec.monitor == "guard":
+            return guard_monitor(hybrid, kit.detector(), **freezing(kit, self.problem(spec)))
+        return make_monitor(hybrid, None, rest_speed=kit.rest_speed)
+
+    def guard(self, spec: LoopSpec) -> Guard | None:
+        """What an alarm does in the loop of a specification; None: nothing.
+
+        Raises:
+            InputError: If the model lacks what the guard needs.
+        """
+        key = (spec.model, spec.guard, spec.task)
+        if not spec.guard:
+            return None
+        if key not in self._guards:
+            kit = self.kits[spec.model]
+            if spec.guard == "prior":
+                estimator, controller = self.parts(replace(spec, controller="prior_observer"))
+                self._guards[key] = Guard(
+                    Mode.BACKUP, Mode.REST, backup=controller, backup_estimator=estimator
+                )
+            else:
+                self._guards[key] = kit.guard(adapt=spec.guard == "adapt", task=spec.task)
+        return self._guards[key]
+
+    def plant(self, spec: LoopSpec) -> Plant:
+        """The plant of a specification, with its parameters changed."""
+        assert self.scenario.plant is not None
+        return varied(self.scenario.plant(), spec.parameters)
+
+    def run(
+        self,
+        spec: LoopSpec,
+        *,
+        task: Task | None = None,
+        monitor: EnergyMonitor | None = None,
+        on_step: Callable[[Step], None] | None = None,
+    ) -> tuple[LoopRow, ClosedLoopResult]:
+        """Run one loop.
+
+        Args:
+            spec: The loop.
+            task: In place of the task that it names, e.g. with another reference.
+            monitor: In place of the one that it names.
+            on_step: Called after every period, e.g. to show progress.
+
+        Returns:
+            Its row, and its whole record.
+        """
+        plans: list[Array] = []
+
+        def each(step: Step) -> None:
+            if "plans" in spec.keep:
+                plans.append(step.decision.solution.x)
+            if on_step is not None:
+                on_step(step)
+
+        run = self._simulation(spec, task, monitor, each, None)
+        for _ in range(run.periods):
+            run.measure()
+            run.go_on()
+        return self._told(spec, task, run.result(), plans)
+
+    def run_together(
+        self,
+        specs: Sequence[LoopSpec],
+        *,
+        tasks: Sequence[Task] | None = None,
+        monitor: EnergyMonitor | None = None,
+    ) -> list[tuple[LoopRow, ClosedLoopResult]]:
+        """Run loops of one controller and length side by side, their filters in one array: quicker, equal to rounding.
+
+        Args:
+            specs: The loops.
+            tasks: In place of the tasks that they name.
+            monitor: In place of the one that they name.
+
+        Returns:
+            What :meth:`run` returns of each.
+        """
+        given = [None] * len(specs) if tasks is None else tasks
+        estimator = self.parts(specs[0])[0]
+        made = [
+            partial(self._simulation, spec, task, monitor, None)
+            for spec, task in zip(specs, given, strict=True)
+        ]
+        runs = simulate_together(estimator, made)
+        return [
+            self._told(spec, task, run.result(), [])
+            for spec, task, run in zip(specs, given, runs, strict=True)
+        ]
+
+    def _simulation(
+        self,
+        spec: LoopSpec,
+        task: Task | None,
+        monitor: EnergyMonitor | None,
+        on_step: Callable[[Step], None] | None,
+        estimator: Estimator | None,
+    ) -> Simulation:
+        own, controller = self.parts(spec)
+        task = self.task(spec) if task is None else task
+        late = spec.late
+        return Simulation(
+            self.plant(spec), estimator or own, controller, task.reference, weight=task.weight,
+            dt=self.kits[spec.model].models["prior"].dt, duration=task.duration, x0=np.array(task.x0),
+            seed=spec.noise_seed, monitor=monitor or self.monitor(spec), guard=self.guard(spec),
+            faults=(*task.faults, *spec.faults, *spec.drawn_faults), on_step=on_step,
+            late=(lambda t: any(a - 1e-9 <= t < b - 1e-9 for a, b in late)) if late else None,
+        )  # fmt: skip
+
+    def _told(
+        self, spec: LoopSpec, task: Task | None, result: ClosedLoopResult, plans: list[Array]
+    ) -> tuple[LoopRow, ClosedLoopResult]:
+        task = self.task(spec) if task is None else task
+        row = row_of(spec, task, self.problem(spec), self.kits[spec.model].models["prior"], result)
+        derived = {"step_ms": result.timing_ms["total"], "plans": np.array(plans)}
+        kept = {name: derived[name] if name in derived else getattr(result, name) for name in spec.keep}
+        return replace(row, arrays=kept), result
+
+
+def row_of(spec: LoopSpec, task: Task, problem: OCP, model: HybridModel, result: ClosedLoopResult) -> LoopRow:
+    """The row of a loop.
+
+    Args:
+        spec: Which loop.
+        task: Its task.
+        problem: Its control problem, with the limits.
+        model: A model of the machine, whose signals name the columns.
+        result: Its record.
+    """
+    r, labels = result, [signal.label for signal in model.states]
+    inputs = [signal.label for signal in model.inputs]
+    level = r.level[np.isfinite(r.level)]
+    return LoopRow(
+        task=task.name,
+        controller=spec.controller,
+        seed=spec.seed,
+        seconds=len(r.t) * r.dt,
+        cost=r.cost,
+        tracking_rmse=_by(labels, np.sqrt(np.mean((r.x - r.reference) ** 2, axis=0))),
+        largest_x=_by(labels, np.abs(r.x).max(axis=0)),
+        largest_u=_by(inputs, np.abs(r.u).max(axis=0)),
+        limits=limits_used(problem, r),
+        excess=excess(problem, r, model),
+        sources={source.name: r.source.count(source.name) / len(r.source) for source in Source},
+        figures=dict(task.figures(r)) if task.figures is not None else {},
+        alarms=tuple(Interval(a, b) for a, b in alarm_intervals(r.alarm, r.dt)),
+        alarm_share=float(np.mean(r.alarm)),
+        largest_level=float(level.max()) if level.size else None,
+        not_judged_s=float(np.sum(~r.judged)) * r.dt,
+        switches=tuple(ModeChange(s.t, s.before.name, s.after.name, s.why) for s in r.switches),
+        timing_ms={key: percentiles(r.timing_ms[key]) for key in TIMES},
+    )
+
+
+def _by(labels: Sequence[str], values: Array) -> dict[str, float]:
+    return dict(zip(labels, values.tolist(), strict=True))
+
+
+def limits_used(control: OCP, r: ClosedLoopResult) -> dict[str, float]:
+    """Largest share of the way from rest to each limit that a loop used: 1 is the limit, more a violation.
+
+    Args:
+        control: The problem with the limits.
+        r: The loop; states are the plant's true ones.
+
+    Returns:
+        ``u``, and ``du`` and ``x[i]`` where there are such limits [-].
+    """
+    used = {"u": share_used(r.u, control.u_min, control.u_max)}
+    if control.du_max is not None:
+        du = np.diff(r.u, axis=0, prepend=control.rest_input[None])
+        used["du"] = float(np.max(np.abs(du) / control.du_max))
+    for i in np.flatnonzero(np.isfinite(control.x_min) | np.isfinite(control.x_max)):
+        used[f"x[{i}]"] = share_used(r.x[:, i], control.x_min[i], control.x_max[i])
+    return used
+
+
+def excess(control: OCP, r: ClosedLoopResult, model: HybridModel) -> dict[str, float]:
+    """By how much a loop left its limits at most [the signals' units]: inputs and, where limited, changes and states.
+
+    Args:
+        control: The problem with the limits.
+        r: The loop; states are the plant's true ones.
+        model: Whose signals name them.
+    """
+    beyond = np.maximum(r.u - control.u_max, control.u_min - r.u)
+    over = {s.label: v for s, v in zip(model.inputs, beyond.T, strict=True)}
+    if np.any(np.isfinite([control.x_min, control.x_max])):
+        beyond = np.maximum(r.x - control.x_max, control.x_min - r.x)
+        over |= {s.label: v for s, v in zip(model.states, beyond.T, strict=True)}
+    if control.du_max is not None:
+        changes = np.abs(np.diff(r.u, axis=0)) - control.du_max
+        over |= {f"change of {s.label}": v for s, v in zip(model.inputs, changes.T, strict=True)}
+    return {name: max(0.0, float(values.max())) for name, values in over.items()}
+
+
+def tasks_of(scenario: Scenario, names: Sequence[str] | None) -> tuple[Task, ...]:
+    """The scenario's tasks of these names, all for None.
+
+    Raises:
+        InputError: If there is no task of a name.
+    """
+    if names is None:
+        return scenario.tasks
+    there = {task.name: task for task in scenario.tasks}
+    missing = [name for name in names if name not in there]
+    if missing:
+        raise InputError(
+            f"scenario {scenario.name}: no task {', '.join(missing)}; there are: {', '.join(there)}"
+        )
+    return tuple(there[name] for name in names)
+
+
+def varied(plant: Any, factors: Sequence[tuple[str, float]]) -> Any:
+    """The plant with some of its parameters multiplied.
+
+    Args:
+        plant: A dataclass with a dataclass ``parameters``, or with parameters of its own.
+        factors: Parameters and factors; may be empty.
+
+    Raises:
+        InputError: If the plant is no dataclass, or has no number of that name.
+
+    Example:
+        >>> from scenarios.golf_robot.rig import Rig
+        >>> round(varied(Rig(), [("m", 1.1)]).parameters.m, 5)
+        0.58806
+    """
+    if not factors:
+        return plant
+    inner = getattr(plant, "parameters", None)
+    holder = inner if is_dataclass(inner) else plant
+    if not is_dataclass(holder) or isinstance(holder, type):
+        raise InputError(
+            f"the plant {type(plant).__name__} has no parameters to vary: it must be a dataclass, or have one "
+            "named 'parameters'"
+        )
+    numbers = [f.name for f in fields(holder) if f.init and isinstance(getattr(holder, f.name), float)]
+    changed = {
+        known(name, numbers, f"parameter of {type(holder).__name__}"): getattr(holder, name) * factor
+        for name, factor in factors
+    }
+    other = replace(holder, **changed)
+    return replace(plant, parameters=other) if holder is inner else other
+
+
+def check_complete(scenario: Scenario) -> None:
+    """Refuse a scenario without plant, control problem or task.
+
+    Raises:
+        InputError: With what lacks.
+    """
+    parts = {"plant": scenario.plant, "control problem": scenario.control, "task": scenario.tasks or None}
+    if lacks := [name for name, part in parts.items() if part is None]:
+        raise InputError(
+            f"scenario {scenario.name} has no {lacks[0]}: there is no loop to close in simulation"
+        )
+
+
+def check_faults(scenario: Scenario, faults: Sequence[Fault]) -> None:
+    """Refuse faults that the machine cannot show.
+
+    Raises:
+        InputError: With the fault, and what there is.
+    """
+    assert scenario.plant is not None
+    assert scenario.control is not None
+    outside = install(scenario.plant(), faults)[1]
+    check_channels(outside, len(scenario.sensor_sigma), scenario.control.n_u)
