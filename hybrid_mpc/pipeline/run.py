@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from hybrid_mpc.errors import InputError, StorageError
+from hybrid_mpc.job.folder import open_folder
 from hybrid_mpc.pipeline import deploy, identify, judge
 from hybrid_mpc.pipeline.context import Context, Progress, Silent
 from hybrid_mpc.pipeline.devices import check_device
@@ -14,7 +15,7 @@ from hybrid_mpc.pipeline.guard_job import guard_stage
 from hybrid_mpc.pipeline.observers import estimation_stage
 from hybrid_mpc.pipeline.preflight import check_scenario
 from hybrid_mpc.pipeline.reporting import report_stage
-from hybrid_mpc.pipeline.settings import RunSettings, open_folder
+from hybrid_mpc.pipeline.settings import RunSettings, claim
 from hybrid_mpc.scenario import load_scenario
 
 STAGES: tuple[tuple[str, str, Callable[[Context], None]], ...] = (
@@ -65,7 +66,7 @@ def run(
     check_scenario(scenario, context.budget)
     identify.check_data(context)
     check_device(settings.device)
-    with open_folder(out, settings, resume=resume):
+    with open_folder(out, claim(settings), resume=resume):
         for name, title, stage in STAGES:
             context.progress.start(title)
             if context.done(name):

@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import write_json, write_text
 from hybrid_mpc.identification.search_space import SearchSpace
+from hybrid_mpc.job.folder import open_folder
 from hybrid_mpc.pipeline import identify
 from hybrid_mpc.pipeline.context import Context, Progress, Silent
 from hybrid_mpc.pipeline.deploy import versions
 from hybrid_mpc.pipeline.preflight import check_scenario
-from hybrid_mpc.pipeline.settings import RunSettings, open_folder
+from hybrid_mpc.pipeline.settings import RunSettings, claim
 from hybrid_mpc.scenario import load_scenario
 
 if TYPE_CHECKING:
@@ -100,7 +101,7 @@ def run_search(
     context = Context(settings, load_scenario(settings.scenario), out, progress or Silent())
     check_scenario(context.scenario, context.budget)
     identify.check_data(context)
-    with open_folder(out, settings, resume=resume):
+    with open_folder(out, claim(settings), resume=resume):
         for name, title, stage in STAGES:
             context.progress.start(title)
             if not context.done(name):

@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import (
-    LOCK,
-    check_writable,
-    digest,
-    is_empty,
-    locked,
-    read_json,
-    read_object,
-    sha256,
-    write_json,
-)
+from hybrid_mpc.files import read_json, read_object, sha256, write_json
+from hybrid_mpc.job.folder import Claim
 
 FILE = "run.json"
 WHOLE = ("hidden", "networks", "teacher_steps", "free_run_steps", "horizon", "validation_horizon", "batch")
@@ -120,46 +110,19 @@ class Identified(Protocol):
         """Settings as plain data."""
 
 
-@contextmanager
-def open_folder(out: Path, settings: Identified, *, resume: bool) -> Iterator[None]:
-    """The job's folder while it works: made, held against other processes, the settings noted in it.
+def claim(settings: Identified) -> Claim:
+    """What a run's folder says of it: its settings, in ``run.json``.
 
     Args:
-        out: The folder.
-        settings: What the job computes.
-        resume: Whether a job of the same settings goes on there.
-
-    Raises:
-        InputError: If the folder holds something else, another job, or (without ``resume``) a job; if another process
-            works in it, or nothing can be written.
+        settings: What the run computes.
     """
     identity = settings.identity()
-    _check(out, identity, resume)
-    check_writable(out)
-    with locked(out):
-        _check(out, identity, resume)  # another process may have been quicker
-        if not (out / FILE).is_file():
-            write_json(out / FILE, {"settings": identity})
-        yield
+    return Claim("run", FILE, identity, lambda out: write_json(out / FILE, {"settings": identity}), _held)
 
 
-def _check(out: Path, identity: Mapping[str, Any], resume: bool) -> None:
-    """Refuse a folder that holds anything but this job, to be resumed."""
-    note = out / FILE
-    if not note.is_file():
-        if not is_empty(out):
-            raise InputError(f"{out} exists and holds something else than a run; choose another --out")
-        if resume and not (out / LOCK).is_file():  # a run that ended before its first note leaves the lock
-            raise InputError(f"{out} holds no run to resume; leave --resume out")
-        return
-    if not resume:
-        raise InputError(f"{out} already holds a run; add --resume to finish it, or choose another --out")
-    before = read_object(note).get("settings")
+def _held(out: Path) -> Mapping[str, Any]:
+    """The settings that a folder's note states."""
+    before = read_object(out / FILE).get("settings")
     if not isinstance(before, dict):
-        raise InputError(f"{note} is damaged: no settings in it; choose another --out")
-    changed = sorted(k for k in {*identity, *before} if digest(identity.get(k)) != digest(before.get(k)))
-    if changed:
-        raise InputError(
-            f"{out} holds a run with other settings ({', '.join(changed)} differ); resume with the same "
-            f"ones or choose another --out"
-        )
+        raise InputError(f"{out / FILE} is damaged: no settings in it; choose another --out")
+    return before

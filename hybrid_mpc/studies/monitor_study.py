@@ -11,6 +11,7 @@ from hybrid_mpc.artifact import Kit, load
 from hybrid_mpc.assembly import adaptable
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_json, write_json
+from hybrid_mpc.job.folder import check_folder, open_folder
 from hybrid_mpc.monitor import Judges
 from hybrid_mpc.pipeline.context import Progress, Silent
 from hybrid_mpc.records import record
@@ -23,8 +24,9 @@ from hybrid_mpc.studies.monitor_loops import CONTROLLER, JUDGES, LEARNING, PRIOR
 from hybrid_mpc.studies.monitor_plan import LEARN, MonitorJob, MonitorStudy
 from hybrid_mpc.studies.monitor_report import write_monitor_report
 from hybrid_mpc.studies.monitor_results import monitor_results
+from hybrid_mpc.studies.note import FILE as NOTE
 from hybrid_mpc.studies.note import read_note
-from hybrid_mpc.studies.runner import RUNS, check_folder, execute, finished, make_note, open_folder
+from hybrid_mpc.studies.runner import RUNS, claim, execute, finished, make_note
 
 RESULTS = "results.json"
 KIND = "monitor"
@@ -62,7 +64,7 @@ def run_monitor_study(
         >>> results = run_monitor_study(monitor_study("runs/golf"), "studies/monitor")  # doctest: +SKIP
     """
     out, say = Path(out), progress or Silent()
-    check_folder(out, resume=resume)
+    check_folder(out, "study", NOTE, resume=resume)
     say.start("reading the model, and the filters' noise")
     held = read_note(out).models if resume else None
     loops, models = load_inputs(
@@ -76,9 +78,8 @@ def run_monitor_study(
         adaptable(load(Path(model.folder)).models["hybrid"], causes)  # or the last loops would fail
     engine = make_engine(MonitorRunner(study, model, str(out.resolve())), workers, None)
     try:
-        open_folder(out, note)
         jobs = list(study.jobs())
-        with RunLog(out / RUNS) as log:
+        with open_folder(out, claim(note), resume=resume), RunLog(out / RUNS) as log:
             todo = _Todo(out, log, engine, say, finished(out, retry_failed))
             first = [job for job in jobs if job.kind == LEARN]
             todo.run("nominal loops to learn from", first)

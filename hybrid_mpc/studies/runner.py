@@ -9,8 +9,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import check_writable, digest, is_empty, sha256
+from hybrid_mpc.files import sha256
+from hybrid_mpc.job.folder import Claim, check_folder, open_folder
 from hybrid_mpc.pipeline.context import Progress, Silent
 from hybrid_mpc.pipeline.deploy import versions
 from hybrid_mpc.records import plain
@@ -71,15 +71,14 @@ def run_study(
         >>> results = run_study(Study("golf_robot", "runs/golf"), "studies/first")  # doctest: +SKIP
     """
     out, say = Path(out), progress or Silent()
-    check_folder(out, resume=resume)
+    check_folder(out, "study", NOTE, resume=resume)
     say.start("reading the models, and the filters' noise")
     run, models = load_inputs(study, read_note(out).models if resume else None)
     note = make_note(study.identity(), models, study.size)
     say.finish(f"{study.size} runs")
     engine = make_engine(run, workers, cluster)
     try:
-        open_folder(out, note)
-        with RunLog(out / RUNS) as log:
+        with open_folder(out, claim(note), resume=resume), RunLog(out / RUNS) as log:
             done = finished(out, retry_failed)
             say.start("running")
             left = (config for config in study.runs() if config.id not in done)
@@ -227,20 +226,6 @@ def duration_text(seconds: float) -> str:
     return f"{seconds:.0f} s"
 
 
-def check_folder(out: Path, *, resume: bool) -> None:
-    """Refuse a folder that holds something else, or (without ``resume``) a study."""
-    if (out / NOTE).is_file():
-        if not resume:
-            raise InputError(
-                f"{out} already holds a study; add --resume to finish it, or choose another --out"
-            )
-    elif not is_empty(out):
-        raise InputError(f"{out} exists and holds something else than a study; choose another --out")
-    elif resume:
-        raise InputError(f"{out} holds no study to resume; leave --resume out")
-    check_writable(out)
-
-
 def make_note(
     study: Mapping[str, Any], models: Mapping[str, ModelNote], runs: int, kind: str = "loops"
 ) -> StudyNote:
@@ -265,25 +250,25 @@ def make_note(
     )
 
 
-def open_folder(out: Path, note: StudyNote) -> None:
-    """Note what the folder holds, or compare it with what it holds already."""
-    if not (out / NOTE).is_file():
-        write_note(out, note)
-        return
-    held = read_note(out)
-    mine, theirs = note.study, held.study
-    differ = [key for key in mine if key != "name" and digest(theirs.get(key)) != digest(mine[key])]
-    if held.scenario_sha256 != note.scenario_sha256:
-        differ.append("the content of the scenario's file")
-    differ += [
-        f"the content of model {label}"
-        for label, model in note.models.items()
-        if label in held.models and held.models[label].sha256 != model.sha256
-    ]
-    if differ:
-        raise InputError(
-            f"{out} holds another study ({', '.join(differ)} differ); resume with the same one, or choose another --out"
-        )
+def claim(note: StudyNote) -> Claim:
+    """What a study's folder says of it.
+
+    Args:
+        note: What the study is made of.
+    """
+    return Claim(
+        "study",
+        NOTE,
+        _identity(note),
+        lambda out: write_note(out, note),
+        lambda out: _identity(read_note(out)),
+    )
+
+
+def _identity(note: StudyNote) -> dict[str, Any]:
+    models = {f"the content of model {label}": model.sha256 for label, model in note.models.items()}
+    settings = {key: value for key, value in note.study.items() if key != "name"}
+    return {**settings, **models, "the content of the scenario's file": note.scenario_sha256}
 
 
 def _content(scenario: str) -> str | None:

@@ -13,10 +13,11 @@ from hybrid_mpc.cli import main
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import LOCK
 from hybrid_mpc.identification.search_space import SearchSpace, parsed_space
+from hybrid_mpc.job.folder import open_folder
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.identify import training_settings
 from hybrid_mpc.pipeline.search_job import SearchSettings, usage
-from hybrid_mpc.pipeline.settings import RunSettings, open_folder, read_network
+from hybrid_mpc.pipeline.settings import RunSettings, claim, read_network
 from hybrid_mpc.scenario import load_scenario
 
 pytestmark = pytest.mark.full  # these share one search of 20 s
@@ -174,16 +175,16 @@ def test_a_run_is_bound_to_the_content_of_its_file(tmp_path):
     path = tmp_path / "settings.json"
     path.write_text('{"hidden": 8}')
     settings = RunSettings("golf_robot", network_file=path)
-    with open_folder(tmp_path / "run", settings, resume=False):
+    with open_folder(tmp_path / "run", claim(settings), resume=False):
         pass
     path.write_text('{ "hidden" : 8 }')
-    with open_folder(tmp_path / "run", settings, resume=True):
+    with open_folder(tmp_path / "run", claim(settings), resume=True):
         pass
     path.write_text('{"hidden": 9}')
     for other in (settings, RunSettings("golf_robot")):
         with (
             pytest.raises(InputError, match="network differ"),
-            open_folder(tmp_path / "run", other, resume=True),
+            open_folder(tmp_path / "run", claim(other), resume=True),
         ):
             pass
 

@@ -82,7 +82,7 @@ def test_batches_grow_with_the_workers(workers, size):
 def test_the_folder_of_another_study(here, tmp_path):
     here(trivial_runs.trivial)
     run_study(trivial_runs.study(3), tmp_path / "s")
-    with pytest.raises(InputError, match=r"another study \(seeds differ\)"):
+    with pytest.raises(InputError, match=r"holds a study with other settings \(seeds differ\)"):
         run_study(trivial_runs.study(4), tmp_path / "s", resume=True)
     note = read_note(tmp_path / "s")
     write_note(tmp_path / "s", replace(note, models={"model": replace(note.models["model"], sha256="1")}))

@@ -13,13 +13,13 @@ from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import (
     check_writable,
     digest,
-    is_empty,
     locked,
     read_document,
     write_document,
     write_json,
 )
 from hybrid_mpc.identification.settings import KINDS
+from hybrid_mpc.job.folder import Claim, check_claim
 from hybrid_mpc.pipeline.context import Progress, Silent
 from hybrid_mpc.pipeline.deploy import versions
 from hybrid_mpc.pipeline.machine_benchmark.choice import IN_MOTION, candidate_errors, recommended
@@ -39,6 +39,8 @@ from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import Scenario, load_scenario
 
 SCHEMA = 1
+NOTE = "benchmark.json"
+"""What says which benchmark a folder holds."""
 
 
 @dataclass(frozen=True)
@@ -300,19 +302,14 @@ def _claim(out: Path, settings: BenchmarkSettings, data: Recordings) -> None:
             [[p.role, p.name, p.t[0], p.t[-1]] for p in (*data.train, *data.valid, *data.held_back)]
         ),
     }
-    note = out / "benchmark.json"
-    if note.is_file():
-        held = read_document(note)
-        changed = [key for key in own if digest(held.get(key)) != digest(own[key])]
-        if changed:
-            raise InputError(
-                f"{out} holds a benchmark with other settings ({', '.join(changed)} differ); give the same ones to go "
-                "on with it, or choose another --out"
-            )
-        return
-    if not is_empty(out):
-        raise InputError(f"{out} exists and holds something else than a benchmark; choose another --out")
-    write_document(note, own)
+    claim = Claim(
+        "benchmark", NOTE, own, lambda folder: write_document(folder / NOTE, own),
+        lambda folder: read_document(folder / NOTE),
+    )  # fmt: skip
+    there = (out / NOTE).is_file()
+    check_claim(out, claim, resume=there)
+    if not there:
+        claim.write(out)
 
 
 def table(results: dict[str, Any]) -> list[str]:
