@@ -15,11 +15,11 @@ from hybrid_mpc.closed_loop import ClosedLoopResult, simulate
 from hybrid_mpc.closed_loop.simulate import Step
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.input_limits import share_used
+from hybrid_mpc.job.engine import WORKERS, run_jobs
 from hybrid_mpc.mpc import OCP
 from hybrid_mpc.pipeline.contenders import CONTENDERS, ORACLES, build
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.loops import make_monitor
-from hybrid_mpc.pipeline.parallel import WORKERS, run_jobs
 from hybrid_mpc.scenario import Budget, Scenario, Task, load_scenario
 
 Array = NDArray[np.float64]

@@ -13,6 +13,7 @@ from scipy.stats import chi2
 
 from hybrid_mpc.artifact import Kit, load, set_calibration
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.job.engine import WORKERS, run_jobs
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.monitor import Calibration, Detector, guard_monitor, learn_detector, learn_plausibility
 from hybrid_mpc.monitor.calibration import MAX_EXTRAPOLATION, MIN_BLOCKS
@@ -27,7 +28,6 @@ from hybrid_mpc.pipeline.judge import RATES, clean_windows, run_calibration
 from hybrid_mpc.pipeline.loops import freezing, make_estimator, make_monitor
 from hybrid_mpc.pipeline.monitor_job import explained
 from hybrid_mpc.pipeline.nominal_loops import CONTENDER, nominal_loops, run_nominal
-from hybrid_mpc.pipeline.parallel import WORKERS, run_jobs
 from hybrid_mpc.records import plain
 
 Array = NDArray[np.float64]
