@@ -20,18 +20,19 @@ import json
 import resource
 import sys
 import tempfile
+from functools import partial
 from pathlib import Path
 from time import perf_counter, process_time
 
 import numpy as np
 
+from hybrid_mpc.job.engine import DaskEngine, LocalEngine
 from hybrid_mpc.pipeline.context import Silent
 from hybrid_mpc.studies import LoopSpec, Study, run_study
-from hybrid_mpc.studies.engines import DaskEngine, LocalEngine
-from hybrid_mpc.studies.inputs import TIMING, load_inputs
+from hybrid_mpc.studies.inputs import TIMING, load_inputs, run_batch
 from hybrid_mpc.studies.log import RunLog, rows, segments
 from hybrid_mpc.studies.results import StudyResults
-from hybrid_mpc.studies.runner import execute
+from hybrid_mpc.studies.runner import THREADS, execute
 from hybrid_mpc.studies.table import compact
 
 
@@ -71,7 +72,7 @@ def overhead(runs: int) -> dict:
     """Time and memory of runs that do nothing, in 2 processes."""
     study, memory = many(runs), Memory()
     with tempfile.TemporaryDirectory() as folder, RunLog(Path(folder)) as log:
-        engine = LocalEngine(nothing, 2)
+        engine = LocalEngine(partial(run_batch, nothing), 2, threads=THREADS)
         execute(many(4).runs(), log, engine, Silent(), 4)  # processes have started
         begin, cpu = perf_counter(), process_time()
         execute(study.runs(), log, engine, memory, runs)
@@ -206,7 +207,7 @@ def dask(runs: int) -> dict:
         tempfile.TemporaryDirectory() as folder,
         RunLog(Path(folder)) as log,
     ):
-        engine = DaskEngine(nothing, client)
+        engine = DaskEngine(partial(run_batch, nothing), client)
         execute(many(4).runs(), log, engine, Silent(), 4)
         begin, cpu = perf_counter(), process_time()
         execute(many(runs).runs(), log, engine, Silent(), runs)

@@ -18,7 +18,7 @@ LONG = (
     "pipeline/test_search_command.py",
     "identification/test_training_options.py",
     "identification/test_training.py",
-    "studies/test_engines.py",
+    "job/test_engine.py",
     "studies/test_loops.py",
 )
 """Modules that take longest. Processes that share the tests by whole modules must not end with one of them."""

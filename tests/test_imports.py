@@ -93,6 +93,11 @@ def test_only_the_command_line_knows_typer():
             assert not {"typer", "rich"} & {name.split(".")[0] for name in imports(path, at_load=False)}, path
 
 
+def test_the_engine_computes_any_work_and_knows_none():
+    own = {name for name in imports(ROOT / "hybrid_mpc/job/engine.py", at_load=False) if name.startswith(OWN)}
+    assert own == {"hybrid_mpc.errors"}
+
+
 CLOSED_LOOP = """
 import sys
 class Refuse:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from hybrid_mpc.studies import Study, run_study, runner
 from hybrid_mpc.studies.draws import generator
-from hybrid_mpc.studies.inputs import run_batch
 from hybrid_mpc.studies.note import ModelNote, NoiseNote
 
 SCENARIO = "golf_robot"
@@ -66,15 +65,15 @@ class Here:
 
     name, workers, died = "here", 1, 0
 
-    def __init__(self, run):
-        self._run, self._batches = run, []
+    def __init__(self, work):
+        self._work, self._batches = work, []
 
     def submit(self, batch):
         self._batches.append(batch)
 
     def next(self, timeout):
         batch = self._batches.pop(0)
-        return batch, run_batch(self._run, batch)
+        return batch, self._work(batch)
 
     def close(self):
         pass

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from hybrid_mpc.artifact import load
 from hybrid_mpc.closed_loop.simulate import Step
 from hybrid_mpc.job.contenders import CONTENDERS, ORACLES
+from hybrid_mpc.job.engine import WORKERS, run_jobs
 from hybrid_mpc.job.loops import Bench, LoopRow, LoopSpec, tasks_of
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.control_job import MODEL
-from hybrid_mpc.pipeline.parallel import WORKERS, run_jobs
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import Budget, Scenario, Task, load_scenario
 

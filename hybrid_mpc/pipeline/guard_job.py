@@ -14,6 +14,7 @@ from scipy.stats import chi2
 from hybrid_mpc.artifact import Kit, set_calibration
 from hybrid_mpc.assembly import freezing, make_monitor
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.job.engine import WORKERS, run_jobs
 from hybrid_mpc.job.loops import Bench
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.monitor import Detector, guard_monitor, learn_detector, learn_plausibility
@@ -29,7 +30,6 @@ from hybrid_mpc.pipeline.faulted_loops import faulted, kept
 from hybrid_mpc.pipeline.judge import RATES, clean_windows, run_calibration
 from hybrid_mpc.pipeline.monitor_job import explained
 from hybrid_mpc.pipeline.nominal_loops import nominal_loops, stage_of
-from hybrid_mpc.pipeline.parallel import WORKERS, run_jobs
 from hybrid_mpc.records import plain
 
 Array = NDArray[np.float64]

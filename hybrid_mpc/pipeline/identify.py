@@ -12,9 +12,9 @@ import numpy as np
 from hybrid_mpc.data.excitation_check import check_excitation
 from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.job.engine import WORKERS, run_jobs
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.late_prior import prior_with_delay
-from hybrid_mpc.pipeline.parallel import WORKERS, run_jobs
 from hybrid_mpc.scenario import load_scenario
 
 if TYPE_CHECKING:

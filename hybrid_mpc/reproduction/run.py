@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 from hybrid_mpc.data.trajectories import Dataset, Trajectory
 from hybrid_mpc.files import read_arrays, read_json
+from hybrid_mpc.job.engine import WORKERS, run_jobs
 from hybrid_mpc.job.folder import open_folder
 from hybrid_mpc.pipeline.context import Progress, Silent
 from hybrid_mpc.pipeline.devices import check_device
-from hybrid_mpc.pipeline.parallel import WORKERS, run_jobs
 from hybrid_mpc.pipeline.settings import claim
 from hybrid_mpc.reproduction.experiment import Effort, Experiment
 from hybrid_mpc.reproduction.jobs import Case, Ruler, ensemble_job, fit_job, physics_job, sindy_job

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +12,14 @@ from hybrid_mpc.artifact import Kit, load
 from hybrid_mpc.assembly import adaptable
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_json, write_json
+from hybrid_mpc.job.engine import Engine, make_engine
 from hybrid_mpc.job.folder import check_folder, open_folder
 from hybrid_mpc.monitor import Judges
 from hybrid_mpc.pipeline.context import Progress, Silent
 from hybrid_mpc.records import record
 from hybrid_mpc.scenario import load_scenario
 from hybrid_mpc.studies.configuration import Study
-from hybrid_mpc.studies.engines import Engine, make_engine
-from hybrid_mpc.studies.inputs import load_inputs
+from hybrid_mpc.studies.inputs import load_inputs, run_batch
 from hybrid_mpc.studies.log import RunLog, rows
 from hybrid_mpc.studies.monitor_loops import CONTROLLER, JUDGES, LEARNING, PRIOR, MonitorRunner, learn
 from hybrid_mpc.studies.monitor_plan import LEARN, MonitorJob, MonitorStudy
@@ -26,7 +27,7 @@ from hybrid_mpc.studies.monitor_report import write_monitor_report
 from hybrid_mpc.studies.monitor_results import monitor_results
 from hybrid_mpc.studies.note import FILE as NOTE
 from hybrid_mpc.studies.note import read_note
-from hybrid_mpc.studies.runner import RUNS, claim, execute, finished, make_note
+from hybrid_mpc.studies.runner import RUNS, THREADS, Batch, Rows, claim, execute, finished, make_note
 
 RESULTS = "results.json"
 KIND = "monitor"
@@ -76,7 +77,8 @@ def run_monitor_study(
     if study.guard_seeds:
         causes = load_scenario(study.scenario).causes
         adaptable(load(Path(model.folder)).models["hybrid"], causes)  # or the last loops would fail
-    engine = make_engine(MonitorRunner(study, model, str(out.resolve())), workers, None)
+    run = MonitorRunner(study, model, str(out.resolve()))
+    engine = make_engine(partial(run_batch, run), workers, threads=THREADS)
     try:
         jobs = list(study.jobs())
         with open_folder(out, claim(note), resume=resume), RunLog(out / RUNS) as log:
@@ -117,7 +119,9 @@ def is_monitor_study(folder: Path) -> bool:
 class _Todo:
     """What is left of a study, run in its engine."""
 
-    def __init__(self, out: Path, log: RunLog, engine: Engine, say: Progress, done: set[str]) -> None:
+    def __init__(
+        self, out: Path, log: RunLog, engine: Engine[Batch, Rows], say: Progress, done: set[str]
+    ) -> None:
         self._out, self._log, self._engine, self._say, self._done = out, log, engine, say, done
 
     def run(self, title: str, jobs: Iterable[MonitorJob]) -> None:

@@ -5,19 +5,20 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from hybrid_mpc.files import sha256
+from hybrid_mpc.job.engine import Engine, Lost, make_engine
 from hybrid_mpc.job.folder import Claim, check_folder, open_folder
 from hybrid_mpc.pipeline.context import Progress, Silent
 from hybrid_mpc.pipeline.deploy import versions
 from hybrid_mpc.records import plain
 from hybrid_mpc.scenario import load_scenario
 from hybrid_mpc.studies.configuration import Study
-from hybrid_mpc.studies.engines import Batch, Engine, Lost, make_engine
-from hybrid_mpc.studies.inputs import TIMING, load_inputs
+from hybrid_mpc.studies.inputs import TIMING, LoopRunner, load_inputs, run_batch
 from hybrid_mpc.studies.log import RunLog, rows
 from hybrid_mpc.studies.note import FILE as NOTE
 from hybrid_mpc.studies.note import ModelNote, StudyNote, read_note, write_note
@@ -34,6 +35,12 @@ AHEAD = 2
 """Batches a worker: one that it computes, and one that waits for it."""
 TRIES = 3
 """How many workers may die of a run before it is given up."""
+THREADS = 1
+"""Of the numerical libraries in each process: runs are small, and as many processes as cores are side by side."""
+Batch = tuple[Any, ...]
+"""Some configurations, run one after the other by one worker."""
+Rows = list[dict[str, Any]]
+"""Their results."""
 
 
 def run_study(
@@ -76,7 +83,9 @@ def run_study(
     run, models = load_inputs(study, read_note(out).models if resume else None)
     note = make_note(study.identity(), models, study.size)
     say.finish(f"{study.size} runs")
-    engine = make_engine(run, workers, cluster)
+    if cluster is not None and isinstance(run, LoopRunner):  # its workers may not see the models' folders
+        run = run.with_files()
+    engine = make_engine(partial(run_batch, run), workers, cluster, threads=THREADS)
     try:
         with open_folder(out, claim(note), resume=resume), RunLog(out / RUNS) as log:
             done = finished(out, retry_failed)
@@ -127,7 +136,9 @@ class Tally:
         return ", ".join(words)
 
 
-def execute(configs: Iterable[Any], log: RunLog, engine: Engine, progress: Progress, total: int) -> Tally:
+def execute(
+    configs: Iterable[Any], log: RunLog, engine: Engine[Batch, Rows], progress: Progress, total: int
+) -> Tally:
     """Run configurations in an engine and log their rows.
 
     At any time a few batches are under way; a row is logged before the next batch is asked for.
@@ -181,7 +192,7 @@ class _Suspects:
         self.alone = self.left.pop()
         return (self.alone,)
 
-    def judge(self, batch: Batch, lost: Lost) -> list[dict[str, Any]]:
+    def judge(self, batch: Batch, lost: Lost) -> Rows:
         """Suspect the runs of a lost batch; rows of those that are given up."""
         given_up = []
         for config in batch:
@@ -201,7 +212,7 @@ class _Pace:
     def __init__(self, workers: int) -> None:
         self.size, self._aim = 1, max(BATCH_S, workers / BATCHES_A_SECOND)
 
-    def learn(self, done: list[dict[str, Any]]) -> None:
+    def learn(self, done: Rows) -> None:
         spent = sum(row.get(f"{TIMING}total_s", 0.0) for row in done)
         if done:
             wanted = int(self._aim * len(done) / max(spent, 1e-6))

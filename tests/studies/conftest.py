@@ -12,6 +12,6 @@ def here(monkeypatch):
 
     def use(run):
         trivial_runs.stand_in(monkeypatch, run)
-        monkeypatch.setattr(runner, "make_engine", lambda run, workers, cluster: trivial_runs.Here(run))
+        monkeypatch.setattr(runner, "make_engine", lambda work, *given, **named: trivial_runs.Here(work))
 
     return use

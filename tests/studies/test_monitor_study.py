@@ -3,6 +3,7 @@
 import json
 import sys
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,6 +17,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.job.loops import Bench, LoopSpec
 from hybrid_mpc.monitor import METHODS, Detector, Judges
 from hybrid_mpc.studies import monitor_study as room
+from hybrid_mpc.studies.inputs import run_batch
 from hybrid_mpc.studies.monitor_plan import CASES, LoopPlan, MonitorStudy, monitor_study
 from hybrid_mpc.studies.monitor_results import roc
 from scenarios.golf_robot import scenario
@@ -116,7 +118,9 @@ def stand_in(monkeypatch):
         room, "load_inputs", lambda *given: (SimpleNamespace(models=[SimpleNamespace(folder="")]), {})
     )
     monkeypatch.setattr(room, "load", lambda folder: SimpleNamespace(models={"hybrid": model}))
-    monkeypatch.setattr(room, "make_engine", lambda *given: trivial_runs.Here(run))
+    monkeypatch.setattr(
+        room, "make_engine", lambda *given, **named: trivial_runs.Here(partial(run_batch, run))
+    )
 
     def learn(study, paths, dt):
         for path in paths:

@@ -113,8 +113,8 @@ def test_a_full_disk_stops_the_study_and_it_goes_on_later(here, tmp_path, monkey
     def full(file):
         written.append(file)
         if (
-            len(written) == 3 + 4
-        ):  # after the trial of the folder, its note, and the note's folder: the fourth batch
+            len(written) == 4 + 4
+        ):  # after two trials of the folder, its note, the note's folder: the fourth batch
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         real(file)
 

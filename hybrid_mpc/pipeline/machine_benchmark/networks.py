@@ -11,7 +11,7 @@ from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.identification.settings import KINDS, TrainingSettings
 from hybrid_mpc.identification.trained import Trained
 from hybrid_mpc.identification.training import train
-from hybrid_mpc.pipeline.parallel import run_jobs
+from hybrid_mpc.job.engine import run_jobs
 from hybrid_mpc.pipeline.trained_files import is_trained, load_trained, save_trained
 from hybrid_mpc.scenario import load_scenario
 

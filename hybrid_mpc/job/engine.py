@@ -1,0 +1,492 @@
+"""Where work is computed: processes of this machine through joblib's loky, or a cluster through dask."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from contextvars import ContextVar
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection, wait
+from queue import Empty, Queue
+from typing import Any, Generic, Protocol, TypeVar
+
+from hybrid_mpc.errors import InputError
+
+WORKERS = min(2, os.cpu_count() or 1)
+"""Processes side by side: the machine this is made for has two cores."""
+WATCH_S = 0.5
+"""How often a worker looks whether its parent is still there."""
+REPORT_S = 0.02
+"""How long :func:`run_jobs` waits for a report before it looks whether a job has ended."""
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""What tells numerical libraries how many threads to take."""
+CONNECT_S = 5.0
+"""How long a scheduler is waited for."""
+ADDRESS = re.compile(r"(tcp://)?(\[[0-9a-fA-F:]+\]|[A-Za-z0-9_.-]+):[0-9]{1,5}")
+"""Addresses of schedulers that need nothing else to be known."""
+LOOK_S = 2.0
+"""How often the workers of a cluster are counted."""
+ALONE_S = 60.0
+"""How long a cluster may be without any."""
+B = TypeVar("B")
+R = TypeVar("R")
+R_co = TypeVar("R_co", covariant=True)
+
+
+class Lost(Exception):
+    """A batch whose worker died; ``final`` where the engine has tried several times already.
+
+    Args:
+        why: What is known of it.
+        final: Whether there is no use in trying again.
+
+    Example:
+        >>> Lost("the exit codes of the workers are {SIGKILL(-9)}", final=False).final
+        False
+    """
+
+    def __init__(self, why: str, final: bool) -> None:
+        super().__init__(why)
+        self.final = final
+
+
+class Engine(Protocol[B, R_co]):
+    """Computes batches, each in some worker, by a function of the batch; results do not depend on where.
+
+    Example: :class:`LocalEngine` and :class:`DaskEngine`.
+    """
+
+    @property
+    def workers(self) -> int:
+        """Batches that are computed side by side."""
+
+    @property
+    def name(self) -> str:
+        """What it is, for the record."""
+
+    @property
+    def died(self) -> int:
+        """Workers that have died so far; what they were at is lost, and may be begun again."""
+
+    def submit(self, batch: B) -> None:
+        """Begin a batch."""
+
+    def next(self, timeout: float) -> tuple[B, R_co | Lost] | None:
+        """A batch that has ended, with its result or how it was lost; None if none ends within ``timeout`` [s]."""
+
+    def close(self) -> None:
+        """End what still runs."""
+
+
+class _Futures(Generic[B, R]):
+    """Batches as futures that tell a queue when they are done."""
+
+    def __init__(self) -> None:
+        self._ended: Queue[Any] = Queue()
+        self._batches: dict[Any, B] = {}
+
+    def _watch(self, future: Any, batch: B) -> None:
+        self._batches[future] = batch
+        future.add_done_callback(self._ended.put)
+
+    def next(self, timeout: float) -> tuple[B, R | Lost] | None:
+        """See :class:`Engine`."""
+        try:
+            future = self._ended.get(timeout=timeout)
+        except Empty:
+            return None
+        if future not in self._batches:
+            return None
+        return self._batches.pop(future), self._result(future)
+
+    def _result(self, future: Any) -> R | Lost:
+        raise NotImplementedError
+
+
+class LocalEngine(_Futures[B, R]):
+    """Processes of this machine; each computes one batch after the other.
+
+    Args:
+        work: Makes the result of a batch; it must pickle, and so must batches and results.
+        workers: Processes.
+        threads: Threads that numerical libraries take in each process. Default: what the environment says.
+        begin: Called in each process before its first batch; connections in it are inherited. Default: nothing.
+
+    Raises:
+        InputError: If ``workers`` is less than 1.
+
+    Example:
+        >>> engine = LocalEngine(sum, workers=1, threads=1)
+        >>> engine.submit((1, 2, 3))
+        >>> engine.next(timeout=60.0)
+        ((1, 2, 3), 6)
+        >>> engine.close()
+    """
+
+    def __init__(
+        self,
+        work: Callable[[B], R],
+        workers: int,
+        *,
+        threads: int | None = None,
+        begin: Callable[[], None] | None = None,
+    ) -> None:
+        super().__init__()
+        _check(workers)
+        self._work, self.workers, self.name = work, workers, f"joblib, {workers} processes"
+        self._environment = {} if threads is None else dict.fromkeys(THREADS, str(threads))
+        self._begin = begin
+        self.died = 0
+        self._pool: Any = None
+        self._pools: dict[Any, Any] = {}
+        self._broken: list[Any] = []
+
+    def submit(self, batch: B) -> None:
+        """See :class:`Engine`."""
+        from concurrent.futures import BrokenExecutor
+
+        for _ in range(2):
+            self._pool = self._pool or self._started()
+            try:
+                future = self._pool.submit(self._work, batch)
+                break
+            except BrokenExecutor:  # one of its processes has just died; what it was at tells of it
+                self._pool = None
+        self._pools[future] = self._pool
+        self._watch(future, batch)
+
+    def _started(self) -> Any:
+        from joblib.externals.loky import ProcessPoolExecutor
+
+        return ProcessPoolExecutor(
+            self.workers, env=self._environment, initializer=_began, initargs=(os.getpid(), self._begin)
+        )
+
+    def _result(self, future: Any) -> R | Lost:
+        from concurrent.futures import BrokenExecutor, CancelledError
+
+        pool = self._pools.pop(future)
+        try:
+            result: R = future.result()
+            return result
+        except (BrokenExecutor, CancelledError) as error:
+            self.died += pool not in self._broken
+            self._broken.append(pool)
+            self._pool = None if pool is self._pool else self._pool
+            # what happened, and the exit codes; or the traceback of what could not be unpickled
+            why = [line for line in str(error).splitlines() if line][:2]
+            why += [str(error.__cause__)] if error.__cause__ else []
+            return Lost(f"{type(error).__name__}: {' '.join(why)}", False)
+
+    def close(self) -> None:
+        """See :class:`Engine`."""
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, kill_workers=bool(self._batches))
+            self._pool = None
+
+
+class DaskEngine(_Futures[B, R]):
+    """Workers of a dask cluster; ``work`` is sent to each of them once, with all that it holds.
+
+    A worker that dies is the scheduler's affair: it gives the batch to another, and gives it up when several workers
+    died of it.
+
+    Args:
+        work: Makes the result of a batch; it must pickle, and so must batches and results.
+        cluster: Address of a scheduler, ``"tcp://host:8786"``, or a ``distributed.Client``.
+
+    Raises:
+        InputError: If dask is missing, the scheduler cannot be reached, or it has no worker.
+
+    Example:
+        >>> DaskEngine(sum, "tcp://10.0.0.7:8786").submit((1, 2, 3))  # doctest: +SKIP
+    """
+
+    def __init__(self, work: Callable[[B], R], cluster: Any) -> None:
+        super().__init__()
+        self._own = isinstance(cluster, str)
+        self._client = _connected(cluster) if isinstance(cluster, str) else cluster
+        self._work = work
+        self._shared: Any = None
+        self.workers = max(1, len(self._client.nthreads()))
+        if not self._client.nthreads():
+            raise InputError(f"the scheduler {self._address} has no worker; start some: dask worker ADDRESS")
+        self.name = f"dask, {len(self._client.nthreads())} workers"
+        self.died = 0
+        self._seen = set(self._client.nthreads())
+        self._looked = self._manned = time.monotonic()
+
+    @property
+    def _address(self) -> str:
+        return str(self._client.scheduler.address)
+
+    def next(self, timeout: float) -> tuple[B, R | Lost] | None:
+        """See :class:`Engine`.
+
+        Raises:
+            InputError: If the cluster has had no worker for a while.
+        """
+        now = time.monotonic()
+        if now - self._looked >= LOOK_S:
+            self._looked, there = now, set(self._client.nthreads())
+            self.died, self._seen = self.died + len(self._seen - there), there
+            self._manned = now if there else self._manned
+        if now - self._manned > ALONE_S:
+            raise self._alone()
+        return super().next(timeout)
+
+    def submit(self, batch: B) -> None:
+        """See :class:`Engine`."""
+        if self._shared is None:
+            try:
+                self._shared = self._client.scatter(self._work, broadcast=True, hash=False, timeout=ALONE_S)
+            except TimeoutError as error:
+                raise self._alone() from error
+        self._watch(self._client.submit(_called, self._shared, batch, pure=False), batch)
+
+    def _alone(self) -> InputError:
+        return InputError(
+            f"the scheduler {self._address} has had no worker for {ALONE_S:g} s; what has finished is kept, "
+            "--resume goes on when there are some"
+        )
+
+    def _result(self, future: Any) -> R | Lost:
+        from distributed.scheduler import KilledWorker
+
+        try:
+            result: R = future.result()
+            return result
+        except KilledWorker as error:
+            return Lost(f"KilledWorker: {str(error).splitlines()[0]}", True)
+        except Exception as error:  # the shared inputs went with their last worker, or the connection
+            if self._client.status != "running":
+                raise InputError(
+                    f"the scheduler {self._address} is gone; what has finished is kept, --resume goes on"
+                ) from error
+            self._shared = None
+            return Lost(f"{type(error).__name__}: {error}", False)
+
+    def close(self) -> None:
+        """See :class:`Engine`."""
+        self._client.cancel(list(self._batches))
+        self._shared = None
+        if self._own:
+            self._client.close()
+
+
+def make_engine(
+    work: Callable[[B], R], workers: int, cluster: Any = None, *, threads: int | None = None
+) -> Engine[B, R]:
+    """The engine of a cluster, or of this machine where there is none.
+
+    Args:
+        work: Makes the result of a batch; it must pickle, and so must batches and results.
+        workers: Processes of this machine.
+        cluster: Address of a dask scheduler or a ``distributed.Client``. Default: none.
+        threads: Threads in each process of this machine. Default: what the environment says. Those of a cluster's
+            workers are set where they are started.
+
+    Raises:
+        InputError: If ``workers`` is less than 1, or the cluster cannot be reached.
+
+    Example:
+        >>> make_engine(sum, workers=2).name
+        'joblib, 2 processes'
+    """
+    return LocalEngine(work, workers, threads=threads) if cluster is None else DaskEngine(work, cluster)
+
+
+def run_jobs(
+    jobs: Mapping[str, tuple[Callable[..., Any], tuple[Any, ...]]],
+    on_progress: Callable[[str, int, int, str], None],
+    workers: int,
+    on_result: Callable[[str, Any], None] = lambda name, result: None,
+) -> dict[str, Any]:
+    """Run ``function(*args, report)`` for each job on this machine and return the results by name.
+
+    A job calls ``report(done, total, text)`` as it goes. Jobs start in the order given, ``workers`` at a time, each in
+    a fresh process with the environment's number of threads, so results do not depend on how many run side by side.
+
+    Args:
+        jobs: Functions and their arguments by name; both must pickle, and so must the results.
+        on_progress: ``(name, done, total, text)`` for each report, before the job's result.
+        workers: Jobs side by side.
+        on_result: ``(name, result)`` as each job ends, so that what is done can be kept. Default: nothing.
+
+    Raises:
+        InputError: If a job raises one: bad input that shows only then. Or if ``workers`` is less than 1.
+        RuntimeError: If a job fails otherwise; the message holds its traceback. In either case the others are ended.
+
+    Example:
+        >>> def double(x, report):
+        ...     report(1, 1, "doubled")
+        ...     return 2 * x
+        >>> run_jobs({"a": (double, (1,)), "b": (double, (2,))}, lambda *told: None, workers=1)
+        {'a': 2, 'b': 4}
+    """
+    _check(workers)
+    waiting, results = list(jobs), {}
+    running: dict[str, _Job] = {}
+    try:
+        while waiting or running:
+            while waiting and len(running) < workers:
+                name = waiting.pop(0)
+                running[name] = _Job(*jobs[name])
+            wait([job.reports for job in running.values()], REPORT_S)
+            for name, job in list(running.items()):
+                ended = job.ended()
+                for told in job.told(rest=ended is not None):
+                    on_progress(name, *told)
+                if ended is None:
+                    continue
+                running.pop(name).close()
+                results[name] = ended.result(name)
+                on_result(name, results[name])
+    finally:
+        for job in running.values():
+            job.close()
+    return results
+
+
+@dataclass(frozen=True)
+class _Ended:
+    """How a job ended: its value, the InputError that it raised, or what else it failed by."""
+
+    value: Any = None
+    refused: tuple[type[InputError], str] | None = None
+    failed: str | None = None
+
+    def result(self, name: str) -> Any:
+        if self.refused is not None:
+            kind, text = self.refused
+            raise kind(text)
+        if self.failed is not None:
+            raise RuntimeError(f"{name} failed:\n{self.failed}")
+        return self.value
+
+
+class _Job:
+    """A job that runs, and its reports.
+
+    It has an engine, and so a process, of its own: the number of threads that a training sets in torch, what modules
+    keep, and the memory of one job must not reach the next.
+    """
+
+    def __init__(self, function: Callable[..., Any], args: tuple[Any, ...]) -> None:
+        self.reports, self._theirs = Pipe(duplex=False)
+        self._engine = LocalEngine(_run, 1, begin=partial(_report_to, self._theirs))
+        self._engine.submit((function, args))
+
+    def ended(self) -> _Ended | None:
+        """How it ended; None while it runs."""
+        try:
+            found = self._engine.next(timeout=0.0)
+        except Exception:  # arguments or a result that do not pickle
+            return _Ended(failed=traceback.format_exc())
+        if found is None:
+            return None
+        ended = found[1]
+        return _Ended(failed=f"its process ended ({ended})") if isinstance(ended, Lost) else ended
+
+    def told(self, *, rest: bool) -> Iterator[tuple[int, int, str]]:
+        """The next report, if there is one; the ``rest`` of them once the job has ended."""
+        if rest:
+            self._theirs.close()
+        try:
+            while self.reports.poll():
+                yield self.reports.recv()
+                if not rest:
+                    return
+        except EOFError:
+            return
+
+    def close(self) -> None:
+        """End it if it still runs."""
+        self._engine.close()
+        self._theirs.close()
+        self.reports.close()
+
+
+_REPORTS: ContextVar[Connection] = ContextVar("reports")
+"""In a worker of :func:`run_jobs`: the pipe to its parent, which it inherited as it started."""
+
+
+def _report_to(reports: Connection) -> None:
+    _REPORTS.set(reports)
+
+
+def _run(job: tuple[Callable[..., Any], tuple[Any, ...]]) -> _Ended:
+    """Run a job in its worker."""
+    (function, args), reports = job, _REPORTS.get()
+
+    def report(done: int, total: int, text: str) -> None:
+        reports.send((done, total, text))
+
+    try:
+        return _Ended(function(*args, report))
+    except InputError as error:
+        return _Ended(refused=(type(error), str(error)))
+    except BaseException:  # SystemExit too: every failure travels to the parent, which raises it
+        return _Ended(failed=traceback.format_exc())
+    finally:
+        reports.close()
+
+
+def _began(parent: int, begin: Callable[[], None] | None) -> None:
+    follow(parent)
+    if begin is not None:
+        begin()
+
+
+def follow(parent: int) -> None:
+    """Tie a worker to its parent: it leaves Ctrl-C to it, and ends with it, even if the parent was killed.
+
+    Args:
+        parent: The parent's process id.
+
+    Example: ``ProcessPoolExecutor(2, initializer=follow, initargs=(os.getpid(),))``
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(WATCH_S)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _check(workers: int) -> None:
+    if workers < 1:
+        raise InputError(f"workers must be 1 or more, got {workers}")
+
+
+def _called(work: Callable[[B], R], batch: B) -> R:
+    """What a worker of a cluster does, which has ``work`` already."""
+    return work(batch)
+
+
+def _connected(address: str) -> Any:
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise InputError(f"{error}; pip install 'hybrid-mpc[studies]'") from error
+    if not ADDRESS.fullmatch(address):
+        raise InputError(
+            f"the scheduler's address must be tcp://HOST:PORT, got {address!r}; for another kind (tls://) connect a "
+            "distributed.Client yourself, and give it in place of the address"
+        )
+    try:
+        return Client(address, timeout=CONNECT_S, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"no dask scheduler at {address} within {CONNECT_S:g} s ({type(error).__name__}); start one with "
+            "'dask scheduler', or leave --scheduler out to use this machine"
+        ) from error
