@@ -68,12 +68,12 @@ def test_a_whole_loop_with_its_figures(limits):
     assert np.all(np.isfinite(result.x_hat))
     assert result.source.count("MPC") > 0.9 * len(result.source)
     assert np.all((result.u >= limits[0]) & (result.u <= limits[1]))
-    used = limits_used(control, SimpleNamespace(u=result.u, x=result.x))
-    assert set(used) == {"u", "du", "x[0]", "x[1]"}
+    used, u = limits_used(control, result, model), model.inputs[0].name
+    assert set(used) == {u, f"change of {u}", *(s.name for s in model.states)}
     assert all(np.isfinite(share) for share in used.values())
     # A limit is 1, and the QPs keep them to rounding.
-    assert 0 <= used["u"] <= 1 + 1e-9
-    assert 0 < used["du"] <= 1 + 1e-9
+    assert 0 <= used[u] <= 1 + 1e-9
+    assert 0 < used[f"change of {u}"] <= 1 + 1e-9
     left = excess(control, result, model)
     assert left[model.inputs[0].label] == 0.0
     assert left[model.states[0].label] == max(0.0, -1.0 - result.x[:, 0].min())

@@ -8,7 +8,7 @@ from typing import Any
 
 HERE = Path(__file__).parent
 MODELS = ("phy_nominal", "phy", "rnn", "pgrnn", "mopgrnn")
-KEYS = ("e_sim_s", "rmse_rad", "energy_violation_w")
+KEYS = ("e_sim_s", "rmse", "balance_violation")
 
 
 def identification(results: dict[str, Any]) -> list[str]:
@@ -19,10 +19,15 @@ def identification(results: dict[str, Any]) -> list[str]:
         "|" + " --- |" * 6,
     ]
     for model in MODELS:
-        values = [found[key][model] for key in KEYS]
-        shares = [found[key][model] / found[key]["phy"] for key in KEYS[:2]]
+        values = [first(found[key][model]) for key in KEYS]
+        shares = [first(found[key][model]) / first(found[key]["phy"]) for key in KEYS[:2]]
         lines.append(f"| {model} | " + " | ".join(f"{v:.4g}" for v in values + shares) + " |")
     return lines
+
+
+def first(value: Any) -> float:
+    """A number, or the first one of an object by signal."""
+    return float(next(iter(value.values())) if isinstance(value, dict) else value)
 
 
 CONTENDERS = ("prior", "prior_observer", "hybrid", "hybrid_observer", "oracle", "oracle_state")
@@ -37,11 +42,11 @@ def control(results: dict[str, Any]) -> list[str]:
     for task, cells in details["tasks"].items():
         row = []
         for cell in (cells.get(name) for name in CONTENDERS):
-            half = None if cell is None else cell["cost_ci95"]
+            half = None if cell is None else cell["cost"]["ci95"]
             row.append(
                 "–"
                 if cell is None
-                else f"{cell['cost']:.3g}" + (f" ± {half:.1g}" if half is not None else "")
+                else f"{cell['cost']['mean']:.3g}" + (f" ± {half:.1g}" if half is not None else "")
             )
         gap = details["gap_closed_by_task"][task]["value"]
         lines.append(f"| {task} | " + " | ".join(row) + f" | {'–' if gap is None else f'{gap:.2f}'} |")
@@ -50,15 +55,22 @@ def control(results: dict[str, Any]) -> list[str]:
 
 def strokes(results: dict[str, Any]) -> list[str]:
     """Mean absolute errors of the strokes, speed in % and instant in ms."""
-    figures = results["control"].get("details", {}).get("figures", {})
+    tasks = results["control"].get("details", {}).get("tasks", {})
+    figures = {
+        task: {name: cell["mean_abs_figures"] for name, cell in cells.items()}
+        for task, cells in tasks.items()
+    }
+    figures = {task: row for task, row in figures.items() if any(row.values())}
     lines = ["| stroke | " + " | ".join(CONTENDERS) + " |", "|" + " --- |" * 7] if figures else []
     for task, row in figures.items():
         cells = []
         for name in CONTENDERS:
             f = row.get(name)
-            speed = None if f is None else f["mean_abs_speed_error_rel"]
+            speed, time = (
+                (None, None) if not f else (f[k]["mean"] for k in ("speed_error_rel", "timing_error_s"))
+            )
             cells.append(
-                "–" if speed is None else f"{100 * speed:.2f} %, {1e3 * f['mean_abs_timing_error_s']:.2f} ms"
+                "–" if speed is None or time is None else f"{100 * speed:.2f} %, {1e3 * time:.2f} ms"
             )
         lines.append(f"| {task} | " + " | ".join(cells) + " |")
     return lines
@@ -66,11 +78,17 @@ def strokes(results: dict[str, Any]) -> list[str]:
 
 def limits(results: dict[str, Any]) -> list[str]:
     """Largest shares of the limits that the hybrid with observer used, and any controller of its inputs."""
-    used = results["control"].get("details", {}).get("limits_used", {})
-    names = ("u", "du", "x[0]", "x[1]")
-    lines = [f"| task | {' | '.join(names)} | u of any |", "|" + " --- |" * 6] if used else []
+    tasks = results["control"].get("details", {}).get("tasks", {})
+    used = {task: {name: cell["limits"] for name, cell in cells.items()} for task, cells in tasks.items()}
+    names = list(dict.fromkeys(name for row in used.values() for limits in row.values() for name in limits))
+    lines = (
+        [f"| task | {' | '.join(names)} | {names[0]} of any |", "|" + " --- |" * (len(names) + 2)]
+        if used
+        else []
+    )
     for task, row in used.items():
-        shares = [row["hybrid_observer"].get(name) for name in names] + [max(c["u"] for c in row.values())]
+        shares = [row["hybrid_observer"].get(name) for name in names]
+        shares.append(max(limits[names[0]] for limits in row.values()))
         lines.append(f"| {task} | " + " | ".join("–" if s is None else f"{s:.3f}" for s in shares) + " |")
     return lines
 

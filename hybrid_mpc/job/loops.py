@@ -449,7 +449,7 @@ def row_of(spec: LoopSpec, task: Task, problem: OCP, model: HybridModel, result:
         tracking_rmse=_by(labels, np.sqrt(np.mean((r.x - r.reference) ** 2, axis=0))),
         largest_x=_by(labels, np.abs(r.x).max(axis=0)),
         largest_u=_by(inputs, np.abs(r.u).max(axis=0)),
-        limits=limits_used(problem, r),
+        limits=limits_used(problem, r, model),
         excess=excess(problem, r, model),
         sources={source.name: r.source.count(source.name) / len(r.source) for source in Source},
         figures=dict(task.figures(r)) if task.figures is not None else {},
@@ -466,22 +466,26 @@ def _by(labels: Sequence[str], values: Array) -> dict[str, float]:
     return dict(zip(labels, values.tolist(), strict=True))
 
 
-def limits_used(control: OCP, r: ClosedLoopResult) -> dict[str, float]:
+def limits_used(control: OCP, r: ClosedLoopResult, model: HybridModel) -> dict[str, float]:
     """Largest share of the way from rest to each limit that a loop used: 1 is the limit, more a violation.
 
     Args:
         control: The problem with the limits.
         r: The loop; states are the plant's true ones.
+        model: Whose signals name them.
 
     Returns:
-        ``u``, and ``du`` and ``x[i]`` where there are such limits [-].
+        Inputs, and ``change of`` an input and states where there are such limits [-].
     """
-    used = {"u": share_used(r.u, control.u_min, control.u_max)}
-    if control.du_max is not None:
-        du = np.diff(r.u, axis=0, prepend=control.rest_input[None])
-        used["du"] = float(np.max(np.abs(du) / control.du_max))
-    for i in np.flatnonzero(np.isfinite(control.x_min) | np.isfinite(control.x_max)):
-        used[f"x[{i}]"] = share_used(r.x[:, i], control.x_min[i], control.x_max[i])
+    changes = np.abs(np.diff(r.u, axis=0, prepend=control.rest_input[None]))
+    used: dict[str, float] = {}
+    for i, signal in enumerate(model.inputs):
+        used[signal.name] = share_used(r.u[:, i], control.u_min[i], control.u_max[i])
+        if control.du_max is not None:
+            used[f"change of {signal.name}"] = float(np.max(changes[:, i] / control.du_max[i]))
+    for i, signal in enumerate(model.states):
+        if np.isfinite(control.x_min[i]) or np.isfinite(control.x_max[i]):
+            used[signal.name] = share_used(r.x[:, i], control.x_min[i], control.x_max[i])
     return used
 
 

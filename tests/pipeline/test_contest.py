@@ -18,8 +18,12 @@ from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.results import gap_closed
 from hybrid_mpc.pipeline.settings import RunSettings
 from hybrid_mpc.scenario import load_scenario
+from hybrid_mpc.signals import Signal
 
 GOLF = load_scenario("golf_robot")
+SIGNALS = SimpleNamespace(
+    inputs=(Signal("tau", "N m"),), states=(Signal("phi", "rad"), Signal("phi_dot", "rad/s"))
+)
 
 
 def cells(**costs):
@@ -96,8 +100,12 @@ def test_limits_are_shares_of_the_side_that_they_bound():
     loop = SimpleNamespace(
         u=np.array([[0.1], [0.25], [-0.1]]), x=np.array([[0.5, 9.0], [-0.75, 0.0], [1.0, 0.0]])
     )
-    used = limits_used(control, loop)
-    assert used == {"u": pytest.approx(0.5), "du": pytest.approx(0.875), "x[0]": pytest.approx(0.75)}
+    used = limits_used(control, loop, SIGNALS)
+    assert used == {
+        "tau": pytest.approx(0.5),
+        "change of tau": pytest.approx(0.875),
+        "phi": pytest.approx(0.75),
+    }
 
 
 @pytest.mark.parametrize(
@@ -110,9 +118,9 @@ def test_limits_beside_zero_are_used_from_rest_on(u_min, u_max, u, shares):
         u_min=(u_min,), u_max=(u_max,), du_max=(4.0,), x_min=None, x_max=(2.0, np.inf)
     )
     used = limits_used(
-        control, SimpleNamespace(u=np.array(u)[:, None], x=np.array([[1.0, 9.0], [-7.0, 0.0]]))
+        control, SimpleNamespace(u=np.array(u)[:, None], x=np.array([[1.0, 9.0], [-7.0, 0.0]])), SIGNALS
     )
-    assert used == pytest.approx({"u": shares[0], "du": shares[1], "x[0]": 0.5})
+    assert used == pytest.approx({"tau": shares[0], "change of tau": shares[1], "phi": 0.5})
 
 
 def test_tasks_are_found_by_name():
