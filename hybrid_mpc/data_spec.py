@@ -10,6 +10,7 @@ from typing import Literal
 from hybrid_mpc.errors import InputError
 
 Role = Literal["train", "valid", "test", "nominal"]
+"""What a part of a recording is used for, see :class:`Window`."""
 
 
 @dataclass(frozen=True)

@@ -120,21 +120,6 @@ def read_object(path: Path) -> dict[str, Any]:
     return found
 
 
-def write_table(path: Path, header: str, table: NDArray[np.float64]) -> None:
-    """Write a table ``(n, columns)`` as CSV with six decimals, whole or not at all.
-
-    Raises:
-        StorageError: If it cannot be written.
-
-    Example:
-        >>> path = Path(tempfile.mkdtemp()) / "a.csv"
-        >>> write_table(path, "time_s,u_nm", np.array([[0.0, 0.5]])); path.read_text().splitlines()
-        ['time_s,u_nm', '0.000000,0.500000']
-    """
-    with replacing(path) as file:
-        np.savetxt(file, table, "%.6f", delimiter=",", header=header, comments="")
-
-
 def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write arrays as ``.npz`` (no pickle), whole or not at all.
 

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+import hybrid_mpc
+
 ROOT = Path(__file__).parents[1]
 OWN = ("nn_export", "hybrid_mpc", "scenarios")
 ALLOWED = {
@@ -42,7 +44,14 @@ ONLINE = (
 
 
 def imports(path, *, at_load):
-    """Top-level names that a file imports; ``at_load`` leaves out functions and TYPE_CHECKING blocks."""
+    """Modules that a file imports; ``at_load`` leaves out functions and TYPE_CHECKING blocks.
+
+    A public name of ``hybrid_mpc`` counts as the room that it is imported from, which is loaded with it.
+    """
+    return imports_of(path.read_text(), path, at_load=at_load)
+
+
+def imports_of(source, path, *, at_load):
     names = set()
 
     def visit(node):
@@ -56,10 +65,19 @@ def imports(path, *, at_load):
             elif isinstance(child, ast.ImportFrom):
                 assert child.level == 0, f"{path}: relative import"
                 names.add(child.module)
+                if child.module == "hybrid_mpc":
+                    homes = (hybrid_mpc._HOME.get(alias.name) for alias in child.names)
+                    names.update(f"hybrid_mpc.{home}" for home in homes if home)
             visit(child)
 
-    visit(ast.parse(path.read_text()))
+    visit(ast.parse(source))
     return names
+
+
+def with_torch(modules):
+    """Those that load torch: itself, and the offline half of ``hybrid_mpc``."""
+    rooms = [place.removesuffix(".py").removesuffix("/").replace("/", ".") for place in TORCH]
+    return {m for m in modules if any(m == r or m.startswith(f"{r}.") for r in ("torch", *rooms))}
 
 
 FILES = [p for package in OWN for p in sorted((ROOT / package).rglob("*.py"))]
@@ -85,6 +103,32 @@ def test_torch_stays_offline(path):
     parts = path.relative_to(ROOT).with_suffix("").parts
     if parts[0] == "hybrid_mpc" and parts[1] in ONLINE:
         assert "torch" not in {name.split(".")[0] for name in imports(path, at_load=False)}
+    if parts[0] == "scenarios":  # public names of the offline half bring torch along
+        assert not with_torch(imports(path, at_load=True))
+
+
+@pytest.mark.parametrize(
+    ("source", "caught"),
+    [
+        ("from hybrid_mpc import Prior", True),
+        ("from hybrid_mpc import DataSpec, with_friction", True),
+        ("from hybrid_mpc.identification.lags import delayed", True),
+        ("from hybrid_mpc import DataSpec, OCP", False),
+        ("from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from hybrid_mpc import Prior", False),
+        ("def prior():\n    from hybrid_mpc import Prior", False),
+    ],
+)
+def test_a_public_name_that_needs_torch_is_noticed(source, caught):
+    assert bool(with_torch(imports_of(source, "scenario.py", at_load=True))) is caught
+
+
+@pytest.mark.parametrize(
+    "path", [p for p in FILES if "hybrid_mpc" in p.parts], ids=lambda p: str(p.relative_to(ROOT))
+)
+def test_rooms_import_rooms_and_not_the_public_names(path):
+    tree = ast.parse(path.read_text())
+    froms = [n for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and n.module == "hybrid_mpc"]
+    assert not {alias.name for node in froms for alias in node.names} & set(hybrid_mpc._HOME)
 
 
 def test_only_the_command_line_knows_typer():

@@ -32,7 +32,7 @@ from hybrid_mpc.analysis.reduction import (
 )
 from hybrid_mpc.analysis.schedule import GainSchedule, gain_schedule, holding_input
 from hybrid_mpc.analysis.sensitivity import Sensitivities, parameter_sensitivities, with_parameters
-from hybrid_mpc.analysis.structure import Mode, Structure, structure
+from hybrid_mpc.analysis.structure import Mode, Structure, system_structure
 from hybrid_mpc.analysis.symbolic import jacobians
 
 __all__ = [
@@ -51,7 +51,7 @@ __all__ = [
     "FrictionSlopes",
     "analyze",
     "LinearAnalysis",
-    "structure",
+    "system_structure",
     "Structure",
     "Mode",
     "stabilisable",

@@ -62,7 +62,7 @@ class Structure:
         }
 
 
-def structure(sys: Any) -> Structure:
+def system_structure(sys: Any) -> Structure:
     """Modes of a discrete ``control.StateSpace`` with what PBH tests and Hankel singular values say of them.
 
     PBH asks whether a mode can be moved (seen) at all; a Hankel singular value how much of the way from past inputs
@@ -77,7 +77,7 @@ def structure(sys: Any) -> Structure:
 
     Example:
         >>> import control
-        >>> found = structure(control.ss(np.diag([1.2, 0.5]), [[0.0], [1.0]], [[1.0, 1.0]], 0.0, 0.1,
+        >>> found = system_structure(control.ss(np.diag([1.2, 0.5]), [[0.0], [1.0]], [[1.0, 1.0]], 0.0, 0.1,
         ...     remove_useless_states=False))
         >>> [round(m.reach, 3) for m in found.modes], found.stabilisable, found.detectable
         ([0.0, 0.538], False, True)

@@ -14,7 +14,7 @@ from hybrid_mpc.analysis.friction import friction_slopes, linearize_secant
 from hybrid_mpc.analysis.linearize import hidden_fixed_point, linearize, linearize_at_speed
 from hybrid_mpc.analysis.properties import frequency_response
 from hybrid_mpc.analysis.reduction import physical_states
-from hybrid_mpc.analysis.structure import structure
+from hybrid_mpc.analysis.structure import system_structure
 from hybrid_mpc.analysis.subject import Subject
 from hybrid_mpc.analysis.toolbox import control_toolbox
 from hybrid_mpc.data.excitation import multisine
@@ -108,7 +108,7 @@ def linear_part(subject: Subject, points: Mapping[str, tuple[Array, Array]]) -> 
         x, h = points[name]
         result[name] = {"x": x}
         for point, system in systems(subject, name, points[name]).items():
-            found = structure(system)
+            found = system_structure(system)
             row: dict[str, Any] = found.to_dict()
             omega = np.geomspace(0.02, np.pi / model.dt, 400)
             curves = {"": system}

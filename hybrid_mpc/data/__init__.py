@@ -22,7 +22,7 @@ if TYPE_CHECKING:
         differentiate,
     )
     from hybrid_mpc.data.doubts import Finding
-    from hybrid_mpc.data.excitation import chirp, multisine, prbs, sinusoid, steps
+    from hybrid_mpc.data.excitation import chirp, multisine, prbs, random_steps, sinusoid
     from hybrid_mpc.data.excitation_check import Excitation, check_excitation, excitation_of
     from hybrid_mpc.data.low_pass import SmoothingSpline, ZeroPhaseFilter, gcv_cutoff
     from hybrid_mpc.data.scales import noise_of, time_scale, time_unit
@@ -36,7 +36,7 @@ __all__ = [
     "Derivatives", "local_polynomial", "causal_derivatives", "noise_gain", "bandwidth",
     "differentiate", "Differentiator", "gcv_cutoff",
     "LocalPolynomial", "SmoothingSpline", "ZeroPhaseFilter", "CausalPolynomial",
-    "sinusoid", "chirp", "steps", "multisine", "prbs", "crest_factor", "line_spectrum", "hann_spectrum",
+    "sinusoid", "chirp", "random_steps", "multisine", "prbs", "crest_factor", "line_spectrum", "hann_spectrum",
     "Excitation", "excitation_of", "check_excitation",
     "noise_of", "time_scale", "time_unit",
 ]  # fmt: skip
@@ -45,7 +45,7 @@ _MODULES = {
     "differentiation": ("Derivatives", "bandwidth", "causal_derivatives", "local_polynomial", "noise_gain"),
     "differentiators": ("CausalPolynomial", "Differentiator", "LocalPolynomial", "differentiate"),
     "doubts": ("Finding",),
-    "excitation": ("chirp", "multisine", "prbs", "sinusoid", "steps"),
+    "excitation": ("chirp", "multisine", "prbs", "random_steps", "sinusoid"),
     "excitation_check": ("Excitation", "check_excitation", "excitation_of"),
     "low_pass": ("SmoothingSpline", "ZeroPhaseFilter", "gcv_cutoff"),
     "scales": ("noise_of", "time_scale", "time_unit"),

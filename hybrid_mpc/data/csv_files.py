@@ -42,14 +42,15 @@ def csv_source(path: Path) -> Source:
     return Source(path, digest_of(content), tuple(names), read)
 
 
-def write_csv(path: Path | str, columns: Mapping[str, Array]) -> Path:
+def write_csv(path: Path | str, columns: Mapping[str, Array], *, decimals: int | None = None) -> Path:
     r"""Write columns of equal length as CSV: all of it or nothing, the same data as the same bytes.
 
-    Numbers are written with ten significant digits. The file appears under its name only when complete.
+    The file appears under its name only when complete.
 
     Args:
         path: File to write; its folder is made if need be, an old file of that name is replaced.
         columns: Values ``(m,)`` by column name.
+        decimals: Digits after the point. Default: ten significant digits.
 
     Returns:
         The path.
@@ -71,9 +72,15 @@ def write_csv(path: Path | str, columns: Mapping[str, Array]) -> Path:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(arrays)
-    writer.writerows([f"{value + 0.0:.10g}" for value in row] for row in zip(*arrays.values(), strict=True))
+    writer.writerows(
+        [_written(value, decimals) for value in row] for row in zip(*arrays.values(), strict=True)
+    )
     write_text(path, text.getvalue())
     return path
+
+
+def _written(value: float, decimals: int | None) -> str:
+    return f"{value + 0.0:.10g}" if decimals is None else f"{value:.{decimals}f}"  # + 0.0: no "-0"
 
 
 class _Text:

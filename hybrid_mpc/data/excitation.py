@@ -91,7 +91,7 @@ def chirp(
     return offset + amplitude * np.sin(2 * np.pi * cycles)
 
 
-def steps(
+def random_steps(
     t: Array, lower: float, upper: float, *, hold: tuple[float, float], rng: np.random.Generator
 ) -> Array:
     """Random levels, uniform in ``[lower, upper]``, each held for a random time.
@@ -113,14 +113,14 @@ def steps(
         InputError: If a range is empty or the shortest hold is not positive.
 
     Example:
-        >>> u = steps(np.arange(5.0), -1.0, 1.0, hold=(2.0, 2.0), rng=np.random.default_rng(0))
+        >>> u = random_steps(np.arange(5.0), -1.0, 1.0, hold=(2.0, 2.0), rng=np.random.default_rng(0))
         >>> len(set(u.tolist()))
         3
     """
     shortest, longest = hold
     if not (lower <= upper and 0 < shortest <= longest):
         raise InputError(
-            f"steps: need lower <= upper and 0 < shortest <= longest hold, got levels "
+            f"random_steps: need lower <= upper and 0 < shortest <= longest hold, got levels "
             f"{lower:g} to {upper:g} and holds {shortest:g} to {longest:g} s"
         )
     t = np.asarray(t, dtype=float)

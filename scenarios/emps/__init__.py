@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from hybrid_mpc.benchmark_spec import BenchmarkBudget, BenchmarkSpec
-from hybrid_mpc.scenario import DataSpec, Scenario
+from hybrid_mpc import BenchmarkBudget, BenchmarkSpec, DataSpec, Scenario
 
 if TYPE_CHECKING:
-    from hybrid_mpc.physics import Prior
+    from hybrid_mpc import Prior
 
 DESCRIPTION = """\
 A motor drives a carriage along a rail through a ball screw; recorded in closed loop at 1 kHz. The input is the motor's

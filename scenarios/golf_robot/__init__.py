@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from hybrid_mpc.scenario import DEFAULT_BUDGETS, Scenario
+from hybrid_mpc import DEFAULT_BUDGETS, Scenario
 from scenarios.golf_robot.data import make_data
 from scenarios.golf_robot.drawing import draw
 from scenarios.golf_robot.experiment import DATA, EXPERIMENT
@@ -17,7 +17,7 @@ from scenarios.golf_robot.tasks import CONTROL, QUICK_TASKS, TASKS
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from hybrid_mpc.physics import Prior
+    from hybrid_mpc import Prior
 
 __all__ = ["scenario"]
 

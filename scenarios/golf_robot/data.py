@@ -8,9 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.data_spec import Role, Window
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import write_table
+from hybrid_mpc import InputError, Role, Window, write_csv
 from scenarios.golf_robot.excitation import excitation
 from scenarios.golf_robot.rig import Rig, RigState
 
@@ -20,6 +18,7 @@ DURATION = 20.0  # [s]
 RECORD = 0.01  # period of the recording [s]
 GRID = 0.02  # the input changes on this grid [s], the model's
 JITTER = 0.2e-3  # standard deviation of the (recorded) time stamps [s]
+COLUMNS = ("time_s", "phi_rad", "u_nm")
 LARGEST = 1.5  # [rad]; a recording that goes beyond is repeated with less torque
 SMALLER = 0.8  # times the torque, then
 SIZES: Mapping[str, Mapping[Role, int]] = {
@@ -166,7 +165,6 @@ def make_data(folder: Path, seed: int, budget: str, *, data_set: str = "b") -> l
     stems(budget, data_set)
     paths = []
     for stem, table, _ in recordings(seed, budget, data_set):
-        path = folder / f"{stem}.csv"
-        write_table(path, "time_s,phi_rad,u_nm", table)
-        paths.append(path)
+        columns = dict(zip(COLUMNS, table.T, strict=True))
+        paths.append(write_csv(folder / f"{stem}.csv", columns, decimals=6))
     return paths

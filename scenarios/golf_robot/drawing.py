@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError
 from scenarios.golf_robot.dynamics import RigParameters
 
 Array = NDArray[np.float64]

@@ -13,7 +13,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.optimize import least_squares
 from scipy.signal import savgol_coeffs
 
-from hybrid_mpc.data.differentiation import bandwidth, local_polynomial, noise_gain, window_samples
+from hybrid_mpc import LocalPolynomial, differentiate
 from scenarios.golf_robot.data import DURATION, RECORD, recordings
 from scenarios.golf_robot.dynamics import N_STATES, RigParameters, rhs
 from scenarios.golf_robot.nominal import GEAR, PARAMETERS
@@ -84,7 +84,7 @@ def noise_floor(p: RigParameters, window: float = SMOOTHING) -> float:
         True
     """
     sigma = np.hypot(p.noise, p.count / np.sqrt(12))
-    return float(p.J * sigma * noise_gain(RECORD, window, derivative=2))
+    return float(p.J * sigma * LocalPolynomial(window).noise_gain(RECORD, 2))
 
 
 def measure_effects(seed: int = 0, budget: str = "quick", data_set: str = "b") -> Effects:
@@ -166,7 +166,7 @@ def smoothing(window: float = SMOOTHING) -> Array:
         >>> round(float(smoothing().sum()), 9)
         1.0
     """
-    n = window_samples(window, RECORD)
+    n = 2 * LocalPolynomial(window).reach(RECORD) + 1
     taps = savgol_coeffs(n, 4, deriv=2, delta=RECORD, use="dot")
     return np.asarray(np.cumsum(np.cumsum(taps))[:-2] * RECORD**2)
 
@@ -219,7 +219,7 @@ def table(effects: Effects) -> str:
         ("left by the fitted prior, as the differentiation shows it", effects.residual_seen),
     ):
         rows.append(f"| {name} ({value / floor:.2f} x floor) | {1e3 * value:.1f} |")
-    band = bandwidth(RECORD, SMOOTHING)
+    band = LocalPolynomial(SMOOTHING).bandwidth(RECORD)
     rows.append(f"| noise floor ({SMOOTHING:g} s, {band:.1f} Hz) | {1e3 * floor:.1f} |")
     fitted = ", ".join(f"{name} {value:.4g}" for name, value in effects.fitted.items())
     reach = f"largest angle {effects.largest_angle:.2f} rad, speed {effects.largest_speed:.2f} rad/s"
@@ -237,15 +237,15 @@ def differentiation_error(runs: list[tuple[str, Array, Array]], window: float) -
         runs: Stem, table and true states of recordings.
         window: Length [s] of the local quartic.
     """
-    noises, biases = [], []
+    method = LocalPolynomial(window)
+    n, noises, biases = 2 * method.reach(RECORD) + 1, [], []
     for _, table, states in runs:
         t, grid = table[:, 0], RECORD * np.arange(round(DURATION / RECORD) + 1)
         path = CubicHermiteSpline(t, states[:, 0], states[:, 1])
         inside = np.clip(grid, t[0], t[-1])
         phi, v, measured = path(inside), path(inside, 1), np.interp(grid, t, table[:, 1])
-        clean, noisy = (local_polynomial(y, RECORD, window).first for y in (phi, measured))
-        ends = slice(window_samples(window, RECORD), -window_samples(window, RECORD))
-        true, clean, noisy = ((y[2::2] - y[:-2:2])[ends] / (2 * RECORD) for y in (v, clean, noisy))
+        clean, noisy = (differentiate(y, RECORD, method).first for y in (phi, measured))
+        true, clean, noisy = ((y[2::2] - y[:-2:2])[n:-n] / (2 * RECORD) for y in (v, clean, noisy))
         noises.append(noisy - clean)
         biases.append(clean - true)
     j = RigParameters().J

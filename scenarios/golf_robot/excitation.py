@@ -7,8 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.data.excitation import chirp, sinusoid, steps
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError, chirp, random_steps, sinusoid
 
 Array = NDArray[np.float64]
 
@@ -57,7 +56,7 @@ def _sine(rng: np.random.Generator, t: Array) -> Array:
 
 
 def _step(rng: np.random.Generator, t: Array) -> Array:
-    return steps(t, -0.25, 0.25, hold=(1.0, 3.0), rng=rng)
+    return random_steps(t, -0.25, 0.25, hold=(1.0, 3.0), rng=rng)
 
 
 def _chirp(rng: np.random.Generator, t: Array) -> Array:

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from hybrid_mpc.data.trajectories import Dataset, load_trajectories
-from hybrid_mpc.data_spec import DataSpec
-from hybrid_mpc.reproduction.claims import Claim, above, below, level, narrower, ordered, steady
-from hybrid_mpc.reproduction.experiment import Effort, Experiment
+from hybrid_mpc import Claim, Dataset, DataSpec, Effort, Experiment, load_trajectories
 from scenarios.golf_robot.data import SIZES, make_data, windows
 from scenarios.golf_robot.nominal import INPUTS, OUTPUTS, STATES
 
@@ -47,67 +44,67 @@ def claims(data_set: str, rnn: float, pgrnn: float, mopgrnn: float) -> tuple[Cla
             f"{s}_rnn_worse",
             f"RNN at least {100 * rnn:.0f} % above the physics with every amount of data",
             paper,
-            above("rnn", "phy", rnn, s),
+            Claim.above("rnn", "phy", rnn, s),
         ),
         Claim(
             f"{s}_pgrnn_level",
             "PGRNN about level with the physics with least data, here: within 20 %",
             paper,
-            level("pgrnn", "phy", 0.2, s, at="least"),
+            Claim.level("pgrnn", "phy", 0.2, s, at="least"),
         ),
         Claim(
             f"{s}_pgrnn_best",
             f"PGRNN up to {100 * pgrnn:.0f} % below the physics, here: at least that at best",
             paper,
-            below("pgrnn", "phy", pgrnn, s, at="some"),
+            Claim.below("pgrnn", "phy", pgrnn, s, at="some"),
         ),
         Claim(
             f"{s}_mopgrnn",
             f"MOPGRNN {100 * mopgrnn:.0f} % below the physics with most data",
             paper,
-            below("mopgrnn", "phy", mopgrnn, s, at="most"),
+            Claim.below("mopgrnn", "phy", mopgrnn, s, at="most"),
         ),
         Claim(
             f"{s}_rnn_above_pgrnn",
             "RNN above PGRNN with every amount of data",
             paper,
-            above("rnn", "pgrnn", 0.0, s),
+            Claim.above("rnn", "pgrnn", 0.0, s),
         ),
         Claim(
             f"{s}_little_data",
             "MOPGRNN hardly worse with little data, here: with least at most 10 % worse than with most",
             paper,
-            steady("mopgrnn", 0.1, s),
+            Claim.steady("mopgrnn", 0.1, s),
         ),
         Claim(
             f"{s}_narrower",
             "the standard deviation of MOPGRNN below those of PGRNN and RNN with every amount of data",
             paper,
-            narrower("mopgrnn", ("pgrnn", "rnn"), s),
+            Claim.narrower("mopgrnn", ("pgrnn", "rnn"), s),
         ),
         Claim(
             f"{s}_more_physics",
             "the more physics, the more accurate and consistent: RNN, PGRNN, MOPGRNN in this order with most data",
             paper,
-            ordered(("rnn", "pgrnn", "mopgrnn"), s),
+            Claim.ordered(("rnn", "pgrnn", "mopgrnn"), s),
         ),
         Claim(
             f"{s}_violation",
             "the energy violation of MOPGRNN below that of PGRNN with every amount of data",
             goal,
-            below("mopgrnn", "pgrnn", 0.0, s, metric="energy_violation_w"),
+            Claim.below("mopgrnn", "pgrnn", 0.0, s, metric="energy_violation_w"),
         ),
         Claim(
             f"{s}_free_run",
             "training on free runs brings MOPGRNN down by a further 20 % with most data",
             goal,
-            below("hybrid", "mopgrnn", 0.2, s, at="most"),
+            Claim.below("hybrid", "mopgrnn", 0.2, s, at="most"),
         ),
         Claim(
             f"{s}_sindy",
             "SINDy with control reaches comparable accuracy, here: at most 25 % above MOPGRNN with most data",
             "paper, text",
-            below("sindy", "mopgrnn", -0.25, s, at="most"),
+            Claim.below("sindy", "mopgrnn", -0.25, s, at="most"),
         ),
     )
 

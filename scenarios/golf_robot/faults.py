@@ -7,8 +7,7 @@ from math import inf
 
 import numpy as np
 
-from hybrid_mpc.closed_loop.faults import Fault
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import Fault, InputError
 
 CAUSES = {"friction": ("d", "mu"), "mass": ("m", "J"), "motor": ("gain of u",)}
 """What may break, and the prior's parameters that change together then."""

@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hybrid_mpc.closed_loop.faults import Fault, corrupt_input, corrupt_measurement, install
-from hybrid_mpc.plots.style import colour, new_figure, save, shared_legend, title_axes
+from hybrid_mpc import Fault, corrupt_input, corrupt_measurement
+from hybrid_mpc.plots import colour, new_figure, save, shared_legend, title_axes
 from scenarios.golf_robot.data import recordings
 from scenarios.golf_robot.dynamics import N_STATES, RigParameters, rhs
 from scenarios.golf_robot.effects import PUBLISHED, fit, motion, noise_floor, residual_torque
@@ -163,7 +163,8 @@ def faults() -> Figure:
 
 
 def _measured(faults: tuple[Fault, ...]) -> Array:
-    rig, outside = install(Rig(), faults)
+    rig = Rig().with_faults([fault for fault in faults if fault.on_plant])
+    outside = [fault for fault in faults if not fault.on_plant]
     state, rng, seen = rig.reset(np.zeros(2), 0), np.random.default_rng(0), []
     y = np.full(1, np.nan)
     for k in range(400):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hybrid_mpc.signals import Parameter, Signal
+from hybrid_mpc import Parameter, Signal
 
 STATES = (Signal("phi", "rad", -3.2, 3.2), Signal("phi_dot", "rad/s", -15.0, 15.0))
 INPUTS = (Signal("u", "N m", -0.6, 0.6),)

@@ -6,7 +6,7 @@ import warnings
 
 import casadi as ca
 
-from hybrid_mpc.model import HybridModel
+from hybrid_mpc import HybridModel
 from nn_export import compile_function
 from nn_export.errors import CompileError
 from scenarios.golf_robot.dynamics import N_STATES, RigParameters, rhs

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 from scipy.optimize import brentq
 
-from hybrid_mpc.closed_loop.faults import Fault, check_plant_faults
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import Fault, InputError, check_plant_faults
 from scenarios.golf_robot.dynamics import N_STATES, RigParameters
 from scenarios.golf_robot.integration import Stepper, steps
 

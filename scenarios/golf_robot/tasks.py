@@ -7,10 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.closed_loop.faults import Fault
-from hybrid_mpc.closed_loop.result import ClosedLoopResult
-from hybrid_mpc.mpc import OCP
-from hybrid_mpc.scenario import Task
+from hybrid_mpc import OCP, ClosedLoopResult, Fault, Task
 from scenarios.references import faded_sines
 
 Array = NDArray[np.float64]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from hybrid_mpc.scenario import Budget, DataSpec, Scenario
+from hybrid_mpc import Budget, DataSpec, Scenario
 from scenarios.pendulum.data import make_data, windows
 from scenarios.pendulum.experiment import EXPERIMENT
 from scenarios.pendulum.oracle import oracle
@@ -14,7 +14,7 @@ from scenarios.pendulum.tasks import CONTROL, TASKS
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from hybrid_mpc.physics import Prior
+    from hybrid_mpc import Prior
 
 __all__ = ["scenario"]
 

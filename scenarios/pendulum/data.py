@@ -8,11 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.data.excitation import sinusoid
-from hybrid_mpc.data.trajectories import Trajectory
-from hybrid_mpc.data_spec import Role, Window
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import write_table
+from hybrid_mpc import InputError, Role, Trajectory, Window, sinusoid, write_csv
 from scenarios.pendulum.plant import DampedPendulum
 
 Array = NDArray[np.float64]
@@ -20,6 +16,7 @@ Array = NDArray[np.float64]
 DURATION = 5.0  # [s], the paper's
 RECORD = 1e-3  # period of the recording [s], the paper's
 HELD = 10  # samples for which the torque is held: the model's period of 10 ms
+COLUMNS = ("time_s", "phi_rad", "phi_dot_rad_s", "u_nm")
 AMPLITUDE = (4.0, 20.0)  # [N m]; gravity asks for at most 22.1
 FREQUENCY = (0.2, 2.0)  # [Hz]; the pendulum's own is 2.3
 ANGLE, SPEED = 1.5, 5.0  # largest of x0 [rad], [rad/s]
@@ -179,7 +176,6 @@ def make_data(folder: Path, seed: int, budget: str) -> list[Path]:
     stems(budget)
     paths = []
     for stem, table in recordings(seed, budget):
-        path = folder / f"{stem}.csv"
-        write_table(path, "time_s,phi_rad,phi_dot_rad_s,u_nm", table)
-        paths.append(path)
+        columns = dict(zip(COLUMNS, table.T, strict=True))
+        paths.append(write_csv(folder / f"{stem}.csv", columns, decimals=6))
     return paths

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from hybrid_mpc.data.trajectories import Trajectory
-from hybrid_mpc.reproduction.claims import Claim, below, level, narrower, sooner, steady
-from hybrid_mpc.reproduction.experiment import Effort, Experiment
+from hybrid_mpc import Claim, Effort, Experiment, Trajectory
 from scenarios.pendulum.data import ROLES, SIZES, exact_runs
 
 SET = "exact"
@@ -30,7 +28,7 @@ CLAIMS = (
             f"{model}_beats_phy",
             f"{name} lies far below the physics, here: at most half of it, with every amount of data",
             FIGURE,
-            below(model, "phy", 0.5, SET),
+            Claim.below(model, "phy", 0.5, SET),
         )
         for model, name in (("rnn", "RNN"), ("pgrnn", "PGRNN"), ("mopgrnn", "MOPGRNN"))
     ),
@@ -38,44 +36,44 @@ CLAIMS = (
         "pgrnn_below_rnn",
         "PGRNN at least 34 % (to 67 %) below RNN with every amount of data",
         FIGURE,
-        below("pgrnn", "rnn", 0.34, SET),
+        Claim.below("pgrnn", "rnn", 0.34, SET),
     ),
     Claim(
         "mopgrnn_below_rnn",
         "MOPGRNN at least 19 % (to 67 %) below RNN with every amount of data",
         FIGURE,
-        below("mopgrnn", "rnn", 0.19, SET),
+        Claim.below("mopgrnn", "rnn", 0.19, SET),
     ),
     Claim(
         "on_a_par",
         "MOPGRNN on a par with PGRNN, here: within 20 % with every amount of data",
         FIGURE,
-        level("mopgrnn", "pgrnn", 0.2, SET),
+        Claim.level("mopgrnn", "pgrnn", 0.2, SET),
     ),
     Claim(
         "narrower",
         "the standard deviation of MOPGRNN below that of PGRNN with every amount of data",
         FIGURE,
-        narrower("mopgrnn", ("pgrnn",), SET),
+        Claim.narrower("mopgrnn", ("pgrnn",), SET),
     ),
-    Claim("sooner", "MOPGRNN converges faster than PGRNN", FIGURE, sooner("mopgrnn", "pgrnn", SET)),
+    Claim("sooner", "MOPGRNN converges faster than PGRNN", FIGURE, Claim.sooner("mopgrnn", "pgrnn", SET)),
     Claim(
         "no_influence",
         "no clear influence of the amount of data, here: MOPGRNN with least data at most 20 % worse than with most",
         FIGURE,
-        steady("mopgrnn", 0.2, SET),
+        Claim.steady("mopgrnn", 0.2, SET),
     ),
     Claim(
         "free_run",
         "training on free runs brings MOPGRNN down by a further 20 % with most data",
         GOAL,
-        below("hybrid", "mopgrnn", 0.2, SET, at="most"),
+        Claim.below("hybrid", "mopgrnn", 0.2, SET, at="most"),
     ),
     Claim(
         "sindy",
         "SINDy with control reaches comparable accuracy, here: at most 25 % above MOPGRNN with most data",
         "paper, text",
-        below("sindy", "mopgrnn", -0.25, SET, at="most"),
+        Claim.below("sindy", "mopgrnn", -0.25, SET, at="most"),
     ),
 )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from hybrid_mpc.signals import Parameter, Signal
+from hybrid_mpc import Parameter, Signal
 
 STATES = (Signal("phi", "rad", -3.2, 3.2), Signal("phi_dot", "rad/s", -40.0, 40.0))
 INPUTS = (Signal("u", "N m", -30.0, 30.0),)

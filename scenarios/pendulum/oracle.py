@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import casadi as ca
 
-from hybrid_mpc.model import HybridModel
+from hybrid_mpc import HybridModel
 from scenarios.pendulum.nominal import INPUTS, OUTPUTS, PUBLISHED, STATES
 from scenarios.pendulum.plant import PendulumParameters
 

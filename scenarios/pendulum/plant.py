@@ -8,7 +8,7 @@ from math import ceil, cos, isfinite, sin, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError
 
 Array = NDArray[np.float64]
 Values = tuple[float, float, float, float]

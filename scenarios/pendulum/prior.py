@@ -7,8 +7,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from hybrid_mpc.physics import Prior
-from hybrid_mpc.signals import Parameter, Signal
+from hybrid_mpc import Parameter, Prior, Signal
 from scenarios.pendulum.nominal import INPUTS, OUTPUTS, PARAMETERS, PUBLISHED, STATES
 
 

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.closed_loop.faults import Fault
-from hybrid_mpc.mpc import OCP
-from hybrid_mpc.scenario import Task
+from hybrid_mpc import OCP, Fault, Task
 from scenarios.references import faded_sines, quintic
 
 Array = NDArray[np.float64]

@@ -5,13 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from hybrid_mpc.benchmark_spec import BenchmarkBudget, BenchmarkSpec
-from hybrid_mpc.data_spec import DataSpec, Window
-from hybrid_mpc.mpc import OCP
-from hybrid_mpc.scenario import Budget, Scenario
+from hybrid_mpc import OCP, BenchmarkBudget, BenchmarkSpec, Budget, DataSpec, Scenario, Window
 
 if TYPE_CHECKING:
-    from hybrid_mpc.physics import Prior
+    from hybrid_mpc import Prior
 
 DESCRIPTION = """\
 A point mass of 0.546 kg on a rod of 0.5 m, driven through a 6:1 gear; phi = 0 hangs down. Recordings:

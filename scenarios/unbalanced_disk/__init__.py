@@ -10,15 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.benchmark_spec import BenchmarkBudget, BenchmarkSpec
-from hybrid_mpc.scenario import DEFAULT_BUDGETS, DataSpec, Scenario
+from hybrid_mpc import DEFAULT_BUDGETS, BenchmarkBudget, BenchmarkSpec, DataSpec, Scenario
 from scenarios.unbalanced_disk.data import make_data, windows
 from scenarios.unbalanced_disk.nominal import DT
 from scenarios.unbalanced_disk.plant import DiskPlant
 from scenarios.unbalanced_disk.tasks import CONTROL, TASKS
 
 if TYPE_CHECKING:
-    from hybrid_mpc.physics import Prior
+    from hybrid_mpc import Prior
 
 DESCRIPTION = """\
 A small motor turns a disk with a mass off its centre; phi = 0 hangs down, the input is the motor's voltage, only the

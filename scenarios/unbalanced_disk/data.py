@@ -8,10 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.data.excitation import chirp, multisine, steps
-from hybrid_mpc.data_spec import Role, Window
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import write_arrays
+from hybrid_mpc import InputError, Role, Window, chirp, multisine, random_steps, write_arrays
 from scenarios.unbalanced_disk.nominal import DT
 from scenarios.unbalanced_disk.plant import DiskPlant
 
@@ -46,7 +43,7 @@ def _swing(rng: np.random.Generator, t: Array) -> Array:
 
 
 def _step(rng: np.random.Generator, t: Array) -> Array:
-    return steps(t, -PEAK, PEAK, hold=(0.15, 1.2), rng=rng)
+    return random_steps(t, -PEAK, PEAK, hold=(0.15, 1.2), rng=rng)
 
 
 KINDS: Mapping[str, Callable[[np.random.Generator, Array], Array]] = {

@@ -7,7 +7,7 @@ from math import isfinite
 
 import casadi as ca
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError
 
 N_STATES = 4
 """phi [rad], phi_dot [rad/s], motor current [A], deflection of the bristle [rad]."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hybrid_mpc.signals import Parameter, Signal
+from hybrid_mpc import Parameter, Signal
 
 STATES = (
     Signal("phi", "rad", -60.0, 60.0, periodic=True),

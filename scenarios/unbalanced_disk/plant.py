@@ -8,8 +8,7 @@ from math import ceil
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.buffered import BufferedFunction
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import BufferedFunction, InputError
 from scenarios.unbalanced_disk.dynamics import N_STATES, DiskParameters, steps
 
 Array = NDArray[np.float64]

@@ -7,8 +7,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from hybrid_mpc.physics import Prior
-from hybrid_mpc.signals import Parameter, Signal
+from hybrid_mpc import Parameter, Prior, Signal
 from scenarios.unbalanced_disk.nominal import INPUTS, OUTPUTS, PARAMETERS, STATES
 
 FRICTION_SPEED = 0.05

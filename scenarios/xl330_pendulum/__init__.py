@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from hybrid_mpc.benchmark_spec import BenchmarkBudget, BenchmarkSpec
-from hybrid_mpc.scenario import DataSpec, Scenario
+from hybrid_mpc import BenchmarkBudget, BenchmarkSpec, DataSpec, Scenario
 
 if TYPE_CHECKING:
-    from hybrid_mpc.physics import Prior
+    from hybrid_mpc import Prior
 
 DESCRIPTION = """\
 0.49 kg at 0.10 m on a small servo, phi = 0 hangs down. Recordings: Rhoban/bam (Apache-2.0); Duclusaud, Passault,

@@ -7,8 +7,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from hybrid_mpc.physics import Prior
-from hybrid_mpc.signals import Parameter, Signal
+from hybrid_mpc import Parameter, Prior, Signal
 
 FRICTION_SPEED = 0.1
 """Speed [rad/s] over which dry friction changes its sign."""

@@ -14,7 +14,7 @@ from hybrid_mpc.analysis import (
     mpc_loop,
     physical_states,
     steady_filter,
-    structure,
+    system_structure,
 )
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation import ExtendedKalmanFilter
@@ -269,7 +269,7 @@ def test_reduced_hybrid_keeps_the_meaning_of_its_states_and_its_bound():
 
 def test_modes_are_python_control_s_and_pbh_says_what_it_should():
     sys = linearize(pendulum_model(5), [0.1, 0.5], [0.0])
-    found = structure(sys)
+    found = system_structure(sys)
     wn, zeta, poles = control.damp(sys, doprint=False)
     order = np.argsort(-np.abs(poles), kind="stable")
     assert np.abs(np.sort([m.frequency for m in found.modes]) - np.sort(wn)).max() < 1e-6 * wn.max()
@@ -278,5 +278,5 @@ def test_modes_are_python_control_s_and_pbh_says_what_it_should():
     blind = control.ss(
         np.diag([1.2, 0.5]), [[1.0], [1.0]], [[0.0, 1.0]], 0.0, 0.1, remove_useless_states=False
     )
-    assert (structure(blind).stabilisable, structure(blind).detectable) == (True, False)
-    assert np.isinf(structure(blind).hankel[0])
+    assert (system_structure(blind).stabilisable, system_structure(blind).detectable) == (True, False)
+    assert np.isinf(system_structure(blind).hankel[0])

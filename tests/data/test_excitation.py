@@ -8,8 +8,8 @@ from hybrid_mpc.data import (
     line_spectrum,
     multisine,
     prbs,
+    random_steps,
     sinusoid,
-    steps,
 )
 from hybrid_mpc.errors import InputError
 
@@ -24,13 +24,13 @@ def test_chirp_has_the_stated_frequencies_at_its_ends():
 
 def test_steps_keep_bounds_and_hold_times_and_repeat_with_the_seed():
     t = np.arange(0, 50, 0.01)
-    u = steps(t, -0.4, 0.9, hold=(0.5, 1.5), rng=np.random.default_rng(3))
+    u = random_steps(t, -0.4, 0.9, hold=(0.5, 1.5), rng=np.random.default_rng(3))
     assert u.min() >= -0.4
     assert u.max() <= 0.9
     switch = t[1:][np.diff(u) != 0]
     assert np.diff(switch).min() >= 0.5 - 0.011  # one grid step of rounding
     assert np.diff(switch).max() <= 1.5 + 0.011
-    again = steps(t, -0.4, 0.9, hold=(0.5, 1.5), rng=np.random.default_rng(3))
+    again = random_steps(t, -0.4, 0.9, hold=(0.5, 1.5), rng=np.random.default_rng(3))
     np.testing.assert_array_equal(u, again)
 
 
@@ -39,7 +39,7 @@ def test_bounds_are_refused_not_clipped():
     with pytest.raises(InputError, match="Lower the amplitude"):
         sinusoid(t, 1.0, 1.0, offset=0.2, upper=1.0)
     with pytest.raises(InputError, match="hold"):
-        steps(t, 0, 1, hold=(0.0, 1.0), rng=np.random.default_rng(0))
+        random_steps(t, 0, 1, hold=(0.0, 1.0), rng=np.random.default_rng(0))
 
 
 def test_multisine_has_its_lines_all_of_one_size_and_nothing_else():
@@ -125,7 +125,9 @@ def test_chirp_is_flat_between_its_frequencies():
 
 def test_steps_have_their_power_at_low_frequencies():
     t = 0.01 * np.arange(100_000)
-    f, amplitude = line_spectrum(steps(t, -1.0, 1.0, hold=(0.5, 1.5), rng=np.random.default_rng(5)), 0.01)
+    f, amplitude = line_spectrum(
+        random_steps(t, -1.0, 1.0, hold=(0.5, 1.5), rng=np.random.default_rng(5)), 0.01
+    )
     power = amplitude[1:] ** 2
     low = f[1:] < 0.44
     assert 0.6 < power[low].sum() / power.sum() < 0.85  # 0.72 for equal holds

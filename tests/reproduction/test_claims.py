@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from hybrid_mpc.reproduction.claims import Claim, above, below, level, narrower, ordered, sooner, steady
+from hybrid_mpc.reproduction.claims import Claim
 from hybrid_mpc.reproduction.table import Divergence, Network, Row, Table
 
 AWAY = Divergence("test_01", 7, 0.14, 2)
@@ -32,20 +32,20 @@ def table(figures, spread=0.0, steps=None):
 @pytest.mark.parametrize(
     ("check", "holds"),
     [
-        (below("mopgrnn", "phy", 0.46, "a"), True),  # 48 % and 50 %
-        (below("mopgrnn", "phy", 0.49, "a"), False),
-        (below("mopgrnn", "phy", 0.49, "a", at="most"), True),
-        (below("mopgrnn", "phy", 0.49, "a", at="some"), True),
-        (below("mopgrnn", "phy", 0.49, "a", at="least"), False),
-        (below("pgrnn", "rnn", 0.2, "a", metric="energy_violation_w"), True),
-        (below("rnn", "phy", -0.1, "a"), True),
-        (above("rnn", "pgrnn", 0.2, "a"), True),  # 29 % and 60 %
-        (above("rnn", "pgrnn", 0.5, "a"), False),
-        (above("phy", "rnn", 0.2, "a"), False),  # 11 % and 25 %
-        (level("rnn", "phy", 0.2, "a"), True),
-        (level("mopgrnn", "phy", 0.2, "a"), False),
-        (steady("mopgrnn", 0.1, "a"), True),  # 4 %
-        (steady("pgrnn", 0.1, "a"), False),  # 40 %
+        (Claim.below("mopgrnn", "phy", 0.46, "a"), True),  # 48 % and 50 %
+        (Claim.below("mopgrnn", "phy", 0.49, "a"), False),
+        (Claim.below("mopgrnn", "phy", 0.49, "a", at="most"), True),
+        (Claim.below("mopgrnn", "phy", 0.49, "a", at="some"), True),
+        (Claim.below("mopgrnn", "phy", 0.49, "a", at="least"), False),
+        (Claim.below("pgrnn", "rnn", 0.2, "a", metric="energy_violation_w"), True),
+        (Claim.below("rnn", "phy", -0.1, "a"), True),
+        (Claim.above("rnn", "pgrnn", 0.2, "a"), True),  # 29 % and 60 %
+        (Claim.above("rnn", "pgrnn", 0.5, "a"), False),
+        (Claim.above("phy", "rnn", 0.2, "a"), False),  # 11 % and 25 %
+        (Claim.level("rnn", "phy", 0.2, "a"), True),
+        (Claim.level("mopgrnn", "phy", 0.2, "a"), False),
+        (Claim.steady("mopgrnn", 0.1, "a"), True),  # 4 %
+        (Claim.steady("pgrnn", 0.1, "a"), False),  # 40 %
     ],
 )
 def test_a_claim_is_judged_by_its_numbers(check, holds):
@@ -53,7 +53,7 @@ def test_a_claim_is_judged_by_its_numbers(check, holds):
 
 
 def test_the_line_tells_verdict_claim_and_numbers():
-    claim = Claim("x", "MOPGRNN 46 % below", "paper, Fig. 5", below("mopgrnn", "phy", 0.46, "a"))
+    claim = Claim("x", "MOPGRNN 46 % below", "paper, Fig. 5", Claim.below("mopgrnn", "phy", 0.46, "a"))
     line = claim.line(table(CALM))
     assert line == (
         "reproduced: MOPGRNN 46 % below (paper, Fig. 5). Found: mopgrnn to phy −48 %, −50 % (with 3, 15 sequences)."
@@ -63,43 +63,43 @@ def test_the_line_tells_verdict_claim_and_numbers():
 
 def test_a_better_model_of_which_a_network_diverged_is_not_better():
     rows = [Row("a", 3, "phy", (network(1.0),)), Row("a", 3, "mopgrnn", (network(0.1), network(math.inf)))]
-    verdict = below("mopgrnn", "phy", 0.4, "a")(Table(rows))
+    verdict = Claim.below("mopgrnn", "phy", 0.4, "a")(Table(rows))
     assert verdict.holds is False
     assert "1 of 2 networks of mopgrnn diverged" in verdict.found
 
 
 def test_a_model_of_which_all_diverged_is_infinitely_worse():
     lost = table(CALM | {"rnn": (math.inf, math.inf)})
-    assert above("rnn", "phy", 0.23, "a")(lost).holds is True
-    assert below("rnn", "phy", 0.5, "a")(lost).holds is False
-    assert below("pgrnn", "rnn", 0.34, "a")(lost).holds is True
-    assert "∞" in above("rnn", "phy", 0.23, "a")(lost).found
+    assert Claim.above("rnn", "phy", 0.23, "a")(lost).holds is True
+    assert Claim.below("rnn", "phy", 0.5, "a")(lost).holds is False
+    assert Claim.below("pgrnn", "rnn", 0.34, "a")(lost).holds is True
+    assert "∞" in Claim.above("rnn", "phy", 0.23, "a")(lost).found
     both = table({"rnn": (math.inf, math.inf), "pgrnn": (math.inf, math.inf)})
-    assert below("pgrnn", "rnn", 0.34, "a")(both).holds is None
+    assert Claim.below("pgrnn", "rnn", 0.34, "a")(both).holds is None
 
 
 def test_a_missing_model_is_not_tested():
-    verdict = below("sindy", "mopgrnn", -0.25, "a", at="most")(table(CALM))
+    verdict = Claim.below("sindy", "mopgrnn", -0.25, "a", at="most")(table(CALM))
     assert verdict.holds is None
     assert "no sindy" in verdict.found
 
 
 def test_deviations_and_order():
     wide = {"phy": 0.0, "rnn": 0.3, "pgrnn": 0.2, "mopgrnn": 0.1}
-    assert narrower("mopgrnn", ("pgrnn", "rnn"), "a")(table(CALM, wide)).holds is True
-    assert narrower("pgrnn", ("mopgrnn", "rnn"), "a")(table(CALM, wide)).holds is False
+    assert Claim.narrower("mopgrnn", ("pgrnn", "rnn"), "a")(table(CALM, wide)).holds is True
+    assert Claim.narrower("pgrnn", ("mopgrnn", "rnn"), "a")(table(CALM, wide)).holds is False
     one = Table([Row("a", 3, m, (network(0.5),)) for m in ("pgrnn", "mopgrnn")])
-    assert narrower("mopgrnn", ("pgrnn",), "a")(one).holds is None
+    assert Claim.narrower("mopgrnn", ("pgrnn",), "a")(one).holds is None
     falling = CALM | {"mopgrnn": (0.5, 0.4)}
-    assert ordered(("rnn", "pgrnn", "mopgrnn"), "a")(table(falling, wide)).holds is True
-    assert ordered(("pgrnn", "rnn", "mopgrnn"), "a")(table(falling, wide)).holds is False
+    assert Claim.ordered(("rnn", "pgrnn", "mopgrnn"), "a")(table(falling, wide)).holds is True
+    assert Claim.ordered(("pgrnn", "rnn", "mopgrnn"), "a")(table(falling, wide)).holds is False
 
 
 def test_which_converges_sooner():
     steps = {"mopgrnn": 200, "pgrnn": 300}
-    assert sooner("mopgrnn", "pgrnn", "a")(table(CALM, steps=steps)).holds is True
-    assert sooner("pgrnn", "mopgrnn", "a")(table(CALM, steps=steps)).holds is False
-    assert sooner("mopgrnn", "pgrnn", "a")(table(CALM)).holds is None
+    assert Claim.sooner("mopgrnn", "pgrnn", "a")(table(CALM, steps=steps)).holds is True
+    assert Claim.sooner("pgrnn", "mopgrnn", "a")(table(CALM, steps=steps)).holds is False
+    assert Claim.sooner("mopgrnn", "pgrnn", "a")(table(CALM)).holds is None
 
 
 def test_statistics_count_the_diverged():
