@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
+from hybrid_mpc import Scenario, load_scenario
 from hybrid_mpc.data import Table, read_tables, stillness
 from hybrid_mpc.data.doubts import Finding, doubts_of
-from hybrid_mpc.scenario import Scenario, load_scenario
 
 FROZEN = (0.1, 0.3, 1.0)
 TIMES = 20

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc import Trajectory
 from hybrid_mpc.identification.prior_long_runs import OutputErrorFit, cut_runs
 from hybrid_mpc.pipeline.machine_benchmark.recordings import read_test
 from scenarios.emps import scenario

@@ -31,8 +31,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from hybrid_mpc import n_features
 from hybrid_mpc.identification.networks import StackedGRU
-from hybrid_mpc.identification.step import n_features
 from scenarios.golf_robot import scenario
 
 NETWORKS = 16

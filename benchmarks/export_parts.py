@@ -20,8 +20,7 @@ import torch
 from scipy.linalg import blas
 
 import nn_export
-from hybrid_mpc.identification.networks import GRUNetwork
-from hybrid_mpc.identification.step import HybridStep, Scaling, n_features
+from hybrid_mpc import GRUNetwork, HybridStep, Scaling, n_features
 from scenarios.golf_robot import scenario
 
 ROUNDS = 15

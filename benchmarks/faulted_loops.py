@@ -29,9 +29,7 @@ from time import perf_counter
 
 import numpy as np
 
-from hybrid_mpc.artifact import load, save_artifact
-from hybrid_mpc.assembly import make_controller, make_estimator, make_monitor
-from hybrid_mpc.closed_loop import Fault, simulate
+from hybrid_mpc import Fault, load, make_controller, make_estimator, make_monitor, save_artifact, simulate
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.faults import catalogue
 
@@ -182,8 +180,7 @@ def _excess(u, ocp) -> float:
 
 def _nominal(folder: Path) -> Path:
     """An artifact with the prior of the published parameters."""
-    from hybrid_mpc.identification.export import model_info, trace_model
-    from hybrid_mpc.identification.step import PriorStep
+    from hybrid_mpc import PriorStep, model_info, trace_model
 
     prior = scenario.prior()
     programs = {"prior": trace_model(PriorStep(prior, DT).requires_grad_(False))}

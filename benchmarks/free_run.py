@@ -27,10 +27,8 @@ import casadi as ca
 import numpy as np
 import torch
 
-from hybrid_mpc.artifact import load, save_artifact
-from hybrid_mpc.identification.export import model_info, trace_model
+from hybrid_mpc import HybridStep, Scaling, load, model_info, n_features, save_artifact, trace_model
 from hybrid_mpc.identification.networks import StackedGRU
-from hybrid_mpc.identification.step import HybridStep, Scaling, n_features
 from nn_export import compile_function
 from scenarios.golf_robot import scenario
 

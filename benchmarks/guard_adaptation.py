@@ -24,10 +24,8 @@ import numpy as np
 from guard_loops import DT, Plan
 from scipy.stats import t as student
 
-from hybrid_mpc import load, make_adaptive_guard, make_controller, make_estimator
-from hybrid_mpc.closed_loop import simulate
+from hybrid_mpc import guard_monitor, load, make_adaptive_guard, make_controller, make_estimator, simulate
 from hybrid_mpc.files import read_json, write_json
-from hybrid_mpc.monitor import guard_monitor
 from hybrid_mpc.pipeline.monitor_job import read_detector
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.tasks import CONTROL

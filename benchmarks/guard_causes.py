@@ -21,8 +21,7 @@ from types import SimpleNamespace
 import numpy as np
 from guard_loops import DT, FAULTS, Loops, fault_plans, noise_of
 
-from hybrid_mpc import load
-from hybrid_mpc.monitor import Diagnoser, guard_monitor
+from hybrid_mpc import Diagnoser, guard_monitor, load
 from hybrid_mpc.pipeline.monitor_job import read_detector
 from scenarios.golf_robot import scenario
 

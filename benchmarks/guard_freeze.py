@@ -18,11 +18,18 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_mpc import find_noise, load, make_controller, make_estimator
-from hybrid_mpc.assembly import freezing, make_resting_guard
-from hybrid_mpc.closed_loop import simulate
+from hybrid_mpc import (
+    find_noise,
+    guard_monitor,
+    load,
+    make_controller,
+    make_estimator,
+    make_resting_guard,
+    simulate,
+)
+from hybrid_mpc.assembly import freezing
 from hybrid_mpc.files import read_json
-from hybrid_mpc.monitor import Judges, guard_monitor
+from hybrid_mpc.monitor import Judges
 from hybrid_mpc.records import record
 from hybrid_mpc.studies.monitor_loops import loop_figures
 from hybrid_mpc.studies.monitor_plan import SEEDS, LoopPlan

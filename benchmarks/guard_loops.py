@@ -15,10 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_mpc.artifact import Kit
-from hybrid_mpc.assembly import make_controller, make_estimator
-from hybrid_mpc.closed_loop import simulate
-from hybrid_mpc.files import read_arrays, write_arrays
+from hybrid_mpc import Kit, make_controller, make_estimator, simulate, write_arrays
+from hybrid_mpc.files import read_arrays
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.faults import FaultCase, catalogue
 from scenarios.golf_robot.tasks import CONTROL, sine_reference, steps

@@ -26,13 +26,22 @@ import numpy as np
 from guard_loops import DT, Loops, Plan, noise_of, nominal_plans
 from scipy.stats import t as student
 
-from hybrid_mpc import load
-from hybrid_mpc.assembly import make_controller, make_estimator, make_ocp
-from hybrid_mpc.closed_loop import simulate
-from hybrid_mpc.data.trajectories import load_trajectories
+from hybrid_mpc import (
+    CondensedController,
+    Plausibility,
+    SafeController,
+    SQPController,
+    excess_bound,
+    learn_plausibility,
+    load,
+    load_trajectories,
+    make_controller,
+    make_estimator,
+    make_ocp,
+    region_bound,
+    simulate,
+)
 from hybrid_mpc.files import read_json, write_json
-from hybrid_mpc.monitor import Plausibility, excess_bound, learn_plausibility, region_bound
-from hybrid_mpc.mpc import CondensedController, SafeController, SQPController
 from hybrid_mpc.records import record
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.tasks import CONTROL

@@ -19,12 +19,8 @@ from pathlib import Path
 import numpy as np
 from guard_loops import DT, fault_plans
 
-from hybrid_mpc import load, make_controller, make_estimator
-from hybrid_mpc.closed_loop import Guard, simulate
-from hybrid_mpc.closed_loop.guard import Mode
+from hybrid_mpc import Guard, Limits, Mode, guard_monitor, load, make_controller, make_estimator, simulate
 from hybrid_mpc.files import write_json
-from hybrid_mpc.monitor import guard_monitor
-from hybrid_mpc.mpc import Limits
 from hybrid_mpc.pipeline.monitor_job import read_detector
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.tasks import CONTROL

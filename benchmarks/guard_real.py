@@ -20,9 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_mpc import load
-from hybrid_mpc.assembly import make_estimator
-from hybrid_mpc.data.trajectories import load_trajectories
+from hybrid_mpc import load, load_trajectories, make_estimator
 from hybrid_mpc.files import write_json
 from hybrid_mpc.monitor.held_out import HeldOut, leave_one_out
 from hybrid_mpc.records import plain
@@ -97,8 +95,7 @@ def table(rows) -> list[str]:
 
 def picture(found: HeldOut, y, path: Path, title: str) -> None:
     """Everything the monitor says, alarms shaded; clean windows as bars at the top."""
-    from hybrid_mpc.plots import save
-    from hybrid_mpc.plots.monitor_trace import overview
+    from hybrid_mpc.plots import overview, save
     from scenarios.torque_pendulum import make_prior
 
     figure = overview(found.trace, y, output=make_prior().outputs[0], title=title)

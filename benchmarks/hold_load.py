@@ -23,9 +23,8 @@ from pathlib import Path
 import numpy as np
 
 import hybrid_mpc as hm
-from hybrid_mpc.assembly import FIRST_LOAD, make_controller, make_estimator
-from hybrid_mpc.closed_loop import Fault, simulate
-from hybrid_mpc.estimation import ExtendedKalmanFilter
+from hybrid_mpc import ExtendedKalmanFilter, Fault, make_controller, make_estimator, simulate
+from hybrid_mpc.assembly import FIRST_LOAD
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.tasks import CONTROL
 

@@ -20,9 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_mpc import load
-from hybrid_mpc.assembly import make_controller, make_estimator, make_monitor
-from hybrid_mpc.closed_loop import simulate
+from hybrid_mpc import load, make_controller, make_estimator, make_monitor, simulate
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.tasks import CONTROL
 

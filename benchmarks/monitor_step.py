@@ -19,9 +19,7 @@ from time import process_time
 
 import numpy as np
 
-from hybrid_mpc import load
-from hybrid_mpc.assembly import make_monitor
-from hybrid_mpc.monitor import Detector, guard_monitor
+from hybrid_mpc import Detector, guard_monitor, load, make_monitor
 
 SAMPLES = 300
 

@@ -31,7 +31,7 @@ import casadi as ca
 import numpy as np
 from mpc_step import GOAL, RIVAL_PERIODS, hybrid, problem, record, timed
 
-from hybrid_mpc.mpc import CondensedController, IpoptController, SQPController, Status
+from hybrid_mpc import CondensedController, IpoptController, SQPController, Status
 
 SAME = 1e-6
 """Largest relative difference of two solvers' costs of the same problem."""

@@ -31,12 +31,22 @@ import casadi as ca
 import numpy as np
 import torch
 
-from hybrid_mpc.artifact import load, save_artifact
-from hybrid_mpc.estimation.kalman import Estimate
-from hybrid_mpc.identification.export import model_info, trace_model
-from hybrid_mpc.identification.networks import GRUNetwork
-from hybrid_mpc.identification.step import HybridStep, Scaling, n_features
-from hybrid_mpc.mpc import OCP, CondensedController, IpoptController, SQPController, Status
+from hybrid_mpc import (
+    OCP,
+    CondensedController,
+    Estimate,
+    GRUNetwork,
+    HybridStep,
+    IpoptController,
+    Scaling,
+    SQPController,
+    Status,
+    load,
+    model_info,
+    n_features,
+    save_artifact,
+    trace_model,
+)
 from scenarios.golf_robot import scenario
 
 PERIODS, RIVAL_PERIODS, GROWTH_PERIODS, SKIPPED = 150, 18, 30, 3

@@ -32,7 +32,7 @@ import numpy as np
 from mpc_step import RIVAL_PERIODS, SingleShooting, hybrid, problem, programs, record, timed
 
 import nn_export
-from hybrid_mpc.mpc import CondensedController, IpoptController, SQPController, Status
+from hybrid_mpc import CondensedController, IpoptController, SQPController, Status
 
 WARM = {"mu_strategy": "monotone", "mu_init": 1e-3}
 

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc import Trajectory
 from hybrid_mpc.identification.dataset import cut_windows
 from hybrid_mpc.identification.prior_fit import STAGES
 from hybrid_mpc.identification.prior_residuals import ParameterFit

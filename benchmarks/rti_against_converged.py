@@ -26,10 +26,16 @@ from time import perf_counter
 import numpy as np
 from scipy import stats
 
-from hybrid_mpc import load
-from hybrid_mpc.assembly import make_estimator, make_ocp
-from hybrid_mpc.closed_loop import simulate
-from hybrid_mpc.mpc import CondensedController, IpoptController, SafeController, SQPController
+from hybrid_mpc import (
+    CondensedController,
+    IpoptController,
+    SafeController,
+    SQPController,
+    load,
+    make_estimator,
+    make_ocp,
+    simulate,
+)
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.tasks import CONTROL
 

@@ -26,12 +26,11 @@ from time import perf_counter, process_time
 
 import numpy as np
 
+from hybrid_mpc import LoopSpec, Study, StudyResults, run_study
 from hybrid_mpc.job.engine import DaskEngine, LocalEngine
 from hybrid_mpc.pipeline.context import Silent
-from hybrid_mpc.studies import LoopSpec, Study, run_study
 from hybrid_mpc.studies.inputs import TIMING, load_inputs, run_batch
 from hybrid_mpc.studies.log import RunLog, rows, segments
-from hybrid_mpc.studies.results import StudyResults
 from hybrid_mpc.studies.runner import THREADS, execute
 from hybrid_mpc.studies.table import compact
 

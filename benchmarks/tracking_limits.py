@@ -19,11 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_mpc import load
-from hybrid_mpc.assembly import make_controller, make_estimator
-from hybrid_mpc.closed_loop import simulate
-from hybrid_mpc.estimation import Estimate, TrueState
-from hybrid_mpc.model import HybridModel
+from hybrid_mpc import Estimate, HybridModel, TrueState, load, make_controller, make_estimator, simulate
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.tasks import CONTROL
 

@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from hybrid_mpc.data import write_csv
+from hybrid_mpc import write_csv
 
 MACHINE = """
 import torch
-from hybrid_mpc.benchmark_spec import BenchmarkBudget, BenchmarkSpec
-from hybrid_mpc.physics import Prior
-from hybrid_mpc.scenario import DataSpec, Scenario
-from hybrid_mpc.signals import Parameter, Signal
+from hybrid_mpc import BenchmarkBudget, BenchmarkSpec
+from hybrid_mpc import Prior
+from hybrid_mpc import DataSpec, Scenario
+from hybrid_mpc import Parameter, Signal
 
 
 class Cart(Prior):

@@ -7,10 +7,16 @@ from dataclasses import dataclass, field
 import numpy as np
 from online_models import PendulumPlant, pendulum_model
 
-from hybrid_mpc.closed_loop import Runner, simulate
-from hybrid_mpc.estimation import ExtendedKalmanFilter
-from hybrid_mpc.job.loops import LoopRow
-from hybrid_mpc.mpc import OCP, CondensedController, SafeController, Source
+from hybrid_mpc import (
+    OCP,
+    CondensedController,
+    ExtendedKalmanFilter,
+    LoopRow,
+    Runner,
+    SafeController,
+    simulate,
+)
+from hybrid_mpc.mpc import Source
 
 DT = 0.02
 POINT = [0.0, 1.0], [0.0]

@@ -52,7 +52,7 @@ def call(monkeypatch, capsys):
 @pytest.fixture(scope="session")
 def noisy_artifact(golf_artifact, tmp_path_factory) -> Path:
     """The same, with the process noise of its filters, as a run leaves it."""
-    from hybrid_mpc.artifact import set_process_noise
+    from hybrid_mpc import set_process_noise
 
     folder = shutil.copytree(golf_artifact, tmp_path_factory.mktemp("noisy") / "model")
     names = ("prior", "prior_observer", "hybrid", "hybrid_observer")
@@ -68,10 +68,8 @@ def golf_artifact(tmp_path_factory) -> Path:
     """
     import torch
 
-    from hybrid_mpc.artifact import save_artifact
-    from hybrid_mpc.identification.export import model_info, trace_model
+    from hybrid_mpc import HybridStep, PriorStep, Scaling, model_info, n_features, save_artifact, trace_model
     from hybrid_mpc.identification.networks import StackedGRU
-    from hybrid_mpc.identification.step import HybridStep, PriorStep, Scaling, n_features
     from scenarios.golf_robot.prior import GolfRobotPrior
 
     prior = GolfRobotPrior()

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 import scenarios
-from hybrid_mpc.physics import Prior
+from hybrid_mpc import Prior
 
 EPS = float(np.finfo(float).eps)
 SAMPLES = 200

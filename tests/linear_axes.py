@@ -6,9 +6,7 @@ import casadi as ca
 import numpy as np
 from monitor_parts import Run
 
-from hybrid_mpc.estimation import ExtendedKalmanFilter
-from hybrid_mpc.model import HybridModel
-from hybrid_mpc.signals import Signal
+from hybrid_mpc import ExtendedKalmanFilter, HybridModel, Signal
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from hybrid_mpc.model import HybridModel
-from hybrid_mpc.signals import Signal
+from hybrid_mpc import HybridModel, Signal
 
 DT, J, MGL, GAMMA = 0.02, 0.1, 1.5, 0.15
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from hybrid_mpc.model import HybridModel
-from hybrid_mpc.signals import Signal
+from hybrid_mpc import HybridModel, Signal
 
 
 def linear_model(a, b, c, dt=0.1, n_h=0):

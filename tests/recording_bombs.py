@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy.io import savemat
 
-from hybrid_mpc.data_spec import DataSpec
-from hybrid_mpc.signals import Signal
+from hybrid_mpc import DataSpec, Signal
 
 SPEC = DataSpec("time_s", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.2)
 SIGNALS = {"outputs": (Signal("phi", "rad", -10, 10),), "inputs": (Signal("torque", "N m", -5, 5),)}
@@ -246,8 +245,7 @@ def main(folder):
     """Read every file of a folder; a line of JSON for each: name, outcome, seconds."""
     import resource
 
-    from hybrid_mpc.data import load_trajectories
-    from hybrid_mpc.errors import InputError
+    from hybrid_mpc import InputError, load_trajectories
 
     def read(path):
         begin = time.process_time()

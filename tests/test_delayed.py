@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from online_models import pendulum_model
 
-from hybrid_mpc.artifact import FILE, load, save_artifact
-from hybrid_mpc.delayed import MOST_WAITING, with_input_delay
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError, load, save_artifact, with_input_delay
+from hybrid_mpc.artifact import FILE
+from hybrid_mpc.delayed import MOST_WAITING
 
 DT = 0.02
 
@@ -107,8 +107,7 @@ def test_a_delay_of_too_many_periods_is_refused_at_once():
 
 
 def test_an_artifact_keeps_the_delay(tmp_path):
-    from hybrid_mpc.identification.export import model_info, trace_model
-    from hybrid_mpc.identification.step import PriorStep
+    from hybrid_mpc import PriorStep, model_info, trace_model
     from scenarios.pendulum.prior import PendulumPrior
 
     prior = PendulumPrior()

@@ -14,7 +14,8 @@ import pytest
 
 import hybrid_mpc.files
 import hybrid_mpc.records
-from hybrid_mpc.errors import InputError, StorageError
+from hybrid_mpc import InputError, write_arrays
+from hybrid_mpc.errors import StorageError
 from hybrid_mpc.files import (
     check_folder,
     check_npz,
@@ -26,7 +27,6 @@ from hybrid_mpc.files import (
     read_document_arrays,
     read_json,
     replacing,
-    write_arrays,
     write_document,
     write_json,
     write_text,

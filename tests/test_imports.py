@@ -152,9 +152,9 @@ sys.meta_path.insert(0, Refuse())
 import numpy as np
 from pathlib import Path
 from hybrid_mpc import load
-from hybrid_mpc.closed_loop.simulate import simulate
-from hybrid_mpc.assembly import make_controller, make_estimator, make_monitor
-from hybrid_mpc.scenario import load_scenario
+from hybrid_mpc import simulate
+from hybrid_mpc import make_controller, make_estimator, make_monitor
+from hybrid_mpc import load_scenario
 artifact, scenario = load(Path(sys.argv[1])), load_scenario("golf_robot")
 model, prior, task = artifact.models["hybrid"], artifact.models["prior"], scenario.tasks[0]
 result = simulate(

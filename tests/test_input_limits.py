@@ -9,22 +9,34 @@ import pytest
 from closed_loop_parts import Told
 from online_models import PendulumPlant, linear_model, pendulum_model
 
+from hybrid_mpc import (
+    OCP,
+    CondensedController,
+    Guard,
+    InputError,
+    Limits,
+    Loop,
+    Mode,
+    SafeController,
+    Scenario,
+    Signal,
+    TrueState,
+    guard_monitor,
+    load_scenario,
+    make_controller,
+    make_estimator,
+    make_resting_guard,
+    simulate,
+)
 from hybrid_mpc.analysis.study_models import drive
 from hybrid_mpc.analysis.study_signals import measured_part
 from hybrid_mpc.analysis.subject import _inputs, _outer, _range
-from hybrid_mpc.assembly import freezing, make_controller, make_estimator, make_resting_guard, working_point
-from hybrid_mpc.closed_loop import Guard, Loop, Mode, simulate
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation import TrueState
+from hybrid_mpc.assembly import freezing, working_point
 from hybrid_mpc.input_limits import share_used
 from hybrid_mpc.job.loops import excess, limits_used
-from hybrid_mpc.monitor import guard_monitor
-from hybrid_mpc.mpc import OCP, CondensedController, Limits, SafeController
 from hybrid_mpc.pipeline.judge import unknown_load
 from hybrid_mpc.pipeline.preflight import check_scenario
-from hybrid_mpc.plots.loops import Motion, closed_loops
-from hybrid_mpc.scenario import Scenario, load_scenario
-from hybrid_mpc.signals import Signal
+from hybrid_mpc.plots import Motion, closed_loops
 
 INF = np.inf
 FINITE = {
@@ -106,9 +118,8 @@ class Track:
 @pytest.fixture(scope="module")
 def carts(tmp_path_factory):
     """The scenario of the cart, and its prior as a deployed model."""
+    from hybrid_mpc import PriorStep, model_info, trace_model
     from hybrid_mpc.artifact import build_model
-    from hybrid_mpc.identification.export import model_info, trace_model
-    from hybrid_mpc.identification.step import PriorStep
 
     path = tmp_path_factory.mktemp("cart") / "cart.py"
     path.write_text(cart.MACHINE)

@@ -10,20 +10,24 @@ import numpy as np
 import pytest
 
 import hybrid_mpc as hm
-from hybrid_mpc.artifact import (
+from hybrid_mpc import (
+    Calibration,
+    Detector,
+    ExtendedKalmanFilter,
+    Fault,
     LoopSettings,
-    read_description,
+    Mode,
+    SoftBound,
+    SwitchingFilter,
+    load_scenario,
+    make_controller,
+    make_estimator,
     set_calibration,
     set_process_noise,
-    write_description,
+    simulate,
 )
-from hybrid_mpc.assembly import make_controller, make_estimator
-from hybrid_mpc.closed_loop import Fault, Mode, simulate
-from hybrid_mpc.estimation import ExtendedKalmanFilter, SwitchingFilter
-from hybrid_mpc.monitor import Calibration, Detector
-from hybrid_mpc.mpc import SoftBound
+from hybrid_mpc.artifact import read_description, write_description
 from hybrid_mpc.pipeline.deploy import loop_settings
-from hybrid_mpc.scenario import load_scenario
 
 README = Path(__file__).parents[1] / "README.md"
 GOLF = load_scenario("golf_robot")

@@ -6,7 +6,8 @@ import sys
 import time
 from pathlib import Path
 
-from hybrid_mpc.studies import Study, run_study, runner
+from hybrid_mpc import Study, run_study
+from hybrid_mpc.studies import runner
 from hybrid_mpc.studies.draws import generator
 from hybrid_mpc.studies.note import ModelNote, NoiseNote
 

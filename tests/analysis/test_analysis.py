@@ -8,18 +8,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from hybrid_mpc.analysis import (
-    analyze,
-    detectable,
-    fixed_point,
-    frequency_response,
-    linearize,
-    linearize_at_speed,
-    stabilisable,
-)
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.model import HybridModel
-from hybrid_mpc.signals import Signal
+from hybrid_mpc import HybridModel, InputError, Signal, frequency_response, linearize, linearize_at_speed
+from hybrid_mpc.analysis import analyze, detectable, fixed_point, stabilisable
 
 DT, J, MGL, GAMMA = 0.02, 0.1, 1.5, 0.15
 

@@ -15,21 +15,23 @@ from PIL import Image
 from typer.testing import CliRunner
 
 import hybrid_mpc.analysis
-from hybrid_mpc import load
-from hybrid_mpc.analysis import run_model
+from hybrid_mpc import (
+    InputError,
+    load,
+    make_controller,
+    multisine,
+    run_model,
+    set_process_noise,
+    simulate,
+    write_csv,
+)
 from hybrid_mpc.analysis.outputs import write_analysis
 from hybrid_mpc.analysis.study import study
 from hybrid_mpc.analysis.study_loops import loops_part
 from hybrid_mpc.analysis.study_signals import measured_part
 from hybrid_mpc.analysis.subject import Request, Subject, subject_of
 from hybrid_mpc.analysis.toolbox import control_toolbox
-from hybrid_mpc.artifact import set_process_noise
-from hybrid_mpc.assembly import make_controller
 from hybrid_mpc.cli.main import app
-from hybrid_mpc.closed_loop import simulate
-from hybrid_mpc.data import write_csv
-from hybrid_mpc.data.excitation import multisine
-from hybrid_mpc.errors import InputError
 from nn_export import load_programs
 from scenarios.golf_robot import scenario
 

@@ -5,10 +5,14 @@ import numpy as np
 import pytest
 from online_models import linear_model, pendulum_model, random_linear
 
-from hybrid_mpc.analysis import (
+from hybrid_mpc import (
+    OCP,
+    CondensedController,
+    Estimate,
+    ExtendedKalmanFilter,
+    InputError,
     balanced_truncation,
     frequency_response,
-    hankel_singular_values,
     linearize,
     mpc_gain,
     mpc_loop,
@@ -16,10 +20,7 @@ from hybrid_mpc.analysis import (
     steady_filter,
     system_structure,
 )
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation import ExtendedKalmanFilter
-from hybrid_mpc.estimation.kalman import Estimate
-from hybrid_mpc.mpc import OCP, CondensedController
+from hybrid_mpc.analysis import hankel_singular_values
 
 
 def controller_of(model, n=20, r_delta=0.0, **options):

@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 from online_models import linear_model, pendulum_model
 
-from hybrid_mpc import load
-from hybrid_mpc.analysis import (
+from hybrid_mpc import (
+    InputError,
     equilibria,
-    fixed_point,
     friction_slopes,
     gain_schedule,
     holding_input,
@@ -16,8 +15,9 @@ from hybrid_mpc.analysis import (
     linearize,
     linearize_along,
     linearize_secant,
+    load,
 )
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.analysis import fixed_point
 from scenarios.golf_robot.nominal import GEAR
 from scenarios.golf_robot.nominal import PARAMETERS as GOLF
 

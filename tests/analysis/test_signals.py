@@ -6,23 +6,21 @@ import pytest
 from online_models import linear_model, pendulum_model
 
 import nn_export
-from hybrid_mpc.analysis import (
-    GruWeights,
+from hybrid_mpc import (
+    HybridModel,
+    InputError,
+    Signal,
     contraction,
     feature_box,
     frequency_response,
     gru_weights,
-    interval_bounds,
     linearize,
     lyapunov_exponent,
     multisine_response,
     parameter_sensitivities,
     run_model,
-    welch_response,
 )
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.model import HybridModel
-from hybrid_mpc.signals import Signal
+from hybrid_mpc.analysis import GruWeights, interval_bounds, welch_response
 
 LAG = linear_model([[0.95, 0.1], [-0.1, 0.9]], [[0.0], [0.1]], [[1.0, 0.0]], dt=0.1)
 

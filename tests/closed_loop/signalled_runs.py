@@ -15,7 +15,8 @@ from pathlib import Path
 from closed_loop_parts import DT, Rig, make_runner, make_safe, sine
 from online_models import pendulum_model
 
-from hybrid_mpc.closed_loop import RealClock, SafeEnd, safe_end
+from hybrid_mpc import SafeEnd
+from hybrid_mpc.closed_loop import RealClock, safe_end
 from hybrid_mpc.files import write_text
 
 SAFE = 0.25

@@ -7,9 +7,16 @@ import pytest
 from closed_loop_parts import Told, make_ekf, run
 from monitor_parts import MGL, J, pendulum
 
-from hybrid_mpc.closed_loop import Guard, Mode
-from hybrid_mpc.estimation import parameter_factors, parameter_filter, with_parameter_states
-from hybrid_mpc.mpc import OCP, CondensedController, SafeController
+from hybrid_mpc import (
+    OCP,
+    CondensedController,
+    Guard,
+    Mode,
+    SafeController,
+    parameter_factors,
+    parameter_filter,
+    with_parameter_states,
+)
 
 DU, BROKEN = 0.4, 50
 SIGMA = {"sigma_y": [1e-4], "sigma_x": [1e-5, 1e-3], "sigma_x0": [1e-3, 0.1]}

@@ -7,9 +7,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from online_models import PendulumPlant, pendulum_model
 
-from hybrid_mpc.closed_loop import Fault, simulate
-from hybrid_mpc.estimation import DelayCompensation, TrueState
-from hybrid_mpc.mpc import OCP, CondensedController, SafeController, SQPController
+from hybrid_mpc import (
+    OCP,
+    CondensedController,
+    DelayCompensation,
+    Fault,
+    SafeController,
+    SQPController,
+    TrueState,
+    simulate,
+)
 
 
 def loop(model, plant, reference, duration=6.0, **options):

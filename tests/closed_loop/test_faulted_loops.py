@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid_mpc.mpc import OCP
+from hybrid_mpc import OCP
 
 PATH = Path(__file__).parents[2] / "benchmarks" / "faulted_loops.py"
 

@@ -3,15 +3,8 @@ import pytest
 from closed_loop_parts import Recorder, make_ekf, run
 from online_models import PendulumPlant
 
-from hybrid_mpc.closed_loop import Fault
-from hybrid_mpc.closed_loop.faults import (
-    check_channels,
-    check_plant_faults,
-    corrupt_input,
-    corrupt_measurement,
-    install,
-)
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import Fault, InputError, check_plant_faults, corrupt_input, corrupt_measurement
+from hybrid_mpc.closed_loop.faults import check_channels, install
 
 Y, BEFORE = np.array([1.0, 2.0]), np.array([7.0, 8.0])
 

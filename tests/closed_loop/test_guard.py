@@ -7,10 +7,7 @@ import pytest
 from closed_loop_parts import DT, Told, make_ekf, make_safe, run, sine
 from online_models import PendulumPlant, pendulum_model
 
-from hybrid_mpc.closed_loop import Fault, Guard, Mode, Runner
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.monitor import EnergyMonitor
-from hybrid_mpc.mpc import Limits
+from hybrid_mpc import EnergyMonitor, Fault, Guard, InputError, Limits, Mode, Runner
 
 DU = 0.4
 

@@ -10,10 +10,7 @@ import pytest
 from closed_loop_parts import POINT, hold, make_ekf, run, sine
 from online_models import PendulumPlant, pendulum_model
 
-from hybrid_mpc import load
-from hybrid_mpc.closed_loop import Fault
-from hybrid_mpc.estimation import DelayCompensation
-from hybrid_mpc.mpc import OCP, CondensedController, SafeController
+from hybrid_mpc import OCP, CondensedController, DelayCompensation, Fault, SafeController, load
 
 PATH = Path(__file__).parents[2] / "benchmarks" / "hold_load.py"
 SAME = {"gravity": 2.4, "damping": 0.2, "friction": 0.0, "inertia": 0.14}

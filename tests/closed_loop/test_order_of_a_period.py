@@ -8,11 +8,20 @@ import pytest
 from closed_loop_parts import DT, Rig, Told, hold, make_ekf, make_safe, run, sine
 from online_models import PendulumPlant, pendulum_model
 
-from hybrid_mpc.closed_loop import Fault, Guard, Loop, Mode
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation import DelayCompensation, TrueState
-from hybrid_mpc.monitor.energy import EnergyMonitor
-from hybrid_mpc.mpc import OCP, CondensedController, SafeController, SoftBound
+from hybrid_mpc import (
+    OCP,
+    CondensedController,
+    DelayCompensation,
+    EnergyMonitor,
+    Fault,
+    Guard,
+    InputError,
+    Loop,
+    Mode,
+    SafeController,
+    SoftBound,
+    TrueState,
+)
 
 N = 30
 X, U = ca.MX.sym("x", 2), ca.MX.sym("u")

@@ -9,10 +9,8 @@ import pytest
 from closed_loop_parts import DT, FakeClock, Rig, make_ekf, make_runner, make_safe, run, sine
 from online_models import pendulum_model
 
-from hybrid_mpc.closed_loop import Fault, RealClock, Runner
-from hybrid_mpc.estimation import DelayCompensation
-from hybrid_mpc.monitor.energy import EnergyMonitor
-from hybrid_mpc.mpc import SafeController
+from hybrid_mpc import DelayCompensation, EnergyMonitor, Fault, Runner, SafeController
+from hybrid_mpc.closed_loop import RealClock
 
 N = 30
 

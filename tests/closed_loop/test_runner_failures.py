@@ -7,9 +7,8 @@ import pytest
 from closed_loop_parts import DT, FakeClock, Rig, Said, make_ekf, make_runner, sine
 from online_models import pendulum_model
 
-from hybrid_mpc.closed_loop import Runner, safe_end
-from hybrid_mpc.errors import InputError, SafeInputError
-from hybrid_mpc.estimation import TrueState
+from hybrid_mpc import InputError, Runner, SafeInputError, TrueState
+from hybrid_mpc.closed_loop import safe_end
 
 N = 30
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from closed_loop_parts import Rig, make_runner
 
-from hybrid_mpc.closed_loop import SafeEnd
+from hybrid_mpc import SafeEnd
 
 if not hasattr(os, "fork"):
     pytest.skip("signals between processes as POSIX has them", allow_module_level=True)

@@ -7,11 +7,18 @@ import pytest
 from closed_loop_parts import DT, Recorder, hold, make_ekf, make_safe, run, sine
 from online_models import PendulumPlant, linear_model, pendulum_model
 
-from hybrid_mpc.closed_loop import ClosedLoopResult, Fault, simulate
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation import DelayCompensation, ExtendedKalmanFilter, TrueState
-from hybrid_mpc.monitor.energy import EnergyMonitor
-from hybrid_mpc.mpc import OCP, CondensedController
+from hybrid_mpc import (
+    OCP,
+    ClosedLoopResult,
+    CondensedController,
+    DelayCompensation,
+    EnergyMonitor,
+    ExtendedKalmanFilter,
+    Fault,
+    InputError,
+    TrueState,
+    simulate,
+)
 
 
 def test_two_runs_differ_in_nothing_but_durations(model, safe):

@@ -5,9 +5,7 @@ import pytest
 from closed_loop_parts import make_ekf, run
 from online_models import PendulumPlant, linear_model, pendulum_model
 
-from hybrid_mpc.closed_loop import Fault
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.mpc import OCP
+from hybrid_mpc import OCP, Fault, InputError
 
 
 def test_to_pandas_has_every_column(model, safe):

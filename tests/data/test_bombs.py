@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import recording_bombs as bombs
 
+from hybrid_mpc import InputError
 from hybrid_mpc.data import read_table
 from hybrid_mpc.data.array_files import check_npz
-from hybrid_mpc.errors import InputError
 
 ROOT = Path(__file__).parents[2]
 SECONDS = 2.0

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from hybrid_mpc import InputError
 from hybrid_mpc.data.differentiation import (
     bandwidth,
     causal_derivatives,
@@ -9,7 +10,6 @@ from hybrid_mpc.data.differentiation import (
     noise_gain,
     window_samples,
 )
-from hybrid_mpc.errors import InputError
 
 DT, LENGTH = 0.01, 0.2
 

@@ -2,19 +2,15 @@ import numpy as np
 import pytest
 from scipy.interpolate import make_smoothing_spline
 
-from hybrid_mpc.data import (
+from hybrid_mpc import (
     CausalPolynomial,
+    InputError,
     LocalPolynomial,
     SmoothingSpline,
     ZeroPhaseFilter,
-    bandwidth,
-    causal_derivatives,
     differentiate,
-    gcv_cutoff,
-    local_polynomial,
-    noise_gain,
 )
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.data import bandwidth, causal_derivatives, gcv_cutoff, local_polynomial, noise_gain
 
 DT = 0.01
 METHODS = [

@@ -6,11 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid_mpc.data import load_trajectories, read_table, write_csv
-from hybrid_mpc.data_spec import DataSpec
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.scenario import load_scenario
-from hybrid_mpc.signals import Signal
+from hybrid_mpc import DataSpec, InputError, Signal, load_scenario, load_trajectories, write_csv
+from hybrid_mpc.data import read_table
 
 RECORDINGS = Path(__file__).parents[3] / "shared" / "data"
 SPEC = DataSpec("t", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.2)

@@ -1,17 +1,8 @@
 import numpy as np
 import pytest
 
-from hybrid_mpc.data import (
-    chirp,
-    crest_factor,
-    hann_spectrum,
-    line_spectrum,
-    multisine,
-    prbs,
-    random_steps,
-    sinusoid,
-)
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError, chirp, multisine, prbs, random_steps, sinusoid
+from hybrid_mpc.data import crest_factor, hann_spectrum, line_spectrum
 
 
 def test_chirp_has_the_stated_frequencies_at_its_ends():

@@ -1,9 +1,7 @@
 import numpy as np
 import pytest
 
-from hybrid_mpc.data import Trajectory, check_excitation, excitation_of, multisine, prbs
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.signals import Signal
+from hybrid_mpc import InputError, Signal, Trajectory, check_excitation, excitation_of, multisine, prbs
 
 DT = 0.02
 INPUT, OUTPUT = (Signal("torque", "N m", -0.5, 0.5),), (Signal("phi", "rad", -3, 3),)

@@ -12,10 +12,7 @@ from hypothesis import strategies as st
 from recording_bombs import GOOD, SIGNALS, SPEC, T
 from scipy.io import savemat
 
-from hybrid_mpc.data import load_trajectories
-from hybrid_mpc.data_spec import DataSpec
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.signals import Signal
+from hybrid_mpc import DataSpec, InputError, Signal, load_trajectories
 
 STRANGE = (
     0.0,

@@ -5,11 +5,8 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from hybrid_mpc.data import load_trajectories, write_csv
+from hybrid_mpc import DataSpec, InputError, Signal, Window, load_trajectories, write_csv
 from hybrid_mpc.data.trajectories import hold_mean
-from hybrid_mpc.data_spec import DataSpec, Window
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.signals import Signal
 
 SPEC = DataSpec("t", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.2)
 SIGNALS = {"outputs": (Signal("phi", "rad"),), "inputs": (Signal("torque", "N m"),)}
@@ -145,9 +142,8 @@ def test_unequal_columns_are_refused_by_file_and_column(tmp_path):
 
 
 def test_the_main_job_reads_mat_files(tmp_path):
+    from hybrid_mpc import RunSettings, load_scenario
     from hybrid_mpc.pipeline.context import Context
-    from hybrid_mpc.pipeline.settings import RunSettings
-    from hybrid_mpc.scenario import load_scenario
 
     t = np.arange(0, 30, 0.01)
     savemat(tmp_path / "mine.mat", {"time_s": t, "u_nm": 0.1 * np.cos(t), "angle": np.sin(t)})

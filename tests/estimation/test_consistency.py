@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from online_models import random_linear
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation import ExtendedKalmanFilter, SwitchingFilter, consistency, innovations
+from hybrid_mpc import ExtendedKalmanFilter, InputError, SwitchingFilter
+from hybrid_mpc.estimation import consistency, innovations
 
 SIGMA_Y, SIGMA_X = 0.1, 0.05
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from online_models import pendulum_model, random_linear
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation import DelayCompensation, ExtendedKalmanFilter, TrueState
+from hybrid_mpc import DelayCompensation, ExtendedKalmanFilter, InputError, TrueState
 
 
 def make_filter(model):

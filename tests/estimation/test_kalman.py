@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 from online_models import PendulumPlant, linear_model, pendulum_model, random_linear
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation import ExtendedKalmanFilter, TrueState
+from hybrid_mpc import ExtendedKalmanFilter, InputError, TrueState
 from hybrid_mpc.estimation.kalman import START_LIMIT
 
 

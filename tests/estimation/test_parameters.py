@@ -7,11 +7,16 @@ import numpy as np
 import pytest
 from monitor_parts import DT, J, pendulum, simulate
 
-from hybrid_mpc import load
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation import parameter_factors, parameter_filter, parameter_states, with_parameter_states
-from hybrid_mpc.model import HybridModel
-from hybrid_mpc.signals import Signal
+from hybrid_mpc import (
+    HybridModel,
+    InputError,
+    Signal,
+    load,
+    parameter_factors,
+    parameter_filter,
+    parameter_states,
+    with_parameter_states,
+)
 
 GROUPS = {"mass": ("m", "J"), "friction": ("d", "mu")}
 

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from online_models import pendulum_model, random_linear
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.riccati import dare, hidden_fixed_point, lqr
+from hybrid_mpc import InputError, dare, lqr
+from hybrid_mpc.riccati import hidden_fixed_point
 
 
 def test_dare_solves_its_equation_and_stabilises():

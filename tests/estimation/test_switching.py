@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from online_models import linear_model, pendulum_model, random_linear
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation import DelayCompensation, ExtendedKalmanFilter, SwitchingFilter
+from hybrid_mpc import DelayCompensation, ExtendedKalmanFilter, InputError, SwitchingFilter
 
 TWO = [[0.99, 0.01], [0.5, 0.5]]
 

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation import ExtendedKalmanFilter, log_likelihood, most_likely, process_noise
-from hybrid_mpc.model import HybridModel
-from hybrid_mpc.signals import Signal
+from hybrid_mpc import ExtendedKalmanFilter, HybridModel, InputError, Signal, process_noise
+from hybrid_mpc.estimation import log_likelihood, most_likely
 
 DT, SIGMA_Y, SIGMA_X = 0.1, 0.02, (0.0, 0.05)
 

@@ -5,10 +5,8 @@ import shutil
 
 import pytest
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError, RunSettings, load_scenario
 from hybrid_mpc.pipeline.context import STAGES, Context
-from hybrid_mpc.pipeline.settings import RunSettings
-from hybrid_mpc.scenario import load_scenario
 from tests.fuzz.forked import command
 from tests.pipeline.conftest import arguments, finished, machine
 
@@ -84,7 +82,7 @@ def test_the_note_of_a_run(arguments, finished, tmp_path):
 def test_a_training_that_was_interrupted_and_damaged(tmp_path):
     import torch
 
-    from hybrid_mpc.errors import InputError
+    from hybrid_mpc import InputError
     from hybrid_mpc.identification.checkpoint import load_checkpoint, save_checkpoint
 
     path = tmp_path / "pgrnn.safetensors"

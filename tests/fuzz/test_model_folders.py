@@ -9,10 +9,8 @@ import shutil
 import numpy as np
 import pytest
 
-from hybrid_mpc.artifact import set_calibration, set_process_noise
+from hybrid_mpc import Calibration, Detector, Plausibility, set_calibration, set_process_noise
 from hybrid_mpc.files import HASH, digest
-from hybrid_mpc.monitor import Calibration, Detector
-from hybrid_mpc.monitor.plausibility import Plausibility
 from tests.fuzz.forked import cheap, command, refused
 
 ODD = [

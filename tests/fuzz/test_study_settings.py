@@ -6,7 +6,7 @@ import shutil
 import pytest
 import yaml
 
-from hybrid_mpc.studies import run_study
+from hybrid_mpc import run_study
 from tests.fuzz.forked import command, refused
 from tests.trivial_runs import stand_in, study, trivial
 

@@ -16,21 +16,34 @@ import numpy as np
 from scipy.stats import t as student
 
 import nn_export
-from hybrid_mpc.artifact import ModelInfo, build_model, load
-from hybrid_mpc.closed_loop import Fault, Guard, Mode, Runner, simulate
-from hybrid_mpc.estimation import (
+from hybrid_mpc import (
+    OCP,
+    Calibration,
+    CondensedController,
     DelayCompensation,
+    EnergyMonitor,
     Estimate,
     ExtendedKalmanFilter,
+    Fault,
+    Guard,
+    Limits,
+    Mode,
+    ModelInfo,
+    Runner,
+    SafeController,
+    SQPController,
+    Status,
     SwitchingFilter,
+    guard_monitor,
+    load,
+    load_scenario,
     parameter_filter,
+    simulate,
     with_parameter_states,
 )
-from hybrid_mpc.monitor import Calibration, EnergyMonitor, guard_monitor
-from hybrid_mpc.mpc import OCP, CondensedController, Limits, SafeController, SQPController, Status
+from hybrid_mpc.artifact import build_model
 from hybrid_mpc.records import record
 from hybrid_mpc.report import schema
-from hybrid_mpc.scenario import load_scenario
 
 HERE = Path(__file__).parent
 MACHINES = ("golf_robot", "unbalanced_disk")

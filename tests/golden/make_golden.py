@@ -121,11 +121,11 @@ RUNNER = {
 
 def freeze(name, run):
     """The folder of a machine from a finished run: programs, weights, plain numbers, references."""
-    from hybrid_mpc.artifact import load, read_description, write_description
-    from hybrid_mpc.assembly import first_controller, freezing, make_estimator, make_monitor, make_ocp
+    from hybrid_mpc import load, load_scenario, make_estimator, make_monitor, make_ocp
+    from hybrid_mpc.artifact import read_description, write_description
+    from hybrid_mpc.assembly import first_controller, freezing
     from hybrid_mpc.files import sha256
     from hybrid_mpc.job.contenders import no_surer_than_prior
-    from hybrid_mpc.scenario import load_scenario
 
     folder, run = HERE / name, Path(run)
     folder.mkdir(exist_ok=True)
@@ -271,7 +271,7 @@ def make_keys(run):
 def make_artifact(name):
     """The artifact's files anew from the plain form, for when the artifact's schema has changed."""
     import nn_export
-    from hybrid_mpc.artifact import save_artifact
+    from hybrid_mpc import save_artifact
 
     m, programs = machine(name), {}
     for key, program in nn_export.load_programs(m.folder).items():

@@ -5,9 +5,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from hybrid_mpc.data import Trajectory
-from hybrid_mpc.physics import Prior
-from hybrid_mpc.signals import Parameter, Signal
+from hybrid_mpc import Parameter, Prior, Signal, Trajectory
 
 DT = 0.02
 TRUTH = {"J": 0.1, "mgl": 1.2, "d": 0.05}

@@ -7,12 +7,9 @@ import pytest
 import torch
 from simulated_pendulum import TRUTH, Killed, Pendulum, dragged, same_training
 
-from hybrid_mpc.benchmark_spec import BenchmarkBudget
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import DEFAULT_BUDGETS, BenchmarkBudget, InputError, TrainingSettings, train
 from hybrid_mpc.identification.anchors import COUNTED, FOLLOWED, RUNS, anchor_penalty, make_anchors
-from hybrid_mpc.identification.training import TrainingSettings, train
 from hybrid_mpc.identification.training_run import TrainingRun
-from hybrid_mpc.scenario import DEFAULT_BUDGETS
 
 SMALL = TrainingSettings("pgrnn", 4, 2, 20, 20, seed=3, warm=10, horizon=20, batch=8, every=10, anchors=10.0)
 PRIOR = Pendulum(TRUTH)
@@ -29,7 +26,7 @@ def anchors(data):
 
 
 def test_they_are_the_priors_own_motion_under_recorded_inputs(data, anchors):
-    from hybrid_mpc.identification.step import PriorStep
+    from hybrid_mpc import PriorStep
 
     step = PriorStep(PRIOR, data[0][0].dt)
     x, _ = step(anchors.x[:-1], torch.zeros(*anchors.x.shape[:-1], 0)[:-1], anchors.u[:-1])

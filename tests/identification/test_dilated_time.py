@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from simulated_pendulum import DT, TRUTH, Pendulum, record
 
+from hybrid_mpc import fit_prior, fit_smoother
 from hybrid_mpc.data import time_unit
 from hybrid_mpc.identification import prior_fit
-from hybrid_mpc.identification.prior_fit import fit_prior
-from hybrid_mpc.identification.smoothing import fit_smoother
 
 POWERS = {"J": 2, "mgl": 0, "d": 1}
 """With time k times as long, an inertia of k^2 J and a damping of k d give the same swings."""

@@ -5,9 +5,9 @@ import pytest
 import torch
 from simulated_pendulum import DT, TRUTH, Pendulum, record
 
-from hybrid_mpc.identification.evaluation import FreeRun, free_runs, judged, score
+from hybrid_mpc import PriorStep, free_runs, judged, score
+from hybrid_mpc.identification.evaluation import FreeRun
 from hybrid_mpc.identification.smoothing import Smoother
-from hybrid_mpc.identification.step import PriorStep
 
 
 def hand_made(n, dt, error):

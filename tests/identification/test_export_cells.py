@@ -5,10 +5,8 @@ import pytest
 import torch
 from simulated_pendulum import DT, Pendulum, record
 
-from hybrid_mpc.artifact import load, save_artifact
+from hybrid_mpc import TrainingSettings, check_parity, load, model_info, save_artifact, trace_model
 from hybrid_mpc.identification.dataset import cut_windows, literal_scaling_of, scaling_of
-from hybrid_mpc.identification.export import check_parity, model_info, trace_model
-from hybrid_mpc.identification.settings import TrainingSettings
 from hybrid_mpc.identification.trained import stack_for, step_for
 
 CELLS = ("gru", "gru_paper", "lstm", "feed_forward")

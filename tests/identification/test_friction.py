@@ -8,20 +8,19 @@ import torch
 from energy_checks import check_energy_balance, random_points, random_values
 from simulated_pendulum import Pendulum
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.identification.friction import (
+from hybrid_mpc import (
     Coulomb,
+    InputError,
     LoadDependent,
+    Parameter,
     PendulumLoad,
+    Prior,
+    Signal,
     Stribeck,
     Viscous,
-    coulomb,
-    load_dependent,
-    stribeck,
     with_friction,
 )
-from hybrid_mpc.physics import Prior
-from hybrid_mpc.signals import Parameter, Signal
+from hybrid_mpc.identification.friction import coulomb, load_dependent, stribeck
 from scenarios.golf_robot.prior import GolfRobotPrior
 from scenarios.pendulum.prior import PendulumPrior
 from scenarios.torque_pendulum.prior import TorquePendulumPrior
@@ -167,7 +166,7 @@ def test_what_cannot_be_is_refused():
 def test_it_is_fitted_and_exported_as_any_prior():
     import casadi as ca
 
-    from hybrid_mpc.identification.step import PriorStep
+    from hybrid_mpc import PriorStep
     from nn_export import to_casadi
 
     made = with_friction(PendulumPrior, *TERMS["all"])

@@ -10,19 +10,19 @@ from energy_checks import check_energy_balance, random_values
 from scipy.integrate import solve_ivp
 from simulated_pendulum import DT, TRUTH, Pendulum, record
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.identification.friction import Coulomb, with_friction
-from hybrid_mpc.identification.lags import (
-    DelayedPriorStep,
-    DelayedStep,
-    delayed,
-    lagged,
+from hybrid_mpc import (
+    Coulomb,
+    InputError,
+    Parameter,
+    Prior,
+    PriorStep,
+    Signal,
+    fit_prior,
+    with_friction,
     with_input_lag,
 )
-from hybrid_mpc.identification.prior_fit import fit_prior
-from hybrid_mpc.identification.step import PriorStep, rk4
-from hybrid_mpc.physics import Prior
-from hybrid_mpc.signals import Parameter, Signal
+from hybrid_mpc.identification.lags import DelayedPriorStep, DelayedStep, delayed, lagged
+from hybrid_mpc.identification.step import rk4
 from scenarios.golf_robot.prior import GolfRobotPrior
 from scenarios.pendulum.prior import PendulumPrior
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError
 from hybrid_mpc.identification.cells import StackedFeedForward, StackedLSTM, make_stack
 from hybrid_mpc.identification.fused_gru import fused_states
 from hybrid_mpc.identification.networks import StackedGRU

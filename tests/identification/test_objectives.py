@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from simulated_pendulum import DT, Pendulum, record
 
+from hybrid_mpc import HybridStep, n_features
 from hybrid_mpc.identification.combination import VectorPerformanceIndex
 from hybrid_mpc.identification.dataset import cut_windows, literal_scaling_of, scaling_of
 from hybrid_mpc.identification.networks import StackedGRU
@@ -19,7 +20,7 @@ from hybrid_mpc.identification.objectives import (
     position_objective,
     teacher_forced,
 )
-from hybrid_mpc.identification.step import HybridStep, LiteralStep, n_features
+from hybrid_mpc.identification.step import LiteralStep
 
 losses = st.lists(st.lists(st.floats(1e-6, 1e6), min_size=2, max_size=2), min_size=1, max_size=8)
 

@@ -6,13 +6,20 @@ import torch
 from simulated_pendulum import DT, TRUTH, Pendulum, record
 
 import nn_export
-from hybrid_mpc.artifact import load, save_artifact
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.identification.evaluation import free_runs, score
-from hybrid_mpc.identification.export import model_info, trace_model
-from hybrid_mpc.identification.output_network import OutputSettings, train_output, with_output
-from hybrid_mpc.identification.step import PriorStep
-from hybrid_mpc.signals import Signal
+from hybrid_mpc import (
+    InputError,
+    PriorStep,
+    Signal,
+    free_runs,
+    load,
+    model_info,
+    save_artifact,
+    score,
+    trace_model,
+    train_output,
+    with_output,
+)
+from hybrid_mpc.identification.output_network import OutputSettings
 
 OFFSET, ECCENTRIC, PHASE, NOISE = 0.1, 0.05, 0.7, 2e-4  # an encoder's, rad
 QUICK = OutputSettings(networks=2, steps=600)

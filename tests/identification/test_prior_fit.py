@@ -5,8 +5,7 @@ import pytest
 import torch
 from simulated_pendulum import DT, TRUTH, Pendulum, record
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.identification.prior_fit import fit_prior
+from hybrid_mpc import InputError, fit_prior
 from hybrid_mpc.identification.prior_residuals import ParameterFit
 
 NOISE = 2e-3

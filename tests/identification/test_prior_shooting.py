@@ -3,7 +3,7 @@ import pytest
 from scipy.optimize._numdiff import approx_derivative
 from simulated_pendulum import DT, TRUTH, Pendulum, record
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError
 from hybrid_mpc.identification.prior_residuals import ParameterFit
 from hybrid_mpc.identification.prior_shooting import _Problem, cut_segments, multiple_shooting
 

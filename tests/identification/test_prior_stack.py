@@ -7,14 +7,21 @@ import pytest
 import torch
 from simulated_pendulum import DT, TRUTH, Pendulum, record
 
+from hybrid_mpc import (
+    InputError,
+    Parameter,
+    TrainingSettings,
+    check_parity,
+    free_runs,
+    model_info,
+    score,
+    trace_model,
+    train,
+)
 from hybrid_mpc.artifact import build_model
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.identification.evaluation import free_runs, score
-from hybrid_mpc.identification.export import check_parity, model_info, trace_model
 from hybrid_mpc.identification.prior_stack import StackedPrior, with_values
-from hybrid_mpc.identification.training import TrainingSettings, _key, train
+from hybrid_mpc.identification.training import _key
 from hybrid_mpc.identification.training_run import TrainingRun
-from hybrid_mpc.signals import Parameter
 from scenarios.pendulum.prior import PublishedPendulumPrior
 
 SHORT = TrainingSettings(

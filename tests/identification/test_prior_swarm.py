@@ -7,9 +7,8 @@ import pytest
 import torch
 from simulated_pendulum import DT, TRUTH, Pendulum, record
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError, fit_prior
 from hybrid_mpc.identification.dataset import cut_windows
-from hybrid_mpc.identification.prior_fit import fit_prior
 from hybrid_mpc.identification.prior_residuals import ParameterFit
 from hybrid_mpc.identification.prior_swarm import SwarmSettings, errors_of, particle_swarm
 

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from simulated_pendulum import TRUTH, Pendulum, record
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError, SearchSpace, TrainingSettings, search, train
 from hybrid_mpc.identification import search as module
-from hybrid_mpc.identification.search import SearchSpace, _without_default, search
+from hybrid_mpc.identification.search import _without_default
 from hybrid_mpc.identification.search_space import parsed_space
-from hybrid_mpc.identification.training import TrainingSettings, train
 
 SMALL = TrainingSettings("mopgrnn", 4, 2, 20, 20, seed=3, warm=10, horizon=20, batch=8, every=10)
 BASE = replace(SMALL, hidden=16, batch=32, teacher_steps=200, free_run_steps=200, every=20)

@@ -8,11 +8,17 @@ import pytest
 import torch
 from simulated_pendulum import DT, TRUTH, Pendulum, record
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.identification.evaluation import free_runs, score
-from hybrid_mpc.identification.export import check_parity, model_info, trace_model
-from hybrid_mpc.identification.sindy import Factor, Library, SindyStep, fit_sindy, machine_libraries
-from hybrid_mpc.identification.step import PriorStep
+from hybrid_mpc import (
+    InputError,
+    PriorStep,
+    check_parity,
+    fit_sindy,
+    free_runs,
+    model_info,
+    score,
+    trace_model,
+)
+from hybrid_mpc.identification.sindy import Factor, Library, SindyStep, machine_libraries
 from scenarios.pendulum.data import exact_runs
 from scenarios.pendulum.plant import DampedPendulum
 from scenarios.pendulum.prior import PendulumPrior

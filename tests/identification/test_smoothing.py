@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hybrid_mpc import fit_smoother
 from hybrid_mpc.data.differentiation import local_polynomial
-from hybrid_mpc.identification.smoothing import Smoother, fit_smoother
+from hybrid_mpc.identification.smoothing import Smoother
 from tests.identification.simulated_pendulum import DT, TRUTH, Pendulum, record
 
 SIGMA = 1e-3

@@ -6,18 +6,10 @@ import pytest
 import torch
 from simulated_pendulum import DT, Pendulum, record
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import HybridStep, InputError, PriorStep, Scaling, load_scenario, n_features
 from hybrid_mpc.identification.networks import StackedGRU
-from hybrid_mpc.identification.step import (
-    HybridStep,
-    LiteralStep,
-    PriorStep,
-    Scaling,
-    n_features,
-    required_substeps,
-    rk4,
-)
-from hybrid_mpc.scenario import load_scenario, registered_scenarios
+from hybrid_mpc.identification.step import LiteralStep, required_substeps, rk4
+from hybrid_mpc.scenario import registered_scenarios
 
 UNIT = Scaling(x=(1.0, 1.0), u=(1.0,), acceleration=(1.0,), correction=(1.0,))
 

@@ -5,11 +5,11 @@ import pytest
 import torch
 from simulated_pendulum import DT, TRUTH, Killed, Pendulum, dragged, same_training
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError, TrainingSettings, train
 from hybrid_mpc.identification.checkpoint import load_checkpoint, save_checkpoint
 from hybrid_mpc.identification.dataset import cut_windows, fitting_horizon
 from hybrid_mpc.identification.objectives import OBJECTIVES, energy_objective
-from hybrid_mpc.identification.training import KINDS, TrainingSettings, train
+from hybrid_mpc.identification.training import KINDS
 from hybrid_mpc.identification.training_run import REPEATS, TrainingRun
 
 SMALL = TrainingSettings("mopgrnn", 4, 2, 20, 20, seed=3, warm=10, horizon=20, batch=8, every=10)

@@ -7,9 +7,8 @@ import pytest
 import torch
 from simulated_pendulum import DT, TRUTH, Killed, Pendulum, dragged, same_training
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError, TrainingSettings, train
 from hybrid_mpc.identification.objectives import OBJECTIVES, energy_objective, free_run, teacher_forced
-from hybrid_mpc.identification.training import TrainingSettings, train
 from hybrid_mpc.identification.training_run import TrainingRun
 
 SHORT = TrainingSettings("mopgrnn", 4, 2, 15, 10, seed=3, warm=10, horizon=20, batch=8, every=5)

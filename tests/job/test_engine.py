@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 import trivial_runs
 
-from hybrid_mpc.errors import InputError, StorageError
+from hybrid_mpc import InputError, StudyResults, run_study
+from hybrid_mpc.errors import StorageError
 from hybrid_mpc.job import engine
 from hybrid_mpc.job.engine import THREADS, Lost, make_engine, run_jobs
 from hybrid_mpc.pipeline.context import Silent
-from hybrid_mpc.studies import StudyResults, run_study
 from hybrid_mpc.studies.inputs import TIMING
 
 ROOT, TESTS = (

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError
 from hybrid_mpc.monitor.detection import METHODS, Judges, held, learn_judges
 from hybrid_mpc.records import plain, record
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from monitor_parts import DT, GAMMA, NOISE, Observer, pendulum, simulate
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.monitor import Calibration, Detector, EnergyMonitor, Plausibility, learn_detector, replay
+from hybrid_mpc import Calibration, Detector, EnergyMonitor, InputError, Plausibility, replay
+from hybrid_mpc.monitor import learn_detector
 from hybrid_mpc.monitor.learning import detector_levels
 from hybrid_mpc.records import plain, record
 

@@ -7,9 +7,7 @@ import pytest
 from monitor_parts import DT, GAMMA, MGL, NOISE, Observer, pendulum, simulate
 from monitor_parts import J as INERTIA
 
-from hybrid_mpc.artifact import load, save_artifact
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.monitor import Detector, Diagnoser, EnergyMonitor
+from hybrid_mpc import Detector, Diagnoser, EnergyMonitor, InputError, load, save_artifact
 
 SIGMA = 2e-3  # N m: the residuals' scatter under this noise
 DETECTOR = Detector(DT, ((SIGMA**2, 0.0, 0.0, 0.0),), (), 1.0, 20.0)
@@ -110,7 +108,7 @@ def test_the_artifact_brings_what_it_needs_and_old_ones_say_what_is_missing(golf
 
 def test_an_artifact_without_the_program_still_loads(golf_artifact, tmp_path):
     import nn_export
-    from hybrid_mpc.artifact import ModelInfo
+    from hybrid_mpc import ModelInfo
 
     programs = nn_export.load_programs(golf_artifact)
     model = load(golf_artifact).models["prior"]

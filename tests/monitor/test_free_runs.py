@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from monitor_parts import DT, GAMMA, Estimate, Exact, Observer, pendulum, simulate
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.monitor import EnergyMonitor
+from hybrid_mpc import EnergyMonitor, InputError
 
 
 def readings(monitor, estimator, run):

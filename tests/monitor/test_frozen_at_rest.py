@@ -7,10 +7,7 @@ import numpy as np
 import pytest
 from monitor_parts import DT, Estimate, J, pendulum
 
-from hybrid_mpc.delayed import with_input_delay
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.monitor import EnergyMonitor
-from hybrid_mpc.signals import Signal
+from hybrid_mpc import EnergyMonitor, InputError, Signal, with_input_delay
 
 STEP, LIMIT = 1e-3, 1.0
 """Step of the sensor [rad]; input from -1 to 1 N m, a quarter of that is 0.5 N m."""

@@ -13,11 +13,9 @@ from monitor_parts import DT, Exact, pendulum, simulate
 from online_models import pendulum_model
 from typer.testing import CliRunner
 
+from hybrid_mpc import Calibration, EnergyMonitor, Fault, Guard, InputError, Mode, replay, write_csv
 from hybrid_mpc.cli.main import app
-from hybrid_mpc.closed_loop import Fault, Guard, Mode
-from hybrid_mpc.data import write_csv
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.monitor import Calibration, EnergyMonitor, Verdict, judge, replay
+from hybrid_mpc.monitor import Verdict, judge
 
 WINDOW, AVERAGE = 5, 10
 NEVER = Calibration(1e9, 1e9, 1.0, 1, 1.0, "by hand")
@@ -139,10 +137,17 @@ def diverging(folder):
     """An artifact whose network's correction is beyond all numbers."""
     import torch
 
-    from hybrid_mpc.artifact import LoopSettings, save_artifact
-    from hybrid_mpc.identification.export import model_info, trace_model
+    from hybrid_mpc import (
+        HybridStep,
+        LoopSettings,
+        PriorStep,
+        Scaling,
+        model_info,
+        n_features,
+        save_artifact,
+        trace_model,
+    )
     from hybrid_mpc.identification.networks import StackedGRU
-    from hybrid_mpc.identification.step import HybridStep, PriorStep, Scaling, n_features
     from scenarios.golf_robot.prior import GolfRobotPrior
 
     prior = GolfRobotPrior()

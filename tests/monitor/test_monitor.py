@@ -7,16 +7,8 @@ import numpy as np
 import pytest
 from monitor_parts import DT, GAMMA, NOISE, Estimate, Exact, Observer, Run, pendulum, simulate
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.monitor import (
-    Calibration,
-    EnergyMonitor,
-    calibrate,
-    count_alarms,
-    judge,
-    replay,
-    with_residual,
-)
+from hybrid_mpc import Calibration, EnergyMonitor, InputError, count_alarms, replay
+from hybrid_mpc.monitor import calibrate, judge, with_residual
 
 
 @pytest.mark.parametrize("kind", ["sine", "steps"])

@@ -8,15 +8,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from hybrid_mpc.artifact import set_calibration
+from hybrid_mpc import Calibration, Detector, InputError, load_scenario, set_calibration, write_csv
 from hybrid_mpc.cli.main import app
-from hybrid_mpc.data import write_csv
-from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import write_json
-from hybrid_mpc.monitor import Calibration, Detector
 from hybrid_mpc.pipeline.monitor_job import MonitorJob, prepared, read_detector, watched
 from hybrid_mpc.records import plain
-from hybrid_mpc.scenario import load_scenario
 from scenarios.golf_robot.rig import Rig
 
 DT = 0.02

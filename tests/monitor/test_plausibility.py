@@ -10,18 +10,17 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.model import HybridModel
-from hybrid_mpc.monitor.plausibility import (
+from hybrid_mpc import (
+    HybridModel,
+    InputError,
     Plausibility,
+    Signal,
     excess_bound,
     learn_plausibility,
-    plan_distance,
-    reach_of,
     region_bound,
 )
+from hybrid_mpc.monitor.plausibility import plan_distance, reach_of
 from hybrid_mpc.records import plain, record
-from hybrid_mpc.signals import Signal
 
 PATH = Path(__file__).parents[2] / "benchmarks" / "guard_exploit.py"
 

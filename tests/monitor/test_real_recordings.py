@@ -8,11 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid_mpc.assembly import make_estimator
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError, guard_monitor, make_estimator, replay
 from hybrid_mpc.monitor.held_out import clean_samples, judged, leave_one_out, settled_windows
-from hybrid_mpc.monitor.replay import replay
-from hybrid_mpc.monitor.standard import guard_monitor
 from scenarios.torque_pendulum import scenario
 
 ROOT = Path(__file__).parents[2]
@@ -45,9 +42,8 @@ def real():
 @pytest.fixture(scope="module")
 def model():
     """The fitted prior alone: it needs no training, and on these recordings it does as well as the hybrid."""
+    from hybrid_mpc import PriorStep, model_info, trace_model
     from hybrid_mpc.artifact import build_model
-    from hybrid_mpc.identification.export import model_info, trace_model
-    from hybrid_mpc.identification.step import PriorStep
 
     values = json.loads(PRIOR.read_text())["identification"]["details"]["prior_parameters"]["values"]
     prior = scenario.prior(values)

@@ -10,14 +10,22 @@ import pytest
 from linear_axes import Axis
 from monitor_parts import Estimate, Exact, Run
 
-from hybrid_mpc.data import load_trajectories, noise_of, time_unit
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import (
+    Calibration,
+    Detector,
+    EnergyMonitor,
+    HybridModel,
+    InputError,
+    Signal,
+    guard_monitor,
+    load_scenario,
+    load_trajectories,
+    replay,
+    rest_speeds,
+)
+from hybrid_mpc.data import noise_of, time_unit
 from hybrid_mpc.files import plain
-from hybrid_mpc.model import HybridModel
-from hybrid_mpc.monitor import Calibration, Detector, EnergyMonitor, guard_monitor, replay, rest_speeds
 from hybrid_mpc.records import record
-from hybrid_mpc.scenario import load_scenario
-from hybrid_mpc.signals import Signal
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
 FIVE_CM = Axis(0.01, mass=2.0, viscous=10.0, dry=0.1)

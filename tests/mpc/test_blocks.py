@@ -8,8 +8,15 @@ from lq_oracle import states
 from online_models import pendulum_model, random_linear
 from scipy.optimize import minimize
 
-from hybrid_mpc.estimation.kalman import Estimate
-from hybrid_mpc.mpc import OCP, CondensedController, IpoptController, SafeController, SQPController, Status
+from hybrid_mpc import (
+    OCP,
+    CondensedController,
+    Estimate,
+    IpoptController,
+    SafeController,
+    SQPController,
+    Status,
+)
 
 POINT = [0.0, 1.0], [0.0]
 BLOCKS = (1, 1, 2, 3, 5, 8)

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from online_models import pendulum_model
 
-from hybrid_mpc.estimation.kalman import Estimate
-from hybrid_mpc.mpc import OCP, CondensedController, SoftBound, SQPController, Status
+from hybrid_mpc import OCP, CondensedController, Estimate, SoftBound, SQPController, Status
 from hybrid_mpc.mpc.condensing import condense_all, condense_hessians
 from hybrid_mpc.mpc.curvature import convex
 from hybrid_mpc.mpc.landscape import Case, Landscape

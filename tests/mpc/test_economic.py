@@ -5,9 +5,16 @@ import numpy as np
 import pytest
 from online_models import pendulum_model
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation.kalman import Estimate
-from hybrid_mpc.mpc import OCP, CondensedController, IpoptController, SQPController, Status, output_cost
+from hybrid_mpc import (
+    OCP,
+    CondensedController,
+    Estimate,
+    InputError,
+    IpoptController,
+    SQPController,
+    Status,
+    output_cost,
+)
 from hybrid_mpc.mpc.economic import EconomicCost
 
 POINT = [0.0, 1.0], [0.0]

@@ -6,19 +6,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from online_models import pendulum_model
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation.kalman import Estimate
-from hybrid_mpc.mpc import (
+from hybrid_mpc import (
     OCP,
     BestOf,
     CondensedController,
+    Estimate,
+    InputError,
     IpoptController,
     Limits,
     SafeController,
-    Source,
     SQPController,
     Status,
 )
+from hybrid_mpc.mpc import Source
 
 POINT = [0.0, 1.0], [0.0]
 E0 = Estimate(0.0, np.array([-0.4, 0.0]), np.zeros(0), np.zeros(1), np.eye(3), np.zeros(1), 0.0)

@@ -7,10 +7,16 @@ from online_models import linear_model, random_linear
 from scipy.linalg import block_diag
 from scipy.optimize import minimize
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation.kalman import Estimate
-from hybrid_mpc.mpc import OCP, CondensedController, IpoptController, SQPController, Status
-from hybrid_mpc.riccati import dare
+from hybrid_mpc import (
+    OCP,
+    CondensedController,
+    Estimate,
+    InputError,
+    IpoptController,
+    SQPController,
+    Status,
+    dare,
+)
 
 INF = np.inf
 

@@ -5,10 +5,7 @@ import numpy as np
 import pytest
 from online_models import linear_model, pendulum_model
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation.kalman import Estimate
-from hybrid_mpc.model import HybridModel
-from hybrid_mpc.mpc import OCP, CondensedController, IpoptController, Status
+from hybrid_mpc import OCP, CondensedController, Estimate, HybridModel, InputError, IpoptController, Status
 
 
 def ipopt_plan(model, ocp, terminal, z0, d, reference, u_prev):

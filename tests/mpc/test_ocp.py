@@ -2,9 +2,7 @@ import numpy as np
 import pytest
 from online_models import pendulum_model, random_linear
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.mpc import OCP
-from hybrid_mpc.riccati import dare
+from hybrid_mpc import OCP, InputError, dare
 
 GOOD = {
     "horizon": 10, "q": [1.0, 0.1], "r": [0.1], "r_delta": [0.0], "u_min": [-1.0], "u_max": [2.0],

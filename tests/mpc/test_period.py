@@ -8,13 +8,20 @@ import pytest
 from closed_loop_parts import DT, PendulumPlant, Recorder, make_safe, sine
 from online_models import pendulum_model, random_linear
 
-from hybrid_mpc.closed_loop import simulate
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation import ExtendedKalmanFilter
-from hybrid_mpc.estimation.kalman import Estimate
-from hybrid_mpc.model import longer_period
-from hybrid_mpc.mpc import OCP, CondensedController, IpoptController, SafeController, SQPController, Status
-from hybrid_mpc.riccati import dare
+from hybrid_mpc import (
+    OCP,
+    CondensedController,
+    Estimate,
+    ExtendedKalmanFilter,
+    InputError,
+    IpoptController,
+    SafeController,
+    SQPController,
+    Status,
+    dare,
+    longer_period,
+    simulate,
+)
 
 M = 3
 

@@ -12,11 +12,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from online_models import pendulum_model
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation import TrueState
-from hybrid_mpc.mpc import OCP, CondensedController, SoftBound, SQPController, output_cost
+from hybrid_mpc import (
+    OCP,
+    CondensedController,
+    InputError,
+    SoftBound,
+    SQPController,
+    TrueState,
+    load_scenario,
+    output_cost,
+)
 from hybrid_mpc.records import plain, record
-from hybrid_mpc.scenario import load_scenario, registered_scenarios
+from hybrid_mpc.scenario import registered_scenarios
 
 
 def expressions(kind=ca.SX):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hybrid_mpc.mpc import OCP, Status
+from hybrid_mpc import OCP, Status
 from hybrid_mpc.mpc.qp import InputQP
 
 HESSIAN = np.array([[2.0, 0.3, 0.1], [0.3, 1.0, 0.2], [0.1, 0.2, 3.0]])

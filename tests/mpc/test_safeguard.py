@@ -9,11 +9,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from online_models import linear_model, pendulum_model
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation import ExtendedKalmanFilter
-from hybrid_mpc.estimation.kalman import Estimate
-from hybrid_mpc.mpc import OCP, CondensedController, SafeController, Source, SQPController, Status
-from hybrid_mpc.riccati import lqr
+from hybrid_mpc import (
+    OCP,
+    CondensedController,
+    Estimate,
+    ExtendedKalmanFilter,
+    InputError,
+    SafeController,
+    SQPController,
+    Status,
+    lqr,
+)
+from hybrid_mpc.mpc import Source
 
 POINT = [0.0, 1.0], [0.0]
 LIMITS = OCP(15, [50.0, 0.5], [0.5], [0.2], [-1.0], [2.0], [0.25], working_point=POINT)

@@ -6,9 +6,7 @@ import pytest
 from lq_oracle import soft_plan, states
 from online_models import linear_model, pendulum_model, random_linear
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation.kalman import Estimate
-from hybrid_mpc.mpc import OCP, CondensedController, SoftBound, Status
+from hybrid_mpc import OCP, CondensedController, Estimate, InputError, SoftBound, Status
 from hybrid_mpc.mpc.soft import SoftRows
 
 DT = 0.1

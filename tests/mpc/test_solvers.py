@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from online_models import pendulum_model, random_linear
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation.kalman import Estimate
-from hybrid_mpc.mpc import (
+from hybrid_mpc import (
     OCP,
     BestOf,
     CondensedController,
+    Estimate,
+    InputError,
     IpoptController,
     SafeController,
     SoftBound,
@@ -241,8 +241,7 @@ def test_a_rivals_plan_is_a_start():
 
 
 def even(shift=0.0):
-    from hybrid_mpc.model import HybridModel
-    from hybrid_mpc.signals import Signal
+    from hybrid_mpc import HybridModel, Signal
 
     x, h, u, w = ca.MX.sym("x"), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w")
     one = (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),)

@@ -8,13 +8,21 @@ import pytest
 import torch
 from online_models import pendulum_model
 
+from hybrid_mpc import (
+    OCP,
+    CondensedController,
+    Estimate,
+    GRUNetwork,
+    HybridStep,
+    InputError,
+    PriorStep,
+    Scaling,
+    SQPController,
+    model_info,
+    n_features,
+    trace_model,
+)
 from hybrid_mpc.artifact import build_model
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation.kalman import Estimate
-from hybrid_mpc.identification.export import model_info, trace_model
-from hybrid_mpc.identification.networks import GRUNetwork
-from hybrid_mpc.identification.step import HybridStep, PriorStep, Scaling, n_features
-from hybrid_mpc.mpc import OCP, CondensedController, SQPController
 from hybrid_mpc.mpc.condensing import Condenser, adjoint, propagate
 from hybrid_mpc.mpc.stages import Stages, VectorisedStages, stages
 from scenarios.golf_robot import scenario

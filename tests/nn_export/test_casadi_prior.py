@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from hybrid_mpc.identification.export import trace_model
+from hybrid_mpc import HybridStep, Parameter, Prior, Scaling, Signal, n_features, trace_model
 from hybrid_mpc.identification.networks import StackedGRU
-from hybrid_mpc.identification.step import HybridStep, Scaling, n_features, required_substeps
-from hybrid_mpc.physics import Prior
-from hybrid_mpc.signals import Parameter, Signal
+from hybrid_mpc.identification.step import required_substeps
 from nn_export import build, from_casadi, parity
 
 torch.set_num_threads(1)

@@ -8,12 +8,8 @@ import pytest
 from closed_loop_parts import Told, run
 from monitor_parts import MGL, J, pendulum
 
-from hybrid_mpc import make_adaptive_guard, make_controller, make_estimator
+from hybrid_mpc import OCP, InputError, Mode, Scenario, make_adaptive_guard, make_controller, make_estimator
 from hybrid_mpc.assembly import adaptable
-from hybrid_mpc.closed_loop import Mode
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.mpc import OCP
-from hybrid_mpc.scenario import Scenario
 
 CONTROL = OCP(20, q=(300.0, 1.0), r=(0.05,), r_delta=(0.05,), u_min=(-6.0,), u_max=(6.0,))
 CAUSES = {"mass": ("J", "mgl"), "friction": ("gamma",), "motor": ("gain of u",)}

@@ -5,12 +5,9 @@ from dataclasses import replace
 import pytest
 from cart import recording, written
 
-from hybrid_mpc.benchmark_spec import BenchmarkSpec
-from hybrid_mpc.data_spec import Window
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import BenchmarkSpec, InputError, Window, load_scenario
 from hybrid_mpc.pipeline.machine_benchmark.choice import recommended
 from hybrid_mpc.pipeline.machine_benchmark.recordings import read_training
-from hybrid_mpc.scenario import load_scenario
 
 
 @pytest.fixture(scope="module")

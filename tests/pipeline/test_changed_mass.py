@@ -3,15 +3,20 @@
 import numpy as np
 import pytest
 
+from hybrid_mpc import (
+    PriorStep,
+    fit_smoother,
+    make_estimator,
+    make_monitor,
+    model_info,
+    replay,
+    trace_model,
+    write_csv,
+)
 from hybrid_mpc.artifact import build_model
-from hybrid_mpc.assembly import make_estimator, make_monitor
-from hybrid_mpc.data import write_csv
-from hybrid_mpc.identification.export import model_info, trace_model
 from hybrid_mpc.identification.prior_result import PriorFit
-from hybrid_mpc.identification.smoothing import fit_smoother
-from hybrid_mpc.identification.step import PriorStep
 from hybrid_mpc.monitor.calibration import calibrate, with_residual
-from hybrid_mpc.monitor.replay import judge, replay
+from hybrid_mpc.monitor.replay import judge
 from hybrid_mpc.pipeline.machine_benchmark.free_runs import figures_of, run_freely
 from hybrid_mpc.pipeline.machine_benchmark.physics import Physics
 from hybrid_mpc.pipeline.machine_benchmark.recordings import pieces, read_test

@@ -8,17 +8,13 @@ import numpy as np
 import pytest
 from closed_loop_parts import loop_row
 
-from hybrid_mpc.artifact import set_process_noise
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError, RunSettings, Signal, load_scenario, set_process_noise
 from hybrid_mpc.job.contenders import CONTENDERS, ORACLES
 from hybrid_mpc.job.loops import limits_used, tasks_of
 from hybrid_mpc.job.table import by_task, interval, summaries
 from hybrid_mpc.pipeline.contest import TIMED, _seeds, contest, parts_of
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.results import gap_closed
-from hybrid_mpc.pipeline.settings import RunSettings
-from hybrid_mpc.scenario import load_scenario
-from hybrid_mpc.signals import Signal
 
 GOLF = load_scenario("golf_robot")
 SIGNALS = SimpleNamespace(

@@ -8,15 +8,16 @@ from functools import partial
 import numpy as np
 import pytest
 
-from hybrid_mpc.artifact import (
+from hybrid_mpc import (
+    Calibration,
+    Detector,
+    InputError,
     Provenance,
-    read_description,
+    load_scenario,
     set_calibration,
     set_process_noise,
-    write_description,
 )
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.monitor import Calibration, Detector
+from hybrid_mpc.artifact import read_description, write_description
 from hybrid_mpc.pipeline.control_job import (
     ControlSettings,
     parsed_fault,
@@ -24,7 +25,6 @@ from hybrid_mpc.pipeline.control_job import (
     selected_tasks,
 )
 from hybrid_mpc.records import record
-from hybrid_mpc.scenario import load_scenario
 
 GOLF = load_scenario("golf_robot")
 SIGMA = {name: [1e-4, 2e-2] for name in ("prior", "prior_observer", "hybrid", "hybrid_observer", "oracle")}

@@ -2,9 +2,8 @@
 
 import pytest
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError, RunSettings
 from hybrid_mpc.pipeline.devices import check_device
-from hybrid_mpc.pipeline.settings import RunSettings
 from hybrid_mpc.reproduction.settings import ReproductionSettings
 
 

@@ -7,13 +7,12 @@ import pytest
 from cart import recording as cart_recording
 from cart import written
 
+from hybrid_mpc import InputError, load_scenario
 from hybrid_mpc.cli.progress import Bars, Lines
-from hybrid_mpc.errors import InputError
 from hybrid_mpc.pipeline import identify
 from hybrid_mpc.pipeline import run as job
 from hybrid_mpc.pipeline.context import Silent
 from hybrid_mpc.pipeline.machine_benchmark.job import BenchmarkSettings, _read
-from hybrid_mpc.scenario import load_scenario
 
 from .conftest import recording, write
 
@@ -176,7 +175,7 @@ def measured_with_findings(tmp_path):
 from dataclasses import replace
 from pathlib import Path
 from hybrid_mpc import DataSpec, Signal
-from hybrid_mpc.data import load_trajectories
+from hybrid_mpc import load_trajectories
 from scenarios.pendulum import scenario
 spec = DataSpec("time_s", ("tau_nm",), ("phi_rad",), dt=0.02, max_gap=0.05, smoothing=0.2, warm_up=0.2)
 

@@ -5,7 +5,8 @@ import shutil
 
 import pytest
 
-from hybrid_mpc.errors import InputError, StorageError
+from hybrid_mpc import InputError
+from hybrid_mpc.errors import StorageError
 from hybrid_mpc.pipeline import run as job
 from hybrid_mpc.pipeline.context import STAGES, failed_stages
 

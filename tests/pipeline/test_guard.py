@@ -9,22 +9,28 @@ import numpy as np
 import pytest
 from closed_loop_parts import loop_row
 
-from hybrid_mpc.artifact import load, set_calibration, set_process_noise
-from hybrid_mpc.closed_loop import Fault
-from hybrid_mpc.data import write_csv
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.job.loops import Bench
+from hybrid_mpc import (
+    Bench,
+    Calibration,
+    Detector,
+    Fault,
+    InputError,
+    Plausibility,
+    RunSettings,
+    load,
+    load_scenario,
+    set_calibration,
+    set_process_noise,
+    write_csv,
+)
 from hybrid_mpc.job.rounds import repeated
-from hybrid_mpc.monitor import Calibration, Detector, Plausibility
 from hybrid_mpc.pipeline import guard_job, nominal_loops
 from hybrid_mpc.pipeline.contest import keep, kept
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.guard_job import guard_stage, learned
 from hybrid_mpc.pipeline.guard_report import guard_figures, guard_results, guard_tables, guard_words
-from hybrid_mpc.pipeline.settings import RunSettings
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.report.schema import SCHEMA, _check
-from hybrid_mpc.scenario import load_scenario
 from scenarios.golf_robot.rig import Rig
 
 GOLF = load_scenario("golf_robot")

@@ -6,10 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError, Scaling, TrainingSettings
 from hybrid_mpc.identification import training
-from hybrid_mpc.identification.settings import TrainingSettings
-from hybrid_mpc.identification.step import Scaling
 from hybrid_mpc.identification.trained import Fault, Trained
 from hybrid_mpc.pipeline.identify import _train_kind, load_trained
 from hybrid_mpc.pipeline.trained_files import is_trained, save_trained

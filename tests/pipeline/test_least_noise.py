@@ -6,10 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hybrid_mpc.artifact import Kit, LoopSettings, Provenance
+from hybrid_mpc import Kit, LoopSettings, Provenance, find_noise, load_scenario
 from hybrid_mpc.job import contenders
-from hybrid_mpc.job.contenders import find_noise
-from hybrid_mpc.scenario import load_scenario
 from scenarios.golf_robot import scenario
 
 OWN = {"prior": np.array([1e-3, 2e-2]), "hybrid": np.array([4e-4, 3e-2])}

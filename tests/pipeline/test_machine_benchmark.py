@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from cart import DELAY, TRUE, recording, written
 
-from hybrid_mpc.benchmark_spec import BenchmarkBudget
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import BenchmarkBudget, InputError, load_scenario
 from hybrid_mpc.files import read_document, write_document
 from hybrid_mpc.identification.dataset import cut_windows
 from hybrid_mpc.pipeline.machine_benchmark import networks
@@ -17,7 +16,6 @@ from hybrid_mpc.pipeline.machine_benchmark.job import BenchmarkSettings, benchma
 from hybrid_mpc.pipeline.machine_benchmark.physics import fit_physics, shifted
 from hybrid_mpc.pipeline.machine_benchmark.recordings import read_test, read_training
 from hybrid_mpc.pipeline.machine_benchmark.store import load_model
-from hybrid_mpc.scenario import load_scenario
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from hybrid_mpc.artifact import Provenance, read_description, write_description
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.studies import run_study
+from hybrid_mpc import InputError, Provenance, run_study
+from hybrid_mpc.artifact import read_description, write_description
 from hybrid_mpc.studies.files import read_study
 from tests.trivial_runs import stand_in, study, trivial
 

@@ -5,8 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hybrid_mpc.data.trajectories import Trajectory
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError, Trajectory
 from hybrid_mpc.pipeline import observers
 from hybrid_mpc.pipeline.observers import JUDGED_PERIODS, JUDGED_RECORDINGS, estimation_stage, judged_parts
 from hybrid_mpc.pipeline.results import _estimation

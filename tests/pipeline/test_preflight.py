@@ -8,11 +8,21 @@ import numpy as np
 import pytest
 import torch
 
-from hybrid_mpc import OCP, Budget, DataSpec, Parameter, Prior, Scenario, Signal
-from hybrid_mpc.closed_loop import Fault
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import (
+    OCP,
+    Budget,
+    DataSpec,
+    Fault,
+    InputError,
+    Parameter,
+    Prior,
+    Scenario,
+    Signal,
+    Task,
+    load_scenario,
+)
 from hybrid_mpc.pipeline.preflight import check_scenario
-from hybrid_mpc.scenario import Task, load_scenario, registered_scenarios
+from hybrid_mpc.scenario import registered_scenarios
 
 
 class Pendulum(Prior):

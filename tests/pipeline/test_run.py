@@ -12,8 +12,7 @@ import time
 import numpy as np
 import pytest
 
-from hybrid_mpc import load
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError, load
 from hybrid_mpc.report.schema import validate_results
 
 

@@ -9,16 +9,15 @@ from pathlib import Path
 
 import pytest
 
+from hybrid_mpc import InputError, RunSettings, SearchSpace, load_scenario
 from hybrid_mpc.cli import main
-from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import LOCK
-from hybrid_mpc.identification.search_space import SearchSpace, parsed_space
+from hybrid_mpc.identification.search_space import parsed_space
 from hybrid_mpc.job.folder import open_folder
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.identify import training_settings
 from hybrid_mpc.pipeline.search_job import SearchSettings, usage
-from hybrid_mpc.pipeline.settings import RunSettings, claim, read_network
-from hybrid_mpc.scenario import load_scenario
+from hybrid_mpc.pipeline.settings import claim, read_network
 
 pytestmark = pytest.mark.full  # these share one search of 20 s
 PNG = b"\x89PNG"

@@ -6,21 +6,26 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from hybrid_mpc.artifact import load, read_description, save_artifact, set_process_noise, write_description
+from hybrid_mpc import (
+    OCP,
+    DataSpec,
+    InputError,
+    RunSettings,
+    Scenario,
+    load,
+    save_artifact,
+    set_process_noise,
+    write_csv,
+)
+from hybrid_mpc.artifact import read_description, write_description
 from hybrid_mpc.cli.main import app
-from hybrid_mpc.data import write_csv
-from hybrid_mpc.data_spec import DataSpec
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.mpc import OCP
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.figures import _monitor as monitor_figures
 from hybrid_mpc.pipeline.guard_job import guard_stage
 from hybrid_mpc.pipeline.guard_report import guard_figures, guard_results, guard_tables, guard_words
 from hybrid_mpc.pipeline.judge import monitor_stage
 from hybrid_mpc.pipeline.results import _monitor as monitor_results
-from hybrid_mpc.pipeline.settings import RunSettings
 from hybrid_mpc.report.schema import SCHEMA, _check
-from hybrid_mpc.scenario import Scenario
 
 AXIS = """
 from hybrid_mpc import Prior, Parameter, Signal
@@ -75,8 +80,7 @@ QUICK = Machine(dt=1e-3, speed=0.1, swing=0.5, noise=1e-7)
 
 def context(machine, samples, out, warm_up):
     """A run that has come to stage monitor: its model is the prior that made the recordings."""
-    from hybrid_mpc.identification.export import model_info, trace_model
-    from hybrid_mpc.identification.step import PriorStep
+    from hybrid_mpc import PriorStep, model_info, trace_model
 
     room = {}
     exec(machine.source, room)

@@ -6,10 +6,9 @@ import re
 import numpy as np
 import pytest
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError, Signal
+from hybrid_mpc.plots import save
 from hybrid_mpc.plots.reproduction import LOOKS, errors_over_sequences, shown_free_run
-from hybrid_mpc.plots.style import save
-from hybrid_mpc.signals import Signal
 
 
 def curve(mean, diverged=(0, 0)):

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError
 from hybrid_mpc.plots.search import STATES, history, settings
 
 ROWS = [

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError
 from hybrid_mpc.plots import save
 from hybrid_mpc.plots.tasks import CONTROLLERS, costs, strokes
 

@@ -8,13 +8,22 @@ from pathlib import Path
 
 import numpy as np
 
+from hybrid_mpc import Signal
 from hybrid_mpc.monitor import MonitorTrace
-from hybrid_mpc.plots import analysis, data, estimation, fit, loops, monitor, save, training
-from hybrid_mpc.plots.monitor_trace import overview
-from hybrid_mpc.plots.style import name_of
+from hybrid_mpc.plots import (
+    analysis,
+    data,
+    estimation,
+    fit,
+    loops,
+    monitor,
+    name_of,
+    overview,
+    save,
+    training,
+)
 from hybrid_mpc.report import KeyFigure, Report, Section, Table, write_report
 from hybrid_mpc.report.texts import TITLES, paragraphs
-from hybrid_mpc.signals import Signal
 
 STATES = (Signal("phi", "rad"), Signal("phi_dot", "rad/s"))
 INPUTS = (Signal("tau", "N m"),)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError
 from hybrid_mpc.report import KeyFigure, Report, Section, Table, write_report
 from hybrid_mpc.report.page import render
 from hybrid_mpc.report.texts import TEXTS, TITLES

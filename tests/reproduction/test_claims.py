@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from hybrid_mpc.reproduction.claims import Claim
+from hybrid_mpc import Claim
 from hybrid_mpc.reproduction.table import Divergence, Network, Row, Table
 
 AWAY = Divergence("test_01", 7, 0.14, 2)

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from hybrid_mpc.identification.evaluation import FreeRun, free_runs, stacked_free_runs
-from hybrid_mpc.identification.settings import TrainingSettings
-from hybrid_mpc.identification.training import train
+from hybrid_mpc import TrainingSettings, free_runs, train
+from hybrid_mpc.identification.evaluation import FreeRun, stacked_free_runs
 from hybrid_mpc.reproduction.judging import BEYOND, converged_steps, divergence, judged_network
 from scenarios.pendulum.data import exact_runs
 from scenarios.pendulum.prior import PublishedPendulumPrior

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.identification.step import PriorStep
+from hybrid_mpc import InputError, PriorStep
 from hybrid_mpc.reproduction import run as run_module
 from hybrid_mpc.reproduction.outputs import SCHEMA_VERSION, read_results, table_of, text_table
 from hybrid_mpc.reproduction.run import reproduce

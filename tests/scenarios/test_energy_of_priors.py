@@ -5,8 +5,7 @@ import pytest
 import torch
 from energy_checks import check_energy_balance, random_values, scenario_priors
 
-from hybrid_mpc.physics import Prior
-from hybrid_mpc.signals import Parameter, Signal
+from hybrid_mpc import Parameter, Prior, Signal
 
 PRIORS = scenario_priors()
 

@@ -6,10 +6,8 @@ from functools import partial
 import numpy as np
 import pytest
 
+from hybrid_mpc import InputError, Window, load_trajectories, write_csv
 from hybrid_mpc.cli.data import readme, write_data
-from hybrid_mpc.data import load_trajectories, write_csv
-from hybrid_mpc.data_spec import Window
-from hybrid_mpc.errors import InputError
 from scenarios.golf_robot import scenario
 from scenarios.torque_pendulum import scenario as torque_pendulum
 

@@ -5,12 +5,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from hybrid_mpc.assembly import make_estimator, make_ocp
-from hybrid_mpc.closed_loop import Fault, simulate
+from hybrid_mpc import (
+    CondensedController,
+    Fault,
+    InputError,
+    SafeController,
+    make_estimator,
+    make_ocp,
+    simulate,
+)
 from hybrid_mpc.closed_loop.faults import install
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.mpc.condensed import CondensedController
-from hybrid_mpc.mpc.safeguard import SafeController
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.faults import catalogue, fault_case
 from scenarios.golf_robot.rig import Rig
@@ -40,7 +44,7 @@ def linear_model():
     """The pendulum of the published parameters without dry friction: enough to close a loop."""
     import casadi as ca
 
-    from hybrid_mpc.model import HybridModel
+    from hybrid_mpc import HybridModel
     from scenarios.golf_robot.nominal import GEAR, INPUTS, OUTPUTS, PARAMETERS, STATES
 
     p = {spec.name: spec.value for spec in PARAMETERS}

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError
 from scenarios.golf_robot.dynamics import (
     LOSSES,
     N_STATES,

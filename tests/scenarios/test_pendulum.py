@@ -8,10 +8,8 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from hybrid_mpc.data import load_trajectories
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError, Scenario, load_scenario, load_trajectories
 from hybrid_mpc.report.schema import validate_results
-from hybrid_mpc.scenario import Scenario, load_scenario
 from scenarios.pendulum import scenario
 from scenarios.pendulum.data import (
     AMPLITUDE,

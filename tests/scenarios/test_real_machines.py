@@ -10,9 +10,7 @@ import pytest
 import torch
 from energy_checks import check_energy_balance
 
-from hybrid_mpc.data import write_csv
-from hybrid_mpc.data.trajectories import Trajectory
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError, Trajectory, write_csv
 from hybrid_mpc.identification.step import required_substeps
 from hybrid_mpc.pipeline.machine_benchmark.recordings import in_turn, read_test, read_training
 from scenarios.emps import NEWTON_PER_VOLT

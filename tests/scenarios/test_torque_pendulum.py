@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from hybrid_mpc.data import load_trajectories, write_csv
-from hybrid_mpc.scenario import Scenario
+from hybrid_mpc import Scenario, load_trajectories, write_csv
 from scenarios.torque_pendulum import WINDOWS, scenario
 from scenarios.torque_pendulum.prior import TorquePendulumPrior
 

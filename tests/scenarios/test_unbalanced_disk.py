@@ -8,14 +8,19 @@ import numpy as np
 import pytest
 import torch
 
-from hybrid_mpc.artifact import load, save_artifact
-from hybrid_mpc.assembly import make_controller, make_estimator
-from hybrid_mpc.closed_loop import simulate
-from hybrid_mpc.data import load_trajectories
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.identification.export import model_info, trace_model
-from hybrid_mpc.identification.step import PriorStep
-from hybrid_mpc.scenario import load_scenario
+from hybrid_mpc import (
+    InputError,
+    PriorStep,
+    load,
+    load_scenario,
+    load_trajectories,
+    make_controller,
+    make_estimator,
+    model_info,
+    save_artifact,
+    simulate,
+    trace_model,
+)
 from scenarios.unbalanced_disk import data, scenario
 from scenarios.unbalanced_disk.dynamics import DiskParameters
 from scenarios.unbalanced_disk.nominal import DT, INPUTS, OUTPUTS

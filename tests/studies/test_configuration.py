@@ -6,11 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybrid_mpc.closed_loop import Fault
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import Fault, FaultKind, InputError, LoopSpec, RandomFaults, Study, varied
 from hybrid_mpc.job.contenders import CONTENDERS
-from hybrid_mpc.job.loops import varied
-from hybrid_mpc.studies import FaultKind, LoopSpec, RandomFaults, Study
 from hybrid_mpc.studies.draws import generator
 from hybrid_mpc.studies.files import read_study
 from hybrid_mpc.studies.ready import READY, ready_study

@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError
 from hybrid_mpc.studies import log as log_module
 from hybrid_mpc.studies.log import RunLog, rows, segments
 from hybrid_mpc.studies.table import compact, provenance_of

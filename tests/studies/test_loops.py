@@ -6,20 +6,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybrid_mpc.artifact import (
+from hybrid_mpc import (
+    Calibration,
+    FaultKind,
+    InputError,
     Provenance,
-    read_description,
+    RandomFaults,
+    Study,
+    dry_run,
+    load_scenario,
+    run_study,
     set_calibration,
     set_process_noise,
-    write_description,
 )
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.monitor import Calibration
+from hybrid_mpc.artifact import read_description, write_description
 from hybrid_mpc.pipeline.context import Silent
 from hybrid_mpc.pipeline.control_job import ControlSettings, prepared, run_loops
-from hybrid_mpc.scenario import load_scenario
-from hybrid_mpc.studies import FaultKind, RandomFaults, Study, run_study
-from hybrid_mpc.studies.dry_run import dry_run
 from hybrid_mpc.studies.inputs import TIMING, load_inputs
 
 GOLF = load_scenario("golf_robot")

@@ -10,12 +10,10 @@ import numpy as np
 import pytest
 import trivial_runs
 
-from hybrid_mpc import load
+from hybrid_mpc import Bench, Detector, InputError, LoopSpec, load
 from hybrid_mpc.cli import main
 from hybrid_mpc.closed_loop.faults import install
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.job.loops import Bench, LoopSpec
-from hybrid_mpc.monitor import METHODS, Detector, Judges
+from hybrid_mpc.monitor import METHODS, Judges
 from hybrid_mpc.studies import monitor_study as room
 from hybrid_mpc.studies.inputs import run_batch
 from hybrid_mpc.studies.monitor_plan import CASES, LoopPlan, MonitorStudy, monitor_study

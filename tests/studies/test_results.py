@@ -7,11 +7,9 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc import InputError, StudyResults, run_study, write_study_report
 from hybrid_mpc.plots import studies as plots
-from hybrid_mpc.studies import StudyResults, run_study
 from hybrid_mpc.studies.note import ModelNote, NoiseNote, StudyNote
-from hybrid_mpc.studies.report import write_study_report
 from hybrid_mpc.studies.table import intact
 from tests.trivial_runs import stand_in, study, trivial
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import trivial_runs
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.studies import StudyResults, run_study, runner
+from hybrid_mpc import InputError, StudyResults, run_study
+from hybrid_mpc.studies import runner
 from hybrid_mpc.studies.log import RunLog, rows
 from hybrid_mpc.studies.note import read_note, write_note
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc import Trajectory
 from scenarios.pendulum.experiment import SET, runs
 
 

@@ -14,15 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
+from hybrid_mpc import Scaling, load_scenario
 from hybrid_mpc.files import read_arrays, read_json
 from hybrid_mpc.identification.evaluation import stacked_free_runs
-from hybrid_mpc.identification.step import Scaling
 from hybrid_mpc.identification.trained import Trained
 from hybrid_mpc.pipeline.context import Silent
 from hybrid_mpc.reproduction.jobs import Case
 from hybrid_mpc.reproduction.run import Work
 from hybrid_mpc.reproduction.settings import ReproductionSettings, case_key, experiment_of
-from hybrid_mpc.scenario import load_scenario
 
 EDGES = (0.0, 0.05, 0.5, 2.0, np.inf)
 MODELS = ("pgrnn", "mopgrnn")

@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
+from hybrid_mpc import load_scenario
 from hybrid_mpc.files import read_json
 from hybrid_mpc.pipeline.context import Silent
 from hybrid_mpc.reproduction.jobs import ensemble_job, fit_job
 from hybrid_mpc.reproduction.run import Work, record_stage
 from hybrid_mpc.reproduction.settings import ReproductionSettings, case_key, experiment_of
-from hybrid_mpc.scenario import load_scenario
 
 DATA_SET, COUNT = "b", 15
 
