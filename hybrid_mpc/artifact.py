@@ -126,6 +126,19 @@ class LoopSettings:
         sigmas = self.sensor_sigma, self.first_sigma or (), *self.process_noise.values()
         if not all(0 <= sigma < math.inf for values in sigmas for sigma in values):
             raise InputError("loop: standard deviations must be finite and not negative")
+        for name, problem in self.control.items():
+            if self.safe_input is not None and not _within(self.safe_input, problem):
+                raise InputError(
+                    f"safe_input {self.safe_input} is outside the limits {problem.u_min} to {problem.u_max} of the control "
+                    f"problem of {name or 'all tasks'}"
+                )
+
+
+def _within(u: tuple[float, ...], problem: OCP) -> bool:
+    """Whether an input fits a problem's number of inputs and their limits."""
+    return len(u) == problem.n_u and all(
+        low <= value <= high for value, low, high in zip(u, problem.u_min, problem.u_max, strict=True)
+    )
 
 
 @dataclass(frozen=True)
@@ -282,8 +295,7 @@ class Kit:
         Args:
             scenario: The machine.
         """
-        stated = loop_settings(scenario, self.loop.process_noise)
-        return replace(self, loop=replace(stated, safe_input=self.loop.safe_input))
+        return replace(self, loop=loop_settings(scenario, self.loop.process_noise))
 
     def problem(self, task: str = "") -> OCP:
         """The control problem of a task.
@@ -452,8 +464,9 @@ def loop_settings(
     problems = {"": scenario.control} | {task.name: task.control for task in scenario.tasks}
     given = {name: problem for name, problem in problems.items() if problem is not None}
     return LoopSettings(
-        given, scenario.sensor_sigma, scenario.first_sigma, dict(process_noise or {}), dict(scenario.causes)
-    )
+        given, scenario.sensor_sigma, scenario.first_sigma, dict(process_noise or {}), dict(scenario.causes),
+        scenario.safe_input,
+    )  # fmt: skip
 
 
 def set_calibration(folder: Path, calibration: Calibration) -> None:

@@ -145,6 +145,8 @@ class Scenario:
             estimator's start. Default: ``sqrt(2) sensor_sigma / dt``, what the first two samples tell of speeds: a
             start at rest then counts as much as they do, and after five samples of a start in motion it has 5 % of the
             weight.
+        safe_input: Input ``(n_u,)`` [input units] that the machine is left with when a loop ends or the sensor is lost
+            for good. Default: zero, or the limit next to it; a machine that would fall or run away needs its own.
         tasks: Closed-loop tasks.
         budgets: Effort by name.
         draw: ``x (n_x,) -> polylines (m, 2) [m]`` of the machine, for moving pictures; default: none.
@@ -173,6 +175,7 @@ class Scenario:
     control: OCP | None = None
     sensor_sigma: tuple[float, ...] = ()
     first_sigma: tuple[float, ...] | None = None
+    safe_input: tuple[float, ...] | None = None
     tasks: tuple[Task, ...] = ()
     budgets: Mapping[str, Budget] = field(default_factory=lambda: DEFAULT_BUDGETS)
     draw: Callable[[Array], Sequence[Array]] | None = None

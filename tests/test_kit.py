@@ -26,8 +26,7 @@ from hybrid_mpc import (
     set_process_noise,
     simulate,
 )
-from hybrid_mpc.artifact import read_description, write_description
-from hybrid_mpc.pipeline.deploy import loop_settings
+from hybrid_mpc.artifact import loop_settings, read_description, write_description
 
 README = Path(__file__).parents[1] / "README.md"
 GOLF = load_scenario("golf_robot")
@@ -83,6 +82,21 @@ def test_every_part_is_made_from_the_folder(run, tmp_path):
     assert kit.problem(limited.name) == limited.control
     assert kit.problem("another") == GOLF.control
     assert kit.controller(task=limited.name).controller.ocp.u_max == limited.control.u_max
+
+
+def test_the_safe_input_is_the_scenario_s(run):
+    kit = hm.load(run)
+    np.testing.assert_array_equal(kit.on(replace(GOLF, safe_input=(0.1,))).safe_input, [0.1])
+    for wrong in ((9.0,), (0.0, 0.0), (np.nan,)):
+        with pytest.raises(hm.InputError, match="outside the limits"):
+            kit.on(replace(GOLF, safe_input=wrong))
+
+
+def test_a_scenario_s_problem_is_taken_as_it_now_is(run):
+    kit = hm.load(run).on(replace(GOLF, control=GOLF.control.changed(horizon=7), sensor_sigma=(2e-3,)))
+    assert kit.controller().controller.ocp.horizon == 7
+    assert kit.sensor_sigma == (2e-3,)
+    np.testing.assert_array_equal(kit.noise("hybrid"), NOISE["hybrid"])  # learned, so the model's
 
 
 def test_a_guarded_loop(run):

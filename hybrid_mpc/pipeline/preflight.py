@@ -6,13 +6,14 @@ import math
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_mpc.artifact import loop_settings
 from hybrid_mpc.closed_loop.faults import check_channels, install
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.model import HybridModel
@@ -272,6 +273,8 @@ def _check_control(
     _check_sensors(report, scenario, prior)
     _check_problem(report, scenario, "control", control, prior, model)
     built = {_structure(control)}
+    with report.part("safe_input"):
+        loop_settings(replace(scenario, sensor_sigma=(), first_sigma=None))
     for task in scenario.tasks:
         if task.control is not None:  # a controller is built once for all that differ in numbers alone
             new = _structure(task.control) not in built
