@@ -159,6 +159,7 @@ class HybridModel:
         p: Expression | None = None,
         rate: Expression | None = None,
         energy: Expression | None = None,
+        with_jacobian: ca.Function | None = None,
         disturbances: Sequence[Signal] = (),
         nominal_w: Sequence[float] = (),
         parameters: Sequence[Parameter] = (),
@@ -182,6 +183,7 @@ class HybridModel:
             p: Symbol of the parameters ``(n_p,)``. Default: there are none.
             rate: Symbol ``(n_x,)`` of any rate of the state, for ``energy``.
             energy: Residual [W] of the balance of energy if the state changes at ``rate``. Default: no balance.
+            with_jacobian: See :class:`HybridModel`.
             disturbances: Signals of ``w``.
             nominal_w: See :class:`HybridModel`.
             parameters: The parameters ``p``.
@@ -213,7 +215,7 @@ class HybridModel:
             name, dt, tuple(states), tuple(inputs), tuple(outputs),
             step=function("step", point, [x_next, h if h_next is None else h_next], [*STEP_INPUTS], [*STEP_OUTPUTS]),
             xdot=function("xdot", point, [xdot]),
-            output=function("output", [x, u, w, p], [y]),
+            output=function("output", [x, u, w, p], [y]), with_jacobian=with_jacobian,
             disturbances=tuple(disturbances), nominal_w=tuple(nominal_w), parameters=tuple(parameters),
             balances=()
             if energy is None
@@ -302,6 +304,38 @@ def longer_period(model: HybridModel, periods: int) -> HybridModel:
         with_jacobian=step_function("with_jacobian", point, [*by_jacobian, ca.densify(a), ca.densify(b)]),
         side_by_side=None,  # that of the model knows one of its own periods only
     )
+
+
+def prior_acceleration(model: HybridModel, prior: HybridModel | None = None) -> ca.Function:
+    """``(x, u, w, p) -> a`` ``(n_q,)``: what the prior behind a model says, without what a network adds.
+
+    Args:
+        model: The model, state ``[q, v]``.
+        prior: Model of its prior alone. Default: the model itself, where it has no network.
+
+    Raises:
+        InputError: If the model has a network and no prior is given, the two have other parameters, or there are none.
+
+    Example:
+        ``prior_acceleration(kit.models["hybrid"], kit.models["prior"])``
+    """
+    if prior is None:
+        if model.n_h > model.waiting:
+            raise InputError(
+                f"model {model.name} has a network, and its parameters are those of its prior: give prior=, the model "
+                'of the prior alone, e.g. kit.models["prior"]'
+            )
+        prior = model
+    if prior.parameters != model.parameters or not model.n_p:
+        own, other = ([p.name for p in m.parameters] for m in (model, prior))
+        raise InputError(
+            f"model {model.name} has the parameters {own} and its prior {prior.name} {other}: parameters, the same of "
+            "both, are needed, as models have that are made of programs of one artifact (hybrid-mpc run)"
+        )
+    n_q, point = prior.n_x // 2, step_symbols(prior)
+    x, _, u, w, p = point
+    a = prior.xdot(x, ca.DM.zeros(prior.n_h), u, w, p)[n_q : 2 * n_q]
+    return ca.Function("acceleration", [x, u, w, p], [ca.densify(a)])
 
 
 def step_symbols(model: HybridModel) -> list[ca.MX]:

@@ -94,7 +94,7 @@ def faulted(
     assert control is not None
     start = model.dt * round(0.5 * task.duration / model.dt)
     estimator, controller = build(CONTENDER, scenario, artifact, control, noise)
-    diagnose = model.parametric is not None
+    diagnose = model.n_p > 0
     rows: list[dict[str, Any]] = []
     arrays: dict[str, Array] = {}
     for case in cases(scenario):
@@ -105,7 +105,10 @@ def faulted(
             guard=make_resting_guard(model), faults=(*task.faults, Fault(start, math.inf, case.target, case.value)),
         )  # fmt: skip
         # The estimator is deterministic: over the record it says again what it said in the loop.
-        trace, alarms = explained(monitor, estimator, Samples(result.t, result.y, result.u), scenario.causes)
+        recording = Samples(result.t, result.y, result.u)
+        trace, alarms = explained(
+            monitor, estimator, recording, scenario.causes, prior=artifact.models["prior"]
+        )
         rows.append({**_told(case, task.name, start, trace, alarms), "switches": switches(result)})
         arrays |= kept(case.name, trace, result.y)
     return rows, arrays

@@ -232,7 +232,7 @@ def _recorded(
     if detector is None:
         monitor = make_monitor(model, calibration)
     else:
-        diagnose = model.parametric is not None
+        diagnose = model.n_p > 0
         monitor = guard_monitor(model, detector, **freezing(context.scenario, control), diagnose=diagnose)
     estimator = make_estimator(model, context.scenario, noise(context)[CONTENDER])
     tested = [r for r in context.dataset.whole if clean_windows(context, r, ("test",))]
@@ -240,7 +240,9 @@ def _recorded(
     arrays: dict[str, Array] = {}
     watched, starts = 0.0, 0
     for recording, say in along(tested, context.progress.update):
-        trace, alarms = explained(monitor, estimator, recording, context.scenario.causes, say)
+        trace, alarms = explained(
+            monitor, estimator, recording, context.scenario.causes, say, prior=artifact.models["prior"]
+        )
         found += [{"file": recording.name, **alarm} for alarm in alarms]
         edges = np.diff(trace.alarm.astype(int), prepend=0) == 1
         for window in clean_windows(context, recording, ("test",)):
