@@ -202,7 +202,9 @@ class HybridModel:
         rates = type(x).sym("rate", x.shape[0]) if rate is None else rate
         point = [x, h, u, w, p]
 
-        def function(key: str, given: list[Expression], values: list[Expression], *names: list[str]) -> ca.Function:
+        def function(
+            key: str, given: list[Expression], values: list[Expression], *names: list[str]
+        ) -> ca.Function:
             try:
                 return ca.Function(key, given, [ca.densify(v) for v in values], *names)
             except RuntimeError as error:

@@ -129,7 +129,9 @@ def linearize_secant(
         e = np.eye(model.n_x)[n_q + j]
 
         def after(w: float, e: Array = e) -> Array:
-            return np.concatenate([m.full().ravel() for m in model.step(x0 + w * e, h0, u0, model.w, model.p)])
+            return np.concatenate(
+                [m.full().ravel() for m in model.step(x0 + w * e, h0, u0, model.w, model.p)]
+            )
 
         a[:, n_q + j] = np.reshape(_chord(after, v, kind), n_z)
     return control_toolbox().ss(a, b, c, d, model.dt, remove_useless_states=False, **signal_names(model))

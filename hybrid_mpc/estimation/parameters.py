@@ -194,7 +194,9 @@ def _check_model(model: HybridModel) -> None:
     x, h, u, w, p = step_symbols(model)
     n_q = model.n_x // 2
     slope = ca.jacobian(model.xdot(x, h, u, w, p)[:n_q], ca.vertcat(x, u))
-    found = ca.Function("kinematics", [x, h, u], [ca.substitute(slope, ca.vertcat(w, p), np.append(model.w, model.p))])
+    found = ca.Function(
+        "kinematics", [x, h, u], [ca.substitute(slope, ca.vertcat(w, p), np.append(model.w, model.p))]
+    )
     if model.n_x % 2 or not np.array_equal(found(0, 0, 0).full(), np.eye(n_q, model.n_x + model.n_u, n_q)):
         raise InputError(
             f"parameter states: the states {[s.name for s in model.states]} of model {model.name} are not positions "

@@ -221,7 +221,12 @@ def watched(
 ) -> tuple[MonitorTrace, list[dict[str, Any]]]:
     """Trace of a recording, and its alarms with what explains them (empty where nothing can say)."""
     return explained(
-        job.monitor, job.estimator, recording, job.scenario.causes, on_progress, prior=job.artifact.models.get("prior")
+        job.monitor,
+        job.estimator,
+        recording,
+        job.scenario.causes,
+        on_progress,
+        prior=job.artifact.models.get("prior"),
     )
 
 

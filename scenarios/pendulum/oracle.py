@@ -41,5 +41,16 @@ def oracle(dt: float, parameters: PendulumParameters | None = None, sub_steps: i
     m, length, d, g = (published[name] for name in ("m", "l", "d", "g"))
     torque = m * length**2 * rate[1] + m * g * length * ca.sin(x[0]) + d * x[1] - u
     return HybridModel.of(
-        "oracle", dt, STATES, INPUTS, OUTPUTS, x=x, u=u, x_next=z, xdot=rates(x), y=x[0], rate=rate, energy=x[1] * torque
+        "oracle",
+        dt,
+        STATES,
+        INPUTS,
+        OUTPUTS,
+        x=x,
+        u=u,
+        x_next=z,
+        xdot=rates(x),
+        y=x[0],
+        rate=rate,
+        energy=x[1] * torque,
     )
