@@ -521,15 +521,16 @@ def load(folder: str | Path) -> Kit:
 
 def build_model(name: str, programs: Mapping[str, nn_export.Program], info: ModelInfo) -> HybridModel:
     """The :class:`HybridModel` of ``programs["<name>/step"]`` and its siblings, with the input's delay."""
-    functions = {f: nn_export.build(programs[f"{name}/{f}"], f) for f in FUNCTIONS}
+    step, xdot, output = (nn_export.build(programs[f"{name}/{f}"], f) for f in FUNCTIONS)
     balances = tuple(
         Balance(b.name, b.unit, b.rate_unit, nn_export.build(programs[f"{name}/{b.program}"], BALANCE))
         for b in info.balances
     )
-    step = programs[f"{name}/step"]
+    program = programs[f"{name}/step"]
     model = HybridModel(
-        name, info.dt, info.states, info.inputs, info.outputs, **functions,
-        with_jacobian=nn_export.with_jacobian(step, JACOBIANS), side_by_side=partial(nn_export.SideBySide, step),
+        name, info.dt, info.states, info.inputs, info.outputs, step, xdot, output,
+        with_jacobian=nn_export.with_jacobian(program, JACOBIANS),
+        side_by_side=partial(nn_export.SideBySide, program),
         disturbances=info.disturbances, nominal_w=info.nominal_w, parameters=info.parameters,
         covariance=info.covariance, balances=balances, time_unit=info.time_unit,
     )  # fmt: skip

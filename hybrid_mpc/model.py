@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -15,11 +15,12 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.signals import Parameter, Signal
 
 Array = NDArray[np.float64]
-Expression: TypeAlias = ca.MX | ca.SX
+Expression: TypeAlias = Any
+"""A CasADi expression, of MX or of SX."""
 ManyPoints: TypeAlias = Callable[..., tuple[Array, ...]]
 """``(x, h, u, w, p)``, each ``(n, size)``, to ``(x_next, h_next)`` and Jacobians ``(n, n_z, columns)``."""
 SideBySide: TypeAlias = Callable[[int, Mapping[str, Sequence[str]]], ManyPoints]
-"""Makes such a function: from ``n`` and, for each Jacobian, those of ``x, h, u`` that it is by, ``{"A": ("x", "h")}``."""
+"""Makes such a function: from ``n`` and, for each Jacobian, which of ``x, h, u`` it is by, ``{"A": ("x", "h")}``."""
 STEP_INPUTS = ("x", "h", "u", "w", "p")
 STEP_OUTPUTS = ("x_next", "h_next")
 
@@ -194,7 +195,8 @@ class HybridModel:
         Example:
             >>> x, u = ca.MX.sym("x"), ca.MX.sym("u")
             >>> level = (Signal("x", "m"),)
-            >>> tank = HybridModel.of("tank", 1.0, level, (Signal("u", "m/s"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
+            >>> tank = HybridModel.of(
+            ...     "tank", 1.0, level, (Signal("u", "m/s"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
             >>> tank.n_h, float(tank.step(0.5, [], 0.25, tank.w, tank.p)[0])
             (0, 0.75)
         """
@@ -202,20 +204,18 @@ class HybridModel:
         rates = type(x).sym("rate", x.shape[0]) if rate is None else rate
         point = [x, h, u, w, p]
 
-        def function(
-            key: str, given: list[Expression], values: list[Expression], *names: list[str]
-        ) -> ca.Function:
+        def function(key: str, given: list[Expression], values: list[Expression]) -> ca.Function:
             try:
-                return ca.Function(key, given, [ca.densify(v) for v in values], *names)
+                return ca.Function(key, given, [ca.densify(v) for v in values])
             except RuntimeError as error:
                 raise InputError(
-                    f"model {name}: no function {key} of {', '.join(map(str, given))} can be made of its expression: "
-                    f"{str(error).strip().splitlines()[-1]}"
+                    f"model {name}: {key} must be an expression of the symbols given (x, u; h, w, p, rate where there "
+                    f"are any): {str(error).strip().splitlines()[-1]}"
                 ) from error
 
         return cls(
             name, dt, tuple(states), tuple(inputs), tuple(outputs),
-            step=function("step", point, [x_next, h if h_next is None else h_next], [*STEP_INPUTS], [*STEP_OUTPUTS]),
+            step=function("step", point, [x_next, h if h_next is None else h_next]),
             xdot=function("xdot", point, [xdot]),
             output=function("output", [x, u, w, p], [y]), with_jacobian=with_jacobian,
             disturbances=tuple(disturbances), nominal_w=tuple(nominal_w), parameters=tuple(parameters),

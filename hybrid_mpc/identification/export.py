@@ -170,10 +170,13 @@ def check_parity(
     *,
     seed: int,
 ) -> Parity:
-    """Measure the exported step, at its nominal parameters, against torch on random and extreme inputs of the trajectories' magnitude."""
+    """Measure the exported step against torch on random and extreme inputs of the trajectories' magnitude.
+
+    The step's parameters are the fitted ones.
+    """
     model = build_model("m", {f"m/{name}": program for name, program in programs.items()}, info)
     point = step_symbols(model)
-    nominal = model.step(*point[:3], model.w, model.p)
+    nominal = list(model.step(*point[:3], model.w, model.p))
     examples = _examples(step)
     x, u = (np.concatenate([getattr(t, name) for t in trajectories]) for name in ("x", "u"))
     scale = (np.abs(x).max(0), np.ones(examples["h"].numel()), np.abs(u).max(0))

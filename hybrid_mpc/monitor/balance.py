@@ -131,7 +131,7 @@ def energy_balance(model: HybridModel, x: ca.MX, xdot: ca.MX, u: ca.MX) -> ca.MX
     known = ", ".join(b.name for b in model.balances) or "none"
     raise InputError(
         f"energy monitor: model {model.name} has no balance {ENERGY!r} (it has: {known}), so its energy cannot be "
-        "watched; give its prior inertia(x), or energy_balance(x, xdot, u), and export it again, or run without a monitor"
+        "watched; give its prior inertia(x), or energy_balance(x, xdot, u), and export it again, or take no monitor"
     )
 
 

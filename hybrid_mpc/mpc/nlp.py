@@ -187,7 +187,7 @@ class IpoptController:
         x_ref, weight = ca.MX.sym("x_ref", n_x, n + 1), ca.MX.sym("weight", n_x, n + 1)
         p = ca.MX.sym("p", ocp.n_p, n + 1)
         point = step_symbols(model)[:3]
-        self._step = ca.Function("step", point, model.step(*point, model.w, model.p)).map(n)
+        self._step = ca.Function("step", point, list(model.step(*point, model.w, model.p))).map(n)
         z_next = ca.vertcat(*self._step(z[:n_x, :-1], z[n_x:, :-1], u + ca.repmat(d, 1, n)))
         du = u - ca.horzcat(u_prev, u[:, :-1])
         self._u_scale = ocp.input_scale

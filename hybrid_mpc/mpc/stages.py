@@ -153,8 +153,7 @@ class VectorisedStages:
 def _run(model: HybridModel, n: int, compiled: bool) -> BufferedFunction:
     z, u = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("u", model.n_u)
     inline = model.step.is_a("MXFunction")  # a call less a stage
-    point = [z[: model.n_x], z[model.n_x :], u, model.w, model.p]
-    z_next = ca.vertcat(*model.step.call(point, inline, False))
+    z_next = ca.vertcat(*model.step.call(_point(model, z, u), inline, False))
     step = ca.Function("z_step", [z, u], [z_next])
     return BufferedFunction((_compiled(step) if compiled else step).mapaccum("run", n))
 
@@ -170,9 +169,13 @@ def _stage(model: HybridModel) -> ca.Function:
     assert model.with_jacobian is not None
     # Written into the caller's graph where that is possible: a call less a stage.
     inline = model.with_jacobian.is_a("MXFunction")
-    point = [z[: model.n_x], z[model.n_x :], u, model.w, model.p]
-    x_next, h_next, a, b = model.with_jacobian.call(point, inline, False)
+    x_next, h_next, a, b = model.with_jacobian.call(_point(model, z, u), inline, False)
     return ca.Function("stage", [z, u], [ca.vertcat(x_next, h_next), ca.densify(a), ca.densify(b)])
+
+
+def _point(model: HybridModel, z: ca.MX, u: ca.MX) -> list[ca.MX]:
+    """What the model's step takes."""
+    return [z[: model.n_x], z[model.n_x :], u, ca.MX(ca.DM(model.w)), ca.MX(ca.DM(model.p))]
 
 
 def _compiled(stage: ca.Function) -> ca.Function:

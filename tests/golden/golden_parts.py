@@ -217,12 +217,16 @@ def model_values(m):
     for name, model in m.models.items():
         own = h[:, : model.n_h]  # inputs on their way come first: the prior has these alone
         given = model.w, model.p
-        rows = [[v.full().ravel() for v in model.step(*point, *given)] for point in zip(x, own, u, strict=True)]
+        rows = [
+            [v.full().ravel() for v in model.step(*point, *given)] for point in zip(x, own, u, strict=True)
+        ]
         xdot = np.array([model.xdot(*point, *given).full().ravel() for point in zip(x, own, u, strict=True)])
         found[f"{name}/x_next"] = np.array([row[0] for row in rows])
         found[f"{name}/h_next"] = np.array([row[1] for row in rows[POINTS]])
         found[f"{name}/xdot"] = xdot
-        found[f"{name}/y"] = np.array([model.output(*p, *given).full().ravel() for p in zip(x, u, strict=True)])
+        found[f"{name}/y"] = np.array(
+            [model.output(*p, *given).full().ravel() for p in zip(x, u, strict=True)]
+        )
         # the rates one period on, held against this state: the balance is not zero
         late = zip(x[:-1], xdot[1:], u[:-1], strict=True)
         found[f"{name}/balance"] = np.array([float(model.balances[0].residual(*p, *given)) for p in late])
