@@ -30,12 +30,12 @@ def errors(model, loop, ahead: int) -> np.ndarray:
     h, hidden = np.zeros(model.n_h), []
     for x, u in zip(loop.x, loop.u, strict=True):
         hidden.append(h)
-        h = model.step(x, h, u)[1]
+        h = model.step(x, h, u, model.w, model.p)[1]
     found = []
     for k in range(FOLLOWED, len(loop.t) - ahead, 2):
         x, h = loop.x[k], hidden[k]
         for u in loop.u[k : k + ahead]:
-            x, h = model.step(x, h, u)
+            x, h = model.step(x, h, u, model.w, model.p)
         found.append(float(x[0]) - loop.x[k + ahead, 0])
     return np.array(found)
 

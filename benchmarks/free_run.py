@@ -67,7 +67,7 @@ def exported(step):
         model = load(Path(folder) / "model").models["hybrid"]
     z, u = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("u", model.n_u)
     inline = model.step.is_a("MXFunction")
-    after = model.step.call([z[: model.n_x], z[model.n_x :], u], inline, False)
+    after = model.step.call([z[: model.n_x], z[model.n_x :], u, model.w, model.p], inline, False)
     return ca.Function("z_step", [z, u], [ca.vertcat(*after)])
 
 

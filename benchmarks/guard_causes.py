@@ -14,7 +14,6 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -24,20 +23,6 @@ from guard_loops import DT, FAULTS, Loops, fault_plans, noise_of
 from hybrid_mpc import Diagnoser, guard_monitor, load
 from hybrid_mpc.pipeline.monitor_job import read_detector
 from scenarios.golf_robot import scenario
-
-
-def completed(artifact):
-    """The hybrid, which knows how its prior depends on its parameters."""
-    model = artifact.models["hybrid"]
-    if model.parametric is not None:
-        return model
-    import nn_export
-    from hybrid_mpc.identification.export import trace_parametric
-
-    prior = scenario.prior(artifact.provenance.prior_parameters)
-    return replace(
-        model, parameters=prior.values, parametric=nn_export.build(trace_parametric(prior), "parametric")
-    )
 
 
 def said(monitor, diagnoser, loop, onset: float, after) -> list[str]:
@@ -63,9 +48,9 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, help="folder of the loops")
     given = parser.parse_args()
     artifact = load(given.model)
-    monitor = guard_monitor(completed(artifact), read_detector(given.detector), diagnose=True)
+    monitor = guard_monitor(artifact.models["hybrid"], read_detector(given.detector), diagnose=True)
     diagnoser, loops = (
-        Diagnoser(monitor, scenario.causes),
+        Diagnoser(monitor, scenario.causes, prior=artifact.models["prior"]),
         Loops(artifact, noise_of(artifact), given.keep),
     )
     for plan in fault_plans(FAULTS, given.seeds, 500):

@@ -64,9 +64,7 @@ def measured(model, rounds: int) -> dict[str, dict[str, float]]:
     monitors = {
         "main job": make_monitor(model, None),
         "guard": guard_monitor(model, detector, resolution=[1.5e-3]),
-        "guard with history": guard_monitor(
-            model, detector, resolution=[1.5e-3], diagnose=model.parametric is not None
-        ),
+        "guard with history": guard_monitor(model, detector, resolution=[1.5e-3], diagnose=model.n_p > 0),
     }
     rows, found = samples(model), {name: [] for name in monitors}
     for _ in range(rounds):

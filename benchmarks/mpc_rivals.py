@@ -50,7 +50,7 @@ class DoMpc:
             plant.set_variable("_x", "z", (n_x + model.n_h, 1)),
             plant.set_variable("_u", "u", (model.n_u, 1)),
         )
-        x_next, h_next = model.step(z[:n_x], z[n_x:], u)
+        x_next, h_next = model.step(z[:n_x], z[n_x:], u, model.w, model.p)
         plant.set_rhs("z", ca.vertcat(x_next, h_next))
         plant.setup()
         mpc = do_mpc.controller.MPC(plant)

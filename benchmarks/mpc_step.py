@@ -89,7 +89,7 @@ def record(model, ocp):
     for _ in range(PERIODS):
         states.append(e)
         plan = controller.solve(plan, e, np.array([[GOAL, 0.0]]))
-        e = estimate(model, *(v.full().ravel() for v in model.step(e.x, e.h, plan.u[0])))
+        e = estimate(model, *(v.full().ravel() for v in model.step(e.x, e.h, plan.u[0], model.w, model.p)))
     return states
 
 
@@ -133,7 +133,7 @@ class SingleShooting:
         for k in range(n):
             error, du = x - x_ref, u[k] - before
             cost += model.dt * (ca.dot(ocp.q, error**2) + ocp.r[0] * u[k] ** 2 + ocp.r_delta[0] * du**2)
-            x, h = model.step(x, h, u[k])
+            x, h = model.step(x, h, u[k], model.w, model.p)
             before = u[k]
         cost += (x - x_ref).T @ self._guide.problem.terminal @ (x - x_ref)
         nlp = {"x": u, "p": ca.vertcat(z0, u_prev, x_ref), "f": cost}

@@ -61,7 +61,7 @@ class Fatrop:
             x, h, before = s[k][:n_x], s[k][n_x:n_z], s[k][n_z]
             error, du = x - x_ref, u[k] - before
             cost += model.dt * (ca.dot(ocp.q, error**2) + ocp.r[0] * u[k] ** 2 + ocp.r_delta[0] * du**2)
-            gaps = [s[k + 1] - ca.vertcat(*model.step(x, h, u[k]), u[k])]
+            gaps = [s[k + 1] - ca.vertcat(*model.step(x, h, u[k], model.w, model.p), u[k])]
             gaps += [s[0] - ca.vertcat(z0, u_prev)] if k == 0 else []
             unknowns += [s[k], u[k]]
             low += [np.full(n_z + 1, -np.inf), ocp.u_min]

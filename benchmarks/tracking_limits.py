@@ -38,7 +38,12 @@ class TrueX(TrueState):
 
     def predict(self, estimate, u) -> Estimate:
         """The model's step."""
-        x, h = (v.full().ravel() for v in self.model.step(estimate.x, estimate.h, np.asarray(u, dtype=float)))
+        x, h = (
+            v.full().ravel()
+            for v in self.model.step(
+                estimate.x, estimate.h, np.asarray(u, dtype=float), self.model.w, self.model.p
+            )
+        )
         return replace(estimate, t=estimate.t + self.model.dt, x=x, h=h)
 
     def correct(self, estimate, y, u=None) -> Estimate:

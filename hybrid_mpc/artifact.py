@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,12 +16,12 @@ import nn_export
 from hybrid_mpc.delayed import with_input_delay
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_document, read_object, sha256, write_document
-from hybrid_mpc.model import HybridModel
+from hybrid_mpc.model import STEP_INPUTS, STEP_OUTPUTS, Balance, HybridModel
 from hybrid_mpc.monitor.calibration import Calibration
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.records import known, plain, record
-from hybrid_mpc.signals import Signal
+from hybrid_mpc.signals import Parameter, Signal
 
 if TYPE_CHECKING:
     from hybrid_mpc.closed_loop.guard import Guard
@@ -31,28 +31,48 @@ if TYPE_CHECKING:
     from hybrid_mpc.mpc.safeguard import SafeController
     from hybrid_mpc.scenario import Scenario
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 FILE = "model.json"
 FILES = (FILE, "programs.json", "weights.safetensors")
 """All files of an artifact; whatever else lies in its folder is none of it."""
 MOST_MODELS = 16
 """Models that an artifact may hold: prior, hybrid, and a few to compare them with."""
-FUNCTIONS = ("step", "xdot", "output", "energy_balance")
+FUNCTIONS = ("step", "xdot", "output")
+BALANCE = "balance"
+"""Function of a balance: its program is ``<model>/balance/<name of the balance>``."""
 INPUTS = {
-    "step": ("x", "h", "u"),
-    "xdot": ("x", "h", "u"),
-    "output": ("x", "u"),
-    "energy_balance": ("x", "xdot", "u"),
+    "step": STEP_INPUTS,
+    "xdot": STEP_INPUTS,
+    "output": ("x", "u", "w", "p"),
+    BALANCE: ("x", "xdot", "u", "w", "p"),
 }
 OUTPUTS = {
-    "step": ("x_next", "h_next"),
+    "step": STEP_OUTPUTS,
     "xdot": ("xdot",),
     "output": ("y",),
-    "energy_balance": ("dE",),
+    BALANCE: ("residual",),
 }
-PARAMETRIC = "parametric"
-"""Program ``(x, u, p) -> acceleration`` of the prior, which artifacts of earlier versions lack."""
 JACOBIANS = {"A": ("x", "h"), "B": ("u",)}
+
+
+@dataclass(frozen=True)
+class BalanceInfo:
+    """Name and units of a balance, see :class:`~hybrid_mpc.model.Balance`.
+
+    Args:
+        name: E.g. ``"energy"``.
+        unit: Of the storage, e.g. ``"J"``.
+        rate_unit: Of its rate and of the residual, e.g. ``"W"``.
+    """
+
+    name: str
+    unit: str
+    rate_unit: str
+
+    @property
+    def program(self) -> str:
+        """Name of its program among those of a model."""
+        return f"{BALANCE}/{self.name}"
 
 
 @dataclass(frozen=True)
@@ -64,18 +84,26 @@ class ModelInfo:
         states: Signals of x.
         inputs: Signals of u.
         outputs: Signals of y.
-        parameters: Values [SI] of the prior's parameters by name. Default: unknown.
+        parameters: The prior's parameters with their fitted values, in the order of p. Default: none.
         input_delay: Time [s] from a command to the input that the programs take. Default: none.
         time_unit: The machine's second [s], see :class:`~hybrid_mpc.model.HybridModel`. Default 1.
+        disturbances: Signals of w. Default: none.
+        nominal_w: What is taken for w where none is given. Default: zeros.
+        covariance: Rows of the covariance of the fitted values. Default: unknown.
+        balances: Balances whose programs there are. Default: none.
     """
 
     dt: float
     states: tuple[Signal, ...]
     inputs: tuple[Signal, ...]
     outputs: tuple[Signal, ...]
-    parameters: Mapping[str, float] = field(default_factory=dict)
+    parameters: tuple[Parameter, ...] = ()
     input_delay: float = 0.0
     time_unit: float = 1.0
+    disturbances: tuple[Signal, ...] = ()
+    nominal_w: tuple[float, ...] = ()
+    covariance: tuple[tuple[float, ...], ...] = ()
+    balances: tuple[BalanceInfo, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -129,8 +157,8 @@ class LoopSettings:
         for name, problem in self.control.items():
             if self.safe_input is not None and not _within(self.safe_input, problem):
                 raise InputError(
-                    f"safe_input {self.safe_input} is outside the limits {problem.u_min} to {problem.u_max} of the control "
-                    f"problem of {name or 'all tasks'}"
+                    f"safe_input {self.safe_input} is outside the limits {problem.u_min} to {problem.u_max} of the "
+                    f"control problem of {name or 'all tasks'}"
                 )
 
 
@@ -152,7 +180,11 @@ class Description:
         states: Signals of x.
         inputs: Signals of u.
         outputs: Signals of y.
-        parameters: Values [SI] of the prior's parameters by name.
+        disturbances: Signals of w.
+        nominal_w: What is taken for w where none is given.
+        parameters: The prior's parameters with their fitted values, in the order of p.
+        covariance: Rows of the covariance of the fitted values; empty: unknown.
+        balances: Names and units of the balances.
         input_delay_s: Time [s] from a command to the input that the programs take.
         time_unit_s: The machine's second [s], see :attr:`HybridModel.time_unit`.
         calibration: Calibration of the energy monitor, or None.
@@ -169,7 +201,11 @@ class Description:
     states: tuple[Signal, ...]
     inputs: tuple[Signal, ...]
     outputs: tuple[Signal, ...]
-    parameters: Mapping[str, float]
+    disturbances: tuple[Signal, ...]
+    nominal_w: tuple[float, ...]
+    parameters: tuple[Parameter, ...]
+    covariance: tuple[tuple[float, ...], ...]
+    balances: tuple[BalanceInfo, ...]
     input_delay_s: float
     time_unit_s: float
     calibration: Calibration | None
@@ -185,8 +221,6 @@ class Description:
             raise InputError(f"input_delay_s: a number of seconds is needed, got {self.input_delay_s}")
         if not 0 < len(set(self.models)) == len(self.models) <= MOST_MODELS:
             raise InputError(f"models: 1 to {MOST_MODELS} different names are needed, got {len(self.models)}")
-        if not all(math.isfinite(value) for value in self.parameters.values()):
-            raise InputError("parameters: finite numbers are needed")
 
 
 @dataclass(frozen=True)
@@ -425,7 +459,8 @@ def save_artifact(
 
     Args:
         folder: Made if missing.
-        programs: Program of each function of each model, e.g. ``programs["hybrid"]["step"]``.
+        programs: Program of each function of each model, e.g. ``programs["hybrid"]["step"]``, and of each of its
+            balances, ``programs["hybrid"]["balance/energy"]``.
         info: Period and signals, the same for all models.
         calibration: Calibration of the monitor.
         provenance: What the models were made from.
@@ -441,8 +476,8 @@ def save_artifact(
         folder,
         Description(
             tuple(programs), sha256(folder / "programs.json"), info.dt, info.states, info.inputs, info.outputs,
-            info.parameters, info.input_delay, info.time_unit, calibration, provenance or Provenance(),
-            loop or LoopSettings(),
+            info.disturbances, info.nominal_w, info.parameters, info.covariance, info.balances, info.input_delay,
+            info.time_unit, calibration, provenance or Provenance(), loop or LoopSettings(),
         ),
     )  # fmt: skip
 
@@ -558,7 +593,10 @@ def load(folder: str | Path) -> Kit:
     """
     folder = artifact_folder(Path(folder))
     d = read_description(folder)
-    info = ModelInfo(d.dt_s, d.states, d.inputs, d.outputs, d.parameters, d.input_delay_s, d.time_unit_s)
+    info = ModelInfo(
+        d.dt_s, d.states, d.inputs, d.outputs, d.parameters, d.input_delay_s, d.time_unit_s, d.disturbances,
+        d.nominal_w, d.covariance, d.balances,
+    )  # fmt: skip
     if sha256(folder / "programs.json") != d.programs_sha256:
         raise InputError(
             f"{folder}: programs.json is not the one that {FILE} was saved with; take the folder from its run again"
@@ -575,16 +613,17 @@ def load(folder: str | Path) -> Kit:
 
 def build_model(name: str, programs: Mapping[str, nn_export.Program], info: ModelInfo) -> HybridModel:
     """The :class:`HybridModel` of ``programs["<name>/step"]`` and its siblings, with the input's delay."""
-    functions: dict[str, Any] = {f: nn_export.build(programs[f"{name}/{f}"], f) for f in FUNCTIONS}
-    step = programs[f"{name}/step"]
-    functions["with_jacobian"] = nn_export.with_jacobian(step, JACOBIANS)
-    many = partial(nn_export.SideBySide, step)
-    known: dict[str, Any] = {}
-    if info.parameters and f"{name}/{PARAMETRIC}" in programs:
-        parametric = nn_export.build(programs[f"{name}/{PARAMETRIC}"], PARAMETRIC)
-        known = {"parameters": info.parameters, "parametric": parametric}
+    step, xdot, output = (nn_export.build(programs[f"{name}/{f}"], f) for f in FUNCTIONS)
+    balances = tuple(
+        Balance(b.name, b.unit, b.rate_unit, nn_export.build(programs[f"{name}/{b.program}"], BALANCE))
+        for b in info.balances
+    )
+    program = programs[f"{name}/step"]
     model = HybridModel(
-        name, info.dt, info.states, info.inputs, info.outputs, **functions, side_by_side=many, **known,
-        time_unit=info.time_unit,
+        name, info.dt, info.states, info.inputs, info.outputs, step, xdot, output,
+        with_jacobian=nn_export.with_jacobian(program, JACOBIANS),
+        side_by_side=partial(nn_export.SideBySide, program),
+        disturbances=info.disturbances, nominal_w=info.nominal_w, parameters=info.parameters,
+        covariance=info.covariance, balances=balances, time_unit=info.time_unit,
     )  # fmt: skip
     return with_input_delay(model, info.input_delay) if info.input_delay else model

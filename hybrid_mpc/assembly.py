@@ -344,7 +344,7 @@ def make_adaptive_guard(
 
     Args:
         model: The model that the normal controller plans with; it must know its parameters.
-        prior: The fitted prior, for terminal weight and fallback.
+        prior: The fitted prior, whose parameters change, for terminal weight and fallback.
         scenario: The machine: its sensors' noise, and as ``causes`` the parameters that change together, by name. Gains
             of inputs are left out where there are other causes: a weaker motor is a heavier machine, but for its
             friction.
@@ -360,7 +360,7 @@ def make_adaptive_guard(
         ``make_adaptive_guard(hybrid, prior, scenario, sigma_x)``
     """
     groups = adaptable(model, scenario.causes)
-    adaptive = with_parameter_states(model, groups)
+    adaptive = with_parameter_states(model, groups, prior=prior)
     control = scenario.control if control is None else control
     if control is None:
         raise InputError(f"a guard that adapts needs a control problem; scenario {scenario.name} has none")
@@ -394,10 +394,10 @@ def adaptable(model: HybridModel, causes: Mapping[str, Sequence[str]]) -> dict[s
             'a guard that adapts needs causes: groups of parameters that may change, e.g. {"mass": ("m", "J")}; '
             "a scenario names them in its field causes"
         )
-    if model.parametric is None:
+    if not model.n_p:
         raise InputError(
-            f"a guard that adapts needs a model that knows its parameters; model {model.name} is of an artifact of an "
-            "earlier version: train it anew"
+            f"a guard that adapts needs a model that knows its parameters; model {model.name} has none: give its prior "
+            "a parameters_spec and train it anew"
         )
     if model.waiting:
         raise InputError(

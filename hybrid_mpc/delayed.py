@@ -11,7 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.model import HybridModel, ManyPoints, SideBySide
+from hybrid_mpc.model import (
+    STEP_INPUTS,
+    HybridModel,
+    ManyPoints,
+    SideBySide,
+    step_function,
+    step_symbols,
+)
 
 Array = NDArray[np.float64]
 TINY = 1e-9
@@ -26,8 +33,8 @@ def with_input_delay(model: HybridModel, delay: float) -> HybridModel:
 
     A delay of ``m`` periods and a share ``f`` makes ``(1 - f) u_{k-m} + f u_{k-m-1}`` act in period ``k``, the mean
     over the period: what :func:`hybrid_mpc.identification.lags.delayed` gives the training. Estimator, controller and
-    monitor take such a model as any other; the first estimate takes the inputs before it for zero. ``xdot``, the energy
-    balance and ``parametric`` are those of the model: they take the input that acts.
+    monitor take such a model as any other; the first estimate takes the inputs before it for zero. ``xdot`` and the
+    balances are those of the model: they take the input that acts.
 
     Args:
         model: The model without delay.
@@ -38,13 +45,12 @@ def with_input_delay(model: HybridModel, delay: float) -> HybridModel:
 
     Example:
         >>> from hybrid_mpc.signals import Signal
-        >>> x, h, u, w = ca.MX.sym("x"), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w")
-        >>> model = HybridModel("sum", 1.0, (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),),
-        ...     ca.Function("f", [x, h, u], [x + u, h]), ca.Function("g", [x, h, u], [u]),
-        ...     ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]))
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
         >>> late = with_input_delay(model, 0.75)
-        >>> [v.full().ravel().tolist() for v in late.step(0.0, 4.0, 8.0)]  # three quarters of the old, one of the new
-        [[5.0], [8.0]]
+        >>> x_next, h_next = late.step(0.0, 4.0, 8.0, late.w, late.p)  # three quarters of the old, one of the new
+        >>> float(x_next), float(h_next)
+        (5.0, 8.0)
     """
     if not (delay > 0 and math.isfinite(delay)):
         raise InputError(f"model {model.name}: the input's delay must be positive, got {delay} s")
@@ -58,27 +64,20 @@ def with_input_delay(model: HybridModel, delay: float) -> HybridModel:
     if model.waiting:
         raise InputError(f"model {model.name} has inputs that wait already; give the one without delay")
     queue = _Queue(periods, model.n_u)
-    x, u = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
+    x, _, u, w, p = step_symbols(model)
     h = ca.MX.sym("h", queue.size + model.n_h)
     waiting = ca.vertcat(h[: queue.size], u)
     own, acting, later = h[queue.size :], ca.DM(queue.share) @ waiting, waiting[model.n_u :]
     assert model.with_jacobian is not None
     inline = model.step.is_a("MXFunction"), model.with_jacobian.is_a("MXFunction")
-    x_next, h_next = model.step.call([x, own, acting], inline[0], False)
-    x_slope, h_slope, a, b = model.with_jacobian.call([x, own, acting], inline[1], False)
-    names, after = ["x", "h", "u"], ["x_next", "h_next"]
-    slopes = queue.slopes(model.n_x, a, b)
+    x_next, h_next = model.step.call([x, own, acting, w, p], inline[0], False)
+    x_slope, h_slope, a, b = model.with_jacobian.call([x, own, acting, w, p], inline[1], False)
+    point, slopes = [x, h, u, w, p], queue.slopes(model.n_x, a, b)
     return replace(
         model,
-        step=ca.Function("step", [x, h, u], [x_next, ca.vertcat(later, h_next)], names, after),
-        xdot=ca.Function("xdot", [x, h, u], [model.xdot(x, own, u)], names, ["xdot"]),
-        with_jacobian=ca.Function(
-            "with_jacobian",
-            [x, h, u],
-            [x_slope, ca.vertcat(later, h_slope), *slopes],
-            names,
-            [*after, "A", "B"],
-        ),
+        step=step_function("step", point, [x_next, ca.vertcat(later, h_next)]),
+        xdot=ca.Function("xdot", point, [model.xdot(x, own, u, w, p)], [*STEP_INPUTS], ["xdot"]),
+        with_jacobian=step_function("with_jacobian", point, [x_slope, ca.vertcat(later, h_slope), *slopes]),
         side_by_side=None
         if model.side_by_side is None
         else _side_by_side(model.side_by_side, model.n_x, queue),
@@ -126,9 +125,9 @@ def _side_by_side(inner: SideBySide, n_x: int, queue: _Queue) -> SideBySide:
         size, n_u = queue.size, queue.n_u
         moved = np.eye(size, size + n_u, n_u)
 
-        def evaluate(x: Array, h: Array, u: Array) -> tuple[Array, ...]:
+        def evaluate(x: Array, h: Array, u: Array, w: Array, p: Array) -> tuple[Array, ...]:
             waiting = np.hstack([h[:, :size], u])
-            x_next, h_next, by_x, by_h, by_u = many(x, h[:, size:], waiting @ queue.share.T)
+            x_next, h_next, by_x, by_h, by_u = many(x, h[:, size:], waiting @ queue.share.T, w, p)
             by_queue = by_u @ queue.share
             zero_x, zero_h = np.zeros((n, size, by_x.shape[2])), np.zeros((n, size, by_h.shape[2]))
             shift = np.broadcast_to(moved, (n, *moved.shape))

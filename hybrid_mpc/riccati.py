@@ -84,16 +84,15 @@ def hidden_fixed_point(
     Example:
         >>> import casadi as ca
         >>> from hybrid_mpc.signals import Signal
-        >>> x, h, u, w = (ca.MX.sym(n) for n in "xhuw")
-        >>> model = HybridModel("lag", 0.1, (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),),
-        ...     ca.Function("f", [x, h, u], [x + u, 0.5 * h + x]), ca.Function("g", [x, h, u], [u]),
-        ...     ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]))
+        >>> (x, h, u), level = (ca.MX.sym(n) for n in "xhu"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("lag", 0.1, level, (Signal("u", "-"),), level,
+        ...     x=x, h=h, u=u, x_next=x + u, h_next=0.5 * h + x, xdot=u, y=x)
         >>> hidden_fixed_point(model, np.ones(1), np.zeros(1)).round(6)
         array([2.])
     """
     h = np.zeros(model.n_h)
     for _ in range(limit if model.n_h else 0):
-        h_next = model.step(x, h, u)[1].full().ravel()
+        h_next = model.step(x, h, u, model.w, model.p)[1].full().ravel()
         moved, h = np.max(np.abs(h_next - h)), h_next
         if not moved > tol:
             break
@@ -104,7 +103,7 @@ def linearisation(model: HybridModel, x: Array, u: Array) -> tuple[Array, Array,
     """``A``, ``B`` of ``z = (x, h)`` by ``z`` and ``u`` at ``(x, u)``, and the fixed point ``h`` used."""
     h = hidden_fixed_point(model, x, u)
     assert model.with_jacobian is not None
-    _, _, a, b = model.with_jacobian(x, h, u)
+    _, _, a, b = model.with_jacobian(x, h, u, model.w, model.p)
     return a.full(), b.full(), h
 
 
@@ -136,10 +135,8 @@ def lqr(
     Example:
         >>> import casadi as ca
         >>> from hybrid_mpc.signals import Signal
-        >>> x, h, u, w = ca.MX.sym("x"), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w")
-        >>> model = HybridModel("sum", 1.0, (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),),
-        ...     ca.Function("f", [x, h, u], [x + u, h]), ca.Function("g", [x, h, u], [u]),
-        ...     ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]))
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
         >>> lqr(model, [0.0], [0.0], [1.0], [1.0]).gain.round(6)
         array([[0.618034]])
     """

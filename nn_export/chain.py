@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from itertools import accumulate, pairwise
+from itertools import accumulate, compress, pairwise
 from typing import Any, Generic, TypeVar
 
 import casadi as ca
@@ -110,7 +110,7 @@ class Piece:
         scalar: True for an SX graph, False for one of MX.
         inner: Its symbols.
         values: The expressions.
-        blocks: The Jacobian of each expression, a row, by each symbol.
+        blocks: The Jacobian of each expression, a row, by each symbol; empty by those that nobody asks for.
     """
 
     scalar: bool
@@ -119,14 +119,14 @@ class Piece:
     blocks: list[list[Any]]
 
 
-def differentiated(symbols: list[ca.MX], targets: list[ca.MX], budget: Budget) -> Piece:
-    """Expressions with their Jacobians, as scalar code where they are small.
+def differentiated(symbols: list[ca.MX], targets: list[ca.MX], wanted: list[bool], budget: Budget) -> Piece:
+    """Expressions with their Jacobians by the symbols that are wanted, as scalar code where they are small.
 
     Raises:
         ProgramError: If the budget does not hold them.
     """
     piece = ca.Function("piece", symbols, targets)
-    rows, columns = _edges(targets), _edges(symbols)
+    rows, columns = _edges(targets), _edges(list(compress(symbols, wanted)))
     sweeps = min(rows[-1], columns[-1])
     count = operations(piece)
     scalar = count * sweeps <= SCALAR_LIMIT
@@ -141,8 +141,16 @@ def differentiated(symbols: list[ca.MX], targets: list[ca.MX], budget: Budget) -
     )
     inner: list[Any] = [(ca.SX if scalar else ca.MX).sym("v", *s.shape) for s in symbols]
     values = piece.call(inner, True, False)
-    whole = ca.jacobian(ca.veccat(*values), ca.veccat(*inner))
-    blocks = [[whole[a:b, c:d] for c, d in pairwise(columns)] for a, b in pairwise(rows)]
+    whole = ca.jacobian(ca.veccat(*values), ca.veccat(*compress(inner, wanted)))
+    blocks = []
+    for a, b in pairwise(rows):
+        asked = (whole[a:b, c:d] for c, d in pairwise(columns))
+        blocks.append(
+            [
+                next(asked) if by else type(whole)(b - a, v.numel())
+                for v, by in zip(inner, wanted, strict=True)
+            ]
+        )
     return Piece(scalar, inner, values, blocks)
 
 

@@ -67,8 +67,10 @@ def with_jacobian(
         sizes = {name: symbol.numel() for name, symbol in zip(inputs, symbols, strict=True)}
         spend_results(budget, outputs, blocks, sizes)
         budget.spend("the slopes of the inputs", memory=4 * NUMBER * sum(sizes.values()))  # sparse identities
+        wanted = {i for names in blocks.values() for i in names}
         for symbol in (s for s in symbols if s.numel()):  # CasADi has no empty symbols
-            chain.add(symbol, _Known(symbol, {symbol.name(): ca.MX.eye(symbol.numel())}))
+            slopes = {symbol.name(): ca.MX.eye(symbol.numel())} if symbol.name() in wanted else {}
+            chain.add(symbol, _Known(symbol, slopes))
         chain.settle()
         results = chain.derive([v.mx for v in outputs])
         stacked = [_stack(results, {i: sizes[i] for i in names}) for names in blocks.values()]
@@ -107,7 +109,7 @@ class _Chain(Chain[_Known]):
         return _Known(target, {})
 
     def _piece(self, symbols: list[ca.MX], targets: list[ca.MX], arguments: list[_Known]) -> list[_Known]:
-        piece = differentiated(symbols, targets, self.budget)
+        piece = differentiated(symbols, targets, [bool(a.slopes) for a in arguments], self.budget)
         values, jacobians = _evaluated(piece, [a.value for a in arguments])
         known = []
         for value, row in zip(values, jacobians, strict=True):

@@ -169,7 +169,7 @@ class _Chain(Chain[_Known]):
         return _Known(np.repeat(column, self._n, axis=1), {})
 
     def _piece(self, symbols: list[ca.MX], targets: list[ca.MX], arguments: list[_Known]) -> list[_Known]:
-        piece = differentiated(symbols, targets, self.budget)
+        piece = differentiated(symbols, targets, [bool(a.slopes) for a in arguments], self.budget)
         values = [np.zeros((t.numel(), self._n)) for t in targets]
         expressions = [ca.densify(ca.vec(v)) for v in piece.values]
         raw: list[Array] = []

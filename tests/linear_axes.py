@@ -1,12 +1,12 @@
 """Linear axes of any size and pace with known friction and pushes, that the tests of the monitor share; no torch."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
 from monitor_parts import Run
 
-from hybrid_mpc import ExtendedKalmanFilter, HybridModel, Signal
+from hybrid_mpc import ExtendedKalmanFilter, HybridModel, Parameter, Signal
 
 
 @dataclass(frozen=True)
@@ -23,14 +23,14 @@ class Axis:
     time_unit: float = 1.0
 
     def model(self):
-        x, h, u, w = ca.MX.sym("x", 2), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w", 2)
+        x, u, rate, p = ca.MX.sym("x", 2), ca.MX.sym("u"), ca.MX.sym("rate", 2), ca.MX.sym("p", 2)
 
         def force(x):
-            friction = self.viscous * x[1] + self.dry * ca.tanh(x[1] / self.width)
+            friction = p[1] * x[1] + self.dry * ca.tanh(x[1] / self.width)
             return u + self.push - friction - self.stiffness * x[0]
 
         def rhs(x):
-            return ca.vertcat(x[1], force(x) / self.mass)
+            return ca.vertcat(x[1], force(x) / p[0])
 
         z, n = x, 8
         for _ in range(n):
@@ -39,24 +39,21 @@ class Axis:
             k2 = rhs(z + d / 2 * k1)
             k3 = rhs(z + d / 2 * k2)
             z = z + d / 6 * (k1 + 2 * k2 + 2 * k3 + rhs(z + d * k3))
-        p = ca.MX.sym("p", 2)
-        return HybridModel(
+        known = Parameter("m", self.mass, "kg", 0.0, 1e6), Parameter("d", self.viscous, "N s/m", 0.0, 1e6)
+        model = HybridModel.of(
             "axis", self.dt, (Signal("q", "m"), Signal("v", "m/s")), (Signal("F", "N"),), (Signal("q", "m"),),
-            step=ca.Function("step", [x, h, u], [z, h]),
-            xdot=ca.Function("xdot", [x, h, u], [rhs(x)]),
-            output=ca.Function("output", [x, u], [x[0]]),
-            energy_balance=ca.Function("energy", [x, w, u], [(self.mass * w[1] - force(x)) * x[1]]),
-            parameters={"m": self.mass, "d": self.viscous},
-            parametric=ca.Function("parametric", [x, u, p], [(u - p[1] * x[1]) / p[0]]),
-            time_unit=self.time_unit,
+            x=x, u=u, p=p, x_next=z, xdot=rhs(x), y=x[0], rate=rate, energy=(p[0] * rate[1] - force(x)) * x[1],
+            parameters=known,
         )  # fmt: skip
+        return replace(model, time_unit=self.time_unit)
 
     def run(self, u, *, noise=0.0, step=0.0, seed=0, fault=None, at=10**9):
         """A run under inputs ``(n,)``; from sample ``at`` on it is that of another axis."""
         own, broken = self.model(), (fault or self).model()
         x = np.zeros((len(u), 2))
         for k in range(len(u) - 1):
-            x[k + 1] = (broken if k >= at else own).step(x[k], [], u[k])[0].full().ravel()
+            model = broken if k >= at else own
+            x[k + 1] = model.step(x[k], [], u[k], model.w, model.p)[0].full().ravel()
         y = x[:, :1] + noise * np.random.default_rng(seed).standard_normal((len(u), 1))
         y = step * np.round(y / step) if step else y
         return Run(self.dt * np.arange(len(u)), y, np.asarray(u)[:, None], x)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from hybrid_mpc import HybridModel, Signal
+from hybrid_mpc import HybridModel, Parameter, Signal
 
 DT, J, MGL, GAMMA = 0.02, 0.1, 1.5, 0.15
 
@@ -13,18 +13,14 @@ DT, J, MGL, GAMMA = 0.02, 0.1, 1.5, 0.15
 def pendulum(
     friction: float = GAMMA, push: float = 0.0, dry: float = 0.0, inertia: float = J, mgl: float = MGL
 ) -> HybridModel:
-    x, h, u, w = ca.MX.sym("x", 2), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w", 2)
+    x, u, rate, p = ca.MX.sym("x", 2), ca.MX.sym("u"), ca.MX.sym("rate", 2), ca.MX.sym("p", 3)
 
-    def balance(x, w, u, friction=friction):
-        losses = friction * x[1] + dry * ca.tanh(x[1] / 0.02)
-        return (inertia * w[1] + mgl * ca.sin(x[0]) + losses - u - push) * x[1]
+    def torque(x):
+        return u + push - p[1] * ca.sin(x[0]) - p[2] * x[1] - dry * ca.tanh(x[1] / 0.02)
 
     def rhs(x):
-        losses = friction * x[1] + dry * ca.tanh(x[1] / 0.02)
-        return ca.vertcat(x[1], (u + push - mgl * ca.sin(x[0]) - losses) / inertia)
+        return ca.vertcat(x[1], torque(x) / p[0])
 
-    p = ca.MX.sym("p", 3)
-    a = (u + push - p[1] * ca.sin(x[0]) - p[2] * x[1]) / p[0]
     z = x
     for _ in range(4):
         d = DT / 4
@@ -32,15 +28,14 @@ def pendulum(
         k2 = rhs(z + d / 2 * k1)
         k3 = rhs(z + d / 2 * k2)
         z = z + d / 6 * (k1 + 2 * k2 + 2 * k3 + rhs(z + d * k3))
-    return HybridModel(
+    return HybridModel.of(
         "pendulum", DT, (Signal("phi", "rad"), Signal("phi_dot", "rad/s")), (Signal("tau", "N m"),),
         (Signal("phi", "rad"),),
-        step=ca.Function("step", [x, h, u], [z, h]),
-        xdot=ca.Function("xdot", [x, h, u], [rhs(x)]),
-        output=ca.Function("output", [x, u], [x[0]]),
-        energy_balance=ca.Function("energy", [x, w, u], [balance(x, w, u)]),
-        parameters={"J": inertia, "mgl": mgl, "gamma": friction},
-        parametric=ca.Function("parametric", [x, u, p], [a]),
+        x=x, u=u, p=p, x_next=z, xdot=rhs(x), y=x[0], rate=rate, energy=(p[0] * rate[1] - torque(x)) * x[1],
+        parameters=(
+            Parameter("J", inertia, "kg m^2", 0.0, 100.0), Parameter("mgl", mgl, "N m", 0.0, 100.0),
+            Parameter("gamma", friction, "N m s", 0.0, 100.0),
+        ),
     )  # fmt: skip
 
 
@@ -78,13 +73,14 @@ class Observer:
     """A Luenberger observer with disturbance: exact model prediction, fixed gains (poles near 0.7)."""
 
     def __init__(self, model):
-        self.step = model.step
+        self.model = model
 
     def start(self, y, t):
         return Estimate(np.array([y[0], 0.0]), np.zeros(0), np.zeros(1))
 
     def update(self, estimate, y, u_prev):
-        x = self.step(estimate.x, estimate.h, u_prev + estimate.d)[0].full().ravel()
+        m = self.model
+        x = m.step(estimate.x, estimate.h, u_prev + estimate.d, m.w, m.p)[0].full().ravel()
         e = y[0] - x[0]
         return Estimate(x + np.array([0.6, 5.0]) * e, np.zeros(0), estimate.d + 3.0 * e)
 
@@ -100,7 +96,8 @@ def simulate(n, seed=0, fault=None, at=10**9, noise=0.0, kind="sine"):
     model, broken = pendulum(), fault or pendulum()
     x = np.zeros((n, 2))
     for k in range(n - 1):
-        x[k + 1] = (broken if k >= at else model).step(x[k], [], u[k])[0].full().ravel()
+        acting = broken if k >= at else model
+        x[k + 1] = acting.step(x[k], [], u[k], acting.w, acting.p)[0].full().ravel()
     return Run(t, x[:, :1] + noise * rng.standard_normal((n, 1)), u[:, None], x)
 
 

@@ -14,17 +14,14 @@ def linear_model(a, b, c, dt=0.1, n_h=0):
     """Linear model over (x, h) from its matrices; the outputs are C x."""
     n_z, n_u = np.shape(b)
     n_x, n_y = n_z - n_h, len(c)
-    x, h, u, w = ca.MX.sym("x", n_x), ca.MX.sym("h", n_h), ca.MX.sym("u", n_u), ca.MX.sym("w", n_x)
+    x, h, u = ca.MX.sym("x", n_x), ca.MX.sym("h", n_h), ca.MX.sym("u", n_u)
     z = ca.DM(a) @ ca.vertcat(x, h) + ca.DM(b) @ u
-    return HybridModel(
+    return HybridModel.of(
         "linear", dt,
         tuple(Signal(f"x{i}", "-") for i in range(n_x)),
         tuple(Signal(f"u{i}", "-") for i in range(n_u)),
         tuple(Signal(f"y{i}", "-") for i in range(n_y)),
-        step=ca.Function("step", [x, h, u], [z[:n_x], z[n_x:]]),
-        xdot=ca.Function("xdot", [x, h, u], [(z[:n_x] - x) / dt]),
-        output=ca.Function("output", [x, u], [ca.DM(c) @ x]),
-        energy_balance=ca.Function("energy_balance", [x, w, u], [ca.dot(x, w)]),
+        x=x, h=h, u=u, x_next=z[:n_x], h_next=z[n_x:], xdot=(z[:n_x] - x) / dt, y=ca.DM(c) @ x,
     )  # fmt: skip
 
 
@@ -58,7 +55,7 @@ def rk4(f, x, dt, substeps):
 def pendulum_model(z=0, dt=0.02, seed=0, correction=0.3, **parameters):
     """Pendulum, RK4 with 2 substeps; z > 0 adds a random stable GRU cell that corrects the acceleration."""
     rng = np.random.default_rng(seed)
-    x, h, u, w = ca.MX.sym("x", 2), ca.MX.sym("h", z), ca.MX.sym("u"), ca.MX.sym("w", 2)
+    x, h, u, rate = ca.MX.sym("x", 2), ca.MX.sym("h", z), ca.MX.sym("u"), ca.MX.sym("rate", 2)
     extra, h_next = 0, h
     if z:
         s = ca.vertcat(ca.sin(x[0]), ca.cos(x[0]), x[1], u, pendulum_rhs(x, u, **parameters)[1] / 10)
@@ -70,14 +67,12 @@ def pendulum_model(z=0, dt=0.02, seed=0, correction=0.3, **parameters):
         h_next = (1 - g) * n + g * h
         extra = correction * ca.DM(rng.normal(size=(1, z)) / np.sqrt(z)) @ h_next
     rhs = lambda v: pendulum_rhs(v, u, **parameters) + ca.vertcat(0, extra)  # noqa: E731
-    return HybridModel(
+    return HybridModel.of(
         f"pendulum_{z}", dt,
         (Signal("phi", "rad", periodic=True), Signal("phi_dot", "rad/s")),
         (Signal("torque", "N m"),), (Signal("phi", "rad"),),
-        step=ca.Function("step", [x, h, u], [rk4(rhs, x, dt, 2), h_next]),
-        xdot=ca.Function("xdot", [x, h, u], [rhs(x)]),
-        output=ca.Function("output", [x, u], [x[0]]),
-        energy_balance=ca.Function("energy_balance", [x, w, u], [(0.14 * w[1] - u) * x[1]]),
+        x=x, h=h, u=u, x_next=rk4(rhs, x, dt, 2), h_next=h_next, xdot=rhs(x), y=x[0],
+        rate=rate, energy=(0.14 * rate[1] - u) * x[1],
     )  # fmt: skip
 
 

@@ -16,7 +16,7 @@ DT = 0.02
 
 
 def step(model, x, h, u):
-    return tuple(v.full().ravel() for v in model.step(x, h, u))
+    return tuple(v.full().ravel() for v in model.step(x, h, u, model.w, model.p))
 
 
 @pytest.mark.parametrize(("delay", "waiting"), [(0.4, 1), (1.0, 1), (1.6, 2), (2.0, 2)])
@@ -44,11 +44,11 @@ def test_the_input_of_a_period_is_the_mean_of_what_acts_in_it(delay, waiting):
 def test_its_jacobian_is_the_derivative_of_its_step(delay):
     late = with_input_delay(pendulum_model(z=3, dt=DT), delay * DT)
     x, h, u = ca.MX.sym("x", 2), ca.MX.sym("h", late.n_h), ca.MX.sym("u")
-    after = ca.vertcat(*late.step(x, h, u))
+    after = ca.vertcat(*late.step(x, h, u, late.w, late.p))
     by_hand = ca.Function("j", [x, h, u], [ca.jacobian(after, ca.vertcat(x, h, u))])
     rng = np.random.default_rng(1)
     point = rng.normal(size=2), rng.normal(size=late.n_h), rng.normal(size=1)
-    x_next, h_next, a, b = (v.full() for v in late.with_jacobian(*point))
+    x_next, h_next, a, b = (v.full() for v in late.with_jacobian(*point, late.w, late.p))
     np.testing.assert_allclose(np.hstack([a, b]), by_hand(*point).full(), atol=1e-12)  # rounding
     np.testing.assert_allclose(
         np.vstack([x_next, h_next]).ravel(), np.concatenate(step(late, *point)), atol=1e-12
@@ -60,8 +60,8 @@ def beside(model):
     columns = {"x": slice(0, 2), "h": slice(2, 2 + model.n_h), "u": slice(2 + model.n_h, None)}
 
     def make(n, blocks):
-        def evaluate(x, h, u):
-            found = [[v.full() for v in model.with_jacobian(x[i], h[i], u[i])] for i in range(n)]
+        def evaluate(*points):
+            found = [[v.full() for v in model.with_jacobian(*point)] for point in zip(*points, strict=True)]
             every = np.stack([np.hstack(f[2:]) for f in found])
             slopes = [
                 np.concatenate([every[:, :, columns[i]] for i in names], axis=2) for names in blocks.values()
@@ -78,7 +78,7 @@ def test_many_points_at_once_are_the_points_one_by_one(delay):
     model = pendulum_model(z=3, dt=DT)
     late = with_input_delay(replace(model, side_by_side=beside(model)), delay * DT)
     rng, blocks = np.random.default_rng(2), {"A": ("x", "h"), "B": ("u",), "slopes": ("x", "u", "h")}
-    points = rng.normal(size=(5, 2)), rng.normal(size=(5, late.n_h)), rng.normal(size=(5, 1))
+    points = [rng.normal(size=(5, n)) for n in (2, late.n_h, 1, 0, 0)]
     for given, one_by_one in zip(
         late.side_by_side(5, blocks)(*points), beside(late)(5, blocks)(*points), strict=True
     ):

@@ -96,14 +96,15 @@ def test_a_whole_loop_with_its_figures(limits):
 class Track:
     """The cart of ``cart.py`` as its prior has it, with a sensor of 0.1 mm."""
 
-    def __init__(self, step):
-        self._step = step
+    def __init__(self, model):
+        self._model = model
 
     def reset(self, x0, seed):
         return np.asarray(x0, dtype=float)
 
     def step(self, state, u, dt):
-        return self._step(state, [], u)[0].full().ravel()
+        m = self._model
+        return m.step(state, [], u, m.w, m.p)[0].full().ravel()
 
     def measure(self, state, rng):
         return state[:1] + 1e-4 * rng.normal(size=1)
@@ -141,7 +142,7 @@ def test_a_cart_is_brought_to_what_its_limits_allow(carts, limits):
     # At rest the spring of 1 N/m holds what pushes: a place of so many metres takes so many newtons.
     for place in (0.7, -0.7):
         result = simulate(
-            Track(model.step), make_estimator(model, machine, np.array([1e-5, 1e-4])),
+            Track(model), make_estimator(model, machine, np.array([1e-5, 1e-4])),
             make_controller(model, model, control), lambda t, place=place: np.tile([place, 0.0], (len(t), 1)),
             dt=model.dt, duration=14.0, x0=[0.0, 0.0], seed=0,
         )  # fmt: skip

@@ -31,7 +31,7 @@ from hybrid_mpc.analysis.reduction import (
     physical_states,
 )
 from hybrid_mpc.analysis.schedule import GainSchedule, gain_schedule, holding_input
-from hybrid_mpc.analysis.sensitivity import Sensitivities, parameter_sensitivities, with_parameters
+from hybrid_mpc.analysis.sensitivity import Sensitivities, parameter_sensitivities
 from hybrid_mpc.analysis.structure import Mode, Structure, system_structure
 from hybrid_mpc.analysis.symbolic import jacobians
 
@@ -86,6 +86,5 @@ __all__ = [
     "lyapunov_exponent",
     "LyapunovExponent",
     "parameter_sensitivities",
-    "with_parameters",
     "Sensitivities",
 ]

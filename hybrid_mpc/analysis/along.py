@@ -98,10 +98,9 @@ def linearize_along(
     Example:
         >>> import casadi as ca
         >>> from hybrid_mpc.signals import Signal
-        >>> x, h, u, w = ca.MX.sym("x"), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w")
-        >>> model = HybridModel("square", 1.0, (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),),
-        ...     ca.Function("f", [x, h, u], [x**2 + u, h]), ca.Function("g", [x, h, u], [u]),
-        ...     ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]))
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("square", 1.0, level, (Signal("u", "-"),), level,
+        ...     x=x, u=u, x_next=x**2 + u, xdot=u, y=x)
         >>> ltv = linearize_along(model, [1.0], np.ones((3, 1)))
         >>> ltv.A.ravel().tolist(), ltv.transition(0, 3).item()
         ([2.0, 4.0, 10.0], 80.0)
@@ -123,7 +122,7 @@ def linearize_along(
     now, h_now = given if free else given[0], start
     for k in range(n):
         states[k], hidden[k] = (now if free else given[k]), h_now
-        now, h_now = (m.full().ravel() for m in model.step(states[k], h_now, inputs[k]))
+        now, h_now = (m.full().ravel() for m in model.step(states[k], h_now, inputs[k], model.w, model.p))
     if not (np.all(np.isfinite(states)) and np.all(np.isfinite(hidden))):
         raise InputError(
             f"model {model.name}: the free run is not finite; take a shorter one or other inputs"

@@ -96,12 +96,12 @@ def feature_box(program: Program, x: ArrayLike, u: ArrayLike) -> tuple[Array, Ar
     """Bounds of the inputs of a program's GRU cell over a box of states and inputs, by interval arithmetic.
 
     Args:
-        program: ``(x, h, u) -> ...`` with one GRU cell whose inputs do not depend on ``h``.
+        program: ``(x, h, u, ...) -> ...`` with one GRU cell whose inputs depend on ``x`` and ``u`` alone.
         x: Lower and upper bounds ``(n_x, 2)``.
         u: Lower and upper bounds ``(n_u, 2)``.
 
     Raises:
-        InputError: If there is no such cell, or an operation on the way to it is not known.
+        InputError: If there is no such cell, its inputs depend on more, or an operation on the way to it is not known.
 
     Example:
         ``low, high = feature_box(program, [(-1, 1), (-4, 4)], [(-0.5, 0.5)])``
@@ -115,7 +115,12 @@ def feature_box(program: Program, x: ArrayLike, u: ArrayLike) -> tuple[Array, Ar
     box = np.vstack([np.asarray(x, dtype=float), np.asarray(u, dtype=float)])
     n_x = f.numel_in(0)
     z = ca.MX.sym("z", n_x + f.numel_in(2))
-    s = f(z[:n_x], np.zeros(f.numel_in(1)), z[n_x:])
+    rest = [ca.MX.sym(f.name_in(i), f.numel_in(i)) for i in range(f.n_in()) if i not in (0, 2)]
+    s = f.call([z[:n_x], rest[0], z[n_x:], *rest[1:]], True, False)[0]
+    if ca.depends_on(s, ca.veccat(*rest)):
+        raise InputError(
+            "contraction: the GRU cell's inputs depend on more than x and u, of which there is a box"
+        )
     return interval_bounds(ca.Function("s", [z], [ca.vec(s)]), box[:, 0], box[:, 1])
 
 

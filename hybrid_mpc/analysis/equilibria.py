@@ -87,10 +87,9 @@ def equilibria(
     Example:
         >>> import casadi as ca
         >>> from hybrid_mpc.signals import Signal
-        >>> x, h, u, w = ca.MX.sym("x"), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w")
-        >>> model = HybridModel("cubic", 0.1, (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),),
-        ...     ca.Function("f", [x, h, u], [x + 0.1 * (x - x**3), h]), ca.Function("g", [x, h, u], [u]),
-        ...     ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]))
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("cubic", 0.1, level, (Signal("u", "-"),), level,
+        ...     x=x, u=u, x_next=x + 0.1 * (x - x**3), xdot=u, y=x)
         >>> found = equilibria(model, [0.0], [(-2.0, 2.0)])
         >>> [(round(float(p.x[0]), 6) + 0.0, p.stability) for p in found.points]
         [(-1.0, 'stable'), (0.0, 'unstable'), (1.0, 'stable')]
@@ -129,7 +128,7 @@ def equilibria(
 def _point(model: HybridModel, z: Array, error: float, hits: int, u: Array) -> Equilibrium:
     x, h = z[: model.n_x], z[model.n_x :]
     assert model.with_jacobian is not None
-    poles = np.linalg.eigvals(model.with_jacobian(x, h, u)[2].full()).astype(np.complex128)
+    poles = np.linalg.eigvals(model.with_jacobian(x, h, u, model.w, model.p)[2].full()).astype(np.complex128)
     poles = poles[np.argsort(-np.abs(poles), kind="stable")]
     over = float(np.abs(poles[0])) - 1.0
     stability = "marginal" if abs(over) <= MARGINAL else "stable" if over < 0 else "unstable"

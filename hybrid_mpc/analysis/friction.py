@@ -78,7 +78,7 @@ def friction_slopes(
     e = np.eye(model.n_x)[i]
 
     def acceleration(v: float) -> float:
-        return float(model.xdot(x + v * e, h, held)[i])
+        return float(model.xdot(x + v * e, h, held, model.w, model.p)[i])
 
     slope = _slope_of(model, i)
     secant = np.array([_chord(acceleration, v, "secant") for v in size])
@@ -129,7 +129,9 @@ def linearize_secant(
         e = np.eye(model.n_x)[n_q + j]
 
         def after(w: float, e: Array = e) -> Array:
-            return np.concatenate([m.full().ravel() for m in model.step(x0 + w * e, h0, u0)])
+            return np.concatenate(
+                [m.full().ravel() for m in model.step(x0 + w * e, h0, u0, model.w, model.p)]
+            )
 
         a[:, n_q + j] = np.reshape(_chord(after, v, kind), n_z)
     return control_toolbox().ss(a, b, c, d, model.dt, remove_useless_states=False, **signal_names(model))
@@ -146,6 +148,6 @@ def _chord(f: Any, v: float, kind: Kind) -> Any:
 def _slope_of(model: HybridModel, i: int) -> Any:
     """``(x, h, u)`` to the derivatives of ``xdot[i]`` by ``x[i]`` and by the first input."""
     x, h, u = ca.MX.sym("x", model.n_x), ca.MX.sym("h", model.n_h), ca.MX.sym("u", model.n_u)
-    rate = model.xdot(x, h, u)[i]
+    rate = model.xdot(x, h, u, model.w, model.p)[i]
     f = ca.Function("slope", [x, h, u], [ca.jacobian(rate, x)[i], ca.jacobian(rate, u)[0]])
     return lambda *point: tuple(float(m) for m in f(*point))

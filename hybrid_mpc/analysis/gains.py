@@ -67,10 +67,8 @@ def mpc_gain(
         >>> from hybrid_mpc.model import HybridModel
         >>> from hybrid_mpc.mpc import OCP
         >>> from hybrid_mpc.signals import Signal
-        >>> x, h, u, w = ca.MX.sym("x"), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w")
-        >>> model = HybridModel("sum", 1.0, (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),),
-        ...     ca.Function("f", [x, h, u], [x + u, h]), ca.Function("g", [x, h, u], [u]),
-        ...     ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]))
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
         >>> controller = CondensedController(model, OCP(5, [1.0], [1.0], [0.0], [-9.0], [9.0]))
         >>> mpc_gain(controller, [0.0], [0.0]).by_state.round(6)
         array([[-0.618034]])
@@ -164,10 +162,8 @@ def steady_filter(
         >>> import casadi as ca
         >>> from hybrid_mpc.model import HybridModel
         >>> from hybrid_mpc.signals import Signal
-        >>> x, h, u, w = ca.MX.sym("x"), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w")
-        >>> model = HybridModel("sum", 1.0, (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),),
-        ...     ca.Function("f", [x, h, u], [x + u, h]), ca.Function("g", [x, h, u], [u]),
-        ...     ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]))
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
         >>> ekf = ExtendedKalmanFilter(model, sigma_y=[1.0], sigma_x=[1.0], sigma_x0=[1.0])
         >>> steady_filter(ekf, [0.0], [0.0]).gain[:1].round(6)
         array([[0.618034]])

@@ -63,7 +63,7 @@ def hidden_fixed_point(model: HybridModel, x: ArrayLike, u: ArrayLike) -> Array:
         return np.zeros(0)
     h = ca.MX.sym("h", model.n_h)
     p = ca.MX.sym("p", model.n_x + model.n_u)
-    r = model.step(p[: model.n_x], h, p[model.n_x :])[1] - h
+    r = model.step(p[: model.n_x], h, p[model.n_x :], model.w, model.p)[1] - h
     residual = ca.Function("residual", [h, p], [r, ca.densify(ca.jacobian(r, h))])
     found, size = newton(residual, settled_hidden(model, x0, u0), np.concatenate([x0, u0]))
     if size > RESIDUAL:
@@ -137,7 +137,7 @@ def rest_residual(model: HybridModel) -> ca.Function:
     """``(z, u)`` to what one step changes of ``z = (x, h)``, and its Jacobian by ``z``."""
     x, h = ca.MX.sym("x", model.n_x), ca.MX.sym("h", model.n_h)
     z, v = ca.vertcat(x, h), ca.MX.sym("u", model.n_u)
-    r = ca.vertcat(*model.step(x, h, v)) - z
+    r = ca.vertcat(*model.step(x, h, v, model.w, model.p)) - z
     return ca.Function("residual", [z, v], [r, ca.densify(ca.jacobian(r, z))])
 
 
@@ -166,7 +166,7 @@ def settled_hidden(model: HybridModel, x: Array, u: Array, steps: int = 100) -> 
     """Hidden state ``(n_h,)`` after some periods at held ``x`` and ``u``, from zero."""
     h = np.zeros(model.n_h)
     for _ in range(steps if model.n_h else 0):
-        h = model.step(x, h, u)[1].full().ravel()
+        h = model.step(x, h, u, model.w, model.p)[1].full().ravel()
     return h
 
 

@@ -59,10 +59,9 @@ def lyapunov_exponent(
     Example:
         >>> import casadi as ca
         >>> from hybrid_mpc.signals import Signal
-        >>> x, h, u, w = ca.MX.sym("x"), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w")
-        >>> model = HybridModel("lag", 0.1, (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),),
-        ...     ca.Function("f", [x, h, u], [0.9 * x + u, h]), ca.Function("g", [x, h, u], [u]),
-        ...     ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]))
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("lag", 0.1, level, (Signal("u", "-"),), level,
+        ...     x=x, u=u, x_next=0.9 * x + u, xdot=u, y=x)
         >>> round(lyapunov_exponent(model, [1.0], np.zeros((100, 1))).value, 6)  # log(0.9) / 0.1
         -1.053605
     """

@@ -188,8 +188,8 @@ def run_model(model: HybridModel, x0: ArrayLike, h0: ArrayLike | None = None, *,
         x, h = np.asarray(x0, dtype=float), np.zeros(model.n_h) if h0 is None else np.asarray(h0, dtype=float)
         y = np.empty(u.size)
         for k, held in enumerate(u):
-            y[k] = float(model.output(x, held)[output])
-            x, h = model.step(x, h, held)
+            y[k] = float(model.output(x, held, model.w, model.p)[output])
+            x, h = model.step(x, h, held, model.w, model.p)
         return y
 
     return run

@@ -68,10 +68,8 @@ def gain_schedule(
     Example:
         >>> import casadi as ca
         >>> from hybrid_mpc.signals import Signal
-        >>> x, h, u, w = ca.MX.sym("x"), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w")
-        >>> model = HybridModel("sum", 1.0, (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),),
-        ...     ca.Function("f", [x, h, u], [x + u, h]), ca.Function("g", [x, h, u], [u]),
-        ...     ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]))
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
         >>> gain_schedule(model, [([0.0], [0.0])], [1.0], [1.0]).gain.round(6).ravel()
         array([0.618034])
     """
@@ -115,7 +113,7 @@ def holding_input(model: HybridModel, q: ArrayLike, *, u_guess: ArrayLike | None
     x = np.concatenate([column(model, "q", q, n_q), np.zeros(n_q)])
     start = np.zeros(model.n_u) if u_guess is None else column(model, "u_guess", u_guess, model.n_u)
     h, u, v = ca.MX.sym("h", model.n_h), ca.MX.sym("u", model.n_u), ca.MX.sym("x", model.n_x)
-    x_next, h_next = model.step(v, h, u)
+    x_next, h_next = model.step(v, h, u, model.w, model.p)
     unknown, change = ca.vertcat(h, u), ca.vertcat(h_next - h, x_next[n_q:] - v[n_q:])
     residual = ca.Function("hold", [unknown, v], [change, ca.densify(ca.jacobian(change, unknown))])
     found, size = newton(residual, np.concatenate([settled_hidden(model, x, start), start]), x)
@@ -134,7 +132,7 @@ def _between(model: HybridModel, x: Array, guess: float) -> Array | None:
 
     def gained(u: float) -> float:
         held = np.array([u])
-        return float(model.step(x, settled_hidden(model, x, held), held)[0][n_q])
+        return float(model.step(x, settled_hidden(model, x, held), held, model.w, model.p)[0][n_q])
 
     for reach in 0.01 * 2.0 ** np.arange(12):
         low, high = guess - reach, guess + reach

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -12,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import qr
 
 from hybrid_mpc.errors import InputError
-from nn_export import Port, Program, build
+from hybrid_mpc.model import HybridModel
 
 Array = NDArray[np.float64]
 
@@ -83,90 +82,54 @@ class Sensitivities:
         return np.asarray(inverse / np.outer(spread, spread))
 
 
-def parameter_names(program: Program, prefix: str = "prior.") -> tuple[str, ...]:
-    """Scalar weights of a program whose names begin with ``prefix``: the prior's parameters in a step's program."""
-    return tuple(n for n, v in program.weights.items() if n.startswith(prefix) and np.shape(v) == ())
-
-
-def with_parameters(program: Program, names: Sequence[str]) -> Program:
-    """The program with some of its scalar weights as further inputs, so that CasADi can differentiate by them.
-
-    Args:
-        program: The program.
-        names: Names of scalar weights, e.g. ``["prior.J"]``; the inputs are called ``p0``, ``p1`` and so on.
-
-    Raises:
-        InputError: If there is no such scalar weight.
-
-    Example:
-        ``nn_export.build(with_parameters(program, ["prior.J", "prior.d"]))``
-    """
-    for name in names:
-        if name not in program.weights or np.shape(program.weights[name]) != ():
-            there = ", ".join(parameter_names(program, "")) or "none"
-            raise InputError(f"sensitivities: no scalar weight {name!r} in the program; there are: {there}")
-    ports = {name: f"p{i}" for i, name in enumerate(names)}
-
-    def turned(data: Any) -> Any:
-        if isinstance(data, dict):
-            if len(data) == 1 and data.get("weight") in ports:
-                return {"input": ports[data["weight"]]}
-            return {key: turned(value) for key, value in data.items()}
-        return [turned(item) for item in data] if isinstance(data, list) else data
-
-    nodes = tuple(replace(n, args=turned(n.args), kwargs=turned(n.kwargs)) for n in program.nodes)
-    weights = {n: v for n, v in program.weights.items() if n not in ports}
-    inputs = (*program.inputs, *(Port(p, ()) for p in ports.values()))
-    return replace(program, inputs=inputs, nodes=nodes, weights=weights)
-
-
 def parameter_sensitivities(
-    program: Program, x: ArrayLike, u: ArrayLike, *, names: Sequence[str] | None = None
+    model: HybridModel, x: ArrayLike, u: ArrayLike, *, names: Sequence[str] | None = None
 ) -> Sensitivities:
-    """Exact derivatives of a free run by the prior's parameters, from the program of a step.
+    """Exact derivatives of a free run by the prior's parameters.
 
-    Works for a prior and for a hybrid alike: in the hybrid the parameters also move the network's inputs.
+    Works for a prior and for a hybrid alike; what a hybrid's network adds does not change with the parameters, but for
+    the states that they move.
 
     Args:
-        program: ``"prior/step"`` or ``"hybrid/step"`` of an artifact (``nn_export.load_programs``).
+        model: The model.
         x: Start ``(n_x,)``; a hidden state starts at zero.
         u: Inputs ``(n, n_u)``.
-        names: Weights, see :func:`with_parameters`. Default: all scalar ones that begin with ``prior.``.
+        names: Which of the model's parameters. Default: all.
 
     Raises:
-        InputError: If there is no such weight, a shape does not fit, or the run is not finite.
+        InputError: If the model has no such parameter, a shape does not fit, or the run is not finite.
 
     Source: forward sensitivities: Hairer, Norsett, Wanner, *Solving Ordinary Differential Equations I*, section I.14.
 
     Example:
-        ``parameter_sensitivities(programs["prior/step"], [0.3, 0.0], np.zeros((200, 1))).relative``
+        ``parameter_sensitivities(kit.models["prior"], [0.3, 0.0], np.zeros((200, 1))).relative``
     """
-    chosen = parameter_names(program) if names is None else tuple(names)
-    if not chosen:
+    there = [parameter.name for parameter in model.parameters]
+    chosen = tuple(there if names is None else names)
+    if not chosen or not set(chosen) <= set(there):
         raise InputError(
-            "sensitivities: the program has no scalar weight that begins with 'prior.'; give names"
+            f"sensitivities: parameters {list(chosen)} of model {model.name} asked for; it has: "
+            f"{', '.join(there) or 'none'}"
         )
-    values = np.array([float(program.weights[n]) for n in chosen if n in program.weights])
-    step = build(with_parameters(program, chosen), "step", plain=True)
-    n_x, n_h, n_u = (step.numel_in(i) for i in range(3))
+    n_x, n_h, n_u = model.n_x, model.n_h, model.n_u
     inputs, now = np.asarray(u, dtype=float), np.asarray(x, dtype=float).reshape(-1)
     if inputs.ndim != 2 or inputs.shape[1] != n_u or now.shape != (n_x,):
         raise InputError(
             f"sensitivities: x {now.shape} and u {inputs.shape} given, ({n_x},) and (n, {n_u}) needed"
         )
-    z, v, p = ca.MX.sym("z", n_x + n_h), ca.MX.sym("v", n_u), ca.MX.sym("p", len(chosen))
-    after = ca.vertcat(*step(z[:n_x], z[n_x:], v, *ca.vertsplit(p)))
-    f = ca.Function(
-        "f", [z, v, p], [after, ca.densify(ca.jacobian(after, z)), ca.densify(ca.jacobian(after, p))]
-    )
+    columns = [there.index(name) for name in chosen]
+    z, v, p = ca.MX.sym("z", n_x + n_h), ca.MX.sym("v", n_u), ca.MX.sym("p", model.n_p)
+    after = ca.vertcat(*model.step(z[:n_x], z[n_x:], v, model.w, p))
+    by_p = ca.densify(ca.jacobian(after, p))[:, columns]
+    f = ca.Function("f", [z, v, p], [after, ca.densify(ca.jacobian(after, z)), by_p])
     state, slope = np.concatenate([now, np.zeros(n_h)]), np.zeros((n_x + n_h, len(chosen)))
     states, slopes = [state[:n_x]], [slope[:n_x]]
     for held in inputs:
-        state, a, b = (m.full() for m in f(state, held, values))
+        state, a, b = (m.full() for m in f(state, held, model.p))
         state, slope = state.ravel(), a @ slope + b
         states.append(state[:n_x])
         slopes.append(slope[:n_x])
-    found = Sensitivities(chosen, values, np.stack(states), np.stack(slopes))
+    found = Sensitivities(chosen, model.p[columns], np.stack(states), np.stack(slopes))
     if not (np.all(np.isfinite(found.x)) and np.all(np.isfinite(found.by))):
         raise InputError("sensitivities: the free run is not finite; take a shorter one or other inputs")
     return found

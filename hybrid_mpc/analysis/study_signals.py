@@ -106,14 +106,14 @@ def sensitivity_part(subject: Subject) -> Part:
     arrays: dict[str, Any] = {}
     for name, model in subject.models.items():
         u = drive(subject, model, 10.0)
-        found = parameter_sensitivities(subject.programs[f"{name}/step"], np.zeros(model.n_x), u)
+        found = parameter_sensitivities(model, np.zeros(model.n_x), u)
         sigma = np.full(model.n_x, np.inf)
         sigma[: model.n_y] = 1.0  # positions are what is measured
         apart = found.apart(sigma)
         rms = np.sqrt(np.mean(found.relative**2, axis=0))
         result[name] = {
-            "parameters": [n.removeprefix("prior.") for n in found.names], "rms_per_100_percent": rms,
-            "told_apart": [n.removeprefix("prior.") for n in apart.names], "correlation": apart.correlation(sigma),
+            "parameters": found.names, "rms_per_100_percent": rms,
+            "told_apart": apart.names, "correlation": apart.correlation(sigma),
         }  # fmt: skip
         arrays |= {f"{name}/t": model.dt * np.arange(len(found.x)), f"{name}/relative": found.relative}
     return result, arrays

@@ -23,10 +23,9 @@ def jacobians(model: HybridModel, *, continuous: bool = False) -> ca.Function:
 
     Example:
         >>> from hybrid_mpc.signals import Signal
-        >>> x, h, u, w = ca.MX.sym("x"), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w")
-        >>> model = HybridModel("cubic", 0.1, (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),),
-        ...     ca.Function("f", [x, h, u], [x + 0.1 * (u - x**3), h]), ca.Function("g", [x, h, u], [u - x**3]),
-        ...     ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]))
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("cubic", 0.1, level, (Signal("u", "-"),), level,
+        ...     x=x, u=u, x_next=x + 0.1 * (u - x**3), xdot=u - x**3, y=x)
         >>> round(float(jacobians(model)(2.0, [], 0.0)[0]), 12)
         -0.2
         >>> float(jacobians(model, continuous=True)(2.0, [], 0.0)[0])
@@ -39,12 +38,12 @@ def jacobians(model: HybridModel, *, continuous: bool = False) -> ca.Function:
         )
     x, h, u = ca.MX.sym("x", model.n_x), ca.MX.sym("h", model.n_h), ca.MX.sym("u", model.n_u)
     if continuous:
-        f = model.xdot(x, h, u)
+        f = model.xdot(x, h, u, model.w, model.p)
         a, b = ca.jacobian(f, x), ca.jacobian(f, u)
     else:
         assert model.with_jacobian is not None
-        *_, a, b = model.with_jacobian(x, h, u)
-    y = model.output(x, u)
+        *_, a, b = model.with_jacobian(x, h, u, model.w, model.p)
+    y = model.output(x, u, model.w, model.p)
     c = ca.horzcat(ca.jacobian(y, x), ca.MX.zeros(model.n_y, model.n_h))
     results = [ca.densify(m) for m in (a, b, c, ca.jacobian(y, u))]
     return ca.Function("jacobians", [x, h, u], results, ["x", "h", "u"], ["A", "B", "C", "D"])

@@ -144,10 +144,9 @@ class Loop:
         >>> from hybrid_mpc.estimation import ExtendedKalmanFilter
         >>> from hybrid_mpc.mpc import OCP, CondensedController
         >>> from hybrid_mpc.signals import Signal
-        >>> x, h, u, w = ca.MX.sym("x"), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w")
-        >>> model = HybridModel("tank", 1.0, (Signal("x", "m"),), (Signal("u", "m/s"),), (Signal("x", "m"),),
-        ...     ca.Function("f", [x, h, u], [x + u, h]), ca.Function("g", [x, h, u], [u]),
-        ...     ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]))
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "m"),)
+        >>> model = HybridModel.of("tank", 1.0, level, (Signal("u", "m/s"),), level,
+        ...     x=x, u=u, x_next=x + u, xdot=u, y=x)
         >>> ekf = ExtendedKalmanFilter(model, sigma_y=[0.01], sigma_x=[0.01], sigma_x0=[1.0])
         >>> loop = Loop(ekf, CondensedController(model, OCP(9, [1.0], [0.1], [0.1], [-1.0], [1.0])), reference=[0.5])
         >>> level, u = 0.0, loop.start([0.0])

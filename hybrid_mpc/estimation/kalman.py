@@ -91,10 +91,8 @@ class ExtendedKalmanFilter:
 
     Example:
         >>> from hybrid_mpc.signals import Signal
-        >>> x, h, u, w = ca.MX.sym("x"), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w")
-        >>> model = HybridModel("sum", 1.0, (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),),
-        ...     ca.Function("f", [x, h, u], [x + u, h]), ca.Function("g", [x, h, u], [u]),
-        ...     ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]))
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
         >>> ekf = ExtendedKalmanFilter(model, sigma_y=[0.1], sigma_x=[0.1], sigma_x0=[0.1])
         >>> estimate = ekf.update(ekf.start(np.array([1.0])), y=np.array([1.3]), u_prev=np.zeros(1))
         >>> estimate.x.round(3)
@@ -132,6 +130,7 @@ class ExtendedKalmanFilter:
         self._lost = LOST * max(np.max(v) for v in (self._noise, self._first, self._noise_y))
         assert model.with_jacobian is not None
         self._step, self._output = map(BufferedFunction, (model.with_jacobian, _output_with_jacobian(model)))
+        self._step.inputs[3][:], self._step.inputs[4][:] = model.w, model.p
 
     @property
     def model(self) -> HybridModel:
@@ -296,7 +295,7 @@ def _variance(sigma: ArrayLike | Sequence[float], size: int, name: str) -> Array
 
 def _output_with_jacobian(model: HybridModel) -> ca.Function:
     x, u = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
-    y = model.output(x, u)
+    y = model.output(x, u, model.w, model.p)
     return ca.Function(
         "output_with_jacobian", [x, u], [y, ca.densify(ca.jacobian(y, x)), ca.densify(ca.jacobian(y, u))]
     )

@@ -13,7 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import ExtendedKalmanFilter
 from hybrid_mpc.estimation.switching import SwitchingFilter
-from hybrid_mpc.model import HybridModel, ManyPoints, SideBySide
+from hybrid_mpc.model import (
+    HybridModel,
+    ManyPoints,
+    SideBySide,
+    prior_acceleration,
+    step_function,
+    step_symbols,
+)
 
 Array = NDArray[np.float64]
 LEAST = 1.0 - 1e-9
@@ -27,7 +34,11 @@ SWITCHES = ((0.9795, 0.02, 0.0005), (0.5, 0.4995, 0.0005), (0.45, 0.05, 0.5))
 
 
 def with_parameter_states(
-    model: HybridModel, groups: Mapping[str, Sequence[str]], *, most: float = 4.0
+    model: HybridModel,
+    groups: Mapping[str, Sequence[str]],
+    *,
+    prior: HybridModel | None = None,
+    most: float = 4.0,
 ) -> HybridModel:
     """The same model with states that the prior's parameters follow, one for each group of them.
 
@@ -44,31 +55,33 @@ def with_parameter_states(
     the given model, ``OCP.terminal_weight(model)``.
 
     Args:
-        model: A model that knows its parameters (``parametric``).
+        model: A model that knows its parameters.
         groups: Names, and the parameters of each, which change in proportion; an input's gain is
             ``"gain of <input>"``.
+        prior: Model of the prior alone, whose parameters change. Default: the model itself, where it has no network.
         most: Largest factor; the smallest is one over it. Default 4.
 
     Raises:
-        InputError: If the model does not know its parameters, has further states than positions and velocities, or
-            inputs that act later; if a parameter is unknown, or ``most`` is not above 1.
+        InputError: If the model does not know its parameters, has a network and no prior is given, has further states
+            than positions and velocities, or inputs that act later; if a parameter is unknown, or ``most`` is not
+            above 1.
 
     Source: Simon, *Optimal State Estimation*, 2006, section 13.4 (parameter estimation).
 
     Example:
-        >>> from hybrid_mpc.signals import Signal
-        >>> x, h, u, w, p = (ca.MX.sym(n, k) for n, k in zip("xhuwp", (2, 0, 1, 2, 1), strict=True))
-        >>> model = HybridModel("cart", 0.1,
+        >>> from hybrid_mpc.signals import Parameter, Signal
+        >>> x, u, p = ca.MX.sym("x", 2), ca.MX.sym("u"), ca.MX.sym("p")
+        >>> model = HybridModel.of("cart", 0.1,
         ...     (Signal("q", "m"), Signal("v", "m/s")), (Signal("F", "N"),), (Signal("q", "m"),),
-        ...     ca.Function("f", [x, h, u], [x + 0.1 * ca.vertcat(x[1], u / 2), h]),
-        ...     ca.Function("g", [x, h, u], [ca.vertcat(x[1], u / 2)]),
-        ...     ca.Function("y", [x, u], [x[0]]), ca.Function("e", [x, w, u], [(2 * w[1] - u) * x[1]]),
-        ...     parameters={"m": 2.0}, parametric=ca.Function("a", [x, u, p], [u / p]))
+        ...     x=x, u=u, p=p, x_next=x + 0.1 * ca.vertcat(x[1], u / p), xdot=ca.vertcat(x[1], u / p), y=x[0],
+        ...     parameters=(Parameter("m", 2.0, "kg", 1.0, 4.0),))
         >>> adaptive = with_parameter_states(model, {"mass": ["m"]})
+        >>> x, w, p = np.zeros(2), adaptive.w, adaptive.p
         >>> heavier = parameter_states([1.25])  # 2.5 kg
-        >>> [round(float(adaptive.step(np.zeros(2), h, 1.0)[0][1]), 6) for h in (np.zeros(1), heavier)]
+        >>> [round(float(adaptive.step(x, h, 1.0, w, p)[0][1]), 6) for h in (np.zeros(1), heavier)]
         [0.05, 0.04]
     """
+    given = prior_acceleration(model, prior)
     _check_model(model)
     if not (math.isfinite(most) and most > 1):
         raise InputError(
@@ -76,21 +89,21 @@ def with_parameter_states(
         )
     if not groups:
         raise InputError('parameter states: at least one group needed, e.g. {"mass": ("m", "J")}')
-    acceleration = _acceleration(model, groups, most)
+    acceleration = _acceleration(model, given, groups, most)
     change, n_g = _change(model, acceleration), len(groups)
-    x, u = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
+    x, _, u, w, p = step_symbols(model)
     h = ca.MX.sym("h", model.n_h + n_g)
     own, theta = h[: model.n_h], h[model.n_h :]
-    x_next, h_next = model.step.call([x, own, u], model.step.is_a("MXFunction"), False)
-    dx = change(0.5 * (x + x_next), theta, u)[0]
-    more = acceleration(x, u, theta) - acceleration(x, u, ca.DM.zeros(n_g))
-    xdot = model.xdot(x, own, u) + ca.vertcat(ca.MX.zeros(*more.shape), more)
-    names = ["x", "h", "u"], ["x_next", "h_next"]
+    x_next, h_next = model.step.call([x, own, u, w, p], model.step.is_a("MXFunction"), False)
+    dx = change(0.5 * (x + x_next), theta, u, w, p)[0]
+    more = acceleration(x, u, theta, w, p) - acceleration(x, u, ca.DM.zeros(n_g), w, p)
+    xdot = model.xdot(x, own, u, w, p) + ca.vertcat(ca.MX.zeros(*more.shape), more)
+    point = [x, h, u, w, p]
     return replace(
         model,
         name=f"{model.name} with {', '.join(groups)}",
-        step=ca.Function("step", [x, h, u], [x_next + dx, ca.vertcat(h_next, theta)], *names),
-        xdot=ca.Function("xdot", [x, h, u], [xdot]),
+        step=step_function("step", point, [x_next + dx, ca.vertcat(h_next, theta)]),
+        xdot=ca.Function("xdot", point, [xdot]),
         with_jacobian=_with_jacobian(model, change, n_g),
         side_by_side=None
         if model.side_by_side is None
@@ -178,16 +191,16 @@ def parameter_states(factors: ArrayLike, most: float = 4.0) -> Array:
 
 
 def _check_model(model: HybridModel) -> None:
-    if model.parametric is None:
+    x, h, u, w, p = step_symbols(model)
+    n_q = model.n_x // 2
+    slope = ca.jacobian(model.xdot(x, h, u, w, p)[:n_q], ca.vertcat(x, u))
+    found = ca.Function(
+        "kinematics", [x, h, u], [ca.substitute(slope, ca.vertcat(w, p), np.append(model.w, model.p))]
+    )
+    if model.n_x % 2 or not np.array_equal(found(0, 0, 0).full(), np.eye(n_q, model.n_x + model.n_u, n_q)):
         raise InputError(
-            f"parameter states: model {model.name} does not know how its prior depends on its parameters: an artifact "
-            "of an earlier version lacks the program 'parametric'; export it again (hybrid-mpc run)"
-        )
-    n_q = model.parametric.size1_out(0)
-    if model.n_x != 2 * n_q:
-        raise InputError(
-            f"parameter states: model {model.name} has {model.n_x} states, its prior {n_q} accelerations; only "
-            "positions and velocities are dealt with, no lags"
+            f"parameter states: the states {[s.name for s in model.states]} of model {model.name} are not positions "
+            "and then their velocities; nothing else is dealt with, no lags"
         )
     if model.waiting:
         raise InputError(
@@ -196,10 +209,11 @@ def _check_model(model: HybridModel) -> None:
         )
 
 
-def _acceleration(model: HybridModel, groups: Mapping[str, Sequence[str]], most: float) -> ca.Function:
-    """``(x, u, theta) -> a`` of the prior; one function, so that it is exactly itself at equal arguments."""
-    assert model.parametric is not None
-    known = (*model.parameters, *(f"gain of {s.name}" for s in model.inputs))
+def _acceleration(
+    model: HybridModel, given: ca.Function, groups: Mapping[str, Sequence[str]], most: float
+) -> ca.Function:
+    """``(x, u, theta, w, p) -> a`` of the prior; one function, so that it is exactly itself at equal arguments."""
+    known = (*(p.name for p in model.parameters), *(f"gain of {s.name}" for s in model.inputs))
     incidence = np.zeros((len(known), len(groups)))
     for j, (group, names) in enumerate(groups.items()):
         if not names:
@@ -208,25 +222,24 @@ def _acceleration(model: HybridModel, groups: Mapping[str, Sequence[str]], most:
             if name not in known:
                 raise InputError(f"parameter states: no parameter {name!r}; there are: {', '.join(known)}")
             incidence[known.index(name), j] = 1.0
-    x, u = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
-    theta, bound, n_p = ca.MX.sym("theta", len(groups)), math.log(most), len(model.parameters)
+    x, _, u, w, p = step_symbols(model)
+    theta, bound = ca.MX.sym("theta", len(groups)), math.log(most)
     factors = ca.exp(ca.DM(incidence) @ (bound * ca.tanh(theta / bound)))
-    p = factors[:n_p] * ca.DM(list(model.parameters.values()))
-    a = model.parametric(x, factors[n_p:] * u, p)
-    return _expanded(ca.Function("acceleration", [x, u, theta], [ca.densify(a)]))
+    a = given(x, factors[model.n_p :] * u, w, factors[: model.n_p] * p)
+    return _expanded(ca.Function("acceleration", [x, u, theta, w, p], [a]))
 
 
 def _change(model: HybridModel, acceleration: ca.Function) -> ca.Function:
-    """``(x, theta, u) -> (dx, its Jacobian by all of them)``: what the parameters change in the period around x."""
+    """``(x, theta, u, w, p) -> dx`` and its Jacobian by ``x, theta, u``: what theta changes in the period around x."""
     n_g, n_q, dt = acceleration.size1_in(2), acceleration.size1_out(0), model.dt
-    x, u, theta = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u), ca.MX.sym("theta", n_g)
-    changed = acceleration(x, u, theta)
+    (x, _, u, w, p), theta = step_symbols(model), ca.MX.sym("theta", n_g)
+    changed = acceleration(x, u, theta, w, p)
     by_v = ca.jacobian(changed, x)[:, n_q:]
-    more = changed - acceleration(x, u, ca.DM.zeros(n_g))
+    more = changed - acceleration(x, u, ca.DM.zeros(n_g), w, p)
     dv = ca.solve(ca.DM.eye(n_q) - dt / 2 * by_v, dt * more)
     dx = ca.vertcat(dt / 2 * dv, dv)
     slopes = ca.horzcat(*(ca.jacobian(dx, s) for s in (x, theta, u)))
-    return _expanded(ca.Function("change", [x, theta, u], [ca.densify(dx), ca.densify(slopes)]))
+    return _expanded(ca.Function("change", [x, theta, u, w, p], [ca.densify(dx), ca.densify(slopes)]))
 
 
 def _expanded(f: ca.Function) -> ca.Function:
@@ -238,13 +251,13 @@ def _expanded(f: ca.Function) -> ca.Function:
 
 
 def _with_jacobian(model: HybridModel, change: ca.Function, n_g: int) -> ca.Function:
-    x, u = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
+    x, _, u, w, p = step_symbols(model)
     h = ca.MX.sym("h", model.n_h + n_g)
     own, theta = h[: model.n_h], h[model.n_h :]
     f, n_x, n_h = model.with_jacobian, model.n_x, model.n_h
     assert f is not None
-    x_next, h_next, a, b = f.call([x, own, u], f.is_a("MXFunction"), False)
-    dx, slopes = change(0.5 * (x + x_next), theta, u)
+    x_next, h_next, a, b = f.call([x, own, u, w, p], f.is_a("MXFunction"), False)
+    dx, slopes = change(0.5 * (x + x_next), theta, u, w, p)
     by_x, by_theta, by_u = ca.horzsplit(slopes, [0, n_x, n_x + n_g, slopes.size2()])
     onto = ca.DM.eye(n_x) + 0.5 * by_x  # what the model's own step passes on, moved to the middle
     rows_x = ca.horzcat(onto @ a[:n_x, :] + 0.5 * ca.horzcat(by_x, ca.MX.zeros(n_x, n_h)), by_theta)
@@ -252,8 +265,7 @@ def _with_jacobian(model: HybridModel, change: ca.Function, n_g: int) -> ca.Func
     rows_theta = ca.horzcat(ca.MX.zeros(n_g, n_x + n_h), ca.MX.eye(n_g))
     b = ca.vertcat(onto @ b[:n_x, :] + by_u, b[n_x:, :], ca.MX.zeros(n_g, model.n_u))
     outputs = [x_next + dx, ca.vertcat(h_next, theta), ca.vertcat(rows_x, rows_h, rows_theta), b]
-    names = ["x", "h", "u"], ["x_next", "h_next", "A", "B"]
-    return ca.Function("with_jacobian", [x, h, u], [ca.densify(o) for o in outputs], *names)
+    return step_function("with_jacobian", [x, h, u, w, p], [ca.densify(o) for o in outputs])
 
 
 def _side_by_side(model: HybridModel, base: SideBySide, change: ca.Function, n_g: int) -> SideBySide:
@@ -264,10 +276,10 @@ def _side_by_side(model: HybridModel, base: SideBySide, change: ca.Function, n_g
     def make(n: int, by: Mapping[str, Sequence[str]]) -> ManyPoints:
         own, changes = base(n, by), change.map(n)
 
-        def evaluate(x: Array, h: Array, u: Array) -> tuple[Array, ...]:
-            x_next, h_next, *jacobians = own(x, np.ascontiguousarray(h[:, :n_h]), u)
+        def evaluate(x: Array, h: Array, u: Array, w: Array, p: Array) -> tuple[Array, ...]:
+            x_next, h_next, *jacobians = own(x, np.ascontiguousarray(h[:, :n_h]), u, w, p)
             theta = h[:, n_h:]
-            dx, slopes = (m.full() for m in changes(0.5 * (x + x_next).T, theta.T, u.T))
+            dx, slopes = (m.full() for m in changes(0.5 * (x + x_next).T, theta.T, u.T, w.T, p.T))
             by_x, by_theta, by_u = np.split(
                 slopes.reshape(n_x, n, -1).transpose(1, 0, 2), [n_x, n_x + n_g], axis=2
             )

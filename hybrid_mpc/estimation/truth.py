@@ -48,7 +48,9 @@ class TrueState:
     def predict(self, estimate: Estimate, u: ArrayLike) -> Estimate:
         """The model's own step with ``u`` ``(n_u,)`` held: what an oracle knows of the time ahead."""
         m = self._model
-        x, h = (v.full().ravel() for v in m.step(estimate.x, estimate.h, np.asarray(u, dtype=float)))
+        x, h = (
+            v.full().ravel() for v in m.step(estimate.x, estimate.h, np.asarray(u, dtype=float), m.w, m.p)
+        )
         return self.start(np.concatenate([x, h]), estimate.t + m.dt)
 
     def correct(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> Estimate:

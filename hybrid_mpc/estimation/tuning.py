@@ -71,7 +71,9 @@ def process_noise(model: HybridModel, recordings: Sequence[Known], most: int = 4
     for recording in recordings:
         h = np.zeros(model.n_h)
         for k in range(len(recording.u) - 1):
-            x_next, h = (m.full().ravel() for m in model.step(recording.x[k], h, recording.u[k]))
+            x_next, h = (
+                m.full().ravel() for m in model.step(recording.x[k], h, recording.u[k], model.w, model.p)
+            )
             if k >= model.waiting:  # before, nobody knows what was under way
                 errors.append(x_next - recording.x[k + 1])
         if len(errors) >= most:

@@ -98,11 +98,14 @@ class OutputModel(nn.Module):
 
     def forward(self, x: Tensor, u: Tensor) -> Tensor:
         """Outputs ``(..., n_y)``."""
-        y = self.prior.output(x, u)
+        return self.prior.output(x, u) + self.correction(x, u)
+
+    def correction(self, x: Tensor, u: Tensor) -> Tensor:
+        """What the network adds to the prior's outputs, ``(..., n_y)`` [output units]."""
         parts = _features(self.prior.states, x, self.scale_x)
-        parts += [u / self.scale_u, *_features(self.prior.outputs, y, self.scale_y)]
-        correction, _ = self.network(torch.cat(parts, dim=-1), x[..., :0])
-        return y + correction * self.scale_correction
+        parts += [u / self.scale_u, *_features(self.prior.outputs, self.prior.output(x, u), self.scale_y)]
+        out: Tensor = self.network(torch.cat(parts, dim=-1), x[..., :0])[0]
+        return out * self.scale_correction
 
 
 @dataclass(frozen=True)

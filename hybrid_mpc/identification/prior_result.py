@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -73,6 +74,28 @@ class PriorFit:
         ]
         return (*self.warnings, *close, *small)
 
+    def covariance(self, parameters: Sequence[Parameter]) -> tuple[tuple[float, ...], ...]:
+        """Rows of the covariance of the fitted values, as an artifact holds it; fixed parameters have none.
+
+        Args:
+            parameters: The prior's ``parameters_spec``.
+
+        Returns:
+            ``(n_p, n_p)``; empty where the fit does not tell the errors of all that are free.
+
+        Example:
+            >>> fit = PriorFit({"J": 0.11, "d": 0.01}, {"J": 0.01, "d": 0.02}, (), (), {"J, d": 0.5})
+            >>> spec = [Parameter(n, v, "-", 0.0, 1.0) for n, v in fit.values.items()]
+            >>> [[round(v, 6) for v in row] for row in fit.covariance(spec)]
+            [[0.0001, 0.0001], [0.0001, 0.0004]]
+        """
+        errors = [0.0 if p.fixed else self.standard_errors.get(p.name, math.nan) for p in parameters]
+        rows = tuple(
+            tuple(a * b * self._correlation(p.name, q.name) for q, b in zip(parameters, errors, strict=True))
+            for p, a in zip(parameters, errors, strict=True)
+        )
+        return rows if all(math.isfinite(value) for row in rows for value in row) else ()
+
     def rows(self, parameters: Sequence[Parameter]) -> list[dict[str, Any]]:
         """One row a parameter: name, unit, nominal, fitted, standard error, t-ratio, largest correlation.
 
@@ -116,6 +139,10 @@ class PriorFit:
                 "the table needs pandas, which is not installed: pip install 'hybrid-mpc[report]'; rows() does not"
             ) from missing
         return pd.DataFrame(self.rows(parameters)).set_index("parameter")
+
+    def _correlation(self, first: str, second: str) -> float:
+        known = (self.correlations.get(f"{a}, {b}") for a, b in ((first, second), (second, first)))
+        return 1.0 if first == second else next((value for value in known if value is not None), 0.0)
 
     def _closest(self, name: str) -> float | None:
         own = [value for names, value in self.correlations.items() if name in names.split(", ")]

@@ -17,6 +17,8 @@ RUNS = 2
 """Free runs side by side, half a length apart: the older one always has half a length behind it."""
 RUN_SUMS = 3
 """Sums of a free run: energy departure, squared speed, squared input."""
+ENERGY = "energy"
+"""Name of the balance that is watched."""
 HELD_SHARE = 0.25
 """Change of an input, as a share of its plausible range, that no sticking friction is believed to hold."""
 
@@ -117,6 +119,22 @@ def weights(window: int, dt: float) -> tuple[Array, Array, Array, Array, Array]:
     return position, velocity, acceleration, kernel, np.diff(kernel) / dt
 
 
+def energy_balance(model: HybridModel, x: ca.MX, xdot: ca.MX, u: ca.MX) -> ca.MX:
+    """Residual [W] of the model's energy balance if its state changes at ``xdot``.
+
+    Raises:
+        InputError: If the model has no energy balance.
+    """
+    for balance in model.balances:
+        if balance.name == ENERGY:
+            return balance.residual(x, xdot, u, model.w, model.p)
+    known = ", ".join(b.name for b in model.balances) or "none"
+    raise InputError(
+        f"energy monitor: model {model.name} has no balance {ENERGY!r} (it has: {known}), so its energy cannot be "
+        "watched; give its prior inertia(x), or energy_balance(x, xdot, u), and export it again, or take no monitor"
+    )
+
+
 def inertia_of(model: HybridModel, x: ca.MX, u: ca.MX) -> ca.MX:
     """Inertia matrix ``M(q)`` of the energy balance, which is ``v' M a`` plus terms without ``a``."""
     n_q = model.n_x // 2
@@ -125,7 +143,7 @@ def inertia_of(model: HybridModel, x: ca.MX, u: ca.MX) -> ca.MX:
         v = ca.DM.zeros(n_q)
         v[i] = 1.0
         state, rate = ca.vertcat(x[:n_q], v), ca.vertcat(v, a)
-        rows.append(ca.jacobian(model.energy_balance(state, rate, u), a))
+        rows.append(ca.jacobian(energy_balance(model, state, rate, u), a))
     return ca.graph_substitute(ca.vertcat(*rows), [a], [ca.MX.zeros(n_q)])
 
 
@@ -143,7 +161,7 @@ def _near_rest(
     """
     n_q = model.n_x // 2
     (back, forth), (faster_back, faster_forth) = (
-        [model.xdot(ca.vertcat(position, sign * speed), h, u)[n_q:] for sign in (-1, 1)]
+        [model.xdot(ca.vertcat(position, sign * speed), h, u, model.w, model.p)[n_q:] for sign in (-1, 1)]
         for speed in (rest, 2 * rest)
     )
     slowed = 0.5 * (back - forth)
@@ -184,12 +202,12 @@ def _free_run(
     """
     model, window, n_q = layout.model, layout.window, layout.n_q
     n_x, n_z = model.n_x, model.n_x + model.n_h
-    x, h = model.step(memory[:n_x], memory[n_x:n_z], u)
+    x, h = model.step(memory[:n_x], memory[n_x:n_z], u, model.w, model.p)
     ring = ca.vertcat(memory[n_z + n_q : n_z + window * n_q], x[:n_q])
     position, velocity, acceleration, _, _ = weights(window, model.dt)
     # No need to take the newest off: a run is short.
     q_m, v_m, a_m = (ca.reshape(ring, n_q, window) @ ca.DM(w) for w in (position, velocity, acceleration))
-    power = model.energy_balance(ca.vertcat(q_m, v_m), ca.vertcat(v_m, a_m), u_mean)
+    power = energy_balance(model, ca.vertcat(q_m, v_m), ca.vertcat(v_m, a_m), u_mean)
     added = model.dt * ca.vertcat(power - measured_w, ca.dot(v, v), ca.dot(u_mean, u_mean))
     sums = memory[n_z + window * n_q :] + ca.if_else(judged, added, 0)
     return ca.vertcat(x, h, ring, sums), sums
@@ -249,7 +267,7 @@ def reading_function(layout: Layout, rest_speed: Sequence[float], spans: Array) 
     memory = ca.MX.sym("memory", layout.size)
     x, h, u = ca.MX.sym("x", model.n_x), ca.MX.sym("h", model.n_h), ca.MX.sym("u", n_u)
     y, judged = ca.MX.sym("y", n_q), ca.MX.sym("judged", RUNS)
-    x_next = model.step(x, h, u)[0]
+    x_next = model.step(x, h, u, model.w, model.p)[0]
     dv = x_next[n_q:] - x[n_q:]
     dp = x_next[:n_q] - x[:n_q] - dt * x[n_q:]
     ys = ca.vertcat(memory[n_q : window * n_q], y)
@@ -261,7 +279,7 @@ def reading_function(layout: Layout, rest_speed: Sequence[float], spans: Array) 
     a_model = row_grid[:n_q, :] @ ca.DM(kernel[1:]) - row_grid[n_q : 2 * n_q, :] @ ca.DM(slope)
     u_mean = row_grid[2 * n_q :, :] @ ca.DM(0.5 * dt * (kernel[:-1] + kernel[1:]))
     state = ca.vertcat(q + y, v)
-    balances = [model.energy_balance(state, ca.vertcat(v, a), u_mean) for a in (a_model, a_measured)]
+    balances = [energy_balance(model, state, ca.vertcat(v, a), u_mean) for a in (a_model, a_measured)]
     residual = _residual(model, a_measured, a_model, state, h, u_mean, rest)
     # What is predicted while the sensor repeats itself; a missing sample or estimate begins anew. Where friction may
     # stick nothing counts: there an estimate creeps that does not know of it.
@@ -300,11 +318,12 @@ def check_model(model: HybridModel) -> None:
     """Refuse a model that the monitor cannot read.
 
     Raises:
-        InputError: If its outputs are not its positions, or its energy balance says nothing of its motion.
+        InputError: If its outputs are not its positions, it has no energy balance, or one that says nothing of its
+            motion.
     """
     n_q = model.n_x // 2
     x, u = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
-    jacobian = ca.Function("C", [x, u], [ca.jacobian(model.output(x, u), ca.vertcat(x, u))])
+    jacobian = ca.Function("C", [x, u], [ca.jacobian(model.output(x, u, model.w, model.p), ca.vertcat(x, u))])
     given = np.array(jacobian(0, 0).full())
     if given.shape[0] != n_q or not np.array_equal(given, np.eye(n_q, model.n_x + model.n_u)):
         raise InputError(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.model import HybridModel
+from hybrid_mpc.model import HybridModel, prior_acceleration
 from hybrid_mpc.monitor.balance import inertia_of
 from hybrid_mpc.monitor.energy import EnergyMonitor
 from hybrid_mpc.monitor.reading import MonitorState
@@ -93,35 +93,37 @@ class Diagnoser:
     law) is in no deviation.
 
     Args:
-        monitor: With ``history`` and a detector, on a model that knows its parameters.
+        monitor: With ``history`` and a detector.
         causes: Names, and the parameters of each; an input's gain is ``"gain of <input>"``. Default: each by itself.
+        prior: Model of the prior alone, whose parameters change. Default: the monitor's, where it has no network.
 
     Raises:
-        InputError: If the monitor keeps no history or has no detector, the artifact is of an earlier version, or a
-            parameter is unknown.
+        InputError: If the monitor keeps no history or has no detector, the prior has no parameters, or one is unknown.
 
     Example: see ``tests/monitor/test_diagnosis.py``; with a monitor that has seen friction double::
 
-        Diagnoser(monitor, {"friction": ("d", "mu"), "mass": ("m", "J")}).diagnose(state).text
+        Diagnoser(monitor, {"friction": ("d", "mu"), "mass": ("m", "J")}, prior=prior).diagnose(state).text
     """
 
-    def __init__(self, monitor: EnergyMonitor, causes: Mapping[str, Sequence[str]] | None = None) -> None:
+    def __init__(
+        self,
+        monitor: EnergyMonitor,
+        causes: Mapping[str, Sequence[str]] | None = None,
+        *,
+        prior: HybridModel | None = None,
+    ) -> None:
         model, detector = monitor.model, monitor.detector
-        if model.parametric is None:
-            raise InputError(
-                f"diagnosis: model {model.name} does not know how its prior depends on its parameters: an artifact of "
-                "an earlier version lacks the program 'parametric'; export it again (hybrid-mpc run)"
-            )
+        acceleration = prior_acceleration(model, prior)
         if not monitor.layout.history:
             raise InputError("diagnosis: the monitor keeps no history; make it with history=2.0 [s], say")
         if detector is None:
             raise InputError(
                 "diagnosis: the monitor has no detector, so the residuals' own scatter is unknown"
             )
-        known = (*model.parameters, *(f"gain of {s.name}" for s in model.inputs))
+        known = (*(p.name for p in model.parameters), *(f"gain of {s.name}" for s in model.inputs))
         chosen = {name: (name,) for name in known} if causes is None else causes
         self._monitor, self._detector, self._names = monitor, detector, list(chosen)
-        self._force = _force_function(model, _incidence(known, chosen))
+        self._force = _force_function(model, acceleration, _incidence(known, chosen))
 
     def diagnose(self, state: MonitorState, since: float = math.inf) -> Diagnosis:
         """What explains the residual force.
@@ -166,15 +168,14 @@ def _incidence(known: Sequence[str], causes: Mapping[str, Sequence[str]]) -> Arr
     return matrix
 
 
-def _force_function(model: HybridModel, incidence: Array) -> ca.Function:
+def _force_function(model: HybridModel, acceleration: ca.Function, incidence: Array) -> ca.Function:
     """``(x, u, shares) -> (force (n_q,), its slopes (n_q, causes))``."""
-    assert model.parametric is not None
-    values, n_p = ca.DM(list(model.parameters.values())), len(model.parameters)
+    values, n_p = ca.DM(model.p), model.n_p
     x, u = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
     shares = ca.MX.sym("shares", incidence.shape[1])
     factors = 1 + ca.DM(incidence) @ shares
-    changed = model.parametric(x, factors[n_p:] * u, factors[:n_p] * values)
-    force = inertia_of(model, x, u) @ (changed - model.parametric(x, u, values))
+    changed = acceleration(x, factors[n_p:] * u, model.w, factors[:n_p] * values)
+    force = inertia_of(model, x, u) @ (changed - acceleration(x, u, model.w, values))
     return ca.Function("force", [x, u, shares], [ca.densify(force), ca.densify(ca.jacobian(force, shares))])
 
 

@@ -92,13 +92,11 @@ class EnergyMonitor:
     Example:
         >>> import casadi as ca
         >>> from hybrid_mpc.signals import Signal
-        >>> x, h, u, w = ca.MX.sym("x", 2), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w", 2)
-        >>> model = HybridModel(
+        >>> x, u, rate = ca.MX.sym("x", 2), ca.MX.sym("u"), ca.MX.sym("rate", 2)
+        >>> model = HybridModel.of(
         ...     "cart", 0.1, (Signal("q", "m"), Signal("v", "m/s")), (Signal("F", "N"),), (Signal("q", "m"),),
-        ...     step=ca.Function("f", [x, h, u], [x + 0.1 * ca.vertcat(x[1] + 0.05 * u, u), h]),
-        ...     xdot=ca.Function("g", [x, h, u], [ca.vertcat(x[1], u)]),
-        ...     output=ca.Function("y", [x, u], [x[0]]),
-        ...     energy_balance=ca.Function("e", [x, w, u], [(w[1] - u) * x[1]]))
+        ...     x=x, u=u, x_next=x + 0.1 * ca.vertcat(x[1] + 0.05 * u, u), xdot=ca.vertcat(x[1], u), y=x[0],
+        ...     rate=rate, energy=(rate[1] - u) * x[1])
         >>> monitor = EnergyMonitor(model, window=5, average=2)
         >>> round(monitor.delay, 6)
         0.2

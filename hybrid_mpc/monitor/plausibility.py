@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model import HybridModel
+from hybrid_mpc.monitor.balance import energy_balance
 from hybrid_mpc.mpc.soft import SoftBound
 
 Array = NDArray[np.float64]
@@ -155,8 +156,9 @@ def balance_function(model: HybridModel) -> ca.Function:
     x, u = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
     h = ca.MX.zeros(model.n_h)
     for _ in range(SETTLED if model.n_h else 0):
-        h = model.step(x, h, u)[1]
-    return ca.Function("balance", [x, u], [ca.densify(model.energy_balance(x, model.xdot(x, h, u), u))])
+        h = model.step(x, h, u, model.w, model.p)[1]
+    rate = model.xdot(x, h, u, model.w, model.p)
+    return ca.Function("balance", [x, u], [ca.densify(energy_balance(model, x, rate, u))])
 
 
 def excess_bound(model: HybridModel, ordinary: Plausibility, *, strength: float = STRENGTH) -> SoftBound:
@@ -228,9 +230,9 @@ def _symbols(model: HybridModel, ordinary: Plausibility) -> tuple[ca.MX, ca.MX]:
 def _moving_power(model: HybridModel, x: Array, u: Array) -> float:
     """Root mean square of ``v' M a`` [W], what the model's own acceleration takes; at least the smallest number."""
     state, held, h = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u), ca.MX.zeros(model.n_h)
-    rate = model.xdot(state, h, held)
+    rate = model.xdot(state, h, held, model.w, model.p)
     standing = ca.vertcat(rate[: model.n_x // 2], ca.MX.zeros(model.n_x - model.n_x // 2))
-    power = model.energy_balance(state, rate, held) - model.energy_balance(state, standing, held)
+    power = energy_balance(model, state, rate, held) - energy_balance(model, state, standing, held)
     found = ca.Function("power", [state, held], [ca.densify(power)]).map(len(x))(x.T, u.T).full()
     return float(np.sqrt(np.mean(found**2))) or float(np.finfo(float).tiny)
 

@@ -55,10 +55,9 @@ class BestOf:
         >>> from hybrid_mpc.estimation import TrueState
         >>> from hybrid_mpc.mpc.sqp import SQPController
         >>> from hybrid_mpc.signals import Signal
-        >>> x, h, u, w = ca.MX.sym("x"), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w")
-        >>> model = HybridModel("even", 1.0, (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),),
-        ...     ca.Function("f", [x, h, u], [x - u**2, h]), ca.Function("g", [x, h, u], [u]),
-        ...     ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]))
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("even", 1.0, level, (Signal("u", "-"),), level,
+        ...     x=x, u=u, x_next=x - u**2, xdot=u, y=x)
         >>> ocp = OCP(2, [1.0], [0.1], [0.0], [-1.0], [1.0], terminal=[[1.0]])
         >>> single = SQPController(model, ocp)  # u = 0 is stationary: it sees no way down
         >>> best = BestOf(single, starts=[np.full((2, 1), 0.5)])

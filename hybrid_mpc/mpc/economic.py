@@ -92,7 +92,8 @@ def output_cost(output: ca.Function, q_y: ArrayLike) -> ca.Function:
     ``q`` says the same and has a terminal weight.
 
     Args:
-        output: ``(x, u) -> y``, a column, e.g. ``model.output``.
+        output: ``(x, u) -> y``, a column; of a model's own outputs ``(x, u, w, p) -> y`` with its ``w`` and ``p``
+            put in.
         q_y: Weights ``(n_y,)`` [cost/s/unit^2], not negative.
 
     Raises:

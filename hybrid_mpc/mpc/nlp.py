@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
-from hybrid_mpc.model import HybridModel
+from hybrid_mpc.model import HybridModel, step_symbols
 from hybrid_mpc.mpc.limits import Limits
 from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.problem import Problem
@@ -186,7 +186,8 @@ class IpoptController:
         z0, d, u_prev = ca.MX.sym("z0", n_z), ca.MX.sym("d", n_u), ca.MX.sym("u_prev", n_u)
         x_ref, weight = ca.MX.sym("x_ref", n_x, n + 1), ca.MX.sym("weight", n_x, n + 1)
         p = ca.MX.sym("p", ocp.n_p, n + 1)
-        self._step = model.step.map(n)
+        point = step_symbols(model)[:3]
+        self._step = ca.Function("step", point, list(model.step(*point, model.w, model.p))).map(n)
         z_next = ca.vertcat(*self._step(z[:n_x, :-1], z[n_x:, :-1], u + ca.repmat(d, 1, n)))
         du = u - ca.horzcat(u_prev, u[:, :-1])
         self._u_scale = ocp.input_scale

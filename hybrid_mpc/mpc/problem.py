@@ -94,10 +94,8 @@ class Problem:
 
     Example:
         >>> from hybrid_mpc.signals import Signal
-        >>> x, h, u, w = ca.MX.sym("x"), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w")
-        >>> model = HybridModel("sum", 1.0, (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),),
-        ...     ca.Function("f", [x, h, u], [x + u, h]), ca.Function("g", [x, h, u], [u]),
-        ...     ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]))
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
         >>> problem = Problem(model, OCP(3, [1.0], [1.0], [0.0], [-9.0], [9.0], terminal=[[1.0]]))
         >>> z = problem.run(np.zeros(1), np.ones((3, 1)))
         >>> z[:, 0].tolist()
@@ -206,5 +204,5 @@ class Problem:
 
 def _rollout(model: HybridModel, n: int) -> BufferedFunction:
     z, u = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("u", model.n_u)
-    z_next = ca.vertcat(*model.step(z[: model.n_x], z[model.n_x :], u))
+    z_next = ca.vertcat(*model.step(z[: model.n_x], z[model.n_x :], u, model.w, model.p))
     return BufferedFunction(ca.Function("z_step", [z, u], [z_next]).mapaccum("rollout", n))

@@ -74,10 +74,8 @@ class SafeController:
         >>> from hybrid_mpc.estimation import TrueState
         >>> from hybrid_mpc.mpc import OCP, CondensedController
         >>> from hybrid_mpc.signals import Signal
-        >>> x, h, u, w = ca.MX.sym("x"), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w")
-        >>> model = HybridModel("sum", 1.0, (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),),
-        ...     ca.Function("f", [x, h, u], [x + u, h]), ca.Function("g", [x, h, u], [u]),
-        ...     ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]))
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
         >>> ocp = OCP(5, [1.0], [1.0], [0.0], [-9.0], [9.0], du_max=[0.5])
         >>> safe = SafeController(CondensedController(model, ocp), fallback=model)
         >>> estimate = TrueState(model).start([2.0])
@@ -244,7 +242,7 @@ def _check_first(first: Controller, controller: Controller) -> None:
 def _equilibrium_input(model: HybridModel) -> ca.Function:
     """``x -> u`` that holds a state best: one least-squares Newton step of ``xdot(x, 0, u)`` from zero."""
     x, u = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
-    v_dot = model.xdot(x, ca.DM.zeros(model.n_h, 1), u)[model.n_x // 2 :]
+    v_dot = model.xdot(x, ca.DM.zeros(model.n_h, 1), u, model.w, model.p)[model.n_x // 2 :]
     slope = ca.jacobian(v_dot, u)
     damping = 1e-12 * ca.DM.eye(model.n_u)
     best = -ca.solve(slope.T @ slope + damping, slope.T @ v_dot)

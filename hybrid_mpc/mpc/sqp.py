@@ -62,10 +62,9 @@ class SQPController:
         >>> import casadi as ca
         >>> from hybrid_mpc.estimation import TrueState
         >>> from hybrid_mpc.signals import Signal
-        >>> x, h, u, w = ca.MX.sym("x"), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w")
-        >>> model = HybridModel("sine", 1.0, (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),),
-        ...     ca.Function("f", [x, h, u], [x + ca.sin(u), h]), ca.Function("g", [x, h, u], [u]),
-        ...     ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]))
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("sine", 1.0, level, (Signal("u", "-"),), level,
+        ...     x=x, u=u, x_next=x + ca.sin(u), xdot=u, y=x)
         >>> controller = SQPController(model, OCP(5, [1.0], [1.0], [0.0], [-1.5], [1.5]))
         >>> estimate = TrueState(model).start([2.0])
         >>> solution = controller.solve(controller.initial(estimate), estimate, np.zeros((6, 1)))

@@ -66,10 +66,8 @@ class Stages:
 
     Example:
         >>> from hybrid_mpc.signals import Signal
-        >>> x, h, u, w = ca.MX.sym("x"), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w")
-        >>> model = HybridModel("sum", 1.0, (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),),
-        ...     ca.Function("f", [x, h, u], [x + u, h]), ca.Function("g", [x, h, u], [u]),
-        ...     ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]))
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
         >>> Stages(model, 3).run(np.zeros(1), np.ones((3, 1))).ravel().tolist()
         [0.0, 1.0, 2.0, 3.0]
     """
@@ -126,13 +124,14 @@ class VectorisedStages:
 
     def __init__(self, model: HybridModel, n: int, *, compiled: bool = False) -> None:
         assert model.side_by_side is not None
-        self._model, self._many, self._n, self._n_x = model, model.side_by_side, n, model.n_x
-        self._at = self._many(n, {"A": ("x", "h"), "B": ("u",)})
+        self._many, self._n, self._n_x = model.side_by_side, n, model.n_x
+        self._given = model.w, model.p
+        self._at, self._held = self._many(n, {"A": ("x", "h"), "B": ("u",)}), self._tiled(n)
         self._along = _run(model, n, compiled)
 
     def at(self, z: Array, u: Array) -> Derivatives:
         """See :class:`Linearisation`."""
-        x_next, h_next, a, b = self._at(z[:, : self._n_x], z[:, self._n_x :], u)
+        x_next, h_next, a, b = self._at(z[:, : self._n_x], z[:, self._n_x :], u, *self._held)
         return np.hstack([x_next, h_next]), np.ascontiguousarray(a.transpose(0, 2, 1)), b
 
     def run(self, z0: Array, u: Array) -> Array:
@@ -142,14 +141,19 @@ class VectorisedStages:
     def slopes(self, times: int, *, hidden: bool = False) -> Slopes:
         """See :class:`Linearisation`."""
         by = ("x", "u", "h") if hidden else ("x", "u")
-        many, n_x = self._many(times * self._n, {"slopes": by}), self._n_x
-        return lambda z, u: many(z[:, :n_x], z[:, n_x:], u)[2]
+        points, n_x = times * self._n, self._n_x
+        many, held = self._many(points, {"slopes": by}), self._tiled(points)
+        return lambda z, u: many(z[:, :n_x], z[:, n_x:], u, *held)[2]
+
+    def _tiled(self, n: int) -> list[Array]:
+        """Disturbances and parameters, the same at all points."""
+        return [np.tile(values, (n, 1)) for values in self._given]
 
 
 def _run(model: HybridModel, n: int, compiled: bool) -> BufferedFunction:
     z, u = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("u", model.n_u)
     inline = model.step.is_a("MXFunction")  # a call less a stage
-    z_next = ca.vertcat(*model.step.call([z[: model.n_x], z[model.n_x :], u], inline, False))
+    z_next = ca.vertcat(*model.step.call(_point(model, z, u), inline, False))
     step = ca.Function("z_step", [z, u], [z_next])
     return BufferedFunction((_compiled(step) if compiled else step).mapaccum("run", n))
 
@@ -165,8 +169,13 @@ def _stage(model: HybridModel) -> ca.Function:
     assert model.with_jacobian is not None
     # Written into the caller's graph where that is possible: a call less a stage.
     inline = model.with_jacobian.is_a("MXFunction")
-    x_next, h_next, a, b = model.with_jacobian.call([z[: model.n_x], z[model.n_x :], u], inline, False)
+    x_next, h_next, a, b = model.with_jacobian.call(_point(model, z, u), inline, False)
     return ca.Function("stage", [z, u], [ca.vertcat(x_next, h_next), ca.densify(a), ca.densify(b)])
+
+
+def _point(model: HybridModel, z: ca.MX, u: ca.MX) -> list[ca.MX]:
+    """What the model's step takes."""
+    return [z[: model.n_x], z[model.n_x :], u, ca.MX(ca.DM(model.w)), ca.MX(ca.DM(model.p))]
 
 
 def _compiled(stage: ca.Function) -> ca.Function:

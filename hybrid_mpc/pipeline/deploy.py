@@ -46,6 +46,7 @@ def versions() -> dict[str, str]:
 def export_stage(context: Context) -> None:
     """Write the hybrid and the fitted prior as one artifact; measure both against torch."""
     from hybrid_mpc.identification.export import check_parity, model_info, trace_model
+    from hybrid_mpc.identification.prior_result import PriorFit
     from hybrid_mpc.identification.step import PriorStep, RecurrentStep
     from hybrid_mpc.pipeline.identify import load_trained
 
@@ -55,7 +56,9 @@ def export_stage(context: Context) -> None:
         "hybrid": load_trained(context, DEPLOYED).step(phy, dt),
         "prior": PriorStep(phy, dt),
     }
-    info = model_info(phy, dt)
+    found = context.result("prior")
+    fit = PriorFit(found["values"], found["standard_errors"], (), (), found["correlations"])
+    info = model_info(phy, dt, fit.covariance(phy.parameters_spec))
     deployed = replace(info, input_delay=context.delay, time_unit=context.time_unit)
     programs, parities = {}, []
     for i, (name, step) in enumerate(steps.items()):

@@ -90,7 +90,7 @@ def faulted(
     task = next((t for t in scenario.tasks if not t.faults and t.weight is None), scenario.tasks[0])
     start = dt * round(0.5 * task.duration / dt)
     detects = freezing(kit, kit.problem(task.name))
-    monitor = guard_monitor(model, kit.detector(), **detects, diagnose=model.parametric is not None)
+    monitor = guard_monitor(model, kit.detector(), **detects, diagnose=model.n_p > 0)
     rows: list[dict[str, Any]] = []
     arrays: dict[str, Array] = {}
     for case in cases(scenario):
@@ -102,7 +102,7 @@ def faulted(
         row, result = bench.run(spec, monitor=monitor)
         # The estimator is deterministic: over the record it says again what it said in the loop.
         samples = Samples(result.t, result.y, result.u)
-        trace, alarms = explained(monitor, bench.parts(spec)[0], samples, causes)
+        trace, alarms = explained(monitor, bench.parts(spec)[0], samples, causes, prior=kit.models["prior"])
         rows.append({**_told(case, task.name, start, trace, alarms), "switches": plain(row.switches)})
         arrays |= kept(case.name, trace, result.y)
     return rows, arrays

@@ -235,7 +235,7 @@ def _recorded(
     if detector is None:
         monitor = make_monitor(model, kit.calibration)
     else:
-        diagnose = model.parametric is not None
+        diagnose = model.n_p > 0
         monitor = guard_monitor(model, detector, **freezing(kit, kit.problem()), diagnose=diagnose)
     estimator = kit.observer()
     tested = [r for r in context.dataset.whole if clean_windows(context, r, ("test",))]
@@ -243,7 +243,9 @@ def _recorded(
     arrays: dict[str, Array] = {}
     watched, starts = 0.0, 0
     for recording, say in along(tested, context.progress.update):
-        trace, alarms = explained(monitor, estimator, recording, context.scenario.causes, say)
+        trace, alarms = explained(
+            monitor, estimator, recording, context.scenario.causes, say, prior=kit.models["prior"]
+        )
         found += [{"file": recording.name, **alarm} for alarm in alarms]
         edges = np.diff(trace.alarm.astype(int), prepend=0) == 1
         for window in clean_windows(context, recording, ("test",)):

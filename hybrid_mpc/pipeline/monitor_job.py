@@ -16,6 +16,7 @@ from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_object, write_json, write_text
 from hybrid_mpc.job.contenders import find_noise
+from hybrid_mpc.model import HybridModel
 from hybrid_mpc.monitor import Detector, Diagnoser, EnergyMonitor, MonitorTrace, guard_monitor
 from hybrid_mpc.monitor.lengths import HISTORY_S, samples
 from hybrid_mpc.monitor.reading import Verdict
@@ -61,7 +62,7 @@ class MonitorJob:
         """The guard's monitor where there is a detector, else that of the main job with the artifact's thresholds."""
         model = self.kit.models["hybrid"]
         if self.detector is not None:
-            known, ranges = model.parametric is not None, self.kit.problem().input_range
+            known, ranges = model.n_p > 0, self.kit.problem().input_range
             return guard_monitor(
                 model, self.detector, resolution=self.resolution, input_range=ranges, diagnose=known
             )
@@ -208,7 +209,9 @@ def watched(
     job: MonitorJob, recording: Trajectory, on_progress: Callable[[int, int], None] = lambda done, total: None
 ) -> tuple[MonitorTrace, list[dict[str, Any]]]:
     """Trace of a recording, and its alarms with what explains them (empty where nothing can say)."""
-    return explained(job.monitor, job.estimator, recording, job.kit.causes, on_progress)
+    return explained(
+        job.monitor, job.estimator, recording, job.kit.causes, on_progress, prior=job.kit.models.get("prior")
+    )
 
 
 def explained(
@@ -217,6 +220,8 @@ def explained(
     recording: TrajectoryLike,
     causes: Mapping[str, tuple[str, ...]],
     on_progress: Callable[[int, int], None] = lambda done, total: None,
+    *,
+    prior: HybridModel | None = None,
 ) -> tuple[MonitorTrace, list[dict[str, Any]]]:
     """Replay a monitor, and say of each alarm what explains it.
 
@@ -226,12 +231,13 @@ def explained(
         recording: On the model's grid.
         causes: What may break, see :class:`~hybrid_mpc.monitor.Diagnoser`. Empty: each parameter by itself.
         on_progress: ``(done, total)`` samples.
+        prior: Model of the prior alone, see there.
 
     Returns:
         The trace, and ``{start_s, end_s, diagnosis}`` of each alarm; no diagnosis where nothing can say.
     """
     can = monitor.layout.history and monitor.detector is not None
-    diagnoser = Diagnoser(monitor, causes or None) if can else None
+    diagnoser = Diagnoser(monitor, causes or None, prior=prior) if can else None
     dt, last = monitor.model.dt, len(recording.t) - 1
     later = samples(HISTORY_S, monitor.model)  # by then the history holds nothing from before the alarm
     texts: dict[int, str] = {}

@@ -35,23 +35,18 @@ def oracle(dt: float, parameters: RigParameters | None = None, sub_steps: int = 
     """
     p = parameters or RigParameters()
     run = steps(p, sub_steps)
-    x, h, u, w = ca.MX.sym("x", 2), ca.MX.sym("h", N_STATES - 2), ca.MX.sym("u"), ca.MX.sym("xdot", 2)
+    x, h, u, rate = ca.MX.sym("x", 2), ca.MX.sym("h", N_STATES - 2), ca.MX.sym("u"), ca.MX.sym("rate", 2)
     after = run(ca.vertcat(x, h), u, dt / sub_steps)
     end, a, b = steps_with_jacobian(p, sub_steps)(ca.vertcat(x, h), u, dt / sub_steps)
     s, v = ca.SX.sym("s", N_STATES), ca.SX.sym("v")
     f = ca.Function("f", [s, v], [rhs(s, v, p)[0][:2]])
-    return HybridModel(
-        "oracle",
-        dt,
-        STATES,
-        INPUTS,
-        OUTPUTS,
-        step=ca.Function("step", [x, h, u], [after[:2], after[2:]]),
-        xdot=ca.Function("xdot", [x, h, u], [f(ca.vertcat(x, h), u)]),
-        output=ca.Function("output", [x, u], [x[0]]),
-        energy_balance=ca.Function("energy_balance", [x, w, u], [_energy_balance(x, w, u)]),
-        with_jacobian=_compiled(ca.Function("with_jacobian", [x, h, u], [end[:2], end[2:], a, b])),
-    )
+    none = ca.MX.sym("none", 0)
+    slopes = ca.Function("with_jacobian", [x, h, u, none, none], [end[:2], end[2:], a, b])
+    return HybridModel.of(
+        "oracle", dt, STATES, INPUTS, OUTPUTS,
+        x=x, h=h, u=u, x_next=after[:2], h_next=after[2:], xdot=f(ca.vertcat(x, h), u), y=x[0],
+        rate=rate, energy=_energy_balance(x, rate, u), with_jacobian=_compiled(slopes),
+    )  # fmt: skip
 
 
 def _compiled(f: ca.Function) -> ca.Function:

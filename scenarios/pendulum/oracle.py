@@ -25,7 +25,7 @@ def oracle(dt: float, parameters: PendulumParameters | None = None, sub_steps: i
         0
     """
     p = parameters or PendulumParameters()
-    x, h, u, w = ca.SX.sym("x", 2), ca.SX.sym("h", 0), ca.SX.sym("u"), ca.SX.sym("xdot", 2)
+    x, u, rate = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("rate", 2)
 
     def rates(z: ca.SX) -> ca.SX:
         return ca.vertcat(z[1], (u - p.gravity * ca.sin(z[0]) - p.d * z[1]) / p.inertia)
@@ -39,15 +39,18 @@ def oracle(dt: float, parameters: PendulumParameters | None = None, sub_steps: i
         z = z + s / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
     published = {spec.name: spec.value for spec in PUBLISHED}
     m, length, d, g = (published[name] for name in ("m", "l", "d", "g"))
-    torque = m * length**2 * w[1] + m * g * length * ca.sin(x[0]) + d * x[1] - u
-    return HybridModel(
+    torque = m * length**2 * rate[1] + m * g * length * ca.sin(x[0]) + d * x[1] - u
+    return HybridModel.of(
         "oracle",
         dt,
         STATES,
         INPUTS,
         OUTPUTS,
-        step=ca.Function("step", [x, h, u], [z, h]),
-        xdot=ca.Function("xdot", [x, h, u], [rates(x)]),
-        output=ca.Function("output", [x, u], [x[0]]),
-        energy_balance=ca.Function("energy_balance", [x, w, u], [x[1] * torque]),
+        x=x,
+        u=u,
+        x_next=z,
+        xdot=rates(x),
+        y=x[0],
+        rate=rate,
+        energy=x[1] * torque,
     )

@@ -16,7 +16,7 @@ DT, J, MGL, GAMMA = 0.02, 0.1, 1.5, 0.15
 
 def machine(coulomb: float = 0.0, n_h: int = 0) -> HybridModel:
     """A pendulum, RK4 with 10 sub-steps; with n_h = 1 a leaky hidden state adds torque."""
-    x, h, u, w = ca.MX.sym("x", 2), ca.MX.sym("h", n_h), ca.MX.sym("u"), ca.MX.sym("w", 2)
+    x, h, u = ca.MX.sym("x", 2), ca.MX.sym("h", n_h), ca.MX.sym("u")
     extra = 0.1 * h[0] if n_h else 0.0
 
     def rhs(z):
@@ -30,13 +30,10 @@ def machine(coulomb: float = 0.0, n_h: int = 0) -> HybridModel:
         k3 = rhs(z + d / 2 * k2)
         z = z + d / 6 * (k1 + 2 * k2 + 2 * k3 + rhs(z + d * k3))
     h_next = 0.8 * h + 0.1 * ca.tanh(x[1] + u) if n_h else h
-    return HybridModel(
+    return HybridModel.of(
         "pendulum", DT, (Signal("phi", "rad"), Signal("phi_dot", "rad/s")), (Signal("tau", "N m"),),
         (Signal("phi", "rad"),),
-        step=ca.Function("step", [x, h, u], [z, h_next]),
-        xdot=ca.Function("xdot", [x, h, u], [rhs(x)]),
-        output=ca.Function("output", [x, u], [x[0]]),
-        energy_balance=ca.Function("energy", [x, w, u], [(J * w[1] - u) * x[1]]),
+        x=x, h=h, u=u, x_next=z, h_next=h_next, xdot=rhs(x), y=x[0],
     )  # fmt: skip
 
 
@@ -55,7 +52,7 @@ def test_fixed_points_hanging_upright_and_under_torque():
 def test_fixed_point_holds_the_hidden_state_too():
     model = machine(n_h=1)
     x, h = fixed_point(model, [0.2], [0.1, 0.0])
-    x_next, h_next = (m.full().ravel() for m in model.step(x, h, [0.2]))
+    x_next, h_next = (m.full().ravel() for m in model.step(x, h, [0.2], model.w, model.p))
     assert np.abs(np.concatenate([x_next - x, h_next - h])).max() <= 1e-10
     assert abs(h[0] - 0.5 * np.tanh(0.2)) < 1e-8  # h = 0.8 h + 0.1 tanh(u)
     assert abs(MGL * np.sin(x[0]) - 0.2 - 0.1 * h[0]) < 1e-6
@@ -84,7 +81,7 @@ def test_linearisation_agrees_with_central_differences():
     sys = linearize(model, z0[:2], u0, z0[2:])
 
     def f(w):
-        return np.concatenate([m.full().ravel() for m in model.step(w[:2], w[2:3], w[3:])])
+        return np.concatenate([m.full().ravel() for m in model.step(w[:2], w[2:3], w[3:], model.w, model.p)])
 
     w0 = np.concatenate([z0, u0])
     numeric = np.column_stack([(f(w0 + e * i) - f(w0 - e * i)) / (2 * e) for i in np.eye(4)])

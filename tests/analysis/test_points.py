@@ -69,7 +69,12 @@ def test_symbolic_matrices_agree_with_central_differences(golf, name):
 
     def f(w):
         x, h, u = np.split(w, [2, 2 + model.n_h])
-        return np.concatenate([m.full().ravel() for m in (*model.step(x, h, u), model.output(x, u))])
+        return np.concatenate(
+            [
+                m.full().ravel()
+                for m in (*model.step(x, h, u, model.w, model.p), model.output(x, u, model.w, model.p))
+            ]
+        )
 
     numeric = np.column_stack([(f(w0 + e * i) - f(w0 - e * i)) / (2 * e) for i in np.eye(w0.size)])
     x, h, u = np.split(w0, [2, 2 + model.n_h])
@@ -84,7 +89,7 @@ def test_along_a_free_run_the_product_of_the_maps_is_the_run_s_derivative():
     def end(x):
         x, h = np.array(x), np.zeros(3)
         for held in u:
-            x, h = (m.full().ravel() for m in model.step(x, h, held))
+            x, h = (m.full().ravel() for m in model.step(x, h, held, model.w, model.p))
         return np.concatenate([x, h])
 
     along = linearize_along(model, [0.2, 0.0], u)
@@ -124,7 +129,7 @@ def test_points_of_rest_hold_the_hidden_state():
     found = equilibria(model, [0.0], REGION, starts=32)
     assert len(found.points) >= 2
     for p in found.points:
-        x, h = (m.full().ravel() for m in model.step(p.x, p.h, p.u))
+        x, h = (m.full().ravel() for m in model.step(p.x, p.h, p.u, model.w, model.p))
         assert np.abs(np.concatenate([x - p.x, h - p.h])).max() <= 1e-10
         x_near, h_near = fixed_point(model, [0.0], p.x)
         assert np.abs(np.concatenate([x_near - p.x, h_near - p.h])).max() < 1e-7

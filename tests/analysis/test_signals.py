@@ -15,6 +15,7 @@ from hybrid_mpc import (
     frequency_response,
     gru_weights,
     linearize,
+    load,
     lyapunov_exponent,
     multisine_response,
     parameter_sensitivities,
@@ -154,18 +155,17 @@ def test_weights_and_features_are_read_from_an_artifact(golf_artifact):
     f = nn_export.build(program)
     h = np.zeros(8)
     for s in ([-0.5, -1.0, -0.1], [0.5, 2.0, 0.3]):
-        assert np.all(np.abs(f(s[:2], h, s[2])[1].full().ravel()) <= contraction(cell, low, high).reach)
+        after = f(s[:2], h, s[2], [], np.zeros(8))[1].full().ravel()
+        assert np.all(np.abs(after) <= contraction(cell, low, high).reach)
     with pytest.raises(InputError, match="0 GRU cells"):
         gru_weights(nn_export.load_programs(golf_artifact)["prior/step"])
 
 
 def test_exponent_of_the_logistic_map_is_log_two():
-    x, h, u, w = ca.MX.sym("x"), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w")
-    one = (Signal("x", "-"),)
-    chaos = HybridModel(
-        "logistic", 0.5, one, (Signal("u", "-"),), one, ca.Function("f", [x, h, u], [4 * x * (1 - x), h]),
-        ca.Function("g", [x, h, u], [u]), ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]),
-    )  # fmt: skip
+    x, u, one = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+    chaos = HybridModel.of(
+        "logistic", 0.5, one, (Signal("u", "-"),), one, x=x, u=u, x_next=4 * x * (1 - x), xdot=u, y=x
+    )
     found = lyapunov_exponent(chaos, [0.3], np.zeros((4000, 1)))
     # ln 2 a period of 0.5 s; 3,200 periods of a mean with deviation 0.9 or so.
     assert abs(found.value - np.log(2) / 0.5) < 5 * found.deviation + 0.02
@@ -184,22 +184,16 @@ def test_exponent_of_a_linear_run_is_its_slowest_pole_s():
 
 
 def test_sensitivities_agree_with_central_differences(golf_artifact):
-    programs = nn_export.load_programs(golf_artifact)
     u = 0.2 * np.sin(0.1 * np.arange(60))[:, None]
-    for name in ("prior/step", "hybrid/step"):
-        program = programs[name]
-        found = parameter_sensitivities(program, [0.1, 0.0], u, names=["prior.J", "prior.mu"])
+    for model in load(golf_artifact).models.values():
+        found = parameter_sensitivities(model, [0.1, 0.0], u, names=["mu", "J"])
         for j, key in enumerate(found.names):
             ends = []
             for sign in (1, -1):
-                value = np.asarray(program.weights[key]) * (1 + sign * 1e-5)
-                changed = nn_export.Program(
-                    program.inputs, program.outputs, program.nodes, {**program.weights, key: value}
-                )
-                f, x = nn_export.build(changed), np.array([0.1, 0.0])
-                h, run = np.zeros(f.numel_in(1)), [np.array([0.1, 0.0])]
+                size = [1 + sign * 1e-5 * (parameter.name == key) for parameter in model.parameters]
+                x, h, run = np.array([0.1, 0.0]), np.zeros(model.n_h), [np.array([0.1, 0.0])]
                 for held in u:
-                    x, h = f(x, h, held)
+                    x, h = model.step(x, h, held, model.w, size * model.p)
                     run.append(x.full().ravel())
                 ends.append(np.array(run))
             numeric = (ends[0] - ends[1]) / 2e-5
@@ -209,14 +203,14 @@ def test_sensitivities_agree_with_central_differences(golf_artifact):
 
 
 def test_parameters_that_a_run_does_not_tell_apart_are_named(golf_artifact):
-    program = nn_export.load_programs(golf_artifact)["prior/step"]
+    model = load(golf_artifact).models["prior"]
     u = 0.25 * np.sin(0.1 * np.arange(300))[:, None]
-    found = parameter_sensitivities(program, [0.0, 0.0], u)
+    found = parameter_sensitivities(model, [0.0, 0.0], u)
     sigma = [1e-3, np.inf]
     with pytest.raises(InputError, match="apart"):
         found.correlation(sigma)  # r and mu are one product
     apart = found.apart(sigma)
-    assert not {"prior.r", "prior.mu"} <= set(apart.names)
+    assert not {"r", "mu"} <= set(apart.names)
     assert np.allclose(np.diag(apart.correlation(sigma)), 1.0)
-    with pytest.raises(InputError, match="no scalar weight"):
-        parameter_sensitivities(program, [0.0, 0.0], u, names=["prior.nothing"])
+    with pytest.raises(InputError, match=r"\['nothing'\] of model prior asked for; it has: m, g,"):
+        parameter_sensitivities(model, [0.0, 0.0], u, names=["nothing"])

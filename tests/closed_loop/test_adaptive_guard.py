@@ -22,7 +22,7 @@ DU, BROKEN = 0.4, 50
 SIGMA = {"sigma_y": [1e-4], "sigma_x": [1e-5, 1e-3], "sigma_x0": [1e-3, 0.1]}
 
 
-WHOLE, HEAVY = (pendulum(inertia=factor * J, mgl=factor * MGL).step for factor in (1.0, 1.5))
+WHOLE, HEAVY = (pendulum(inertia=factor * J, mgl=factor * MGL) for factor in (1.0, 1.5))
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,8 @@ class Heavier:
 
     def step(self, state, u, dt):
         x, k = state
-        return (HEAVY if k >= self.broken else WHOLE)(x, [], u)[0].full().ravel(), k + 1
+        m = HEAVY if k >= self.broken else WHOLE
+        return m.step(x, [], u, m.w, m.p)[0].full().ravel(), k + 1
 
     def measure(self, state, rng):
         return state[0][:1] + 1e-4 * rng.normal(size=1)

@@ -83,7 +83,7 @@ def test_an_oracle_predicts_with_its_model():
         e = ahead.update(e, z, u)  # the machine has not moved, say
     x, h = z[:2], z[2:]
     for u in decided:
-        x, h = (v.full().ravel() for v in model.step(x, h, u))
+        x, h = (v.full().ravel() for v in model.step(x, h, u, model.w, model.p))
     np.testing.assert_allclose(np.concatenate([e.x, e.h]), np.concatenate([x, h]), atol=1e-15)
 
 

@@ -58,7 +58,7 @@ def test_start_is_at_rest_at_the_measurement_with_the_hidden_state_warmed_up():
     np.testing.assert_allclose(e.x, [0.7, 0.0], atol=1e-12)  # solved to 1e-12
     h = np.zeros(model.n_h)
     for _ in range(START_LIMIT):  # at rest for as long as training warms h up
-        h = model.step(e.x, h, [0.0])[1].full().ravel()
+        h = model.step(e.x, h, [0.0], model.w, model.p)[1].full().ravel()
     np.testing.assert_allclose(e.h, h, atol=1e-9)  # or fewer periods, once h moves by less than 1e-10
     assert e.t == 2.0
     assert np.all(e.d == 0)

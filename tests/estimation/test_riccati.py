@@ -40,7 +40,7 @@ def test_hidden_state_at_its_fixed_point():
     model = pendulum_model(z=5)
     x, u = np.array([0.4, 0.0]), np.array([0.3])
     h = hidden_fixed_point(model, x, u)
-    np.testing.assert_allclose(model.step(x, h, u)[1].full().ravel(), h, atol=1e-9)
+    np.testing.assert_allclose(model.step(x, h, u, model.w, model.p)[1].full().ravel(), h, atol=1e-9)
     assert np.max(np.abs(h)) > 1e-3
 
 
@@ -58,5 +58,5 @@ def test_lqr_stabilises_the_upright_pendulum():
     k = lqr(model, up, [0.0], [10.0, 1.0], [0.1])
     x = up + np.array([0.05, 0.0])
     for _ in range(500):
-        x = model.step(x, [], k.u_target - k.gain @ (x - k.x_target))[0].full().ravel()
+        x = model.step(x, [], k.u_target - k.gain @ (x - k.x_target), model.w, model.p)[0].full().ravel()
     assert np.max(np.abs(x - up)) < 1e-4  # 10 s, several time constants of the closed loop

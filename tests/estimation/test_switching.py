@@ -29,8 +29,10 @@ def recorded(model, load, seed, n=400):
     """Outputs of the model under an unknown load ``load(k)``, with the noise that the filters assume."""
     rng, x, ys = np.random.default_rng(seed), np.zeros(model.n_x), []
     for k in range(n):
-        ys.append(model.output(x, 0.0).full().ravel() + 0.1 * rng.normal(size=1))
-        x = model.step(x, np.zeros(0), load(k))[0].full().ravel() + 0.01 * rng.normal(size=model.n_x)
+        ys.append(model.output(x, 0.0, model.w, model.p).full().ravel() + 0.1 * rng.normal(size=1))
+        x = model.step(x, np.zeros(0), load(k), model.w, model.p)[0].full().ravel() + 0.01 * rng.normal(
+            size=model.n_x
+        )
     return np.array(ys)
 
 

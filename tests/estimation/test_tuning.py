@@ -14,13 +14,10 @@ DT, SIGMA_Y, SIGMA_X = 0.1, 0.02, (0.0, 0.05)
 
 
 def mass() -> HybridModel:
-    x, h, u, w = ca.MX.sym("x", 2), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w", 2)
-    return HybridModel(
+    x, u = ca.MX.sym("x", 2), ca.MX.sym("u")
+    return HybridModel.of(
         "mass", DT, (Signal("q", "m"), Signal("v", "m/s")), (Signal("F", "N"),), (Signal("q", "m"),),
-        step=ca.Function("f", [x, h, u], [ca.vertcat(x[0] + DT * x[1], x[1] + DT * u), h]),
-        xdot=ca.Function("g", [x, h, u], [ca.vertcat(x[1], u)]),
-        output=ca.Function("y", [x, u], [x[0]]),
-        energy_balance=ca.Function("e", [x, w, u], [(w[1] - u) * x[1]]),
+        x=x, u=u, x_next=ca.vertcat(x[0] + DT * x[1], x[1] + DT * u), xdot=ca.vertcat(x[1], u), y=x[0],
     )  # fmt: skip
 
 

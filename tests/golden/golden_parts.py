@@ -171,7 +171,7 @@ class Machine:
         if kind == "limit":
             limits = Limits(times["u_min"], times["u_max"])
             return Guard(Mode.LIMITED, Mode.REST, limits=limits, dwell=times["dwell"], quiet=times["quiet"])
-        adaptive = with_parameter_states(self.hybrid, times["groups"])
+        adaptive = with_parameter_states(self.hybrid, times["groups"], prior=self.models["prior"])
         backup = SafeController(CondensedController(adaptive, self.problem(problem)), self.models["prior"])
         noise, quiet = self.data["observer"], self.data["observer"]["modes"][0]
         estimator = parameter_filter(
@@ -229,17 +229,22 @@ def model_values(m):
     found = {}
     for name, model in m.models.items():
         own = h[:, : model.n_h]  # inputs on their way come first: the prior has these alone
-        rows = [[v.full().ravel() for v in model.step(*point)] for point in zip(x, own, u, strict=True)]
-        xdot = np.array([model.xdot(*point).full().ravel() for point in zip(x, own, u, strict=True)])
+        given = model.w, model.p
+        rows = [
+            [v.full().ravel() for v in model.step(*point, *given)] for point in zip(x, own, u, strict=True)
+        ]
+        xdot = np.array([model.xdot(*point, *given).full().ravel() for point in zip(x, own, u, strict=True)])
         found[f"{name}/x_next"] = np.array([row[0] for row in rows])
         found[f"{name}/h_next"] = np.array([row[1] for row in rows[POINTS]])
         found[f"{name}/xdot"] = xdot
-        found[f"{name}/y"] = np.array([model.output(*p).full().ravel() for p in zip(x, u, strict=True)])
+        found[f"{name}/y"] = np.array(
+            [model.output(*p, *given).full().ravel() for p in zip(x, u, strict=True)]
+        )
         # the rates one period on, held against this state: the balance is not zero
         late = zip(x[:-1], xdot[1:], u[:-1], strict=True)
-        found[f"{name}/balance"] = np.array([float(model.energy_balance(*p)) for p in late])
+        found[f"{name}/balance"] = np.array([float(model.balances[0].residual(*p, *given)) for p in late])
         points = x[POINTS], own[POINTS], u[POINTS]
-        slopes = [model.with_jacobian(*p)[2:] for p in zip(*points, strict=True)]
+        slopes = [model.with_jacobian(*p, *given)[2:] for p in zip(*points, strict=True)]
         found[f"{name}/A"] = np.array([a.full() for a, _ in slopes])
         found[f"{name}/B"] = np.array([b.full() for _, b in slopes])
     return found
@@ -250,6 +255,7 @@ def many_points(m, name):
     replay, model = m.replay, m.models[name]
     x, h, u = m.arrays[f"{replay}/switching/x"], m.arrays[f"{replay}/switching/h"], m.arrays[f"{replay}/u"]
     points = [np.ascontiguousarray(v[POINTS]) for v in (x, h[:, : model.n_h], u)]
+    points += [np.tile(values, (len(points[0]), 1)) for values in (model.w, model.p)]
     return model.side_by_side(len(points[0]), {"A": ("x", "h"), "B": ("u",)})(*points)
 
 

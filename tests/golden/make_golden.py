@@ -121,7 +121,7 @@ RUNNER = {
 
 def freeze(name, run):
     """The folder of a machine from a finished run: programs, weights, plain numbers, references."""
-    from hybrid_mpc import load, load_scenario, make_estimator, make_monitor, make_ocp
+    from hybrid_mpc import ModelInfo, load, load_scenario, make_estimator, make_monitor, make_ocp
     from hybrid_mpc.artifact import read_description, write_description
     from hybrid_mpc.assembly import first_controller, freezing
     from hybrid_mpc.files import sha256
@@ -171,11 +171,12 @@ def freeze(name, run):
         arrays[f"first/{short}"] = solver.solve(solver.initial(rest), rest, task.reference(t), weight).u
     data = {
         "made": {"commit": commit(), **made_from(run)},
-        "model": {
-            "dt": hybrid.dt, "states": plain(hybrid.states), "inputs": plain(hybrid.inputs),
-            "outputs": plain(hybrid.outputs), "parameters": plain(description.parameters),
-            "input_delay": artifact.input_delay, "time_unit": hybrid.time_unit,
-        },
+        "model": plain(
+            ModelInfo(
+                hybrid.dt, hybrid.states, hybrid.inputs, hybrid.outputs, hybrid.parameters, artifact.input_delay,
+                hybrid.time_unit, hybrid.disturbances, hybrid.nominal_w, hybrid.covariance, description.balances,
+            )
+        ),
         "models": list(artifact.models),
         "calibration": plain(artifact.calibration),
         "observer": {

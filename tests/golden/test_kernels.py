@@ -85,7 +85,8 @@ def test_the_artifact_is_the_plain_form(m):
     assert list(models) == list(m.models)
     x, h, u = (m.arrays[f"{m.replay}/{key}"][50] for key in ("switching/x", "switching/h", "u"))
     for name, model in models.items():
-        both = zip(model.step(x, h[: model.n_h], u), m.models[name].step(x, h[: model.n_h], u), strict=True)
+        point = x, h[: model.n_h], u, model.w, model.p
+        both = zip(model.step(*point), m.models[name].step(*point), strict=True)
         for found, wanted in both:
             np.testing.assert_array_equal(found.full(), wanted.full())
 

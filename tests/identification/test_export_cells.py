@@ -47,7 +47,7 @@ def test_a_saved_model_runs_freely_like_torch(cell, tmp_path):
     x_own, h_own = RUN.x[0], np.zeros(step.network.n_h)
     for u in RUN.u[:50]:
         x, h = step(x, h, torch.tensor(u))
-        x_own, h_own = (m.full().ravel() for m in saved.step(x_own, h_own, u))
+        x_own, h_own = (m.full().ravel() for m in saved.step(x_own, h_own, u, saved.w, saved.p))
     # rounding through 50 steps of a model that is no faster than 1 / dt
     np.testing.assert_allclose(x_own, x, rtol=1e-10, atol=1e-10)
     np.testing.assert_allclose(h_own, h, rtol=1e-10, atol=1e-10)

@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 import torch
@@ -20,6 +21,7 @@ from hybrid_mpc import (
     with_output,
 )
 from hybrid_mpc.identification.output_network import OutputSettings
+from hybrid_mpc.model import step_symbols
 
 OFFSET, ECCENTRIC, PHASE, NOISE = 0.1, 0.05, 0.7, 2e-4  # an encoder's, rad
 QUICK = OutputSettings(networks=2, steps=600)
@@ -105,13 +107,16 @@ def test_the_exported_model_carries_it_at_rounding(runs, trained, tmp_path):
     step, output, info = PriorStep(prior, DT), trained.model(prior), model_info(prior, DT)
     save_artifact(tmp_path, {"g": trace_model(step, output), "plain": trace_model(step)}, info)
     models = load(tmp_path).models
-    report = nn_export.parity(
-        output, models["g"].output, (torch.zeros(2).double(), torch.zeros(1).double()), seed=0
-    )
+    x, _, u, *_ = step_symbols(models["g"])
+    held = {name: (model.w, model.p) for name, model in models.items()}
+    function = ca.Function("output", [x, u], [models["g"].output(x, u, *held["g"])])
+    report = nn_export.parity(output, function, (torch.zeros(2).double(), torch.zeros(1).double()), seed=0)
     assert report.value_rel < 1e-12
     assert report.jacobian_rel < 1e-12
-    assert float(models["plain"].output([0.3, 1.0], [0.1])) == 0.3  # the prior's output, as ever
-    assert float(models["g"].output([0.3, 1.0], [0.1])) == pytest.approx(encoder(0.3), abs=5e-3)
+    assert (
+        float(models["plain"].output([0.3, 1.0], [0.1], *held["plain"])) == 0.3
+    )  # the prior's output, as ever
+    assert float(models["g"].output([0.3, 1.0], [0.1], *held["g"])) == pytest.approx(encoder(0.3), abs=5e-3)
 
 
 def test_networks_of_a_stack_are_independent_and_training_is_deterministic(runs):

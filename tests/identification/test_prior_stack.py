@@ -126,8 +126,18 @@ def test_the_exported_model_carries_the_values_and_the_fitted_priors_balance(dat
     model = build_model("m", {f"m/{name}": p for name, p in programs.items()}, info)
     x, u = torch.tensor([0.4, 1.5]).double(), torch.tensor([0.2]).double()
     for made, zero in ((prior, True), (with_values(prior, trained.prior_values()), False)):
-        balance = float(model.energy_balance(x.numpy(), made(x, u).numpy(), u.numpy()))
+        rate = made(x, u).numpy()
+        balance = float(model.balances[0].residual(x.numpy(), rate, u.numpy(), model.w, model.p))
         assert (abs(balance) < 1e-12) == zero  # W, rounding of terms of 1 W
+    # with other parameters those that were trained are moved as far as the fitted ones
+    more = {p.name: 1.1 * p.value for p in model.parameters}
+    moved = {n: v + more[n] - prior.values[n] for n, v in trained.prior_values().items()}
+    h = torch.rand(step.network.n_h).double()
+    before = [with_values(prior, values)(x, u).numpy() for values in (trained.prior_values(), moved)]
+    after = [model.xdot(x.numpy(), h.numpy(), u.numpy(), model.w, p) for p in (model.p, list(more.values()))]
+    np.testing.assert_allclose(
+        (after[1] - after[0]).full().ravel(), before[1] - before[0], rtol=1e-9, atol=1e-9
+    )
     # without the values the network alone would be another model
     bare = replace(trained, weights={n: w for n, w in trained.weights.items() if "prior." not in n})
     h = torch.zeros(step.network.n_h).double()

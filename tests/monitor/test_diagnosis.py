@@ -7,7 +7,19 @@ import pytest
 from monitor_parts import DT, GAMMA, MGL, NOISE, Observer, pendulum, simulate
 from monitor_parts import J as INERTIA
 
-from hybrid_mpc import Detector, Diagnoser, EnergyMonitor, InputError, load, save_artifact
+from hybrid_mpc import (
+    Detector,
+    Diagnoser,
+    EnergyMonitor,
+    InputError,
+    Prior,
+    PriorStep,
+    Signal,
+    load,
+    model_info,
+    save_artifact,
+    trace_model,
+)
 
 SIGMA = 2e-3  # N m: the residuals' scatter under this noise
 DETECTOR = Detector(DT, ((SIGMA**2, 0.0, 0.0, 0.0),), (), 1.0, 20.0)
@@ -83,41 +95,53 @@ def test_what_the_motion_does_not_tell_apart_is_named():
     assert " or " in weaker.text
 
 
-def test_the_artifact_brings_what_it_needs_and_old_ones_say_what_is_missing(golf_artifact, tmp_path):
-    model = load(golf_artifact).models["hybrid"]
-    assert set(model.parameters) >= {"J", "d", "mu"}
-    x, u = [0.3, 0.8], [0.05]
-    values = np.array(list(model.parameters.values()))
-    prior = load(golf_artifact).models["prior"]
-    # the same program traced twice, once with its parameters inside: the same operations
-    np.testing.assert_allclose(
-        model.parametric(x, u, values).full(), prior.xdot(x, [], u)[1:].full(), rtol=1e-13
-    )
-    heavier = values * np.where(np.array(list(model.parameters)) == "J", 2.0, 1.0)
-    np.testing.assert_allclose(
-        2 * model.parametric(x, u, heavier).full(), model.parametric(x, u, values).full(), rtol=1e-13
-    )
+def test_the_artifact_brings_what_it_needs(golf_artifact):
+    models = load(golf_artifact).models
+    model, prior = models["hybrid"], models["prior"]
+    names = [p.name for p in model.parameters]
+    assert set(names) >= {"J", "d", "mu"}
+    x, u, h = [0.3, 0.8], [0.05], np.full(model.n_h, 0.1)
+    heavier = model.p * np.where(np.array(names) == "J", 2.0, 1.0)
+    given, halved = (prior.xdot(x, [], u, prior.w, p)[1] for p in (prior.p, heavier))
+    assert 2 * float(halved) == pytest.approx(float(given), rel=1e-13)
+    # what the network adds does not change with the prior's parameters
+    both = [model.xdot(x, h, u, model.w, p)[1] for p in (model.p, heavier)]
+    assert float(both[1] - both[0]) == pytest.approx(float(halved - given), rel=1e-12)
     monitor = EnergyMonitor(model, window=11, average=5, detector=DETECTOR, history=1.0)
-    Diagnoser(monitor, {"friction": ("d", "mu"), "mass": ("m", "J")})
-    old = replace(model, parametric=None, parameters={})
-    with pytest.raises(InputError, match="earlier version lacks"):
-        Diagnoser(EnergyMonitor(old, window=11, average=5, detector=DETECTOR, history=1.0))
+    Diagnoser(monitor, {"friction": ("d", "mu"), "mass": ("m", "J")}, prior=prior)
+    with pytest.raises(InputError, match=r"has a network.*give prior="):
+        Diagnoser(monitor)
     with pytest.raises(InputError, match="no parameter 'mus'"):
-        Diagnoser(monitor, {"friction": ("mus",)})
+        Diagnoser(monitor, {"friction": ("mus",)}, prior=prior)
 
 
-def test_an_artifact_without_the_program_still_loads(golf_artifact, tmp_path):
-    import nn_export
-    from hybrid_mpc import ModelInfo
+class Bare(Prior):
+    """A prior whose numbers nobody may change."""
 
-    programs = nn_export.load_programs(golf_artifact)
-    model = load(golf_artifact).models["prior"]
-    info = ModelInfo(model.dt, model.states, model.inputs, model.outputs)
-    kept = {
-        n.split("/")[1]: p for n, p in programs.items() if n.startswith("prior/") and "parametric" not in n
-    }
-    save_artifact(tmp_path / "old", {"prior": kept}, info)
-    assert load(tmp_path / "old").models["prior"].parametric is None
+    states = (Signal("q", "m"), Signal("v", "m/s"))
+    inputs = (Signal("F", "N"),)
+    outputs = states[:1]
+    parameters_spec = ()
+
+    def acceleration(self, x, u):
+        return u / 2.0
+
+    def inertia(self, x):
+        return 2.0
+
+
+def test_an_artifact_without_parameters_or_balances_loads_and_its_monitors_say_what_is_missing(tmp_path):
+    programs, info = trace_model(PriorStep(Bare(), DT)), model_info(Bare(), DT)
+    save_artifact(tmp_path, {"prior": programs}, info)
+    model = load(tmp_path).models["prior"]
+    assert (model.n_p, [b.name for b in model.balances]) == (0, ["energy"])
+    with pytest.raises(InputError, match="parameters, the same of both, are needed"):
+        Diagnoser(EnergyMonitor(model, window=11, average=5, detector=DETECTOR, history=1.0))
+    save_artifact(tmp_path, {"prior": programs}, replace(info, balances=()))
+    silent = load(tmp_path).models["prior"]
+    assert silent.balances == ()
+    with pytest.raises(InputError, match=r"no balance 'energy' \(it has: none\)"):
+        EnergyMonitor(silent, window=11, average=5)
 
 
 def test_bad_input_speaks():

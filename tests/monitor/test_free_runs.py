@@ -8,6 +8,7 @@ import pytest
 from monitor_parts import DT, GAMMA, Estimate, Exact, Observer, pendulum, simulate
 
 from hybrid_mpc import EnergyMonitor, InputError
+from hybrid_mpc.model import Balance
 
 
 def readings(monitor, estimator, run):
@@ -163,7 +164,10 @@ def test_bad_input_speaks():
         EnergyMonitor(model, window=11, average=1, free_run=0.3)
     with pytest.raises(InputError, match="positive steps"):
         EnergyMonitor(model, window=11, average=1, resolution=[0.0])
-    x, w, u = ca.MX.sym("x", 2), ca.MX.sym("w", 2), ca.MX.sym("u")
-    without = replace(model, energy_balance=ca.Function("e", [x, w, u], [x[1] * u]))
+    x, rate, u, w, p = (ca.MX.sym(f"s{i}", n) for i, n in enumerate((2, 2, 1, 0, 3)))
+    silent = Balance("energy", "J", "W", ca.Function("e", [x, rate, u, w, p], [x[1] * u]))
     with pytest.raises(InputError, match="does not grow with its acceleration"):
-        EnergyMonitor(without, window=11, average=1)
+        EnergyMonitor(replace(model, balances=(silent,)), window=11, average=1)
+    mass = replace(silent, name="mass", unit="kg", rate_unit="kg/s")
+    with pytest.raises(InputError, match=r"no balance 'energy' \(it has: mass\).* give its prior inertia"):
+        EnergyMonitor(replace(model, balances=(mass,)), window=11, average=1)

@@ -8,6 +8,7 @@ import pytest
 from monitor_parts import DT, Estimate, J, pendulum
 
 from hybrid_mpc import EnergyMonitor, InputError, Signal, with_input_delay
+from hybrid_mpc.model import step_symbols
 
 STEP, LIMIT = 1e-3, 1.0
 """Step of the sensor [rad]; input from -1 to 1 N m, a quarter of that is 0.5 N m."""
@@ -15,11 +16,12 @@ STEP, LIMIT = 1e-3, 1.0
 
 def jacobian(model):
     """``with_jacobian`` of a model that has none."""
-    x, h, u = ca.MX.sym("x", model.n_x), ca.MX.sym("h", model.n_h), ca.MX.sym("u", model.n_u)
-    ahead = ca.vertcat(*model.step(x, h, u))
+    point = step_symbols(model)
+    x, h, u = point[:3]
+    ahead = ca.vertcat(*model.step(*point))
     slopes = ca.jacobian(ahead, ca.vertcat(x, h)), ca.jacobian(ahead, u)
     return ca.Function(
-        "with_jacobian", [x, h, u], [ahead[: model.n_x], ahead[model.n_x :], *map(ca.densify, slopes)]
+        "with_jacobian", point, [ahead[: model.n_x], ahead[model.n_x :], *map(ca.densify, slopes)]
     )
 
 
@@ -75,7 +77,7 @@ def moved(u, model, x0=(0.0, 0.0)):
     """States under the inputs, and what the sensor says of them."""
     x, h = [np.array(x0)], [np.zeros(model.n_h)]
     for value in u[:-1]:
-        step = model.step(x[-1], h[-1], value)
+        step = model.step(x[-1], h[-1], value, model.w, model.p)
         x.append(step[0].full().ravel())
         h.append(step[1].full().ravel())
     x, h = np.array(x), np.array(h)

@@ -8,6 +8,7 @@ import pytest
 from monitor_parts import DT, GAMMA, NOISE, Estimate, Exact, Observer, Run, pendulum, simulate
 
 from hybrid_mpc import Calibration, EnergyMonitor, InputError, count_alarms, replay
+from hybrid_mpc.model import step_symbols
 from hybrid_mpc.monitor import calibrate, judge, with_residual
 
 
@@ -166,9 +167,9 @@ def test_bad_input_speaks():
     with pytest.raises(InputError, match="odd"):
         EnergyMonitor(pendulum(), window=10, average=1)
     model = pendulum()
-    x, u = ca.MX.sym("x", 2), ca.MX.sym("u")
+    x, _, u, w, p = step_symbols(model)
     with pytest.raises(InputError, match="positions"):
-        EnergyMonitor(replace(model, output=ca.Function("o", [x, u], [x[1]])), window=5, average=1)
+        EnergyMonitor(replace(model, output=ca.Function("o", [x, u, w, p], [x[1]])), window=5, average=1)
     run = simulate(10)
     monitor = EnergyMonitor(model, window=5, average=1)
     with pytest.raises(InputError, match="resample"):

@@ -128,11 +128,10 @@ def test_bad_input_speaks(data, ordinary):
         learn_plausibility(cart(0.0), [data], quantile=1.0)
     with pytest.raises(InputError, match="at least 1"):
         replace(ordinary, reach=0.5)
-    x, u, h, w = ca.MX.sym("x", 4), ca.MX.sym("u"), ca.MX.sym("h", 0), ca.MX.sym("w", 4)
+    x, u = ca.MX.sym("x", 4), ca.MX.sym("u")
     names = tuple(Signal(n, "-") for n in "abcd")
-    other = HybridModel(
-        "other", DT, names, (Signal("u", "-"),), names[:1], ca.Function("f", [x, h, u], [x, h]),
-        ca.Function("g", [x, h, u], [x]), ca.Function("y", [x, u], [x[0]]), ca.Function("e", [x, w, u], [x[0]]),
-    )  # fmt: skip
+    other = HybridModel.of(
+        "other", DT, names, (Signal("u", "-"),), names[:1], x=x, u=u, x_next=x, xdot=x, y=x[0], energy=x[0]
+    )
     with pytest.raises(InputError, match="learned for 3"):
         excess_bound(other, ordinary)

@@ -161,7 +161,7 @@ def test_bad_input_speaks(strokes):
 
 def two_joints(push=(0.0, 0.0)):
     """Two joints with coupled inertia: an angle with 0.2 N m of dry friction, and a slide with 0.1 N."""
-    x, h, u, w = ca.MX.sym("x", 4), ca.MX.sym("h", 0), ca.MX.sym("u", 2), ca.MX.sym("w", 4)
+    x, u, rate = ca.MX.sym("x", 4), ca.MX.sym("u", 2), ca.MX.sym("rate", 4)
     inertia = ca.DM([[2.0, 0.5], [0.5, 1.0]])
 
     def force(x):
@@ -172,12 +172,10 @@ def two_joints(push=(0.0, 0.0)):
         return ca.vertcat(x[2:], ca.solve(inertia, force(x)))
 
     names = [Signal("phi", "rad"), Signal("q", "m"), Signal("phi_dot", "rad/s"), Signal("v", "m/s")]
-    return HybridModel(
+    return HybridModel.of(
         "joints", 0.02, tuple(names), (Signal("tau", "N m"), Signal("F", "N")), tuple(names[:2]),
-        step=ca.Function("step", [x, h, u], [x + 0.02 * rhs(x), h]),
-        xdot=ca.Function("xdot", [x, h, u], [rhs(x)]),
-        output=ca.Function("output", [x, u], [x[:2]]),
-        energy_balance=ca.Function("energy", [x, w, u], [ca.dot(x[2:], inertia @ w[2:] - force(x))]),
+        x=x, u=u, x_next=x + 0.02 * rhs(x), xdot=rhs(x), y=x[:2],
+        rate=rate, energy=ca.dot(x[2:], inertia @ rate[2:] - force(x)),
     )  # fmt: skip
 
 

@@ -104,6 +104,6 @@ def test_a_closed_loop_of_held_inputs_arrives():
         decision = controller.decide(decision, e, np.zeros((1, 2)))
         assert decision.solution.status.ok
         assert is_held(decision.solution.u)
-        x, h = (v.full().ravel() for v in model.step(e.x, e.h, decision.u))
+        x, h = (v.full().ravel() for v in model.step(e.x, e.h, decision.u, model.w, model.p))
         e = replace(e, x=x, h=h)
     assert np.max(np.abs(e.x)) < 0.02  # within friction and the network's own torque

@@ -34,7 +34,7 @@ def derivatives(model, ocp, u):
         cost += model.dt * (
             ca.dot(ocp.q, (x - 2.0) ** 2) + 0.5 * v[k] ** 2 + 0.2 * (v[k] - before) ** 2
         )  # fmt: skip
-        x, h = model.step(x, h, v[k] + 0.1)
+        x, h = model.step(x, h, v[k] + 0.1, model.w, model.p)
         before = v[k]
     cost += (x - 2.0).T @ terminal @ (x - 2.0)
     hessian, gradient = ca.hessian(cost, v)
@@ -181,7 +181,7 @@ def closed_loop(controller, periods=25):
     for _ in range(periods):
         plan = controller.solve(plan, e, np.array([[0.5, 0.0]]))
         plans.append(plan)
-        x, h = (v.full().ravel() for v in model.step(e.x, e.h, plan.u[0]))
+        x, h = (v.full().ravel() for v in model.step(e.x, e.h, plan.u[0], model.w, model.p))
         e = replace(e, x=x, h=h)
     return plans
 

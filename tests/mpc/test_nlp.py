@@ -1,11 +1,13 @@
 """Iterated to convergence, the controller must find what an interior-point solver finds for the full problem."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
 from online_models import linear_model, pendulum_model
 
-from hybrid_mpc import OCP, CondensedController, Estimate, HybridModel, InputError, IpoptController, Status
+from hybrid_mpc import OCP, CondensedController, Estimate, InputError, IpoptController, Status
 
 
 def ipopt_plan(model, ocp, terminal, z0, d, reference, u_prev):
@@ -15,7 +17,7 @@ def ipopt_plan(model, ocp, terminal, z0, d, reference, u_prev):
     opti.subject_to(z[:, 0] == z0)
     cost, before = 0, u_prev
     for k in range(n):
-        x_next, h_next = model.step(z[:n_x, k], z[n_x:, k], u[:, k] + d)
+        x_next, h_next = model.step(z[:n_x, k], z[n_x:, k], u[:, k] + d, model.w, model.p)
         opti.subject_to(z[:, k + 1] == ca.vertcat(x_next, h_next))
         error, du = z[:n_x, k] - reference[k], u[:, k] - before
         cost += model.dt * (
@@ -76,7 +78,7 @@ def test_real_time_iterations_converge_along_a_closed_loop():
     solution, defects = controller.initial(e), []
     for _ in range(40):
         solution = controller.solve(solution, e, np.zeros((1, 2)))
-        x = model.step(e.x, e.h, solution.u[0] + e.d)[0].full().ravel()
+        x = model.step(e.x, e.h, solution.u[0] + e.d, model.w, model.p)[0].full().ravel()
         e, _ = start(model, x), defects.append(solution.defect)
     full = CondensedController(model, ocp, iterations=30).solve(solution, e, np.zeros((1, 2)))
     once = controller.solve(solution, e, np.zeros((1, 2)))
@@ -92,27 +94,18 @@ def test_disturbance_acts_like_an_input():
     e = start(model, [0.3, 0.0])
     s = controller.solve(controller.initial(e), e, np.zeros((1, 2)))
     for k in range(20):  # the plan is the model's own run on u + d; defects are below 1e-9 by then
-        x, _ = model.step(s.x[k], s.h[k], s.u[k] + e.d)
+        x, _ = model.step(s.x[k], s.h[k], s.u[k] + e.d, model.w, model.p)
         np.testing.assert_allclose(s.x[k + 1], x.full().ravel(), atol=1e-8)
 
 
 def test_sparse_jacobians_of_a_users_model_are_read_rightly():
     a, b = np.diag([0.9, 0.8]), np.array([[0.1], [0.0]])
     dense = linear_model(a, b, np.eye(2)[:1])
-    x, h, u = ca.MX.sym("x", 2), ca.MX.sym("h", 0), ca.MX.sym("u")
+    x, h, u, w, p = (ca.MX.sym(name, n) for name, n in zip("xhuwp", (2, 0, 1, 0, 0), strict=True))
     jacobians = ca.sparsify(ca.DM(a)), ca.sparsify(ca.DM(b))
     assert not jacobians[0].is_dense()
-    by_hand = ca.Function("j", [x, h, u], [*dense.step(x, h, u), *jacobians])
-    fields = (
-        dense.states,
-        dense.inputs,
-        dense.outputs,
-        dense.step,
-        dense.xdot,
-        dense.output,
-        dense.energy_balance,
-    )
-    sparse = HybridModel("sparse", dense.dt, *fields, with_jacobian=by_hand)
+    by_hand = ca.Function("j", [x, h, u, w, p], [*dense.step(x, h, u, w, p), *jacobians])
+    sparse = replace(dense, with_jacobian=by_hand)
     ocp = OCP(8, [1.0, 1.0], [0.1], [0.0], [-1.0], [1.0])
     e = Estimate(0.0, np.array([1.0, -2.0]), np.zeros(0), np.zeros(1), np.eye(3), np.zeros(1), 0.0)
     plans = []

@@ -166,7 +166,7 @@ def test_fallback_stabilises_the_pendulum_at_a_reference_without_any_solve(parts
     decision = safe.initial(estimate_of(x, n_h=0))
     for _ in range(300):
         decision = safe.decide(decision, estimate_of(x, n_h=0), goal)
-        x = prior.step(x, [], decision.u)[0].full().ravel()
+        x = prior.step(x, [], decision.u, prior.w, prior.p)[0].full().ravel()
     assert decision.source is Source.FALLBACK
     assert abs(x[0] - 0.6) < 0.01  # a gain of about 10 N m/rad against 0.05 N m of dry friction, which creeps
 

@@ -243,13 +243,9 @@ def test_a_rivals_plan_is_a_start():
 def even(shift=0.0):
     from hybrid_mpc import HybridModel, Signal
 
-    x, h, u, w = ca.MX.sym("x"), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w")
+    x, u = ca.MX.sym("x"), ca.MX.sym("u")
     one = (Signal("x", "-"),), (Signal("u", "-"),), (Signal("x", "-"),)
-    model = HybridModel(
-        "even", 1.0, *one,
-        ca.Function("f", [x, h, u], [x - u**2 - shift * u, h]), ca.Function("g", [x, h, u], [u]),
-        ca.Function("y", [x, u], [x]), ca.Function("e", [x, w, u], [w - u]),
-    )  # fmt: skip
+    model = HybridModel.of("even", 1.0, *one, x=x, u=u, x_next=x - u**2 - shift * u, xdot=u, y=x)
     ocp = OCP(3, [1.0], [0.1], [0.0], [-1.0], [1.0], terminal=[[1.0]])
     return model, ocp, Estimate(0.0, np.ones(1), np.zeros(0), np.zeros(1), np.eye(2), np.zeros(1), 0.0)
 

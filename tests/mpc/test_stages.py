@@ -36,7 +36,7 @@ def test_a_run_is_the_models_own_with_the_jacobians_along_it():
     z = stages.run(z0, u)
     z_next, a_t, b = stages.at(z[:-1], u)
     for k in range(6):
-        x, h, a, by_u = (m.full() for m in model.with_jacobian(z[k, :2], z[k, 2:], u[k]))
+        x, h, a, by_u = (m.full() for m in model.with_jacobian(z[k, :2], z[k, 2:], u[k], model.w, model.p))
         np.testing.assert_allclose(z[k + 1], np.vstack([x, h]).ravel(), rtol=1e-14, atol=1e-15)
         np.testing.assert_allclose(a_t[k].T, a, rtol=1e-13, atol=1e-14)
         np.testing.assert_allclose(b[k], by_u, rtol=1e-13, atol=1e-14)

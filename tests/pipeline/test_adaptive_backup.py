@@ -1,22 +1,23 @@
 """The guard that adapts, made of a scenario's control problem: what it adapts to, what it refuses, that it pays."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from closed_loop_parts import Told, run
+from hybrid_mpc.pipeline.guards import adaptable
 from monitor_parts import MGL, J, pendulum
+from online_models import pendulum_model
 
-from hybrid_mpc import OCP, InputError, Mode, Scenario, make_adaptive_guard, make_controller, make_estimator
-from hybrid_mpc.assembly import adaptable
+from hybrid_mpc import OCP, InputError, Mode, Scenario, with_input_delay
+from hybrid_mpc.pipeline import make_adaptive_guard, make_controller, make_estimator
 
 CONTROL = OCP(20, q=(300.0, 1.0), r=(0.05,), r_delta=(0.05,), u_min=(-6.0,), u_max=(6.0,))
 CAUSES = {"mass": ("J", "mgl"), "friction": ("gamma",), "motor": ("gain of u",)}
 SCENARIO = Scenario(
     "pendulum", "", "", prior=pendulum, data=None, control=CONTROL, sensor_sigma=(1e-4,), causes=CAUSES
 )
-LATE = SimpleNamespace(parametric=pendulum().parametric, waiting=1, name="late")
+LATE = with_input_delay(pendulum(), 0.02)
 SIGMA_X = np.array([1e-5, 1e-3])
 
 
@@ -24,13 +25,14 @@ class Heavy:
     """A pendulum half as heavy again from the start; its sensor is good to 0.1 mrad."""
 
     def __init__(self):
-        self._step = pendulum(inertia=1.5 * J, mgl=1.5 * MGL).step
+        self._model = pendulum(inertia=1.5 * J, mgl=1.5 * MGL)
 
     def reset(self, x0, seed):
         return np.asarray(x0, dtype=float)
 
     def step(self, state, u, dt):
-        return self._step(state, [], u)[0].full().ravel()
+        m = self._model
+        return m.step(state, [], u, m.w, m.p)[0].full().ravel()
 
     def measure(self, state, rng):
         return state[:1] + 1e-4 * rng.normal(size=1)
@@ -74,7 +76,7 @@ def test_what_it_needs():
     with pytest.raises(InputError, match="scenario pendulum has none"):
         made(control=None)
     with pytest.raises(InputError, match="knows its parameters"):
-        adaptable(replace(pendulum(), parametric=None), CAUSES)
+        adaptable(pendulum_model(), CAUSES)
     with pytest.raises(InputError, match="act later"):
         adaptable(LATE, CAUSES)
     with pytest.raises(InputError, match="'typo' is empty"):

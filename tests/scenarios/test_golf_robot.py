@@ -57,7 +57,8 @@ def test_prior_agrees_with_the_oracle_s_energy_balance():
     rng = np.random.default_rng(0)
     for x, w, u in zip(*(rng.normal(size=(20, n)) for n in (2, 2, 1)), strict=True):
         expected = prior.energy_balance(*(torch.from_numpy(a) for a in (x, w, u))).item()
-        assert float(model.energy_balance(x, w, u)) == pytest.approx(expected, abs=1e-12)  # same formula
+        balance = float(model.balances[0].residual(x, w, u, model.w, model.p))
+        assert balance == pytest.approx(expected, abs=1e-12)  # same formula
 
 
 def test_friction_slope_at_rest_is_stable_at_all_bounds():
@@ -73,7 +74,7 @@ def run_beside(torques, x0):
     x, h, worst = rig.truth(state), rig.hidden(state), 0.0
     for torque in torques:
         u = np.array([torque])
-        state, (x, h) = rig.step(state, u, 0.02), model.step(x, h, u)
+        state, (x, h) = rig.step(state, u, 0.02), model.step(x, h, u, model.w, model.p)
         worst = max(worst, abs(float(x[0]) - state.z[0]))
     return worst, np.array(h).ravel(), rig.hidden(state)
 
@@ -89,14 +90,14 @@ def test_oracle_follows_the_rig():
 def test_oracle_jacobian_is_the_derivative_of_its_step():
     model = oracle(0.02)
     x, h, u = ca.MX.sym("x", 2), ca.MX.sym("h", 4), ca.MX.sym("u")
-    after = ca.vertcat(*model.step(x, h, u))
+    after = ca.vertcat(*model.step(x, h, u, model.w, model.p))
     own = ca.Function("own", [x, h, u], [after, ca.jacobian(after, ca.vertcat(x, h)), ca.jacobian(after, u)])
     for z in (
         [0.3, 1.0, 1.3, 0.1, 2e-3, 1.1],
         [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
         [-0.2, -0.02, 1.9, 0.3, -1e-3, 3],
     ):
-        x_next, h_next, a, b = (m.full() for m in model.with_jacobian(z[:2], z[2:], 0.1))
+        x_next, h_next, a, b = (m.full() for m in model.with_jacobian(z[:2], z[2:], 0.1, model.w, model.p))
         wanted = [m.full() for m in own(z[:2], z[2:], 0.1)]
         for given, want in zip((np.vstack([x_next, h_next]), a, b), wanted, strict=True):
             assert given == pytest.approx(want, rel=1e-9, abs=1e-10)  # rounding of entries up to 100
@@ -110,7 +111,10 @@ def test_oracle_s_jacobian_is_sane_through_stiction_and_backlash():
     scale = np.array([1.0, 3.0, 1.5, 0.5, 5e-3, 3.0])
     for k in range(200):
         u = np.array([0.12 * np.sin(2 * np.pi * 0.5 * 0.02 * k)])
-        a, b = (m.full() for m in model.with_jacobian(rig.truth(state), rig.hidden(state), u)[2:])
+        a, b = (
+            m.full()
+            for m in model.with_jacobian(rig.truth(state), rig.hidden(state), u, model.w, model.p)[2:]
+        )
         assert np.isfinite(a).all()
         largest = max(largest, np.abs(np.linalg.eigvals(a)).max())
         # the largest: a stuck club's bristles take up 1500 / 36 of a speed, 83 in these scales

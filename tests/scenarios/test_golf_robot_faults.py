@@ -48,16 +48,12 @@ def linear_model():
     from scenarios.golf_robot.nominal import GEAR, INPUTS, OUTPUTS, PARAMETERS, STATES
 
     p = {spec.name: spec.value for spec in PARAMETERS}
-    x, h, u, w = ca.MX.sym("x", 2), ca.MX.sym("h", 0), ca.MX.sym("u"), ca.MX.sym("w", 2)
+    x, u = ca.MX.sym("x", 2), ca.MX.sym("u")
     a = (GEAR * u - p["m"] * p["g"] * p["a"] * ca.sin(x[0]) - 0.1 * x[1]) / p["J"]
     after = ca.vertcat(x[0] + DT * x[1] + DT**2 / 2 * a, x[1] + DT * a)
-    return HybridModel(
-        "pendulum", DT, STATES, INPUTS, OUTPUTS,
-        step=ca.Function("step", [x, h, u], [after, h]),
-        xdot=ca.Function("xdot", [x, h, u], [ca.vertcat(x[1], a)]),
-        output=ca.Function("output", [x, u], [x[0]]),
-        energy_balance=ca.Function("energy", [x, w, u], [p["J"] * (w[1] - a) * x[1]]),
-    )  # fmt: skip
+    return HybridModel.of(
+        "pendulum", DT, STATES, INPUTS, OUTPUTS, x=x, u=u, x_next=after, xdot=ca.vertcat(x[1], a), y=x[0]
+    )
 
 
 @pytest.fixture(scope="module")

@@ -60,13 +60,12 @@ def test_prior_plant_and_oracle_are_one_equation():
     np.testing.assert_allclose(mine, by_hand, rtol=0, atol=1e-12)
     model, nominal = oracle(DT), PendulumPrior()
     for k in range(20):
-        xdot = model.xdot(x[k], [], u[k]).full().ravel()
+        xdot = model.xdot(x[k], [], u[k], model.w, model.p).full().ravel()
         np.testing.assert_allclose(xdot, [x[k, 1], by_hand[k]], rtol=0, atol=1e-12)
         row = torch.tensor(x[k]), torch.tensor(xdot), torch.tensor(u[k])
         # the balance's terms reach 50 W
-        assert float(model.energy_balance(x[k], xdot, u[k])) == pytest.approx(
-            float(nominal.energy_balance(*row)), abs=1e-12
-        )
+        balance = float(model.balances[0].residual(x[k], xdot, u[k], model.w, model.p))
+        assert balance == pytest.approx(float(nominal.energy_balance(*row)), abs=1e-12)
 
 
 def swing(plant, seconds=5.0, x0=(1.2, -3.0)):
@@ -136,7 +135,7 @@ def test_small_swings_decay_as_the_linear_pendulum():
 def test_oracle_s_step_is_the_plant_s():
     model, state = oracle(DT), QUIET.reset(np.array([0.7, 4.0]), 0)
     for torque in (20.0, -20.0, 5.0):
-        x = model.step(QUIET.truth(state), [], torque)[0].full().ravel()
+        x = model.step(QUIET.truth(state), [], torque, model.w, model.p)[0].full().ravel()
         state = QUIET.step(state, np.array([torque]), DT)
         np.testing.assert_allclose(
             x, QUIET.truth(state), rtol=0, atol=1e-8
