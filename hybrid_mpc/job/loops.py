@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.artifact import Kit
-from hybrid_mpc.assembly import freezing, make_monitor
+from hybrid_mpc.assembly import SOLVERS, freezing, make_monitor
 from hybrid_mpc.closed_loop.faults import Fault, check_channels, install
 from hybrid_mpc.closed_loop.guard import Guard, Mode
 from hybrid_mpc.closed_loop.result import ClosedLoopResult
@@ -70,6 +70,9 @@ class LoopSpec:
             ``(n,)`` and ``"plans"`` ``(n, N + 1, n_x)``. No part of the run's identity.
         number: Place in a study, no part of the run's identity.
 
+    Raises:
+        InputError: If there is no controller, solver, monitor or guard of a name.
+
     Example:
         >>> spec = LoopSpec("golf_robot", "model", "track_sine", "prior", seed=3)
         >>> spec.noise_seed, replace(spec, run_seed=2).noise_seed, replace(spec, number=7).id == spec.id
@@ -95,6 +98,12 @@ class LoopSpec:
     rounds: tuple[float, ...] = ()
     keep: tuple[str, ...] = field(default=(), compare=False)
     number: int = field(default=0, compare=False)
+
+    def __post_init__(self) -> None:
+        known(self.controller, CONTENDERS, "controller")
+        known(self.solver, SOLVERS, "solver")
+        known(self.monitor, MONITORS, "monitor")
+        known(self.guard, GUARDS, "guard")
 
     @cached_property
     def id(self) -> str:
@@ -248,7 +257,7 @@ class Bench:
         kits: Loaded artifacts by label; their process noise is that of the filters.
 
     Raises:
-        InputError: If the scenario has nothing to run.
+        InputError: If the scenario has nothing to run, or a model is another machine's.
 
     Example:
         ``row, result = Bench(scenario, {"model": hm.load("runs/golf")}).run(spec)``
@@ -256,10 +265,20 @@ class Bench:
 
     def __init__(self, scenario: Scenario, kits: Mapping[str, Kit]) -> None:
         check_complete(scenario)
+        for label, kit in kits.items():
+            check_kit(scenario, kit, f"model {label}")
         self.scenario = scenario
         self.kits = {label: kit.on(scenario) for label, kit in kits.items()}
         self._parts: OrderedDict[tuple[object, ...], tuple[Estimator, SafeController]] = OrderedDict()
         self._guards: dict[tuple[str, str, str], Guard] = {}
+
+    def kit(self, spec: LoopSpec) -> Kit:
+        """The model of a specification.
+
+        Raises:
+            InputError: If there is none of that label.
+        """
+        return self.kits[known(spec.model, self.kits, "model on the bench")]
 
     def task(self, spec: LoopSpec) -> Task:
         """The task of a specification: its rounds and its duration.
@@ -268,7 +287,7 @@ class Bench:
             InputError: If there is none of that name.
         """
         (task,) = tasks_of(self.scenario, (spec.task,))
-        kit = self.kits[spec.model]
+        kit = self.kit(spec)
         if spec.rounds:
             model = kit.models["prior"]
             task = repeated(task, model.dt, np.array(spec.rounds), model.time_unit)
@@ -276,12 +295,12 @@ class Bench:
 
     def problem(self, spec: LoopSpec) -> OCP:
         """The control problem of a specification."""
-        problem = self.kits[spec.model].problem(spec.task)
+        problem = self.kit(spec).problem(spec.task)
         return problem if spec.horizon is None else problem.changed(horizon=spec.horizon)
 
     def parts(self, spec: LoopSpec) -> tuple[Estimator, SafeController]:
         """Estimator and controller of a specification; they remember nothing, so one serves many loops."""
-        kit = self.kits[spec.model]
+        kit = self.kit(spec)
         stated = spec.task if spec.task in kit.loop.control else ""
         key = (spec.model, spec.controller, spec.solver, spec.horizon, stated)
         if key not in self._parts:
@@ -299,7 +318,7 @@ class Bench:
         Raises:
             InputError: If the model lacks what the monitor needs.
         """
-        kit = self.kits[spec.model]
+        kit = self.kit(spec)
         if spec.monitor == "none" or CONTENDERS[spec.controller].model != "hybrid":
             return None
         hybrid = kit.models["hybrid"]
@@ -321,7 +340,7 @@ class Bench:
         if not spec.guard:
             return None
         if key not in self._guards:
-            kit = self.kits[spec.model]
+            kit = self.kit(spec)
             if spec.guard == "prior":
                 estimator, controller = self.parts(replace(spec, controller="prior_observer"))
                 self._guards[key] = Guard(
@@ -411,7 +430,7 @@ class Bench:
         late = spec.late
         return Simulation(
             self.plant(spec), estimator or own, controller, task.reference, weight=task.weight,
-            dt=self.kits[spec.model].models["prior"].dt, duration=task.duration, x0=np.array(task.x0),
+            dt=self.kit(spec).models["prior"].dt, duration=task.duration, x0=np.array(task.x0),
             seed=spec.noise_seed, monitor=monitor or self.monitor(spec), guard=self.guard(spec),
             faults=(*task.faults, *spec.faults, *spec.drawn_faults), on_step=on_step,
             late=(lambda t: any(a - 1e-9 <= t < b - 1e-9 for a, b in late)) if late else None,
@@ -421,7 +440,7 @@ class Bench:
         self, spec: LoopSpec, task: Task | None, result: ClosedLoopResult, plans: list[Array]
     ) -> tuple[LoopRow, ClosedLoopResult]:
         task = self.task(spec) if task is None else task
-        row = row_of(spec, task, self.problem(spec), self.kits[spec.model].models["prior"], result)
+        row = row_of(spec, task, self.problem(spec), self.kit(spec).models["prior"], result)
         derived = {"step_ms": result.timing_ms["total"], "plans": np.array(plans)}
         kept = {name: derived[name] if name in derived else getattr(result, name) for name in spec.keep}
         return replace(row, arrays=kept), result
@@ -569,6 +588,30 @@ def check_complete(scenario: Scenario) -> None:
         raise InputError(
             f"scenario {scenario.name} has no {lacks[0]}: there is no loop to close in simulation"
         )
+
+
+def check_kit(scenario: Scenario, kit: Kit, where: str) -> None:
+    """Refuse the models of another machine.
+
+    Args:
+        scenario: The machine, with its control problem.
+        kit: The loaded artifact.
+        where: What it is, for the message.
+
+    Raises:
+        InputError: If prior or hybrid are missing, the artifact was made for another scenario, or sizes do not fit.
+    """
+    assert scenario.control is not None
+    if missing := [name for name in ("prior", "hybrid") if name not in kit.models]:
+        raise InputError(f"{where} holds {', '.join(kit.models)}; needed is a model {missing[0]} too")
+    if kit.name and kit.name != scenario.name:
+        raise InputError(f"{where} was made for scenario {kit.name}, not for {scenario.name}")
+    needed = scenario.control.n_x, scenario.control.n_u, len(scenario.sensor_sigma)
+    for name, model in kit.models.items():
+        if (sizes := (model.n_x, model.n_u, model.n_y)) != needed:
+            raise InputError(
+                f"{where}: model {name} has (states, inputs, outputs) = {sizes}, scenario {scenario.name} {needed}"
+            )
 
 
 def check_faults(scenario: Scenario, faults: Sequence[Fault]) -> None:

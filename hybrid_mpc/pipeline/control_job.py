@@ -17,8 +17,7 @@ from hybrid_mpc.closed_loop import ClosedLoopResult, Fault
 from hybrid_mpc.closed_loop.simulate import Step
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.job.contenders import CONTENDERS, ORACLES, find_noise
-from hybrid_mpc.job.loops import Bench, LoopRow, LoopSpec, check_complete, check_faults
-from hybrid_mpc.mpc import OCP
+from hybrid_mpc.job.loops import Bench, LoopRow, LoopSpec, check_complete, check_faults, check_kit
 from hybrid_mpc.scenario import Scenario, Task
 
 Array = NDArray[np.float64]
@@ -205,8 +204,7 @@ def prepared(
         raise InputError(f"scenario {scenario.name} has no oracle; leave --controller {oracles[0]} out")
     tasks, folder = selected_tasks(scenario, settings.tasks), artifact_folder(model)
     kit = load(folder)
-    assert scenario.control is not None
-    _check_artifact(scenario, kit, folder, scenario.control)
+    check_kit(scenario, kit, str(folder))
     if settings.guard:
         kit.detector()
     if settings.guard == "adapt":
@@ -218,22 +216,6 @@ def prepared(
         source = "given"
     bench = Bench(scenario, {MODEL: kit.with_noise(noise)})
     return Job(bench, named or scenario.name, tasks, settings, source)
-
-
-def _check_artifact(scenario: Scenario, artifact: Kit, folder: Path, control: OCP) -> None:
-    missing = [name for name in ("prior", "hybrid") if name not in artifact.models]
-    if missing:
-        raise InputError(f"{folder} holds {', '.join(artifact.models)}; needed is a model {missing[0]} too")
-    made_for = artifact.provenance.scenario
-    if made_for and made_for != scenario.name:
-        raise InputError(f"{folder} was made for scenario {made_for}, not for {scenario.name}")
-    for name, model in artifact.models.items():
-        sizes = model.n_x, model.n_u, model.n_y
-        needed = control.n_x, control.n_u, len(scenario.sensor_sigma)
-        if sizes != needed:
-            raise InputError(
-                f"{folder}: model {name} has (states, inputs, outputs) = {sizes}, scenario {scenario.name} {needed}"
-            )
 
 
 def run_loops(

@@ -1,0 +1,65 @@
+"""What a bench refuses, and how it holds what it has built."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hybrid_mpc import Bench, InputError, LoopSpec, Provenance, load, load_scenario
+
+GOLF = load_scenario("golf_robot")
+SPEC = LoopSpec("golf_robot", "mine", "track_sine", "hybrid_observer", duration=0.1)
+
+
+@pytest.fixture(scope="module")
+def kit(golf_artifact):
+    return load(golf_artifact).with_noise({"hybrid_observer": np.array([1e-4, 2e-2])})
+
+
+@pytest.fixture(scope="module")
+def bench(kit):
+    return Bench(GOLF, {"mine": kit})
+
+
+def test_what_is_built_serves_again(bench):
+    first, _ = bench.run(SPEC)
+    built = bench.parts(SPEC)
+    again, _ = bench.run(replace(SPEC, seed=0))
+    assert again.cost == first.cost
+    assert bench.parts(replace(SPEC, seed=5)) is built
+    assert bench.parts(replace(SPEC, horizon=7))[1].controller.ocp.horizon == 7
+    assert bench.parts(SPEC) is built
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"controller": "hybird"}, "did you mean 'hybrid'"),
+        ({"solver": "newton"}, "no solver 'newton'"),
+        ({"monitor": "energi"}, "did you mean 'energy'"),
+        ({"guard": "run"}, "no guard 'run'"),
+    ],
+)
+def test_names_are_checked_where_they_are_given(change, told):
+    with pytest.raises(InputError, match=told):
+        replace(SPEC, **change)
+
+
+def test_what_is_not_there_is_named(bench):
+    with pytest.raises(InputError, match="no model on the bench 'yours'"):
+        bench.run(replace(SPEC, model="yours"))
+    with pytest.raises(InputError, match="no task nothing; there are: track_sine"):
+        bench.run(replace(SPEC, task="nothing"))
+    with pytest.raises(InputError, match="without process noise for prior"):
+        bench.run(replace(SPEC, controller="prior"))
+    with pytest.raises(InputError, match="holds no detector"):
+        bench.run(replace(SPEC, monitor="guard", guard="rest"))
+
+
+def test_another_machine_s_model_is_refused(kit):
+    with pytest.raises(InputError, match=r"model mine was made for scenario emps, not for golf_robot"):
+        Bench(GOLF, {"mine": replace(kit, provenance=Provenance("emps"))})
+    with pytest.raises(InputError, match="model mine holds hybrid; needed is a model prior"):
+        Bench(GOLF, {"mine": replace(kit, models={"hybrid": kit.models["hybrid"]})})
+    with pytest.raises(InputError, match="has no plant"):
+        Bench(replace(GOLF, plant=None), {})
