@@ -144,8 +144,8 @@ class Loop:
         >>> from hybrid_mpc.estimation import ExtendedKalmanFilter
         >>> from hybrid_mpc.mpc import OCP, CondensedController
         >>> from hybrid_mpc.signals import Signal
-        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "m"),)
-        >>> model = HybridModel.of("tank", 1.0, level, (Signal("u", "m/s"),), level,
+        >>> x, u, height = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "m"),)
+        >>> model = HybridModel.of("tank", 1.0, height, (Signal("u", "m/s"),), height,
         ...     x=x, u=u, x_next=x + u, xdot=u, y=x)
         >>> ekf = ExtendedKalmanFilter(model, sigma_y=[0.01], sigma_x=[0.01], sigma_x0=[1.0])
         >>> loop = Loop(ekf, CondensedController(model, OCP(9, [1.0], [0.1], [0.1], [-1.0], [1.0])), reference=[0.5])
@@ -153,7 +153,7 @@ class Loop:
         >>> for _ in range(9):
         ...     level += u[0]
         ...     u = loop.step([level])
-        >>> round(level, 3)
+        >>> round(float(level), 3)
         0.5
     """
 

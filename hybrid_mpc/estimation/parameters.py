@@ -82,7 +82,7 @@ def with_parameter_states(
         [0.05, 0.04]
     """
     given = prior_acceleration(model, prior)
-    _check_model(model)
+    _check_model(model, prior or model)
     if not (math.isfinite(most) and most > 1):
         raise InputError(
             f"parameter states: most = {most} given, the largest factor; it must be above 1, e.g. 4"
@@ -190,14 +190,11 @@ def parameter_states(factors: ArrayLike, most: float = 4.0) -> Array:
     return np.asarray(bound * np.arctanh(np.clip(np.log(values) / bound, -LEAST, LEAST)))
 
 
-def _check_model(model: HybridModel) -> None:
-    x, h, u, w, p = step_symbols(model)
-    n_q = model.n_x // 2
-    slope = ca.jacobian(model.xdot(x, h, u, w, p)[:n_q], ca.vertcat(x, u))
-    found = ca.Function(
-        "kinematics", [x, h, u], [ca.substitute(slope, ca.vertcat(w, p), np.append(model.w, model.p))]
-    )
-    if model.n_x % 2 or not np.array_equal(found(0, 0, 0).full(), np.eye(n_q, model.n_x + model.n_u, n_q)):
+def _check_model(model: HybridModel, prior: HybridModel) -> None:
+    point, n_q = step_symbols(prior), model.n_x // 2
+    slope = ca.jacobian(prior.xdot(*point)[:n_q], ca.vertcat(point[0], point[2]))
+    found = ca.Function("kinematics", point, [slope])(0, 0, 0, prior.w, prior.p).full()
+    if model.n_x % 2 or not np.array_equal(found, np.eye(n_q, model.n_x + model.n_u, n_q)):
         raise InputError(
             f"parameter states: the states {[s.name for s in model.states]} of model {model.name} are not positions "
             "and then their velocities; nothing else is dealt with, no lags"

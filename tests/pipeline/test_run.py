@@ -149,7 +149,7 @@ def test_resume_of_a_damaged_checkpoint(call, arguments, finished, tmp_path):
         ("model.json", lambda b: b[: len(b) // 2], "damaged"),
         (
             "model.json",
-            lambda b: b.replace(b'"schema_version": 2', b'"schema_version": 99'),
+            lambda b: b.replace(b'"schema_version": 3', b'"schema_version": 99'),
             "schema version",
         ),
         ("programs.json", lambda b: b[: len(b) // 2], "programs.json"),
@@ -177,6 +177,21 @@ def test_artifact_holds_data_only(finished):
     assert artifact.models["prior"].n_h == 0
     assert artifact.calibration is not None
     assert artifact.provenance.data_hash == results(finished)["data"]["hash"]
+
+
+def test_the_artifact_holds_the_fitted_parameters_with_what_is_known_of_them(finished):
+    fit, model = (
+        results(finished)["identification"]["details"]["prior_parameters"],
+        load(finished / "model").models["hybrid"],
+    )
+    assert {p.name: p.value for p in model.parameters} == fit["values"]
+    assert all(p.lower <= p.value <= p.upper and p.unit for p in model.parameters)
+    errors = [fit["standard_errors"].get(p.name, 0.0) for p in model.parameters]
+    covariance = np.array(model.covariance)
+    assert covariance.shape == (model.n_p, model.n_p)
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), errors, rtol=1e-12)
+    np.testing.assert_allclose(covariance, covariance.T)
+    assert min(errors) == 0.0 or np.all(np.linalg.eigvalsh(covariance) > 0)
 
 
 def test_the_main_job_says_what_its_guard_lacks(finished):
