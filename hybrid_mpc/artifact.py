@@ -494,7 +494,7 @@ def loop_settings(
     Example:
         >>> from scenarios.golf_robot import scenario
         >>> sorted(loop_settings(scenario).control)[:2]
-        ['', 'track_limits']
+        ['', 'reject_load']
     """
     problems = {"": scenario.control} | {task.name: task.control for task in scenario.tasks}
     given = {name: problem for name, problem in problems.items() if problem is not None}

@@ -1,6 +1,5 @@
 """Files are written whole or not at all, read within limits, and folders are held by one job at a time."""
 
-import doctest
 import io
 import json
 import os
@@ -42,12 +41,6 @@ from hybrid_mpc.cli import main
 main()
 """
 """The command line on a disk that is full after 20 kB of any file."""
-
-
-@pytest.mark.parametrize("module", [hybrid_mpc.files, hybrid_mpc.records])
-def test_examples(module):
-    flags = doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL
-    assert doctest.testmod(module, optionflags=flags).failed == 0
 
 
 def test_two_writers_never_damage_what_a_reader_sees(tmp_path):

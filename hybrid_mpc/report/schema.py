@@ -209,7 +209,7 @@ def validate_results(results: Mapping[str, Any]) -> None:
         InputError: With the path of the first key that is missing, unknown or of the wrong kind.
 
     Example:
-        >>> validate_results({"schema_version": 3, "seed": 0})
+        >>> validate_results({"schema_version": 4, "seed": 0})
         Traceback (most recent call last):
         ...
         hybrid_mpc.errors.InputError: results: 'scenario' is missing; it must be a text that is not empty
