@@ -272,10 +272,9 @@ class Kit:
         return self.loop.control.get("")
 
     @property
-    def safe_input(self) -> NDArray[np.float64]:
-        """Input ``(n_u,)`` that the machine is left with, whatever ends a loop."""
-        given = self.loop.safe_input
-        return self.problem().rest_input if given is None else np.array(given, dtype=np.float64)
+    def safe_input(self) -> tuple[float, ...] | None:
+        """Input ``(n_u,)`` where nothing is known; None: zero, or the limit next to it."""
+        return self.loop.safe_input
 
     @property
     def rest_speed(self) -> tuple[float, ...] | None:
@@ -389,7 +388,12 @@ class Kit:
         from hybrid_mpc.assembly import make_controller
 
         return make_controller(
-            self._model(model), self._model("prior"), self.problem(task), solver=solver, iterations=iterations
+            self._model(model),
+            self._model("prior"),
+            self.problem(task),
+            solver=solver,
+            iterations=iterations,
+            safe_input=self.safe_input,
         )
 
     def monitor(self, model: str = "hybrid") -> EnergyMonitor:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.closed_loop.guard import Guard, Mode
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation.kalman import ExtendedKalmanFilter
+from hybrid_mpc.estimation.kalman import Estimator, ExtendedKalmanFilter
 from hybrid_mpc.estimation.parameters import parameter_filter, with_parameter_states
 from hybrid_mpc.estimation.switching import SwitchingFilter
 from hybrid_mpc.estimation.tuning import most_likely
@@ -78,6 +78,10 @@ class Machine(Protocol):
     @property
     def control(self) -> OCP | None:
         """The control problem."""
+
+    @property
+    def safe_input(self) -> tuple[float, ...] | None:
+        """What it is left with where nothing is known ``(n_u,)``; None: zero, or the limit next to it."""
 
     @property
     def causes(self) -> Mapping[str, tuple[str, ...]]:
@@ -190,7 +194,13 @@ SOLVERS = ("rti", "sqp", "ipopt")
 
 
 def make_controller(
-    model: HybridModel, prior: HybridModel, control: OCP, *, solver: str = "rti", iterations: int = 1
+    model: HybridModel,
+    prior: HybridModel,
+    control: OCP,
+    *,
+    solver: str = "rti",
+    iterations: int = 1,
+    safe_input: ArrayLike | None = None,
 ) -> SafeController:
     """A model's controller behind the safeguards that stand on the prior.
 
@@ -203,6 +213,7 @@ def make_controller(
         control: The control problem.
         solver: Name in :data:`SOLVERS`.
         iterations: Linearisations a period of ``rti``. Default: one.
+        safe_input: What the machine is left with where nothing is known. Default: zero, or the limit next to it.
 
     Raises:
         InputError: If there is no such solver.
@@ -212,11 +223,11 @@ def make_controller(
     """
     ocp = make_ocp(prior, control)
     if known(solver, SOLVERS, "solver") == "sqp":
-        return SafeController(SQPController(model, ocp), prior)
+        return SafeController(SQPController(model, ocp), prior, safe_input=safe_input)
     if solver == "ipopt":
-        return SafeController(IpoptController(model, ocp), prior)
+        return SafeController(IpoptController(model, ocp), prior, safe_input=safe_input)
     rti = CondensedController(model, ocp, iterations=iterations)
-    return SafeController(rti, prior, first=first_controller(model, ocp))
+    return SafeController(rti, prior, first=first_controller(model, ocp), safe_input=safe_input)
 
 
 def first_controller(model: HybridModel, ocp: OCP) -> SQPController | BestOf:
@@ -328,6 +339,23 @@ def make_resting_guard(model: HybridModel) -> Guard:
     return Guard(Mode.NORMAL, Mode.REST, dwell=DWELL_S * unit, quiet=QUIET_S * unit)
 
 
+def make_backup_guard(controller: SafeController, estimator: Estimator) -> Guard:
+    """A guard that hands over to another controller where the model does not describe the machine.
+
+    Args:
+        controller: The backup, e.g. that of the fitted prior; its model's unit of time counts.
+        estimator: Its estimator.
+
+    Example:
+        ``make_backup_guard(kit.controller("prior"), kit.observer("prior"))``
+    """
+    unit = controller.controller.model.time_unit
+    return Guard(
+        Mode.BACKUP, Mode.REST, backup=controller, backup_estimator=estimator, dwell=DWELL_S * unit,
+        quiet=QUIET_S * unit,
+    )  # fmt: skip
+
+
 def make_adaptive_guard(
     model: HybridModel,
     prior: HybridModel,
@@ -367,7 +395,10 @@ def make_adaptive_guard(
     span = control.input_range
     plain = make_ocp(prior, control)
     ocp = plain.changed(terminal=plain.terminal_weight(model))
-    backup = SafeController(CondensedController(adaptive, ocp), prior, first=first_controller(adaptive, ocp))
+    backup = SafeController(
+        CondensedController(adaptive, ocp), prior, first=first_controller(adaptive, ocp),
+        safe_input=scenario.safe_input,
+    )  # fmt: skip
     first, unit = first_deviations(model, scenario), model.time_unit
     estimator = parameter_filter(
         adaptive, len(groups), sigma_y=scenario.sensor_sigma, sigma_x=sigma_x, sigma_x0=first,

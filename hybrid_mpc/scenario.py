@@ -145,8 +145,9 @@ class Scenario:
             estimator's start. Default: ``sqrt(2) sensor_sigma / dt``, what the first two samples tell of speeds: a
             start at rest then counts as much as they do, and after five samples of a start in motion it has 5 % of the
             weight.
-        safe_input: Input ``(n_u,)`` [input units] that the machine is left with when a loop ends or the sensor is lost
-            for good. Default: zero, or the limit next to it; a machine that would fall or run away needs its own.
+        safe_input: Input ``(n_u,)`` [input units] that the machine is left with where nothing is known: before the
+            first plan, on a sensor that is lost, at the end of a run. Default: zero, or the limit next to it; a machine
+            that would fall or run away needs its own.
         tasks: Closed-loop tasks.
         budgets: Effort by name.
         draw: ``x (n_x,) -> polylines (m, 2) [m]`` of the machine, for moving pictures; default: none.

@@ -77,7 +77,8 @@ def test_every_part_is_made_from_the_folder(run, tmp_path):
     assert kit.monitor().detector == DETECTOR
     assert kit.guard(adapt=True).on_model is Mode.BACKUP
     assert (kit.name, kit.causes) == ("", GOLF.causes)
-    np.testing.assert_array_equal(kit.safe_input, [0.0])
+    assert kit.safe_input is None
+    np.testing.assert_array_equal(kit.controller().safe_input, [0.0])
     limited = next(task for task in GOLF.tasks if task.control is not None)
     assert kit.problem(limited.name) == limited.control
     assert kit.problem("another") == GOLF.control
@@ -86,7 +87,16 @@ def test_every_part_is_made_from_the_folder(run, tmp_path):
 
 def test_the_safe_input_is_the_scenario_s(run):
     kit = hm.load(run)
-    np.testing.assert_array_equal(kit.on(replace(GOLF, safe_input=(0.1,))).safe_input, [0.1])
+    other = kit.on(replace(GOLF, safe_input=(0.1,)))
+    result = closed(
+        other.observer(), other.controller(), monitor=other.monitor(), guard=other.guard(),
+        faults=[Fault(0.4, 0.8, "measurement_freeze")],
+    )  # fmt: skip
+    first = round(result.switches[0].t / result.dt)
+    assert result.switches[0].after is Mode.REST
+    # the limit of the change lets it be reached in a few periods
+    assert 0.1 in np.round(result.u[first : first + 10, 0], 9)
+    assert hm.Loop(other.observer(), other.controller()).safe_input.tolist() == [0.1]
     for wrong in ((9.0,), (0.0, 0.0), (np.nan,)):
         with pytest.raises(hm.InputError, match="outside the limits"):
             kit.on(replace(GOLF, safe_input=wrong))
@@ -179,3 +189,24 @@ def test_public_names_are_there():
         assert getattr(hm, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = hm.nothing
+
+
+def test_parts_of_two_models_are_refused_before_the_loop_begins(run):
+    kit = hm.load(run)
+    with pytest.raises(hm.InputError, match=r"the monitor's model hybrid has .*give both the same"):
+        hm.Loop(kit.observer("prior"), kit.controller("prior"), monitor=kit.monitor())
+    hm.Loop(kit.observer("prior"), kit.controller("prior"), monitor=kit.monitor("prior"))
+
+
+def test_a_state_of_other_parts_is_refused(run):
+    kit = hm.load(run)
+    mine, prior = (hm.Loop(kit.observer(name), kit.controller(name)) for name in ("hybrid", "prior"))
+    mine.start([0.0])
+    prior.start([0.0])
+    with pytest.raises(hm.InputError, match="hidden state has 0 numbers, needed are 8"):
+        mine.restore(prior.state)
+    with pytest.raises(hm.InputError, match="its loop had no monitor, this one has a"):
+        hm.Loop(kit.observer(), kit.controller(), monitor=kit.monitor()).restore(mine.state)
+    with pytest.raises(hm.InputError, match=r"what Loop\.state was is needed, got NoneType"):
+        mine.restore(None)
+    assert mine.restore(mine.state) == mine.decision.u

@@ -115,7 +115,7 @@ def summary(results: dict[str, Any]) -> list[str]:
 
 def _guarded(row: dict[str, Any]) -> list[str]:
     """What the guard of one loop saw and did."""
-    blind = row["not_judged_s"]
+    blind = row["not_judged_s"] or 0.0
     dark = f"; not judged: {blind:.2f} s" if blind else ""
     if not row["alarms"]:
         return [f"guard, {row['task']}, seed {row['seed']}: no alarm{dark}"]

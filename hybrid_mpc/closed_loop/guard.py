@@ -286,9 +286,9 @@ class GuardedController:
         return decision, replace(state, planner=planner)
 
     def _rest(self, previous: Decision, limits: Limits | None) -> Decision:
-        """No input, as soon as ``du_max`` lets it be none."""
+        """The safe input, as soon as ``du_max`` lets it be."""
         ocp = self.safe.controller.ocp
-        u = ocp.saturate(np.zeros(ocp.n_u), previous.u, limits)
+        u = ocp.saturate(self.safe.safe_input, previous.u, limits)
         plan = replace(previous.solution, u=np.tile(u, (ocp.horizon, 1)))
         return Decision(u, Source.ZERO, plan, Status.INITIAL, 0)
 

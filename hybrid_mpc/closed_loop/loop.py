@@ -176,6 +176,7 @@ class Loop:
         self._estimator, self._safe, self._monitor = estimator, safe, monitor
         self.model, self.ocp = estimator.model, safe.controller.ocp
         _check_models(self.model, safe.controller.model)
+        _check_monitor(monitor, self.model)
         if guard is not None and monitor is None:
             raise InputError("a guard acts on a monitor's alarms; give monitor= as well")
         self._control = GuardedController(safe, guard)
@@ -202,6 +203,11 @@ class Loop:
         if self._state is None:
             raise InputError("the loop has not begun; call start() with the first sample")
         return self._state
+
+    @property
+    def safe_input(self) -> Array:
+        """Input ``(n_u,)`` that the machine is left with where nothing is known, as the controller has it."""
+        return self._safe.safe_input.copy()
 
     @property
     def t(self) -> float:
@@ -245,7 +251,7 @@ class Loop:
         """Who gives the input: the controller, or in ``"manual"`` an operator, whose inputs are ``applied``.
 
         While manual, the estimator goes on with the inputs that really act, so that nothing winds up, and the input
-        that a step returns is the operator's last one. Back in automatic the controller begins from it: without a bump.
+        that a step returns is the operator's last one. Back in automatic the controller begins from it, within ``du_max``.
         """
         return self.state.mode
 
@@ -256,7 +262,18 @@ class Loop:
         self._state = replace(self.state, mode=mode)
 
     def restore(self, state: LoopState) -> Array:
-        """Go on from a state, which a loop of the same parts had; returns the input that is held ``(n_u,)``."""
+        """Go on from a state, which a loop of the same parts had.
+
+        Args:
+            state: What :attr:`state` was.
+
+        Returns:
+            The input that is held ``(n_u,)``.
+
+        Raises:
+            InputError: If it is no state, or that of a loop of another model or horizon.
+        """
+        _check_state(state, self.model, self.ocp, self._monitor)
         self._state, self._period, self._ahead, self._reading = state, None, None, None
         return state.decision.u
 
@@ -528,6 +545,42 @@ def _with_input(decision: Decision, u: Array) -> Decision:
 def _held(plan: Any, u: Array) -> Any:
     """The plan with ``u`` as the input that is held."""
     return replace(plan, u=np.vstack([u[None], plan.u[1:]]))
+
+
+def _check_state(state: LoopState, model: HybridModel, ocp: OCP, monitor: Monitor | None) -> None:
+    if not isinstance(state, LoopState):
+        raise InputError(f"restore: what Loop.state was is needed, got {type(state).__name__}")
+    plan, estimate = state.decision.solution, state.estimate
+    sizes = [
+        ("y", state.y, model.n_y),
+        ("input", state.decision.u, model.n_u),
+        ("plan", plan.u, ocp.horizon * ocp.n_u),
+    ]
+    if estimate is not None:
+        sizes += [("estimate", estimate.x, model.n_x), ("hidden state", estimate.h, model.n_h)]
+    wrong = [
+        f"{name} has {np.size(value)} numbers, needed are {n}"
+        for name, value, n in sizes
+        if np.size(value) != n
+    ]
+    if (state.monitor is None) != (monitor is None):
+        wrong.append(
+            f"its loop had {'no' if state.monitor is None else 'a'} monitor, this one has {'a' if monitor else 'no'}"
+        )
+    if wrong:
+        raise InputError(f"restore: the state is of a loop of other parts: {'; '.join(wrong)}")
+
+
+def _check_monitor(monitor: Monitor | None, model: HybridModel) -> None:
+    own: HybridModel | None = getattr(monitor, "model", None)
+    if own is None:
+        return
+    sizes = [(m.n_x, m.n_h, m.n_u, m.n_y) for m in (own, model)]
+    if sizes[0] != sizes[1]:
+        raise InputError(
+            f"the monitor's model {own.name} has (n_x, n_h, n_u, n_y) = {sizes[0]}, the estimator's model {model.name} "
+            f"{sizes[1]}; give both the same model, e.g. kit.monitor({model.name!r})"
+        )
 
 
 def _check_models(estimated: HybridModel, controlled: HybridModel) -> None:

@@ -17,10 +17,8 @@ from hybrid_mpc.closed_loop.timing import CheckedClock, Clock, RealClock, Runner
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.delays import sees_truth
 from hybrid_mpc.estimation.kalman import Estimator
-from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.problem import Controller
-from hybrid_mpc.mpc.safeguard import SafeController
-from hybrid_mpc.riccati import vector
+from hybrid_mpc.mpc.safeguard import SafeController, checked_safe_input
 
 Array = NDArray[np.float64]
 
@@ -55,7 +53,7 @@ class Runner:
         horizon: Periods of preview. Default: the controller's horizon.
         monitor: Default: none.
         deadline: Time [s] after a period's instant by which its input must be decided. Default: one period.
-        safe_input: Input ``(n_u,)`` within the limits for the end of the run. Default: zero, or the bound next to it.
+        safe_input: Input ``(n_u,)`` within the limits for the end of the run. Default: the controller's.
         input_delay: Periods after which an input acts, as the estimator knows it; shifts the preview.
         sensor_delay: Periods after which a measurement arrives; pairs it with its input for the monitor.
         clock: Default: the computer's. One that does not wait, stands still, goes back or gives NaN ends the run.
@@ -110,7 +108,8 @@ class Runner:
             )  # fmt: skip
 
         self._dt, self._make = dt, make
-        self._safe_input = _checked_safe(safe_input, make(math.inf, self._clock.now).ocp)
+        loop = make(math.inf, self._clock.now)
+        self._safe_input = loop.safe_input if safe_input is None else checked_safe_input(safe_input, loop.ocp)
 
     @property
     def safe_input(self) -> Array:
@@ -161,10 +160,3 @@ class Runner:
                 f"Runner: duration {duration} s given; at least one period of {dt} s, and finite, needed"
             )
         return round(duration / dt)
-
-
-def _checked_safe(given: ArrayLike | None, ocp: OCP) -> Array:
-    u = vector(ocp.rest_input if given is None else given, ocp.n_u, "safe_input")
-    if np.any(u < ocp.u_min) or np.any(u > ocp.u_max):
-        raise InputError(f"Runner: safe_input {u} is outside the limits {ocp.u_min} to {ocp.u_max}")
-    return u

@@ -79,7 +79,7 @@ def build(
     if c.model != "oracle":
         model = kit.models[c.model]
         estimator = make_estimator(model, kit, kit.noise(name), control, observer=c.observer)
-        return estimator, make_controller(model, prior, control, solver=solver)
+        return estimator, make_controller(model, prior, control, solver=solver, safe_input=kit.safe_input)
     if scenario.oracle is None:
         raise InputError(f"scenario {scenario.name} has no oracle")
     model = scenario.oracle(prior.dt)
@@ -87,7 +87,7 @@ def build(
     rivals = [CondensedController(kit.models[m], ocp) for m in ("prior", "hybrid")]
     best = BestOf(SQPController(model, ocp, iterations=ORACLE_ITERATIONS), rivals=rivals, most=1)
     first = BestOf(SQPController(model, ocp, iterations=FIRST_ITERATIONS), starts=ocp.starts, rivals=rivals)
-    safe = SafeController(best, prior, first=first)
+    safe = SafeController(best, prior, first=first, safe_input=kit.safe_input)
     if c.truth:
         return TrueState(model), safe
     return make_estimator(model, kit, kit.noise(name), control, observer=c.observer), safe
@@ -158,26 +158,31 @@ def find_noise(
         ``noise, source = find_noise(scenario, hm.load("runs/golf"), ("hybrid_observer",), 0)``
     """
     needed = [name for name in controllers if not CONTENDERS[name].truth]
-    held = artifact.loop.process_noise
-    if set(needed) <= set(held):
-        return no_surer_than_prior(scenario, {name: artifact.noise(name) for name in held}), "the model's own"
-    if not needed:
-        return {}, "no filter"
-    if not any(name in ORACLES for name in needed):
-        scenario = replace(scenario, oracle=None)  # whose noise takes the longest
-    return _estimated_noise(scenario, artifact, seed), (
-        f"recordings of the simulated machine (quick, seed {seed}), smoothed by the prior"
-    )
+    held = {name: artifact.noise(name) for name in artifact.loop.process_noise}
+    lacking = [name for name in needed if name not in held]
+    if not lacking:
+        return no_surer_than_prior(scenario, held), "the model's own" if needed else "no filter"
+    machine = scenario
+    if not any(name in ORACLES for name in lacking):
+        machine = replace(scenario, oracle=None)  # whose noise takes the longest
+    source = f"recordings of the simulated machine (quick, seed {seed}), smoothed by the prior"
+    if kept := [name for name in needed if name in held]:
+        source = f"{', '.join(lacking)}: {source}; {', '.join(kept)}: the model's own"
+    return no_surer_than_prior(
+        scenario, {**_estimated_noise(machine, artifact, lacking, seed), **held}
+    ), source
 
 
-def _estimated_noise(scenario: Scenario, artifact: Kit, seed: int) -> Mapping[str, Array]:
+def _estimated_noise(
+    scenario: Scenario, artifact: Kit, lacking: Sequence[str], seed: int
+) -> Mapping[str, Array]:
     from hybrid_mpc.data.trajectories import load_trajectories
     from hybrid_mpc.identification.smoothing import fit_smoother
     from hybrid_mpc.pipeline.machine_benchmark.physics import shifted, with_states
 
     if scenario.make_data is None or scenario.control is None:
         raise InputError(
-            f"the model holds no process noise for its filters, and scenario {scenario.name} makes no data to "
+            f"the model holds no process noise for {', '.join(lacking)}, and scenario {scenario.name} makes no data to "
             "estimate it on; run the scenario again"
         )
     prior = scenario.prior(artifact.provenance.prior_parameters)

@@ -12,9 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.artifact import Kit
-from hybrid_mpc.assembly import SOLVERS, freezing, make_monitor
+from hybrid_mpc.assembly import (
+    SOLVERS,
+    freezing,
+    make_adaptive_guard,
+    make_backup_guard,
+    make_monitor,
+    make_resting_guard,
+)
 from hybrid_mpc.closed_loop.faults import Fault, check_channels, install
-from hybrid_mpc.closed_loop.guard import Guard, Mode
+from hybrid_mpc.closed_loop.guard import Guard
 from hybrid_mpc.closed_loop.result import ClosedLoopResult
 from hybrid_mpc.closed_loop.simulate import Simulation, Step, simulate_together
 from hybrid_mpc.closed_loop.timing import percentiles
@@ -28,17 +35,24 @@ from hybrid_mpc.model import HybridModel
 from hybrid_mpc.monitor import EnergyMonitor, guard_monitor
 from hybrid_mpc.monitor.calibration import alarm_intervals
 from hybrid_mpc.mpc import OCP, SafeController, Source
-from hybrid_mpc.records import known
+from hybrid_mpc.records import known, plain
 from hybrid_mpc.scenario import Plant, Scenario, Task
 
 Array = NDArray[np.float64]
+MODEL = "model"
+"""Label of the model on the bench where there is one."""
 Intervals: TypeAlias = tuple[tuple[float, float], ...]
 MONITORS = ("own", "none", "energy", "readings", "guard")
 """What watches a hybrid: ``own``: levels without thresholds; ``none``; ``energy``: the model's thresholds, so that it
 alarms; ``readings``: what a detector reads, without one; ``guard``: the model's detector."""
+ALARMING = ("energy", "guard")
+"""Those that alarm."""
 GUARDS = ("", "rest", "adapt", "prior")
 """What an alarm does: nothing; a frozen sensor takes the input away; and a backup takes over, which estimates the
 prior's parameters, or which plans with the fitted prior."""
+NOT_KEPT = ("dt", "timing_ms", "switches")
+KEEPABLE = ("step_ms", "plans", *(f.name for f in fields(ClosedLoopResult) if f.name not in NOT_KEPT))
+"""What a row may hold of its loop."""
 TIMES = ("total", "solve", "estimate")
 KEPT_PARTS = 64
 """Controllers that a bench keeps built; runs come ordered by controller, so few are asked for again."""
@@ -55,7 +69,8 @@ class LoopSpec:
         controller: Name of the contender, with its estimator.
         solver: ``"rti"``, ``"sqp"`` or ``"ipopt"``.
         horizon: Periods; None for the task's own.
-        monitor: Name in :data:`MONITORS`; without a hybrid there is none.
+        monitor: Name in :data:`MONITORS`; without a hybrid there is none. Default: ``"own"``, or ``"guard"`` with a
+            guard.
         faults: Beside what the task itself brings.
         drawn_faults: Those that a draw takes at random.
         late: Intervals [s] in which solves miss their deadline.
@@ -63,7 +78,7 @@ class LoopSpec:
         draw: Number of the draw that ``parameters`` and random faults are from.
         seed: Number of the loop; the same number, the same sensor noise for all that share draw and ``run_seed``.
         duration: Longest duration [s]; None for the task's own.
-        guard: Name in :data:`GUARDS`.
+        guard: Name in :data:`GUARDS`. It acts on the alarms of the monitor, so it needs one that alarms.
         run_seed: Seed of the run that the loop belongs to.
         rounds: The task is run over and over, with its reference scaled by these factors, one a round. Default: once.
         keep: Arrays that its row holds: fields of :class:`~hybrid_mpc.closed_loop.ClosedLoopResult`, ``"step_ms"``
@@ -85,7 +100,7 @@ class LoopSpec:
     controller: str
     solver: str = "rti"
     horizon: int | None = None
-    monitor: str = "own"
+    monitor: str = ""
     faults: tuple[Fault, ...] = ()
     drawn_faults: tuple[Fault, ...] = ()
     late: Intervals = ()
@@ -102,8 +117,27 @@ class LoopSpec:
     def __post_init__(self) -> None:
         known(self.controller, CONTENDERS, "controller")
         known(self.solver, SOLVERS, "solver")
+        object.__setattr__(self, "monitor", self.monitor or ("guard" if self.guard else "own"))
         known(self.monitor, MONITORS, "monitor")
-        known(self.guard, GUARDS, "guard")
+        if self.guard:
+            known(self.guard, GUARDS[1:], "guard")
+        if self.guard and (self.monitor not in ALARMING or CONTENDERS[self.controller].model != "hybrid"):
+            raise InputError(
+                f"a guard acts on alarms: give a controller with the hybrid and monitor {' or '.join(ALARMING)}, got "
+                f"controller {self.controller} and monitor {self.monitor}"
+            )
+        if not (
+            isinstance(self.seed, int)
+            and isinstance(self.run_seed, int)
+            and min(self.seed, self.run_seed) >= 0
+        ):
+            raise InputError(
+                f"seed and run_seed are whole numbers from 0 on, got {self.seed!r} and {self.run_seed!r}"
+            )
+        if self.duration is not None and not self.duration > 0:
+            raise InputError(f"duration: a positive number of seconds needed, got {self.duration}")
+        for name in self.keep:
+            known(name, KEEPABLE, "array to keep")
 
     @cached_property
     def id(self) -> str:
@@ -193,14 +227,16 @@ class LoopRow:
         tracking_rmse: Root mean square deviation of the true states from their reference, by signal.
         largest_x: Largest magnitude of the true states, by signal.
         largest_u: Largest magnitude of the inputs, by signal.
-        limits: Largest share of the way from rest to each limit that was used: 1 is the limit, more a violation.
-        excess: By how much limits were left at most, in their own units: ``u [unit]``, ``du [unit]``, states by signal.
+        limits: Largest share of the way from rest to each limit that was used, by signal: 1 is the limit, more a
+            violation.
+        excess: By how much limits were left at most, by signal with its unit; ``change of`` an input where it is limited.
         sources: Share of periods by what gave the input.
         figures: The task's own figures.
-        alarms: Alarms of the monitor.
-        alarm_share: Share of periods with an alarm.
+        alarms: Alarms of the monitor; one that is still on at the end ends there. None where nothing could alarm: there is
+            no monitor, or one without thresholds.
+        alarm_share: Share of periods with an alarm; None where nothing could alarm.
         largest_level: Largest level of the monitor [W]; None without one.
-        not_judged_s: Time in which the monitor could not judge [s].
+        not_judged_s: Time in which the monitor could not judge [s]; None without one.
         switches: Changes of the guard's mode.
         timing_ms: ``median, p95, p99, max`` of the durations of ``total``, ``solve`` and ``estimate`` [ms].
         arrays: What the specification asked to keep. Default: nothing.
@@ -218,13 +254,19 @@ class LoopRow:
     excess: Mapping[str, float]
     sources: Mapping[str, float]
     figures: Mapping[str, float]
-    alarms: tuple[Interval, ...]
-    alarm_share: float
+    alarms: tuple[Interval, ...] | None
+    alarm_share: float | None
     largest_level: float | None
-    not_judged_s: float
+    not_judged_s: float | None
     switches: tuple[ModeChange, ...]
     timing_ms: Mapping[str, Mapping[str, float]]
     arrays: Mapping[str, Array] = field(default_factory=dict, compare=False)
+
+    def plain(self) -> dict[str, Any]:
+        """The row in JSON's own types, without its arrays."""
+        told: dict[str, Any] = plain(replace(self, arrays={}))
+        del told["arrays"]
+        return told
 
     def columns(self) -> dict[str, Any]:
         """The row as flat columns of a table, without its arrays; durations begin with ``timing_``."""
@@ -236,7 +278,7 @@ class LoopRow:
             **{f"{name} {signal}": v for name, by in groups.items() for signal, v in by.items()},
             **{f"share_{source}": share for source, share in self.sources.items()},
             **{f"task_{name}": float(value) for name, value in self.figures.items()},
-            "alarm_share": self.alarm_share,
+            "alarm_share": float("nan") if self.alarm_share is None else self.alarm_share,
             "first_alarm_s": self.alarms[0].start_s if self.alarms else float("nan"),
             "largest_level_w": float("nan") if self.largest_level is None else self.largest_level,
             **{
@@ -270,14 +312,16 @@ class Bench:
         self.scenario = scenario
         self.kits = {label: kit.on(scenario) for label, kit in kits.items()}
         self._parts: OrderedDict[tuple[object, ...], tuple[Estimator, SafeController]] = OrderedDict()
-        self._guards: dict[tuple[str, str, str], Guard] = {}
+        self._guards: dict[tuple[object, ...], Guard] = {}
 
     def kit(self, spec: LoopSpec) -> Kit:
         """The model of a specification.
 
         Raises:
-            InputError: If there is none of that label.
+            InputError: If there is none of that label, or the loop is another scenario's.
         """
+        if spec.scenario != self.scenario.name and not spec.scenario.endswith(".py"):
+            raise InputError(f"a loop of scenario {spec.scenario} given, the bench has {self.scenario.name}")
         return self.kits[known(spec.model, self.kits, "model on the bench")]
 
     def task(self, spec: LoopSpec) -> Task:
@@ -301,8 +345,7 @@ class Bench:
     def parts(self, spec: LoopSpec) -> tuple[Estimator, SafeController]:
         """Estimator and controller of a specification; they remember nothing, so one serves many loops."""
         kit = self.kit(spec)
-        stated = spec.task if spec.task in kit.loop.control else ""
-        key = (spec.model, spec.controller, spec.solver, spec.horizon, stated)
+        key = (spec.model, spec.controller, spec.solver, spec.horizon, self._stated(spec))
         if key not in self._parts:
             self._parts[key] = build(
                 spec.controller, self.scenario, kit, self.problem(spec), solver=spec.solver
@@ -336,19 +379,29 @@ class Bench:
         Raises:
             InputError: If the model lacks what the guard needs.
         """
-        key = (spec.model, spec.guard, spec.task)
         if not spec.guard:
             return None
+        kit = self.kit(spec)
+        hybrid = kit.models["hybrid"]
+        if spec.guard == "rest":
+            return make_resting_guard(hybrid)
+        key = (spec.model, spec.guard, spec.solver, spec.horizon, self._stated(spec))
         if key not in self._guards:
-            kit = self.kit(spec)
             if spec.guard == "prior":
-                estimator, controller = self.parts(replace(spec, controller="prior_observer"))
-                self._guards[key] = Guard(
-                    Mode.BACKUP, Mode.REST, backup=controller, backup_estimator=estimator
+                estimator, controller = self.parts(
+                    replace(spec, controller="prior_observer", guard="", monitor="none")
                 )
+                self._guards[key] = make_backup_guard(controller, estimator)
             else:
-                self._guards[key] = kit.guard(adapt=spec.guard == "adapt", task=spec.task)
+                noise = kit.noise("hybrid_observer")
+                self._guards[key] = make_adaptive_guard(
+                    hybrid, kit.models["prior"], kit, noise, self.problem(spec)
+                )
         return self._guards[key]
+
+    def _stated(self, spec: LoopSpec) -> str:
+        """Whose control problem it is: the task's own, or that of all tasks."""
+        return spec.task if spec.task in self.kit(spec).loop.control else ""
 
     def plant(self, spec: LoopSpec) -> Plant:
         """The plant of a specification, with its parameters changed."""
@@ -459,6 +512,8 @@ def row_of(spec: LoopSpec, task: Task, problem: OCP, model: HybridModel, result:
     r, labels = result, [signal.label for signal in model.states]
     inputs = [signal.label for signal in model.inputs]
     level = r.level[np.isfinite(r.level)]
+    watched = spec.monitor != "none" and CONTENDERS[spec.controller].model == "hybrid"
+    can_alarm = watched and spec.monitor in ALARMING
     return LoopRow(
         task=task.name,
         controller=spec.controller,
@@ -472,10 +527,10 @@ def row_of(spec: LoopSpec, task: Task, problem: OCP, model: HybridModel, result:
         excess=excess(problem, r, model),
         sources={source.name: r.source.count(source.name) / len(r.source) for source in Source},
         figures=dict(task.figures(r)) if task.figures is not None else {},
-        alarms=tuple(Interval(a, b) for a, b in alarm_intervals(r.alarm, r.dt)),
-        alarm_share=float(np.mean(r.alarm)),
+        alarms=tuple(Interval(a, b) for a, b in alarm_intervals(r.alarm, r.dt)) if can_alarm else None,
+        alarm_share=float(np.mean(r.alarm)) if can_alarm else None,
         largest_level=float(level.max()) if level.size else None,
-        not_judged_s=float(np.sum(~r.judged)) * r.dt,
+        not_judged_s=float(np.sum(~r.judged)) * r.dt if watched else None,
         switches=tuple(ModeChange(s.t, s.before.name, s.after.name, s.why) for s in r.switches),
         timing_ms={key: percentiles(r.timing_ms[key]) for key in TIMES},
     )
@@ -522,7 +577,7 @@ def excess(control: OCP, r: ClosedLoopResult, model: HybridModel) -> dict[str, f
         beyond = np.maximum(r.x - control.x_max, control.x_min - r.x)
         over |= {s.label: v for s, v in zip(model.states, beyond.T, strict=True)}
     if control.du_max is not None:
-        changes = np.abs(np.diff(r.u, axis=0)) - control.du_max
+        changes = np.abs(np.diff(r.u, axis=0, prepend=control.rest_input[None])) - control.du_max
         over |= {f"change of {s.label}": v for s, v in zip(model.inputs, changes.T, strict=True)}
     return {name: max(0.0, float(values.max())) for name, values in over.items()}
 

@@ -7,7 +7,7 @@ from enum import Enum
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimate
@@ -15,6 +15,7 @@ from hybrid_mpc.model import HybridModel
 from hybrid_mpc.mpc.condensed import CondensedController
 from hybrid_mpc.mpc.condensing import Prepared
 from hybrid_mpc.mpc.limits import Limits
+from hybrid_mpc.mpc.ocp import OCP
 from hybrid_mpc.mpc.problem import Controller
 from hybrid_mpc.mpc.solution import Solution, Status
 from hybrid_mpc.riccati import lqr, vector
@@ -28,7 +29,7 @@ class Source(Enum):
     MPC = "the checked solution of the MPC"
     PLAN = "the previous plan, shifted: the solve failed"
     FALLBACK = "the stabilising feedback on the prior: the solve failed and the plan is used up"
-    ZERO = "zero within the limits: nothing else was finite"
+    ZERO = "the safe input, by default zero within the limits: nothing else was finite"
     MANUAL = "the operator"
 
 
@@ -52,7 +53,7 @@ class Decision:
 
 
 class SafeController:
-    """Guards a controller: checked solution, else the shifted plan, else a fallback, else zero.
+    """Guards a controller: checked solution, else the shifted plan, else a fallback, else the safe input.
 
     Every input is within ``[u_min, u_max]`` and within ``du_max`` of the last one, whatever the solver,
     the model or the estimate do. The object keeps nothing between calls: what must be remembered
@@ -66,9 +67,12 @@ class SafeController:
             Default: the problem's own, else zero, the input within its limits.
         first: Controller that makes the first plan, before the loop starts; an
             :class:`~hybrid_mpc.mpc.SQPController` converges it. Default: ``controller``.
+        safe_input: Input ``(n_u,)`` within the limits that is applied where nothing is known: before the first plan, on
+            a sensor that is lost, at the end of a run. Default: zero, or the limit next to it.
 
     Raises:
-        InputError: If the fallback does not fit the problem or cannot be stabilised.
+        InputError: If the fallback does not fit the problem or cannot be stabilised, or the safe input is outside the
+            limits.
 
     Example:
         >>> from hybrid_mpc.estimation import TrueState
@@ -92,11 +96,13 @@ class SafeController:
         max_age: int = 5,
         working_point: tuple[Array, Array] | None = None,
         first: Controller | None = None,
+        safe_input: ArrayLike | None = None,
     ) -> None:
         if max_age < 0:
             raise InputError(f"max_age must not be negative, got {max_age}")
         ocp = controller.ocp
         self._controller, self._max_age = controller, max_age
+        self.safe_input = checked_safe_input(safe_input, ocp)
         self._rti = controller if isinstance(controller, CondensedController) else None
         self._first = controller if first is None else first
         _check_first(self._first, controller)
@@ -134,7 +140,7 @@ class SafeController:
 
         Args:
             estimate: Where the plan starts.
-            u: Input ``(n_u,)`` that is held. Default: zero, or the bound next to it.
+            u: Input ``(n_u,)`` that is held. Default: the safe input.
             reference: ``(m, n_x)``, from the first period on in steps of ``dt``: the plan is optimised for it.
                 Default: none; the plan holds ``u``.
             weight: Factors on ``q`` ``(m, n_x)``, as the reference. Default: 1.
@@ -143,7 +149,7 @@ class SafeController:
             InputError: If ``u`` has another size or is not finite, or another shape does not fit.
         """
         ocp = self._controller.ocp
-        held = ocp.rest_input if u is None else np.clip(vector(u, ocp.n_u, "u"), ocp.u_min, ocp.u_max)
+        held = self.safe_input if u is None else np.clip(vector(u, ocp.n_u, "u"), ocp.u_min, ocp.u_max)
         plan = self._controller.initial(estimate, np.tile(held, (ocp.horizon, 1)))
         if reference is not None:
             solution = self._first.solve(plan, estimate, reference, weight)
@@ -227,7 +233,28 @@ class SafeController:
                 )
             if np.all(np.isfinite(u)):
                 return u, Source.FALLBACK
-        return np.zeros(self._controller.ocp.n_u), Source.ZERO
+        return self.safe_input, Source.ZERO
+
+
+def checked_safe_input(given: ArrayLike | None, ocp: OCP) -> Array:
+    """The safe input ``(n_u,)`` of a problem.
+
+    Args:
+        given: What was declared. Default: zero, or the limit next to it.
+        ocp: The problem, with the limits.
+
+    Raises:
+        InputError: If it has another size, is not finite, or is outside the limits.
+
+    Example:
+        >>> from hybrid_mpc.mpc import OCP
+        >>> checked_safe_input(None, OCP(5, [1.0], [1.0], [0.0], [2.0], [9.0])).tolist()
+        [2.0]
+    """
+    u = vector(ocp.rest_input if given is None else given, ocp.n_u, "safe_input")
+    if np.any(u < ocp.u_min) or np.any(u > ocp.u_max):
+        raise InputError(f"safe_input {u} is outside the limits {ocp.u_min} to {ocp.u_max}")
+    return u
 
 
 def _check_first(first: Controller, controller: Controller) -> None:

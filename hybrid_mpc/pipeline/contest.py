@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.artifact import load
+from hybrid_mpc.artifact import load, loop_settings, read_description
 from hybrid_mpc.closed_loop.simulate import Step
+from hybrid_mpc.files import digest
 from hybrid_mpc.job.contenders import CONTENDERS, ORACLES
 from hybrid_mpc.job.engine import WORKERS, run_jobs
-from hybrid_mpc.job.loops import Bench, LoopRow, LoopSpec, tasks_of
+from hybrid_mpc.job.loops import MODEL, Bench, LoopRow, LoopSpec, tasks_of
 from hybrid_mpc.pipeline.context import Context
-from hybrid_mpc.pipeline.control_job import MODEL
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import Budget, Scenario, Task, load_scenario
 
@@ -90,17 +90,13 @@ def contest(context: Context) -> list[LoopRow]:
     """
     parts, settings = parts_of(context.scenario, context.budget), context.settings
     common = settings.scenario, context.out / "model"
-    missing = [part for part in parts if not context.done(part.stage)]
+    specs = {part.stage: part.specs(settings.scenario, settings.seed) for part in parts}
+    missing = [part for part in parts if not is_kept(context, part.stage, specs[part.stage])]
     timed = [part for part in missing if part.timed]
     for i, part in enumerate(timed):
         context.progress.update("timed loops", i, len(timed), f"{part.task.name}, {part.controller}")
-        keep(context, part.stage, run_specs(*common, part.specs(settings.scenario, settings.seed)))
-    jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
-        part.stage: (run_specs, (*common, part.specs(settings.scenario, settings.seed)))
-        for part in missing
-        if not part.timed
-    }
-    run_jobs(jobs, context.progress.update, WORKERS, lambda stage, rows: keep(context, stage, rows))
+        keep(context, part.stage, run_specs(*common, specs[part.stage]), specs[part.stage])
+    run_parts(context, {part.stage: specs[part.stage] for part in missing if not part.timed})
     rows = [row for part in parts for row in kept(context, part.stage)]
     order = [task.name for task in tasks_of(context.scenario, context.budget.tasks)]
     return sorted(rows, key=lambda row: (order.index(row.task), row.controller, row.seed))
@@ -147,15 +143,58 @@ def _bench(scenario: str, folder: Path, changed: int) -> Bench:
     return Bench(load_scenario(scenario), {MODEL: load(folder)})
 
 
-def keep(context: Context, stage: str, rows: list[LoopRow]) -> None:
-    """Write rows as a checkpoint.
+def run_parts(context: Context, parts: Mapping[str, list[LoopSpec]]) -> None:
+    """Run loops side by side in processes; each part is kept as it ends.
+
+    Args:
+        context: The run.
+        parts: Loops by the checkpoint that keeps them.
+    """
+    common = context.settings.scenario, context.out / "model"
+    jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
+        stage: (run_specs, (*common, specs)) for stage, specs in parts.items()
+    }
+    run_jobs(
+        jobs, context.progress.update, WORKERS, lambda stage, rows: keep(context, stage, rows, parts[stage])
+    )
+
+
+def keep(context: Context, stage: str, rows: list[LoopRow], specs: Sequence[LoopSpec] = ()) -> None:
+    """Write rows as a checkpoint, with what they are of.
 
     Args:
         context: The run.
         stage: Name of the checkpoint.
         rows: The loops.
+        specs: Their specifications, to know them again. Default: unknown.
     """
-    context.save(stage, {"rows": [plain(replace(row, arrays={})) for row in rows]}, arrays_of(rows))
+    told = [row.plain() for row in rows]
+    context.save(stage, {"rows": told, "of": identity(context, specs)}, arrays_of(rows))
+
+
+def is_kept(context: Context, stage: str, specs: Sequence[LoopSpec]) -> bool:
+    """Whether a checkpoint holds these loops of the run's present model, noise and control problem.
+
+    Args:
+        context: The run.
+        stage: Name of the checkpoint.
+        specs: The loops.
+    """
+    return context.done(stage) and context.result(stage).get("of") == identity(context, specs)
+
+
+def identity(context: Context, specs: Sequence[LoopSpec]) -> str:
+    """Digest of all that decides what loops of a run compute: their specifications, and the run's model.
+
+    Args:
+        context: The run.
+        specs: The loops.
+    """
+    model = read_description(context.out / "model")
+    rest = None if model.calibration is None else model.calibration.rest_speed
+    of_monitor = rest if any(spec.monitor == "readings" for spec in specs) else None
+    loop = loop_settings(context.scenario, model.loop.process_noise)
+    return digest([[spec.id for spec in specs], model.programs_sha256, plain(loop), of_monitor])
 
 
 def kept(context: Context, stage: str) -> list[LoopRow]:

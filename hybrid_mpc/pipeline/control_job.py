@@ -17,14 +17,14 @@ from hybrid_mpc.closed_loop import ClosedLoopResult, Fault
 from hybrid_mpc.closed_loop.simulate import Step
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.job.contenders import CONTENDERS, ORACLES, find_noise
-from hybrid_mpc.job.loops import Bench, LoopRow, LoopSpec, check_complete, check_faults, check_kit
+from hybrid_mpc.job.loops import MODEL, Bench, LoopRow, LoopSpec, check_complete, check_faults, check_kit
 from hybrid_mpc.scenario import Scenario, Task
 
 Array = NDArray[np.float64]
 DEFAULT_CONTROLLERS = ("prior_observer", "hybrid_observer")
 GUARDED_CONTROLLERS = ("hybrid_observer",)
-MODEL = "model"
-"""Label of the model on the bench."""
+WITHOUT_VALUE = ("measurement_freeze", "measurement_dropout")
+"""Faults that are not large or small."""
 REACTIONS = ("rest", "adapt")
 """What ``hybrid-mpc control --guard`` and ``--adapt`` do."""
 
@@ -116,7 +116,8 @@ def parsed_fault(text: str) -> Fault:
     """A fault from ``TARGET[=VALUE][@START[:END]]``, times in seconds.
 
     Args:
-        text: e.g. ``"input_gain=0.8@1.0"``; default value 0, start 0, end never.
+        text: e.g. ``"input_gain=0.8@1.0"``; start 0 by default, end never. A sensor that freezes or drops out has no
+            value, every other fault needs one.
 
     Raises:
         InputError: If it has another form, or there is no such fault.
@@ -137,7 +138,10 @@ def parsed_fault(text: str) -> Fault:
         ) from error
     if math.isnan(numbers[0]) or math.isnan(numbers[1]):
         raise InputError(f"fault {text!r}: times must be numbers of seconds")
-    return Fault(numbers[0], numbers[1], target, numbers[2])
+    fault = Fault(numbers[0], numbers[1], target, numbers[2])
+    if not value and target not in WITHOUT_VALUE:
+        raise InputError(f"fault {text!r} has no value; write how large it is, e.g. {target}=1.5@1.0")
+    return fault
 
 
 @dataclass(frozen=True)

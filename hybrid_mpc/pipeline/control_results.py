@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,7 +47,7 @@ def run_control(job: Job, out: Path, progress: Progress, *, gif: bool = True) ->
     progress.start("closing the loop")
     firsts: dict[str, dict[str, tuple[ClosedLoopResult, Array]]] = {}
     for row, result in run_loops(job, progress.update):
-        rows.append(replace(row, arrays={}))
+        rows.append(row)
         steps.setdefault(row.controller, []).append(result.timing_ms["total"])
         if row.seed == 0:
             firsts.setdefault(row.task, {})[row.controller] = (result, row.arrays["plans"])
@@ -89,7 +88,7 @@ def collected(job: Job, rows: Sequence[LoopRow], times: Mapping[str, Array]) -> 
         "period_ms": 1e3 * kit.models["prior"].dt,
         "step_ms": {name: percentiles(values) for name, values in times.items()},
         "summary": plain(summaries(rows)),
-        "loops": plain(rows),
+        "loops": [row.plain() for row in rows],
     }
 
 

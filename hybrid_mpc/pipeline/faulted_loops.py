@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.assembly import freezing
 from hybrid_mpc.closed_loop import Fault
-from hybrid_mpc.job.loops import Bench, LoopSpec
+from hybrid_mpc.job.loops import MODEL, Bench, LoopSpec
 from hybrid_mpc.monitor import MonitorTrace, guard_monitor
 from hybrid_mpc.monitor.calibration import alarm_intervals
-from hybrid_mpc.pipeline.contest import MODEL
 from hybrid_mpc.pipeline.monitor_job import explained
-from hybrid_mpc.pipeline.nominal_loops import CONTENDER, knows
+from hybrid_mpc.pipeline.nominal_loops import CONTENDER, knows, nominal_tasks
 from hybrid_mpc.records import plain
 from hybrid_mpc.scenario import Scenario
 
@@ -87,7 +86,7 @@ def faulted(
     """
     scenario, kit = bench.scenario, bench.kits[MODEL]
     model, dt = kit.models["hybrid"], kit.models["hybrid"].dt
-    task = next((t for t in scenario.tasks if not t.faults and t.weight is None), scenario.tasks[0])
+    task = nominal_tasks(scenario)[0]
     start = dt * round(0.5 * task.duration / dt)
     detects = freezing(kit, kit.problem(task.name))
     monitor = guard_monitor(model, kit.detector(), **detects, diagnose=model.n_p > 0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -14,8 +14,7 @@ from scipy.stats import chi2
 from hybrid_mpc.artifact import Kit, set_calibration
 from hybrid_mpc.assembly import freezing, make_monitor
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.job.engine import WORKERS, run_jobs
-from hybrid_mpc.job.loops import Bench
+from hybrid_mpc.job.loops import MODEL, Bench
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.monitor import Detector, guard_monitor, learn_detector, learn_plausibility
 from hybrid_mpc.monitor.calibration import MAX_EXTRAPOLATION, MIN_BLOCKS
@@ -23,7 +22,7 @@ from hybrid_mpc.monitor.lengths import BLOCK_S, SETTLING_S, block_seconds, sampl
 from hybrid_mpc.monitor.replay import along, replay
 from hybrid_mpc.monitor.rest import REST_SPEED
 from hybrid_mpc.monitor.standard import DRIFT
-from hybrid_mpc.pipeline.contest import MODEL, keep, run_specs
+from hybrid_mpc.pipeline.contest import is_kept, run_parts
 from hybrid_mpc.pipeline.contest import kept as rows_of
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.pipeline.faulted_loops import faulted, kept
@@ -85,7 +84,7 @@ def guard_stage(context: Context) -> None:
     kit, detector = context.kit, found.get("detector")
     recorded, arrays = _recorded(context, kit, detector)
     result |= recorded
-    if detector is not None and scenario.plant is not None and scenario.tasks:
+    if detector is not None and scenario.plant is not None and any(not t.faults for t in scenario.tasks):
         context.progress.update("faults", 0, 1, "loops in which something breaks")
         bench, s = Bench(scenario, {MODEL: kit}), context.settings
         result["faults"], more = faulted(bench, s.scenario, s.seed, scenario.causes)
@@ -196,12 +195,8 @@ def _from_loops(context: Context, model: HybridModel) -> NominalData:
     wanted = nominal_loops(
         context.scenario, context.budget, model, named=settings.scenario, run_seed=settings.seed
     )
-    jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
-        stage_of(spec): (run_specs, (settings.scenario, context.out / "model", [spec]))
-        for spec in wanted
-        if not context.done(stage_of(spec))
-    }
-    run_jobs(jobs, context.progress.update, WORKERS, lambda stage, rows: keep(context, stage, rows))
+    parts = {stage_of(spec): [spec] for spec in wanted}
+    run_parts(context, {stage: part for stage, part in parts.items() if not is_kept(context, stage, part)})
     content, runs = hashlib.sha256(), []
     told: list[dict[str, Any]] = []
     for spec in wanted:

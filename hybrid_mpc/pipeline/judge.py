@@ -13,14 +13,13 @@ from hybrid_mpc.assembly import make_monitor, working_point
 from hybrid_mpc.closed_loop.faults import Fault
 from hybrid_mpc.closed_loop.result import ClosedLoopResult
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.job.loops import Bench, LoopSpec
+from hybrid_mpc.job.loops import MODEL, Bench, LoopSpec
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.monitor.calibration import Calibration, alarm_intervals, calibrate, with_residual
 from hybrid_mpc.monitor.lengths import block_seconds
 from hybrid_mpc.monitor.replay import along, judge, replay
 from hybrid_mpc.monitor.rest import rest_speeds
 from hybrid_mpc.mpc import OCP
-from hybrid_mpc.pipeline.contest import MODEL
 from hybrid_mpc.pipeline.context import Context
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.riccati import hidden_fixed_point
@@ -134,12 +133,12 @@ def run_calibration(context: Context) -> Calibration:
 def _load_loop(context: Context, kit: Kit) -> tuple[dict[str, Any], ClosedLoopResult]:
     """The first task with an unknown constant load from its middle on: does the monitor see it?"""
     task, settings = context.scenario.tasks[0], context.settings
-    start, added = 0.5 * task.duration, unknown_load(kit.problem())
+    start, added = 0.5 * task.duration, unknown_load(kit.problem(task.name))
     spec = LoopSpec(
-        settings.scenario, MODEL, task.name, "hybrid_observer", monitor="energy", seed=settings.seed,
+        settings.scenario, MODEL, task.name, "hybrid_observer", monitor="energy", run_seed=settings.seed,
         faults=(Fault(start, task.duration, "input_offset", added),),
     )  # fmt: skip
-    calm = replace(task, faults=(), control=None)
+    calm = replace(task, faults=())
     result = Bench(context.scenario, {MODEL: kit}).run(spec, task=calm)[1]
     before, after = result.alarm[result.t < start], np.flatnonzero(result.alarm & (result.t >= start))
     delay = float(result.t[after[0]] - start) if after.size else None

@@ -8,10 +8,9 @@ import numpy as np
 
 from hybrid_mpc.closed_loop.faults import Fault, install
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.job.loops import LoopSpec
+from hybrid_mpc.job.loops import MODEL, LoopSpec
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.monitor.lengths import SETTLING_S, block_seconds, samples
-from hybrid_mpc.pipeline.contest import MODEL
 from hybrid_mpc.scenario import Budget, Scenario, Task
 
 CONTENDER = "hybrid_observer"

@@ -168,6 +168,8 @@ def gap_closed(cells: Mapping[str, Sequence[LoopRow]]) -> tuple[float | None, st
     hybrid, oracle = costs[REPORTED["hybrid"]], costs["oracle"]
     if min(len(baseline), len(oracle)) < 2:
         return None, "one seed has no standard error: more oracle_seeds are needed (budget full)"
+    if not all(np.all(np.isfinite(c)) for c in (baseline, hybrid, oracle)):
+        return None, "a loop diverged"
     gap = float(baseline.mean() - oracle.mean())
     error = math.sqrt(sum(float(c.var(ddof=1)) / len(c) for c in (baseline, oracle)))
     if gap <= 2.0 * error:

@@ -88,7 +88,7 @@ class _Worker:
 
     def __init__(self, runner: LoopRunner) -> None:
         self.alone = Lock()
-        kits = {m.label: load(_local_folder(m)).with_noise(dict(m.noise)) for m in runner.models}
+        kits = {m.label: load(local_folder(m)).with_noise(dict(m.noise)) for m in runner.models}
         self._bench = Bench(load_scenario(runner.scenario), kits)
 
     def run(self, spec: LoopSpec) -> dict[str, Any]:
@@ -180,13 +180,16 @@ def _digest(files: Sequence[tuple[str, bytes]]) -> str:
     return whole.hexdigest()
 
 
-def _local_folder(model: ModelInput) -> Path:
+def local_folder(model: ModelInput) -> Path:
     """The model's folder if this machine has it, else one that its files are unpacked in."""
     folder = Path(model.folder)
-    if not model.files:
-        return folder
     if folder.is_dir() and _digest(_files(folder)) == model.digest:
         return folder
+    if not model.files:
+        raise InputError(
+            f"study: {folder} is not the model {model.label} any more that the study began with; take a copy of the "
+            "folder that nobody changes"
+        )
     unpacked = Path(tempfile.mkdtemp(prefix="hybrid-mpc-model-"))
     for name, content in model.files:
         (unpacked / name).write_bytes(content)

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from hybrid_mpc.artifact import Kit, load
 from hybrid_mpc.closed_loop import ClosedLoopResult
 from hybrid_mpc.files import read_arrays, read_json, write_arrays
-from hybrid_mpc.job.loops import Bench, LoopSpec
+from hybrid_mpc.job.loops import MODEL, Bench, LoopSpec
 from hybrid_mpc.monitor import METHODS, Detector, EnergyMonitor, Judges, guard_monitor, learn_judges
 from hybrid_mpc.monitor.rest import REST_SPEED
-from hybrid_mpc.pipeline.control_job import MODEL, selected_tasks
+from hybrid_mpc.pipeline.control_job import selected_tasks
 from hybrid_mpc.records import record
 from hybrid_mpc.scenario import Task, load_scenario
-from hybrid_mpc.studies.inputs import ModelInput
+from hybrid_mpc.studies.inputs import ModelInput, local_folder
 from hybrid_mpc.studies.monitor_plan import FAULT, GUARD, LEARN, LoopPlan, MonitorJob, MonitorStudy
 
 Array = NDArray[np.float64]
@@ -64,7 +64,7 @@ class _Loops:
 
     def __init__(self, runner: MonitorRunner) -> None:
         self._study, self._folder = runner.study, Path(runner.folder)
-        kit = load(Path(runner.model.folder)).with_noise(dict(runner.model.noise))
+        kit = load(local_folder(runner.model)).with_noise(dict(runner.model.noise))
         self._bench = Bench(load_scenario(runner.study.scenario), {MODEL: kit})
         self._kit = self._bench.kits[MODEL]
         self._task = plain_task(selected_tasks(self._bench.scenario, (runner.study.task,))[0])
@@ -93,7 +93,8 @@ class _Loops:
     def _spec(self, plan: LoopPlan, arm: str = "", horizon: int | None = None) -> LoopSpec:
         reaction = {"backup": "prior"}.get(arm, arm)
         return LoopSpec(
-            self._study.scenario, MODEL, self._task.name, CONTROLLER, horizon=horizon, monitor="readings",
+            self._study.scenario, MODEL, self._task.name, CONTROLLER, horizon=horizon,
+            monitor="guard" if arm else "readings",
             faults=plan.faults(self._dt), seed=plan.seed, guard=reaction,
         )  # fmt: skip
 

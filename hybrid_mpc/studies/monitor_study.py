@@ -67,7 +67,7 @@ def run_monitor_study(
     out, say = Path(out), progress or Silent()
     check_folder(out, "study", NOTE, resume=resume)
     say.start("reading the model, and the filters' noise")
-    held = read_note(out).models if resume else None
+    held = read_note(out).models if (out / NOTE).is_file() else None
     loops, models = load_inputs(
         Study(study.scenario, study.model, tasks=(study.task,), controllers=(PRIOR, CONTROLLER)), held
     )
@@ -87,6 +87,7 @@ def run_monitor_study(
             todo.run("nominal loops to learn from", first)
             if not (out / JUDGES).is_file():
                 _learn(study, out, first, load(Path(model.folder)))
+            shutil.rmtree(out / LEARNING, ignore_errors=True)  # judges.json has what was learned
             todo.run("nominal, faulted and guarded loops", [job for job in jobs if job.kind != LEARN])
     finally:
         engine.close()
@@ -141,4 +142,3 @@ def _learn(study: MonitorStudy, out: Path, jobs: list[MonitorJob], artifact: Kit
             "--resume --retry-failed runs it again"
         )
     write_json(out / JUDGES, learn(study, paths, artifact))
-    shutil.rmtree(out / LEARNING)

@@ -80,7 +80,7 @@ def run_study(
     out, say = Path(out), progress or Silent()
     check_folder(out, "study", NOTE, resume=resume)
     say.start("reading the models, and the filters' noise")
-    run, models = load_inputs(study, read_note(out).models if resume else None)
+    run, models = load_inputs(study, read_note(out).models if (out / NOTE).is_file() else None)
     note = make_note(study.identity(), models, study.size)
     say.finish(f"{study.size} runs")
     if cluster is not None and isinstance(run, LoopRunner):  # its workers may not see the models' folders

@@ -183,3 +183,7 @@ def test_a_contest_that_was_killed_goes_on_from_what_it_kept(golf_artifact, tmp_
                 np.testing.assert_array_equal(one.arrays[key], other.arrays[key])
     assert all(path.is_file() for path in kept)
     assert stamps == {path: path.stat().st_mtime_ns for path in stamps}
+    set_process_noise(out / "model", {name: np.array([1e-4, 2e-2]) for name in CONTENDERS})
+    other = contest(context)  # loops of another filter: none of those that are kept
+    assert [r.controller for r in other] == [r.controller for r in rows]
+    assert all(a.cost != b.cost for a, b in zip(other, rows, strict=True))

@@ -83,7 +83,7 @@ def test_loops_of_two_controllers(call, run_folder, tmp_path):
     repeated = json.loads((again / "results.json").read_text())
     for r in (*results["loops"], *repeated["loops"]):
         del r["timing_ms"]
-        assert r["arrays"] == {}
+        assert "arrays" not in r
     assert repeated["loops"] == results["loops"]
     assert repeated["summary"] == results["summary"]
 
@@ -112,7 +112,8 @@ def test_a_fault_from_the_command_line_acts(call, run_folder, tmp_path):
         costs[name] = results["loops"][0]["cost"]
     assert results["faults"] == [{"target": "plant_friction", "value": 4.0, "start_s": 0.5, "end_s": "inf"}]
     assert (results["guard"], results["reaction"]) == (None, "")
-    assert results["loops"][0]["alarms"] == results["loops"][0]["switches"] == []
+    assert results["loops"][0]["alarms"] is None  # nothing could alarm
+    assert results["loops"][0]["switches"] == []
     assert costs["worn"] > 2 * costs["healthy"]  # four times the friction on a filter without observer
     assert results["summary"]["track_sine"]["prior"]["cost"]["ci95"] is None  # one seed
 

@@ -146,7 +146,7 @@ def context(golf_artifact, tmp_path_factory):
         read = np.vstack([np.full((50, 11), np.nan), numbers(nominal_loops.BLOCKS, i)])  # a second settles
         arrays = {"numbers": read, "y": np.full((9, 1), i), "u": np.zeros((9, 1))}
         row = loop_row(spec.task, spec.controller, spec.seed, seconds=46.0, arrays=arrays)
-        keep(made, nominal_loops.stage_of(spec), [row])
+        keep(made, nominal_loops.stage_of(spec), [row], [spec])
     return made
 
 
@@ -155,7 +155,7 @@ def resumed(context):
     """The stage after the kill: no loop that is kept runs again."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            guard_job, "run_jobs", lambda jobs, *rest: jobs and pytest.fail(f"runs {list(jobs)} again")
+            guard_job, "run_parts", lambda context, parts: parts and pytest.fail(f"runs {list(parts)} again")
         )
         guard_stage(context)
     return context.result("guard")
@@ -169,10 +169,12 @@ def test_the_stage_learns_from_what_is_kept_and_fills_the_artifact(context, resu
     assert stored.threshold_w == CALIBRATION.threshold_w
     assert stored.plausibility.data_hash == context.dataset.hash
     assert stored.plausibility.samples == sum(len(t.t) for t in context.trajectories("train"))
+    spec = nominal_loops.nominal_loops(context.scenario, context.budget, MODEL)[0]
     (row,) = kept(context, "guard/track_sine-500")
-    keep(context, "guard/track_sine-500", [replace(row, arrays=row.arrays | {"y": row.arrays["y"] + 1})])
+    other = replace(row, arrays=row.arrays | {"y": row.arrays["y"] + 1})
+    keep(context, "guard/track_sine-500", [other], [spec])
     changed = guard_job._from_loops(context, MODEL).data_hash
-    keep(context, "guard/track_sine-500", [row])
+    keep(context, "guard/track_sine-500", [row], [spec])
     assert guard_job._from_loops(context, MODEL).data_hash == stored.detector.data_hash != changed
 
 
