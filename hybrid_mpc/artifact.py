@@ -16,6 +16,7 @@ import nn_export
 from hybrid_mpc.delayed import with_input_delay
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_document, read_object, sha256, write_document
+from hybrid_mpc.input_limits import numbers
 from hybrid_mpc.model import STEP_INPUTS, STEP_OUTPUTS, Balance, HybridModel
 from hybrid_mpc.monitor.calibration import Calibration
 from hybrid_mpc.monitor.detector import Detector
@@ -502,10 +503,15 @@ def loop_settings(
     """
     problems = {"": scenario.control} | {task.name: task.control for task in scenario.tasks}
     given = {name: problem for name, problem in problems.items() if problem is not None}
+    safe = None if scenario.safe_input is None else tuple(numbers(scenario.safe_input, "safe_input").tolist())
     return LoopSettings(
-        given, scenario.sensor_sigma, scenario.first_sigma, dict(process_noise or {}), dict(scenario.causes),
-        scenario.safe_input,
-    )  # fmt: skip
+        given,
+        scenario.sensor_sigma,
+        scenario.first_sigma,
+        dict(process_noise or {}),
+        dict(scenario.causes),
+        safe,
+    )
 
 
 def set_calibration(folder: Path, calibration: Calibration) -> None:
@@ -560,8 +566,10 @@ def artifact_folder(folder: Path) -> Path:
     for place in (folder, folder / "model"):
         if (place / FILE).is_file():
             return place
-    state = "holds no model.json" if folder.is_dir() else "does not exist"
-    raise InputError(f"{folder} {state}; needed is an artifact folder, such as model/ of a finished run")
+    state = "holds no model.json" if folder.is_dir() else "is a file" if folder.exists() else "does not exist"
+    raise InputError(
+        f"{folder} {state}; needed is an artifact folder, such as model/ of a finished run, or the run's own folder"
+    )
 
 
 def read_description(folder: Path) -> Description:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -54,9 +55,11 @@ class Fault:
 
     def __post_init__(self) -> None:
         if self.target not in SIGNAL_TARGETS and not self.on_plant:
-            known = ", ".join(SIGNAL_TARGETS)
+            near = difflib.get_close_matches(self.target, SIGNAL_TARGETS, 1)
+            meant = f"; did you mean {near[0]!r}? There are" if near else "; known"
             raise InputError(
-                f"fault target {self.target!r} is unknown; known: {known}, and what a plant knows as plant_..."
+                f"fault target {self.target!r} is unknown{meant}: {', '.join(SIGNAL_TARGETS)}, and what a plant knows "
+                "as plant_..."
             )
         if not self.start < self.end:
             raise InputError(f"fault {self.target}: the interval [{self.start}, {self.end}) s is empty")

@@ -251,7 +251,8 @@ class Loop:
         """Who gives the input: the controller, or in ``"manual"`` an operator, whose inputs are ``applied``.
 
         While manual, the estimator goes on with the inputs that really act, so that nothing winds up, and the input
-        that a step returns is the operator's last one. Back in automatic the controller begins from it, within ``du_max``.
+        that a step returns is the operator's last one. Back in automatic the controller begins from it, within
+        ``du_max``.
         """
         return self.state.mode
 

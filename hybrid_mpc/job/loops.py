@@ -229,11 +229,12 @@ class LoopRow:
         largest_u: Largest magnitude of the inputs, by signal.
         limits: Largest share of the way from rest to each limit that was used, by signal: 1 is the limit, more a
             violation.
-        excess: By how much limits were left at most, by signal with its unit; ``change of`` an input where it is limited.
+        excess: By how much limits were left at most, by signal with its unit; ``change of`` an input where that is
+            limited.
         sources: Share of periods by what gave the input.
         figures: The task's own figures.
-        alarms: Alarms of the monitor; one that is still on at the end ends there. None where nothing could alarm: there is
-            no monitor, or one without thresholds.
+        alarms: Alarms of the monitor; one that is still on at the end ends there. None where nothing could alarm: there
+            is no monitor, or one without thresholds.
         alarm_share: Share of periods with an alarm; None where nothing could alarm.
         largest_level: Largest level of the monitor [W]; None without one.
         not_judged_s: Time in which the monitor could not judge [s]; None without one.

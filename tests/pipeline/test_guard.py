@@ -142,6 +142,7 @@ def context(golf_artifact, tmp_path_factory):
     made.save("prior", {}, smooth)
     set_process_noise(out / "model", SIGMA)
     made.save("monitor", {"calibration": plain(CALIBRATION)}, {})
+    set_calibration(out / "model", CALIBRATION)
     for i, spec in enumerate(nominal_loops.nominal_loops(scenario, made.budget, MODEL)):
         read = np.vstack([np.full((50, 11), np.nan), numbers(nominal_loops.BLOCKS, i)])  # a second settles
         arrays = {"numbers": read, "y": np.full((9, 1), i), "u": np.zeros((9, 1))}
