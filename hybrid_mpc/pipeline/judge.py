@@ -215,7 +215,9 @@ def analysis_stage(context: Context) -> None:
     arrays: dict[str, Any] = {}
     for i, (name, model) in enumerate(artifact.models.items()):
         context.progress.update("models", i, len(artifact.models), name)
-        u, x = np.zeros(model.n_u), np.zeros(model.n_x)
+        control = context.scenario.control
+        u = np.zeros(model.n_u) if control is None else control.rest_input
+        x = np.zeros(model.n_x)
         result[name] = {}
         try:
             x, h = fixed_point(model, u, x)
