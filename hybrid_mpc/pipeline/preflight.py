@@ -313,6 +313,7 @@ def _check_problem(
     model: HybridModel | None,
 ) -> None:
     from hybrid_mpc.assembly import make_controller, make_estimator
+    from hybrid_mpc.closed_loop.loop import Loop
 
     before = len(report.problems)
     if not isinstance(control, OCP):
@@ -328,13 +329,14 @@ def _check_problem(
         return
     with report.part(f"{what}: estimator"):
         estimator = make_estimator(model, scenario, np.ones(model.n_x), control)
-        estimate = estimator.update(
-            estimator.start(np.zeros(model.n_y)), np.zeros(model.n_y), np.zeros(model.n_u)
-        )
     with report.part(f"{what}: controller"):
         controller = make_controller(model, model, control)
-        reference = np.zeros((control.horizon + 1, control.n_x + control.n_p))
-        controller.decide(controller.initial(estimate), estimate, reference)
+    if len(report.problems) > before:
+        return
+    with report.part(f"{what}: a period of the loop"):
+        loop = Loop(estimator, controller)
+        loop.start(np.zeros(model.n_y))
+        loop.step(np.zeros(model.n_y))
 
 
 def _check_plant(report: _Report, scenario: Scenario, prior: Prior | None, model: HybridModel | None) -> None:
