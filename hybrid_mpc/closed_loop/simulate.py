@@ -17,7 +17,7 @@ from hybrid_mpc.closed_loop.loop import TIMED, Loop, Monitor, Reading, preview_o
 from hybrid_mpc.closed_loop.machine import Machine, Preview, Previews, fitting
 from hybrid_mpc.closed_loop.result import ClosedLoopResult
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation.bank import FilterBank
+from hybrid_mpc.estimation.bank import FilterBank, measures_first_states
 from hybrid_mpc.estimation.kalman import Estimate, Estimator
 from hybrid_mpc.estimation.switching import SwitchingFilter
 from hybrid_mpc.model import HybridModel
@@ -228,7 +228,8 @@ def simulate_together(
 ) -> list[Simulation]:
     """Run simulations of one estimator and length side by side; each is what it is alone, to rounding.
 
-    Switching filters go through each operation together, which is quicker; other estimators take turns.
+    Switching filters on a model whose outputs are its first states go through each operation together, which is
+    quicker; other estimators take turns.
 
     Args:
         estimator: The estimator of all.
@@ -239,7 +240,7 @@ def simulate_together(
 
     Example: ``simulate_together(ekf, [lambda e, s=s: Simulation(plant, e, mpc, ref, seed=s, ...) for s in range(9)])``
     """
-    if not isinstance(estimator, SwitchingFilter):
+    if not (isinstance(estimator, SwitchingFilter) and measures_first_states(estimator.model)):
         runs = [one(estimator) for one in make]
         for run in runs:
             for _ in range(run.periods):
