@@ -1,5 +1,6 @@
 """Loops side by side: each is what it is alone."""
 
+import time
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -12,10 +13,12 @@ from hybrid_mpc import (
     CondensedController,
     ExtendedKalmanFilter,
     Fault,
+    InputError,
     SafeController,
     SwitchingFilter,
 )
 from hybrid_mpc.closed_loop.simulate import Simulation, simulate_together
+from hybrid_mpc.estimation.bank import FilterBank
 
 A, B, DT = np.array([[1.0, 0.1], [-0.1, 0.9]]), np.array([[0.0], [0.1]]), 0.1
 
@@ -74,12 +77,8 @@ def makers(filters, gain=1.0, seeds=3, duration=2.0, **more):
 def test_together_is_alone(gain, atol):
     filters = switching(gain)
     made = makers(filters, gain)
-    for run, make in zip(simulate_together(filters, made), made, strict=True):
-        found, alone = run.result(), make(filters)
-        for _ in range(alone.periods):
-            alone.measure()
-            alone.go_on()
-        wanted = alone.result()
+    for found, make in zip(simulate_together(filters, made), made, strict=True):
+        wanted = make(filters).run()
         for field in fields(ClosedLoopResult):
             if field.name == "timing_ms":
                 continue
@@ -90,3 +89,41 @@ def test_together_is_alone(gain, atol):
                 np.testing.assert_allclose(one, other, rtol=0, atol=scale * atol, err_msg=field.name)
             else:
                 np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("gain", [1.0, 2.0])
+def test_loops_of_different_length_are_refused(gain):
+    filters = switching(gain)
+    with pytest.raises(InputError, match="loops of 20, 25 periods given"):
+        simulate_together(filters, makers(filters, gain, seeds=2, longer=0.5))
+    assert simulate_together(filters, []) == []
+
+
+def test_the_time_of_what_is_done_together_is_shared_out(monkeypatch):
+    spent, update = [], FilterBank.update
+
+    def slow(bank, y, u):
+        begin = time.perf_counter()
+        time.sleep(0.05)
+        estimates = update(bank, y, u)
+        spent.append(1e3 * (time.perf_counter() - begin))
+        return estimates
+
+    monkeypatch.setattr(FilterBank, "update", slow)
+    filters = switching()
+    timings = [r.timing_ms for r in simulate_together(filters, makers(filters, seeds=2, duration=0.5))]
+    for timing in timings:
+        assert np.all(timing["estimate"][1:] >= np.array(spent) / 2)
+        parts = [timing[name] for name in ("estimate", "solve", "monitor", "prepare")]
+        np.testing.assert_allclose(timing["total"], np.sum(parts, axis=0), rtol=1e-12)
+    # all but what the loops spend besides, far less than the sleep
+    assert sum(timing["estimate"].sum() for timing in timings) < 1.5 * sum(spent)
+
+
+def test_a_simulation_runs_what_is_left():
+    filters = switching()
+    (make,) = makers(filters, seeds=1)
+    whole, begun = make(filters).run(), make(filters)
+    begun.measure()
+    begun.go_on()
+    np.testing.assert_array_equal(begun.run().x, whole.x)
