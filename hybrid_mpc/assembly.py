@@ -12,7 +12,7 @@ from hybrid_mpc.closed_loop.guard import Guard, Mode
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import Estimator, ExtendedKalmanFilter
 from hybrid_mpc.estimation.parameters import parameter_filter, with_parameter_states
-from hybrid_mpc.estimation.switching import SwitchingFilter
+from hybrid_mpc.estimation.switching import SLIP, SWITCHES, SwitchingFilter
 from hybrid_mpc.estimation.tuning import most_likely
 from hybrid_mpc.model import HybridModel
 from hybrid_mpc.monitor.calibration import Calibration
@@ -35,12 +35,8 @@ JUMP_SHARE = 0.05
 """Step of the estimated input disturbance per period, as a share of the input's range: while nothing happens (drift,
 temperature), and when a load comes or goes. A load of a twentieth of what the drive can do is an ordinary one;
 a larger one takes a few periods."""
-SLIP = 10.0
-"""Process noise over the quiet one when the machine slips: sticking friction that breaks, backlash, an impact."""
 MODES = ("quiet", "slip", "jump")
-SWITCHES = ((0.9795, 0.02, 0.0005), (0.5, 0.4995, 0.0005), (0.45, 0.05, 0.5))
-"""Probability per period to go from one of the modes to another: a slip every second, a load that comes or goes in
-40 s, and either lasts a period or two."""
+"""Of its observer, in the order of :data:`~hybrid_mpc.estimation.switching.SWITCHES`."""
 FIRST_LOAD = 0.001
 """Deviation of the first disturbance, as a share of the input's range. Small: a machine that sticks at rest shows
 nothing of its load, and what an observer makes of it there is wrong when it moves."""

@@ -42,10 +42,10 @@ class Machine:
         self._rng = np.random.default_rng(seed)
         self.state = plant.reset(x0, seed)
         self._on_the_way = [self._sensor() for _ in range(sensor_delay)]
-        self._sensor_delay, self._input_delay = sensor_delay, input_delay
+        self._input_delay = input_delay
         self._y = np.full(n_y, np.nan)
         self._commands: list[Array] = []
-        self._applied: list[Array] = []
+        self._acting: Array = np.zeros(0)
 
     def _sensor(self) -> Array:
         return fitting(self._plant.measure(self.state, self._rng), self._n_y, "the plant's measurement")
@@ -59,21 +59,17 @@ class Machine:
     def rest(self, u: Array) -> None:
         """The input ``u`` was held before the start."""
         self._commands = [u] * self._input_delay
-        self._applied = [u] * (self._sensor_delay + 1)
-
-    def held_at_measurement(self) -> Array:
-        """The input held up to the instant of the measurement that has just arrived."""
-        return self._applied[-1 - self._sensor_delay]
+        self._acting = u
 
     def command(self, u: Array) -> tuple[Array, Array]:
         """The input that acts from now on when ``u`` is commanded, and the one that acted before."""
         self._commands.append(u)
-        self._applied.append(self._commands.pop(0))
-        return self._applied[-1], self._applied[-2]
+        before, self._acting = self._acting, self._commands.pop(0)
+        return self._acting, before
 
     def advance(self, t: float) -> None:
         """One period on."""
-        self.state = self._plant.step(self.state, corrupt_input(self._faults, t, self._applied[-1]), self._dt)
+        self.state = self._plant.step(self.state, corrupt_input(self._faults, t, self._acting), self._dt)
 
 
 class Previews:

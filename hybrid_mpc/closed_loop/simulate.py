@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from hybrid_mpc.closed_loop.loop import TIMED, Loop, Monitor, Reading, preview_o
 from hybrid_mpc.closed_loop.machine import Machine, Preview, Previews, fitting
 from hybrid_mpc.closed_loop.result import ClosedLoopResult
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation.bank import FilterBank
+from hybrid_mpc.estimation.bank import FilterBank, measures_first_states
 from hybrid_mpc.estimation.kalman import Estimate, Estimator
 from hybrid_mpc.estimation.switching import SwitchingFilter
 from hybrid_mpc.model import HybridModel
@@ -108,15 +109,11 @@ def simulate(
         result = simulate(plant, ekf, controller, task.reference, weight=task.weight, dt=0.02,
                           duration=task.duration, x0=task.x0, seed=0)
     """
-    run = Simulation(
+    return Simulation(
         plant, estimator, controller, reference, dt=dt, duration=duration, x0=x0, seed=seed, weight=weight,
         horizon=horizon, monitor=monitor, faults=faults, stage_cost=stage_cost, on_step=on_step,
         sensor_delay=sensor_delay, input_delay=input_delay, late=late, guard=guard,
-    )  # fmt: skip
-    for _ in range(run.periods):
-        run.measure()
-        run.go_on()
-    return run.result()
+    ).run()  # fmt: skip
 
 
 class Simulation:
@@ -124,7 +121,7 @@ class Simulation:
 
     Args: as :func:`simulate`.
 
-    Example: ``run = Simulation(plant, ekf, controller, [0.0, 0.0], dt=0.02, duration=1.0, x0=[0.0, 0.0], seed=0)``
+    Example: ``Simulation(plant, ekf, mpc, [0.0, 0.0], dt=0.02, duration=1.0, x0=[0.0, 0.0], seed=0).run()``
     """
 
     def __init__(
@@ -172,14 +169,25 @@ class Simulation:
         """Input ``(n_u,)`` that the controller has given for the period before the one in hand."""
         return self.loop.decision.u
 
+    def run(self) -> ClosedLoopResult:
+        """All periods that are left; returns the record."""
+        while self._k < self.periods:
+            self.measure()
+            self.go_on()
+        return self.result()
+
     def measure(self) -> Array:
         """The sample ``(n_y,)`` of the period that begins."""
         self._x = fitting(self._plant.truth(self._machine.state), self.loop.ocp.n_x, "the plant's truth")
         self.y = self._machine.measure(self._k * self._dt)
         return self.y
 
-    def go_on(self) -> None:
-        """Decide on the sample, hold the input for a period, and note what happened."""
+    def go_on(self, estimating: float = 0.0) -> None:
+        """Decide on the sample, hold the input for a period, and note what happened.
+
+        Args:
+            estimating: Time [s] that was spent on the estimate before, outside the loop. Default: none.
+        """
         loop, machine, t = self.loop, self._machine, self._k * self._dt
         truth = np.concatenate([self._x, self._plant.hidden(machine.state)])
         in_time = None if self._late is None else partial(_is_in_time, self._late, t)
@@ -197,7 +205,8 @@ class Simulation:
                 self._cost.stage_cost(self._x, u, x_ref[0, : self._x.size], u - u_prev, now_factors)
             )
         step = Step(self._k, t, self._x, self.y, loop.estimate, loop.decision, loop.reading)
-        self._rows.append(_row(step, x_ref[0, : self._x.size].copy(), stage, loop.spent))
+        spent = {**loop.spent, "estimate": loop.spent["estimate"] + estimating}
+        self._rows.append(_row(step, x_ref[0, : self._x.size].copy(), stage, spent))
         if self._on_step is not None:
             self._on_step(step)
         machine.advance(t)
@@ -225,40 +234,51 @@ class Simulation:
 
 def simulate_together(
     estimator: Estimator, make: Sequence[Callable[[Estimator], Simulation]]
-) -> list[Simulation]:
+) -> list[ClosedLoopResult]:
     """Run simulations of one estimator and length side by side; each is what it is alone, to rounding.
 
-    Switching filters go through each operation together, which is quicker; other estimators take turns.
+    Switching filters on a model whose outputs are its first states go through each operation together, which is
+    quicker; other estimators take turns. The time of what they do together is shared out evenly.
 
     Args:
         estimator: The estimator of all.
         make: Makes each simulation with the estimator that it is handed.
 
     Returns:
-        The simulations at their end.
+        Their records.
+
+    Raises:
+        InputError: If their numbers of periods differ.
 
     Example: ``simulate_together(ekf, [lambda e, s=s: Simulation(plant, e, mpc, ref, seed=s, ...) for s in range(9)])``
     """
-    if not isinstance(estimator, SwitchingFilter):
-        runs = [one(estimator) for one in make]
-        for run in runs:
-            for _ in range(run.periods):
-                run.measure()
-                run.go_on()
-        return runs
+    if not (isinstance(estimator, SwitchingFilter) and measures_first_states(estimator.model)):
+        return [run.run() for run in _of_one_length([one(estimator) for one in make])]
     told = [_Told(estimator.model) for _ in make]
-    runs = [one(each) for one, each in zip(make, told, strict=True)]
+    runs = _of_one_length([one(each) for one, each in zip(make, told, strict=True)])
     bank = None
-    for _ in range(runs[0].periods):
-        y = np.array([run.measure() for run in runs])
+    for _ in range(runs[0].periods if runs else 0):
+        y, spent = np.array([run.measure() for run in runs]), 0.0
         if bank is None:
             bank = FilterBank(estimator, y)
             estimates = bank.estimates(np.full_like(y, np.nan), np.full(len(y), np.nan))
         else:
+            begin = perf_counter()
             estimates = bank.update(y, np.array([run.held for run in runs]))
+            spent = (perf_counter() - begin) / len(runs)
         for run, each, estimate in zip(runs, told, estimates, strict=True):
             each.estimate = estimate
-            run.go_on()
+            run.go_on(spent)
+    return [run.result() for run in runs]
+
+
+def _of_one_length(runs: list[Simulation]) -> list[Simulation]:
+    lengths = sorted({run.periods for run in runs})
+    if len(lengths) > 1:
+        raise InputError(
+            f"loops of {', '.join(map(str, lengths))} periods given; side by side they must be of one length: give "
+            "all the same duration, or run them one by one"
+        )
     return runs
 
 

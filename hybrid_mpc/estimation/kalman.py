@@ -129,7 +129,7 @@ class ExtendedKalmanFilter:
         )
         self._lost = LOST * max(np.max(v) for v in (self._noise, self._first, self._noise_y))
         assert model.with_jacobian is not None
-        self._step, self._output = map(BufferedFunction, (model.with_jacobian, _output_with_jacobian(model)))
+        self._step, self._output = map(BufferedFunction, (model.with_jacobian, output_with_jacobian(model)))
         self._step.inputs[3][:], self._step.inputs[4][:] = model.w, model.p
 
     @property
@@ -293,7 +293,14 @@ def _variance(sigma: ArrayLike | Sequence[float], size: int, name: str) -> Array
     return values**2
 
 
-def _output_with_jacobian(model: HybridModel) -> ca.Function:
+def output_with_jacobian(model: HybridModel) -> ca.Function:
+    """Output ``(n_y,)`` of a model at ``(x, u)`` and its dense Jacobians by ``x`` and by ``u``.
+
+    Args:
+        model: The model.
+
+    Example: ``y, c_x, c_u = output_with_jacobian(model)(x, u)``
+    """
     x, u = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
     y = model.output(x, u, model.w, model.p)
     return ca.Function(

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimation.kalman import ExtendedKalmanFilter
-from hybrid_mpc.estimation.switching import SwitchingFilter
+from hybrid_mpc.estimation.switching import SLIP, SWITCHES, SwitchingFilter
 from hybrid_mpc.model import (
     HybridModel,
     ManyPoints,
@@ -27,10 +27,6 @@ LEAST = 1.0 - 1e-9
 """Share of its bound at which a factor's state ends: at the bound itself it would be infinite."""
 FIRST = 0.02
 """Deviation of the first parameter states: a fitted model's parameters are known to a few per cent."""
-SLIP = 10.0
-"""Process noise over the quiet one while the machine slips: sticking friction that breaks, backlash, an impact."""
-SWITCHES = ((0.9795, 0.02, 0.0005), (0.5, 0.4995, 0.0005), (0.45, 0.05, 0.5))
-"""Probability per period to go from quiet, slip or break to each of them: a slip every second, a break in 40 s."""
 
 
 def with_parameter_states(

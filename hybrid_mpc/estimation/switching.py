@@ -16,6 +16,11 @@ Array = NDArray[np.float64]
 NEGLIGIBLE = 0.01
 """Share of a mode's past below which another mode does not enter it: the wide covariance of an improbable jump would
 make the quiet filter a little restless all the time."""
+SLIP = 10.0
+"""Process noise over the quiet one while a machine slips: sticking friction that breaks, backlash, an impact."""
+SWITCHES = ((0.9795, 0.02, 0.0005), (0.5, 0.4995, 0.0005), (0.45, 0.05, 0.5))
+"""Probability per period to go from one of three modes (quiet, slip, and a jump or break) to another: a slip every
+second, a load that comes or goes or a part that breaks in 40 s, and either lasts a period or two."""
 
 
 @dataclass(frozen=True)

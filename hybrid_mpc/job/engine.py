@@ -76,10 +76,17 @@ class Engine(Protocol[B, R_co]):
         """Workers that have died so far; what they were at is lost, and may be begun again."""
 
     def submit(self, batch: B) -> None:
-        """Begin a batch."""
+        """Begin a batch.
+
+        Raises:
+            RuntimeError: If no worker can be started for it.
+        """
 
     def next(self, timeout: float) -> tuple[B, R_co | Lost] | None:
-        """A batch that has ended, with its result or how it was lost; None if none ends within ``timeout`` [s]."""
+        """A batch that has ended, with its result or how it was lost; None if none ends within ``timeout`` [s].
+
+        What the work itself raises is raised here.
+        """
 
     def close(self) -> None:
         """End what still runs."""
@@ -157,8 +164,12 @@ class LocalEngine(_Futures[B, R]):
             try:
                 future = self._pool.submit(self._work, batch)
                 break
-            except BrokenExecutor:  # one of its processes has just died; what it was at tells of it
-                self._pool = None
+            except BrokenExecutor as error:  # one of its processes has just died; what it was at tells of it
+                self._pool, broken = None, error
+        else:
+            raise RuntimeError(
+                f"new processes end as they begin ({type(broken).__name__}: {broken}); out of memory, or of processes?"
+            ) from broken
         self._pools[future] = self._pool
         self._watch(future, batch)
 
@@ -215,12 +226,17 @@ class DaskEngine(_Futures[B, R]):
         self._client = _connected(cluster) if isinstance(cluster, str) else cluster
         self._work = work
         self._shared: Any = None
-        self.workers = max(1, len(self._client.nthreads()))
-        if not self._client.nthreads():
-            raise InputError(f"the scheduler {self._address} has no worker; start some: dask worker ADDRESS")
-        self.name = f"dask, {len(self._client.nthreads())} workers"
+        try:
+            self._seen = set(self._client.nthreads())
+            if not self._seen:
+                raise InputError(
+                    f"the scheduler {self._address} has no worker; start some: dask worker ADDRESS"
+                )
+        except BaseException:
+            self.close()
+            raise
+        self.workers, self.name = len(self._seen), f"dask, {len(self._seen)} workers"
         self.died = 0
-        self._seen = set(self._client.nthreads())
         self._looked = self._manned = time.monotonic()
 
     @property
@@ -258,6 +274,8 @@ class DaskEngine(_Futures[B, R]):
         )
 
     def _result(self, future: Any) -> R | Lost:
+        from concurrent.futures import CancelledError
+
         from distributed.scheduler import KilledWorker
 
         try:
@@ -265,12 +283,16 @@ class DaskEngine(_Futures[B, R]):
             return result
         except KilledWorker as error:
             return Lost(f"KilledWorker: {str(error).splitlines()[0]}", True)
-        except Exception as error:  # the shared inputs went with their last worker, or the connection
+        except Exception as error:
+            if future.status == "error":  # what the work itself has raised
+                raise
             if self._client.status != "running":
                 raise InputError(
                     f"the scheduler {self._address} is gone; what has finished is kept, --resume goes on"
                 ) from error
-            self._shared = None
+            if not isinstance(error, (CancelledError, OSError)):  # a result that does not unpickle
+                raise
+            self._shared = None  # the shared inputs went with their last worker, or a connection did
             return Lost(f"{type(error).__name__}: {error}", False)
 
     def close(self) -> None:
@@ -318,7 +340,8 @@ def run_jobs(
         jobs: Functions and their arguments by name; both must pickle, and so must the results.
         on_progress: ``(name, done, total, text)`` for each report, before the job's result.
         workers: Jobs side by side.
-        on_result: ``(name, result)`` as each job ends, so that what is done can be kept. Default: nothing.
+        on_result: ``(name, result)`` as each job ends, so that what is done can be kept, also beside one that fails.
+            Default: nothing.
 
     Raises:
         InputError: If a job raises one: bad input that shows only then. Or if ``workers`` is less than 1.
@@ -340,6 +363,7 @@ def run_jobs(
                 name = waiting.pop(0)
                 running[name] = _Job(*jobs[name])
             wait([job.reports for job in running.values()], REPORT_S)
+            failed: dict[str, _Ended] = {}
             for name, job in list(running.items()):
                 ended = job.ended()
                 for told in job.told(rest=ended is not None):
@@ -347,8 +371,14 @@ def run_jobs(
                 if ended is None:
                     continue
                 running.pop(name).close()
-                results[name] = ended.result(name)
-                on_result(name, results[name])
+                if ended.succeeded:
+                    results[name] = ended.value
+                    on_result(name, ended.value)
+                else:
+                    failed[name] = ended
+            if failed:  # raised only now: others that had ended by then are kept
+                name, first = next(iter(failed.items()))
+                raise first.error(name)
     finally:
         for job in running.values():
             job.close()
@@ -363,13 +393,16 @@ class _Ended:
     refused: tuple[type[InputError], str] | None = None
     failed: str | None = None
 
-    def result(self, name: str) -> Any:
+    @property
+    def succeeded(self) -> bool:
+        return self.refused is None and self.failed is None
+
+    def error(self, name: str) -> Exception:
+        """What to raise of a job that has not succeeded."""
         if self.refused is not None:
             kind, text = self.refused
-            raise kind(text)
-        if self.failed is not None:
-            raise RuntimeError(f"{name} failed:\n{self.failed}")
-        return self.value
+            return kind(text)
+        return RuntimeError(f"{name} failed:\n{self.failed}")
 
 
 class _Job:

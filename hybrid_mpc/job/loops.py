@@ -429,18 +429,8 @@ class Bench:
             Its row, and its whole record.
         """
         plans: list[Array] = []
-
-        def each(step: Step) -> None:
-            if "plans" in spec.keep:
-                plans.append(step.decision.solution.x)
-            if on_step is not None:
-                on_step(step)
-
-        run = self._simulation(spec, task, monitor, each, None)
-        for _ in range(run.periods):
-            run.measure()
-            run.go_on()
-        return self._told(spec, task, run.result(), plans)
+        run = self._simulation(spec, task, monitor, _noting(spec, plans, on_step), None)
+        return self._told(spec, task, run.run(), plans)
 
     def run_together(
         self,
@@ -458,17 +448,31 @@ class Bench:
 
         Returns:
             What :meth:`run` returns of each.
+
+        Raises:
+            InputError: If estimators, controllers or lengths differ, or there are not as many tasks as loops.
         """
         given = [None] * len(specs) if tasks is None else tasks
-        estimator = self.parts(specs[0])[0]
+        if len(given) != len(specs):
+            raise InputError(f"{len(specs)} loops and {len(given)} tasks given; needed: a task for each loop")
+        if not specs:
+            return []
+        parts = self.parts(specs[0])
+        other = next((spec for spec in specs if self.parts(spec) is not parts), None)
+        if other is not None:
+            raise InputError(
+                f"loops of different parts given: {_parts_text(specs[0])}, and {_parts_text(other)}; side by side "
+                "they must share estimator and controller: group them, or run them one by one"
+            )
+        plans: list[list[Array]] = [[] for _ in specs]
         made = [
-            partial(self._simulation, spec, task, monitor, None)
-            for spec, task in zip(specs, given, strict=True)
+            partial(self._simulation, spec, task, monitor, _noting(spec, kept, None))
+            for spec, task, kept in zip(specs, given, plans, strict=True)
         ]
-        runs = simulate_together(estimator, made)
+        results = simulate_together(parts[0], made)
         return [
-            self._told(spec, task, run.result(), [])
-            for spec, task, run in zip(specs, given, runs, strict=True)
+            self._told(spec, task, result, kept)
+            for spec, task, result, kept in zip(specs, given, results, plans, strict=True)
         ]
 
     def _simulation(
@@ -498,6 +502,29 @@ class Bench:
         derived = {"step_ms": result.timing_ms["total"], "plans": np.array(plans)}
         kept = {name: derived[name] if name in derived else getattr(result, name) for name in spec.keep}
         return replace(row, arrays=kept), result
+
+
+def _noting(
+    spec: LoopSpec, plans: list[Array], on_step: Callable[[Step], None] | None
+) -> Callable[[Step], None] | None:
+    """What is called after every period: it notes the plan where the row is to hold plans."""
+    if "plans" not in spec.keep:
+        return on_step
+
+    def note(step: Step) -> None:
+        plans.append(step.decision.solution.x)
+        if on_step is not None:
+            on_step(step)
+
+    return note
+
+
+def _parts_text(spec: LoopSpec) -> str:
+    horizon = "the task's own" if spec.horizon is None else spec.horizon
+    return (
+        f"controller {spec.controller} of model {spec.model} for task {spec.task}, solver {spec.solver}, "
+        f"horizon {horizon}"
+    )
 
 
 def row_of(spec: LoopSpec, task: Task, problem: OCP, model: HybridModel, result: ClosedLoopResult) -> LoopRow:

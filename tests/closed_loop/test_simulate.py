@@ -19,6 +19,7 @@ from hybrid_mpc import (
     TrueState,
     simulate,
 )
+from hybrid_mpc.closed_loop.machine import Machine
 
 
 def test_two_runs_differ_in_nothing_but_durations(model, safe):
@@ -285,3 +286,16 @@ def test_several_inputs_and_outputs():
     np.testing.assert_allclose(result.d[-20:].mean(axis=0), [0.0, 0.2], atol=5e-3)
     assert np.max(np.abs(result.x[-20:, 0])) < 5e-3
     assert replace(result, dt=0.2).cost == pytest.approx(2 * result.cost)
+
+
+def test_a_machine_remembers_its_delays_and_no_more():
+    machine = Machine(PendulumPlant(), np.zeros(2), 0, 1, (), DT, 2, 3)
+    machine.rest(np.zeros(1))
+    held, lengths = [], []
+    for k in range(20):
+        machine.measure(k * DT)
+        held.append(machine.command(np.array([float(k)])))
+        machine.advance(k * DT)
+        lengths.append(sum(len(v) for v in vars(machine).values() if isinstance(v, list)))
+    assert held[7] == (np.array([4.0]), np.array([3.0]))  # three periods late
+    assert len(set(lengths)) == 1

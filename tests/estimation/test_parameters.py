@@ -13,11 +13,14 @@ from hybrid_mpc import (
     Parameter,
     Signal,
     load,
+    load_scenario,
+    make_estimator,
     parameter_factors,
     parameter_filter,
     parameter_states,
     with_parameter_states,
 )
+from hybrid_mpc.estimation.switching import SLIP, SWITCHES
 
 GROUPS = {"mass": ("m", "J"), "friction": ("d", "mu")}
 
@@ -177,6 +180,17 @@ def test_bad_input_speaks(models):
     for n in (3, 4):
         with pytest.raises(InputError, match="no lags"):
             with_parameter_states(lagged(n), {"mass": ("m",)})
+
+
+def test_observer_and_parameter_filter_switch_by_the_same_numbers(adaptive, golf):
+    sigma_x = np.array([1e-6, 1e-4])
+    observer = make_estimator(golf, load_scenario("golf_robot"), sigma_x)
+    for several in (
+        observer, parameter_filter(adaptive, 2, sigma_y=[1e-4], sigma_x=sigma_x, sigma_x0=[1e-4, 0.1])
+    ):  # fmt: skip
+        np.testing.assert_array_equal(several.transition, SWITCHES)
+        quiet, slip, _ = (f.noise[0][:2] for f in several.filters)
+        np.testing.assert_allclose(slip, SLIP**2 * quiet, rtol=1e-12)
 
 
 def lagged(n):

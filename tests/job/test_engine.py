@@ -7,6 +7,8 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import BrokenExecutor, CancelledError
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -86,6 +88,13 @@ def lasts(path, report):
 def fails_beside(path, report):
     while not os.path.exists(path):
         time.sleep(0.01)
+    raise ValueError("too bad")
+
+
+def fails_after(go, failing, report):
+    while not os.path.exists(go):
+        time.sleep(0.01)
+    Path(failing).touch()
     raise ValueError("too bad")
 
 
@@ -180,6 +189,34 @@ def test_one_that_fails_ends_the_others_at_once(tmp_path):
         run_jobs({"a": (lasts, (path,)), "b": (fails_beside, (path,))}, quiet, 2)
     assert gone(int(path.read_text()))
     assert time.monotonic() - begin < 30.0
+
+
+def test_what_is_done_beside_one_that_fails_is_kept(tmp_path):
+    go, failing, kept = tmp_path / "go", tmp_path / "failing", {}
+
+    def told(name, *report):  # both end while the caller is busy; the one that fails is looked at first
+        go.touch()
+        until = time.monotonic() + 60
+        while not failing.exists():
+            assert time.monotonic() < until
+            time.sleep(0.01)
+        time.sleep(3.0)
+
+    jobs = {"a": (fails_after, (str(go), str(failing))), "b": (double, (2,))}
+    with pytest.raises(RuntimeError, match="too bad"):
+        run_jobs(jobs, told, 2, kept.__setitem__)
+    assert kept == {"b": 4}
+
+
+def test_processes_that_cannot_begin_are_told(monkeypatch):
+    class Broken:
+        def submit(self, *given):
+            raise BrokenExecutor("no memory for it")
+
+    local = make_engine(sum, 1)
+    monkeypatch.setattr(local, "_started", Broken)
+    with pytest.raises(RuntimeError, match=r"new processes end as they begin .*no memory for it"):
+        local.submit((1, 2))
 
 
 def test_no_workers():
@@ -318,6 +355,72 @@ def test_a_cluster_computes_the_same_and_loses_its_workers(tmp_path, monkeypatch
         run_study(study, tmp_path / "alone", cluster=address, resume=True)
     kept = StudyResults.load(tmp_path / "alone")
     assert 6 <= len(kept.table) < 40
+
+
+@pytest.fixture
+def here_cluster():
+    """``make(n)``: the address of a scheduler in this process, and a client of it with n workers in threads."""
+    from distributed import Client, LocalCluster
+
+    with ExitStack() as stack:
+
+        def make(n):
+            local = LocalCluster(
+                n_workers=n,
+                processes=False,
+                threads_per_worker=1,
+                protocol="tcp",
+                host="127.0.0.1",
+                dashboard_address=None,
+            )
+            stack.enter_context(local)
+            return local.scheduler_address, stack.enter_context(Client(local, set_as_default=False))
+
+        yield make
+
+
+def raises(batch):
+    raise batch[0]("not a worker's death")
+
+
+def waits(batch):
+    time.sleep(1.0)
+
+
+@pytest.mark.parametrize("kind", [TypeError, OSError, CancelledError])
+def test_what_the_work_raises_on_a_cluster_is_no_lost_worker(here_cluster, kind):
+    far = make_engine(raises, 1, here_cluster(1)[1])
+    far.submit((kind,))
+    with pytest.raises(kind, match="not a worker's death"):
+        far.next(60.0)
+    far.close()
+
+
+def test_what_a_cluster_has_forgotten_is_lost(here_cluster):
+    from distributed import Future
+
+    client = here_cluster(1)[1]
+    far = make_engine(waits, 1, client)
+    far.submit((1,))
+    client.cancel([Future(key, client) for key in client.futures if "_called" in key])
+    batch, ended = far.next(60.0)
+    assert batch == (1,)
+    assert isinstance(ended, Lost)
+    assert not ended.final
+    far.close()
+
+
+def test_a_refused_cluster_is_left(here_cluster, monkeypatch):
+    connected, own = engine._connected, []
+
+    def noted(address):
+        own.append(connected(address))
+        return own[-1]
+
+    monkeypatch.setattr(engine, "_connected", noted)
+    with pytest.raises(InputError, match="has no worker"):
+        make_engine(sum, 1, here_cluster(0)[0])
+    assert own[0].status == "closed"
 
 
 @pytest.mark.full
