@@ -5,12 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from closed_loop_parts import Told, run
-from hybrid_mpc.pipeline.guards import adaptable
 from monitor_parts import MGL, J, pendulum
 from online_models import pendulum_model
 
-from hybrid_mpc import OCP, InputError, Mode, Scenario, with_input_delay
-from hybrid_mpc.pipeline import make_adaptive_guard, make_controller, make_estimator
+from hybrid_mpc import (
+    OCP,
+    InputError,
+    Mode,
+    Scenario,
+    make_adaptive_guard,
+    make_controller,
+    make_estimator,
+    with_input_delay,
+)
+from hybrid_mpc.assembly import adaptable
 
 CONTROL = OCP(20, q=(300.0, 1.0), r=(0.05,), r_delta=(0.05,), u_min=(-6.0,), u_max=(6.0,))
 CAUSES = {"mass": ("J", "mgl"), "friction": ("gamma",), "motor": ("gain of u",)}
