@@ -36,7 +36,7 @@ from hybrid_mpc.monitor import EnergyMonitor, guard_monitor
 from hybrid_mpc.monitor.calibration import alarm_intervals
 from hybrid_mpc.mpc import OCP, SafeController, Source
 from hybrid_mpc.records import known, plain
-from hybrid_mpc.scenario import Plant, Scenario, Task
+from hybrid_mpc.scenario import Plant, Scenario, Task, load_scenario, registered_scenarios
 
 Array = NDArray[np.float64]
 MODEL = "model"
@@ -321,8 +321,10 @@ class Bench:
         Raises:
             InputError: If there is none of that label, or the loop is another scenario's.
         """
-        if spec.scenario != self.scenario.name and not spec.scenario.endswith(".py"):
-            raise InputError(f"a loop of scenario {spec.scenario} given, the bench has {self.scenario.name}")
+        own = self.scenario.name
+        others = () if spec.scenario == own else registered_scenarios()
+        if spec.scenario in others and load_scenario(spec.scenario).name != own:
+            raise InputError(f"a loop of scenario {spec.scenario} given, the bench has {own}")
         return self.kits[known(spec.model, self.kits, "model on the bench")]
 
     def task(self, spec: LoopSpec) -> Task:
