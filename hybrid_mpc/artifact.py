@@ -53,6 +53,8 @@ OUTPUTS = {
     "output": ("y",),
     BALANCE: ("residual",),
 }
+WATCHES = ("own", "energy", "readings", "guard")
+"""Kinds of monitor, see :meth:`Kit.monitor`."""
 JACOBIANS = {"A": ("x", "h"), "B": ("u",)}
 
 
@@ -397,14 +399,21 @@ class Kit:
             safe_input=self.safe_input,
         )
 
-    def monitor(self, model: str = "hybrid") -> EnergyMonitor:
-        """The energy monitor with what the run has learned: its detector, else thresholds, else no alarm.
+    def monitor(
+        self, model: str = "hybrid", *, kind: str = "", task: str = "", diagnose: bool = False
+    ) -> EnergyMonitor:
+        """The energy monitor with what the run has learned.
 
         Args:
             model: Name of the model that is held against the machine. Default: the hybrid.
+            kind: ``"guard"``: alarms by the detector, and finds frozen sensors; ``"energy"``: alarms by thresholds, if
+                there are any; ``"own"``: records levels; ``"readings"``: what a detector reads, without one. Default:
+                the detector, else thresholds.
+            task: Whose control problem tells the inputs' ranges. Default: the common one.
+            diagnose: Whether it remembers what a diagnosis of its alarms needs. Default: no.
 
         Raises:
-            InputError: If there is no such model.
+            InputError: If there is no such model or kind, or no detector where one is asked for.
 
         Example:
             ``hm.load("runs/mine").monitor()``
@@ -413,9 +422,16 @@ class Kit:
         from hybrid_mpc.monitor import guard_monitor
 
         held, found = self._model(model), self.calibration
-        if found is None or found.detector is None or self.control is None:
+        detects = found is not None and found.detector is not None and self.control is not None
+        kind = known(kind or ("guard" if detects else "energy"), WATCHES, "kind of monitor")
+        if kind == "energy":
             return make_monitor(held, found)
-        return guard_monitor(held, found.detector, **freezing(self, self.control))
+        if kind == "own":
+            return make_monitor(held, None, rest_speed=self.rest_speed)
+        if kind == "readings":
+            return guard_monitor(held, rest_speed=self.rest_speed)
+        ranges = freezing(self, self.problem(task))
+        return guard_monitor(held, self.detector(), **ranges, diagnose=diagnose and held.n_p > 0)
 
     def guard(self, *, adapt: bool = False, task: str = "") -> Guard:
         """What a loop does on alarms: no input while the sensor is frozen; the rest is recorded, or adapted to.

@@ -11,13 +11,11 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.artifact import Kit
+from hybrid_mpc.artifact import WATCHES, Kit
 from hybrid_mpc.assembly import (
     SOLVERS,
-    freezing,
     make_adaptive_guard,
     make_backup_guard,
-    make_monitor,
     make_resting_guard,
 )
 from hybrid_mpc.closed_loop.faults import Fault, check_channels, install
@@ -32,7 +30,7 @@ from hybrid_mpc.input_limits import share_used
 from hybrid_mpc.job.contenders import CONTENDERS, build
 from hybrid_mpc.job.rounds import repeated
 from hybrid_mpc.model import HybridModel
-from hybrid_mpc.monitor import EnergyMonitor, guard_monitor
+from hybrid_mpc.monitor import EnergyMonitor
 from hybrid_mpc.monitor.calibration import alarm_intervals
 from hybrid_mpc.mpc import OCP, SafeController, Source
 from hybrid_mpc.records import known, plain
@@ -42,9 +40,8 @@ Array = NDArray[np.float64]
 MODEL = "model"
 """Label of the model on the bench where there is one."""
 Intervals: TypeAlias = tuple[tuple[float, float], ...]
-MONITORS = ("own", "none", "energy", "readings", "guard")
-"""What watches a hybrid: ``own``: levels without thresholds; ``none``; ``energy``: the model's thresholds, so that it
-alarms; ``readings``: what a detector reads, without one; ``guard``: the model's detector."""
+MONITORS = (*WATCHES, "none")
+"""What watches a hybrid, see :meth:`~hybrid_mpc.artifact.Kit.monitor`; or nothing does."""
 ALARMING = ("energy", "guard")
 """Those that alarm."""
 GUARDS = ("", "rest", "adapt", "prior")
@@ -364,17 +361,9 @@ class Bench:
         Raises:
             InputError: If the model lacks what the monitor needs.
         """
-        kit = self.kit(spec)
         if spec.monitor == "none" or CONTENDERS[spec.controller].model != "hybrid":
             return None
-        hybrid = kit.models["hybrid"]
-        if spec.monitor == "energy":
-            return make_monitor(hybrid, kit.calibration)
-        if spec.monitor == "readings":
-            return guard_monitor(hybrid, rest_speed=kit.rest_speed)
-        if spec.monitor == "guard":
-            return guard_monitor(hybrid, kit.detector(), **freezing(kit, self.problem(spec)))
-        return make_monitor(hybrid, None, rest_speed=kit.rest_speed)
+        return self.kit(spec).monitor(kind=spec.monitor, task=spec.task)
 
     def guard(self, spec: LoopSpec) -> Guard | None:
         """What an alarm does in the loop of a specification; None: nothing.

@@ -18,7 +18,6 @@ from hybrid_mpc.artifact import (
     save_artifact,
     set_process_noise,
 )
-from hybrid_mpc.assembly import make_monitor
 from hybrid_mpc.closed_loop.loop import Loop
 from hybrid_mpc.estimation import ExtendedKalmanFilter, SwitchingFilter
 from hybrid_mpc.job.contenders import noise_of
@@ -108,7 +107,7 @@ def _only_timing(context: Context, kit: Kit) -> None:
     controller, estimator, durations = kit.controller(), kit.observer(), []
     for i, recording in enumerate(whole):
         context.progress.update("recordings", i, len(whole), f"timing on {recording.name}")
-        monitor = make_monitor(kit.models["hybrid"], None)
+        monitor = kit.monitor(kind="own")
         durations.append(time_on_recording(controller, estimator, monitor, recording, most))
     reason = f"scenario {context.scenario.name} has no plant to close the loop with"
     context.save("control", {"reason": reason}, {"step_ms": np.concatenate(durations)})

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.assembly import freezing
 from hybrid_mpc.closed_loop import Fault
 from hybrid_mpc.job.loops import MODEL, Bench, LoopSpec
-from hybrid_mpc.monitor import MonitorTrace, guard_monitor
+from hybrid_mpc.monitor import MonitorTrace
 from hybrid_mpc.monitor.calibration import alarm_intervals
 from hybrid_mpc.pipeline.monitor_job import explained
 from hybrid_mpc.pipeline.nominal_loops import CONTENDER, knows, nominal_tasks
@@ -85,11 +84,10 @@ def faulted(
         before, changes of the guard's mode; and the traces for the report, see :func:`read_trace`.
     """
     scenario, kit = bench.scenario, bench.kits[MODEL]
-    model, dt = kit.models["hybrid"], kit.models["hybrid"].dt
+    dt = kit.models["hybrid"].dt
     task = nominal_tasks(scenario)[0]
     start = dt * round(0.5 * task.duration / dt)
-    detects = freezing(kit, kit.problem(task.name))
-    monitor = guard_monitor(model, kit.detector(), **detects, diagnose=model.n_p > 0)
+    monitor = kit.monitor(kind="guard", task=task.name, diagnose=True)
     rows: list[dict[str, Any]] = []
     arrays: dict[str, Array] = {}
     for case in cases(scenario):

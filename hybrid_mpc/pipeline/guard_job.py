@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2
 
 from hybrid_mpc.artifact import Kit, set_calibration
-from hybrid_mpc.assembly import freezing, make_monitor
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.job.loops import MODEL, Bench
 from hybrid_mpc.model import HybridModel
@@ -227,11 +226,7 @@ def _recorded(
     Without either the readings are kept and nothing but a blind monitor alarms.
     """
     model = kit.models["hybrid"]
-    if detector is None:
-        monitor = make_monitor(model, kit.calibration)
-    else:
-        diagnose = model.n_p > 0
-        monitor = guard_monitor(model, detector, **freezing(kit, kit.problem()), diagnose=diagnose)
+    monitor = kit.monitor(kind="energy" if detector is None else "guard", diagnose=True)
     estimator = kit.observer()
     tested = [r for r in context.dataset.whole if clean_windows(context, r, ("test",))]
     found: list[dict[str, Any]] = []
