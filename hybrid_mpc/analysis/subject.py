@@ -57,7 +57,8 @@ class Request:
 
     Args:
         folder: Artifact folder, or the folder of the run that holds it as ``model``.
-        scenario: Name or file. Default: the one that the artifact names; without any there are no loops.
+        scenario: Name or file. Default: the one that the artifact names; without any the artifact's own control problem
+            and noise make the loops, where it holds them.
         data: Recordings.
         speed: Working speed. Default: that of the scenario's weights, else 1.
         seed: Of the recordings that the scenario makes to estimate the filters' noise on, if the artifact holds none.
@@ -93,7 +94,10 @@ def subject_of(request: Request) -> tuple[Subject, tuple[str, ...]]:
     notes = [f"scenario {name}" if name else "no scenario: no response of a machine"]
     ocp: OCP | None = None
     filters: dict[tuple[str, str], ExtendedKalmanFilter] = {}
-    if control is not None and {"prior", "hybrid"} <= set(artifact.models):
+    told = scenario is not None or {"prior_observer", "hybrid_observer"} <= set(artifact.loop.process_noise)
+    if control is not None and not told:
+        notes.append("no loops: the model holds no process noise for its filters; run the scenario again")
+    if control is not None and told and {"prior", "hybrid"} <= set(artifact.models):
         from hybrid_mpc.assembly import make_ocp
 
         ocp = make_ocp(artifact.models["prior"], control)

@@ -156,8 +156,9 @@ class Simulation:
         check_channels(faults, model.n_y, ocp.n_u)
         self._cost = _checked_cost(ocp, ocp if stage_cost is None else stage_cost)
         end = self.periods * dt
-        acting = Previews(preview_of(reference, ocp), weight, ocp, horizon, dt, end)
-        self._acting = acting if input_delay else None
+        self._acting = (
+            Previews(preview_of(reference, ocp), weight, ocp, horizon, dt, end) if input_delay else None
+        )
         rest = vector(x0, ocp.n_x, "x0")
         self._machine = Machine(self._plant, rest, seed, model.n_y, faults, dt, sensor_delay, input_delay)
         self._late, self._on_step = late, on_step

@@ -33,7 +33,10 @@ def guard_results(context: Context) -> dict[str, Any]:
         keys = ("fault", "start_s", "delay_s", "diagnosis")
         out["faults"] = [{key: row[key] for key in keys} for row in found["faults"]]
     else:
-        out["faults_reason"] = f"scenario {context.scenario.name} has no plant that could break"
+        lacks = (
+            "plant that could break" if context.scenario.plant is None else "task in which nothing goes wrong"
+        )
+        out["faults_reason"] = f"scenario {context.scenario.name} has no {lacks}"
     kept = ("source", "loops", "detector", "plausibility", "plausibility_reason", "test", "faults")
     return {**out, "details": {key: found[key] for key in kept if key in found}}
 

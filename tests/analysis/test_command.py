@@ -31,6 +31,7 @@ from hybrid_mpc.analysis.study_loops import loops_part
 from hybrid_mpc.analysis.study_signals import measured_part
 from hybrid_mpc.analysis.subject import Request, Subject, subject_of
 from hybrid_mpc.analysis.toolbox import control_toolbox
+from hybrid_mpc.artifact import loop_settings, read_description, write_description
 from hybrid_mpc.cli.main import app
 from nn_export import load_programs
 from scenarios.golf_robot import scenario
@@ -99,6 +100,20 @@ def test_recordings_are_taken_before_the_simulated_machine(golf_artifact, prior_
     assert result["prior"]["median_relative_error"] < 0.02
     assert np.median(curves["measured/coherence"][:20]) > 0.9
     assert "1 recordings" in result["source"]
+
+
+def test_a_folder_alone_has_loops_where_it_holds_what_they_need(golf_artifact, tmp_path):
+    folder = shutil.copytree(golf_artifact, tmp_path / "bare")
+    note = read_description(folder)
+    anonymous = replace(note, loop=loop_settings(scenario), provenance=replace(note.provenance, scenario=""))
+    write_description(folder, anonymous)
+    subject, notes = subject_of(Request(folder))
+    assert subject.filters == {}
+    assert "holds no process noise" in notes[1]
+    set_process_noise(folder, {name: [1e-4, 2e-2] for name in ("prior_observer", "hybrid_observer")})
+    subject, notes = subject_of(Request(folder))
+    assert set(subject.filters) == {(m, f) for m in ("prior", "hybrid") for f in ("quiet", "jump")}
+    assert notes[1] == "filters' noise: the model's own"
 
 
 def test_without_python_control_it_is_said_what_to_install(monkeypatch):
