@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc import CausalPolynomial, LocalPolynomial, SmoothingSpline, ZeroPhaseFilter, differentiate
-from hybrid_mpc.data import Differentiator, gcv_cutoff
+from hybrid_mpc.data.differentiate import Differentiator, gcv_cutoff
 
 Array = NDArray[np.float64]
 SECONDS, END = 40.0, 0.25

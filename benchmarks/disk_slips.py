@@ -20,9 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_mpc import load_scenario
-from hybrid_mpc.pipeline.machine_benchmark.free_runs import run_freely
-from hybrid_mpc.pipeline.machine_benchmark.recordings import benchmark_of, read_training
-from hybrid_mpc.pipeline.machine_benchmark.store import load_model
+from hybrid_mpc.job.benchmark import load_model
+from hybrid_mpc.job.benchmark_runs import benchmark_of, read_training, run_freely
 
 JUMP = 60.0
 """Acceleration [rad/s^2]."""

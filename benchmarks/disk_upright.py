@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_mpc import load_scenario
-from hybrid_mpc.pipeline.control_job import ControlSettings, prepared, run_loops
+from hybrid_mpc.job.control import ControlSettings, prepared, run_loops
 
 AHEAD = (1, 4, 10, 20)
 FOLLOWED = 20

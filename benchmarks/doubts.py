@@ -16,8 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_mpc import Scenario, load_scenario
-from hybrid_mpc.data import Table, read_tables, stillness
+from hybrid_mpc.data import doubts as stillness
 from hybrid_mpc.data.doubts import Finding, doubts_of
+from hybrid_mpc.data.tables import Table, read_tables
 
 FROZEN = (0.1, 0.3, 1.0)
 TIMES = 20

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_mpc import Trajectory
-from hybrid_mpc.identification.prior_long_runs import OutputErrorFit, cut_runs
-from hybrid_mpc.pipeline.machine_benchmark.recordings import read_test
+from hybrid_mpc.identify.delay import OutputErrorFit, cut_runs
+from hybrid_mpc.job.benchmark_runs import read_test
 from scenarios.emps import scenario
 
 

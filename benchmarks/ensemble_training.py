@@ -32,7 +32,7 @@ import torch
 from torch import Tensor, nn
 
 from hybrid_mpc import n_features
-from hybrid_mpc.identification.networks import StackedGRU
+from hybrid_mpc.identify.networks import StackedGRU
 from scenarios.golf_robot import scenario
 
 NETWORKS = 16

@@ -28,7 +28,7 @@ import numpy as np
 import torch
 
 from hybrid_mpc import HybridStep, Scaling, load, model_info, n_features, save_artifact, trace_model
-from hybrid_mpc.identification.networks import StackedGRU
+from hybrid_mpc.identify.networks import StackedGRU
 from nn_export import compile_function
 from scenarios.golf_robot import scenario
 

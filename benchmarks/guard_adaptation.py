@@ -6,7 +6,7 @@ seeds three times: hybrid MPC with its observer (off), the same with a guard who
 friction have become (guard), and that backup all the time without a guard (always). Cost on the true state; ratios to
 "off" of the mean costs with 95 % intervals from the paired loops. ``--keep`` is a folder that finished loops lie in.
 ``--time`` prints the processor time of a period instead. The detector is that of ``hybrid-mpc monitor ... --learn``
-or ``judges.json`` of ``hybrid-mpc study run monitor``.
+or ``judges.json`` of ``python -m scenarios.golf_robot.monitor_study``.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from scipy.stats import t as student
 
 from hybrid_mpc import guard_monitor, load, make_adaptive_guard, make_controller, make_estimator, simulate
 from hybrid_mpc.files import read_json, write_json
-from hybrid_mpc.pipeline.monitor_job import read_detector
+from hybrid_mpc.job.monitor import read_detector
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.tasks import CONTROL
 

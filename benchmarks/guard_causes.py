@@ -4,7 +4,7 @@
 Loops of guard_loops.py, replayed; what the diagnosis says so long [s] after the onset, of its whole history and of
 the time since the onset alone. An artifact of an earlier version is completed with the prior's program of its
 provenance (torch). The detector is that of ``hybrid-mpc monitor ... --learn`` or ``judges.json`` of
-``hybrid-mpc study run monitor``.
+``python -m scenarios.golf_robot.monitor_study``.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 from guard_loops import DT, FAULTS, Loops, fault_plans, noise_of
 
 from hybrid_mpc import Diagnoser, guard_monitor, load
-from hybrid_mpc.pipeline.monitor_job import read_detector
+from hybrid_mpc.job.monitor import read_detector
 from scenarios.golf_robot import scenario
 
 

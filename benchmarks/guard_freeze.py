@@ -1,6 +1,7 @@
 """A sensor that freezes 1.5 to 3.5 s into a loop: ``python benchmarks/guard_freeze.py --study DIR --model DIR``.
 
-Loops of the study ``monitor`` (``hybrid-mpc study run monitor --model DIR --out DIR``, its thresholds and its seeds) in
+Loops of the study ``monitor`` (``python -m scenarios.golf_robot.monitor_study run DIR --out DIR``, its thresholds
+and its seeds) in
 which the encoder freezes on the sinusoidal task, with the guard that rests. Printed: how long after the freeze the
 input is taken away [s], whether or not the club moved at that moment, and which loops leave a limit. ``--seeds``:
 default 40, the study's.
@@ -27,13 +28,13 @@ from hybrid_mpc import (
     make_resting_guard,
     simulate,
 )
-from hybrid_mpc.assembly import freezing
 from hybrid_mpc.files import read_json
-from hybrid_mpc.monitor import Judges
+from hybrid_mpc.kit.assembly import freezing
 from hybrid_mpc.records import record
-from hybrid_mpc.studies.monitor_loops import loop_figures
-from hybrid_mpc.studies.monitor_plan import SEEDS, LoopPlan
 from scenarios.golf_robot import scenario
+from scenarios.golf_robot.monitor_study.detection import Judges
+from scenarios.golf_robot.monitor_study.loops import loop_figures
+from scenarios.golf_robot.monitor_study.plan import SEEDS, LoopPlan
 from scenarios.golf_robot.tasks import CONTROL, sine_reference
 
 RATE, FAULT_S = 0.25, 7.5

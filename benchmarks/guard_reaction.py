@@ -3,8 +3,9 @@
 
 The golf robot's rig on the sinusoidal task, 6 s, a fault from 1.5 to 3.5 s on (guard_loops.py), the same seeds without
 a guard and with two: tighter limits (0.3 N m of 0.5), and the fallback. A frozen sensor puts both to rest. Backups are
-judged by ``hybrid-mpc study run monitor``. Cost on the true state, largest angle [rad] and speed beyond its soft
-limits. The detector is that of ``hybrid-mpc monitor ... --learn`` or ``judges.json`` of ``study run monitor``.
+judged by ``python -m scenarios.golf_robot.monitor_study``. Cost on the true state, largest angle [rad] and speed
+beyond its soft
+limits. The detector is that of ``hybrid-mpc monitor ... --learn`` or ``judges.json`` of that study.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from guard_loops import DT, fault_plans
 
 from hybrid_mpc import Guard, Limits, Mode, guard_monitor, load, make_controller, make_estimator, simulate
 from hybrid_mpc.files import write_json
-from hybrid_mpc.pipeline.monitor_job import read_detector
+from hybrid_mpc.job.monitor import read_detector
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.tasks import CONTROL
 

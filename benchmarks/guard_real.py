@@ -95,7 +95,8 @@ def table(rows) -> list[str]:
 
 def picture(found: HeldOut, y, path: Path, title: str) -> None:
     """Everything the monitor says, alarms shaded; clean windows as bars at the top."""
-    from hybrid_mpc.plots import overview, save
+    from hybrid_mpc.plots.monitor import overview
+    from hybrid_mpc.plots.style import save
     from scenarios.torque_pendulum import make_prior
 
     figure = overview(found.trace, y, output=make_prior().outputs[0], title=title)

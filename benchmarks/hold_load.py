@@ -24,7 +24,7 @@ import numpy as np
 
 import hybrid_mpc as hm
 from hybrid_mpc import ExtendedKalmanFilter, Fault, make_controller, make_estimator, simulate
-from hybrid_mpc.assembly import FIRST_LOAD
+from hybrid_mpc.kit.assembly import FIRST_LOAD
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.tasks import CONTROL
 

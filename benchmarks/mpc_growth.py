@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_mpc.plots import COLOURS, new_figure, save, title_axes
+from hybrid_mpc.plots.style import COLOURS, new_figure, save, title_axes
 
 SOLVERS = {"rti": COLOURS["hybrid"], "sqp": COLOURS["prior"]}
 KEY = re.compile(r"(\w+)_ms at z=(\d+) n=(\d+)")

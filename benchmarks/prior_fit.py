@@ -15,11 +15,10 @@ import torch
 from numpy.typing import NDArray
 
 from hybrid_mpc import Trajectory
-from hybrid_mpc.identification.dataset import cut_windows
-from hybrid_mpc.identification.prior_fit import STAGES
-from hybrid_mpc.identification.prior_residuals import ParameterFit
-from hybrid_mpc.identification.prior_shooting import cut_segments, multiple_shooting
-from hybrid_mpc.identification.prior_swarm import SwarmSettings, particle_swarm
+from hybrid_mpc.identify.dataset import cut_windows
+from hybrid_mpc.identify.fit import STAGES, cut_segments, multiple_shooting
+from hybrid_mpc.identify.residuals import ParameterFit
+from hybrid_mpc.identify.swarm import SwarmSettings, particle_swarm
 from scenarios.pendulum.data import run
 from scenarios.pendulum.plant import DampedPendulum
 from scenarios.pendulum.prior import PendulumPrior

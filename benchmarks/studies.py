@@ -27,12 +27,10 @@ from time import perf_counter, process_time
 import numpy as np
 
 from hybrid_mpc import LoopSpec, Study, StudyResults, run_study
+from hybrid_mpc.job.context import Silent
 from hybrid_mpc.job.engine import DaskEngine, LocalEngine
-from hybrid_mpc.pipeline.context import Silent
-from hybrid_mpc.studies.inputs import TIMING, load_inputs, run_batch
-from hybrid_mpc.studies.log import RunLog, rows, segments
-from hybrid_mpc.studies.runner import THREADS, execute
-from hybrid_mpc.studies.table import compact
+from hybrid_mpc.job.study_log import RunLog, compact, rows, segments
+from hybrid_mpc.job.study_run import THREADS, TIMING, execute, load_inputs, run_batch
 
 
 def nothing(config: LoopSpec) -> dict:
@@ -197,7 +195,7 @@ def dask(runs: int) -> dict:
     """Runs that do nothing on a local cluster of 2 processes, one a batch."""
     from distributed import Client, LocalCluster
 
-    from hybrid_mpc.studies import runner
+    from hybrid_mpc.job import study_run as runner
 
     runner.BATCH_MOST = 1
     with (

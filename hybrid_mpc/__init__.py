@@ -15,33 +15,78 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from hybrid_mpc import plots
-    from hybrid_mpc.analysis import (
+    from hybrid_mpc.analyze.equilibria import equilibria
+    from hybrid_mpc.analyze.friction import friction_slopes, linearize_secant
+    from hybrid_mpc.analyze.linearize import jacobians, linearize, linearize_along, linearize_at_speed
+    from hybrid_mpc.analyze.margins import mpc_gain, mpc_loop, steady_filter
+    from hybrid_mpc.analyze.measured import multisine_response, run_model, run_plant
+    from hybrid_mpc.analyze.memory import contraction, feature_box, gru_weights, lyapunov_exponent
+    from hybrid_mpc.analyze.properties import (
         balanced_truncation,
-        contraction,
-        equilibria,
-        feature_box,
         frequency_response,
-        friction_slopes,
-        gain_schedule,
-        gru_weights,
-        holding_input,
-        jacobians,
-        linearize,
-        linearize_along,
-        linearize_at_speed,
-        linearize_secant,
-        lyapunov_exponent,
-        mpc_gain,
-        mpc_loop,
-        multisine_response,
-        parameter_sensitivities,
         physical_states,
-        run_model,
-        run_plant,
-        steady_filter,
         system_structure,
     )
-    from hybrid_mpc.artifact import (
+    from hybrid_mpc.analyze.schedule import gain_schedule, holding_input
+    from hybrid_mpc.analyze.sensitivity import parameter_sensitivities
+    from hybrid_mpc.control.best_of import BestOf
+    from hybrid_mpc.control.nlp import IpoptController
+    from hybrid_mpc.control.ocp import OCP, Limits
+    from hybrid_mpc.control.problem import Status, output_cost
+    from hybrid_mpc.control.rti import CondensedController
+    from hybrid_mpc.control.safeguard import SafeController
+    from hybrid_mpc.control.soft import SoftBound
+    from hybrid_mpc.control.sqp import SQPController
+    from hybrid_mpc.data.differentiate import (
+        CausalPolynomial,
+        LocalPolynomial,
+        SmoothingSpline,
+        ZeroPhaseFilter,
+        differentiate,
+    )
+    from hybrid_mpc.data.excitation import (
+        check_excitation,
+        chirp,
+        excitation_of,
+        multisine,
+        prbs,
+        random_steps,
+        sinusoid,
+    )
+    from hybrid_mpc.data.files import write_csv
+    from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
+    from hybrid_mpc.errors import InputError, SafeInputError
+    from hybrid_mpc.estimate.delay import DelayCompensation
+    from hybrid_mpc.estimate.kalman import Estimate, ExtendedKalmanFilter, TrueState
+    from hybrid_mpc.estimate.parameters import (
+        parameter_factors,
+        parameter_filter,
+        parameter_states,
+        with_parameter_states,
+    )
+    from hybrid_mpc.estimate.switching import SwitchingFilter
+    from hybrid_mpc.estimate.tuning import process_noise
+    from hybrid_mpc.files import write_arrays
+    from hybrid_mpc.identify.delay import with_input_lag
+    from hybrid_mpc.identify.evaluate import free_runs, judged, score
+    from hybrid_mpc.identify.export import check_parity, model_info, trace_model
+    from hybrid_mpc.identify.fit import fit_prior
+    from hybrid_mpc.identify.networks import GRUNetwork
+    from hybrid_mpc.identify.output_network import train_output, with_output
+    from hybrid_mpc.identify.settings import TrainingSettings
+    from hybrid_mpc.identify.sindy import fit_sindy
+    from hybrid_mpc.identify.smooth import fit_smoother
+    from hybrid_mpc.identify.step import HybridStep, PriorStep, Scaling, n_features
+    from hybrid_mpc.identify.train import train
+    from hybrid_mpc.identify.tune import SearchSpace, search
+    from hybrid_mpc.job.controllers import find_noise
+    from hybrid_mpc.job.loops import Bench, LoopRow, LoopSpec, varied
+    from hybrid_mpc.job.run import run
+    from hybrid_mpc.job.settings import RunSettings
+    from hybrid_mpc.job.study import FaultKind, RandomFaults, Study
+    from hybrid_mpc.job.study_results import StudyResults, write_study_report
+    from hybrid_mpc.job.study_run import dry_run, run_study
+    from hybrid_mpc.kit.artifact import (
         Kit,
         LoopSettings,
         ModelInfo,
@@ -51,7 +96,7 @@ if TYPE_CHECKING:
         set_calibration,
         set_process_noise,
     )
-    from hybrid_mpc.assembly import (
+    from hybrid_mpc.kit.assembly import (
         make_adaptive_guard,
         make_controller,
         make_estimator,
@@ -59,111 +104,35 @@ if TYPE_CHECKING:
         make_ocp,
         make_resting_guard,
     )
-    from hybrid_mpc.benchmark_spec import BenchmarkBudget, BenchmarkSpec
-    from hybrid_mpc.buffered import BufferedFunction
-    from hybrid_mpc.closed_loop import ClosedLoopResult, Fault, Guard, Loop, Mode, Runner, SafeEnd, simulate
-    from hybrid_mpc.closed_loop.faults import check_plant_faults, corrupt_input, corrupt_measurement
-    from hybrid_mpc.data import (
-        CausalPolynomial,
-        Dataset,
-        LocalPolynomial,
-        SmoothingSpline,
-        Trajectory,
-        ZeroPhaseFilter,
-        check_excitation,
-        chirp,
-        differentiate,
-        excitation_of,
-        load_trajectories,
-        multisine,
-        prbs,
-        random_steps,
-        sinusoid,
-        write_csv,
-    )
-    from hybrid_mpc.data_spec import DataSpec, Role, Window
-    from hybrid_mpc.delayed import with_input_delay
-    from hybrid_mpc.errors import InputError, SafeInputError
-    from hybrid_mpc.estimation import (
-        DelayCompensation,
-        Estimate,
-        ExtendedKalmanFilter,
-        SwitchingFilter,
-        TrueState,
-        parameter_factors,
-        parameter_filter,
-        parameter_states,
-        process_noise,
-        with_parameter_states,
-    )
-    from hybrid_mpc.files import write_arrays
-    from hybrid_mpc.identification.evaluation import free_runs, judged, score
-    from hybrid_mpc.identification.export import check_parity, model_info, trace_model
-    from hybrid_mpc.identification.friction import (
+    from hybrid_mpc.loop.faults import Fault, check_plant_faults, corrupt_input, corrupt_measurement
+    from hybrid_mpc.loop.guard import Guard, Mode
+    from hybrid_mpc.loop.loop import Loop
+    from hybrid_mpc.loop.realtime import Runner, SafeEnd
+    from hybrid_mpc.loop.simulate import ClosedLoopResult, simulate
+    from hybrid_mpc.machine.signals import Parameter, Signal
+    from hybrid_mpc.machine.specification import BenchmarkBudget, BenchmarkSpec, DataSpec, Role, Window
+    from hybrid_mpc.machine.torch_prior import (
         Coulomb,
         LoadDependent,
         PendulumLoad,
+        Prior,
         Stribeck,
         Viscous,
         with_friction,
     )
-    from hybrid_mpc.identification.lags import with_input_lag
-    from hybrid_mpc.identification.networks import GRUNetwork
-    from hybrid_mpc.identification.output_network import train_output, with_output
-    from hybrid_mpc.identification.prior_fit import fit_prior
-    from hybrid_mpc.identification.search import search
-    from hybrid_mpc.identification.search_space import SearchSpace
-    from hybrid_mpc.identification.settings import TrainingSettings
-    from hybrid_mpc.identification.sindy import fit_sindy
-    from hybrid_mpc.identification.smoothing import fit_smoother
-    from hybrid_mpc.identification.step import HybridStep, PriorStep, Scaling, n_features
-    from hybrid_mpc.identification.training import train
-    from hybrid_mpc.job.contenders import find_noise
-    from hybrid_mpc.job.loops import Bench, LoopRow, LoopSpec, varied
-    from hybrid_mpc.model import HybridModel, longer_period
-    from hybrid_mpc.monitor import (
-        Calibration,
-        Detector,
-        Diagnoser,
-        EnergyMonitor,
-        Plausibility,
-        count_alarms,
-        excess_bound,
-        guard_monitor,
-        learn_from,
-        learn_plausibility,
-        region_bound,
-        replay,
-        rest_speeds,
-    )
-    from hybrid_mpc.mpc import (
-        OCP,
-        BestOf,
-        CondensedController,
-        IpoptController,
-        Limits,
-        SafeController,
-        SoftBound,
-        SQPController,
-        Status,
-        output_cost,
-    )
-    from hybrid_mpc.physics import Prior
-    from hybrid_mpc.pipeline.run import run
-    from hybrid_mpc.pipeline.settings import RunSettings
-    from hybrid_mpc.reproduction import Claim, Effort, Experiment
-    from hybrid_mpc.riccati import dare, lqr
+    from hybrid_mpc.model.buffered import BufferedFunction
+    from hybrid_mpc.model.delay import with_input_delay
+    from hybrid_mpc.model.model import HybridModel, longer_period
+    from hybrid_mpc.model.riccati import dare, lqr
+    from hybrid_mpc.monitor.calibrate import Calibration, count_alarms
+    from hybrid_mpc.monitor.detector import Detector
+    from hybrid_mpc.monitor.diagnose import Diagnoser
+    from hybrid_mpc.monitor.energy import EnergyMonitor
+    from hybrid_mpc.monitor.learn import guard_monitor, learn_from
+    from hybrid_mpc.monitor.lengths import rest_speeds
+    from hybrid_mpc.monitor.plausibility import Plausibility, excess_bound, learn_plausibility, region_bound
+    from hybrid_mpc.monitor.replay import replay
     from hybrid_mpc.scenario import DEFAULT_BUDGETS, Budget, Scenario, Task, load_scenario
-    from hybrid_mpc.signals import Parameter, Signal
-    from hybrid_mpc.studies import (
-        FaultKind,
-        RandomFaults,
-        Study,
-        StudyResults,
-        run_study,
-        write_study_report,
-    )
-    from hybrid_mpc.studies.dry_run import dry_run
 
 try:
     __version__ = version("hybrid-mpc")
@@ -171,132 +140,259 @@ except PackageNotFoundError:  # a source tree that was never installed
     __version__ = "0+unknown"
 
 __all__ = [
-    "__version__", "plots",
-    "balanced_truncation", "contraction", "equilibria", "feature_box", "frequency_response", "friction_slopes",
-    "gain_schedule", "gru_weights", "holding_input", "jacobians", "linearize", "linearize_along",
-    "linearize_at_speed", "linearize_secant", "lyapunov_exponent", "mpc_gain", "mpc_loop", "multisine_response",
-    "parameter_sensitivities", "physical_states", "run_model", "run_plant", "steady_filter", "system_structure",
-    "Kit", "LoopSettings", "ModelInfo", "Provenance", "load", "save_artifact", "set_calibration",
-    "set_process_noise",
-    "make_adaptive_guard", "make_controller", "make_estimator", "make_monitor", "make_ocp", "make_resting_guard",
-    "BenchmarkBudget", "BenchmarkSpec",
+    "__version__",
+    "plots",
+    "Bench",
+    "BenchmarkBudget",
+    "BenchmarkSpec",
+    "BestOf",
+    "Budget",
     "BufferedFunction",
-    "ClosedLoopResult", "Fault", "Guard", "Loop", "Mode", "Runner", "SafeEnd", "simulate",
-    "check_plant_faults", "corrupt_input", "corrupt_measurement",
-    "CausalPolynomial", "Dataset", "LocalPolynomial", "SmoothingSpline", "Trajectory", "ZeroPhaseFilter",
-    "check_excitation", "chirp", "differentiate", "excitation_of", "load_trajectories", "multisine", "prbs",
-    "random_steps", "sinusoid", "write_csv",
-    "DataSpec", "Role", "Window",
-    "with_input_delay",
-    "InputError", "SafeInputError",
-    "DelayCompensation", "Estimate", "ExtendedKalmanFilter", "SwitchingFilter", "TrueState", "parameter_factors",
-    "parameter_filter", "parameter_states", "process_noise", "with_parameter_states",
-    "write_arrays",
-    "free_runs", "judged", "score",
-    "check_parity", "model_info", "trace_model",
-    "Coulomb", "LoadDependent", "PendulumLoad", "Stribeck", "Viscous", "with_friction",
-    "with_input_lag",
+    "Calibration",
+    "CausalPolynomial",
+    "ClosedLoopResult",
+    "CondensedController",
+    "Coulomb",
+    "DEFAULT_BUDGETS",
+    "DataSpec",
+    "Dataset",
+    "DelayCompensation",
+    "Detector",
+    "Diagnoser",
+    "EnergyMonitor",
+    "Estimate",
+    "ExtendedKalmanFilter",
+    "Fault",
+    "FaultKind",
     "GRUNetwork",
-    "train_output", "with_output",
-    "fit_prior",
-    "search",
+    "Guard",
+    "HybridModel",
+    "HybridStep",
+    "InputError",
+    "IpoptController",
+    "Kit",
+    "Limits",
+    "LoadDependent",
+    "LocalPolynomial",
+    "Loop",
+    "LoopRow",
+    "LoopSettings",
+    "LoopSpec",
+    "Mode",
+    "ModelInfo",
+    "OCP",
+    "Parameter",
+    "PendulumLoad",
+    "Plausibility",
+    "Prior",
+    "PriorStep",
+    "Provenance",
+    "RandomFaults",
+    "Role",
+    "RunSettings",
+    "Runner",
+    "SQPController",
+    "SafeController",
+    "SafeEnd",
+    "SafeInputError",
+    "Scaling",
+    "Scenario",
     "SearchSpace",
+    "Signal",
+    "SmoothingSpline",
+    "SoftBound",
+    "Status",
+    "Stribeck",
+    "Study",
+    "StudyResults",
+    "SwitchingFilter",
+    "Task",
     "TrainingSettings",
+    "Trajectory",
+    "TrueState",
+    "Viscous",
+    "Window",
+    "ZeroPhaseFilter",
+    "balanced_truncation",
+    "check_excitation",
+    "check_parity",
+    "check_plant_faults",
+    "chirp",
+    "contraction",
+    "corrupt_input",
+    "corrupt_measurement",
+    "count_alarms",
+    "dare",
+    "differentiate",
+    "dry_run",
+    "equilibria",
+    "excess_bound",
+    "excitation_of",
+    "feature_box",
+    "find_noise",
+    "fit_prior",
     "fit_sindy",
     "fit_smoother",
-    "HybridStep", "PriorStep", "Scaling", "n_features",
-    "train",
-    "find_noise",
-    "Bench", "LoopRow", "LoopSpec", "varied",
-    "HybridModel", "longer_period",
-    "Calibration", "Detector", "Diagnoser", "EnergyMonitor", "Plausibility", "count_alarms", "excess_bound",
-    "guard_monitor", "learn_from", "learn_plausibility", "region_bound", "replay", "rest_speeds",
-    "OCP", "BestOf", "CondensedController", "IpoptController", "Limits", "SQPController", "SafeController",
-    "SoftBound", "Status", "output_cost",
-    "Prior",
+    "free_runs",
+    "frequency_response",
+    "friction_slopes",
+    "gain_schedule",
+    "gru_weights",
+    "guard_monitor",
+    "holding_input",
+    "jacobians",
+    "judged",
+    "learn_from",
+    "learn_plausibility",
+    "linearize",
+    "linearize_along",
+    "linearize_at_speed",
+    "linearize_secant",
+    "load",
+    "load_scenario",
+    "load_trajectories",
+    "longer_period",
+    "lqr",
+    "lyapunov_exponent",
+    "make_adaptive_guard",
+    "make_controller",
+    "make_estimator",
+    "make_monitor",
+    "make_ocp",
+    "make_resting_guard",
+    "model_info",
+    "mpc_gain",
+    "mpc_loop",
+    "multisine",
+    "multisine_response",
+    "n_features",
+    "output_cost",
+    "parameter_factors",
+    "parameter_filter",
+    "parameter_sensitivities",
+    "parameter_states",
+    "physical_states",
+    "prbs",
+    "process_noise",
+    "random_steps",
+    "region_bound",
+    "replay",
+    "rest_speeds",
     "run",
-    "RunSettings",
-    "Claim", "Effort", "Experiment",
-    "dare", "lqr",
-    "DEFAULT_BUDGETS", "Budget", "Scenario", "Task", "load_scenario",
-    "Parameter", "Signal",
-    "FaultKind", "RandomFaults", "Study", "StudyResults", "run_study", "write_study_report",
-    "dry_run",
-]  # fmt: skip
+    "run_model",
+    "run_plant",
+    "run_study",
+    "save_artifact",
+    "score",
+    "search",
+    "set_calibration",
+    "set_process_noise",
+    "simulate",
+    "sinusoid",
+    "steady_filter",
+    "system_structure",
+    "trace_model",
+    "train",
+    "train_output",
+    "varied",
+    "with_friction",
+    "with_input_delay",
+    "with_input_lag",
+    "with_output",
+    "with_parameter_states",
+    "write_arrays",
+    "write_csv",
+    "write_study_report",
+]
 _ROOMS = {
-    "analysis": (
-        "balanced_truncation", "contraction", "equilibria", "feature_box", "frequency_response",
-        "friction_slopes", "gain_schedule", "gru_weights", "holding_input", "jacobians", "linearize",
-        "linearize_along", "linearize_at_speed", "linearize_secant", "lyapunov_exponent", "mpc_gain",
-        "mpc_loop", "multisine_response", "parameter_sensitivities", "physical_states", "run_model",
-        "run_plant", "steady_filter", "system_structure",
+    "analyze.equilibria": ("equilibria",),
+    "analyze.friction": ("friction_slopes", "linearize_secant"),
+    "analyze.linearize": ("jacobians", "linearize", "linearize_along", "linearize_at_speed"),
+    "analyze.margins": ("mpc_gain", "mpc_loop", "steady_filter"),
+    "analyze.measured": ("multisine_response", "run_model", "run_plant"),
+    "analyze.memory": ("contraction", "feature_box", "gru_weights", "lyapunov_exponent"),
+    "analyze.properties": (
+        "balanced_truncation", "frequency_response", "physical_states", "system_structure",
     ),
-    "artifact": (
+    "analyze.schedule": ("gain_schedule", "holding_input"),
+    "analyze.sensitivity": ("parameter_sensitivities",),
+    "control.best_of": ("BestOf",),
+    "control.nlp": ("IpoptController",),
+    "control.ocp": ("Limits", "OCP"),
+    "control.problem": ("Status", "output_cost"),
+    "control.rti": ("CondensedController",),
+    "control.safeguard": ("SafeController",),
+    "control.soft": ("SoftBound",),
+    "control.sqp": ("SQPController",),
+    "data.differentiate": (
+        "CausalPolynomial", "LocalPolynomial", "SmoothingSpline", "ZeroPhaseFilter", "differentiate",
+    ),
+    "data.excitation": (
+        "check_excitation", "chirp", "excitation_of", "multisine", "prbs", "random_steps", "sinusoid",
+    ),
+    "data.files": ("write_csv",),
+    "data.trajectories": ("Dataset", "Trajectory", "load_trajectories"),
+    "errors": ("InputError", "SafeInputError"),
+    "estimate.delay": ("DelayCompensation",),
+    "estimate.kalman": ("Estimate", "ExtendedKalmanFilter", "TrueState"),
+    "estimate.parameters": (
+        "parameter_factors", "parameter_filter", "parameter_states", "with_parameter_states",
+    ),
+    "estimate.switching": ("SwitchingFilter",),
+    "estimate.tuning": ("process_noise",),
+    "files": ("write_arrays",),
+    "identify.delay": ("with_input_lag",),
+    "identify.evaluate": ("free_runs", "judged", "score"),
+    "identify.export": ("check_parity", "model_info", "trace_model"),
+    "identify.fit": ("fit_prior",),
+    "identify.networks": ("GRUNetwork",),
+    "identify.output_network": ("train_output", "with_output"),
+    "identify.settings": ("TrainingSettings",),
+    "identify.sindy": ("fit_sindy",),
+    "identify.smooth": ("fit_smoother",),
+    "identify.step": ("HybridStep", "PriorStep", "Scaling", "n_features"),
+    "identify.train": ("train",),
+    "identify.tune": ("SearchSpace", "search"),
+    "job.controllers": ("find_noise",),
+    "job.loops": ("Bench", "LoopRow", "LoopSpec", "varied"),
+    "job.run": ("run",),
+    "job.settings": ("RunSettings",),
+    "job.study": ("FaultKind", "RandomFaults", "Study"),
+    "job.study_results": ("StudyResults", "write_study_report"),
+    "job.study_run": ("dry_run", "run_study"),
+    "kit.artifact": (
         "Kit", "LoopSettings", "ModelInfo", "Provenance", "load", "save_artifact", "set_calibration",
         "set_process_noise",
     ),
-    "assembly": (
+    "kit.assembly": (
         "make_adaptive_guard", "make_controller", "make_estimator", "make_monitor", "make_ocp",
         "make_resting_guard",
     ),
-    "benchmark_spec": ("BenchmarkBudget", "BenchmarkSpec"),
-    "buffered": ("BufferedFunction",),
-    "closed_loop": ("ClosedLoopResult", "Fault", "Guard", "Loop", "Mode", "Runner", "SafeEnd", "simulate"),
-    "closed_loop.faults": ("check_plant_faults", "corrupt_input", "corrupt_measurement"),
-    "data": (
-        "CausalPolynomial", "Dataset", "LocalPolynomial", "SmoothingSpline", "Trajectory", "ZeroPhaseFilter",
-        "check_excitation", "chirp", "differentiate", "excitation_of", "load_trajectories", "multisine",
-        "prbs", "random_steps", "sinusoid", "write_csv",
+    "loop.faults": ("Fault", "check_plant_faults", "corrupt_input", "corrupt_measurement"),
+    "loop.guard": ("Guard", "Mode"),
+    "loop.loop": ("Loop",),
+    "loop.realtime": ("Runner", "SafeEnd"),
+    "loop.simulate": ("ClosedLoopResult", "simulate"),
+    "machine.signals": ("Parameter", "Signal"),
+    "machine.specification": ("BenchmarkBudget", "BenchmarkSpec", "DataSpec", "Role", "Window"),
+    "machine.torch_prior": (
+        "Coulomb", "LoadDependent", "PendulumLoad", "Prior", "Stribeck", "Viscous", "with_friction",
     ),
-    "data_spec": ("DataSpec", "Role", "Window"),
-    "delayed": ("with_input_delay",),
-    "errors": ("InputError", "SafeInputError"),
-    "estimation": (
-        "DelayCompensation", "Estimate", "ExtendedKalmanFilter", "SwitchingFilter", "TrueState",
-        "parameter_factors", "parameter_filter", "parameter_states", "process_noise", "with_parameter_states",
-    ),
-    "files": ("write_arrays",),
-    "identification.evaluation": ("free_runs", "judged", "score"),
-    "identification.export": ("check_parity", "model_info", "trace_model"),
-    "identification.friction": (
-        "Coulomb", "LoadDependent", "PendulumLoad", "Stribeck", "Viscous", "with_friction",
-    ),
-    "identification.lags": ("with_input_lag",),
-    "identification.networks": ("GRUNetwork",),
-    "identification.output_network": ("train_output", "with_output"),
-    "identification.prior_fit": ("fit_prior",),
-    "identification.search": ("search",),
-    "identification.search_space": ("SearchSpace",),
-    "identification.settings": ("TrainingSettings",),
-    "identification.sindy": ("fit_sindy",),
-    "identification.smoothing": ("fit_smoother",),
-    "identification.step": ("HybridStep", "PriorStep", "Scaling", "n_features"),
-    "identification.training": ("train",),
-    "job.contenders": ("find_noise",),
-    "job.loops": ("Bench", "LoopRow", "LoopSpec", "varied"),
-    "model": ("HybridModel", "longer_period"),
-    "monitor": (
-        "Calibration", "Detector", "Diagnoser", "EnergyMonitor", "Plausibility", "count_alarms",
-        "excess_bound", "guard_monitor", "learn_from", "learn_plausibility", "region_bound", "replay",
-        "rest_speeds",
-    ),
-    "mpc": (
-        "OCP", "BestOf", "CondensedController", "IpoptController", "Limits", "SQPController",
-        "SafeController", "SoftBound", "Status", "output_cost",
-    ),
-    "physics": ("Prior",),
-    "pipeline.run": ("run",),
-    "pipeline.settings": ("RunSettings",),
-    "reproduction": ("Claim", "Effort", "Experiment"),
-    "riccati": ("dare", "lqr"),
-    "scenario": ("DEFAULT_BUDGETS", "Budget", "Scenario", "Task", "load_scenario"),
-    "signals": ("Parameter", "Signal"),
-    "studies": (
-        "FaultKind", "RandomFaults", "Study", "StudyResults", "run_study", "write_study_report",
-    ),
-    "studies.dry_run": ("dry_run",),
+    "model.buffered": ("BufferedFunction",),
+    "model.delay": ("with_input_delay",),
+    "model.model": ("HybridModel", "longer_period"),
+    "model.riccati": ("dare", "lqr"),
+    "monitor.calibrate": ("Calibration", "count_alarms"),
+    "monitor.detector": ("Detector",),
+    "monitor.diagnose": ("Diagnoser",),
+    "monitor.energy": ("EnergyMonitor",),
+    "monitor.learn": ("guard_monitor", "learn_from"),
+    "monitor.lengths": ("rest_speeds",),
+    "monitor.plausibility": ("Plausibility", "excess_bound", "learn_plausibility", "region_bound"),
+    "monitor.replay": ("replay",),
+    "scenario": ("Budget", "DEFAULT_BUDGETS", "Scenario", "Task", "load_scenario"),
 }  # fmt: skip
-"""Names by the room that they are imported from."""
+"""Public names by the module that defines them."""
 _HOME = {name: room for room, names in _ROOMS.items() for name in names}
 
 

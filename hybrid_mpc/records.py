@@ -94,7 +94,7 @@ def record(kind: type[T], data: object, where: str) -> T:
         InputError: Naming all fields that are missing, unknown (with the nearest known one) or do not fit.
 
     Example:
-        >>> from hybrid_mpc.signals import Signal
+        >>> from hybrid_mpc.machine.signals import Signal
         >>> record(Signal, {"name": "q", "unit": "m", "upper": "inf"}, "model.json").label
         'q [m]'
         >>> record(Signal, {"nam": "q", "unit": 3}, "model.json")

@@ -8,46 +8,23 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.benchmark_spec import BenchmarkSpec, check_anchors
-from hybrid_mpc.data_spec import DataSpec
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.machine.specification import BenchmarkSpec, DataSpec, check_anchors
 
 if TYPE_CHECKING:
-    from hybrid_mpc.closed_loop.faults import Fault
-    from hybrid_mpc.closed_loop.result import ClosedLoopResult
-    from hybrid_mpc.model import HybridModel
-    from hybrid_mpc.mpc.ocp import OCP
-    from hybrid_mpc.physics import Prior
-    from hybrid_mpc.reproduction.experiment import Experiment
+    from hybrid_mpc.control.ocp import OCP
+    from hybrid_mpc.loop.faults import Fault
+    from hybrid_mpc.loop.plant import Plant
+    from hybrid_mpc.loop.simulate import ClosedLoopResult
+    from hybrid_mpc.machine.torch_prior import Prior
+    from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
-
-
-class Plant(Protocol):
-    """The machine in simulation. Its state is its own affair; ``truth`` gives the model's states.
-
-    It uses numpy, scipy and casadi only, and its own integrator with its own tolerance.
-    """
-
-    def reset(self, x0: Array, seed: int) -> Any:
-        """Plant state at rest within itself at the model state ``x0`` ``(n_x,)`` [SI]."""
-
-    def step(self, state: Any, u: Array, dt: float) -> Any:
-        """Plant state after ``dt`` [s] with the input ``u`` ``(n_u,)`` held."""
-
-    def measure(self, state: Any, rng: np.random.Generator) -> Array:
-        """Measured outputs ``(n_y,)`` with sensor noise drawn from ``rng``."""
-
-    def truth(self, state: Any) -> Array:
-        """True model states ``(n_x,)``."""
-
-    def hidden(self, state: Any) -> Array:
-        """True internal states ``(n_h,)`` in the order of the scenario's oracle model (may be empty)."""
 
 
 @dataclass(frozen=True)
@@ -151,9 +128,8 @@ class Scenario:
         tasks: Closed-loop tasks.
         budgets: Effort by name.
         draw: ``x (n_x,) -> polylines (m, 2) [m]`` of the machine, for moving pictures; default: none.
-        experiment: The paper's experiment on it, for ``hybrid-mpc reproduce``; default: none.
         causes: What may break, by name: the prior's parameters (or ``"gain of <input>"``) that change together then,
-            for :class:`~hybrid_mpc.monitor.Diagnoser`. Default: each by itself.
+            for :class:`~hybrid_mpc.monitor.diagnose.Diagnoser`. Default: each by itself.
         benchmark: How ``hybrid-mpc benchmark`` judges the machine on recordings; default: not at all.
         beyond_recordings: Whether tasks go where no recording was. A network knows nothing there, so the filters on the
             hybrid then assume no less process noise than those on the prior; see also ``Budget.anchors``. Default: no.
@@ -180,7 +156,6 @@ class Scenario:
     tasks: tuple[Task, ...] = ()
     budgets: Mapping[str, Budget] = field(default_factory=lambda: DEFAULT_BUDGETS)
     draw: Callable[[Array], Sequence[Array]] | None = None
-    experiment: Experiment | None = None
     causes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     benchmark: BenchmarkSpec | None = None
     beyond_recordings: bool = False

@@ -16,7 +16,7 @@ from hybrid_mpc import (
     SafeController,
     simulate,
 )
-from hybrid_mpc.mpc import Source
+from hybrid_mpc.control.safeguard import Source
 
 DT = 0.02
 POINT = [0.0, 1.0], [0.0]

@@ -35,7 +35,7 @@ def call(monkeypatch, capsys):
     """Run ``hybrid-mpc`` with some words in this process: ``(exit code, stdout, stderr)``."""
 
     def run(*words):
-        from hybrid_mpc.cli import main
+        from hybrid_mpc.cli.main import main
 
         monkeypatch.setattr(sys, "argv", ["hybrid-mpc", *map(str, words)])
         try:
@@ -69,7 +69,7 @@ def golf_artifact(tmp_path_factory) -> Path:
     import torch
 
     from hybrid_mpc import HybridStep, PriorStep, Scaling, model_info, n_features, save_artifact, trace_model
-    from hybrid_mpc.identification.networks import StackedGRU
+    from hybrid_mpc.identify.networks import StackedGRU
     from scenarios.golf_robot.prior import GolfRobotPrior
 
     prior = GolfRobotPrior()

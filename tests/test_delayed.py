@@ -9,8 +9,8 @@ import pytest
 from online_models import pendulum_model
 
 from hybrid_mpc import InputError, load, save_artifact, with_input_delay
-from hybrid_mpc.artifact import FILE
-from hybrid_mpc.delayed import MOST_WAITING
+from hybrid_mpc.kit.artifact import FILE
+from hybrid_mpc.model.delay import MOST_WAITING
 
 DT = 0.02
 

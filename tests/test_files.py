@@ -37,7 +37,7 @@ from pathlib import Path
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 sys.argv = ["hybrid-mpc", *sys.argv[1:]]
-from hybrid_mpc.cli import main
+from hybrid_mpc.cli.main import main
 main()
 """
 """The command line on a disk that is full after 20 kB of any file."""

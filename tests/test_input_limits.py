@@ -28,15 +28,13 @@ from hybrid_mpc import (
     make_resting_guard,
     simulate,
 )
-from hybrid_mpc.analysis.study_models import drive
-from hybrid_mpc.analysis.study_signals import measured_part
-from hybrid_mpc.analysis.subject import _inputs, _outer, _range
-from hybrid_mpc.assembly import freezing, working_point
-from hybrid_mpc.input_limits import share_used
+from hybrid_mpc.job.analyze import _inputs, _outer, _range, drive, measured_part
+from hybrid_mpc.job.check import check_scenario
 from hybrid_mpc.job.loops import excess, limits_used
-from hybrid_mpc.pipeline.judge import unknown_load
-from hybrid_mpc.pipeline.preflight import check_scenario
-from hybrid_mpc.plots import Motion, closed_loops
+from hybrid_mpc.job.stages.monitor import unknown_load
+from hybrid_mpc.kit.assembly import freezing, working_point
+from hybrid_mpc.model.limits import share_used
+from hybrid_mpc.plots.loops import Motion, closed_loops
 
 INF = np.inf
 FINITE = {
@@ -120,7 +118,7 @@ class Track:
 def carts(tmp_path_factory):
     """The scenario of the cart, and its prior as a deployed model."""
     from hybrid_mpc import PriorStep, model_info, trace_model
-    from hybrid_mpc.artifact import build_model
+    from hybrid_mpc.kit.artifact import build_model
 
     path = tmp_path_factory.mktemp("cart") / "cart.py"
     path.write_text(cart.MACHINE)

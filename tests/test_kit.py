@@ -26,7 +26,7 @@ from hybrid_mpc import (
     set_process_noise,
     simulate,
 )
-from hybrid_mpc.artifact import loop_settings, read_description, write_description
+from hybrid_mpc.kit.artifact import loop_settings, read_description, write_description
 
 README = Path(__file__).parents[1] / "README.md"
 GOLF = load_scenario("golf_robot")

@@ -20,8 +20,8 @@ from hybrid_mpc import (
     longer_period,
     with_input_delay,
 )
-from hybrid_mpc.model import Balance, prior_acceleration, step_symbols
-from hybrid_mpc.mpc.stages import Stages, VectorisedStages
+from hybrid_mpc.model.model import Balance, prior_acceleration, step_symbols
+from hybrid_mpc.model.stages import Stages, VectorisedStages
 
 DT = 0.1
 STATES = Signal("q", "m"), Signal("v", "m/s")

@@ -7,9 +7,9 @@ import time
 from pathlib import Path
 
 from hybrid_mpc import Study, run_study
-from hybrid_mpc.studies import runner
-from hybrid_mpc.studies.draws import generator
-from hybrid_mpc.studies.note import ModelNote, NoiseNote
+from hybrid_mpc.job import study_run as runner
+from hybrid_mpc.job.study import generator
+from hybrid_mpc.job.study_log import ModelNote, NoiseNote
 
 SCENARIO = "golf_robot"
 

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hybrid_mpc.cli.options import MOST_SEED
+from hybrid_mpc.records import MOST_SEED
 
 if TYPE_CHECKING:
-    from hybrid_mpc.analysis.subject import Request
+    from hybrid_mpc.job.analyze import Request
 
 EXAMPLES = (
     "Examples:\n\n"
@@ -38,11 +38,10 @@ def analyze(
     seed: Annotated[int, typer.Option(help="Seed of what is drawn at random.", min=0, max=MOST_SEED)] = 0,
 ) -> None:
     """Poles, Bode plots, margins of the control loop and more, as tables, pictures and a page."""
-    from hybrid_mpc.analysis.outputs import write_analysis
-    from hybrid_mpc.analysis.study import study
-    from hybrid_mpc.analysis.subject import Request, subject_of
     from hybrid_mpc.cli.progress import make_progress
     from hybrid_mpc.files import check_folder
+    from hybrid_mpc.job.analyze import Request, study, subject_of
+    from hybrid_mpc.job.analyze_page import write_analysis
 
     check_folder(out)
     request = Request(model, scenario, tuple(data or ()), speed, seed)

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from hybrid_mpc.cli.options import MOST_SEED, ScenarioName
+from hybrid_mpc.cli.options import ScenarioName
+from hybrid_mpc.records import MOST_SEED
 
 EXAMPLES = (
     "Examples:\n\n"
@@ -42,9 +43,8 @@ def benchmark(
 ) -> None:
     """Fit the prior, train networks on it, and judge free runs over unseen recordings."""
     from hybrid_mpc.cli.progress import make_progress
-    from hybrid_mpc.pipeline.machine_benchmark.figures import draw
-    from hybrid_mpc.pipeline.machine_benchmark.job import BenchmarkSettings, table
-    from hybrid_mpc.pipeline.machine_benchmark.job import benchmark as run_job
+    from hybrid_mpc.job.benchmark import BenchmarkSettings, draw, table
+    from hybrid_mpc.job.benchmark import benchmark as run_job
     from hybrid_mpc.scenario import load_scenario
 
     folder = out or Path("runs") / f"{Path(machine).stem}-benchmark"

@@ -7,7 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from hybrid_mpc.cli.options import MOST_SEED, EmptyFolder, ScenarioName
+from hybrid_mpc.cli.options import EmptyFolder, ScenarioName
+from hybrid_mpc.records import MOST_SEED
 from hybrid_mpc.scenario import load_scenario
 
 EXAMPLES = (
@@ -58,14 +59,14 @@ def control(
     """Close the loop around the simulated machine with a trained model, without training anything."""
     from hybrid_mpc.cli.progress import make_progress
     from hybrid_mpc.files import check_folder
-    from hybrid_mpc.pipeline.control_job import (
+    from hybrid_mpc.job.control import (
         DEFAULT_CONTROLLERS,
         GUARDED_CONTROLLERS,
         ControlSettings,
         parsed_fault,
         prepared,
+        run_control,
     )
-    from hybrid_mpc.pipeline.control_results import run_control
 
     check_folder(out)
     settings = ControlSettings(

@@ -11,10 +11,11 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from hybrid_mpc.cli.options import MOST_SEED, EmptyFolder, ScenarioName
-from hybrid_mpc.data.differentiation import bandwidth
+from hybrid_mpc.cli.options import EmptyFolder, ScenarioName
+from hybrid_mpc.data.differentiate import bandwidth
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import check_folder, write_text
+from hybrid_mpc.records import MOST_SEED
 from hybrid_mpc.scenario import Scenario, load_scenario
 
 EXAMPLES = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from importlib.metadata import entry_points
 from typing import Annotated
 
 # Before numpy or torch are loaded: arrays here are small, threads inside them only cost time.
@@ -23,7 +24,6 @@ from hybrid_mpc.cli import benchmark as benchmark_command
 from hybrid_mpc.cli import control as control_command
 from hybrid_mpc.cli import data as data_command
 from hybrid_mpc.cli import monitor as monitor_command
-from hybrid_mpc.cli import reproduce as reproduce_command
 from hybrid_mpc.cli import run as run_command
 from hybrid_mpc.cli import scenarios as scenarios_command
 from hybrid_mpc.cli import search as search_command
@@ -56,7 +56,6 @@ app = typer.Typer(
 )
 app.command("run", epilog=run_command.EXAMPLES)(run_command.run)
 app.command("control", epilog=control_command.EXAMPLES)(control_command.control)
-app.command("reproduce", epilog=reproduce_command.EXAMPLES)(reproduce_command.reproduce)
 app.command("analyze", epilog=analyze_command.EXAMPLES)(analyze_command.analyze)
 app.command("benchmark", epilog=benchmark_command.EXAMPLES)(benchmark_command.benchmark)
 app.command("data", epilog=data_command.EXAMPLES)(data_command.data)
@@ -64,6 +63,9 @@ app.command("search", epilog=search_command.EXAMPLES)(search_command.search)
 app.command("monitor", epilog=monitor_command.EXAMPLES)(monitor_command.monitor)
 app.command("scenarios")(scenarios_command.scenarios)
 app.add_typer(study_command.app, name="study")
+for entry in entry_points(group="hybrid_mpc.commands"):  # commands of scenarios, e.g. `reproduce`
+    command = entry.load()
+    app.command(entry.name, epilog=sys.modules[entry.module].EXAMPLES)(command)
 
 
 def _version(wanted: bool) -> None:

@@ -11,7 +11,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.scenario import scenario_of
 
 if TYPE_CHECKING:
-    from hybrid_mpc.pipeline.monitor_job import MonitorJob
+    from hybrid_mpc.job.monitor import MonitorJob
 
 EXAMPLES = (
     "Examples:\n\n"
@@ -47,11 +47,11 @@ def monitor(
 
     Exit code 1 if nothing of a recording could be judged.
     """
-    from hybrid_mpc.artifact import FILE, artifact_folder, read_description
     from hybrid_mpc.cli.progress import make_progress
     from hybrid_mpc.files import check_folder
-    from hybrid_mpc.pipeline.monitor_job import learn as learn_job
-    from hybrid_mpc.pipeline.monitor_job import prepared, watch
+    from hybrid_mpc.job.monitor import learn as learn_job
+    from hybrid_mpc.job.monitor import prepared, watch
+    from hybrid_mpc.kit.artifact import FILE, artifact_folder, read_description
 
     check_folder(out)
     folder = artifact_folder(model)

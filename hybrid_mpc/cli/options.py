@@ -7,8 +7,6 @@ from typing import Annotated, TypeAlias
 
 import typer
 
-from hybrid_mpc.records import MOST_SEED as MOST_SEED
-
 ScenarioName: TypeAlias = Annotated[
     str, typer.Argument(help="A registered name (see: hybrid-mpc scenarios) or a .py file.")
 ]

@@ -8,15 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
-from hybrid_mpc.cli.options import (
-    MOST_SEED,
-    Device,
-    InputColumns,
-    OutputColumns,
-    Recordings,
-    ScenarioName,
-    TimeColumn,
-)
+from hybrid_mpc.cli.options import Device, InputColumns, OutputColumns, Recordings, ScenarioName, TimeColumn
+from hybrid_mpc.records import MOST_SEED
 
 INCOMPLETE = 1
 """Exit code of a run whose report lacks a part."""
@@ -52,9 +45,9 @@ def run(
     Exit code 1 if a stage after the export could not run; the report then says why.
     """
     from hybrid_mpc.cli.progress import make_progress
-    from hybrid_mpc.pipeline.context import failed_stages
-    from hybrid_mpc.pipeline.run import run as run_job
-    from hybrid_mpc.pipeline.settings import RunSettings
+    from hybrid_mpc.job.context import failed_stages
+    from hybrid_mpc.job.run import run as run_job
+    from hybrid_mpc.job.settings import RunSettings
 
     folder = out or Path("runs") / Path(scenario).stem
     settings = RunSettings(

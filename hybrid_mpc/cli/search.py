@@ -7,14 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from hybrid_mpc.cli.options import (
-    MOST_SEED,
-    InputColumns,
-    OutputColumns,
-    Recordings,
-    ScenarioName,
-    TimeColumn,
-)
+from hybrid_mpc.cli.options import InputColumns, OutputColumns, Recordings, ScenarioName, TimeColumn
+from hybrid_mpc.records import MOST_SEED
 
 EXAMPLES = (
     "Examples:\n\n"
@@ -52,8 +46,8 @@ def search(
 ) -> None:
     """Search hidden units and other settings of the networks by the validation error of free runs."""
     from hybrid_mpc.cli.progress import make_progress
-    from hybrid_mpc.identification.search_space import parsed_space
-    from hybrid_mpc.pipeline.search_job import SearchSettings, run_search, usage
+    from hybrid_mpc.identify.tune import parsed_space
+    from hybrid_mpc.job.tune import SearchSettings, run_search, usage
 
     folder = out or Path("runs") / f"search-{Path(scenario).stem}"
     settings = SearchSettings(

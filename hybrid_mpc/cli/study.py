@@ -12,20 +12,18 @@ from hybrid_mpc.errors import InputError
 if TYPE_CHECKING:
     import pandas as pd
 
-    from hybrid_mpc.studies import Study, StudyResults
-    from hybrid_mpc.studies.dry_run import Plan
+    from hybrid_mpc.job.study import Study
+    from hybrid_mpc.job.study_results import StudyResults
+    from hybrid_mpc.job.study_run import Plan
 
 EXAMPLES = (
     "Examples:\n\n"
     "  hybrid-mpc study list\n\n"
     "  hybrid-mpc study run plant_variation --model runs/golf/model --out studies/variation --dry-run\n\n"
     "  hybrid-mpc study run mine.yaml --workers 2 --out studies/mine\n\n"
-    "  hybrid-mpc study run monitor --model runs/golf/model --out studies/monitor --budget quick\n\n"
     "  hybrid-mpc study run horizon_size --model z16=runs/small --model z32=runs/golf --out studies/size\n\n"
     "  hybrid-mpc study run mine.yaml --scheduler tcp://10.0.0.7:8786 --out studies/mine --resume"
 )
-MONITOR = "monitor"
-"""The ready study that learns before it judges."""
 FAILED = 1
 """Exit code where runs have failed."""
 
@@ -61,24 +59,11 @@ def run(
     dry: Annotated[
         bool, typer.Option("--dry-run", help="Say how many runs there are, and how long they take.")
     ] = False,
-    budget: Annotated[
-        str | None, typer.Option(help="Size of the study monitor: full (default) or quick.")
-    ] = None,
 ) -> None:
     """Run a study; exit code 1 if runs have failed."""
     from hybrid_mpc.cli.progress import make_progress
-    from hybrid_mpc.studies import run_study
-    from hybrid_mpc.studies.dry_run import dry_run
+    from hybrid_mpc.job.study_run import dry_run, run_study
 
-    if study == MONITOR:
-        if dry or scheduler is not None:
-            raise InputError(
-                "study monitor runs in processes of this machine, and has no dry run; leave these out"
-            )
-        _run_monitor(_models(model), budget or "full", out, workers, resume, retry_failed)
-        return
-    if budget is not None:
-        raise InputError(f"study {study}: only the study monitor has budgets; leave --budget out")
     wanted = _study(study, _models(model), scenario)
     if dry:
         with make_progress() as progress:
@@ -97,45 +82,11 @@ def run(
         raise typer.Exit(FAILED)
 
 
-def _run_monitor(
-    models: dict[str, str],
-    budget: str,
-    out: Path,
-    workers: int,
-    resume: bool,
-    retry_failed: bool,
-) -> None:
-    from hybrid_mpc.cli.progress import make_progress
-    from hybrid_mpc.studies.monitor_plan import monitor_study
-    from hybrid_mpc.studies.monitor_study import run_monitor_study
-
-    if len(models) != 1:
-        raise InputError(
-            f"study monitor needs one model, got {len(models)}: --model FOLDER, e.g. model/ of a finished run"
-        )
-    with make_progress() as progress:
-        wanted = monitor_study(next(iter(models.values())), budget)
-        results = run_monitor_study(
-            wanted, out, workers=workers, resume=resume, retry_failed=retry_failed, progress=progress,
-        )  # fmt: skip
-    print((out / "table.md").read_text(encoding="utf-8"))
-    print(f"report: {(out / 'report.html').resolve()}")
-    if results["jobs"]["failed"]:
-        print(f"{results['jobs']['failed']} jobs failed; {out / 'runs'} has their tracebacks")
-        raise typer.Exit(FAILED)
-
-
 @app.command("report")
 def report(folder: Annotated[Path, typer.Argument(help="Folder of a study.")]) -> None:
     """Write report.html, of a study that still runs too."""
-    from hybrid_mpc.studies import StudyResults
-    from hybrid_mpc.studies.monitor_study import finish, is_monitor_study
-    from hybrid_mpc.studies.report import write_study_report
+    from hybrid_mpc.job.study_results import StudyResults, write_study_report
 
-    if is_monitor_study(folder):
-        finish(folder)
-        print(f"report: {(folder / 'report.html').resolve()}")
-        return
     print(f"report: {write_study_report(StudyResults.load(folder)).resolve()}")
 
 
@@ -146,7 +97,7 @@ def compare(
     value: Annotated[str, typer.Option(help="Figure to compare.")] = "cost",
 ) -> None:
     """Compare two studies run by run, on common draws and seeds."""
-    from hybrid_mpc.studies import StudyResults
+    from hybrid_mpc.job.study_results import StudyResults
 
     found = StudyResults.load(first).compare(StudyResults.load(second), value)
     for column, (one, two) in found.attrs["differs"].items():
@@ -158,19 +109,14 @@ def compare(
 @app.command("list")
 def list_ready() -> None:
     """List the studies that are ready."""
-    from hybrid_mpc.studies.monitor_plan import monitor_study
-    from hybrid_mpc.studies.ready import READY, ready_study
+    from hybrid_mpc.job.study import READY, ready_study
 
     for name, ready in READY.items():
         print(f"{name:16} {ready_study(name, 'model').size:6} runs with one model: {ready.title}")
-    print(
-        f"{MONITOR:16} {monitor_study('model').size:6} jobs: delays and misses of faults, false alarms, a guard's worth"
-    )
 
 
 def _study(name: str, models: dict[str, str], scenario: str) -> Study:
-    from hybrid_mpc.studies.files import read_study
-    from hybrid_mpc.studies.ready import READY, ready_study
+    from hybrid_mpc.job.study import READY, read_study, ready_study
 
     if name in READY:
         if scenario:
@@ -180,7 +126,7 @@ def _study(name: str, models: dict[str, str], scenario: str) -> Study:
         return ready_study(name, models)
     if not Path(name).is_file() and Path(name).suffix not in (".yaml", ".yml"):
         raise InputError(
-            f"no study {name!r}; ready are: {', '.join((*READY, MONITOR))}. Or give the path of a .yaml file."
+            f"no study {name!r}; ready are: {', '.join(READY)}. Or give the path of a .yaml file."
         )
     return read_study(
         name, **({"models": models} if models else {}), **({"scenario": scenario} if scenario else {})
@@ -202,7 +148,7 @@ def _models(given: list[str] | None) -> dict[str, str]:
 
 
 def _plan(plan: Plan, workers: int) -> list[str]:
-    from hybrid_mpc.studies.runner import duration_text
+    from hybrid_mpc.job.study_results import duration_text
 
     axes = " x ".join(f"{n} {name}" for name, n in plan.axes.items() if n > 1) or "a single one"
     lines = [f"{plan.runs} runs: {axes}"]

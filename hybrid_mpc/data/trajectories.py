@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from hybrid_mpc.data.differentiation import local_polynomial, window_samples
+from hybrid_mpc.data.differentiate import local_polynomial, window_samples
 from hybrid_mpc.data.doubts import Finding, doubts_of
 from hybrid_mpc.data.tables import MIN_SCORED, Table, checked_tables
-from hybrid_mpc.data_spec import DataSpec, Role, Window
 from hybrid_mpc.errors import SHOWN, InputError, refuse
-from hybrid_mpc.signals import Signal
+from hybrid_mpc.machine.signals import Signal
+from hybrid_mpc.machine.specification import DataSpec, Role, Window
 
 Array = NDArray[np.float64]
 ROLES: tuple[Role, ...] = ("train", "valid", "test")
@@ -133,7 +133,7 @@ def load_trajectories(
 
     Example:
         >>> import tempfile
-        >>> from hybrid_mpc.data import write_csv
+        >>> from hybrid_mpc.data.files import write_csv
         >>> spec = DataSpec("t", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.5)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     t = 0.01 * np.arange(1000)

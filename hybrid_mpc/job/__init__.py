@@ -1,1 +1,1 @@
-"""Jobs: closed loops from a specification to a row, the folder that a job works in, and the engine that runs it."""
+"""Jobs: the main job and its stages, closed loops compared, studies, and the engine that runs them."""

@@ -1,7 +1,8 @@
-"""One closed-loop run: from its specification to its row, on a bench that holds the machine and its models."""
+"""Rows of closed loops summed up: means with intervals, by task and controller."""
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
@@ -11,37 +12,112 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.artifact import WATCHES, Kit
-from hybrid_mpc.assembly import (
-    SOLVERS,
-    make_adaptive_guard,
-    make_backup_guard,
-    make_resting_guard,
-)
-from hybrid_mpc.closed_loop.faults import Fault, check_channels, install
-from hybrid_mpc.closed_loop.guard import Guard
-from hybrid_mpc.closed_loop.result import ClosedLoopResult
-from hybrid_mpc.closed_loop.simulate import Simulation, Step, simulate_together
-from hybrid_mpc.closed_loop.timing import percentiles
+from hybrid_mpc.control.ocp import OCP
+from hybrid_mpc.control.safeguard import SafeController, Source
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimation.kalman import Estimator
+from hybrid_mpc.estimate.kalman import Estimator
 from hybrid_mpc.files import digest
-from hybrid_mpc.input_limits import share_used
-from hybrid_mpc.job.contenders import CONTENDERS, build
-from hybrid_mpc.job.rounds import repeated
-from hybrid_mpc.model import HybridModel
-from hybrid_mpc.monitor import EnergyMonitor
-from hybrid_mpc.monitor.calibration import alarm_intervals
-from hybrid_mpc.mpc import OCP, SafeController, Source
+from hybrid_mpc.job.controllers import CONTENDERS, build
+from hybrid_mpc.kit.artifact import WATCHES, Kit
+from hybrid_mpc.kit.assembly import SOLVERS, make_adaptive_guard, make_backup_guard, make_resting_guard
+from hybrid_mpc.loop.faults import Fault, check_channels, install
+from hybrid_mpc.loop.guard import Guard
+from hybrid_mpc.loop.plant import Plant
+from hybrid_mpc.loop.realtime import percentiles
+from hybrid_mpc.loop.simulate import ClosedLoopResult, Simulation, Step, simulate_together
+from hybrid_mpc.model.limits import share_used
+from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.monitor.calibrate import alarm_intervals
+from hybrid_mpc.monitor.energy import EnergyMonitor
 from hybrid_mpc.records import known, plain
-from hybrid_mpc.scenario import Plant, Scenario, Task, load_scenario, registered_scenarios
+from hybrid_mpc.scenario import Scenario, Task, load_scenario, registered_scenarios
+
+# A task over and over: what a long loop follows.
 
 Array = NDArray[np.float64]
+RETURN_S = 1.0
+"""Shortest way back to the reference's beginning [the machine's seconds]."""
+
+
+def repeated(task: Task, dt: float, shares: Array, time_unit: float = 1.0) -> Task:
+    """The task over and over: to its end, back to its beginning along a quintic, and again.
+
+    Args:
+        task: A task; its reference is asked for within its duration alone.
+        dt: Period [s]; a round takes whole periods, since weights may be of single instants.
+        shares: Factor ``(m,)`` on the distance from the reference's beginning, a round each.
+        time_unit: The machine's second [s]: the way back takes one at least. Default 1.
+
+    Returns:
+        The task of ``m`` rounds.
+
+    Example:
+        >>> ramp = Task("ramp", "", 1.0, (0.0, 0.0), lambda t: np.column_stack([t, np.ones(len(t))]))
+        >>> twice = repeated(ramp, 0.02, np.array([1.0, 0.5]))
+        >>> twice.duration, twice.reference(np.array([0.5, 3.5])).round(6).tolist()
+        (6.0, [[0.5, 1.0], [0.25, 0.5]])
+    """
+    n_q, length = len(task.x0) // 2, round(task.duration / dt)
+    rows = task.reference(np.arange(length + 1, dtype=np.float64) * dt)
+    first, last = rows[0], rows[-1]
+    fastest = np.abs(rows[:, n_q : 2 * n_q]).max(axis=0)
+    far = np.abs(last - first)[:n_q] / np.maximum(fastest, 1e-9)  # a quintic's top speed is 15/8 of its mean
+    back = max(RETURN_S * time_unit, 2.0 * float(far.max(initial=0.0)) if np.all(fastest > 0) else 0.0)
+    period = (length + math.ceil(back / dt - 1e-9)) * dt
+    curve = [
+        _quintic(first[i], last[i], first[n_q + i], last[n_q + i], period - length * dt) for i in range(n_q)
+    ]
+
+    def place(t: Array) -> tuple[NDArray[np.int_], Array, NDArray[np.bool_]]:
+        number = np.clip(np.floor(t / period + 1e-9).astype(int), 0, None)
+        inside = np.maximum(t - number * period, 0.0)
+        return np.minimum(number, len(shares) - 1), inside, inside < length * dt - 1e-9
+
+    def reference(t: Array) -> Array:
+        number, inside, during = place(np.asarray(t, dtype=float))
+        rows = np.tile(last, (len(inside), 1))
+        if during.any():
+            rows[during] = task.reference(inside[during])
+        left = inside[~during] - length * dt
+        for i, polynomial in enumerate(curve):
+            rows[~during, i], rows[~during, n_q + i] = polynomial(left), polynomial.deriv()(left)
+        start = np.concatenate([first[:n_q], np.zeros(len(first) - n_q)])
+        rows[:, : 2 * n_q] = (start + shares[number, None] * (rows - start))[:, : 2 * n_q]
+        return rows
+
+    def weight(t: Array) -> Array:
+        assert task.weight is not None
+        _, inside, during = place(np.asarray(t, dtype=float))
+        rows = np.ones((len(inside), len(task.x0)))
+        if during.any():
+            rows[during] = task.weight(inside[during])
+        return rows
+
+    return replace(
+        task,
+        duration=round(period * len(shares), 9),
+        reference=reference,
+        weight=None if task.weight is None else weight,
+        figures=None,
+    )
+
+
+def _quintic(p1: float, p0: float, v1: float, v0: float, time: float) -> np.polynomial.Polynomial:
+    """From position ``p0`` and speed ``v0`` to ``p1`` and ``v1`` within ``time``, without acceleration at the ends."""
+    d = p1 - p0
+    a3 = (10 * d - time * (6 * v0 + 4 * v1)) / time**3
+    a4 = (-15 * d + time * (8 * v0 + 7 * v1)) / time**4
+    a5 = (6 * d - time * 3 * (v0 + v1)) / time**5
+    return np.polynomial.Polynomial([p0, v0, 0.0, a3, a4, a5])
+
+
+# One closed-loop run: from its specification to its row, on a bench that holds the machine and its models.
+
 MODEL = "model"
 """Label of the model on the bench where there is one."""
 Intervals: TypeAlias = tuple[tuple[float, float], ...]
 MONITORS = (*WATCHES, "none")
-"""What watches a hybrid, see :meth:`~hybrid_mpc.artifact.Kit.monitor`; or nothing does."""
+"""What watches a hybrid, see :meth:`~hybrid_mpc.kit.artifact.Kit.monitor`; or nothing does."""
 ALARMING = ("energy", "guard")
 """Those that alarm."""
 GUARDS = ("", "rest", "adapt", "prior")
@@ -78,7 +154,7 @@ class LoopSpec:
         guard: Name in :data:`GUARDS`. It acts on the alarms of the monitor, so it needs one that alarms.
         run_seed: Seed of the run that the loop belongs to.
         rounds: The task is run over and over, with its reference scaled by these factors, one a round. Default: once.
-        keep: Arrays that its row holds: fields of :class:`~hybrid_mpc.closed_loop.ClosedLoopResult`, ``"step_ms"``
+        keep: Arrays that its row holds: fields of :class:`~hybrid_mpc.loop.simulate.ClosedLoopResult`, ``"step_ms"``
             ``(n,)`` and ``"plans"`` ``(n, N + 1, n_x)``. No part of the run's identity.
         number: Place in a study, no part of the run's identity.
 
@@ -698,3 +774,111 @@ def check_faults(scenario: Scenario, faults: Sequence[Fault]) -> None:
     assert scenario.control is not None
     outside = install(scenario.plant(), faults)[1]
     check_channels(outside, len(scenario.sensor_sigma), scenario.control.n_u)
+
+
+@dataclass(frozen=True)
+class Mean:
+    """A mean with its 95 % interval (Student's t).
+
+    Args:
+        mean: The mean; None where a value is not finite, or there is none.
+        ci95: Half width of the interval; None of a single value.
+        n: Number of values.
+    """
+
+    mean: float | None
+    ci95: float | None
+    n: int
+
+
+def interval(values: Sequence[float]) -> Mean:
+    """Mean of values and half width of its 95 % interval.
+
+    Args:
+        values: ``(n,)``.
+
+    Example:
+        >>> interval([1.0])
+        Mean(mean=1.0, ci95=None, n=1)
+        >>> found = interval([1.0, 2.0])  # t(0.975, 1) = 12.706, standard error 0.5
+        >>> found.mean, round(found.ci95, 3)
+        (1.5, 6.353)
+    """
+    from scipy.stats import t as student
+
+    x, n = np.asarray(values, dtype=float), len(values)
+    if not (n and np.all(np.isfinite(x))):
+        return Mean(None, None, n)
+    half = float(student.ppf(0.975, n - 1) * x.std(ddof=1) / math.sqrt(n)) if n > 1 else None
+    return Mean(float(x.mean()), half, n)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What the loops of one task and controller come to.
+
+    Args:
+        cost: Closed-loop cost.
+        tracking_rmse: Tracking errors by signal.
+        figures: The task's own figures.
+        mean_abs_figures: Their magnitudes.
+        sources: Share of periods by what gave the input.
+        limits: Largest share of each limit that any loop used.
+    """
+
+    cost: Mean
+    tracking_rmse: Mapping[str, Mean]
+    figures: Mapping[str, Mean]
+    mean_abs_figures: Mapping[str, Mean]
+    sources: Mapping[str, float]
+    limits: Mapping[str, float]
+
+
+def by_task(rows: Sequence[LoopRow]) -> dict[str, dict[str, list[LoopRow]]]:
+    """Rows by task and controller, in the order in which they come.
+
+    Args:
+        rows: The loops.
+    """
+    table: dict[str, dict[str, list[LoopRow]]] = {}
+    for row in rows:
+        table.setdefault(row.task, {}).setdefault(row.controller, []).append(row)
+    return table
+
+
+def summaries(rows: Sequence[LoopRow]) -> dict[str, dict[str, Summary]]:
+    """What loops come to, by task and controller.
+
+    Args:
+        rows: The loops.
+
+    Example:
+        ``summaries(rows)["track_sine"]["hybrid"].cost.mean``
+    """
+    return {task: {name: summary(r) for name, r in cell.items()} for task, cell in by_task(rows).items()}
+
+
+def summary(rows: Sequence[LoopRow]) -> Summary:
+    """What loops of one task and controller come to.
+
+    Args:
+        rows: At least one.
+    """
+
+    def of(
+        pick: Callable[[LoopRow], Mapping[str, float]], change: Callable[[float], float] = float
+    ) -> dict[str, Mean]:
+        return {key: interval([change(pick(row)[key]) for row in rows]) for key in pick(rows[0])}
+
+    limits: dict[str, float] = {}
+    for row in rows:
+        for key, share in row.limits.items():
+            limits[key] = max(share, limits.get(key, 0.0))
+    return Summary(
+        cost=interval([row.cost for row in rows]),
+        tracking_rmse=of(lambda row: row.tracking_rmse),
+        figures=of(lambda row: row.figures),
+        mean_abs_figures=of(lambda row: row.figures, abs),
+        sources={s.name: float(np.mean([row.sources[s.name] for row in rows])) for s in Source},
+        limits=limits,
+    )

@@ -1,4 +1,4 @@
-"""Detector of small, lasting departures: residuals in units of their own scatter, summed up."""
+"""The monitor that a guard listens to, and its detector from nominal recordings."""
 
 from __future__ import annotations
 
@@ -10,8 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.monitor.lengths import SHORTEST_S
-from hybrid_mpc.monitor.rest import REST_SPEED, checked_rest
+from hybrid_mpc.monitor.lengths import (
+    REST_SPEED,
+    SHORTEST_S,
+    checked_rest,
+)
+
+# Detector of small, lasting departures: residuals in units of their own scatter, summed up.
 
 Array = NDArray[np.float64]
 CAP = 1.5
@@ -212,3 +217,6 @@ def force_terms(v2: Array, u2: Array, rest_speed: Sequence[float]) -> Array:
 
 def _fit(row: Sequence[float]) -> bool:
     return len(row) == TERMS and all(math.isfinite(a) and a >= 0 for a in row) and any(row)
+
+
+# A detector learned from nominal data: scales of its residuals, thresholds for a wanted rate of false alarms.

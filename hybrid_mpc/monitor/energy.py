@@ -3,21 +3,137 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from types import MappingProxyType
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.model import HybridModel
-from hybrid_mpc.monitor.balance import Layout, check_model, reading_function
-from hybrid_mpc.monitor.calibration import Calibration
+from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.monitor.calibrate import Calibration
 from hybrid_mpc.monitor.detector import Detector
-from hybrid_mpc.monitor.reading import QUIET, EstimateLike, MonitorReading, MonitorState, Verdict
-from hybrid_mpc.monitor.rest import REST_SPEED, checked_rest
+from hybrid_mpc.monitor.lengths import REST_SPEED, checked_rest
+from hybrid_mpc.monitor.residuals import Layout, check_model, reading_function
+
+# What the energy monitor remembers and what it says.
 
 Array = NDArray[np.float64]
+QUIET = (False, False)
+
+
+class Verdict(IntEnum):
+    """Whether a sample was judged, and if not, why."""
+
+    JUDGED = 0
+    """It was: violation and residual force are numbers."""
+    WARM_UP = 1
+    """The window was not full yet."""
+    MISSING = 2
+    """A measurement or input in the window was missing."""
+    NOT_FINITE = 3
+    """All was there, and still a reading is no number: the model or the estimator is at fault."""
+
+
+SECONDS: Mapping[Verdict, str] = MappingProxyType(
+    {
+        Verdict.JUDGED: "judged_s",
+        Verdict.WARM_UP: "warm_up_s",
+        Verdict.MISSING: "missing_s",
+        Verdict.NOT_FINITE: "not_finite_s",
+    }
+)
+"""Names under which results count the seconds of each."""
+
+
+class EstimateLike(Protocol):
+    """What the monitor reads of an estimate: ``x`` (n_x,) and ``h`` (n_h,). It ignores ``d``."""
+
+    @property
+    def x(self) -> Any:
+        """Estimated state ``(n_x,)``."""
+
+    @property
+    def h(self) -> Any:
+        """Hidden state ``(n_h,)`` before this sample's input."""
+
+
+@dataclass(frozen=True)
+class MonitorState:
+    """All that the monitor remembers. Never changed in place.
+
+    Args:
+        memory: Past measurements, model increments and inputs of the window, the averaged readings, the model's free
+            runs and the rows for :func:`~hybrid_mpc.monitor.diagnose.diagnose`, in one vector; NaN until filled.
+        x: Estimated state ``(n_x,)`` at the latest sample.
+        h: Hidden state ``(n_h,)`` at the latest sample.
+        alarms: True while the alarm on the violation, and the one on the residual force, is on.
+        left: Periods left of each free run. Default: there are none.
+        detector: What the detector of scaled residuals remembers. Default: nothing.
+        frozen: True while the sensor is held for frozen.
+        seen: Samples taken, up to the window's.
+        whole: Samples since something was missing, up to the window's.
+        dark: Samples in a row that were not judged.
+    """
+
+    memory: Array
+    x: Array
+    h: Array
+    alarms: tuple[bool, bool]
+    left: tuple[int, ...] = ()
+    detector: Any = None
+    frozen: bool = False
+    seen: int = 0
+    whole: int = 0
+    dark: int = 0
+
+
+@dataclass(frozen=True)
+class MonitorReading:
+    """One reading. It speaks of the window's centre, ``EnergyMonitor.delay`` before this sample.
+
+    Args:
+        dE_model_w: Energy balance [W] with the model's acceleration.
+        dE_measured_w: Energy balance [W] with the measured acceleration, at the same state.
+        violation_w: ``|dE_model_w - dE_measured_w|`` [W].
+        level_w: Mean violation [W] over the last ``average`` samples.
+        residual: Force that the model does not explain ``(n_q,)`` [N m for an angle, N for a length]; what
+            sticking friction may hold is taken off near rest.
+        residual_level: Length of the mean residual over the last ``average`` samples.
+        alarm: True while any alarm is on, or the monitor is blind; without calibration, detector and freeze test
+            there is no other.
+        energy_j: Energy [J] by which the model's own free run departs from the measurement, accumulated over
+            ``energy_s``; NaN without free runs, and after a missing measurement until the next run.
+        energy_s: Time [s] over which it was accumulated.
+        frozen: True while the sensor repeats itself although the estimator predicts motion or the input asks for it.
+        scores: What the detector compares with its thresholds, each as a share of its threshold: the sum of residual
+            forces, the power of the free runs. Default: none.
+        numbers: What a detector is learned from: both balances, violation, residual, travel, speed and input at the
+            centre; with free runs energy, squared speed and squared input times time, and the time. Default: none.
+        verdict: Whether this sample was judged, and if not, why.
+        blind: True while the monitor has judged nothing for longer than its windows, that of the derivative and that of
+            the averages together: it cannot vouch for the model.
+    """
+
+    dE_model_w: float
+    dE_measured_w: float
+    violation_w: float
+    level_w: float
+    residual: Array
+    residual_level: float
+    alarm: bool
+    energy_j: float = float("nan")
+    energy_s: float = 0.0
+    frozen: bool = False
+    scores: tuple[float, ...] = ()
+    numbers: tuple[float, ...] = ()
+    verdict: Verdict = Verdict.JUDGED
+    blind: bool = False
+
+
 FROZEN_STEPS = 3.0
 """Steps of the sensor that the estimator must have predicted while the sensor repeated itself."""
 
@@ -70,7 +186,7 @@ class EnergyMonitor:
         average: Samples in the moving average of the level.
         calibration: Thresholds of the alarm. Default: none, then there is no alarm from the levels.
         rest_speed: Speeds ``(n_q,)`` [unit of v] below which friction may stick, or one for all: what
-            :func:`~hybrid_mpc.monitor.rest_speeds` finds in recordings. Default: the detector's, else the
+            :func:`~hybrid_mpc.monitor.lengths.rest_speeds` finds in recordings. Default: the detector's, else the
             calibration's, else 0.2, which suits angles in rad/s and was every machine's before rest speeds were
             learned.
         free_run: Length [s] of the model's free runs. Default 0: none.
@@ -79,7 +195,7 @@ class EnergyMonitor:
         input_range: Range ``(n_u,)`` of each input, largest less smallest, for the test for freezing near rest.
             Default: that of the model's signals; there is no such test for an input without bounds,
             and hardly one with wide ones.
-        history: Time [s] over which :func:`~hybrid_mpc.monitor.diagnosis.diagnose` looks back. Default 0: not at all.
+        history: Time [s] over which :func:`~hybrid_mpc.monitor.diagnose.diagnose` looks back. Default 0: not at all.
 
     Raises:
         InputError: If the window, the average or a rest speed is unfit, a free run is no longer than two windows, the
@@ -91,7 +207,7 @@ class EnergyMonitor:
 
     Example:
         >>> import casadi as ca
-        >>> from hybrid_mpc.signals import Signal
+        >>> from hybrid_mpc.machine.signals import Signal
         >>> x, u, rate = ca.MX.sym("x", 2), ca.MX.sym("u"), ca.MX.sym("rate", 2)
         >>> model = HybridModel.of(
         ...     "cart", 0.1, (Signal("q", "m"), Signal("v", "m/s")), (Signal("F", "N"),), (Signal("q", "m"),),

@@ -10,13 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.model import HybridModel
+from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.monitor.detector import Detector
-from hybrid_mpc.monitor.learning import learn_detector
-from hybrid_mpc.monitor.lengths import SETTLING_S
+from hybrid_mpc.monitor.learn import DRIFT, guard_monitor, learn_detector
+from hybrid_mpc.monitor.lengths import SETTLING_S, rest_speeds
 from hybrid_mpc.monitor.replay import EstimatorLike, MonitorTrace, TrajectoryLike, replay
-from hybrid_mpc.monitor.rest import rest_speeds
-from hybrid_mpc.monitor.standard import DRIFT, guard_monitor
 
 Array = NDArray[np.float64]
 TINY = 1e-6
@@ -110,8 +108,8 @@ def leave_one_out(
         false_alarms_per_hour: Wanted rate [1/h]; default 1. Little data ask for more.
         resolution: Step of each sensor ``(n_y,)``. Default: unknown, no test for freezing.
         rest_speed: Speeds ``(n_q,)`` below which friction may stick. Default: what
-            :func:`~hybrid_mpc.monitor.rest_speeds` finds in all clean windows.
-        block_s: Length of a block [s] of the extreme values; see :func:`~hybrid_mpc.monitor.learning.learn_detector`.
+            :func:`~hybrid_mpc.monitor.lengths.rest_speeds` finds in all clean windows.
+        block_s: Length of a block [s] of the extreme values; see :func:`~hybrid_mpc.monitor.learn.learn_detector`.
         data_hash: Hash of the recordings, kept in the detectors.
 
     Raises:

@@ -10,10 +10,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_mpc.control.soft import SoftBound
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.model import HybridModel
-from hybrid_mpc.monitor.balance import energy_balance
-from hybrid_mpc.mpc.soft import SoftBound
+from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.monitor.residuals import energy_balance
 
 Array = NDArray[np.float64]
 MOST = 2000

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.monitor.calibration import alarm_intervals
-from hybrid_mpc.monitor.energy import EnergyMonitor
-from hybrid_mpc.monitor.reading import SECONDS, MonitorReading, MonitorState
+from hybrid_mpc.monitor.calibrate import alarm_intervals
+from hybrid_mpc.monitor.energy import SECONDS, EnergyMonitor, MonitorReading, MonitorState
 
 Array = NDArray[np.float64]
 REPORTED = 500
@@ -54,10 +53,10 @@ Recording = TypeVar("Recording", bound=TrajectoryLike)
 
 @dataclass(frozen=True)
 class MonitorTrace:
-    """Readings over time, all ``(n,)``; see :class:`~hybrid_mpc.monitor.reading.MonitorReading`.
+    """Readings over time, all ``(n,)``; see :class:`~hybrid_mpc.monitor.energy.MonitorReading`.
 
     ``scores`` are ``(n, 2)`` and ``numbers`` ``(n, columns)``; without a detector there are no scores. ``verdict`` are
-    the values of :class:`~hybrid_mpc.monitor.Verdict`. ``state`` is the monitor's after the last sample.
+    the values of :class:`~hybrid_mpc.monitor.energy.Verdict`. ``state`` is the monitor's after the last sample.
 
     Example:
         >>> z = np.zeros(3)

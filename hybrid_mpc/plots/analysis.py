@@ -1,19 +1,22 @@
-"""Figures of the linear analysis: poles in the z-plane, Bode plot."""
+"""Figures of the linear analysis of models: against a machine's response, in time, friction, sensitivities."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MultipleLocator
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.plots.style import (
     FAINT,
+    INK,
     Array,
     axis_label,
     checked,
@@ -21,10 +24,13 @@ from hybrid_mpc.plots.style import (
     line_style,
     name_of,
     new_figure,
+    plain,
+    plain_log,
     shared_legend,
     title_axes,
 )
-from hybrid_mpc.signals import Signal
+
+# Figures of the linear analysis: poles in the z-plane, Bode plot.
 
 _MARKERS = {"phy": "x", "prior": "x", "mopgrnn": "o", "hybrid": "o", "oracle": "s"}
 _DAMPING = (0.1, 0.3, 0.5, 0.7, 0.9)
@@ -194,5 +200,352 @@ def bode(
     title_axes(magnitude_ax, f"from {axis_label(input_signal)} to {axis_label(output_signal)}")
     phase_ax.yaxis.set_major_locator(MultipleLocator(45 if np.ptp(np.concatenate(phases)) < 270 else 90))
     figure.align_ylabels([magnitude_ax, phase_ax])
+    shared_legend(figure)
+    return figure
+
+
+# Figures of linearised loops: sensitivity functions, Nyquist curves, gain schedules.
+
+_POINTS = {"rest": ", tangent at rest", "working": ", friction of working size"}
+_COLOURS = ("#0072B2", "#D55E00", "#CC79A7", "#009E73", "#E69F00", "#56B4E9")
+_DASHES = ("-", "--", ":", "-.")
+
+
+def sensitivity_functions(loops: Mapping[str, Mapping[str, Array]], *, title: str = "") -> Figure:
+    """Sensitivity and complementary sensitivity of loops at the plant's input.
+
+    Args:
+        loops: By loop: ``omega`` ``(n,)`` [rad/s], complex ``S`` and ``T`` ``(n,)``. Names that differ after their last
+            comma only (``"prior on prior, quiet"``) share a colour.
+        title: Title over the figure. Default: none.
+
+    Raises:
+        InputError: If there is no loop or lengths differ.
+
+    Example:
+        >>> one = {"omega": np.array([1.0, 2.0]), "S": np.array([0.5 + 0j, 1.0]), "T": np.array([0.5 + 0j, 0.0])}
+        >>> len(sensitivity_functions({"hybrid": one}).axes)
+        2
+    """
+    if not loops:
+        raise InputError("sensitivity functions: there is no loop to draw")
+    figure, axes = new_figure(1, 2, sharex=True, sharey=True, size=(10, 4.2), title=title)
+    texts = ("S: what is left of a load", "T: what the input takes of it")
+    looks = _looks(loops)
+    for ax, key, text in zip(axes[0], "ST", texts, strict=True):
+        for name, one in loops.items():
+            omega = np.asarray(one["omega"], dtype=float)
+            size = checked(f"{key} of {name}", np.abs(one[key]), omega.size)
+            ax.loglog(omega, size, **looks[name])
+        ax.axhline(1.0, color=FAINT, linewidth=0.8)
+        ax.set_xlabel("angular frequency [rad/s]")
+        title_axes(ax, text)
+        plain_log(ax.xaxis, float(omega.min()), float(omega.max()))
+        ax.set_ylim(1e-2, 10)
+        plain_log(ax.yaxis, 1e-2, 10.0)
+    axes[0, 0].set_ylabel("magnitude [-]")
+    shared_legend(figure, columns=3)
+    return figure
+
+
+def _looks(names: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Colours by what stands before the last comma of a name (the loop), dashes by what follows it (its filter)."""
+    loops: list[str] = []
+    variants: list[str] = []
+    looks = {}
+    for name in names:
+        loop, _, variant = name.rpartition(", ")
+        loop, variant = (loop, variant) if loop else (variant, "")
+        loops += [loop] * (loop not in loops)
+        variants += [variant] * (variant not in variants)
+        looks[name] = {
+            "color": _COLOURS[loops.index(loop) % len(_COLOURS)],
+            "linestyle": _DASHES[variants.index(variant) % len(_DASHES)],
+            "linewidth": 1.5,
+            "label": plain(name),
+        }
+    return looks
+
+
+def nyquist(loops: Mapping[str, Array], *, modulus: float | None = None) -> Figure:
+    """Nyquist curves of loops in negative-feedback sign, around -1.
+
+    Args:
+        loops: By loop: complex loop gain ``(n,)`` along increasing frequency; names as in
+            :func:`sensitivity_functions`.
+        modulus: Radius of a circle around -1 to draw, e.g. the smallest distance wanted. Default: none.
+
+    Raises:
+        InputError: If there is no loop.
+
+    Example:
+        >>> len(nyquist({"hybrid": np.array([1 - 1j, 0.1 - 0.5j])}, modulus=0.5).axes)
+        1
+    """
+    if not loops:
+        raise InputError("Nyquist plot: there is no loop to draw")
+    figure, axes = new_figure(1, 1, size=(6.4, 5.6))
+    ax = axes[0, 0]
+    angle = np.linspace(0, 2 * np.pi, 361)
+    ax.plot(np.cos(angle), np.sin(angle), color=FAINT, linewidth=0.8)
+    if modulus is not None:
+        ax.plot(-1 + modulus * np.cos(angle), modulus * np.sin(angle), color=FAINT, linewidth=0.8, linestyle="--",
+                label=f"distance {modulus:g} from -1")  # fmt: skip
+    looks = _looks(loops)
+    for name, curve in loops.items():
+        g = np.asarray(curve)
+        ax.plot(g.real, g.imag, **looks[name])
+    ax.plot([-1], [0], marker="+", color=INK, markersize=10)
+    ax.set_xlim(-2.2, 1.2)
+    ax.set_ylim(-1.9, 1.3)
+    ax.set_aspect("equal")
+    ax.set_xlabel("real part [-]")
+    ax.set_ylabel("imaginary part [-]")
+    title_axes(ax, "loop gain at the plant's input, negative feedback")
+    shared_legend(figure, columns=2)
+    return figure
+
+
+def gain_schedules(
+    schedules: Mapping[str, Mapping[str, tuple[Array, Array]]],
+    *,
+    position: Signal,
+    states: tuple[Signal, ...],
+) -> Figure:
+    """LQR gains of the physical states over the position.
+
+    Args:
+        schedules: By model, then by point (``"rest"``, ``"working"``): positions ``(n,)`` and gains ``(n, n_x)``.
+        position: The position.
+        states: Signals of the states.
+
+    Raises:
+        InputError: If there is nothing to draw or shapes differ.
+
+    Example:
+        >>> q, x = Signal("q", "m"), (Signal("q", "m"), Signal("v", "m/s"))
+        >>> curve = {"prior": {"rest": (np.array([0.0, 1.0]), np.ones((2, 2)))}}
+        >>> len(gain_schedules(curve, position=q, states=x).axes)
+        2
+    """
+    if not schedules:
+        raise InputError("gain schedule: there is nothing to draw")
+    figure, axes = new_figure(1, len(states), sharex=True, size=(4.8 * len(states), 3.8))
+    for name, points in schedules.items():
+        for point, (q, gain) in points.items():
+            values = checked(f"gains of {name}", gain, len(q), len(states))
+            style: dict[str, Any] = {
+                "color": colour(name), "linestyle": ":" if point == "rest" else "-", "marker": ".", "markersize": 4,
+                "label": name_of(name) + _POINTS.get(point, ""),
+            }  # fmt: skip
+            for ax, column in zip(axes[0], values.T, strict=True):
+                ax.plot(q, column, **style)
+    for ax, signal in zip(axes[0], states, strict=True):
+        ax.set_xlabel(axis_label(position))
+        title_axes(ax, f"gain of {axis_label(signal)}")
+    axes[0, 0].set_ylabel("input per unit of state")
+    shared_legend(figure, columns=2)
+    return figure
+
+
+_RESPONSE_POINTS = {
+    "rest": "tangent at rest",
+    "working": "friction of working size",
+    "moving": "tangent in motion",
+    "driven": "mean of a driven run",
+}
+
+
+def measured_bode(
+    responses: Mapping[str, Mapping[str, Array]],
+    *,
+    input_signal: Signal,
+    output_signal: Signal,
+    source: str,
+) -> Figure:
+    """Frequency responses estimated in the same way from a machine and from models.
+
+    Args:
+        responses: By name (``"measured"`` for the machine): ``omega`` [rad/s], complex ``response``, ``coherence``,
+            ``deviation`` of the magnitude, each ``(n,)``.
+        input_signal: The input.
+        output_signal: The output.
+        source: What was done, for the title.
+
+    Raises:
+        InputError: If there is no response.
+
+    Example:
+        >>> one = {"omega": np.array([1.0, 2.0]), "response": np.array([1 + 0j, -1j]),
+        ...     "coherence": np.ones(2), "deviation": np.zeros(2)}
+        >>> u, y = Signal("v", "m/s"), Signal("q", "m")
+        >>> len(measured_bode({"measured": one}, input_signal=u, output_signal=y, source="a multisine").axes)
+        3
+    """
+    if not responses:
+        raise InputError("measured response: there is nothing to draw")
+    figure, axes = new_figure(3, 1, sharex=True, size=(9, 7.2), heights=(3, 2, 1.2))
+    upper, middle, lower = axes[:, 0]
+    for name, one in responses.items():
+        omega = np.asarray(one["omega"], dtype=float)
+        g = np.asarray(one["response"])
+        shown = np.isfinite(g)
+        w, size = omega[shown], np.abs(g[shown])
+        machine = name == "measured"
+        style = line_style(name) | {"linewidth": 1.4}
+        if machine:
+            style |= {"linestyle": "none", "marker": "o", "markersize": 4, "markerfacecolor": "none"}
+            spread = np.asarray(one["deviation"], dtype=float)[shown]
+            band = np.maximum(size - 2 * spread, 1e-3 * size), size + 2 * spread
+            upper.fill_between(w, *band, color=FAINT, alpha=0.25, linewidth=0)
+        upper.loglog(w, size, **style)
+        middle.semilogx(w, np.degrees(np.unwrap(np.angle(g[shown]))), **style)
+        lower.semilogx(w, np.asarray(one["coherence"], dtype=float)[shown], **style)
+    unit = "/".join(f"({s.unit})" if " " in s.unit else s.unit for s in (output_signal, input_signal))
+    upper.set_ylabel(f"magnitude\n[{unit}]")
+    middle.set_ylabel("phase [°]")
+    middle.yaxis.set_major_locator(MultipleLocator(90))
+    lower.set_ylabel("coherence [-]")
+    lower.set_ylim(0, 1.05)
+    lower.set_xlabel("angular frequency [rad/s]")
+    every = np.concatenate([np.asarray(r["omega"], dtype=float) for r in responses.values()])
+    plain_log(lower.xaxis, float(every.min()), float(every.max()))
+    title_axes(upper, f"from {axis_label(input_signal)} to {axis_label(output_signal)}: {plain(source)}")
+    figure.align_ylabels([upper, middle, lower])
+    shared_legend(figure)
+    return figure
+
+
+def step_responses(
+    curves: Mapping[str, Mapping[str, tuple[Array, Array]]], *, input_signal: Signal, output_signal: Signal
+) -> Figure:
+    """Unit step responses of linearisations, a panel a point of linearisation.
+
+    Args:
+        curves: By point (``"rest"``), then by model: times ``(n,)`` [s] and output per unit of the input ``(n,)``.
+        input_signal: The input.
+        output_signal: The output.
+
+    Raises:
+        InputError: If there is nothing to draw or lengths differ.
+
+    Example:
+        >>> t = np.linspace(0.0, 1.0, 5)
+        >>> u, y = Signal("v", "m/s"), Signal("q", "m")
+        >>> len(step_responses({"rest": {"prior": (t, t)}}, input_signal=u, output_signal=y).axes)
+        1
+    """
+    if not curves:
+        raise InputError("step responses: there is nothing to draw")
+    figure, axes = new_figure(1, len(curves), size=(3.4 * len(curves) + 1, 3.6))
+    for ax, (point, models) in zip(axes[0], curves.items(), strict=True):
+        for name, (t, y) in models.items():
+            ax.plot(t, checked(f"step response of {name}", y, len(t)), **line_style(name))
+        ax.set_xlabel("time [s]")
+        title_axes(ax, _RESPONSE_POINTS.get(point, point))
+    axes[0, 0].set_ylabel(f"{axis_label(output_signal)}\nper {input_signal.unit}")
+    shared_legend(figure)
+    return figure
+
+
+def friction_damping(curves: Mapping[str, Mapping[str, Array]], *, working_speed: float, unit: str) -> Figure:
+    """How much damping a motion of some size feels: slope at rest, chords, slope in motion.
+
+    Args:
+        curves: By model: ``speed``, ``secant``, ``harmonic``, ``moving`` ``(n,)`` and ``tangent``, a number [1/s].
+        working_speed: Working speed, drawn as a line.
+        unit: Unit of the speed.
+
+    Raises:
+        InputError: If there is nothing to draw.
+
+    Example:
+        >>> v = np.array([0.1, 1.0])
+        >>> one = {"speed": v, "secant": 1 / v, "harmonic": 1.2 / v, "moving": 0 * v, "tangent": np.array(50.0)}
+        >>> len(friction_damping({"prior": one}, working_speed=0.5, unit="rad/s").axes)
+        1
+    """
+    if not curves:
+        raise InputError("friction: there is nothing to draw")
+    figure, axes = new_figure(1, len(curves), size=(5.0 * len(curves), 4.4), sharey=True)
+    kinds = (
+        ("secant", "--", "secant"),
+        ("harmonic", "-", "describing function"),
+        ("moving", ":", "tangent in motion"),
+    )
+    for ax, (name, one) in zip(axes[0], curves.items(), strict=True):
+        speed = np.asarray(one["speed"], dtype=float)
+        ax.axhline(float(one["tangent"]), color=INK, linestyle="-.", linewidth=1.0, label="tangent at rest")
+        for key, dashes, label in kinds:
+            values = checked(f"{key} of {name}", one[key], speed.size)
+            ax.loglog(
+                speed, np.where(values > 0, values, np.nan), color=colour(name), linestyle=dashes, label=label
+            )
+        ax.axvline(working_speed, color=FAINT, linewidth=0.9)
+        ax.annotate(
+            " working speed",
+            (working_speed, 0.02),
+            xycoords=("data", "axes fraction"),
+            fontsize=8,
+            color=FAINT,
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
+        )
+        ax.set_xlabel(f"size of the speed [{unit}]")
+        title_axes(ax, name_of(name))
+        plain_log(ax.xaxis, float(speed.min()), float(speed.max()))
+    low = min(float(np.nanmin(np.asarray(c["secant"], dtype=float))) for c in curves.values())
+    axes[0, 0].set_ylim(bottom=0.1 * max(low, 1e-6))
+    axes[0, 0].set_ylabel("damping: acceleration over speed [1/s]")
+    _one_legend(figure)
+    return figure
+
+
+def _one_legend(figure: Figure) -> None:
+    """The kinds of lines once, in ink: the panels' colours tell models apart, not kinds."""
+    seen: dict[str, Any] = {}
+    for ax in figure.axes:
+        for line in ax.get_lines():
+            label = str(line.get_label())
+            if not label.startswith("_"):
+                seen.setdefault(label, line.get_linestyle())
+    handles = [Line2D([], [], color=INK, linestyle=dashes) for dashes in seen.values()]
+    figure.legend(handles, list(seen), loc="outside lower center", ncols=len(seen), frameon=False, fontsize=9)
+
+
+def sensitivities(
+    t: Array, relative: Mapping[str, Array], names: Sequence[str], *, output_signal: Signal
+) -> Figure:
+    """How a free run's output moves per relative change of the prior's parameters.
+
+    Args:
+        t: Times ``(n,)`` [s].
+        relative: By model: change of the output per 100 % of each parameter ``(n, n_p)``.
+        names: Parameters ``(n_p,)``.
+        output_signal: The output.
+
+    Raises:
+        InputError: If there is nothing to draw or shapes differ.
+
+    Example:
+        >>> t = np.linspace(0.0, 1.0, 5)
+        >>> len(sensitivities(t, {"prior": np.zeros((5, 2))}, ["J", "d"], output_signal=Signal("q", "m")).axes)
+        2
+    """
+    if not relative or not names:
+        raise InputError("sensitivities: there is nothing to draw")
+    figure, axes = new_figure(
+        (len(names) + 1) // 2, 2, sharex=True, size=(10, 1.7 * ((len(names) + 1) // 2) + 1)
+    )
+    for j, (ax, parameter) in enumerate(zip(axes.ravel(), names, strict=False)):
+        for name, values in relative.items():
+            ax.plot(
+                t, checked(f"sensitivity of {name}", values, len(t), len(names))[:, j], **line_style(name)
+            )
+        title_axes(ax, f"by {plain(parameter)}")
+    for ax in axes.ravel()[len(names) :]:
+        ax.set_visible(False)
+    for ax in axes[-1]:
+        ax.set_xlabel("time [s]")
+    figure.supylabel(f"{axis_label(output_signal)} per 100 %", fontsize=10, color=INK)
     shared_legend(figure)
     return figure

@@ -3,17 +3,215 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
+from matplotlib.patches import Polygon
 from PIL import Image
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import replacing
-from hybrid_mpc.plots.scene import Draw, Loop, Scene
-from hybrid_mpc.plots.style import Array, checked
-from hybrid_mpc.signals import Signal
+from hybrid_mpc.machine.signals import Signal
+from hybrid_mpc.plots.style import FAINT, INK, Array, axis_label, checked, colour, dress, plain, shared_legend
+
+# The picture of a moving machine: what stays is drawn once, each frame's lines over a copy of it.
+
+Draw = Callable[[Array], Sequence[Array]]
+
+DPI = 96
+SIZE = (8.0, 4.1)  # [inch]
+GHOSTS = 6  # planned positions drawn at most
+PLAN = colour("hybrid")
+
+
+@dataclass(frozen=True)
+class Loop:
+    """Checked arguments of an animation; ``lines[k]`` are the machine's polylines in the state ``x[k]``."""
+
+    t: Array
+    x: Array
+    u: Array
+    plans: Array
+    dt: float
+    draw: Draw
+    moving: tuple[bool, ...]
+
+
+class Scene:
+    """The picture: what stays is drawn once, then each frame's lines over a copy of it."""
+
+    def __init__(
+        self,
+        loop: Loop,
+        title: str,
+        position: Signal,
+        inputs: Sequence[Signal],
+        limits: tuple[Sequence[float] | Array, Sequence[float] | Array] | None,
+        reference: Array | None,
+    ) -> None:
+        self._loop = loop
+        self._figure = Figure(figsize=SIZE, dpi=DPI, layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.06))
+        self._canvas = FigureCanvasAgg(self._figure)
+        self._figure.suptitle(plain(title), fontsize=12, fontweight="bold", color=INK)
+        grid = self._figure.add_gridspec(1 + len(inputs), 2, height_ratios=[1.5] + [1.0] * len(inputs))
+        machine = self._figure.add_subplot(grid[:, 0])
+        curve = self._figure.add_subplot(grid[0, 1])
+        below = [self._figure.add_subplot(grid[1 + i, 1], sharex=curve) for i in range(len(inputs))]
+        self._live: list[tuple[Axes, Artist]] = []
+        self._machine_panel(machine)
+        self._curve_panel(curve, position, reference)
+        for i, (ax, signal) in enumerate(zip(below, inputs, strict=True)):
+            self._input_panel(ax, i, signal, None if limits is None else (limits[0][i], limits[1][i]))
+        (below[-1] if below else curve).set_xlabel("time [s]")
+        for ax in [curve, *below[:-1]] if below else []:
+            ax.tick_params(labelbottom=False)
+        self._figure.align_ylabels([curve, *below])
+        shared_legend(self._figure)
+
+    def _line(self, ax: Axes, **style: object) -> Line2D:
+        """A line that each frame draws anew; over those before it."""
+        (line,) = ax.plot([], [], animated=True, **style)  # type: ignore[arg-type]
+        self._live.append((ax, line))
+        return line
+
+    def _body(
+        self, ax: Axes, index: int, ink: str, alpha: float, width: float
+    ) -> tuple[int, Line2D | Polygon]:
+        """The artist of one of the machine's moving lines, with that line's index."""
+        if not _closed(self._loop.draw(self._loop.x[0])[index]):
+            return index, self._line(ax, color=ink, linewidth=width, alpha=alpha, solid_capstyle="round")
+        shape = Polygon([(0.0, 0.0)], color=ink, linewidth=0.0, alpha=alpha, zorder=2, animated=True)
+        ax.add_patch(shape)
+        self._live.append((ax, shape))
+        return index, shape
+
+    def _machine_panel(self, ax: Axes) -> None:
+        loop = self._loop
+        first = loop.draw(loop.x[0])
+        for line, moves in zip(first, loop.moving, strict=True):
+            if not moves:
+                ax.plot(*np.asarray(line).T, color=FAINT, linewidth=1.4, zorder=2)
+                if _closed(line):
+                    ax.fill(*np.asarray(line).T, color="white", ec=FAINT, linewidth=1.4, zorder=2)
+        dress(ax)
+        ax.set_aspect("equal")
+        low, high = self._view()
+        ax.set_xlim(low[0], high[0])
+        ax.set_ylim(low[1], high[1])
+        ax.set_xlabel("horizontal [m]")
+        ax.set_ylabel("vertical [m]")
+        bodies = [i for i, moves in enumerate(loop.moving) if moves]
+        self._ghosts = [
+            [self._body(ax, i, PLAN, float(alpha), 2.0) for i in bodies]
+            for alpha in np.linspace(0.12, 0.5, GHOSTS)
+        ]
+        self._machine = [self._body(ax, i, INK, 1.0, 2.8) for i in bodies]
+        self._clock = ax.text(0.03, 0.96, "", transform=ax.transAxes, fontsize=10, color=INK, va="top")
+        self._clock.set_animated(True)
+        self._live.append((ax, self._clock))
+
+    def _view(self) -> tuple[Array, Array]:
+        """Corners of the machine's panel: all true positions, and the planned ones unless far beyond."""
+        loop = self._loop
+        states = loop.x[:: max(1, len(loop.x) // 100)]
+        true = np.concatenate([np.asarray(line) for state in states for line in loop.draw(state)])
+        low, high = true.min(axis=0), true.max(axis=0)
+        planned = [row[np.all(np.isfinite(row), axis=1)] for row in loop.plans[:: max(1, len(loop.x) // 30)]]
+        ends = [np.asarray(line) for row in planned for state in row[-1:] for line in loop.draw(state)]
+        room = 0.25 * max(float(np.max(high - low)), 1e-3)
+        for points in ends:
+            low = np.maximum(np.minimum(low, points.min(axis=0)), true.min(axis=0) - room)
+            high = np.minimum(np.maximum(high, points.max(axis=0)), true.max(axis=0) + room)
+        margin = 0.06 * max(float(np.max(high - low)), 1e-3)
+        return low - margin, high + margin
+
+    def _curve_panel(self, ax: Axes, position: Signal, reference: Array | None) -> None:
+        loop = self._loop
+        dress(ax)
+        if reference is not None:
+            ax.plot(loop.t, reference, color=FAINT, linewidth=1.2, label="reference")
+        low, high = float(loop.x[:, 0].min()), float(loop.x[:, 0].max())
+        room = 0.4 * max(high - low, 1e-6)  # a plan that runs away does not flatten the motion
+        seen = loop.plans[:, :, 0][np.isfinite(loop.plans[:, :, 0])]
+        seen = np.concatenate([seen, [low, high], [] if reference is None else reference])
+        low, high = max(float(np.nanmin(seen)), low - room), min(float(np.nanmax(seen)), high + room)
+        margin = 0.06 * max(high - low, 1e-6)
+        ax.set_ylim(low - margin, high + margin)
+        ax.set_xlim(loop.t[0], max(loop.t[-1], loop.t[0] + loop.dt))
+        ax.set_ylabel(axis_label(position))
+        self._past = self._line(ax, color=INK, linewidth=1.8, label="true motion")
+        self._plan = self._line(ax, color=PLAN, linewidth=1.6, linestyle=(0, (4, 2)), label="planned motion")
+        self._dot = self._line(ax, color=INK, marker="o", markersize=4.5, linestyle="")
+        self._applied: list[Line2D] = []
+
+    def _input_panel(self, ax: Axes, index: int, signal: Signal, bounds: tuple[float, float] | None) -> None:
+        dress(ax)
+        for bound in filter(math.isfinite, bounds or ()):
+            ax.axhline(bound, color=INK, linestyle=":", linewidth=1.1, label="input limits")
+        values = np.append(self._loop.u[:, index], bounds or ())
+        values = values[np.isfinite(values)]
+        low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
+        margin = 0.1 * max(high - low, 1e-6)
+        ax.set_ylim(low - margin, high + margin)
+        ax.set_ylabel(axis_label(signal))
+        self._applied.append(self._line(ax, color=colour("prior"), drawstyle="steps-post", label="input"))
+
+    def pictures(self, shown: Sequence[int]) -> Iterator[Image.Image]:
+        """One RGB picture for each of these samples."""
+        self._canvas.draw()
+        still = self._canvas.copy_from_bbox(self._figure.bbox)
+        for k in shown:
+            self._canvas.restore_region(still)
+            self._set(k)
+            for ax, artist in self._live:
+                ax.draw_artist(artist)
+            yield Image.fromarray(np.array(self._canvas.buffer_rgba())).convert("RGB")
+
+    def _set(self, k: int) -> None:
+        loop = self._loop
+        times = loop.t[k] + loop.dt * np.arange(loop.plans.shape[1])
+        ahead = np.all(np.isfinite(loop.plans[k]), axis=1)
+        self._past.set_data(loop.t[: k + 1], loop.x[: k + 1, 0])
+        self._dot.set_data(loop.t[k : k + 1], loop.x[k : k + 1, 0])
+        self._plan.set_data(times[ahead], loop.plans[k, ahead, 0])
+        held = min(k + 1, len(loop.t) - 1)  # the input of this instant holds until the next one
+        for i, line in enumerate(self._applied):
+            line.set_data(
+                np.append(loop.t[: k + 1], loop.t[held]), np.append(loop.u[: k + 1, i], loop.u[k, i])
+            )
+        self._clock.set_text(f"t = {loop.t[k]:.2f} s")
+        _place(self._machine, loop.draw(loop.x[k]))
+        later = np.flatnonzero(ahead)[1:]
+        even = np.linspace(0, len(later) - 1, GHOSTS + 1)[1:].astype(int)
+        chosen = later[np.unique(even)] if len(later) else later
+        drawn: list[Sequence[Array] | None]
+        drawn = [loop.draw(loop.plans[k, j]) for j in reversed(chosen)]  # the farthest first, the faintest
+        hidden = GHOSTS - len(drawn)
+        for lines, ghost in zip([None] * hidden + drawn, self._ghosts, strict=True):
+            _place(ghost, lines)
+
+
+def _place(bodies: Sequence[tuple[int, Line2D | Polygon]], lines: Sequence[Array] | None) -> None:
+    """Move artists to a state's lines; nowhere without them."""
+    for i, artist in bodies:
+        points = np.full((2, 2), np.nan) if lines is None else np.asarray(lines[i])
+        if isinstance(artist, Polygon):
+            artist.set_xy(points)
+        else:
+            artist.set_data(*points.T)
+
+
+def _closed(line: Array) -> bool:
+    return len(line) > 2 and bool(np.allclose(line[0], line[-1], rtol=0.0, atol=1e-9))
+
 
 MOST_FRAMES = 250  # of a longer loop fewer frames a second are drawn; it still plays in real time
 LAST = 1.2  # [s] for which the last frame stays before the loop starts again

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.plots.style import (
     Array,
     axis_label,
@@ -20,7 +21,6 @@ from hybrid_mpc.plots.style import (
     shared_legend,
     title_axes,
 )
-from hybrid_mpc.signals import Signal
 
 ROLES = ("train", "valid", "test")
 

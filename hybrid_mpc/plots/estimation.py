@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.plots.style import (
     COLOURS,
     FAINT,
@@ -21,7 +22,6 @@ from hybrid_mpc.plots.style import (
     shared_legend,
     title_axes,
 )
-from hybrid_mpc.signals import Signal
 
 WINDOW = 50
 BAND = "#009E73"

@@ -1,4 +1,4 @@
-"""Figures of the identified models: free runs, errors by model, parity of the export."""
+"""Figures of the training: both objectives, their bounds, and the validation metric."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.plots.style import (
     FAINT,
     INK,
@@ -21,10 +22,12 @@ from hybrid_mpc.plots.style import (
     name_of,
     new_figure,
     number,
+    plain_log,
     shared_legend,
     title_axes,
 )
-from hybrid_mpc.signals import Signal
+
+# Figures of the identified models: free runs, errors by model, parity of the export.
 
 METRICS: Mapping[str, str] = {
     "e_sim_s": "simulation error $E_{sim}$ [s]",
@@ -230,3 +233,171 @@ def parity(errors: Mapping[str, Array], tolerances: Mapping[str, float]) -> Figu
     ax.title.set_color(FAINT)
     shared_legend(figure)
     return figure
+
+
+# Free runs over unseen recordings of a machine, beside the measurement.
+
+SHOWN = 20.0
+"""Length [s] of what is drawn sample by sample; of a longer run the rest is in the errors' course."""
+COURSE = 200
+"""Points of the course of the errors over the whole run."""
+
+
+def benchmark_run(
+    t: Array,
+    y: Array,
+    predictions: Mapping[str, Array],
+    u: Array,
+    *,
+    output: Signal,
+    inputs: Sequence[Signal],
+    unit: str,
+    scale: float,
+    title: str = "",
+    names: Mapping[str, str] | None = None,
+) -> Figure:
+    """A free run over a recording: output, errors, inputs, and the errors' course over the whole run.
+
+    Args:
+        t: Times ``(n,)`` [s].
+        y: Measured output ``(n,)``.
+        predictions: Output of each model's free run ``(n,)``.
+        u: Inputs ``(n, n_u)``.
+        output: Signal of ``y``.
+        inputs: Signals of ``u``.
+        unit: Unit of the errors.
+        scale: Errors' units in an SI unit.
+        title: Title. Default: none.
+        names: How models are to be called in the legend, where not as everywhere. Default: none.
+
+    Returns:
+        The figure. The first 20 s of a longer run are drawn; the last row has all of it.
+
+    Raises:
+        InputError: If shapes do not fit.
+
+    Example:
+        >>> t, y = 0.1 * np.arange(50), np.zeros(50)
+        >>> figure = benchmark_run(t, y, {"phy": y + 0.1}, y, output=Signal("q", "m"), inputs=(Signal("F", "N"),),
+        ...                        unit="mm", scale=1e3)
+        >>> len(figure.axes)
+        4
+    """
+    t = np.asarray(t, dtype=float)
+    y, u = checked("y", y, len(t)), checked("u", u, len(t), len(inputs))
+    runs = {name: checked(f"free run of {name}", run, len(t)) for name, run in predictions.items()}
+    heights = [1.8, 1.3, *[0.8] * len(inputs), 1.3]
+    figure, axes = new_figure(
+        len(heights), 1, heights=heights, title=title, size=(10, 0.8 + 1.3 * sum(heights))
+    )
+    column, near = axes[:, 0], t <= t[0] + SHOWN
+    column[0].plot(t[near], y[near], **(line_style("measured") | {"linewidth": 2.2, "alpha": 0.85}))
+    room = 0.3 * max(float(np.ptp(y[near])), 1e-9)
+    for name, run in runs.items():
+        label = (names or {}).get(name, name_of(name))
+        column[0].plot(t[near], run[near], **(line_style(name) | {"label": label}))
+        column[1].plot(t[near], scale * (run - y)[near], color=colour(name), linewidth=1.0, label=label)
+        at, course = _course(t, scale * (run - y))
+        column[-1].plot(at, course, color=colour(name), linewidth=1.4)
+    column[0].set_ylim(y[near].min() - room, y[near].max() + room)  # a model that runs away flattens no other
+    worst = [float(np.abs(scale * (run - y)[near]).max()) for run in runs.values()]
+    best = min((value for value in worst if np.isfinite(value)), default=0.0)
+    if best > 0:
+        column[1].set_ylim(-1.5 * best, 1.5 * best)
+    column[-1].set_yscale("log")
+    column[0].set_ylabel(axis_label(output))
+    column[1].set_ylabel(f"error [{unit}]")
+    column[-1].set_ylabel(f"RMS error [{unit}]")
+    for i, signal in enumerate(inputs):
+        column[2 + i].plot(t[near], u[near, i], color=INK, linewidth=0.9, drawstyle="steps-post")
+        column[2 + i].set_ylabel(axis_label(signal))
+        size = max(float(np.abs(u[near, i]).max()), 1e-9)
+        if np.ptp(u[near, i]) < 1e-6 * size:  # a constant input is drawn as one, not its rounding
+            column[2 + i].set_ylim(float(u[near, i].mean()) - size, float(u[near, i].mean()) + size)
+    for ax in column:
+        ax.margins(x=0)
+    column[-2].set_xlabel("time [s]")
+    column[-1].set_xlabel("time [s], the whole run")
+    figure.align_ylabels(list(column))
+    shared_legend(figure, columns=6)
+    return figure
+
+
+def _course(t: Array, error: Array) -> tuple[Array, Array]:
+    """Root mean square of the error over short parts of the run, at their middles."""
+    parts = np.array_split(np.arange(len(t)), min(COURSE, max(1, len(t) // 5)))
+    rms = np.array([np.sqrt(np.mean(error[part] ** 2)) for part in parts])
+    return np.array([t[part].mean() for part in parts]), np.maximum(rms, 1e-12)
+
+
+_ROWS = (
+    ("loss_error", "bound_error", "error objective [-]"),
+    ("loss_energy", "bound_energy", "energy objective [-]"),
+    ("validation", None, "validation [-]"),
+)
+
+
+def curves(
+    training: Mapping[str, Mapping[str, Any]],
+    *,
+    free_run_start: Mapping[str, float] | None = None,
+    units: tuple[str, str, str] = ("-", "-", "-"),
+) -> Figure:
+    """Training curves of each model: two objectives with their never-rising bounds, and the validation.
+
+    Args:
+        training: By model, arrays of equal length: ``step``, ``loss_error`` and, where the model has
+            them, ``loss_energy``, ``bound_error``, ``bound_energy``, ``validation``. NaN where a value
+            was not taken at a step.
+        free_run_start: Step at which a model's training turns from teacher forcing to free runs.
+        units: Units of the error objective, the energy objective and the validation metric.
+
+    Returns:
+        The figure: one column a model, logarithmic axes up.
+
+    Raises:
+        InputError: If there is no model, ``step`` is missing, or lengths differ.
+
+    Example:
+        >>> data = {"step": [0, 1, 2], "loss_error": [3.0, 2.0, 1.0]}
+        >>> len(curves({"rnn": data}).axes)
+        3
+    """
+    if not training:
+        raise InputError("plot of the training: there is no model to draw")
+    figure, axes = new_figure(3, len(training), sharex="col", sharey="row", size=(10, 6.6))
+    for column, (model, data) in zip(axes.T, training.items(), strict=True):
+        if "step" not in data:
+            raise InputError(f"plot of the training of {model}: no array 'step'; it has {', '.join(data)}")
+        step = np.asarray(data["step"], dtype=float)
+        for (
+            ax,
+            (loss, bound, _),
+        ) in zip(column, _ROWS, strict=True):
+            _curve(ax, model, step, data.get(loss), loss)
+            if bound is not None and data.get(bound) is not None:
+                values = checked(f"{bound} of {model}", data[bound], len(step))
+                ax.plot(step, values, "k--", linewidth=1.2, drawstyle="steps-post", label="bound $c_j$")
+            if free_run_start is not None and model in free_run_start:
+                ax.axvline(free_run_start[model], color=FAINT, linestyle=":", label="free-run stage starts")
+        title_axes(column[0], name_of(model))
+        column[-1].set_xlabel("optimiser step [-]")
+    for row, (_, _, label), unit in zip(axes, _ROWS, units, strict=True):
+        row[0].set_ylabel(label.replace("[-]", f"[{unit}]"))
+        if any(ax.get_yscale() == "log" for ax in row):
+            plain_log(row[0].yaxis, *row[0].get_ylim())
+    figure.align_ylabels(list(axes[:, 0]))
+    shared_legend(figure)
+    return figure
+
+
+def _curve(ax: Axes, model: str, step: Any, values: Any, name: str) -> None:
+    if values is None:
+        ax.text(0.25, 0.5, "not used", transform=ax.transAxes, ha="center", color=FAINT, fontsize=9)
+        return
+    array = checked(f"{name} of {model}", values, len(step))
+    taken = np.isfinite(array) & (array > 0)
+    marker = "o" if name == "validation" else ""
+    ax.plot(step[taken], array[taken], color=colour(model), lw=1.1, marker=marker, ms=3)
+    if taken.any():
+        ax.set_yscale("log")

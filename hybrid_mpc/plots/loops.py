@@ -1,15 +1,19 @@
-"""Figures of the closed loops: tracking of each controller, and the time a step takes."""
+"""Figures of the tasks: what each controller costs beside the oracle, and how well strokes hit."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.plots.style import (
     FAINT,
     INK,
@@ -21,11 +25,13 @@ from hybrid_mpc.plots.style import (
     name_of,
     new_figure,
     number,
+    plain,
     plain_log,
     shared_legend,
     title_axes,
 )
-from hybrid_mpc.signals import Signal
+
+# Figures of the closed loops: tracking of each controller, and the time a step takes.
 
 
 @dataclass(frozen=True)
@@ -171,3 +177,221 @@ def solve_times(times_ms: Mapping[str, Array], period_ms: float) -> Figure:
     title_axes(right, "share of steps that took longer")
     shared_legend(figure, columns=2)
     return figure
+
+
+# Name, role whose colour it takes, marker, filled. With a disturbance observer: the same colour, hollow.
+CONTROLLERS: Mapping[str, tuple[str, str, str, bool]] = MappingProxyType(
+    {
+        "prior": (name_of("prior"), "prior", "o", True),
+        "prior_observer": ("prior with observer", "prior", "s", False),
+        "hybrid": (name_of("hybrid"), "hybrid", "o", True),
+        "hybrid_observer": ("MOPGRNN with observer", "hybrid", "s", False),
+        "oracle": ("oracle, measuring", "oracle", "D", True),
+        "oracle_state": ("oracle, true state", "oracle", "D", False),
+    }
+)
+SPEED_TARGET = 1.0  # [%]
+TIMING_TARGET = 10.0  # [ms]
+
+Costs = Mapping[str, Mapping[str, tuple[float, float]]]
+
+
+def costs(table: Costs) -> Figure:
+    """Closed-loop cost of every controller in every task, relative to the oracle that measures.
+
+    The interval is the controller's own, divided by the oracle's mean; the oracle's own interval shows how
+    well that is known. A missing controller or a mean that is not finite leaves a gap; an interval that is not
+    finite (a single seed) is not drawn. A task without the oracle's cost keeps its row, with a note.
+
+    Args:
+        table: By task and controller: mean cost and half width of its 95 % interval. Controllers:
+            ``prior``, ``prior_observer``, ``hybrid``, ``hybrid_observer``, ``oracle``, ``oracle_state``.
+
+    Returns:
+        The figure: one row a task; logarithmic where the costs span more than a factor of 5.
+
+    Raises:
+        InputError: If no task has a positive cost of ``oracle``.
+
+    Example:
+        >>> figure = costs({"track_sine": {"prior": (2.0, 0.1), "hybrid": (1.1, 0.1), "oracle": (1.0, 0.05)}})
+        >>> [text.get_text() for text in figure.legends[0].get_texts()][:2]
+        ['prior, fitted', 'MOPGRNN (hybrid)']
+    """
+    relative = {task: _relative(row) for task, row in table.items()}
+    points = [mean for row in relative.values() for mean, _ in row.values()]
+    if not points:
+        raise InputError(
+            f"plot of the costs: none of the tasks {sorted(table)} has a positive cost of 'oracle' to compare with"
+        )
+    present = _ordered({name for row in relative.values() for name in row})
+    height = 0.25 + 0.11 * len(present)
+    figure, axes = new_figure(1, 1, size=(9, 1.5 + height * len(table)))
+    ax = axes[0, 0]
+    log = max(points) > 5 * min(points) > 0
+    lowest = 0.8 * min(points)  # on a logarithmic axis an interval that reaches zero is cut here
+    ax.axvline(1.0, color=FAINT, linewidth=1.0, zorder=1)
+    for k, row in enumerate(relative.values()):
+        if k:
+            ax.axhline(k - 0.5, color="#dddddd", linewidth=0.8, zorder=1)
+        if not row:
+            note, at = "no cost of the oracle", ax.get_yaxis_transform()
+            ax.text(0.98, k, note, transform=at, color=FAINT, fontsize=9, ha="right", va="center")
+        for name, (mean, half) in row.items():
+            at = k + 0.74 * ((present.index(name) + 0.5) / len(present) - 0.5)
+            left = max(mean - half, lowest) if log else mean - half
+            ax.plot([left, mean + half], [at, at], color=_style(name)["color"], linewidth=1.6, zorder=3)
+            ax.plot(mean, at, linestyle="", zorder=4, **_style(name))
+    if log:
+        ax.set_xscale("log")
+        plain_log(ax.xaxis, *ax.get_xlim())
+    ax.set_yticks(range(len(table)), [plain(task.replace("_", " ")) for task in table])
+    ax.set_ylim(len(table) - 0.5, -0.5)
+    ax.grid(False, axis="y")
+    ax.tick_params(axis="y", length=0)
+    ax.set_xlabel("cost relative to the measuring oracle, with 95 % interval [-]")
+    _legend(figure, ax, present)
+    return figure
+
+
+def _relative(row: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+    """Finite means over the oracle's, with half widths (0 where unknown); empty without an oracle."""
+    scale = float(row.get("oracle", (math.nan, math.nan))[0])
+    if not (math.isfinite(scale) and scale > 0):
+        return {}
+    finite = {name: value for name, value in row.items() if math.isfinite(value[0])}
+    return {
+        name: (mean / scale, half / scale if math.isfinite(half) else 0.0)
+        for name, (mean, half) in finite.items()
+    }
+
+
+def strokes(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """Errors of speed and instant at the ball over the target speed: every stroke, and the mean of its speed.
+
+    Bands show the targets of 1 % and 10 ms. The legend gives each controller's mean absolute errors over all
+    speeds, and how many strokes never came past the ball (NaN or None; in no mean). An axis is logarithmic
+    beyond the band on both sides where the errors span more than ten times of it.
+
+    Args:
+        rows: One mapping a stroke: ``controller``, ``speed_rad_s`` (the target, positive),
+            ``speed_error_rel`` (signed, a share of the target) and ``timing_error_s`` (positive: late).
+
+    Returns:
+        The figure: speed error [%] above, timing error [ms] below.
+
+    Raises:
+        InputError: If there is no stroke, a key is missing, or a target speed is not positive.
+
+    Example:
+        >>> row = {"controller": "hybrid", "speed_rad_s": 1.2, "speed_error_rel": 0.005, "timing_error_s": 2e-3}
+        >>> [ax.get_ylabel() for ax in strokes([row]).axes]
+        ['speed error [%]', 'timing error [ms]']
+    """
+    data = _by_controller(rows)
+    present = _ordered(set(data))
+    figure, axes = new_figure(2, 1, sharex=True, size=(9, 6.0))
+    panels = (
+        (axes[0, 0], 1, "speed error [%]", SPEED_TARGET, "%"),
+        (axes[1, 0], 2, "timing error [ms]", TIMING_TARGET, "ms"),
+    )
+    speeds = np.unique(np.concatenate([values[:, 0] for values in data.values()]))
+    for ax, column, label, target, unit in panels:
+        ax.axhspan(-target, target, color="#009E73", alpha=0.13, linewidth=0)
+        title_axes(ax, f"band: target, within {target:g} {unit}; large: mean of a target speed")
+        ax.axhline(0.0, color=FAINT, linewidth=0.8)
+        for i, name in enumerate(present):
+            beside = 0.72 * ((i + 0.5) / len(present) - 0.5)
+            place = np.searchsorted(speeds, data[name][:, 0]).astype(np.float64) + beside
+            _cloud(ax, place, data[name][:, column], name)
+        ax.set_ylabel(label)
+        _scale(ax, np.concatenate([values[:, column] for values in data.values()]), target)
+    axes[1, 0].set_xlabel("target speed of the club [rad/s]")
+    axes[1, 0].set_xticks(range(len(speeds)), [f"{v:g}" for v in speeds])
+    axes[1, 0].set_xlim(-0.5, len(speeds) - 0.5)
+    figure.align_ylabels([axes[0, 0], axes[1, 0]])
+    _legend(figure, axes[0, 0], present, {name: _note(data[name]) for name in present}, columns=2)
+    figure.legends[0].set_title("mean absolute errors of the strokes that met the ball")
+    return figure
+
+
+def _note(values: Array) -> str:
+    """Mean absolute errors of a controller's strokes, and how many never came past the ball."""
+    found = values[np.all(np.isfinite(values), axis=1)]
+    missed = f", {len(values) - len(found)} of {len(values)} missed" if len(found) < len(values) else ""
+    if not len(found):
+        return f": all {len(values)} missed"
+    speed, timing = (number(float(mean)) for mean in np.mean(np.abs(found[:, 1:]), axis=0))
+    return f": {speed} %, {timing} ms{missed}"
+
+
+def _by_controller(rows: Sequence[Mapping[str, Any]]) -> dict[str, Array]:
+    """Target speed [rad/s], speed error [%] and timing error [ms] ``(n, 3)`` of each controller's strokes."""
+    keys = ("controller", "speed_rad_s", "speed_error_rel", "timing_error_s")
+    for row in rows:
+        if missing := [key for key in keys if key not in row]:
+            raise InputError(
+                f"plot of the strokes: a row has no {', '.join(missing)}; it has {', '.join(row)}"
+            )
+        if not (math.isfinite(row["speed_rad_s"]) and row["speed_rad_s"] > 0):
+            raise InputError(
+                f"plot of the strokes: a target speed must be positive, got {row['speed_rad_s']}"
+            )
+    if not rows:
+        raise InputError("plot of the strokes: there is no stroke to draw")
+    scale = np.array([1.0, 100.0, 1000.0])
+    data: dict[str, list[list[float]]] = {}
+    for row in rows:
+        values = [math.nan if row[key] is None else float(row[key]) for key in keys[1:]]
+        data.setdefault(str(row["controller"]), []).append(values)
+    return {name: np.array(values) * scale for name, values in data.items()}
+
+
+def _cloud(ax: Axes, place: Array, error: Array, name: str) -> None:
+    """Every stroke small and pale; the mean of each place large."""
+    ink = _style(name)["color"]
+    found = np.isfinite(error)
+    ax.plot(place[found], error[found], ".", color=ink, markersize=4, alpha=0.45, zorder=2.6)
+    for at in np.unique(place[found]):
+        mean = float(np.mean(error[found & (place == at)]))
+        ax.plot(at, mean, linestyle="", zorder=4, **_style(name))
+
+
+def _scale(ax: Axes, errors: Array, target: float) -> None:
+    """Room for the band; logarithmic beyond it where the errors span much more."""
+    errors = errors[np.isfinite(errors)]
+    top = max(1.5 * target, 1.15 * float(np.max(np.abs(errors), initial=0.0)))
+    if top > 10 * target:
+        ax.set_yscale("symlog", linthresh=target, linscale=1.0)
+        steps = target * np.array([s * 10.0**k for k in range(8) for s in (1, 3)])
+        ticks = steps[steps <= top]
+        ticks = np.concatenate([-ticks[::-1], [0.0], ticks])
+        ax.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+        ax.minorticks_off()
+    ax.set_ylim(-top, top)
+
+
+def _ordered(names: set[str]) -> list[str]:
+    """The known controllers in their order, then others by name."""
+    return [name for name in CONTROLLERS if name in names] + sorted(names - set(CONTROLLERS))
+
+
+def _style(name: str) -> dict[str, Any]:
+    _, role, marker, filled = CONTROLLERS.get(name, (name, name, "^", True))
+    ink = colour(role)
+    face = ink if filled else "white"
+    return {"color": ink, "marker": marker, "markersize": 7, "markerfacecolor": face, "markeredgewidth": 1.5}
+
+
+def _legend(
+    figure: Figure,
+    ax: Axes,
+    present: Sequence[str],
+    notes: Mapping[str, str] = MappingProxyType({}),
+    columns: int = 3,
+) -> None:
+    """A legend in the order of the controllers, whichever task or stroke each of them has."""
+    for name in present:
+        label = CONTROLLERS[name][0] if name in CONTROLLERS else plain(name)
+        ax.plot([], [], linestyle="", label=label + notes.get(name, ""), **_style(name))
+    shared_legend(figure, columns=columns)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import replacing
-from hybrid_mpc.signals import Signal
+from hybrid_mpc.machine.signals import Signal
 
 Array = NDArray[np.float64]
 Share = bool | Literal["none", "all", "row", "col"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from hybrid_mpc import DEFAULT_BUDGETS, Scenario
+from hybrid_mpc import DEFAULT_BUDGETS
 from scenarios.golf_robot.data import make_data
 from scenarios.golf_robot.drawing import draw
 from scenarios.golf_robot.experiment import DATA, EXPERIMENT
@@ -13,6 +13,7 @@ from scenarios.golf_robot.faults import CAUSES
 from scenarios.golf_robot.oracle import oracle
 from scenarios.golf_robot.rig import Rig
 from scenarios.golf_robot.tasks import CONTROL, QUICK_TASKS, TASKS
+from scenarios.paper.experiment import PaperScenario
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -28,7 +29,7 @@ def _prior(values: Mapping[str, float] | None = None) -> Prior:
     return GolfRobotPrior(values)
 
 
-scenario = Scenario(
+scenario = PaperScenario(
     name="golf_robot",
     title="Golf robot: a club on a belt drive with load-dependent dry friction",
     description=(

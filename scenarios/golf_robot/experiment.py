@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from hybrid_mpc import Claim, Dataset, DataSpec, Effort, Experiment, load_trajectories
+from hybrid_mpc import Dataset, DataSpec, load_trajectories
 from scenarios.golf_robot.data import SIZES, make_data, windows
 from scenarios.golf_robot.nominal import INPUTS, OUTPUTS, STATES
+from scenarios.paper.experiment import Effort, Experiment
+from scenarios.paper.table import Claim
 
 FIGURE = "paper, Fig. 5 ({}) and its text"
 GOAL = "goal of this project, ({})"

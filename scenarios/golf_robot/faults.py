@@ -20,7 +20,7 @@ class FaultCase:
     Args:
         name: Short name, e.g. ``"friction_x2"``.
         title: One line for plots and the report.
-        faults: What acts; see :func:`hybrid_mpc.closed_loop.faults.install`.
+        faults: What acts; see :func:`hybrid_mpc.loop.faults.install`.
         nominal: True for ageing that a monitor must not take for a fault.
     """
 

@@ -51,7 +51,7 @@ class RigState:
 
 @dataclass(frozen=True)
 class Rig:
-    """The golf robot in simulation (a :class:`hybrid_mpc.scenario.Plant`).
+    """The golf robot in simulation (a :class:`hybrid_mpc.loop.plant.Plant`).
 
     RK4 with sub-steps of at most ``sub_step``, less at high speed: the bristle relaxes at
     ``sigma0 |phi_dot| / mu``, 5600 1/s at 5 rad/s.

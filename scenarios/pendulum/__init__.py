@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from hybrid_mpc import Budget, DataSpec, Scenario
+from hybrid_mpc import Budget, DataSpec
+from scenarios.paper.experiment import PaperScenario
 from scenarios.pendulum.data import make_data, windows
 from scenarios.pendulum.experiment import EXPERIMENT
 from scenarios.pendulum.oracle import oracle
@@ -25,7 +26,7 @@ def _prior(values: Mapping[str, float] | None = None) -> Prior:
     return PublishedPendulumPrior(values)
 
 
-scenario = Scenario(
+scenario = PaperScenario(
     name="pendulum",
     title="Damped pendulum: a prior of the right form with wrong parameters",
     description=(

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from hybrid_mpc import Claim, Effort, Experiment, Trajectory
+from hybrid_mpc import Trajectory
+from scenarios.paper.experiment import Effort, Experiment
+from scenarios.paper.table import Claim
 from scenarios.pendulum.data import ROLES, SIZES, exact_runs
 
 SET = "exact"

@@ -78,7 +78,7 @@ class PendulumState:
 
 @dataclass(frozen=True)
 class DampedPendulum:
-    """The paper's pendulum (a :class:`hybrid_mpc.scenario.Plant`).
+    """The paper's pendulum (a :class:`hybrid_mpc.loop.plant.Plant`).
 
     Classical Runge-Kutta of order 4 with equal sub-steps of at most ``sub_step``. At the default a run of 5 s stays
     within 1e-9 rad of a solution of tolerance 1e-12, and the energy's books close within 1e-8 J; both are tested.

@@ -37,7 +37,7 @@ class DiskState:
 
 @dataclass(frozen=True)
 class DiskPlant:
-    """A disk like the real one (a :class:`hybrid_mpc.scenario.Plant`), of another structure than the prior.
+    """A disk like the real one (a :class:`hybrid_mpc.loop.plant.Plant`), of another structure than the prior.
 
     The prior is a driven pendulum with viscous friction, dry friction ``tanh(phi_dot / v_c)`` of one size, a torque
     that follows the voltage at once, and a delay of any length in front. This plant has

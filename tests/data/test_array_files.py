@@ -9,8 +9,8 @@ from scipy.io import savemat
 from scipy.sparse import csc_array
 
 from hybrid_mpc import DataSpec, InputError, Signal, Window, write_csv
-from hybrid_mpc.data import read_table
 from hybrid_mpc.data.mat_structure import check_structure, version
+from hybrid_mpc.data.tables import read_table
 
 SPEC = DataSpec("time_s", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.2)
 SIGNALS = {"outputs": (Signal("phi", "rad", -10, 10),), "inputs": (Signal("torque", "N m", -5, 5),)}

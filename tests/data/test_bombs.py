@@ -13,8 +13,8 @@ import pytest
 import recording_bombs as bombs
 
 from hybrid_mpc import InputError
-from hybrid_mpc.data import read_table
-from hybrid_mpc.data.array_files import check_npz
+from hybrid_mpc.data.tables import read_table
+from hybrid_mpc.files import check_npz
 
 ROOT = Path(__file__).parents[2]
 SECONDS = 2.0

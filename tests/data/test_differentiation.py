@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import InputError
-from hybrid_mpc.data.differentiation import (
+from hybrid_mpc.data.differentiate import (
     bandwidth,
     causal_derivatives,
     frequency_gain,

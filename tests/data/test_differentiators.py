@@ -10,7 +10,13 @@ from hybrid_mpc import (
     ZeroPhaseFilter,
     differentiate,
 )
-from hybrid_mpc.data import bandwidth, causal_derivatives, gcv_cutoff, local_polynomial, noise_gain
+from hybrid_mpc.data.differentiate import (
+    bandwidth,
+    causal_derivatives,
+    gcv_cutoff,
+    local_polynomial,
+    noise_gain,
+)
 
 DT = 0.01
 METHODS = [

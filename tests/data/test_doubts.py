@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import DataSpec, InputError, Signal, load_scenario, load_trajectories, write_csv
-from hybrid_mpc.data import read_table
+from hybrid_mpc.data.tables import read_table
 
 RECORDINGS = Path(__file__).parents[3] / "shared" / "data"
 SPEC = DataSpec("t", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.2)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import InputError, chirp, multisine, prbs, random_steps, sinusoid
-from hybrid_mpc.data import crest_factor, hann_spectrum, line_spectrum
+from hybrid_mpc.data.excitation import crest_factor, hann_spectrum, line_spectrum
 
 
 def test_chirp_has_the_stated_frequencies_at_its_ends():

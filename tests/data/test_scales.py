@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import load_scenario, load_trajectories
-from hybrid_mpc.data import noise_of, time_scale, time_unit
+from hybrid_mpc.data.scales import noise_of, time_scale, time_unit
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
 

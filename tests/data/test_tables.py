@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybrid_mpc import DataSpec, InputError, Signal, Window, write_csv
-from hybrid_mpc.data import read_csv
+from hybrid_mpc.data.tables import read_csv
 
 SPEC = DataSpec("time_s", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.2)
 SIGNALS = {"outputs": (Signal("phi", "rad", -10, 10),), "inputs": (Signal("torque", "N m", -5, 5),)}

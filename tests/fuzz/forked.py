@@ -45,7 +45,7 @@ def command(*words: object) -> Ended:
 
 
 def _in_child(pipe: int, words: list[str]) -> None:
-    from hybrid_mpc.cli import main
+    from hybrid_mpc.cli.main import main
 
     signal.alarm(HANGS_S)
     out, code = io.StringIO(), None

@@ -6,9 +6,9 @@ import shutil
 import pytest
 
 from hybrid_mpc import InputError, RunSettings, load_scenario
-from hybrid_mpc.pipeline.context import STAGES, Context
+from hybrid_mpc.job.context import STAGES, Context
 from tests.fuzz.forked import command
-from tests.pipeline.conftest import arguments, finished, machine
+from tests.job.conftest import arguments, finished, machine
 
 __all__ = ["arguments", "finished", "machine"]  # fixtures
 
@@ -83,7 +83,7 @@ def test_a_training_that_was_interrupted_and_damaged(tmp_path):
     import torch
 
     from hybrid_mpc import InputError
-    from hybrid_mpc.identification.checkpoint import load_checkpoint, save_checkpoint
+    from hybrid_mpc.identify.train import load_checkpoint, save_checkpoint
 
     path = tmp_path / "pgrnn.safetensors"
     save_checkpoint(path, "key", {"w": torch.arange(12.0).reshape(3, 4)}, {"done": 3})
@@ -101,6 +101,6 @@ def test_a_training_that_was_interrupted_and_damaged(tmp_path):
 
 
 def test_names_of_stages_are_those_of_the_job():
-    from hybrid_mpc.pipeline.run import STAGES as WITH_FUNCTIONS
+    from hybrid_mpc.job.run import STAGES as WITH_FUNCTIONS
 
     assert tuple(name for name, _, _ in WITH_FUNCTIONS) == STAGES

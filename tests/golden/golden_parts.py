@@ -41,9 +41,9 @@ from hybrid_mpc import (
     simulate,
     with_parameter_states,
 )
-from hybrid_mpc.artifact import build_model
+from hybrid_mpc.job.stages import results as schema
+from hybrid_mpc.kit.artifact import build_model
 from hybrid_mpc.records import record
-from hybrid_mpc.report import schema
 
 HERE = Path(__file__).parent
 MACHINES = ("golf_robot", "unbalanced_disk")

@@ -122,10 +122,10 @@ RUNNER = {
 def freeze(name, run):
     """The folder of a machine from a finished run: programs, weights, plain numbers, references."""
     from hybrid_mpc import ModelInfo, load, load_scenario, make_estimator, make_monitor, make_ocp
-    from hybrid_mpc.artifact import read_description, write_description
-    from hybrid_mpc.assembly import first_controller, freezing
     from hybrid_mpc.files import sha256
-    from hybrid_mpc.job.contenders import no_surer_than_prior
+    from hybrid_mpc.job.controllers import no_surer_than_prior
+    from hybrid_mpc.kit.artifact import read_description, write_description
+    from hybrid_mpc.kit.assembly import first_controller, freezing
 
     folder, run = HERE / name, Path(run)
     folder.mkdir(exist_ok=True)

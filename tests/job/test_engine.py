@@ -17,9 +17,9 @@ import trivial_runs
 from hybrid_mpc import InputError, StudyResults, run_study
 from hybrid_mpc.errors import StorageError
 from hybrid_mpc.job import engine
+from hybrid_mpc.job.context import Silent
 from hybrid_mpc.job.engine import THREADS, Lost, make_engine, run_jobs
-from hybrid_mpc.pipeline.context import Silent
-from hybrid_mpc.studies.inputs import TIMING
+from hybrid_mpc.job.study_run import TIMING
 
 ROOT, TESTS = (
     str(Path(__file__).parents[i]) for i in (2, 1)

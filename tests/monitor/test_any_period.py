@@ -5,8 +5,8 @@ import pytest
 from linear_axes import Axis, kalman
 
 from hybrid_mpc import Diagnoser, guard_monitor, make_monitor, make_resting_guard, replay, rest_speeds
-from hybrid_mpc.data import time_unit
-from hybrid_mpc.monitor import learn_detector
+from hybrid_mpc.data.scales import time_unit
+from hybrid_mpc.monitor.learn import learn_detector
 from hybrid_mpc.monitor.lengths import SETTLING_S, block_seconds, samples, seconds
 
 TODAY = {

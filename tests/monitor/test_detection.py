@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import InputError
-from hybrid_mpc.monitor.detection import METHODS, Judges, held, learn_judges
 from hybrid_mpc.records import plain, record
+from scenarios.golf_robot.monitor_study.detection import METHODS, Judges, held, learn_judges
 
 DT, STEP, RATE = 0.02, 1.5e-3, 2.5
 PERIODS = 9_000  # 180 s: 35 blocks of 5 s after the first second

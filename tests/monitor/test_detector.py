@@ -8,8 +8,7 @@ import pytest
 from monitor_parts import DT, GAMMA, NOISE, Observer, pendulum, simulate
 
 from hybrid_mpc import Calibration, Detector, EnergyMonitor, InputError, Plausibility, replay
-from hybrid_mpc.monitor import learn_detector
-from hybrid_mpc.monitor.learning import detector_levels
+from hybrid_mpc.monitor.learn import detector_levels, learn_detector
 from hybrid_mpc.records import plain, record
 
 WINDOW = {"window": 11, "average": 5, "free_run": 0.6}

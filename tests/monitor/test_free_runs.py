@@ -8,7 +8,7 @@ import pytest
 from monitor_parts import DT, GAMMA, Estimate, Exact, Observer, pendulum, simulate
 
 from hybrid_mpc import EnergyMonitor, InputError
-from hybrid_mpc.model import Balance
+from hybrid_mpc.model.model import Balance
 
 
 def readings(monitor, estimator, run):

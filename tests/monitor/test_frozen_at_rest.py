@@ -8,7 +8,7 @@ import pytest
 from monitor_parts import DT, Estimate, J, pendulum
 
 from hybrid_mpc import EnergyMonitor, InputError, Signal, with_input_delay
-from hybrid_mpc.model import step_symbols
+from hybrid_mpc.model.model import step_symbols
 
 STEP, LIMIT = 1e-3, 1.0
 """Step of the sensor [rad]; input from -1 to 1 N m, a quarter of that is 0.5 N m."""

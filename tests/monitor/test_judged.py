@@ -15,8 +15,9 @@ from typer.testing import CliRunner
 
 from hybrid_mpc import Calibration, EnergyMonitor, Fault, Guard, InputError, Mode, replay, write_csv
 from hybrid_mpc.cli.main import app
-from hybrid_mpc.model import step_symbols
-from hybrid_mpc.monitor import Verdict, judge
+from hybrid_mpc.model.model import step_symbols
+from hybrid_mpc.monitor.energy import Verdict
+from hybrid_mpc.monitor.replay import judge
 
 WINDOW, AVERAGE = 5, 10
 NEVER = Calibration(1e9, 1e9, 1.0, 1, 1.0, "by hand")
@@ -148,7 +149,7 @@ def diverging(folder):
         save_artifact,
         trace_model,
     )
-    from hybrid_mpc.identification.networks import StackedGRU
+    from hybrid_mpc.identify.networks import StackedGRU
     from scenarios.golf_robot.prior import GolfRobotPrior
 
     prior = GolfRobotPrior()

@@ -8,8 +8,9 @@ import pytest
 from monitor_parts import DT, GAMMA, NOISE, Estimate, Exact, Observer, Run, pendulum, simulate
 
 from hybrid_mpc import Calibration, EnergyMonitor, InputError, count_alarms, replay
-from hybrid_mpc.model import step_symbols
-from hybrid_mpc.monitor import calibrate, judge, with_residual
+from hybrid_mpc.model.model import step_symbols
+from hybrid_mpc.monitor.calibrate import calibrate, with_residual
+from hybrid_mpc.monitor.replay import judge
 
 
 @pytest.mark.parametrize("kind", ["sine", "steps"])

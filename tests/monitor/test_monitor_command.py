@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from hybrid_mpc import Calibration, Detector, InputError, load_scenario, set_calibration, write_csv
 from hybrid_mpc.cli.main import app
 from hybrid_mpc.files import write_json
-from hybrid_mpc.pipeline.monitor_job import MonitorJob, prepared, read_detector, watched
+from hybrid_mpc.job.monitor import MonitorJob, prepared, read_detector, watched
 from hybrid_mpc.records import plain
 from scenarios.golf_robot.rig import Rig
 

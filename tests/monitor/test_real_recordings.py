@@ -43,7 +43,7 @@ def real():
 def model():
     """The fitted prior alone: it needs no training, and on these recordings it does as well as the hybrid."""
     from hybrid_mpc import PriorStep, model_info, trace_model
-    from hybrid_mpc.artifact import build_model
+    from hybrid_mpc.kit.artifact import build_model
 
     values = json.loads(PRIOR.read_text())["identification"]["details"]["prior_parameters"]["values"]
     prior = scenario.prior(values)

@@ -23,9 +23,8 @@ from hybrid_mpc import (
     replay,
     rest_speeds,
 )
-from hybrid_mpc.data import noise_of, time_unit
-from hybrid_mpc.files import plain
-from hybrid_mpc.records import record
+from hybrid_mpc.data.scales import noise_of, time_unit
+from hybrid_mpc.records import plain, record
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
 FIVE_CM = Axis(0.01, mass=2.0, viscous=10.0, dry=0.1)

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from hybrid_mpc import HybridStep, Parameter, Prior, Scaling, Signal, n_features, trace_model
-from hybrid_mpc.identification.networks import StackedGRU
-from hybrid_mpc.identification.step import required_substeps
+from hybrid_mpc.identify.networks import StackedGRU
+from hybrid_mpc.identify.step import required_substeps
 from nn_export import build, from_casadi, parity
 
 torch.set_num_threads(1)

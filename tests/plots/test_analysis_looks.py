@@ -3,7 +3,9 @@
 import numpy as np
 
 from hybrid_mpc import Signal
-from hybrid_mpc.plots import analysis, analysis_loops, colour, line_style
+from hybrid_mpc.plots import analysis
+from hybrid_mpc.plots import analysis as analysis_loops
+from hybrid_mpc.plots.style import colour, line_style
 
 U, Y = Signal("u", "N m"), Signal("phi", "rad")
 

@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 
 from hybrid_mpc import InputError, Signal
-from hybrid_mpc.plots import Scene, animate, animation
-from hybrid_mpc.plots.scene import GHOSTS
+from hybrid_mpc.plots import animation
+from hybrid_mpc.plots.animation import GHOSTS, Scene, animate
 from scenarios.golf_robot.drawing import draw
 
 PLANNED = np.array([213, 94, 0])  # the colour of all that is planned (#D55E00)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import InputError, Signal
-from hybrid_mpc.plots import estimation, save
+from hybrid_mpc.plots import estimation
+from hybrid_mpc.plots.style import save
 
 PHI = (Signal("phi", "rad"),)
 BANDS = {"mean_band": (0.9, 1.1), "correlation_band": 0.1}

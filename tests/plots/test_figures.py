@@ -11,20 +11,9 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import InputError, Signal
-from hybrid_mpc.plots import (
-    COLOURS,
-    analysis,
-    data,
-    fit,
-    line_style,
-    loops,
-    monitor,
-    name_of,
-    new_figure,
-    save,
-    training,
-)
-from hybrid_mpc.plots.style import checked, number
+from hybrid_mpc.plots import analysis, data, fit, loops, monitor
+from hybrid_mpc.plots import fit as training
+from hybrid_mpc.plots.style import COLOURS, checked, line_style, name_of, new_figure, number, save
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "report"))
 import report_example as example

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import InputError, Signal
-from hybrid_mpc.plots import save
-from hybrid_mpc.plots.reproduction import LOOKS, errors_over_sequences, shown_free_run
+from hybrid_mpc.plots.style import save
+from scenarios.paper.plots import LOOKS, errors_over_sequences, shown_free_run
 
 
 def curve(mean, diverged=(0, 0)):

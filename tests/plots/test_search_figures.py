@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import InputError
-from hybrid_mpc.plots.search import STATES, history, settings
+from hybrid_mpc.plots.tune import STATES, history, settings
 
 ROWS = [
     {"number": n, "state": state, "value": value, "values": {"hidden": 4 * 2**n, "decay": 10.0**n}}

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import InputError
-from hybrid_mpc.plots import save
-from hybrid_mpc.plots.tasks import CONTROLLERS, costs, strokes
+from hybrid_mpc.plots.loops import CONTROLLERS, costs, strokes
+from hybrid_mpc.plots.style import save
 
 NAN = math.nan
 ROW = {"prior": (8.0, 1.0), "hybrid": (2.4, 0.2), "oracle": (2.0, 0.1)}
@@ -162,7 +162,7 @@ def test_bad_strokes_are_refused(rows):
 
 def test_no_global_figure_and_no_torch():
     code = (
-        "import sys; from hybrid_mpc.plots import animation, tasks; "
+        "import sys; from hybrid_mpc.plots import animation, loops as tasks; "
         "assert not {'torch', 'matplotlib.pyplot', 'casadi'} & set(sys.modules), 'a forbidden import'"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -9,21 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_mpc import Signal
-from hybrid_mpc.monitor import MonitorTrace
-from hybrid_mpc.plots import (
-    analysis,
-    data,
-    estimation,
-    fit,
-    loops,
-    monitor,
-    name_of,
-    overview,
-    save,
-    training,
-)
-from hybrid_mpc.report import KeyFigure, Report, Section, Table, write_report
-from hybrid_mpc.report.texts import TITLES, paragraphs
+from hybrid_mpc.job.stages.report import TITLES, paragraphs
+from hybrid_mpc.monitor.replay import MonitorTrace
+from hybrid_mpc.plots import analysis, data, estimation, fit, loops, monitor
+from hybrid_mpc.plots import fit as training
+from hybrid_mpc.plots.monitor import overview
+from hybrid_mpc.plots.style import name_of, save
+from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, write_report
 
 STATES = (Signal("phi", "rad"), Signal("phi_dot", "rad/s"))
 INPUTS = (Signal("tau", "N m"),)

@@ -9,9 +9,8 @@ from pathlib import Path
 import pytest
 
 from hybrid_mpc import InputError
-from hybrid_mpc.report import KeyFigure, Report, Section, Table, write_report
-from hybrid_mpc.report.page import render
-from hybrid_mpc.report.texts import TEXTS, TITLES
+from hybrid_mpc.job.stages.report import TEXTS, TITLES
+from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, render, write_report
 
 sys.path.insert(0, str(Path(__file__).parent))
 import report_example as example

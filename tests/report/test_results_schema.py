@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from hybrid_mpc import InputError
-from hybrid_mpc.report.schema import SCHEMA, Group, validate_results
+from hybrid_mpc.job.stages.results import SCHEMA, Group, validate_results
 
 PER_MODEL = {"phy_nominal": 1.0, "phy": 0.2, "rnn": 0.4, "pgrnn": 0.17, "mopgrnn": 0.15}
 RESULTS = {

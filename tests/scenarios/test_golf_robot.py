@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from hybrid_mpc import InputError
-from hybrid_mpc.data.differentiation import local_polynomial
+from hybrid_mpc.data.differentiate import local_polynomial
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.data import make_data, record, stems
 from scenarios.golf_robot.effects import measure_effects, smoothing

@@ -14,7 +14,7 @@ from hybrid_mpc import (
     make_ocp,
     simulate,
 )
-from hybrid_mpc.closed_loop.faults import install
+from hybrid_mpc.loop.faults import install
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.faults import catalogue, fault_case
 from scenarios.golf_robot.rig import Rig

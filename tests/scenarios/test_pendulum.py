@@ -9,7 +9,7 @@ import torch
 from scipy.integrate import solve_ivp
 
 from hybrid_mpc import InputError, Scenario, load_scenario, load_trajectories
-from hybrid_mpc.report.schema import validate_results
+from hybrid_mpc.job.stages.results import validate_results
 from scenarios.pendulum import scenario
 from scenarios.pendulum.data import (
     AMPLITUDE,

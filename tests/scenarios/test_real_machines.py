@@ -11,8 +11,8 @@ import torch
 from energy_checks import check_energy_balance
 
 from hybrid_mpc import InputError, Trajectory, write_csv
-from hybrid_mpc.identification.step import required_substeps
-from hybrid_mpc.pipeline.machine_benchmark.recordings import in_turn, read_test, read_training
+from hybrid_mpc.identify.step import required_substeps
+from hybrid_mpc.job.benchmark_runs import in_turn, read_test, read_training
 from scenarios.emps import NEWTON_PER_VOLT
 from scenarios.emps import scenario as emps
 from scenarios.emps.prior import EmpsPrior

@@ -16,12 +16,12 @@ import numpy as np
 
 from hybrid_mpc import Scaling, load_scenario
 from hybrid_mpc.files import read_arrays, read_json
-from hybrid_mpc.identification.evaluation import stacked_free_runs
-from hybrid_mpc.identification.trained import Trained
-from hybrid_mpc.pipeline.context import Silent
-from hybrid_mpc.reproduction.jobs import Case
-from hybrid_mpc.reproduction.run import Work
-from hybrid_mpc.reproduction.settings import ReproductionSettings, case_key, experiment_of
+from hybrid_mpc.identify.evaluate import stacked_free_runs
+from hybrid_mpc.identify.train import Trained
+from hybrid_mpc.job.context import Silent
+from scenarios.paper.jobs import Case
+from scenarios.paper.run import Work
+from scenarios.paper.settings import ReproductionSettings, case_key, experiment_of
 
 EDGES = (0.0, 0.05, 0.5, 2.0, np.inf)
 MODELS = ("pgrnn", "mopgrnn")

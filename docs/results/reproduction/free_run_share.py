@@ -16,10 +16,10 @@ import numpy as np
 
 from hybrid_mpc import load_scenario
 from hybrid_mpc.files import read_json
-from hybrid_mpc.pipeline.context import Silent
-from hybrid_mpc.reproduction.jobs import ensemble_job, fit_job
-from hybrid_mpc.reproduction.run import Work, record_stage
-from hybrid_mpc.reproduction.settings import ReproductionSettings, case_key, experiment_of
+from hybrid_mpc.job.context import Silent
+from scenarios.paper.jobs import ensemble_job, fit_job
+from scenarios.paper.run import Work, record_stage
+from scenarios.paper.settings import ReproductionSettings, case_key, experiment_of
 
 DATA_SET, COUNT = "b", 15
 

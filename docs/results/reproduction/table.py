@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from hybrid_mpc.files import write_text
-from hybrid_mpc.reproduction.outputs import claim_lines, read_results, said_cell, table_of
-from hybrid_mpc.reproduction.table import METRICS
+from scenarios.paper.run import claim_lines, read_results, said_cell, table_of
+from scenarios.paper.table import METRICS
 
 HERE = Path(__file__).parent
 SHOWN = ("e_sim_s", "rmse_rad", "energy_violation_w")

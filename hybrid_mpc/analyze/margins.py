@@ -1,0 +1,475 @@
+"""The linearised control loop: MPC, estimator and plant; margins and sensitivity functions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from time import perf_counter
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_discrete_are
+
+from hybrid_mpc.analyze.linearize import column, control_toolbox, hidden_fixed_point, linearize, period
+from hybrid_mpc.analyze.properties import frequency_response
+from hybrid_mpc.control.rti import CondensedController, propagate
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimate.kalman import Estimate, ExtendedKalmanFilter
+
+# What controller and estimator are to first order: the gain of the MPC's QP, the steady Kalman filter.
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MpcGain:
+    """An MPC to first order: ``du_0 = by_state dz + by_load dd + by_before du_before + by_reference dr``.
+
+    It is exact as long as no bound acts and the prediction's linearisation stays the same.
+
+    Args:
+        by_state: By the estimate of ``z = (x, h)``, ``(n_u, n_z)``.
+        by_load: By the estimated input disturbance ``(n_u, n_u)``.
+        by_before: By the input held before ``(n_u, n_u)``; zero without ``r_delta``.
+        by_reference: By a reference that is constant over the horizon ``(n_u, n_x)``.
+    """
+
+    by_state: Array
+    by_load: Array
+    by_before: Array
+    by_reference: Array
+
+
+def mpc_gain(
+    controller: CondensedController, x: ArrayLike, u: ArrayLike, h: ArrayLike | None = None, *, system: Any = None
+) -> MpcGain:  # fmt: skip
+    """Derivative of the QP's solution where no bound acts, at an operating point that the whole plan holds.
+
+    The condensed QP ``min 1/2 s'Hs + g's`` has the solution ``s = -H^{-1} g``, and ``g`` is affine in the estimate,
+    the disturbance, the input before and the reference; so the derivative is a solve with the controller's own ``H``.
+
+    Args:
+        controller: The real-time iteration; its weights, horizon, terminal weight and move blocks are used.
+        x: Operating point ``(n_x,)``.
+        u: Input there ``(n_u,)``, within the bounds.
+        h: Hidden state ``(n_h,)``. Default: its fixed point.
+        system: Linearisation over ``(x, h)`` that the prediction is to have, e.g. of :func:`linearize_secant`.
+            Default: the tangent at the point.
+
+    Raises:
+        InputError: If a size is wrong, the point violates a bound of the inputs or a soft one, or the problem has an
+            economic stage cost (its curvature changes along the plan).
+
+    Source: Fiacco, *Introduction to Sensitivity and Stability Analysis in Nonlinear Programming*, 1983, for bounds
+    that do not act; Bemporad, Morari, Dua, Pistikopoulos, *The explicit linear quadratic regulator for constrained
+    systems*, Automatica 38 (2002).
+
+    Example:
+        >>> import casadi as ca
+        >>> from hybrid_mpc.model.model import HybridModel
+        >>> from hybrid_mpc.control.ocp import OCP
+        >>> from hybrid_mpc.machine.signals import Signal
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
+        >>> controller = CondensedController(model, OCP(5, [1.0], [1.0], [0.0], [-9.0], [9.0]))
+        >>> mpc_gain(controller, [0.0], [0.0]).by_state.round(6)
+        array([[-0.618034]])
+    """
+    model, ocp = controller.model, controller.ocp
+    n, n_x, n_u = ocp.horizon, model.n_x, model.n_u
+    x0, u0 = column(model, "x", x, n_x), column(model, "u", u, n_u)
+    h0 = hidden_fixed_point(model, x0, u0) if h is None else column(model, "h", h, model.n_h)
+    if np.any(u0 <= ocp.u_min) or np.any(u0 >= ocp.u_max):
+        raise InputError(
+            f"MPC gain: the input {u0.tolist()} lies on or outside the bounds, where it does not move"
+        )
+    if ocp.economic is not None:
+        raise InputError(
+            "MPC gain: the problem has an economic stage cost; its gain depends on the whole plan"
+        )
+    z0 = np.concatenate([x0, h0])
+    plan, z = np.tile(u0, (n, 1)), np.tile(z0, (n + 1, 1))
+    if np.any(controller.problem.soft.excess(controller.problem.soft.values(z[:, :n_x], plan)) > 0):
+        raise InputError(
+            f"MPC gain: the point x = {x0.tolist()} violates a soft bound; take one where none acts"
+        )
+    sys = linearize(model, x0, u0, h0) if system is None else system
+    a, b = np.asarray(sys.A, dtype=float), np.asarray(sys.B, dtype=float)
+    derivatives = z[1:], np.tile(a.T, (n, 1, 1)), np.tile(b, (n, 1, 1))
+    weight = np.ones((n + 1, n_x))
+    prepared = controller.condense(plan, z, np.zeros(n_u), u0, weight, derivatives, perf_counter())
+    none = np.zeros((n, len(a)))
+    stages = list(prepared.a_t.transpose(0, 2, 1))
+    by_z = np.stack([propagate(stages, none, e)[:, :n_x].ravel() for e in np.eye(len(a))], axis=1)
+    every = np.tile(np.eye(n_u), (n, 1))
+    hold = np.tile(np.eye(n_x), (n + 1, 1))
+    before = np.zeros((n * n_u, n_u))
+    before[:n_u] = -2 * model.dt * np.diag(ocp.r_delta)
+    slopes = np.hstack([
+        2 * prepared.weighted.T @ by_z, 2 * prepared.weighted.T @ (prepared.from_u @ every), before,
+        -2 * prepared.weighted.T @ hold,
+    ])  # fmt: skip
+    hessian, slopes = _blocked(controller, prepared.hessian, slopes)
+    first = -cho_solve(cho_factor(hessian), slopes)[:n_u]
+    edges = np.cumsum([len(a), n_u, n_u])
+    return MpcGain(*np.split(first, edges, axis=1))
+
+
+def _blocked(controller: CondensedController, hessian: Array, slopes: Array) -> tuple[Array, Array]:
+    if controller.ocp.blocks is None:
+        return hessian, slopes
+    qp = controller.qp
+    return qp.blocked_hessian(hessian), qp.by_blocks(slopes.T).T
+
+
+@dataclass(frozen=True)
+class SteadyFilter:
+    """A Kalman filter in its steady state over ``w = (x, h, d)``.
+
+    ``w- = F w + G u``, then ``w = w- + gain (y - C w-)``.
+
+    Args:
+        F: ``(n_w, n_w)``.
+        G: ``(n_w, n_u)``.
+        C: ``(n_y, n_w)``.
+        gain: ``(n_w, n_y)``.
+        P: Covariance after a measurement ``(n_w, n_w)``.
+    """
+
+    F: Array
+    G: Array
+    C: Array
+    gain: Array
+    P: Array
+
+
+def steady_filter(
+    ekf: ExtendedKalmanFilter, x: ArrayLike, u: ArrayLike, h: ArrayLike | None = None, *, system: Any = None
+) -> SteadyFilter:  # fmt: skip
+    """The extended filter's gain once its covariance has settled at an operating point.
+
+    Args:
+        ekf: The filter; a disturbance that it takes for constant keeps a gain of zero.
+        x: Operating point ``(n_x,)``.
+        u: Input there ``(n_u,)``.
+        h: Hidden state ``(n_h,)``. Default: its fixed point.
+        system: Linearisation over ``(x, h)`` instead of the tangent at the point. Default: none.
+
+    Raises:
+        InputError: If a size is wrong, an output depends on the input at once, or the covariance does not settle.
+
+    Source: Anderson and Moore, *Optimal Filtering*, 1979, section 4.4.
+
+    Example:
+        >>> import casadi as ca
+        >>> from hybrid_mpc.model.model import HybridModel
+        >>> from hybrid_mpc.machine.signals import Signal
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
+        >>> ekf = ExtendedKalmanFilter(model, sigma_y=[1.0], sigma_x=[1.0], sigma_x0=[1.0])
+        >>> steady_filter(ekf, [0.0], [0.0]).gain[:1].round(6)
+        array([[0.618034]])
+    """
+    model = ekf.model
+    x0, u0 = column(model, "x", x, model.n_x), column(model, "u", u, model.n_u)
+    h0 = hidden_fixed_point(model, x0, u0) if h is None else column(model, "h", h, model.n_h)
+    sys = linearize(model, x0, u0, h0) if system is None else system
+    if np.any(np.asarray(sys.D) != 0):
+        raise InputError(
+            f"model {model.name}: an output depends on the input at once; the loop here has no such path"
+        )
+    n_z, n_u = model.n_x + model.n_h, model.n_u
+    n_w = n_z + n_u
+    known = Estimate(
+        0.0, x0, h0, np.zeros(n_u), np.zeros((n_w, n_w)), np.full(model.n_y, np.nan), float("nan")
+    )
+    noise = np.diag(ekf.predict(known, u0).P)  # of a state that was known exactly: what one period adds
+    noise_y = ekf.innovation_covariance(known, u0)
+    f, g = np.eye(n_w), np.zeros((n_w, n_u))
+    f[:n_z, :n_z], f[:n_z, n_z:], g[:n_z] = sys.A, sys.B, sys.B
+    c = np.hstack([np.asarray(sys.C, dtype=float), np.zeros((model.n_y, n_u))])
+    alive = np.concatenate([np.ones(n_z, dtype=bool), noise[n_z:] > 0])
+    gain, p = np.zeros((n_w, model.n_y)), np.zeros((n_w, n_w))
+    where = np.ix_(alive, alive)
+    try:
+        before = solve_discrete_are(f[where].T, c[:, alive].T, np.diag(noise[alive]), noise_y)
+    except (LinAlgError, ValueError) as error:
+        raise InputError(
+            f"model {model.name}: the filter's covariance does not settle ({error}); its noise must reach, and the "
+            "outputs show, every mode on or outside the unit circle"
+        ) from error
+    seen = c[:, alive]
+    gain[alive] = np.linalg.solve(seen @ before @ seen.T + noise_y, seen @ before).T
+    p[where] = before - gain[alive] @ seen @ before
+    return SteadyFilter(f, g, c, gain, p)
+
+
+Complex = NDArray[np.complex128]
+FREQUENCIES = 2000
+MOST_DELAY = 200
+"""Most whole periods of delay that are tried."""
+
+
+@dataclass(frozen=True)
+class Margins:
+    """How far a loop is from instability, broken at one input.
+
+    Args:
+        gain_up: Factor on the loop's gain that makes it unstable, above 1; infinite if none does.
+        gain_down: Such a factor below 1; 0 if none does.
+        phase: Smallest phase margin [rad]; infinite without gain crossover.
+        delay: Smallest delay margin [s]: phase margin over its crossover frequency, all crossovers looked at.
+        delay_periods: Most whole periods of delay at the input with which the closed loop's poles are still inside the
+            circle; 0 where one already is too many.
+        crossover: Highest gain crossover [rad/s]; NaN without.
+        modulus: Smallest distance of the Nyquist curve from -1: one over the peak of the sensitivity.
+        disk: Symmetric disk margin [-]: gain may vary by ``(1 + disk / 2) / (1 - disk / 2)`` either way, or phase by
+            ``disk_phase``, or some of both, at any frequency.
+        disk_gain: That factor.
+        disk_phase: That phase [rad].
+    """
+
+    gain_up: float
+    gain_down: float
+    phase: float
+    delay: float
+    delay_periods: int
+    crossover: float
+    modulus: float
+    disk: float
+    disk_gain: float
+    disk_phase: float
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A linearised loop of plant and output feedback, both discrete, with ``u = feedback y``.
+
+    Args:
+        plant: ``control.StateSpace`` from inputs to outputs.
+        feedback: ``control.StateSpace`` from outputs to inputs, no sign in between.
+        closed: Closed loop from loads at the inputs and noise at the outputs to outputs and inputs.
+        poles: Its poles, largest first.
+    """
+
+    plant: Any
+    feedback: Any
+    closed: Any
+    poles: Complex
+
+    @property
+    def stable(self) -> bool:
+        """All poles of the closed loop are inside the unit circle."""
+        return bool(np.abs(self.poles[0]) < 1.0)
+
+    def broken(self, input: int = 0) -> Any:
+        """The loop transfer function with one input cut open, the others closed, in negative-feedback sign.
+
+        Raises:
+            InputError: If there is no such input.
+        """
+        n_u = self.plant.ninputs
+        if not 0 <= input < n_u:
+            raise InputError(f"loop: input {input} asked for, the plant has {n_u}")
+        a, b, c, d = _open(self.plant, self.feedback)
+        others = [j for j in range(n_u) if j != input]
+        if others:
+            back = np.linalg.inv(np.eye(len(others)) - d[np.ix_(others, others)])
+            a, b, c, d = (
+                a + b[:, others] @ back @ c[others], b + b[:, others] @ back @ d[others],
+                c + d[:, others] @ back @ c[others], d + d[:, others] @ back @ d[others],
+            )  # fmt: skip
+        one = slice(input, input + 1)
+        return control_toolbox().ss(
+            a, b[:, one], -c[one], -d[one, one], self.plant.dt, remove_useless_states=False, name="loop"
+        )
+
+    def margins(self, input: int = 0) -> Margins:
+        """Margins of the loop broken at one input, by python-control on a fine grid of frequencies.
+
+        Raises:
+            InputError: If there is no such input, or the closed loop is not stable: it has no margins then.
+        """
+        if not self.stable:
+            raise InputError(
+                f"loop: the closed loop is not stable (spectral radius {abs(self.poles[0]):.6g}); it has no margins"
+            )
+        control, dt, broken = control_toolbox(), period(self.plant), self.broken(input)
+        omega = _grid(broken, dt)
+        response = frequency_response(broken, omega)
+        given = (response.magnitude[0, 0], np.degrees(response.phase[0, 0]), omega)
+        gains, phases, _, _, at_phase, _ = control.stability_margins(given, returnall=True)
+        gains, phases = np.atleast_1d(gains), np.radians(np.atleast_1d(phases))
+        g = response.magnitude[0, 0] * np.exp(1j * response.phase[0, 0])
+        at_nyquist = float(g[-1].real)
+        ends = [at_nyquist, _at_rest(broken)]  # real: crossings that python-control leaves out
+        gains = np.append(gains, [-1.0 / end for end in ends if end < 0])
+        at = np.atleast_1d(at_phase)
+        delays = [(p % (2 * np.pi)) / w for p, w in zip(phases, at, strict=True)]
+        if at_nyquist > 1:  # one period turns it to below -1, and no gain crossover tells
+            delays.append(dt)
+        disk, _, _ = control.disk_margins(broken, omega, skew=0.0)
+        size = min(float(disk), 2.0)
+        return Margins(
+            float(min((k for k in gains if k > 1), default=np.inf)),
+            float(max((k for k in gains if k < 1), default=0.0)),
+            float(np.abs(phases).min(initial=np.inf)),
+            float(min(delays, default=np.inf)),
+            self._delay_periods(input),
+            float(at.max()) if at.size else float("nan"),
+            float(np.abs(1 + g).min()),
+            float(disk),
+            (1 + size / 2) / (1 - size / 2) if size < 2 else float("inf"),
+            2 * float(np.arctan(size / 2)),
+        )
+
+    def _delay_periods(self, input: int) -> int:
+        loop = self.broken(input)
+        a, b, c, d = (np.asarray(m, dtype=float) for m in (loop.A, loop.B, loop.C, loop.D))
+        for periods in range(1, MOST_DELAY + 1):
+            n = len(a)
+            whole = np.zeros((n + periods, n + periods))
+            # the newest value of the line is -(C x + D oldest), the oldest one acts
+            whole[:n, :n], whole[:n, n:][:, -1:] = a, b
+            whole[n : n + 1, :n], whole[n, -1] = -c, -d.item()
+            whole[n + 1 :, n:-1] += np.eye(periods - 1)
+            if np.abs(np.linalg.eigvals(whole)).max() >= 1.0:
+                return periods - 1
+        return MOST_DELAY
+
+    def sensitivity(self, omega: ArrayLike) -> Mapping[str, Complex]:
+        """Sensitivity functions at frequencies ``(n,)`` [rad/s] in ``(0, pi / dt]``.
+
+        Returns:
+            ``"S"`` and ``"T"`` ``(n_u, n_u, n)`` at the inputs: what is left of a load there, and what of it the
+            controller's input takes; ``"KS"`` ``(n_u, n_y, n)`` from noise of the outputs to the inputs; ``"GS"``
+            ``(n_y, n_u, n)`` from loads to the outputs; ``"S_y"`` ``(n_y, n_y, n)`` at the outputs.
+
+        Raises:
+            InputError: If a frequency lies outside.
+        """
+        g, k = (_response(s, omega) for s in (self.plant, self.feedback))
+        n_u, n_y = self.plant.ninputs, self.plant.noutputs
+        s = np.linalg.inv(np.eye(n_u) - k @ g)
+        s_y = np.linalg.inv(np.eye(n_y) - g @ k)
+        parts = {"S": s, "T": -s @ k @ g, "KS": s @ k, "GS": g @ s, "S_y": s_y}
+        return MappingProxyType({name: np.moveaxis(v, 0, -1) for name, v in parts.items()})
+
+
+def mpc_loop(gain: MpcGain, filter: SteadyFilter, plant: Any, *, delay: int = 0) -> Loop:
+    """The loop of an MPC's gain, a steady filter and a plant, in the order of ``closed_loop.simulate``.
+
+    At ``t_k``: measure ``y_k``, ``w_k = w- + L (y_k - C w-)`` with ``w- = F w_{k-1} + G u_{k-1}``, then ``u_k`` from
+    ``w_k`` and ``u_{k-1}``, held until ``t_{k+1}``.
+
+    Args:
+        gain: Of the controller, see :func:`mpc_gain`.
+        filter: Of the estimator, see :func:`steady_filter`.
+        plant: Discrete ``control.StateSpace`` of the machine: the model itself, or a better one, to see what a
+            controller on a prior is worth on the hybrid.
+        delay: Whole periods that the input arrives late, unknown to the controller. Default: none.
+
+    Raises:
+        InputError: If sizes or periods do not fit, or the plant's outputs depend on its inputs at once.
+
+    Example:
+        >>> import control
+        >>> plant = control.ss([[1.0]], [[1.0]], [[1.0]], 0.0, 1.0)
+        >>> one, none = np.ones((1, 1)), np.zeros((1, 1))
+        >>> gain = MpcGain(-0.5 * one, none, none, none)
+        >>> known = SteadyFilter(np.diag([1.0, 0.0]), np.array([[1.0], [0.0]]), np.array([[1.0, 0.0]]),
+        ...     np.array([[1.0], [0.0]]), np.zeros((2, 2)))
+        >>> loop = mpc_loop(gain, known, plant)
+        >>> loop.stable, round(loop.margins().gain_up, 6), round(loop.margins().modulus, 6)
+        (True, 4.0, 0.75)
+    """
+    period(plant)
+    (n_u, n_z), (n_w, n_y) = gain.by_state.shape, filter.gain.shape
+    if (plant.ninputs, plant.noutputs, n_w) != (n_u, n_y, n_z + n_u):
+        raise InputError(
+            f"loop: plant with {plant.ninputs} inputs and {plant.noutputs} outputs, filter over {n_w} with {n_y} "
+            f"outputs, gain of {n_u} inputs by {n_z} states; these do not fit each other"
+        )
+    if np.any(np.asarray(plant.D) != 0):
+        raise InputError(
+            "loop: an output of the plant depends on its input at once; the loop here has no such path"
+        )
+    if delay < 0:
+        raise InputError(f"loop: delay must be a whole number of periods, not negative, got {delay}")
+    # a disturbance that the filter takes for constant stays zero: it is no state of the loop
+    alive = (np.arange(n_w) < n_z) | np.any(filter.gain != 0, axis=1)
+    k, follow = np.hstack([gain.by_state, gain.by_load])[:, alive], filter.gain[alive]
+    keep = np.eye(int(alive.sum())) - follow @ filter.C[:, alive]
+    forward = np.hstack([keep @ filter.F[np.ix_(alive, alive)], keep @ filter.G[alive]])
+    out = k @ forward
+    out[:, len(keep) :] += gain.by_before
+    a, b = np.vstack([forward, out]), np.vstack([follow, k @ follow])
+    feedback = control_toolbox().ss(a, b, out, k @ follow, plant.dt, remove_useless_states=False)
+    late = plant
+    for _ in range(delay):
+        late = _delayed(late)
+    closed = _closed(late, feedback)
+    poles = np.linalg.eigvals(closed.A).astype(np.complex128)
+    return Loop(late, feedback, closed, poles[np.argsort(-np.abs(poles), kind="stable")])
+
+
+def _delayed(plant: Any) -> Any:
+    """The plant with its inputs one period late."""
+    a, b, c = (np.asarray(m, dtype=float) for m in (plant.A, plant.B, plant.C))
+    n, n_u = b.shape
+    whole = np.block([[a, b], [np.zeros((n_u, n + n_u))]])
+    into = np.vstack([np.zeros((n, n_u)), np.eye(n_u)])
+    seen = np.hstack([c, np.zeros((len(c), n_u))])
+    return control_toolbox().ss(whole, into, seen, 0.0, plant.dt, remove_useless_states=False)
+
+
+def _open(plant: Any, feedback: Any) -> tuple[Array, Array, Array, Array]:
+    """From the plant's inputs through plant and feedback."""
+    a, b, c = (np.asarray(m, dtype=float) for m in (plant.A, plant.B, plant.C))
+    f, g, h, k = (np.asarray(m, dtype=float) for m in (feedback.A, feedback.B, feedback.C, feedback.D))
+    whole = np.block([[a, np.zeros((len(a), len(f)))], [g @ c, f]])
+    into = np.vstack([b, np.zeros((len(f), b.shape[1]))])
+    return whole, into, np.hstack([k @ c, h]), np.zeros((len(h), b.shape[1]))
+
+
+def _closed(plant: Any, feedback: Any) -> Any:
+    """From loads at the inputs and noise at the outputs to outputs and the controller's inputs."""
+    a, b, c, _ = _open(plant, feedback)
+    n, (n_y, n_u) = plant.nstates, (plant.noutputs, plant.ninputs)
+    g, k = np.asarray(feedback.B, dtype=float), np.asarray(feedback.D, dtype=float)
+    noise = np.vstack([b[:n] @ k, g])
+    outputs = np.hstack([np.asarray(plant.C, dtype=float), np.zeros((n_y, feedback.nstates))])
+    direct = np.block([[np.zeros((n_y, n_u + n_y))], [np.zeros((n_u, n_u)), k]])
+    return control_toolbox().ss(
+        a + b @ c, np.hstack([b, noise]), np.vstack([outputs, c]), direct, plant.dt, remove_useless_states=False,
+        inputs=[f"load_{i}" for i in range(n_u)] + [f"noise_{i}" for i in range(n_y)],
+        outputs=[f"y_{i}" for i in range(n_y)] + [f"u_{i}" for i in range(n_u)],
+    )  # fmt: skip
+
+
+def _response(sys: Any, omega: ArrayLike) -> Complex:
+    response = frequency_response(sys, omega)
+    return np.asarray(np.moveaxis(response.magnitude * np.exp(1j * response.phase), -1, 0))
+
+
+def _at_rest(sys: Any) -> float:
+    """Gain of a single loop at the frequency zero; 0 with an integrator, whose curve goes to infinity there."""
+    a, b, c, d = (np.asarray(m, dtype=float) for m in (sys.A, sys.B, sys.C, sys.D))
+    if not len(a):
+        return float(d.item())
+    if np.abs(np.linalg.eigvals(a) - 1.0).min() < 1e-9:
+        return 0.0
+    return float((c @ np.linalg.solve(np.eye(len(a)) - a, b) + d).item())
+
+
+def _grid(sys: Any, dt: float) -> Array:
+    """Frequencies up to Nyquist, with all slow poles and the circle's top covered."""
+    poles = np.linalg.eigvals(sys.A).astype(np.complex128)
+    sizes = np.abs(np.log(poles[np.abs(poles) > 0])) / dt
+    moving = sizes[(sizes > 1e-6) & (sizes < np.pi / dt)]
+    lowest = min(0.01 * float(moving.min(initial=np.pi / dt)), 1e-3 * np.pi / dt)
+    near = (moving[:, None] * np.linspace(0.9, 1.1, 41)).ravel()
+    omega = np.concatenate([np.geomspace(lowest, np.pi / dt, FREQUENCIES), near])
+    return np.append(np.unique(omega[omega < (1 - 1e-12) * np.pi / dt]), np.pi / dt)

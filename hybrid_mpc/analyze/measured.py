@@ -1,0 +1,206 @@
+"""Frequency responses estimated from signals: from recordings, or from a machine driven by a multisine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.signal import csd, welch
+
+from hybrid_mpc.data.excitation import multisine
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.loop.plant import Plant
+from hybrid_mpc.model.model import HybridModel
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+Run: TypeAlias = Callable[[Array], Array]
+"""Inputs ``(n,)`` to outputs ``(n,)`` of one channel, measured before each input acts."""
+
+
+@dataclass(frozen=True)
+class MeasuredResponse:
+    """A frequency response from one input to one output, estimated from signals.
+
+    Of a nonlinear machine it is the best linear approximation for signals of that size and band: it depends on both.
+    Compare it with the same estimate from a model that was given the same inputs.
+
+    Args:
+        omega: Frequencies ``(n,)`` [rad/s].
+        response: Complex response ``(n,)``.
+        coherence: ``(n,)``: share of the output's power that is linear in the input; 1 is clean.
+        deviation: Standard deviation of ``|response|`` ``(n,)``: noise, and nonlinearity that looks like noise.
+        averages: Independent averages behind each value.
+    """
+
+    omega: Array
+    response: Complex
+    coherence: Array
+    deviation: Array
+    averages: float
+
+
+def welch_response(
+    pieces: Sequence[tuple[ArrayLike, ArrayLike]], dt: float, *, length: float
+) -> MeasuredResponse:
+    """H1 estimate ``S_uy / S_uu`` with its coherence, averaged over half-overlapping Hann windows of all pieces.
+
+    H1 is unbiased by noise of the output. A window that is short against the machine's ringing smears its resonance.
+
+    Args:
+        pieces: Pairs of inputs ``(n,)`` and outputs ``(n,)``, recordings on the same grid.
+        dt: Period [s].
+        length: Length of the windows [s]; pieces shorter than one are left out.
+
+    Raises:
+        InputError: If no piece is long enough, shapes differ, or fewer than four windows come together: coherence of
+            one window is 1 whatever the signals are.
+
+    Source: Welch, *The use of fast Fourier transform for the estimation of power spectra*, IEEE Trans. Audio
+    Electroacoust. 15 (1967), also for the variance of overlapping windows; Bendat and Piersol, *Random Data*, 4th
+    edition, section 9.2, for the deviation.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> u = rng.normal(size=4000)
+        >>> found = welch_response([(u, 2.0 * u)], 0.01, length=1.0)
+        >>> bool(np.allclose(found.response, 2.0)), round(float(found.coherence.min()), 9)
+        (True, 1.0)
+    """
+    n = round(length / dt)
+    total, count = np.zeros((3, n // 2 + 1), dtype=np.complex128), 0
+    for given_u, given_y in pieces:
+        u, y = np.asarray(given_u, dtype=float).ravel(), np.asarray(given_y, dtype=float).ravel()
+        if u.shape != y.shape:
+            raise InputError(
+                f"frequency response: {u.size} inputs and {y.size} outputs given, as many of each needed"
+            )
+        if n < 8 or u.size < n:
+            continue
+        windows = 1 + (u.size - n) // (n // 2)
+        options = {"fs": 1.0 / dt, "nperseg": n, "noverlap": n - n // 2, "detrend": "linear"}
+        total += windows * np.stack([welch(u, **options)[1], welch(y, **options)[1], csd(u, y, **options)[1]])
+        count += windows
+    if count < 4:
+        raise InputError(
+            f"frequency response: {count} windows of {length:g} s in the recordings, at least 4 needed; take shorter "
+            "windows or more data"
+        )
+    uu, yy, uy = total[0].real[1:-1], total[1].real[1:-1], total[2][1:-1]
+    omega = np.asarray(2 * np.pi * np.arange(1, n // 2) / (n * dt), dtype=np.float64)
+    averages = max(1.0, 9 / 11 * count)
+    return _response(omega, uu[: omega.size], yy[: omega.size], uy[: omega.size], averages)
+
+
+def multisine_response(
+    run: Run, dt: float, *, amplitude: float, band: tuple[float, float], period: float = 10.0, periods: int = 4,
+    settle: int = 1, bias: float = 0.0, odd: bool = True,
+) -> MeasuredResponse:  # fmt: skip
+    """Response at the lines of a multisine that a machine or a model is driven by, without leakage.
+
+    Args:
+        run: The machine: a plant (:func:`run_plant`) or a model (:func:`run_model`).
+        dt: Period of the input [s].
+        amplitude: Largest deviation of the input from its bias [input unit].
+        band: Lowest and highest line [Hz].
+        period: Period of the multisine [s].
+        periods: Whole periods that count; from their scatter comes the deviation.
+        settle: Whole periods that are left out at the start.
+        bias: Mean input. Default: zero.
+        odd: Odd lines only, so that what an even nonlinearity makes falls between them. Default: yes.
+
+    Raises:
+        InputError: If fewer than two periods count, the period is no multiple of ``dt``, or the band holds no line.
+
+    Source: Pintelon and Schoukens, *System Identification: A Frequency Domain Approach*, 2nd edition, chapter 4.
+
+    Example:
+        >>> found = multisine_response(lambda u: np.append(0.0, u[:-1]), 0.1, amplitude=1.0, band=(0.1, 2.0))
+        >>> bool(np.allclose(found.response, np.exp(-0.1j * found.omega)))
+        True
+    """
+    n = round(period / dt)
+    if periods < 2 or settle < 0 or abs(n * dt - period) > 1e-9 * period:
+        raise InputError(
+            f"multisine: at least 2 periods of a multiple of {dt:g} s needed, got {periods} of {period:g} s, {settle} "
+            "left out"
+        )
+    t = np.asarray(dt * np.arange((settle + periods) * n), dtype=np.float64)
+    u = multisine(t, amplitude, *band, period=period, odd=odd, offset=bias)
+    y = np.asarray(run(u), dtype=float).ravel()
+    if y.shape != u.shape:
+        raise InputError(f"multisine: the run returned {y.size} outputs for {u.size} inputs")
+    lines = np.arange(np.ceil(band[0] * period - 1e-9), np.floor(band[1] * period + 1e-9) + 1).astype(int)
+    lines = lines[lines % 2 == 1] if odd else lines
+    spectra = [np.fft.rfft(v[settle * n :].reshape(periods, n), axis=1)[:, lines] for v in (u, y)]
+    mean_u, mean_y = (s.mean(axis=0) for s in spectra)
+    uu, yy = np.abs(mean_u) ** 2, np.mean(np.abs(spectra[1]) ** 2, axis=0)
+    return _response(2 * np.pi * lines / period, uu, yy, np.conj(mean_u) * mean_y, float(periods))
+
+
+def run_plant(plant: Plant, x0: ArrayLike, dt: float, *, seed: int = 0, output: int = 0) -> Run:
+    """A simulated machine as a :data:`Run`, its sensor noise included.
+
+    Args:
+        plant: The machine.
+        x0: Start ``(n_x,)``.
+        dt: Period over which each input is held [s].
+        seed: Of the plant and the noise.
+        output: Which output. Default: the first.
+
+    Example:
+        ``multisine_response(run_plant(scenario.plant(), [0.0, 0.0], 0.02), 0.02, amplitude=0.2, band=(0.1, 3.0))``
+    """
+
+    def run(u: Array) -> Array:
+        rng, state = np.random.default_rng(seed), plant.reset(np.asarray(x0, dtype=float), seed)
+        y = np.empty(u.size)
+        for k, held in enumerate(u):
+            y[k] = np.ravel(plant.measure(state, rng))[output]
+            state = plant.step(state, np.array([held]), dt)
+        return y
+
+    return run
+
+
+def run_model(model: HybridModel, x0: ArrayLike, h0: ArrayLike | None = None, *, output: int = 0) -> Run:
+    """A model's free run as a :data:`Run`.
+
+    Args:
+        model: The model; it has one input.
+        x0: Start ``(n_x,)``.
+        h0: Hidden state there ``(n_h,)``. Default: zero.
+        output: Which output. Default: the first.
+
+    Raises:
+        InputError: If the model has several inputs.
+
+    Example:
+        ``welch_response([(u, run_model(model, x0)(u))], model.dt, length=5.0)``
+    """
+    if model.n_u != 1:
+        raise InputError(f"model {model.name} has {model.n_u} inputs; a run drives one")
+
+    def run(u: Array) -> Array:
+        x, h = np.asarray(x0, dtype=float), np.zeros(model.n_h) if h0 is None else np.asarray(h0, dtype=float)
+        y = np.empty(u.size)
+        for k, held in enumerate(u):
+            y[k] = float(model.output(x, held, model.w, model.p)[output])
+            x, h = model.step(x, h, held, model.w, model.p)
+        return y
+
+    return run
+
+
+def _response(omega: Array, uu: Array, yy: Array, uy: Complex, averages: float) -> MeasuredResponse:
+    floor = 1e-12 * float(uu.max(initial=0.0))
+    used = uu > floor
+    g, coherence = np.full(omega.size, np.nan + 0j), np.zeros(omega.size)
+    g[used] = uy[used] / uu[used]
+    coherence[used] = np.clip(np.abs(uy[used]) ** 2 / np.maximum(uu[used] * yy[used], 1e-300), 0.0, 1.0)
+    safe = np.maximum(coherence, 1e-12)
+    deviation = np.abs(g) * np.sqrt((1 - coherence) / (2 * averages * safe))
+    return MeasuredResponse(omega, g, coherence, deviation, averages)

@@ -1,0 +1,484 @@
+"""Mode by mode: frequency, damping, how well inputs reach it and outputs show it; Hankel singular values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import cholesky, schur, solve_discrete_lyapunov, solve_sylvester
+
+from hybrid_mpc.analyze.linearize import control_toolbox, linearize, period
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.model.model import HybridModel
+
+# Poles, stabilisability, detectability and frequency responses of a linearised model.
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+# Rank decisions: rounding of an SVD is about n * eps * norm ~ 1e-14; a mode this close (relative to the
+# norm) to uncontrollable would need inputs a hundred million times the others'.
+RANK_TOLERANCE = 1e-8
+
+
+@dataclass(frozen=True)
+class LinearAnalysis:
+    """Poles and structural properties of a discrete linear model.
+
+    Args:
+        dt: Period [s].
+        poles: Eigenvalues of A ``(n,)``, largest magnitude first.
+        frequency: Natural frequency ``|log(z) / dt|`` ``(n,)`` [rad/s] of the continuous equivalent.
+        damping: Damping ratio ``(n,)`` of the continuous equivalent; 1 for a pole at rest (z = 1).
+        slow: True where the natural frequency lies below ``split`` ``(n,)``.
+        split: Border [rad/s] between slow and fast poles.
+        stable: All poles inside the unit circle.
+        stabilisable: See :func:`stabilisable`.
+        detectable: See :func:`detectable`.
+    """
+
+    dt: float
+    poles: Complex
+    frequency: Array
+    damping: Array
+    slow: NDArray[np.bool_]
+    split: float
+    stable: bool
+    stabilisable: bool
+    detectable: bool
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain dictionary for JSON: complex as ``[re, im]``, an infinite frequency (z = 0) as None."""
+        return {
+            "dt": self.dt,
+            "poles": [[float(z.real), float(z.imag)] for z in self.poles],
+            "frequency_rad_s": [float(w) if np.isfinite(w) else None for w in self.frequency],
+            "damping": [float(d) for d in self.damping],
+            "slow": [bool(s) for s in self.slow],
+            "split_rad_s": self.split,
+            "stable": self.stable,
+            "stabilisable": self.stabilisable,
+            "detectable": self.detectable,
+        }
+
+
+@dataclass(frozen=True)
+class FrequencyResponse:
+    """Frequency response for Bode plots.
+
+    Args:
+        omega: Frequencies ``(n,)`` [rad/s].
+        magnitude: ``|G|`` ``(n_y, n_u, n)`` [output unit / input unit].
+        phase: Unwrapped phase ``(n_y, n_u, n)`` [rad].
+    """
+
+    omega: Array
+    magnitude: Array
+    phase: Array
+
+
+def analyze(sys: Any, *, split: float | None = None) -> LinearAnalysis:
+    """Poles and properties of a discrete ``control.StateSpace``.
+
+    Args:
+        sys: The system, with a period.
+        split: Border [rad/s] between slow and fast poles. Default: a tenth of the Nyquist frequency.
+
+    Raises:
+        InputError: If the system has no period.
+
+    Example:
+        >>> import control
+        >>> analyze(control.ss([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.1)).stable
+        True
+    """
+    dt = period(sys)
+    poles = np.linalg.eigvals(sys.A).astype(np.complex128)
+    poles = poles[np.argsort(-np.abs(poles), kind="stable")]
+    frequency, damping = np.full(poles.size, np.inf), np.ones(poles.size)
+    moving = np.abs(poles) > 0
+    s = np.log(poles[moving]) / dt
+    frequency[moving] = np.abs(s)
+    damping[moving] = np.where(s == 0, 1.0, -s.real / np.where(s == 0, 1.0, np.abs(s)))
+    border = 0.1 * np.pi / dt if split is None else split
+    return LinearAnalysis(
+        dt,
+        poles,
+        frequency,
+        damping,
+        frequency < border,
+        float(border),
+        bool(np.all(np.abs(poles) < 1.0)),
+        stabilisable(sys),
+        detectable(sys),
+    )
+
+
+def stabilisable(sys: Any) -> bool:
+    """True if the input reaches every mode on or outside the unit circle (Popov-Belevitch-Hautus).
+
+    A mode z counts as unstable if ``|z| >= 1 - 1e-8``; it is reached if the smallest singular value of
+    ``[A - z I, B]`` exceeds 1e-8 of the largest of ``[A, B]``, with B's columns scaled to the norm of A
+    (input units must not decide).
+
+    Args:
+        sys: Discrete ``control.StateSpace``.
+
+    Raises:
+        InputError: If the system has no period.
+
+    Example:
+        >>> import control
+        >>> stabilisable(control.ss([[2.0]], [[0.0]], [[1.0]], [[0.0]], 0.1, remove_useless_states=False))
+        False
+    """
+    period(sys)
+    return _hautus(np.asarray(sys.A), np.asarray(sys.B))
+
+
+def detectable(sys: Any) -> bool:
+    """True if the output shows every mode on or outside the unit circle; the dual of :func:`stabilisable`.
+
+    Raises:
+        InputError: If the system has no period.
+
+    Example:
+        >>> import control
+        >>> detectable(control.ss([[2.0]], [[1.0]], [[1.0]], [[0.0]], 0.1))
+        True
+    """
+    period(sys)
+    return _hautus(np.asarray(sys.A).T, np.asarray(sys.C).T)
+
+
+def frequency_response(sys: Any, omega: ArrayLike) -> FrequencyResponse:
+    """``C (e^{i w dt} I - A)^-1 B + D`` at the frequencies ``omega`` ``(n,)`` [rad/s].
+
+    Raises:
+        InputError: If the system has no period or a frequency lies outside (0, pi / dt].
+
+    Example:
+        >>> import control
+        >>> sys = control.ss([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.1)
+        >>> round(float(frequency_response(sys, [1e-6]).magnitude[0, 0, 0]), 6)
+        2.0
+    """
+    dt = period(sys)
+    w = np.asarray(omega, dtype=np.float64).reshape(-1)
+    if w.size == 0 or not (w.min() > 0 and w.max() <= np.pi / dt * (1 + 1e-9)):
+        raise InputError(f"frequency response: give frequencies in (0, {np.pi / dt:.6g}] rad/s (Nyquist)")
+    a, b, c, d = (np.asarray(m, dtype=np.float64) for m in (sys.A, sys.B, sys.C, sys.D))
+    z = np.exp(1j * w * dt)
+    response = c @ np.linalg.solve(z[:, None, None] * np.eye(a.shape[0]) - a, b.astype(complex)) + d
+    g = np.moveaxis(response, 0, -1)
+    return FrequencyResponse(w, np.abs(g), np.unwrap(np.angle(g), axis=-1))
+
+
+def _hautus(a: Array, b: Array) -> bool:
+    size = max(float(np.linalg.norm(a, 2)), 1.0)
+    norms = np.linalg.norm(b, axis=0)
+    scaled = b * np.where(norms > 0, size / np.where(norms > 0, norms, 1.0), 0.0)
+    largest = np.linalg.norm(np.hstack([a, scaled]), 2)
+    for z in np.linalg.eigvals(a):
+        if abs(z) < 1.0 - RANK_TOLERANCE:
+            continue
+        pencil = np.hstack([a - z * np.eye(a.shape[0]), scaled])
+        if np.linalg.svd(pencil, compute_uv=False)[-1] <= RANK_TOLERANCE * largest:
+            return False
+    return True
+
+
+# Balanced truncation of discrete systems, also of unstable ones, and back to physical states.
+
+Matrices = tuple[Array, Array, Array, Array]
+EDGE = 1e-9
+"""Poles closer to the unit circle than this have no Gramian and are kept."""
+NOTHING = 1e-14
+"""Hankel singular values below this share of the largest are rounding: such states are always truncated."""
+
+
+@dataclass(frozen=True)
+class Reduced:
+    """A reduced system and what the reduction costs.
+
+    Args:
+        system: ``control.StateSpace``.
+        hankel: Hankel singular values ``(n,)`` of the system before, infinite for poles on or outside the circle.
+        order: States kept.
+        bound: Largest difference of the two frequency responses, at any frequency, at most: twice the sum of the
+            singular values left out.
+    """
+
+    system: Any
+    hankel: Array
+    order: int
+    bound: float
+
+
+def hankel_singular_values(sys: Any) -> Array:
+    """Hankel singular values ``(n,)`` of a discrete system, largest first; infinite for each unstable pole.
+
+    Raises:
+        InputError: If the system has no period.
+
+    Example:
+        >>> import control
+        >>> hankel_singular_values(control.ss([[0.6]], [[0.8]], [[0.8]], 0.0, 1.0)).round(12)
+        array([1.])
+    """
+    period(sys)
+    _, stable = _split(_matrices(sys))
+    values = _balance(*stable[:3])[0]
+    return np.concatenate([np.full(len(sys.A) - values.size, np.inf), values])
+
+
+def balanced_truncation(sys: Any, order: int) -> Reduced:
+    """The system with ``order`` states that balanced truncation leaves.
+
+    Poles on or outside the unit circle are kept as they are; of the rest those states go that past inputs hardly
+    reach and future outputs hardly see. Scale inputs and outputs first (:func:`physical_states` does) if units differ.
+
+    Args:
+        sys: Discrete ``control.StateSpace``.
+        order: States to keep; at least the number of poles that are not stable.
+
+    Raises:
+        InputError: If the system has no period, or the order does not fit.
+
+    Source: Moore, *Principal component analysis in linear systems*, IEEE TAC 26 (1981); square-root form of Tombs and
+    Postlethwaite, Int. J. Control 46 (1987); error bound for discrete systems of Al-Saggaf and Franklin, IEEE TAC 32
+    (1987).
+
+    Example:
+        >>> import control
+        >>> sys = control.ss(np.diag([0.9, 0.1]), [[1.0], [0.01]], [[1.0, 0.01]], 0.0, 0.1)
+        >>> reduced = balanced_truncation(sys, 1)
+        >>> reduced.system.nstates, bool(reduced.bound < 3e-4)
+        (1, True)
+    """
+    dt = period(sys)
+    kept, stable = _split(_matrices(sys))
+    values, left, right = _balance(*stable[:3])
+    fixed, n = len(kept[0]), len(sys.A)
+    if not fixed <= order <= n:
+        raise InputError(
+            f"balanced truncation: order {order} asked for; the system has {n} states, {fixed} of them not stable and "
+            f"kept, so give {fixed} to {n}"
+        )
+    r = min(order - fixed, right.shape[1])
+    t, w = right[:, :r], left[:r]
+    a = np.zeros((fixed + r, fixed + r))
+    a[:fixed, :fixed], a[fixed:, fixed:] = kept[0], w @ stable[0] @ t
+    b = np.vstack([kept[1], w @ stable[1]])
+    c = np.hstack([kept[2], stable[2] @ t])
+    small = control_toolbox().ss(
+        a, b, c, stable[3], dt, remove_useless_states=False,
+        inputs=list(sys.input_labels), outputs=list(sys.output_labels), name=str(sys.name) + "_reduced",
+    )  # fmt: skip
+    hankel = np.concatenate([np.full(fixed, np.inf), values])
+    return Reduced(small, hankel, fixed + r, float(2 * values[r:].sum()))
+
+
+def physical_states(
+    model: HybridModel, x: ArrayLike, u: ArrayLike, h: ArrayLike | None = None,
+    *, x_scale: ArrayLike | None = None, u_scale: ArrayLike | None = None, system: Any = None,
+) -> Reduced:  # fmt: skip
+    """The linearisation with as many states as the machine has, which mean what the machine's mean.
+
+    Balanced truncation of the way from inputs to all physical states (scaled by ``x_scale``, ``u_scale``), then the
+    coordinates in which the reduced system's states are its approximations of these states. The hidden state's
+    slow part is folded in, the rest is within the bound.
+
+    Args:
+        model: The model.
+        x: Operating point ``(n_x,)``.
+        u: Input ``(n_u,)``.
+        h: Hidden state ``(n_h,)``. Default: its fixed point.
+        x_scale: Size of each state that counts as 1 ``(n_x,)``. Default: 1.
+        u_scale: Size of each input that counts as 1 ``(n_u,)``. Default: 1.
+        system: A linearisation over ``(x, h)`` to reduce instead of the tangent at the point. Default: none.
+
+    Returns:
+        The reduced system over ``x``, with the model's outputs; the bound is that of the scaled states' response.
+
+    Raises:
+        InputError: If a size is wrong, or more poles are not stable than there are physical states.
+
+    Example:
+        ``physical_states(model, [0.0, 0.0], [0.0], x_scale=[0.5, 2.0], u_scale=[0.2]).system.A``
+    """
+    sys = linearize(model, x, u, h) if system is None else system
+    n_x = model.n_x
+    by_x = _scale(x_scale, n_x, "x_scale")
+    by_u = _scale(u_scale, model.n_u, "u_scale")
+    a, b, c, d = _matrices(sys)
+    states = np.hstack([np.diag(1.0 / by_x), np.zeros((n_x, len(a) - n_x))])
+    control = control_toolbox()
+    scaled = control.ss(a, b * by_u, states, 0.0, sys.dt, remove_useless_states=False)
+    reduced = balanced_truncation(scaled, n_x)
+    turn = by_x[:, None] * np.asarray(reduced.system.C)  # reduced state to physical states
+    if reduced.order < n_x or np.linalg.cond(turn / by_x[:, None]) > 1.0 / np.sqrt(np.finfo(float).eps):
+        raise InputError(
+            f"model {model.name}: {n_x} states of the reduced system do not tell the physical states apart "
+            "(one is not reached by any input); keep the full linearisation"
+        )
+    small = control.ss(
+        turn @ reduced.system.A @ np.linalg.inv(turn), turn @ reduced.system.B / by_u, c[:, :n_x], d, sys.dt,
+        remove_useless_states=False, states=[s.name for s in model.states], inputs=list(sys.input_labels),
+        outputs=list(sys.output_labels), name=model.name + "_reduced",
+    )  # fmt: skip
+    return Reduced(small, reduced.hankel, n_x, reduced.bound)
+
+
+def _scale(value: ArrayLike | None, n: int, name: str) -> Array:
+    scale = np.ones(n) if value is None else np.asarray(value, dtype=float).reshape(-1)
+    if scale.shape != (n,) or not np.all(np.isfinite(scale)) or not np.all(scale > 0):
+        raise InputError(f"{name}: {n} positive numbers needed, got {scale.tolist()}")
+    return scale
+
+
+def _matrices(sys: Any) -> Matrices:
+    a, b, c, d = (np.asarray(m, dtype=float) for m in (sys.A, sys.B, sys.C, sys.D))
+    return a, b, c, d
+
+
+def _split(matrices: Matrices) -> tuple[Matrices, Matrices]:
+    """The part with poles not inside the circle, and the stable part with D: an ordered Schur form, decoupled."""
+    a, b, c, d = matrices
+    t, q, kept = schur(a, sort=lambda re, im: np.hypot(re, im) >= 1.0 - EDGE)
+    if len(t) - kept == 0 or kept == 0:
+        whole, none = (q.T @ a @ q, q.T @ b, c @ q, d), _empty(b, c, d)
+        return (none, whole) if kept == 0 else (whole, none)
+    first, second, cross = t[:kept, :kept], t[kept:, kept:], t[:kept, kept:]
+    x = solve_sylvester(first, -second, -cross)
+    b, c = q.T @ b, c @ q
+    upper = (first, b[:kept] - x @ b[kept:], c[:, :kept], np.zeros_like(d))
+    return upper, (second, b[kept:], c[:, kept:] + c[:, :kept] @ x, d)
+
+
+def _empty(b: Array, c: Array, d: Array) -> Matrices:
+    return np.zeros((0, 0)), np.zeros((0, b.shape[1])), np.zeros((c.shape[0], 0)), d
+
+
+def _balance(a: Array, b: Array, c: Array) -> tuple[Array, Array, Array]:
+    """Hankel singular values, and the projections ``W`` (rows) and ``T`` (columns) with ``W T = I``."""
+    if not len(a):
+        return np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0))
+    reach = _root(solve_discrete_lyapunov(a, b @ b.T, method="bilinear"))
+    see = _root(solve_discrete_lyapunov(a.T, c.T @ c, method="bilinear"))
+    left, values, right = np.linalg.svd(see.T @ reach)
+    there = int(np.sum(values > NOTHING * values[0])) if values.size and values[0] > 0 else 0
+    scale = 1.0 / np.sqrt(values[:there])
+    return values, (see @ left[:, :there] * scale).T, reach @ right[:there].T * scale
+
+
+def _root(gramian: Array) -> Array:
+    """``R`` with ``R R' = gramian``; one that rounding left indefinite has its negative eigenvalues at zero."""
+    symmetric = 0.5 * (gramian + gramian.T)
+    try:
+        return np.asarray(cholesky(symmetric, lower=True))
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(symmetric)
+        return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+class Mode(NamedTuple):
+    """One mode of a discrete system.
+
+    Fields: ``pole``; ``frequency`` [rad/s] and ``damping`` of the continuous equivalent (infinite and 1 for a pole at
+    zero); ``reach``, distance from being uncontrollable, and ``see``, from being unobservable: smallest singular value
+    of the Popov-Belevitch-Hautus pencil over its largest, input and output units divided out.
+    """
+
+    pole: complex
+    frequency: float
+    damping: float
+    reach: float
+    see: float
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Modes and input-output weight of a discrete system.
+
+    Args:
+        dt: Period [s].
+        modes: Largest pole first.
+        hankel: Hankel singular values ``(n,)`` of the stable part, largest first, inputs and outputs as they are
+            given; infinite for each mode on or outside the unit circle.
+        stabilisable: Every mode on or outside the unit circle is reached.
+        detectable: Every such mode is seen.
+    """
+
+    dt: float
+    modes: tuple[Mode, ...]
+    hankel: Array
+    stabilisable: bool
+    detectable: bool
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain dictionary for JSON; complex as ``[re, im]``."""
+        return {
+            "dt": self.dt,
+            "modes": [
+                {**m._asdict(), "pole": [float(np.real(m.pole)), float(np.imag(m.pole))]} for m in self.modes
+            ],
+            "hankel": self.hankel.tolist(),
+            "stabilisable": self.stabilisable,
+            "detectable": self.detectable,
+        }
+
+
+def system_structure(sys: Any) -> Structure:
+    """Modes of a discrete ``control.StateSpace`` with what PBH tests and Hankel singular values say of them.
+
+    PBH asks whether a mode can be moved (seen) at all; a Hankel singular value how much of the way from past inputs
+    to future outputs goes through a state. A hidden state of a network has mostly modes that pass the first and
+    weigh nothing in the second.
+
+    Args:
+        sys: The system, with a period.
+
+    Raises:
+        InputError: If the system has no period.
+
+    Example:
+        >>> import control
+        >>> found = system_structure(control.ss(np.diag([1.2, 0.5]), [[0.0], [1.0]], [[1.0, 1.0]], 0.0, 0.1,
+        ...     remove_useless_states=False))
+        >>> [round(m.reach, 3) for m in found.modes], found.stabilisable, found.detectable
+        ([0.0, 0.538], False, True)
+    """
+    dt = period(sys)
+    a, b, c = (np.asarray(m, dtype=float) for m in (sys.A, sys.B, sys.C))
+    poles = np.linalg.eigvals(a).astype(np.complex128)
+    poles = poles[np.argsort(-np.abs(poles), kind="stable")]
+    modes = tuple(
+        Mode(complex(z), *_shape(z, dt), _hautus_at(a, b, z), _hautus_at(a.T, c.T, z)) for z in poles
+    )
+    risky = [m for m in modes if abs(m.pole) >= 1.0 - RANK_TOLERANCE]
+    return Structure(
+        dt,
+        modes,
+        hankel_singular_values(sys),
+        all(m.reach > RANK_TOLERANCE for m in risky),
+        all(m.see > RANK_TOLERANCE for m in risky),
+    )
+
+
+def _shape(z: complex, dt: float) -> tuple[float, float]:
+    """Natural frequency [rad/s] and damping of the continuous equivalent."""
+    if z == 0:
+        return float("inf"), 1.0
+    s = complex(np.log(z)) / dt
+    return abs(s), 1.0 if s == 0 else -s.real / abs(s)
+
+
+def _hautus_at(a: Array, b: Array, z: complex) -> float:
+    size = max(float(np.linalg.norm(a, 2)), 1.0)
+    norms = np.linalg.norm(b, axis=0)
+    scaled = b * np.where(norms > 0, size / np.where(norms > 0, norms, 1.0), 0.0)
+    pencil = np.hstack([a - z * np.eye(len(a)), scaled])
+    smallest = float(np.linalg.svd(pencil, compute_uv=False)[-1])
+    return smallest / float(np.linalg.norm(np.hstack([a, scaled]), 2))

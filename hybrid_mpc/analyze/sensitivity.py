@@ -1,0 +1,135 @@
+"""How a trajectory moves when parameters of the model do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import qr
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.model.model import HybridModel
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sensitivities:
+    """Derivatives of a free run by parameters.
+
+    Args:
+        names: Parameters ``(n_p,)``.
+        values: Their values ``(n_p,)``.
+        x: The run ``(n + 1, n_x)``.
+        by: ``(n + 1, n_x, n_p)``: derivative of the states by the parameters.
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    x: Array
+    by: Array
+
+    @property
+    def relative(self) -> Array:
+        """``(n + 1, n_x, n_p)``: change of the states per relative change of each parameter (1 is 100 %)."""
+        return self.by * self.values
+
+    def apart(self, sigma: ArrayLike, *, share: float = 0.05) -> Sensitivities:
+        """The parameters that this run tells apart: chosen one by one, each by what the ones before do not explain.
+
+        Args:
+            sigma: Standard deviation of each state's error ``(n_x,)``; infinite for states that are not measured.
+            share: A parameter is left out where less than this share of its own effect is not that of others, too.
+        """
+        rows = self._rows(sigma)
+        size = np.linalg.norm(rows, axis=0)
+        some = np.flatnonzero(size > 0)
+        _, r, order = qr(rows[:, some] / size[some], mode="economic", pivoting=True)
+        keep = np.sort(some[order[: len(r)][np.abs(np.diag(r)) > share]])
+        return Sensitivities(
+            tuple(self.names[i] for i in keep), self.values[keep], self.x, self.by[:, :, keep]
+        )
+
+    def _rows(self, sigma: ArrayLike) -> Array:
+        return np.asarray(
+            (self.relative / np.asarray(sigma, dtype=float)[None, :, None]).reshape(-1, len(self.names))
+        )
+
+    def correlation(self, sigma: ArrayLike) -> Array:
+        """Correlation ``(n_p, n_p)`` that a least-squares fit of this run would leave between the parameters.
+
+        Pairs near 1 or -1 cannot be told apart by it.
+
+        Args:
+            sigma: Standard deviation of each state's error ``(n_x,)``; infinite for states that are not measured.
+
+        Raises:
+            InputError: If the run does not tell the parameters apart at all.
+        """
+        rows = self._rows(sigma)
+        size = np.linalg.norm(rows, axis=0)
+        scaled = rows / np.where(size > 0, size, 1.0)
+        if np.any(size == 0) or np.linalg.cond(scaled) > 1e7:
+            raise InputError(
+                f"sensitivities: this run does not tell {', '.join(self.names)} apart; leave some out (a product of "
+                "two parameters is one)"
+            )
+        inverse = np.linalg.inv(scaled.T @ scaled)
+        spread = np.sqrt(np.diag(inverse))
+        return np.asarray(inverse / np.outer(spread, spread))
+
+
+def parameter_sensitivities(
+    model: HybridModel, x: ArrayLike, u: ArrayLike, *, names: Sequence[str] | None = None
+) -> Sensitivities:
+    """Exact derivatives of a free run by the prior's parameters.
+
+    Works for a prior and for a hybrid alike; what a hybrid's network adds does not change with the parameters, but for
+    the states that they move.
+
+    Args:
+        model: The model.
+        x: Start ``(n_x,)``; a hidden state starts at zero.
+        u: Inputs ``(n, n_u)``.
+        names: Which of the model's parameters. Default: all.
+
+    Raises:
+        InputError: If the model has no such parameter, a shape does not fit, or the run is not finite.
+
+    Source: forward sensitivities: Hairer, Norsett, Wanner, *Solving Ordinary Differential Equations I*, section I.14.
+
+    Example:
+        ``parameter_sensitivities(kit.models["prior"], [0.3, 0.0], np.zeros((200, 1))).relative``
+    """
+    there = [parameter.name for parameter in model.parameters]
+    chosen = tuple(there if names is None else names)
+    if not chosen or not set(chosen) <= set(there):
+        raise InputError(
+            f"sensitivities: parameters {list(chosen)} of model {model.name} asked for; it has: "
+            f"{', '.join(there) or 'none'}"
+        )
+    n_x, n_h, n_u = model.n_x, model.n_h, model.n_u
+    inputs, now = np.asarray(u, dtype=float), np.asarray(x, dtype=float).reshape(-1)
+    if inputs.ndim != 2 or inputs.shape[1] != n_u or now.shape != (n_x,):
+        raise InputError(
+            f"sensitivities: x {now.shape} and u {inputs.shape} given, ({n_x},) and (n, {n_u}) needed"
+        )
+    columns = [there.index(name) for name in chosen]
+    z, v, p = ca.MX.sym("z", n_x + n_h), ca.MX.sym("v", n_u), ca.MX.sym("p", model.n_p)
+    after = ca.vertcat(*model.step(z[:n_x], z[n_x:], v, model.w, p))
+    by_p = ca.densify(ca.jacobian(after, p))[:, columns]
+    f = ca.Function("f", [z, v, p], [after, ca.densify(ca.jacobian(after, z)), by_p])
+    state, slope = np.concatenate([now, np.zeros(n_h)]), np.zeros((n_x + n_h, len(chosen)))
+    states, slopes = [state[:n_x]], [slope[:n_x]]
+    for held in inputs:
+        state, a, b = (m.full() for m in f(state, held, model.p))
+        state, slope = state.ravel(), a @ slope + b
+        states.append(state[:n_x])
+        slopes.append(slope[:n_x])
+    found = Sensitivities(chosen, model.p[columns], np.stack(states), np.stack(slopes))
+    if not (np.all(np.isfinite(found.x)) and np.all(np.isfinite(found.by))):
+        raise InputError("sensitivities: the free run is not finite; take a shorter one or other inputs")
+    return found

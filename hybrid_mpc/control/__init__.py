@@ -1,0 +1,1 @@
+"""Model predictive control: the problem, its solvers behind one interface, the safeguard."""

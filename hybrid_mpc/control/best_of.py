@@ -1,0 +1,169 @@
+"""The best of several solves: an oracle's defence against local optima."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from time import perf_counter
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.control.ocp import OCP, Limits
+from hybrid_mpc.control.problem import Controller, Problem, Solution
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimate.kalman import START_LIMIT, Estimate
+from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.model.riccati import hidden_fixed_point
+
+Array = NDArray[np.float64]
+Start = Callable[[Estimate], Array]
+
+
+class HasProblem(Controller, Protocol):
+    """A controller that can say what a plan costs on its model."""
+
+    @property
+    def problem(self) -> Problem:
+        """Problem and model made ready."""
+
+
+class BestOf:
+    """Solves from several first guesses and returns the cheapest plan; slower than real time is fine.
+
+    Guesses are the previous plan, shifted; the given ``starts``; and the plans of ``rivals``, controllers on
+    other models of the same machine: whatever they find, this one starts there too, so that its plan is at
+    most as expensive by its own model as theirs carried out. Plans are compared by their cost on a run of
+    the model itself, not by what a linearisation promises. Rivals have no memory here: their hidden state
+    starts at the fixed point at the estimated state, their disturbance is the estimate's own.
+
+    Args:
+        controller: Solves from every guess, e.g. an :class:`~hybrid_mpc.control.sqp.SQPController`.
+        starts: Guesses: input plans ``(N, n_u)``, or functions ``estimate -> (N, n_u)``.
+        rivals: Controllers whose plans are guesses too; same states, inputs and horizon.
+        most: Guesses beside the previous plan that are solved from: those that are cheapest on a run of the
+            model. Default: all.
+
+    Raises:
+        InputError: If a rival or a plan does not fit, ``most < 1``, or there is neither start nor rival.
+
+    Example:
+        >>> import casadi as ca
+        >>> from hybrid_mpc.estimate.kalman import TrueState
+        >>> from hybrid_mpc.control.sqp import SQPController
+        >>> from hybrid_mpc.machine.signals import Signal
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("even", 1.0, level, (Signal("u", "-"),), level,
+        ...     x=x, u=u, x_next=x - u**2, xdot=u, y=x)
+        >>> ocp = OCP(2, [1.0], [0.1], [0.0], [-1.0], [1.0], terminal=[[1.0]])
+        >>> single = SQPController(model, ocp)  # u = 0 is stationary: it sees no way down
+        >>> best = BestOf(single, starts=[np.full((2, 1), 0.5)])
+        >>> estimate = TrueState(model).start([1.0])
+        >>> plans = [c.solve(c.initial(estimate), estimate, np.zeros((1, 1))) for c in (single, best)]
+        >>> [round(plan.cost, 2) for plan in plans]
+        [3.0, 1.1]
+    """
+
+    def __init__(
+        self,
+        controller: HasProblem,
+        *,
+        starts: Sequence[Array | Start] = (),
+        rivals: Sequence[Controller] = (),
+        most: int | None = None,
+    ) -> None:
+        ocp = controller.ocp
+        if most is not None and most < 1:
+            raise InputError(f"most: 1 or more guesses needed, got {most}; leave it out for all")
+        for rival in rivals:
+            given = rival.ocp.n_x, rival.ocp.n_u, rival.ocp.horizon
+            if given != (ocp.n_x, ocp.n_u, ocp.horizon):
+                raise InputError(
+                    f"rival on {rival.model.name}: (n_x, n_u, N) = {given}, "
+                    f"needed: {(ocp.n_x, ocp.n_u, ocp.horizon)}"
+                )
+        for start in starts:
+            if not callable(start):
+                _checked(start, ocp)
+        if not starts and not rivals:
+            raise InputError("best of one start is the controller itself; give starts or rivals")
+        self._controller, self._starts, self._rivals = controller, tuple(starts), tuple(rivals)
+        self._most = most
+
+    @property
+    def model(self) -> HybridModel:
+        """The model that predicts."""
+        return self._controller.model
+
+    @property
+    def ocp(self) -> OCP:
+        """The problem."""
+        return self._controller.ocp
+
+    @property
+    def problem(self) -> Problem:
+        """Problem and model made ready."""
+        return self._controller.problem
+
+    def initial(self, estimate: Estimate, u: Array | None = None) -> Solution:
+        """A first plan: the model run freely from the estimate; see :meth:`Problem.initial`."""
+        return self._controller.initial(estimate, u)
+
+    def solve(
+        self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,
+        *, limits: Limits | None = None,
+    ) -> Solution:  # fmt: skip
+        """The cheapest plan of all guesses; see :meth:`Controller.solve`.
+
+        Its cost is that on a run of the model. If no solve ends well, the one from the previous plan is
+        returned.
+        """
+        begin = perf_counter()
+        known = np.all(np.isfinite(np.concatenate([estimate.x, estimate.h, estimate.d])))
+        target, u_prev = self.problem.target(reference, weight), previous.u[0]
+        z0 = np.concatenate([estimate.x, estimate.h])
+
+        def cost_of(u: Array) -> float:
+            cost = self.problem.cost(self.problem.run(z0, u + estimate.d), u, u_prev, target)
+            return cost if np.isfinite(cost) else np.inf
+
+        given = estimate, reference, weight
+        first = self._controller.solve(previous, *given, limits=limits)
+        solutions = [first]
+        guesses = self._guesses(previous, *given, limits) if known else []
+        for guess in sorted(guesses, key=cost_of)[: self._most]:
+            start = self._from(guess, previous, estimate)
+            solutions.append(self._controller.solve(start, *given, limits=limits))
+        best, least = first, np.inf
+        for s in solutions:
+            cost = cost_of(s.u)
+            if s.status.ok and cost < least:
+                best, least = replace(s, cost=cost), cost
+        return replace(best, timing={"solve": (perf_counter() - begin) * 1e3})
+
+    def _guesses(
+        self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None,
+        limits: Limits | None,
+    ) -> list[Array]:  # fmt: skip
+        guesses = [_checked(s(estimate), self.ocp) if callable(s) else s for s in self._starts]
+        for rival in self._rivals:
+            h = hidden_fixed_point(rival.model, estimate.x, previous.u[0], limit=START_LIMIT)
+            own = replace(estimate, h=h)
+            plan = rival.solve(rival.initial(own, previous.u), own, reference, weight, limits=limits)
+            if plan.status.ok:
+                guesses.append(plan.u)
+        return guesses
+
+    def _from(self, guess: Array, previous: Solution, estimate: Estimate) -> Solution:
+        """A previous plan whose shift is the guess: solves shift what they are given."""
+        return self._controller.initial(estimate, guess).delayed(previous.u[0])
+
+
+def _checked(start: Array, ocp: OCP) -> Array:
+    u = np.asarray(start, dtype=float)
+    if u.shape != (ocp.horizon, ocp.n_u) or not np.all(np.isfinite(u)):
+        raise InputError(
+            f"start: finite inputs of shape {(ocp.horizon, ocp.n_u)} needed, got shape {u.shape}"
+        )
+    return u

@@ -1,0 +1,222 @@
+"""Second derivatives of the cost that Gauss-Newton leaves out, and Hessians made convex."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import eigh, solve_triangular
+
+from hybrid_mpc.control.ocp import OCP
+from hybrid_mpc.control.rti import condense_all, condense_hessians
+from hybrid_mpc.control.soft import SoftRows
+from hybrid_mpc.model.stages import Linearisation
+
+Array = NDArray[np.float64]
+
+SHIFT = 1e-5
+"""Step of the difference of two Jacobians, in tolerated deviations (states), scales of the inputs and 1 (hidden)."""
+FLOOR = 1e-3
+"""Least curvature along a direction, as a share of Gauss-Newton's."""
+MATTERS = 0.2
+"""Share of Gauss-Newton's curvature, along some direction, below which the hidden state's is left out: what is
+left out slows convergence down to that share a step."""
+AT_ONCE = 200
+"""Periods whose Jacobians are taken in one call: more would not stay in a core's cache."""
+
+
+class StageCurvature:
+    """Second derivatives of the dynamics by ``(x, u, h)``, weighted with the multipliers of the dynamics.
+
+    They are differences of the model's exact Jacobians: ``n_x + n_u`` evaluations for the block by states and
+    inputs, in which friction curves sharply, and ``n_h`` for the blocks by the hidden state. The second
+    derivatives of the expressions of soft bounds, weighted with their multipliers, are added.
+
+    Args:
+        stages: The model's stages.
+        ocp: The problem; its weights and limits give the length of the differences.
+        n_h: Number of hidden states.
+        soft: The problem's soft bounds. Default: none has an expression that curves.
+    """
+
+    def __init__(self, stages: Linearisation, ocp: OCP, n_h: int = 0, soft: SoftRows | None = None) -> None:
+        self._n_x, self._n_u, self._n_h = ocp.n_x, ocp.n_u, n_h
+        self._soft = soft if ocp.soft else None
+        tolerated = 1 / np.sqrt(np.where(ocp.q > 0, ocp.q, 1.0))
+        self._shift = SHIFT * np.concatenate([tolerated, ocp.input_scale])
+        self._by_few = stages.slopes(self._shift.size)
+        self._group = min(n_h, max(1, AT_ONCE // ocp.horizon))
+        self._by_hidden = stages.slopes(self._group, hidden=True) if n_h else None
+
+    @property
+    def size(self) -> int:
+        """Number of a stage's states, inputs and hidden states."""
+        return self._shift.size + self._n_h
+
+    def fits(self, curvature: Array, horizon: int) -> bool:
+        """True for second derivatives that can go with this model's stages."""
+        return curvature.shape in [(horizon, size, size) for size in (self._shift.size, self.size)]
+
+    def of(
+        self, z: Array, u: Array, a_t: Array, b: Array, adjoint: Array, soft: Array, old: Array | None = None
+    ) -> Array:
+        """Curvature ``(N, n, n)`` of every stage by ``(x, u, h)``, or by ``(x, u)`` alone where ``old`` has no more.
+
+        Args:
+            z: ``(N + 1, n_z)``, where the Jacobians were taken.
+            u: Inputs ``(N, n_u)`` and what the model runs on ``(N, n_u)``, stacked ``(2, N, n_u)``.
+            a_t: Transposed ``A_k`` ``(N, n_z, n_z)``.
+            b: ``B_k`` ``(N, n_z, n_u)``.
+            adjoint: Multipliers ``(N, n_z)`` of the stages' results.
+            soft: Multipliers ``(M,)`` of the soft bounds.
+            old: Curvature whose hidden part is kept. Default: all is taken.
+        """
+        few = self._shift.size
+        size = self.size if old is None else old.shape[1]
+        curvature = np.empty((len(b), size, size)) if old is None else old.copy()
+        curvature[:, :few, :few] = self._few(z[:-1], u[1], a_t, b, adjoint)
+        if self._soft is not None and np.any(soft):
+            curvature[:, :few, :few] += self._of_soft(self._soft, z, u[0], soft)
+        if old is None and self._n_h:
+            rows = self._hidden(z[:-1], u[1], a_t, b, adjoint)
+            curvature[:, few:] = rows
+            curvature[:, :few, few:] = rows[:, :, :few].transpose(0, 2, 1)
+            curvature[:, few:, few:] = 0.5 * (rows[:, :, few:] + rows[:, :, few:].transpose(0, 2, 1))
+        return curvature
+
+    def _few(self, z: Array, u: Array, a_t: Array, b: Array, adjoint: Array) -> Array:
+        n, n_x, m = len(b), self._n_x, self._shift.size
+        here = np.hstack([z[:, :n_x], u])
+        moved = np.repeat(here[None], m, axis=0)
+        each = np.arange(m)
+        moved[each, :, each] += self._shift[:, None]
+        taken = moved[each, :, each] - here.T  # as rounded
+        flat = moved.reshape(m * n, m)
+        slopes = self._by_few(np.hstack([flat[:, :n_x], np.tile(z[:, n_x:], (m, 1))]), flat[:, n_x:])
+        change = slopes.reshape(m, n, -1, m)
+        change -= np.concatenate([a_t[:, :n_x].transpose(0, 2, 1), b], axis=2)
+        weighted = (adjoint[:, None, :] @ change)[:, :, 0]
+        curvature = (weighted / taken[:, :, None]).transpose(1, 0, 2)
+        return np.asarray(0.5 * (curvature + curvature.transpose(0, 2, 1)))
+
+    def _hidden(self, z: Array, u: Array, a_t: Array, b: Array, adjoint: Array) -> Array:
+        """The rows of the hidden states ``(N, n_h, n_x + n_u + n_h)``."""
+        assert self._by_hidden is not None
+        n, n_x, m = len(b), self._n_x, self._group
+        by_z = (a_t @ adjoint[:, :, None])[:, :, 0]
+        here = np.hstack([by_z[:, :n_x], (adjoint[:, None, :] @ b)[:, 0], by_z[:, n_x:]])
+        rows = np.empty((self._n_h, n, here.shape[1]))
+        inputs, weights, each = np.tile(u, (m, 1)), np.tile(adjoint, (m, 1))[:, None, :], np.arange(m)
+        for first in range(0, self._n_h, m):
+            chosen = (first + each) % self._n_h  # the last group is filled with the first ones
+            moved = np.repeat(z[None], m, axis=0)
+            moved[each, :, n_x + chosen] += SHIFT
+            taken = moved[each, :, n_x + chosen] - z.T[n_x + chosen]
+            slopes = (weights @ self._by_hidden(moved.reshape(m * n, -1), inputs)).reshape(m, n, -1)
+            rows[chosen] = (slopes - here) / taken[:, :, None]
+        return rows.transpose(1, 0, 2)
+
+    def _of_soft(self, soft: SoftRows, z: Array, u: Array, multipliers: Array) -> Array:
+        """Second derivatives of the soft bounds' expressions, which know the states and inputs before the last."""
+        n, n_x, m = len(u), self._n_x, self._shift.size
+
+        def slopes(points: Array) -> Array:
+            _, by_x, by_u = soft.linearise(np.vstack([points[:, :n_x], z[-1:, :n_x]]), points[:, n_x:])
+            total = np.zeros((n + 1, m))
+            np.add.at(total, soft.stage, multipliers[:, None] * np.hstack([by_x, by_u]))
+            return total[:-1]  # bounds on states do not curve
+
+        here = np.hstack([z[:-1, :n_x], u])
+        before, rows = slopes(here), []
+        for j in range(m):
+            moved = here.copy()
+            moved[:, j] += self._shift[j]
+            rows.append((slopes(moved) - before) / (moved - here)[:, j, None])
+        curvature = np.stack(rows, axis=1)
+        return np.asarray(0.5 * (curvature + curvature.transpose(0, 2, 1)))
+
+    def condensed(self, curvature: Array, from_u: Array, by_inputs: Array) -> Array:
+        """The stages' curvature as that of the inputs ``(N n_u, N n_u)``.
+
+        Args:
+            curvature: As :meth:`of` returns it.
+            from_u: As in ``Prepared``.
+            by_inputs: As the ``Condenser`` that made it has it.
+        """
+        if curvature.shape[1] > self._shift.size:
+            return condense_all(curvature, by_inputs, self._n_x, self._n_u)
+        return condense_hessians(curvature, from_u, self._n_x)
+
+    def without_what_is_small(
+        self, curvature: Array, gauss_newton: Array, from_u: Array, by_inputs: Array
+    ) -> Array:
+        """The curvature, the hidden state's left out where it hardly matters to the Hessian."""
+        few = self._shift.size
+        if curvature.shape[1] == few:
+            return curvature
+        small = curvature[:, :few, :few]
+        hidden = self.condensed(curvature, from_u, by_inputs) - condense_hessians(small, from_u, self._n_x)
+        return small.copy() if share_of(gauss_newton, hidden) < MATTERS else curvature
+
+
+def convex(gauss_newton: Array, rest: Array, held: NDArray[np.bool_] | None = None) -> Array:
+    """``gauss_newton + rest``, positive definite: where the sum curves down or hardly up, its size counts.
+
+    Along every direction the result has at least the share 0.001 of Gauss-Newton's curvature; directions are
+    the joint eigenvectors of the two. Where the sum curves up as long as the ``held`` unknowns stay where they
+    are, only their own block is changed: a step that leaves them there does not feel it.
+
+    Example:
+        >>> convex(np.eye(2), np.diag([1.0, -3.0]))
+        array([[2., 0.],
+               [0., 2.]])
+    """
+    whole = gauss_newton + rest
+    try:
+        np.linalg.cholesky(whole - FLOOR * gauss_newton)
+    except np.linalg.LinAlgError:
+        pass
+    else:
+        return np.asarray(whole)
+    try:
+        if held is not None and np.any(held) and not np.all(held):
+            return _convex_in_parts(gauss_newton, rest, held)
+        return _upwards(gauss_newton, rest)
+    except (np.linalg.LinAlgError, ValueError):
+        return gauss_newton
+
+
+def _upwards(gauss_newton: Array, rest: Array) -> Array:
+    values, vectors = eigh(rest, gauss_newton)
+    changed = np.maximum(np.abs(1 + values), FLOOR)
+    back = gauss_newton @ vectors
+    whole = (back * changed) @ back.T
+    return np.asarray(0.5 * (whole + whole.T))
+
+
+def _convex_in_parts(gauss_newton: Array, rest: Array, held: NDArray[np.bool_]) -> Array:
+    """First the block of the free unknowns, then what of the held ones' is left when the free follow them."""
+    free = ~held
+    whole = gauss_newton + rest
+    inner = convex(gauss_newton[np.ix_(free, free)], rest[np.ix_(free, free)])
+    coupling = whole[np.ix_(free, held)]
+    follow = coupling.T @ np.linalg.solve(inner, coupling)
+    outer = gauss_newton[np.ix_(held, held)]
+    left = whole[np.ix_(held, held)] - 0.5 * (follow + follow.T)
+    whole[np.ix_(free, free)] = inner
+    whole[np.ix_(held, held)] = _upwards(outer, left - outer) + 0.5 * (follow + follow.T)
+    return whole
+
+
+def share_of(gauss_newton: Array, rest: Array) -> float:
+    """Size of ``rest`` relative to ``gauss_newton``, at least that along any direction.
+
+    Example:
+        >>> round(share_of(2.0 * np.eye(2), np.diag([1.0, 0.0])), 9)
+        0.5
+    """
+    try:
+        root = np.linalg.cholesky(gauss_newton)
+    except np.linalg.LinAlgError:
+        return np.inf
+    half = solve_triangular(root, rest, lower=True, check_finite=False)
+    return float(np.linalg.norm(solve_triangular(root, half.T, lower=True, check_finite=False)))

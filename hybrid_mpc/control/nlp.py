@@ -1,0 +1,252 @@
+"""The exact reference: direct multiple shooting solved by IPOPT with exact derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybrid_mpc.control.ocp import OCP, Limits
+from hybrid_mpc.control.problem import Problem, Solution, Status
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimate.kalman import Estimate
+from hybrid_mpc.model.model import HybridModel, step_symbols
+
+Array = NDArray[np.float64]
+NAN = float("nan")
+FEASIBLE = 1e-6
+"""Largest defect and violation of a limit, as a share of its range, that an answer may have."""
+
+
+class Rows(NamedTuple):
+    """Constraints ``lower <= value <= upper``, and what counts as one unit of their violation."""
+
+    value: ca.MX
+    lower: ArrayLike
+    upper: ArrayLike
+    scale: ArrayLike
+
+
+class IpoptController:
+    """Nonlinear MPC by IPOPT on the sparse multiple-shooting problem: the reference, slower than real time.
+
+    Unknowns are the inputs, the states and hidden states of every period, and a slack for every soft bound.
+    Second derivatives are exact. Whatever IPOPT reports, the answer counts only if it is finite and keeps
+    model and limits; it is SOLVED if IPOPT converged or the KKT residual is small, else STOPPED.
+
+    Args:
+        model: The deployed model; ``n_h`` may be 0.
+        ocp: The problem.
+        tolerance: IPOPT's own, relative to its scaling.
+        iterations: IPOPT's most iterations.
+        options: Further options of IPOPT by name. Default: the adaptive barrier.
+
+    Raises:
+        InputError: If problem and model do not fit, an option is not positive, or IPOPT does not know it.
+
+    Source: Wächter and Biegler, *On the implementation of an interior-point filter line-search algorithm
+    for large-scale nonlinear programming*, Math. Program. 106 (2006).
+
+    Example: as :class:`~hybrid_mpc.control.sqp.SQPController`, whose interface it shares.
+    """
+
+    def __init__(
+        self,
+        model: HybridModel,
+        ocp: OCP,
+        *,
+        tolerance: float = 1e-9,
+        iterations: int = 500,
+        options: Mapping[str, Any] | None = None,
+    ) -> None:
+        if not tolerance > 0 or iterations < 1:
+            raise InputError(
+                f"tolerance must be positive and iterations at least 1, got {tolerance} and {iterations}"
+            )
+        self._problem = Problem(model, ocp)
+        self._bounds: dict[str, Array] = {}
+        nlp = self._formulate()
+        settings: dict[str, Any] = {"print_time": False, "error_on_fail": False, "calc_lam_p": False}
+        settings["ipopt"] = {
+            "print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": iterations,
+            "mu_strategy": "adaptive",
+            **(options or {}),
+        }  # fmt: skip
+        try:
+            self._solver = ca.nlpsol("mpc", "ipopt", nlp, settings)
+        except RuntimeError as error:
+            raise InputError(f"options: IPOPT does not take {dict(options or {})}: {error}") from error
+        w, g = nlp["x"], nlp["g"]
+        multipliers = ca.MX.sym("lam", g.shape[0])
+        slope = ca.gradient(nlp["f"] + ca.dot(multipliers, g), w)
+        self._slope = ca.Function("slope", [w, nlp["p"], multipliers], [slope, ca.gradient(nlp["f"], w), g])
+
+    @property
+    def model(self) -> HybridModel:
+        """The model that predicts."""
+        return self._problem.model
+
+    @property
+    def ocp(self) -> OCP:
+        """The problem."""
+        return self._problem.ocp
+
+    @property
+    def problem(self) -> Problem:
+        """Problem and model made ready."""
+        return self._problem
+
+    def initial(self, estimate: Estimate, u: Array | None = None) -> Solution:
+        """A first plan: the model run freely from the estimate; see :meth:`Problem.initial`."""
+        return self._problem.initial(estimate, u)
+
+    @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
+    def solve(
+        self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,
+        *, limits: Limits | None = None,
+    ) -> Solution:  # fmt: skip
+        """The plan from now on; see :meth:`Controller.solve`. The previous plan, shifted, is the first guess."""
+        start = perf_counter()
+        problem, u_prev = self._problem, previous.u[0]
+        target = problem.target(reference, weight)
+        u = np.vstack([previous.u[1:], previous.u[-1:]])
+        z = np.hstack([previous.x, previous.h])
+        z = np.vstack([np.concatenate([estimate.x, estimate.h]), z[2:], z[-1:]])
+        given = np.concatenate(
+            [z[0], estimate.d, u_prev, target.x.ravel(), target.weight.ravel(), target.p.ravel()]
+        )
+        bounds = self._limited(self.ocp.bounds(u_prev, limits))
+        failed = self._plan(u, z, estimate.d, NAN, Status.NOT_FINITE, NAN, start, 0)
+        if not (
+            target.ok and np.all(np.isfinite(given)) and np.all(np.isfinite(u)) and np.all(np.isfinite(z))
+        ):
+            return failed
+        slack = problem.soft.excess(problem.soft.values(z[:, : self.ocp.n_x], u))
+        guess = np.concatenate([u.ravel(), z.ravel(), slack])
+        answer = self._solver(x0=guess, p=given, **bounds)
+        stats = self._solver.stats()
+        w, lam_g, lam_x = (answer[key].full().ravel() for key in ("x", "lam_g", "lam_x"))
+        if not (np.all(np.isfinite(w)) and np.all(np.isfinite(lam_g)) and np.all(np.isfinite(lam_x))):
+            return failed
+        violated, kkt = self._check(w, given, lam_g, lam_x, bounds)
+        count = stats["iter_count"]
+        if not violated <= FEASIBLE:
+            return self._plan(u, z, estimate.d, NAN, Status.NLP_FAILED, kkt, start, count)
+        status = Status.SOLVED if stats["success"] or kkt <= FEASIBLE else Status.STOPPED
+        u = np.clip(w[: u.size].reshape(u.shape), *self.ocp.bounds(u_prev, limits))
+        z = w[u.size : u.size + z.size].reshape(z.shape)
+        cost = problem.cost(z, u, u_prev, target)
+        return self._plan(u, z, estimate.d, cost, status, kkt, start, count)
+
+    def _limited(self, of_inputs: tuple[Array, Array]) -> dict[str, Array]:
+        """Bounds of unknowns and rows with those of the inputs put in."""
+        lower, upper = self._bounds["lbx"].copy(), self._bounds["ubx"].copy()
+        lower[: of_inputs[0].size], upper[: of_inputs[1].size] = (bound.ravel() for bound in of_inputs)
+        return {**self._bounds, "lbx": lower, "ubx": upper}
+
+    def _check(
+        self, w: Array, given: Array, lam_g: Array, lam_x: Array, bounds: dict[str, Array]
+    ) -> tuple[float, float]:
+        """Largest violation as a share of its range, and the KKT residual relative to the objective's slope."""
+        slope, objective, g = (m.full().ravel() for m in self._slope(w, given, lam_g))
+        kkt = float(np.max(np.abs(slope + lam_x)) / max(1.0, np.max(np.abs(objective))))
+        beyond = np.maximum(bounds["lbg"] - g, g - bounds["ubg"]) / self._g_scale
+        n = self.ocp.horizon * self.ocp.n_u
+        outside = np.maximum(bounds["lbx"][:n] - w[:n], w[:n] - bounds["ubx"][:n])
+        outside = outside.reshape(self.ocp.horizon, -1) / self._u_scale
+        return max(float(np.max(beyond, initial=0.0)), float(np.max(outside))), kkt
+
+    def _plan(
+        self, u: Array, z: Array, d: Array, cost: float, status: Status, kkt: float, start: float, i: int
+    ) -> Solution:
+        n_x, soft = self.ocp.n_x, self._problem.soft
+        excess = soft.excess(soft.values(z[:, :n_x], u)) if len(soft) else np.zeros(0)
+        defect = self._defect(z, u + d)
+        spent = {"solve": (perf_counter() - start) * 1e3}
+        largest = float(np.max(excess, initial=0.0))
+        return Solution(u, z[:, :n_x], z[:, n_x:], d, cost, status, kkt, defect, spent, largest, i)
+
+    def _defect(self, z: Array, u: Array) -> float:
+        n_x = self.ocp.n_x
+        x, h = self._step(z[:-1, :n_x].T, z[:-1, n_x:].T, u.T)
+        return float(np.max(np.abs(np.vstack([x.full(), h.full()]).T - z[1:])))
+
+    def _formulate(self) -> dict[str, ca.MX]:
+        """Problem of ``nlpsol`` over ``(u, z, slacks)``; keeps the bounds of its unknowns and rows."""
+        ocp, model, soft = self.ocp, self.model, self._problem.soft
+        n, n_x, n_u = ocp.horizon, ocp.n_x, ocp.n_u
+        n_z = n_x + model.n_h
+        u, z, s = ca.MX.sym("u", n_u, n), ca.MX.sym("z", n_z, n + 1), ca.MX.sym("s", len(soft))
+        z0, d, u_prev = ca.MX.sym("z0", n_z), ca.MX.sym("d", n_u), ca.MX.sym("u_prev", n_u)
+        x_ref, weight = ca.MX.sym("x_ref", n_x, n + 1), ca.MX.sym("weight", n_x, n + 1)
+        p = ca.MX.sym("p", ocp.n_p, n + 1)
+        point = step_symbols(model)[:3]
+        self._step = ca.Function("step", point, list(model.step(*point, model.w, model.p))).map(n)
+        z_next = ca.vertcat(*self._step(z[:n_x, :-1], z[n_x:, :-1], u + ca.repmat(d, 1, n)))
+        du = u - ca.horzcat(u_prev, u[:, :-1])
+        self._u_scale = ocp.input_scale
+        rows = [Rows(z[:, 0] - z0, 0.0, 0.0, 1.0), Rows(z[:, 1:] - z_next, 0.0, 0.0, 1.0)]
+        if ocp.du_max is not None:
+            limit = np.tile(ocp.du_max, n)
+            rows.append(Rows(du, -limit, limit, np.tile(self._u_scale, n)))
+        inside = [int(k) for k in np.setdiff1d(np.arange(n), ocp.block_starts)]
+        if inside:  # move blocks
+            rows.append(Rows(du[:, inside], 0.0, 0.0, np.tile(self._u_scale, len(inside))))
+        rows += self._soft_rows(u, z, s)
+        free = np.full(n_z * (n + 1), np.inf)
+        self._bounds = {
+            "lbx": np.concatenate([np.tile(ocp.u_min, n), -free, np.zeros(len(soft))]),
+            "ubx": np.concatenate([np.tile(ocp.u_max, n), free, np.full(len(soft), np.inf)]),
+            "lbg": _filled(rows, 1), "ubg": _filled(rows, 2),
+        }  # fmt: skip
+        self._g_scale = _filled(rows, 3)
+        return {
+            "x": ca.vertcat(ca.vec(u), ca.vec(z), s),
+            "p": ca.vertcat(z0, d, u_prev, ca.vec(x_ref), ca.vec(weight), ca.vec(p)),
+            "f": self._objective(u, du, z[:n_x, :] - x_ref, weight, s) + self._economic(z[:n_x, :-1], u, p),
+            "g": ca.vertcat(*(ca.vec(row.value) for row in rows)),
+        }
+
+    def _objective(self, u: ca.MX, du: ca.MX, error: ca.MX, weight: ca.MX, s: ca.MX) -> ca.MX:
+        ocp, soft = self.ocp, self._problem.soft
+        last = ca.sqrt(weight[:, -1]) * error[:, -1]
+        stages = ca.sum2(weight[:, :-1] * error[:, :-1] ** 2), ca.sum2(u**2), ca.sum2(du**2)
+        stage = sum(ca.dot(q, v) for q, v in zip((ocp.q, ocp.r, ocp.r_delta), stages, strict=True))
+        penalty = ca.dot(soft.linear, s) + ca.dot(soft.quadratic, s**2)
+        return self.model.dt * (stage + penalty) + last.T @ self._problem.terminal @ last
+
+    def _economic(self, x: ca.MX, u: ca.MX, p: ca.MX) -> ca.MX:
+        f = self.ocp.economic
+        if f is None:
+            return ca.MX(0)
+        given = (x, u, p[:, :-1]) if f.n_in() > 2 else (x, u)
+        (stages,) = f.map(self.ocp.horizon).call(list(given))
+        return self.model.dt * ca.sum2(stages)
+
+    def _soft_rows(self, u: ca.MX, z: ca.MX, s: ca.MX) -> list[Rows]:
+        soft, rows = self._problem.soft, []
+        value = ca.vertcat(*self._soft_values(u, z))
+        for bound, sign in ((soft.upper, 1.0), (soft.lower, -1.0)):
+            chosen = np.flatnonzero(np.isfinite(bound))
+            pick = [int(i) for i in chosen]
+            if pick:
+                gap = sign * (value[pick] - bound[chosen]) - s[pick]
+                rows.append(Rows(gap, -np.inf, 0.0, soft.scale[chosen]))
+        return rows
+
+    def _soft_values(self, u: ca.MX, z: ca.MX) -> list[ca.MX]:
+        """Bounded values in the order of the problem's rows."""
+        ocp = self.ocp
+        chosen = [int(i) for i in np.flatnonzero(np.isfinite(ocp.x_min) | np.isfinite(ocp.x_max))]
+        values = [ca.vec(z[chosen, 1:])] if chosen else []
+        x = z[: ocp.n_x, :-1]
+        return values + [ca.vec(bound.expression.map(ocp.horizon)(x, u)) for bound in ocp.soft]
+
+
+def _filled(rows: list[Rows], field: int) -> Array:
+    """One field of all rows, a value an element."""
+    return np.concatenate([np.broadcast_to(row[field], row.value.numel()) for row in rows])

@@ -1,0 +1,474 @@
+"""Gauss-Newton real-time iteration on the condensed multiple-shooting problem."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg.blas import dgemv
+
+from hybrid_mpc.control.ocp import OCP, Limits
+from hybrid_mpc.control.problem import Problem, Solution, Status, Target, weights_ok
+from hybrid_mpc.control.qp import InputQP
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimate.kalman import Estimate
+from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.model.stages import Derivatives, Linearisation, stages
+
+# Condensing: from the stages' Jacobians to the states as functions of the inputs.
+
+Array = NDArray[np.float64]
+GROUP = 10
+"""Periods whose second derivatives are condensed by one product."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Everything of an iteration that needs neither the estimate nor the reference.
+
+    With ``dz = (x, h) - (x_bar, h_bar)`` the linearised prediction is ``dz_{k+1} = A_k dz_k + B_k (du_k +
+    dd) + defect_k``; of it, ``x`` depends on the inputs by ``from_u``.
+
+    Args:
+        u: Linearisation inputs ``(N, n_u)``.
+        z: Linearisation trajectory ``(N + 1, n_x + n_h)``.
+        d: Linearisation disturbance ``(n_u,)``.
+        u_prev: Input ``(n_u,)`` held before the plan.
+        a_t: Transposed ``A_k`` ``(N, n_z, n_z)``.
+        b: ``B_k`` ``(N, n_z, n_u)``.
+        defects: ``(N, n_z)``.
+        from_u: Derivative of the states by the inputs ``((N + 1) n_x, N n_u)``.
+        weighted: State weights times ``from_u``.
+        hessian: Hessian of the cost by ``du`` ``(N n_u, N n_u)``.
+        weight: Weight factors ``(N + 1, n_x)``.
+        soft: Soft bounds' values ``(M,)``, their derivatives by their state ``(M, n_x)`` and by the inputs
+            ``(M, N n_u)``.
+        economic: First derivatives ``(N, n_x + n_u)`` of the economic stage costs and their convex second ones;
+            None where there are none.
+        milliseconds: Time the preparation took.
+    """
+
+    u: Array
+    z: Array
+    d: Array
+    u_prev: Array
+    a_t: Array
+    b: Array
+    defects: Array
+    from_u: Array
+    weighted: Array
+    hessian: Array
+    weight: Array
+    soft: tuple[Array, Array, Array]
+    economic: tuple[Array, Array] | None
+    milliseconds: float
+
+
+class Condenser:
+    """Derivative of the states by the inputs, on scratch memory of its own: not for several threads at once.
+
+    The products run transposed, on contiguous memory: rows of the scratch arrays are inputs, a period's
+    array is written by one product from the one before. They are the condensing's whole arithmetic, ``N^2
+    n_u n_z^2`` operations; of the hidden states' derivatives neither cost nor bounds see anything.
+
+    Args:
+        n: Periods N.
+        n_z: Number of states and hidden states.
+        n_u: Number of inputs.
+        n_x: Number of states; they come first in z.
+
+    Example:
+        >>> Condenser(2, 1, 1, 1)(np.ones((2, 1, 1)), np.ones((2, 1, 1)))
+        array([[0., 0.],
+               [1., 0.],
+               [1., 1.]])
+    """
+
+    def __init__(self, n: int, n_z: int, n_u: int, n_x: int) -> None:
+        self._by_inputs = np.zeros((n + 1, n * n_u, n_z))  # of z_0 .. z_N; later inputs' rows stay zero
+        self._newest = self._by_inputs[1:].reshape(n, n, n_u, n_z)
+        self._stages = np.arange(n)
+        self._before = [self._by_inputs[k, : k * n_u] for k in range(1, n)]
+        self._after = [self._by_inputs[k + 1, : k * n_u] for k in range(1, n)]
+        self._states = self._by_inputs[:, :, :n_x].transpose(0, 2, 1)
+        self._shape = (n + 1) * n_x, n * n_u
+
+    def __call__(self, a_t: Array, b: Array) -> Array:
+        """``((N + 1) n_x, N n_u)`` from transposed ``A_k`` ``(N, n_z, n_z)`` and ``B_k`` ``(N, n_z, n_u)``."""
+        self._newest[self._stages, self._stages] = b.transpose(0, 2, 1)
+        for before, a, after in zip(self._before, a_t[1:], self._after, strict=True):
+            np.dot(before, a, out=after)
+        return np.array(self._states, order="C").reshape(
+            self._shape
+        )  # what is prepared outlives the next call
+
+    @property
+    def by_inputs(self) -> Array:
+        """Derivatives ``(N + 1, N n_u, n_z)`` of ``z_0 .. z_N`` by the inputs; the next call overwrites them."""
+        return self._by_inputs
+
+
+def propagate(a: Sequence[Array], drift: Array, dz0: Array) -> Array:
+    """``dz_{k+1} = A_k dz_k + drift_k`` from ``dz0``: ``(N + 1, n_z)``.
+
+    Args:
+        a: ``A_k`` ``(n_z, n_z)``; column by column in memory is fastest.
+        drift: ``(N, n_z)``.
+        dz0: ``(n_z,)``.
+
+    Example:
+        >>> propagate([np.array([[0.5]])] * 2, np.ones((2, 1)), np.zeros(1)).ravel()
+        array([0. , 1. , 1.5])
+    """
+    dz = np.concatenate([dz0[None], drift])
+    rows = list(dz)
+    for matrix, before, after in zip(a, rows[:-1], rows[1:], strict=True):
+        dgemv(1.0, matrix, before, 1.0, after, overwrite_y=1)  # in place: half the time of numpy's two calls
+    return dz
+
+
+def adjoint(a_t: Array, last: Array, stages: Array) -> Array:
+    """Multipliers ``(N, n_z)`` of the stages' results: derivative of the cost by ``z_1 .. z_N``.
+
+    Args:
+        a_t: Transposed ``A_k`` ``(N, n_z, n_z)``.
+        last: Derivative of the terminal cost by ``x_N`` ``(n_x,)``.
+        stages: Derivatives of the stage costs by ``x_0 .. x_{N-1}`` ``(N, n_x)``.
+
+    Example:
+        >>> adjoint(np.full((2, 1, 1), 0.5), np.ones(1), np.full((2, 1), 3.0)).ravel()
+        array([3.5, 1. ])
+    """
+    n_x = last.size
+    multipliers = np.zeros((len(a_t), a_t.shape[1]))
+    multipliers[:-1, :n_x] = stages[1:]
+    multipliers[-1, :n_x] = last
+    backwards = a_t.transpose(0, 2, 1)[:0:-1], multipliers[:0:-1], multipliers[-2::-1]
+    for a, after, before in zip(*backwards, strict=True):
+        dgemv(1.0, a, after, 1.0, before, trans=1, overwrite_y=1)
+    return multipliers
+
+
+def condense_hessians(stages: Array, from_u: Array, n_x: int) -> Array:
+    """Second derivatives by the stages' ``(x, u)`` ``(N, n_x + n_u, n_x + n_u)`` as those by the inputs.
+
+    Example:
+        >>> condense_hessians(np.full((1, 2, 2), 3.0), np.array([[0.0], [5.0]]), 1)
+        array([[3.]])
+    """
+    n, size, _ = stages.shape
+    n_u = size - n_x
+    states = from_u[: n * n_x].reshape(n, n_x, n * n_u)
+    by_state = (stages[:, :n_x, :n_x] @ states).reshape(n * n_x, n * n_u)
+    by_input = (stages[:, n_x:, :n_x] @ states).reshape(n * n_u, n * n_u)
+    total = from_u[: n * n_x].T @ by_state + by_input + by_input.T
+    blocks = total.reshape(n, n_u, n, n_u)
+    blocks[np.arange(n), :, np.arange(n)] += stages[:, n_x:, n_x:]
+    return np.asarray(total)
+
+
+def condense_all(stages: Array, by_inputs: Array, n_x: int, n_u: int) -> Array:
+    """Second derivatives by the stages' ``(x, u, h)`` ``(N, n, n)`` as those by the inputs ``(N n_u, N n_u)``.
+
+    Args:
+        stages: Second derivatives.
+        by_inputs: Derivatives ``(N + 1, N n_u, n_z)`` of states and hidden states by the inputs.
+        n_x: Number of states.
+        n_u: Number of inputs.
+
+    Example:
+        >>> condense_all(np.full((1, 3, 3), 3.0), np.zeros((2, 1, 2)), 1, 1)
+        array([[3.]])
+    """
+    n, few = len(stages), n_x + n_u
+    z = np.r_[:n_x, few : stages.shape[1]]
+    by_z, mixed = stages[:, z[:, None], z], stages[:, n_x:few][:, :, z]
+    total, one_sided = np.zeros((n * n_u, n * n_u)), np.zeros((n * n_u, n * n_u))
+    for first in range(1, n, GROUP):  # the first state knows no input, later ones only those before them
+        last = min(first + GROUP, n)
+        m = (last - 1) * n_u
+        states = np.ascontiguousarray(by_inputs[first:last, :m].transpose(0, 2, 1))
+        flat = states.reshape(-1, m)
+        total[:m, :m] += flat.T @ (by_z[first:last] @ states).reshape(-1, m)
+        one_sided[first * n_u : last * n_u, :m] = (mixed[first:last] @ states).reshape(-1, m)
+    total += one_sided + one_sided.T
+    total.reshape(n, n_u, n, n_u)[np.arange(n), :, np.arange(n)] += stages[:, n_x:few, n_x:few]
+    return total
+
+
+NAN = float("nan")
+
+
+class CondensedController:
+    """Nonlinear MPC by Gauss-Newton real-time iterations (RTI).
+
+    A period's work is split: :meth:`prepare` shifts the previous plan, linearises the model along it in
+    one call and condenses states and hidden states away (their multiple-shooting trajectory and
+    its defects are kept); :meth:`feedback` embeds the new estimate and solves the QP of ``N n_u``
+    unknowns (and a slack for every soft bound and period, where one acts). The QP's answer is checked,
+    whatever status its solver reports. Everything is built here; no method changes the object (apart from
+    scratch buffers: not for several threads at once) or raises on the numbers of an estimate, a reference,
+    a weight or a plan.
+
+    Args:
+        model: The deployed model; ``n_h`` may be 0.
+        ocp: The problem.
+        iterations: Linearisations per solve; 1 is the RTI, more converge to the NLP's solution.
+        compiled: Whether what is evaluated period by period is compiled as C, cached as
+            :func:`nn_export.compile_function` says: the runs of a model with a ``side_by_side``, else its
+            Jacobians too. Default: no.
+
+    Raises:
+        InputError: If problem and model do not fit, ``iterations < 1``, the terminal weight cannot be found,
+            or the model is to be compiled and cannot be.
+
+    Source: Diehl, Bock, Schlöder, *A real-time iteration scheme for nonlinear optimization in optimal
+    feedback control*, SIAM J. Control Optim. 43 (2005).
+
+    Example:
+        >>> import casadi as ca
+        >>> from hybrid_mpc.estimate.kalman import TrueState
+        >>> from hybrid_mpc.machine.signals import Signal
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
+        >>> controller = CondensedController(model, OCP(5, [1.0], [1.0], [0.0], [-9.0], [9.0]))
+        >>> estimate = TrueState(model).start([1.0])
+        >>> solution = controller.solve(controller.initial(estimate), estimate, np.zeros((6, 1)))
+        >>> solution.status.name, solution.u[0].round(6)
+        ('SOLVED', array([-0.618034]))
+    """
+
+    def __init__(self, model: HybridModel, ocp: OCP, *, iterations: int = 1, compiled: bool = False) -> None:
+        if iterations < 1:
+            raise InputError(f"iterations must be at least 1, got {iterations}")
+        self._problem = Problem(model, ocp)
+        self._model, self._ocp, self._iterations = model, ocp, iterations
+        n, n_u = ocp.horizon, ocp.n_u
+        self._stages = stages(model, n, compiled=compiled)
+        difference = np.eye(n * n_u) - np.eye(n * n_u, k=-n_u)
+        r, r_delta = np.tile(ocp.r, n) * model.dt, np.tile(ocp.r_delta, n) * model.dt
+        self._input_hessian = 2 * (np.diag(r) + (difference.T * r_delta) @ difference)
+        self._qp = InputQP(ocp, self._problem.soft, model.dt)
+        self._n_x = ocp.n_x
+        self._condenser = Condenser(n, ocp.n_x + model.n_h, n_u, ocp.n_x)
+        self._evaluate_once()
+
+    @property
+    def model(self) -> HybridModel:
+        """The model that predicts."""
+        return self._model
+
+    @property
+    def ocp(self) -> OCP:
+        """The problem."""
+        return self._ocp
+
+    @property
+    def problem(self) -> Problem:
+        """Problem and model made ready; what the plan costs on the model itself."""
+        return self._problem
+
+    @property
+    def stages(self) -> Linearisation:
+        """The model along the horizon."""
+        return self._stages
+
+    @property
+    def condenser(self) -> Condenser:
+        """The condensing."""
+        return self._condenser
+
+    @property
+    def qp(self) -> InputQP:
+        """The QP over the inputs."""
+        return self._qp
+
+    def initial(self, estimate: Estimate, u: Array | None = None) -> Solution:
+        """A first plan: the model run freely from the estimate; see :meth:`Problem.initial`."""
+        return self._problem.initial(estimate, u)
+
+    def prepare(self, previous: Solution, weight: Array | None = None) -> Prepared:
+        """Linearise and condense along the previous plan, shifted by one period.
+
+        Args:
+            previous: The last plan. ``previous.u[0]`` is the input that is being held; the shifted plan
+                repeats its last input.
+            weight: Factors on ``q`` ``(m, n_x)``, from now on in steps of ``dt``; if ``m < N + 1`` the last
+                value holds. Default: 1.
+
+        Raises:
+            InputError: If the weight has another shape.
+        """
+        u = self._ocp.held(np.vstack([previous.u[1:], previous.u[-1:]]))
+        z = np.hstack([previous.x, previous.h])
+        z = np.vstack([z[1:], z[-1:]])
+        weight = self._problem.weights(weight)
+        return self._condense(u, z, previous.d, previous.u[0], weight, shifted=True)
+
+    def linearise(self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array) -> Prepared:
+        """Linearise and condense along a trajectory as it is: ``u`` ``(N, n_u)``, ``z`` ``(N + 1, n_z)``."""
+        return self._condense(u, z, d, u_prev, weight, shifted=False)
+
+    @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
+    def feedback(
+        self, prepared: Prepared, estimate: Estimate, reference: Array, limits: Limits | None = None
+    ) -> Solution:
+        """Embed the estimate and the reference, solve the QP and check its answer.
+
+        Args:
+            prepared: What :meth:`prepare` returned.
+            estimate: The state now; its ``d`` is assumed constant over the horizon.
+            reference: ``(m, n_x)``, from now on in steps of ``dt``; if ``m < N + 1`` its last value holds;
+                see :meth:`Controller.solve`.
+            limits: Bounds of the inputs for this solve. Default: the problem's own.
+
+        Returns:
+            The plan. If its status is not ``ok`` the inputs are the shifted previous plan.
+
+        Raises:
+            InputError: If the reference or the limits have another shape.
+        """
+        start = perf_counter()
+        target = replace(self._problem.target(reference), weight=prepared.weight)
+        hessian, economic = self._at_parameters(prepared, target)
+        if not target.ok or not np.all(np.isfinite(hessian)):
+            return self._failed(prepared, Status.NOT_FINITE, start)
+        n_x = self._n_x
+        dz0 = np.concatenate([estimate.x, estimate.h]) - prepared.z[0]
+        drift = prepared.defects + prepared.b @ (estimate.d - prepared.d)
+        matrices = list(prepared.a_t.transpose(0, 2, 1))
+        free = propagate(matrices, drift, dz0)
+        error = prepared.z[:, :n_x] + free[:, :n_x] - target.x
+        u_bar = prepared.u.ravel()
+        gradient = 2 * error.ravel() @ prepared.weighted + self.input_gradient(u_bar, prepared.u_prev)
+        if economic is not None:
+            slope, curvature = economic
+            slope = slope + (curvature[:, :, :n_x] @ free[:-1, :n_x, None])[:, :, 0]
+            gradient += (
+                slope[:, :n_x].ravel() @ prepared.from_u[: slope.shape[0] * n_x] + slope[:, n_x:].ravel()
+            )
+        soft = self._soft_rows(prepared, free)
+        if not (np.all(np.isfinite(gradient)) and (soft is None or np.all(np.isfinite(soft[0])))):
+            return self._failed(prepared, Status.NOT_FINITE, start)
+        answer = self._qp.answer(hessian, gradient, prepared.u, prepared.u_prev, soft, limits)
+        step = answer.step
+        if not answer.status.ok:
+            return self._failed(prepared, answer.status, start, answer.kkt)
+        u = (u_bar + step).reshape(prepared.u.shape)
+        drift += (prepared.b @ step.reshape(len(u), -1, 1))[:, :, 0]
+        z = prepared.z + propagate(matrices, drift, dz0)
+        excess = np.zeros(0) if soft is None else self._problem.soft.excess(soft[0] + soft[1] @ step)
+        cost = self._problem.cost(z, u, prepared.u_prev, target, excess)
+        if not np.isfinite(cost):
+            return self._failed(prepared, Status.NOT_FINITE, start, answer.kkt)
+        u = np.clip(u, *self._ocp.bounds(prepared.u_prev, limits))  # the QP keeps them to its tolerance only
+        return Solution(
+            u, z[:, :n_x], z[:, n_x:], estimate.d, cost, answer.status, answer.kkt, _largest(prepared.defects),
+            self._timing(prepared, start), float(np.max(excess, initial=0.0)),
+        )  # fmt: skip
+
+    def solve(
+        self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,
+        *, limits: Limits | None = None,
+    ) -> Solution:  # fmt: skip
+        """:meth:`prepare` and :meth:`finish`."""
+        return self.finish(self.prepare(previous, weight), estimate, reference, limits)
+
+    def finish(
+        self, prepared: Prepared, estimate: Estimate, reference: Array, limits: Limits | None = None
+    ) -> Solution:
+        """:meth:`feedback`, then linearised anew until there have been ``iterations``; arguments as there."""
+        solution = self.feedback(prepared, estimate, reference, limits)
+        for i in range(1, self._iterations):
+            if not solution.status.ok:
+                break
+            spent = solution.timing
+            z = np.hstack([solution.x, solution.h])
+            again = self.linearise(solution.u, z, solution.d, prepared.u_prev, prepared.weight)
+            solution = self.feedback(again, estimate, reference, limits)
+            total = {name: spent[name] + solution.timing[name] for name in spent}
+            solution = replace(solution, timing=total, iterations=i + 1)
+        return solution
+
+    @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
+    def _condense(
+        self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array, *, shifted: bool
+    ) -> Prepared:
+        start = perf_counter()
+        derivatives = self._stages.at(z[:-1], u + d)
+        if shifted:  # the appended period has no trajectory yet: start it without a defect
+            z = np.vstack([z[:-1], derivatives[0][-1:]])
+        return self.condense(u, z, d, u_prev, weight, derivatives, start)
+
+    def condense(
+        self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array,
+        derivatives: Derivatives, start: float, p: Array | None = None,
+    ) -> Prepared:  # fmt: skip
+        """Condense derivatives ``(z_next, A_t, B)`` that are known; ``start`` is when the work began.
+
+        ``p`` ``(N + 1, n_p)`` are the values of the economic cost's parameters. Default: none are known yet; where
+        the cost has some it is left to the feedback.
+        """
+        n, n_x = self._ocp.horizon, self._n_x
+        z_next, a_t, b = derivatives
+        from_u = self._condenser(a_t, b)
+        if weights_ok(weight):
+            by_stage, terminal = self._problem.state_weights(weight)
+            weighted = np.empty_like(from_u)
+            np.multiply(from_u[: n * n_x], by_stage.reshape(-1, 1), out=weighted[: n * n_x])
+            weighted[n * n_x :] = terminal @ from_u[n * n_x :]
+        else:
+            weighted = np.full_like(from_u, np.nan)
+        hessian = 2 * from_u.T @ weighted + self._input_hessian
+        soft = self._problem.soft.condensed(z[:, :n_x], u, from_u)
+        known = self._ocp.economic is not None and (p is not None or not self._ocp.n_p)
+        economic = self._problem.economic.convex(z[:, :n_x], u, p) if known else None
+        if economic is not None:
+            hessian += condense_hessians(economic[1], from_u, n_x)
+        spent = (perf_counter() - start) * 1e3
+        return Prepared(
+            u, z, d, u_prev, a_t, b, z_next - z[1:], from_u, weighted, hessian, weight, soft, economic, spent
+        )
+
+    def _at_parameters(self, prepared: Prepared, target: Target) -> tuple[Array, tuple[Array, Array] | None]:
+        """Hessian and economic derivatives, those that wait for the parameters' values included."""
+        if not self._ocp.n_p:
+            return prepared.hessian, prepared.economic
+        economic = self._problem.economic.convex(prepared.z[:, : self._n_x], prepared.u, target.p)
+        return prepared.hessian + condense_hessians(economic[1], prepared.from_u, self._n_x), economic
+
+    def _soft_rows(self, prepared: Prepared, free: Array) -> tuple[Array, Array] | None:
+        """Values of the soft bounds before a step, and their derivatives by it."""
+        value, by_x, slope = prepared.soft
+        if not value.size:
+            return None
+        moved = np.sum(by_x * free[self._problem.soft.stage, : self._n_x], axis=1)
+        return value + moved, slope
+
+    def _evaluate_once(self) -> None:
+        """Solve once at zero, so that no later call is the first of a CasADi function, which is slow."""
+        m = self._model
+        x, h, d, p = np.zeros(m.n_x), np.zeros(m.n_h), np.zeros(m.n_u), np.zeros((0, 0))
+        zero = Estimate(0.0, x, h, d, p, np.zeros(0), NAN)
+        self.solve(self.initial(zero), zero, np.zeros((1, m.n_x + self._ocp.n_p)))
+
+    def input_gradient(self, u: Array, u_prev: Array) -> Array:
+        """Gradient of the input costs at the plan ``u`` ``(N n_u,)``."""
+        gradient: Array = self._input_hessian @ u
+        gradient[: u_prev.size] -= 2 * self._model.dt * self._ocp.r_delta * u_prev
+        return gradient
+
+    def _failed(self, prepared: Prepared, status: Status, start: float, kkt: float = NAN) -> Solution:
+        x, h = prepared.z[:, : self._n_x], prepared.z[:, self._n_x :]
+        return Solution(prepared.u, x, h, prepared.d, NAN, status, kkt, _largest(prepared.defects),
+                        self._timing(prepared, start), NAN)  # fmt: skip
+
+    def _timing(self, prepared: Prepared, start: float) -> dict[str, float]:
+        return {"prepare": prepared.milliseconds, "feedback": (perf_counter() - start) * 1e3}
+
+
+def _largest(defects: Array) -> float:
+    return float(np.max(np.abs(defects)))

@@ -1,0 +1,273 @@
+"""A controller that always returns an admissible input and says where it came from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybrid_mpc.control.ocp import OCP, Limits
+from hybrid_mpc.control.problem import Controller, Solution, Status
+from hybrid_mpc.control.rti import CondensedController, Prepared
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimate.kalman import Estimate
+from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.model.riccati import lqr, vector
+
+Array = NDArray[np.float64]
+
+
+class Source(Enum):
+    """Where an applied input came from; the value is the message."""
+
+    MPC = "the checked solution of the MPC"
+    PLAN = "the previous plan, shifted: the solve failed"
+    FALLBACK = "the stabilising feedback on the prior: the solve failed and the plan is used up"
+    ZERO = "the safe input, by default zero within the limits: nothing else was finite"
+    MANUAL = "the operator"
+
+
+@dataclass(frozen=True)
+class Decision:
+    """The input of one period.
+
+    Args:
+        u: Input ``(n_u,)``, always within the bounds and the limit of its change.
+        source: Where it came from.
+        solution: The plan to go on from; its ``u[0]`` is ``u``.
+        status: How this period's solve ended.
+        age: Periods since the last successful solve.
+    """
+
+    u: Array
+    source: Source
+    solution: Solution
+    status: Status
+    age: int
+
+
+class SafeController:
+    """Guards a controller: checked solution, else the shifted plan, else a fallback, else the safe input.
+
+    Every input is within ``[u_min, u_max]`` and within ``du_max`` of the last one, whatever the solver,
+    the model or the estimate do. The object keeps nothing between calls: what must be remembered
+    (the held input, the plan, its age) is in the :class:`Decision`.
+
+    Args:
+        controller: The controller to guard.
+        fallback: Model, usually the fitted prior, whose LQR takes over. Default: none, then zero follows.
+        max_age: Periods a plan may be followed without a successful solve.
+        working_point: ``(x, u)`` at which the fallback is linearised; see :func:`hybrid_mpc.model.riccati.lqr`.
+            Default: the problem's own, else zero, the input within its limits.
+        first: Controller that makes the first plan, before the loop starts; an
+            :class:`~hybrid_mpc.control.sqp.SQPController` converges it. Default: ``controller``.
+        safe_input: Input ``(n_u,)`` within the limits that is applied where nothing is known: before the first plan, on
+            a sensor that is lost, at the end of a run. Default: zero, or the limit next to it.
+
+    Raises:
+        InputError: If the fallback does not fit the problem or cannot be stabilised, or the safe input is outside the
+            limits.
+
+    Example:
+        >>> from hybrid_mpc.estimate.kalman import TrueState
+        >>> from hybrid_mpc.control.ocp import OCP; from hybrid_mpc.control.rti import CondensedController
+        >>> from hybrid_mpc.machine.signals import Signal
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
+        >>> ocp = OCP(5, [1.0], [1.0], [0.0], [-9.0], [9.0], du_max=[0.5])
+        >>> safe = SafeController(CondensedController(model, ocp), fallback=model)
+        >>> estimate = TrueState(model).start([2.0])
+        >>> decision = safe.decide(safe.initial(estimate), estimate, np.full((6, 1), np.nan))
+        >>> decision.source.name, decision.status.name
+        ('PLAN', 'NOT_FINITE')
+    """
+
+    def __init__(
+        self,
+        controller: Controller,
+        fallback: HybridModel | None = None,
+        *,
+        max_age: int = 5,
+        working_point: tuple[Array, Array] | None = None,
+        first: Controller | None = None,
+        safe_input: ArrayLike | None = None,
+    ) -> None:
+        if max_age < 0:
+            raise InputError(f"max_age must not be negative, got {max_age}")
+        ocp = controller.ocp
+        self._controller, self._max_age = controller, max_age
+        self.safe_input = checked_safe_input(safe_input, ocp)
+        self._rti = controller if isinstance(controller, CondensedController) else None
+        self._first = controller if first is None else first
+        _check_first(self._first, controller)
+        self._fallback = None
+        if fallback is not None:
+            if (fallback.n_x, fallback.n_u) != (ocp.n_x, ocp.n_u):
+                raise InputError(
+                    f"fallback {fallback.name} has {fallback.n_x} states and {fallback.n_u} inputs, "
+                    f"the problem {ocp.n_x} and {ocp.n_u}"
+                )
+            rest = np.zeros(ocp.n_x), ocp.rest_input
+            point = working_point or ocp.working_point or rest
+            feedback = lqr(fallback, *rest, ocp.q, ocp.r + ocp.r_delta, working_point=point)
+            self._gain = feedback.gain[:, : ocp.n_x]
+            self._late = feedback.gain[:, ocp.n_x : ocp.n_x + fallback.waiting]
+            self._fallback = _equilibrium_input(fallback)
+            self._fallback(np.zeros(ocp.n_x))  # a CasADi function's first call is slow
+
+    @property
+    def controller(self) -> Controller:
+        """The guarded controller."""
+        return self._controller
+
+    def initial(
+        self,
+        estimate: Estimate,
+        u: Array | None = None,
+        reference: Array | None = None,
+        weight: Array | None = None,
+    ) -> Decision:
+        """Decision before the first: an input is held, and there is a plan to go on from.
+
+        A real-time iteration improves a plan a little in every period; the first plan has no predecessor. So
+        make it here, while the machine rests and no deadline presses.
+
+        Args:
+            estimate: Where the plan starts.
+            u: Input ``(n_u,)`` that is held. Default: the safe input.
+            reference: ``(m, n_x)``, from the first period on in steps of ``dt``: the plan is optimised for it.
+                Default: none; the plan holds ``u``.
+            weight: Factors on ``q`` ``(m, n_x)``, as the reference. Default: 1.
+
+        Raises:
+            InputError: If ``u`` has another size or is not finite, or another shape does not fit.
+        """
+        ocp = self._controller.ocp
+        held = self.safe_input if u is None else np.clip(vector(u, ocp.n_u, "u"), ocp.u_min, ocp.u_max)
+        plan = self._controller.initial(estimate, np.tile(held, (ocp.horizon, 1)))
+        if reference is not None:
+            solution = self._first.solve(plan, estimate, reference, weight)
+            plan = solution.delayed(held) if solution.status.ok else plan
+        return Decision(held, Source.ZERO, plan, Status.INITIAL, 0)
+
+    def decide(
+        self, previous: Decision, estimate: Estimate, reference: Array, weight: Array | None = None,
+        *, limits: Limits | None = None, prepared: Prepared | None = None,
+    ) -> Decision:  # fmt: skip
+        """The input to hold from now on.
+
+        Args:
+            previous: The last decision; its ``u`` is being held.
+            estimate: The state now.
+            reference: ``(m, n_x)`` from now on in steps of ``dt``.
+            weight: Factors on ``q`` ``(m, n_x)``, as the reference. Default: 1.
+            limits: Bounds of the inputs for this period, e.g. those of a guard; where ``du_max`` does not let the
+                input be within them at once, it goes there as fast as it may. Default: the problem's own.
+            prepared: What :meth:`prepare` made of ``previous`` and ``weight``. Default: it is made now.
+        """
+        if prepared is not None and self._rti is not None:
+            solution = self._rti.finish(prepared, estimate, reference, limits)
+        else:
+            solution = self._controller.solve(previous.solution, estimate, reference, weight, limits=limits)
+        if solution.status.ok:
+            u = self._controller.ocp.saturate(solution.u[0], previous.u, limits)
+            plan = replace(solution, u=np.vstack([u[None], solution.u[1:]]))
+            return Decision(u, Source.MPC, plan, solution.status, 0)
+        return self._without(previous, estimate, reference, solution, limits)
+
+    def prepare(self, previous: Decision, weight: Array | None = None) -> Prepared | None:
+        """The part of the next :meth:`decide` that needs no measurement, to be done while the input acts.
+
+        Args:
+            previous: The decision that the next one goes on from.
+            weight: Factors on ``q`` ``(m, n_x)`` of the next period. Default: 1.
+
+        Returns:
+            The linearisation, condensed; None for a solver without such a part.
+        """
+        return None if self._rti is None else self._rti.prepare(previous.solution, weight)
+
+    def late(
+        self, previous: Decision, estimate: Estimate, reference: Array, *, limits: Limits | None = None
+    ) -> Decision:
+        """The input to hold where the solve has not come in time: as after a failed solve, status LATE."""
+        plan = previous.solution
+        shifted = np.vstack([plan.u[1:], plan.u[-1:]])
+        failed = replace(plan, u=shifted, status=Status.LATE)
+        return self._without(previous, estimate, reference, failed, limits)
+
+    def _without(
+        self, previous: Decision, estimate: Estimate, reference: Array, solution: Solution,
+        limits: Limits | None,
+    ) -> Decision:  # fmt: skip
+        """The decision where no solution may be applied; ``solution`` holds the shifted plan and why."""
+        ocp, held = self._controller.ocp, previous.u
+        u, source = self._instead(solution, estimate, np.asarray(reference, dtype=float), previous.age + 1)
+        u = ocp.saturate(u, held, limits)
+        inputs = np.vstack([u[None], solution.u[1:]])
+        inputs = np.where(np.isfinite(inputs), inputs, u)
+        known = bool(np.all(np.isfinite(np.concatenate([estimate.x, estimate.h, estimate.d]))))
+        plan = self._controller.initial(estimate, inputs) if known else replace(solution, u=inputs)
+        return Decision(u, source, plan, solution.status, previous.age + 1)
+
+    @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
+    def _instead(
+        self, failed: Solution, estimate: Estimate, reference: Array, age: int
+    ) -> tuple[Array, Source]:
+        if age <= self._max_age and np.all(np.isfinite(failed.u[0])):
+            return failed.u[0], Source.PLAN
+        if self._fallback is not None:
+            goal = reference[0, : self._controller.ocp.n_x]
+            goal = goal if np.all(np.isfinite(goal)) else np.zeros_like(goal)
+            best = self._fallback(goal).full().ravel()
+            u = best - self._gain @ (estimate.x - goal) - estimate.d
+            if self._late.size:  # what is under way to the machine already
+                u = u - self._late @ (
+                    estimate.h[: self._late.shape[1]] - np.tile(best, self._late.shape[1] // u.size)
+                )
+            if np.all(np.isfinite(u)):
+                return u, Source.FALLBACK
+        return self.safe_input, Source.ZERO
+
+
+def checked_safe_input(given: ArrayLike | None, ocp: OCP) -> Array:
+    """The safe input ``(n_u,)`` of a problem.
+
+    Args:
+        given: What was declared. Default: zero, or the limit next to it.
+        ocp: The problem, with the limits.
+
+    Raises:
+        InputError: If it has another size, is not finite, or is outside the limits.
+
+    Example:
+        >>> from hybrid_mpc.control.ocp import OCP
+        >>> checked_safe_input(None, OCP(5, [1.0], [1.0], [0.0], [2.0], [9.0])).tolist()
+        [2.0]
+    """
+    u = vector(ocp.rest_input if given is None else given, ocp.n_u, "safe_input")
+    if np.any(u < ocp.u_min) or np.any(u > ocp.u_max):
+        raise InputError(f"safe_input {u} is outside the limits {ocp.u_min} to {ocp.u_max}")
+    return u
+
+
+def _check_first(first: Controller, controller: Controller) -> None:
+    sizes = [(c.model.n_x, c.model.n_h, c.ocp.n_u, c.ocp.horizon) for c in (first, controller)]
+    if sizes[0] != sizes[1]:
+        raise InputError(
+            f"first: (n_x, n_h, n_u, N) = {sizes[0]}, the controller has {sizes[1]}; "
+            "give both the same model and problem"
+        )
+
+
+def _equilibrium_input(model: HybridModel) -> ca.Function:
+    """``x -> u`` that holds a state best: one least-squares Newton step of ``xdot(x, 0, u)`` from zero."""
+    x, u = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
+    v_dot = model.xdot(x, ca.DM.zeros(model.n_h, 1), u, model.w, model.p)[model.n_x // 2 :]
+    slope = ca.jacobian(v_dot, u)
+    damping = 1e-12 * ca.DM.eye(model.n_u)
+    best = -ca.solve(slope.T @ slope + damping, slope.T @ v_dot)
+    return ca.Function("equilibrium_input", [x], [ca.substitute(best, u, ca.DM.zeros(model.n_u, 1))])

@@ -1,0 +1,528 @@
+"""Sequential quadratic programming: the condensed iteration repeated to convergence, with damping."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.control.curvature import StageCurvature, convex
+from hybrid_mpc.control.ocp import OCP, Limits
+from hybrid_mpc.control.problem import Problem, Solution, Status, Target
+from hybrid_mpc.control.qp import Answer
+from hybrid_mpc.control.rti import CondensedController, Prepared, adjoint, condense_hessians
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimate.kalman import Estimate
+from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.model.stages import Derivatives
+
+# Cost and derivatives of a problem along runs of its model.
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Case:
+    """What one solve is given: disturbance, input held before, targets, and limits tighter than the problem's."""
+
+    d: Array
+    u_prev: Array
+    target: Target
+    limits: Limits | None = None
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run of the model on inputs.
+
+    Args:
+        u: Inputs ``(N, n_u)``.
+        z: Trajectory ``(N + 1, n_z)``.
+        soft: Values of the soft bounds ``(M,)``, their derivatives by their state ``(M, n_x)`` and input.
+        cost: Penalties of soft bounds included.
+    """
+
+    u: Array
+    z: Array
+    soft: tuple[Array, Array, Array]
+    cost: float
+
+
+@dataclass(frozen=True)
+class Point:
+    """A run with its first derivatives.
+
+    Args:
+        run: The run.
+        derivatives: Successors, transposed ``A`` and ``B`` of the stages.
+        multipliers: Derivative of the cost by ``z_1 .. z_N``, soft bounds left out ``(N, n_z)``.
+        gradient: Of the cost by the inputs, soft bounds left out ``(N n_u,)``.
+    """
+
+    run: Run
+    derivatives: Derivatives
+    multipliers: Array
+    gradient: Array
+
+
+class Landscape:
+    """Cost and derivatives of a problem along runs of its model. Built once, for any number of cases."""
+
+    def __init__(self, inner: CondensedController) -> None:
+        self.inner, self.problem = inner, inner.problem
+        self.stages = StageCurvature(inner.stages, inner.ocp, inner.model.n_h, inner.problem.soft)
+        self.metric: Array = np.tile(inner.ocp.input_scale**-2.0, inner.ocp.horizon)
+
+    def run(self, z0: Array, u: Array, case: Case) -> Run:
+        """The run from ``z0`` on ``u``."""
+        problem, n_x = self.problem, self.inner.ocp.n_x
+        z = self.inner.stages.run(z0, u + case.d)
+        soft = problem.soft.linearise(z[:, :n_x], u)
+        excess = problem.soft.excess(soft[0])
+        return Run(u, z, soft, problem.cost(z, u, case.u_prev, case.target, excess))
+
+    def at(self, run: Run, case: Case) -> Point:
+        """What is known along a run."""
+        problem, n_x = self.problem, self.inner.ocp.n_x
+        derivatives = self.inner.stages.at(run.z[:-1], run.u + case.d)
+        stages, terminal = problem.state_weights(case.target.weight)
+        error = run.z[:, :n_x] - case.target.x
+        slopes, direct = 2 * stages * error[:-1], self.inner.input_gradient(run.u.ravel(), case.u_prev)
+        if self.inner.ocp.economic is not None:
+            economic = problem.economic.derivatives(run.z[:, :n_x], run.u, case.target.p)[0]
+            slopes, direct = slopes + economic[:, :n_x], direct + economic[:, n_x:].ravel()
+        multipliers = adjoint(derivatives[1], 2 * terminal @ error[-1], slopes)
+        gradient = (multipliers[:, None, :] @ derivatives[2]).ravel() + direct
+        return Point(run, derivatives, multipliers, gradient)
+
+    def lagrangian(self, at: Point, soft: Array) -> tuple[Array, Array]:
+        """Multipliers of the dynamics and gradient with the soft bounds in, whose multipliers are ``soft``."""
+        acting = np.flatnonzero(soft)
+        if not acting.size:
+            return at.multipliers, at.gradient
+        _, by_x, by_u = at.run.soft
+        n, stage = len(at.run.u), self.problem.soft.stage[acting]
+        slopes, direct = np.zeros((n + 1, by_x.shape[1])), np.zeros((n + 1, by_u.shape[1]))
+        np.add.at(slopes, stage, soft[acting, None] * by_x[acting])
+        np.add.at(direct, stage, soft[acting, None] * by_u[acting])  # the last state has no input
+        more = adjoint(at.derivatives[1], slopes[-1], slopes[:-1])
+        gradient = at.gradient + (more[:, None, :] @ at.derivatives[2]).ravel() + direct[:-1].ravel()
+        return at.multipliers + more, gradient
+
+    def curvature(
+        self, at: Point, case: Case, multipliers: Array, soft: Array, old: Array | None = None
+    ) -> Array:
+        """Second derivatives of the stages, weighted; see :meth:`StageCurvature.of`."""
+        _, a_t, b = at.derivatives
+        inputs = np.stack([at.run.u, at.run.u + case.d])
+        return self.stages.of(at.run.z, inputs, a_t, b, multipliers, soft, old)
+
+    def condensed(self, at: Point, case: Case) -> Prepared:
+        """The Gauss-Newton model of the cost at a point."""
+        return self.inner.condense(
+            at.run.u, at.run.z, case.d, case.u_prev, case.target.weight, at.derivatives, perf_counter(),
+            case.target.p,
+        )  # fmt: skip
+
+    def without_what_is_small(self, prepared: Prepared, curvature: Array) -> Array:
+        """See :meth:`StageCurvature.without_what_is_small`; nothing was condensed since ``prepared``."""
+        by_inputs = self.inner.condenser.by_inputs
+        return self.stages.without_what_is_small(curvature, prepared.hessian, prepared.from_u, by_inputs)
+
+    def penalty(self, values: Array) -> float:
+        """What values of the soft bounds cost."""
+        soft = self.problem.soft
+        return self.problem.model.dt * soft.penalty(soft.excess(values))
+
+    def gap(self, values: Array, multipliers: Array) -> float:
+        """By how much the penalties of values may exceed those after the best change (Fenchel's inequality).
+
+        Args:
+            values: Of the soft bounds ``(M,)``.
+            multipliers: Under which everything else is stationary ``(M,)``.
+        """
+        soft, dt, acting = self.problem.soft, self.problem.model.dt, np.flatnonzero(multipliers)
+        mu = multipliers[acting]
+        bound = np.where(mu > 0, soft.upper[acting], soft.lower[acting])
+        beyond = np.maximum(0.0, np.abs(mu) - dt * soft.linear[acting])
+        proven = mu @ (values[acting] - bound) - np.sum(beyond**2 / (4 * dt * soft.quadratic[acting]))
+        return self.penalty(values) - float(proven)
+
+    def rest(self, prepared: Prepared, curvature: Array, case: Case) -> Array:
+        """What the exact Hessian has besides ``prepared``'s; nothing was condensed since."""
+        rest = self.stages.condensed(curvature, prepared.from_u, self.inner.condenser.by_inputs)
+        if prepared.economic is not None:  # what curves down, which the convex model takes as flat
+            n_x = self.inner.ocp.n_x
+            exact = self.problem.economic.derivatives(prepared.z[:, :n_x], prepared.u, case.target.p)[1]
+            rest = rest + condense_hessians(exact - prepared.economic[1], prepared.from_u, n_x)
+        return rest
+
+
+# One solve of the SQP: the steps from one run of the model to the next.
+
+NAN = float("nan")
+ARMIJO = 1e-4
+KKT = 1e-6
+ATTEMPTS = 15
+"""Most QPs of an iteration, each damped more than the one before."""
+MORE = 4.0
+"""Factor of the damping from one attempt to the next; a good step takes as much away."""
+POOR, GOOD = 0.25, 0.5
+"""Shares of the promise: a step that keeps less asks for damping, one that keeps more for less of it."""
+CORRECTIONS = 2
+"""Most corrections of a step by what it was found to bend."""
+SLOW = 0.1
+"""Share of the residual that the Hessian got wrong, above which second derivatives are taken anew."""
+AGAIN = (1, 4, 16, 64)
+"""Times at which a hidden state's curvature that hardly mattered is looked at again."""
+
+
+@dataclass(frozen=True)
+class _Step:
+    """What a search has found.
+
+    Args:
+        run: The model on the step; None if no step lowers the cost.
+        answer: The QP's.
+        hessian: The damped Hessian that the answer belongs to.
+        promised: What the model without damping promises of the step before its correction.
+        own: That model's curvature along the step, in the damping's metric.
+    """
+
+    run: Run | None
+    answer: Answer
+    hessian: Array
+    promised: float
+    own: float
+
+
+class Descent:
+    """The steps of one solve, from a first point on.
+
+    Args:
+        landscape: Cost and derivatives.
+        case: What the solve is given.
+        at: The first run; its cost is finite.
+        curvature: Second derivatives from the last solve, shifted. Default: taken at the first run.
+        tolerance: See :class:`~hybrid_mpc.control.sqp.SQPController`.
+    """
+
+    def __init__(
+        self, landscape: Landscape, case: Case, at: Point, curvature: Array | None, tolerance: float
+    ) -> None:
+        self._land, self._case, self._tolerance = landscape, case, tolerance
+        self.at, self.curvature = at, curvature
+        self.count, self.status, self.kkt, self.ended = 0, Status.STOPPED, NAN, False
+        self._stale, self._fresh, self._plain, self._taken = curvature is None, False, False, 0
+        self._soft = np.zeros(at.run.soft[0].size)  # multipliers
+        self._damping = 0.0
+
+    def iterate(self) -> None:
+        """One linearisation, and QPs until the step of one lowers the cost."""
+        self.count += 1
+        prepared = self._land.condensed(self.at, self._case)
+        hessian = self._hessian(prepared)
+        found = self._search(prepared, hessian)
+        if not found.answer.status.ok:
+            self._refused(found.answer.status)
+        elif found.run is None:
+            self._lost(found)
+        else:
+            self._go(hessian, found, found.run)
+
+    def _go(self, hessian: Array, found: _Step, run: Run) -> None:
+        """Make a step, and judge by the QP's multipliers what is left to do there."""
+        answer, land = found.answer, self._land
+        before = max(answer.kkt, self._residual(hessian, found.hessian @ answer.step))
+        gained = self.at.run.cost - run.cost
+        new = land.at(run, self._case)
+        change = land.lagrangian(new, answer.multipliers)[1]
+        change = change - land.lagrangian(self.at, answer.multipliers)[1]
+        wrong = self._residual(hessian, change - hessian @ answer.step)
+        left = change - found.hessian @ answer.step
+        after = max(answer.kkt, self._residual(hessian, left))
+        self.at, self.kkt, self._soft = new, after, answer.multipliers
+        self._stale, self._fresh, self._plain = wrong > SLOW * before, False, False
+        self.ended = after <= KKT and self._promise(hessian, left) <= self._enough
+        self.status = Status.SOLVED if self.ended else Status.STOPPED
+        if gained < POOR * found.promised:
+            self._damping = max(2 * self._damping, 0.5 * found.own)
+        elif gained > GOOD * found.promised:
+            self._damping = self._damping / MORE if self._damping > 0.1 * found.own else 0.0
+
+    def _search(self, prepared: Prepared, hessian: Array) -> _Step:
+        """The first step, damped more and more, that lowers the cost enough, if there is one."""
+        first = None
+        for _ in range(ATTEMPTS):
+            damped = hessian
+            if self._damping:
+                damped = hessian + np.diag(self._damping * self._land.metric)
+            answer = self._answer(damped, self.at.gradient, prepared.soft[0], prepared.soft[2])
+            step = answer.step
+            own = float(step @ (hessian @ step)) / max(float(step**2 @ self._land.metric), 1e-300)
+            found = _Step(None, answer, damped, self._promised(prepared, hessian, step), own)
+            first = found if first is None else first
+            if not answer.status.ok:
+                return found
+            promised = self._promised(prepared, damped, step)
+            run, answer = self._along(prepared, damped, answer, promised)
+            if run is not None:
+                return _Step(run, answer, damped, found.promised, own)
+            if promised <= self._enough:
+                break
+            self._damping = max(MORE * self._damping, own)
+        assert first is not None
+        return first
+
+    def _along(
+        self, prepared: Prepared, damped: Array, answer: Answer, promised: float
+    ) -> tuple[Run | None, Answer]:
+        """The run on a step if it lowers the cost enough, or on the step corrected by what it was found to bend."""
+        least, before = self.at.run.cost - ARMIJO * promised, np.inf
+        for i in range(1 + CORRECTIONS):
+            run = self._trial(answer.step)
+            if run.cost <= least:
+                return run, answer
+            if i == CORRECTIONS or not run.cost < before:
+                break
+            before, answer = run.cost, self._corrected(prepared, damped, answer, run)
+            if not answer.status.ok:
+                break
+        return None, answer
+
+    def _corrected(self, prepared: Prepared, damped: Array, answer: Answer, run: Run) -> Answer:
+        """The QP once more, with what states and soft bounds were found to be beside the last answer's line."""
+        old, n_x, (value, _, slope) = self.at.run, self._land.inner.ocp.n_x, prepared.soft
+        bend = (run.z[:, :n_x] - old.z[:, :n_x]).ravel() - prepared.from_u @ answer.step
+        if len(slope):
+            value = run.soft[0] - slope @ answer.step
+        return self._answer(damped, self.at.gradient + 2 * bend @ prepared.weighted, value, slope)
+
+    def _answer(self, hessian: Array, gradient: Array, value: Array, slope: Array) -> Answer:
+        soft = (value, slope) if value.size else None
+        case = self._case
+        return self._land.inner.qp.answer(hessian, gradient, self.at.run.u, case.u_prev, soft, case.limits)
+
+    def _trial(self, step: Array) -> Run:
+        run, bounds = self.at.run, self._land.inner.ocp.bounds(self._case.u_prev, self._case.limits)
+        u = np.clip(run.u + step.reshape(run.u.shape), *bounds)
+        return self._land.run(run.z[0], u, self._case)
+
+    def _promised(self, prepared: Prepared, hessian: Array, step: Array) -> float:
+        """By how much the convex model falls along a step."""
+        value, _, slope = prepared.soft
+        lowers = -float(step @ (self.at.gradient + 0.5 * (hessian @ step)))
+        if value.size:
+            lowers += self._land.penalty(value) - self._land.penalty(value + slope @ step)
+        return lowers
+
+    def _promise(self, hessian: Array, left: Array) -> float:
+        """What the convex model at the point promises at most (weak duality), ``left`` of the stationarity."""
+        qp = self._land.inner.qp
+        left, hessian = qp.by_blocks(left), qp.blocked_hessian(hessian)
+        promise = 0.5 * float(left @ np.linalg.solve(hessian, left))
+        return promise + self._land.gap(self.at.run.soft[0], self._soft)
+
+    def _residual(self, hessian: Array, slope: Array) -> float:
+        """A gradient of the cost by the inputs in the QP's scaling."""
+        qp = self._land.inner.qp
+        size = np.max(np.diag(qp.blocked_hessian(hessian)) * qp.scale**2)
+        return float(np.max(np.abs(qp.scale * qp.by_blocks(slope))) / size)
+
+    @property
+    def _enough(self) -> float:
+        return self._tolerance * max(abs(self.at.run.cost), 1e-12)
+
+    def _hessian(self, prepared: Prepared) -> Array:
+        if self._plain:
+            return prepared.hessian
+        multipliers, slope = self._land.lagrangian(self.at, self._soft)
+        if self._stale or self.curvature is None:
+            self.curvature = self._taken_anew(prepared, multipliers)
+        if not np.all(np.isfinite(self.curvature)):
+            return prepared.hessian
+        return convex(
+            prepared.hessian, self._land.rest(prepared, self.curvature, self._case), self._held(slope)
+        )
+
+    def _taken_anew(self, prepared: Prepared, multipliers: Array) -> Array:
+        """Second derivatives here; the hidden state's, which change slowly, from the second time on."""
+        land, old = self._land, self.curvature
+        small = old is not None and old.shape[1] < land.stages.size
+        if old is not None and (self._taken in AGAIN if small else self._taken > 0):
+            old = None
+        curvature = land.curvature(self.at, self._case, multipliers, self._soft, old)
+        if old is None:
+            curvature = land.without_what_is_small(prepared, curvature)
+        self._stale, self._fresh, self._taken = False, True, self._taken + 1
+        return curvature
+
+    def _held(self, slope: Array) -> NDArray[np.bool_] | None:
+        """Inputs that lie on a bound against which the cost pushes them."""
+        ocp, u = self._land.inner.ocp, self.at.run.u
+        if ocp.blocks is not None:
+            return None
+        s, near = slope.reshape(u.shape), 1e-6 * self._land.inner.qp.scale.reshape(u.shape)
+        lower, upper = ocp.bounds(self._case.u_prev, self._case.limits)
+        return (((u <= lower + near) & (s > 0)) | ((u >= upper - near) & (s < 0))).ravel()
+
+    def _lost(self, found: _Step) -> None:
+        """No step lowers the cost: where it is flat what is left is rounding, else start anew."""
+        self.kkt = max(found.answer.kkt, self._residual(found.hessian, found.hessian @ found.answer.step))
+        flat = found.promised <= self._enough
+        self.ended = (flat and self.kkt <= KKT) or self._plain
+        self.status = Status.SOLVED if self.ended and flat else Status.STOPPED
+        self._stale, self._plain, self._damping = not self._fresh, self._fresh, 0.0
+
+    def _refused(self, status: Status) -> None:
+        """The QP's answer is no good: Gauss-Newton's Hessian is better conditioned, then it is over."""
+        self.ended = self._plain
+        self._plain, self._damping = True, 0.0
+        if self.ended:
+            self.status = status if self.count <= 2 else Status.STOPPED
+
+
+class SQPController:
+    """Nonlinear MPC by SQP to convergence with exact second derivatives, globalised by damping.
+
+    Every iterate is a run of the model itself: the dynamics hold exactly, limits of inputs and changes are
+    linear and kept by every QP, soft bounds are penalties within the cost. So the cost itself is the merit
+    function, and a step is made when it lowers the cost by a share (1e-4) of what the QP's convex model
+    promises. One that does not is corrected first by what states and soft bounds were found to bend along it
+    (Fletcher's second-order correction: a stiff weight or penalty otherwise cuts every step short), then the QP
+    is solved again with more curvature in all directions (Levenberg and Marquardt's damping), which carries
+    over to the next iteration and falls where steps keep their promise.
+
+    The QP's Hessian is Gauss-Newton's and the second derivatives of the dynamics and of soft bounds by states,
+    inputs and hidden states, weighted with their multipliers: under a steep friction law or a trained network
+    these outweigh Gauss-Newton's, which alone then converges slowly. They are differences of the exact
+    Jacobians (``n_x + n_u + n_h`` evaluations), come along with a plan, shifted by a period, and are taken
+    anew where the Hessian got more than a tenth of the residual wrong, those by the hidden state from the
+    second time in a solve on. Where their sum with Gauss-Newton's is not convex it is made so, if possible in
+    the inputs alone that lie on a bound. The plan is independent of the first guess but for the basin it lies
+    in.
+
+    Args:
+        model: The deployed model; ``n_h`` may be 0. It must not be so unstable that a run over the horizon
+            overflows: then no line search finds a finite cost.
+        ocp: The problem.
+        tolerance: Converged when the convex model promises to lower the cost by less than this share, and
+            the KKT residual is at most 1e-6.
+        iterations: Most linearisations; the plan then reached has the status STOPPED and may be applied.
+        compiled: As in :class:`~hybrid_mpc.control.rti.CondensedController`.
+
+    Raises:
+        InputError: As :class:`~hybrid_mpc.control.rti.CondensedController`, or if an option is not positive.
+
+    Source: Burke, *Descent methods for composite nondifferentiable optimization problems*, Math. Program.
+    33 (1985); Fletcher, *Second order corrections for non-differentiable optimization*, Numerical Analysis,
+    Lecture Notes in Mathematics 912 (1982).
+
+    Example:
+        >>> import casadi as ca
+        >>> from hybrid_mpc.estimate.kalman import TrueState
+        >>> from hybrid_mpc.machine.signals import Signal
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("sine", 1.0, level, (Signal("u", "-"),), level,
+        ...     x=x, u=u, x_next=x + ca.sin(u), xdot=u, y=x)
+        >>> controller = SQPController(model, OCP(5, [1.0], [1.0], [0.0], [-1.5], [1.5]))
+        >>> estimate = TrueState(model).start([2.0])
+        >>> solution = controller.solve(controller.initial(estimate), estimate, np.zeros((6, 1)))
+        >>> solution.status.name, solution.defect
+        ('SOLVED', 0.0)
+    """
+
+    def __init__(
+        self,
+        model: HybridModel,
+        ocp: OCP,
+        *,
+        tolerance: float = 1e-10,
+        iterations: int = 100,
+        compiled: bool = False,
+    ) -> None:
+        if not tolerance > 0 or iterations < 1:
+            raise InputError(
+                f"tolerance must be positive and iterations at least 1, got {tolerance} and {iterations}"
+            )
+        self._inner = CondensedController(model, ocp, compiled=compiled)
+        self._tolerance, self._iterations = tolerance, iterations
+        self._landscape = Landscape(self._inner)
+
+    @property
+    def model(self) -> HybridModel:
+        """The model that predicts."""
+        return self._inner.model
+
+    @property
+    def ocp(self) -> OCP:
+        """The problem."""
+        return self._inner.ocp
+
+    @property
+    def problem(self) -> Problem:
+        """Problem and model made ready."""
+        return self._inner.problem
+
+    def initial(self, estimate: Estimate, u: Array | None = None) -> Solution:
+        """A first plan: the model run freely from the estimate; see :meth:`Problem.initial`."""
+        return self._inner.initial(estimate, u)
+
+    @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
+    def solve(
+        self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,
+        *, limits: Limits | None = None,
+    ) -> Solution:  # fmt: skip
+        """The plan from now on, converged; see :meth:`Controller.solve`.
+
+        Its ``kkt`` is the residual of the nonlinear problem in the QP's scaling, with the multipliers of the
+        last QP.
+        """
+        start = perf_counter()
+        case = Case(estimate.d, previous.u[0], self.problem.target(reference, weight), limits)
+        u = self._admissible(np.vstack([previous.u[1:], previous.u[-1:]]), case)
+        run = self._landscape.run(np.concatenate([estimate.x, estimate.h]), u, case)
+        at = self._landscape.at(run, case)
+        search = Descent(self._landscape, case, at, self._shifted(previous), self._tolerance)
+        if not (np.isfinite(run.cost) and np.all(np.isfinite(at.gradient)) and case.target.ok):
+            search.status = Status.NOT_FINITE
+            return replace(self._plan(search, estimate.d), timing=_spent(start))
+        while search.count < self._iterations and not search.ended:
+            search.iterate()
+        return replace(self._plan(search, estimate.d), timing=_spent(start))
+
+    def _shifted(self, previous: Solution) -> Array | None:
+        """Second derivatives along the previous plan, a period later; None if it has none that fit."""
+        given = previous.curvature
+        if given is None or not self._landscape.stages.fits(given, self.ocp.horizon):
+            return None
+        return np.concatenate([given[1:], given[-1:]]) if np.all(np.isfinite(given)) else None
+
+    def _admissible(self, u: Array, case: Case) -> Array:
+        """``u`` held over its blocks and moved into the limits, one input after the other.
+
+        The QPs keep what the first guess keeps.
+        """
+        u_prev = case.u_prev
+        lower, upper = self.ocp.bounds(u_prev, case.limits)
+        if self.ocp.du_max is None:
+            return self.ocp.held(np.clip(u, lower, upper))
+        rows = u.copy()
+        for start in self.ocp.block_starts:
+            u_prev = np.clip(self.ocp.saturate(u[start], u_prev), lower[start], upper[start])
+            rows[start] = u_prev
+        return self.ocp.held(rows)
+
+    def _plan(self, search: Descent, d: Array) -> Solution:
+        at, n_x = search.at.run, self.ocp.n_x
+        excess = self.problem.soft.excess(at.soft[0])
+        return Solution(
+            at.u, at.z[:, :n_x], at.z[:, n_x:], d, at.cost, search.status, search.kkt, 0.0, {},
+            float(np.max(excess, initial=0.0)), search.count, search.curvature,
+        )  # fmt: skip
+
+
+def _spent(start: float) -> dict[str, float]:
+    return {"solve": (perf_counter() - start) * 1e3}

@@ -1,0 +1,529 @@
+"""Smoothing and differentiation by a bandwidth: smoothing spline and zero-phase low-pass filter."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline, make_smoothing_spline
+from scipy.optimize import minimize_scalar
+from scipy.signal import butter, savgol_coeffs, savgol_filter, sosfiltfilt
+
+from hybrid_mpc.errors import InputError
+
+# Smooth and differentiate a sampled signal by local polynomials (Savitzky-Golay).
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Derivatives:
+    """A smoothed signal with its first two derivatives, each of the signal's shape.
+
+    Args:
+        value: Smoothed signal.
+        first: First derivative [1/s].
+        second: Second derivative [1/s^2].
+    """
+
+    value: Array
+    first: Array
+    second: Array
+
+
+def window_samples(length: float, dt: float, order: int = 4) -> int:
+    """Odd number of samples in a window of at most ``length`` [s] at the period ``dt`` [s].
+
+    Raises:
+        InputError: If the window holds no more than ``order + 1`` samples: the polynomial would go
+            through every sample and smooth nothing.
+
+    Example:
+        >>> window_samples(0.2, 0.02)
+        11
+    """
+    n = 2 * int(np.floor(length / (2 * dt) + 1e-6)) + 1
+    if n <= order + 1:
+        need = 2 * (order // 2 + 1) * dt
+        raise InputError(
+            f"smoothing of {length:g} s holds {n} samples at {dt:g} s; a polynomial of order {order} needs "
+            f"at least {need:g} s. Raise smoothing in the DataSpec or record faster."
+        )
+    return n
+
+
+def local_polynomial(y: Array, dt: float, length: float, order: int = 4) -> Derivatives:
+    """Value, first and second derivative of a local polynomial fitted around each sample.
+
+    Exact for polynomials up to ``order``. It looks ahead by half of ``length`` at most; within half a
+    window of the ends the first or last whole window's polynomial is evaluated (noisier there).
+
+    Args:
+        y: Samples ``(n,)`` or ``(n, n_y)`` on a uniform grid.
+        dt: Period [s].
+        length: Length of the window [s].
+        order: Order of the polynomial, default 4.
+
+    Returns:
+        Arrays of the shape of ``y``.
+
+    Raises:
+        InputError: If the window holds too few samples or is longer than the signal.
+
+    Example:
+        >>> t = 0.01 * np.arange(50)
+        >>> d = local_polynomial(t**3, 0.01, length=0.1)
+        >>> bool(np.allclose(d.second, 6 * t))
+        True
+
+    Source: A. Savitzky and M. J. E. Golay, Analytical Chemistry 36 (1964) 1627.
+    """
+    n = window_samples(length, dt, order)
+    if n > len(y):
+        raise InputError(
+            f"smoothing of {length:g} s needs {n} samples, the signal has {len(y)}. Shorten smoothing or "
+            "give a longer recording."
+        )
+    value, first, second = (
+        np.asarray(savgol_filter(y, n, order, deriv=i, delta=dt, axis=0, mode="interp"), dtype=float)
+        for i in range(3)
+    )
+    return Derivatives(value, first, second)
+
+
+def noise_gain(dt: float, length: float, order: int = 4, derivative: int = 0) -> float:
+    """Standard deviation of a (derivative's) estimate per unit of white noise in the samples.
+
+    It is the Euclidean norm of the filter's coefficients, away from the ends.
+
+    Args:
+        dt: Period [s].
+        length: Length of the window [s].
+        order: Order of the polynomial, default 4.
+        derivative: 0, 1 or 2.
+
+    Example:
+        >>> round(noise_gain(0.005, 0.2, derivative=2))
+        351
+    """
+    n = window_samples(length, dt, order)
+    return float(np.linalg.norm(savgol_coeffs(n, order, deriv=derivative, delta=dt)))
+
+
+def bandwidth(dt: float, length: float, order: int = 4) -> float:
+    """Frequency [Hz] at which the smoothed value has lost 3 dB (gain 1/sqrt(2)).
+
+    Args:
+        dt: Period [s].
+        length: Length of the window [s].
+        order: Order of the polynomial, default 4.
+
+    Example:
+        >>> 7.0 < bandwidth(0.005, 0.2) < 10.0
+        True
+    """
+    n = window_samples(length, dt, order)
+    f = np.linspace(0.0, 0.5 / dt, 20001)
+    below = frequency_gain(f, dt, n, order) < np.sqrt(0.5)
+    return float(f[np.argmax(below)]) if below.any() else float(f[-1])
+
+
+def frequency_gain(f: Array, dt: float, n: int, order: int = 4, derivative: int = 0) -> Array:
+    """Response of the filter at ``f`` [Hz] over that of the exact derivative ``(2 pi f j)^derivative``.
+
+    The response is real: the window is symmetric. At ``f = 0`` it is 1.
+
+    Example:
+        >>> frequency_gain(np.array([0.0]), 0.01, 11).round(12).tolist()
+        [1.0]
+    """
+    c = savgol_coeffs(n, order, deriv=derivative, delta=dt, use="dot")
+    s = 2 * np.pi * np.asarray(f, dtype=float)
+    phase = np.exp(1j * np.outer(s, np.arange(n) - n // 2) * dt)
+    exact = np.where(s > 0, (1j * s) ** derivative, 1.0)
+    gain = np.real(phase @ c / exact)
+    return np.where(s > 0, gain, 1.0)
+
+
+def causal_derivatives(y: Array, dt: float) -> Derivatives:
+    """Local quadratic over the last samples, evaluated at the window's centre: for online use.
+
+    The estimate belongs to the instant ``(n - 1) / 2 * dt`` before the last sample: that is its delay.
+
+    Args:
+        y: The last ``n >= 3`` samples ``(n,)`` or ``(n, n_y)``, oldest first; ``n`` odd.
+        dt: Period [s].
+
+    Returns:
+        Scalars or arrays ``(n_y,)`` at the centre of the window.
+
+    Raises:
+        InputError: If ``n`` is even or below 3.
+
+    Example:
+        >>> d = causal_derivatives(np.array([0.0, 0.01, 0.04, 0.09, 0.16]), 0.1)
+        >>> round(float(d.first), 9), round(float(d.second), 9)
+        (0.4, 2.0)
+    """
+    y = np.asarray(y, dtype=float)
+    n = len(y)
+    if n < 3 or n % 2 == 0:
+        raise InputError(f"causal derivatives need an odd number of samples, at least 3; got {n}")
+    value, first, second = (
+        np.asarray(savgol_coeffs(n, 2, deriv=i, delta=dt, use="dot") @ y) for i in range(3)
+    )
+    return Derivatives(value, first, second)
+
+
+# Ways to smooth and differentiate a sampled signal behind one interface; each says its bandwidth, delay and noise.
+
+HALF_POWER = math.sqrt(0.5)
+POINTS = 2**15
+"""Points of the transform in which a bandwidth is looked for: steps of 3 mHz at 100 Hz."""
+
+
+class Differentiator(ABC):
+    """A linear, time-invariant way to smooth and differentiate; implementations are frozen.
+
+    ``delay`` is what lies between the instant that an estimate belongs to and its row, and zero for all methods
+    that look ahead.
+    """
+
+    @abstractmethod
+    def derivatives(self, y: Array, dt: float) -> Derivatives:
+        """Value and derivatives of samples ``(n,)`` or ``(n, n_y)``; NaN where too little past is known.
+
+        Raises:
+            InputError: If the signal is too short or the method does not fit ``dt`` [s].
+        """
+
+    @abstractmethod
+    def reach(self, dt: float) -> int:
+        """Samples before and after a row beyond which nothing acts on it (for recursions: but rounding)."""
+
+    def delay(self, dt: float) -> float:
+        """Time [s] from the instant that an estimate speaks of to the sample in whose row it stands."""
+        return 0.0
+
+    def kernel(self, dt: float, derivative: int = 0) -> Array:
+        """Weights ``(2 reach + 1,)`` of the samples, newest first, away from the ends of the signal."""
+        reach = self.reach(dt)
+        impulse = np.zeros(4 * reach + 1)
+        impulse[2 * reach] = 1.0
+        d = self.derivatives(impulse, dt)
+        return (d.value, d.first, d.second)[derivative][reach : 3 * reach + 1]
+
+    def response(self, f: Array, dt: float, derivative: int = 0) -> NDArray[np.complex128]:
+        """Gain and phase at ``f`` ``(m,)`` [Hz] over those of the exact derivative, delay taken off; 1 at ``f = 0``.
+
+        Args:
+            f: Frequencies [Hz].
+            dt: Period [s].
+            derivative: 0, 1 or 2.
+        """
+        s = 2 * np.pi * np.asarray(f, dtype=float)
+        reach = self.reach(dt)
+        phase = np.exp(-1j * np.outer(s, np.arange(-reach, reach + 1)) * dt)
+        exact = np.where(s > 0, (1j * s) ** derivative, 1.0) * np.exp(-1j * s * self.delay(dt))
+        return np.where(s > 0, phase @ self.kernel(dt, derivative) / exact, 1.0)
+
+    def bandwidth(self, dt: float, derivative: int = 0) -> float:
+        """Lowest frequency [Hz] at which the estimate has lost 3 dB (gain 1/sqrt(2)) against the exact derivative."""
+        kernel = self.kernel(dt, derivative)
+        n = max(POINTS, 2 ** math.ceil(math.log2(8 * len(kernel))))
+        f = np.fft.rfftfreq(n, dt)[1:]
+        gain = np.abs(np.fft.rfft(kernel, n)[1:]) / (2 * np.pi * f) ** derivative
+        below = gain < HALF_POWER
+        return float(f[np.argmax(below)]) if below.any() else float(f[-1])
+
+    def noise_gain(self, dt: float, derivative: int = 0) -> float:
+        """Standard deviation of an estimate per unit of white noise in the samples, away from the ends."""
+        return float(np.linalg.norm(self.kernel(dt, derivative)))
+
+
+def differentiate(y: Array, dt: float, method: Differentiator) -> Derivatives:
+    """Smoothed signal with its first two derivatives.
+
+    Args:
+        y: Samples ``(n,)`` or ``(n, n_y)`` on a uniform grid, finite.
+        dt: Period [s].
+        method: :class:`LocalPolynomial`, :class:`~hybrid_mpc.data.differentiate.SmoothingSpline`,
+            :class:`~hybrid_mpc.data.differentiate.ZeroPhaseFilter`, or :class:`CausalPolynomial` for what can be
+            known at each
+            sample.
+
+    Returns:
+        Arrays of the shape of ``y``. Row ``k`` belongs to the instant ``k dt - method.delay(dt)``; where a causal
+        method has too little past it is NaN.
+
+    Raises:
+        InputError: If ``y`` is no such array, ``dt`` is not positive, or the signal is too short for the method.
+
+    Example:
+        >>> from hybrid_mpc.data.differentiate import SmoothingSpline, ZeroPhaseFilter
+        >>> t = 0.01 * np.arange(300)
+        >>> for method in LocalPolynomial(0.2), SmoothingSpline(8.0), ZeroPhaseFilter(8.0):
+        ...     d = differentiate(np.sin(t), 0.01, method)
+        ...     print(bool(np.abs(d.first - np.cos(t))[50:-50].max() < 1e-3))
+        True
+        True
+        True
+    """
+    y = np.asarray(y, dtype=float)
+    if y.ndim not in (1, 2) or not y.size:
+        raise InputError(f"differentiate: needs samples (n,) or (n, n_y), got an array of shape {y.shape}")
+    if not (math.isfinite(dt) and dt > 0):
+        raise InputError(f"differentiate: the period must be positive, got {dt} s")
+    if not np.isfinite(y).all():
+        row = int(np.argwhere(~np.isfinite(y))[0, 0])
+        raise InputError(f"differentiate: sample {row} is not finite; cut the signal there or repair it")
+    return method.derivatives(y, dt)
+
+
+@dataclass(frozen=True)
+class LocalPolynomial(Differentiator):
+    """Savitzky-Golay: a polynomial fitted around each sample (:func:`~hybrid_mpc.data.differentiate.local_polynomial`).
+
+    Exact for polynomials up to ``order``; nothing outside its window acts on an estimate. What the main job uses.
+
+    Args:
+        length: Length of the window [s]; it looks ahead by half of it.
+        order: Order of the polynomial, default 4.
+
+    Example:
+        >>> 8.0 < LocalPolynomial(0.2).bandwidth(0.01) < 9.0
+        True
+    """
+
+    length: float
+    order: int = 4
+
+    def derivatives(self, y: Array, dt: float) -> Derivatives:
+        """See :func:`~hybrid_mpc.data.differentiate.local_polynomial`."""
+        return local_polynomial(y, dt, self.length, self.order)
+
+    def reach(self, dt: float) -> int:
+        """Half the window."""
+        return window_samples(self.length, dt, self.order) // 2
+
+
+@dataclass(frozen=True)
+class CausalPolynomial(Differentiator):
+    """A polynomial through the last samples: for use while they come in, and to see what that costs.
+
+    With the default lag and order this is :func:`~hybrid_mpc.data.differentiate.causal_derivatives` over the last
+    window.
+
+    Args:
+        length: Length of the window [s].
+        order: Order of the polynomial, default 2.
+        lag: Time [s] before the newest sample at which the polynomial is evaluated, rounded to whole periods; 0 is
+            now: take order 3 then (a quadratic's second derivative is the same everywhere), and expect much more
+            noise. Default: half the window.
+
+    Example:
+        >>> d = differentiate(0.01 * np.arange(8.0) ** 2, 0.1, CausalPolynomial(0.4))
+        >>> d.first.round(9).tolist()  # of t^2, at the window's centre 0.2 s before
+        [nan, nan, nan, nan, 0.4, 0.6, 0.8, 1.0]
+    """
+
+    length: float
+    order: int = 2
+    lag: float | None = None
+
+    def derivatives(self, y: Array, dt: float) -> Derivatives:
+        """Estimates from the window that ends with each row."""
+        n, back = self._samples(dt)
+        if len(y) < n:
+            raise InputError(too_short(n, len(y)))
+        past = np.lib.stride_tricks.sliding_window_view(y, n, axis=0)
+        empty = np.full((n - 1, *y.shape[1:]), np.nan)
+        value, first, second = (
+            np.concatenate(
+                [empty, past @ savgol_coeffs(n, self.order, deriv=i, delta=dt, pos=n - 1 - back, use="dot")]
+            )
+            for i in range(3)
+        )
+        return Derivatives(value, first, second)
+
+    def reach(self, dt: float) -> int:
+        """The window."""
+        return self._samples(dt)[0] - 1
+
+    def delay(self, dt: float) -> float:
+        """The lag in whole periods."""
+        return self._samples(dt)[1] * dt
+
+    def _samples(self, dt: float) -> tuple[int, int]:
+        n = window_samples(self.length, dt, self.order)
+        back = n // 2 if self.lag is None else round(self.lag / dt)
+        if not 0 <= back < n:
+            raise InputError(
+                f"causal polynomial: its lag of {self.lag:g} s must be within the {self.length:g} s window"
+            )
+        return n, back
+
+
+def too_short(need: int, got: int) -> str:
+    """What is said of a signal that is shorter than a method needs."""
+    return f"differentiate: the method needs {need} samples, the signal has {got}. Give more or smooth less."
+
+
+ROOM = math.sqrt(2.0) - 1.0
+"""``1 / (1 + ROOM)`` is a gain of -3 dB."""
+DECAYS = 28.0
+"""Time constants after which a kernel is below 1e-12 of its peak: rounding."""
+SLOWEST = 2e-4
+"""Lowest cutoff of a smoothing spline over the sampling rate: below it the spline's equations lose four digits."""
+
+
+@dataclass(frozen=True)
+class SmoothingSpline(Differentiator):
+    """Cubic smoothing spline: least squares with a penalty on the second derivative.
+
+    On a uniform grid, away from the ends, the samples' spline has the gain ``B / (B + lam D^2)`` with
+    ``B = (4 + 2 cos w) / 6``, ``D = 2 - 2 cos w``, ``w = 2 pi f dt``: the penalty follows from the bandwidth.
+
+    Args:
+        cutoff: Frequency [Hz] at which the smoothed value has lost 3 dB; :func:`gcv_cutoff` proposes one.
+
+    Source: C. H. Reinsch, Numerische Mathematik 10 (1967) 177; the gain: M. Unser et al., IEEE Transactions on Signal
+    Processing 41 (1993) 834.
+
+    Example:
+        >>> round(SmoothingSpline(5.0).bandwidth(0.01), 2)
+        5.0
+    """
+
+    cutoff: float
+
+    def derivatives(self, y: Array, dt: float) -> Derivatives:
+        """The spline and its derivatives at the samples."""
+        _check_cutoff(self.cutoff, dt, len(y))
+        if self.cutoff * dt < SLOWEST:
+            raise InputError(
+                f"smoothing spline: cutoff of {self.cutoff:g} Hz at {1 / dt:g} Hz is too low to be computed. Raise it "
+                f"to {SLOWEST / dt:g} Hz, take ZeroPhaseFilter, or keep fewer samples."
+            )
+        k = np.arange(len(y), dtype=float)
+        lam = ROOM * _spline_ratio(np.array(2 * np.pi * self.cutoff * dt)).item()
+        columns = [make_smoothing_spline(k, column, lam=lam) for column in y.reshape(len(y), -1).T]
+        value, first, second = (
+            np.column_stack([np.asarray(s.derivative(i)(k) if i else s(k)) for s in columns]).reshape(y.shape)
+            / dt**i
+            for i in range(3)
+        )
+        return Derivatives(value, first, second)
+
+    def reach(self, dt: float) -> int:
+        """The kernel falls by e in ``ROOM^(1/4) sqrt(2) / (2 pi cutoff)``."""
+        return math.ceil(DECAYS * ROOM**0.25 * math.sqrt(2) / (2 * math.pi * self.cutoff * dt))
+
+
+@dataclass(frozen=True)
+class ZeroPhaseFilter(Differentiator):
+    """Butterworth low-pass run forwards and backwards, then differentiated through a cubic spline.
+
+    The spline interpolates: its derivatives at the samples are compact differences, of order 4 and 2 in ``dt``.
+    At the ends the signal is continued by its point reflection, as far as the filter reaches.
+
+    Args:
+        cutoff: Frequency [Hz] at which both runs together have lost 3 dB.
+        order: Order of each run, default 4.
+
+    Source: F. Gustafsson, IEEE Transactions on Signal Processing 44 (1996) 988 (its start is scipy's ``odd``).
+
+    Example:
+        >>> round(ZeroPhaseFilter(5.0).bandwidth(0.01), 2)
+        5.0
+    """
+
+    cutoff: float
+    order: int = 4
+
+    def derivatives(self, y: Array, dt: float) -> Derivatives:
+        """Filtered signal with its spline's derivatives."""
+        _check_cutoff(self.cutoff, dt, len(y))
+        sos = butter(self.order, self._run(dt), output="sos")
+        pad = min(len(y) - 1, self.reach(dt))  # so far that the recursion's start has died away
+        spline = CubicSpline(dt * np.arange(len(y)), sosfiltfilt(sos, y, axis=0, padlen=pad))
+        t = spline.x
+        return Derivatives(spline(t), spline(t, 1), spline(t, 2))
+
+    def reach(self, dt: float) -> int:
+        """Until the slowest pole has died away, or the interpolating spline's, ``sqrt(3) - 2``."""
+        _, poles, _ = butter(self.order, self._run(dt), output="zpk")
+        slowest = max(float(np.abs(poles).max()), 2 - math.sqrt(3))
+        return math.ceil(DECAYS / -math.log(slowest))
+
+    def _run(self, dt: float) -> float:
+        """Cutoff of one run over half the sampling rate.
+
+        Each run alone has the gain ``1 / sqrt(1 + (W / W_d)^(2 order))`` in ``W = tan(pi f dt)``, both its square.
+        """
+        warped = math.tan(math.pi * self.cutoff * dt) / ROOM ** (0.5 / self.order)
+        return 2 / math.pi * math.atan(warped)
+
+
+def gcv_cutoff(y: Array, dt: float) -> float:
+    """Cutoff [Hz] of a smoothing spline by generalised cross-validation: for white noise of unknown size.
+
+    It minimises ``n |y - y_hat|^2 / (n - tr)^2``, where the trace of the smoother is the sum of its gains over the
+    frequencies ``k / (2 n dt)``. Quantisation is no white noise where the signal is slow: look at the result.
+
+    Args:
+        y: Samples ``(n,)``.
+        dt: Period [s].
+
+    Raises:
+        InputError: If there are fewer than 16 samples.
+
+    Source: P. Craven and G. Wahba, Numerische Mathematik 31 (1979) 377.
+
+    Example:
+        >>> t = 0.01 * np.arange(1000)
+        >>> noise = np.random.default_rng(0).standard_normal(1000)
+        >>> rough, fine = (gcv_cutoff(np.sin(5 * t) + s * noise, 0.01) for s in (0.5, 0.001))
+        >>> 0.8 < rough < fine
+        True
+    """
+    y = np.asarray(y, dtype=float)
+    n = len(y)
+    if y.ndim != 1 or n < 16:
+        raise InputError(
+            f"gcv_cutoff: needs at least 16 samples of one signal, got an array of shape {y.shape}"
+        )
+    ratio = 1 / _spline_ratio(np.pi * np.arange(1, n) / n)
+
+    def score(log_cutoff: float) -> float:
+        cutoff = math.exp(log_cutoff)
+        lam = ROOM * _spline_ratio(np.array(2 * np.pi * cutoff * dt)).item()
+        trace = 1 + float(np.sum(1 / (1 + lam * ratio)))
+        left = y - SmoothingSpline(cutoff).derivatives(y, dt).value
+        return float(n * (left @ left) / (n - trace) ** 2)
+
+    # the score may have several minima: the best point of a grid, refined between its neighbours
+    grid = np.log(np.geomspace(max(2 / n, SLOWEST) / dt, 0.45 / dt, 40))
+    scores = [score(point) for point in grid]
+    k = min(max(int(np.argmin(scores)), 1), len(grid) - 2)
+    found = minimize_scalar(score, bounds=(grid[k - 1], grid[k + 1]), method="bounded")
+    return math.exp(float(found.x))
+
+
+def _spline_ratio(w: Array) -> Array:
+    """``B / D^2`` of the smoothing spline's gain at ``w`` [rad per sample]."""
+    return (4 + 2 * np.cos(w)) / 6 / (2 - 2 * np.cos(w)) ** 2
+
+
+def _check_cutoff(cutoff: float, dt: float, n: int) -> None:
+    if not 0 < cutoff < 0.5 / dt:
+        raise InputError(
+            f"cutoff of {cutoff:g} Hz must be positive and below {0.5 / dt:g} Hz, half the sampling rate of "
+            f"{1 / dt:g} Hz"
+        )
+    need = max(5, math.ceil(1 / (cutoff * dt)))
+    if n < need:
+        raise InputError(too_short(need, n))

@@ -1,0 +1,557 @@
+"""Named vectors of ``.npz`` and MATLAB ``.mat`` files as columns. Nothing in these files is executed."""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import difflib
+import errno
+import hashlib
+import io
+import math
+import warnings
+from array import array
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+from scipy.io import loadmat
+from scipy.io.matlab import MatlabObject, MatlabOpaque, MatReadWarning
+
+import nn_export.files
+from hybrid_mpc.data.mat_structure import check_structure, version
+from hybrid_mpc.errors import InputError, refuse
+from hybrid_mpc.files import check_npz, write_text
+from hybrid_mpc.records import LONGEST, shown
+
+# What a recording's file holds, whatever its format: names of columns, and numbers on request.
+
+Array = NDArray[np.float64]
+ENDINGS = (".csv", ".npz", ".mat")
+"""Formats with a reader of their own; any other ending is read as CSV."""
+LARGEST = 2**31
+"""Most bytes of a file, and of the numbers in it [byte]: three columns at 1 kHz for a day."""
+SMALL = 2**26
+"""Bytes of numbers that any file may hold [byte], however well they are compressed: 8 million numbers."""
+PACKED = 20
+"""Beyond ``SMALL``, most bytes of numbers for one byte of a file. Recorded motions are compressed to a tenth at best; a
+thousand to one is what zeros, and bombs, come to."""
+CHUNK = 2**20
+"""Bytes of a file that are looked at in one go [byte]."""
+LISTED = 30
+"""Most names that a message lists."""
+COMPARED = 1000
+"""Most names among which a message looks for one that is nearly right."""
+
+
+class MissingColumn(InputError):
+    """A column that a file lacks."""
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Numbers of some columns.
+
+    Args:
+        values: ``(m, n)``, a column for each name asked for; NaN where there is no finite number.
+        row: What the file's own tools call a row: ``"row"`` or ``"index"``.
+        numbers: Number of each row, ``m`` of them, as those tools count.
+        problems: What is wrong with single columns, each with place and remedy, without the file's name. Default: all
+            numbers are finite.
+    """
+
+    values: Array
+    row: str
+    numbers: Sequence[int]
+    problems: tuple[str, ...] = ()
+
+    def place(self, k: int) -> str:
+        """Where sample ``k`` stands in the file, e.g. ``"row 12"``."""
+        return f"{self.row} {self.numbers[k]}"
+
+
+@dataclass(frozen=True)
+class Source:
+    """A recording's file, opened.
+
+    Args:
+        path: The file.
+        sha256: SHA-256 of its bytes, in hexadecimal.
+        header: Names of its columns, in its order.
+        read: ``(full names) -> Columns``, the first one being the time.
+        note: What else a user should know who misses a column; default: nothing.
+    """
+
+    path: Path
+    sha256: str
+    header: tuple[str, ...]
+    read: Callable[[Sequence[str]], Columns]
+    note: str = ""
+
+    def find(self, name: str) -> str:
+        """Full name of a column: its own, or ``struct.field`` where just one struct has such a field.
+
+        Raises:
+            MissingColumn: If there is none.
+            InputError: If there are several.
+        """
+        count = self.header.count(name)
+        if count == 1:
+            return name
+        there = listed(self.header)
+        if count > 1:
+            raise InputError(
+                f"{self.path}: column {name!r} appears {count} times in {there}. Rename all but one."
+            )
+        fields = [column for column in self.header if column.endswith(f".{name}")]
+        if len(fields) == 1:
+            return fields[0]
+        if fields:
+            raise InputError(
+                f"{self.path}: column {name!r} may be {' or '.join(map(shown, fields[:LISTED]))}. "
+                "Name it whole in the scenario's DataSpec."
+            )
+        near = difflib.get_close_matches(name, [c for c in self.header[:COMPARED] if len(c) < LONGEST], n=1)
+        hint = f" Did you mean {near[0]!r}?" if near else ""
+        raise MissingColumn(
+            f"{self.path}: no column {name!r}; it has {there}.{hint} "
+            f"Rename the column or name yours in the scenario's DataSpec.{self.note}"
+        )
+
+
+def content_of(path: Path, check: Callable[[bytes], None] | None = None) -> bytes:
+    """The file's bytes, at least one of which says something.
+
+    Only a regular file is read: nothing else says how long it is, and a pipe or a device may never end. It is opened
+    without waiting.
+
+    Args:
+        path: The file.
+        check: Called with one piece of at most ``CHUNK`` after the other before anything is kept; it raises where the
+            rest is not worth reading. Default: no check.
+
+    Raises:
+        InputError: If it is missing, no regular file, too large, cannot be read or is empty.
+    """
+    try:
+        with nn_export.files.opened(path, LARGEST) as (file, size):
+            left = size
+            while check is not None and left > 0 and (piece := file.read(min(CHUNK, left))):
+                check(piece)
+                left -= len(piece)
+            file.seek(0)
+            content = file.read(size)  # what is written to it by now is left for the next time
+    except FileNotFoundError:
+        raise InputError(
+            f"{path}: there is no such file{_beside(path)}. Check the path given with --data."
+        ) from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}). {_instead(error)}") from error
+    if not content or content.isspace():
+        raise InputError(f"{path}: the file is empty. It needs a header line and rows of numbers.")
+    return content
+
+
+def _instead(error: OSError) -> str:
+    """What to do about it."""
+    if error.errno == errno.EFBIG:
+        return "Split the recording, or leave out columns that are not needed."
+    return "Give a readable CSV, npz or mat file."
+
+
+def _beside(path: Path) -> str:
+    """What recordings the folder of a missing one has, for a message."""
+    try:
+        near = sorted(p.name for p in path.parent.iterdir() if p.suffix.lower() in ENDINGS)
+    except OSError:
+        return ""
+    return f"; that folder has: {', '.join(near[:LISTED])}" if near else ""
+
+
+def budget_of(content: bytes) -> int:
+    """Bytes of numbers that a file of this content may hold [byte].
+
+    Example:
+        >>> budget_of(bytes(100)) == SMALL, budget_of(bytes(10_000_000)) == 200_000_000
+        (True, True)
+    """
+    return min(LARGEST, max(SMALL, PACKED * len(content)))
+
+
+def megabytes(size: int) -> str:
+    """A number of bytes for a message.
+
+    Example:
+        >>> megabytes(2_500_000)
+        '2.5 MB'
+    """
+    return f"{size / 1e6:.4g} MB"
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names in quotes for a message, the first of many.
+
+    Example:
+        >>> listed(["t", "phi"]), listed([])
+        ("'t', 'phi'", 'none')
+    """
+    more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
+    return ", ".join(shown(name) for name in names[:LISTED]) + more or "none"
+
+
+def digest_of(content: bytes) -> str:
+    """SHA-256 in hexadecimal.
+
+    Example:
+        >>> digest_of(b"a")[:8]
+        'ca978112'
+    """
+    return hashlib.sha256(content).hexdigest()
+
+
+# CSV files, read into columns and written.
+
+Row = tuple[int, list[str]]
+LONGEST_ROW = 2**20
+"""Most bytes of a row [byte]: ten thousand columns of a hundred characters."""
+
+
+def csv_source(path: Path) -> Source:
+    """Open a CSV file: comma, decimal point, first line the header, UTF-8.
+
+    Raises:
+        InputError: If the file is missing, no regular file, too large, empty, no UTF-8 text or no table.
+    """
+    text = _Text(path)
+    content = content_of(path, text.check)
+    text.finish()
+    header_row, header = next(_rows(path, content), (1, []))
+    names = [name.strip() for name in header]
+
+    def read(wanted: Sequence[str]) -> Columns:
+        return _columns(path, _rows(path, content), (header_row, names), wanted)
+
+    return Source(path, digest_of(content), tuple(names), read)
+
+
+def write_csv(path: Path | str, columns: Mapping[str, Array], *, decimals: int | None = None) -> Path:
+    r"""Write columns of equal length as CSV: all of it or nothing, the same data as the same bytes.
+
+    The file appears under its name only when complete.
+
+    Args:
+        path: File to write; its folder is made if need be, an old file of that name is replaced.
+        columns: Values ``(m,)`` by column name.
+        decimals: Digits after the point. Default: ten significant digits.
+
+    Returns:
+        The path.
+
+    Raises:
+        InputError: If the columns differ in length or are not one-dimensional.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_csv(Path(folder) / "a.csv", {"t": np.array([0.0, 0.1])}).read_text()
+        't\n0\n0.1\n'
+    """
+    path = Path(path)
+    arrays = {name: np.asarray(column, dtype=float) for name, column in columns.items()}
+    shapes = {name: array.shape for name, array in arrays.items()}
+    if len(set(shapes.values())) != 1 or any(len(shape) != 1 for shape in shapes.values()):
+        raise InputError(f"{path}: columns must be one-dimensional and of one length, got {shapes}")
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(arrays)
+    writer.writerows(
+        [_written(value, decimals) for value in row] for row in zip(*arrays.values(), strict=True)
+    )
+    write_text(path, text.getvalue())
+    return path
+
+
+def _written(value: float, decimals: int | None) -> str:
+    return f"{value + 0.0:.10g}" if decimals is None else f"{value:.{decimals}f}"  # + 0.0: no "-0"
+
+
+class _Text:
+    """Whether bytes are UTF-8 text with rows of a bearable length, told piece by piece."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._decoder = codecs.getincrementaldecoder("utf-8")()
+        self._row, self._length = 1, 0
+
+    def check(self, piece: bytes) -> None:
+        """Look at the next piece of the file.
+
+        Raises:
+            InputError: If it is no text, or a row is too long.
+        """
+        codes = np.frombuffer(piece, dtype=np.uint8)
+        ends = np.flatnonzero((codes == ord("\n")) | (codes == ord("\r")))
+        lengths = np.diff(ends, prepend=-1 - self._length)
+        rest = len(piece) - 1 - int(ends[-1]) if len(ends) else self._length + len(piece)
+        if max(int(lengths.max(initial=0)), rest) > LONGEST_ROW:
+            raise InputError(
+                f"{self._path}: has a row of more than {megabytes(LONGEST_ROW)}. Write one line a sample, with "
+                "the columns that are needed."
+            )
+        self._decode(piece)
+        self._row, self._length = self._row + piece.count(b"\n"), rest
+
+    def finish(self) -> None:
+        """Nothing follows.
+
+        Raises:
+            InputError: If the text ends within a character.
+        """
+        self._decode(b"", last=True)
+
+    def _decode(self, piece: bytes, last: bool = False) -> None:
+        try:
+            self._decoder.decode(piece, last)
+        except UnicodeDecodeError as error:
+            row = self._row + error.object[: error.start].count(b"\n")
+            raise InputError(
+                f"{self._path}: row {row} is no UTF-8 text. Export the table as CSV (UTF-8), or name the file .npz or "
+                ".mat if it is one; unpack it if it is packed."
+            ) from error
+
+
+def _rows(path: Path, content: bytes) -> Iterator[Row]:
+    """Number and cells of each row; blank ones are skipped but counted."""
+    reader = csv.reader(io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline=""))
+    try:
+        for row in reader:
+            if any(cell.strip() for cell in row):
+                yield reader.line_num, row
+    except csv.Error as error:
+        raise InputError(f"{path}: row {reader.line_num}: {error}. Export the table as plain CSV.") from error
+
+
+def _columns(
+    path: Path, rows: Iterator[Row], header: tuple[int, list[str]], wanted: Sequence[str]
+) -> Columns:
+    """Numbers of the wanted columns; a row of another length than the header is an error of the whole file."""
+    names = header[1]
+    next(rows, None)
+    places = [names.index(name) for name in wanted]
+    columns, numbers = [array("d") for _ in places], array("q")
+    bad: list[tuple[int, str, int] | None] = [None] * len(places)
+    unequal: tuple[int, int, int] | None = None
+    most = LARGEST // 8 // (len(places) + 1)
+    for line, cells in rows:
+        if len(cells) != len(names):
+            unequal = (unequal[0], unequal[1], unequal[2] + 1) if unequal else (line, len(cells), 1)
+            continue
+        if len(numbers) == most:
+            raise InputError(f"{path}: has more than {most} rows, more than are read. Split the recording.")
+        numbers.append(line)
+        for j, place in enumerate(places):
+            value = _number(cells[place])
+            columns[j].append(value)
+            if value != value:
+                first = bad[j]
+                bad[j] = (first[0], first[1], first[2] + 1) if first else (line, cells[place].strip(), 1)
+    if unequal:
+        line, count, times = unequal
+        raise InputError(
+            f"{path}: row {line} has {count} cells, the header (row {header[0]}) has {len(names)}"
+            f"{f' ({times} such rows)' if times > 1 else ''}. "
+            "Separate cells by commas, write decimals with a point, and complete or delete the row."
+        )
+    values = np.column_stack([np.array(column) for column in columns])
+    problems = tuple(_told(name, *one) for name, one in zip(wanted, bad, strict=True) if one)
+    return Columns(values, "row", numbers, problems)
+
+
+def _number(cell: str) -> float:
+    """The number in a cell; NaN for what is no finite one."""
+    try:
+        value = float(cell)
+    except ValueError:
+        return math.nan
+    return value if math.isfinite(value) and "_" not in cell else math.nan
+
+
+def _told(name: str, line: int, cell: str, count: int) -> str:
+    """What is wrong with a column that has other cells than numbers."""
+    what = f"is {shown(cell)}, not a finite number" if cell else "is empty"
+    such = f" ({count} such rows)" if count > 1 else ""
+    return (
+        f"row {line}, column {shown(name)} {what}{such}. Delete the row (longer gaps are cut out) or repair "
+        "the value."
+    )
+
+
+Lookup = Callable[[str], NDArray[Any]]
+
+
+def npz_source(path: Path) -> Source:
+    """Open a ``.npz`` file of named vectors; object arrays (pickles) are refused, not loaded.
+
+    Raises:
+        InputError: If the file is missing, no regular file, too large, empty, damaged or no ``.npz``.
+    """
+    content = content_of(path)
+    if content.startswith(npy.MAGIC_PREFIX):
+        raise InputError(
+            f"{path}: is no .npz file but one array without a name. Write named vectors with numpy.savez(file, "
+            "name=vector, ...)."
+        )
+    try:
+        check_npz(content, 0, ())
+        file = np.load(io.BytesIO(content), allow_pickle=False)
+    except Exception as error:  # a damaged archive raises nearly anything
+        raise InputError(
+            f"{path}: is no .npz file or damaged ({_line(error)}). Write it with numpy.savez(file, name=vector, ...)."
+        ) from error
+
+    def lookup(name: str) -> NDArray[Any]:
+        try:
+            check_npz(content, budget_of(content), (name,))
+            return np.asarray(file[name])
+        except Exception as error:
+            raise InputError(
+                f"{path}: column {shown(name)} cannot be read ({_line(error)}). Save it as a vector of numbers, large "
+                "ones with numpy.savez and not packed; objects are refused, since loading them could run code."
+            ) from error
+
+    return Source(path, digest_of(content), tuple(file.files), _reader(path, content, lookup, "index", 0))
+
+
+def mat_source(path: Path) -> Source:
+    """Open a ``.mat`` file (MATLAB's -v4, -v6 or -v7): its vectors, and those in its structs as ``struct.field``.
+
+    Raises:
+        InputError: If the file is missing, empty, damaged, no ``.mat`` or one of version 7.3 (HDF5).
+    """
+    content = content_of(path)
+    if version(content) == "7.3":
+        raise InputError(
+            f"{path}: is a .mat file of version 7.3 (HDF5), which is not read. Save it in MATLAB with "
+            f"save('{path.name}', ..., '-v7')."
+        )
+    try:
+        check_structure(content, budget_of(content))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", MatReadWarning)  # two variables of one name, for one
+            variables = loadmat(io.BytesIO(content), struct_as_record=True)
+    except Exception as error:  # a damaged file raises nearly anything
+        raise InputError(
+            f"{path}: is no .mat file, damaged or too large ({_line(error)}). Save it again in MATLAB with "
+            f"save('{path.name}', ..., '-v7'), large vectors with '-v6'."
+        ) from error
+    vectors, note = _fields({name: v for name, v in variables.items() if not name.startswith("__")})
+    return Source(
+        path, digest_of(content), tuple(vectors), _reader(path, content, vectors.__getitem__, "row", 1), note
+    )
+
+
+def _fields(variables: Mapping[str, Any]) -> tuple[dict[str, NDArray[Any]], str]:
+    """Variables and the fields of structs, by name; a note on what a user may miss among them."""
+    found: dict[str, NDArray[Any]] = {}
+    left: set[str] = set()
+    for name, value in variables.items():
+        what = _unread(value)
+        if what:
+            left.add(what)
+        elif value.dtype.names is None:
+            found[name] = value
+        else:
+            for field in value.dtype.names:
+                inner = value[field].item()
+                what = _unread(inner) or ("structs in structs" if inner.dtype.names else "")
+                if what:
+                    left.add(what)
+                else:
+                    found[f"{name}.{field}"] = inner
+    note = f" Not read are {' and '.join(sorted(left))}: save their vectors as variables." if left else ""
+    return found, note
+
+
+def _unread(value: Any) -> str:
+    """What kind of variable this is if it is of a kind that is not read."""
+    if isinstance(value, MatlabOpaque | MatlabObject):
+        return "objects (timeseries, timetable, datetime)"
+    if isinstance(value, np.ndarray) and value.dtype.names is not None and value.size != 1:
+        return "arrays of structs"
+    return "" if isinstance(value, np.ndarray) else "sparse matrices"
+
+
+def _reader(
+    path: Path, content: bytes, lookup: Lookup, row: str, first: int
+) -> Callable[[Sequence[str]], Columns]:
+    """A source's ``read``: vectors of one length; a single number as the time is the sampling time."""
+
+    def read(names: Sequence[str]) -> Columns:
+        columns: list[Array] = []
+        problems: list[str] = []
+        left = budget_of(content)
+        for name in names:
+            try:
+                array = lookup(name)
+                left -= 8 * array.size
+                if left < 0:
+                    raise InputError(
+                        f"{path}: its columns take more than the {megabytes(budget_of(content))} of numbers that are "
+                        "read from a file of this length. Save it unpacked, or split the recording."
+                    )
+                columns.append(_vector(path, name, array))
+            except InputError as error:
+                problems += error.problems
+        refuse(problems)
+        if columns[0].size == 1 and len(columns) > 1:
+            columns[0] = _uniform(path, names[0], columns[0].item(), len(columns[1]))
+        lengths = dict(zip(names, map(len, columns), strict=True))
+        if len(set(lengths.values())) > 1:
+            told = ", ".join(f"{shown(name)} {length}" for name, length in lengths.items())
+            raise InputError(f"{path}: columns differ in length: {told}. Save vectors of one length.")
+        values = np.column_stack(columns)
+        found = []
+        for name, column in zip(names, values.T, strict=True):
+            bad = np.flatnonzero(~np.isfinite(column))
+            if len(bad):
+                found.append(
+                    f"{row} {bad[0] + first}, column {shown(name)} is {column[bad[0]]:g}, not a finite number "
+                    f"({len(bad)} such). Delete the row (longer gaps are cut out) or repair the value."
+                )
+        values[~np.isfinite(values)] = np.nan
+        return Columns(values, row, range(first, first + len(values)), tuple(found))
+
+    return read
+
+
+def _vector(path: Path, name: str, array: NDArray[Any]) -> Array:
+    if array.dtype.kind not in "biuf":
+        what = {"c": "complex numbers", "U": "text", "S": "text", "M": "dates"}.get(array.dtype.kind)
+        raise InputError(
+            f"{path}: column {shown(name)} holds {what or 'cells or other objects'}, not real numbers. "
+            "Save it as a vector of numbers."
+        )
+    if array.size and sum(length != 1 for length in array.shape) > 1:
+        raise InputError(
+            f"{path}: column {shown(name)} has the shape {array.shape}, not that of a vector. Save each of its columns "
+            "under a name of its own."
+        )
+    return np.asarray(array, dtype=np.float64).ravel()
+
+
+def _uniform(path: Path, name: str, dt: float, m: int) -> Array:
+    if not (np.isfinite(dt) and dt > 0):
+        raise InputError(
+            f"{path}: column {shown(name)} is the single number {dt:g}; as a sampling time [s] it must be positive. "
+            "Give that, or a vector of time stamps."
+        )
+    return dt * np.arange(m, dtype=np.float64)
+
+
+def _line(error: BaseException) -> str:
+    """The first line of an error's message, or its kind."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")

@@ -1,0 +1,1 @@
+"""Estimators of state, hidden state and disturbance on a deployed model."""

@@ -1,0 +1,201 @@
+"""Does a filter believe what it should: its innovations on recordings against what its own covariances say."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
+from hybrid_mpc.estimate.switching import SwitchingFilter
+from hybrid_mpc.estimate.tuning import Recording
+
+Array = NDArray[np.float64]
+LEVEL = 0.95
+"""Share of consistent filters that each of the two tests passes."""
+
+
+@dataclass(frozen=True)
+class Innovations:
+    """Innovations of a filter along one recording, the first ``skip`` samples left out.
+
+    Args:
+        t: Times ``(n,)`` [s] since the recording's begin.
+        normalised: ``L^-1 (y - y_predicted)`` with ``L L' = C P C' + R``, ``(n, n_y)`` [-]; white with unit
+            variance if the filter's assumptions hold; NaN in rows with a missing output.
+        nis: Normalised innovations squared ``(n,)`` [-]; NaN without a measurement. A switching filter's are those of
+            its mixture's mean and covariance: its own ``nis`` favours whichever mode fits.
+        degrees: Outputs measured ``(n,)``: degrees of freedom of each NIS.
+    """
+
+    t: Array
+    normalised: Array
+    nis: Array
+    degrees: NDArray[np.int_]
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """Two tests of a filter's innovations, each passed by 95 % of the consistent filters.
+
+    Args:
+        runs: Innovations of each recording.
+        samples: Samples with a measurement.
+        mean_nis: Mean NIS [-].
+        nis_band: 95 % band of the mean NIS of a consistent filter. Above it the filter is too sure of itself (noise
+            assumed too small, or a wrong model), below it too unsure.
+        nis_inside: Share of single NIS below the 95 % point of their own distribution.
+        autocorrelation: Of the normalised innovations at lags 1, 2, ..., ``(lags, n_y)`` [-].
+        correlation_band: Half width of the 95 % band of one autocorrelation of white innovations.
+        ljung_box: Ljung-Box statistic, summed over the outputs.
+        ljung_box_limit: Its 95 % point for white innovations.
+    """
+
+    runs: tuple[Innovations, ...]
+    samples: int
+    mean_nis: float
+    nis_band: tuple[float, float]
+    nis_inside: float
+    autocorrelation: Array
+    correlation_band: float
+    ljung_box: float
+    ljung_box_limit: float
+
+    @property
+    def nis_passes(self) -> bool:
+        """Whether the mean NIS is within its band."""
+        return self.nis_band[0] <= self.mean_nis <= self.nis_band[1]
+
+    @property
+    def white(self) -> bool:
+        """Whether the Ljung-Box statistic is within its limit."""
+        return self.ljung_box <= self.ljung_box_limit
+
+
+def consistency(
+    estimator: ExtendedKalmanFilter | SwitchingFilter,
+    recordings: Sequence[Recording],
+    *,
+    skip: int = 25,
+    lags: int = 20,
+) -> Consistency:
+    """Test a filter on recordings, which should be others than those it was tuned on.
+
+    The mean NIS is compared with the band that the chi-square distribution gives it, the autocorrelations of the
+    normalised innovations with those of white ones (about zero, not about their mean: an offset is a failure too).
+    On a nonlinear model both hold approximately. A consistent switching filter has the same mean NIS, but its
+    single NIS scatter more than the band and ``nis_inside`` suppose: its innovations are a mixture of Gaussians.
+
+    Args:
+        estimator: The filter.
+        recordings: Inputs ``u (n, n_u)`` and measurements ``y (n, n_y)`` on the model's grid; NaN where missing.
+        skip: Samples at the start of each that only end the filter's ignorance. Default 25.
+        lags: Largest lag [samples]. Default 20.
+
+    Returns:
+        Statistics with their bands, and the innovations.
+
+    Raises:
+        InputError: If ``skip`` or ``lags`` is not positive, or too few samples are left (five times ``lags``).
+
+    Source: Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to Tracking and Navigation*, 2001, section
+    5.4; Ljung, Box, *On a measure of lack of fit in time series models*, Biometrika 65 (1978).
+
+    Example:
+        ``consistency(ekf, test_recordings).nis_passes``
+    """
+    from scipy.stats import chi2, norm
+
+    if skip < 1 or lags < 1:
+        raise InputError(f"consistency: skip and lags must be 1 or more, got {skip} and {lags}")
+    runs = tuple(innovations(estimator, recording, skip) for recording in recordings)
+    nis = np.concatenate([run.nis for run in runs]) if runs else np.zeros(0)
+    degrees = np.concatenate([run.degrees for run in runs]) if runs else np.zeros(0, dtype=int)
+    seen = np.isfinite(nis)
+    n, freedom = int(seen.sum()), int(degrees[seen].sum())
+    if n < 5 * lags:
+        raise InputError(
+            f"consistency: {n} samples are left after the first {skip} of each recording, at least {5 * lags} "
+            f"are needed for {lags} lags; give longer recordings or fewer lags"
+        )
+    tail = (1.0 - LEVEL) / 2
+    low, high = (float(chi2.ppf(share, freedom)) / n for share in (tail, 1.0 - tail))
+    r, pairs = _autocorrelation([run.normalised for run in runs], lags)
+    size = int(sum(np.all(np.isfinite(run.normalised), axis=1).sum() for run in runs))
+    return Consistency(
+        runs=runs,
+        samples=n,
+        mean_nis=float(nis[seen].mean()),
+        nis_band=(low, high),
+        nis_inside=float(np.mean(nis[seen] <= chi2.ppf(LEVEL, degrees[seen]))),
+        autocorrelation=r,
+        correlation_band=float(norm.ppf(1.0 - tail)) / np.sqrt(size),
+        ljung_box=float(size * (size + 2) * np.sum(r**2 / pairs[:, None])),
+        ljung_box_limit=float(chi2.ppf(LEVEL, r.size)),
+    )
+
+
+def innovations(
+    estimator: ExtendedKalmanFilter | SwitchingFilter, recording: Recording, skip: int = 25
+) -> Innovations:
+    """Innovations of a filter along a recording.
+
+    Args:
+        estimator: The filter.
+        recording: Inputs and measurements on the model's grid.
+        skip: Samples left out at the start. Default 25.
+
+    Raises:
+        InputError: If the shapes do not fit.
+    """
+    n_y, n = estimator.model.n_y, len(recording.y)
+    if recording.y.shape != (n, n_y) or recording.u.shape != (n, estimator.model.n_u) or n == 0:
+        raise InputError(
+            f"consistency: y {recording.y.shape} and u {recording.u.shape} given; needed: (n, {n_y}) and "
+            f"(n, {estimator.model.n_u}) with n > 0"
+        )
+    estimate = estimator.start(recording.y[0])
+    rows: list[Array] = []
+    nis: list[float] = []
+    degrees: list[int] = []
+    for k in range(1, n):
+        u, y = recording.u[k - 1], recording.y[k]
+        s = estimator.innovation_covariance(estimator.predict(estimate, u), u)
+        estimate = estimator.update(estimate, y, u)
+        whole = bool(np.all(np.isfinite(estimate.innovation)) and np.all(np.isfinite(s)))
+        normalised = (
+            np.linalg.solve(np.linalg.cholesky(s), estimate.innovation) if whole else np.full(n_y, np.nan)
+        )
+        rows.append(normalised)
+        mixed = whole and isinstance(estimator, SwitchingFilter)
+        nis.append(float(normalised @ normalised) if mixed else estimate.nis)
+        degrees.append(int(np.isfinite(estimate.innovation).sum()))
+    kept = slice(skip - 1, None)  # the first row belongs to the second sample
+    return Innovations(
+        estimator.model.dt * np.arange(1.0, n)[kept],
+        np.array(rows).reshape(-1, n_y)[kept],
+        np.array(nis)[kept],
+        np.array(degrees, dtype=int)[kept],
+    )
+
+
+def _autocorrelation(runs: Sequence[Array], lags: int) -> tuple[Array, Array]:
+    """Autocorrelations ``(lags, n_y)`` over all runs, never across them, and the pairs behind each lag.
+
+    A missing sample leaves its pairs out; each lag's sum is scaled to the pairs that a whole run would have.
+    """
+    n_y = runs[0].shape[1]
+    finite = [np.all(np.isfinite(e), axis=1) for e in runs]
+    power = sum((np.sum(e[f] ** 2, axis=0) for e, f in zip(runs, finite, strict=True)), np.zeros(n_y))
+    r, pairs = np.zeros((lags, n_y)), np.zeros(lags)
+    for lag in range(1, lags + 1):
+        for e, f in zip(runs, finite, strict=True):
+            both = f[lag:] & f[:-lag]
+            r[lag - 1] += np.sum((e[lag:] * e[:-lag])[both], axis=0)
+            pairs[lag - 1] += both.sum()
+    if np.any(power == 0) or np.any(pairs == 0):
+        raise InputError("consistency: the recordings hold no pairs of samples at some lag; use fewer lags")
+    return r / power, pairs

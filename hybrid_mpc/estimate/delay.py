@@ -1,0 +1,129 @@
+"""Estimates for loops with delays: filter what has arrived, predict to the instant at which the input acts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimate.kalman import Estimate, Estimator, TrueState
+from hybrid_mpc.model.model import HybridModel
+
+Array = NDArray[np.float64]
+
+
+class Predictor(Estimator, Protocol):
+    """An estimator that predicts without a measurement and corrects without a prediction."""
+
+    def predict(self, estimate: Estimate, u: ArrayLike) -> Estimate:
+        """Estimate one period later with ``u`` held."""
+
+    def correct(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> Estimate:
+        """Estimate after a measurement at its instant."""
+
+
+@dataclass(frozen=True)
+class DelayedEstimate(Estimate):
+    """An estimate of the instant at which the next input acts, and where it comes from.
+
+    Args:
+        filtered: Estimate of the instant of the last measurement that has arrived.
+        inputs: Inputs held since then, the oldest first, each for a period.
+        missing: Measurements still to come that were taken before the start.
+    """
+
+    filtered: Estimate
+    inputs: tuple[Array, ...]
+    missing: int
+
+
+class DelayCompensation:
+    """Makes an estimator right for a loop with delays.
+
+    A measurement arrives ``sensor_delay`` periods after it was taken, an input acts ``input_delay`` periods
+    after it was decided. The wrapped estimator runs on the measurements at their own instants; its model
+    then runs on the inputs that are known but not yet measured, ``sensor_delay + input_delay`` periods
+    ahead. Missing measurements (NaN) leave the prediction, as without delays. No method changes the object.
+
+    At the start the machine has rested: the first measurement counts for the start itself, those that
+    follow until the sensor has caught up are not used, and an input of zero was held.
+
+    Args:
+        estimator: The estimator of the loop without delays.
+        sensor_delay: Periods.
+        input_delay: Periods.
+
+    Raises:
+        InputError: If a delay is not a whole number of periods, or negative.
+
+    Example:
+        >>> import casadi as ca
+        >>> from hybrid_mpc.machine.signals import Signal
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
+        >>> ahead = DelayCompensation(TrueState(model), input_delay=1)
+        >>> first = ahead.start(np.array([2.0]))
+        >>> ahead.update(first, np.array([2.0]), np.array([0.5])).x  # 0.5 acts in the next period
+        array([2.5])
+    """
+
+    def __init__(self, estimator: Predictor, *, sensor_delay: int = 0, input_delay: int = 0) -> None:
+        for name, delay in (("sensor_delay", sensor_delay), ("input_delay", input_delay)):
+            if int(delay) != delay or delay < 0:
+                raise InputError(f"{name}: a whole number of periods needed, not negative; got {delay}")
+        self._estimator, self._sensor, self._input = estimator, int(sensor_delay), int(input_delay)
+
+    @property
+    def model(self) -> HybridModel:
+        """The model of the wrapped estimator."""
+        return self._estimator.model
+
+    @property
+    def estimator(self) -> Predictor:
+        """The wrapped estimator."""
+        return self._estimator
+
+    def start(self, y: ArrayLike, t: float = 0.0) -> DelayedEstimate:
+        """First estimate, of the instant ``t`` plus the input delay, from the first measurement."""
+        resting = (np.zeros(self.model.n_u),) * self._input
+        first = self._estimator.start(np.asarray(y, dtype=float), t)
+        return self._ahead(first, resting, self._sensor)
+
+    def update(self, estimate: Estimate, y: ArrayLike, u_prev: ArrayLike) -> DelayedEstimate:
+        """Estimate one period later, from what arrives and the input decided since.
+
+        Raises:
+            InputError: If the estimate is not one of this class.
+        """
+        if not isinstance(estimate, DelayedEstimate):
+            raise InputError("DelayCompensation goes on from its own estimates only; begin with start()")
+        base, y = estimate.filtered, np.asarray(y, dtype=float)
+        inputs = (*estimate.inputs, np.asarray(u_prev, dtype=float).ravel())
+        if estimate.missing:
+            missing = estimate.missing - 1
+            if not missing:  # this one was taken at the start itself
+                base = self._estimator.correct(base, y)
+            return self._ahead(base, inputs, missing)
+        return self._ahead(self._estimator.update(base, y, inputs[0]), inputs[1:], 0)
+
+    def _ahead(self, base: Estimate, inputs: tuple[Array, ...], missing: int) -> DelayedEstimate:
+        now = base
+        for u in inputs:
+            now = self._estimator.predict(now, u)
+        return DelayedEstimate(
+            now.t, now.x, now.h, now.d, now.P, base.innovation, base.nis, base, inputs, missing
+        )
+
+
+def filtered(estimate: Estimate) -> Estimate:
+    """The estimate of the instant of the last measurement: of a delayed one, where it was predicted from."""
+    return estimate.filtered if isinstance(estimate, DelayedEstimate) else estimate
+
+
+def sees_truth(estimator: Estimator) -> bool:
+    """True for an oracle's estimator, which is handed the true state."""
+    inner = estimator.estimator if isinstance(estimator, DelayCompensation) else estimator
+    return isinstance(inner, TrueState)

@@ -1,0 +1,128 @@
+"""Process noise of a filter: a model's errors over one period, and their scale by maximum likelihood."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimate.kalman import Estimate
+from hybrid_mpc.model.model import HybridModel
+
+Array = NDArray[np.float64]
+ROUNDING = 1e-9
+"""Share of a state's size below which a model's error is rounding: no filter is to believe itself more exact."""
+
+
+class Recording(Protocol):
+    """A recording on the model's grid."""
+
+    @property
+    def u(self) -> Array:
+        """Inputs ``(n, n_u)``, each held over the period that it begins."""
+
+    @property
+    def y(self) -> Array:
+        """Measurements ``(n, n_y)``."""
+
+
+class Known(Recording, Protocol):
+    """A recording whose states are known, smoothed for instance."""
+
+    @property
+    def x(self) -> Array:
+        """States ``(n, n_x)``."""
+
+
+class Assessor(Protocol):
+    """A filter that can say how likely its measurements are."""
+
+    def start(self, y: Array) -> Estimate:
+        """First estimate from the first measurement."""
+
+    def predict(self, estimate: Estimate, u: Array) -> Estimate:
+        """Estimate one period later with ``u`` held."""
+
+    def assess(self, estimate: Estimate, y: Array, u: Array) -> tuple[Estimate, float]:
+        """Estimate after a measurement, and its log-likelihood."""
+
+
+def process_noise(model: HybridModel, recordings: Sequence[Known], most: int = 4000) -> Array:
+    """Standard deviations ``(n_x,)`` of the model's one-period errors on recordings [SI].
+
+    The hidden state runs along the measured states, from zero.
+
+    Args:
+        model: The model.
+        recordings: Smoothed recordings on the model's grid (the training ones).
+        most: After so many periods no further recording is looked at. Default 4000.
+
+    Raises:
+        InputError: If there is no period to look at.
+
+    Example:
+        ``ExtendedKalmanFilter(model, sigma_x=process_noise(model, train), sigma_y=[1e-3], sigma_x0=[1e-3, 0.1])``
+    """
+    errors: list[Array] = []
+    for recording in recordings:
+        h = np.zeros(model.n_h)
+        for k in range(len(recording.u) - 1):
+            x_next, h = (
+                m.full().ravel() for m in model.step(recording.x[k], h, recording.u[k], model.w, model.p)
+            )
+            if k >= model.waiting:  # before, nobody knows what was under way
+                errors.append(x_next - recording.x[k + 1])
+        if len(errors) >= most:
+            break
+    if not errors:
+        raise InputError(
+            "process noise: no recording with at least two samples given; pass training recordings"
+        )
+    sizes = np.sqrt(np.mean(np.square(np.concatenate([r.x for r in recordings])), axis=0))
+    least = ROUNDING * np.where(sizes > 0, sizes, 1.0)
+    return np.maximum(np.sqrt(np.mean(np.square(errors), axis=0)), least)
+
+
+def log_likelihood(estimator: Assessor, recording: Recording, skip: int = 25) -> float:
+    """Log-likelihood of the measured outputs under a filter's own innovations and their variances.
+
+    Args:
+        estimator: The filter; an extended Kalman filter or several that switch.
+        recording: Inputs and measurements.
+        skip: Samples at the start that only end the filter's ignorance. Default 25.
+
+    Returns:
+        The sum over samples, without the constant; minus infinity where the filter is lost.
+
+    Source: Schweppe, *Evaluation of likelihood functions for Gaussian signals*, IEEE T-IT 11 (1965).
+    """
+    estimate, total = estimator.start(recording.y[0]), 0.0
+    for k in range(1, len(recording.y)):
+        ahead = estimator.predict(estimate, recording.u[k - 1])
+        estimate, likelihood = estimator.assess(ahead, recording.y[k], recording.u[k - 1])
+        if k >= skip:
+            total += likelihood
+        if not np.all(np.isfinite(estimate.x)):
+            return -math.inf
+    return total
+
+
+def most_likely(
+    make: Callable[[float], Assessor], recordings: Sequence[Recording], scales: Sequence[float]
+) -> float:
+    """The one of ``scales`` whose filter ``make(scale)`` makes the recordings most likely.
+
+    Args:
+        make: Builds the filter for a scale of its process noise.
+        recordings: Undisturbed recordings that nothing is judged on.
+        scales: Scales to try.
+
+    Example:
+        ``scale = most_likely(lambda s: ExtendedKalmanFilter(model, sigma_x=s * base, ...), runs, (0.1, 1.0))``
+    """
+    values = [sum(log_likelihood(make(s), r) for r in recordings) for s in scales]
+    return float(scales[int(np.argmax(values))])

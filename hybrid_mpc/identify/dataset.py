@@ -1,0 +1,148 @@
+"""Trajectories as tensors: windows for training, whole runs for evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.identify.step import Scaling
+from hybrid_mpc.machine.torch_prior import Prior
+
+SPAN = 10
+"""Periods over which the correction is averaged to find its scale."""
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Equal windows cut from trajectories: a warm-up on measurements, then a scored part.
+
+    Args:
+        x: States ``(n, warm + horizon + 1, n_x)`` [SI].
+        u: Inputs ``(n, warm + horizon, n_u)`` [SI].
+        warm: Samples of the warm-up.
+        xdot: Derivatives of the states at the periods' starts ``(n, warm + horizon, n_x)`` [SI].
+    """
+
+    x: Tensor
+    u: Tensor
+    warm: int
+    xdot: Tensor
+
+    @property
+    def horizon(self) -> int:
+        """Scored periods of each window."""
+        return self.u.shape[1] - self.warm
+
+    def __len__(self) -> int:
+        return self.x.shape[0]
+
+    def take(self, index: Tensor) -> Windows:
+        """The windows of ``index``."""
+        index = index.to(self.x.device)
+        return Windows(self.x[index], self.u[index], self.warm, self.xdot[index])
+
+    def to(self, device: torch.device) -> Windows:
+        """The same windows on a device."""
+        return Windows(self.x.to(device), self.u.to(device), self.warm, self.xdot.to(device))
+
+
+def cut_windows(trajectories: Sequence[Trajectory], warm: int, horizon: int, stride: int) -> Windows:
+    """Windows of ``warm + horizon`` periods, every ``stride`` samples, from every trajectory long enough.
+
+    Raises:
+        InputError: If no trajectory is long enough, or one holds a value that is not finite.
+    """
+    x, u, xdot, length = [], [], [], warm + horizon
+    for trajectory in trajectories:
+        _check_finite(trajectory)
+        for start in range(0, len(trajectory.t) - length, stride):
+            x.append(trajectory.x[start : start + length + 1])
+            u.append(trajectory.u[start : start + length])
+            xdot.append(trajectory.xdot[start : start + length])
+    if not x:
+        longest = max((len(t.t) for t in trajectories), default=0)
+        raise InputError(
+            f"no training trajectory is long enough: the longest has {longest} samples, a window of "
+            f"{warm} warm-up and {horizon} scored periods needs {length + 1}. Record longer runs or lower "
+            "warm_up."
+        )
+    x_all, u_all, xdot_all = (torch.tensor(np.stack(parts)) for parts in (x, u, xdot))
+    return Windows(x_all, u_all, warm, xdot_all)
+
+
+def fitting_horizon(trajectories: Sequence[Trajectory], warm: int, most: int) -> int:
+    """Scored periods of a window that let the shortest trajectory give windows at several starts.
+
+    That is two thirds of what the warm-up leaves of it, at most ``most``. Where that is less than half of
+    ``most``, the longest trajectory decides up to that half: one too short then gives no window, which is
+    better than short windows for all.
+
+    Args:
+        trajectories: The trajectories to cut.
+        warm: Samples of the warm-up.
+        most: Most scored periods.
+
+    Example:
+        >>> import numpy as np
+        >>> z = np.zeros((65, 1))
+        >>> short = Trajectory("run", "train", 0.02, 0.02 * np.arange(65), z, z, z, z)
+        >>> fitting_horizon([short], warm=10, most=50)
+        36
+    """
+    lengths = [2 * (len(t.t) - warm - 1) // 3 for t in trajectories]
+    return max(1, min(most, max(min(lengths), min(most // 2, max(lengths)))))
+
+
+def scaling_of(prior: Prior, windows: Windows, dt: float, *, use_prior: bool) -> Scaling:
+    """Scaling from training windows: root mean squares of signals and of what the network must give.
+
+    What it must give is averaged over ``SPAN`` periods first: the noise of a twice differentiated position
+    would set the scale otherwise, and networks on so large a scale learn noise.
+    """
+    x, u = windows.x[:, :-1].reshape(-1, windows.x.shape[-1]), windows.u.reshape(-1, windows.u.shape[-1])
+    n_q = prior.n_q
+    measured = (windows.x[:, 1:, n_q:] - windows.x[:, :-1, n_q:]) / dt
+    predicted = prior.acceleration(x, u)
+    residual = measured - predicted.reshape(measured.shape) if use_prior else measured
+    whole = residual[:, : residual.shape[1] // SPAN * SPAN] if residual.shape[1] >= SPAN else residual
+    averaged = whole.unflatten(1, (-1, min(SPAN, whole.shape[1]))).mean(2).reshape(-1, n_q)
+
+    return Scaling(x=_rms(x), u=_rms(u), acceleration=_rms(predicted), correction=_rms(averaged))
+
+
+def literal_scaling_of(prior: Prior, windows: Windows) -> Scaling:
+    """Scaling of the paper's literal form: root mean squares of signals, of the prior's xdot and of xdot."""
+    x, u = windows.x[:, :-1].flatten(0, 1), windows.u.flatten(0, 1)
+    return Scaling(
+        x=_rms(x), u=_rms(u), acceleration=_rms(prior(x, u)), correction=_rms(windows.xdot.flatten(0, 1))
+    )
+
+
+def _rms(values: Tensor) -> tuple[float, ...]:
+    return tuple(float(v) for v in values.square().mean(0).sqrt().clamp_min(1e-9))
+
+
+def check_rates(trajectories: Sequence[Trajectory]) -> None:
+    """Refuse trajectories whose derivative is not known: the literal form is trained on it.
+
+    Raises:
+        InputError: If xdot holds a value that is not finite.
+    """
+    for trajectory in trajectories:
+        _check_finite(trajectory, ("xdot",))
+
+
+def _check_finite(trajectory: Trajectory, names: Sequence[str] = ("x", "u")) -> None:
+    for name in names:
+        bad = np.flatnonzero(~np.isfinite(getattr(trajectory, name)).all(axis=1))
+        if len(bad):
+            raise InputError(
+                f"{trajectory.name}: {name} is not finite at {trajectory.t[bad[0]]:g} s ({len(bad)} samples "
+                "in all); leave these samples out of the file"
+            )

@@ -1,0 +1,386 @@
+"""Fit of the prior's parameters to the training trajectories: the honest baseline ``phy``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from torch import Tensor
+from torch.func import functional_call
+
+from hybrid_mpc.data import scales
+from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.identify.dataset import Windows, cut_windows
+from hybrid_mpc.identify.prior_result import PriorFit
+from hybrid_mpc.identify.residuals import LARGEST, ParameterFit, spread_of
+from hybrid_mpc.identify.step import required_substeps, rk4
+from hybrid_mpc.identify.swarm import SwarmSettings, particle_swarm
+from hybrid_mpc.machine.torch_prior import Prior
+
+# What all fits of a prior share: scaled parameters, residuals of free runs with exact derivatives, confidence.
+
+Array = NDArray[np.float64]
+
+
+# Output error by multiple shooting: the states at the segments' starts are unknowns beside the parameters.
+
+MOST_SEGMENTS = 60
+"""Unknown states grow with the segments, and the time of a step with their cube."""
+CONTINUITY = (1.0, 10.0, 100.0)
+"""Weights, one after the other, of the gaps between segments: first they may gape, in the end they are closed to a
+ten-thousandth of a measurement's share."""
+EVALUATIONS = 15
+
+
+@dataclass(frozen=True)
+class Segments:
+    """Adjacent segments of trajectories.
+
+    Args:
+        windows: The segments, ``n`` of them.
+        joined: True ``(n,)`` where a segment's end is the next one's start.
+    """
+
+    windows: Windows
+    joined: NDArray[np.bool_]
+
+
+def cut_segments(trajectories: Sequence[Trajectory], periods: int, most: int = MOST_SEGMENTS) -> Segments:
+    """Adjacent segments of ``periods``, of evenly chosen trajectories if there are more than ``most``.
+
+    Args:
+        trajectories: Recordings; what is left at the end of one is not used.
+        periods: Length of a segment.
+        most: Most segments.
+
+    Raises:
+        InputError: If no trajectory holds a segment.
+
+    Example:
+        >>> t, z = 0.02 * np.arange(65), np.zeros((65, 1))
+        >>> run = Trajectory("run", "train", 0.02, t, z, z, np.hstack([z, z]), np.hstack([z, z]))
+        >>> cut_segments([run, run], 30).joined.tolist()
+        [True, False, True, False]
+    """
+    counts = [(len(t.t) - 1) // periods for t in trajectories]
+    fitting = [i for i, count in enumerate(counts) if count]
+    if not fitting:
+        raise InputError(
+            f"multiple shooting: no trajectory holds a segment of {periods} periods; the longest has "
+            f"{max((len(t.t) for t in trajectories), default=0)} samples. Take shorter segments or longer runs."
+        )
+    take = max(1, min(len(fitting), most // max(counts)))
+    chosen = [fitting[i] for i in np.linspace(0, len(fitting) - 1, take).round().astype(int)]
+    parts, joined = [], []
+    for i in chosen:
+        n = min(counts[i], most)
+        parts.append(cut_windows([trajectories[i]], 0, periods, periods).take(torch.arange(n)))
+        joined += [True] * (n - 1) + [False]
+    x, u, xdot = (torch.cat([getattr(p, name) for p in parts]) for name in ("x", "u", "xdot"))
+    whole = Windows(x, u, 0, xdot)
+    return Segments(whole, np.array(joined))
+
+
+def multiple_shooting(fit: ParameterFit, start: Array, segments: Segments) -> tuple[Array, Array]:
+    """Fit parameters and the state at the start of every segment together.
+
+    Residuals, in spreads of the data: the measured states along each segment, those at the start of a trajectory, and
+    the gaps between segments times a weight that grows (``CONTINUITY``). With all gaps closed a trajectory is one free
+    run from an unknown state: no measured state is taken for exact, while free runs from measured ones carry their
+    noise along. Derivatives are exact (forward mode through the integrator).
+
+    Args:
+        fit: The parameters.
+        start: First ``theta``; the states start as they are measured.
+        segments: What is fitted.
+
+    Returns:
+        ``theta`` and the Jacobian by it with the states projected out, over the residuals' standard deviation: the
+        standard errors made of it know that the states are unknown.
+
+    Source: Bock, *Recent advances in parameter identification techniques for O.D.E.* (1983).
+    """
+    problem = _Problem(fit, segments, start)
+    z = np.concatenate([fit.inside(start), problem.measured.ravel()])
+    free = np.full(problem.measured.size, np.inf)
+    bounds = np.concatenate([fit.lower, -free]), np.concatenate([fit.upper, free])
+    result: Any = None
+    for weight in CONTINUITY:
+        z = np.concatenate([fit.inside(z[: len(start)]), z[len(start) :]])
+        result = least_squares(
+            lambda z, w=weight: problem.residual(z, w),
+            z,
+            jac=lambda z, w=weight: problem.jacobian(z, w),
+            bounds=bounds,
+            max_nfev=EVALUATIONS,
+        )
+        z = result.x
+    n = len(start)
+    own, states = result.jac[:, :n], np.linalg.qr(result.jac[:, n:])[0]
+    degrees = max(1, problem.measurements - n)
+    noise = np.sqrt(max(2 * result.cost / degrees, 1e-30))
+    return z[:n], (own - states @ (states.T @ own)) / noise
+
+
+class _Problem:
+    """Residuals of multiple shooting over ``z = [theta, states in spreads]``, and their Jacobian."""
+
+    def __init__(self, fit: ParameterFit, segments: Segments, near: Array) -> None:
+        self.fit, self.joined = fit, np.flatnonzero(segments.joined)
+        # the start of a segment that follows another is measured as that one's end
+        self.first = np.setdiff1d(np.arange(len(segments.joined)), self.joined + 1)
+        self.spread = spread_of(segments.windows)
+        self.u = segments.windows.u
+        scaled = segments.windows.x / self.spread
+        self.measured, self.later = scaled[:, 0].numpy(), scaled[:, 1:]
+        self.measurements = self.later.numel()
+        self.substeps = required_substeps(fit.make(fit.values(near)), fit.dt)
+        run = self._run()
+        self._value = torch.func.vmap(run, in_dims=(None, 0, 0))
+        self._slopes = torch.func.vmap(torch.func.jacfwd(run, argnums=(0, 1)), in_dims=(None, 0, 0))
+
+    def residual(self, z: Array, weight: float) -> Array:
+        theta, nodes = self._split(z)
+        ahead = self._value(torch.tensor(theta), torch.tensor(nodes), self.u)
+        errors = _limited(ahead - self.later).numpy()
+        gaps = _limited(ahead[:, -1]).numpy()[self.joined] - nodes[self.joined + 1]
+        starts = (nodes - self.measured)[self.first]
+        return np.concatenate([errors.ravel(), starts.ravel(), weight * gaps.ravel()])
+
+    def jacobian(self, z: Array, weight: float) -> Array:
+        theta, nodes = self._split(z)
+        by_theta, by_node = (
+            torch.nan_to_num(s, 0.0, 0.0, 0.0).clamp(-1e6, 1e6).numpy()
+            for s in self._slopes(torch.tensor(theta), torch.tensor(nodes), self.u)
+        )
+        n, periods, n_x = by_theta.shape[:3]
+        p, rows = len(theta), n * periods * n_x
+        gaps = rows + len(self.first) * n_x
+        out = np.zeros((gaps + len(self.joined) * n_x, p + n * n_x))
+        out[:rows, :p] = by_theta.reshape(rows, p)
+        for i in range(n):
+            out[i * periods * n_x : (i + 1) * periods * n_x, self._columns(i)] = by_node[i].reshape(-1, n_x)
+        for k, i in enumerate(self.first.tolist()):
+            out[rows + k * n_x : rows + (k + 1) * n_x, self._columns(i)] = np.eye(n_x)
+        for k, i in enumerate(self.joined.tolist()):
+            at = slice(gaps + k * n_x, gaps + (k + 1) * n_x)
+            out[at, :p] = weight * by_theta[i, -1]
+            out[at, self._columns(i)] = weight * by_node[i, -1]
+            out[at, self._columns(i + 1)] = -weight * np.eye(n_x)
+        return out
+
+    def _columns(self, i: int) -> slice:
+        p, n_x = len(self.fit.free), self.measured.shape[1]
+        return slice(p + i * n_x, p + (i + 1) * n_x)
+
+    def _split(self, z: Array) -> tuple[Array, Array]:
+        p = len(self.fit.free)
+        return z[:p], z[p:].reshape(self.measured.shape)
+
+    def _run(self) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
+        fit, spread, substeps = self.fit, self.spread, self.substeps
+        unit, names = torch.tensor(fit.unit), [p.name for p in fit.free]
+
+        def run(theta: Tensor, node: Tensor, inputs: Tensor) -> Tensor:
+            """States ``(periods, n_x)`` [spreads] of one segment."""
+            values = dict(zip(names, theta * unit, strict=True))
+            x, states = node * spread, []
+            for u in inputs:
+                x = rk4(lambda z, u=u: functional_call(fit.prior, values, (z, u)), x, fit.dt, substeps)  # type: ignore[misc]
+                states.append(x / spread)
+            return torch.stack(states)
+
+        return run
+
+
+def _limited(values: Tensor) -> Tensor:
+    return torch.nan_to_num(values, LARGEST, LARGEST, -LARGEST).clamp(-LARGEST, LARGEST)
+
+
+STAGES = ((0.5, 20), (2.0, 10), (5.0, 6))
+"""Lengths [the machine's seconds, :func:`~hybrid_mpc.data.scales.time_unit`] of the free runs that are fitted, from
+short (convex) to long (what is judged), each with its most evaluations: the long ones start near their optimum."""
+MAX_WINDOWS = 48
+METHODS = ("equation_error", "output_error", "multiple_shooting", "particle_swarm")
+"""What :func:`fit_prior` can do."""
+DEFAULT_METHODS = ("equation_error", "output_error")
+SWARM_SECONDS = 2.0
+SWARM_WINDOWS = 24
+"""The swarm simulates every set of parameters over so many free runs of at most this length [the machine's seconds]."""
+SEGMENT = 0.5
+"""Length [the machine's seconds] of a segment of multiple shooting: that of the first free runs."""
+Candidate: TypeAlias = tuple[str, NDArray[np.float64], Any]
+"""Name of a stage, its parameters over their nominal sizes, and the Jacobian that its confidence comes from."""
+
+
+def fit_prior(
+    make: Callable[..., Prior],
+    train: Sequence[Trajectory],
+    valid: Sequence[Trajectory],
+    *,
+    dt: float,
+    before: PriorFit | None = None,
+    methods: Sequence[str] = DEFAULT_METHODS,
+    swarm: SwarmSettings | None = None,
+    time_unit: float | None = None,
+    on_progress: Callable[[int, int, str], None] = lambda done, total, text: None,
+) -> PriorFit:
+    """Fit by each of the methods; the best of all on free runs of the validation trajectories wins.
+
+    ``equation_error``: states one period ahead. ``output_error``: longer and longer free runs from measured
+    states. ``multiple_shooting``: adjacent segments of 0.5 s whose first states are unknowns too.
+    ``particle_swarm``: free runs of up to 2 s, searched between the bounds without derivatives (the paper's; an
+    optional extra). They run in the order swarm, equation error, output error, shooting, whatever the order given;
+    output error and shooting start from the best so far. Residuals are the states' errors over their spread in the
+    data, with exact derivatives (forward mode through the integrator). A prior without free parameters stays as it is.
+
+    The lengths are in the machine's seconds (:func:`~hybrid_mpc.data.scales.time_unit`): they are seconds on machines
+    that
+    swing in 0.25 to 4 s, and longer or shorter on slower or faster ones.
+
+    Args:
+        make: Prior class or factory ``(values=None) -> Prior``.
+        train: Training trajectories.
+        valid: Validation trajectories (chosen by, not fitted to).
+        dt: Model period [s].
+        before: An earlier fit to the same recordings, smoothed otherwise: only the length of free run that
+            was best then is fitted, from its parameters on (or multiple shooting, if that was; a swarm does not
+            search again). Default: all lengths, from the nominal ones.
+        methods: Some of ``METHODS``. Default: equation error and output error.
+        swarm: Effort of the particle swarm. Default: 24 particles, 40 generations.
+        time_unit: The machine's second [s]. Default: that of the training trajectories.
+        on_progress: ``(done, total, text)`` after every stage.
+
+    Raises:
+        InputError: If no trajectory is long enough, the inputs leave every parameter undetermined, there is no such
+            method, or the particle swarm is asked for and pymoo is not installed.
+    """
+    _check_methods(methods)
+    fit = ParameterFit(make, dt)
+    unit = scales.time_unit(train, dt) if time_unit is None else time_unit
+    stages = [(unit * length, most) for length, most in STAGES]
+    stages = [s for s in stages if _fits(train, s[0], dt)] or [(_shortest(train, dt), 20)]
+    lengths = [s for s, _ in stages]
+    longest = scales.periods(_longest(valid or train, lengths), dt)
+    judge = _sample(cut_windows(valid or train, 0, longest, scales.periods(unit * STAGES[0][0], dt)))
+    if not fit.free:
+        row = {"stage": "nominal", "validation_error": fit.judge(fit.nominal, judge)}
+        return PriorFit(fit.prior.values, {}, (), (row,))
+    candidates: list[Candidate]
+    if before is None:
+        candidates = [("nominal", fit.nominal, None)]
+        found = _first_searches(fit, train, methods, swarm or SwarmSettings(), lengths, unit, on_progress)
+        candidates += found
+    else:
+        candidates = [("the fit before", fit.scaled(before.values), None)]
+        stages, methods = _again(before, stages, methods)
+    if "output_error" not in methods:
+        stages = []
+    for i, (length, evaluations) in enumerate(stages):
+        on_progress(i, len(stages), f"output error over {length:g} s")
+        windows = _sample(cut_windows(train, 0, scales.periods(length, dt), scales.periods(length / 4, dt)))
+        start = min(candidates, key=lambda c: fit.judge(c[1], windows))[1]
+        theta, jacobian = fit.output_error(start, windows, evaluations)
+        candidates.append((f"output error {length:g} s", theta, jacobian))
+    if "multiple_shooting" in methods:
+        on_progress(len(stages), len(stages) + 1, "multiple shooting")
+        candidates.append(_shooting(fit, train, candidates, min(unit * SEGMENT, *lengths)))
+    on_progress(len(stages), len(stages), "done")
+    return _winner(fit, candidates, judge, before)
+
+
+def _winner(
+    fit: ParameterFit, candidates: Sequence[Candidate], judge: Windows, before: PriorFit | None
+) -> PriorFit:
+    """The candidate with the least validation error, with what is known of its confidence."""
+    scores = [fit.judge(theta, judge) for _, theta, _ in candidates]
+    if not np.isfinite(min(scores)):
+        raise InputError("the prior diverges with every set of parameters tried; check its signs and units")
+    best = int(np.argmin(scores))
+    _, theta, jacobian = candidates[best]
+    if best == 0 and before is not None:
+        errors, warnings = dict(before.standard_errors), list(before.warnings)
+        correlations = dict(before.correlations)
+    else:
+        errors, warnings = fit.confidence(theta, jacobian)
+        correlations = fit.correlations(jacobian)
+    table = tuple({"stage": c[0], "validation_error": s} for c, s in zip(candidates, scores, strict=True))
+    return PriorFit(fit.values(theta), errors, tuple(warnings), table, correlations)
+
+
+def _first_searches(
+    fit: ParameterFit,
+    train: Sequence[Trajectory],
+    methods: Sequence[str],
+    swarm: SwarmSettings,
+    lengths: Sequence[float],
+    unit: float,
+    on_progress: Callable[[int, int, str], None],
+) -> list[Candidate]:
+    """What needs no start: the particle swarm and the equation error."""
+    found: list[Candidate] = []
+    if "particle_swarm" in methods:
+        length = max((s for s in lengths if s <= unit * SWARM_SECONDS), default=min(lengths))
+        periods = scales.periods(length, fit.dt)
+        windows = _sample(cut_windows(train, 0, periods, max(1, periods // 4)), SWARM_WINDOWS)
+        theta = particle_swarm(
+            fit, windows, swarm, lambda done, total: on_progress(done, total, "particle swarm")
+        )
+        found.append(("particle swarm", theta, fit.jacobian(theta, windows)))
+    if "equation_error" in methods:
+        theta, jacobian = fit.equation_error(_sample(cut_windows(train, 0, 1, 3), 4000))
+        found.append(("equation error", theta, jacobian))
+    return found
+
+
+def _shooting(
+    fit: ParameterFit, train: Sequence[Trajectory], candidates: Sequence[Candidate], length: float
+) -> Candidate:
+    """Multiple shooting over segments of ``length`` [s] from the candidate that is best on them."""
+    segments = cut_segments(train, scales.periods(length, fit.dt))
+    start = min(candidates, key=lambda c: fit.judge(c[1], segments.windows))[1]
+    return (f"multiple shooting {length:g} s", *multiple_shooting(fit, start, segments))
+
+
+def _again(
+    before: PriorFit, stages: list[tuple[float, int]], methods: Sequence[str]
+) -> tuple[list[tuple[float, int]], Sequence[str]]:
+    """What is fitted again after an earlier fit: the length or the method that won, of the methods asked for."""
+    won = before.best.startswith("multiple shooting")
+    if "multiple_shooting" in methods and (won or "output_error" not in methods):
+        return [], ("multiple_shooting",)
+    stages = [s for s in stages if before.best == f"output error {s[0]:g} s"] or stages[:1]
+    return stages, tuple(m for m in methods if m == "output_error")
+
+
+def _check_methods(methods: Sequence[str]) -> None:
+    unknown = [m for m in methods if m not in METHODS]
+    if isinstance(methods, str) or unknown or not methods:
+        raise InputError(
+            f"fit of the prior: methods must be some of {', '.join(METHODS)}, in a tuple; got {methods!r}"
+        )
+
+
+def _sample(windows: Windows, most: int = MAX_WINDOWS) -> Windows:
+    """At most ``most`` windows, evenly spread."""
+    return windows.take(torch.linspace(0, len(windows) - 1, min(most, len(windows))).round().long())
+
+
+def _fits(trajectories: Sequence[Trajectory], seconds: float, dt: float) -> bool:
+    return any(len(t.t) > round(seconds / dt) for t in trajectories)
+
+
+def _shortest(trajectories: Sequence[Trajectory], dt: float) -> float:
+    return max((len(t.t) - 1) * dt for t in trajectories) * 0.5
+
+
+def _longest(trajectories: Sequence[Trajectory], lengths: Sequence[float]) -> float:
+    dt = trajectories[0].dt
+    fitting = [s for s in lengths if _fits(trajectories, s, dt)]
+    return max(fitting) if fitting else _shortest(trajectories, dt)

@@ -1,0 +1,135 @@
+"""Anchors: where nothing was measured a learned correction is asked to fade, and the prior stands alone.
+
+A network extrapolates as it likes. Beyond its recordings, upright on a pendulum that has only been swung, say, its
+correction is a number that no datum has asked for, and a controller that goes there takes it for knowledge. Anchors
+are short runs of the prior from states anywhere in the measured range, all the way round for an angle. Where they pass
+through states that no recording comes near, the training asks for no correction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.identify.networks import StackedNetwork
+from hybrid_mpc.identify.step import PriorStep, RecurrentStep
+from hybrid_mpc.machine.torch_prior import Prior
+
+Array = NDArray[np.float64]
+RUNS = 2000
+BATCH = 64
+"""Runs a training step."""
+FOLLOWED = 10
+"""Periods that the hidden state is given to follow a run before its corrections count."""
+COUNTED = 20
+HELD = 5
+"""Periods that an input is held; each is one that was recorded."""
+AWAY = 10.0
+"""Ranges beyond the measured one of a state that is no angle at which a run ends: a prior may run away."""
+NEAR = 0.1
+"""Distance from measured states at which an anchor has 0.63 of its weight: each state over its root mean square in the
+recordings, an angle by sine and cosine."""
+
+
+@dataclass(frozen=True)
+class Anchors:
+    """Runs of the prior, and how much each of their states counts.
+
+    Args:
+        x: States ``(FOLLOWED + COUNTED, n, n_x)`` [SI].
+        u: Inputs ``(FOLLOWED + COUNTED, n, n_u)`` [SI].
+        weight: ``(FOLLOWED + COUNTED, n)``: 0 at a recorded sample, 1 far from all of them; 0 beyond the measured
+            range of a state that is no angle.
+    """
+
+    x: Tensor
+    u: Tensor
+    weight: Tensor
+
+    def take(self, index: Tensor) -> Anchors:
+        """The runs of ``index``."""
+        index = index.to(self.x.device)
+        return Anchors(self.x[:, index], self.u[:, index], self.weight[:, index])
+
+    def to(self, device: torch.device) -> Anchors:
+        """The same runs on a device."""
+        return Anchors(self.x.to(device), self.u.to(device), self.weight.to(device))
+
+
+def make_anchors(prior: Prior, training: Sequence[Trajectory], seed: int) -> Anchors:
+    """Anchors around training trajectories.
+
+    Args:
+        prior: The fitted prior.
+        training: Training trajectories.
+        seed: Of starts and inputs; the same seed and data give the same anchors.
+
+    Example:
+        >>> from scenarios.unbalanced_disk import scenario
+        >>> prior, t = scenario.prior(), 0.025 * np.arange(500.0)
+        >>> x = 0.3 * np.column_stack([np.sin(3 * t), 3 * np.cos(3 * t)])  # hangs and swings a little
+        >>> u, y = np.zeros((500, 1)), x[:, :1]
+        >>> anchors = make_anchors(prior, [Trajectory("run", "train", 0.025, t, u, y, x, 0 * x)], seed=0)
+        >>> anchors.x.shape
+        torch.Size([30, 2000, 2])
+        >>> up = (anchors.x[..., 0].cos() < -0.9) & (anchors.x[..., 1].abs() < 0.9)  # as fast as was measured
+        >>> bool(anchors.weight[up].min() > 0.99)
+        True
+    """
+    rng = np.random.default_rng([seed, 1])
+    x, u = (np.concatenate([getattr(t, key) for t in training]) for key in ("x", "u"))
+    low, high = x.min(0), x.max(0)
+    angles = np.array([signal.periodic for signal in prior.states])
+    start = rng.uniform(np.where(angles, -np.pi, low), np.where(angles, np.pi, high), (RUNS, x.shape[1]))
+    length = FOLLOWED + COUNTED
+    inputs = u[rng.integers(len(u), size=(-(-length // HELD), RUNS))].repeat(HELD, axis=0)[:length]
+    far = np.where(angles, np.inf, AWAY * (high - low))
+    states = _prior_runs(prior, training[0].dt, start, inputs, (low - far, high + far))
+    places = _Places(angles, np.sqrt(np.mean(x**2, axis=0)).clip(1e-9))
+    distance, _ = cKDTree(places(x)).query(places(states.reshape(-1, x.shape[1])))
+    weight = 1.0 - np.exp(-((distance.reshape(states.shape[:2]) / NEAR) ** 2))
+    weight *= (angles | ((states >= low) & (states <= high))).all(-1)
+    return Anchors(torch.tensor(states), torch.tensor(inputs), torch.tensor(weight))
+
+
+def anchor_penalty(step: RecurrentStep, anchors: Anchors) -> Tensor:
+    """Mean over all anchors of weight times squared correction over its scale, a value per network."""
+    stack = cast(StackedNetwork, step.network)
+    features = step.stacked_features(anchors.x, anchors.u)
+    out, _ = stack.sequence(features, stack.initial(anchors.x.shape[1]))
+    weight = anchors.weight[FOLLOWED:, None, :, None]
+    return (weight * out[FOLLOWED:].square()).mean(dim=(0, 2, 3))
+
+
+def _prior_runs(prior: Prior, dt: float, start: Array, inputs: Array, bounds: tuple[Array, Array]) -> Array:
+    """States ``(n, RUNS, n_x)`` of the prior alone; a run that would leave the bounds stays where it is."""
+    step, none = PriorStep(prior, dt), torch.zeros(len(start), 0, dtype=torch.float64)
+    low, high = (torch.tensor(bound) for bound in bounds)
+    x, states = torch.tensor(start), []
+    with torch.no_grad():
+        for u in torch.tensor(inputs):
+            states.append(x)
+            x_next, _ = step(x, none, u)
+            within = ((x_next >= low) & (x_next <= high) & x_next.isfinite()).all(-1, keepdim=True)
+            x = torch.where(within, x_next, x)
+    return torch.stack(states).numpy()
+
+
+@dataclass(frozen=True)
+class _Places:
+    """States as points between which a distance says something."""
+
+    angles: NDArray[np.bool_]
+    scale: Array
+
+    def __call__(self, x: Array) -> Array:
+        turns = x[:, self.angles]
+        return np.hstack([np.sin(turns), np.cos(turns), (x / self.scale)[:, ~self.angles]])

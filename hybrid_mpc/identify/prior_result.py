@@ -1,0 +1,149 @@
+"""What a fit of the prior gives: values, standard errors, and what the data do not tell. No torch in here."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.machine.signals import Parameter
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+CORRELATED = 0.99
+"""Two parameters whose errors are correlated by more are hardly told apart."""
+TOLD = 2.0
+"""A parameter below so many standard errors is not told from zero."""
+
+
+@dataclass(frozen=True)
+class PriorFit:
+    """Fitted parameters with their standard errors.
+
+    Args:
+        values: Fitted values [SI] by name, fixed ones included.
+        standard_errors: Standard errors [SI] of the fitted ones, from the last fit's Jacobian (they hold
+            for a model without structural error, so read them as lower bounds).
+        warnings: Parameters at a bound, or ones the data do not tell apart.
+        stages: One row per stage: its name and the validation error that chose the winner.
+        correlations: Correlation of the errors of every two fitted parameters, by ``"a, b"``. Default: none known.
+
+    Example:
+        >>> fit = PriorFit({"J": 0.11, "d": 0.01}, {"J": 0.01, "d": 0.02}, (), (), {"J, d": 0.995})
+        >>> fit.t_ratios
+        {'J': 11.0, 'd': 0.5}
+        >>> for line in fit.identifiability: print(line)
+        J and d are hardly told apart: their errors are correlated by 0.995
+        d is not told from zero: 0.5 standard errors
+    """
+
+    values: dict[str, float]
+    standard_errors: dict[str, float]
+    warnings: tuple[str, ...]
+    stages: tuple[dict[str, Any], ...]
+    correlations: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def best(self) -> str:
+        """Name of the stage that won."""
+        return str(min(self.stages, key=lambda row: row["validation_error"])["stage"])
+
+    @property
+    def t_ratios(self) -> dict[str, float]:
+        """Value over standard error of every fitted parameter, by name; infinite without error."""
+        return {
+            name: self.values[name] / error if error else float("inf")
+            for name, error in self.standard_errors.items()
+        }
+
+    @property
+    def identifiability(self) -> tuple[str, ...]:
+        """What the data do not tell: :attr:`warnings`, correlations above 0.99, t-ratios below 2."""
+        close = [
+            f"{names.replace(', ', ' and ')} are hardly told apart: their errors are correlated by {value:.3f}"
+            for names, value in self.correlations.items()
+            if abs(value) > CORRELATED
+        ]
+        small = [
+            f"{name} is not told from zero: {abs(ratio):.1f} standard errors"
+            for name, ratio in self.t_ratios.items()
+            if abs(ratio) < TOLD
+        ]
+        return (*self.warnings, *close, *small)
+
+    def covariance(self, parameters: Sequence[Parameter]) -> tuple[tuple[float, ...], ...]:
+        """Rows of the covariance of the fitted values, as an artifact holds it; fixed parameters have none.
+
+        Args:
+            parameters: The prior's ``parameters_spec``.
+
+        Returns:
+            ``(n_p, n_p)``; empty where the fit does not tell the errors of all that are free.
+
+        Example:
+            >>> fit = PriorFit({"J": 0.11, "d": 0.01}, {"J": 0.01, "d": 0.02}, (), (), {"J, d": 0.5})
+            >>> spec = [Parameter(n, v, "-", 0.0, 1.0) for n, v in fit.values.items()]
+            >>> [[round(v, 6) for v in row] for row in fit.covariance(spec)]
+            [[0.0001, 0.0001], [0.0001, 0.0004]]
+        """
+        errors = [0.0 if p.fixed else self.standard_errors.get(p.name, math.nan) for p in parameters]
+        rows = tuple(
+            tuple(a * b * self._correlation(p.name, q.name) for q, b in zip(parameters, errors, strict=True))
+            for p, a in zip(parameters, errors, strict=True)
+        )
+        return rows if all(math.isfinite(value) for row in rows for value in row) else ()
+
+    def rows(self, parameters: Sequence[Parameter]) -> list[dict[str, Any]]:
+        """One row a parameter: name, unit, nominal, fitted, standard error, t-ratio, largest correlation.
+
+        Args:
+            parameters: The prior's ``parameters_spec``. What a fit does not tell of a fixed one is None.
+
+        Example:
+            >>> fit = PriorFit({"J": 0.11}, {"J": 0.01}, (), ())
+            >>> fit.rows([Parameter("J", 0.1, "kg m^2", 0.01, 1.0)])[0]["t_ratio"]
+            11.0
+        """
+        ratios = self.t_ratios
+        return [
+            {
+                "parameter": p.name,
+                "unit": p.unit,
+                "nominal": p.value,
+                "fitted": self.values[p.name],
+                "standard_error": self.standard_errors.get(p.name),
+                "t_ratio": ratios.get(p.name),
+                "correlation": self._closest(p.name),
+            }
+            for p in parameters
+        ]
+
+    def table(self, parameters: Sequence[Parameter]) -> pd.DataFrame:
+        """:meth:`rows` as a data frame, by parameter; ``fit.table(prior.parameters_spec).to_csv(path)`` keeps it.
+
+        Raises:
+            InputError: If pandas is not installed.
+
+        Example:
+            >>> fit = PriorFit({"J": 0.11}, {"J": 0.01}, (), ())
+            >>> fit.table([Parameter("J", 0.1, "kg m^2", 0.01, 1.0)]).loc["J", "fitted"].item()
+            0.11
+        """
+        try:
+            import pandas as pd
+        except ImportError as missing:
+            raise InputError(
+                "the table needs pandas, which is not installed: pip install 'hybrid-mpc[report]'; rows() does not"
+            ) from missing
+        return pd.DataFrame(self.rows(parameters)).set_index("parameter")
+
+    def _correlation(self, first: str, second: str) -> float:
+        known = (self.correlations.get(f"{a}, {b}") for a, b in ((first, second), (second, first)))
+        return 1.0 if first == second else next((value for value in known if value is not None), 0.0)
+
+    def _closest(self, name: str) -> float | None:
+        own = [value for names, value in self.correlations.items() if name in names.split(", ")]
+        return max(own, key=abs) if own else None

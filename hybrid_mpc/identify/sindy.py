@@ -1,0 +1,525 @@
+"""SINDy with control: a sparse equation of motion, picked from libraries of terms (pysindy, an optional extra)."""
+
+from __future__ import annotations
+
+import importlib
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+from typing import Any, Literal, get_args
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.identify.dataset import Windows, check_rates, cut_windows
+from hybrid_mpc.identify.evaluate import free_runs, score
+from hybrid_mpc.identify.step import MAX_SUBSTEPS, rk4, substeps_for
+from hybrid_mpc.machine.torch_prior import Prior
+
+# Libraries of candidate terms, and the model that a sparse regression over them gives, as a step (torch).
+
+STEEPNESS = (5.0, 10.0, 20.0, 50.0, 100.0)
+"""Slopes gamma [s/rad] of ``tanh(gamma v)`` that :func:`machine_libraries` offers: no regression finds gamma."""
+DEGREE = 3
+"""Highest degree of the polynomials that :func:`machine_libraries` offers."""
+_FUNCTIONS: dict[str, tuple[Callable[[Tensor], Tensor], str]] = {
+    "value": (lambda z: z, "{}"),
+    "sin": (torch.sin, "sin({})"),
+    "cos": (torch.cos, "cos({})"),
+    "tanh": (torch.tanh, "tanh({})"),
+    "abs": (torch.abs, "|{}|"),
+    "abs_cos": (lambda z: torch.abs(torch.cos(z)), "|cos({})|"),
+}
+
+
+@dataclass(frozen=True)
+class Factor:
+    """``function(scale * signal) ** power``, a factor of a candidate term.
+
+    Args:
+        signal: Name of a state or an input.
+        function: ``"value"``, ``"sin"``, ``"cos"``, ``"tanh"``, ``"abs"`` or ``"abs_cos"``. Default: the value.
+        scale: Default 1.
+        power: 1, 2, ... Default 1.
+
+    Raises:
+        InputError: If there is no such function, or the power is none.
+
+    Example:
+        >>> Factor("phi_dot", "tanh", 20.0).label
+        'tanh(20 phi_dot)'
+    """
+
+    signal: str
+    function: str = "value"
+    scale: float = 1.0
+    power: int = 1
+
+    def __post_init__(self) -> None:
+        if self.function not in _FUNCTIONS:
+            raise InputError(f"a term has no function {self.function!r}; there are: {', '.join(_FUNCTIONS)}")
+        if not isinstance(self.power, int) or self.power < 1:
+            raise InputError(f"a power must be a whole number of at least 1, got {self.power}")
+
+    @property
+    def label(self) -> str:
+        """As an equation has it."""
+        inner = self.signal if self.scale == 1.0 else f"{self.scale:g} {self.signal}"
+        text = _FUNCTIONS[self.function][1].format(inner)
+        return text if self.power == 1 else f"{text}^{self.power}"
+
+    def __call__(self, signal: Tensor) -> Tensor:
+        """Its value, any shape."""
+        value = base = _FUNCTIONS[self.function][0](self.scale * signal if self.scale != 1.0 else signal)
+        for _ in range(self.power - 1):
+            value = value * base
+        return value
+
+
+Term = tuple[Factor, ...]
+"""A candidate term: the product of its factors; none of them is the constant 1."""
+
+
+@dataclass(frozen=True)
+class Library:
+    """Candidate terms of an acceleration, as plain data.
+
+    Args:
+        name: Names it in tables.
+        terms: The terms.
+
+    Example:
+        >>> Library("mine", ((), (Factor("v"), Factor("v", "abs")))).labels
+        ('1', 'v |v|')
+    """
+
+    name: str
+    terms: tuple[Term, ...]
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Each term as an equation has it."""
+        return tuple(" ".join(factor.label for factor in term) or "1" for term in self.terms)
+
+
+class SindyStep(nn.Module):
+    """An identified equation as a step ``(x, h, u) -> (x_next, h_next)`` with an empty hidden state.
+
+    Kinematics are exact, the acceleration is the sum of terms times coefficients, Runge-Kutta of order 4 integrates
+    with the input held: as :class:`~hybrid_mpc.identify.step.PriorStep` does.
+
+    Args:
+        prior: Names the states and gives output and energy balance; its equation of motion is not used.
+        library: The terms.
+        coefficients: ``(n_terms, n_q)`` [SI]. Leading axes are those of a batch, a model for each of its rows.
+        dt: Model period [s].
+        substeps: Runge-Kutta steps a period; default: what the stiffness at rest asks for.
+        candidates: What it was chosen from; default: nothing.
+
+    Raises:
+        InputError: If a term names no signal of the prior, shapes do not fit, or the model is too stiff for ``dt``.
+
+    Example:
+        >>> from scenarios.pendulum.prior import PendulumPrior
+        >>> library = Library("pendulum", ((Factor("u"),), (Factor("phi_dot"),), (Factor("phi", "sin"),)))
+        >>> step = SindyStep(PendulumPrior(), library, torch.tensor([[8.0], [-16.0], [-196.2]]).double(), 0.01)
+        >>> step.equations()
+        ("phi_dot' = 8 u - 16 phi_dot - 196.2 sin(phi)",)
+        >>> x, h, u = torch.zeros(2).double(), torch.zeros(0).double(), torch.ones(1).double()
+        >>> step.xdot(x, h, u).tolist()
+        [0.0, 8.0]
+    """
+
+    coefficients: Tensor
+
+    def __init__(
+        self,
+        prior: Prior,
+        library: Library,
+        coefficients: Tensor,
+        dt: float,
+        substeps: int | None = None,
+        candidates: tuple[SindyCandidate, ...] = (),
+    ) -> None:
+        super().__init__()
+        self.prior, self.library, self.dt, self.candidates = prior, library, dt, candidates
+        self._names = signal_names(prior, library)
+        if coefficients.shape[-2:] != (len(library.terms), prior.n_q):
+            raise InputError(
+                f"library {library.name}: coefficients are {tuple(coefficients.shape)}, its terms and the "
+                f"accelerations need {(len(library.terms), prior.n_q)}"
+            )
+        self.register_buffer("coefficients", coefficients)
+        n_x, n_u = len(prior.states), len(prior.inputs)
+        name = f"SINDy with the library {library.name}: the model"
+        self.substeps = substeps or substeps_for(self._xdot, n_x, n_u, dt, name)
+
+    def forward(self, x: Tensor, h: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        """Next state ``(..., n_x)`` and the hidden state as it came."""
+        return rk4(lambda z: self._xdot(z, u), x, self.dt, self.substeps), h
+
+    def xdot(self, x: Tensor, h: Tensor, u: Tensor) -> Tensor:
+        """Derivative of the state at the instant."""
+        return self._xdot(x, u)
+
+    def features(self, x: Tensor, u: Tensor) -> Tensor:
+        """The terms ``(..., n_terms)`` at ``x`` ``(..., n_x)`` and ``u`` ``(..., n_u)``, which broadcast."""
+        return evaluate(self.library, self._names, x, u)
+
+    def equations(self, digits: int = 4) -> tuple[str, ...]:
+        """The identified equations, one an acceleration; terms whose coefficient is zero are left out.
+
+        Args:
+            digits: Significant digits of a coefficient. Default 4.
+        """
+        n_q, made = self.prior.n_q, []
+        for i, signal in enumerate(self.prior.states[n_q : 2 * n_q]):
+            pairs = zip(self.coefficients[:, i].tolist(), self.library.labels, strict=True)
+            parts = [
+                f"{'-' if c < 0 else '+'} {abs(c):.{digits}g}{'' if term == '1' else ' ' + term}"
+                for c, term in pairs
+                if c
+            ]
+            right = " ".join(parts).removeprefix("+ ") or "0"
+            made.append(f"{signal.name}' = {right}")
+        return tuple(made)
+
+    def _xdot(self, x: Tensor, u: Tensor) -> Tensor:
+        acceleration = (self.features(x, u).unsqueeze(-1) * self.coefficients).sum(-2)
+        return torch.cat([x[..., self.prior.n_q :], acceleration], dim=-1)
+
+
+@dataclass(frozen=True)
+class SindyCandidate:
+    """One fit that was judged.
+
+    Args:
+        library: Name of its library.
+        threshold: Its threshold, a share of the acceleration's root mean square.
+        terms: Number of terms that it keeps.
+        training: Mean absolute error of the training accelerations [rad/s²].
+        validation: E_sim on the validation free runs (duration form, λ = 0); infinite if one of them diverges or the
+            model is too stiff for the period.
+    """
+
+    library: str
+    threshold: float
+    terms: int
+    training: float
+    validation: float
+
+
+def evaluate(library: Library, names: dict[str, int], x: Tensor, u: Tensor) -> Tensor:
+    """Terms of a library ``(..., n_terms)``; ``names`` gives the column of each signal in ``[x, u]``."""
+    n_x, made = x.shape[-1], {}
+    shape = torch.broadcast_shapes(x.shape[:-1], u.shape[:-1])
+    columns = []
+    for term in library.terms:
+        column = x.new_ones(()).expand(shape)
+        for i, factor in enumerate(term):
+            if factor not in made:  # terms share factors
+                at = names[factor.signal]
+                made[factor] = factor(x[..., at] if at < n_x else u[..., at - n_x])
+            column = made[factor] if i == 0 else column * made[factor]
+        columns.append(column.expand(shape))
+    return torch.stack(columns, dim=-1)
+
+
+def signal_names(prior: Prior, library: Library) -> dict[str, int]:
+    """Column of each state and input in ``[x, u]``.
+
+    Raises:
+        InputError: If a term of the library names none of them, or the library has no term.
+    """
+    names = {signal.name: i for i, signal in enumerate((*prior.states, *prior.inputs))}
+    unknown = {factor.signal for term in library.terms for factor in term} - set(names)
+    if unknown or not library.terms:
+        what = f"names no signal {', '.join(sorted(unknown))}" if unknown else "has no term"
+        raise InputError(f"library {library.name} {what}; {type(prior).__name__} has: {', '.join(names)}")
+    return names
+
+
+def machine_libraries(prior: Prior) -> tuple[Library, ...]:
+    """Libraries for machines that turn or slide: polynomials, trigonometric terms, and friction of several slopes.
+
+    With q, v, u of each axis: ``polynomial`` has all monomials of [q, v] up to degree 3 (an angle that turns is left
+    out) and u; ``trigonometric`` has 1, sin q, cos q, v, v², v abs(v), u, u cos q; ``friction_20`` has those and
+    ``tanh(20 v)`` alone and times cos q, abs(cos q) and v², which is the golf robot's friction where its load keeps
+    its sign. Axes meet in the polynomials only: coupled ones need a library of their own.
+
+    Args:
+        prior: Names the signals.
+
+    Example:
+        >>> from scenarios.pendulum.prior import PendulumPrior
+        >>> libraries = machine_libraries(PendulumPrior())
+        >>> [library.name for library in libraries][:3]
+        ['polynomial', 'trigonometric', 'friction_5']
+        >>> libraries[1].labels
+        ('1', 'sin(phi)', 'cos(phi)', 'phi_dot', 'phi_dot^2', 'phi_dot |phi_dot|', 'u', 'u cos(phi)')
+    """
+    n_q = prior.n_q
+    q, v = prior.states[:n_q], [s.name for s in prior.states[n_q : 2 * n_q]]
+    u = [s.name for s in prior.inputs]
+    torque = [(Factor(j),) for j in u]
+    variables = [s.name for s in q if not s.periodic] + v
+    powers = [
+        tuple(Factor(name, power=chosen.count(name)) for name in dict.fromkeys(chosen))
+        for degree in range(DEGREE + 1)
+        for chosen in combinations_with_replacement(variables, degree)
+    ]
+    sine: list[Term] = [()]
+    for position, speed in zip(q, v, strict=True):
+        sine += [(Factor(position.name, "sin"),), (Factor(position.name, "cos"),), (Factor(speed),)]
+        sine += [(Factor(speed, power=2),), (Factor(speed), Factor(speed, "abs"))]
+    sine += torque + [(Factor(j), Factor(position.name, "cos")) for j in u for position in q]
+    libraries = [Library("polynomial", (*powers, *torque)), Library("trigonometric", tuple(sine))]
+    for gamma in STEEPNESS:
+        rubbing: list[Term] = []
+        for position, speed in zip(q, v, strict=True):
+            sign = Factor(speed, "tanh", gamma)
+            loads = (Factor(position.name, "cos"), Factor(position.name, "abs_cos"), Factor(speed, power=2))
+            rubbing += [(sign,), *((sign, load) for load in loads)]
+        libraries.append(Library(f"friction_{gamma:g}", (*sine, *rubbing)))
+    return tuple(libraries)
+
+
+__all__ = ["fit_sindy", "SindyStep", "SindyCandidate", "Library", "Factor", "machine_libraries", "Target"]
+
+Array = NDArray[np.float64]
+Target = Literal["mean_rate", "derivative"]
+THRESHOLDS = (0.0, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1)
+"""Shares of the acceleration's root mean square below which a term is dropped."""
+SAME = 0.02, 1e-3
+"""Validation errors this share of the best, or of the mean ``|xdot|_1``, above the best count as equal to it."""
+
+ALIKE = 1e-10
+"""Columns whose cosine is this near to 1 are one: no data of a machine tell them apart, and rounding is 1e-16."""
+
+
+def fit_sindy(
+    training: Sequence[Trajectory],
+    prior: Prior,
+    dt: float,
+    *,
+    validation: Sequence[Trajectory],
+    libraries: Sequence[Library] | None = None,
+    thresholds: Sequence[float] = THRESHOLDS,
+    target: Target = "mean_rate",
+    warm: int = 0,
+    ridge: float = 1e-5,
+) -> SindyStep:
+    """Identify the accelerations as sparse sums of candidate terms; kinematics are exact.
+
+    The runs are stacked, each with its own inputs. Every library is fitted with every threshold by pysindy's
+    sequentially thresholded least squares, on columns scaled to a root mean square of 1. The free runs over the
+    validation trajectories choose among all of them: of those that are as good as the best (``SAME``) the one of
+    fewest terms. A candidate that diverges or is too stiff has an infinite error and stays in ``step.candidates``.
+    If all of them are, the one that fits the training data best is returned with its infinite error.
+
+    Args:
+        training: Training trajectories.
+        prior: Names the signals; its energy balance and output judge the free runs. Its equation of motion is not used.
+        dt: Model period [s], that of the trajectories.
+        validation: Validation trajectories, which alone choose library and threshold. Use
+            :func:`~hybrid_mpc.identify.evaluate.judged` on noisy ones.
+        libraries: Default: :func:`~hybrid_mpc.identify.sindy.machine_libraries`.
+        thresholds: Default: ``THRESHOLDS``.
+        target: What is regressed: ``"mean_rate"``, the acceleration's mean over each period, against the terms' mean
+            over it with the input held (Simpson's rule, the state between two samples from the cubic through both),
+            or ``"derivative"``, the recorded derivative at the samples.
+        warm: Samples of the validation trajectories before the free run starts. Default 0.
+        ridge: Ridge while terms are dropped, a share of the columns' squares: it keeps two terms that are nearly
+            one from growing against each other. The terms that stay are fitted without it. Default 1e-5.
+
+    Returns:
+        The model with its equations and candidates.
+
+    Raises:
+        InputError: If pysindy is not installed, trajectories do not fit the prior or ``dt``, are not finite or too
+            short, or an input never changes.
+
+    Source: Brunton, Proctor, Kutz, *Sparse identification of nonlinear dynamics with control (SINDYc)*, IFAC
+    NOLCOS (2016); de Silva et al., *PySINDy*, Journal of Open Source Software 5 (2020).
+
+    Example:
+        >>> from scenarios.pendulum.data import exact_runs
+        >>> from scenarios.pendulum.prior import PendulumPrior
+        >>> step = fit_sindy(
+        ...     exact_runs("train", 2), PendulumPrior(), 0.01, validation=exact_runs("valid", 1)
+        ... )  # doctest: +SKIP
+        >>> step.equations()  # doctest: +SKIP
+        ("phi_dot' = -218 sin(phi) - 20.74 phi_dot + 9.877 u",)
+    """
+    pysindy = _pysindy()
+    _check(training, validation, prior, dt)
+    if target not in get_args(Target):
+        raise InputError(f"target has no {target!r}; there are: {', '.join(get_args(Target))}")
+    if not thresholds or min(thresholds) < 0.0:
+        raise InputError(f"thresholds must be at least one number, none below 0, got {tuple(thresholds)}")
+    windows = cut_windows(training, 0, 1, 1)
+    if target == "derivative":
+        check_rates(training)
+    fits: list[_Fit] = []
+    for library in libraries or machine_libraries(prior):
+        theta, rate = _regression(library, prior, windows, dt, target)
+        found = _sparse(pysindy, theta, rate, thresholds, ridge)
+        fits += _judged(prior, library, found, validation, dt, warm)
+    best = _choice(fits, validation)
+    return _pruned(prior, best, dt, tuple(fit.candidate for fit in fits))
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A candidate with what makes it a model."""
+
+    candidate: SindyCandidate
+    library: Library
+    coefficients: Array
+    substeps: int
+
+
+def _regression(
+    library: Library, prior: Prior, windows: Windows, dt: float, target: Target
+) -> tuple[Array, Array]:
+    """Terms ``(n, n_terms)`` and accelerations ``(n, n_q)`` of all periods of all runs."""
+    names, n_q = signal_names(prior, library), prior.n_q
+    x, x_next, u = windows.x[:, 0], windows.x[:, 1], windows.u[:, 0]
+    if target == "derivative":
+        return evaluate(library, names, x, u).numpy(), windows.xdot[:, 0, n_q : 2 * n_q].numpy()
+    (q, v), (q_next, v_next) = (z.split(n_q, dim=-1) for z in (x, x_next))
+    middle = torch.cat(
+        [0.5 * (q + q_next) - dt / 8.0 * (v_next - v), 1.5 / dt * (q_next - q) - 0.25 * (v + v_next)], -1
+    )
+    first, half, last = (evaluate(library, names, z, u) for z in (x, middle, x_next))
+    return ((first + 4.0 * half + last) / 6.0).numpy(), ((v_next - v) / dt).numpy()
+
+
+def _sparse(
+    pysindy: Any, theta: Array, rate: Array, thresholds: Sequence[float], ridge: float
+) -> list[tuple[float, Array, float]]:
+    """Threshold, coefficients ``(n_terms, n_q)`` [SI] and training error of each fit that differs from the others."""
+    scale, size = _rms(theta), _rms(rate)
+    columns = _distinct(theta / scale)
+    found: dict[bytes, tuple[float, Array, float]] = {}
+    for threshold in thresholds:
+        optimizer = pysindy.STLSQ(threshold=threshold, alpha=ridge * len(theta))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that a threshold leaves nothing: its free run will tell
+            optimizer.fit((theta / scale)[:, columns], rate / size)
+        coefficients = np.zeros((theta.shape[1], rate.shape[1]))
+        coefficients[columns] = np.asarray(optimizer.coef_).T / scale[columns, None] * size
+        error = float(np.abs(theta @ coefficients - rate).mean())
+        found.setdefault((coefficients != 0).tobytes(), (float(threshold), coefficients, error))
+    return list(found.values())
+
+
+def _judged(
+    prior: Prior,
+    library: Library,
+    found: list[tuple[float, Array, float]],
+    validation: Sequence[Trajectory],
+    dt: float,
+    warm: int,
+) -> list[_Fit]:
+    """E_sim of each fit's validation free runs; those of one library run side by side."""
+    substeps = []
+    for _, coefficients, _ in found:
+        try:
+            substeps.append(SindyStep(prior, library, torch.tensor(coefficients), dt).substeps)
+        except InputError:  # too stiff
+            substeps.append(0)
+    stable = [i for i, n in enumerate(substeps) if n]
+    errors = np.full(len(found), np.inf)
+    if stable:
+        stacked = torch.tensor(np.repeat([found[i][1] for i in stable], len(validation), axis=0))
+        step = SindyStep(prior, library, stacked, dt, max(substeps))
+        empty = torch.zeros(0, dtype=torch.float64)
+        with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges is scored as infinite
+            runs = free_runs(step, prior, list(validation) * len(stable), warm, empty)
+            for k, i in enumerate(stable):
+                errors[i] = score(runs[k * len(validation) : (k + 1) * len(validation)]).e_sim_s
+    return [
+        _Fit(
+            SindyCandidate(library.name, threshold, int(np.count_nonzero(c)), error, float(errors[i])),
+            library,
+            c,
+            max(substeps) or MAX_SUBSTEPS,
+        )
+        for i, (threshold, c, error) in enumerate(found)
+    ]
+
+
+def _choice(fits: list[_Fit], validation: Sequence[Trajectory]) -> _Fit:
+    """The fewest terms among those as good as the best on validation; if none runs, the best on training data."""
+    least = min(fit.candidate.validation for fit in fits)
+    if not np.isfinite(least):
+        return min(fits, key=lambda fit: fit.candidate.training)
+    size = np.mean([np.abs(np.diff(t.x, axis=0)).sum(1).mean() / t.dt for t in validation])
+    equal = [fit for fit in fits if fit.candidate.validation <= least + max(SAME[0] * least, SAME[1] * size)]
+    return min(equal, key=lambda fit: (fit.candidate.terms, fit.candidate.validation))
+
+
+def _pruned(prior: Prior, fit: _Fit, dt: float, candidates: tuple[SindyCandidate, ...]) -> SindyStep:
+    """The step without the terms that no acceleration has."""
+    keep = np.flatnonzero((fit.coefficients != 0).any(axis=1))
+    keep = keep if len(keep) else np.zeros(1, dtype=int)  # nothing was left: the acceleration is zero
+    library = Library(fit.library.name, tuple(fit.library.terms[i] for i in keep))
+    return SindyStep(prior, library, torch.tensor(fit.coefficients[keep]), dt, fit.substeps, candidates)
+
+
+def _distinct(scaled: Array) -> NDArray[np.intp]:
+    """Columns that are no multiple of an earlier one, such as abs(cos q) where no run goes beyond a right angle."""
+    alike = np.abs(scaled.T @ scaled) / len(scaled) > 1.0 - ALIKE
+    keep: list[int] = []
+    for j in range(scaled.shape[1]):
+        if not alike[j, keep].any():
+            keep.append(j)
+    return np.array(keep)
+
+
+def _rms(values: Array) -> Array:
+    size: Array = np.sqrt((values**2).mean(axis=0))
+    return np.where(size > 0.0, size, 1.0)
+
+
+def _check(training: Sequence[Trajectory], validation: Sequence[Trajectory], prior: Prior, dt: float) -> None:
+    if prior.n_extra:
+        raise InputError(
+            f"{type(prior).__name__} has states beside [q, v]; SINDy identifies accelerations only"
+        )
+    if not training or not validation:
+        raise InputError("SINDy needs training and validation trajectories, at least one of each")
+    sizes = {"x": len(prior.states), "u": len(prior.inputs)}
+    for trajectory in (*training, *validation):
+        for name, size in sizes.items():
+            columns = getattr(trajectory, name).shape[1]
+            if columns != size:
+                raise InputError(
+                    f"{trajectory.name}: {name} has {columns} columns, {type(prior).__name__} has {size}"
+                )
+        if abs(trajectory.dt - dt) > 1e-9 * dt:
+            raise InputError(
+                f"{trajectory.name}: its period is {trajectory.dt} s, the model's {dt} s; resample it"
+            )
+    for j, signal in enumerate(prior.inputs):
+        u = np.concatenate([t.u[:, j] for t in training])
+        if np.ptp(u) == 0.0:
+            raise InputError(
+                f"input {signal.name} is {u[0]:g} {signal.unit} in all training runs: nothing tells what it does. "
+                "Record runs that excite it."
+            )
+
+
+def _pysindy() -> Any:
+    try:
+        return importlib.import_module("pysindy")
+    except ImportError as missing:
+        raise InputError(
+            "SINDy needs pysindy, which is not installed: pip install 'hybrid-mpc[sindy]'"
+        ) from missing

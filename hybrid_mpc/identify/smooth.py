@@ -1,0 +1,175 @@
+"""Smoothing of measured positions with the prior's own equations: states that know where the input jumped."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+from torch import Tensor
+
+from hybrid_mpc.data import scales
+from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.identify.step import required_substeps, rk4
+from hybrid_mpc.machine.torch_prior import Prior
+
+Array = NDArray[np.float64]
+SWEEPS = 5
+"""Linearisations along the smoothed trajectory; the last ones change it by far less than the noise."""
+DECADES = (-2.0, 6.0)
+"""Range searched for the ratio of walk to sigma [1/s^2, in the machine's seconds]: from a prior that is right to data
+that jump."""
+IGNORANCE = 1e4
+"""Standard deviation of the start in units of what the noise makes of it, seen over one period."""
+SAMPLE = 12
+"""At most so many trajectories decide the noise levels."""
+
+
+@dataclass(frozen=True)
+class Smoother:
+    """Fixed-interval smoother over ``(q, v, d)``: ``d`` is the acceleration that the prior does not explain.
+
+    ``x_{k+1} = f(x_k, u_k, d_k)`` is the prior integrated over a period with ``d_k`` held, ``d`` walks at
+    random, ``y_k = q_k + noise``. A local polynomial smears the jump of a bang-bang input over its length,
+    and a network would learn the smear; here the input's part of the motion is known.
+
+    Args:
+        prior: The fitted prior.
+        dt: Period [s].
+        sigma: Standard deviation of the measurement ``(n_q,)`` [output unit].
+        walk: Standard deviation of d's change per period ``(n_q,)`` [output unit / s^2].
+
+    Source: Rauch, Tung, Striebel, *Maximum likelihood estimates of linear dynamic systems* (1965); iterated
+    linearisation: Bell, *The iterated Kalman smoother as a Gauss-Newton method* (1994).
+    """
+
+    prior: Prior
+    dt: float
+    sigma: tuple[float, ...]
+    walk: tuple[float, ...]
+
+    def smooth(self, trajectories: Sequence[Trajectory]) -> list[Trajectory]:
+        """Every trajectory with ``x`` and ``xdot`` from all of its own samples and from nothing outside it."""
+        smoothed: dict[int, Trajectory] = {}
+        for group in _by_length(trajectories):
+            z, _ = self._estimate(group)
+            for i, t, zi in zip(group, group.values(), z, strict=True):
+                smoothed[i] = self._with_states(t, zi)
+        return [smoothed[i] for i in range(len(trajectories))]
+
+    def innovations(self, trajectories: Sequence[Trajectory]) -> tuple[float, float]:
+        """Squared innovations over their variances, and the logarithms of these variances, both summed."""
+        sums = [self._estimate(group)[1] for group in _by_length(trajectories)]
+        return sum(s[0] for s in sums), sum(s[1] for s in sums)
+
+    def _with_states(self, trajectory: Trajectory, z: Array) -> Trajectory:
+        n_x = len(self.prior.states)
+        x, d = z[:, :n_x], z[:, n_x:]
+        with torch.no_grad():
+            a = self.prior.acceleration(torch.tensor(x), torch.tensor(trajectory.u)).numpy() + d
+        return replace(trajectory, x=x, xdot=np.hstack([x[:, self.prior.n_q :], a]))
+
+    def _estimate(self, group: dict[int, Trajectory]) -> tuple[Array, tuple[float, float]]:
+        """Smoothed ``(q, v, d)`` ``(b, n, 3 n_q)`` of trajectories of one length, and their innovations."""
+        y, u = (np.stack([getattr(t, key) for t in group.values()]) for key in ("y", "u"))
+        z = np.concatenate([y, np.gradient(y, self.dt, axis=1), np.zeros_like(y)], axis=-1)
+        sums = (0.0, 0.0)
+        for _ in range(SWEEPS):
+            predicted, slope = self._linearise(z[:, :-1], u[:, :-1])
+            offset = predicted - (slope @ z[:, :-1, :, None])[..., 0]
+            z, sums = self._sweep(offset, slope, y)
+        return z, sums
+
+    def _linearise(self, z: Array, u: Array) -> tuple[Array, Array]:
+        """Next ``(q, v, d)`` from each ``z`` ``(b, n, 3 n_q)``, and its Jacobian."""
+        n_x, substeps = len(self.prior.states), required_substeps(self.prior, self.dt)
+
+        def step(z: Tensor, u: Tensor) -> Tensor:
+            x, d = z[:n_x], z[n_x:]
+
+            def xdot(x: Tensor) -> Tensor:
+                return self.prior(x, u) + torch.cat([torch.zeros_like(d), d])
+
+            return torch.cat([rk4(xdot, x, self.dt, substeps), d])
+
+        flat = torch.tensor(z).flatten(0, 1), torch.tensor(u).flatten(0, 1)
+        with torch.no_grad():
+            slope = torch.func.vmap(torch.func.jacfwd(step))(*flat).numpy()
+            value = torch.func.vmap(step)(*flat).numpy()
+        return value.reshape(z.shape), slope.reshape(*z.shape, z.shape[-1])
+
+    def _sweep(self, offset: Array, slope: Array, y: Array) -> tuple[Array, tuple[float, float]]:
+        """Kalman filter and Rauch-Tung-Striebel smoother of ``z_{k+1} = slope_k z_k + offset_k + w``."""
+        (b, n, n_q), r = y.shape, np.square(self.sigma)
+        noise = np.diag(np.concatenate([np.zeros(2 * n_q), np.square(self.walk)]))
+        start = np.concatenate([r, r / self.dt**2, np.square(self.walk) + r / self.dt**2])
+        z = np.concatenate([y[:, 0], np.zeros((b, 2 * n_q))], axis=-1)
+        p = np.broadcast_to(np.diag(IGNORANCE**2 * start), (b, 3 * n_q, 3 * n_q))
+        kept: list[tuple[Array, Array, Array, Array]] = []
+        squares = logs = 0.0
+        for k in range(n):
+            if k:
+                z = (slope[:, k - 1] @ z[..., None])[..., 0] + offset[:, k - 1]
+                p = slope[:, k - 1] @ p @ slope[:, k - 1].swapaxes(1, 2) + noise
+            ahead = z, p
+            s, e = p[:, :n_q, :n_q] + np.diag(r), y[:, k] - z[:, :n_q]
+            gain = np.linalg.solve(s, p[:, :n_q]).swapaxes(1, 2)
+            if k > 2:  # three samples end the ignorance of position, velocity and correction
+                squares += float(np.sum(e[:, None] @ np.linalg.solve(s, e[..., None])))
+                logs += float(np.linalg.slogdet(s)[1].sum())
+            z = z + (gain @ e[..., None])[..., 0]
+            p = p - gain @ p[:, :n_q]
+            p = 0.5 * (p + p.swapaxes(1, 2))
+            kept.append((z, p, *ahead))
+        smooth = np.stack([row[0] for row in kept], axis=1)
+        for k in range(n - 2, -1, -1):
+            back = np.linalg.solve(kept[k + 1][3], slope[:, k] @ kept[k][1]).swapaxes(1, 2)
+            smooth[:, k] += (back @ (smooth[:, k + 1] - kept[k + 1][2])[..., None])[..., 0]
+        return smooth, (squares, logs)
+
+
+def fit_smoother(
+    prior: Prior, trajectories: Sequence[Trajectory], dt: float, *, time_unit: float | None = None
+) -> Smoother:
+    """Smoother whose noise and walk make the measurements most likely.
+
+    The ratio of walk to noise is searched, the noise's scale follows in closed form. Several outputs keep
+    the ratio of noises that their third differences show, and share one ratio of walk to noise.
+
+    Args:
+        prior: The fitted prior.
+        trajectories: Recordings; at most ``SAMPLE`` of them, evenly chosen, are used.
+        dt: Period [s].
+        time_unit: The machine's second [s]. Default: that of the trajectories.
+    """
+    unit = scales.time_unit(trajectories, dt) if time_unit is None else time_unit
+    chosen = sorted(
+        set(np.linspace(0, len(trajectories) - 1, min(SAMPLE, len(trajectories))).round().astype(int))
+    )
+    sample = [trajectories[i] for i in chosen]
+    sigma = np.maximum(scales.noise_of(sample), 1e-12)
+    count = sum((len(t.t) - 3) * t.y.shape[1] for t in sample)
+
+    def at(ratio: float, scale: float = 1.0) -> Smoother:
+        levels = scale * sigma, scale * 10.0**ratio * sigma
+        return Smoother(prior, dt, *(tuple(float(v) for v in level) for level in levels))
+
+    def cost(ratio: float) -> float:
+        squares, logs = at(ratio).innovations(sample)
+        return count * math.log(squares / count) + logs
+
+    bounds = [decade - 2.0 * math.log10(unit) for decade in DECADES]
+    best = float(minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 0.05}).x)
+    return at(best, math.sqrt(at(best).innovations(sample)[0] / count))
+
+
+def _by_length(trajectories: Iterable[Trajectory]) -> list[dict[int, Trajectory]]:
+    """Trajectories of equal length together, each under its place in the order given."""
+    groups: dict[int, dict[int, Trajectory]] = {}
+    for i, trajectory in enumerate(trajectories):
+        groups.setdefault(len(trajectory.t), {})[i] = trajectory
+    return list(groups.values())

@@ -1,0 +1,491 @@
+"""Search of training settings by the validation error of free runs (Optuna): resumable, pruned, repeatable."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from typing import TYPE_CHECKING
+
+from hybrid_mpc.errors import InputError
+
+if TYPE_CHECKING:
+    from optuna.distributions import BaseDistribution
+
+    from hybrid_mpc.identify.settings import TrainingSettings
+
+import hashlib
+import math
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import optuna
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
+from optuna.trial import FrozenTrial, Trial, TrialState
+
+from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.files import MOST_CONTENT, digest, read_bytes
+from hybrid_mpc.identify.settings import TrainingSettings
+from hybrid_mpc.identify.train import Trained, train
+from hybrid_mpc.machine.torch_prior import Prior
+
+# What a search of settings may change, and between which bounds. No torch in here.
+
+Values = Mapping[str, float]
+WHOLE = ("hidden", "batch", "horizon")
+"""Settings that are whole numbers."""
+USUAL: Mapping[str, tuple[float, float]] = {
+    "hidden": (4, 64),
+    "learning_rate": (2e-3, 5e-2),
+    "free_run_learning_rate": (5e-4, 2e-2),
+    "decay": (10.0, 30000.0),
+    "batch": (8, 128),
+    "horizon": (20, 100),
+    "anchors": (0.3, 300.0),
+}
+"""Bounds of a setting that is searched without bounds of its own."""
+
+
+@dataclass(frozen=True)
+class SearchSpace:
+    """Settings that are searched, each between two bounds on a logarithmic scale; None leaves one as it is.
+
+    Args:
+        hidden: Hidden units z, whole numbers. Default: 4 to 64.
+        learning_rate: Start of the schedule of teacher forcing; its end keeps the ratio that the base has.
+            Default: 0.002 to 0.05.
+        free_run_learning_rate: The same of the free runs. Default: 0.0005 to 0.02.
+        decay: Weight decay times the number of training samples. Default: 10 to 30000.
+        batch: Windows a step, whole numbers. Default: not searched; twice the batch is twice the work.
+        horizon: Most scored periods of a free-run window, whole numbers. Default: not searched; twice the
+            horizon is twice the work.
+        anchors: Weight of fading corrections where nothing was measured. Default: not searched. Zero, none, is on no
+            logarithmic scale: whoever has none compares with a search without them.
+
+    Raises:
+        InputError: If nothing is searched, or bounds are not positive, not rising, or not whole where they must be.
+
+    Example:
+        >>> SearchSpace(hidden=(8, 32), decay=None).names
+        ('hidden', 'learning_rate', 'free_run_learning_rate')
+    """
+
+    hidden: tuple[int, int] | None = (4, 64)
+    learning_rate: tuple[float, float] | None = (2e-3, 5e-2)
+    free_run_learning_rate: tuple[float, float] | None = (5e-4, 2e-2)
+    decay: tuple[float, float] | None = (10.0, 30000.0)
+    batch: tuple[int, int] | None = None
+    horizon: tuple[int, int] | None = None
+    anchors: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            bounds = getattr(self, field.name)
+            if bounds is not None:
+                object.__setattr__(self, field.name, _checked(field.name, bounds))
+        if not self.names:
+            raise InputError(f"the search has nothing to vary; give bounds to one of: {', '.join(USUAL)}")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Settings that are searched."""
+        return tuple(name for name, bounds in asdict(self).items() if bounds is not None)
+
+    def bounds(self, name: str) -> tuple[float, float]:
+        """Bounds of a setting that is searched."""
+        low, high = getattr(self, name)
+        return low, high
+
+    def values_of(self, settings: TrainingSettings) -> dict[str, float]:
+        """What the searched settings are in ``settings``."""
+        rates = settings.learning_rates
+        own = {"learning_rate": rates[0], "free_run_learning_rate": rates[2]}
+        return {name: own[name] if name in own else getattr(settings, name) for name in self.names}
+
+    def holds(self, values: Values) -> bool:
+        """Whether all values lie within the bounds."""
+        return all(self.bounds(n)[0] <= values[n] <= self.bounds(n)[1] for n in self.names)
+
+    def apply(self, base: TrainingSettings, values: Values) -> TrainingSettings:
+        """``base`` with the values in it."""
+        start, end, free_start, free_end = base.learning_rates
+        rate = values.get("learning_rate", start)
+        free = values.get("free_run_learning_rate", free_start)
+        rates = (rate, rate * (end / start), free, free * (free_end / free_start))
+        changes = {name: value for name, value in values.items() if not name.endswith("learning_rate")}
+        return replace(base, learning_rates=rates, **changes)  # type: ignore[arg-type]
+
+    def distributions(self) -> dict[str, BaseDistribution]:
+        """Optuna's distributions of the searched settings."""
+        from optuna.distributions import FloatDistribution, IntDistribution
+
+        made: dict[str, BaseDistribution] = {}
+        for name in self.names:
+            low, high = self.bounds(name)
+            whole = name in WHOLE
+            made[name] = (
+                IntDistribution(int(low), int(high), log=True)
+                if whole
+                else FloatDistribution(low, high, log=True)
+            )
+        return made
+
+
+def parsed_space(texts: Sequence[str]) -> SearchSpace:
+    """A space from ``NAME`` or ``NAME=LOW:HIGH`` for each setting; all that are not named stay as they are.
+
+    Args:
+        texts: e.g. ``["hidden=8:32", "batch"]``; a name alone has its usual bounds. None at all is the default
+            space.
+
+    Raises:
+        InputError: If a name is not known or given twice, or bounds are no numbers.
+
+    Example:
+        >>> parsed_space(["hidden=8:32", "batch"]).batch
+        (8, 128)
+    """
+    if not texts:
+        return SearchSpace()
+    found: dict[str, tuple[float, float] | None] = {}
+    for text in texts:
+        name, _, given = text.partition("=")
+        if name not in USUAL:
+            raise InputError(f"no setting {name!r} to vary; there are: {', '.join(USUAL)}")
+        if name in found:
+            raise InputError(f"{name} is varied twice; give it once")
+        found[name] = _parsed_bounds(text, given) if given else USUAL[name]
+    return SearchSpace(**(dict.fromkeys(USUAL) | found))
+
+
+def _parsed_bounds(text: str, given: str) -> tuple[float, float]:
+    low, _, high = given.partition(":")
+    try:
+        return float(low), float(high)
+    except ValueError as error:
+        raise InputError(f"{text!r}: the form is NAME=LOW:HIGH, e.g. hidden=8:32") from error
+
+
+def _checked(name: str, bounds: Sequence[float]) -> tuple[float, float]:
+    if len(bounds) != 2 or not 0 < bounds[0] < bounds[1] < float("inf"):
+        raise InputError(
+            f"{name} is to be varied between {list(bounds)}; needed are two positive numbers, the lower one first"
+        )
+    if name not in WHOLE:
+        return float(bounds[0]), float(bounds[1])
+    if any(b != int(b) for b in bounds):
+        raise InputError(f"{name} is to be varied between {list(bounds)}; its bounds must be whole numbers")
+    return int(bounds[0]), int(bounds[1])
+
+
+# The journal of a search: Optuna's, in lines of JSON, bound to its search.
+
+STUDY = "hybrid-mpc search"
+
+
+def open_study(storage: Path, identity: Mapping[str, str]) -> optuna.Study:
+    """The study of a journal, whose trials are all finished or given up.
+
+    Args:
+        storage: The journal; made if missing.
+        identity: Hashes by name of everything that decides what the trials are.
+
+    Raises:
+        InputError: If the journal is damaged or another search's.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     open_study(Path(folder) / "search.jsonl", {"seed": "0"}).user_attrs
+        {'identity': {'seed': '0'}}
+    """
+    storage.parent.mkdir(parents=True, exist_ok=True)
+    _mend(storage)
+    try:
+        # whole path: a lock is a link to it, which has to lead somewhere
+        journal = JournalStorage(JournalFileBackend(str(storage.resolve())))
+        names = optuna.get_all_study_names(journal)
+        with _quiet():
+            make = optuna.load_study if STUDY in names else optuna.create_study
+            study = make(storage=journal, study_name=STUDY)
+        held = study.user_attrs.get("identity", {})
+    except (ValueError, KeyError, TypeError, AttributeError, OSError) as error:
+        raise InputError(
+            f"{storage} is no journal of a search or is damaged ({type(error).__name__}: {error}); choose another "
+            "file or delete it to search anew"
+        ) from error
+    if not held and not study.trials:  # new, or killed before it was named
+        study.set_user_attr("identity", dict(identity))
+    elif differ := [name for name in identity if held.get(name) != identity[name]]:
+        raise InputError(
+            f"{storage} holds another search ({', '.join(differ)} differ); go on with the same ones or choose "
+            "another file"
+        )
+    for _ in study.get_trials(states=(TrialState.WAITING,)):  # drawn, not begun, when the search was ended
+        study.ask()
+    for trial in study.get_trials(states=(TrialState.RUNNING,)):
+        study.tell(trial.number, state=TrialState.FAIL)
+    return study
+
+
+def _mend(storage: Path) -> None:
+    """Cut off a line that a kill left unfinished."""
+    if storage.is_file():
+        content = read_bytes(storage, MOST_CONTENT)
+        whole = content.rfind(b"\n") + 1
+        if whole < len(content):
+            os.truncate(storage, whole)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without Optuna's word that a study was made or found."""
+    before = optuna.logging.get_verbosity()
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    try:
+        yield
+    finally:
+        optuna.logging.set_verbosity(before)
+
+
+__all__ = ["search", "SearchSpace", "SearchResult", "TrialRow", "Progress"]
+
+Progress = Callable[[int, int, int, float], None]
+STARTUP = 6
+"""Trials at random before the sampler looks at their results."""
+JUDGES = 4
+"""Finished trainings that a median is taken of before one is pruned by it."""
+PATIENCE = 0.2
+"""Share of the optimiser steps that every training gets: a good setting may start slowly."""
+ENOUGH = 8
+"""Finished trainings from which the settings' importance is estimated."""
+
+
+@dataclass(frozen=True)
+class TrialRow:
+    """One training of a search.
+
+    Args:
+        number: 0, 1, ...
+        state: ``"complete"``, ``"pruned"`` (stopped while worse than the median of the finished ones at the same
+            step) or ``"diverged"`` (no network had a finite validation error).
+        value: Validation error of the best network [E_sim's unit]; of a pruned training that at its end, of a
+            diverged one infinite.
+        mean: Mean of the networks' validation errors; NaN for a pruned training.
+        steps: Optimiser steps done.
+        duration: How long it took [s].
+        values: The searched settings.
+    """
+
+    number: int
+    state: str
+    value: float
+    mean: float
+    steps: int
+    duration: float
+    values: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class SearchResult:
+    """What a search found.
+
+    Args:
+        settings: The best training's settings; :func:`~hybrid_mpc.identify.train.train` with them gives
+            ``best.value`` again.
+        best: The best training.
+        base: Validation error with the settings that the search started from; None where the space does not hold them.
+        trials: All trainings.
+        importance: Share of each setting in the differences of the finished trainings' values (PED-ANOVA, sums to
+            one); empty where fewer than eight finished or one setting alone is searched.
+    """
+
+    settings: TrainingSettings
+    best: TrialRow
+    base: float | None
+    trials: tuple[TrialRow, ...]
+    importance: Mapping[str, float]
+
+
+def search(
+    prior: Prior,
+    training: Sequence[Trajectory],
+    validation: Sequence[Trajectory],
+    base: TrainingSettings,
+    space: SearchSpace,
+    *,
+    trials: int,
+    storage: Path,
+    seed: int = 0,
+    on_progress: Progress = lambda number, done, total, error: None,
+    timeout: float | None = None,
+) -> SearchResult:
+    """Search settings by the validation error of free runs, the best network of each training counting.
+
+    The first training has the settings ``base``, if the space holds them. Settings are drawn from (seed, number of
+    the trial, results so far), and a training that was interrupted is drawn again: a search that was killed and goes
+    on is the search that was not. Every finished trial stands in ``storage`` at once. Validation chooses here what
+    it also chooses within a training, so the best value is too good to be true by some; judge on test runs.
+
+    Args:
+        prior: The fitted prior.
+        training: Training trajectories.
+        validation: Validation trajectories; the only ones that decide.
+        base: All settings that are not searched, and the first trial's.
+        space: What is searched.
+        trials: Trials in all, those in ``storage`` counted.
+        storage: Journal: JSON lines, made if missing, gone on with if there. One search at a time.
+        seed: Seed of the search; weights and batches have that of ``base``.
+        on_progress: ``(number of the trial, steps done, steps in all, best validation error)``.
+        timeout: No further trial starts after this time of the call [s]; one trial is made in any case. Default: none.
+
+    Raises:
+        InputError: If the journal is damaged or of another search, a number is too small, all trainings diverged, or
+            the data are such that :func:`~hybrid_mpc.identify.train.train` refuses them.
+
+    Example:
+        >>> found = search(prior, train_runs, valid_runs, base, SearchSpace(), trials=20,
+        ...                storage=Path("search.jsonl"))  # doctest: +SKIP
+        >>> train(prior, train_runs, valid_runs, found.settings)  # doctest: +SKIP
+    """
+    check_numbers(trials, seed, timeout)
+    if space.horizon is not None:  # trials must be judged by windows of the same length
+        base = replace(base, validation_horizon=base.validation_horizon or 5 * base.horizon)
+    study = open_study(storage, _identity(prior, training, validation, base, space, seed))
+    warm_up = math.ceil(PATIENCE * (base.teacher_steps + base.free_run_steps))
+    study.pruner = optuna.pruners.MedianPruner(JUDGES, warm_up)
+    start = time.monotonic()
+    while (number := len(_finished(study))) < trials:
+        trial = _ask(study, number, base, space, seed)
+        settings = space.apply(base, trial.params)
+        with _kept(study, trial, partial(on_progress, number)) as report:
+            report.trained = train(prior, training, validation, settings, on_progress=report)
+        if timeout is not None and time.monotonic() - start >= timeout:
+            break
+    return _result(study, base, space)
+
+
+def check_numbers(trials: int, seed: int, timeout: float | None) -> None:
+    """Refuse numbers that no search can be made with.
+
+    Raises:
+        InputError: If one is too small.
+    """
+    if trials < 1 or seed < 0 or (timeout is not None and not timeout > 0):
+        raise InputError(
+            f"a search needs trials of 1 or more, a seed of 0 or more and a timeout above 0 s, got "
+            f"{trials}, {seed}, {timeout}"
+        )
+
+
+class _Report:
+    """Hands the validation errors of a training on, to the user and to the pruner."""
+
+    def __init__(self, trial: Trial, on_progress: Callable[[int, int, float], None]) -> None:
+        self.trial, self.on_progress = trial, on_progress
+        self.trained: Trained | None = None
+
+    def __call__(self, done: int, total: int, error: float) -> None:
+        self.trial.report(error, done)
+        self.on_progress(done, total, error)
+        if done < total and self.trial.should_prune():
+            raise optuna.TrialPruned
+
+
+@contextmanager
+def _kept(
+    study: optuna.Study, trial: Trial, on_progress: Callable[[int, int, float], None]
+) -> Iterator[_Report]:
+    """A trial's training is noted as it ended; one that is interrupted stays open and is drawn again."""
+    report = _Report(trial, on_progress)
+    try:
+        yield report
+    except optuna.TrialPruned:
+        study.tell(trial, state=TrialState.PRUNED)
+        return
+    assert report.trained is not None
+    trial.set_user_attr("mean", str(float(report.trained.validation.mean())))
+    study.tell(trial, float(report.trained.validation.min()))
+
+
+def _ask(study: optuna.Study, number: int, base: TrainingSettings, space: SearchSpace, seed: int) -> Trial:
+    """The trial of this number: the base first, then what (seed, number) and the finished trials give."""
+    own = int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
+    study.sampler = optuna.samplers.TPESampler(seed=own, n_startup_trials=STARTUP)
+    values = space.values_of(base)
+    if number == 0 and space.holds(values):
+        study.enqueue_trial(values)
+    return study.ask(space.distributions())
+
+
+def _identity(
+    prior: Prior,
+    training: Sequence[Trajectory],
+    validation: Sequence[Trajectory],
+    base: TrainingSettings,
+    space: SearchSpace,
+    seed: int,
+) -> dict[str, str]:
+    """Hashes of everything that decides what the trials are."""
+    data = hashlib.sha256()
+    for trajectory in (*training, *validation):
+        data.update(f"{trajectory.role} {trajectory.dt} {trajectory.x.shape}".encode())
+        for name in ("x", "u", "xdot"):
+            data.update(np.ascontiguousarray(getattr(trajectory, name)).tobytes())
+    return {
+        "data": data.hexdigest(),
+        "prior": digest([type(prior).__name__, prior.values]),
+        "base settings": digest(_without_default(base)),
+        "space": digest(_without_default(space)),
+        "seed": digest(seed),
+    }
+
+
+def _without_default(settings: TrainingSettings | SearchSpace) -> dict[str, Any]:
+    """As plain data; without anchors, where there are none, as in searches from before there were any."""
+    return {name: value for name, value in asdict(settings).items() if name != "anchors" or value}
+
+
+def _finished(study: optuna.Study) -> list[FrozenTrial]:
+    return study.get_trials(states=(TrialState.COMPLETE, TrialState.PRUNED))
+
+
+def _result(study: optuna.Study, base: TrainingSettings, space: SearchSpace) -> SearchResult:
+    rows = tuple(_row(number, trial) for number, trial in enumerate(_finished(study)))
+    complete = [row for row in rows if row.state == "complete"]
+    if not complete:
+        raise InputError(
+            f"all {len(rows)} trainings of the search diverged: no network had a finite validation error; look at "
+            "the data and the fitted prior, or lower the learning rates' bounds"
+        )
+    best = min(complete, key=lambda row: row.value)
+    importance: dict[str, float] = {}
+    if len(complete) >= ENOUGH and len(space.names) > 1:
+        importance = dict(optuna.importance.get_param_importances(study))
+    first = space.holds(space.values_of(base))
+    return SearchResult(
+        space.apply(base, best.values), best, rows[0].value if first else None, rows, importance
+    )
+
+
+def _row(number: int, trial: FrozenTrial) -> TrialRow:
+    assert trial.duration is not None
+    value = math.inf if trial.value is None else trial.value
+    state = (
+        "pruned" if trial.state == TrialState.PRUNED else "complete" if math.isfinite(value) else "diverged"
+    )
+    return TrialRow(
+        number,
+        state,
+        value,
+        float(trial.user_attrs.get("mean", "nan")),
+        trial.last_step or 0,
+        trial.duration.total_seconds(),
+        dict(trial.params),
+    )

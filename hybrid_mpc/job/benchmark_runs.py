@@ -1,0 +1,391 @@
+"""Free runs of all models over recordings by a machine's convention, and the figures that judge them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Container, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.data.scales import time_unit
+from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.identify.delay import Physics, lost_samples, shifted
+from hybrid_mpc.identify.evaluate import judged
+from hybrid_mpc.identify.settings import KINDS
+from hybrid_mpc.identify.step import PriorStep
+from hybrid_mpc.identify.train import Trained, stack_for, step_for
+from hybrid_mpc.machine.specification import BenchmarkSpec, Role
+from hybrid_mpc.machine.torch_prior import Prior
+from hybrid_mpc.scenario import Scenario
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+
+# Recordings of a benchmark: training files in pieces with roles, test files as whole runs.
+
+LONGEST = 60.0
+"""Most of a recording in :attr:`Recordings.long` [the machine's seconds]: a model that drifts shows it by then."""
+SCORED = 50
+"""Fewest periods of a piece after its warm-up."""
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """The training files of a benchmark.
+
+    Args:
+        train: Pieces that are fitted and trained on.
+        valid: Pieces that choose; nothing is fitted to them.
+        held_back: Pieces that neither fit nor choose; may be none.
+        long: Recordings that were split in order of time and are judged whole, from their first sample to where
+            validation ends, at most a minute (of the machine's own seconds). Most or all of them was trained on, so
+            they tell drift and not how good a model is.
+        dataset: The files as they were read.
+    """
+
+    train: tuple[Trajectory, ...]
+    valid: tuple[Trajectory, ...]
+    held_back: tuple[Trajectory, ...]
+    long: tuple[Trajectory, ...]
+    dataset: Dataset
+
+
+def benchmark_of(scenario: Scenario) -> BenchmarkSpec:
+    """The scenario's convention.
+
+    Raises:
+        InputError: If it has none.
+
+    Example:
+        >>> from scenarios.torque_pendulum import scenario
+        >>> benchmark_of(scenario).length
+        2.5
+    """
+    if scenario.benchmark is None:
+        raise InputError(
+            f"scenario {scenario.name} has no benchmark: give it one with Scenario(benchmark=BenchmarkSpec(...))"
+        )
+    return scenario.benchmark
+
+
+def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
+    """Read training files; long ones are cut into pieces of the benchmark's length.
+
+    Raises:
+        InputError: If a file is bad, has windows where whole files are to validate, or no piece is left for training or
+            validation.
+    """
+    prior, spec = scenario.prior(), benchmark_of(scenario)
+    uncut = 0 < spec.valid_every <= len(paths)
+    named = [path.name for path in paths if path.stem in scenario.data.windows]
+    if uncut and named:
+        raise InputError(
+            f"{named[0]} has windows in the data specification, and the benchmark's valid_every={spec.valid_every} "
+            "gives whole files their roles; leave out one of the two"
+        )
+    needed: tuple[Role, ...] = () if spec.cycle or uncut else ("train", "valid")
+    dataset = load_trajectories(
+        paths, scenario.data, outputs=prior.outputs, inputs=prior.inputs, states=prior.states, needed=needed
+    )
+    parts = _parts(dataset, scenario, uncut)
+    train, valid, held = (tuple(p for p in parts if p.role == role) for role in ("train", "valid", "test"))
+    if not (train and valid):
+        cut = "".join(f"\n  {c.file} {c.start:g} to {c.end:g} s: {c.why}" for c in dataset.cuts)
+        raise InputError(
+            f"nothing is left to {'validate on' if train else 'train on'}; give longer recordings"
+            + (f". Cut out:{cut}" if cut else "")
+        )
+    in_order = not (spec.cycle or uncut) and spec.length is None
+    long = until_validated(dataset, scenario.data.windows) if in_order else ()
+    return Recordings(train, valid, held, long, dataset)
+
+
+def _parts(dataset: Dataset, scenario: Scenario, uncut: bool) -> list[Trajectory]:
+    """Pieces with roles: by the cycle, by whole files (``uncut``), or as the data specification splits."""
+    spec, data = benchmark_of(scenario), scenario.data
+    if not spec.cycle:
+        runs = whole_runs(dataset, spec.valid_every) if uncut else dataset.trajectories
+        return [p for t in runs for p in pieces(t, spec.piece)]
+    parts = [p for t in dataset.whole for p in in_turn(t, spec, data.smoothing)]
+    shortest = data.warm_up + SCORED * data.dt
+    if any(len(p.t) * p.dt < shortest for p in parts):
+        raise InputError(
+            f"a recording is too short to be cut into {len(spec.cycle)} pieces of {shortest:.3g} s and more, which "
+            "training and validation need; give longer ones"
+        )
+    return parts
+
+
+def until_validated(dataset: Dataset, windows: Container[str]) -> tuple[Trajectory, ...]:
+    """Recordings that were split in order of time, from the first sample to a gap or where validation ends.
+
+    Args:
+        dataset: Recordings and their pieces.
+        windows: Stems of files whose pieces are named windows; what lies between these may be anything.
+
+    Example:
+        >>> t = 0.1 * np.arange(10)
+        >>> z, x = np.zeros((10, 1)), np.zeros((10, 2))
+        >>> whole = Trajectory("run", "", 0.1, t, z, z, x, x)
+        >>> pieces = (whole.part(t < 0.45, "run", "train"), whole.part((t > 0.45) & (t < 0.75), "run#2", "valid"))
+        >>> data = Dataset(pieces, (whole,), (), ("run.csv",), (), "")
+        >>> [(run.role, len(run.t)) for run in until_validated(data, ())], until_validated(data, {"run"})
+        ([('valid', 8)], ())
+    """
+    stems, found = {Path(file).stem for file in dataset.files}, []
+    longest = LONGEST * time_unit(dataset.whole, dataset.whole[0].dt) if dataset.whole else 0.0
+    for whole in dataset.whole:
+        # one that begins after a gap begins in motion, and a run that judges does not
+        if whole.name not in stems or whole.name in windows:
+            continue
+        ends = [p.t[-1] for p in dataset.by_role("valid") if _stem(p.name, stems) == whole.name]
+        if ends:
+            end = min(max(ends), whole.t[0] + longest)
+            found.append(whole.part(whole.t <= end, whole.name, "valid"))
+    return tuple(found)
+
+
+def _stem(name: str, stems: Container[str]) -> str:
+    """Stem of the file that a piece is from: later pieces of a file have # and their number after it.
+
+    Example:
+        >>> _stem("run#12", {"run"}), _stem("run", {"run"}), _stem("take#2", {"take", "take#2"})
+        ('run', 'run', 'take#2')
+    """
+    return name if name in stems else name.rpartition("#")[0]
+
+
+def whole_runs(dataset: Dataset, every: int) -> tuple[Trajectory, ...]:
+    """All recordings uncut, those of every so many-th file as validation; a gap stays a cut.
+
+    Example:
+        >>> z = np.zeros((2, 1))
+        >>> runs = [Trajectory(name, "", 0.1, z[:, 0], z, z, z, z) for name in ("c", "a", "b", "c#2")]
+        >>> data = Dataset((), tuple(runs), (), ("c.csv", "a.csv", "b.csv"), (), "")
+        >>> [(t.name, t.role) for t in whole_runs(data, 3)]
+        [('c', 'valid'), ('a', 'train'), ('b', 'train'), ('c#2', 'valid')]
+    """
+    stems = sorted(Path(file).stem for file in dataset.files)
+    chosen = set(stems[every - 1 :: every])
+    return tuple(
+        replace(t, role="valid" if _stem(t.name, stems) in chosen else "train") for t in dataset.whole
+    )
+
+
+def read_test(
+    scenario: Scenario, path: Path, warn: Callable[[str], None] = lambda text: None
+) -> tuple[Trajectory, ...]:
+    """A test file as whole runs, one for each side of a gap; windows known for a file's name are not looked at.
+
+    Args:
+        scenario: The machine.
+        path: The file.
+        warn: Takes what is doubtful about it. Default: nobody does.
+
+    Raises:
+        InputError: If the file is bad or nothing of it is long enough.
+    """
+    prior = scenario.prior()
+    spec = replace(scenario.data, windows={})
+    dataset = load_trajectories(
+        [path], spec, outputs=prior.outputs, inputs=prior.inputs, states=prior.states, needed=()
+    )
+    if not dataset.whole:
+        raise InputError(
+            f"{path}: no part is long enough for a free run after {spec.warm_up:g} s that are given"
+        )
+    for finding in dataset.findings:
+        warn(str(finding))
+    return dataset.whole
+
+
+def in_turn(trajectory: Trajectory, spec: BenchmarkSpec, distance: float) -> tuple[Trajectory, ...]:
+    """Pieces of a whole recording with the cycle's roles in turn; ``distance`` [s] between them is in none of them.
+
+    Example:
+        >>> z = np.zeros((400, 1))
+        >>> run = Trajectory("run", "", 0.1, 0.1 * np.arange(400), z, z, np.zeros((400, 2)), np.zeros((400, 2)))
+        >>> spec = BenchmarkSpec(piece=10.0, cycle=("train", "valid"))
+        >>> [(p.role, len(p.t)) for p in in_turn(run, spec, 0.4)]
+        [('train', 96), ('valid', 96), ('train', 96), ('valid', 96)]
+    """
+    seconds = min(spec.piece, len(trajectory.t) * trajectory.dt / len(spec.cycle))
+    margin = round(0.5 * distance / trajectory.dt)
+    parts = []
+    for i, part in enumerate(pieces(trajectory, seconds)):
+        index = np.arange(len(part.t))
+        inner = (index >= margin) & (index < len(part.t) - margin)
+        parts.append(part.part(inner, part.name, spec.cycle[i % len(spec.cycle)]))
+    return tuple(parts)
+
+
+def pieces(trajectory: Trajectory, seconds: float) -> tuple[Trajectory, ...]:
+    """Equal pieces of about ``seconds``; a few samples at the end may be left over.
+
+    Example:
+        >>> z = np.zeros((101, 1))
+        >>> run = Trajectory("run", "train", 0.1, 0.1 * np.arange(101), z, z, np.zeros((101, 2)), np.zeros((101, 2)))
+        >>> [(p.name, len(p.t)) for p in pieces(run, 5.0)], len(pieces(run, 60.0))
+        ([('run.1', 50), ('run.2', 50)], 1)
+    """
+    count = round(len(trajectory.t) * trajectory.dt / seconds)
+    if count < 2:
+        return (trajectory,)
+    n, index = len(trajectory.t) // count, np.arange(len(trajectory.t))
+    return tuple(
+        trajectory.part(
+            (index >= i * n) & (index < (i + 1) * n), f"{trajectory.name}.{i + 1}", trajectory.role
+        )
+        for i in range(count)
+    )
+
+
+Array = NDArray[np.float64]
+MODELS = ("phy", *KINDS)
+
+
+@dataclass(frozen=True)
+class Run:
+    """What is known of one free run.
+
+    Args:
+        name: Of the trajectory.
+        t: Times of the scored samples ``(n,)`` [s].
+        u: Commanded inputs there ``(n, n_u)``, as they act.
+        y: Measured outputs ``(n, n_y)``.
+        y_hat: By candidate, ``(n, n_y)``.
+    """
+
+    name: str
+    t: Array
+    u: Array
+    y: Array
+    y_hat: Mapping[str, Array]
+
+
+def run_freely(
+    prior: Prior,
+    physics: Physics,
+    networks: Mapping[str, Trained],
+    trajectories: Sequence[Trajectory],
+    *,
+    warm_up: float,
+    length: float | None,
+) -> list[Run]:
+    """Free runs of the prior, of the best network of each kind, and of the mean over the networks of each kind.
+
+    Of a trajectory only what lies within ``warm_up`` is known: from it comes the state that all models start from,
+    and the networks' hidden states. Everything after it is scored.
+
+    Args:
+        prior: The fitted prior.
+        physics: Its delay and smoother.
+        networks: Trained networks by kind; each kind's best is that of its own validation.
+        trajectories: Recordings with the commanded inputs.
+        warm_up: Length [s] of what is given.
+        length: Length [s] of a run after it; default: to the end.
+
+    Returns:
+        A run for each trajectory; candidates are ``phy``, ``rnn``, ``rnn mean`` and so on.
+    """
+    import torch
+
+    dt = trajectories[0].dt
+    warm = warm_samples(warm_up, physics.delay, dt)
+    starts = judged(shifted(trajectories, physics.delay), physics.smoother(prior, dt), warm)
+    if length is not None:
+        starts = [_first(t, warm + round(length / dt) + 1) for t in starts]
+    found = {
+        "phy": _simulate(PriorStep(prior, dt), torch.zeros(1, 1, 0, dtype=torch.float64), starts, warm)[0]
+    }
+    for kind, trained in networks.items():
+        stack = stack_for(prior, trained.settings)
+        stack.load_state_dict({name: torch.tensor(value) for name, value in trained.weights.items()})
+        step = step_for(prior, stack, trained.scaling, dt, trained.settings)
+        all_runs = _simulate(step, stack.initial(1), starts, warm)
+        found |= {kind: all_runs[trained.best], f"{kind} mean": all_runs.mean(0)}
+    with torch.no_grad():
+        outputs = {
+            name: prior.output(torch.tensor(x), torch.zeros(len(prior.inputs))).numpy()
+            for name, x in found.items()
+        }
+    return [
+        Run(
+            t.name,
+            t.t[warm + 1 :],
+            t.u[warm + 1 :],
+            t.y[warm + 1 :],
+            {name: y[i, : len(t.t) - warm - 1] for name, y in outputs.items()},
+        )
+        for i, t in enumerate(starts)
+    ]
+
+
+def figures_of(runs: Sequence[Run], name: str, *, unit: str, scale: float) -> dict[str, Any]:
+    """RMSE over all scored samples, and its share of the measured output's standard deviation.
+
+    Args:
+        runs: Free runs over one file.
+        name: The candidate.
+        unit: Unit of the figures.
+        scale: Figures' units in an SI unit.
+
+    Example:
+        >>> y = np.array([[0.0], [1.0], [2.0]])
+        >>> run = Run("run", np.arange(3.0), y, y, {"phy": y + 0.1})
+        >>> figures_of([run], "phy", unit="mm", scale=1e3)["rmse"].__round__(6)
+        100.0
+    """
+    error = np.concatenate([run.y_hat[name][:, 0] - run.y[:, 0] for run in runs])
+    spread = float(np.std(np.concatenate([run.y[:, 0] for run in runs])))
+    rmse = float(np.sqrt(np.mean(error**2)))
+    if not np.isfinite(rmse):
+        rmse = float("inf")
+    relative = rmse / spread if spread > 0 else float("inf")
+    return {"rmse": scale * rmse, "relative": relative, "unit": unit}
+
+
+def warm_samples(warm_up: float, delay: float, dt: float) -> int:
+    """Periods from the first sample whose acting input is known to the last one that is given.
+
+    Example:
+        >>> warm_samples(1.225, 0.0, 0.025), warm_samples(1.225, 0.03, 0.025)
+        (49, 47)
+    """
+    return max(1, round(warm_up / dt) - lost_samples(delay, dt))
+
+
+def _first(trajectory: Trajectory, n: int) -> Trajectory:
+    arrays = {key: getattr(trajectory, key)[:n] for key in ("t", "u", "y", "x", "xdot")}
+    return replace(trajectory, **arrays)
+
+
+def _simulate(step: nn.Module, h0: Tensor, trajectories: Sequence[Trajectory], warm: int) -> Array:
+    """States ``(networks, runs, n, n_x)`` of the samples after ``warm``; shorter runs go on under their last input."""
+    import torch
+
+    longest = max(len(t.t) for t in trajectories)
+    x_all, u_all = (
+        torch.tensor(np.stack([_padded(getattr(t, key), longest) for t in trajectories]))
+        for key in ("x", "u")
+    )
+    networks, runs = h0.shape[0], len(trajectories)
+    with torch.no_grad():
+        h, states = h0.expand(networks, runs, -1), []
+        wide = [a.expand(networks, *a.shape) for a in (x_all, u_all)]
+        for k in range(warm):
+            _, h = step(wide[0][:, :, k], h, wide[1][:, :, k])
+        x = wide[0][:, :, warm]
+        for k in range(warm, longest - 1):
+            x, h = step(x, h, wide[1][:, :, k])
+            states.append(x)
+    return torch.stack(states, 2).numpy()
+
+
+def _padded(values: Array, length: int) -> Array:
+    return np.concatenate([values, np.repeat(values[-1:], length - len(values), axis=0)])

@@ -1,0 +1,199 @@
+"""The controllers that a scenario's closed loops compare: same problem, period, horizon and safeguards."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.control.best_of import BestOf
+from hybrid_mpc.control.ocp import OCP
+from hybrid_mpc.control.rti import CondensedController
+from hybrid_mpc.control.safeguard import SafeController
+from hybrid_mpc.control.sqp import SQPController
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimate.kalman import Estimator, TrueState
+from hybrid_mpc.estimate.tuning import process_noise
+from hybrid_mpc.kit.artifact import Kit
+from hybrid_mpc.kit.assembly import make_controller, make_estimator, make_ocp, tuned_noise
+from hybrid_mpc.records import known
+from hybrid_mpc.scenario import Scenario
+
+if TYPE_CHECKING:
+    from hybrid_mpc.data.trajectories import Trajectory
+
+Array = NDArray[np.float64]
+ORACLE_ITERATIONS = 1
+FIRST_ITERATIONS = 10
+"""Linearisations an oracle makes from each of its starts in a period, and for its first plan from all of them. In a
+period it starts from its last plan and from the rival's that is cheaper by its own equations."""
+
+
+@dataclass(frozen=True)
+class Contender:
+    """One of the compared controllers.
+
+    Args:
+        model: ``"prior"``, ``"hybrid"`` or ``"oracle"``.
+        observer: Whether the estimator follows an unknown load at the input.
+        truth: Whether it is handed the plant's true state instead of the measurement.
+    """
+
+    model: str
+    observer: bool = False
+    truth: bool = False
+
+
+CONTENDERS: Mapping[str, Contender] = {
+    "prior": Contender("prior"),
+    "prior_observer": Contender("prior", observer=True),
+    "hybrid": Contender("hybrid"),
+    "hybrid_observer": Contender("hybrid", observer=True),
+    "oracle": Contender("oracle", observer=True),
+    "oracle_state": Contender("oracle", truth=True),
+}
+"""Baselines: the fitted prior without and with disturbance observer; the hybrid likewise; two oracles on the
+plant's own equations, one with the same measurements through the same kind of estimator, one with the truth."""
+ORACLES = ("oracle", "oracle_state")
+LEAST_NOISE: Mapping[str, str] = {"hybrid": "prior", "hybrid_observer": "prior_observer"}
+"""Whose process noise is the least that a contender has, where tasks go beyond the recordings."""
+
+
+def build(
+    name: str, scenario: Scenario, kit: Kit, control: OCP, *, solver: str = "rti"
+) -> tuple[Estimator, SafeController]:
+    """Estimator and controller of a contender.
+
+    Args:
+        name: Name in :data:`CONTENDERS`.
+        scenario: The machine, with its oracle if that is asked for.
+        kit: Prior and hybrid, and the process noise of the contender's filter.
+        control: The task's control problem.
+        solver: Name in :data:`~hybrid_mpc.kit.assembly.SOLVERS`; oracles have their own.
+
+    Raises:
+        InputError: If there is no such contender, the scenario has no oracle, or the kit no noise.
+    """
+    c, prior = CONTENDERS[known(name, CONTENDERS, "controller")], kit.models["prior"]
+    if c.model != "oracle":
+        model = kit.models[c.model]
+        estimator = make_estimator(model, kit, kit.noise(name), control, observer=c.observer)
+        return estimator, make_controller(model, prior, control, solver=solver, safe_input=kit.safe_input)
+    if scenario.oracle is None:
+        raise InputError(f"scenario {scenario.name} has no oracle")
+    model = scenario.oracle(prior.dt)
+    ocp = make_ocp(prior, control)
+    rivals = [CondensedController(kit.models[m], ocp) for m in ("prior", "hybrid")]
+    best = BestOf(SQPController(model, ocp, iterations=ORACLE_ITERATIONS), rivals=rivals, most=1)
+    first = BestOf(SQPController(model, ocp, iterations=FIRST_ITERATIONS), starts=ocp.starts, rivals=rivals)
+    safe = SafeController(best, prior, first=first, safe_input=kit.safe_input)
+    if c.truth:
+        return TrueState(model), safe
+    return make_estimator(model, kit, kit.noise(name), control, observer=c.observer), safe
+
+
+def noise_of(scenario: Scenario, artifact: Kit, recordings: Sequence[Trajectory]) -> dict[str, Array]:
+    """Process noise of every contender that estimates, each by maximum likelihood on the same recordings.
+
+    Args:
+        scenario: The machine, its sensors' noise and input range; where its tasks go beyond the recordings a hybrid has
+            no less than its prior.
+        artifact: Prior and hybrid.
+        recordings: Training recordings with smoothed states.
+    """
+    models = dict(artifact.models)
+    if scenario.oracle is not None:
+        models["oracle"] = scenario.oracle(artifact.models["prior"].dt)
+    errors = {name: process_noise(model, recordings) for name, model in artifact.models.items()}
+    # the plant's own equations err by nothing but the smoothing: start from the better model's errors
+    errors["oracle"] = errors["hybrid"]
+    found = {
+        name: tuned_noise(models[c.model], scenario, errors[c.model], recordings, observer=c.observer)
+        for name, c in CONTENDERS.items()
+        if c.model in models and not c.truth
+    }
+    return no_surer_than_prior(scenario, found)
+
+
+def no_surer_than_prior(scenario: Scenario, noise: Mapping[str, Array]) -> dict[str, Array]:
+    """Process noise by contender; where tasks go beyond the recordings a hybrid has no less than its prior.
+
+    Args:
+        scenario: The machine.
+        noise: What suits the recordings.
+
+    Example:
+        >>> from scenarios.unbalanced_disk import scenario
+        >>> noise = {"prior": np.array([2.0, 5.0]), "hybrid": np.array([1.0, 7.0])}
+        >>> no_surer_than_prior(scenario, noise)["hybrid"].tolist()
+        [2.0, 7.0]
+    """
+    found = dict(noise)
+    if scenario.beyond_recordings:
+        for hybrid, prior in LEAST_NOISE.items():
+            if hybrid in found and prior in found:
+                found[hybrid] = np.maximum(found[hybrid], found[prior])
+    return found
+
+
+def find_noise(
+    scenario: Scenario,
+    artifact: Kit,
+    controllers: Sequence[str],
+    seed: int,
+) -> tuple[Mapping[str, Array], str]:
+    """Process noise of the filters of contenders, and in words where it came from.
+
+    Args:
+        scenario: The machine.
+        artifact: Prior and hybrid.
+        controllers: Names of contenders.
+        seed: Seed of the recordings that the machine makes where the artifact holds no noise.
+
+    Raises:
+        InputError: If the artifact's noise does not fit its models, or it holds none and there is no way to make data.
+
+    Example:
+        ``noise, source = find_noise(scenario, hm.load("runs/golf"), ("hybrid_observer",), 0)``
+    """
+    needed = [name for name in controllers if not CONTENDERS[name].truth]
+    held = {name: artifact.noise(name) for name in artifact.loop.process_noise}
+    lacking = [name for name in needed if name not in held]
+    if not lacking:
+        return no_surer_than_prior(scenario, held), "the model's own" if needed else "no filter"
+    machine = scenario
+    if not any(name in ORACLES for name in lacking):
+        machine = replace(scenario, oracle=None)  # whose noise takes the longest
+    source = f"recordings of the simulated machine (quick, seed {seed}), smoothed by the prior"
+    if kept := [name for name in needed if name in held]:
+        source = f"{', '.join(lacking)}: {source}; {', '.join(kept)}: the model's own"
+    return no_surer_than_prior(
+        scenario, {**_estimated_noise(machine, artifact, lacking, seed), **held}
+    ), source
+
+
+def _estimated_noise(
+    scenario: Scenario, artifact: Kit, lacking: Sequence[str], seed: int
+) -> Mapping[str, Array]:
+    from hybrid_mpc.data.trajectories import load_trajectories
+    from hybrid_mpc.identify.delay import shifted, with_states
+    from hybrid_mpc.identify.smooth import fit_smoother
+
+    if scenario.make_data is None or scenario.control is None:
+        raise InputError(
+            f"the model holds no process noise for {', '.join(lacking)}, and scenario {scenario.name} makes no data to "
+            "estimate it on; run the scenario again"
+        )
+    prior = scenario.prior(artifact.provenance.prior_parameters)
+    with tempfile.TemporaryDirectory() as folder:
+        files = scenario.make_data(Path(folder), seed, "quick")
+        data = load_trajectories(files, scenario.data, outputs=prior.outputs, inputs=prior.inputs)
+    train = [t for t in data.trajectories if t.role == "train"]
+    delay = artifact.input_delay
+    smoother = fit_smoother(prior, shifted(train, delay), scenario.data.dt)
+    return noise_of(scenario, artifact, with_states(train, smoother, delay))

@@ -1,0 +1,165 @@
+"""Where networks can be trained."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import read_json, read_object, sha256, write_json
+from hybrid_mpc.job.folder import Claim
+
+# Settings of a run, those of its networks from a file, and the folder that holds it.
+
+FILE = "run.json"
+WHOLE = ("hidden", "networks", "teacher_steps", "free_run_steps", "horizon", "validation_horizon", "batch")
+MOST = {
+    "hidden": 4096, "networks": 1024, "teacher_steps": 10**8, "free_run_steps": 10**8, "horizon": 10**5,
+    "validation_horizon": 10**6, "batch": 10**6, "decay": 1e12, "learning_rates": 1.0, "anchors": 1e12,
+}  # fmt: skip
+"""Largest values: a file of settings must not ask for more memory than a machine has."""
+NETWORK = (*WHOLE, "decay", "learning_rates", "anchors")
+"""What a file of network settings may hold: arguments of ``identification.TrainingSettings``."""
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """Everything that decides what a run computes.
+
+    Args:
+        scenario: Registered name or path of a user's Python file.
+        data: Recordings of the user (CSV, npz, mat), in order; empty for a simulated machine.
+        seed: Seed of data, training and closed loops.
+        budget: Name of the scenario's budget.
+        inputs: Columns that replace the scenario's inputs; default: the scenario's.
+        outputs: Columns that replace the scenario's outputs; default: the scenario's.
+        time: Column that replaces the scenario's time; default: the scenario's.
+        network_file: JSON object with settings of the networks that replace the budget's, as a search leaves them;
+            default: none.
+        device: Where the networks are trained, ``"cpu"`` or e.g. ``"cuda"``. Default: cpu.
+    """
+
+    scenario: str
+    data: tuple[Path, ...] = ()
+    seed: int = 0
+    budget: str = "quick"
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+    time: str = ""
+    network_file: Path | None = None
+    device: str = "cpu"
+
+    def network(self) -> dict[str, Any]:
+        """Settings of the networks that replace the budget's: what the file holds, checked."""
+        return {} if self.network_file is None else read_network(self.network_file)
+
+    def identity(self) -> dict[str, Any]:
+        """Settings as plain data, with the content hash of every file in place of where it lies.
+
+        Raises:
+            InputError: If a file cannot be read or is none of network settings.
+        """
+        files = [{"name": path.name, "sha256": sha256(path)} for path in self.data]
+        scenario = self.scenario
+        if scenario.endswith(".py") and Path(scenario).is_file():
+            scenario = f"{Path(scenario).name} {sha256(Path(scenario))}"
+        plain = {**asdict(replace(self, data=(), scenario=scenario)), "data": files}
+        network = self.network()  # a run without such a file has no word of it
+        del plain["network_file"]
+        if self.device == "cpu":
+            del plain["device"]  # as in runs from before there was a choice
+        return plain | ({"network": network} if network else {})
+
+
+def read_network(path: Path) -> dict[str, Any]:
+    """Settings of networks from a JSON file.
+
+    Args:
+        path: An object with any of ``NETWORK``; ``learning_rates`` are four numbers.
+
+    Raises:
+        InputError: If the file is missing, damaged or holds anything else.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = (Path(folder) / "settings.json").write_text('{"hidden": 24, "decay": 300}')
+        ...     read_network(Path(folder) / "settings.json")
+        {'hidden': 24, 'decay': 300}
+    """
+    held = read_json(path)
+    if not isinstance(held, dict) or (unknown := sorted(set(held) - set(NETWORK))):
+        what = "no JSON object" if not isinstance(held, dict) else f"also {', '.join(unknown)}"
+        raise InputError(f"{path} holds {what}; network settings are any of: {', '.join(NETWORK)}")
+    for name, value in held.items():
+        numbers = value if name == "learning_rates" and isinstance(value, list) else [value]
+        kinds = (int,) if name in WHOLE else (int, float)
+        good = all(isinstance(v, kinds) and not isinstance(v, bool) and abs(v) <= MOST[name] for v in numbers)
+        positive = good and all(v > 0 or (v == 0 and name in ("decay", "anchors")) for v in numbers)
+        if not positive or (name == "learning_rates" and len(numbers) != 4):
+            needed = f"a whole number from 1 to {MOST[name]}" if name in WHOLE else "a number of 0 or more"
+            needed = "four positive numbers of at most 1" if name == "learning_rates" else needed
+            raise InputError(f"{path}: {name} is {str(value)[:40]}; it must be {needed}")
+    return {name: tuple(v) if isinstance(v, list) else v for name, v in held.items()}
+
+
+class Identified(Protocol):
+    """Settings that tell whether two runs are the same."""
+
+    def identity(self) -> dict[str, Any]:
+        """Settings as plain data."""
+
+
+def claim(settings: Identified) -> Claim:
+    """What a run's folder says of it: its settings, in ``run.json``.
+
+    Args:
+        settings: What the run computes.
+    """
+    identity = settings.identity()
+    return Claim("run", FILE, identity, lambda out: write_json(out / FILE, {"settings": identity}), _held)
+
+
+def _held(out: Path) -> Mapping[str, Any]:
+    """The settings that a folder's note states."""
+    before = read_object(out / FILE).get("settings")
+    if not isinstance(before, dict):
+        raise InputError(f"{out / FILE} is damaged: no settings in it; choose another --out")
+    return before
+
+
+def check_device(device: str) -> None:
+    """Refuse a device that this machine does not have, before a long job starts.
+
+    Args:
+        device: ``"cpu"``, or a name of torch's such as ``"cuda"`` or ``"cuda:1"``.
+
+    Raises:
+        InputError: If torch does not know the name, or cannot compute with 64-bit floats there.
+
+    Example:
+        >>> check_device("cpu")
+        >>> check_device("toaster")
+        Traceback (most recent call last):
+        ...
+        hybrid_mpc.errors.InputError: --device toaster: ...
+    """
+    if device == "cpu":
+        return
+    import torch
+
+    try:
+        torch.ones(1, dtype=torch.float64, device=device).sum().item()
+    except (
+        RuntimeError,
+        AssertionError,
+        NotImplementedError,
+        TypeError,
+        ImportError,
+    ) as error:  # torch raises any of them
+        reason = str(error).strip().splitlines()[0]
+        raise InputError(
+            f"--device {device}: torch cannot compute there ({reason}); leave it out to use cpu"
+        ) from error

@@ -1,0 +1,475 @@
+"""Stage guard: detector and plausibility of the energy guard, learned, kept in the artifact, and tried out."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import chi2
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.job.context import Context
+from hybrid_mpc.job.loops import MODEL, Bench, LoopSpec
+from hybrid_mpc.job.monitor import explained
+from hybrid_mpc.job.stages.compare import is_kept, run_parts
+from hybrid_mpc.job.stages.compare import kept as rows_of
+from hybrid_mpc.job.stages.monitor import RATES, clean_windows, run_calibration
+from hybrid_mpc.kit.artifact import Kit, set_calibration
+from hybrid_mpc.loop.faults import Fault, install
+from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.monitor.calibrate import MAX_EXTRAPOLATION, MIN_BLOCKS, alarm_intervals
+from hybrid_mpc.monitor.detector import Detector
+from hybrid_mpc.monitor.learn import DRIFT, guard_monitor, learn_detector
+from hybrid_mpc.monitor.lengths import BLOCK_S, REST_SPEED, SETTLING_S, block_seconds, samples, seconds
+from hybrid_mpc.monitor.plausibility import learn_plausibility
+from hybrid_mpc.monitor.replay import MonitorTrace, along, replay
+from hybrid_mpc.records import plain
+from hybrid_mpc.scenario import Budget, Scenario, Task
+
+# Nominal loops that the energy guard is learned from: the tasks, over and over, under the hybrid MPC.
+
+CONTENDER = "hybrid_observer"
+"""The controller that the guard is for."""
+BLOCKS = 9
+"""Whole blocks (of five of the machine's seconds) in a loop. Four such loops carry two false alarms an hour, eight
+carry one."""
+FEWEST, MOST = 4, 16
+"""Loops: two for each seed of the budget, within these."""
+FIRST_SEED = 500
+"""Their numbers begin here, away from those of the compared loops."""
+SMALLEST = 0.6
+"""Every time round, the reference is scaled by a factor drawn from here to 1: no two rounds are alike."""
+AGEING, DRIFT_S = (1.0, 1.1, 0.9), 30.0
+"""Where the plant knows it, friction drifts to these shares, in turn, within so many of the machine's seconds:
+ageing, of which the guard is to say nothing."""
+
+
+def nominal_tasks(scenario: Scenario) -> list[Task]:
+    """Tracking tasks in which nothing goes wrong; if there are none, other tasks without faults.
+
+    Raises:
+        InputError: If something goes wrong in every task.
+    """
+    calm = [task for task in scenario.tasks if not task.faults]
+    tasks = [task for task in calm if task.weight is None] or calm
+    if not tasks:
+        raise InputError(
+            f"scenario {scenario.name}: every task brings a fault; the guard is learned from one without"
+        )
+    return tasks
+
+
+def nominal_loops(
+    scenario: Scenario, budget: Budget, model: HybridModel, *, named: str = "", run_seed: int = 0
+) -> list[LoopSpec]:
+    """The loops of a budget: calm tasks in turn, each round of them scaled by its own share.
+
+    Args:
+        scenario: The machine.
+        budget: Whose seeds tell how many.
+        model: The model, whose period and unit of time count.
+        named: Registered name or path of the scenario. Default: its own name.
+        run_seed: Seed of the run. Default 0.
+
+    Raises:
+        InputError: If something goes wrong in every task.
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> from hybrid_mpc.scenario import load_scenario
+        >>> golf, model = load_scenario("golf_robot"), SimpleNamespace(dt=0.02, time_unit=1.0)
+        >>> loops = nominal_loops(golf, golf.budgets["quick"], model)
+        >>> [(loop.task, [fault.value for fault in loop.faults]) for loop in loops]
+        [('track_sine', []), ('track_step', [1.1]), ('track_sine', [0.9]), ('track_step', [])]
+    """
+    tasks, unit = nominal_tasks(scenario), model.time_unit
+    ages = AGEING if knows(scenario, "plant_friction") else AGEING[:1]
+    blocks = BLOCKS * max(round(block_seconds(model.dt, unit) / model.dt), 1)
+    seconds, found = (samples(SETTLING_S, model) + blocks) * model.dt, []
+    for i in range(min(max(2 * budget.seeds, FEWEST), MOST)):
+        task, friction, seed = tasks[i % len(tasks)], ages[i % len(ages)], FIRST_SEED + i
+        drift = Fault(0.0, math.inf, "plant_friction", friction, ramp=DRIFT_S * unit)
+        shares = np.random.default_rng([run_seed, seed]).uniform(
+            SMALLEST, 1.0, math.ceil(seconds / task.duration)
+        )
+        found.append(
+            LoopSpec(
+                named or scenario.name, MODEL, task.name, CONTENDER, monitor="readings", seed=seed, duration=seconds,
+                faults=() if friction == 1.0 else (drift,), run_seed=run_seed, rounds=tuple(shares.tolist()),
+                keep=("numbers", "y", "u"),
+            )
+        )  # fmt: skip
+    return found
+
+
+def stage_of(spec: LoopSpec) -> str:
+    """Name of a nominal loop's checkpoint.
+
+    Args:
+        spec: The loop.
+    """
+    return f"guard/{spec.task}-{spec.seed}"
+
+
+def knows(scenario: Scenario, target: str) -> bool:
+    """Whether the scenario's plant can show a fault of its own."""
+    if scenario.plant is None:
+        return False
+    try:
+        install(scenario.plant(), (Fault(0.0, 1.0, target, 1.0),))
+    except InputError:
+        return False
+    return True
+
+
+# Loops in which something breaks, watched by the learned guard: how soon it is seen, and what it is taken for.
+
+Array = NDArray[np.float64]
+SEED = 600
+"""Number of these loops, away from those that the detector is learned from."""
+SHOWN = ("t", "violation_w", "level_w", "residual_level", "energy_j", "energy_s", "frozen", "scores", "alarm")
+"""What of a trace is kept for the report."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """What breaks in a loop.
+
+    Args:
+        name: Short name.
+        title: In words.
+        target: Of the fault.
+        value: Its size.
+    """
+
+    name: str
+    title: str
+    target: str
+    value: float = 0.0
+
+
+FRICTION = Case("friction", "friction doubles", "plant_friction", 2.0)
+DRIVE = Case("drive", "the drive loses a fifth of its force", "input_gain", 0.8)
+FREEZE = Case("freeze", "the sensor freezes", "measurement_freeze")
+
+
+@dataclass(frozen=True)
+class Samples:
+    """What a loop recorded: ``t`` (n,), ``y`` (n, n_y), ``u`` (n, n_u)."""
+
+    t: Array
+    y: Array
+    u: Array
+
+
+def cases(scenario: Scenario) -> tuple[Case, ...]:
+    """What is tried: friction twice as large, or a weaker drive where the plant knows no friction; a frozen sensor.
+
+    Example:
+        >>> from hybrid_mpc.scenario import load_scenario
+        >>> [case.name for case in cases(load_scenario("golf_robot"))]
+        ['friction', 'freeze']
+    """
+    return FRICTION if knows(scenario, FRICTION.target) else DRIVE, FREEZE
+
+
+def faulted(
+    bench: Bench, named: str, run_seed: int, causes: Mapping[str, tuple[str, ...]]
+) -> tuple[list[dict[str, Any]], dict[str, Array]]:
+    """A loop of each case on the first tracking task, in which something breaks from the middle on.
+
+    Args:
+        bench: The machine and its model, with the detector that the guard listens to.
+        named: Name or path of the scenario.
+        run_seed: Seed of the run.
+        causes: What may break, by name.
+
+    Returns:
+        A row each: what breaks and when, ``delay_s`` to the alarm (None: never), what the diagnosis says, false alarms
+        before, changes of the guard's mode; and the traces for the report, see :func:`read_trace`.
+    """
+    scenario, kit = bench.scenario, bench.kits[MODEL]
+    dt = kit.models["hybrid"].dt
+    task = nominal_tasks(scenario)[0]
+    start = dt * round(0.5 * task.duration / dt)
+    monitor = kit.monitor(kind="guard", task=task.name, diagnose=True)
+    rows: list[dict[str, Any]] = []
+    arrays: dict[str, Array] = {}
+    for case in cases(scenario):
+        fault = Fault(start, math.inf, case.target, case.value)
+        spec = LoopSpec(
+            named, MODEL, task.name, CONTENDER, monitor="guard", guard="rest", seed=SEED, run_seed=run_seed,
+            faults=(fault,),
+        )  # fmt: skip
+        row, result = bench.run(spec, monitor=monitor)
+        # The estimator is deterministic: over the record it says again what it said in the loop.
+        samples = Samples(result.t, result.y, result.u)
+        trace, alarms = explained(monitor, bench.parts(spec)[0], samples, causes, prior=kit.models["prior"])
+        rows.append({**_told(case, task.name, start, trace, alarms), "switches": plain(row.switches)})
+        arrays |= kept(case.name, trace, result.y)
+    return rows, arrays
+
+
+def _told(
+    case: Case, task: str, start: float, trace: MonitorTrace, alarms: list[dict[str, Any]]
+) -> dict[str, Any]:
+    after = np.flatnonzero(trace.alarm & (trace.t >= start - 1e-9))
+    seen = [alarm for alarm in alarms if alarm["end_s"] >= start - 1e-9]
+    return {
+        "fault": case.name,
+        "title": case.title,
+        "target": case.target,
+        "value": case.value,
+        "task": task,
+        "start_s": start,
+        "delay_s": float(trace.t[after[0]]) - start if after.size else None,
+        "diagnosis": seen[0]["diagnosis"] if seen else "",
+        "false_alarms": len(alarm_intervals(trace.alarm[trace.t < start - 1e-9], 1.0)),
+    }
+
+
+def kept(name: str, trace: MonitorTrace, y: Array) -> dict[str, Array]:
+    """A trace's arrays and the first output of ``y`` ``(n, n_y)`` under a name, for the checkpoint.
+
+    Example:
+        >>> z = np.zeros(2)
+        >>> trace = MonitorTrace(z, z, z, z, z, z, z > 0)
+        >>> read_trace(kept("a", trace, np.zeros((2, 1))), "a").alarm.tolist()
+        [False, False]
+    """
+    return {f"{name}/{key}": np.asarray(getattr(trace, key)) for key in SHOWN} | {f"{name}/y": y[:, 0]}
+
+
+def read_trace(arrays: Mapping[str, Any], name: str) -> MonitorTrace:
+    """The trace that :func:`kept` kept; the balances, which the report does not show, are NaN."""
+    own = {key: arrays[f"{name}/{key}"] for key in SHOWN}
+    none = np.full(len(own["t"]), np.nan)
+    return MonitorTrace(dE_model_w=none, dE_measured_w=none, **own)
+
+
+HELD = ("valid", "nominal")
+"""Roles that no parameter was fitted to. Test recordings are kept to try the detector on."""
+
+
+@dataclass(frozen=True)
+class NominalData:
+    """What the detector is learned from.
+
+    Args:
+        runs: Reading numbers, each ``(n, columns)``.
+        source: Where they come from, in words.
+        data_hash: Hash of the data.
+        loops: What was run for it. Default: nothing.
+    """
+
+    runs: Sequence[Array]
+    source: str
+    data_hash: str
+    loops: tuple[dict[str, Any], ...] = field(default=())
+
+
+def guard_stage(context: Context) -> None:
+    """Learn detector and plausibility, put them into the artifact, and try them on faults and test recordings."""
+    scenario, folder = context.scenario, context.out / "model"
+    if scenario.control is None:
+        reason = "the guard's estimator needs the scenario's control problem (input range, sensor noise)"
+        context.save("guard", {"reason": reason}, {})
+        return
+    kit = context.kit
+    model, calibration = kit.models["hybrid"], run_calibration(context)
+    rest = calibration.rest_speed or (REST_SPEED,)
+    data = _nominal_data(context, kit, rest)
+    result: dict[str, Any] = {"source": data.source, "loops": data.loops}
+    found: dict[str, Any] = {}
+    try:
+        found["detector"] = learned(
+            data.runs, model.dt, model.n_y, data.data_hash, rest_speed=rest,
+            time_unit=model.time_unit,
+        )  # fmt: skip
+    except InputError as none:
+        result["reason"] = f"no detector could be learned from {data.source}: {none}"
+    try:
+        found["plausibility"] = learn_plausibility(
+            model, context.smoothed("train"), data_hash=context.dataset.hash
+        )
+    except InputError as none:
+        result["plausibility_reason"] = str(none)
+    set_calibration(folder, replace(calibration, **found))
+    result |= {name: plain(part) for name, part in found.items()}
+    kit, detector = context.kit, found.get("detector")
+    recorded, arrays = _recorded(context, kit, detector)
+    result |= recorded
+    if detector is not None and scenario.plant is not None and any(not t.faults for t in scenario.tasks):
+        context.progress.update("faults", 0, 1, "loops in which something breaks")
+        bench, s = Bench(scenario, {MODEL: kit}), context.settings
+        result["faults"], more = faulted(bench, s.scenario, s.seed, scenario.causes)
+        arrays |= more
+    context.save("guard", result, arrays)
+
+
+def learned(
+    runs: Sequence[Array],
+    dt: float,
+    n_q: int,
+    data_hash: str,
+    *,
+    rest_speed: ArrayLike = REST_SPEED,
+    time_unit: float = 1.0,
+) -> Detector:
+    """The detector for the lowest of the rates 1, 2, 5 and 10 an hour that the data are long enough for.
+
+    Of a machine with another second (:func:`~hybrid_mpc.data.scales.time_unit`) they are 1, 2, 5 and 10 in 3600 of
+    these.
+
+    Args:
+        runs: Reading numbers of nominal runs, each ``(n, columns)``.
+        dt: Period [s].
+        n_q: Degrees of freedom.
+        data_hash: Hash of the data.
+        rest_speed: That of the monitor which made the numbers. Default 0.2, as the monitor's.
+        time_unit: The machine's second [s], the model's. Default 1.
+
+    Raises:
+        InputError: If they are too short for any of them (it says how much is needed), or hold an alarm.
+
+    Example:
+        >>> learned([np.zeros((3000, 11))], 0.02, 1, "")
+        Traceback (most recent call last):
+        hybrid_mpc.errors.InputError: 1.0 min in whole blocks of 5 s are too little: 10 false alarms an hour need ...
+    """
+    block_s = block_seconds(dt, time_unit)
+    blocks = _whole_blocks(runs, block_s, dt)
+    for rate in RATES:
+        if blocks >= blocks_needed(rate):
+            return learn_detector(
+                runs, dt, n_q, drift=DRIFT, false_alarms_per_hour=rate / time_unit, rest_speed=rest_speed,
+                data_hash=data_hash, time_unit=time_unit,
+            )  # fmt: skip
+    least, most = (blocks_needed(rate) * block_s / 60 for rate in (RATES[-1], RATES[0]))
+    raise InputError(
+        f"{blocks * block_s / 60:.1f} min in whole blocks of {block_s:g} s are too little: {RATES[-1] / time_unit:g} "
+        f"false alarms an hour need {least:g} min, {RATES[0] / time_unit:g} an hour {most:g} min; record the machine "
+        "for longer and learn with hybrid-mpc monitor MODEL NOMINAL.csv --learn RATE"
+    )
+
+
+def blocks_needed(rate: float) -> int:
+    """Blocks that a rate of false alarms needs, half of it for either of the detector's two alarms.
+
+    Args:
+        rate: Wanted false alarms in 3600 of the machine's seconds, of which a block has five.
+
+    Example:
+        >>> [blocks_needed(rate) for rate in (1.0, 2.0, 10.0)]
+        [72, 36, 30]
+    """
+    return max(MIN_BLOCKS, int(np.ceil(3600.0 / (0.5 * rate * BLOCK_S * MAX_EXTRAPOLATION) - 1e-9)))
+
+
+def _whole_blocks(runs: Sequence[Array], block_s: float, dt: float) -> int:
+    """Whole blocks of ``block_s`` [s] in all runs."""
+    size = max(round(block_s / dt), 1)
+    return sum(len(run) // size for run in runs)
+
+
+def _nominal_data(context: Context, kit: Kit, rest: tuple[float, ...]) -> NominalData:
+    """Loops of the simulated machine, like those that the guard will watch; else undisturbed recordings."""
+    scenario, model = context.scenario, kit.models["hybrid"]
+    if scenario.plant is not None and any(not task.faults for task in scenario.tasks):
+        return _from_loops(context, model)
+    monitor, estimator = guard_monitor(model, rest_speed=rest), kit.observer()
+    whole = context.dataset.whole
+    numbers = [
+        replay(monitor, estimator, recording, on_progress=say).numbers
+        for recording, say in along(whole, context.progress.update)
+    ]
+
+    def inside(roles: tuple[str, ...]) -> list[Array]:
+        return [
+            rows[_settled(recording.t, start, end, model)]
+            for recording, rows in zip(whole, numbers, strict=True)
+            for start, end in clean_windows(context, recording, roles)
+        ]
+
+    runs, block_s = inside(HELD), block_seconds(model.dt, model.time_unit)
+    source = "recordings that nothing was trained on"
+    if _whole_blocks(runs, block_s, model.dt) < blocks_needed(RATES[-1]):
+        runs = inside((*HELD, "train"))
+        source = (
+            "undisturbed recordings, also those of the training, which the model fits better than new ones"
+        )
+    return NominalData(runs, source, context.dataset.hash)
+
+
+def _settled(t: Array, start: float, end: float, model: HybridModel) -> NDArray[np.bool_]:
+    """The samples of a stretch whose readings hold nothing from before it."""
+    return np.asarray((t >= start + seconds(SETTLING_S, model)) & (t <= end))
+
+
+def _from_loops(context: Context, model: HybridModel) -> NominalData:
+    settings = context.settings
+    wanted = nominal_loops(
+        context.scenario, context.budget, model, named=settings.scenario, run_seed=settings.seed
+    )
+    parts = {stage_of(spec): [spec] for spec in wanted}
+    run_parts(context, {stage: part for stage, part in parts.items() if not is_kept(context, stage, part)})
+    content, runs = hashlib.sha256(), []
+    told: list[dict[str, Any]] = []
+    for spec in wanted:
+        (row,) = rows_of(context, stage_of(spec))
+        friction = spec.faults[0].value if spec.faults else 1.0
+        told.append(
+            {
+                "task": row.task,
+                "seed": row.seed,
+                "friction": friction,
+                "seconds": row.seconds,
+                "cost": row.cost,
+            }
+        )
+        runs.append(row.arrays["numbers"][samples(SETTLING_S, model) :])
+        for name in ("y", "u"):
+            content.update(np.ascontiguousarray(row.arrays[name], dtype="<f8").tobytes())
+    minutes = sum(row["seconds"] for row in told) / 60
+    source = f"{len(told)} loops of the simulated machine under the hybrid MPC, {minutes:.1f} min"
+    return NominalData(runs, source, content.hexdigest(), tuple(told))
+
+
+def _recorded(
+    context: Context, kit: Kit, detector: Detector | None
+) -> tuple[dict[str, Any], dict[str, Array]]:
+    """Recordings with test windows, watched by the guard's monitor, or without detector by that of the thresholds.
+
+    Without either the readings are kept and nothing but a blind monitor alarms.
+    """
+    model = kit.models["hybrid"]
+    monitor = kit.monitor(kind="energy" if detector is None else "guard", diagnose=True)
+    estimator = kit.observer()
+    tested = [r for r in context.dataset.whole if clean_windows(context, r, ("test",))]
+    found: list[dict[str, Any]] = []
+    arrays: dict[str, Array] = {}
+    watched, starts = 0.0, 0
+    for recording, say in along(tested, context.progress.update):
+        trace, alarms = explained(
+            monitor, estimator, recording, context.scenario.causes, say, prior=kit.models["prior"]
+        )
+        found += [{"file": recording.name, **alarm} for alarm in alarms]
+        edges = np.diff(trace.alarm.astype(int), prepend=0) == 1
+        for window in clean_windows(context, recording, ("test",)):
+            inside = _settled(recording.t, *window, model)
+            watched += float(inside.sum() * model.dt)
+            starts += int((edges & inside).sum())
+        if not arrays or (alarms and not arrays["recorded/alarm"].any()):  # one is shown, best with an alarm
+            arrays = kept("recorded", trace, recording.y)
+            shown = recording.name
+    result: dict[str, Any] = {"test": {"seconds": watched, "alarms": starts, "list": found}}
+    if watched > 0:
+        result["test"]["at_most_per_hour"] = 0.5 * float(chi2.ppf(0.95, 2 * starts + 2)) / (watched / 3600)
+    if arrays:
+        result["shown"] = shown
+    return result, arrays

@@ -1,0 +1,383 @@
+"""Stages data, prior, training and evaluation: from CSV files to judged models."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hybrid_mpc.data.excitation import check_excitation
+from hybrid_mpc.data.scales import time_unit
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import read_document, read_document_arrays, write_document
+from hybrid_mpc.identify.settings import TrainingSettings
+from hybrid_mpc.identify.step import Scaling
+from hybrid_mpc.identify.train import Fault, Trained
+from hybrid_mpc.job.context import Context
+from hybrid_mpc.job.engine import WORKERS, run_jobs
+from hybrid_mpc.records import plain, record
+from hybrid_mpc.scenario import load_scenario
+
+if TYPE_CHECKING:
+    from hybrid_mpc.data.trajectories import Trajectory
+    from hybrid_mpc.identify.evaluate import FreeRun
+    from hybrid_mpc.identify.prior_result import PriorFit
+    from hybrid_mpc.identify.settings import TrainingSettings
+    from hybrid_mpc.identify.smooth import Smoother
+    from hybrid_mpc.identify.train import Trained
+    from hybrid_mpc.machine.torch_prior import Prior
+
+
+# Trained networks on disk, as the jobs keep them between their stages: JSON and plain arrays, a pair a kind.
+
+
+@dataclass(frozen=True)
+class _Note:
+    """What stands in the JSON file beside the arrays."""
+
+    settings: TrainingSettings
+    scaling: Scaling
+    faults: tuple[Fault, ...]
+
+
+def save_trained(folder: Path, trained: Trained) -> None:
+    """Write the networks of one kind."""
+    kind = trained.settings.kind
+    arrays: dict[str, Any] = {f"weights.{n}": v for n, v in trained.weights.items()}
+    arrays |= {f"curve.{n}": v for n, v in trained.curve.items()}
+    arrays |= {"own.validation": trained.validation, "own.skipped": trained.skipped}
+    note = _Note(trained.settings, trained.scaling, trained.faults)
+    write_document(folder / f"{kind}.json", plain(note), arrays)
+
+
+def is_trained(folder: Path, settings: TrainingSettings) -> bool:
+    """Whether a folder holds finished networks of these settings.
+
+    Raises:
+        InputError: If it holds networks of the same kind and other settings.
+
+    Example:
+        >>> is_trained(Path("nowhere"), TrainingSettings("pgrnn", 4, 1, 5, 5, seed=0, warm=2))
+        False
+    """
+    if not (folder / f"{settings.kind}.json").is_file():
+        return False
+    held, own = (asdict(s) for s in (load_trained(folder, settings.kind).settings, settings))
+    changed = [f"{name} {held[name]} instead of {own[name]}" for name in own if held[name] != own[name]]
+    if changed:
+        raise InputError(
+            f"{folder} holds finished networks of other settings ({settings.kind}: {'; '.join(changed)}), from another "
+            "version or scenario; choose another --out"
+        )
+    return True
+
+
+def load_trained(folder: Path, kind: str) -> Trained:
+    """Read the networks of one kind.
+
+    Raises:
+        InputError: If a file is missing or damaged.
+    """
+    path = folder / f"{kind}.json"
+    remedy = f"delete {kind}.* in {folder}, and the same command trains these networks anew"
+    note = record(_Note, read_document(path, remedy), str(path))
+    arrays = read_document_arrays(path, remedy)
+    part: dict[str, dict[str, Any]] = {"weights": {}, "curve": {}, "own": {}}
+    for name, value in arrays.items():
+        group, _, key = name.partition(".")
+        part[group][key] = value
+    return Trained(
+        note.settings,
+        note.scaling,
+        part["weights"],
+        part["own"]["validation"],
+        part["curve"],
+        part["own"]["skipped"],
+        note.faults,
+    )
+
+
+# Stage prior of a machine whose input acts later: parameters and delay together.
+
+DELAY_RUNS = 5.0
+"""Longest free runs [the machine's seconds] that parameters and delay are fitted to: a swing near the top multiplies
+every error."""
+
+
+def prior_with_delay(context: Context) -> None:
+    """Fit the prior's parameters and the input's delay together, to free runs, and smooth the measurements."""
+    from hybrid_mpc.identify.delay import fit_physics, smoothed
+
+    make, spec = context.scenario.prior, context.spec
+    train, valid, test = (context.trajectories(role) for role in ("train", "valid", "test"))
+    physics = fit_physics(
+        make, train, valid, dt=spec.dt, length=DELAY_RUNS * context.time_unit, largest_delay=spec.largest_delay,
+        on_progress=lambda done, total, text: context.progress.update("free runs", done, total, text),
+    )  # fmt: skip
+    every = smoothed(make, physics, [*train, *valid, *test], spec.dt)
+    notes = {
+        "nominal": make().values,
+        "units": {p.name: p.unit for p in make().parameters_spec},
+        "smoother": {"sigma": physics.sigma, "walk": physics.walk},
+        "delay": physics.delay,
+    }
+    arrays = {f"{t.name}/{key}": getattr(t, key) for t in every for key in ("x", "xdot")}
+    context.save("prior", {**asdict(physics.fit), **notes}, arrays)
+    for warning in physics.fit.warnings:
+        context.progress.warn(f"fit of the prior: {warning}")
+
+
+ROUNDS = ("polynomially smoothed", "smoothed by the prior")
+"""States that the prior is fitted to, one after the other."""
+MODELS = ("phy_nominal", "phy", "rnn", "pgrnn", "mopgrnn")
+
+
+def check_data(context: Context) -> None:
+    """Read the user's recordings before anything is written: bad ones leave no folder behind."""
+    if context.settings.data:
+        doubts(context)  # reads, checks and keeps the recordings
+    elif context.scenario.make_data is None:
+        raise InputError(
+            f"scenario {context.scenario.name} is a real machine: give its recordings with --data FILE.csv "
+            f"(once for each file)"
+        )
+
+
+def data_stage(context: Context) -> None:
+    """Take the user's recordings, or let a simulated machine make its own; note what is in them, and all doubts."""
+    if not context.settings.data:
+        assert context.scenario.make_data is not None
+        context.progress.update("files", 0, 1, "recording the simulated machine")
+        context.scenario.make_data(context.out / "data", context.settings.seed, context.settings.budget)
+    dataset, warnings = context.dataset, doubts(context)
+    roles = ("train", "valid", "test")
+    context.save(
+        "data",
+        {
+            "files": dataset.files,
+            "hash": dataset.hash,
+            "cuts": [{"file": c.file, "from_s": c.start, "to_s": c.end, "why": c.why} for c in dataset.cuts],
+            "pieces": {role: len(context.trajectories(role)) for role in roles},
+            "seconds": {role: sum(len(t.t) * t.dt for t in context.trajectories(role)) for role in roles},
+            "warnings": list(warnings),
+        },
+    )
+    for warning in warnings:
+        context.progress.warn(warning)
+
+
+def doubts(context: Context) -> tuple[str, ...]:
+    """What is doubtful about the recordings, and what the training ones do not excite; some of it is refused.
+
+    Args:
+        context: The run.
+
+    Raises:
+        InputError: If a recording is bad, an input does nothing in those for training, or an output.
+    """
+    found = tuple(str(finding) for finding in context.dataset.findings)
+    prior = context.scenario.prior()
+    free = sum(not p.fixed for p in prior.parameters_spec)
+    train = context.trajectories("train")
+    if not train:  # the prior's fit says so
+        return found
+    return (
+        *found,
+        *check_excitation(train, inputs=prior.inputs, outputs=prior.outputs, parameters=free),
+    )
+
+
+def prior_stage(context: Context) -> None:
+    """Fit the prior's parameters, let it smooth the measurements, fit it to these, smooth once more."""
+    make = context.scenario.prior
+    if context.spec.largest_delay:
+        prior_with_delay(context)
+        return
+    fit, smoother, train, valid = fit_and_smooth(
+        make,
+        context.trajectories("train"),
+        context.trajectories("valid"),
+        context.spec.dt,
+        on_progress=context.progress.update,
+    )
+    arrays = {
+        f"{t.name}/{key}": getattr(t, key)
+        for t in (*train, *valid, *smoother.smooth(context.trajectories("test")))
+        for key in ("x", "xdot")
+    }
+    notes = {
+        "nominal": make().values,
+        "units": {p.name: p.unit for p in make().parameters_spec},
+        "smoother": {"sigma": smoother.sigma, "walk": smoother.walk},
+    }
+    context.save("prior", {**asdict(fit), **notes}, arrays)
+    for warning in fit.warnings:
+        context.progress.warn(f"fit of the prior: {warning}")
+
+
+def fit_and_smooth(
+    make: Callable[..., Prior],
+    train: Sequence[Trajectory],
+    valid: Sequence[Trajectory],
+    dt: float,
+    *,
+    methods: Sequence[str] | None = None,
+    on_progress: Callable[[str, int, int, str], None] = lambda key, done, total, text: None,
+) -> tuple[PriorFit, Smoother, list[Trajectory], list[Trajectory]]:
+    """Fit a prior to polynomially smoothed states, smooth by it, fit it to these, smooth once more.
+
+    Args:
+        make: Prior class or factory ``(values=None) -> Prior``.
+        train: Training trajectories.
+        valid: Validation trajectories.
+        dt: Model period [s].
+        methods: Methods of the fit. Default: those of :func:`~hybrid_mpc.identify.fit.fit_prior`.
+        on_progress: ``(round, done, total, text)`` with a title of ``ROUNDS``.
+
+    Returns:
+        The last fit, the last smoother, and training and validation trajectories smoothed by it.
+    """
+    from hybrid_mpc.identify.fit import DEFAULT_METHODS, fit_prior
+    from hybrid_mpc.identify.smooth import fit_smoother
+
+    fit: PriorFit | None = None
+    unit = time_unit(train, dt)
+    for title in ROUNDS:
+        fit = fit_prior(
+            make, train, valid, dt=dt, before=fit, methods=methods or DEFAULT_METHODS, time_unit=unit,
+            on_progress=lambda done, total, text, key=title: on_progress(key, done, total, text),  # type: ignore[misc]
+        )  # fmt: skip
+        smoother = fit_smoother(make(fit.values), [*train, *valid], dt, time_unit=unit)
+        train, valid = smoother.smooth(train), smoother.smooth(valid)
+    assert fit is not None
+    return fit, smoother, list(train), list(valid)
+
+
+def training_stage(context: Context) -> None:
+    """Train the networks of every kind, two kinds side by side."""
+    from hybrid_mpc.identify.settings import KINDS
+
+    folder = context.out / "checkpoints" / "training"
+    values = context.result("prior")["values"]
+    todo = [k for k in reversed(KINDS) if not is_trained(folder, training_settings(context, k))]
+    jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
+        kind: (
+            _train_kind,
+            (context.settings.scenario, values, context.smoothed("train"), context.smoothed("valid"),
+             training_settings(context, kind), folder, context.settings.device),
+        )
+        for kind in todo
+    }  # fmt: skip
+    run_jobs(jobs, context.progress.update, WORKERS)
+    trained = {kind: trained_models(context, kind) for kind in KINDS}
+    best = {k: float(t.validation.min()) for k, t in trained.items()}
+    skipped = {k: int(t.skipped.sum()) for k, t in trained.items()}
+    faults = {k: [asdict(f) for f in t.faults] for k, t in trained.items()}
+    context.save("training", {"validation_e_sim_s": best, "skipped_updates": skipped, "faults": faults})
+
+
+def trained_models(context: Context, kind: str) -> Trained:
+    """A finished training from the run's folder."""
+    return load_trained(context.out / "checkpoints" / "training", kind)
+
+
+def evaluation_stage(context: Context) -> None:
+    """Free runs of every model over the test trajectories; the figures show them whole."""
+    from hybrid_mpc.identify.evaluate import free_runs, judged, score
+    from hybrid_mpc.identify.smooth import Smoother
+
+    prior, spec = context.result("prior"), context.spec
+    phy = context.scenario.prior(prior["values"])
+    smoother = Smoother(phy, spec.dt, tuple(prior["smoother"]["sigma"]), tuple(prior["smoother"]["walk"]))
+    whole = context.smoothed("test")
+    shown, test = (judged(whole, smoother, context.warm, length) for length in (None, spec.free_run))
+    scores: dict[str, Any] = {}
+    files: dict[str, Any] = {}
+    arrays: dict[str, Any] = {}
+    for i, name in enumerate(MODELS):
+        context.progress.update("models", i, len(MODELS), name)
+        members = _members(context, name, phy)
+        all_scores = []
+        for k, (step, h0) in enumerate(members):
+            runs = free_runs(step, phy, test, context.warm, h0)
+            all_scores.append(asdict(score(runs)))
+            if k == 0:
+                files[name] = {f: asdict(score(part)) for f, part in _by_file(runs).items()}
+                for run in free_runs(step, phy, shown, context.warm, h0):
+                    for key in ("t", "u", "x", "x_hat", "y", "energy_measured_w", "energy_model_w"):
+                        arrays[f"{name}/{run.name}/{key}"] = getattr(run, key)
+        scores[name] = {"best": all_scores[0], "networks": all_scores}
+    context.save("evaluation", {"scores": scores, "by_file": files, "runs": [t.name for t in whole]}, arrays)
+
+
+def _by_file(runs: Sequence[FreeRun]) -> dict[str, list[FreeRun]]:
+    """Free runs by the stem of the recording they come from."""
+    files: dict[str, list[FreeRun]] = {}
+    for run in runs:
+        files.setdefault(run.name.split("#")[0], []).append(run)
+    return files
+
+
+def _members(context: Context, name: str, phy: Prior) -> list[tuple[Any, Any]]:
+    """Steps of one model with their initial hidden states, the deployed one first."""
+    import torch
+
+    from hybrid_mpc.identify.step import PriorStep
+    from hybrid_mpc.identify.train import stack_for
+
+    dt, double = context.spec.dt, torch.float64
+    if name in ("phy_nominal", "phy"):
+        prior = phy if name == "phy" else context.scenario.prior()
+        return [(PriorStep(prior, dt), torch.zeros(0, dtype=double))]
+    trained = trained_models(context, name)
+    order = np.argsort(trained.validation, kind="stable")
+    h0 = torch.zeros(stack_for(phy, trained.settings).n_h, dtype=double)
+    return [(trained.step(phy, dt, int(i)), h0) for i in order]
+
+
+def training_settings(context: Context, kind: str) -> TrainingSettings:
+    """What the networks of a kind are trained with: the budget, and what the run's own file replaces of it."""
+    from hybrid_mpc.identify.settings import TrainingSettings
+
+    b = context.budget
+    settings = TrainingSettings(
+        kind=kind,  # type: ignore[arg-type]
+        hidden=b.hidden,
+        networks=b.networks,
+        teacher_steps=b.teacher_steps,
+        free_run_steps=b.free_run_steps,
+        seed=context.settings.seed,
+        warm=context.warm,
+        decay=b.decay,
+        anchors=b.anchors,
+    )
+    return replace(settings, **context.settings.network())
+
+
+def _train_kind(
+    scenario: str,
+    values: dict[str, float],
+    training: Sequence[Trajectory],
+    validation: Sequence[Trajectory],
+    settings: TrainingSettings,
+    folder: Path,
+    device: str,
+    report: Callable[[int, int, str], None],
+) -> None:
+    """Job of one process: train one kind and leave its files."""
+    from hybrid_mpc.identify.train import train
+
+    prior = load_scenario(scenario).prior(values)
+    trained = train(
+        prior,
+        training,
+        validation,
+        settings,
+        checkpoint=folder / f"{settings.kind}.safetensors",
+        device=device,
+        on_progress=lambda done, total, error: report(done, total, f"validation E_sim {error:.4g}"),
+    )
+    save_trained(folder, trained)

@@ -1,0 +1,682 @@
+"""Stage report: figures, ``report.html`` and ``results.json``."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from markupsafe import Markup
+
+from hybrid_mpc.files import write_json
+from hybrid_mpc.job.context import Context
+from hybrid_mpc.job.controllers import CONTENDERS
+from hybrid_mpc.job.stages.figures import OBSERVER_TITLES, Figures, draw_all
+from hybrid_mpc.job.stages.identify import training_settings
+from hybrid_mpc.job.stages.monitor import RATES
+from hybrid_mpc.job.stages.results import CONTROLLERS, MODELS, OBSERVERS, collect
+from hybrid_mpc.plots.style import name_of
+from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, write_report
+
+# What the report says in general about each section: plain words for a reader new to the method.
+#
+# Every text is ``Markup`` (our own HTML, trusted). Words about one scenario are supplied by the caller as
+# plain strings, which the page escapes.
+
+TITLES: Mapping[str, str] = {
+    "data": "Data",
+    "models": "Prior and models",
+    "training": "Training",
+    "free_run": "Free runs: how well the models predict",
+    "export": "Export",
+    "control": "Closed loops",
+    "estimation": "Estimation: are the observers as sure as they may be",
+    "timing": "Time of a controller step",
+    "monitor": "Energy monitor",
+    "guard": "Energy guard",
+    "analysis": "Linear analysis",
+    "glossary": "Names and definitions",
+}
+
+_M = Markup
+
+TEXTS: Mapping[str, tuple[Markup, ...]] = {
+    "data": (
+        _M(
+            "The recordings were brought to one uniform time grid, and cut wherever the distance between "
+            "two samples was too large to interpolate. Positions were measured; velocities and "
+            "accelerations come first from a short polynomial around every sample, to which the prior is "
+            "fitted, and then from the prior's own equations, which know where the input jumped and leave a "
+            "slowly changing force to be explained."
+        ),
+        _M(
+            "The shading tells what a part is used for: <b>training</b> data fit the parameters, "
+            "<b>validation</b> data choose among the trained networks, and <b>test</b> data are seen by "
+            "no model before the errors on this page are computed. The phase portrait shows position "
+            "against velocity: where test data leave the region that training has covered, a model "
+            "must extrapolate."
+        ),
+    ),
+    "models": (
+        _M(
+            "The <b>prior</b> is the equation of motion that an engineer would write down, with a few "
+            "physical parameters. Its published (nominal) parameters seldom fit the machine on the bench, "
+            "so they are first fitted to the training data. The <b>fitted prior is the honest "
+            "baseline</b>: every percentage on this page refers to it."
+        ),
+        _M(
+            "The networks are small recurrent ones (GRU). Their memory, the hidden state <i>h</i>, can "
+            "take up what the prior leaves out, such as friction that depends on the past. The hybrid "
+            "keeps the prior and lets the network correct its acceleration only: that a velocity is the "
+            "derivative of a position needs no learning."
+        ),
+    ),
+    "training": (
+        _M(
+            "Two objectives fall together: the error of the predicted motion, and the error of the energy "
+            "balance. The dashed lines are the bounds <i>c</i><sub>j</sub>. At each stage the larger of the "
+            "two ratios loss / bound is lowered, and the bounds never rise; so neither "
+            "objective is bought at the expense of the other."
+        ),
+        _M(
+            "Training starts with measured states at the model's input (teacher forcing). At the dotted line "
+            "it turns to free runs, in which the model is fed its own predictions, as a controller will use "
+            "it. The lowest row is the error on validation data; the network that is best there is kept."
+        ),
+    ),
+    "free_run": (
+        _M(
+            "In a free run a model gets the measured input and an initial state, and nothing else: from "
+            "then on it lives on its own predictions. Errors accumulate, which makes this a much harder "
+            "test than predicting one step. The initial state comes from a short measured past, the "
+            "same for every model; that past also warms the networks' memory up, and is not scored."
+        ),
+        _M(
+            "Read from top to bottom: the states, the input, the energy balances of the measurement and of "
+            "the hybrid, and their distance, the violation. A good model stays on the black line, and its "
+            "violation stays near zero. Bars compare the errors of all models on test data; the dashed "
+            "line is the fitted prior, and shorter bars are better."
+        ),
+    ),
+    "export": (
+        _M(
+            "The trained model leaves the training framework (PyTorch) as plain text and numbers, and is "
+            "built again as a symbolic function (CasADi) that the controller can differentiate. Both are "
+            "then evaluated at the same points in double precision."
+        ),
+        _M(
+            "The table gives the largest difference at random points of the data's magnitude, at zero, and far "
+            "outside (a thousand times). Differences around 10<sup>−16</sup> are the rounding of double "
+            "precision itself."
+        ),
+    ),
+    "control": (
+        _M(
+            "A model predictive controller computes, in every period, the input that is best over the next "
+            "second or more according to its model, applies the first part, and starts again with the next "
+            "measurement. The same controller with the same weights runs here with different models: the "
+            "fitted prior, the hybrid, and an <b>oracle</b> that knows the equations of the simulated "
+            "machine."
+        ),
+        _M(
+            "The dashed black line is the reference. The cost is computed on the machine's true state. The "
+            "oracle marks what better modelling could gain at most; the <i>gap closed</i> is the share of "
+            "the distance between prior and oracle that the hybrid covers:"
+            '<span class="formula">gap closed = (<i>J</i><sub>prior</sub> − <i>J</i><sub>hybrid</sub>) / '
+            "(<i>J</i><sub>prior</sub> − <i>J</i><sub>oracle</sub>)</span>"
+            "It is summed over the tasks in which prior and oracle differ by more than twice the standard error."
+        ),
+    ),
+    "estimation": (
+        _M(
+            "An observer predicts every measurement before it comes, and says how far off it may be. The "
+            "<b>NIS</b> (normalised innovation squared) is the square of how far off it was, over the square "
+            "it had allowed for: an observer that knows how wrong it can be has an average of one (for each "
+            "measured output), above that it is too sure of itself, below too cautious."
+        ),
+        _M(
+            "The lower picture asks whether one error tells of the next. Bars outside the green band mean "
+            "that it does: there is something in the measurement, such as friction that the model lacks or "
+            "an encoder's steps, that the observer does not use. On recordings of a real machine few observers "
+            "pass these tests to the letter; how far they are off tells which noise to look at."
+        ),
+    ),
+    "timing": (
+        _M(
+            "A controller step is everything between measurement and input: estimation, prediction, "
+            "optimisation and monitoring. It must end within the control period, the black line. "
+            "Both axes of time are logarithmic."
+        ),
+        _M(
+            "For real time the slow steps count, not the typical one. The right panel shows which share of "
+            "the steps took longer than a given time; where a curve crosses the dotted 1 % line lies its "
+            "99th percentile (p99). These numbers belong to the computer that ran this job, and are the "
+            "only ones on this page that change when the same job runs again."
+        ),
+    ),
+    "monitor": (
+        _M(
+            "The prior's energy balance says how much power enters, leaves and is stored. As long as "
+            "nothing unknown acts on the machine, the balance of the measurement and that of the model "
+            "agree. A push by hand, a collision or a jammed bearing moves energy that the model knows "
+            "nothing about, and the violation rises. At rest no power flows, whatever pushes: there the "
+            "residual force is judged, less what sticking friction may hold."
+        ),
+        _M(
+            "Grey is the violation at each sample, red-orange the averaged level that is compared with the "
+            "threshold (dashed). Pink shading marks alarms. The green bar at the bottom marks "
+            "stretches known to be undisturbed: an alarm that starts there is a false one. Both thresholds "
+            "were calibrated on undisturbed data."
+        ),
+    ),
+    "guard": (
+        _M(
+            "The guard looks at the same violation sooner and closer: residual forces in units of their own "
+            "scatter, summed up for as long as they last; the energy by which the model, running on its own "
+            "for half a second, departs from the machine; and whether the sensor repeats itself while motion "
+            "is predicted. What is ordinary was learned where nothing was wrong, for a wanted rate of "
+            "false alarms, and lies in the model's folder: <code>hybrid-mpc monitor</code> and "
+            "<code>hybrid-mpc control --guard</code> use it."
+        ),
+        _M(
+            "From top to bottom: violation, residual force, energy of the free run, what is compared with the "
+            "thresholds (1 is an alarm), and the measured position. Pink shading marks alarms, lines what "
+            "breaks and what the guard does. What explains an alarm is a change of the prior's "
+            "parameters; where the prior's form is not the machine's, its size is off by that."
+        ),
+    ),
+    "analysis": (
+        _M(
+            "Around a point of rest the models can be replaced by linear ones. The poles tell how the "
+            "machine moves when left alone: inside the unit circle a motion dies out, outside it grows, "
+            "and the closer to the circle the longer it lasts. The hybrid has more poles than the prior, "
+            "since its memory has a motion of its own; those near the origin die out within a few samples."
+        ),
+        _M(
+            "The Bode plot shows how strongly, and how late, the machine answers to a sinusoidal input of "
+            "each frequency. Where both curves agree the network left the prior alone. The linear picture "
+            "is valid near that point of rest only, and friction at very low speed is not linear at all."
+        ),
+    ),
+    "glossary": (
+        _M(
+            "<b>Models</b><dl>"
+            "<dt>prior, nominal</dt><dd>The equation of motion with published or data-sheet parameters.</dd>"
+            "<dt>prior, fitted</dt><dd>The same equation, its parameters fitted to the training data. The "
+            "baseline of every percentage.</dd>"
+            "<dt>RNN</dt><dd>A recurrent network without any physics.</dd>"
+            "<dt>PGRNN</dt><dd>Physics-guided recurrent network: fitted prior and network together, trained "
+            "on the error of motion.</dd>"
+            "<dt>MOPGRNN (hybrid)</dt><dd>Multi-objective PGRNN: the same, trained on the error of motion "
+            "and the energy balance. It is the model that is exported and used for control.</dd>"
+            "<dt>oracle</dt><dd>The equations of the simulated machine itself. Only a simulation "
+            "has one.</dd>"
+            "</dl>"
+        ),
+        _M(
+            "<b>Simulation error.</b> The mean absolute deviation of the state's derivative along free runs, "
+            "over <i>N</i> runs of duration <i>T</i><sub>l</sub>; with λ &gt; 0 late deviations count less:"
+            '<span class="formula"><i>E</i><sub>sim</sub> = 1/<i>N</i> Σ<sub>l</sub> '
+            "1/<i>T</i><sub>l</sub> ∫<sub>0</sub><sup><i>T</i><sub>l</sub></sup> "
+            "‖<i>ẋ</i>(<i>t</i>) − <i>x̂̇</i>(<i>t</i>)‖<sub>1</sub> / (1 + λ<i>t</i>) d<i>t</i></span>"
+            "The source of the method prints it in seconds, and so does this page."
+        ),
+        _M(
+            "<b>Energy balance.</b> The equation of motion times the velocity: stored power plus losses "
+            "minus the power put in. For a pendulum of inertia <i>J</i>, mass <i>m</i>, distance <i>l</i> "
+            "of the centre of mass and damping <i>d</i>:"
+            '<span class="formula">Δ<i>E</i> = <i>J</i> <i>φ̈</i> <i>φ̇</i> + <i>m g l</i> <i>φ̇</i> '
+            "sin <i>φ</i> + <i>d</i> <i>φ̇</i><sup>2</sup> − <i>u</i> <i>φ̇</i>&nbsp;&nbsp;[W]</span>"
+            "It is zero along the prior's own motion. Δ<i>E</i><sub>S</sub> puts the measured motion "
+            "in, Δ<i>E</i><sub>M</sub> the model's. It is a power, although the source calls it an energy."
+        ),
+        _M(
+            "<b>Violation.</b> The distance of the two balances:"
+            '<span class="formula">Δ = |Δ<i>E</i><sub>M</sub> − Δ<i>E</i><sub>S</sub>|&nbsp;&nbsp;[W]</span>'
+            "What both leave out cancels; what only one of them shows remains."
+        ),
+    ),
+}
+
+
+def paragraphs(section: str) -> tuple[Markup, ...]:
+    """General text of a section.
+
+    Args:
+        section: ``"data"``, ``"models"``, ``"training"``, ``"free_run"``, ``"export"``, ``"control"``,
+            ``"estimation"``, ``"timing"``, ``"monitor"``, ``"guard"``, ``"analysis"`` or ``"glossary"``.
+
+    Returns:
+        Its paragraphs, as HTML.
+
+    Example:
+        >>> len(paragraphs("training"))
+        2
+    """
+    return TEXTS[section]
+
+
+# What a run says of its energy guard: in results.json, and as a section of the report.
+
+
+def guard_tables(results: dict[str, Any]) -> list[Table]:
+    """Thresholds, faults, and alarms in the recordings with test data."""
+    guard = results["guard"]
+    if guard["data_hash"] is None:
+        return []
+    detector = guard["details"]["detector"]
+    low = detector["interval"]
+    rows: list[tuple[Any, ...]] = [
+        ("sum of residual forces [deviations]", guard["force_threshold"], f"{low[0]:.3g} to {low[1]:.3g}"),
+        ("power of the free run [deviations]", guard["energy_threshold"], f"{low[2]:.3g} to {low[3]:.3g}"),
+    ]
+    caption = (
+        f"Thresholds for {guard['false_alarms_per_hour']:g} false alarms an hour, both together; learned from "
+        f"{60 * guard['hours']:.1f} min with hash {guard['data_hash'][:16]}."
+    )
+    tables = [Table(("what is compared", "threshold", "5 to 95 % of a bootstrap"), rows, caption)]
+    if guard["faults"] is not None:
+        tables.append(_fault_table(guard["details"]["faults"]))
+    alarms = guard["details"]["test"]["list"]
+    if alarms:
+        tables.append(
+            Table(
+                ("recording", "from [s]", "to [s]", "what explains it"),
+                [(a["file"], a["start_s"], a["end_s"], a["diagnosis"] or None) for a in alarms],
+                "Alarms over the recordings that hold test data, all of each.",
+            )
+        )
+    return tables
+
+
+def _fault_table(faults: list[dict[str, Any]]) -> Table:
+    rows = [
+        (
+            row["title"],
+            row["start_s"],
+            "never" if row["delay_s"] is None else f"{row['delay_s']:.2f}",
+            row["false_alarms"],
+            row["diagnosis"] or None,
+            ", ".join(f"{s['after'].lower()} at {s['t_s']:.2f} s" for s in row["switches"]) or "stays normal",
+        )
+        for row in faults
+    ]
+    columns = (
+        "what breaks",
+        "from [s]",
+        "alarm after [s]",
+        "alarms before",
+        "what the diagnosis says",
+        "guard",
+    )
+    return Table(columns, rows, f"Loops of the task {faults[0]['task']} in which something breaks, one each.")
+
+
+def guard_words(results: dict[str, Any]) -> tuple[str, ...]:
+    """What this run's detector was learned from, what it does not promise, and the plan's plausibility."""
+    guard, details = results["guard"], results["guard"].get("details", {})
+    if guard["data_hash"] is None:
+        words = [f"{guard['reason'][0].upper()}{guard['reason'][1:]}."]
+    else:
+        rate, wanted = guard["false_alarms_per_hour"], RATES[0] / details["detector"].get("time_unit", 1.0)
+        words = [f"The detector was learned from {details['source']}."]
+        if rate > wanted:
+            alarms = "one false alarm" if wanted == 1 else f"{wanted:g} false alarms"
+            words[0] += (
+                f" They are too short for {alarms} an hour, so the thresholds are for {rate:g}; a longer run "
+                f"(budget full), or recordings of the machine with hybrid-mpc monitor --learn {wanted:g}, give better "
+                "ones."
+            )
+        test = details["test"]
+        if test["seconds"] > 0:
+            words.append(
+                f"In {test['seconds']:.0f} s of test recordings it alarmed {_times(test['alarms'])}; that bounds its "
+                f"rate there at {test['at_most_per_hour']:.3g} an hour (95 %)."
+            )
+            if details["loops"]:
+                words[-1] += (
+                    " They were driven otherwise, and wider, than the loops: an alarm there says that the model is "
+                    "less right where the loops do not go."
+                )
+        else:
+            words.append("No test recording is long enough to try it on.")
+    if "plausibility" in details:
+        ordinary = details["plausibility"]
+        words.append(
+            f"For bounds in the plan: {100 * ordinary['quantile']:g} % of {ordinary['samples']} training samples have "
+            f"a model balance within a bound of {ordinary['tolerance_w']:.3g} W in the median."
+        )
+    elif "plausibility_reason" in details:
+        words.append(f"There is no plausibility for the plan: {details['plausibility_reason']}.")
+    return tuple(words)
+
+
+def _times(n: int) -> str:
+    return {0: "never", 1: "once", 2: "twice"}.get(n, f"{n} times")
+
+
+def report_stage(context: Context) -> None:
+    """Draw, write the report, and last the results."""
+    results = collect(context)
+    figures = draw_all(context)
+    write_report(context.out / "report.html", _report(context, results, figures))
+    write_json(context.out / "results.json", results)
+    context.save("report", results)
+
+
+def command(context: Context) -> str:
+    """The command line that makes this run."""
+    s = context.settings
+    words = ["hybrid-mpc", "run", s.scenario, *(w for f in s.data for w in ("--data", f.name))]
+    for option, values in (("--input-column", s.inputs), ("--output-column", s.outputs)):
+        words += [w for v in values for w in (option, v)]
+    words += ["--time-column", s.time] if s.time else []
+    words += ["--settings", s.network_file.name] if s.network_file else []
+    return shlex.join([*words, "--seed", str(s.seed), "--budget", s.budget])
+
+
+def _report(context: Context, results: dict[str, Any], figures: Figures) -> Report:
+    tables: dict[str, Table | None] = {
+        "data": _data_table(results),
+        "models": _prior_table(context),
+        "free_run": _score_table(results),
+        "export": _export_table(results),
+        "control": _control_table(results),
+        "estimation": _observer_table(results),
+        "timing": _timing_table(results),
+        "monitor": _alarm_table(results),
+        "analysis": _pole_table(results),
+    }
+    notes, several = _notes(context, results), {"guard": guard_tables(results)}
+    sections = tuple(
+        Section(
+            TITLES[key],
+            notes["instead"].get(key, paragraphs(key)),
+            figures.get(key, ()),
+            [t for t in (tables.get(key), *several.get(key, ())) if t is not None and t.rows],
+            notes["after"].get(key, ()),
+        )
+        for key in TITLES
+    )
+    versions = ", ".join(f"{name} {v}" for name, v in results["versions"].items())
+    return Report(
+        f"hybrid-mpc: {context.scenario.name}",
+        context.scenario.title,
+        context.scenario.description,
+        command(context),
+        _summary(context, results),
+        sections,
+        f"seed {results['seed']}, budget {results['budget']}; {versions}",
+    )
+
+
+def _summary(context: Context, results: dict[str, Any]) -> list[KeyFigure]:
+    identification, timing = results["identification"], results["timing"]
+    output = context.scenario.prior().outputs[0]
+    rmse = {m: _first(value) for m, value in identification["rmse"].items() if m in MODELS}
+    ratio = identification["details"]["hybrid_over_phy"]
+    e_sim = identification["e_sim_s"]
+    summary = [
+        KeyFigure(
+            "Free-run error (RMSE) of the hybrid on unseen data", rmse["mopgrnn"], output.unit,
+            f"fitted prior: {_text(rmse['phy'])} {output.unit}", _verdict(ratio["rmse"], 1.0),
+        ),
+        KeyFigure(
+            "Simulation error E_sim of the hybrid", e_sim["mopgrnn"], "s",
+            f"fitted prior: {_text(e_sim['phy'])}, RNN: {_text(e_sim['rnn'])}", _verdict(ratio["e_sim_s"], 1.0),
+        ),
+    ]  # fmt: skip
+    control = results["control"]
+    if control["gap_closed"] is not None:
+        costs = ", ".join(f"{n} {_text(control[n]['cost'])}" for n in CONTROLLERS)
+        gap = control["gap_closed"]
+        summary.append(
+            KeyFigure(
+                "Gap from prior to oracle closed by the hybrid",
+                gap,
+                "",
+                f"mean over the tasks that tell controllers apart; summed costs: {costs}",
+                "good" if gap > 0 else "bad",
+            )
+        )
+    if timing["misses"] is not None:
+        p99 = timing["controller_step_ms"]["p99"]
+        summary.append(
+            KeyFigure("Controller step, 99th percentile", p99, "ms", f"period: {timing['period_ms']:g} ms",
+                      _verdict(p99 / timing["period_ms"], 1.0))
+        )  # fmt: skip
+    if results["monitor"]["alarms"] is not None:
+        clean = results["monitor"]["details"]["clean"]
+        summary.append(
+            KeyFigure("Alarms of the energy monitor", len(results["monitor"]["alarms"]), "",
+                      f"{clean['alarms']} of them in {clean['seconds']:.0f} s known to be undisturbed",
+                      "good" if clean["alarms"] == 0 else "bad")
+        )  # fmt: skip
+    return summary
+
+
+def _verdict(ratio: float | None, most: float) -> Any:
+    return "plain" if ratio is None else "good" if ratio < most else "bad"
+
+
+def _text(value: float | None) -> str:
+    return "diverged" if value is None else f"{value:.3g}"
+
+
+def _notes(context: Context, results: dict[str, Any]) -> dict[str, dict[str, tuple[str, ...]]]:
+    instead: dict[str, tuple[str, ...]] = {}
+    after: dict[str, tuple[str, ...]] = {}
+    if results["control"]["gap_closed"] is None:
+        reason = results["control"]["gap_closed_reason"]
+        if results["control"]["hybrid"]["cost"] is None:
+            instead["control"] = (f"There is no closed loop here: {reason}. The controller was built and timed "
+                                  "on recorded states instead.",)  # fmt: skip
+        else:
+            after["control"] = (f"The gap closed is not defined: {reason}.",)
+    tested = results["estimation"]
+    without = [r["reason"] for r in (tested, *(tested[n] for n in OBSERVERS)) if r and "reason" in r]
+    if without:
+        after["estimation"] = (f"Not tested: {'; '.join(dict.fromkeys(without))}.",)
+    if results["data"]["details"]["warnings"]:
+        after["data"] = tuple(f"Warning: {text}" for text in results["data"]["details"]["warnings"])
+    after["training"] = _anchor_words(training_settings(context, "mopgrnn").anchors)
+    warnings = context.result("prior")["warnings"]
+    if warnings:
+        after["models"] = ("Warnings of the fit: " + "; ".join(warnings) + ".",)
+    if results["monitor"]["alarms"] is not None:
+        method = results["monitor"]["details"]["calibration"]["method"]
+        after["monitor"] = (_monitor_words(context, results), f"Calibration: {method}.")
+    else:
+        after["monitor"] = (f"No alarms here: {results['monitor']['reason'].rstrip('.')}.",)
+    after["monitor"] += coverage_words(results["monitor"]["details"].get("recordings", ()))
+    after["guard"] = guard_words(results)
+    points = results["analysis"]["details"]
+    if "reason" in results["analysis"]:
+        instead["analysis"] = (f"There is no analysis here: {results['analysis']['reason'].rstrip('.')}.",)
+    reasons = [
+        f"{m}: {points[m]['fixed_point_reason']}" for m in points if "fixed_point_reason" in _dict(points[m])
+    ]
+    if reasons:
+        after["analysis"] = tuple(reasons)
+    return {"instead": instead, "after": after}
+
+
+def _anchor_words(weight: float) -> tuple[str, ...]:
+    """What the report says of anchors.
+
+    Example:
+        >>> _anchor_words(0.0), len(_anchor_words(10.0))
+        ((), 1)
+    """
+    words = "Corrections were asked to fade where no recording comes near; the prior stands alone there"
+    return (f"{words} (anchors, weight {weight:g}).",) if weight else ()
+
+
+def _dict(value: Any) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def _monitor_words(context: Context, results: dict[str, Any]) -> str:
+    clean = results["monitor"]["details"]["clean"]
+    words = (
+        f"In {clean['seconds']:.0f} s known to be undisturbed there were {clean['alarms']} alarms, "
+        f"in the {clean['test_seconds']:.0f} s of test data among them {clean['test_alarms']}."
+    )
+    load = context.result("monitor").get("load")
+    if load is None:
+        return words
+    seen = "never" if load["delay_s"] is None else f"after {load['delay_s']:.2f} s"
+    return f"{words} The unknown load in the closed loop was reported {seen}."
+
+
+def coverage_words(recordings: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+    """What the monitor could not judge, in a sentence; nothing if that is but the warm-up.
+
+    Args:
+        recordings: Of each the seconds that were judged and that were not, by reason.
+
+    Example:
+        >>> coverage_words([{"judged_s": 4.0, "warm_up_s": 0.3, "missing_s": 0.0, "not_finite_s": 2.0}])
+        ('Not judged: 2 s in which model or estimator gave no finite number.',)
+    """
+    why = {
+        "missing_s": "with missing samples",
+        "not_finite_s": "in which model or estimator gave no finite number",
+    }
+    sums = {key: sum(float(row[key]) for row in recordings) for key in why}
+    told = [f"{sums[key]:.3g} s {words}" for key, words in why.items() if sums[key] > 0]
+    return (f"Not judged: {', '.join(told)}.",) if told else ()
+
+
+def _data_table(results: dict[str, Any]) -> Table:
+    data = results["data"]
+    rows: list[tuple[Any, ...]] = [(role, seconds) for role, seconds in data["details"]["seconds"].items()]
+    rows += [
+        (f"cut: {c['file']}, {c['start_s']:.2f} to {c['end_s']:.2f} s: {why}", c["end_s"] - c["start_s"])
+        for c, why in zip(data["cuts"], data["details"]["why_cut"], strict=True)
+    ]
+    caption = f"{len(data['files'])} files; content hash {data['hash'][:16]}."
+    return Table(("part", "length [s]"), rows, caption)
+
+
+def _prior_table(context: Context) -> Table:
+    prior = context.result("prior")
+    rows = [
+        (p.label, p.description, prior["nominal"][p.name], prior["values"][p.name],
+         prior["standard_errors"].get(p.name, "fixed"))
+        for p in context.scenario.prior().parameters_spec
+    ]  # fmt: skip
+    caption = "Parameters of the prior. Standard errors suppose that the prior's structure is right."
+    return Table(("parameter", "meaning", "nominal", "fitted", "standard error"), rows, caption)
+
+
+def _score_table(results: dict[str, Any]) -> Table:
+    found = results["identification"]
+    groups = [{m: _first(found[key][m]) for m in MODELS} for key in ("e_sim_s", "rmse", "balance_violation")]
+    unit = next((k for m in MODELS for k in found["rmse"][m] or ()), "[-]").partition(" ")[2]
+    base = [group["phy"] for group in groups]
+    rows = [
+        (name_of(m), *(g[m] for g in groups), *(_percent(g[m], b) for g, b in zip(groups, base, strict=True)))
+        for m in MODELS
+    ]
+    columns = ("model", "E_sim [s]", f"RMSE {unit}", "violation [W]", "E_sim", "RMSE", "violation")
+    return Table(columns, rows, "Free runs on unseen data; the last columns against the fitted prior.")
+
+
+def _first(value: Any) -> float | None:
+    """The first number of an object by name, or the number itself."""
+    return next(iter(value.values())) if isinstance(value, Mapping) else value
+
+
+def _percent(value: float | None, base: float | None) -> str:
+    return "–" if value is None or not base else f"{100 * (value / base - 1):+.0f} %"
+
+
+def _export_table(results: dict[str, Any]) -> Table:
+    e = results["export"]
+    rows = [
+        ("values", e["parity_max_abs_error"], "1e-12"),
+        ("Jacobians", e["jacobian_max_abs_error"], "1e-10"),
+    ]
+    caption = "Largest difference between the exported models and PyTorch, relative to the outputs' scale."
+    return Table(
+        ("compared", "largest difference", "allowed"), [(a, f"{b:.1e}", c) for a, b, c in rows], caption
+    )
+
+
+def _control_table(results: dict[str, Any]) -> Table | None:
+    if results["control"]["hybrid"]["cost"] is None:
+        return None
+    details = results["control"]["details"]
+    names = [n for n in CONTENDERS if any(n in cells for cells in details["tasks"].values())]
+    rows = [
+        (task, *(_cost(cells.get(name)) for name in names), _gap(details["gap_closed_by_task"][task]))
+        for task, cells in details["tasks"].items()
+    ]
+    caption = (
+        "Closed-loop cost J on the true state: mean over seeds with its 95 % interval (none for one seed). Gap: "
+        "share of the distance from the better baseline to the measuring oracle that the hybrid with observer "
+        "covers; a dash where baseline and oracle do not differ enough to say."
+    )
+    return Table(("task", *(n.replace("_", ", ") for n in names), "gap closed"), rows, caption)
+
+
+def _cost(cell: dict[str, Any] | None) -> str:
+    if cell is None:
+        return "–"
+    mean, half = cell["cost"]["mean"], cell["cost"]["ci95"]
+    if mean is None:
+        return "diverged"
+    return f"{mean:.3g}" + (f" ± {half:.1g}" if half is not None else "")
+
+
+def _gap(gap: dict[str, Any]) -> str:
+    return "–" if gap["value"] is None else f"{gap['value']:.2f}"
+
+
+def _observer_table(results: dict[str, Any]) -> Table:
+    found = {OBSERVER_TITLES[n]: results["estimation"][n] for n in OBSERVERS}
+    rows = [
+        (title, r["mean_nis"], f"{r['nis_low']:.2f} to {r['nis_high']:.2f}", f"{100 * r['nis_inside']:.0f} %",
+         f"{r['ljung_box']:.0f}", f"{r['ljung_box_limit']:.0f}", r["samples"])
+        for title, r in found.items()
+        if r is not None and r["mean_nis"] is not None
+    ]  # fmt: skip
+    columns = ("observer", "mean NIS", "consistent", "below 95 %", "Ljung-Box", "white below", "samples")
+    return Table(columns, rows, "Innovations on test recordings, the first 25 samples of each left out.")
+
+
+def _timing_table(results: dict[str, Any]) -> Table | None:
+    timing = results["timing"]
+    if timing["misses"] is None:
+        return None
+    ms = timing["controller_step_ms"]
+    row = (ms["median"], ms["p95"], ms["p99"], ms["max"], timing["period_ms"], timing["misses"])
+    return Table(("median [ms]", "p95 [ms]", "p99 [ms]", "max [ms]", "period [ms]", "misses"), (row,))
+
+
+def _alarm_table(results: dict[str, Any]) -> Table | None:
+    if results["monitor"]["alarms"] is None:
+        return None
+    rows = [(a["file"], a["start_s"], a["end_s"]) for a in results["monitor"]["alarms"]]
+    calibration = results["monitor"]["details"]["calibration"]
+    caption = (
+        f"Alarms over the whole recordings; thresholds {calibration['threshold_w']:.3g} W and "
+        f"{calibration['residual_threshold']:.3g} N m (N for a slider)."
+    )
+    return Table(("recording", "from [s]", "to [s]"), rows, caption)
+
+
+def _pole_table(results: dict[str, Any]) -> Table:
+    rows = []
+    for model, points in results["analysis"]["details"].items():  # empty where the stage could not run
+        if not isinstance(points, dict):
+            continue
+        for point, a in points.items():
+            if point.startswith("fixed_point"):
+                continue
+            slow = [f"{w:.2f} ({z:.2f})" for w, z in
+                    list(zip(a["frequency_rad_s"], a["damping"], strict=True))[:2] if w is not None]  # fmt: skip
+            rows.append((model, point, ", ".join(slow), a["stable"], a["stabilisable"], a["detectable"]))
+    columns = ("model", "point", "slowest poles: rad/s (damping)", "stable", "stabilisable", "detectable")
+    return Table(columns, rows, "Linearisations at rest and at working speed.")

@@ -1,0 +1,672 @@
+"""Studies that are ready: they need models only."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from itertools import count, product
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import read_bytes
+from hybrid_mpc.job.control import DEFAULT_CONTROLLERS, parsed_fault, selected_tasks
+from hybrid_mpc.job.controllers import CONTENDERS, ORACLES
+from hybrid_mpc.job.loops import Intervals, LoopSpec
+from hybrid_mpc.kit.assembly import SOLVERS
+from hybrid_mpc.loop.faults import SIGNAL_TARGETS, Fault
+from hybrid_mpc.records import MOST_SEED, known, plain, record
+from hybrid_mpc.scenario import load_scenario, scenario_of
+
+# What differs from draw to draw of a study: parameters of the plant, and faults of random kind, size and instant.
+
+LATE = "late"
+"""A target beside those of :class:`~hybrid_mpc.loop.faults.Fault`: solves miss their deadline."""
+
+
+@dataclass(frozen=True)
+class FaultKind:
+    """One kind of fault and how large it gets.
+
+    Args:
+        target: Target of a :class:`~hybrid_mpc.loop.faults.Fault`, or ``"late"``: solves miss their deadline.
+        low: Smallest size.
+        high: Largest size; drawn uniformly between.
+        signed: Whether it takes either sign. Default: no.
+        ramp: Time [s] over which it grows. Default: at once.
+        length: Shortest and longest duration [s] of this kind, which then always ends. Default: the common one.
+
+    Raises:
+        InputError: If the target is unknown or a range is empty.
+
+    Example:
+        >>> FaultKind("plant_friction", 1.5, 4.0).signed
+        False
+    """
+
+    target: str
+    low: float = 0.0
+    high: float = 0.0
+    signed: bool = False
+    ramp: float = 0.0
+    length: Sequence[float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.target != LATE and not str(self.target).startswith("plant_"):
+            known(self.target, (*SIGNAL_TARGETS, LATE), "fault target")
+        _span((self.low, self.high), f"random fault {self.target}: low to high")
+        if self.length is not None:
+            span = _span(self.length, f"random fault {self.target}: length", above=0.0)
+            object.__setattr__(self, "length", span)
+
+
+@dataclass(frozen=True)
+class RandomFaults:
+    """Faults that a draw takes at random.
+
+    Args:
+        kinds: What can happen; mappings of :class:`FaultKind`'s fields are taken too.
+        at_once: Fewest and most kinds in one draw. Default: 1 to 3.
+        start: Earliest and latest instant [s] at which one begins. Default: 1.4 to 2.
+        length: Shortest and longest duration [s] of one that ends. Default: 0.2 to 2.
+        lasting: Share of those that never end. Default: a half.
+
+    Raises:
+        InputError: If there is no kind, more are asked for than there are, or a range is empty.
+
+    Example:
+        >>> some = RandomFaults([{"target": "input_gain", "low": 0.7, "high": 0.9}], at_once=(1, 1))
+        >>> faults, late = some.drawn(np.random.default_rng(0))
+        >>> faults[0].target, 0.7 <= faults[0].value <= 0.9, late
+        ('input_gain', True, ())
+    """
+
+    kinds: Sequence[FaultKind | Mapping[str, Any]]
+    at_once: Sequence[int] = (1, 3)
+    start: Sequence[float] = (1.4, 2.0)
+    length: Sequence[float] = (0.2, 2.0)
+    lasting: float = 0.5
+
+    def __post_init__(self) -> None:
+        kinds = tuple(
+            k if isinstance(k, FaultKind) else record(FaultKind, k, f"random_faults.kinds[{i}]")
+            for i, k in enumerate(self.kinds)
+        )
+        object.__setattr__(self, "kinds", kinds)
+        object.__setattr__(self, "start", _span(self.start, "random_faults: start", least=0.0))
+        object.__setattr__(self, "length", _span(self.length, "random_faults: length", above=0.0))
+        fewest, most = (int(n) for n in _span(self.at_once, "random_faults: at_once", least=0.0))
+        object.__setattr__(self, "at_once", (fewest, most))
+        if most < 1 or most > len(kinds):
+            raise InputError(f"random_faults: at_once goes up to {most}; there are {len(kinds)} kinds")
+        if not 0.0 <= self.lasting <= 1.0:
+            raise InputError(f"random_faults: lasting is a share from 0 to 1, got {self.lasting}")
+
+    def drawn(self, rng: np.random.Generator) -> tuple[tuple[Fault, ...], Intervals]:
+        """Faults, and the intervals [s] in which solves are late."""
+        n = int(rng.integers(self.at_once[0], self.at_once[1] + 1))
+        faults, late = [], []
+        for i in rng.choice(len(self.kinds), size=n, replace=False).tolist():
+            kind = self.kinds[i]
+            assert isinstance(kind, FaultKind)
+            size, start = rng.uniform(kind.low, kind.high), float(rng.uniform(self.start[0], self.start[1]))
+            sign = float(rng.choice([-1.0, 1.0])) if kind.signed else 1.0
+            shortest, longest = kind.length or self.length
+            length, lasts = rng.uniform(shortest, longest), rng.random() < self.lasting
+            end = math.inf if lasts and kind.length is None else start + float(length)
+            if kind.target == LATE:
+                late.append((start, end))
+            else:
+                faults.append(Fault(start, end, kind.target, float(sign * size), ramp=kind.ramp))
+        return tuple(faults), tuple(late)
+
+    def examples(self) -> tuple[Fault, ...]:
+        """The largest fault of each kind, to be checked against a plant."""
+        found = []
+        for kind in self.kinds:
+            assert isinstance(kind, FaultKind)
+            if kind.target != LATE:
+                found.append(Fault(0.0, 1.0, kind.target, kind.high, ramp=kind.ramp))
+        return tuple(found)
+
+
+def generator(seed: int, draw: int, what: str) -> np.random.Generator:
+    """Random numbers of one thing in one draw, whatever else is drawn.
+
+    Example:
+        >>> float(generator(0, 3, "m").random()) == float(generator(0, 3, "m").random())
+        True
+    """
+    key = hashlib.sha256(f"{seed}/{draw}/{what}".encode()).digest()
+    return np.random.default_rng(int.from_bytes(key[:16], "big"))
+
+
+def factors(vary: Sequence[tuple[str, float]], seed: int, draw: int) -> tuple[tuple[str, float], ...]:
+    """Factors of the plant's parameters, uniform in ``1 - span`` to ``1 + span``.
+
+    Args:
+        vary: Parameters with the span of each.
+        seed: Seed of the study's draws.
+        draw: Number of the draw.
+
+    Example:
+        >>> [(name, round(factor, 3)) for name, factor in factors([("m", 0.2)], seed=0, draw=1)]
+        [('m', 1.194)]
+    """
+    return tuple(
+        (name, float(1.0 + span * generator(seed, draw, name).uniform(-1.0, 1.0))) for name, span in vary
+    )
+
+
+def _span(
+    values: Sequence[float], what: str, *, least: float = -math.inf, above: float = -math.inf
+) -> tuple[float, float]:
+    """Two numbers in order.
+
+    Raises:
+        InputError: If they are not.
+    """
+    try:
+        low, high = (float(v) for v in values)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{what}: two numbers are needed, got {values!r}") from error
+    if not (math.isfinite(low) and math.isfinite(high) and low <= high and low >= least and low > above):
+        raise InputError(f"{what}: [{low}, {high}] is no range of numbers that is allowed here")
+    return low, high
+
+
+# What a study consists of, and the runs that it expands to.
+
+ESTIMATORS: Mapping[str, tuple[bool, bool] | None] = {
+    "own": None,
+    "plain": (False, False),
+    "observer": (True, False),
+    "truth": (False, True),
+}
+"""By name: whether it follows an unknown load, and whether it is handed the truth; None for the controller's own."""
+MONITORS = ("own", "none", "energy")
+"""``own``: what ``hybrid-mpc control`` runs, the uncalibrated energy monitor beside a hybrid; ``energy``: the same with
+the artifact's calibration, so that it alarms."""
+MOST_DRAWS = 1_000_000
+"""Most seeds, and most draws, of a study: all of them are in memory."""
+MOST_HORIZON = 10_000
+"""Longest horizon [periods] of a study: a plan is in memory with its derivatives."""
+AXES = ("models", "tasks", "controllers", "estimators", "solvers", "horizons", "monitors", "faults", "seeds")
+
+
+@dataclass(frozen=True)
+class Study:
+    """Closed loops of every combination of what is listed.
+
+    Lists may be given as any sequence; they become tuples, so that a study can be compared and hashed.
+
+    Args:
+        scenario: Registered name or path of a user's file.
+        models: Artifact folders (or folders of runs) by label; a single folder gets the label ``"model"``.
+        tasks: Names of tasks, or their beginnings. Default: all.
+        controllers: Names of contenders. Default: prior and hybrid, with observer.
+        estimators: Names in :data:`ESTIMATORS`: another estimator for each of the controllers. Default: its own.
+        solvers: ``"rti"``, ``"sqp"``, ``"ipopt"``. Default: the first.
+        horizons: Periods; None for the task's own, which is the default.
+        monitors: Names in :data:`MONITORS`. Default: ``"own"``.
+        faults: Sets of faults, each one text (``"plant_friction=2@1.5 + input_gain=0.8"``; ``"none"``), a
+            :class:`~hybrid_mpc.loop.faults.Fault` or a sequence of either. Default: one empty set.
+        vary: Parameters of the plant, and by what share each is varied at most in either direction. Default: none.
+        random_faults: Faults that a draw takes at random, see :class:`~hybrid_mpc.job.study.RandomFaults`. Default:
+        none.
+        draws: How many times the random things are drawn; all controllers meet the same draws. Default: 1.
+        seeds: Numbers of the loops, or how many. Default: 10.
+        seed: Seed of the draws.
+        duration: Longest duration of a loop [s]. Default: the task's own.
+        name: For tables and the report.
+
+    Raises:
+        InputError: If a name is unknown (with the nearest one), a number is impossible, or a combination is.
+
+    Example:
+        >>> study = Study("golf_robot", "runs/golf/model", tasks=["track"], vary={"m": 0.2}, draws=3, seeds=2)
+        >>> study.size, len({run.id for run in study.runs()})
+        (24, 24)
+        >>> Study("golf_robot", "m", controllers=["hybird"])
+        Traceback (most recent call last):
+        hybrid_mpc.errors.InputError: no controller 'hybird'; did you mean 'hybrid'? There are: prior, prior_observer, \
+hybrid, hybrid_observer, oracle, oracle_state
+    """
+
+    scenario: str
+    models: str | Path | Mapping[str, str | Path] | Sequence[tuple[str, str]]
+    tasks: Sequence[str] = ()
+    controllers: Sequence[str] = DEFAULT_CONTROLLERS
+    estimators: Sequence[str] = ("own",)
+    solvers: Sequence[str] = ("rti",)
+    horizons: Sequence[int | None] = (None,)
+    monitors: Sequence[str] = ("own",)
+    faults: Sequence[str | Fault | Sequence[str | Fault]] = ((),)
+    vary: Mapping[str, float] | Sequence[tuple[str, float]] = ()
+    random_faults: RandomFaults | Mapping[str, Any] | None = None
+    draws: int = 1
+    seeds: int | Sequence[int] = 10
+    seed: int = 0
+    duration: float | None = None
+    name: str = "study"
+
+    def __post_init__(self) -> None:
+        for field, value in _normal(self).items():
+            object.__setattr__(self, field, value)
+        for name in AXES:
+            values = getattr(self, name)
+            if not values and name != "tasks":
+                raise InputError(f"study: {name} is empty; leave it out for the default")
+            if len(set(values)) != len(values):
+                raise InputError(f"study: {name} lists something twice: {values}")
+        for what, table in (("controllers", CONTENDERS), ("estimators", ESTIMATORS), ("solvers", SOLVERS)):
+            for word in getattr(self, what):
+                known(word, table, what[:-1])
+        for word in self.monitors:
+            known(word, MONITORS, "monitor")
+        for label in self.folders:
+            if not re.fullmatch(r"[A-Za-z0-9_.-]*[A-Za-z0-9_-]", label):
+                raise InputError(f"study: a model's label is made of letters, digits, _ . -; got {label!r}")
+        self._check_numbers()
+        self._check_combinations()
+
+    @property
+    def folders(self) -> dict[str, Path]:
+        """Folders of the models by label."""
+        return {label: Path(folder) for label, folder in cast("Sequence[tuple[str, str]]", self.models)}
+
+    @property
+    def spans(self) -> tuple[tuple[str, float], ...]:
+        """Varied parameters with their shares."""
+        return cast("tuple[tuple[str, float], ...]", self.vary)
+
+    @property
+    def loop_seeds(self) -> tuple[int, ...]:
+        """Numbers of the loops."""
+        return cast("tuple[int, ...]", self.seeds)
+
+    @property
+    def fault_sets(self) -> tuple[tuple[Fault, ...], ...]:
+        """Sets of faults."""
+        return cast("tuple[tuple[Fault, ...], ...]", self.faults)
+
+    @property
+    def contenders(self) -> tuple[str, ...]:
+        """Controllers with their estimators, each once."""
+        pairs = product(self.controllers, self.estimators)
+        return tuple(dict.fromkeys(_contender(c, e) for c, e in pairs))
+
+    @property
+    def axes(self) -> dict[str, int]:
+        """How many of each thing there are; the product is the number of runs."""
+        lengths = {
+            name: len(getattr(self, name)) for name in AXES if name not in ("controllers", "estimators")
+        }
+        tasks = len(selected_tasks(load_scenario(self.scenario), self.tasks))
+        return {**lengths, "tasks": tasks, "controllers": len(self.contenders), "draws": self.draws}
+
+    @property
+    def size(self) -> int:
+        """Number of runs."""
+        return math.prod(self.axes.values())
+
+    def runs(self) -> Iterator[LoopSpec]:
+        """The runs, those with the same controller next to each other; none is kept, so there may be millions."""
+        tasks = [t.name for t in selected_tasks(load_scenario(self.scenario), self.tasks)]
+        drawn = [self._drawn(i) for i in range(self.draws)]
+        outer = product(
+            self.folders, tasks, self.contenders, self.solvers, self.horizons, self.monitors, self.fault_sets
+        )
+        number = count()
+        for model, task, contender, solver, horizon, monitor, faults in outer:
+            for draw, (parameters, some, late) in enumerate(drawn):
+                for seed in self.loop_seeds:
+                    yield LoopSpec(
+                        self.scenario, model, task, contender, solver, horizon, monitor,
+                        faults, some, late, parameters, draw, seed, self.duration, number=next(number),
+                    )  # fmt: skip
+
+    def identity(self) -> dict[str, Any]:
+        """The study as plain data, without where its models lie."""
+        whole: dict[str, Any] = plain(asdict(self))
+        return {**whole, "models": list(self.folders)}
+
+    def with_models(self, models: Mapping[str, str | Path]) -> Study:
+        """The same study of other models."""
+        return replace(self, models=models)
+
+    def _drawn(self, i: int) -> tuple[tuple[tuple[str, float], ...], tuple[Fault, ...], Intervals]:
+        faults: tuple[tuple[Fault, ...], Intervals] = ((), ())
+        if isinstance(self.random_faults, RandomFaults):
+            faults = self.random_faults.drawn(generator(self.seed, i, "faults"))
+        return factors(self.spans, self.seed, i), *faults
+
+    def _check_numbers(self) -> None:
+        lists: tuple[tuple[str, Sequence[int | None], int, int], ...] = (
+            ("draws", [self.draws], 1, MOST_DRAWS),
+            ("seed", [self.seed], 0, MOST_SEED),
+            ("seeds", self.loop_seeds, 0, MOST_SEED),
+            ("horizons", [h for h in self.horizons if h is not None], 1, MOST_HORIZON),
+        )
+        for name, values, least, most in lists:
+            for number in values:
+                whole = isinstance(number, int) and not isinstance(number, bool)
+                if not whole or not least <= number <= most:  # type: ignore[operator]
+                    raise InputError(
+                        f"study: {name}: whole numbers from {least} to {most} are needed, got {str(number)[:40]}"
+                    )
+        for name, span in self.spans:
+            if not (isinstance(span, int | float) and 0.0 < span < 1.0):
+                raise InputError(f"study: vary {name}: a share between 0 and 1 is needed, got {span!r}")
+        if self.duration is not None and not (
+            isinstance(self.duration, int | float) and 0 < self.duration < math.inf
+        ):
+            raise InputError(f"study: duration must be a positive number of seconds, got {self.duration!r}")
+
+    def _check_combinations(self) -> None:
+        oracles = [name for name in self.contenders if name in ORACLES]
+        if oracles and set(self.solvers) != {"rti"}:
+            raise InputError(
+                f"study: {oracles[0]} has a solver of its own (several starts); leave it or solvers out"
+            )
+        if oracles and self.vary:
+            raise InputError(
+                f"study: {oracles[0]} knows the machine as it is built, not as it is drawn; leave it or vary out"
+            )
+        if self.draws > 1 and not self.vary and self.random_faults is None:
+            raise InputError(
+                f"study: {self.draws} draws, and nothing that is drawn: give vary or random_faults, or use seeds"
+            )
+        watched = [name for name in self.contenders if CONTENDERS[name].model != "hybrid"]
+        if "energy" in self.monitors and watched:
+            raise InputError(
+                f"study: monitor energy is calibrated for the hybrid, {watched[0]} has none; take monitor own, or "
+                "controllers with a hybrid"
+            )
+
+
+def _normal(s: Study) -> dict[str, Any]:
+    """The fields that may be given in several forms, as tuples."""
+    models = {"model": s.models} if isinstance(s.models, str | Path) else s.models
+    try:
+        pairs = tuple((str(k), str(v)) for k, v in _items(models))
+        vary = tuple((str(k), v) for k, v in _items(s.vary))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"study: models and vary are mappings (name: value); {error}") from error
+    drawn = s.random_faults
+    if isinstance(drawn, Mapping):
+        drawn = record(RandomFaults, drawn, "random_faults")
+    lists: dict[str, Any] = {
+        name: _listed(getattr(s, name), name)
+        for name in ("tasks", "controllers", "estimators", "solvers", "horizons", "monitors")
+    }
+    if isinstance(s.seeds, int) and not isinstance(s.seeds, bool):
+        if not 1 <= s.seeds <= MOST_DRAWS:
+            raise InputError(
+                f"study: seeds: their number must be from 1 to {MOST_DRAWS}, got {str(s.seeds)[:40]}"
+            )
+        seeds: tuple[Any, ...] = tuple(range(s.seeds))
+    else:
+        seeds = _listed(s.seeds, "seeds")
+    faults = tuple(_fault_set(entry) for entry in _listed(s.faults, "faults"))
+    return {**lists, "models": pairs, "vary": vary, "random_faults": drawn, "seeds": seeds, "faults": faults}
+
+
+def _items(value: Any) -> Any:
+    return value.items() if isinstance(value, Mapping) else value
+
+
+def _listed(value: Any, name: str) -> tuple[Any, ...]:
+    if isinstance(value, str | Fault) or value is None or not isinstance(value, Sequence):
+        raise InputError(f"study: {name} is a list, got {value!r}; write [{value!r}]")
+    return tuple(value)
+
+
+def _fault_set(entry: Any) -> tuple[Fault, ...]:
+    if isinstance(entry, Fault):
+        return (entry,)
+    if isinstance(entry, str):
+        words = [word.strip() for word in entry.split(" + ")]
+        return () if words in (["none"], [""]) else tuple(parsed_fault(word) for word in words)
+    if not isinstance(entry, Sequence):
+        raise InputError(f"study: faults are texts, lists of texts, or Fault; got {entry!r}")
+    return tuple(fault for part in entry for fault in _fault_set(part))
+
+
+def _contender(controller: str, estimator: str) -> str:
+    """The contender of a controller's model with that estimator.
+
+    Raises:
+        InputError: If there is none.
+    """
+    wanted, model = ESTIMATORS[estimator], CONTENDERS[controller].model
+    if wanted is None:
+        return controller
+    for name, c in CONTENDERS.items():
+        if c.model == model and (c.observer, c.truth) == wanted:
+            return name
+    raise InputError(
+        f"study: controller {controller} with estimator {estimator} is impossible: there is no such contender"
+    )
+
+
+# Studies in YAML files.
+
+MOST_YAML = 2**16
+"""Largest study [bytes] that is read."""
+
+
+def read_study(path: str | Path, **instead: Any) -> Study:
+    r"""The study that a YAML file describes: its keys are the fields of :class:`~hybrid_mpc.job.study.Study`.
+
+    Folders of models are meant from the folder of the YAML file. The name is that of the file if it gives none. A
+    settings file runs nothing: its scenario is a registered name; a ``.py`` file is given as ``scenario=`` (on the
+    command line ``--scenario FILE.py``).
+
+    Args:
+        path: The file.
+        instead: Fields that replace those of the file, e.g. ``models``.
+
+    Raises:
+        InputError: If the file is missing or no YAML, its scenario is not registered, a key is unknown (with the
+            nearest valid one), or the study is not valid.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "mine.yaml"
+        >>> _ = path.write_text("scenario: golf_robot\nmodels: {z32: runs/golf}\nseeds: 2\n")
+        >>> study = read_study(path)
+        >>> study.name, study.seeds, study.folders["z32"] == path.parent / "runs/golf"
+        ('mine', (0, 1), True)
+    """
+    path = Path(path)
+    keys = _mapping(path)
+    models, here = keys.get("models"), path.parent
+    if isinstance(models, str):
+        models = {"model": models}
+    if isinstance(models, dict):
+        keys["models"] = {label: here / str(folder) for label, folder in models.items()}
+    keys.update(instead)
+    if "scenario" not in instead and isinstance(keys.get("scenario"), str):
+        scenario_of(keys["scenario"], path)
+    if "models" not in keys:
+        raise InputError(f"{path}: no models; add 'models: {{label: FOLDER}}', or give --model FOLDER")
+    study = record(Study, keys, str(path))
+    return study if "name" in keys else replace(study, name=path.stem)
+
+
+def _mapping(path: Path) -> dict[str, Any]:
+    import yaml
+
+    try:
+        found = yaml.load(read_bytes(path, MOST_YAML), Loader=_loader())
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path} is no YAML: {' '.join(str(error).split())[:300]}") from error
+    if not isinstance(found, dict):
+        raise InputError(f"{path}: a mapping of keys to values is needed, got {type(found).__name__}")
+    return {str(key): value for key, value in found.items()}
+
+
+@cache
+def _loader() -> Any:
+    """A YAML loader of plain data: texts, numbers, true, false, null, lists and mappings with each key once.
+
+    YAML 1.1, which PyYAML reads, makes of ``on`` a flag, of ``2024-01-01`` a date and of ``1:30`` a number; here they
+    are the texts that they look like (YAML 1.2, core schema). Anchors and aliases, with which a small file becomes a
+    huge one, are refused.
+    """
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012  its own, none of YAML 1.1
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            event = self.peek_event()
+            if getattr(event, "anchor", None) is not None:
+                raise yaml.composer.ComposerError(
+                    None,
+                    None,
+                    "anchors (&) and aliases (*) are not read; write the value out",
+                    event.start_mark,
+                )
+            return super().compose_node(parent, index)
+
+        def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+            keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+            if len(set(keys)) < len(keys):
+                twice = next(key for key in keys if keys.count(key) > 1)
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"{twice!r} stands twice", node.start_mark
+                )
+            return super().construct_mapping(node, deep)
+
+    for tag, pattern, first in _PLAIN:
+        Loader.add_implicit_resolver(f"tag:yaml.org,2002:{tag}", re.compile(rf"^(?:{pattern})$"), list(first))
+    return Loader
+
+
+_PLAIN = (
+    ("bool", "true|True|TRUE|false|False|FALSE", "tTfF"),
+    ("null", "~|null|Null|NULL|", ["~", "n", "N", ""]),
+    ("int", r"[-+]?[0-9]{1,20}", "-+0123456789"),
+    ("float", r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)",
+     "-+.0123456789"),
+)  # fmt: skip
+"""Kinds of plain words of YAML 1.2's core schema, with the letters that they begin with."""
+
+Models = str | Path | Mapping[str, str | Path]
+DEPLOYABLE = ("prior", "prior_observer", "hybrid", "hybrid_observer")
+"""The contenders without oracles, which know the machine as it is built, not as it is drawn."""
+SPAN = 0.2
+
+
+@dataclass(frozen=True)
+class Ready:
+    """A ready study.
+
+    Args:
+        title: One line.
+        make: From models by label to the study.
+    """
+
+    title: str
+    make: Callable[[Models], Study]
+
+
+def ready_study(name: str, models: Models) -> Study:
+    """The ready study of that name with these models.
+
+    Args:
+        name: Name in :data:`READY`.
+        models: Artifact folders by label, or one.
+
+    Raises:
+        InputError: If there is none of that name.
+
+    Example:
+        >>> ready_study("faults_1000", "runs/golf").size
+        1000
+    """
+    return READY[known(name, READY, "ready study")].make(models)
+
+
+def _plant_variation(models: Models) -> Study:
+    """The parts of the rig that a copy of it would differ in: masses, drive, friction, belt."""
+    varied = (
+        "m",
+        "a",
+        "J",
+        "d",
+        "mu_c",
+        "mu_s",
+        "motor_gain",
+        "drag",
+        "belt_stiffness",
+        "gap",
+        "motor_friction",
+    )
+    return Study(
+        "golf_robot", models, controllers=DEPLOYABLE, vary=dict.fromkeys(varied, SPAN), draws=20, seeds=1,
+        name="plant_variation",
+    )  # fmt: skip
+
+
+def _horizon_size(models: Models) -> Study:
+    """Tasks that can be done with any horizon: a stroke needs one that reaches the impact."""
+    return Study(
+        "golf_robot", models, tasks=("track_sine", "track_step", "reject_load"), controllers=("hybrid_observer",),
+        horizons=(10, 20, 35, 50, 80), solvers=("rti", "sqp"), seeds=5, name="horizon_size",
+    )  # fmt: skip
+
+
+def _data_amount(models: Models) -> Study:
+    return Study(
+        "golf_robot", models, tasks=("track_sine", "stroke_1.4", "stroke_3", "reject_push"), seeds=10,
+        controllers=("prior_observer", "hybrid_observer"), name="data_amount",
+    )  # fmt: skip
+
+
+def _faults_1000(models: Models) -> Study:
+    """The golf robot's catalogue of faults at 70 to 130 % of its sizes, one to three at once, and late solves."""
+    kinds = (
+        FaultKind("plant_friction", 1.35, 4.9),
+        FaultKind("plant_mass", 1.07, 1.65),
+        FaultKind("input_gain", 0.74, 0.86),
+        FaultKind("measurement_offset", 0.014, 0.026, signed=True),
+        FaultKind("measurement_scale", 1.035, 1.065),
+        FaultKind("measurement_freeze"),
+        FaultKind("measurement_dropout", length=(0.02, 0.1)),
+        FaultKind("plant_push", 0.7, 1.3, signed=True, length=(0.1, 0.3)),
+        FaultKind("plant_belt", 0.56, 1.04),
+        FaultKind("plant_delay", 0.042, 0.078, ramp=5.0),
+        FaultKind("late", length=(0.02, 0.24)),
+    )
+    return Study(
+        "golf_robot", models, tasks=("track_sine", "track_step", "stroke_1.4", "stroke_3", "reject_heavy"),
+        controllers=("prior_observer", "hybrid_observer"), random_faults=RandomFaults(kinds), draws=100, seeds=1,
+        duration=4.0, name="faults_1000",
+    )  # fmt: skip
+
+
+READY: Mapping[str, Ready] = {
+    "plant_variation": Ready(
+        "every controller on every task of the golf robot, 20 copies of the rig that differ by up to 20 %",
+        _plant_variation,
+    ),
+    "horizon_size": Ready(
+        "horizon x hidden units (one --model each) x solver: what a longer look or a larger network pays",
+        _horizon_size,
+    ),
+    "data_amount": Ready(
+        "models of runs with more and less data (one --model each): what data pay", _data_amount
+    ),
+    "faults_1000": Ready("1,000 loops of the golf robot with one to three random faults each", _faults_1000),
+}

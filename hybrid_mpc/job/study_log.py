@@ -1,0 +1,363 @@
+"""Rows of a finished study as one Parquet file, with what it is made of in the file's metadata."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import locked, read_document, replacing, write_document
+from hybrid_mpc.records import NUMBERS, plain, record
+from nn_export.files import parse_json
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+# What a study's folder says of itself: ``study.json``, and the same in the table of its results.
+
+FILE = "study.json"
+SCHEMA_VERSION = 2
+
+
+@dataclass(frozen=True)
+class NoiseNote:
+    """Process noise of a model's filters.
+
+    Args:
+        source: Where it is from, in words.
+        sigma_x: Standard deviations per period by contender.
+    """
+
+    source: str
+    sigma_x: Mapping[str, tuple[float, ...]]
+
+
+@dataclass(frozen=True)
+class ModelNote:
+    """A model of a study.
+
+    Args:
+        sha256: Hash of its folder.
+        provenance: What it says of itself.
+        noise: What its filters assume.
+    """
+
+    sha256: str
+    provenance: Mapping[str, Any]
+    noise: NoiseNote
+
+
+@dataclass(frozen=True)
+class StudyNote:
+    """What a study is made of.
+
+    Args:
+        study: Its settings as plain data.
+        title: The machine, one line.
+        description: The machine, a paragraph.
+        models: By label.
+        runs: How many there are.
+        versions: Versions of the packages.
+        kind: Kind of study. Default: closed loops of all combinations.
+        scenario_sha256: Hash of the scenario's file; None for a registered scenario.
+        engine: What has computed it; empty until it is finished.
+        workers_died: Workers that died on the way.
+        schema_version: Of this note.
+    """
+
+    study: Mapping[str, Any]
+    title: str
+    description: str
+    models: Mapping[str, ModelNote]
+    runs: int
+    versions: Mapping[str, str] = field(default_factory=dict)
+    kind: str = "loops"
+    scenario_sha256: str | None = None
+    engine: str = ""
+    workers_died: int = 0
+    schema_version: int = SCHEMA_VERSION
+
+
+def write_note(folder: Path, note: StudyNote) -> None:
+    """Write ``study.json``.
+
+    Raises:
+        StorageError: If it cannot be written.
+    """
+    write_document(folder / FILE, plain(note))
+
+
+def read_note(folder: Path) -> StudyNote:
+    """What a study's folder says of itself.
+
+    Raises:
+        InputError: If it is no folder of a study, damaged, or of another version.
+    """
+    if not (folder / FILE).is_file():
+        raise InputError(f"{folder} holds no study; give the folder that 'study run --out' made")
+    return note_of(read_document(folder / FILE), str(folder / FILE))
+
+
+def note_of(data: Mapping[str, Any], where: str) -> StudyNote:
+    """A note from plain data.
+
+    Raises:
+        InputError: If it is of another version, or a field does not fit.
+    """
+    if data.get("schema_version") != SCHEMA_VERSION:
+        raise InputError(
+            f"{where}: a study of schema version {str(data.get('schema_version'))[:20]}, this version of hybrid-mpc "
+            f"reads {SCHEMA_VERSION}; run it anew"
+        )
+    return record(StudyNote, data, where)
+
+
+# The rows of a study while it runs: appended durably, whole after a kill at any moment.
+
+STATUS = ("done", "failed")
+MOST_LINE = 2**24
+"""Largest row [bytes]: a run's figures, or the traceback of one that failed."""
+SEGMENT_ROWS = 10_000
+"""Rows of one file: a study of a million runs has a hundred of them."""
+
+
+class RunLog:
+    """Append-only JSON lines in a few numbered files, one row a finished run.
+
+    What :meth:`append` has returned from is on the disk. A line that a kill tore apart is cut off when the log is
+    opened again: its run counts as not finished. One process at a time may hold the log.
+
+    Args:
+        folder: Folder of the files; made if missing.
+
+    Raises:
+        InputError: If another process holds the log.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> with RunLog(folder) as log:
+        ...     log.append([{"id": "a", "status": "done", "cost": cost} for cost in (0.1, float("inf"))])
+        >>> [row["cost"] for row in rows(folder)]
+        [0.1, inf]
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._held = ExitStack()
+        self._held.enter_context(locked(folder))
+        files = segments(folder)
+        self._number = len(files) - 1 if files else 0
+        self._rows = _repaired(files[-1]) if files else 0
+        self._file = self._open()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, t: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let go of the files; the log may be opened again."""
+        os.close(self._file)
+        self._held.close()
+
+    def append(self, new: Iterable[Mapping[str, Any]]) -> None:
+        """Add rows; on return they are on the disk.
+
+        Raises:
+            InputError: If they cannot be written (a full disk); what was there before is unharmed.
+        """
+        lines = [json.dumps(plain(row), separators=(",", ":")) + "\n" for row in new]
+        if not lines:
+            return
+        if self._rows >= SEGMENT_ROWS:
+            os.close(self._file)
+            self._number, self._rows = self._number + 1, 0
+            self._file = self._open()
+        end = os.fstat(self._file).st_size
+        try:
+            left = memoryview("".join(lines).encode())
+            while left:
+                left = left[os.write(self._file, left) :]
+            os.fsync(self._file)
+        except OSError as error:
+            os.ftruncate(self._file, end)  # needs no room
+            raise InputError(
+                f"{self._folder}: cannot write ({error.strerror}); the runs that were finished before are kept. Make "
+                "room, then the same command with --resume goes on"
+            ) from error
+        self._rows += len(lines)
+
+    def _open(self) -> int:
+        path = self._folder / f"{self._number:06}.jsonl"
+        binary = getattr(os, "O_BINARY", 0)  # on Windows: line ends as they are written
+        return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | binary, 0o644)
+
+
+def segments(folder: Path) -> list[Path]:
+    """Files of a log, in order."""
+    return sorted(path for path in folder.glob("[0-9]*.jsonl") if path.is_file())
+
+
+def rows(folder: Path) -> Iterator[dict[str, Any]]:
+    """Rows of a log, in the order in which they were written; a torn last line is left out.
+
+    Raises:
+        InputError: If a line within is damaged.
+    """
+    for path in segments(folder):
+        with path.open("rb") as file:
+            for number, line in enumerate(iter(partial(file.readline, MOST_LINE), b""), 1):
+                if not line.endswith(b"\n") and len(line) < MOST_LINE:
+                    return
+                yield _parsed(line, path, number)
+
+
+def _parsed(line: bytes, path: Path, number: int) -> dict[str, Any]:
+    try:
+        if len(line) == MOST_LINE:
+            raise ValueError(f"longer than {MOST_LINE} bytes")
+        row = parse_json(line)
+        if not (isinstance(row, dict) and isinstance(row.get("id"), str) and row.get("status") in STATUS):
+            raise ValueError("no row of a run: id and status are needed")
+    except ValueError as error:
+        raise InputError(
+            f"{path}:{number} is damaged ({error}); delete this line, and --resume runs its run again"
+        ) from error
+    return {
+        key: NUMBERS[value] if isinstance(value, str) and value in NUMBERS else value
+        for key, value in row.items()
+    }
+
+
+def _repaired(path: Path) -> int:
+    """Rows of a file, after a torn line at its end was cut off."""
+    count = whole = 0
+    with path.open("rb") as file:
+        for line in file:
+            if line.endswith(b"\n"):
+                count, whole = count + 1, whole + len(line)
+    if whole < path.stat().st_size:
+        os.truncate(path, whole)
+    return count
+
+
+RESULTS = "results.parquet"
+METADATA = b"hybrid_mpc.study"
+GROUP_ROWS = 20_000
+"""Rows that are in memory at a time."""
+
+
+def compact(log: Path, path: Path, provenance: Mapping[str, Any]) -> None:
+    """Write the rows of a log as Parquet: all of it or nothing. Of several rows of a run the last counts.
+
+    Args:
+        log: Folder of the log.
+        path: File to write.
+        provenance: Plain data for the file's metadata.
+
+    Raises:
+        StorageError: If it cannot be written (a full disk); the log is unharmed.
+    """
+    import pyarrow.parquet as pq
+
+    last: dict[str, int] = {}
+    kinds: dict[str, set[type]] = {}
+    for i, row in enumerate(rows(log)):
+        last[row["id"]] = i
+        for key, value in row.items():
+            kinds.setdefault(key, set()).add(type(value))
+    schema = _schema(kinds).with_metadata({METADATA: json.dumps(plain(provenance)).encode()})
+    kept = (row for i, row in enumerate(rows(log)) if last[row["id"]] == i)
+    with replacing(path) as file, pq.ParquetWriter(file, schema, compression="zstd") as writer:
+        for group in _groups(kept, GROUP_ROWS):
+            writer.write_table(_table(group, schema))
+
+
+def intact(path: Path) -> bool:
+    """Whether a Parquet file is there and can be read to its end.
+
+    Example:
+        >>> intact(Path("nowhere.parquet"))
+        False
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    if not path.is_file():
+        return False
+    try:
+        provenance_of(path)
+        for group in pq.ParquetFile(path).iter_batches():
+            group.validate(full=True)
+    except (InputError, OSError, ValueError, pa.ArrowException):
+        return False
+    return True
+
+
+def provenance_of(path: Path) -> dict[str, Any]:
+    """What a Parquet file of a study says of itself.
+
+    Raises:
+        InputError: If it is no such file.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        metadata = pq.read_schema(path).metadata or {}
+    except (OSError, pa.ArrowException) as error:
+        raise InputError(f"{path} is missing or damaged: {error}") from error
+    if METADATA not in metadata:
+        raise InputError(f"{path} is no table of a study")
+    try:
+        return dict(parse_json(metadata[METADATA]))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path} is damaged: {error}") from error
+
+
+def _schema(kinds: Mapping[str, set[type]]) -> pa.Schema:
+    import pyarrow as pa
+
+    return pa.schema([(key, _type(found - {type(None)})) for key, found in kinds.items()])
+
+
+def _type(found: set[type]) -> pa.DataType:
+    import pyarrow as pa
+
+    if found == {bool}:
+        return pa.bool_()
+    if found == {int}:
+        return pa.int64()
+    return pa.float64() if found <= {int, float} else pa.string()
+
+
+def _table(group: list[dict[str, Any]], schema: pa.Schema) -> pa.Table:
+    import pyarrow as pa
+
+    columns = []
+    for column in schema:
+        values = [row.get(column.name) for row in group]
+        if column.type == pa.float64():
+            values = [None if v is None else float(v) for v in values]
+        elif column.type == pa.string():
+            values = [None if v is None else str(v) for v in values]
+        columns.append(pa.array(values, type=column.type))
+    return pa.Table.from_arrays(columns, schema=schema)
+
+
+def _groups(values: Iterator[dict[str, Any]], size: int) -> Iterator[list[dict[str, Any]]]:
+    while group := list(islice(values, size)):
+        yield group

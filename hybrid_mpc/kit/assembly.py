@@ -1,0 +1,437 @@
+"""Assembly: estimator, controller, monitor and guard from models, noise and a control problem. No torch in here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybrid_mpc.control.best_of import BestOf
+from hybrid_mpc.control.nlp import IpoptController
+from hybrid_mpc.control.ocp import OCP
+from hybrid_mpc.control.rti import CondensedController
+from hybrid_mpc.control.safeguard import SafeController
+from hybrid_mpc.control.sqp import SQPController
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimate.kalman import Estimator, ExtendedKalmanFilter
+from hybrid_mpc.estimate.parameters import parameter_filter, with_parameter_states
+from hybrid_mpc.estimate.switching import SLIP, SWITCHES, SwitchingFilter
+from hybrid_mpc.estimate.tuning import most_likely
+from hybrid_mpc.loop.guard import Guard, Mode
+from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.monitor.calibrate import Calibration
+from hybrid_mpc.monitor.energy import EnergyMonitor
+from hybrid_mpc.monitor.lengths import LEVEL_S, half_window, samples
+from hybrid_mpc.records import known
+
+if TYPE_CHECKING:
+    from hybrid_mpc.data.trajectories import Trajectory
+
+Array = NDArray[np.float64]
+QUIET_SHARE = 0.0003
+JUMP_SHARE = 0.05
+"""Step of the estimated input disturbance per period, as a share of the input's range: while nothing happens (drift,
+temperature), and when a load comes or goes. A load of a twentieth of what the drive can do is an ordinary one;
+a larger one takes a few periods."""
+MODES = ("quiet", "slip", "jump")
+"""Of its observer, in the order of :data:`~hybrid_mpc.estimate.switching.SWITCHES`."""
+FIRST_LOAD = 0.001
+"""Deviation of the first disturbance, as a share of the input's range. Small: a machine that sticks at rest shows
+nothing of its load, and what an observer makes of it there is wrong when it moves."""
+
+SCALES = (1.0, 3.0)
+"""Process noise over the model's one-period errors; the most likely one is taken."""
+TUNED_PERIODS = 500
+TUNED_RECORDINGS = 3
+"""So many periods of so many training recordings decide."""
+
+
+DWELL_S, QUIET_S = 0.5, 1.0
+"""A guard's shortest time in a mode, and the time without alarm before it goes back [the machine's seconds]."""
+PATIENCE_S = 0.8
+"""[The machine's seconds.] A push of 0.2 s raised alarms for up to 0.7 s, through the monitor's windows and what the
+observer makes of it; a backup that takes it for a heavier machine costs more than it saves (docs/energy-guard.md)."""
+GAIN = "gain of "
+
+
+class Machine(Protocol):
+    """What estimators and guards assume of a machine: a scenario, or a loaded artifact."""
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+
+    @property
+    def sensor_sigma(self) -> tuple[float, ...]:
+        """Standard deviations of the sensors ``(n_y,)``."""
+
+    @property
+    def first_sigma(self) -> tuple[float, ...] | None:
+        """Those of what is not measured at an estimator's start; None: by the sensors'."""
+
+    @property
+    def control(self) -> OCP | None:
+        """The control problem."""
+
+    @property
+    def safe_input(self) -> tuple[float, ...] | None:
+        """What it is left with where nothing is known ``(n_u,)``; None: zero, or the limit next to it."""
+
+    @property
+    def causes(self) -> Mapping[str, tuple[str, ...]]:
+        """What may break, by name."""
+
+
+def tuned_noise(
+    model: HybridModel, scenario: Machine, base: Array, recordings: Sequence[Trajectory], *, observer: bool
+) -> Array:
+    """Process noise ``(n_x,)``: ``base`` times the scale under which undisturbed recordings are most likely.
+
+    Args:
+        model: The model to estimate with.
+        scenario: Sensor noise, and the control problem's input range.
+        base: Its one-period errors, see :func:`~hybrid_mpc.estimate.tuning.process_noise`.
+        recordings: Training recordings.
+        observer: Whether the estimator follows an unknown load.
+
+    Example:
+        ``tuned_noise(model, scenario, process_noise(model, train), train, observer=True)``
+    """
+    places = np.linspace(0, len(recordings) - 1, min(TUNED_RECORDINGS, len(recordings))).round().astype(int)
+    parts = [
+        recordings[i].part(np.arange(len(recordings[i].t)) < TUNED_PERIODS, recordings[i].name, "train")
+        for i in dict.fromkeys(places.tolist())
+    ]
+    return base * most_likely(
+        lambda s: make_estimator(model, scenario, s * base, observer=observer), parts, SCALES
+    )
+
+
+def make_estimator(
+    model: HybridModel,
+    scenario: Machine,
+    sigma_x: Array,
+    control: OCP | None = None,
+    *,
+    observer: bool = True,
+) -> ExtendedKalmanFilter | SwitchingFilter:
+    """The estimator that all controllers share, tuned by the model's own one-period errors.
+
+    With observer it switches between three filters (``MODES``): one filter that is quick enough for a push lets
+    the encoder's steps through at all times, and one that is quiet takes a push for noise.
+
+    Args:
+        model: The model to estimate with.
+        scenario: The machine, whose sensors' noise it assumes.
+        sigma_x: Process noise ``(n_x,)`` per period, see :func:`~hybrid_mpc.estimate.tuning.process_noise`.
+        control: The control problem, by whose ``input_range`` a load is small or large. Default: the scenario's.
+        observer: Whether it estimates an unknown load at the input. Default: yes.
+
+    Raises:
+        InputError: If ``sensor_sigma`` or ``first_sigma`` does not fit the model, or there is no control problem.
+
+    Example:
+        ``make_estimator(model, scenario, process_noise(model, train))``
+    """
+    control = scenario.control if control is None else control
+    if control is None:
+        raise InputError(
+            f"scenario {scenario.name} has no control problem, so no input range; give control=OCP(...)"
+        )
+    first, span = first_deviations(model, scenario), control.input_range
+
+    def filter_of(scale: float, step: float | None) -> ExtendedKalmanFilter:
+        return ExtendedKalmanFilter(
+            model,
+            sigma_y=np.array(scenario.sensor_sigma),
+            sigma_x=scale * sigma_x,
+            sigma_d=None if step is None else step * span,
+            sigma_x0=first,
+            sigma_d0=None if step is None else FIRST_LOAD * span,
+        )
+
+    if not observer:
+        return filter_of(1.0, None)
+    modes = filter_of(1.0, QUIET_SHARE), filter_of(SLIP, QUIET_SHARE), filter_of(1.0, JUMP_SHARE)
+    return SwitchingFilter(modes, SWITCHES)
+
+
+def first_deviations(model: HybridModel, scenario: Machine) -> Array:
+    """Standard deviations ``(n_x,)`` of the state at the estimator's start: at rest where the sensors say.
+
+    Args:
+        model: The model.
+        scenario: Sensor noise, and how uncertain is at first what is not measured.
+
+    Raises:
+        InputError: If ``sensor_sigma`` or ``first_sigma`` does not fit the model.
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> machine = SimpleNamespace(sensor_sigma=(5e-4,), first_sigma=None)
+        >>> first_deviations(SimpleNamespace(n_x=2, n_y=1, dt=0.02), machine).round(4).tolist()
+        [0.0005, 0.0354]
+    """
+    n, sigma, others = model.n_x - model.n_y, scenario.sensor_sigma, scenario.first_sigma
+    if len(sigma) != model.n_y:
+        raise InputError(f"sensor_sigma needs {model.n_y} standard deviations of the outputs, got {sigma}")
+    if others is None:
+        differenced = np.sqrt(2.0) * np.array(sigma) / model.dt
+        others = tuple(differenced if n == model.n_y else np.full(n, differenced.max()))
+    if len(others) != n:
+        raise InputError(f"first_sigma needs {n} standard deviations of what is not measured, got {others}")
+    return np.array([*sigma, *others], dtype=np.float64)
+
+
+SOLVERS = ("rti", "sqp", "ipopt")
+"""The condensed real-time iteration; sequential quadratic programs to convergence; the same by IPOPT."""
+
+
+def make_controller(
+    model: HybridModel,
+    prior: HybridModel,
+    control: OCP,
+    *,
+    solver: str = "rti",
+    iterations: int = 1,
+    safe_input: ArrayLike | None = None,
+) -> SafeController:
+    """A model's controller behind the safeguards that stand on the prior.
+
+    The first plan of ``rti``, made before the loop starts, is converged, from every start that the control problem
+    names.
+
+    Args:
+        model: The model to plan with.
+        prior: The fitted prior, for terminal weight and fallback.
+        control: The control problem.
+        solver: Name in :data:`SOLVERS`.
+        iterations: Linearisations a period of ``rti``. Default: one.
+        safe_input: What the machine is left with where nothing is known. Default: zero, or the limit next to it.
+
+    Raises:
+        InputError: If there is no such solver.
+
+    Example:
+        ``make_controller(models["hybrid"], models["prior"], scenario.control)``
+    """
+    ocp = make_ocp(prior, control)
+    if known(solver, SOLVERS, "solver") == "sqp":
+        return SafeController(SQPController(model, ocp), prior, safe_input=safe_input)
+    if solver == "ipopt":
+        return SafeController(IpoptController(model, ocp), prior, safe_input=safe_input)
+    rti = CondensedController(model, ocp, iterations=iterations)
+    return SafeController(rti, prior, first=first_controller(model, ocp), safe_input=safe_input)
+
+
+def first_controller(model: HybridModel, ocp: OCP) -> SQPController | BestOf:
+    """What makes the first plan: SQP, from each of the problem's starts where it names some."""
+    sqp = SQPController(model, ocp)
+    return BestOf(sqp, starts=ocp.starts) if ocp.starts else sqp
+
+
+def make_ocp(prior: HybridModel, control: OCP) -> OCP:
+    """The problem with a working point: terminal weight (and the fallback) are linearised in motion if it names none.
+
+    At rest the slope of dry friction would pass for strong damping.
+
+    Args:
+        prior: The fitted prior.
+        control: The control problem.
+
+    Example:
+        ``CondensedController(models["hybrid"], make_ocp(models["prior"], scenario.control))``
+    """
+    return control.changed(working_point=working_point(prior, control))
+
+
+def working_point(model: HybridModel, control: OCP) -> tuple[Array, Array]:
+    """``(x, u)`` that the problem names, else in motion at the position zero: speeds of ``1 / sqrt(q)``, no input.
+
+    Args:
+        model: The model, state ``[q, v]`` if the problem names no point.
+        control: The control problem; a speed without weight is what crosses the position's own acceptable deviation
+            ``1 / sqrt(q)`` within the horizon.
+
+    Example:
+        ``x, u = working_point(models["prior"], scenario.control)``
+    """
+    if control.working_point is not None:
+        return control.working_point
+    x, half = np.zeros(model.n_x), model.n_x // 2
+    far, fast = (
+        np.where(q > 0, 1.0 / np.sqrt(np.where(q > 0, q, 1.0)), 0.0)
+        for q in (control.q[:half], control.q[half:])
+    )
+    x[half:] = np.where(fast > 0, fast, np.resize(far, fast.size) / (control.horizon * model.dt))
+    return x, control.rest_input
+
+
+def make_monitor(
+    model: HybridModel, calibration: Calibration | None, *, rest_speed: ArrayLike | None = None
+) -> EnergyMonitor:
+    """The energy monitor with its default window: about 0.3 s (the machine's) for the derivative and for the level.
+
+    Args:
+        model: The model that is held against the machine.
+        calibration: Its thresholds; None: its levels raise no alarm.
+        rest_speed: Speeds ``(n_q,)`` below which friction may stick. Default: the calibration's.
+
+    Example:
+        ``make_monitor(artifact.models["hybrid"], None)``
+    """
+    return EnergyMonitor(
+        model,
+        window=2 * half_window(LEVEL_S, model) + 1,
+        average=samples(LEVEL_S, model),
+        calibration=calibration,
+        rest_speed=rest_speed,
+    )
+
+
+def sensor_steps(sensor_sigma: Sequence[float]) -> tuple[float, ...]:
+    """Steps of the sensors, at most: what an even error within a step makes the deviation that filters assume.
+
+    A real one may be finer; then a frozen sensor is found a little later.
+
+    Args:
+        sensor_sigma: Standard deviations of the sensors, as a scenario's.
+
+    Example:
+        >>> [round(step, 6) for step in sensor_steps((0.001,))]
+        [0.003464]
+    """
+    return tuple(float(np.sqrt(12.0) * sigma) for sigma in sensor_sigma)
+
+
+def freezing(scenario: Machine, control: OCP) -> dict[str, Any]:
+    """What a monitor's test for a frozen sensor needs to know: steps of the sensors, ranges of the inputs.
+
+    Args:
+        scenario: The machine with its sensors.
+        control: The control problem.
+
+    Example:
+        ``guard_monitor(model, detector, **freezing(scenario, scenario.control))``
+    """
+    return {
+        "resolution": sensor_steps(scenario.sensor_sigma),
+        "input_range": tuple(control.input_range.tolist()),
+    }
+
+
+def make_resting_guard(model: HybridModel) -> Guard:
+    """A guard that records where the model does not describe the machine, and rests where the sensor is frozen.
+
+    Args:
+        model: The model, whose unit of time its times are in.
+
+    Example:
+        ``simulate(..., monitor=monitor, guard=make_resting_guard(hybrid))``
+    """
+    unit = model.time_unit
+    return Guard(Mode.NORMAL, Mode.REST, dwell=DWELL_S * unit, quiet=QUIET_S * unit)
+
+
+def make_backup_guard(controller: SafeController, estimator: Estimator) -> Guard:
+    """A guard that hands over to another controller where the model does not describe the machine.
+
+    Args:
+        controller: The backup, e.g. that of the fitted prior; its model's unit of time counts.
+        estimator: Its estimator.
+
+    Example:
+        ``make_backup_guard(kit.controller("prior"), kit.observer("prior"))``
+    """
+    unit = controller.controller.model.time_unit
+    return Guard(
+        Mode.BACKUP, Mode.REST, backup=controller, backup_estimator=estimator, dwell=DWELL_S * unit,
+        quiet=QUIET_S * unit,
+    )  # fmt: skip
+
+
+def make_adaptive_guard(
+    model: HybridModel,
+    prior: HybridModel,
+    scenario: Machine,
+    sigma_x: Array,
+    control: OCP | None = None,
+    *,
+    patience: float | None = None,
+) -> Guard:
+    """A guard whose backup estimates what has become of the prior's parameters, and plans with it.
+
+    The backup's filter runs all the time, so it has found the change when the guard switches. A frozen sensor takes
+    the input away.
+
+    Args:
+        model: The model that the normal controller plans with; it must know its parameters.
+        prior: The fitted prior, whose parameters change, for terminal weight and fallback.
+        scenario: The machine: its sensors' noise, and as ``causes`` the parameters that change together, by name. Gains
+            of inputs are left out where there are other causes: a weaker motor is a heavier machine, but for its
+            friction.
+        sigma_x: Process noise ``(n_x,)`` per period of the model's estimator.
+        control: The control problem. Default: the scenario's.
+        patience: Time [s] for which the model must have been in doubt. Default: 0.8 of the machine's seconds.
+
+    Raises:
+        InputError: If there are no causes or no control problem, the model does not know its parameters, or one of
+            them is unknown.
+
+    Example:
+        ``make_adaptive_guard(hybrid, prior, scenario, sigma_x)``
+    """
+    groups = adaptable(model, scenario.causes)
+    adaptive = with_parameter_states(model, groups, prior=prior)
+    control = scenario.control if control is None else control
+    if control is None:
+        raise InputError(f"a guard that adapts needs a control problem; scenario {scenario.name} has none")
+    span = control.input_range
+    plain = make_ocp(prior, control)
+    ocp = plain.changed(terminal=plain.terminal_weight(model))
+    backup = SafeController(
+        CondensedController(adaptive, ocp), prior, first=first_controller(adaptive, ocp),
+        safe_input=scenario.safe_input,
+    )  # fmt: skip
+    first, unit = first_deviations(model, scenario), model.time_unit
+    estimator = parameter_filter(
+        adaptive, len(groups), sigma_y=scenario.sensor_sigma, sigma_x=sigma_x, sigma_x0=first,
+        sigma_d=QUIET_SHARE * span, sigma_d0=FIRST_LOAD * span,
+    )  # fmt: skip
+    return Guard(
+        Mode.BACKUP, Mode.REST, backup=backup, backup_estimator=estimator, dwell=DWELL_S * unit, quiet=QUIET_S * unit,
+        patience=PATIENCE_S * unit if patience is None else patience,
+    )  # fmt: skip
+
+
+def adaptable(model: HybridModel, causes: Mapping[str, Sequence[str]]) -> dict[str, tuple[str, ...]]:
+    """Those of the causes that a backup adapts to.
+
+    Raises:
+        InputError: If there are none, the model does not know its parameters, or its inputs act later.
+
+    Example:
+        ``adaptable(hybrid, {"mass": ("m", "J"), "motor": ("gain of u",)})`` is ``{"mass": ("m", "J")}``.
+    """
+    groups = {name: tuple(names) for name, names in causes.items()}
+    if not groups:
+        raise InputError(
+            'a guard that adapts needs causes: groups of parameters that may change, e.g. {"mass": ("m", "J")}; '
+            "a scenario names them in its field causes"
+        )
+    if not model.n_p:
+        raise InputError(
+            f"a guard that adapts needs a model that knows its parameters; model {model.name} has none: give its prior "
+            "a parameters_spec and train it anew"
+        )
+    if model.waiting:
+        raise InputError(
+            f"a guard that adapts needs a model whose inputs act at once; those of model {model.name} act later"
+        )
+    return {name: names for name, names in groups.items() if not _is_gain(names)} or groups
+
+
+def _is_gain(names: Sequence[str]) -> bool:
+    return bool(names) and all(name.startswith(GAIN) for name in names)

@@ -1,0 +1,305 @@
+"""A loop that reacts: on an alarm tighter limits, another controller, or rest; and back, without a bump."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.control.ocp import Limits
+from hybrid_mpc.control.problem import Controller, Status
+from hybrid_mpc.control.rti import Prepared
+from hybrid_mpc.control.safeguard import Decision, SafeController, Source
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimate.kalman import Estimate, Estimator
+
+Array = NDArray[np.float64]
+TINY = 1e-9
+"""Tolerance [s] of comparisons between times; far below any period, above rounding."""
+USED_UP = 10**6
+"""Age of a plan that no :class:`SafeController` follows any more, so that its fallback takes over."""
+
+
+class Mode(IntEnum):
+    """How the loop is run, the more careful the larger."""
+
+    NORMAL = 0
+    """The controller as it is."""
+    LIMITED = 1
+    """The same controller within the guard's limits."""
+    BACKUP = 2
+    """Another controller with an estimator of its own: usually the MPC of the fitted prior with observer."""
+    FALLBACK = 3
+    """The stabilising feedback of the safeguards."""
+    REST = 4
+    """No input: what is left where the sensor cannot be believed. The machine must come to rest by itself."""
+
+
+@dataclass(frozen=True)
+class Switch:
+    """A change of mode.
+
+    Args:
+        t: First instant [s] at which the new mode decides.
+        before: Mode until then.
+        after: Mode from then on.
+        why: In words.
+    """
+
+    t: float
+    before: Mode
+    after: Mode
+    why: str
+
+
+@dataclass(frozen=True)
+class Guard:
+    """What a loop does on alarms of its monitor.
+
+    A reading of one period acts in the next. To a more careful mode the guard goes at once; back, when the alarm that
+    asked for it has been off for ``quiet`` and the mode has lasted for ``dwell``. On the way from one controller to
+    another nothing jumps: the input is held within ``du_max`` of the last one, the new controller begins from the old
+    one's plan, and both estimators run all the time. While no alarm comes the loop is the same as without a guard.
+
+    A frozen sensor and a machine at rest look alike: in ``REST`` the guard stays there until the sensor moves.
+
+    A monitor that judges nothing for longer than its windows (``reading.blind``: samples are missing, or model or
+    estimator gives no number) has failed: that is no quiet, and asks for ``on_model`` as a doubt of the model does.
+
+    Args:
+        on_model: Mode where the model does not describe the machine, or nobody can say whether it does. Default:
+            ``LIMITED`` or ``BACKUP``, whichever there is something for, else ``FALLBACK``.
+        on_sensor: Mode where the sensor is frozen (``reading.frozen``). Default ``REST``.
+        limits: Bounds of the inputs in every mode but ``NORMAL``. Default: the problem's own.
+        backup: Controller of ``BACKUP``; a bare one is guarded without fallback.
+        backup_estimator: Its estimator.
+        dwell: Shortest time [s] in a mode before going back. Default 0.5.
+        quiet: Time [s] without alarm before going back. Default 1.
+        patience: Time [s] for which the model must have been in doubt before ``on_model``; alarms less than ``quiet``
+            apart count as one. A push is over by then, and the normal controller's observer deals with it better than
+            a backup that takes it for a fault. A frozen sensor is never waited for. Default 0: at once.
+
+    Raises:
+        InputError: If a mode lacks what it needs, a time is negative, or there is patience without quiet.
+
+    Example:
+        >>> Guard(limits=Limits([-0.2], [0.2])).on_model.name, Guard().on_model.name
+        ('LIMITED', 'FALLBACK')
+    """
+
+    on_model: Mode
+    on_sensor: Mode
+    limits: Limits | None
+    backup: SafeController | None
+    backup_estimator: Estimator | None
+    dwell: float
+    quiet: float
+    patience: float
+
+    def __init__(
+        self,
+        on_model: Mode | None = None,
+        on_sensor: Mode = Mode.REST,
+        *,
+        limits: Limits | None = None,
+        backup: SafeController | Controller | None = None,
+        backup_estimator: Estimator | None = None,
+        dwell: float = 0.5,
+        quiet: float = 1.0,
+        patience: float = 0.0,
+    ) -> None:
+        if (backup is None) != (backup_estimator is None):
+            raise InputError("guard: backup and backup_estimator belong together; give both or neither")
+        guarded = backup if backup is None or isinstance(backup, SafeController) else SafeController(backup)
+        if on_model is None:
+            on_model = Mode.BACKUP if guarded else Mode.LIMITED if limits else Mode.FALLBACK
+        if Mode.BACKUP in (on_model, on_sensor) and guarded is None:
+            raise InputError(
+                "guard: mode BACKUP needs a controller and its estimator: backup, backup_estimator"
+            )
+        if Mode.LIMITED in (on_model, on_sensor) and limits is None:
+            raise InputError("guard: mode LIMITED needs limits, e.g. Limits([-0.2], [0.2])")
+        times = float(dwell), float(quiet), float(patience)
+        if not all(0 <= value < math.inf for value in times):
+            raise InputError(
+                f"guard: dwell, quiet and patience must be 0 s or more, got {dwell} s, {quiet} s and {patience} s"
+            )
+        if patience > 0 and quiet == 0:
+            raise InputError(
+                f"guard: patience of {patience} s needs a quiet above 0 s, to tell one alarm from the next"
+            )
+        values = on_model, on_sensor, limits, guarded, backup_estimator, *times
+        for name, value in zip(self.__dataclass_fields__, values, strict=True):
+            object.__setattr__(self, name, value)
+
+
+@dataclass(frozen=True)
+class GuardState:
+    """What a guard remembers from one period to the next.
+
+    Args:
+        mode: The mode that decides now.
+        wanted: The mode of the next period.
+        why: Why it is wanted, in words.
+        since: Time [s] from which the mode decides.
+        alarm: Time [s] of the last alarm.
+        doubt: Time [s] at which the present row of alarms began.
+        frozen: Time [s] at which the sensor was last seen frozen.
+        backup: Estimate of the backup's estimator; None without one, and before the first sample.
+        planner: Whose plan the last one is: ``"controller"``, ``"backup"`` or nobody's (at rest).
+        switches: Changes of the mode until now.
+    """
+
+    mode: Mode = Mode.NORMAL
+    wanted: Mode = Mode.NORMAL
+    why: str = ""
+    since: float = 0.0
+    alarm: float = -math.inf
+    doubt: float = -math.inf
+    frozen: float = -math.inf
+    backup: Estimate | None = None
+    planner: Literal["controller", "backup", "nobody"] = "controller"
+    switches: tuple[Switch, ...] = ()
+
+
+class GuardedController:
+    """A controller that changes with the guard's mode. Pure: what it remembers is a :class:`GuardState`.
+
+    Args:
+        safe: The loop's own controller.
+        guard: What to do on alarms. Default: nothing; the mode stays normal.
+
+    Raises:
+        InputError: If the backup has another problem or period.
+    """
+
+    def __init__(self, safe: SafeController, guard: Guard | None = None) -> None:
+        self.safe, self.guard = safe, guard
+        if guard is not None and guard.backup is not None and guard.backup_estimator is not None:
+            _check_alike(safe.controller, guard.backup.controller, guard.backup_estimator)
+
+    def measured(self, state: GuardState, t: float, y: Array, u_prev: Array) -> GuardState:
+        """State with a sample ``y`` ``(n_y,)`` at ``t``, ``u_prev`` held before it; the mode wanted begins now."""
+        if state.wanted is not state.mode:
+            switch = Switch(t, state.mode, state.wanted, state.why)
+            state = replace(state, mode=state.wanted, since=t, switches=(*state.switches, switch))
+        estimator = None if self.guard is None else self.guard.backup_estimator
+        if estimator is None:
+            return state
+        known = state.backup
+        return replace(
+            state, backup=estimator.start(y, t) if known is None else estimator.update(known, y, u_prev)
+        )
+
+    def decide(
+        self, state: GuardState, previous: Decision, estimate: Estimate, reference: Array,
+        weight: Array | None = None, *, prepared: Prepared | None = None,
+    ) -> tuple[Decision, GuardState]:  # fmt: skip
+        """The input to hold from now on, by the mode's controller; see :meth:`SafeController.decide`."""
+        mode, bounds = state.mode, self._bounds(state)
+        if mode is Mode.REST:
+            return self._rest(previous, bounds), replace(state, planner="nobody")
+        safe, known = self._active(state, estimate)
+        before, state = self._handed(state, previous, safe, known)
+        if mode is Mode.FALLBACK:
+            decision = safe.late(replace(before, age=USED_UP), known, reference, limits=bounds)
+            return replace(decision, status=Status.INITIAL, age=0), state
+        return safe.decide(before, known, reference, weight, limits=bounds, prepared=prepared), state
+
+    def late(
+        self, state: GuardState, previous: Decision, estimate: Estimate, reference: Array
+    ) -> tuple[Decision, GuardState]:
+        """The input where a solve has not come in time; see :meth:`SafeController.late`."""
+        bounds = self._bounds(state)
+        if state.mode is Mode.REST:
+            return self._rest(previous, bounds), replace(state, planner="nobody")
+        safe, known = self._active(state, estimate)
+        before, state = self._handed(state, previous, safe, known)
+        return safe.late(before, known, reference, limits=bounds), state
+
+    def prepare(self, state: GuardState, decision: Decision, weight: Array | None) -> Prepared | None:
+        """What of the next solve can be done now; None where there is no such part, or another's plan is taken over."""
+        if state.wanted in (Mode.FALLBACK, Mode.REST):
+            return None
+        safe = self._backup if state.wanted is Mode.BACKUP and state.backup is not None else self.safe
+        return safe.prepare(decision, weight) if self._planner(safe) == state.planner else None
+
+    def watched(self, state: GuardState, t: float, reading: Any) -> GuardState:
+        """State with what the monitor said of the period at ``t``; it decides on the next period's mode."""
+        guard = self.guard
+        if guard is None:
+            return state
+        alarm, doubt, frozen = state.alarm, state.doubt, state.frozen
+        if reading.alarm:
+            if t - alarm >= guard.quiet - TINY:
+                doubt = t
+            alarm = t
+        if getattr(reading, "frozen", False):
+            frozen = t
+        on = alarm == t or t - alarm < guard.quiet - TINY
+        if frozen == t or t - frozen < guard.quiet - TINY:
+            wanted, why = guard.on_sensor, "the sensor repeats itself while motion is predicted"
+        elif on and alarm - doubt >= guard.patience - TINY:
+            blind = getattr(reading, "blind", False)
+            said = "the monitor cannot judge" if blind else "the model does not describe the machine"
+            wanted, why = guard.on_model, said
+        else:
+            wanted, why = Mode.NORMAL, f"no alarm for {guard.quiet:g} s"
+        if wanted < state.mode and t - state.since < guard.dwell - TINY:
+            wanted = state.mode
+        return replace(state, wanted=wanted, why=why, alarm=alarm, doubt=doubt, frozen=frozen)
+
+    @property
+    def _backup(self) -> SafeController:
+        own = None if self.guard is None else self.guard.backup
+        return self.safe if own is None else own
+
+    def _planner(self, safe: SafeController) -> Literal["controller", "backup"]:
+        return "controller" if safe is self.safe else "backup"
+
+    def _active(self, state: GuardState, estimate: Estimate) -> tuple[SafeController, Estimate]:
+        if state.mode is Mode.BACKUP and state.backup is not None:
+            return self._backup, state.backup
+        return self.safe, estimate
+
+    def _bounds(self, state: GuardState) -> Limits | None:
+        return None if state.mode is Mode.NORMAL or self.guard is None else self.guard.limits
+
+    def _handed(
+        self, state: GuardState, previous: Decision, safe: SafeController, estimate: Estimate
+    ) -> tuple[Decision, GuardState]:
+        """The decision before as one of ``safe``'s: its plan's inputs, run through the model of ``safe``."""
+        planner = self._planner(safe)
+        if planner == state.planner:
+            return previous, state
+        u = np.vstack([previous.solution.u[1:], previous.solution.u[-1:]])
+        finite = replace(
+            estimate, **{name: np.nan_to_num(getattr(estimate, name)) for name in ("x", "h", "d")}
+        )
+        following = safe.controller.initial(finite, u).delayed(previous.u)
+        decision = Decision(previous.u, previous.source, following, Status.INITIAL, 0)
+        return decision, replace(state, planner=planner)
+
+    def _rest(self, previous: Decision, limits: Limits | None) -> Decision:
+        """The safe input, as soon as ``du_max`` lets it be."""
+        ocp = self.safe.controller.ocp
+        u = ocp.saturate(self.safe.safe_input, previous.u, limits)
+        plan = replace(previous.solution, u=np.tile(u, (ocp.horizon, 1)))
+        return Decision(u, Source.ZERO, plan, Status.INITIAL, 0)
+
+
+def _check_alike(main: Controller, backup: Controller, estimator: Estimator) -> None:
+    shapes = [(c.model.n_x, c.ocp.n_u, c.ocp.horizon, c.model.dt) for c in (main, backup)]
+    if shapes[0] != shapes[1]:
+        raise InputError(
+            f"guard: the backup has (n_x, n_u, N, dt) = {shapes[1]}, the controller {shapes[0]}; give both one problem"
+        )
+    sizes = [(m.n_x, m.n_h, m.n_u) for m in (backup.model, estimator.model)]
+    if sizes[0] != sizes[1]:
+        raise InputError(
+            f"guard: the backup's model has (n_x, n_h, n_u) = {sizes[0]}, that of its estimator {sizes[1]}"
+        )

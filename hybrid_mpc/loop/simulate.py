@@ -1,0 +1,488 @@
+"""The closed loop: measure, estimate, solve, monitor, hold."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.errors import InputError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from hybrid_mpc.loop.guard import Switch
+    from hybrid_mpc.model.model import HybridModel
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from time import perf_counter
+from typing import NamedTuple
+
+from numpy.typing import ArrayLike
+
+from hybrid_mpc.control.ocp import OCP
+from hybrid_mpc.control.problem import Controller
+from hybrid_mpc.control.safeguard import Decision, SafeController
+from hybrid_mpc.estimate.kalman import Estimate, Estimator
+from hybrid_mpc.estimate.switching import FilterBank, SwitchingFilter, measures_first_states
+from hybrid_mpc.loop.faults import Fault, check_channels, install
+from hybrid_mpc.loop.guard import Guard
+from hybrid_mpc.loop.loop import TIMED, Loop, Monitor, Reading, preview_of
+from hybrid_mpc.loop.plant import Machine, Plant, Preview, Previews, fitting
+from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.model.riccati import vector
+
+# The record of a closed loop.
+
+Array = NDArray[np.float64]
+UNITS = {"stage_cost": "1/s", "violation": "W", "level": "W"}
+
+
+@dataclass(frozen=True)
+class ClosedLoopResult:
+    """A closed loop of n periods; row k belongs to ``t_k = k dt``.
+
+    Args:
+        dt: Period [s].
+        t: ``(n,)`` [s].
+        x: True states ``(n, n_x)`` at ``t_k``.
+        y: Measurements ``(n, n_y)`` as they arrived, faults and noise included; NaN for a dropout.
+        u: Commanded inputs ``(n, n_u)``, held from ``t_k`` on (with an input delay: from that much later).
+        x_hat: Estimated states ``(n, n_x)``; with an input delay of the instant at which ``u`` will act.
+        h: Estimated hidden states ``(n, n_h)``.
+        d: Estimated input disturbance ``(n, n_u)``.
+        reference: Reference ``(n, n_x)`` at ``t_k``.
+        source: Name of the :class:`~hybrid_mpc.control.safeguard.Source` of each input.
+        status: Name of the :class:`~hybrid_mpc.control.problem.Status` of each solve.
+        stage_cost: Stage cost ``(n,)`` per second on the true state and the input that acts on it, with the
+            weight factors of that instant and without penalties of soft bounds.
+        timing_ms: Durations ``(n,)`` [ms] of ``estimate``, ``solve``, ``monitor``, ``prepare`` and ``total``. The only
+            field in which two runs may differ.
+        violation: Energy violation ``(n,)`` [W]; NaN without a monitor.
+        level: Alarm level ``(n,)`` [W]; NaN without a monitor.
+        alarm: ``(n,)``, True while the monitor alarms.
+        switches: Changes of the guard's mode, in their order. Default: none.
+        judged: ``(n,)``, True where the monitor could judge the period. Default: unknown.
+        innovation: Innovations of the estimator ``(n, n_y)`` [output units]; NaN where it had none. Default: unknown.
+        nis: Normalised innovations squared ``(n,)`` [-]; NaN where there was none. Default: unknown.
+        numbers: The monitor's readings as numbers ``(n, columns)``, from which detectors are learned. Default: none.
+
+    Example:
+        >>> one = np.ones((2, 1))
+        >>> result = ClosedLoopResult(0.1, np.array([0.0, 0.1]), one, one, one, one, one, one, 0 * one,
+        ...     ("MPC",) * 2, ("SOLVED",) * 2, np.array([2.0, 4.0]), {},
+        ...     one[:, 0], one[:, 0], np.zeros(2, bool))
+        >>> round(result.cost, 6), result.tracking_rmse
+        (0.6, 1.0)
+    """
+
+    dt: float
+    t: Array
+    x: Array
+    y: Array
+    u: Array
+    x_hat: Array
+    h: Array
+    d: Array
+    reference: Array
+    source: tuple[str, ...]
+    status: tuple[str, ...]
+    stage_cost: Array
+    timing_ms: Mapping[str, Array]
+    violation: Array
+    level: Array
+    alarm: NDArray[np.bool_]
+    switches: tuple[Switch, ...] = ()
+    judged: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    innovation: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    nis: Array = field(default_factory=lambda: np.zeros(0))
+    numbers: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+    @property
+    def mode(self) -> tuple[str, ...]:
+        """Name of the guard's mode in each period."""
+        names = ["NORMAL"] * len(self.t)
+        for switch in self.switches:
+            first = int(np.searchsorted(self.t, switch.t - 0.5 * self.dt))
+            names[first:] = [switch.after.name] * (len(names) - first)
+        return tuple(names)
+
+    @property
+    def cost(self) -> float:
+        """Closed-loop cost ``J = sum_k stage_cost_k dt`` on the true state."""
+        return float(np.sum(self.stage_cost) * self.dt)
+
+    @property
+    def tracking_rmse(self) -> float:
+        """Root mean square of the true first state's deviation from its reference [its unit]."""
+        return float(np.sqrt(np.mean((self.x[:, 0] - self.reference[:, 0]) ** 2)))
+
+    def to_pandas(self, model: HybridModel | None = None) -> pd.DataFrame:
+        """One row a period. Needs pandas.
+
+        Args:
+            model: Names and units of the columns: ``"x phi [rad]"``, ``"y phi [rad]"``, ``"t [s]"``. Default: numbers
+                without units, ``x_0``, ``x_1``, ``t``.
+
+        Raises:
+            InputError: If the model has other numbers of states, inputs or outputs.
+
+        Example: ``result.to_pandas(model)["u torque [N m]"]``
+        """
+        import pandas as pd
+
+        columns: dict[str, object] = {"t" if model is None else "t [s]": self.t}
+        for name in ("x", "y", "u", "x_hat", "h", "d", "reference"):
+            values = getattr(self, name)
+            labels = _labels(name, values.shape[1], model)
+            columns.update({label: values[:, i] for i, label in enumerate(labels)})
+        for name in ("source", "status", "stage_cost", "violation", "level", "alarm"):
+            unit = "" if model is None or name not in UNITS else f" [{UNITS[name]}]"
+            columns[name + unit] = getattr(self, name)
+        unit = "_ms" if model is None else " [ms]"
+        columns.update({f"{name}{unit}": values for name, values in self.timing_ms.items()})
+        return pd.DataFrame(columns)
+
+
+def _labels(name: str, n: int, model: HybridModel | None) -> list[str]:
+    if model is None or name == "h":
+        return [f"{name}_{i}" for i in range(n)]
+    signals = model.outputs if name == "y" else model.inputs if name in ("u", "d") else model.states
+    if len(signals) != n:
+        raise InputError(
+            f"to_pandas: the loop has {n} columns of {name}, the model {model.name} {len(signals)}"
+        )
+    return [f"{name} {s.name} [{s.unit}]" for s in signals]
+
+
+@dataclass(frozen=True)
+class Step:
+    """One period as ``on_step`` sees it: number, time [s], truth, measurement, estimate, decision."""
+
+    k: int
+    t: float
+    x: Array
+    y: Array
+    estimate: Estimate
+    decision: Decision
+    reading: Reading | None
+
+
+def simulate(
+    plant: Plant,
+    estimator: Estimator,
+    controller: SafeController | Controller,
+    reference: Preview | ArrayLike,
+    *,
+    dt: float,
+    duration: float,
+    x0: ArrayLike,
+    seed: int,
+    weight: Preview | None = None,
+    horizon: int | None = None,
+    monitor: Monitor | None = None,
+    faults: Sequence[Fault] = (),
+    stage_cost: OCP | None = None,
+    on_step: Callable[[Step], None] | None = None,
+    sensor_delay: int = 0,
+    input_delay: int = 0,
+    late: Callable[[float], bool] | None = None,
+    guard: Guard | None = None,
+) -> ClosedLoopResult:
+    """Run a plant under control; deterministic except for the recorded durations.
+
+    It drives a :class:`~hybrid_mpc.loop.loop.Loop` on a virtual clock. No time passes between measuring and
+    holding but the delays given. Input faults act behind the controller, which is not told.
+
+    The preview reaches beyond the end of the run: reference and weight are asked for those times too. Where
+    they are not finite there (a recording that ends), their last value within the run is held.
+
+    With delays the estimate must be that of the instant at which the input will act: give
+    :class:`~hybrid_mpc.estimate.delay.DelayCompensation` as estimator. Before the start the machine has rested
+    at ``x0`` with the first held input, and the sensor has measured it there.
+
+    Args:
+        plant: The machine.
+        estimator: Filter, or :class:`~hybrid_mpc.estimate.kalman.TrueState`, which is handed the truth, undelayed.
+        controller: A :class:`~hybrid_mpc.control.safeguard.SafeController`; a bare controller is guarded without
+            fallback.
+        reference: ``t (n,) -> x_ref (n, n_x)`` or a set-point; see :class:`~hybrid_mpc.loop.loop.Loop`.
+        dt: Period [s]; must be the models' own.
+        duration: Length [s], rounded to whole periods.
+        x0: Initial state ``(n_x,)``.
+        seed: Seed of the plant and of the measurement noise.
+        weight: Factors on ``q``, ``t (n,) -> (n, n_x)``, previewed alike; they count in the recorded cost.
+            Default: 1.
+        horizon: Periods of preview. Default: the controller's horizon.
+        monitor: Default: none.
+        faults: Default: none.
+        stage_cost: Problem whose stage cost is recorded. Default: the controller's.
+        on_step: Called after every period, e.g. to show progress.
+        sensor_delay: Periods after which a measurement arrives; faults of a sensor act on arrival.
+        input_delay: Periods after which an input reaches the plant: computing and transport.
+        late: ``t [s] -> True`` where the solve misses its deadline. Default: never.
+        guard: What to do on alarms of the monitor, which it needs. Default: nothing.
+
+    Returns:
+        The record of ``round(duration / dt)`` periods.
+
+    Raises:
+        InputError: If a period, shape or channel does not fit.
+
+    Example: see ``tests/loop``; with a scenario::
+
+        result = simulate(plant, ekf, controller, task.reference, weight=task.weight, dt=0.02,
+                          duration=task.duration, x0=task.x0, seed=0)
+    """
+    return Simulation(
+        plant, estimator, controller, reference, dt=dt, duration=duration, x0=x0, seed=seed, weight=weight,
+        horizon=horizon, monitor=monitor, faults=faults, stage_cost=stage_cost, on_step=on_step,
+        sensor_delay=sensor_delay, input_delay=input_delay, late=late, guard=guard,
+    ).run()  # fmt: skip
+
+
+class Simulation:
+    """A plant in a loop, a period at a time: what :func:`simulate` drives, and what drives several side by side.
+
+    Args: as :func:`simulate`.
+
+    Example: ``Simulation(plant, ekf, mpc, [0.0, 0.0], dt=0.02, duration=1.0, x0=[0.0, 0.0], seed=0).run()``
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        estimator: Estimator,
+        controller: SafeController | Controller,
+        reference: Preview | ArrayLike,
+        *,
+        dt: float,
+        duration: float,
+        x0: ArrayLike,
+        seed: int,
+        weight: Preview | None = None,
+        horizon: int | None = None,
+        monitor: Monitor | None = None,
+        faults: Sequence[Fault] = (),
+        stage_cost: OCP | None = None,
+        on_step: Callable[[Step], None] | None = None,
+        sensor_delay: int = 0,
+        input_delay: int = 0,
+        late: Callable[[float], bool] | None = None,
+        guard: Guard | None = None,
+    ) -> None:
+        self.loop = loop = Loop(
+            estimator, controller, monitor=monitor, reference=reference, weight=weight, guard=guard, horizon=horizon,
+            end=_end(dt, duration, estimator.model.dt), input_delay=input_delay, sensor_delay=sensor_delay,
+        )  # fmt: skip
+        ocp, model = loop.ocp, loop.model
+        self.periods, self._dt, self._k = round(duration / dt), dt, 0
+        self._plant, faults = install(plant, faults)
+        check_channels(faults, model.n_y, ocp.n_u)
+        self._cost = _checked_cost(ocp, ocp if stage_cost is None else stage_cost)
+        end = self.periods * dt
+        self._acting = (
+            Previews(preview_of(reference, ocp), weight, ocp, horizon, dt, end) if input_delay else None
+        )
+        rest = vector(x0, ocp.n_x, "x0")
+        self._machine = Machine(self._plant, rest, seed, model.n_y, faults, dt, sensor_delay, input_delay)
+        self._late, self._on_step = late, on_step
+        self._rows: list[_Row] = []
+        self._x, self.y = rest, np.full(model.n_y, np.nan)
+
+    @property
+    def held(self) -> Array:
+        """Input ``(n_u,)`` that the controller has given for the period before the one in hand."""
+        return self.loop.decision.u
+
+    def run(self) -> ClosedLoopResult:
+        """All periods that are left; returns the record."""
+        while self._k < self.periods:
+            self.measure()
+            self.go_on()
+        return self.result()
+
+    def measure(self) -> Array:
+        """The sample ``(n_y,)`` of the period that begins."""
+        self._x = fitting(self._plant.truth(self._machine.state), self.loop.ocp.n_x, "the plant's truth")
+        self.y = self._machine.measure(self._k * self._dt)
+        return self.y
+
+    def go_on(self, estimating: float = 0.0) -> None:
+        """Decide on the sample, hold the input for a period, and note what happened.
+
+        Args:
+            estimating: Time [s] that was spent on the estimate before, outside the loop. Default: none.
+        """
+        loop, machine, t = self.loop, self._machine, self._k * self._dt
+        truth = np.concatenate([self._x, self._plant.hidden(machine.state)])
+        in_time = None if self._late is None else partial(_is_in_time, self._late, t)
+        if self._k == 0:
+            loop.start(self.y, truth=truth, in_time=in_time)
+            machine.rest(loop.state.held[0])
+        else:
+            loop.step(self.y, truth=truth, in_time=in_time)
+        u, u_prev = machine.command(loop.decision.u)
+        loop.finish()
+        x_ref, factors = loop.previewed if self._acting is None else self._acting(t)
+        now_factors = 1.0 if factors is None else factors[0]
+        with np.errstate(over="ignore", invalid="ignore"):  # an absurd reference costs infinitely much
+            stage = float(
+                self._cost.stage_cost(self._x, u, x_ref[0, : self._x.size], u - u_prev, now_factors)
+            )
+        step = Step(self._k, t, self._x, self.y, loop.estimate, loop.decision, loop.reading)
+        spent = {**loop.spent, "estimate": loop.spent["estimate"] + estimating}
+        self._rows.append(_row(step, x_ref[0, : self._x.size].copy(), stage, spent))
+        if self._on_step is not None:
+            self._on_step(step)
+        machine.advance(t)
+        self._k += 1
+
+    def result(self) -> ClosedLoopResult:
+        """The record of the periods until now."""
+        rows = self._rows
+        readings = [row.reading for row in rows]
+        timing = {name: 1e3 * np.array([row.spent[name] for row in rows]) for name in TIMED}
+        return ClosedLoopResult(
+            dt=self._dt,
+            **{name: np.array([getattr(row, name) for row in rows]) for name in COLUMNS},
+            source=tuple(row.source for row in rows),
+            status=tuple(row.status for row in rows),
+            timing_ms={**timing, "total": np.sum(list(timing.values()), axis=0)},
+            violation=np.array([np.nan if r is None else r.violation_w for r in readings]),
+            level=np.array([np.nan if r is None else r.level_w for r in readings]),
+            alarm=np.array([r is not None and bool(r.alarm) for r in readings]),
+            judged=np.array([r is not None and not getattr(r, "verdict", 0) for r in readings]),
+            switches=self.loop.switches,
+            numbers=np.array([getattr(r, "numbers", ()) for r in readings], dtype=np.float64),
+        )
+
+
+def simulate_together(
+    estimator: Estimator, make: Sequence[Callable[[Estimator], Simulation]]
+) -> list[ClosedLoopResult]:
+    """Run simulations of one estimator and length side by side; each is what it is alone, to rounding.
+
+    Switching filters on a model whose outputs are its first states go through each operation together, which is
+    quicker; other estimators take turns. The time of what they do together is shared out evenly.
+
+    Args:
+        estimator: The estimator of all.
+        make: Makes each simulation with the estimator that it is handed.
+
+    Returns:
+        Their records.
+
+    Raises:
+        InputError: If their numbers of periods differ.
+
+    Example: ``simulate_together(ekf, [lambda e, s=s: Simulation(plant, e, mpc, ref, seed=s, ...) for s in range(9)])``
+    """
+    if not (isinstance(estimator, SwitchingFilter) and measures_first_states(estimator.model)):
+        return [run.run() for run in _of_one_length([one(estimator) for one in make])]
+    told = [_Told(estimator.model) for _ in make]
+    runs = _of_one_length([one(each) for one, each in zip(make, told, strict=True)])
+    bank = None
+    for _ in range(runs[0].periods if runs else 0):
+        y, spent = np.array([run.measure() for run in runs]), 0.0
+        if bank is None:
+            bank = FilterBank(estimator, y)
+            estimates = bank.estimates(np.full_like(y, np.nan), np.full(len(y), np.nan))
+        else:
+            begin = perf_counter()
+            estimates = bank.update(y, np.array([run.held for run in runs]))
+            spent = (perf_counter() - begin) / len(runs)
+        for run, each, estimate in zip(runs, told, estimates, strict=True):
+            each.estimate = estimate
+            run.go_on(spent)
+    return [run.result() for run in runs]
+
+
+def _of_one_length(runs: list[Simulation]) -> list[Simulation]:
+    lengths = sorted({run.periods for run in runs})
+    if len(lengths) > 1:
+        raise InputError(
+            f"loops of {', '.join(map(str, lengths))} periods given; side by side they must be of one length: give "
+            "all the same duration, or run them one by one"
+        )
+    return runs
+
+
+class _Told:
+    """An estimator whose estimates come from a bank of filters."""
+
+    def __init__(self, model: HybridModel) -> None:
+        self.model = model
+        self.estimate: Estimate | None = None
+
+    def start(self, y: ArrayLike, t: float = 0.0) -> Estimate:
+        assert self.estimate is not None
+        return self.estimate
+
+    def update(self, estimate: Estimate, y: ArrayLike, u: ArrayLike) -> Estimate:
+        assert self.estimate is not None
+        return self.estimate
+
+
+class _Row(NamedTuple):
+    """What is kept of a period; plans and covariances, which a long run has no room for, are not."""
+
+    t: float
+    x: Array
+    y: Array
+    u: Array
+    x_hat: Array
+    h: Array
+    d: Array
+    reference: Array
+    stage_cost: float
+    innovation: Array
+    nis: float
+    source: str
+    status: str
+    reading: Reading | None
+    spent: Mapping[str, float]
+
+
+COLUMNS = _Row._fields[:11]
+"""Those that are numbers."""
+
+
+def _row(step: Step, reference: Array, stage: float, spent: Mapping[str, float]) -> _Row:
+    e, d = step.estimate, step.decision
+    return _Row(
+        step.t, step.x, step.y, d.u, e.x, e.h, e.d, reference, stage, e.innovation, e.nis, d.source.name,
+        d.status.name, step.reading, spent,
+    )  # fmt: skip
+
+
+def _is_in_time(late: Callable[[float], bool], t: float) -> bool:
+    return not late(t)
+
+
+def _checked_cost(ocp: OCP, cost: OCP) -> OCP:
+    if (cost.n_x, cost.n_u) != (ocp.n_x, ocp.n_u):
+        raise InputError(
+            f"stage_cost has {cost.n_x} states and {cost.n_u} inputs, needed: {ocp.n_x} and {ocp.n_u}"
+        )
+    return cost
+
+
+def _end(dt: float, duration: float, period: float) -> float:
+    """End of the run [s].
+
+    Raises:
+        InputError: If a time is not finite, the period another than the models', or the run shorter than one.
+    """
+    if not (math.isfinite(duration) and math.isfinite(dt) and dt > 0):
+        raise InputError(f"dt and duration must be finite and dt positive; got {dt} s and {duration} s")
+    if not abs(dt - period) <= 1e-9 * period:
+        raise InputError(f"dt = {dt} s given, a model's period is {period} s; they must agree")
+    if round(duration / dt) < 1:
+        raise InputError(f"duration {duration} s is shorter than one period of {dt} s")
+    return round(duration / dt) * dt

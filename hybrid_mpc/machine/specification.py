@@ -1,0 +1,195 @@
+"""How a machine is judged on recordings, and with what effort: the part of a scenario that ``benchmark`` reads."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from hybrid_mpc.errors import InputError
+
+# How a machine's recordings are read, and what their parts are used for.
+
+Role = Literal["train", "valid", "test", "nominal"]
+"""What a part of a recording is used for, see :class:`Window`."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """A part of a recording and what it is used for.
+
+    Args:
+        start: First time [s] in the recording's own time.
+        end: Last time [s].
+        role: ``"train"``, ``"valid"``, ``"test"``, or ``"nominal"``: known to be free of disturbances but used
+            for no free run (standing at an unstable point, say); the monitor must stay quiet there.
+    """
+
+    start: float
+    end: float
+    role: Role
+
+
+@dataclass(frozen=True)
+class DataSpec:
+    """How a machine's recordings are read.
+
+    Args:
+        time: Column of the time stamps [s].
+        inputs: Columns of the inputs, in the order of the prior's inputs (zero-order hold).
+        outputs: Columns of the measured positions, in the order of the prior's outputs.
+        dt: Model period [s]; declaring it is the request to resample to it.
+        max_gap: Longest distance [s] between two samples; a run is cut where it is exceeded.
+        smoothing: Length [s] of the local polynomial that first smooths and differentiates the positions; the
+            prior is fitted to that, then smooths them once more by its own equations.
+        warm_up: Measured past [s] that starts every free run: x(0) is smoothed from it, h warmed up on
+            it, and none of it is scored.
+        windows: Known windows by file stem. A recording that is not named here is split by ``fractions``.
+        fractions: Shares of training, validation and test samples, in this order of time.
+        free_run: Length [s] of the free runs that judge a model, started every fifth of it. Default: each
+            test trajectory as a whole. Where an unstable point multiplies every error, short runs from many
+            starts say more than one long one.
+        inputs_of: Input columns of single recordings, by file stem, where they differ from ``inputs``.
+        units: Units of columns that are not in seconds or in their signal's unit, by column: ``"ms"``, ``"deg"``, or
+            the factor as a number (:mod:`hybrid_mpc.data.tables`).
+        largest_delay: Longest delay [s] of the inputs that the main job searches for, with the prior's parameters, and
+            then gives the deployed models. Default 0: none is searched, the input acts at once.
+
+    Raises:
+        InputError: If a length is not positive, the delay is negative, or the fractions do not sum to one.
+    """
+
+    time: str
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    dt: float
+    max_gap: float
+    smoothing: float
+    warm_up: float
+    windows: Mapping[str, tuple[Window, ...]] = field(default_factory=dict)
+    fractions: tuple[float, float, float] = (0.6, 0.2, 0.2)
+    free_run: float | None = None
+    inputs_of: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    units: Mapping[str, str | float] = field(default_factory=dict)
+    largest_delay: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.largest_delay < math.inf:
+            raise InputError(
+                f"data specification: largest_delay must be 0 s or more, got {self.largest_delay}"
+            )
+        for name in ("dt", "max_gap", "smoothing", "warm_up"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"data specification: {name} must be positive, got {getattr(self, name)}")
+        if self.free_run is not None and not self.free_run > 0:
+            raise InputError(
+                f"data specification: free_run must be positive or left out, got {self.free_run}"
+            )
+        if abs(sum(self.fractions) - 1.0) > 1e-9 or min(self.fractions) < 0:
+            raise InputError(f"data specification: fractions must sum to 1, got {self.fractions}")
+
+
+@dataclass(frozen=True)
+class BenchmarkBudget:
+    """Effort of the networks of one benchmark.
+
+    Args:
+        hidden: Hidden units z.
+        networks: Networks of each kind.
+        teacher_steps: Optimiser steps with teacher forcing.
+        free_run_steps: Optimiser steps on free runs.
+        horizon: Most scored periods of a free run in training.
+        batch: Windows a step. Default: 32.
+        decay: Weight decay times the number of training samples. Default: that of the training.
+        anchors: Weight of fading corrections where nothing was measured: see ``TrainingSettings``. Default: zero.
+
+    Example:
+        >>> BenchmarkBudget(hidden=16, networks=2, teacher_steps=100, free_run_steps=200, horizon=40).batch
+        32
+    """
+
+    hidden: int
+    networks: int
+    teacher_steps: int
+    free_run_steps: int
+    horizon: int
+    batch: int = 32
+    decay: float = 300.0
+    anchors: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_anchors(self.anchors)
+
+
+def check_anchors(weight: float) -> None:
+    """Refuse a weight of anchors that is none.
+
+    Raises:
+        InputError: If it is negative or not finite.
+
+    Example:
+        >>> check_anchors(10.0)
+    """
+    if not 0 <= weight < math.inf:
+        raise InputError(f"anchors must be a weight of 0 or more, got {weight}")
+
+
+@dataclass(frozen=True)
+class BenchmarkSpec:
+    """How a machine's models are judged by free runs over recordings that they have not seen.
+
+    What is given at the start of a run is the scenario's ``warm_up``. The whole recording after it is one run, or
+    its first ``length`` seconds.
+
+    Args:
+        budgets: Effort by name, ``"quick"`` and ``"full"``.
+        unit: Unit of the figures. Default: ``"rad"``.
+        scale: Figures' units in an SI unit of the output. Default: 1.
+        largest_delay: Longest delay [s] of the input that is searched for; zero: none. Default: 0.
+        length: Length [s] of a run after what is given. Default: the whole recording.
+        piece: Length [s] of the pieces that long training recordings are cut into. Default: 25 s.
+        cycle: Roles of these pieces, again and again in order of time, where a recording's parts are not alike and
+            its last ones would not be a fair sample. Default: none, the data specification splits.
+        valid_every: Of several training files every so many-th, in the order of their names, validates from its first
+            sample to its last, and the others train as wholes. For short runs: the last second of a run that was
+            trained on is no sample of a free run over another one. Nothing is held back then, and the files must
+            not have windows in the data specification. Fewer files than that are split by it. Default: zero, never.
+
+    Raises:
+        InputError: If a length, the scale or the delay is out of its range, a cycle lacks a role that is needed, or
+            both ``cycle`` and ``valid_every`` are given.
+
+    Example:
+        >>> BenchmarkSpec({}, unit="mm", scale=1e3).length is None
+        True
+    """
+
+    budgets: Mapping[str, BenchmarkBudget] = field(default_factory=dict)
+    unit: str = "rad"
+    scale: float = 1.0
+    largest_delay: float = 0.0
+    length: float | None = None
+    piece: float = 25.0
+    cycle: tuple[str, ...] = ()
+    valid_every: int = 0
+
+    def __post_init__(self) -> None:
+        if not (self.scale > 0 and self.piece > 0 and (self.length is None or self.length > 0)):
+            raise InputError(
+                f"benchmark specification: scale, piece and length must be positive, got {self.scale}, "
+                f"{self.piece}, {self.length}"
+            )
+        if self.cycle and not {"train", "valid"} <= set(self.cycle) <= {"train", "valid", "test"}:
+            raise InputError(
+                f"benchmark specification: cycle needs 'train' and 'valid', and may have 'test'; got {self.cycle}"
+            )
+        if self.valid_every and (self.valid_every < 2 or self.cycle):
+            raise InputError(
+                f"benchmark specification: valid_every must be 2 or more (or 0 for never), and there must be no cycle "
+                f"beside it; got {self.valid_every} and cycle {self.cycle}"
+            )
+        if self.largest_delay < 0:
+            raise InputError(
+                f"benchmark specification: largest_delay must not be negative, got {self.largest_delay}"
+            )

@@ -1,0 +1,387 @@
+"""Friction as an option of any prior: blocks that are added to its equation of motion and to its energy balance.
+
+``with_friction(PendulumPrior, Coulomb(...), Stribeck(...))`` is a prior class like any other: it is fitted, trained on
+and exported as one. Every block gives the torque (or force) that opposes the velocity of one axis; what it takes from
+the machine is that times the velocity, never negative.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.machine.signals import Parameter, Signal
+
+# The prior: the ODE that explains most of a machine, written once (torch).
+#
+# The same code trains on any batch and is exported for one sample, because it indexes the last axis.
+
+
+class Prior(nn.Module):
+    """A mechanical ODE prior with its output equation and its energy balance.
+
+    The state is ``x = [q, v]``: positions first, then their velocities, so that ``q_dot = v`` is exact. ``n_extra``
+    states of another kind (a lagging input, say) may follow, whose rates :meth:`extra_rates` gives.
+    A subclass names its signals and parameters as class attributes and writes two methods. Every
+    parameter becomes a float64 ``nn.Parameter`` of shape ``()`` under its name.
+
+    Args:
+        values: Parameter values [SI] by name that replace the nominal ones, e.g. fitted ones.
+
+    Raises:
+        InputError: If a name in ``values`` is no parameter, or the signals do not form ``[q, v]``.
+
+    Example:
+        >>> class Pendulum(Prior):
+        ...     states = (Signal("phi", "rad"), Signal("phi_dot", "rad/s"))
+        ...     inputs = (Signal("torque", "N m"),)
+        ...     outputs = (Signal("phi", "rad"),)
+        ...     parameters_spec = (Parameter("J", 0.1, "kg m^2", 0.01, 1.0),)
+        ...     def acceleration(self, x, u):
+        ...         return u / self.J
+        ...     def inertia(self, x):
+        ...         return self.J
+        >>> Pendulum()(torch.tensor([0.0, 1.0]), torch.tensor([0.2])).tolist()
+        [1.0, 2.0]
+    """
+
+    states: ClassVar[tuple[Signal, ...]]
+    inputs: ClassVar[tuple[Signal, ...]]
+    outputs: ClassVar[tuple[Signal, ...]]
+    parameters_spec: ClassVar[tuple[Parameter, ...]]
+    n_extra: ClassVar[int] = 0
+
+    def __init__(self, values: Mapping[str, float] | None = None) -> None:
+        super().__init__()
+        if (len(self.states) - self.n_extra) % 2:
+            found = len(self.states) - self.n_extra
+            raise InputError(f"{type(self).__name__}: states must be [q, v] in pairs, got {found}")
+        values = dict(values or {})
+        for spec in self.parameters_spec:
+            value = torch.tensor(values.pop(spec.name, spec.value), dtype=torch.float64)
+            self.register_parameter(spec.name, nn.Parameter(value, requires_grad=False))
+        if values:
+            names = ", ".join(spec.name for spec in self.parameters_spec)
+            raise InputError(f"{type(self).__name__} has no parameter {', '.join(values)}; it has: {names}")
+
+    @property
+    def n_q(self) -> int:
+        """Number of degrees of freedom."""
+        return (len(self.states) - self.n_extra) // 2
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Current parameter values [SI] by name."""
+        return {spec.name: float(getattr(self, spec.name)) for spec in self.parameters_spec}
+
+    def acceleration(self, x: Tensor, u: Tensor) -> Tensor:
+        """Accelerations ``v_dot``, shape ``(..., n_q)``, at ``x`` ``(..., 2 n_q)`` and ``u`` ``(..., n_u)``."""
+        raise NotImplementedError(f"{type(self).__name__} must define acceleration(x, u)")
+
+    def forward(self, x: Tensor, u: Tensor) -> Tensor:
+        """Derivative ``xdot`` ``(..., n_x)`` of the state: exact kinematics and :meth:`acceleration`."""
+        if self.n_extra:
+            return torch.cat([self._velocity(x), self.acceleration(x, u), self.extra_rates(x, u)], dim=-1)
+        return torch.cat([x[..., self.n_q :], self.acceleration(x, u)], dim=-1)
+
+    def extra_rates(self, x: Tensor, u: Tensor) -> Tensor:
+        """Rates ``(..., n_extra)`` of the states after ``[q, v]``; only a prior that has such states needs it."""
+        raise NotImplementedError(
+            f"{type(self).__name__} has n_extra states and must define extra_rates(x, u)"
+        )
+
+    def output(self, x: Tensor, u: Tensor) -> Tensor:
+        """Measured outputs ``(..., n_y)``. Default: the positions."""
+        return x[..., : len(self.outputs)]
+
+    def inertia(self, x: Tensor) -> Tensor | float:
+        """Generalised inertia of each velocity [SI], a number or ``(..., n_q)``, for :meth:`energy_balance`."""
+        raise NotImplementedError(
+            f"{type(self).__name__} must define inertia(x), or energy_balance(x, xdot, u)"
+        )
+
+    def energy_balance(self, x: Tensor, xdot: Tensor, u: Tensor) -> Tensor:
+        """Energy balance ΔE [W], shape ``(...)``: zero along the prior's own flow.
+
+        The velocity comes from the state ``x``, the acceleration from ``xdot``. By default it is the equation
+        of motion times the velocity, ``inertia * (v_dot - acceleration(x, u)) * v``: the same number as the
+        balance written out term by term, and no equation is written twice.
+        """
+        v, v_dot = self._velocity(x), self._velocity(xdot)
+        return (self.inertia(x) * (v_dot - self.acceleration(x, u)) * v).sum(-1)
+
+    def _velocity(self, x: Tensor) -> Tensor:
+        """The second ``n_q`` of a state or of its derivative."""
+        return x[..., self.n_q : 2 * self.n_q] if self.n_extra else x[..., self.n_q :]
+
+
+class FrictionTerm(Protocol):
+    """A block: its parameters, its axis, and its torque."""
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Its parameters, which the prior takes among its own."""
+
+    @property
+    def axis(self) -> int:
+        """Number of the degree of freedom that it brakes."""
+
+    def torque(self, prior: Prior, x: Tensor, v: Tensor) -> Tensor:
+        """Torque against the motion ``(...)`` [SI] at states ``x`` ``(..., n_x)`` and the axis' velocity ``v``."""
+
+
+@dataclass(frozen=True)
+class Viscous:
+    """``d v``.
+
+    Args:
+        d: Damping [N m s/rad], not negative.
+        axis: Degree of freedom. Default: the first.
+
+    Example:
+        >>> damping = Parameter("d_2", 0.1, "N m s/rad", 0.0, 1.0)
+        >>> viscous(torch.tensor(3.0), torch.tensor(0.5)).item()
+        1.5
+    """
+
+    d: Parameter
+    axis: int = 0
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Damping."""
+        return (self.d,)
+
+    def torque(self, prior: Prior, x: Tensor, v: Tensor) -> Tensor:
+        """See :func:`viscous`."""
+        return viscous(v, _of(prior, self.d))
+
+
+@dataclass(frozen=True)
+class Coulomb:
+    """``F_c tanh(gamma v)``: dry friction, smooth at rest.
+
+    ``gamma F_c / inertia`` is the rate at which it stops the machine near rest, and the prior's sub-steps follow it:
+    an upper bound of gamma that asks for more than 20 of them a period is refused by whoever steps the prior.
+
+    Args:
+        level: Sliding friction F_c [N m].
+        steepness: gamma [s/rad].
+        axis: Degree of freedom. Default: the first.
+    """
+
+    level: Parameter
+    steepness: Parameter
+    axis: int = 0
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Level and steepness."""
+        return self.level, self.steepness
+
+    def torque(self, prior: Prior, x: Tensor, v: Tensor) -> Tensor:
+        """See :func:`coulomb`."""
+        return coulomb(v, _of(prior, self.level), _of(prior, self.steepness))
+
+
+@dataclass(frozen=True)
+class Stribeck:
+    """``(F_c + (F_s - F_c) exp(-(v / v_s)^2)) tanh(gamma v)``: more friction near rest than in motion.
+
+    Args:
+        level: Sliding friction F_c [N m].
+        static: Friction near rest F_s [N m].
+        speed: Stribeck speed v_s [rad/s], positive.
+        steepness: gamma [s/rad]; 2 / v_s and more, or the smooth sign hides the peak.
+        axis: Degree of freedom. Default: the first.
+
+    Source: Armstrong-Hélouvry, Dupont, Canudas de Wit, *A survey of models, analysis tools and compensation methods
+    for the control of machines with friction*, Automatica 30 (1994).
+    """
+
+    level: Parameter
+    static: Parameter
+    speed: Parameter
+    steepness: Parameter
+    axis: int = 0
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Level, static level, Stribeck speed, steepness."""
+        return self.level, self.static, self.speed, self.steepness
+
+    def torque(self, prior: Prior, x: Tensor, v: Tensor) -> Tensor:
+        """See :func:`stribeck`."""
+        return stribeck(v, *(_of(prior, p) for p in self.parameters))
+
+
+@dataclass(frozen=True)
+class LoadDependent:
+    """``rho tanh(gamma v) |load(x)|``: Coulomb friction of a bearing that carries a load.
+
+    Args:
+        arm: Friction coefficient times friction radius rho [m]; motion tells only their product.
+        steepness: gamma [s/rad].
+        load: ``(prior, x) -> (...)``, the load [N] of either sign, e.g. :class:`PendulumLoad`.
+        axis: Degree of freedom. Default: the first.
+
+    Source: Schön, Götte, Timmermann (2022), system 2.
+    """
+
+    arm: Parameter
+    steepness: Parameter
+    load: Callable[[Prior, Tensor], Tensor]
+    axis: int = 0
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Arm and steepness."""
+        return self.arm, self.steepness
+
+    def torque(self, prior: Prior, x: Tensor, v: Tensor) -> Tensor:
+        """See :func:`load_dependent`."""
+        return load_dependent(v, self.load(prior, x), _of(prior, self.arm), _of(prior, self.steepness))
+
+
+@dataclass(frozen=True)
+class PendulumLoad:
+    """``m v^2 l + m g cos phi``: what the axis of a pendulum carries along its rod [N].
+
+    Args:
+        mass: Name of the prior's parameter m [kg].
+        length: Name of l [m].
+        gravity: Name of g [m/s^2].
+    """
+
+    mass: str = "m"
+    length: str = "l"
+    gravity: str = "g"
+
+    def __call__(self, prior: Prior, x: Tensor) -> Tensor:
+        """The load ``(...)`` [N] at ``x`` ``(..., n_x)``."""
+        m, length, g = (getattr(prior, name) for name in (self.mass, self.length, self.gravity))
+        return m * x[..., 1] * x[..., 1] * length + m * g * torch.cos(x[..., 0])
+
+
+def viscous(v: Tensor, d: Tensor) -> Tensor:
+    """``d v``, any shape."""
+    return d * v
+
+
+def coulomb(v: Tensor, level: Tensor, steepness: Tensor) -> Tensor:
+    """``level tanh(steepness v)``, any shape.
+
+    Example:
+        >>> round(coulomb(torch.tensor(0.1), torch.tensor(2.0), torch.tensor(10.0)).item(), 4)
+        1.5232
+    """
+    return level * torch.tanh(steepness * v)
+
+
+def stribeck(v: Tensor, level: Tensor, static: Tensor, speed: Tensor, steepness: Tensor) -> Tensor:
+    """``(level + (static - level) exp(-(v / speed)^2)) tanh(steepness v)``, any shape."""
+    ratio = v / speed
+    return (level + (static - level) * torch.exp(-ratio * ratio)) * torch.tanh(steepness * v)
+
+
+def load_dependent(v: Tensor, load: Tensor, arm: Tensor, steepness: Tensor) -> Tensor:
+    """``arm tanh(steepness v) |load|``, any shape."""
+    return arm * torch.tanh(steepness * v) * torch.abs(load)
+
+
+def with_friction(base: type[Prior], *terms: FrictionTerm) -> type[Prior]:
+    """A prior class that has the terms beside what ``base`` has; its balance stays zero along its own flow.
+
+    ``M v_dot = M base_acceleration(x, u) - sum of torques``, and the torques times the velocities join the energy
+    balance. The terms' parameters come after those of ``base``, with their own bounds for the fit.
+
+    Args:
+        base: Prior class with ``inertia(x)``.
+        terms: Blocks, any number on any axis.
+
+    Returns:
+        A class like ``base``: ``cls(values)``.
+
+    Raises:
+        InputError: If there is no term, ``base`` has no ``inertia``, a parameter's name is there already, or there
+            is no such axis.
+
+    Example:
+        >>> from scenarios.pendulum.prior import PendulumPrior
+        >>> level = Parameter("F_c", 0.5, "N m", 0.0, 2.0)
+        >>> rubbing = with_friction(PendulumPrior, Coulomb(level, Parameter("gamma", 20.0, "s/rad", 1.0, 50.0)))
+        >>> rubbing({"F_c": 0.3}).values["F_c"]
+        0.3
+    """
+    _check(base, terms)
+    added = tuple(p for term in terms for p in term.parameters)
+
+    def torques(prior: Prior, x: Tensor) -> Tensor:
+        n_q = prior.n_q
+        v = x[..., n_q : 2 * n_q]
+        none = torch.zeros_like(v[..., 0])
+        on = [[t.torque(prior, x, v[..., i]) for t in terms if t.axis == i] for i in range(n_q)]
+        return torch.stack([sum(parts, none) for parts in on], dim=-1)
+
+    class Rubbing(base):  # type: ignore[valid-type,misc]
+        parameters_spec = (*base.parameters_spec, *added)
+        balance_follows_acceleration = follows_acceleration(base)
+
+        def acceleration(self, x: Tensor, u: Tensor) -> Tensor:
+            free: Tensor = super().acceleration(x, u)
+            return free - torques(self, x) / self.inertia(x)
+
+        def energy_balance(self, x: Tensor, xdot: Tensor, u: Tensor) -> Tensor:
+            balance: Tensor = super().energy_balance(x, xdot, u)
+            if self.balance_follows_acceleration:
+                return balance  # it is made of this class's acceleration
+            return balance + (torques(self, x) * self._velocity(x)).sum(-1)
+
+    return _named(Rubbing, base, f"{base.__name__}With{''.join(type(t).__name__ for t in terms)}")
+
+
+def follows_acceleration(base: type[Prior]) -> bool:
+    """Whether a class's energy balance is made of its ``acceleration``, not written out term by term."""
+    own = base.energy_balance is Prior.energy_balance
+    return own or bool(getattr(base, "balance_follows_acceleration", False))
+
+
+def _named(made: Any, base: type[Prior], name: str) -> type[Prior]:
+    """The class under a name and with a docstring that tell what it is."""
+    made.__name__ = made.__qualname__ = name
+    made.__module__, made.__doc__ = base.__module__, base.__doc__
+    result: type[Prior] = made
+    return result
+
+
+def _of(prior: Prior, parameter: Parameter) -> Tensor:
+    value: Tensor = getattr(prior, parameter.name)
+    return value
+
+
+def _check(base: type[Prior], terms: Sequence[FrictionTerm]) -> None:
+    if not terms:
+        raise InputError(
+            f"friction for {base.__name__}: give at least one term, e.g. Coulomb(level, steepness)"
+        )
+    if base.inertia is Prior.inertia:
+        raise InputError(
+            f"friction for {base.__name__}: it must define inertia(x), which turns torque into motion"
+        )
+    names = [p.name for p in base.parameters_spec] + [p.name for t in terms for p in t.parameters]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError(
+            f"friction for {base.__name__}: parameter {', '.join(twice)} is there twice; rename one"
+        )
+    n_q = (len(base.states) - base.n_extra) // 2
+    for term in terms:
+        if not 0 <= term.axis < n_q:
+            raise InputError(
+                f"friction for {base.__name__}: no axis {term.axis}; it has {n_q} degrees of freedom, from 0"
+            )

@@ -1,0 +1,393 @@
+"""HybridModel: the deployed model of a machine as CasADi functions. No torch in here."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.machine.signals import Parameter, Signal
+
+Array = NDArray[np.float64]
+Expression: TypeAlias = Any
+"""A CasADi expression, of MX or of SX."""
+ManyPoints: TypeAlias = Callable[..., tuple[Array, ...]]
+"""``(x, h, u, w, p)``, each ``(n, size)``, to ``(x_next, h_next)`` and Jacobians ``(n, n_z, columns)``."""
+SideBySide: TypeAlias = Callable[[int, Mapping[str, Sequence[str]]], ManyPoints]
+"""Makes such a function: from ``n`` and, for each Jacobian, which of ``x, h, u`` it is by, ``{"A": ("x", "h")}``."""
+STEP_INPUTS = ("x", "h", "u", "w", "p")
+STEP_OUTPUTS = ("x_next", "h_next")
+
+
+@dataclass(frozen=True)
+class Balance:
+    """A balance of what a machine stores, e.g. of its energy: what the prior says is stored, supplied and lost.
+
+    Args:
+        name: E.g. ``"energy"``.
+        unit: Of the storage, e.g. ``"J"``.
+        rate_unit: Of its rate, e.g. ``"W"``.
+        residual: ``(x, xdot, u, w, p) -> residual`` [rate_unit]: by how much the balance is violated if the state
+            changes at ``xdot``; zero along the prior's own flow.
+
+    Example:
+        >>> x, xdot, u, w, p = (ca.SX.sym(name, n) for name, n in (("x", 2), ("xdot", 2), ("u", 1), ("w", 0), ("p", 1)))
+        >>> power = ca.Function("residual", [x, xdot, u, w, p], [(p * xdot[1] - u) * x[1]])
+        >>> cart = Balance("energy", "J", "W", power)
+        >>> float(cart.residual([0.0, 2.0], [2.0, 1.5], 1.0, [], 0.5))
+        -0.5
+    """
+
+    name: str
+    unit: str
+    rate_unit: str
+    residual: ca.Function
+
+
+@dataclass(frozen=True)
+class HybridModel:
+    """A discrete-time model over the state ``x`` and the hidden state ``h``, all in SI units.
+
+    ``h`` is the hidden state before ``(x_k, u_k)``; it is empty (``n_h = 0``, 0 x 1) for a prior. ``w`` are
+    disturbances, measured but not commanded; ``p`` are the prior's parameters. Both may be empty; where nobody gives
+    them, :attr:`w` and :attr:`p` are taken. The fitted prior, the hybrid and an oracle share this interface.
+    :meth:`of` makes one of expressions.
+
+    Args:
+        name: e.g. ``"mopgrnn"``.
+        dt: Model period [s].
+        states: Signals of ``x``, ``[q, v]``.
+        inputs: Signals of ``u``.
+        outputs: Signals of ``y``.
+        step: ``(x, h, u, w, p) -> (x_next, h_next)``, columns n_x, n_h, n_u, n_w, n_p.
+        xdot: ``(x, h, u, w, p) -> xdot`` at the instant, with the correction that ``(x, h, u)`` gives.
+        output: ``(x, u, w, p) -> y``.
+        with_jacobian: ``(x, h, u, w, p) -> (x_next, h_next, A, B)`` with ``A`` of ``(x_next, h_next)`` by
+            ``(x, h)`` and ``B`` by ``u``. Default: made from ``step`` by CasADi's own derivatives.
+        side_by_side: The same at many points in one call, where the model has a faster way than one call a
+            point: what :class:`nn_export.SideBySide` makes of a program. Default: none.
+        disturbances: Signals of ``w``. Default: none.
+        nominal_w: What is taken for ``w`` where none is given ``(n_w,)`` [their units]. Default: zeros.
+        parameters: The prior's parameters with their fitted values and bounds: ``p`` in this order. What the prior
+            says changes with ``p``; what a network adds does not. Default: none; then nobody can tell what broke.
+        covariance: Rows ``(n_p, n_p)`` of the covariance of the fitted values. Default: unknown.
+        balances: What the prior says of stored energy, mass, heat, ... Default: nothing.
+        waiting: Leading entries of ``h`` that are inputs on their way to the machine, the oldest first; ``xdot`` and
+            the balances then take the input that acts. Default 0: none waits.
+        time_unit: The machine's second [s] (:func:`~hybrid_mpc.data.scales.time_unit`): what the lengths of monitor
+            and guard
+            are counted in. Default 1.
+
+    Raises:
+        InputError: If the functions' shapes do not fit the signals and parameters.
+
+    Example:
+        >>> x, h, u = ca.MX.sym("x", 2), ca.MX.sym("h", 0), ca.MX.sym("u")
+        >>> w, p = ca.MX.sym("w", 0), ca.MX.sym("p")
+        >>> rhs = ca.vertcat(x[1], u / p)
+        >>> model = HybridModel(
+        ...     "cart", 0.1, (Signal("q", "m"), Signal("v", "m/s")), (Signal("F", "N"),), (Signal("q", "m"),),
+        ...     step=ca.Function("step", [x, h, u, w, p], [x + 0.1 * rhs, h]),
+        ...     xdot=ca.Function("xdot", [x, h, u, w, p], [rhs]),
+        ...     output=ca.Function("output", [x, u, w, p], [x[0]]),
+        ...     parameters=(Parameter("m", 2.0, "kg", 1.0, 4.0),))
+        >>> model.n_x, model.n_h, model.n_u, model.n_w, model.n_p
+        (2, 0, 1, 0, 1)
+        >>> x_next, h_next = model.step([0.0, 1.0], [], 3.0, model.w, model.p)
+        >>> x_next
+        DM([0.1, 1.15])
+    """
+
+    name: str
+    dt: float
+    states: tuple[Signal, ...]
+    inputs: tuple[Signal, ...]
+    outputs: tuple[Signal, ...]
+    step: ca.Function
+    xdot: ca.Function
+    output: ca.Function
+    with_jacobian: ca.Function | None = None
+    side_by_side: SideBySide | None = None
+    disturbances: tuple[Signal, ...] = ()
+    nominal_w: tuple[float, ...] = ()
+    parameters: tuple[Parameter, ...] = ()
+    covariance: tuple[tuple[float, ...], ...] = ()
+    balances: tuple[Balance, ...] = ()
+    waiting: int = 0
+    time_unit: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("dt", "time_unit"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"model {self.name}: {name} must be positive, got {getattr(self, name)}")
+        x, h, u, y = (self.n_x, 1), (self.n_h, 1), (self.n_u, 1), (self.n_y, 1)
+        w, p = (self.n_w, 1), (self.n_p, 1)
+        _check(self.name, "step", self.step, [x, h, u, w, p], [x, h])
+        _check(self.name, "xdot", self.xdot, [x, h, u, w, p], [x])
+        _check(self.name, "output", self.output, [x, u, w, p], [y])
+        for balance in self.balances:
+            _check(self.name, f"balance {balance.name}", balance.residual, [x, x, u, w, p], [(1, 1)])
+        with_jacobian = self.with_jacobian or _with_jacobian(self.step)
+        object.__setattr__(self, "with_jacobian", with_jacobian)
+        n_z = self.n_x + self.n_h
+        slopes = [(n_z, n_z), (n_z, self.n_u)]
+        _check(self.name, "with_jacobian", with_jacobian, [x, h, u, w, p], [x, h, *slopes])
+        object.__setattr__(self, "nominal_w", self.nominal_w or (0.0,) * self.n_w)
+        _check_numbers(self)
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        dt: float,
+        states: Sequence[Signal],
+        inputs: Sequence[Signal],
+        outputs: Sequence[Signal],
+        *,
+        x: Expression,
+        u: Expression,
+        x_next: Expression,
+        xdot: Expression,
+        y: Expression,
+        h: Expression | None = None,
+        h_next: Expression | None = None,
+        w: Expression | None = None,
+        p: Expression | None = None,
+        rate: Expression | None = None,
+        energy: Expression | None = None,
+        with_jacobian: ca.Function | None = None,
+        disturbances: Sequence[Signal] = (),
+        nominal_w: Sequence[float] = (),
+        parameters: Sequence[Parameter] = (),
+    ) -> HybridModel:
+        """A model of CasADi expressions: what it has none of is left out, and the functions are made of the rest.
+
+        Args:
+            name: Its name.
+            dt: Model period [s].
+            states: Signals of ``x``.
+            inputs: Signals of ``u``.
+            outputs: Signals of ``y``.
+            x: Symbol of the state ``(n_x,)``.
+            u: Symbol of the input ``(n_u,)``.
+            x_next: The state one period on.
+            xdot: Its rate at the instant.
+            y: The outputs.
+            h: Symbol of the hidden state ``(n_h,)``. Default: there is none.
+            h_next: The hidden state one period on. Default: as it is.
+            w: Symbol of the disturbances ``(n_w,)``. Default: there are none.
+            p: Symbol of the parameters ``(n_p,)``. Default: there are none.
+            rate: Symbol ``(n_x,)`` of any rate of the state, for ``energy``.
+            energy: Residual [W] of the balance of energy if the state changes at ``rate``. Default: no balance.
+            with_jacobian: See :class:`HybridModel`.
+            disturbances: Signals of ``w``.
+            nominal_w: See :class:`HybridModel`.
+            parameters: The parameters ``p``.
+
+        Raises:
+            InputError: If an expression holds another symbol, or shapes do not fit.
+
+        Example:
+            >>> x, u = ca.MX.sym("x"), ca.MX.sym("u")
+            >>> level = (Signal("x", "m"),)
+            >>> tank = HybridModel.of(
+            ...     "tank", 1.0, level, (Signal("u", "m/s"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
+            >>> tank.n_h, float(tank.step(0.5, [], 0.25, tank.w, tank.p)[0])
+            (0, 0.75)
+        """
+        h, w, p = (type(x).sym(key, 0) if s is None else s for key, s in zip("hwp", (h, w, p), strict=True))
+        rates = type(x).sym("rate", x.shape[0]) if rate is None else rate
+        point = [x, h, u, w, p]
+
+        def function(key: str, given: list[Expression], values: list[Expression]) -> ca.Function:
+            try:
+                return ca.Function(key, given, [ca.densify(v) for v in values])
+            except RuntimeError as error:
+                raise InputError(
+                    f"model {name}: {key} must be an expression of the symbols given (x, u; h, w, p, rate where there "
+                    f"are any): {str(error).strip().splitlines()[-1]}"
+                ) from error
+
+        return cls(
+            name, dt, tuple(states), tuple(inputs), tuple(outputs),
+            step=function("step", point, [x_next, h if h_next is None else h_next]),
+            xdot=function("xdot", point, [xdot]),
+            output=function("output", [x, u, w, p], [y]), with_jacobian=with_jacobian,
+            disturbances=tuple(disturbances), nominal_w=tuple(nominal_w), parameters=tuple(parameters),
+            balances=()
+            if energy is None
+            else (Balance("energy", "J", "W", function("energy", [x, rates, u, w, p], [energy])),),
+        )  # fmt: skip
+
+    @property
+    def n_x(self) -> int:
+        """Number of states."""
+        return len(self.states)
+
+    @property
+    def n_u(self) -> int:
+        """Number of inputs."""
+        return len(self.inputs)
+
+    @property
+    def n_y(self) -> int:
+        """Number of outputs."""
+        return len(self.outputs)
+
+    @property
+    def n_h(self) -> int:
+        """Number of hidden states."""
+        return int(self.step.size1_in(1))
+
+    @property
+    def n_w(self) -> int:
+        """Number of disturbances."""
+        return len(self.disturbances)
+
+    @property
+    def n_p(self) -> int:
+        """Number of parameters."""
+        return len(self.parameters)
+
+    @property
+    def w(self) -> Array:
+        """Disturbances ``(n_w,)`` that are taken where none are given."""
+        return np.array(self.nominal_w, dtype=np.float64)
+
+    @property
+    def p(self) -> Array:
+        """Fitted values ``(n_p,)`` of the parameters."""
+        return np.array([parameter.value for parameter in self.parameters], dtype=np.float64)
+
+
+def longer_period(model: HybridModel, periods: int) -> HybridModel:
+    """The same model with a period that is a multiple of its own; input and disturbance are held all the while.
+
+    One step is ``periods`` steps of the model, the hidden state in each of them, and its Jacobian the chain of
+    theirs, so nothing is discretised anew. Estimator, controller, terminal weight and closed loop made of it all run
+    at the longer period: costs count its instants, ``du_max`` and ``r_delta`` its changes, and bounds on states hold
+    at its instants, not between them. A filter's noise per period is that of the longer one.
+
+    Args:
+        model: The deployed model.
+        periods: Periods of the model that make one of the new ones, at least 1.
+
+    Raises:
+        InputError: If ``periods`` is not a whole number of at least 1.
+
+    Example:
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of(
+        ...     "sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=0.5 * x + u, xdot=u, y=x)
+        >>> slow = longer_period(model, 3)
+        >>> slow.dt, float(slow.step(8.0, [], 1.0, slow.w, slow.p)[0])
+        (3.0, 2.75)
+    """
+    if not isinstance(periods, int) or periods < 1:
+        raise InputError(f"model {model.name}: periods must be a whole number of at least 1, got {periods}")
+    point = step_symbols(model)
+    assert model.with_jacobian is not None
+    inline = model.step.is_a("MXFunction"), model.with_jacobian.is_a("MXFunction")
+    by_value, by_jacobian, held = point[:2], point[:2], point[2:]
+    a, b = ca.MX.eye(model.n_x + model.n_h), ca.MX.zeros(model.n_x + model.n_h, model.n_u)
+    for _ in range(periods):
+        by_value = model.step.call([*by_value, *held], inline[0], False)
+        *by_jacobian, a_k, b_k = model.with_jacobian.call([*by_jacobian, *held], inline[1], False)
+        a, b = a_k @ a, a_k @ b + b_k
+    return replace(
+        model,
+        dt=periods * model.dt,
+        step=step_function("step", point, by_value),
+        with_jacobian=step_function("with_jacobian", point, [*by_jacobian, ca.densify(a), ca.densify(b)]),
+        side_by_side=None,  # that of the model knows one of its own periods only
+    )
+
+
+def prior_acceleration(model: HybridModel, prior: HybridModel | None = None) -> ca.Function:
+    """``(x, u, w, p) -> a`` ``(n_q,)``: what the prior behind a model says, without what a network adds.
+
+    Args:
+        model: The model, state ``[q, v]``.
+        prior: Model of its prior alone. Default: the model itself, where it has no network.
+
+    Raises:
+        InputError: If the model has a network and no prior is given, the two have other parameters, or there are none.
+
+    Example:
+        ``prior_acceleration(kit.models["hybrid"], kit.models["prior"])``
+    """
+    if prior is None:
+        if model.n_h > model.waiting:
+            raise InputError(
+                f"model {model.name} has a network, and its parameters are those of its prior: give prior=, the model "
+                'of the prior alone, e.g. kit.models["prior"]'
+            )
+        prior = model
+    if prior.parameters != model.parameters or not model.n_p:
+        own, other = ([p.name for p in m.parameters] for m in (model, prior))
+        raise InputError(
+            f"model {model.name} has the parameters {own} and its prior {prior.name} {other}: parameters, the same of "
+            "both, are needed, as models have that are made of programs of one artifact (hybrid-mpc run)"
+        )
+    n_q, point = prior.n_x // 2, step_symbols(prior)
+    x, _, u, w, p = point
+    a = prior.xdot(x, ca.DM.zeros(prior.n_h), u, w, p)[n_q : 2 * n_q]
+    return ca.Function("acceleration", [x, u, w, p], [ca.densify(a)])
+
+
+def step_symbols(model: HybridModel) -> list[ca.MX]:
+    """Symbols ``x, h, u, w, p`` of a model's step."""
+    sizes = model.n_x, model.n_h, model.n_u, model.n_w, model.n_p
+    return [ca.MX.sym(name, n) for name, n in zip(STEP_INPUTS, sizes, strict=True)]
+
+
+def step_function(name: str, point: Sequence[ca.MX], values: Sequence[ca.MX]) -> ca.Function:
+    """A function of ``x, h, u, w, p`` with the names of a step, or of one with its Jacobians."""
+    outputs = [*STEP_OUTPUTS, "A", "B"][: len(values)]
+    return ca.Function(name, list(point), list(values), [*STEP_INPUTS], outputs)
+
+
+def _with_jacobian(step: ca.Function) -> ca.Function:
+    point = [ca.MX.sym(name, step.size1_in(i)) for i, name in enumerate(STEP_INPUTS)]
+    x, h, u = point[:3]
+    # Differentiated inside the caller's graph where it is a graph of matrices: twice as fast as a call.
+    x_next, h_next = step.call(point, step.is_a("MXFunction"), False)
+    z = ca.vertcat(x_next, h_next)
+    a = ca.densify(ca.horzcat(ca.jacobian(z, x), ca.jacobian(z, h)))
+    b = ca.densify(ca.jacobian(z, u))
+    return step_function("with_jacobian", point, [x_next, h_next, a, b])
+
+
+def _check_numbers(model: HybridModel) -> None:
+    w, n_p = model.nominal_w, model.n_p
+    if len(w) != model.n_w or not all(map(math.isfinite, w)):
+        raise InputError(f"model {model.name}: nominal_w needs {model.n_w} finite values, got {w}")
+    if model.covariance and [len(row) for row in model.covariance] != [n_p] * n_p:
+        raise InputError(f"model {model.name}: covariance needs {n_p} rows of {n_p} values, one a parameter")
+    for what, names in (
+        ("parameters", [p.name for p in model.parameters]), ("balances", [b.name for b in model.balances])
+    ):  # fmt: skip
+        if len(set(names)) < len(names):
+            raise InputError(f"model {model.name}: {what} need different names, got {', '.join(names)}")
+    if not 0 <= model.waiting <= model.n_h or model.waiting % model.n_u:
+        raise InputError(
+            f"model {model.name}: waiting must be whole inputs within the {model.n_h} entries of h, "
+            f"got {model.waiting}"
+        )
+
+
+def _check(
+    model: str, name: str, f: ca.Function, ins: list[tuple[int, int]], outs: list[tuple[int, int]]
+) -> None:
+    given = [f.size_in(i) for i in range(f.n_in())], [f.size_out(i) for i in range(f.n_out())]
+    if given != (ins, outs):
+        raise InputError(
+            f"model {model}: {name} takes {given[0]} and returns {given[1]}, "
+            f"its signals need {ins} and {outs}"
+        )

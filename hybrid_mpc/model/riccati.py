@@ -1,0 +1,169 @@
+"""Discrete algebraic Riccati equation and LQR gains of a deployed model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.model.limits import numbers
+from hybrid_mpc.model.model import HybridModel
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Lqr:
+    """A stabilising state feedback ``u = u_target - gain @ (z - z_target)`` with ``z = (x, h)``.
+
+    Args:
+        gain: ``(n_u, n_x + n_h)`` [input unit / state unit].
+        cost_to_go: Riccati matrix ``(n_x + n_h, n_x + n_h)``.
+        x_target: ``(n_x,)``.
+        h_target: Hidden state at its fixed point ``(n_h,)``.
+        u_target: ``(n_u,)``.
+    """
+
+    gain: Array
+    cost_to_go: Array
+    x_target: Array
+    h_target: Array
+    u_target: Array
+
+
+def dare(a: ArrayLike, b: ArrayLike, q: ArrayLike, r: ArrayLike) -> tuple[Array, Array]:
+    """Riccati matrix and LQR gain of ``z+ = A z + B u`` with the cost ``sum z'Qz + u'Ru``.
+
+    Args:
+        a: ``(n, n)``.
+        b: ``(n, m)``.
+        q: Symmetric positive semi-definite ``(n, n)``.
+        r: Symmetric positive definite ``(m, m)``.
+
+    Returns:
+        ``P`` ``(n, n)`` and ``K`` ``(m, n)``; the optimal input is ``u = -K z``.
+
+    Raises:
+        InputError: If (A, B) is not stabilisable, or a mode on the unit circle carries no weight.
+
+    Source: Anderson and Moore, *Optimal Control: Linear Quadratic Methods*, 1990, section 2.4.
+
+    Example:
+        >>> p, k = dare([[1.0]], [[1.0]], [[1.0]], [[1.0]])
+        >>> round(float(p[0, 0]), 6), round(float(k[0, 0]), 6)
+        (1.618034, 0.618034)
+    """
+    from scipy.linalg import solve_discrete_are  # takes longer to import than all else that problems need
+
+    a, b, q, r = (np.atleast_2d(np.asarray(m, dtype=float)) for m in (a, b, q, r))
+    hint = "check the pair (A, B), give every undamped state a positive q and every input a positive r"
+    if not all(np.all(np.isfinite(m)) for m in (a, b, q, r)):
+        raise InputError("Riccati equation: A, B, Q or R holds a NaN or an infinite value")
+    try:
+        p = solve_discrete_are(a, b, q, r)
+        p = 0.5 * (p + p.T)
+        k = np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise InputError(f"the Riccati equation has no stabilising solution ({error}); {hint}") from error
+    radius = float(np.max(np.abs(np.linalg.eigvals(a - b @ k))))
+    if not radius < 1.0:
+        raise InputError(f"not stabilisable: spectral radius {radius:.6f} in closed loop; {hint}")
+    return p, k
+
+
+def hidden_fixed_point(
+    model: HybridModel, x: Array, u: Array, *, tol: float = 1e-10, limit: int = 2000
+) -> Array:
+    """Hidden state ``(n_h,)`` that the step reaches with ``x`` ``(n_x,)`` and ``u`` ``(n_u,)`` held.
+
+    The iteration starts at zero and ends when no element moves by more than ``tol``, or after
+    ``limit`` steps with the last value.
+
+    Example:
+        >>> import casadi as ca
+        >>> from hybrid_mpc.machine.signals import Signal
+        >>> (x, h, u), level = (ca.MX.sym(n) for n in "xhu"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("lag", 0.1, level, (Signal("u", "-"),), level,
+        ...     x=x, h=h, u=u, x_next=x + u, h_next=0.5 * h + x, xdot=u, y=x)
+        >>> hidden_fixed_point(model, np.ones(1), np.zeros(1)).round(6)
+        array([2.])
+    """
+    h = np.zeros(model.n_h)
+    for _ in range(limit if model.n_h else 0):
+        h_next = model.step(x, h, u, model.w, model.p)[1].full().ravel()
+        moved, h = np.max(np.abs(h_next - h)), h_next
+        if not moved > tol:
+            break
+    return h
+
+
+def linearisation(model: HybridModel, x: Array, u: Array) -> tuple[Array, Array, Array]:
+    """``A``, ``B`` of ``z = (x, h)`` by ``z`` and ``u`` at ``(x, u)``, and the fixed point ``h`` used."""
+    h = hidden_fixed_point(model, x, u)
+    assert model.with_jacobian is not None
+    _, _, a, b = model.with_jacobian(x, h, u, model.w, model.p)
+    return a.full(), b.full(), h
+
+
+def lqr(
+    model: HybridModel,
+    x_target: ArrayLike,
+    u_target: ArrayLike,
+    q: ArrayLike,
+    r: ArrayLike,
+    *,
+    working_point: tuple[ArrayLike, ArrayLike] | None = None,
+) -> Lqr:
+    """LQR of a model, linearised with its exact Jacobian and its hidden state at the fixed point.
+
+    At rest the steep slope of a smoothed friction law (tanh) dominates the linearisation: it shows the
+    machine as if it stood in honey. ``working_point`` takes the linearisation from a moving point.
+
+    Args:
+        model: The model; ``n_h`` may be 0.
+        x_target: ``(n_x,)`` [SI].
+        u_target: ``(n_u,)`` [SI].
+        q: Weights of the states ``(n_x,)``; the hidden states carry none.
+        r: Weights of the inputs ``(n_u,)``, positive.
+        working_point: ``(x, u)`` to linearise at. Default: the target.
+
+    Raises:
+        InputError: If a shape does not fit, or the linearised model is not stabilisable.
+
+    Example:
+        >>> import casadi as ca
+        >>> from hybrid_mpc.machine.signals import Signal
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
+        >>> lqr(model, [0.0], [0.0], [1.0], [1.0]).gain.round(6)
+        array([[0.618034]])
+    """
+    x_t, u_t = vector(x_target, model.n_x, "x_target"), vector(u_target, model.n_u, "u_target")
+    q_v, r_v = vector(q, model.n_x, "q"), vector(r, model.n_u, "r")
+    point = working_point if working_point is not None else (x_t, u_t)
+    x_w = vector(point[0], model.n_x, "working_point x")
+    u_w = vector(point[1], model.n_u, "working_point u")
+    a, b, _ = linearisation(model, x_w, u_w)
+    weights = np.diag(np.concatenate([q_v, np.zeros(model.n_h)]))
+    p, k = dare(a, b, weights, np.diag(r_v))
+    return Lqr(k, p, x_t, hidden_fixed_point(model, x_t, u_t), u_t)
+
+
+def vector(value: ArrayLike, size: int, name: str) -> Array:
+    """``value`` as a finite float vector ``(size,)``.
+
+    Raises:
+        InputError: If it has another size or holds a NaN, an infinite value or what is no number.
+
+    Example:
+        >>> vector([1, 2], 2, "q")
+        array([1., 2.])
+    """
+    array = numbers(value, name)
+    if array.shape != (size,):
+        raise InputError(f"{name}: {array.size} values given, {size} needed")
+    if not np.all(np.isfinite(array)):
+        raise InputError(f"{name}: values must be finite, got {array}")
+    return array

@@ -1,0 +1,190 @@
+"""The model along a horizon with its Jacobians: all periods side by side, or as one run."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Protocol
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.model.buffered import BufferedFunction
+from hybrid_mpc.model.model import HybridModel
+from nn_export import compile_function
+from nn_export.errors import CompileError
+
+Array = NDArray[np.float64]
+Derivatives = tuple[Array, Array, Array]
+"""Successors ``(N, n_z)``, transposed ``A_k`` ``(N, n_z, n_z)`` and ``B_k`` ``(N, n_z, n_u)``."""
+Slopes = Callable[[Array, Array], Array]
+"""Jacobians of the successors ``(m, n_z, n_x + n_u)`` by ``(x, u)``, of ``z`` ``(m, n_z)`` and ``u``; with
+``hidden`` by ``(x, u, h)``."""
+
+
+class Linearisation(Protocol):
+    """A model's periods over a horizon, values and Jacobians in one call."""
+
+    def at(self, z: Array, u: Array) -> Derivatives:
+        """Every period from its own ``z`` ``(N, n_z)`` on ``u`` ``(N, n_u)``."""
+
+    def run(self, z0: Array, u: Array) -> Array:
+        """Trajectory ``(N + 1, n_z)`` of the model from ``z0`` ``(n_z,)`` on ``u`` ``(N, n_u)``."""
+
+    def slopes(self, times: int, *, hidden: bool = False) -> Slopes:
+        """A function for ``m = times N`` periods; made once, it is called often."""
+
+
+def stages(model: HybridModel, n: int, *, compiled: bool = False) -> Linearisation:
+    """The fastest way that a model has: all periods at once where it can, else one after the other.
+
+    Args:
+        model: The model.
+        n: Periods N.
+        compiled: Whether what is evaluated period by period is compiled as C. Default: no; that needs no
+            compiler.
+
+    Raises:
+        InputError: If it is to be compiled and there is no compiler, or it fails.
+    """
+    kind = Stages if model.side_by_side is None else VectorisedStages
+    return kind(model, n, compiled=compiled)
+
+
+class Stages:
+    """One period after the other in CasADi's machine, or compiled.
+
+    Args:
+        model: The model.
+        n: Periods N.
+        compiled: Whether one period is compiled as C.
+
+    Raises:
+        InputError: If it is to be compiled and there is no compiler, or it fails.
+
+    Example:
+        >>> from hybrid_mpc.machine.signals import Signal
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
+        >>> Stages(model, 3).run(np.zeros(1), np.ones((3, 1))).ravel().tolist()
+        [0.0, 1.0, 2.0, 3.0]
+    """
+
+    def __init__(self, model: HybridModel, n: int, *, compiled: bool = False) -> None:
+        stage = _compiled(_stage(model)) if compiled else _stage(model)
+        self._side_by_side = BufferedFunction(stage.map(n))
+        self._along = _run(model, n, compiled)
+        self._shape, self._n_x = (n, model.n_x + model.n_h), model.n_x
+
+    def at(self, z: Array, u: Array) -> Derivatives:
+        """See :class:`Linearisation`."""
+        z_next, a_t, b = self._call(z, u)
+        return z_next.copy(), a_t.copy(), b.copy()  # the next call overwrites them
+
+    def run(self, z0: Array, u: Array) -> Array:
+        """See :class:`Linearisation`."""
+        return _trajectory(self._along, z0, u)
+
+    def slopes(self, times: int, *, hidden: bool = False) -> Slopes:
+        """See :class:`Linearisation`."""
+        n, n_x = self._shape[0], self._n_x
+
+        def evaluate(z: Array, u: Array) -> Array:
+            parts = []
+            for k in range(0, times * n, n):
+                _, a_t, b = self._call(z[k : k + n], u[k : k + n])
+                a = a_t.transpose(0, 2, 1)
+                blocks = [a[:, :, :n_x], b, a[:, :, n_x:]] if hidden else [a[:, :, :n_x], b]
+                parts.append(np.concatenate(blocks, axis=2))
+            return np.concatenate(parts)
+
+        return evaluate
+
+    def _call(self, z: Array, u: Array) -> Derivatives:
+        (n, n_z), f = self._shape, self._side_by_side
+        f.inputs[0][:], f.inputs[1][:] = z.ravel(), u.ravel()
+        f()
+        z_next, a, b = f.outputs
+        return z_next.reshape(n, n_z), a.reshape(n, n_z, n_z), b.reshape(n, -1, n_z).transpose(0, 2, 1)
+
+
+class VectorisedStages:
+    """All periods at once, of a model with a ``side_by_side``; a run is one of ``step`` alone, then all at once.
+
+    Args:
+        model: The model.
+        n: Periods N.
+        compiled: Whether the run's ``step`` is compiled as C.
+
+    Raises:
+        InputError: If it is to be compiled and there is no compiler, or it fails.
+    """
+
+    def __init__(self, model: HybridModel, n: int, *, compiled: bool = False) -> None:
+        assert model.side_by_side is not None
+        self._many, self._n, self._n_x = model.side_by_side, n, model.n_x
+        self._given = model.w, model.p
+        self._at, self._held = self._many(n, {"A": ("x", "h"), "B": ("u",)}), self._tiled(n)
+        self._along = _run(model, n, compiled)
+
+    def at(self, z: Array, u: Array) -> Derivatives:
+        """See :class:`Linearisation`."""
+        x_next, h_next, a, b = self._at(z[:, : self._n_x], z[:, self._n_x :], u, *self._held)
+        return np.hstack([x_next, h_next]), np.ascontiguousarray(a.transpose(0, 2, 1)), b
+
+    def run(self, z0: Array, u: Array) -> Array:
+        """See :class:`Linearisation`."""
+        return _trajectory(self._along, z0, u)
+
+    def slopes(self, times: int, *, hidden: bool = False) -> Slopes:
+        """See :class:`Linearisation`."""
+        by = ("x", "u", "h") if hidden else ("x", "u")
+        points, n_x = times * self._n, self._n_x
+        many, held = self._many(points, {"slopes": by}), self._tiled(points)
+        return lambda z, u: many(z[:, :n_x], z[:, n_x:], u, *held)[2]
+
+    def _tiled(self, n: int) -> list[Array]:
+        """Disturbances and parameters, the same at all points."""
+        return [np.tile(values, (n, 1)) for values in self._given]
+
+
+def _run(model: HybridModel, n: int, compiled: bool) -> BufferedFunction:
+    z, u = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("u", model.n_u)
+    inline = model.step.is_a("MXFunction")  # a call less a stage
+    z_next = ca.vertcat(*model.step.call(_point(model, z, u), inline, False))
+    step = ca.Function("z_step", [z, u], [z_next])
+    return BufferedFunction((_compiled(step) if compiled else step).mapaccum("run", n))
+
+
+def _trajectory(f: BufferedFunction, z0: Array, u: Array) -> Array:
+    f.inputs[0][:], f.inputs[1][:] = z0, u.ravel()
+    f()
+    return np.concatenate([z0[None], f.outputs[0].reshape(len(u), -1)])
+
+
+def _stage(model: HybridModel) -> ca.Function:
+    z, u = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("u", model.n_u)
+    assert model.with_jacobian is not None
+    # Written into the caller's graph where that is possible: a call less a stage.
+    inline = model.with_jacobian.is_a("MXFunction")
+    x_next, h_next, a, b = model.with_jacobian.call(_point(model, z, u), inline, False)
+    return ca.Function("stage", [z, u], [ca.vertcat(x_next, h_next), ca.densify(a), ca.densify(b)])
+
+
+def _point(model: HybridModel, z: ca.MX, u: ca.MX) -> list[ca.MX]:
+    """What the model's step takes."""
+    return [z[: model.n_x], z[model.n_x :], u, ca.MX(ca.DM(model.w)), ca.MX(ca.DM(model.p))]
+
+
+def _compiled(stage: ca.Function) -> ca.Function:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", RuntimeWarning)  # that is how a missing compiler is told
+            return compile_function(stage)
+    except (RuntimeWarning, CompileError) as error:
+        raise InputError(
+            f"compiled=True given, but the model could not be compiled: {error}; needed: a C compiler (cc, gcc, "
+            "clang or the one that the variable CC names); leave compiled out to do without"
+        ) from error

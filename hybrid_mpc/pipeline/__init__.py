@@ -1,1 +1,0 @@
-"""The stages of the main job, their checkpoints, and what they write."""

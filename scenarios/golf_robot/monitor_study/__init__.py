@@ -1,0 +1,1 @@
+"""The study of the energy guard on the golf robot: what it learns from, what it finds, how soon."""

@@ -1,0 +1,261 @@
+"""A job of the study ``monitor``: its loops, and what is kept of them."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.files import read_arrays, read_json, write_arrays
+from hybrid_mpc.job.control import selected_tasks
+from hybrid_mpc.job.loops import MODEL, Bench, LoopSpec
+from hybrid_mpc.job.study_run import ModelInput, local_folder
+from hybrid_mpc.kit.artifact import Kit, load
+from hybrid_mpc.loop.simulate import ClosedLoopResult
+from hybrid_mpc.monitor.detector import Detector
+from hybrid_mpc.monitor.energy import EnergyMonitor
+from hybrid_mpc.monitor.learn import guard_monitor
+from hybrid_mpc.monitor.lengths import REST_SPEED
+from hybrid_mpc.records import record
+from hybrid_mpc.scenario import Task, load_scenario
+from scenarios.golf_robot.monitor_study.detection import METHODS, Judges, learn_judges
+from scenarios.golf_robot.monitor_study.plan import FAULT, GUARD, LEARN, LoopPlan, MonitorJob, MonitorStudy
+
+Array = NDArray[np.float64]
+JUDGES, LEARNING = "judges.json", "learning"
+MOVING = 1.5
+"""True speed, in rest speeds, above which time counts towards a delay."""
+WITHIN_S = 1.0
+"""Time in motion [s] within which the ROC counts a fault as found."""
+CONTROLLER, PRIOR = "hybrid_observer", "prior_observer"
+
+
+@dataclass(frozen=True)
+class MonitorRunner:
+    """Runs the study's jobs; sent to each worker once.
+
+    Args:
+        study: The study.
+        model: Its model.
+        folder: Folder of the study: learning data go there, what was learned is read there.
+
+    Example: ``MonitorRunner(study, model, "studies/monitor")(job)["loops"]``
+    """
+
+    study: MonitorStudy
+    model: ModelInput
+    folder: str
+
+    def __call__(self, job: MonitorJob) -> dict[str, Any]:
+        """What is kept of the job's loops."""
+        return _loops(self).run(job)
+
+
+@lru_cache(maxsize=1)
+def _loops(runner: MonitorRunner) -> _Loops:
+    return _Loops(runner)
+
+
+class _Loops:
+    """The bench of a process."""
+
+    def __init__(self, runner: MonitorRunner) -> None:
+        self._study, self._folder = runner.study, Path(runner.folder)
+        kit = load(local_folder(runner.model)).with_noise(dict(runner.model.noise))
+        self._bench = Bench(load_scenario(runner.study.scenario), {MODEL: kit})
+        self._kit = self._bench.kits[MODEL]
+        self._task = plain_task(selected_tasks(self._bench.scenario, (runner.study.task,))[0])
+        self._dt = self._kit.models["hybrid"].dt
+        self._judges: Judges | None = None
+
+    @property
+    def judges(self) -> Judges:
+        """What was learned, read when first needed."""
+        if self._judges is None:
+            self._judges = record(Judges, read_json(self._folder / JUDGES), str(self._folder / JUDGES))
+        return self._judges
+
+    def run(self, job: MonitorJob) -> dict[str, Any]:
+        if job.kind == FAULT:
+            return self._fault(job.plans[0])
+        if job.kind == GUARD:
+            return self._guarded(job.plans[0], job.arm)
+        traces = self._nominal(job.plans)
+        if job.kind == LEARN:
+            write_learning(self._folder / LEARNING / f"{job.id}.npz", traces)
+            return {"loops": [{"seconds": plan.duration} for plan in job.plans]}
+        shown = [nominal_figures(self._study, self.judges, t) for t in traces]
+        return {"loops": [{"case": p.case, **f} for p, f in zip(job.plans, shown, strict=True)]}
+
+    def _spec(self, plan: LoopPlan, arm: str = "", horizon: int | None = None) -> LoopSpec:
+        reaction = {"backup": "prior"}.get(arm, arm)
+        return LoopSpec(
+            self._study.scenario, MODEL, self._task.name, CONTROLLER, horizon=horizon,
+            monitor="guard" if arm else "readings",
+            faults=plan.faults(self._dt), seed=plan.seed, guard=reaction,
+        )  # fmt: skip
+
+    def _follows(self, plan: LoopPlan) -> Task:
+        return replace(
+            self._task, reference=plan.reference(self._task.reference), duration=plan.duration,
+            x0=(0.0,) * self._kit.models["hybrid"].n_x, figures=None,
+        )  # fmt: skip
+
+    def _monitor(self, detector: Detector | None = None) -> EnergyMonitor:
+        rest = self._kit.rest_speed if detector is None else None
+        steps = None if detector is None else self.judges.resolution
+        ranges = self._kit.problem(self._task.name).input_range
+        return guard_monitor(
+            self._kit.models["hybrid"], detector, resolution=steps, input_range=ranges, rest_speed=rest
+        )
+
+    def _nominal(self, plans: tuple[LoopPlan, ...]) -> list[Trace]:
+        specs = [self._spec(plan, horizon=self._study.horizon) for plan in plans]
+        follow = [self._follows(plan) for plan in plans]
+        found = self._bench.run_together(specs, tasks=follow, monitor=self._monitor())
+        return [trace_of(result) for _, result in found]
+
+    def _fault(self, plan: LoopPlan) -> dict[str, Any]:
+        row, result = self._bench.run(self._spec(plan), task=self._follows(plan), monitor=self._monitor())
+        onset = round(plan.onset(self._dt) / self._dt)
+        found = fault_figures(self._study, self.judges, trace_of(result), onset)
+        return {**found, "cost": row.cost, "excess": dict(row.excess)}
+
+    def _guarded(self, plan: LoopPlan, arm: str) -> dict[str, Any]:
+        monitor = self._monitor(self.judges.detector_at(self._study.rates[0]))
+        row, _ = self._bench.run(self._spec(plan, arm), task=self._follows(plan), monitor=monitor)
+        early = sum(switch.t_s < plan.onset(self._dt) for switch in row.switches)
+        return {
+            "cost": row.cost,
+            "excess": dict(row.excess),
+            "switches": len(row.switches),
+            "early_switches": early,
+        }
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What detectors see of a loop of n periods.
+
+    Args:
+        numbers: ``MonitorReading.numbers`` ``(n, columns)``.
+        level_w: Averaged one-step violation ``(n,)`` [W].
+        innovation: Innovations of the filter ``(n, n_y)`` [output units]; NaN in the first row.
+        nis: Normalised innovations squared ``(n,)``; NaN in the first.
+        speed: Largest true speed ``(n,)`` of the degrees of freedom [rad/s or m/s].
+    """
+
+    numbers: Array
+    level_w: Array
+    innovation: Array
+    nis: Array
+    speed: Array
+
+
+def trace_of(result: ClosedLoopResult) -> Trace:
+    """What detectors see of a loop.
+
+    Args:
+        result: Its record.
+    """
+    speed = np.abs(result.x[:, result.x.shape[1] // 2 :]).max(axis=1)
+    return Trace(result.numbers, result.level, result.innovation, result.nis, speed)
+
+
+def plain_task(task: Task) -> Task:
+    """The task without disturbances of its own."""
+    return replace(task, faults=())
+
+
+def nominal_figures(study: MonitorStudy, judges: Judges, trace: Trace) -> dict[str, Any]:
+    """Of a nominal loop: false alarms by rate and method, and the largest scores of its blocks.
+
+    Args:
+        study: The study.
+        judges: What was learned.
+        trace: The loop.
+    """
+    dt, levels = judges.detector.dt, judges.levels(trace)
+    size = round(judges.block_s / dt)
+    counts: dict[str, dict[str, int]] = {}
+    for rate in study.rates:
+        alarms = {m: judges.alarm(levels, trace, m, rate) for m in METHODS}
+        counts[f"{rate:g}"] = {
+            m: int(np.sum(np.diff(on.astype(int), prepend=0) == 1)) for m, on in alarms.items()
+        }
+    blocks = {}
+    for method in METHODS:
+        score = judges.score(levels, method, study.rates[0])
+        whole = len(score) // size * size
+        blocks[method] = score[:whole].reshape(-1, size).max(axis=1).round(4).tolist()
+    return {"seconds": len(trace.nis) * dt, "alarms": counts, "blocks": blocks}
+
+
+def fault_figures(study: MonitorStudy, judges: Judges, trace: Trace, onset: int) -> dict[str, Any]:
+    """Of a faulted loop: delays by rate and method, alarms before the fault, and the largest scores soon after.
+
+    Args:
+        study: The study.
+        judges: What was learned.
+        trace: The loop.
+        onset: First sample of the fault.
+    """
+    dt, levels = judges.detector.dt, judges.levels(trace)
+    moving = MOVING * max(judges.detector.rest_speed)
+    moved: Array = np.cumsum(trace.speed[onset:] > moving) * np.float64(dt)
+    delays: dict[str, dict[str, float]] = {}
+    early: dict[str, dict[str, bool]] = {}
+    for rate in study.rates:
+        alarms = {m: judges.alarm(levels, trace, m, rate) for m in METHODS}
+        key = f"{rate:g}"
+        early[key] = {m: bool(on[:onset].any()) for m, on in alarms.items()}
+        delays[key] = {m: _delay(on[onset:], moved) for m, on in alarms.items()}
+    soon = moved <= WITHIN_S + 1e-9
+    scores = {
+        m: round(float(np.max(judges.score(levels, m, study.rates[0])[onset:][soon], initial=0.0)), 4)
+        for m in METHODS
+    }
+    return {"delays": delays, "early": early, "scores": scores}
+
+
+def _delay(alarm: NDArray[np.bool_], moved: Array) -> float:
+    """Time in motion [s] to the first alarm; infinite without one."""
+    places = np.flatnonzero(alarm)
+    return float(moved[places[0]]) if places.size else float("inf")
+
+
+def write_learning(path: Path, traces: list[Trace]) -> None:
+    """Keep what is learned from."""
+    arrays = {f"{name}_{i}": value for i, t in enumerate(traces) for name, value in vars(t).items()}
+    write_arrays(path, arrays)
+
+
+def learn(study: MonitorStudy, paths: list[Path], artifact: Kit) -> Judges:
+    """Thresholds of all methods from the nominal loops in these files.
+
+    Args:
+        study: The study.
+        paths: Files of :func:`write_learning`.
+        artifact: The models that ran in them.
+
+    Raises:
+        InputError: If a file is missing, or there is too little data.
+    """
+    traces, hashed = [], hashlib.sha256()
+    for path in paths:
+        arrays = read_arrays(path)
+        for i in range(len(arrays) // len(Trace.__dataclass_fields__)):
+            fields: Mapping[str, Any] = {name: arrays[f"{name}_{i}"] for name in Trace.__dataclass_fields__}
+            traces.append(Trace(**fields))
+            hashed.update(traces[-1].numbers.tobytes())
+    model, rest = artifact.models["hybrid"], artifact.rest_speed
+    return learn_judges(
+        traces, model.dt, study.resolution, rate=min(study.rates), rest_speed=REST_SPEED if rest is None else rest,
+        time_unit=model.time_unit, data_hash=hashed.hexdigest(),
+    )  # fmt: skip

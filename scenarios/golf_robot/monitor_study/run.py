@@ -1,0 +1,153 @@
+"""Run the ready study ``monitor``: learn, then judge; resumable, with a report."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import read_json, write_json
+from hybrid_mpc.job.context import Progress, Silent
+from hybrid_mpc.job.engine import Engine, make_engine
+from hybrid_mpc.job.folder import check_folder, open_folder
+from hybrid_mpc.job.study import Study
+from hybrid_mpc.job.study_log import FILE as NOTE
+from hybrid_mpc.job.study_log import RunLog, read_note, rows
+from hybrid_mpc.job.study_run import (
+    RUNS,
+    THREADS,
+    Batch,
+    Rows,
+    claim,
+    execute,
+    finished,
+    load_inputs,
+    make_note,
+    run_batch,
+)
+from hybrid_mpc.kit.artifact import Kit, load
+from hybrid_mpc.kit.assembly import adaptable
+from hybrid_mpc.records import record
+from hybrid_mpc.scenario import load_scenario
+from scenarios.golf_robot.monitor_study.detection import Judges
+from scenarios.golf_robot.monitor_study.loops import CONTROLLER, JUDGES, LEARNING, PRIOR, MonitorRunner, learn
+from scenarios.golf_robot.monitor_study.plan import LEARN, MonitorJob, MonitorStudy
+from scenarios.golf_robot.monitor_study.report import write_monitor_report
+from scenarios.golf_robot.monitor_study.results import monitor_results
+
+RESULTS = "results.json"
+KIND = "monitor"
+
+
+def run_monitor_study(
+    study: MonitorStudy,
+    out: str | Path,
+    *,
+    workers: int = 2,
+    resume: bool = False,
+    retry_failed: bool = False,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Run the study into a folder and return its results.
+
+    What is finished is on the disk; after a kill at any moment ``resume=True`` goes on.
+
+    Args:
+        study: What to run.
+        out: Folder to make; new or empty unless ``resume``.
+        workers: Processes.
+        resume: Finish the study that ``out`` holds.
+        retry_failed: Run those jobs again that have failed.
+        progress: Where to report; default: nowhere.
+
+    Returns:
+        What ``out/results.json`` holds; beside it are ``report.html``, ``table.md`` and the figures.
+
+    Raises:
+        InputError: For bad input, a model without parameters or a scenario without causes to adapt to, too little
+            nominal data for the rates, or if every job has failed.
+
+    Example:
+        >>> results = run_monitor_study(monitor_study("runs/golf"), "studies/monitor")  # doctest: +SKIP
+    """
+    out, say = Path(out), progress or Silent()
+    check_folder(out, "study", NOTE, resume=resume)
+    say.start("reading the model, and the filters' noise")
+    held = read_note(out).models if (out / NOTE).is_file() else None
+    loops, models = load_inputs(
+        Study(study.scenario, study.model, tasks=(study.task,), controllers=(PRIOR, CONTROLLER)), held
+    )
+    (model,) = loops.models
+    note = make_note(study.identity(), models, study.size, KIND)
+    say.finish(f"{study.size} jobs")
+    if study.guard_seeds:
+        causes = load_scenario(study.scenario).causes
+        adaptable(load(Path(model.folder)).models["hybrid"], causes)  # or the last loops would fail
+    run = MonitorRunner(study, model, str(out.resolve()))
+    engine = make_engine(partial(run_batch, run), workers, threads=THREADS)
+    try:
+        jobs = list(study.jobs())
+        with open_folder(out, claim(note), resume=resume), RunLog(out / RUNS) as log:
+            todo = _Todo(out, log, engine, say, finished(out, retry_failed))
+            first = [job for job in jobs if job.kind == LEARN]
+            todo.run("nominal loops to learn from", first)
+            if not (out / JUDGES).is_file():
+                _learn(study, out, first, load(Path(model.folder)))
+            shutil.rmtree(out / LEARNING, ignore_errors=True)  # judges.json has what was learned
+            todo.run("nominal, faulted and guarded loops", [job for job in jobs if job.kind != LEARN])
+    finally:
+        engine.close()
+    return finish(out)
+
+
+def finish(out: Path) -> dict[str, Any]:
+    """Results and report of a study's folder, of one that still runs too.
+
+    Args:
+        out: Its folder.
+
+    Raises:
+        InputError: If nothing has been judged yet.
+    """
+    note = read_note(out)
+    done = {row["id"]: row for row in rows(out / RUNS)}
+    judges = record(Judges, read_json(out / JUDGES), str(out / JUDGES))
+    results = monitor_results(note.study, judges, list(done.values()))
+    write_json(out / RESULTS, results)
+    write_monitor_report(out, results, note)
+    return results
+
+
+def is_monitor_study(folder: Path) -> bool:
+    """Whether a folder holds this study."""
+    return read_note(folder).kind == KIND
+
+
+class _Todo:
+    """What is left of a study, run in its engine."""
+
+    def __init__(
+        self, out: Path, log: RunLog, engine: Engine[Batch, Rows], say: Progress, done: set[str]
+    ) -> None:
+        self._out, self._log, self._engine, self._say, self._done = out, log, engine, say, done
+
+    def run(self, title: str, jobs: Iterable[MonitorJob]) -> None:
+        """Those of the jobs that are not done."""
+        left = [job for job in jobs if job.id not in self._done]
+        self._say.start(title)
+        told = execute(iter(left), self._log, self._engine, self._say, len(left))
+        self._say.finish(told.text if left else "done before")
+
+
+def _learn(study: MonitorStudy, out: Path, jobs: list[MonitorJob], artifact: Kit) -> None:
+    failed = [row for row in rows(out / RUNS) if row["kind"] == LEARN and row["status"] == "failed"]
+    paths = [out / LEARNING / f"{job.id}.npz" for job in jobs]
+    if failed and not all(path.is_file() for path in paths):
+        raise InputError(
+            f"{out}: a nominal loop to learn from has failed: {failed[-1]['error'].strip().splitlines()[-1]}; "
+            "--resume --retry-failed runs it again"
+        )
+    write_json(out / JUDGES, learn(study, paths, artifact))

@@ -1,0 +1,276 @@
+"""Jobs of a reproduction, each in a process of its own; each leaves its files and is done when they are there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenarios.paper.table import METRICS, Divergence, Network
+
+if TYPE_CHECKING:
+    from hybrid_mpc.identify.evaluate import FreeRun
+    from hybrid_mpc.identify.train import Trained
+
+import importlib
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.files import write_arrays, write_json
+from hybrid_mpc.scenario import load_scenario
+from scenarios.paper.table import Row
+
+if TYPE_CHECKING:
+    from hybrid_mpc.identify.settings import TrainingSettings
+
+
+# Free runs of all networks of an ensemble on the test runs: their figures, and which of them diverged (torch).
+
+Array = NDArray[np.float64]
+BEYOND = 10.0
+"""An output beyond so many times the largest one measured in any test run counts as diverged."""
+RULE = (
+    f"A network has diverged if in any test run a state of its free run is not finite, or an output goes beyond "
+    f"{BEYOND:g} times the largest one measured in all test runs. Diverged networks are counted; means and standard "
+    "deviations are over the others, medians over all (a diverged one counting as infinite)."
+)
+NEAR = 1.1
+"""A training has converged where its validation error is first within this factor of its best."""
+SHOWN = ("t", "u", "x", "x_hat", "energy_measured_w", "energy_model_w")
+
+
+def divergence(runs: Sequence[FreeRun]) -> Divergence | None:
+    """Where the free runs of one network left all bounds (``RULE``); None if they did not.
+
+    Args:
+        runs: Free runs over all test runs.
+    """
+    largest = np.max([np.abs(run.y).max(0) for run in runs], axis=0)
+    found: list[tuple[FreeRun, int]] = []
+    for run in runs:
+        with np.errstate(invalid="ignore"):
+            bad = ~np.isfinite(run.x_hat).all(1) | (np.abs(run.y_hat) > BEYOND * largest).any(1)
+        if bad.any():
+            found.append((run, int(np.argmax(bad))))
+    if not found:
+        return None
+    run, step = found[0]
+    return Divergence(run.name, step, float(run.t[step] - run.t[0]), len(found))
+
+
+def judged_network(
+    runs: Sequence[FreeRun], validation: float | None = None, converged: int | None = None
+) -> Network:
+    """Figures of one network, or where it diverged.
+
+    Args:
+        runs: Its free runs over all test runs.
+        validation: Its best validation error. Default: there was none.
+        converged: Optimiser steps until it had converged. Default: not known.
+    """
+    from hybrid_mpc.identify.evaluate import score
+
+    where = divergence(runs)
+    figures = {} if where is not None else {k: v for k, v in asdict(score(runs)).items() if k in METRICS}
+    known = validation if validation is not None and np.isfinite(validation) else None
+    return Network(figures, known, converged if known is not None else None, where)
+
+
+def converged_steps(trained: Trained) -> list[int]:
+    """Optimiser steps after which each network's validation error was within ``NEAR`` of its best."""
+    best = np.minimum.accumulate(trained.curve["validation"], axis=0)
+    first = np.argmax(best <= NEAR * best[-1], axis=0)
+    return [int(trained.curve["step"][row, i]) for i, row in enumerate(first)]
+
+
+def shown_run(runs: Sequence[FreeRun], name: str) -> dict[str, Any]:
+    """Arrays of the run that is drawn; of the first one if there is none of that name."""
+    run = next((r for r in runs if r.name == name), runs[0])
+    return {key: getattr(run, key) for key in SHOWN}
+
+
+Report = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True)
+class Ruler:
+    """What judges all models alike.
+
+    Args:
+        test: Test runs; their starts are smoothed from their warm-ups alone.
+        values: Parameters of the prior whose energy balance counts.
+        warm: Samples of the warm-up.
+        shown: Name of the run that is kept for a figure.
+    """
+
+    test: Sequence[Trajectory]
+    values: dict[str, float]
+    warm: int
+    shown: str
+
+
+@dataclass(frozen=True)
+class Case:
+    """One amount of training data of one data set, as a process gets it.
+
+    Args:
+        scenario: Registered name or path.
+        data_set: Name of the data set.
+        training: Its first trajectories, smoothed.
+        validation: Validation trajectories, smoothed by the same.
+        values: Parameters of the prior fitted to them.
+        smoother: ``sigma`` and ``walk`` of the smoother; None where states are exact.
+        ruler: What judges.
+        folder: Where the files go.
+        device: Where the networks are trained.
+    """
+
+    scenario: str
+    data_set: str
+    training: Sequence[Trajectory]
+    validation: Sequence[Trajectory]
+    values: dict[str, float]
+    smoother: dict[str, tuple[float, ...]] | None
+    ruler: Ruler
+    folder: Path
+    device: str = "cpu"
+
+    @property
+    def dt(self) -> float:
+        """Model period [s]."""
+        return self.training[0].dt
+
+
+def fit_job(
+    scenario: str,
+    train: Sequence[Trajectory],
+    valid: Sequence[Trajectory],
+    methods: tuple[str, ...],
+    path: Path,
+    report: Report,
+) -> None:
+    """Fit the prior to one amount of training data and smooth by it, as the main job does."""
+    from hybrid_mpc.job.stages.identify import ROUNDS, fit_and_smooth
+
+    start = time.monotonic()
+    fit, smoother, train, valid = fit_and_smooth(
+        load_scenario(scenario).prior, train, valid, train[0].dt, methods=methods,
+        on_progress=lambda key, done, total, text: report(ROUNDS.index(key), len(ROUNDS), text),
+    )  # fmt: skip
+    write_arrays(path.with_suffix(".npz"), smoothed_arrays([*train, *valid]))
+    note = {**asdict(fit), "smoother": {"sigma": smoother.sigma, "walk": smoother.walk}}
+    write_json(path.with_suffix(".json"), {**note, "seconds": time.monotonic() - start})
+
+
+def smoothed_arrays(trajectories: Sequence[Trajectory]) -> dict[str, Any]:
+    """States and derivatives of trajectories by name, as files hold them."""
+    return {f"{t.name}/{key}": getattr(t, key) for t in trajectories for key in ("x", "xdot")}
+
+
+def physics_job(cases: Sequence[tuple[Case, int]], path: Path, report: Report) -> None:
+    """Judge the nominal and the fitted prior of all amounts of training data.
+
+    Args:
+        cases: Each amount of training data, and its number of sequences.
+        path: File to write, without ending.
+        report: Takes progress.
+    """
+    import torch
+
+    from hybrid_mpc.identify.evaluate import free_runs
+    from hybrid_mpc.identify.step import PriorStep
+
+    start, rows = time.monotonic(), []
+    arrays: dict[str, Any] = {}
+    for i, (case, count) in enumerate(cases):
+        report(i, len(cases), f"{case.data_set}, {count} sequences")
+        make, ruler = load_scenario(case.scenario).prior, case.ruler
+        for model, values in (("phy_nominal", None), ("phy", case.values)):
+            step, empty = PriorStep(make(values), case.dt), torch.zeros(0, dtype=torch.float64)
+            runs = free_runs(step, make(ruler.values), ruler.test, ruler.warm, empty)
+            rows.append(Row(case.data_set, count, model, (judged_network(runs),)))
+            arrays |= {
+                f"{case.data_set}_{count:02d}_{model}/{k}": v for k, v in shown_run(runs, ruler.shown).items()
+            }
+    write_arrays(path.with_suffix(".npz"), arrays)
+    _finish(path, rows, {}, start)
+
+
+def ensemble_job(
+    case: Case, count: int, model: str, settings: TrainingSettings, key: str, report: Report
+) -> None:
+    """Train the networks of one model on one amount of data and judge all of them.
+
+    Args:
+        case: Data and prior.
+        count: Number of sequences.
+        model: Name of the row.
+        settings: Of the training.
+        key: Name of the files.
+        report: Takes progress.
+    """
+    from hybrid_mpc.identify.evaluate import stacked_free_runs
+    from hybrid_mpc.identify.train import train
+
+    start, path = time.monotonic(), case.folder / key
+    make, ruler = load_scenario(case.scenario).prior, case.ruler
+    prior = make(case.values)
+    trained = train(
+        prior, case.training, case.validation, settings,
+        checkpoint=case.folder / f"{key}.safetensors", device=case.device,
+        on_progress=lambda done, total, error: report(done, total, f"validation E_sim {error:.4g}"),
+    )  # fmt: skip
+    with np.errstate(over="ignore", invalid="ignore"):  # a network that diverges is judged as such
+        runs = stacked_free_runs(trained, prior, case.dt, make(ruler.values), ruler.test, ruler.warm)
+        networks = tuple(
+            judged_network(own, float(error), steps)
+            for own, error, steps in zip(runs, trained.validation, converged_steps(trained), strict=True)
+        )
+    arrays = {f"weights.{name}": value for name, value in trained.weights.items()}
+    arrays |= {f"curve.{name}": value for name, value in trained.curve.items()}
+    arrays |= {f"shown.{k}": v for k, v in shown_run(runs[trained.best], ruler.shown).items()}
+    write_arrays(path.with_suffix(".npz"), arrays)
+    details = {
+        "scaling": asdict(trained.scaling),
+        "skipped": trained.skipped.tolist(),
+        "faults": [asdict(fault) for fault in trained.faults],
+        "best_by_validation": trained.best,
+    }
+    _finish(path, [Row(case.data_set, count, model, networks)], details, start)
+
+
+def sindy_job(case: Case, count: int, key: str, report: Report) -> None:
+    """Identify a sparse equation on one amount of data and judge it."""
+    import torch
+
+    from hybrid_mpc.identify.evaluate import free_runs, judged
+    from hybrid_mpc.identify.smooth import Smoother
+
+    start, path = time.monotonic(), case.folder / key
+    make, ruler = load_scenario(case.scenario).prior, case.ruler
+    prior, validation = make(case.values), list(case.validation)
+    report(0, 1, "searching libraries of terms")
+    if case.smoother is not None:
+        smoother = Smoother(prior, case.dt, tuple(case.smoother["sigma"]), tuple(case.smoother["walk"]))
+        validation = judged(validation, smoother, ruler.warm)
+    fit_sindy = importlib.import_module("hybrid_mpc.identify.sindy").fit_sindy
+    step = fit_sindy(case.training, prior, case.dt, validation=validation, warm=ruler.warm)
+    empty = torch.zeros(0, dtype=torch.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        runs = free_runs(step, make(ruler.values), ruler.test, ruler.warm, empty)
+        network = judged_network(runs)
+    write_arrays(path.with_suffix(".npz"), {f"shown.{k}": v for k, v in shown_run(runs, ruler.shown).items()})
+    _finish(path, [Row(case.data_set, count, "sindy", (network,))], {"equations": step.equations()}, start)
+
+
+def _finish(path: Path, rows: Sequence[Row], details: dict[str, Any], start: float) -> None:
+    """Write what means that the job is done."""
+    value = {"rows": [row.plain() for row in rows], "details": details, "seconds": time.monotonic() - start}
+    write_json(path.with_suffix(".json"), value)

@@ -1,0 +1,512 @@
+"""``hybrid-mpc reproduce``: data, priors, ensembles, tables, figures and claims, resumable at any point."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hybrid_mpc.data.trajectories import Dataset, Trajectory
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import read_arrays, read_json, write_json, write_text
+from hybrid_mpc.job.context import Progress, Silent
+from hybrid_mpc.job.engine import WORKERS, run_jobs
+from hybrid_mpc.job.folder import open_folder
+from hybrid_mpc.job.settings import check_device, claim
+from hybrid_mpc.job.stages.export import versions
+from hybrid_mpc.scenario import Scenario, load_scenario
+from scenarios.paper.experiment import Effort, Experiment
+from scenarios.paper.jobs import RULE, Case, Ruler, ensemble_job, fit_job, physics_job, sindy_job
+from scenarios.paper.settings import ReproductionSettings, case_key, experiment_of
+from scenarios.paper.table import METRICS, Row, Table, said
+
+if TYPE_CHECKING:
+    from hybrid_mpc.identify.settings import TrainingSettings
+
+
+# Which process a job runs in, as the terminal shows it. No torch in here.
+
+
+class Slots:
+    """Gives every running job a place, so that the terminal has a bar a process and not one a job.
+
+    Args:
+        count: Processes side by side.
+
+    Example:
+        >>> slots = Slots(2)
+        >>> slots.name("one"), slots.name("two"), slots.name("one")
+        ('process 1', 'process 2', 'process 1')
+        >>> slots.free("one")
+        >>> slots.name("three")
+        'process 1'
+    """
+
+    def __init__(self, count: int) -> None:
+        self._held: dict[int, str] = {}
+        self._count = count
+
+    def name(self, key: str) -> str:
+        """Place of a job; a new one takes the first that is free."""
+        slot = next((i for i, held in self._held.items() if held == key), None)
+        if slot is None:
+            slot = next((i for i in range(self._count) if i not in self._held), self._count)
+            self._held[slot] = key
+        return f"process {slot + 1}"
+
+    def free(self, key: str) -> None:
+        """The job is over."""
+        self._held = {i: held for i, held in self._held.items() if held != key}
+
+
+# What a reproduction writes: results.json, results.csv, the claims and figures. No torch in here.
+
+SCHEMA = "hybrid-mpc reproduction"
+SCHEMA_VERSION = 1
+DRAWN = ("phy", "mopgrnn")
+"""Models whose free run is drawn beside the measurement."""
+
+
+def write_outputs(work: Work) -> dict[str, Any]:
+    """Collect what the jobs left, judge the claims, write tables and figures.
+
+    Args:
+        work: A reproduction whose jobs are all done.
+
+    Returns:
+        What ``results.json`` holds.
+    """
+    rows = work.rows()
+    table = Table(rows)
+    results = collected(work, rows, table)
+    draw(work, table)
+    write_text(work.out / "results.csv", table.csv())
+    write_text(work.out / "claims.txt", "".join(f"{line}\n" for line in claim_lines(results)))
+    write_json(work.out / "results.json", results)
+    return read_results(work.out / "results.json")
+
+
+def collected(work: Work, rows: Sequence[Row], table: Table) -> dict[str, Any]:
+    """The results in the form of the schema; ``timing`` is the only part that two equal runs do not share."""
+    experiment, jobs = work.experiment, {p.stem: read_json(p) for p in sorted(work.folder.glob("*.json"))}
+    claims = []
+    for each in experiment.claims:
+        verdict = each.check(table)
+        claims.append({"name": each.name, "text": each.text, "source": each.source, **asdict(verdict)})
+    priors = {key: {"values": job["values"], "standard_errors": job["standard_errors"], "smoother": job["smoother"]}
+              for key, job in jobs.items() if key.endswith("_prior")}  # fmt: skip
+    return {
+        "schema": SCHEMA,
+        "schema_version": SCHEMA_VERSION,
+        "scenario": work.scenario.name,
+        "figure": experiment.figure,
+        "data_sets": dict(experiment.data_sets),
+        "settings": work.settings.identity(),
+        "versions": versions(),
+        "data": {name: _hash(work, name) for name in experiment.data_sets},
+        "divergence_rule": RULE,
+        "notes": work.notes(),
+        "priors": priors,
+        "summary": table.summary(),
+        "claims": claims,
+        "rows": [row.plain() for row in rows],
+        "details": {key: job["details"] for key, job in jobs.items() if job.get("details")},
+        "timing": {"seconds_of_jobs": {key: job["seconds"] for key, job in jobs.items()}},
+    }
+
+
+def read_results(path: Path) -> dict[str, Any]:
+    """Results of a reproduction.
+
+    Raises:
+        InputError: If the file is missing, damaged, something else, or of another version of the schema.
+    """
+    results = read_json(path)
+    if not isinstance(results, dict) or results.get("schema") != SCHEMA:
+        raise InputError(f"{path} holds no results of 'hybrid-mpc reproduce'")
+    if results.get("schema_version") != SCHEMA_VERSION:
+        raise InputError(
+            f"{path} has schema version {results.get('schema_version')}, this program reads {SCHEMA_VERSION}; "
+            "use the program that wrote it, or run 'hybrid-mpc reproduce' anew"
+        )
+    return results
+
+
+def table_of(results: Mapping[str, Any]) -> Table:
+    """The table of results that were read."""
+    return Table([Row.of(row) for row in results["rows"]])
+
+
+def claim_lines(results: Mapping[str, Any]) -> list[str]:
+    """A line a claim, then a line a note."""
+    from scenarios.paper.table import Verdict
+
+    lines = [said(c["text"], c["source"], Verdict(c["holds"], c["found"])) for c in results["claims"]]
+    return [*lines, *results["notes"]]
+
+
+def draw(work: Work, table: Table) -> None:
+    """E_sim, RMSE and violation over the amount of data, and a free run of the last data set's most data."""
+    from hybrid_mpc.plots.style import save
+    from scenarios.paper.plots import errors_over_sequences, shown_free_run
+
+    folder, titles = work.out / "figures", work.experiment.data_sets
+    for i, metric in enumerate(("e_sim_s", "rmse_rad", "energy_violation_w")):
+        work.progress.update("figures", i, 3 + len(titles), metric)
+        figure = errors_over_sequences(panels(table, titles, metric), METRICS[metric])
+        save(figure, folder / f"{metric.rsplit('_', 1)[0]}.png")
+    for name, title in titles.items():
+        runs = {model: _shown(work, name, model) for model in DRAWN}
+        prior = work.scenario.prior()
+        figure = shown_free_run(runs, prior.states, prior.inputs, model=DRAWN[-1], title=title)
+        save(figure, folder / f"free_run_{name}.png")
+
+
+def panels(table: Table, titles: Mapping[str, str], metric: str) -> dict[str, dict[str, dict[str, Any]]]:
+    """Curves by panel title and model: amounts, means, standard deviations, and diverged networks of how many."""
+    drawn: dict[str, dict[str, dict[str, Any]]] = {}
+    for data_set, title in titles.items():
+        curves = drawn.setdefault(title, {})
+        for model in table.models:
+            cells = {
+                n: c for n in table.sequences if (c := table.cell(data_set, n, model, metric)) is not None
+            }
+            curves[model] = {
+                "sequences": list(cells),
+                "mean": [np.nan if c.mean is None else c.mean for c in cells.values()],
+                "std": [0.0 if c.std is None else c.std for c in cells.values()],
+                "diverged": [c.diverged for c in cells.values()],
+                "networks": [c.networks for c in cells.values()],
+            }
+    return drawn
+
+
+def _shown(work: Work, data_set: str, model: str) -> dict[str, Any]:
+    """The drawn run of a model trained on most data; of an ensemble the network best on validation runs."""
+    key = case_key(data_set, work.effort.sequences[-1], model)
+    if model.startswith("phy"):
+        arrays, prefix = read_arrays(work.folder / "physics.npz"), f"{key}/"
+    else:
+        arrays, prefix = read_arrays(work.folder / f"{key}.npz"), "shown."
+    return {name.removeprefix(prefix): a for name, a in arrays.items() if name.startswith(prefix)}
+
+
+def _hash(work: Work, data_set: str) -> str:
+    digest = hashlib.sha256()
+    for t in work.recorded[data_set]:
+        digest.update(t.name.encode())
+        for array in (t.u, t.y):
+            digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def text_table(results: Mapping[str, Any]) -> list[str]:
+    """E_sim of all rows as lines for a terminal: mean ± standard deviation, and diverged networks."""
+    table = table_of(results)
+    lines = []
+    for data_set in table.data_sets:
+        lines.append(f"E_sim [s] on test runs, {results['data_sets'][data_set]}")
+        lines.append(f"  {'sequences':14}" + "".join(f"{n:>22}" for n in table.sequences))
+        for model in table.models:
+            cells = [said_cell(table, data_set, n, model) for n in table.sequences]
+            lines.append(f"  {model:14}" + "".join(f"{cell:>22}" for cell in cells))
+    return lines
+
+
+def said_cell(table: Table, data_set: str, sequences: int, model: str, metric: str = "e_sim_s") -> str:
+    """A figure as tables print it: mean ± standard deviation, and how many networks diverged."""
+    cell = table.cell(data_set, sequences, model, metric)
+    if cell is None:
+        return "-"
+    if cell.mean is None:
+        return "all diverged"
+    text = f"{cell.mean:.4g}" + ("" if cell.std is None else f" ± {cell.std:.2g}")
+    return text + (f" ({cell.diverged} diverged)" if cell.diverged else "")
+
+
+Jobs = dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]
+NETWORKS = ("hybrid", "mopgrnn", "pgrnn", "rnn")
+"""Models that are ensembles, the slowest first."""
+WITHOUT_SINDY = "sindy is left out: {} is not installed (pip install 'hybrid-mpc[sindy]')"
+
+
+def reproduce(
+    settings: ReproductionSettings,
+    out: Path,
+    *,
+    resume: bool = False,
+    progress: Progress | None = None,
+    workers: int = WORKERS,
+) -> dict[str, Any]:
+    """Rebuild a scenario's experiment into the folder ``out`` and return what stands in its ``results.json``.
+
+    Every fit and every ensemble is a job in a process of its own that leaves its files in ``out/checkpoints``; a
+    training also leaves its state as it goes. A reproduction that was interrupted, at any point, is finished by
+    ``resume=True`` and then equals one that was not.
+
+    Args:
+        settings: What to compute.
+        out: Folder to make; it must be new or empty unless ``resume``.
+        resume: Finish the reproduction that ``out`` holds.
+        progress: Where to report. Default: nowhere.
+        workers: Processes side by side; 0 runs the jobs in this one. Default: two.
+
+    Returns:
+        The results (docs/reproduction.md).
+
+    Raises:
+        InputError: If the scenario has no experiment, a setting is bad, or the folder holds something else.
+
+    Example:
+        >>> results = reproduce(ReproductionSettings("pendulum"), Path("out"))  # doctest: +SKIP
+    """
+    scenario = load_scenario(settings.scenario)
+    experiment = experiment_of(scenario)
+    work = Work(
+        settings, scenario, experiment, settings.effort(experiment), out, progress or Silent(), workers
+    )
+    check_device(settings.device)
+    with open_folder(out, claim(settings), resume=resume):
+        stages: tuple[tuple[str, Callable[[Work], None]], ...] = (
+            ("recording the machine", record_stage),
+            ("fitting the priors", fit_stage),
+            ("judging the priors", physics_stage),
+            ("training the networks", ensemble_stage),
+        )
+        for title, stage in stages:
+            work.progress.start(title)
+            stage(work)
+            work.progress.finish("")
+        work.progress.start("writing tables and figures")
+        results = write_outputs(work)
+        work.progress.finish("")
+        return results
+
+
+@dataclass(frozen=True)
+class Work:
+    """A reproduction in its folder.
+
+    Args:
+        settings: What it computes.
+        scenario: The machine.
+        experiment: Its experiment.
+        effort: How much of it.
+        out: The folder.
+        progress: Where to report.
+        workers: Processes side by side; 0 for none.
+    """
+
+    settings: ReproductionSettings
+    scenario: Scenario
+    experiment: Experiment
+    effort: Effort
+    out: Path
+    progress: Progress = field(default_factory=Silent)
+    workers: int = WORKERS
+
+    @property
+    def folder(self) -> Path:
+        """Where the jobs leave their files."""
+        return self.out / "checkpoints"
+
+    @property
+    def cases(self) -> list[tuple[str, int]]:
+        """Data sets and amounts of training data."""
+        return [(data_set, n) for data_set in self.experiment.data_sets for n in self.effort.sequences]
+
+    @property
+    def warm(self) -> int:
+        """Samples of the warm-up."""
+        return round(self.scenario.data.warm_up / self.scenario.data.dt)
+
+    @cached_property
+    def sets(self) -> dict[str, Sequence[Trajectory] | Dataset]:
+        """What the experiment gives for each data set; the same seed makes the same."""
+        sets: dict[str, Sequence[Trajectory] | Dataset] = {}
+        for i, name in enumerate(self.experiment.data_sets):
+            self.progress.update("data sets", i, len(self.experiment.data_sets), name)
+            sets[name] = self.experiment.runs(name, self.settings.seed, self.out / "data" / name)
+        return sets
+
+    @cached_property
+    def recorded(self) -> dict[str, list[Trajectory]]:
+        """All trajectories of each data set."""
+        return {
+            name: list(found.trajectories if isinstance(found, Dataset) else found)
+            for name, found in self.sets.items()
+        }
+
+    @property
+    def doubts(self) -> list[str]:
+        """What is doubtful about the recordings."""
+        read = [found.findings for found in self.sets.values() if isinstance(found, Dataset)]
+        return list(dict.fromkeys(str(finding) for findings in read for finding in findings))
+
+    def trajectories(self, data_set: str, role: str, most: int) -> list[Trajectory]:
+        """The first trajectories of a role, as they were recorded."""
+        return [t for t in self.recorded[data_set] if t.role == role][:most]
+
+    def fit(self, data_set: str, count: int) -> dict[str, Any]:
+        """Fitted values and smoother of one amount of data; without a fit the scenario's prior and None."""
+        if not self.experiment.measured:
+            return {"values": self.scenario.prior().values, "smoother": None}
+        result: dict[str, Any] = read_json(self.folder / f"{case_key(data_set, count, 'prior')}.json")
+        return result
+
+    @cached_property
+    def ruler(self) -> Ruler:
+        """What judges all models: prior and smoother of the most data of the last data set."""
+        name, count = self.experiment.reference, self.effort.sequences[-1]
+        test, fit = self.trajectories(name, "test", self.effort.test), self.fit(name, count)
+        if self.experiment.measured:
+            from hybrid_mpc.identify.evaluate import judged
+            from hybrid_mpc.identify.smooth import Smoother
+
+            prior, levels = self.scenario.prior(fit["values"]), fit["smoother"]
+            smoother = Smoother(prior, self.scenario.data.dt, tuple(levels["sigma"]), tuple(levels["walk"]))
+            test = judged(smoother.smooth(test), smoother, self.warm)
+        return Ruler(test, fit["values"], self.warm, self.experiment.shown)
+
+    def case(self, data_set: str, count: int) -> Case:
+        """Data and prior of one amount of training data."""
+        train = self.trajectories(data_set, "train", count)
+        valid = self.trajectories(data_set, "valid", self.effort.valid)
+        fit = self.fit(data_set, count)
+        if self.experiment.measured:
+            arrays = read_arrays(self.folder / f"{case_key(data_set, count, 'prior')}.npz")
+            train, valid = (_with_states(part, arrays) for part in (train, valid))
+        return Case(
+            self.settings.scenario,
+            data_set,
+            train,
+            valid,
+            fit["values"],
+            fit["smoother"],
+            self.ruler,
+            self.folder,
+            self.settings.device,
+        )
+
+    def training(self, model: str) -> TrainingSettings:
+        """Settings of an ensemble's training."""
+        from hybrid_mpc.identify.settings import TrainingSettings
+
+        e, free = self.effort, self.effort.free_run_steps if model == "hybrid" else 0
+        return TrainingSettings(
+            kind="mopgrnn" if model == "hybrid" else model,  # type: ignore[arg-type]
+            hidden=e.hidden,
+            networks=e.networks,
+            teacher_steps=e.steps - free,
+            free_run_steps=free,
+            seed=self.settings.seed,
+            warm=self.warm,
+            batch=e.batch,
+            decay=e.decay,
+            every=e.every,
+            form=self.settings.form,  # type: ignore[arg-type]
+            fused=True,
+        )
+
+    def rows(self) -> list[Row]:
+        """Rows of all jobs that are done."""
+        found = [read_json(path) for path in sorted(self.folder.glob("*.json"))]
+        return [Row.of(row) for job in found for row in job.get("rows", ())]
+
+    def notes(self) -> list[str]:
+        """What is doubtful about the recordings, and what was left out, and why."""
+        missing = missing_for_sindy()
+        return [*self.doubts, *([WITHOUT_SINDY.format(missing)] if missing else [])]
+
+    def done(self, key: str) -> bool:
+        """Whether a job has left its files."""
+        return (self.folder / f"{key}.json").is_file()
+
+    def run(self, jobs: Jobs) -> None:
+        """Run those of the jobs that are not done, and show how many are and what each process does."""
+        total, slots = len(jobs), Slots(self.workers)
+        todo = {key: job for key, job in jobs.items() if not self.done(key)}
+        finished = total - len(todo)
+
+        def ended(key: str, result: Any) -> None:
+            nonlocal finished
+            finished += 1
+            slots.free(key)
+            self.progress.update("jobs", finished, total, f"{key} is done")
+
+        def told(key: str, done: int, of: int, text: str) -> None:
+            self.progress.update(slots.name(key), done, of, f"{key}: {text}")
+
+        self.progress.update("jobs", finished, total, "")
+        if self.workers:
+            run_jobs(todo, told, self.workers, ended)
+            return
+        for key, (function, args) in todo.items():
+            ended(key, function(*args, partial(told, key)))
+
+
+def record_stage(work: Work) -> None:
+    """Make the recordings, again if the reproduction was interrupted: the same seed makes the same ones."""
+    for doubt in work.doubts:
+        work.progress.warn(doubt)
+
+
+def fit_stage(work: Work) -> None:
+    """Fit the prior to every amount of training data of every data set, if it is fitted."""
+    jobs: Jobs = {}
+    for data_set, count in work.cases if work.experiment.measured else []:
+        key = case_key(data_set, count, "prior")
+        train = work.trajectories(data_set, "train", count)
+        valid = work.trajectories(data_set, "valid", work.effort.valid)
+        jobs[key] = (
+            fit_job,
+            (work.settings.scenario, train, valid, work.effort.fit, work.folder / key),
+        )
+    work.run(jobs)
+    for key in jobs:
+        for warning in read_json(work.folder / f"{key}.json")["warnings"]:
+            work.progress.warn(f"{key}: {warning}")
+
+
+def physics_stage(work: Work) -> None:
+    """Judge the priors."""
+    if work.done("physics"):
+        return
+    cases = [(work.case(*case), case[1]) for case in work.cases]
+    work.run({"physics": (physics_job, (cases, work.folder / "physics"))})
+
+
+def ensemble_stage(work: Work) -> None:
+    """Train and judge every ensemble, and identify the sparse equations."""
+    jobs: Jobs = {}
+    models = NETWORKS if missing_for_sindy() else (*NETWORKS, "sindy")
+    for data_set, count in work.cases:
+        keys = {model: case_key(data_set, count, model) for model in models}
+        if all(work.done(key) for key in keys.values()):
+            jobs |= dict.fromkeys(keys.values(), (ensemble_job, ()))
+            continue
+        case = work.case(data_set, count)
+        for model, key in keys.items():
+            if model == "sindy":
+                jobs[key] = (sindy_job, (case, count, key))
+            else:
+                jobs[key] = (ensemble_job, (case, count, model, work.training(model), key))
+    work.run(jobs)
+
+
+def missing_for_sindy() -> str:
+    """What the row ``sindy`` needs and is not there; empty if it can be made."""
+    for name in ("hybrid_mpc.identify.sindy", "pysindy"):
+        if importlib.util.find_spec(name) is None:
+            return name
+    return ""
+
+
+def _with_states(trajectories: Sequence[Trajectory], arrays: Mapping[str, Any]) -> list[Trajectory]:
+    return [replace(t, x=arrays[f"{t.name}/x"], xdot=arrays[f"{t.name}/xdot"]) for t in trajectories]

@@ -1,0 +1,128 @@
+"""Settings of a reproduction. No torch in here."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.scenario import Scenario, load_scenario, registered_scenarios
+from scenarios.paper.experiment import Effort, Experiment, PaperScenario
+
+FORMS = ("hybrid", "literal")
+
+
+@dataclass(frozen=True)
+class ReproductionSettings:
+    """Everything that decides what a reproduction computes.
+
+    Args:
+        scenario: Registered name or path of a user's Python file.
+        budget: Name of one of the experiment's efforts. Default: full.
+        networks: Networks of each ensemble. Default: the budget's.
+        sequences: Amounts of training data, in runs. Default: the budget's.
+        seed: Seed of data and training.
+        form: ``"hybrid"`` (exact kinematics, the network corrects the prior's acceleration) or ``"literal"``
+            (the paper's: it gives the whole derivative, explicit Euler integrates).
+        device: Where the networks are trained, ``"cpu"`` or e.g. ``"cuda"``. Default: cpu.
+
+    Example:
+        >>> ReproductionSettings("pendulum", sequences=(3, 15)).effort(load_scenario("pendulum").experiment).networks
+        16
+    """
+
+    scenario: str
+    budget: str = "full"
+    networks: int | None = None
+    sequences: tuple[int, ...] | None = None
+    seed: int = 0
+    form: str = "hybrid"
+    device: str = "cpu"
+
+    def effort(self, experiment: Experiment) -> Effort:
+        """The budget's effort with these networks and sequences.
+
+        Raises:
+            InputError: If there is no such budget or form, no network, or other sequences than there are runs.
+        """
+        if self.budget not in experiment.efforts:
+            raise InputError(
+                f"no budget {self.budget!r} to reproduce with; there are: {', '.join(experiment.efforts)}"
+            )
+        if self.form not in FORMS:
+            raise InputError(f"no form {self.form!r}; there are: {', '.join(FORMS)}")
+        effort = experiment.efforts[self.budget]
+        networks = effort.networks if self.networks is None else self.networks
+        if networks < 1:
+            raise InputError(
+                f"{networks} networks cannot be judged; give --networks at least 1 (the paper has 16)"
+            )
+        return replace(effort, networks=networks, sequences=self._sequences(experiment, effort))
+
+    def identity(self) -> dict[str, Any]:
+        """Settings as plain data, with the content of a user's own scenario file in place of where it lies."""
+        scenario, path = self.scenario, Path(self.scenario)
+        if scenario.endswith(".py") and path.is_file():
+            scenario = f"{path.name} {hashlib.sha256(path.read_bytes()).hexdigest()}"
+        effort = self.effort(experiment_of(load_scenario(self.scenario)))
+        own = {"command": "reproduce", **asdict(replace(self, scenario=scenario)), "effort": asdict(effort)}
+        if self.device == "cpu":
+            del own["device"]  # as in reproductions from before there was a choice
+        return own | {"networks": effort.networks, "sequences": effort.sequences}
+
+    def _sequences(self, experiment: Experiment, effort: Effort) -> tuple[int, ...]:
+        chosen = tuple(sorted(set(effort.sequences if self.sequences is None else self.sequences)))
+        if not chosen or chosen[0] < 1 or chosen[-1] > experiment.most:
+            raise InputError(
+                f"--sequences {','.join(map(str, chosen)) or '(none)'}: {self.scenario} has {experiment.most} "
+                f"training runs; give numbers between 1 and {experiment.most}, e.g. 3,6,9,12,15"
+            )
+        return chosen
+
+
+def parsed_sequences(text: str) -> tuple[int, ...]:
+    """Amounts of training data as the command line has them.
+
+    Raises:
+        InputError: If one is no whole number.
+
+    Example:
+        >>> parsed_sequences("3, 6")
+        (3, 6)
+    """
+    try:
+        return tuple(int(word) for word in text.split(","))
+    except ValueError:
+        raise InputError(
+            f"--sequences {text!r} is no list of whole numbers; write e.g. --sequences 3,6,9,12,15"
+        ) from None
+
+
+def experiment_of(scenario: Scenario) -> Experiment:
+    """The scenario's experiment.
+
+    Raises:
+        InputError: If it has none; the message names the scenarios that have one.
+
+    Example:
+        >>> experiment_of(load_scenario("golf_robot")).figure
+        'Fig. 5'
+    """
+    if not isinstance(scenario, PaperScenario):
+        names = [name for name in registered_scenarios() if isinstance(load_scenario(name), PaperScenario)]
+        raise InputError(
+            f"scenario {scenario.name} has no experiment to reproduce; there is one for: {', '.join(names)}"
+        )
+    return scenario.experiment
+
+
+def case_key(data_set: str, sequences: int, model: str = "") -> str:
+    """Name of a job and its files.
+
+    Example:
+        >>> case_key("a", 3, "rnn"), case_key("b", 15)
+        ('a_03_rnn', 'b_15')
+    """
+    return "_".join([data_set, f"{sequences:02d}", *([model] if model else [])])

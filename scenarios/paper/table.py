@@ -1,0 +1,444 @@
+"""Claims of the paper and goals of this project, beside what was found. No torch in here.
+
+A check is made by one of the static methods of :class:`Claim` and judges a
+:class:`~scenarios.paper.table.Table`. It compares means over the networks that did not diverge; a model of
+which all diverged is infinitely worse than any other. A model that is claimed to be better, and of which a network
+diverged, is not better.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+# Figures of all networks of a reproduction: means, standard deviations, and how many diverged. No torch in here.
+
+MODELS = ("phy_nominal", "phy", "rnn", "pgrnn", "mopgrnn", "hybrid", "sindy")
+"""Rows in their order. ``hybrid`` is the MOPGRNN trained on free runs too."""
+METRICS: Mapping[str, str] = {
+    "e_sim_s": "E_sim [s]",
+    "e_sim_lambda1_s": "E_sim, λ = 1 [s]",
+    "e_sim_literal_s": "E_sim, literal [s]",
+    "rmse_rad": "RMSE [rad]",
+    "energy_violation_w": "violation [W]",
+}
+"""Figures on test free runs, with units."""
+
+
+@dataclass(frozen=True)
+class Divergence:
+    """Where a network's free run left all bounds.
+
+    Args:
+        run: Name of the first test run in which it did.
+        step: Sample of that run, counted from the end of the warm-up.
+        time_s: The same [s].
+        runs: Number of test runs in which it did.
+    """
+
+    run: str
+    step: int
+    time_s: float
+    runs: int
+
+
+@dataclass(frozen=True)
+class Network:
+    """One network on the test runs.
+
+    Args:
+        figures: Figures by name (``METRICS``); empty if it diverged.
+        validation: Its best validation error, or None (infinite, or there was none).
+        converged_step: Optimiser steps until its validation error was within 10 % of its best. Default: none.
+        diverged: Where it diverged. Default: nowhere.
+    """
+
+    figures: Mapping[str, float]
+    validation: float | None = None
+    converged_step: int | None = None
+    diverged: Divergence | None = None
+
+
+@dataclass(frozen=True)
+class Row:
+    """All networks of one model, trained on one amount of data.
+
+    Args:
+        data_set: Name of the data set.
+        sequences: Number of training runs.
+        model: One of ``MODELS``.
+        networks: Its networks.
+    """
+
+    data_set: str
+    sequences: int
+    model: str
+    networks: tuple[Network, ...]
+
+    def plain(self) -> dict[str, Any]:
+        """As JSON holds it."""
+        return asdict(self)
+
+    @staticmethod
+    def of(value: Mapping[str, Any]) -> Row:
+        """From what :meth:`plain` gave.
+
+        Example:
+            >>> row = Row("exact", 3, "rnn", (Network({}, diverged=Divergence("test_01", 7, 0.07, 1)),))
+            >>> Row.of(row.plain()) == row
+            True
+        """
+        networks = tuple(
+            Network(
+                dict(n["figures"]),
+                n["validation"],
+                n["converged_step"],
+                None if n["diverged"] is None else Divergence(**n["diverged"]),
+            )
+            for n in value["networks"]
+        )
+        return Row(value["data_set"], value["sequences"], value["model"], networks)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One figure over the networks of a row.
+
+    Args:
+        mean: Mean over the networks that did not diverge; None if all did.
+        std: Standard deviation over these (n - 1); None if there are fewer than two.
+        median: Median over all networks, a diverged one counting as infinite; None if infinite.
+        networks: Number of networks, diverged ones included.
+        diverged: Number of diverged ones.
+    """
+
+    mean: float | None
+    std: float | None
+    median: float | None
+    networks: int
+    diverged: int
+
+
+class Table:
+    """Rows with their statistics.
+
+    Args:
+        rows: In any order.
+
+    Example:
+        >>> good, bad = Network({"e_sim_s": 2.0}), Network({}, diverged=Divergence("test_01", 7, 0.07, 1))
+        >>> table = Table([Row("exact", 3, "rnn", (good, good, bad))])
+        >>> table.cell("exact", 3, "rnn")
+        Cell(mean=2.0, std=0.0, median=2.0, networks=3, diverged=1)
+        >>> print(table.cell("exact", 6, "rnn"))
+        None
+    """
+
+    def __init__(self, rows: Sequence[Row]) -> None:
+        self._rows = {(row.data_set, row.sequences, row.model): row for row in rows}
+
+    @property
+    def data_sets(self) -> list[str]:
+        """Data sets in order of appearance."""
+        return list(dict.fromkeys(key[0] for key in self._rows))
+
+    @property
+    def sequences(self) -> list[int]:
+        """Amounts of training data, rising."""
+        return sorted({key[1] for key in self._rows})
+
+    @property
+    def models(self) -> list[str]:
+        """Models that have a row, in the order of ``MODELS``."""
+        there = {key[2] for key in self._rows}
+        return [model for model in MODELS if model in there]
+
+    def cell(self, data_set: str, sequences: int, model: str, metric: str = "e_sim_s") -> Cell | None:
+        """One figure of one row, or None if there is no such row or it has no such figure.
+
+        Args:
+            data_set: Name of the data set.
+            sequences: Number of training runs.
+            model: One of ``MODELS``.
+            metric: One of ``METRICS``, or ``"converged_step"``.
+        """
+        row = self._rows.get((data_set, sequences, model))
+        if row is None:
+            return None
+        kept = [n for n in row.networks if n.diverged is None]
+        if metric == "converged_step":
+            found = [None if n.converged_step is None else float(n.converged_step) for n in kept]
+        else:
+            found = [n.figures.get(metric) for n in kept]
+        values = [v for v in found if v is not None]
+        if len(values) < len(kept):
+            return None
+        n, diverged = len(row.networks), len(row.networks) - len(kept)
+        median = float(np.median([*values, *[math.inf] * diverged]))
+        return Cell(
+            float(np.mean(values)) if values else None,
+            float(np.std(values, ddof=1)) if len(values) > 1 else None,
+            median if math.isfinite(median) else None,
+            n,
+            diverged,
+        )
+
+    def summary(self) -> list[dict[str, Any]]:
+        """A flat line a row: mean, standard deviation and median of every figure."""
+        lines = []
+        for data_set, sequences, model in sorted(self._rows, key=self._order):
+            line: dict[str, Any] = {"data_set": data_set, "sequences": sequences, "model": model}
+            for metric in METRICS:
+                cell = self.cell(data_set, sequences, model, metric)
+                assert cell is not None
+                line |= {"networks": cell.networks, "diverged": cell.diverged}
+                line |= {f"{metric}_{name}": getattr(cell, name) for name in ("mean", "std", "median")}
+            lines.append(line)
+        return lines
+
+    def csv(self) -> str:
+        """:meth:`summary` as CSV text; what is not known is empty."""
+        lines, text = self.summary(), io.StringIO()
+        writer = csv.DictWriter(text, list(lines[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(lines)
+        return text.getvalue()
+
+    def _order(self, key: tuple[str, int, str]) -> tuple[int, int, int]:
+        return self.data_sets.index(key[0]), key[1], MODELS.index(key[2])
+
+
+At = Literal["every", "least", "most", "some"]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What was found of a claim.
+
+    Args:
+        holds: Whether it was reproduced; None if the results do not tell.
+        found: The numbers.
+    """
+
+    holds: bool | None
+    found: str
+
+
+Check = Callable[[Table], Verdict]
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A claim and how it is judged.
+
+    Args:
+        name: Short and unique within an experiment.
+        text: In words, with its numbers.
+        source: Who says so, e.g. ``"paper, Fig. 3"``.
+        check: Judges it; made by :meth:`below`, :meth:`above`, :meth:`level`, ... or by a function of one's own.
+
+    Example:
+        >>> from scenarios.paper.table import Network, Row
+        >>> rows = [Row("exact", 3, m, (Network({"e_sim_s": e}),)) for m, e in (("rnn", 1.0), ("pgrnn", 0.5))]
+        >>> claim = Claim("halved", "PGRNN 40 % below RNN", "paper", Claim.below("pgrnn", "rnn", 0.4, "exact"))
+        >>> claim.line(Table(rows))
+        'reproduced: PGRNN 40 % below RNN (paper). Found: pgrnn to rnn −50 % (with 3 sequences).'
+    """
+
+    name: str
+    text: str
+    source: str
+    check: Check
+
+    def line(self, table: Table) -> str:
+        """One line: verdict, claim, numbers."""
+        return said(self.text, self.source, self.check(table))
+
+    @staticmethod
+    def below(
+        model: str, reference: str, share: float, data_set: str, *, at: At = "every", metric: str = "e_sim_s"
+    ) -> Check:
+        """``model`` lies at least ``share`` below ``reference``; a negative share allows it to lie above.
+
+        Args:
+            model: Which is better.
+            reference: Than which.
+            share: Of the reference's figure.
+            data_set: Where.
+            at: With every amount of data, the least, the most, or any of them (``"some"``).
+            metric: Figure. Default E_sim.
+        """
+
+        def check(table: Table) -> Verdict:
+            changes, note = _changes(table, data_set, model, reference, metric, at)
+            if not changes:
+                return Verdict(None, note)
+            fine = [change <= -share for change in changes.values()]
+            clean = not any(_cell(table, data_set, n, model, metric).diverged for n in changes)
+            return Verdict(
+                (any(fine) if at == "some" else all(fine)) and clean, _told(model, reference, changes, note)
+            )
+
+        return check
+
+    @staticmethod
+    def above(model: str, reference: str, share: float, data_set: str, *, at: At = "every") -> Check:
+        """``model`` lies at least ``share`` above ``reference`` in E_sim; one that diverged does too."""
+
+        def check(table: Table) -> Verdict:
+            changes, note = _changes(table, data_set, model, reference, "e_sim_s", at)
+            if not changes:
+                return Verdict(None, note)
+            return Verdict(all(c >= share for c in changes.values()), _told(model, reference, changes, note))
+
+        return check
+
+    @staticmethod
+    def level(model: str, reference: str, share: float, data_set: str, *, at: At = "every") -> Check:
+        """``model`` and ``reference`` differ by at most ``share`` of the reference's E_sim."""
+
+        def check(table: Table) -> Verdict:
+            changes, note = _changes(table, data_set, model, reference, "e_sim_s", at)
+            if not changes:
+                return Verdict(None, note)
+            return Verdict(
+                all(abs(c) <= share for c in changes.values()), _told(model, reference, changes, note)
+            )
+
+        return check
+
+    @staticmethod
+    def steady(model: str, share: float, data_set: str) -> Check:
+        """``model`` is with least data at most ``share`` worse than with most."""
+
+        def check(table: Table) -> Verdict:
+            least, most = table.sequences[0], table.sequences[-1]
+            cells = [table.cell(data_set, n, model) for n in (least, most)]
+            if least == most or any(c is None or c.mean is None for c in cells):
+                return Verdict(None, f"{model} is not there with two amounts of data")
+            few, many = (c.mean for c in cells if c is not None and c.mean is not None)
+            found = f"{model} {few:.4g} s with {least}, {many:.4g} s with {most} sequences ({_percent(few / many - 1)})"
+            clean = not any(c.diverged for c in cells if c is not None)
+            return Verdict(few / many - 1 <= share and clean, found + _diverged(table, data_set, model))
+
+        return check
+
+    @staticmethod
+    def narrower(model: str, others: Sequence[str], data_set: str) -> Check:
+        """The standard deviation of ``model``'s E_sim is below that of all ``others`` with every amount of data."""
+
+        def check(table: Table) -> Verdict:
+            found, fine = [], []
+            for n in table.sequences:
+                spread = [_std(table, data_set, n, name) for name in (model, *others)]
+                own, rest = spread[0], [s for s in spread[1:] if s is not None]
+                if own is None or len(rest) < len(others):
+                    return Verdict(None, "fewer than two networks that did not diverge")
+                fine.append(own < min(rest))
+                found.append(f"{own:.2g} to {', '.join(f'{s:.2g}' for s in rest)} ({n})")
+            names = f"{model} to {', '.join(others)}, by sequences"
+            text = f"standard deviations [s] of {names}: {'; '.join(found)}"
+            clean = not any(_cell(table, data_set, n, model, "e_sim_s").diverged for n in table.sequences)
+            return Verdict(all(fine) and clean, text + _diverged(table, data_set, model, *others))
+
+        return check
+
+    @staticmethod
+    def sooner(model: str, other: str, data_set: str) -> Check:
+        """``model`` comes within 10 % of its best validation error after fewer steps than ``other``, on average."""
+
+        def check(table: Table) -> Verdict:
+            means = []
+            for name in (model, other):
+                cells = [table.cell(data_set, n, name, "converged_step") for n in table.sequences]
+                known = [c.mean for c in cells if c is not None and c.mean is not None]
+                if len(known) < len(cells):
+                    return Verdict(None, f"steps of {name} are not known")
+                means.append(sum(known) / len(known))
+            return Verdict(
+                means[0] < means[1], f"{model} {means[0]:.0f}, {other} {means[1]:.0f} steps on average"
+            )
+
+        return check
+
+    @staticmethod
+    def ordered(models: Sequence[str], data_set: str) -> Check:
+        """E_sim falls along ``models``, and so does its standard deviation, with most data."""
+
+        def check(table: Table) -> Verdict:
+            n = table.sequences[-1]
+            means = [c.mean if (c := table.cell(data_set, n, m)) is not None else None for m in models]
+            spread = [_std(table, data_set, n, m) for m in models]
+            a, b = [v for v in means if v is not None], [v for v in spread if v is not None]
+            if len(a) < len(models) or len(b) < len(models):
+                return Verdict(
+                    None, "a model is missing, or has fewer than two networks that did not diverge"
+                )
+            cells = ", ".join(f"{m} {x:.3g} ± {y:.2g} s" for m, x, y in zip(models, a, b, strict=True))
+            clean = not any(_cell(table, data_set, n, m, "e_sim_s").diverged for m in models)
+            holds = clean and a == sorted(a, reverse=True) and b == sorted(b, reverse=True)
+            return Verdict(holds, f"{cells} with {n} sequences" + _diverged(table, data_set, *models))
+
+        return check
+
+
+def said(text: str, source: str, verdict: Verdict) -> str:
+    """A claim with its verdict as one line."""
+    word = {True: "reproduced", False: "not reproduced", None: "not tested"}[verdict.holds]
+    return f"{word}: {text} ({source}). Found: {verdict.found}."
+
+
+def _changes(
+    table: Table, data_set: str, model: str, reference: str, metric: str, at: At
+) -> tuple[dict[int, float], str]:
+    """Relative changes from reference to model by amount of data, and a note; none if a figure is missing."""
+    counts = table.sequences
+    changes = {}
+    for n in {"least": counts[:1], "most": counts[-1:]}.get(at, counts):
+        a, b = (table.cell(data_set, n, name, metric) for name in (model, reference))
+        if a is None or b is None:
+            return {}, f"there is no {model if a is None else reference} with {n} sequences"
+        if a.mean is None and b.mean is None:
+            return {}, f"all networks of {model} and of {reference} diverged with {n} sequences"
+        if a.mean is None or b.mean is None:  # all networks diverged: infinitely worse than any that did not
+            changes[n] = math.inf if a.mean is None else -1.0
+        else:
+            changes[n] = a.mean / b.mean - 1.0
+    return changes, _diverged(table, data_set, model, reference)
+
+
+def _told(model: str, reference: str, changes: dict[int, float], note: str) -> str:
+    numbers = ", ".join(_percent(c) for c in changes.values())
+    counts = ", ".join(map(str, changes))
+    return f"{model} to {reference} {numbers} (with {counts} sequences)" + note
+
+
+def _diverged(table: Table, data_set: str, *models: str) -> str:
+    """How many networks diverged, for the end of a line; nothing if none did."""
+    parts = []
+    for model in models:
+        cells = [c for n in table.sequences if (c := table.cell(data_set, n, model)) is not None]
+        if count := sum(c.diverged for c in cells):
+            parts.append(f"{count} of {sum(c.networks for c in cells)} networks of {model} diverged")
+    return f"; {' and '.join(parts)}" if parts else ""
+
+
+def _percent(change: float) -> str:
+    return f"{100 * change:+.0f} %".replace("inf", "∞").replace("-", "−")
+
+
+def _std(table: Table, data_set: str, n: int, model: str) -> float | None:
+    cell = table.cell(data_set, n, model)
+    return None if cell is None else cell.std
+
+
+def _cell(table: Table, data_set: str, n: int, model: str, metric: str) -> Cell:
+    cell = table.cell(data_set, n, model, metric)
+    assert cell is not None
+    return cell

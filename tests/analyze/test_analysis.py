@@ -1,0 +1,169 @@
+"""Linear analysis against closed forms and python-control."""
+
+import json
+
+import casadi as ca
+import control
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from hybrid_mpc import HybridModel, InputError, Signal, frequency_response, linearize, linearize_at_speed
+from hybrid_mpc.analyze.linearize import fixed_point
+from hybrid_mpc.analyze.properties import analyze, detectable, stabilisable
+
+DT, J, MGL, GAMMA = 0.02, 0.1, 1.5, 0.15
+
+
+def machine(coulomb: float = 0.0, n_h: int = 0) -> HybridModel:
+    """A pendulum, RK4 with 10 sub-steps; with n_h = 1 a leaky hidden state adds torque."""
+    x, h, u = ca.MX.sym("x", 2), ca.MX.sym("h", n_h), ca.MX.sym("u")
+    extra = 0.1 * h[0] if n_h else 0.0
+
+    def rhs(z):
+        torque = u + extra - MGL * ca.sin(z[0]) - GAMMA * z[1] - coulomb * ca.tanh(z[1] / 0.05)
+        return ca.vertcat(z[1], torque / J)
+
+    z, d = x, DT / 10
+    for _ in range(10):
+        k1 = rhs(z)
+        k2 = rhs(z + d / 2 * k1)
+        k3 = rhs(z + d / 2 * k2)
+        z = z + d / 6 * (k1 + 2 * k2 + 2 * k3 + rhs(z + d * k3))
+    h_next = 0.8 * h + 0.1 * ca.tanh(x[1] + u) if n_h else h
+    return HybridModel.of(
+        "pendulum", DT, (Signal("phi", "rad"), Signal("phi_dot", "rad/s")), (Signal("tau", "N m"),),
+        (Signal("phi", "rad"),),
+        x=x, h=h, u=u, x_next=z, h_next=h_next, xdot=rhs(x), y=x[0],
+    )  # fmt: skip
+
+
+def continuous(phi: float) -> np.ndarray:
+    return np.array([[0, 1, 0], [-MGL * np.cos(phi) / J, -GAMMA / J, 1 / J], [0, 0, 0]])
+
+
+def test_fixed_points_hanging_upright_and_under_torque():
+    for u, guess, expected in [(0.0, 0.3, 0.0), (0.0, 3.0, np.pi), (0.75, 0.4, np.arcsin(0.5))]:
+        x, h = fixed_point(machine(), [u], [guess, 0.0])
+        # residual 1e-10 over the step's sensitivity (about 1 - eig ~ 0.06 for dt = 20 ms): 1e-8.
+        assert np.abs(x - [expected, 0.0]).max() < 1e-8
+        assert h.size == 0
+
+
+def test_fixed_point_holds_the_hidden_state_too():
+    model = machine(n_h=1)
+    x, h = fixed_point(model, [0.2], [0.1, 0.0])
+    x_next, h_next = (m.full().ravel() for m in model.step(x, h, [0.2], model.w, model.p))
+    assert np.abs(np.concatenate([x_next - x, h_next - h])).max() <= 1e-10
+    assert abs(h[0] - 0.5 * np.tanh(0.2)) < 1e-8  # h = 0.8 h + 0.1 tanh(u)
+    assert abs(MGL * np.sin(x[0]) - 0.2 - 0.1 * h[0]) < 1e-6
+
+
+def test_no_fixed_point_is_said():
+    with pytest.raises(InputError, match="no fixed point"):
+        fixed_point(machine(), [5.0], [0.0, 0.0])  # more torque than gravity: it turns for ever
+
+
+@pytest.mark.parametrize("phi", [0.0, np.pi])
+def test_linearisation_is_the_matrix_exponential(phi):
+    sys = linearize(machine(), [phi, 0.0], [0.0])
+    exact = expm(continuous(phi) * DT)
+    # RK4 with d = 2 ms: error 10 * (|A| d)^5 / 120 with |A| ~ 15: 2e-9 of entries up to 1/J dt.
+    assert np.abs(sys.A - exact[:2, :2]).max() < 1e-8
+    assert np.abs(sys.B - exact[:2, 2:]).max() < 1e-8
+    assert np.array_equal(sys.C, [[1.0, 0.0]])
+    assert sys.dt == DT
+    assert sys.state_labels == ["phi", "phi_dot"]
+    assert (sys.input_labels, sys.output_labels) == (["tau"], ["phi"])
+
+
+def test_linearisation_agrees_with_central_differences():
+    model, z0, u0, e = machine(0.05, n_h=1), np.array([0.4, 0.3, 0.2]), np.array([0.1]), 1e-5
+    sys = linearize(model, z0[:2], u0, z0[2:])
+
+    def f(w):
+        return np.concatenate([m.full().ravel() for m in model.step(w[:2], w[2:3], w[3:], model.w, model.p)])
+
+    w0 = np.concatenate([z0, u0])
+    numeric = np.column_stack([(f(w0 + e * i) - f(w0 - e * i)) / (2 * e) for i in np.eye(4)])
+    # Truncation e^2 f''' / 6 (1e-10 * 1e3 for the tanh) and rounding 1e-16 / e: below 1e-6.
+    assert np.abs(np.hstack([sys.A, sys.B]) - numeric).max() < 1e-6
+    assert sys.state_labels == ["phi", "phi_dot", "h0"]
+
+
+def test_poles_frequency_and_damping_are_those_of_the_pendulum():
+    result = analyze(linearize(machine(), [0.0, 0.0], [0.0]))
+    omega, zeta = np.sqrt(MGL / J), GAMMA / (2 * np.sqrt(MGL * J))
+    assert np.abs(result.frequency - omega).max() < 1e-6  # RK4's 1e-9 over dt
+    assert np.abs(result.damping - zeta).max() < 1e-6
+    assert result.stable
+    assert result.slow.all()  # 3.9 rad/s against a tenth of Nyquist, 15.7 rad/s
+    upright = analyze(linearize(machine(), [np.pi, 0.0], [0.0]))
+    assert not upright.stable
+    assert upright.stabilisable
+    assert upright.detectable
+    assert json.loads(json.dumps(upright.to_dict()))["poles"][0][0] > 1.0
+
+
+def test_agrees_with_python_control():
+    sys = linearize(machine(n_h=1), [0.1, 0.5], [0.0])
+    mine = np.sort_complex(analyze(sys).poles)
+    assert np.abs(mine - np.sort_complex(control.poles(sys))).max() < 1e-12  # the same matrix
+    omega = np.geomspace(0.1, 100.0, 30)
+    theirs = control.frequency_response(sys, omega)
+    ours = frequency_response(sys, omega)
+    assert np.allclose(ours.magnitude[0, 0], theirs.magnitude, rtol=1e-9)  # two solvers, condition ~ 1e4
+    assert np.allclose(np.exp(1j * ours.phase[0, 0]), np.exp(1j * theirs.phase), atol=1e-9)
+
+
+def test_working_speed_frees_the_linearisation_of_the_friction_at_rest():
+    sticky, smooth = machine(coulomb=0.05), machine()
+    omega = np.array([3.0])
+    rest = [
+        frequency_response(linearize(m, [0.0, 0.0], [0.0]), omega).magnitude.item() for m in (sticky, smooth)
+    ]
+    work = [
+        frequency_response(linearize_at_speed(m, [0.0], [2.0], [0.0]), omega).magnitude.item()
+        for m in (sticky, smooth)
+    ]
+    # At 40 v_s the slope of tanh is 4 exp(-80): gone. At rest it adds 1 N m s/rad to 0.15.
+    # Left is gravity's slope along the step: cos over 0.04 rad on a path 1e-4 rad shorter, 4e-6.
+    assert abs(work[0] / work[1] - 1.0) < 1e-5
+    assert rest[0] / rest[1] < 0.5
+
+
+def system(a, b, c):
+    return control.ss(a, b, c, 0.0, 0.1, remove_useless_states=False)
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "c", "reach", "see"),
+    [
+        (np.diag([1.2, 0.5]), [[1.0], [0.0]], [[1.0, 0.0]], True, True),  # uncontrollable but stabilisable
+        (np.diag([1.2, 0.5]), [[0.0], [1.0]], [[1.0, 1.0]], False, True),  # the unstable mode is not reached
+        (np.diag([1.2, 0.5]), [[1.0], [1.0]], [[0.0, 1.0]], True, False),  # nor seen
+        (1.2 * np.eye(2), [[1.0], [1.0]], [[1.0, 1.0]], False, False),  # twin modes, one input
+        ([[1.0, 0.1], [0.0, 1.0]], [[0.0], [1e-9]], [[1.0, 0.0]], True, True),  # weak units do not decide
+        ([[1.0, 0.1], [0.0, 1.0]], [[0.0], [1.0]], [[0.0, 1.0]], True, False),  # position not measured
+    ],
+)
+def test_hautus_on_textbook_systems(a, b, c, reach, see):
+    sys = system(a, b, c)
+    assert stabilisable(sys) is reach
+    assert detectable(sys) is see
+
+
+def test_slow_and_fast_poles_are_told_apart():
+    result = analyze(system(np.diag([0.99, 0.0, 0.1]), np.ones((3, 1)), np.ones((1, 3))), split=5.0)
+    assert result.slow.tolist() == [True, False, False]
+    assert np.isinf(result.frequency[2])
+    assert json.loads(json.dumps(result.to_dict()))["frequency_rad_s"][2] is None
+
+
+def test_bad_input_speaks():
+    with pytest.raises(InputError, match="period"):
+        analyze(control.ss([[-1.0]], [[1.0]], [[1.0]], [[0.0]]))
+    with pytest.raises(InputError, match="Nyquist"):
+        frequency_response(system([[0.5]], [[1.0]], [[1.0]]), [100.0])
+    with pytest.raises(InputError, match="x must be 2"):
+        linearize(machine(), [0.0], [0.0])

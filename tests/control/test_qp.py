@@ -1,0 +1,102 @@
+"""The QP's answer is checked, whatever the solver says of it."""
+
+import numpy as np
+import pytest
+
+from hybrid_mpc import OCP, Status
+from hybrid_mpc.control.qp import InputQP
+
+HESSIAN = np.array([[2.0, 0.3, 0.1], [0.3, 1.0, 0.2], [0.1, 0.2, 3.0]])
+GRADIENT = np.array([-9.0, 0.5, 1.0])
+U, HELD = np.zeros((3, 1)), np.zeros(1)
+
+
+def make(du_max=None):
+    return InputQP(OCP(3, [1.0], [1.0], [0.0], [-1.0], [2.0], du_max))
+
+
+class Liar:
+    """A solver that returns something else than it found."""
+
+    def __init__(self, solver, change):
+        self.solver, self.change = solver, change
+        self.inputs, self.outputs = solver.inputs, solver.outputs
+
+    def __call__(self):
+        self.solver()
+        x, _, lam_a, lam_x = self.outputs
+        self.change({"x": x, "lam_a": lam_a, "lam_x": lam_x})
+
+
+def lie(change, du_max=None):
+    qp = make(du_max)
+    qp._solver = Liar(qp._solver, change)
+    return qp.solve(HESSIAN, GRADIENT, U, HELD)
+
+
+def test_an_honest_solver_passes():
+    step, status, kkt = lie(lambda answer: None)
+    assert status is Status.SOLVED
+    assert kkt < 1e-5
+    assert step[0] == pytest.approx(2.0, abs=1e-6)  # the gradient pushes far beyond the upper bound
+
+
+@pytest.mark.parametrize(
+    ("entry", "value", "status"),
+    [
+        ("x", [2.0 / 1.5, 0.0, 0.0], Status.INACCURATE),  # feasible (scaled by half the range), not optimal
+        ("x", [2.5 / 1.5, -0.8, -0.2], Status.INFEASIBLE),
+        ("x", [np.nan, 0.0, 0.0], Status.NOT_FINITE),
+        ("lam_x", [np.inf, 0.0, 0.0], Status.NOT_FINITE),
+        ("lam_x", [0.0, 0.0, 0.0], Status.INACCURATE),  # multipliers that do not prove the answer
+    ],
+)
+def test_wrong_answers_are_caught(entry, value, status):
+    def change(answer):
+        answer[entry][:] = value
+
+    assert lie(change)[1] is status
+
+
+def test_a_multiplier_of_the_wrong_sign_is_caught():
+    def change(answer):  # the lower bound's corner: stationary with a multiplier that pushes outwards
+        answer["x"][0] = -1.0 / 1.5
+        h = HESSIAN * 1.5**2 / (3.0 * 1.5**2)
+        answer["lam_x"][:] = -(h @ answer["x"] + GRADIENT * 1.5 / (3.0 * 1.5**2))
+
+    assert lie(change)[1] is Status.INACCURATE
+
+
+def test_a_violated_limit_of_the_change_is_caught():
+    def change(answer):
+        answer["x"][:] = 2.0 / 1.5
+
+    assert lie(change, du_max=[0.5])[1] is Status.INFEASIBLE
+
+
+def test_crossing_limits_are_infeasible():
+    qp = make([0.5])
+    _, status, _ = qp.solve(
+        HESSIAN, GRADIENT, U, np.array([9.0])
+    )  # 9 was held: no u within its bounds is near
+    assert not status.ok
+
+
+def test_an_ill_conditioned_problem_keeps_its_bounds():
+    # A weight of 1e4 on one instant of a double integrator: at its default tolerance DAQP exceeded bounds by 1e-5.
+    rng, n = np.random.default_rng(0), 80
+    qp = InputQP(OCP(n, [1.0], [1.0], [0.0], [-1.0], [1.0]))
+    far = np.stack([np.arange(n)[::-1] + 0.5, np.ones(n)])
+    for _ in range(20):
+        hessian = far.T @ np.diag([1e2, 1e4]) @ far + 0.1 * np.eye(n)
+        gradient = -far.T @ (np.array([1e5, 1e6]) * rng.normal(size=2)) + rng.normal(size=n)
+        step, status, _ = qp.solve(hessian, gradient, np.zeros((n, 1)), HELD)
+        assert status is Status.SOLVED
+        assert (
+            np.max(np.abs(step)) <= 1 + 1e-7
+        )  # 1e-9 in DAQP's scaling, by which the Hessian's condition counts
+
+
+def test_messages_and_ok():
+    assert [status for status in Status if status.ok] == [Status.SOLVED, Status.STOPPED]
+    assert len({status.value for status in Status}) == len(Status)

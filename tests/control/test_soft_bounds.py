@@ -1,0 +1,175 @@
+"""Soft bounds on linear models against an independent solver, and what an exact penalty promises."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from lq_oracle import soft_plan, states
+from online_models import linear_model, pendulum_model, random_linear
+
+from hybrid_mpc import OCP, CondensedController, Estimate, InputError, SoftBound, Status
+from hybrid_mpc.control.soft import SoftRows
+
+DT = 0.1
+A, B = np.array([[1.0, DT], [0.0, 1.0]]), np.array([[0.5 * DT**2], [DT]])
+
+
+def estimate_of(model, z, d=None):
+    d = np.zeros(model.n_u) if d is None else d
+    return Estimate(0.0, z[: model.n_x], z[model.n_x :], d, np.eye(z.size + d.size), np.zeros(1), 0.0)
+
+
+def solve(model, ocp, z, reference, d=None, weight=None, held=None):
+    controller = CondensedController(model, ocp)
+    e = estimate_of(model, z, d)
+    start = None if held is None else np.tile(held, (ocp.horizon, 1))
+    return controller.solve(controller.initial(e, start), e, reference, weight)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 3, 4, 5, 7])
+@pytest.mark.parametrize("penalty", [0.3, 50.0])
+def test_random_problems_are_solved_as_by_ipopt(seed, penalty):
+    n_u, n_h = 1 + seed % 2, 2 * (seed % 3 == 0)
+    model, a, b, _ = random_linear(seed, n_u=n_u, n_h=n_h, radius=1.02)
+    rng = np.random.default_rng(seed)
+    z, d, reference = rng.normal(size=3 + n_h), 0.1 * rng.normal(size=n_u), rng.normal(size=(11, 3))
+    weight, u_prev = rng.uniform(0.0, 3.0, size=(11, 3)), rng.uniform(-0.3, 0.3, size=n_u)
+    ocp = OCP(
+        10, [1.0, 0.5, 2.0], [0.5] * n_u, [0.1] * n_u, [-0.5] * n_u, [0.4] * n_u, [0.3] * n_u,
+        x_min=[-0.2, -np.inf, -0.4], x_max=[0.3, 0.25, np.inf],
+        slack_linear=[penalty] * 3, slack_quadratic=[2 * penalty] * 3,
+    )  # fmt: skip
+    got = solve(model, ocp, z, reference, d, weight, u_prev)
+    terminal = ocp.terminal_weight(model)
+    want, cost = soft_plan(a, b, ocp, model.dt, terminal, z, d, reference, u_prev, weight)
+    assert got.status is Status.SOLVED
+    x = states(want, a, b, ocp, z, d)
+    assert np.any(np.maximum(x - ocp.x_max, ocp.x_min - x) > -1e-6)  # a soft bound matters
+    # DAQP takes constraints into its active set from 1e-6 of half a range on, IPOPT ends within 1e-11 of the cost.
+    np.testing.assert_allclose(got.u, want, atol=1e-5)
+    assert got.cost == pytest.approx(cost, rel=1e-6)
+    beyond = np.maximum(x - ocp.x_max, ocp.x_min - x)
+    assert got.excess == pytest.approx(max(0.0, np.max(beyond)), abs=1e-5)
+
+
+def double_integrator(**limits):
+    model = linear_model(A, B, np.eye(2)[:1], dt=DT)
+    ocp = OCP(30, [10.0, 0.1], [0.01], [0.0], [-3.0], [3.0], **limits)
+    return model, ocp
+
+
+def test_a_bound_that_can_be_kept_is_kept_exactly():
+    model, ocp = double_integrator(x_min=[-np.inf, -0.5], x_max=[0.8, 0.5])
+    got = solve(model, ocp, np.zeros(2), np.tile([1.0, 0.0], (31, 1)))
+    assert got.status is Status.SOLVED
+    assert np.max(got.x[:, 1]) == pytest.approx(0.5, abs=1e-6)  # both bounds are active ...
+    assert np.max(got.x[:, 0]) == pytest.approx(0.8, abs=1e-6)
+    assert got.excess < 1e-6  # ... and kept to the QP's tolerance, since the penalty is exact
+    # the hard problem has the same answer: raising the penalties changes nothing
+    _, higher = double_integrator(
+        x_min=[-np.inf, -0.5], x_max=[0.8, 0.5], slack_linear=[1e5, 1e5], slack_quadratic=[1e5, 1e5]
+    )
+    again = solve(model, higher, np.zeros(2), np.tile([1.0, 0.0], (31, 1)))
+    np.testing.assert_allclose(
+        again.u, got.u, atol=2e-5
+    )  # the QP's tolerance of half the range of 6, times ten
+
+
+def test_a_bound_that_cannot_be_kept_is_approached_as_fast_as_possible():
+    model, ocp = double_integrator(x_max=[0.5, np.inf])
+    got = solve(model, ocp, np.array([0.6, 1.0]), np.zeros((1, 2)))
+    assert got.status is Status.SOLVED
+    brake = np.array([0.6, 1.0])
+    for k in range(1, 4):  # full braking is what keeps the violation smallest
+        brake = A @ brake + B @ [-3.0]
+        np.testing.assert_allclose(got.x[k], brake, atol=1e-5)
+    assert got.excess == pytest.approx(np.max(got.x[1:, 0]) - 0.5, abs=1e-5)
+
+
+def test_bounds_that_do_not_act_change_nothing():
+    model, free = double_integrator()
+    _, wide = double_integrator(x_min=[-9.0, -9.0], x_max=[9.0, 9.0])
+    plans = [solve(model, ocp, np.array([1.0, 0.0]), np.zeros((1, 2))) for ocp in (free, wide)]
+    np.testing.assert_array_equal(plans[0].u, plans[1].u)  # the same QP, without slacks
+    assert plans[0].cost == plans[1].cost
+
+
+def test_expression_that_is_a_state_or_an_input_bounds_it():
+    x, u = ca.MX.sym("x", 2), ca.MX.sym("u")
+    z, reference = np.zeros(2), np.tile([1.0, 0.0], (31, 1))
+    speed = SoftBound(ca.Function("speed", [x, u], [x[1]]), [-0.5], [0.5], [1e3], [1e3])
+    limit = {"slack_linear": [1.0, 1e3], "slack_quadratic": [1.0, 1e3]}
+    model, by_state = double_integrator(x_min=[-np.inf, -0.5], x_max=[np.inf, 0.5], **limit)
+    by_expression = double_integrator(soft=[speed])[1]
+    want, got = (solve(model, ocp, z, reference) for ocp in (by_state, by_expression))
+    # x_N is bounded by x_max but is in no stage; at rest at the goal neither bound acts there.
+    np.testing.assert_allclose(got.u, want.u, atol=2e-5)
+    assert np.max(want.x[:, 1]) == pytest.approx(0.5, abs=1e-6)
+    torque = SoftBound(ca.Function("torque", [x, u], [u + 0.5 * x[1]]), [-np.inf], [1.0], [1e3], [1e3])
+    plan = solve(model, double_integrator(soft=[torque])[1], z, reference)
+    values = plan.u[:, 0] + 0.5 * plan.x[:-1, 1]
+    assert np.max(values) == pytest.approx(1.0, abs=1e-6)
+    assert np.sum(values > 1 - 1e-6) > 1
+
+
+def test_derivatives_of_expressions_are_those_of_finite_differences():
+    x, u = ca.MX.sym("x", 2), ca.MX.sym("u", 2)
+    e = ca.Function("e", [x, u], [ca.vertcat(x[0] * u[1], ca.sin(x[1]) + u[0] ** 2, x[0] * x[1])])
+    bound = SoftBound(e, [-1.0] * 3, [1.0] * 3, [1.0] * 3, [1.0] * 3)
+    ocp = OCP(3, [1.0, 1.0], [1.0] * 2, [0.0] * 2, [-9.0] * 2, [9.0] * 2, x_max=[np.inf, 0.5], soft=[bound])
+    rows, rng = SoftRows(ocp), np.random.default_rng(0)
+    xs, us = rng.normal(size=(4, 2)), rng.normal(size=(3, 2))
+    value, by_x, by_u = rows.linearise(xs, us)
+    assert len(rows) == 3 + 9
+    dx, du = rng.normal(size=(4, 2)), rng.normal(size=(3, 2))
+    step = 1e-6
+    change = (rows.values(xs + step * dx, us + step * du) - rows.values(xs - step * dx, us - step * du)) / (
+        2 * step
+    )
+    inputs = np.vstack([du, np.zeros(2)])[rows.stage]
+    want = np.sum(by_x * dx[rows.stage], axis=1) + np.sum(by_u * inputs, axis=1)
+    np.testing.assert_allclose(change, want, atol=1e-8)  # central differences, rounding of 1e-16 / 1e-6
+    np.testing.assert_array_equal(value[:3], xs[1:, 1])
+
+
+def test_a_nonlinear_model_keeps_its_bounds_when_iterated():
+    model = pendulum_model(z=3)
+    ocp = OCP(
+        40, [50.0, 0.5], [0.5], [0.1], [-3.0], [3.0], working_point=([0.0, 1.0], [0.0]),
+        x_max=[0.3, 1.2], x_min=[-np.inf, -1.2],
+    )  # fmt: skip
+    controller = CondensedController(model, ocp, iterations=30)
+    e = estimate_of(model, np.array([-0.3, 0.0, 0.0, 0.0, 0.0]))
+    plan = controller.solve(controller.initial(e), e, np.tile([0.5, 0.0], (41, 1)))
+    assert plan.status is Status.SOLVED
+    run = controller.problem.run(np.concatenate([e.x, e.h]), plan.u)
+    # the model's own run keeps them too, to the defects of the last iteration
+    assert np.max(run[:, 0]) == pytest.approx(0.3, abs=1e-5)
+    assert np.max(run[:, 1]) == pytest.approx(1.2, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"x_min": [0.0]}, "lower has 1 values, 2 needed"),
+        ({"x_min": [1.0, 0.0], "x_max": [0.0, 1.0]}, "cross"),
+        ({"x_max": [np.nan, 1.0]}, "cross"),
+        ({"slack_linear": [-1.0, 1.0]}, "linear penalties"),
+        ({"slack_quadratic": [0.0, 1.0]}, "positive"),
+        ({"slack_quadratic": [np.inf, 1.0]}, "finite and positive"),
+    ],
+)
+def test_bad_bounds_are_refused(change, words):
+    with pytest.raises(InputError, match=words):
+        double_integrator(**change)
+
+
+def test_bad_expressions_are_refused():
+    x, u = ca.MX.sym("x", 3), ca.MX.sym("u")
+    with pytest.raises(InputError, match="function \\(x, u\\)"):
+        SoftBound(ca.Function("e", [x], [x]), [0.0] * 3, [1.0] * 3, [1.0] * 3, [1.0] * 3)
+    with pytest.raises(InputError, match="needed"):
+        SoftBound(ca.Function("e", [x, u], [x]), [0.0], [1.0], [1.0], [1.0])
+    three = SoftBound(ca.Function("e", [x, u], [x]), [0.0] * 3, [1.0] * 3, [1.0] * 3, [1.0] * 3)
+    model, ocp = double_integrator(soft=[three])
+    with pytest.raises(InputError, match="2 states"):
+        CondensedController(model, ocp)

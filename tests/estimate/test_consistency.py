@@ -1,0 +1,164 @@
+"""The tests of a filter's innovations: right at their rate, wrong where the filter is."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from online_models import random_linear
+
+from hybrid_mpc import ExtendedKalmanFilter, InputError, SwitchingFilter
+from hybrid_mpc.estimate.consistency import consistency, innovations
+
+SIGMA_Y, SIGMA_X = 0.1, 0.05
+
+
+@dataclass(frozen=True)
+class Run:
+    y: np.ndarray
+    u: np.ndarray
+
+
+def system(n_y=1):
+    return random_linear(2, n_x=2, n_u=1, n_y=n_y)
+
+
+def make(model, scale_y=1.0, scale_x=1.0):
+    return ExtendedKalmanFilter(
+        model, sigma_y=np.full(model.n_y, scale_y * SIGMA_Y), sigma_x=np.full(2, scale_x * SIGMA_X),
+        sigma_x0=[0.3, 0.3],
+    )  # fmt: skip
+
+
+def recorded(a, b, c, n, seed):
+    """A linear system with exactly the noise that the filter assumes."""
+    rng = np.random.default_rng(seed)
+    x, u, y = np.zeros(2), rng.normal(size=(n, 1)), np.zeros((n, len(c)))
+    for k in range(n):
+        y[k] = c @ x + SIGMA_Y * rng.normal(size=len(c))
+        x = a @ x + b @ u[k] + SIGMA_X * rng.normal(size=2)
+    return Run(y, u)
+
+
+def test_a_right_filter_passes_at_the_rate_of_the_bands():
+    model, *matrices = system()
+    ekf = make(model)
+    found = [consistency(ekf, [recorded(*matrices, 180, seed)], lags=10) for seed in range(120)]
+    # 120 trials at 95 %: the number of failures is binomial with mean 6 and deviation 2.4; below 16 (four of
+    # these above the mean), and some must fail, else the bands are too wide: none has probability 0.95^120 = 2e-3.
+    for passes in ([f.nis_passes for f in found], [f.white for f in found]):
+        assert 0 < passes.count(False) < 16
+    # Single lags and single NIS, 1200 and 18 600 of them: 93 % and 97 %, 94 % and 96 % are three deviations and more
+    # away.
+    lags = np.mean([np.abs(f.autocorrelation) <= f.correlation_band for f in found])
+    assert 0.93 < lags < 0.97
+    assert np.mean([f.nis_inside for f in found]) == pytest.approx(0.95, abs=0.01)
+
+
+@pytest.mark.parametrize(("scale", "too"), [(0.5, "small"), (2.0, "large")])
+def test_a_wrong_measurement_noise_fails(scale, too):
+    model, *matrices = system()
+    runs = [recorded(*matrices, 600, seed) for seed in (1, 2)]
+    found = consistency(make(model, scale_y=scale), runs)
+    assert not found.nis_passes
+    assert (found.mean_nis > found.nis_band[1]) == (too == "small")
+    assert consistency(make(model), runs).nis_passes
+
+
+def test_a_wrong_process_noise_colours_the_innovations():
+    model, *matrices = system()
+    runs = [recorded(*matrices, 1500, 3)]
+    found = consistency(make(model, scale_x=0.02), runs)
+    assert not found.white
+    assert np.abs(found.autocorrelation).max() > 3 * found.correlation_band
+    assert consistency(make(model), runs).white
+
+
+def test_an_offset_is_no_white_noise():
+    model, *matrices = system()
+    run = recorded(*matrices, 600, 4)
+    drifting = make(model)
+    shifted = Run(run.y + 2.0 * np.arange(600)[:, None] / 600, run.u)
+    assert consistency(drifting, [run]).white
+    assert not consistency(drifting, [shifted]).white
+
+
+def test_several_outputs_missing_samples_and_recordings():
+    model, *matrices = system(n_y=2)
+    runs = [recorded(*matrices, 800, seed) for seed in (7, 8, 9)]
+    runs[0].y[100:140, 0] = np.nan  # half of the sample is gone
+    runs[1].y[200:230] = np.nan  # all of it
+    found = consistency(make(model), runs, skip=25)
+    assert found.samples == 3 * (800 - 25) - 30
+    assert found.autocorrelation.shape == (20, 2)
+    # One draw of a right filter: seeds that pass. One in twenty does not, as (0, 1, 2), with a statistic of 58 to 56.
+    assert found.nis_passes
+    assert found.white
+    first = found.runs[0]
+    np.testing.assert_array_equal(first.degrees[100 - 25 : 140 - 25], 1)
+    assert np.isnan(first.normalised[75:115]).all()
+    assert first.t[0] == pytest.approx(25 * model.dt)
+    # The squares of the normalised innovations are the NIS, which the filter takes output by output.
+    whole = np.isfinite(first.normalised).all(axis=1)
+    np.testing.assert_allclose(
+        np.sum(first.normalised[whole] ** 2, axis=1), first.nis[whole], rtol=1e-9
+    )  # rounding of two orders of the same arithmetic
+
+
+def test_the_statistics_by_hand():
+    model, *matrices = system()
+    run = recorded(*matrices, 400, 5)
+    found = consistency(make(model), [run], skip=10, lags=3)
+    e = innovations(make(model), run, skip=10).normalised[:, 0]
+    assert len(e) == 390
+    r = [np.sum(e[k:] * e[:-k]) / np.sum(e**2) for k in (1, 2, 3)]
+    np.testing.assert_allclose(found.autocorrelation[:, 0], r, rtol=1e-12)
+    q = 390 * 392 * sum(r[k - 1] ** 2 / (390 - k) for k in (1, 2, 3))
+    assert found.ljung_box == pytest.approx(q, rel=1e-12)
+    assert found.ljung_box_limit == pytest.approx(7.8147, abs=1e-4)  # chi-square table, 3 degrees, 95 %
+    assert found.correlation_band == pytest.approx(1.959964 / np.sqrt(390), rel=1e-6)
+
+
+def test_the_estimates_are_those_of_the_filter_itself():
+    model, *matrices = system()
+    run = recorded(*matrices, 120, 6)
+    nis = [e.nis for e in make(model).run(run.y, run.u)]
+    np.testing.assert_array_equal(innovations(make(model), run, skip=1).nis, nis[1:])
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [({"skip": 0}, "skip"), ({"lags": 0}, "lags"), ({"lags": 100}, "at least 500 are needed")],
+)
+def test_bad_options_are_refused(options, words):
+    model, *matrices = system()
+    with pytest.raises(InputError, match=words):
+        consistency(make(model), [recorded(*matrices, 200, 0)], **options)
+
+
+def test_a_switching_filter_is_judged_by_its_mixture():
+    model, a, b, c = system()
+    chain, steps = np.array([[0.95, 0.05], [0.5, 0.5]]), (SIGMA_X, 10 * SIGMA_X)
+    switching = SwitchingFilter([make(model), make(model, scale_x=10.0)], chain)
+    rng, runs = np.random.default_rng(10), []
+    for _ in range(3):  # a system whose noise switches as the filter supposes
+        x, u, y, mode = np.zeros(2), rng.normal(size=(800, 1)), np.zeros((800, 1)), 0
+        for k in range(800):
+            y[k] = c @ x + SIGMA_Y * rng.normal(size=1)
+            mode = rng.choice(2, p=chain[mode])
+            x = a @ x + b @ u[k] + steps[mode] * rng.normal(size=2)
+        runs.append(Run(y, u))
+    found = consistency(switching, runs)
+    first = found.runs[0]
+    np.testing.assert_array_equal(first.nis, first.normalised[:, 0] ** 2)
+    # 2325 squares of a mixture whose kurtosis is some 7 to 10: the mean's deviation is 0.05 to 0.06
+    assert found.mean_nis == pytest.approx(1.0, abs=0.2)
+    assert consistency(make(model), runs).mean_nis > 2.0  # a filter that knows the quiet mode only
+
+
+def test_no_recordings_and_bad_shapes_are_refused():
+    model, *matrices = system()
+    with pytest.raises(InputError, match="0 samples are left"):
+        consistency(make(model), [])
+    run = recorded(*matrices, 200, 0)
+    with pytest.raises(InputError, match="needed"):
+        consistency(make(model), [Run(run.y, run.u[:-1])])

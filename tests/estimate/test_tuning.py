@@ -1,0 +1,79 @@
+"""Process noise by maximum likelihood, on a linear system whose noise is known."""
+
+from types import SimpleNamespace
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from hybrid_mpc import ExtendedKalmanFilter, HybridModel, InputError, Signal, process_noise
+from hybrid_mpc.estimate.tuning import log_likelihood, most_likely
+
+DT, SIGMA_Y, SIGMA_X = 0.1, 0.02, (0.0, 0.05)
+
+
+def mass() -> HybridModel:
+    x, u = ca.MX.sym("x", 2), ca.MX.sym("u")
+    return HybridModel.of(
+        "mass", DT, (Signal("q", "m"), Signal("v", "m/s")), (Signal("F", "N"),), (Signal("q", "m"),),
+        x=x, u=u, x_next=ca.vertcat(x[0] + DT * x[1], x[1] + DT * u), xdot=ca.vertcat(x[1], u), y=x[0],
+    )  # fmt: skip
+
+
+def filter_with(scale: float) -> ExtendedKalmanFilter:
+    sigma_x = scale * np.array(SIGMA_X)
+    return ExtendedKalmanFilter(mass(), sigma_y=[SIGMA_Y], sigma_x=sigma_x, sigma_x0=[0.1, 0.1])
+
+
+def recording(n: int, seed: int) -> SimpleNamespace:
+    rng = np.random.default_rng(seed)
+    u, x, y = rng.normal(size=(n, 1)), np.zeros(2), np.zeros((n, 1))
+    for k in range(n):
+        y[k] = x[0] + SIGMA_Y * rng.standard_normal()
+        x = np.array([x[0] + DT * x[1], x[1] + DT * u[k, 0]]) + np.array(SIGMA_X) * rng.standard_normal(2)
+    return SimpleNamespace(u=u, y=y)
+
+
+def test_likelihood_is_that_of_the_joint_gaussian():
+    n, run = 12, recording(12, 0)
+    f, c = np.array([[1.0, DT], [0.0, 1.0]]), np.array([1.0, 0.0])
+    # start: at rest at the first sample, known to 0.1 each; then the joint law of the samples 1 .. n - 1
+    mean, p = np.array([run.y[0, 0], 0.0]), np.diag([0.01, 0.01])
+    means, covariance = [], np.zeros((n - 1, n - 1))
+    states = []
+    for k in range(1, n):
+        mean, p = f @ mean + np.array([0.0, DT * run.u[k - 1, 0]]), f @ p @ f.T + np.diag(np.square(SIGMA_X))
+        means.append(c @ mean)
+        states.append(p)
+    for i in range(n - 1):
+        for j in range(i, n - 1):
+            covariance[i, j] = covariance[j, i] = c @ np.linalg.matrix_power(f, j - i) @ states[i] @ c
+    covariance += SIGMA_Y**2 * np.eye(n - 1)
+    exact = multivariate_normal(np.array(means), covariance).logpdf(run.y[1:, 0]) + 0.5 * (n - 1) * np.log(
+        2 * np.pi
+    )
+    assert log_likelihood(filter_with(1.0), run, skip=1) == pytest.approx(exact, rel=1e-9)  # rounding
+
+
+def test_the_true_noise_is_the_most_likely():
+    runs = [recording(600, seed) for seed in (1, 2)]
+    # 1200 samples: a factor of 3 in the noise lowers the likelihood by hundreds
+    assert most_likely(filter_with, runs, (0.1, 0.3, 1.0, 3.0, 10.0)) == 1.0
+
+
+def test_process_noise_is_the_error_of_one_period():
+    rng, n, model = np.random.default_rng(3), 4000, mass()
+    u, x = rng.normal(size=(n, 1)), np.zeros((n, 2))
+    for k in range(n - 1):
+        x[k + 1] = x[k] + DT * np.array([x[k, 1], u[k, 0]])
+        x[k + 1] += np.array([0.001, 0.05]) * rng.standard_normal(2)
+    found = process_noise(model, [SimpleNamespace(u=u, y=x[:, :1], x=x)])
+    # A standard deviation of 4,000 samples is off by 1 / sqrt(8000) = 1.1 %; four of these.
+    assert np.abs(found / [0.001, 0.05] - 1).max() < 0.045
+    half = SimpleNamespace(u=u[:100], y=x[:100, :1], x=x[:100])
+    assert np.array_equal(
+        process_noise(model, [half, half], most=50), process_noise(model, [half])
+    )  # the second one is not looked at
+    with pytest.raises(InputError, match="two samples"):
+        process_noise(model, [])

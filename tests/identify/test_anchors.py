@@ -1,0 +1,148 @@
+"""Corrections fade where nothing was measured."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from simulated_pendulum import TRUTH, Killed, Pendulum, dragged, same_training
+
+from hybrid_mpc import DEFAULT_BUDGETS, BenchmarkBudget, InputError, TrainingSettings, train
+from hybrid_mpc.identify.prior_replay import COUNTED, FOLLOWED, RUNS, anchor_penalty, make_anchors
+from hybrid_mpc.identify.train import TrainingRun
+
+SMALL = TrainingSettings("pgrnn", 4, 2, 20, 20, seed=3, warm=10, horizon=20, batch=8, every=10, anchors=10.0)
+PRIOR = Pendulum(TRUTH)
+
+
+@pytest.fixture(scope="module")
+def data():
+    return dragged()
+
+
+@pytest.fixture(scope="module")
+def anchors(data):
+    return make_anchors(PRIOR, data[0], seed=0)
+
+
+def test_they_are_the_priors_own_motion_under_recorded_inputs(data, anchors):
+    from hybrid_mpc import PriorStep
+
+    step = PriorStep(PRIOR, data[0][0].dt)
+    x, _ = step(anchors.x[:-1], torch.zeros(*anchors.x.shape[:-1], 0)[:-1], anchors.u[:-1])
+    torch.testing.assert_close(x, anchors.x[1:], rtol=0, atol=1e-12)
+    recorded = np.unique(np.concatenate([t.u for t in data[0]]))
+    assert np.isin(anchors.u.numpy(), recorded).all()
+    assert anchors.x.shape[:2] == (FOLLOWED + COUNTED, RUNS)
+
+
+def test_what_was_measured_has_no_weight_and_what_lies_far_off_has(data, anchors):
+    measured = np.concatenate([t.x for t in data[0]])
+    weight, x = anchors.weight.numpy(), anchors.x.numpy()
+    assert ((weight >= 0) & (weight <= 1)).all()
+    # a window's distance from its nearest sample, in the units that the module's text names
+    places = [np.column_stack([np.sin(a[:, 0]), np.cos(a[:, 0]), a[:, 1] / np.sqrt(np.mean(measured[:, 1] ** 2))])
+              for a in (x.reshape(-1, 2), measured)]  # fmt: skip
+    some = np.random.default_rng(0).choice(len(places[0]), 300, replace=False)
+    distance = np.array([np.linalg.norm(places[1] - p, axis=1).min() for p in places[0][some]])
+    inside = (x[..., 1] >= measured[:, 1].min()) & (x[..., 1] <= measured[:, 1].max())
+    expected = np.where(inside.ravel()[some], 1 - np.exp(-((distance / 0.1) ** 2)), 0.0)
+    np.testing.assert_allclose(weight.ravel()[some], expected, atol=1e-9)
+    assert (weight > 0.9).any()
+    assert (weight < 0.1).any()
+
+
+def test_an_angle_counts_all_the_way_round_and_a_full_turn_is_no_distance(data):
+    shifted = [replace(t, x=t.x + np.array([2 * np.pi, 0.0])) for t in data[0]]
+    one, two = (make_anchors(PRIOR, part, seed=0).weight for part in (data[0], shifted))
+    torch.testing.assert_close(one, two, rtol=0, atol=1e-9)
+
+
+def test_corrections_fade_there_and_still_explain_the_data(data, anchors):
+    """Of networks as ``train`` hands them over: the best by validation, which does not know the anchors."""
+
+    def trained(weight):
+        settings = replace(SMALL, teacher_steps=150, free_run_steps=0, anchors=weight)
+        run = TrainingRun(PRIOR, *data, settings)
+        best = train(PRIOR, *data, settings)
+        run._load({name: torch.tensor(value) for name, value in best.weights.items()})
+        with torch.no_grad():
+            return anchor_penalty(run.step, anchors).sqrt(), best
+
+    (without, plain), (anchored, faded) = trained(0.0), trained(10.0)
+    assert (anchored < 0.4 * without).all()
+    # six seconds of motion are thin, so anchors beside them cost; networks that correct nothing have the first error
+    assert (plain.validation < faded.validation).all()
+    assert (faded.validation < 0.9 * faded.curve["validation"][0].min()).all()
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"cell": "gru_paper"},
+        {"cell": "lstm"},
+        {"cell": "feed_forward"},
+        {"prior_parameters": "trained"},
+        {"fused": True},
+    ],
+    ids=str,
+)
+def test_every_kind_of_network_can_be_anchored(data, changed):
+    one, two = (train(PRIOR, *data, replace(SMALL, anchors=w, **changed)) for w in (0.0, 10.0))
+    assert np.isfinite(two.validation).all()
+    assert two.skipped.sum() == 0
+    assert any(not np.array_equal(one.weights[name], two.weights[name]) for name in one.weights)
+
+
+def test_an_anchored_training_resumes_to_the_same_bits(data, tmp_path):
+    def kill(done, total, error):
+        if done == 30:
+            raise Killed
+
+    whole, file = train(PRIOR, *data, SMALL), tmp_path / "training.safetensors"
+    with pytest.raises(Killed):
+        train(PRIOR, *data, SMALL, checkpoint=file, on_progress=kill)
+    same_training(train(PRIOR, *data, SMALL, checkpoint=file), whole)
+    with pytest.raises(InputError, match="other settings or data"):
+        train(PRIOR, *data, replace(SMALL, anchors=5.0), checkpoint=file)
+
+
+def test_an_rnn_has_nothing_to_fall_back_on(data):
+    settings = replace(SMALL, kind="rnn")
+    one, two = train(PRIOR, *data, settings), train(PRIOR, *data, replace(settings, anchors=0.0))
+    for name, weights in one.weights.items():
+        np.testing.assert_array_equal(weights, two.weights[name])
+
+
+@pytest.mark.parametrize("strength", [0.1, 1.0, 1e6])
+def test_a_prior_that_runs_away_costs_no_update(data, strength):
+    class Bursting(Pendulum):
+        def acceleration(self, x, u):
+            return strength * x[..., 1:2] ** 3 + super().acceleration(x, u)
+
+    anchors = make_anchors(Bursting(TRUTH), data[0], seed=0)
+    v = np.concatenate([t.x[:, 1] for t in data[0]])
+    span = v.max() - v.min()
+    assert torch.isfinite(anchors.x).all()
+    assert v.min() - 10 * span <= anchors.x[..., 1].min() <= anchors.x[..., 1].max() <= v.max() + 10 * span
+    assert (anchors.weight > 0.9).any()
+    run = TrainingRun(Bursting(TRUTH), *data, replace(SMALL, anchors=10.0))
+    penalty = anchor_penalty(run.step, run.anchors)
+    penalty.sum().backward()
+    assert all(w.grad is None or torch.isfinite(w.grad).all() for w in run.weights.values())
+
+
+@pytest.mark.parametrize("weight", [-1.0, float("nan"), float("inf")])
+@pytest.mark.parametrize("make", [
+    lambda weight: replace(SMALL, anchors=weight),
+    lambda weight: replace(DEFAULT_BUDGETS["quick"], anchors=weight),
+    lambda weight: BenchmarkBudget(4, 1, 1, 1, 1, anchors=weight),
+], ids=["training", "budget", "benchmark"])  # fmt: skip
+def test_a_weight_that_is_none_is_refused(make, weight):
+    with pytest.raises(InputError, match="anchors must be a weight of 0 or more"):
+        make(weight)
+
+
+def test_the_literal_form_cannot_be_anchored():
+    with pytest.raises(InputError, match="leave anchors 0"):
+        replace(SMALL, form="literal")

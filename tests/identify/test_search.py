@@ -1,0 +1,292 @@
+"""The search of settings: repeatable, resumable, judged by validation alone, and what it refuses."""
+
+import json
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from simulated_pendulum import TRUTH, Pendulum, record
+
+from hybrid_mpc import InputError, SearchSpace, TrainingSettings, search, train
+from hybrid_mpc.identify import tune as module
+from hybrid_mpc.identify.tune import _without_default, parsed_space
+
+SMALL = TrainingSettings("mopgrnn", 4, 2, 20, 20, seed=3, warm=10, horizon=20, batch=8, every=10)
+BASE = replace(SMALL, hidden=16, batch=32, teacher_steps=200, free_run_steps=200, every=20)
+SPACE = SearchSpace(batch=(8, 128))
+TOTAL = BASE.teacher_steps + BASE.free_run_steps
+PRIOR = Pendulum(TRUTH)
+TRIALS = 25
+
+
+def drag(phi, v):
+    """A torque [N m] that the prior lacks."""
+    return -0.08 * np.tanh(v / 0.5)
+
+
+@pytest.fixture(scope="module")
+def data():
+    runs = [record(seed, seconds=3.0, extra=drag) for seed in range(3)]
+    return [*runs[:2]], [replace(runs[2], role="valid")]
+
+
+def fake(prior, training, validation, settings, *, on_progress):
+    """A training in no time: 1 falls to an end that is best at 20 hidden units and a decay of 1000."""
+    end = 0.1 + 0.1 * abs(math.log(settings.hidden / 20)) + 0.05 * abs(math.log(settings.decay / 1000))
+    total = settings.teacher_steps + settings.free_run_steps
+    for done in range(settings.every, total + 1, settings.every):
+        error = end + (1.0 - end) * (1.0 - done / total) ** 2
+        on_progress(done, total, error)
+    return SimpleNamespace(validation=np.array([error + 0.2, error]))
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """The search alone, trainings in no time."""
+    monkeypatch.setattr(module, "train", fake)
+
+
+def run(data, storage, trials=TRIALS, base=BASE, space=SPACE, **options):
+    return search(PRIOR, *data, base, space, trials=trials, storage=storage, **options)
+
+
+def core(result):
+    """Everything of the trials but how long they took."""
+    return [(r.number, r.state, r.value, r.steps, dict(r.values)) for r in result.trials]
+
+
+@pytest.fixture(scope="module")
+def whole(data, tmp_path_factory):
+    """A search with trainings in no time, and its journal."""
+    storage = tmp_path_factory.mktemp("search") / "search.jsonl"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "train", fake)
+        return run(data, storage), storage
+
+
+def test_it_finds_settings_that_train_to_the_value_it_names(data, tmp_path):
+    space = SearchSpace(hidden=(2, 8), batch=(4, 16))
+    result = run(data, tmp_path / "search.jsonl", 4, SMALL, space)
+    assert result.trials[0].values == space.values_of(SMALL)  # what one has already comes first
+    assert result.base == result.trials[0].value
+    assert result.best.value == min(r.value for r in result.trials) <= result.base
+    trained = train(PRIOR, *data, result.settings)
+    assert trained.validation.min() == result.best.value
+    assert trained.validation.mean() == result.best.mean
+    other = space.apply(SMALL, result.trials[2].values)
+    assert train(PRIOR, *data, other).validation.min() == result.trials[2].value
+    assert other.learning_rates[0] != SMALL.learning_rates[0]
+    for i in (0, 2):  # the schedule keeps its shape
+        ratio = SMALL.learning_rates[i + 1] / SMALL.learning_rates[i]
+        assert other.learning_rates[i + 1] == pytest.approx(ratio * other.learning_rates[i], rel=1e-12)
+
+
+def test_it_comes_nearer_to_the_best_settings_than_as_many_random_ones(whole):
+    result, _ = whole
+    assert len(result.trials) == TRIALS
+    assert all(SPACE.holds(r.values) for r in result.trials)
+    assert len({tuple(r.values.values()) for r in result.trials}) == TRIALS
+    rng, shots = np.random.default_rng(0), []
+    for _ in range(300):
+        hidden, decay = (np.exp(rng.uniform(*np.log(SPACE.bounds(n)), TRIALS)) for n in ("hidden", "decay"))
+        shots.append(min(0.1 * abs(np.log(hidden / 20)) + 0.05 * abs(np.log(decay / 1000))))
+    assert result.best.value - 0.1 < np.median(shots)
+    # the value depends on these two alone
+    assert set(list(result.importance)[:2]) == {"hidden", "decay"}
+    assert sum(result.importance.values()) == pytest.approx(1.0)
+
+
+def test_bad_settings_are_pruned_and_good_ones_are_not(whole):
+    result, _ = whole
+    pruned = [r for r in result.trials if r.state == "pruned"]
+    assert pruned
+    for r in pruned:
+        assert module.PATIENCE * TOTAL <= r.steps < TOTAL
+        assert r.number >= module.JUDGES
+        assert math.isnan(r.mean)
+    complete = [r for r in result.trials if r.state == "complete"]
+    assert all(r.steps == TOTAL for r in complete)
+    assert all(r.mean == pytest.approx(r.value + 0.1) for r in complete)  # the fake's other network
+
+
+def test_the_journal_is_lines_of_json_and_the_only_file(whole):
+    _, storage = whole
+    assert all(isinstance(json.loads(line), dict) for line in storage.read_text().splitlines())
+    assert [f.name for f in storage.parent.iterdir()] == [storage.name]
+
+
+def test_the_same_seed_gives_the_same_trials_and_another_seed_others(quick, whole, data, tmp_path):
+    result, _ = whole
+    assert core(run(data, tmp_path / "again")) == core(result)
+    other = run(data, tmp_path / "other", 3, seed=1)
+    assert core(other)[0] == core(result)[0]
+    assert core(other)[1] != core(result)[1]
+
+
+class Killed(BaseException):
+    """As Ctrl-C: no part of a search catches it."""
+
+
+@pytest.mark.parametrize(("trial", "step"), [(0, 20), (2, 400), (12, 60), (24, 100)])
+def test_a_killed_search_goes_on_as_if_nothing_had_been(quick, whole, data, tmp_path, trial, step):
+    def kill(number, done, total, error):
+        if (number, done) == (trial, step):
+            raise Killed
+
+    storage, seen = tmp_path / "search.jsonl", []
+    with pytest.raises(Killed):
+        run(data, storage, on_progress=kill)
+    with storage.open("ab") as file:
+        file.write(b'{"op_code":6,"worker_id"')  # as a kill within a write leaves it
+    resumed = run(data, storage, on_progress=lambda n, d, t, e: seen.append(n))
+    assert min(seen) == trial  # finished trials are not made again
+    assert core(resumed) == core(whole[0])
+    assert resumed.settings == whole[0].settings
+
+
+def test_a_kill_between_drawing_and_training_costs_nothing(quick, whole, data, tmp_path, monkeypatch):
+    def killed(*_):
+        raise Killed
+
+    storage = tmp_path / "search.jsonl"
+    with monkeypatch.context() as patch:
+        patch.setattr(module.optuna.Study, "ask", killed)  # the base's trial waits in the queue
+        with pytest.raises(Killed):
+            run(data, storage)
+    assert core(run(data, storage, 3)) == core(whole[0])[:3]
+
+
+def test_trials_are_counted_in_all_and_a_timeout_ends_after_the_trial(quick, whole, data, tmp_path):
+    result, _ = whole
+    first = run(data, tmp_path / "search.jsonl", timeout=1e-9)
+    assert core(first) == core(result)[:1]
+    seen = []
+    again = run(data, tmp_path / "search.jsonl", 1, on_progress=lambda *a: seen.append(a))
+    assert core(again) == core(first)
+    assert not seen
+    assert core(run(data, tmp_path / "search.jsonl", 4)) == core(result)[:4]
+
+
+def test_anchors_are_searched_when_asked_for_and_else_leave_no_trace():
+    space = SearchSpace(
+        hidden=None, learning_rate=None, free_run_learning_rate=None, decay=None, anchors=(1.0, 100.0)
+    )
+    assert space.apply(BASE, {"anchors": 7.0}).anchors == 7.0
+    assert "anchors" not in _without_default(BASE) | _without_default(SPACE)
+    assert _without_default(replace(BASE, anchors=7.0))["anchors"] == 7.0
+    assert _without_default(space)["anchors"] == (1.0, 100.0)
+
+
+def test_a_journal_of_another_search_is_refused_by_what_differs(whole, data):
+    _, storage = whole
+    training, validation = data
+    other = [training[0], replace(training[1], u=training[1].u + 1.0)]
+    for arguments, names in (
+        ({"base": replace(BASE, horizon=19)}, "base settings differ"),
+        ({"space": SearchSpace(batch=(8, 129))}, "space differ"),
+        ({"seed": 4}, "seed differ"),
+        ({"data": (other, validation)}, "data differ"),
+        ({"data": (validation, training), "seed": 4}, "data, seed differ"),
+    ):
+        before = storage.read_bytes()
+        with pytest.raises(InputError, match=names):
+            run(**({"data": data} | arguments), storage=storage)
+        assert storage.read_bytes() == before
+    with pytest.raises(InputError, match=r"\(prior differ\)"):
+        search(Pendulum(TRUTH | {"d": 0.06}), *data, BASE, SPACE, trials=2, storage=storage)
+
+
+@pytest.mark.parametrize("content", ["not json\nat all\n", '{"a": 1}\n', "[1]\n[2]\n"])
+def test_what_is_no_journal_is_refused(data, tmp_path, content):
+    storage = tmp_path / "search.jsonl"
+    storage.write_text(content)
+    with pytest.raises(InputError, match="no journal of a search or is damaged"):
+        run(data, storage)
+
+
+def diverging(monkeypatch, wrong):
+    """Trainings whose number is in ``wrong`` have no finite validation error."""
+    count = iter(range(100))
+
+    def trained(prior, training, validation, settings, *, on_progress):
+        if next(count) in wrong:
+            on_progress(TOTAL // 2, TOTAL, math.inf)
+            return SimpleNamespace(validation=np.full(2, np.inf))
+        return fake(prior, training, validation, settings, on_progress=on_progress)
+
+    monkeypatch.setattr(module, "train", trained)
+
+
+def test_a_diverged_training_is_kept_and_the_search_goes_on(whole, data, tmp_path, monkeypatch):
+    diverging(monkeypatch, {1})
+    result = run(data, tmp_path / "search.jsonl", 3)
+    assert [r.state for r in result.trials] == ["complete", "diverged", "complete"]
+    assert result.trials[1].value == math.inf
+    assert math.isfinite(result.best.value)
+    assert core(run(data, tmp_path / "search.jsonl", 3)) == core(result)  # the journal gives infinity back
+
+
+def test_a_search_in_which_all_diverge_says_so(data, tmp_path, monkeypatch):
+    diverging(monkeypatch, {0, 1})
+    with pytest.raises(InputError, match="all 2 trainings of the search diverged"):
+        run(data, tmp_path / "search.jsonl", 2)
+
+
+def test_trials_with_other_horizons_are_judged_by_the_same_windows(data, tmp_path, monkeypatch):
+    used = []
+
+    def trained(prior, training, validation, settings, *, on_progress):
+        used.append((settings.horizon, settings.validation_horizon))
+        return fake(prior, training, validation, settings, on_progress=on_progress)
+
+    monkeypatch.setattr(module, "train", trained)
+    space = SearchSpace(None, None, None, None, horizon=(5, 40))
+    result = run(data, tmp_path / "search.jsonl", 3, space=space)
+    assert len({h for h, _ in used}) == 3
+    assert {v for _, v in used} == {5 * BASE.horizon}
+    assert result.settings.validation_horizon == 5 * BASE.horizon
+
+
+def test_a_base_outside_the_space_is_no_trial(quick, data, tmp_path):
+    result = run(data, tmp_path / "search.jsonl", 1, space=SearchSpace(hidden=(17, 20)))
+    assert result.base is None
+    assert result.trials[0].values["hidden"] >= 17
+
+
+@pytest.mark.parametrize("options", [{"trials": 0}, {"seed": -1}, {"timeout": 0.0}, {"timeout": math.nan}])
+def test_numbers_that_are_too_small_are_refused(data, tmp_path, options):
+    with pytest.raises(InputError, match="a search needs trials of 1 or more"):
+        run(data, tmp_path / "search.jsonl", **options)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("bounds", "message"),
+    [
+        ({"hidden": (8, 4)}, "hidden is to be varied between"),
+        ({"hidden": (4.5, 8)}, "whole numbers"),
+        ({"decay": (0.0, 8.0)}, "two positive numbers"),
+        ({"decay": (1.0, math.inf)}, "two positive numbers"),
+        ({"learning_rate": (1e-3, math.nan)}, "two positive numbers"),
+        (dict.fromkeys(("hidden", "learning_rate", "free_run_learning_rate", "decay")), "nothing to vary"),
+    ],
+)
+def test_bounds_that_are_none_are_refused(bounds, message):
+    with pytest.raises(InputError, match=message):
+        SearchSpace(**bounds)
+
+
+@pytest.mark.parametrize(
+    ("texts", "message"),
+    [
+        (["units=4:8"], "no setting 'units'"),
+        (["hidden=4:8", "hidden"], "twice"),
+        (["hidden=4"], "NAME=LOW:HIGH"),
+        (["hidden=a:b"], "NAME=LOW:HIGH"),
+    ],
+)
+def test_a_space_in_words(texts, message):
+    with pytest.raises(InputError, match=message):
+        parsed_space(texts)

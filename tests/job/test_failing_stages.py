@@ -1,0 +1,62 @@
+"""A stage that cannot run costs its own part of the report, and the exit code; what came before is kept."""
+
+import json
+import shutil
+
+import pytest
+
+from hybrid_mpc import InputError
+from hybrid_mpc.errors import StorageError
+from hybrid_mpc.job.context import STAGES, failed_stages
+from hybrid_mpc.job.run import run as job
+
+
+def broken(stages, name, error):
+    """The job's stages, of which one raises."""
+
+    def raises(context):
+        raise error
+
+    return tuple((n, title, raises if n == name else stage) for n, title, stage in stages)
+
+
+def without(finished, tmp_path, name):
+    """A finished run from before a stage."""
+    out = shutil.copytree(finished, tmp_path / "run")
+    for stage in STAGES[STAGES.index(name) :]:
+        (out / "checkpoints" / f"{stage}.json").unlink()
+    (out / "report.html").unlink()
+    return out
+
+
+@pytest.mark.parametrize("name", ["control", "monitor", "analysis"])
+def test_a_stage_that_cannot_run_leaves_its_reason_and_a_report(
+    call, arguments, finished, tmp_path, monkeypatch, name
+):
+    out = without(finished, tmp_path, name)
+    monkeypatch.setattr(job, "STAGES", broken(job.STAGES, name, InputError(f"no {name} on Sundays")))
+    code, told, _ = call(*arguments, "--out", out, "--resume")
+    assert code == 1
+    assert f"stage {name} could not run: no {name} on Sundays" in told
+    assert failed_stages(out)[name] == f"no {name} on Sundays"
+    assert f"no {name} on Sundays" in (out / "report.html").read_text()
+    results = json.loads((out / "results.json").read_text())
+    assert results["identification"]["rmse"]["mopgrnn"] is not None
+
+
+def test_a_stage_that_later_ones_need_ends_the_run(call, arguments, finished, tmp_path, monkeypatch):
+    out = without(finished, tmp_path, "evaluation")
+    monkeypatch.setattr(job, "STAGES", broken(job.STAGES, "evaluation", InputError("none")))
+    code, _, message = call(*arguments, "--out", out, "--resume")
+    assert (code, "error: none" in message) == (2, True)
+
+
+def test_a_full_disk_is_no_reason_to_go_on(call, arguments, finished, tmp_path, monkeypatch):
+    out = without(finished, tmp_path, "monitor")
+    error = StorageError("cannot write monitor.json: No space left on device")
+    monkeypatch.setattr(job, "STAGES", broken(job.STAGES, "monitor", error))
+    code, _, message = call(*arguments, "--out", out, "--resume")
+    assert code == 2
+    assert "No space left" in message
+    assert "finished stages are kept: the same command with --resume goes on" in message
+    assert not (out / "checkpoints" / "monitor.json").exists()

@@ -1,0 +1,204 @@
+"""``hybrid-mpc benchmark`` on a machine that is simulated here, and what it refuses."""
+
+import json
+from functools import partial
+
+import numpy as np
+import pytest
+from cart import DELAY, TRUE, recording, written
+
+from hybrid_mpc import BenchmarkBudget, InputError, load_scenario
+from hybrid_mpc.files import read_document, write_document
+from hybrid_mpc.identify.dataset import cut_windows
+from hybrid_mpc.identify.delay import fit_physics, shifted
+from hybrid_mpc.job.benchmark import BenchmarkSettings, benchmark, load_model
+from hybrid_mpc.job.benchmark import benchmark as networks
+from hybrid_mpc.job.benchmark_runs import figures_of, read_test, read_training, run_freely
+
+
+@pytest.fixture(scope="module")
+def machine(tmp_path_factory):
+    return written(tmp_path_factory.mktemp("cart"))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def trained_here():
+    """Networks are trained in this process: others of their own would take longer to start than to train."""
+
+    def one_by_one(jobs, on_progress, workers):
+        for name, (function, arguments) in jobs.items():
+            function(*arguments, lambda *told, name=name: on_progress(name, *told))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(networks, "run_jobs", one_by_one)
+        yield
+
+
+@pytest.fixture(scope="module")
+def made(machine, tmp_path_factory):
+    """A finished benchmark, by the command itself."""
+    scenario, train, test = machine
+    out = tmp_path_factory.mktemp("out") / "run"
+    settings = BenchmarkSettings(str(scenario), (train,), (test,))
+    results, runs = benchmark(settings, out)
+    return out, results, runs
+
+
+def test_the_delay_and_the_parameters_are_found(machine):
+    scenario = load_scenario(str(machine[0]))
+    data = read_training(scenario, [machine[1]])
+    physics = fit_physics(scenario.prior, data.train, data.valid, dt=0.1, length=20.0, largest_delay=0.3)
+    # a tenth of a period; the delayed input is a mean over the period, which a swing of 3 s hardly notices
+    assert abs(physics.delay - DELAY) < 0.01
+    # the cubic spring counts as a stiffer one: at most 3 * 0.5 * 0.7^2 more, with swings of up to 0.7 m
+    assert TRUE["k"] < physics.fit.values["k"] < TRUE["k"] + 0.75
+    assert abs(physics.fit.values["d"] - TRUE["d"]) < 0.15
+    assert set(physics.fit.standard_errors) == {"k", "d"}
+
+
+def test_a_test_file_is_judged_after_what_is_given_and_on_nothing_before(machine, made):
+    out, results, runs = made
+    assert set(results["test"]) == {"test.csv"}
+    run = runs["test.csv"][0]
+    # 10 periods of warm-up: 11 samples are given, the next one is the first that counts
+    assert run.t[0] == pytest.approx(1.1)
+    assert len(run.t) == 400 - 11 - 1  # the last sample's input has no period after it
+    row = results["test"]["test.csv"]
+    assert set(row) == {"phy", "rnn", "pgrnn", "mopgrnn", "hybrid", "scored_s"}
+    for name in ("phy", "hybrid"):
+        assert row[name]["unit"] == "mm"
+        assert 0 < row[name]["relative"] < 0.3  # the prior knows the machine but for its cubic spring
+    error = 1e3 * (run.y_hat["phy"] - run.y)[:, 0]
+    assert row["phy"]["rmse"] == pytest.approx(np.sqrt(np.mean(error**2)))
+    assert json.loads((out / "results.json").read_text())["test"]["test.csv"]["phy"] == row["phy"]
+
+
+def test_nothing_after_the_warm_up_is_known_to_a_free_run(machine, made, tmp_path):
+    scenario, model = load_scenario(str(machine[0])), load_model(made[0], "cart")
+    prior = scenario.prior(model.physics.fit.values)
+    lines = machine[2].read_text().splitlines()
+    # from the 12th sample on, the measured position is something else; time and input are as they were
+    changed = [*lines[:12], *(",".join([*line.split(",")[:2], "0.5"]) for line in lines[12:])]
+    (tmp_path / "changed.csv").write_text("\n".join(changed) + "\n")
+    assert lines[0].split(",") == ["t", "u", "s"]
+    found = [
+        run_freely(prior, model.physics, model.networks, read_test(scenario, path), warm_up=1.0, length=None)[
+            0
+        ]
+        for path in (machine[2], tmp_path / "changed.csv")
+    ]
+    for name, y_hat in found[0].y_hat.items():
+        np.testing.assert_array_equal(y_hat, found[1].y_hat[name], err_msg=name)
+    assert not np.allclose(found[0].y, found[1].y)
+
+
+def test_the_recommended_model_is_best_on_validation_and_on_runs_of_full_length(made):
+    _, results, _ = made
+    validation, long = (results["model"]["validation"][key] for key in ("rmse", "long_rmse"))
+    names = ("phy", "pgrnn", "mopgrnn", "pgrnn mean", "mopgrnn mean")
+    worse = {n: max(part[n] / part["phy"] for part in (validation, long)) for n in names}
+    assert results["model"]["hybrid"] == min(worse, key=worse.get)
+
+
+def test_networks_are_trained_with_what_the_budget_says():
+    budget = BenchmarkBudget(4, 2, teacher_steps=5, free_run_steps=5, horizon=10, decay=7.0, anchors=3.0)
+    settings = networks.settings_of("pgrnn", budget, seed=1, warm=4)
+    assert (settings.decay, settings.anchors, settings.seed, settings.warm) == (7.0, 3.0, 1, 4)
+
+
+def test_a_model_made_before_gives_the_same_figures_and_an_interrupted_run_goes_on(machine, made, tmp_path):
+    scenario, train, test = machine
+    out, results, _ = made
+    again, _ = benchmark(BenchmarkSettings(str(scenario), test=(test,), model=out), tmp_path / "again")
+    assert again["test"] == results["test"]
+    (out / "checkpoints" / "pgrnn.json").unlink()  # as if it had been killed before this was written
+    (out / "checkpoints" / "pgrnn.npz").unlink()
+    resumed, _ = benchmark(BenchmarkSettings(str(scenario), (train,), (test,)), out)
+    assert resumed["test"] == results["test"]
+
+
+def test_a_changed_machine_is_known_again_after_a_few_seconds(machine, made, tmp_path):
+    scenario, _, _ = machine
+    changed = recording(tmp_path / "changed.csv", seed=2, seconds=40.0, k=7.0)
+    settings = BenchmarkSettings(str(scenario), test=(changed,), model=made[0], refit=10.0)
+    results, _ = benchmark(settings, tmp_path / "judged")
+    found = results["test"]["changed.csv"]["refit"]
+    values = {row["parameter"]: row["fitted"] for row in found["prior"]}
+    assert 7.0 < values["k"] < 7.75  # the cubic spring counts as at most 3 * 0.5 * 0.7^2 more
+    for name in ("phy", "hybrid"):
+        assert found["after"][name]["rmse"] < 0.25 * found["before"][name]["rmse"]
+    with pytest.raises(InputError, match="longer than it"):
+        benchmark(
+            BenchmarkSettings(str(scenario), test=(changed,), model=made[0], refit=50.0), tmp_path / "no"
+        )
+
+
+def test_the_delay_takes_samples_from_the_start_only(machine):
+    scenario = load_scenario(str(machine[0]))
+    (whole,) = read_test(scenario, machine[2])
+    (late,) = shifted([whole], DELAY)
+    assert late.t[-1] == whole.t[-1]
+    assert len(whole.t) - len(late.t) == 2
+    assert len(cut_windows([late], 0, 10, 10)) > 0
+
+
+def test_a_diverging_run_is_infinite_and_not_nan():
+    from hybrid_mpc.job.benchmark_runs import Run
+
+    y = np.array([[0.0], [1.0]])
+    run = Run("run", np.arange(2.0), y, y, {"rnn": np.array([[0.0], [np.nan]])})
+    assert figures_of([run], "rnn", unit="rad", scale=1.0)["rmse"] == float("inf")
+
+
+@pytest.fixture
+def call(call):
+    """Run the command in this process: ``(exit code, stdout, stderr)``."""
+    return partial(call, "benchmark")
+
+
+def test_the_command_judges_a_model_and_draws_it(call, machine, made, tmp_path):
+    out = tmp_path / "judged"
+    code, told, _ = call(machine[0], "--model", made[0], "--test", machine[2], "--out", out)
+    assert code == 0
+    assert "hybrid" in told
+    assert (out / "results.json").is_file()
+    assert (out / "figures" / "test.png").stat().st_size > 10_000  # an empty page of this size has about 2 kB
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ((), "--data FILE, or a model made before"),
+        (("--data", "a.csv", "--model", "m"), "leave --data out"),
+        (("--model", "nowhere"), "--test FILE"),
+        (("--data", "a.csv", "--budget", "huge"), "no benchmark budget 'huge'; it has: quick"),
+        (("--data", "missing.csv"), "there is no such file"),
+        (("--model", "nowhere", "--test", "TEST"), "holds no model of a benchmark"),
+    ],
+)
+def test_what_the_command_refuses(call, machine, tmp_path, words, message):
+    words = [machine[2] if word == "TEST" else word for word in words]
+    code, _, told = call(machine[0], *words, "--out", tmp_path / "out")
+    assert code == 2
+    assert message in told
+    assert not (tmp_path / "out" / "results.json").exists()
+
+
+def test_a_folder_whose_pieces_had_other_roles_is_refused(machine, made):
+    scenario, train, _ = machine
+    note = read_document(made[0] / "benchmark.json")
+    write_document(made[0] / "benchmark.json", note | {"pieces": "of another version"})
+    try:
+        with pytest.raises(InputError, match="pieces differ"):
+            benchmark(BenchmarkSettings(str(scenario), (train,)), made[0])
+    finally:
+        write_document(made[0] / "benchmark.json", note)
+
+
+def test_a_folder_of_another_benchmark_is_refused(call, machine, made):
+    code, _, told = call(machine[0], "--data", machine[2], "--out", made[0])
+    assert code == 2
+    assert "other settings (data, pieces differ)" in told
+    code, _, told = call("golf_robot", "--data", machine[2], "--out", made[0])
+    assert code == 2
+    assert "has no benchmark" in told

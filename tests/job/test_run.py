@@ -1,0 +1,207 @@
+"""The main job as a user runs it: its folder, its determinism, its resumption."""
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from hybrid_mpc import InputError, load
+from hybrid_mpc.job.stages.results import validate_results
+
+
+def results(folder):
+    return json.loads((folder / "results.json").read_text())
+
+
+def without_timing(folder):
+    return {key: value for key, value in results(folder).items() if key != "timing"}
+
+
+def test_folder_holds_what_the_readme_says(finished):
+    found = results(finished)
+    validate_results(found)
+    assert found["scenario"] == "my_machine"
+    assert found["export"]["parity_max_abs_error"] <= 1e-12  # the project's bound for values
+    assert found["export"]["jacobian_max_abs_error"] <= 1e-10  # and for Jacobians
+    page = (finished / "report.html").read_text()
+    assert not re.search(r"(src|href)=[\"']?https?:", page)
+    names = {path.name for path in (finished / "figures").glob("*.png")}
+    for name in ("prior_observer", "hybrid_observer"):
+        assert found["estimation"][name]["samples"] > 100  # at least five times the 20 lags
+        assert f"innovations_{name}.png" in names
+    assert {"recordings.png", "training.png", "errors.png", "step_times.png", "poles.png"} <= names
+
+
+def test_doubts_about_recordings_reach_terminal_results_and_report(finished):
+    (warning,) = results(finished)["data"]["details"]["warnings"]
+    assert "tuesday.csv: column 'phi_rad' repeats" in warning
+    page = (finished / "report.html").read_text()
+    assert "Warning: tuesday.csv: column" in page
+    assert f"warning: {warning}" in (finished.parent / "told.txt").read_text()
+
+
+def test_the_fitted_prior_beats_the_nominal_one(finished):
+    # the machine's parameters are 10 to 20 % off the README's nominal ones, and it has dry friction
+    rmse = results(finished)["identification"]["rmse"]
+    (signal,) = rmse["phy"]
+    assert rmse["phy"][signal] < 0.7 * rmse["phy_nominal"][signal]
+    fitted = results(finished)["identification"]["details"]["prior_parameters"]["values"]
+    assert fitted["mgl"] == pytest.approx(
+        1.1, rel=0.05
+    )  # dry friction that the prior lacks biases it a little
+
+
+def test_a_machine_without_plant_says_why_it_has_no_closed_loop(finished):
+    control = results(finished)["control"]
+    assert control["gap_closed"] is None
+    assert "no plant" in control["gap_closed_reason"]
+    assert results(finished)["timing"]["controller_step_ms"]["median"] > 0
+
+
+def test_bounds_never_rise(finished):
+    curve = np.load(finished / "checkpoints" / "training" / "mopgrnn.npz")
+    for name in ("bound_error", "bound_energy"):
+        for stage in (0.0, 1.0):
+            bound = curve[f"curve.{name}"][curve["curve.free_run"][:, 0] == stage]
+            assert len(bound) >= 2
+            assert (np.diff(bound, axis=0) <= 0).all()
+
+
+def test_killed_and_resumed_run_equals_the_finished_one(finished, arguments, tmp_path):
+    """Also the test of determinism: everything but timing is the same, bit for bit."""
+    out = tmp_path / "run"
+    command = [sys.executable, "-m", "hybrid_mpc.cli", *arguments, "--out", str(out)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
+    deadline = time.monotonic() + 120
+    while not list(out.glob("checkpoints/training/*.safetensors")):  # in the middle of the training
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not (out / "results.json").exists()
+    done = subprocess.run([*command, "--resume"], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert without_timing(out) == without_timing(finished)
+    assert (out / "model" / "weights.safetensors").read_bytes() == (
+        finished / "model" / "weights.safetensors"
+    ).read_bytes()
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("seed", range(4))
+def test_killed_several_times(finished, arguments, tmp_path, seed):
+    """At random moments; whatever the moment, --resume finishes the run to the same results."""
+    rng, out = np.random.default_rng(seed), tmp_path / "run"
+    command = [sys.executable, "-m", "hybrid_mpc.cli", *arguments, "--out", str(out)]
+    for _ in range(3):
+        resume = ["--resume"] if (out / "run.json").is_file() else []
+        process = subprocess.Popen(
+            [*command, *resume], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+        )
+        time.sleep(float(rng.uniform(3.0, 25.0)))
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    resume = ["--resume"] if (out / "run.json").is_file() else []
+    done = subprocess.run([*command, *resume], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert without_timing(out) == without_timing(finished)
+
+
+def test_folder_of_another_run_or_of_something_else(call, arguments, finished, tmp_path):
+    code, _, message = call(*arguments, "--out", finished)
+    assert code == 2
+    assert "--resume" in message
+    code, _, message = call(*arguments, "--seed", "7", "--out", finished, "--resume")
+    assert code == 2
+    assert "seed" in message
+    (tmp_path / "letter.txt").write_text("mine")
+    code, _, message = call(*arguments, "--out", tmp_path)
+    assert code == 2
+    assert "something else" in message
+    code, _, message = call(*arguments, "--out", tmp_path / "fresh", "--resume")
+    assert code == 2
+    assert "no run to resume" in message
+
+
+def test_resume_of_a_damaged_checkpoint(call, arguments, finished, tmp_path):
+    out = tmp_path / "copy"
+    shutil.copytree(finished, out)
+    (out / "checkpoints" / "report.json").unlink()
+    (out / "checkpoints" / "evaluation.json").write_text("{broken")
+    code, _, message = call(*arguments, "--out", out, "--resume")
+    assert code == 2
+    assert "evaluation.json" in message
+    assert "damaged" in message
+
+
+@pytest.mark.parametrize(
+    ("file", "damage", "words"),
+    [
+        ("model.json", lambda b: b[: len(b) // 2], "damaged"),
+        (
+            "model.json",
+            lambda b: b.replace(b'"schema_version": 3', b'"schema_version": 99'),
+            "schema version",
+        ),
+        ("programs.json", lambda b: b[: len(b) // 2], "programs.json"),
+        ("weights.safetensors", lambda b: b[:-8], "weights.safetensors"),
+        ("weights.safetensors", lambda b: b[:-8] + bytes(8), "weights.safetensors"),
+        ("programs.json", None, "programs.json"),
+    ],
+)
+def test_damaged_artifact_is_refused(golf_artifact, tmp_path, file, damage, words):
+    for path in golf_artifact.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    if damage is None:
+        (tmp_path / file).unlink()
+    else:
+        (tmp_path / file).write_bytes(damage((tmp_path / file).read_bytes()))
+    with pytest.raises(InputError, match=re.escape(words)):
+        load(tmp_path)
+
+
+def test_artifact_holds_data_only(finished):
+    names = {path.name for path in (finished / "model").iterdir()}
+    assert names == {"model.json", "programs.json", "weights.safetensors"}
+    artifact = load(finished / "model")
+    assert set(artifact.models) == {"hybrid", "prior"}
+    assert artifact.models["prior"].n_h == 0
+    assert artifact.calibration is not None
+    assert artifact.provenance.data_hash == results(finished)["data"]["hash"]
+
+
+def test_the_artifact_holds_the_fitted_parameters_with_what_is_known_of_them(finished):
+    fit, model = (
+        results(finished)["identification"]["details"]["prior_parameters"],
+        load(finished / "model").models["hybrid"],
+    )
+    assert {p.name: p.value for p in model.parameters} == fit["values"]
+    assert all(p.lower <= p.value <= p.upper and p.unit for p in model.parameters)
+    errors = [fit["standard_errors"].get(p.name, 0.0) for p in model.parameters]
+    covariance = np.array(model.covariance)
+    assert covariance.shape == (model.n_p, model.n_p)
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), errors, rtol=1e-12)
+    np.testing.assert_allclose(covariance, covariance.T)
+    assert min(errors) == 0.0 or np.all(np.linalg.eigvalsh(covariance) > 0)
+
+
+def test_the_main_job_says_what_its_guard_lacks(finished):
+    found = results(finished)["guard"]
+    assert found["data_hash"] is None
+    assert "need 2.5 min" in found["reason"]
+    assert (finished / "figures" / "guard_recorded.png").stat().st_size > 10_000
+    page = (finished / "report.html").read_text()
+    assert "Energy guard" in page
+    assert "No detector could be learned" in page
+    stored = load(finished / "model").calibration
+    assert stored.detector is None
+    assert stored.plausibility.samples > 200

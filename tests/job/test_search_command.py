@@ -1,0 +1,196 @@
+"""``hybrid-mpc search``: its files, resuming, what it refuses, and a run with the settings found."""
+
+import csv
+import dataclasses
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+from hybrid_mpc import InputError, RunSettings, SearchSpace, load_scenario
+from hybrid_mpc.cli.main import main
+from hybrid_mpc.files import LOCK
+from hybrid_mpc.identify.tune import parsed_space
+from hybrid_mpc.job.context import Context
+from hybrid_mpc.job.folder import open_folder
+from hybrid_mpc.job.settings import claim, read_network
+from hybrid_mpc.job.stages.identify import training_settings
+from hybrid_mpc.job.tune import SearchSettings, usage
+
+pytestmark = pytest.mark.full  # these share one search of 20 s
+PNG = b"\x89PNG"
+
+
+def called(*words):
+    """Exit code of the command line in this process."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["hybrid-mpc", *map(str, words)])
+        try:
+            main()
+        except SystemExit as stop:
+            return stop.code or 0
+    return 0
+
+
+@pytest.fixture(scope="module")
+def words(machine):
+    """A search of two trials on one recording without its --out."""
+    data = ["--data", machine / "monday.csv"]
+    vary = ["--vary", "hidden=2:8", "--vary", "horizon=20:60", "--vary", "learning_rate"]
+    return ["search", machine / "my_machine.py", *data, *vary]
+
+
+@pytest.fixture(scope="module")
+def searched(words, tmp_path_factory):
+    out = tmp_path_factory.mktemp("search") / "out"
+    assert called(*words, "--trials", 2, "--out", out) == 0
+    return out
+
+
+def trials(results):
+    return [{k: v for k, v in row.items() if k != "duration"} for row in results["trials"]]
+
+
+def test_it_leaves_settings_a_table_and_figures(searched, machine):
+    results = json.loads((searched / "results.json").read_text())
+    assert (results["schema"], results["kind"], len(results["trials"])) == ("hybrid-mpc search", "mopgrnn", 2)
+    assert results["base_value"] == results["trials"][0]["value"] >= results["best"]["value"]
+    with (searched / "trials.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [float(r["value"]) for r in rows] == [t["value"] for t in results["trials"]]
+    assert [float(r["horizon"]) for r in rows] == [t["values"]["horizon"] for t in results["trials"]]
+    settings = json.loads((searched / "settings.json").read_text())
+    assert settings == results["settings"]
+    assert set(settings) == {"hidden", "horizon", "learning_rates", "validation_horizon"}
+    for name in ("search_history.png", "search_settings.png"):
+        assert (searched / "figures" / name).read_bytes().startswith(PNG)
+    assert {p.name for p in searched.iterdir()} - {LOCK} == {
+        "run.json", "checkpoints", "search.jsonl", "results.json", "settings.json", "trials.csv", "figures",
+    }  # fmt: skip
+    # a run with this file trains what the best trial trained
+    settings = RunSettings(str(machine / "my_machine.py"), network_file=searched / "settings.json")
+    scenario = load_scenario(str(machine / "my_machine.py"))
+    used = training_settings(Context(settings, scenario, searched), "mopgrnn")
+    budget = training_settings(
+        Context(dataclasses.replace(settings, network_file=None), scenario, searched), "mopgrnn"
+    )
+    best = SearchSpace(hidden=(2, 8), decay=None, free_run_learning_rate=None, horizon=(20, 60)).apply(
+        dataclasses.replace(budget, validation_horizon=5 * budget.horizon), results["best"]["values"]
+    )
+    assert used == best
+
+
+def test_a_search_goes_on_with_more_trials(searched, words, tmp_path, capsys):
+    out = tmp_path / "out"
+    shutil.copytree(searched, out)
+    assert called(*words, "--trials", 3, "--out", out, "--resume") == 0
+    told = capsys.readouterr().out
+    assert f"--settings {out}/settings.json" in told
+    assert "best: trial" in told
+    before, after = (json.loads((d / "results.json").read_text()) for d in (searched, out))
+    assert trials(after)[:2] == trials(before)
+    assert len(after["trials"]) == 3
+
+
+def test_what_is_refused(searched, words, arguments, tmp_path, capsys):
+    new = ["--out", tmp_path / "new"]
+    for given, message in (
+        ([*words, "--out", searched], "already holds a run"),
+        ([*words, "--out", searched, "--resume", "--kind", "rnn"], "kind differ"),
+        ([*words, "--out", searched, "--resume", "--seed", "1"], "seed differ"),
+        ([*words[:-1], "decay=1:2", "--out", searched, "--resume"], "space differ"),
+        ([*map(str, words[:4]), "--out", searched, "--resume"], "space differ"),
+        (["run", *map(str, words[1:4]), "--out", searched, "--resume"], "kind, space differ"),
+        ([*words, *new, "--kind", "gru"], "kind has no 'gru'"),
+        ([*words, *new, "--vary", "units=1:2"], "no setting 'units' to vary"),
+        ([*words, *new, "--vary", "decay=8:4"], "lower one first"),
+        ([*words, *new, "--timeout", "0"], "timeout above 0 s"),
+        ([*words, *new, "--budget", "huge"], "no budget 'huge'"),
+        ([*arguments, *new, "--settings", tmp_path / "none.json"], "none.json is missing"),
+    ):
+        assert called(*given) == 2, given
+        assert message in capsys.readouterr().err.replace("\n", " "), given
+        assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("[1]", "no JSON object"),
+        ("{", "is damaged"),
+        ('{"hidden": 8, "kind": "rnn"}', "also kind"),
+        ('{"hidden": 8.5}', "whole number"),
+        ('{"hidden": true}', "whole number"),
+        ('{"hidden": 0}', "whole number"),
+        ('{"batch": [4]}', "whole number"),
+        ('{"decay": -1}', "0 or more"),
+        ('{"decay": "a lot"}', "0 or more"),
+        ('{"decay": NaN}', "NaN is not JSON"),
+        ('{"learning_rates": [0.1, 0.1]}', "four positive numbers"),
+        ('{"learning_rates": 0.1}', "four positive numbers"),
+        ('{"learning_rates": [0.1, 0.1, 0.1, 0]}', "four positive numbers"),
+    ],
+)
+def test_files_of_settings_that_are_none(tmp_path, content, message):
+    path = tmp_path / "settings.json"
+    path.write_text(content)
+    with pytest.raises(InputError, match=message):
+        read_network(path)
+
+
+def test_a_run_without_such_a_file_is_what_it_has_always_been(tmp_path):
+    # what run.json of earlier runs holds: they can be resumed
+    assert set(RunSettings("golf_robot").identity()) == {
+        "scenario", "data", "seed", "budget", "inputs", "outputs", "time",
+    }  # fmt: skip
+    scenario = load_scenario("golf_robot")
+    plain = training_settings(Context(RunSettings("golf_robot"), scenario, tmp_path), "mopgrnn")
+    assert (plain.hidden, plain.horizon, plain.batch, plain.validation_horizon) == (16, 50, 32, None)
+
+
+def test_a_search_without_anchors_is_what_it_has_always_been():
+    assert "anchors" not in SearchSettings("golf_robot").identity()["space"]
+    assert SearchSettings("golf_robot", space=parsed_space(["anchors"])).identity()["space"]["anchors"] == (
+        0.3,
+        300.0,
+    )
+    with pytest.raises(InputError, match="an rnn has no prior to be anchored to"):
+        SearchSettings("golf_robot", kind="rnn", space=parsed_space(["anchors"]))
+
+
+def test_anchors_reach_the_training_from_budget_and_file(tmp_path):
+    scenario = load_scenario("unbalanced_disk")
+    plain = training_settings(Context(RunSettings("unbalanced_disk"), scenario, tmp_path), "mopgrnn")
+    assert plain.anchors == 10.0
+    path = tmp_path / "settings.json"
+    path.write_text('{"anchors": 0}')
+    settings = RunSettings("unbalanced_disk", network_file=path)
+    assert training_settings(Context(settings, scenario, tmp_path), "mopgrnn").anchors == 0
+
+
+def test_a_run_is_bound_to_the_content_of_its_file(tmp_path):
+    path = tmp_path / "settings.json"
+    path.write_text('{"hidden": 8}')
+    settings = RunSettings("golf_robot", network_file=path)
+    with open_folder(tmp_path / "run", claim(settings), resume=False):
+        pass
+    path.write_text('{ "hidden" : 8 }')
+    with open_folder(tmp_path / "run", claim(settings), resume=True):
+        pass
+    path.write_text('{"hidden": 9}')
+    for other in (settings, RunSettings("golf_robot")):
+        with (
+            pytest.raises(InputError, match="network differ"),
+            open_folder(tmp_path / "run", claim(other), resume=True),
+        ):
+            pass
+
+
+def test_the_line_to_use_it():
+    settings = SearchSettings("a b.py", seed=3, budget="full", time="t")
+    assert usage(settings, Path("runs/s")) == (
+        "hybrid-mpc run 'a b.py' --time-column t --seed 3 --budget full --settings runs/s/settings.json "
+        "--out runs/s-run"
+    )

@@ -1,0 +1,217 @@
+"""Stages monitor and guard on linear axes: slow ones are calibrated, and where nothing can be, the run goes on."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from hybrid_mpc import (
+    OCP,
+    DataSpec,
+    InputError,
+    RunSettings,
+    Scenario,
+    load,
+    save_artifact,
+    set_process_noise,
+    write_csv,
+)
+from hybrid_mpc.cli.main import app
+from hybrid_mpc.job.context import Context
+from hybrid_mpc.job.stages.figures import _monitor as monitor_figures
+from hybrid_mpc.job.stages.figures import guard_figures
+from hybrid_mpc.job.stages.guard import guard_stage
+from hybrid_mpc.job.stages.monitor import monitor_stage
+from hybrid_mpc.job.stages.report import guard_tables, guard_words
+from hybrid_mpc.job.stages.results import SCHEMA, _check, guard_results
+from hybrid_mpc.job.stages.results import _monitor as monitor_results
+from hybrid_mpc.kit.artifact import read_description, write_description
+
+AXIS = """
+from hybrid_mpc import Prior, Parameter, Signal
+
+
+class Axis(Prior):
+    states, inputs = (Signal("q", "m"), Signal("v", "m/s")), (Signal("F", "N", -5, 5),)
+    outputs = (Signal("q", "m"),)
+    parameters_spec = (Parameter("m", {mass}, "kg", {mass}, {mass}), Parameter("d", {damping}, "N s/m", 0, 1e9))
+
+    def acceleration(self, x, u):
+        return (u - self.d * x[..., 1:] - {dry} * (x[..., 1:] / {width}).tanh()) / self.m
+
+    def inertia(self, x):
+        return self.m
+"""
+
+
+@dataclass(frozen=True)
+class Machine:
+    """An axis: period [s], top speed [m/s], swing [s], sensor noise [m]; 1 N swings it, 0.1 N of it is dry friction."""
+
+    dt: float
+    speed: float
+    swing: float
+    noise: float
+
+    @property
+    def source(self):
+        mass = self.swing / (2 * np.pi) / (2 * self.speed)
+        numbers = {"mass": mass, "damping": 0.5 / self.speed, "dry": 0.1, "width": 0.01 * self.speed}
+        return AXIS.format(**{key: repr(float(value)) for key, value in numbers.items()})
+
+    def recording(self, seed, n):
+        """Columns of a recording, by semi-implicit Euler in fiftieths of a period."""
+        rng, t = np.random.default_rng(seed), self.dt * np.arange(n)
+        u = np.sin(2 * np.pi * t / self.swing + seed) + 0.6 * np.sin(2 * np.pi * 0.37 * t / self.swing)
+        mass, damping = self.swing / (2 * np.pi) / (2 * self.speed), 0.5 / self.speed
+        q, v, out, h = 0.0, 0.0, np.zeros(n), self.dt / 50
+        for k in range(n):
+            out[k] = q
+            for _ in range(50):
+                v += h * (u[k] - damping * v - 0.1 * np.tanh(v / (0.01 * self.speed))) / mass
+                q += h * v
+        return {"t": t, "F": u, "q": out + self.noise * rng.standard_normal(n)}
+
+
+SLOW = Machine(dt=0.5, speed=1e-3, swing=40.0, noise=1e-7)
+"""Some millimetres a second."""
+QUICK = Machine(dt=1e-3, speed=0.1, swing=0.5, noise=1e-7)
+
+
+def context(machine, samples, out, warm_up):
+    """A run that has come to stage monitor: its model is the prior that made the recordings."""
+    from hybrid_mpc import PriorStep, model_info, trace_model
+
+    room = {}
+    exec(machine.source, room)
+    spec = DataSpec(
+        "t",
+        ("F",),
+        ("q",),
+        dt=machine.dt,
+        max_gap=2.5 * machine.dt,
+        smoothing=10 * machine.dt,
+        warm_up=warm_up,
+    )
+    control = OCP(
+        20,
+        q=(1.0, 1.0),
+        r=(1.0,),
+        r_delta=(1.0,),
+        u_min=(-2.0,),
+        u_max=(2.0,),
+    )
+    scenario = Scenario(
+        "axis", "An axis", "", prior=room["Axis"], data=spec, control=control, sensor_sigma=(machine.noise,)
+    )
+    for i, n in enumerate(samples):
+        write_csv(out / "data" / f"run{i}.csv", machine.recording(i, n))
+    made = Context(RunSettings("axis"), scenario, out)
+    prior = scenario.prior()
+    programs = trace_model(PriorStep(prior, machine.dt).requires_grad_(False))
+    info = replace(model_info(prior, machine.dt), time_unit=made.time_unit)
+    save_artifact(out / "model", {"hybrid": programs, "prior": programs}, info)
+    noise = [machine.noise, 1e-3 * machine.speed]
+    set_process_noise(out / "model", {"hybrid_observer": noise, "prior_observer": noise})
+    train = made.trajectories("train")
+    made.save("prior", {}, {f"{t.name}/{key}": getattr(t, key) for t in train for key in ("x", "xdot")})
+    return made
+
+
+def group(name, values):
+    """What results.json would hold, checked against its schema."""
+    _check({name: values}, type(SCHEMA)({name: SCHEMA.keys[name]}), "", {})
+    return values
+
+
+@pytest.fixture(scope="module")
+def slow(tmp_path_factory):
+    run = context(SLOW, (1200, 900), tmp_path_factory.mktemp("slow"), warm_up=10.0)
+    monitor_stage(run)
+    guard_stage(run)
+    return run
+
+
+def test_an_axis_of_millimetres_a_second_is_calibrated(slow):
+    found = slow.result("monitor")
+    assert "reason" not in found
+    (rest,) = found["calibration"]["rest_speed"]
+    top = max(np.abs(t.x[:, 1]).max() for t in slow.dataset.whole)
+    assert top < 5e-3
+    assert 0.03 * top < rest < 0.07 * top
+    # what dry friction may hold is 0.1 N: a residual that is always within the dead band would leave a threshold of 0
+    assert 0 < found["calibration"]["residual_threshold"] < 0.5
+    assert group("monitor", monitor_results(slow))["threshold"]["energy [W]"] > 0
+    model = load(slow.out / "model").models["hybrid"]
+    assert model.time_unit == slow.time_unit > 5.0
+    covered = found["recordings"][0]
+    assert covered["judged_s"] > 500
+    assert covered["not_finite_s"] == covered["missing_s"] == 0.0
+
+
+def test_monitor_and_guard_take_the_same_rest_speed(slow):
+    artifact = load(slow.out / "model")
+    (rest,) = slow.result("monitor")["calibration"]["rest_speed"]
+    assert artifact.rest_speed == (rest,)
+    # 17 min are too little for the slowest rate of so slow a machine
+    block = 5 * slow.time_unit
+    assert f"in whole blocks of {block:g} s are too little" in guard_results(slow)["reason"]
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory):
+    """Recordings of 0.18 s, whose parts are shorter than the guard's window; training needs 20 ms for each part."""
+    run = context(QUICK, (180, 180), tmp_path_factory.mktemp("short"), warm_up=0.01)
+    monitor_stage(run)
+    guard_stage(run)
+    return run
+
+
+def test_recordings_shorter_than_the_windows_give_a_reason_and_the_run_goes_on(short):
+    found = short.result("monitor")
+    assert "calibration" not in found
+    window = 2 * round(0.1 * short.time_unit / QUICK.dt) + 1
+    assert f"no recording has the {window} samples ({window * QUICK.dt:g} s)" in found["reason"]
+    assert found["recordings"][0]["judged_s"] == 0.0
+    told = group("monitor", monitor_results(short))
+    assert told["alarms"] is None
+    assert found["reason"] == told["reason"]
+    assert told["details"]["recordings"][1]["warm_up_s"] == pytest.approx(0.179)
+    assert list(monitor_figures(short)) == []
+
+
+def test_the_guard_copes_without_a_calibration(short):
+    told = group("guard", guard_results(short))
+    assert "too little" in told["reason"]
+    assert guard_tables({"guard": told}) == []
+    assert guard_words({"guard": told})[0].startswith("No detector could be learned")
+    captions = [caption for *_, caption in guard_figures(short)]
+    assert captions == [
+        "The recording run0, of which test data come, by the monitor, which has no thresholds to judge by."
+    ]
+    artifact = load(short.out / "model")
+    assert artifact.calibration.threshold_w is None
+    assert artifact.rest_speed is None  # a detector that is learned later takes it from its own recordings
+    with pytest.raises(
+        InputError, match="holds no detector"
+    ):  # what control --guard says before its first loop
+        artifact.detector()
+
+
+@pytest.mark.parametrize("stored", ["without thresholds", "none"])
+def test_the_command_watches_with_an_artifact_without_calibration(short, tmp_path, monkeypatch, stored):
+    description = read_description(short.out / "model")
+    if stored == "none":
+        write_description(short.out / "model", replace(description, calibration=None))
+    write_csv(tmp_path / "long.csv", QUICK.recording(5, 900))
+    monkeypatch.setattr("hybrid_mpc.cli.monitor.scenario_of", lambda *given: short.scenario)
+    done = CliRunner().invoke(
+        app, ["monitor", str(short.out / "model"), str(tmp_path / "long.csv"), "--scenario", "axis",
+              "--out", str(tmp_path / "out")],
+    )  # fmt: skip
+    write_description(short.out / "model", description)
+    assert done.exit_code == 0, done.output
+    assert "the artifact holds no detector and no thresholds" in done.output
+    warm_up = 2 * round(0.15 * short.time_unit / QUICK.dt) * QUICK.dt
+    assert f"long: 0.9 s, 0 alarms; not judged: {warm_up:.2f} s warm-up" in done.output
