@@ -3,7 +3,7 @@
 The MPC on the prior sways the simulated disk about the top (task ``track_up``, three seeds). Along these loops both
 models of a run predict from the true state, every second sample, hidden state followed from the start. Printed: mean
 and root mean square error of the angle after so many periods. RUN is the folder of ``hybrid-mpc run unbalanced_disk``;
-for networks without anchors give that run ``--settings FILE`` with ``{"anchors": 0}`` in the file.
+for networks without prior_replay give that run ``--settings FILE`` with ``{"prior_replay": 0}`` in the file.
 """
 
 from __future__ import annotations

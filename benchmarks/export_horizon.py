@@ -7,7 +7,7 @@ Routes: ``inline`` (all N steps of the plain graph written out, what one gets wi
 (calls of the plain step), ``onnx`` (calls of the step that came through CasADi's ONNX import), ``unroll``
 (:func:`nn_export.unroll` of :func:`nn_export.build`), ``fold`` (:func:`nn_export.fold`), ``sx`` (the plain step
 expanded to scalars, inline). Of each: the run; the gradient of the squared last state by all inputs; the Jacobian
-of the last state by all inputs (both by CasADi). ``linearised`` is ``unroll`` of :func:`nn_export.with_jacobian`:
+of the last state by all inputs (both by CasADi). ``linearized`` is ``unroll`` of :func:`nn_export.with_jacobian`:
 the run and the Jacobians A_k, B_k of all steps.
 """
 
@@ -63,7 +63,7 @@ def measure(z: int, n: int) -> dict[str, Any]:
         "plain": lambda: nn_export.unroll(plain, n),
         "unroll": lambda: nn_export.unroll(step, n),
         "fold": lambda: nn_export.fold(step, n),
-        "linearised": lambda: nn_export.unroll(composed, n),
+        "linearized": lambda: nn_export.unroll(composed, n),
     }
     skipped = [parts.l4casadi_reason()]
     scalars = 6 * z * (z + 6) * n
@@ -80,7 +80,7 @@ def measure(z: int, n: int) -> dict[str, Any]:
     runs, derived, rows = {}, {}, {}
     for name, build in found.items():
         runs[name], rows[name] = parts.built(build)
-        if name == "linearised":
+        if name == "linearized":
             continue
         for kind in ("gradient", "jacobian"):
             if kind == "jacobian" and name in ("inline", "sx") and n > JACOBIAN_LIMIT:
@@ -104,7 +104,7 @@ def table(row: dict[str, Any], rate: dict[str, float]) -> str:
     keys = ["build_ms", "graph_MB", "work_kB", "run_us", "gradient_build_ms", "gradient_us"]
     keys += ["jacobian_build_ms", "jacobian_us"]
     lines = [
-        f"z = {row['z']}, N = {row['n']}; multiply-adds at dgemv's rate: run {value:.0f} us, linearised {both:.0f} us",
+        f"z = {row['z']}, N = {row['n']}; multiply-adds at dgemv's rate: run {value:.0f} us, linearized {both:.0f} us",
         "  route       build ms  graph MB   work kB    run us  grad. build ms    grad. us  Jac. build ms     Jac. us",
     ]
     for name, cost in row["routes"].items():

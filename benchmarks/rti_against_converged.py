@@ -3,7 +3,7 @@
 ``python benchmarks/rti_against_converged.py --model DIR [--task NAME ...] [--seeds 5]
 [--solver sqp ...] [--ipopt-seeds 1] [--out FILE.json]``. The golf robot's tasks under the hybrid's observer and
 controller; the cost is that of the rig's true state. All solvers have the same problem, estimator, sensor noise (seed
-by seed), first plan (converged) and safeguards; only what happens within a period differs: one linearisation
+by seed), first plan (converged) and safeguards; only what happens within a period differs: one linearization
 (``rti``), two or five (``rti2``, ``rti5``), convergence with the dynamics' second derivatives (``sqp``), IPOPT with
 exact ones. Printed by task: the mean cost of ``rti`` and, for each other solver, the ratio of the mean costs
 J_rti / J_solver with its 95 % interval from the differences seed by seed (Student's t), and the range of single seeds'

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.machine.specification import BenchmarkSpec, DataSpec, check_anchors
+from hybrid_mpc.machine.specification import BenchmarkSpec, DataSpec, check_prior_replay
 
 if TYPE_CHECKING:
     from hybrid_mpc.control.ocp import OCP
@@ -77,7 +77,7 @@ class Budget:
         tasks: Names of the tasks to run. Default: all.
         decay: Weight decay times the number of training samples. The less data, the more of it is needed to
             keep a network from learning their noise; large recordings do not notice the default.
-        anchors: Weight of fading corrections where nothing was measured: see ``TrainingSettings``. For a machine
+        prior_replay: Weight of fading corrections where nothing was measured: see ``TrainingSettings``. For a machine
             whose tasks go where its recordings do not. Default: zero, none.
     """
 
@@ -89,10 +89,10 @@ class Budget:
     decay: float = 300.0
     oracle_seeds: int = 1
     tasks: tuple[str, ...] | None = None
-    anchors: float = 0.0
+    prior_replay: float = 0.0
 
     def __post_init__(self) -> None:
-        check_anchors(self.anchors)
+        check_prior_replay(self.prior_replay)
 
 
 DEFAULT_BUDGETS: Mapping[str, Budget] = {
@@ -132,7 +132,8 @@ class Scenario:
             for :class:`~hybrid_mpc.monitor.diagnose.Diagnoser`. Default: each by itself.
         benchmark: How ``hybrid-mpc benchmark`` judges the machine on recordings; default: not at all.
         beyond_recordings: Whether tasks go where no recording was. A network knows nothing there, so the filters on the
-            hybrid then assume no less process noise than those on the prior; see also ``Budget.anchors``. Default: no.
+            hybrid then assume no less process noise than those on the prior; see also ``Budget.prior_replay``.
+            Default: no.
 
     Example:
         >>> import numpy as np

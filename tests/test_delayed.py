@@ -10,7 +10,7 @@ from online_models import pendulum_model
 
 from hybrid_mpc import InputError, load, save_artifact, with_input_delay
 from hybrid_mpc.kit.artifact import FILE
-from hybrid_mpc.model.delay import MOST_WAITING
+from hybrid_mpc.model.delay import MOST_DELAY_STATES
 
 DT = 0.02
 
@@ -23,7 +23,7 @@ def step(model, x, h, u):
 def test_the_input_of_a_period_is_the_mean_of_what_acts_in_it(delay, waiting):
     model = pendulum_model(z=3, dt=DT)
     late = with_input_delay(model, delay * DT)
-    assert (late.waiting, late.n_h) == (waiting, 3 + waiting)
+    assert (late.delay_states, late.n_h) == (waiting, 3 + waiting)
     u = np.random.default_rng(0).normal(size=20)
     x, h = np.array([0.3, 0.0]), np.zeros(late.n_h)
     own_x, own_h = x, np.zeros(3)
@@ -92,18 +92,18 @@ def test_what_cannot_be_is_refused():
             with_input_delay(model, delay)
     with pytest.raises(InputError, match="wait already"):
         with_input_delay(with_input_delay(model, DT), DT)
-    with pytest.raises(InputError, match="waiting must be whole inputs"):
-        replace(model, waiting=1)
+    with pytest.raises(InputError, match="delay_states must be whole inputs"):
+        replace(model, delay_states=1)
 
 
 def test_a_delay_of_too_many_periods_is_refused_at_once():
     model = pendulum_model(dt=DT)
-    for periods in (MOST_WAITING + 1, 1e9, 1e308):
+    for periods in (MOST_DELAY_STATES + 1, 1e9, 1e308):
         with pytest.raises(
-            InputError, match=f"inputs would wait, at most {MOST_WAITING} can; give it in seconds"
+            InputError, match=f"inputs would wait, at most {MOST_DELAY_STATES} can; give it in seconds"
         ):
             with_input_delay(model, periods * DT)
-    assert with_input_delay(model, MOST_WAITING * DT).waiting == MOST_WAITING
+    assert with_input_delay(model, MOST_DELAY_STATES * DT).delay_states == MOST_DELAY_STATES
 
 
 def test_an_artifact_keeps_the_delay(tmp_path):
@@ -116,7 +116,7 @@ def test_an_artifact_keeps_the_delay(tmp_path):
         save_artifact(tmp_path / name, programs, replace(info, input_delay=delay))
     assert json.loads((tmp_path / "none" / FILE).read_text())["input_delay_s"] == 0.0
     at_once, late = (load(tmp_path / name).models["prior"] for name in ("none", "late"))
-    assert (at_once.waiting, late.waiting) == (0, 2)
+    assert (at_once.delay_states, late.delay_states) == (0, 2)
     x, u = np.array([0.2, 0.1]), np.array([4.0, 8.0, 9.0])  # the last one comes too late for this period
     np.testing.assert_array_equal(step(late, x, u[:2], u[2])[0], step(at_once, x, [], 0.25 * 4 + 0.75 * 8)[0])
     assert step(late, x, u[:2], u[2])[1].tolist() == [8.0, 9.0]

@@ -76,7 +76,7 @@ def test_a_longer_period_and_a_late_input_hand_them_on():
 
 
 def test_what_has_no_disturbance_of_its_own_takes_the_usual_one():
-    """Estimators, controllers and their linearisations of the model are those of one with the numbers inside."""
+    """Estimators, controllers and their linearizations of the model are those of one with the numbers inside."""
     model = sled()
     point = step_symbols(model)
     x, h, u = point[:3]

@@ -28,7 +28,7 @@ class Equilibrium(NamedTuple):
 
     Fields: ``x`` ``(n_x,)``, ``h`` ``(n_h,)``, ``u`` ``(n_u,)``; ``residual``, the largest change in one step;
     ``poles`` ``(n_z,)`` of the step there, largest first; ``stability``, ``"stable"``, ``"unstable"`` or
-    ``"marginal"`` (an eigenvalue on the unit circle: a continuum of points of rest, or none of the linearisation's
+    ``"marginal"`` (an eigenvalue on the unit circle: a continuum of points of rest, or none of the linearization's
     business); ``hits``, starts that ended here.
     """
 

@@ -1,4 +1,4 @@
-"""Friction in a linearisation: the slope at rest, and the secant at working speed."""
+"""Friction in a linearization: the slope at rest, and the secant at working speed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ANGLES = 64
 
 @dataclass(frozen=True)
 class FrictionSlopes:
-    """How much damping a speed sees, by three linearisations, at rest position ``q`` under the input ``u``.
+    """How much damping a speed sees, by three linearizations, at rest position ``q`` under the input ``u``.
 
     All are ``-d(acceleration) / d(speed)`` [1/s] for the sizes ``speed``; times the inertia they are a viscous
     damping coefficient.
@@ -90,7 +90,7 @@ def linearize_secant(
     model: HybridModel, x: ArrayLike, u: ArrayLike, speed: ArrayLike, h: ArrayLike | None = None,
     *, kind: Kind = "harmonic",
 ) -> Any:  # fmt: skip
-    """Linearisation at rest whose damping is that of motions of a given size.
+    """Linearization at rest whose damping is that of motions of a given size.
 
     A smoothed Coulomb friction has a slope at rest that no motion feels. Here the columns of A by the velocities are
     chords: of the step from ``v = +speed`` and ``-speed`` (``"secant"``), or the mean over a sinusoid of that

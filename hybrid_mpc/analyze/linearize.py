@@ -1,4 +1,4 @@
-"""Linearisation along a trajectory: a linear time-varying system."""
+"""Linearization along a trajectory: a linear time-varying system."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def jacobians(model: HybridModel, *, continuous: bool = False) -> ca.Function:
     if continuous and model.n_h:
         raise InputError(
             f"model {model.name} has {model.n_h} hidden states, which step once a period of {model.dt:g} s and have "
-            "no rate; leave continuous=True out, or linearise the prior"
+            "no rate; leave continuous=True out, or linearize the prior"
         )
     x, h, u = ca.MX.sym("x", model.n_x), ca.MX.sym("h", model.n_h), ca.MX.sym("u", model.n_u)
     if continuous:
@@ -111,7 +111,7 @@ def jacobians(model: HybridModel, *, continuous: bool = False) -> ca.Function:
     return ca.Function("jacobians", [x, h, u], results, ["x", "h", "u"], ["A", "B", "C", "D"])
 
 
-# Fixed points and exact linearisations of a model over ``[x; h]``.
+# Fixed points and exact linearizations of a model over ``[x; h]``.
 
 Array = NDArray[np.float64]
 RESIDUAL = 1e-10
@@ -206,7 +206,7 @@ def linearize(
 
 
 def linearize_at_speed(model: HybridModel, q: ArrayLike, v_work: ArrayLike, u: ArrayLike) -> Any:
-    """Linearisation with friction as it is at working speed, at ``x = (q, v_work)``.
+    """Linearization with friction as it is at working speed, at ``x = (q, v_work)``.
 
     At rest the slope of a smoothed Coulomb friction ``tanh(v / v_s)`` dominates everything: it is a huge
     viscous damper that no motion ever feels. At ``|v_work|`` of several ``v_s`` the slope is that of the
@@ -313,7 +313,7 @@ class AlongTrajectory:
         return control_toolbox().ss(*matrices, self.model.dt, remove_useless_states=False, **names)
 
     def mean(self, skip: int = 0) -> Any:
-        """The matrices' means over the trajectory as ``control.StateSpace``: statistical linearisation.
+        """The matrices' means over the trajectory as ``control.StateSpace``: statistical linearization.
 
         For a deviation that is Gaussian the mean slope is the linear map that predicts a function best; so this is
         what motions like this one see of a friction, and of all else that is nonlinear, networks included.
@@ -349,7 +349,7 @@ class AlongTrajectory:
 def linearize_along(
     model: HybridModel, x: ArrayLike, u: ArrayLike, h: ArrayLike | None = None
 ) -> AlongTrajectory:
-    """Exact linearisations at every period of a trajectory.
+    """Exact linearizations at every period of a trajectory.
 
     Args:
         model: The model.

@@ -1,4 +1,4 @@
-"""The linearised control loop: MPC, estimator and plant; margins and sensitivity functions."""
+"""The linearized control loop: MPC, estimator and plant; margins and sensitivity functions."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 class MpcGain:
     """An MPC to first order: ``du_0 = by_state dz + by_load dd + by_before du_before + by_reference dr``.
 
-    It is exact as long as no bound acts and the prediction's linearisation stays the same.
+    It is exact as long as no bound acts and the prediction's linearization stays the same.
 
     Args:
         by_state: By the estimate of ``z = (x, h)``, ``(n_u, n_z)``.
@@ -55,7 +55,7 @@ def mpc_gain(
         x: Operating point ``(n_x,)``.
         u: Input there ``(n_u,)``, within the bounds.
         h: Hidden state ``(n_h,)``. Default: its fixed point.
-        system: Linearisation over ``(x, h)`` that the prediction is to have, e.g. of :func:`linearize_secant`.
+        system: Linearization over ``(x, h)`` that the prediction is to have, e.g. of :func:`linearize_secant`.
             Default: the tangent at the point.
 
     Raises:
@@ -155,7 +155,7 @@ def steady_filter(
         x: Operating point ``(n_x,)``.
         u: Input there ``(n_u,)``.
         h: Hidden state ``(n_h,)``. Default: its fixed point.
-        system: Linearisation over ``(x, h)`` instead of the tangent at the point. Default: none.
+        system: Linearization over ``(x, h)`` instead of the tangent at the point. Default: none.
 
     Raises:
         InputError: If a size is wrong, an output depends on the input at once, or the covariance does not settle.
@@ -244,8 +244,8 @@ class Margins:
 
 
 @dataclass(frozen=True)
-class Loop:
-    """A linearised loop of plant and output feedback, both discrete, with ``u = feedback y``.
+class LinearLoop:
+    """A linearized loop of plant and output feedback, both discrete, with ``u = feedback y``.
 
     Args:
         plant: ``control.StateSpace`` from inputs to outputs.
@@ -358,7 +358,7 @@ class Loop:
         return MappingProxyType({name: np.moveaxis(v, 0, -1) for name, v in parts.items()})
 
 
-def mpc_loop(gain: MpcGain, filter: SteadyFilter, plant: Any, *, delay: int = 0) -> Loop:
+def mpc_loop(gain: MpcGain, filter: SteadyFilter, plant: Any, *, delay: int = 0) -> LinearLoop:
     """The loop of an MPC's gain, a steady filter and a plant, in the order of ``closed_loop.simulate``.
 
     At ``t_k``: measure ``y_k``, ``w_k = w- + L (y_k - C w-)`` with ``w- = F w_{k-1} + G u_{k-1}``, then ``u_k`` from
@@ -412,7 +412,7 @@ def mpc_loop(gain: MpcGain, filter: SteadyFilter, plant: Any, *, delay: int = 0)
         late = _delayed(late)
     closed = _closed(late, feedback)
     poles = np.linalg.eigvals(closed.A).astype(np.complex128)
-    return Loop(late, feedback, closed, poles[np.argsort(-np.abs(poles), kind="stable")])
+    return LinearLoop(late, feedback, closed, poles[np.argsort(-np.abs(poles), kind="stable")])
 
 
 def _delayed(plant: Any) -> Any:

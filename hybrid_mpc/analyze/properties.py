@@ -13,7 +13,7 @@ from hybrid_mpc.analyze.linearize import control_toolbox, linearize, period
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.model import HybridModel
 
-# Poles, stabilisability, detectability and frequency responses of a linearised model.
+# Poles, stabilisability, detectability and frequency responses of a linearized model.
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -284,7 +284,7 @@ def physical_states(
     model: HybridModel, x: ArrayLike, u: ArrayLike, h: ArrayLike | None = None,
     *, x_scale: ArrayLike | None = None, u_scale: ArrayLike | None = None, system: Any = None,
 ) -> Reduced:  # fmt: skip
-    """The linearisation with as many states as the machine has, which mean what the machine's mean.
+    """The linearization with as many states as the machine has, which mean what the machine's mean.
 
     Balanced truncation of the way from inputs to all physical states (scaled by ``x_scale``, ``u_scale``), then the
     coordinates in which the reduced system's states are its approximations of these states. The hidden state's
@@ -297,7 +297,7 @@ def physical_states(
         h: Hidden state ``(n_h,)``. Default: its fixed point.
         x_scale: Size of each state that counts as 1 ``(n_x,)``. Default: 1.
         u_scale: Size of each input that counts as 1 ``(n_u,)``. Default: 1.
-        system: A linearisation over ``(x, h)`` to reduce instead of the tangent at the point. Default: none.
+        system: A linearization over ``(x, h)`` to reduce instead of the tangent at the point. Default: none.
 
     Returns:
         The reduced system over ``x``, with the model's outputs; the bound is that of the scaled states' response.
@@ -321,7 +321,7 @@ def physical_states(
     if reduced.order < n_x or np.linalg.cond(turn / by_x[:, None]) > 1.0 / np.sqrt(np.finfo(float).eps):
         raise InputError(
             f"model {model.name}: {n_x} states of the reduced system do not tell the physical states apart "
-            "(one is not reached by any input); keep the full linearisation"
+            "(one is not reached by any input); keep the full linearization"
         )
     small = control.ss(
         turn @ reduced.system.A @ np.linalg.inv(turn), turn @ reduced.system.B / by_u, c[:, :n_x], d, sys.dt,

@@ -49,19 +49,19 @@ def gain_schedule(
     model: HybridModel, points: Iterable[tuple[ArrayLike, ArrayLike]], q: ArrayLike, r: ArrayLike,
     *, speed: ArrayLike | None = None, kind: Kind = "harmonic",
 ) -> GainSchedule:  # fmt: skip
-    """LQR of the linearisation at each point, hidden states (at their fixed points) without weight.
+    """LQR of the linearization at each point, hidden states (at their fixed points) without weight.
 
     Args:
         model: The model.
         points: Operating points ``(x, u)``.
         q: Weights of the states ``(n_x,)``.
         r: Weights of the inputs ``(n_u,)``, positive.
-        speed: Size of the motion that the friction is linearised for, see :func:`linearize_secant`. Default: the
+        speed: Size of the motion that the friction is linearized for, see :func:`linearize_secant`. Default: the
             tangent at the point.
         kind: How, see there.
 
     Raises:
-        InputError: If there is no point, a size is wrong, or a linearisation is not stabilisable.
+        InputError: If there is no point, a size is wrong, or a linearization is not stabilisable.
 
     Source: Rugh and Shamma, *Research on gain scheduling*, Automatica 36 (2000).
 

@@ -33,7 +33,7 @@ def analyze(
         typer.Option(help="A recording to take a frequency response from; may be repeated."),
     ] = None,
     speed: Annotated[
-        float | None, typer.Option(help="Size of the motions that friction is linearised for [units of v].")
+        float | None, typer.Option(help="Size of the motions that friction is linearized for [units of v].")
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of what is drawn at random.", min=0, max=MOST_SEED)] = 0,
 ) -> None:
@@ -49,7 +49,7 @@ def analyze(
         progress.start("reading the model")
         subject, notes = subject_of(request)
         progress.finish("; ".join(notes))
-        progress.start("analysing")
+        progress.start("analyzing")
         findings = study(subject, progress.update)
         progress.finish("")
         progress.start("drawing")

@@ -40,7 +40,7 @@ def run(
     ] = None,
     device: Device = "cpu",
 ) -> None:
-    """Fit the prior, train, export, close the loop, monitor, learn the guard, analyse, and write a report.
+    """Fit the prior, train, export, close the loop, monitor, learn the guard, analyze, and write a report.
 
     Exit code 1 if a stage after the export could not run; the report then says why.
     """

@@ -30,7 +30,7 @@ def search(
         list[str] | None,
         typer.Option(
             help="NAME or NAME=LOW:HIGH of hidden, learning_rate, free_run_learning_rate, decay, batch, horizon, "
-            "anchors; may be repeated. Default: the first four."
+            "prior_replay; may be repeated. Default: the first four."
         ),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of data, trainings and search.", min=0, max=MOST_SEED)] = 0,

@@ -35,7 +35,7 @@ class BestOf:
     Guesses are the previous plan, shifted; the given ``starts``; and the plans of ``rivals``, controllers on
     other models of the same machine: whatever they find, this one starts there too, so that its plan is at
     most as expensive by its own model as theirs carried out. Plans are compared by their cost on a run of
-    the model itself, not by what a linearisation promises. Rivals have no memory here: their hidden state
+    the model itself, not by what a linearization promises. Rivals have no memory here: their hidden state
     starts at the fixed point at the estimated state, their disturbance is the estimate's own.
 
     Args:

@@ -9,7 +9,7 @@ from scipy.linalg import eigh, solve_triangular
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.rti import condense_all, condense_hessians
 from hybrid_mpc.control.soft import SoftRows
-from hybrid_mpc.model.stages import Linearisation
+from hybrid_mpc.model.stages import Linearization
 
 Array = NDArray[np.float64]
 
@@ -38,7 +38,7 @@ class StageCurvature:
         soft: The problem's soft bounds. Default: none has an expression that curves.
     """
 
-    def __init__(self, stages: Linearisation, ocp: OCP, n_h: int = 0, soft: SoftRows | None = None) -> None:
+    def __init__(self, stages: Linearization, ocp: OCP, n_h: int = 0, soft: SoftRows | None = None) -> None:
         self._n_x, self._n_u, self._n_h = ocp.n_x, ocp.n_u, n_h
         self._soft = soft if ocp.soft else None
         tolerated = 1 / np.sqrt(np.where(ocp.q > 0, ocp.q, 1.0))
@@ -120,7 +120,7 @@ class StageCurvature:
         n, n_x, m = len(u), self._n_x, self._shift.size
 
         def slopes(points: Array) -> Array:
-            _, by_x, by_u = soft.linearise(np.vstack([points[:, :n_x], z[-1:, :n_x]]), points[:, n_x:])
+            _, by_x, by_u = soft.linearize(np.vstack([points[:, :n_x], z[-1:, :n_x]]), points[:, n_x:])
             total = np.zeros((n + 1, m))
             np.add.at(total, soft.stage, multipliers[:, None] * np.hstack([by_x, by_u]))
             return total[:-1]  # bounds on states do not curve

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from hybrid_mpc.control.soft import SoftBound, fixed, number_content, same_expression, state_bounds
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.limits import at_rest, input_limits, numbers
-from hybrid_mpc.model.riccati import dare, linearisation, vector
+from hybrid_mpc.model.riccati import dare, linearization, vector
 from hybrid_mpc.records import known
 
 if TYPE_CHECKING:
@@ -176,7 +176,7 @@ class OCP:
         u_max: Upper bounds ``(n_u,)``; ``inf`` for none.
         du_max: Largest change per period ``(n_u,)``, positive. Default: none.
         terminal: ``"riccati"``, or a symmetric positive semi-definite ``(n_x, n_x)`` matrix ``P``.
-        working_point: ``(x, u)`` near which the machine works, at which ``"riccati"`` and a fallback linearise the
+        working_point: ``(x, u)`` near which the machine works, at which ``"riccati"`` and a fallback linearize the
             model. With a steep friction law take a moving point (see :func:`hybrid_mpc.model.riccati.lqr`). Default:
             zero,
             the input within its limits; the loops of a scenario take a moving one
@@ -451,13 +451,13 @@ soft, blocks, economic, starts
         change weight is counted as an input weight there: exact for ``r_delta = 0``.
 
         Raises:
-            InputError: If the linearised model is not stabilisable.
+            InputError: If the linearized model is not stabilisable.
         """
         if not isinstance(self.terminal, str):
             return self.terminal
         n_x = self.n_x
         x, u = self.working_point if self.working_point is not None else (np.zeros(n_x), self.rest_input)
-        a, b, _ = linearisation(model, x, u)
+        a, b, _ = linearization(model, x, u)
         q = np.diag(np.concatenate([self.q, np.zeros(model.n_h)]) * model.dt)
         p, _ = dare(a, b, q, np.diag(self.r + self.r_delta) * model.dt)
         if not model.n_h:

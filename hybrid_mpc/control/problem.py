@@ -58,10 +58,10 @@ class Solution:
         cost: Cost of the plan (see :class:`~hybrid_mpc.control.ocp.OCP`); NaN if it was not solved.
         status: How the solve ended.
         kkt: KKT residual in the QP's scaling, relative to its gradient [-]; of ``ipopt`` that of the NLP.
-        defect: Largest defect ``|x_{k+1} - f(x_k, h_k, u_k)|`` at the last linearisation, over (x, h).
+        defect: Largest defect ``|x_{k+1} - f(x_k, h_k, u_k)|`` at the last linearization, over (x, h).
         timing: Durations [ms] by name (``prepare``, ``feedback``); recorded, never used to decide.
         excess: Largest violation of a soft bound in the plan [its unit].
-        iterations: Linearisations (or iterations of the nonlinear solver) of this solve.
+        iterations: Linearizations (or iterations of the nonlinear solver) of this solve.
         curvature: Second derivatives of the stages by ``(x, u, h)`` ``(N, n, n)``, or by ``(x, u)`` where the
             hidden state's hardly matter, that ``sqp`` starts its next solve with; None from other solvers.
     """

@@ -16,7 +16,7 @@ from hybrid_mpc.control.qp import InputQP
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
 from hybrid_mpc.model.model import HybridModel
-from hybrid_mpc.model.stages import Derivatives, Linearisation, stages
+from hybrid_mpc.model.stages import Derivatives, Linearization, stages
 
 # Condensing: from the stages' Jacobians to the states as functions of the inputs.
 
@@ -29,13 +29,13 @@ GROUP = 10
 class Prepared:
     """Everything of an iteration that needs neither the estimate nor the reference.
 
-    With ``dz = (x, h) - (x_bar, h_bar)`` the linearised prediction is ``dz_{k+1} = A_k dz_k + B_k (du_k +
+    With ``dz = (x, h) - (x_bar, h_bar)`` the linearized prediction is ``dz_{k+1} = A_k dz_k + B_k (du_k +
     dd) + defect_k``; of it, ``x`` depends on the inputs by ``from_u``.
 
     Args:
-        u: Linearisation inputs ``(N, n_u)``.
-        z: Linearisation trajectory ``(N + 1, n_x + n_h)``.
-        d: Linearisation disturbance ``(n_u,)``.
+        u: Linearization inputs ``(N, n_u)``.
+        z: Linearization trajectory ``(N + 1, n_x + n_h)``.
+        d: Linearization disturbance ``(n_u,)``.
         u_prev: Input ``(n_u,)`` held before the plan.
         a_t: Transposed ``A_k`` ``(N, n_z, n_z)``.
         b: ``B_k`` ``(N, n_z, n_u)``.
@@ -205,7 +205,7 @@ NAN = float("nan")
 class CondensedController:
     """Nonlinear MPC by Gauss-Newton real-time iterations (RTI).
 
-    A period's work is split: :meth:`prepare` shifts the previous plan, linearises the model along it in
+    A period's work is split: :meth:`prepare` shifts the previous plan, linearizes the model along it in
     one call and condenses states and hidden states away (their multiple-shooting trajectory and
     its defects are kept); :meth:`feedback` embeds the new estimate and solves the QP of ``N n_u``
     unknowns (and a slack for every soft bound and period, where one acts). The QP's answer is checked,
@@ -216,7 +216,7 @@ class CondensedController:
     Args:
         model: The deployed model; ``n_h`` may be 0.
         ocp: The problem.
-        iterations: Linearisations per solve; 1 is the RTI, more converge to the NLP's solution.
+        iterations: Linearizations per solve; 1 is the RTI, more converge to the NLP's solution.
         compiled: Whether what is evaluated period by period is compiled as C, cached as
             :func:`nn_export.compile_function` says: the runs of a model with a ``side_by_side``, else its
             Jacobians too. Default: no.
@@ -272,7 +272,7 @@ class CondensedController:
         return self._problem
 
     @property
-    def stages(self) -> Linearisation:
+    def stages(self) -> Linearization:
         """The model along the horizon."""
         return self._stages
 
@@ -291,7 +291,7 @@ class CondensedController:
         return self._problem.initial(estimate, u)
 
     def prepare(self, previous: Solution, weight: Array | None = None) -> Prepared:
-        """Linearise and condense along the previous plan, shifted by one period.
+        """Linearize and condense along the previous plan, shifted by one period.
 
         Args:
             previous: The last plan. ``previous.u[0]`` is the input that is being held; the shifted plan
@@ -308,8 +308,8 @@ class CondensedController:
         weight = self._problem.weights(weight)
         return self._condense(u, z, previous.d, previous.u[0], weight, shifted=True)
 
-    def linearise(self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array) -> Prepared:
-        """Linearise and condense along a trajectory as it is: ``u`` ``(N, n_u)``, ``z`` ``(N + 1, n_z)``."""
+    def linearize(self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array) -> Prepared:
+        """Linearize and condense along a trajectory as it is: ``u`` ``(N, n_u)``, ``z`` ``(N + 1, n_z)``."""
         return self._condense(u, z, d, u_prev, weight, shifted=False)
 
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
@@ -380,14 +380,14 @@ class CondensedController:
     def finish(
         self, prepared: Prepared, estimate: Estimate, reference: Array, limits: Limits | None = None
     ) -> Solution:
-        """:meth:`feedback`, then linearised anew until there have been ``iterations``; arguments as there."""
+        """:meth:`feedback`, then linearized anew until there have been ``iterations``; arguments as there."""
         solution = self.feedback(prepared, estimate, reference, limits)
         for i in range(1, self._iterations):
             if not solution.status.ok:
                 break
             spent = solution.timing
             z = np.hstack([solution.x, solution.h])
-            again = self.linearise(solution.u, z, solution.d, prepared.u_prev, prepared.weight)
+            again = self.linearize(solution.u, z, solution.d, prepared.u_prev, prepared.weight)
             solution = self.feedback(again, estimate, reference, limits)
             total = {name: spent[name] + solution.timing[name] for name in spent}
             solution = replace(solution, timing=total, iterations=i + 1)

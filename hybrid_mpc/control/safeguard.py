@@ -60,7 +60,7 @@ class SafeController:
         controller: The controller to guard.
         fallback: Model, usually the fitted prior, whose LQR takes over. Default: none, then zero follows.
         max_age: Periods a plan may be followed without a successful solve.
-        working_point: ``(x, u)`` at which the fallback is linearised; see :func:`hybrid_mpc.model.riccati.lqr`.
+        working_point: ``(x, u)`` at which the fallback is linearized; see :func:`hybrid_mpc.model.riccati.lqr`.
             Default: the problem's own, else zero, the input within its limits.
         first: Controller that makes the first plan, before the loop starts; an
             :class:`~hybrid_mpc.control.sqp.SQPController` converges it. Default: ``controller``.
@@ -114,7 +114,7 @@ class SafeController:
             point = working_point or ocp.working_point or rest
             feedback = lqr(fallback, *rest, ocp.q, ocp.r + ocp.r_delta, working_point=point)
             self._gain = feedback.gain[:, : ocp.n_x]
-            self._late = feedback.gain[:, ocp.n_x : ocp.n_x + fallback.waiting]
+            self._late = feedback.gain[:, ocp.n_x : ocp.n_x + fallback.delay_states]
             self._fallback = _equilibrium_input(fallback)
             self._fallback(np.zeros(ocp.n_x))  # a CasADi function's first call is slow
 
@@ -186,7 +186,7 @@ class SafeController:
             weight: Factors on ``q`` ``(m, n_x)`` of the next period. Default: 1.
 
         Returns:
-            The linearisation, condensed; None for a solver without such a part.
+            The linearization, condensed; None for a solver without such a part.
         """
         return None if self._rti is None else self._rti.prepare(previous.solution, weight)
 

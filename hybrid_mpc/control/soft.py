@@ -181,9 +181,9 @@ class SoftRows:
 
     def values(self, x: Array, u: Array) -> Array:
         """Bounded values ``(M,)`` along states ``(N + 1, n_x)`` and inputs ``(N, n_u)``."""
-        return self.linearise(x, u)[0]
+        return self.linearize(x, u)[0]
 
-    def linearise(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
+    def linearize(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
         """Values ``(M,)`` and their derivatives by the row's state ``(M, n_x)`` and input ``(M, n_u)``."""
         n = self._horizon
         by_x = np.tile(np.eye(self._n_x)[self._states], (n, 1))
@@ -212,7 +212,7 @@ class SoftRows:
         """
         if not len(self):
             return np.zeros(0), np.zeros((0, self._n_x)), np.zeros((0, u.size))
-        value, by_x, by_u = self.linearise(x, u)
+        value, by_x, by_u = self.linearize(x, u)
         states = from_u.reshape(len(x), self._n_x, u.size)[self.stage]
         slope = (by_x[:, None, :] @ states)[:, 0, :]
         direct = np.flatnonzero(np.any(by_u != 0, axis=1))

@@ -79,7 +79,7 @@ class Landscape:
         """The run from ``z0`` on ``u``."""
         problem, n_x = self.problem, self.inner.ocp.n_x
         z = self.inner.stages.run(z0, u + case.d)
-        soft = problem.soft.linearise(z[:, :n_x], u)
+        soft = problem.soft.linearize(z[:, :n_x], u)
         excess = problem.soft.excess(soft[0])
         return Run(u, z, soft, problem.cost(z, u, case.u_prev, case.target, excess))
 
@@ -220,7 +220,7 @@ class Descent:
         self._damping = 0.0
 
     def iterate(self) -> None:
-        """One linearisation, and QPs until the step of one lowers the cost."""
+        """One linearization, and QPs until the step of one lowers the cost."""
         self.count += 1
         prepared = self._land.condensed(self.at, self._case)
         hessian = self._hessian(prepared)
@@ -410,7 +410,7 @@ class SQPController:
         ocp: The problem.
         tolerance: Converged when the convex model promises to lower the cost by less than this share, and
             the KKT residual is at most 1e-6.
-        iterations: Most linearisations; the plan then reached has the status STOPPED and may be applied.
+        iterations: Most linearizations; the plan then reached has the status STOPPED and may be applied.
         compiled: As in :class:`~hybrid_mpc.control.rti.CondensedController`.
 
     Raises:

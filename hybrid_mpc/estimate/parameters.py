@@ -195,7 +195,7 @@ def _check_model(model: HybridModel, prior: HybridModel) -> None:
             f"parameter states: the states {[s.name for s in model.states]} of model {model.name} are not positions "
             "and then their velocities; nothing else is dealt with, no lags"
         )
-    if model.waiting:
+    if model.delay_states:
         raise InputError(
             f"parameter states: the inputs of model {model.name} act later; parameters as states are for "
             "models without a delay"

@@ -74,7 +74,7 @@ def process_noise(model: HybridModel, recordings: Sequence[Known], most: int = 4
             x_next, h = (
                 m.full().ravel() for m in model.step(recording.x[k], h, recording.u[k], model.w, model.p)
             )
-            if k >= model.waiting:  # before, nobody knows what was under way
+            if k >= model.delay_states:  # before, nobody knows what was under way
                 errors.append(x_next - recording.x[k + 1])
         if len(errors) >= most:
             break

@@ -1,7 +1,7 @@
-"""Anchors: where nothing was measured a learned correction is asked to fade, and the prior stands alone.
+"""PriorReplay: where nothing was measured a learned correction is asked to fade, and the prior stands alone.
 
 A network extrapolates as it likes. Beyond its recordings, upright on a pendulum that has only been swung, say, its
-correction is a number that no datum has asked for, and a controller that goes there takes it for knowledge. Anchors
+correction is a number that no datum has asked for, and a controller that goes there takes it for knowledge. PriorReplay
 are short runs of the prior from states anywhere in the measured range, all the way round for an angle. Where they pass
 through states that no recording comes near, the training asks for no correction.
 """
@@ -40,7 +40,7 @@ recordings, an angle by sine and cosine."""
 
 
 @dataclass(frozen=True)
-class Anchors:
+class PriorReplay:
     """Runs of the prior, and how much each of their states counts.
 
     Args:
@@ -54,34 +54,34 @@ class Anchors:
     u: Tensor
     weight: Tensor
 
-    def take(self, index: Tensor) -> Anchors:
+    def take(self, index: Tensor) -> PriorReplay:
         """The runs of ``index``."""
         index = index.to(self.x.device)
-        return Anchors(self.x[:, index], self.u[:, index], self.weight[:, index])
+        return PriorReplay(self.x[:, index], self.u[:, index], self.weight[:, index])
 
-    def to(self, device: torch.device) -> Anchors:
+    def to(self, device: torch.device) -> PriorReplay:
         """The same runs on a device."""
-        return Anchors(self.x.to(device), self.u.to(device), self.weight.to(device))
+        return PriorReplay(self.x.to(device), self.u.to(device), self.weight.to(device))
 
 
-def make_anchors(prior: Prior, training: Sequence[Trajectory], seed: int) -> Anchors:
-    """Anchors around training trajectories.
+def make_prior_replay(prior: Prior, training: Sequence[Trajectory], seed: int) -> PriorReplay:
+    """PriorReplay around training trajectories.
 
     Args:
         prior: The fitted prior.
         training: Training trajectories.
-        seed: Of starts and inputs; the same seed and data give the same anchors.
+        seed: Of starts and inputs; the same seed and data give the same prior_replay.
 
     Example:
         >>> from scenarios.unbalanced_disk import scenario
         >>> prior, t = scenario.prior(), 0.025 * np.arange(500.0)
         >>> x = 0.3 * np.column_stack([np.sin(3 * t), 3 * np.cos(3 * t)])  # hangs and swings a little
         >>> u, y = np.zeros((500, 1)), x[:, :1]
-        >>> anchors = make_anchors(prior, [Trajectory("run", "train", 0.025, t, u, y, x, 0 * x)], seed=0)
-        >>> anchors.x.shape
+        >>> prior_replay = make_prior_replay(prior, [Trajectory("run", "train", 0.025, t, u, y, x, 0 * x)], seed=0)
+        >>> prior_replay.x.shape
         torch.Size([30, 2000, 2])
-        >>> up = (anchors.x[..., 0].cos() < -0.9) & (anchors.x[..., 1].abs() < 0.9)  # as fast as was measured
-        >>> bool(anchors.weight[up].min() > 0.99)
+        >>> up = (prior_replay.x[..., 0].cos() < -0.9) & (prior_replay.x[..., 1].abs() < 0.9)  # as fast as was measured
+        >>> bool(prior_replay.weight[up].min() > 0.99)
         True
     """
     rng = np.random.default_rng([seed, 1])
@@ -97,15 +97,15 @@ def make_anchors(prior: Prior, training: Sequence[Trajectory], seed: int) -> Anc
     distance, _ = cKDTree(places(x)).query(places(states.reshape(-1, x.shape[1])))
     weight = 1.0 - np.exp(-((distance.reshape(states.shape[:2]) / NEAR) ** 2))
     weight *= (angles | ((states >= low) & (states <= high))).all(-1)
-    return Anchors(torch.tensor(states), torch.tensor(inputs), torch.tensor(weight))
+    return PriorReplay(torch.tensor(states), torch.tensor(inputs), torch.tensor(weight))
 
 
-def anchor_penalty(step: RecurrentStep, anchors: Anchors) -> Tensor:
-    """Mean over all anchors of weight times squared correction over its scale, a value per network."""
+def prior_replay_penalty(step: RecurrentStep, prior_replay: PriorReplay) -> Tensor:
+    """Mean over all prior_replay of weight times squared correction over its scale, a value per network."""
     stack = cast(StackedNetwork, step.network)
-    features = step.stacked_features(anchors.x, anchors.u)
-    out, _ = stack.sequence(features, stack.initial(anchors.x.shape[1]))
-    weight = anchors.weight[FOLLOWED:, None, :, None]
+    features = step.stacked_features(prior_replay.x, prior_replay.u)
+    out, _ = stack.sequence(features, stack.initial(prior_replay.x.shape[1]))
+    weight = prior_replay.weight[FOLLOWED:, None, :, None]
     return (weight * out[FOLLOWED:].square()).mean(dim=(0, 2, 3))
 
 

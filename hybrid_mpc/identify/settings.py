@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.networks import Cell
 from hybrid_mpc.identify.objectives import OBJECTIVES, CombinationName
-from hybrid_mpc.machine.specification import check_anchors
+from hybrid_mpc.machine.specification import check_prior_replay
 
 Kind = Literal["rnn", "pgrnn", "mopgrnn"]
 Form = Literal["hybrid", "literal"]
@@ -55,7 +55,8 @@ class TrainingSettings:
         prior_parameters: ``"fixed"`` at their fitted values, or ``"trained"`` along within their bounds, each
             network its own (:mod:`~hybrid_mpc.identify.step`). The energy balance that trains and
             judges keeps the fitted values.
-        anchors: Weight of the mean square of the correction (in its own scale) in states that no recording comes near
+        prior_replay: Weight of the mean square of the correction (in its own scale) in states that no recording comes
+            near
             (:mod:`~hybrid_mpc.identify.prior_replay`), so that the prior stands alone there, with its parameters as
             they are trained along if they are. It stands beside the objectives in units of their bounds; these fall
             as the training goes on. Validation, which keeps the best weights, does not know it. An rnn has no prior
@@ -63,8 +64,8 @@ class TrainingSettings:
 
     Raises:
         InputError: If a name is not known, there is no objective, weights do not fit the objectives, an rnn is to
-            train the prior that it does not have, or anchors are negative or asked of the literal form, whose network
-            gives the whole derivative and corrects nothing.
+            train the prior that it does not have, or prior_replay are negative or asked of the literal form, whose
+            network gives the whole derivative and corrects nothing.
 
     Example:
         >>> TrainingSettings("mopgrnn", 16, 4, 100, 100, seed=0, warm=10).objectives
@@ -92,7 +93,7 @@ class TrainingSettings:
     energy: Reading = "stage"
     fused: bool = False
     prior_parameters: PriorParameters = "fixed"
-    anchors: float = 0.0
+    prior_replay: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("objectives", "weights"):  # lists, where they come from a file
@@ -112,10 +113,10 @@ class TrainingSettings:
             )
         if self.kind == "rnn" and self.prior_parameters == "trained":
             raise InputError("an rnn has no prior to train along; leave prior_parameters 'fixed'")
-        check_anchors(self.anchors)
-        if self.anchors and self.form == "literal":
+        check_prior_replay(self.prior_replay)
+        if self.prior_replay and self.form == "literal":
             raise InputError(
-                "the literal form corrects no prior, so it cannot be anchored to it; leave anchors 0"
+                "the literal form corrects no prior, so it cannot be anchored to it; leave prior_replay 0"
             )
 
     @property

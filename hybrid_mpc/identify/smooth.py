@@ -19,7 +19,7 @@ from hybrid_mpc.machine.torch_prior import Prior
 
 Array = NDArray[np.float64]
 SWEEPS = 5
-"""Linearisations along the smoothed trajectory; the last ones change it by far less than the noise."""
+"""Linearizations along the smoothed trajectory; the last ones change it by far less than the noise."""
 DECADES = (-2.0, 6.0)
 """Range searched for the ratio of walk to sigma [1/s^2, in the machine's seconds]: from a prior that is right to data
 that jump."""
@@ -44,7 +44,7 @@ class Smoother:
         walk: Standard deviation of d's change per period ``(n_q,)`` [output unit / s^2].
 
     Source: Rauch, Tung, Striebel, *Maximum likelihood estimates of linear dynamic systems* (1965); iterated
-    linearisation: Bell, *The iterated Kalman smoother as a Gauss-Newton method* (1994).
+    linearization: Bell, *The iterated Kalman smoother as a Gauss-Newton method* (1994).
     """
 
     prior: Prior

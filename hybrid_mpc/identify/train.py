@@ -31,7 +31,7 @@ from hybrid_mpc.identify.dataset import (
 )
 from hybrid_mpc.identify.networks import StackedNetwork, make_stack
 from hybrid_mpc.identify.objectives import OBJECTIVES, Combination, combine, free_run, teacher_forced
-from hybrid_mpc.identify.prior_replay import BATCH, anchor_penalty, make_anchors
+from hybrid_mpc.identify.prior_replay import BATCH, make_prior_replay, prior_replay_penalty
 from hybrid_mpc.identify.settings import KINDS, Kind, TrainingSettings
 from hybrid_mpc.identify.step import (
     PREFIX,
@@ -49,7 +49,7 @@ from hybrid_mpc.machine.torch_prior import Prior
 
 
 @dataclass(frozen=True)
-class Fault:
+class TrainingFailure:
     """Updates of one network that were skipped because a number was not finite.
 
     Args:
@@ -88,7 +88,7 @@ class Trained:
     validation: NDArray[np.float64]
     curve: Mapping[str, NDArray[np.float64]]
     skipped: NDArray[np.int64]
-    faults: tuple[Fault, ...] = ()
+    faults: tuple[TrainingFailure, ...] = ()
 
     @property
     def best(self) -> int:
@@ -225,8 +225,8 @@ class TrainingRun:
         self.fixed = self.windows.take(torch.linspace(0, len(windows) - 1, 64).round().long().unique())
         prior = prior if device == "cpu" else copy.deepcopy(prior)  # the prior given stays where it is
         self.physics = StackedPrior(prior, s.networks) if s.prior_parameters == "trained" else None
-        anchored = bool(s.anchors) and s.use_prior
-        self.anchors = make_anchors(prior, training, s.seed).to(self.device) if anchored else None
+        anchored = bool(s.prior_replay) and s.use_prior
+        self.prior_replay = make_prior_replay(prior, training, s.seed).to(self.device) if anchored else None
         step = step_for(prior, stack_for(prior, s), self.scaling, dt, s, self.physics)
         self.step = step.to(self.device)
         self.weights = dict(self.step.network.named_parameters())
@@ -241,7 +241,7 @@ class TrainingRun:
         self.index = self._combine({"bounds": ones})
         self.skipped, self.in_row = torch.zeros(2, s.networks, dtype=torch.int64, device=self.device)
         self.stopped = torch.zeros(s.networks, dtype=torch.bool, device=self.device)
-        self.faults: dict[int, Fault] = {}
+        self.faults: dict[int, TrainingFailure] = {}
         self.rows: list[Tensor] = []
 
     @property
@@ -275,9 +275,9 @@ class TrainingRun:
         batch = self.windows.take(torch.tensor(rng.integers(len(self.windows), size=s.batch)))
         losses = self._losses(batch, s.objectives if s.kind == "mopgrnn" else s.objectives[:1])
         value = self.index.value(losses) if s.kind == "mopgrnn" else losses[:, 0] / self.index.bounds[:, 0]
-        if self.anchors is not None:
-            index = torch.tensor(rng.integers(self.anchors.x.shape[1], size=BATCH))
-            value = value + s.anchors * anchor_penalty(self.step, self.anchors.take(index))
+        if self.prior_replay is not None:
+            index = torch.tensor(rng.integers(self.prior_replay.x.shape[1], size=BATCH))
+            value = value + s.prior_replay * prior_replay_penalty(self.step, self.prior_replay.take(index))
         self.optimizer.zero_grad()
         value.sum().backward()
         finite = self._clip()
@@ -331,7 +331,7 @@ class TrainingRun:
         for name in ("best", "skipped", "in_row", "stopped"):
             setattr(self, name, tensors[name])
         self.rows = list(tensors["rows"])
-        self.faults = {f["network"]: Fault(**f) for f in numbers["faults"]}
+        self.faults = {f["network"]: TrainingFailure(**f) for f in numbers["faults"]}
         self.done, self.free = int(numbers["done"]), bool(numbers["free"])
 
     def result(self) -> Trained:
@@ -381,7 +381,7 @@ class TrainingRun:
         for i in skips.nonzero().flatten().tolist():
             bad = (~torch.isfinite(losses[i].detach())).nonzero().flatten().tolist()
             objective = self.settings.objectives[bad[0]] if bad else "gradient"
-            self.faults[i] = Fault(i, objective, self.done, bool(self.stopped[i]))
+            self.faults[i] = TrainingFailure(i, objective, self.done, bool(self.stopped[i]))
         if self.stopped.any():
             with torch.no_grad():
                 for name, w in self.weights.items():
@@ -417,7 +417,7 @@ def _by(values: Tensor, weight: Tensor) -> Tensor:
     return values.view(-1, *([1] * (weight.dim() - 1)))
 
 
-__all__ = ["train", "TrainingSettings", "Trained", "Fault", "Kind", "KINDS", "Progress"]
+__all__ = ["train", "TrainingSettings", "Trained", "TrainingFailure", "Kind", "KINDS", "Progress"]
 
 Progress = Callable[[int, int, float], None]
 
@@ -437,7 +437,7 @@ def train(
     First teacher forcing (the paper's training), then free runs with back-propagation through the
     integrator. All kinds get the same steps, batches and data. A network whose gradient is no number skips
     that update; after several in a row it stops with its best weights, and ``Trained.faults`` says what for.
-    With ``settings.anchors`` corrections fade where no training trajectory comes near.
+    With ``settings.prior_replay`` corrections fade where no training trajectory comes near.
 
     Args:
         prior: The fitted prior.
@@ -476,8 +476,8 @@ def _key(
     settings = asdict(s)
     if s.prior_parameters == "fixed":
         del settings["prior_parameters"]  # the key is then that of trainings that could do nothing else
-    if not s.anchors:
-        del settings["anchors"]  # likewise
+    if not s.prior_replay:
+        del settings["prior_replay"]  # likewise
     digest = hashlib.sha256(json.dumps([settings, prior.values], sort_keys=True).encode())
     for trajectory in (*training, *validation):
         digest.update(np.ascontiguousarray(trajectory.x).tobytes())

@@ -47,7 +47,7 @@ USUAL: Mapping[str, tuple[float, float]] = {
     "decay": (10.0, 30000.0),
     "batch": (8, 128),
     "horizon": (20, 100),
-    "anchors": (0.3, 300.0),
+    "prior_replay": (0.3, 300.0),
 }
 """Bounds of a setting that is searched without bounds of its own."""
 
@@ -65,8 +65,8 @@ class SearchSpace:
         batch: Windows a step, whole numbers. Default: not searched; twice the batch is twice the work.
         horizon: Most scored periods of a free-run window, whole numbers. Default: not searched; twice the
             horizon is twice the work.
-        anchors: Weight of fading corrections where nothing was measured. Default: not searched. Zero, none, is on no
-            logarithmic scale: whoever has none compares with a search without them.
+        prior_replay: Weight of fading corrections where nothing was measured. Default: not searched. Zero, none, is
+            on no logarithmic scale: whoever has none compares with a search without them.
 
     Raises:
         InputError: If nothing is searched, or bounds are not positive, not rising, or not whole where they must be.
@@ -82,7 +82,7 @@ class SearchSpace:
     decay: tuple[float, float] | None = (10.0, 30000.0)
     batch: tuple[int, int] | None = None
     horizon: tuple[int, int] | None = None
-    anchors: tuple[float, float] | None = None
+    prior_replay: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -448,8 +448,8 @@ def _identity(
 
 
 def _without_default(settings: TrainingSettings | SearchSpace) -> dict[str, Any]:
-    """As plain data; without anchors, where there are none, as in searches from before there were any."""
-    return {name: value for name, value in asdict(settings).items() if name != "anchors" or value}
+    """As plain data; without prior_replay, where there are none, as in searches from before there were any."""
+    return {name: value for name, value in asdict(settings).items() if name != "prior_replay" or value}
 
 
 def _finished(study: optuna.Study) -> list[FrozenTrial]:

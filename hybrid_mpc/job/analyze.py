@@ -19,7 +19,7 @@ from hybrid_mpc.analyze.linearize import (
     linearize_along,
     linearize_at_speed,
 )
-from hybrid_mpc.analyze.margins import Loop, mpc_gain, mpc_loop, steady_filter
+from hybrid_mpc.analyze.margins import LinearLoop, mpc_gain, mpc_loop, steady_filter
 from hybrid_mpc.analyze.measured import (
     MeasuredResponse,
     multisine_response,
@@ -44,14 +44,14 @@ from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.scenario import Scenario, scenario_of
 from nn_export import Program, load_programs
 
-# From an artifact folder and a scenario to what is analysed.
+# From an artifact folder and a scenario to what is analyzed.
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Subject:
-    """What is analysed.
+    """What is analyzed.
 
     Args:
         models: By name; ``"prior"`` and ``"hybrid"`` are compared.
@@ -80,7 +80,7 @@ class Subject:
 
 @dataclass(frozen=True)
 class Request:
-    """What is to be analysed, as it is asked for.
+    """What is to be analyzed, as it is asked for.
 
     Args:
         folder: Artifact folder, or the folder of the run that holds it as ``model``.
@@ -99,7 +99,7 @@ class Request:
 
 
 def subject_of(request: Request) -> tuple[Subject, tuple[str, ...]]:
-    """What is analysed, and in words where it came from.
+    """What is analyzed, and in words where it came from.
 
     Args:
         request: What is asked for.
@@ -226,7 +226,7 @@ def _recordings(
 Part: TypeAlias = tuple[dict[str, Any], dict[str, Any]]
 """Plain numbers, and curves by name."""
 POINTS = ("rest", "working", "moving", "driven")
-"""Linearisations: the tangent at rest, the describing function of motions of working size around it, the tangent in
+"""Linearizations: the tangent at rest, the describing function of motions of working size around it, the tangent in
 motion at working speed, and the mean along a driven run."""
 FARTHEST = 1e6
 """Zeros farther out belong to a way through the system that begins later: rounding, over the fall of its gain."""
@@ -290,7 +290,7 @@ def friction_part(subject: Subject, points: Mapping[str, tuple[Array, Array]]) -
 
 
 def systems(subject: Subject, name: str, point: tuple[Array, Array]) -> dict[str, Any]:
-    """The linearisations of a model, by the names in :data:`POINTS`."""
+    """The linearizations of a model, by the names in :data:`POINTS`."""
     model, (x, h), u = subject.models[name], point, np.zeros(subject.models[name].n_u)
     return {
         "rest": linearize(model, x, u, h), "working": linearize_secant(model, x, u, subject.speed, h),
@@ -300,7 +300,7 @@ def systems(subject: Subject, name: str, point: tuple[Array, Array]) -> dict[str
 
 
 def linear_part(subject: Subject, points: Mapping[str, tuple[Array, Array]]) -> Part:
-    """Modes, reduced systems, frequency and step responses of the linearisations."""
+    """Modes, reduced systems, frequency and step responses of the linearizations."""
     control = control_toolbox()
     result: dict[str, Any] = {}
     arrays: dict[str, Any] = {}
@@ -527,7 +527,7 @@ def loops_part(subject: Subject, points: Mapping[str, tuple[Array, Array]]) -> P
     return result, arrays
 
 
-def _judged(loop: Loop, dt: float) -> Part:
+def _judged(loop: LinearLoop, dt: float) -> Part:
     row: dict[str, Any] = {"stable": loop.stable, "radius": abs(loop.poles[0])}
     omega = np.geomspace(0.05, np.pi / dt, 500)
     response = frequency_response(loop.broken(), omega)
@@ -559,10 +559,10 @@ class Findings:
 
 
 def study(subject: Subject, say: Say | None = None) -> Findings:
-    """Analyse the models of a subject, part after part; a part that cannot be had says why.
+    """Analyze the models of a subject, part after part; a part that cannot be had says why.
 
     Args:
-        subject: What is analysed.
+        subject: What is analyzed.
         say: Called with ``(part, done, total, text)``. Default: nothing is said.
     """
     result: dict[str, Any] = {}

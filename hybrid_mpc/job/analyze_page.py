@@ -32,7 +32,7 @@ SECTIONS: Sequence[tuple[str, str, tuple[str, ...], tuple[str, ...], tuple[str, 
         ),
     ),
     (
-        "Friction in a linearisation",
+        "Friction in a linearization",
         "friction",
         ("friction",),
         ("friction",),
@@ -44,13 +44,13 @@ SECTIONS: Sequence[tuple[str, str, tuple[str, ...], tuple[str, ...], tuple[str, 
         ),
     ),
     (
-        "Linearised models",
+        "Linearized models",
         "linear",
         ("modes",),
         ("poles", "bode_rest", "bode_working", "bode_moving", "bode_driven", "steps"),
         (
             "Each model four times: the tangent at rest; at rest with friction of working size; the tangent in "
-            "motion; the mean of the tangents along a run driven by a multisine (statistical linearisation). The "
+            "motion; the mean of the tangents along a run driven by a multisine (statistical linearization). The "
             "tangent in motion holds for deviations over times that are short against the motion. With friction "
             "of working size only the columns by the speeds are chords: what a network made of the other signals "
             "stays its tangent at rest, and that is stiction where the machine sticks.",
@@ -77,7 +77,7 @@ SECTIONS: Sequence[tuple[str, str, tuple[str, ...], tuple[str, ...], tuple[str, 
             "the extended Kalman filter in its steady state, quiet, and as it is for a few periods after a load "
             "came or went. 'prior on hybrid' is the prior's controller and filter around the hybrid as the "
             "machine. A loop that is not stable here has no margins; the real loop is nonlinear, and bounded by "
-            "what the linearisation leaves out.",
+            "what the linearization leaves out.",
         ),
     ),
     (
@@ -85,7 +85,7 @@ SECTIONS: Sequence[tuple[str, str, tuple[str, ...], tuple[str, ...], tuple[str, 
         "schedule",
         ("gain_schedule",),
         ("schedule",),
-        ("LQR of the linearisations over the positions, with the weights of the control problem.",),
+        ("LQR of the linearizations over the positions, with the weights of the control problem.",),
     ),
     (
         "Memory of the recurrent part",
@@ -124,7 +124,7 @@ def figures(folder: Path, subject: Subject, findings: Findings) -> dict[str, tup
 
     Args:
         folder: Where the PNG files go; made if missing.
-        subject: What was analysed.
+        subject: What was analyzed.
         findings: What was found.
 
     Returns:
@@ -166,7 +166,7 @@ def _linear(subject: Subject, f: Findings) -> Named:
             {n: f.arrays.get(f"linear/{n}/{point}/{kind}", ()) for n in _names(subject)}
             for kind in ("poles", "zeros")
         )
-        caption = f"Poles and zeros of the linearisations {_TITLES[point]}."
+        caption = f"Poles and zeros of the linearizations {_TITLES[point]}."
         yield figure, analysis.pole_map(poles, some.dt, zeros=zeros), caption
     signals: dict[str, Any] = {"input_signal": some.inputs[0], "output_signal": some.outputs[0]}
     for point in POINTS:
@@ -183,7 +183,7 @@ def _linear(subject: Subject, f: Findings) -> Named:
         yield (
             f"bode_{point}",
             drawn,
-            f"Bode plot of the linearisations {_TITLES[point]}.{_NOTES.get(point, '')}",
+            f"Bode plot of the linearizations {_TITLES[point]}.{_NOTES.get(point, '')}",
         )
     steps = {
         point: {
@@ -196,7 +196,7 @@ def _linear(subject: Subject, f: Findings) -> Named:
     yield (
         "steps",
         analysis_models.step_responses(steps, **signals),
-        "Unit step responses of the linearisations.",
+        "Unit step responses of the linearizations.",
     )
 
 
@@ -227,9 +227,9 @@ def _loops(subject: Subject, f: Findings) -> Named:
             if row["stable"]:
                 shown[label] = {k: f.arrays[f"{at}/{k}"] for k in ("omega", "S", "T")}
     if shown:
-        caption = "Sensitivity functions at the plant's input, linearised along a driven run."
+        caption = "Sensitivity functions at the plant's input, linearized along a driven run."
         yield "sensitivity", analysis_loops.sensitivity_functions(shown), caption
-    caption = "Nyquist curves of the loops, linearised along a driven run; positive frequencies."
+    caption = "Nyquist curves of the loops, linearized along a driven run; positive frequencies."
     yield "nyquist", analysis_loops.nyquist(curves, modulus=0.5), caption
 
 
@@ -269,7 +269,7 @@ def _some(subject: Subject) -> Any:
 
 
 MODES = 6
-"""Modes of each linearisation in the page's table; the CSV has all."""
+"""Modes of each linearization in the page's table; the CSV has all."""
 
 
 def write_analysis(
@@ -279,7 +279,7 @@ def write_analysis(
 
     Args:
         out: Folder; made if missing.
-        subject: What was analysed.
+        subject: What was analyzed.
         findings: What was found.
         notes: Where the numbers came from.
         command: The command line that repeats it.
@@ -374,7 +374,7 @@ def _modes(part: dict[str, Any]) -> Table:
     return Table(
         ("model", "point", "pole, real", "pole, imaginary", "frequency [rad/s]", "damping", "reach", "see",
          "Hankel singular value (own order)"), rows,
-        "Modes of the linearisations; reach and see are distances from being uncontrollable and unobservable.",
+        "Modes of the linearizations; reach and see are distances from being uncontrollable and unobservable.",
     )  # fmt: skip
 
 
@@ -392,7 +392,7 @@ def _margins(part: dict[str, Any]) -> Table:
     return Table(
         ("loop", "point", "filter", "stable", "spectral radius", "gain up", "gain down", "phase [rad]", "delay [s]",
          "delay [periods]", "modulus", "disk"), rows,
-        "Margins of the linearised loops (controller on machine), broken at the plant's input.",
+        "Margins of the linearized loops (controller on machine), broken at the plant's input.",
     )  # fmt: skip
 
 
@@ -472,7 +472,7 @@ def _sections(
 
 
 def _leading(modes: Table) -> Table:
-    """The first modes of each linearisation."""
+    """The first modes of each linearization."""
     rows: list[Any] = []
     for row in modes.rows:
         if sum(r[:2] == row[:2] for r in rows) < MODES:

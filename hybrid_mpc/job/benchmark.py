@@ -32,7 +32,7 @@ from hybrid_mpc.job.benchmark_runs import (
 from hybrid_mpc.job.check import check_scenario
 from hybrid_mpc.job.context import Progress, Silent
 from hybrid_mpc.job.engine import run_jobs
-from hybrid_mpc.job.folder import Claim, check_claim
+from hybrid_mpc.job.folder import JobNote, check_same_job
 from hybrid_mpc.job.stages.export import versions
 from hybrid_mpc.job.stages.identify import is_trained, load_trained, save_trained
 from hybrid_mpc.machine.specification import BenchmarkBudget
@@ -158,7 +158,7 @@ def settings_of(kind: str, budget: BenchmarkBudget, *, seed: int, warm: int) -> 
         horizon=budget.horizon,
         batch=budget.batch,
         decay=budget.decay,
-        anchors=budget.anchors,
+        prior_replay=budget.prior_replay,
         objectives=("position", "energy"),
         fused=True,
     )
@@ -608,12 +608,12 @@ def _claim(out: Path, settings: BenchmarkSettings, data: Recordings) -> None:
             [[p.role, p.name, p.t[0], p.t[-1]] for p in (*data.train, *data.valid, *data.held_back)]
         ),
     }
-    claim = Claim(
+    claim = JobNote(
         "benchmark", NOTE, own, lambda folder: write_document(folder / NOTE, own),
         lambda folder: read_document(folder / NOTE),
     )  # fmt: skip
     there = (out / NOTE).is_file()
-    check_claim(out, claim, resume=there)
+    check_same_job(out, claim, resume=there)
     if not there:
         claim.write(out)
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 ORACLE_ITERATIONS = 1
 FIRST_ITERATIONS = 10
-"""Linearisations an oracle makes from each of its starts in a period, and for its first plan from all of them. In a
+"""Linearizations an oracle makes from each of its starts in a period, and for its first plan from all of them. In a
 period it starts from its last plan and from the rival's that is cheaper by its own equations."""
 
 

@@ -13,7 +13,7 @@ from hybrid_mpc.files import LOCK, check_writable, digest, is_empty, locked
 
 
 @dataclass(frozen=True)
-class Claim:
+class JobNote:
     """What a job says of itself in its folder.
 
     Args:
@@ -62,7 +62,7 @@ def _check_note(out: Path, noun: str, file: str, resume: bool) -> None:
         raise InputError(f"{out} already holds a {noun}; add --resume to finish it, or choose another --out")
 
 
-def check_claim(out: Path, claim: Claim, *, resume: bool) -> None:
+def check_same_job(out: Path, claim: JobNote, *, resume: bool) -> None:
     """Refuse a folder that holds something else, or another job than the one that claims it.
 
     Args:
@@ -85,7 +85,7 @@ def check_claim(out: Path, claim: Claim, *, resume: bool) -> None:
 
 
 @contextmanager
-def open_folder(out: Path, claim: Claim, *, resume: bool) -> Iterator[None]:
+def open_folder(out: Path, claim: JobNote, *, resume: bool) -> Iterator[None]:
     """A job's folder while it works: made, held against other processes, the job noted in it.
 
     Args:
@@ -99,10 +99,10 @@ def open_folder(out: Path, claim: Claim, *, resume: bool) -> Iterator[None]:
 
     Example: ``with open_folder(Path("runs/mine"), claim, resume=False): ...``
     """
-    check_claim(out, claim, resume=resume)
+    check_same_job(out, claim, resume=resume)
     check_writable(out)
     with locked(out):
-        check_claim(out, claim, resume=resume)  # another process may have been quicker
+        check_same_job(out, claim, resume=resume)  # another process may have been quicker
         if not (out / claim.file).is_file():
             claim.write(out)
         yield

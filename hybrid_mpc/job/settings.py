@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_json, read_object, sha256, write_json
-from hybrid_mpc.job.folder import Claim
+from hybrid_mpc.job.folder import JobNote
 
 # Settings of a run, those of its networks from a file, and the folder that holds it.
 
@@ -17,10 +17,10 @@ FILE = "run.json"
 WHOLE = ("hidden", "networks", "teacher_steps", "free_run_steps", "horizon", "validation_horizon", "batch")
 MOST = {
     "hidden": 4096, "networks": 1024, "teacher_steps": 10**8, "free_run_steps": 10**8, "horizon": 10**5,
-    "validation_horizon": 10**6, "batch": 10**6, "decay": 1e12, "learning_rates": 1.0, "anchors": 1e12,
+    "validation_horizon": 10**6, "batch": 10**6, "decay": 1e12, "learning_rates": 1.0, "prior_replay": 1e12,
 }  # fmt: skip
 """Largest values: a file of settings must not ask for more memory than a machine has."""
-NETWORK = (*WHOLE, "decay", "learning_rates", "anchors")
+NETWORK = (*WHOLE, "decay", "learning_rates", "prior_replay")
 """What a file of network settings may hold: arguments of ``identification.TrainingSettings``."""
 
 
@@ -97,7 +97,7 @@ def read_network(path: Path) -> dict[str, Any]:
         numbers = value if name == "learning_rates" and isinstance(value, list) else [value]
         kinds = (int,) if name in WHOLE else (int, float)
         good = all(isinstance(v, kinds) and not isinstance(v, bool) and abs(v) <= MOST[name] for v in numbers)
-        positive = good and all(v > 0 or (v == 0 and name in ("decay", "anchors")) for v in numbers)
+        positive = good and all(v > 0 or (v == 0 and name in ("decay", "prior_replay")) for v in numbers)
         if not positive or (name == "learning_rates" and len(numbers) != 4):
             needed = f"a whole number from 1 to {MOST[name]}" if name in WHOLE else "a number of 0 or more"
             needed = "four positive numbers of at most 1" if name == "learning_rates" else needed
@@ -112,14 +112,14 @@ class Identified(Protocol):
         """Settings as plain data."""
 
 
-def claim(settings: Identified) -> Claim:
+def claim(settings: Identified) -> JobNote:
     """What a run's folder says of it: its settings, in ``run.json``.
 
     Args:
         settings: What the run computes.
     """
     identity = settings.identity()
-    return Claim("run", FILE, identity, lambda out: write_json(out / FILE, {"settings": identity}), _held)
+    return JobNote("run", FILE, identity, lambda out: write_json(out / FILE, {"settings": identity}), _held)
 
 
 def _held(out: Path) -> Mapping[str, Any]:

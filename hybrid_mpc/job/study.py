@@ -219,7 +219,7 @@ class Study:
             :class:`~hybrid_mpc.loop.faults.Fault` or a sequence of either. Default: one empty set.
         vary: Parameters of the plant, and by what share each is varied at most in either direction. Default: none.
         random_faults: Faults that a draw takes at random, see :class:`~hybrid_mpc.job.study.RandomFaults`. Default:
-        none.
+            none.
         draws: How many times the random things are drawn; all controllers meet the same draws. Default: 1.
         seeds: Numbers of the loops, or how many. Default: 10.
         seed: Seed of the draws.
@@ -534,7 +534,7 @@ def _loader() -> Any:
                 raise yaml.composer.ComposerError(
                     None,
                     None,
-                    "anchors (&) and aliases (*) are not read; write the value out",
+                    "prior_replay (&) and aliases (*) are not read; write the value out",
                     event.start_mark,
                 )
             return super().compose_node(parent, index)

@@ -25,7 +25,7 @@ from hybrid_mpc.job.context import Progress, Silent
 from hybrid_mpc.job.control import ControlSettings, prepared
 from hybrid_mpc.job.controllers import CONTENDERS
 from hybrid_mpc.job.engine import Engine, Lost, make_engine
-from hybrid_mpc.job.folder import Claim, check_folder, open_folder
+from hybrid_mpc.job.folder import JobNote, check_folder, open_folder
 from hybrid_mpc.job.loops import Bench, LoopSpec, check_faults, varied
 from hybrid_mpc.job.stages.export import versions
 from hybrid_mpc.job.study import RandomFaults, Study
@@ -510,13 +510,13 @@ def make_note(
     )
 
 
-def claim(note: StudyNote) -> Claim:
+def claim(note: StudyNote) -> JobNote:
     """What a study's folder says of it.
 
     Args:
         note: What the study is made of.
     """
-    return Claim(
+    return JobNote(
         "study",
         NOTE,
         _identity(note),

@@ -56,14 +56,16 @@ class SearchSettings(RunSettings):
         kinds = [name for name in identify.MODELS if not name.startswith("phy")]
         if self.kind not in kinds:
             raise InputError(f"kind has no {self.kind!r}; there are: {', '.join(kinds)}")
-        if self.kind == "rnn" and self.space.anchors is not None:
-            raise InputError("an rnn has no prior to be anchored to; leave anchors out of what is varied")
+        if self.kind == "rnn" and self.space.prior_replay is not None:
+            raise InputError(
+                "an rnn has no prior to be anchored to; leave prior_replay out of what is varied"
+            )
 
     def identity(self) -> dict[str, Any]:
-        """Settings as plain data; without anchors where they are not searched, as in searches from before."""
+        """Settings as plain data; without prior_replay where they are not searched, as in searches from before."""
         plain = super().identity()
-        if plain["space"]["anchors"] is None:
-            del plain["space"]["anchors"]
+        if plain["space"]["prior_replay"] is None:
+            del plain["space"]["prior_replay"]
         return plain
 
 

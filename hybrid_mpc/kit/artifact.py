@@ -380,7 +380,7 @@ class Kit:
             model: Name of the model that plans. Default: the hybrid.
             task: Whose control problem it solves. Default: the common one.
             solver: ``"rti"``, ``"sqp"`` or ``"ipopt"``.
-            iterations: Linearisations a period of ``rti``. Default: one.
+            iterations: Linearizations a period of ``rti``. Default: one.
 
         Raises:
             InputError: If there is no such model or solver, or no control problem.

@@ -208,7 +208,7 @@ def make_controller(
         prior: The fitted prior, for terminal weight and fallback.
         control: The control problem.
         solver: Name in :data:`SOLVERS`.
-        iterations: Linearisations a period of ``rti``. Default: one.
+        iterations: Linearizations a period of ``rti``. Default: one.
         safe_input: What the machine is left with where nothing is known. Default: zero, or the limit next to it.
 
     Raises:
@@ -233,7 +233,7 @@ def first_controller(model: HybridModel, ocp: OCP) -> SQPController | BestOf:
 
 
 def make_ocp(prior: HybridModel, control: OCP) -> OCP:
-    """The problem with a working point: terminal weight (and the fallback) are linearised in motion if it names none.
+    """The problem with a working point: terminal weight (and the fallback) are linearized in motion if it names none.
 
     At rest the slope of dry friction would pass for strong damping.
 
@@ -426,7 +426,7 @@ def adaptable(model: HybridModel, causes: Mapping[str, Sequence[str]]) -> dict[s
             f"a guard that adapts needs a model that knows its parameters; model {model.name} has none: give its prior "
             "a parameters_spec and train it anew"
         )
-    if model.waiting:
+    if model.delay_states:
         raise InputError(
             f"a guard that adapts needs a model whose inputs act at once; those of model {model.name} act later"
         )

@@ -112,7 +112,7 @@ class Loop:
         u = loop.start(read())
         while running():
             write(u)
-            loop.finish()  # monitor, and the next linearisation, while the input acts
+            loop.finish()  # monitor, and the next linearization, while the input acts
             wait()
             u = loop.step(read())
 

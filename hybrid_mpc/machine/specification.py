@@ -102,7 +102,7 @@ class BenchmarkBudget:
         horizon: Most scored periods of a free run in training.
         batch: Windows a step. Default: 32.
         decay: Weight decay times the number of training samples. Default: that of the training.
-        anchors: Weight of fading corrections where nothing was measured: see ``TrainingSettings``. Default: zero.
+        prior_replay: Weight of fading corrections where nothing was measured: see ``TrainingSettings``. Default: zero.
 
     Example:
         >>> BenchmarkBudget(hidden=16, networks=2, teacher_steps=100, free_run_steps=200, horizon=40).batch
@@ -116,23 +116,23 @@ class BenchmarkBudget:
     horizon: int
     batch: int = 32
     decay: float = 300.0
-    anchors: float = 0.0
+    prior_replay: float = 0.0
 
     def __post_init__(self) -> None:
-        check_anchors(self.anchors)
+        check_prior_replay(self.prior_replay)
 
 
-def check_anchors(weight: float) -> None:
-    """Refuse a weight of anchors that is none.
+def check_prior_replay(weight: float) -> None:
+    """Refuse a weight of prior_replay that is none.
 
     Raises:
         InputError: If it is negative or not finite.
 
     Example:
-        >>> check_anchors(10.0)
+        >>> check_prior_replay(10.0)
     """
     if not 0 <= weight < math.inf:
-        raise InputError(f"anchors must be a weight of 0 or more, got {weight}")
+        raise InputError(f"prior_replay must be a weight of 0 or more, got {weight}")
 
 
 @dataclass(frozen=True)

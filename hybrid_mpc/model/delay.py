@@ -23,7 +23,7 @@ from hybrid_mpc.model.model import (
 Array = NDArray[np.float64]
 TINY = 1e-9
 """Share of a period below which a delay's rest counts as none."""
-MOST_WAITING = 1000
+MOST_DELAY_STATES = 1000
 """Inputs that may wait: an estimator can still work with matrices of a thousand rows. It is 10 s of one input at 100
 Hz; a delay for which more would wait is a slip in its unit, or a damaged file."""
 
@@ -38,7 +38,7 @@ def with_input_delay(model: HybridModel, delay: float) -> HybridModel:
 
     Args:
         model: The model without delay.
-        delay: Of the input [s], positive; at most :data:`MOST_WAITING` inputs (periods times inputs) may wait.
+        delay: Of the input [s], positive; at most :data:`MOST_DELAY_STATES` inputs (periods times inputs) may wait.
 
     Raises:
         InputError: If the delay is not positive or too long, or the model has inputs that wait already.
@@ -55,13 +55,13 @@ def with_input_delay(model: HybridModel, delay: float) -> HybridModel:
     if not (delay > 0 and math.isfinite(delay)):
         raise InputError(f"model {model.name}: the input's delay must be positive, got {delay} s")
     periods = delay / model.dt
-    if not periods * model.n_u <= MOST_WAITING:
+    if not periods * model.n_u <= MOST_DELAY_STATES:
         raise InputError(
             f"model {model.name}: an input's delay of {delay:g} s is {periods:.4g} periods of {model.dt:g} s, so that "
-            f"{periods * model.n_u:.4g} inputs would wait, at most {MOST_WAITING} can; give it in seconds, or take a "
-            "model of a longer period"
+            f"{periods * model.n_u:.4g} inputs would wait, at most {MOST_DELAY_STATES} can; give it in seconds, or "
+            "take a model of a longer period"
         )
-    if model.waiting:
+    if model.delay_states:
         raise InputError(f"model {model.name} has inputs that wait already; give the one without delay")
     queue = _Queue(periods, model.n_u)
     x, _, u, w, p = step_symbols(model)
@@ -81,7 +81,7 @@ def with_input_delay(model: HybridModel, delay: float) -> HybridModel:
         side_by_side=None
         if model.side_by_side is None
         else _side_by_side(model.side_by_side, model.n_x, queue),
-        waiting=queue.size,
+        delay_states=queue.size,
     )
 
 

@@ -78,8 +78,8 @@ class HybridModel:
             says changes with ``p``; what a network adds does not. Default: none; then nobody can tell what broke.
         covariance: Rows ``(n_p, n_p)`` of the covariance of the fitted values. Default: unknown.
         balances: What the prior says of stored energy, mass, heat, ... Default: nothing.
-        waiting: Leading entries of ``h`` that are inputs on their way to the machine, the oldest first; ``xdot`` and
-            the balances then take the input that acts. Default 0: none waits.
+        delay_states: Leading entries of ``h`` that are inputs on their way to the machine, the oldest first; ``xdot``
+            and the balances then take the input that acts. Default 0: none waits.
         time_unit: The machine's second [s] (:func:`~hybrid_mpc.data.scales.time_unit`): what the lengths of monitor
             and guard
             are counted in. Default 1.
@@ -119,7 +119,7 @@ class HybridModel:
     parameters: tuple[Parameter, ...] = ()
     covariance: tuple[tuple[float, ...], ...] = ()
     balances: tuple[Balance, ...] = ()
-    waiting: int = 0
+    delay_states: int = 0
     time_unit: float = 1.0
 
     def __post_init__(self) -> None:
@@ -323,7 +323,7 @@ def prior_acceleration(model: HybridModel, prior: HybridModel | None = None) -> 
         ``prior_acceleration(kit.models["hybrid"], kit.models["prior"])``
     """
     if prior is None:
-        if model.n_h > model.waiting:
+        if model.n_h > model.delay_states:
             raise InputError(
                 f"model {model.name} has a network, and its parameters are those of its prior: give prior=, the model "
                 'of the prior alone, e.g. kit.models["prior"]'
@@ -375,10 +375,10 @@ def _check_numbers(model: HybridModel) -> None:
     ):  # fmt: skip
         if len(set(names)) < len(names):
             raise InputError(f"model {model.name}: {what} need different names, got {', '.join(names)}")
-    if not 0 <= model.waiting <= model.n_h or model.waiting % model.n_u:
+    if not 0 <= model.delay_states <= model.n_h or model.delay_states % model.n_u:
         raise InputError(
-            f"model {model.name}: waiting must be whole inputs within the {model.n_h} entries of h, "
-            f"got {model.waiting}"
+            f"model {model.name}: delay_states must be whole inputs within the {model.n_h} entries of h, "
+            f"got {model.delay_states}"
         )
 
 

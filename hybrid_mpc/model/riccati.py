@@ -99,7 +99,7 @@ def hidden_fixed_point(
     return h
 
 
-def linearisation(model: HybridModel, x: Array, u: Array) -> tuple[Array, Array, Array]:
+def linearization(model: HybridModel, x: Array, u: Array) -> tuple[Array, Array, Array]:
     """``A``, ``B`` of ``z = (x, h)`` by ``z`` and ``u`` at ``(x, u)``, and the fixed point ``h`` used."""
     h = hidden_fixed_point(model, x, u)
     assert model.with_jacobian is not None
@@ -116,10 +116,10 @@ def lqr(
     *,
     working_point: tuple[ArrayLike, ArrayLike] | None = None,
 ) -> Lqr:
-    """LQR of a model, linearised with its exact Jacobian and its hidden state at the fixed point.
+    """LQR of a model, linearized with its exact Jacobian and its hidden state at the fixed point.
 
-    At rest the steep slope of a smoothed friction law (tanh) dominates the linearisation: it shows the
-    machine as if it stood in honey. ``working_point`` takes the linearisation from a moving point.
+    At rest the steep slope of a smoothed friction law (tanh) dominates the linearization: it shows the
+    machine as if it stood in honey. ``working_point`` takes the linearization from a moving point.
 
     Args:
         model: The model; ``n_h`` may be 0.
@@ -127,10 +127,10 @@ def lqr(
         u_target: ``(n_u,)`` [SI].
         q: Weights of the states ``(n_x,)``; the hidden states carry none.
         r: Weights of the inputs ``(n_u,)``, positive.
-        working_point: ``(x, u)`` to linearise at. Default: the target.
+        working_point: ``(x, u)`` to linearize at. Default: the target.
 
     Raises:
-        InputError: If a shape does not fit, or the linearised model is not stabilisable.
+        InputError: If a shape does not fit, or the linearized model is not stabilisable.
 
     Example:
         >>> import casadi as ca
@@ -145,7 +145,7 @@ def lqr(
     point = working_point if working_point is not None else (x_t, u_t)
     x_w = vector(point[0], model.n_x, "working_point x")
     u_w = vector(point[1], model.n_u, "working_point u")
-    a, b, _ = linearisation(model, x_w, u_w)
+    a, b, _ = linearization(model, x_w, u_w)
     weights = np.diag(np.concatenate([q_v, np.zeros(model.n_h)]))
     p, k = dare(a, b, weights, np.diag(r_v))
     return Lqr(k, p, x_t, hidden_fixed_point(model, x_t, u_t), u_t)

@@ -24,7 +24,7 @@ Slopes = Callable[[Array, Array], Array]
 ``hidden`` by ``(x, u, h)``."""
 
 
-class Linearisation(Protocol):
+class Linearization(Protocol):
     """A model's periods over a horizon, values and Jacobians in one call."""
 
     def at(self, z: Array, u: Array) -> Derivatives:
@@ -37,7 +37,7 @@ class Linearisation(Protocol):
         """A function for ``m = times N`` periods; made once, it is called often."""
 
 
-def stages(model: HybridModel, n: int, *, compiled: bool = False) -> Linearisation:
+def stages(model: HybridModel, n: int, *, compiled: bool = False) -> Linearization:
     """The fastest way that a model has: all periods at once where it can, else one after the other.
 
     Args:
@@ -79,16 +79,16 @@ class Stages:
         self._shape, self._n_x = (n, model.n_x + model.n_h), model.n_x
 
     def at(self, z: Array, u: Array) -> Derivatives:
-        """See :class:`Linearisation`."""
+        """See :class:`Linearization`."""
         z_next, a_t, b = self._call(z, u)
         return z_next.copy(), a_t.copy(), b.copy()  # the next call overwrites them
 
     def run(self, z0: Array, u: Array) -> Array:
-        """See :class:`Linearisation`."""
+        """See :class:`Linearization`."""
         return _trajectory(self._along, z0, u)
 
     def slopes(self, times: int, *, hidden: bool = False) -> Slopes:
-        """See :class:`Linearisation`."""
+        """See :class:`Linearization`."""
         n, n_x = self._shape[0], self._n_x
 
         def evaluate(z: Array, u: Array) -> Array:
@@ -130,16 +130,16 @@ class VectorisedStages:
         self._along = _run(model, n, compiled)
 
     def at(self, z: Array, u: Array) -> Derivatives:
-        """See :class:`Linearisation`."""
+        """See :class:`Linearization`."""
         x_next, h_next, a, b = self._at(z[:, : self._n_x], z[:, self._n_x :], u, *self._held)
         return np.hstack([x_next, h_next]), np.ascontiguousarray(a.transpose(0, 2, 1)), b
 
     def run(self, z0: Array, u: Array) -> Array:
-        """See :class:`Linearisation`."""
+        """See :class:`Linearization`."""
         return _trajectory(self._along, z0, u)
 
     def slopes(self, times: int, *, hidden: bool = False) -> Slopes:
-        """See :class:`Linearisation`."""
+        """See :class:`Linearization`."""
         by = ("x", "u", "h") if hidden else ("x", "u")
         points, n_x = times * self._n, self._n_x
         many, held = self._many(points, {"slopes": by}), self._tiled(points)

@@ -228,7 +228,7 @@ def _pushed(
     speed, travel, before = ca.vertsplit(
         memory[first : layout.averaged], [0, n_q, 2 * n_q, 2 * n_q + model.n_u]
     )
-    if model.waiting:  # the oldest of the inputs on their way is the one that has begun to act
+    if model.delay_states:  # the oldest of the inputs on their way is the one that has begun to act
         u = h[: model.n_u]
     before = ca.if_else(ca.logic_and(still, ca.mmin(_known(before))), before, u)
     strong = ca.logic_and(still, ca.mmax(ca.fabs(u - before) - HELD_SHARE * spans) > 0)

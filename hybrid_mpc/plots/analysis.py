@@ -37,7 +37,7 @@ _DAMPING = (0.1, 0.3, 0.5, 0.7, 0.9)
 
 
 def pole_map(poles: Mapping[str, Any], dt: float, *, zeros: Mapping[str, Any] | None = None) -> Figure:
-    """Poles (and zeros) of the linearised models in the z-plane; right, the slow ones near z = 1 enlarged.
+    """Poles (and zeros) of the linearized models in the z-plane; right, the slow ones near z = 1 enlarged.
 
     Args:
         poles: Eigenvalues ``(n,)``, complex, of each model's one-step map.
@@ -148,7 +148,7 @@ def bode(
     output_signal: Signal,
     nyquist: float | None = None,
 ) -> Figure:
-    """Frequency responses of the linearised models from one input to one output.
+    """Frequency responses of the linearized models from one input to one output.
 
     Args:
         responses: By model: angular frequencies ``(n,)`` [rad/s], magnitude ``(n,)`` [output unit / input
@@ -204,7 +204,7 @@ def bode(
     return figure
 
 
-# Figures of linearised loops: sensitivity functions, Nyquist curves, gain schedules.
+# Figures of linearized loops: sensitivity functions, Nyquist curves, gain schedules.
 
 _POINTS = {"rest": ", tangent at rest", "working": ", friction of working size"}
 _COLOURS = ("#0072B2", "#D55E00", "#CC79A7", "#009E73", "#E69F00", "#56B4E9")
@@ -419,7 +419,7 @@ def measured_bode(
 def step_responses(
     curves: Mapping[str, Mapping[str, tuple[Array, Array]]], *, input_signal: Signal, output_signal: Signal
 ) -> Figure:
-    """Unit step responses of linearisations, a panel a point of linearisation.
+    """Unit step responses of linearizations, a panel a point of linearization.
 
     Args:
         curves: By point (``"rest"``), then by model: times ``(n,)`` [s] and output per unit of the input ``(n,)``.

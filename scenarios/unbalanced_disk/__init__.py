@@ -28,7 +28,7 @@ Closed loops run on a simulated disk of another structure than the prior: a moto
 dry friction that is larger at rest and differs over a turn, cogging, a delay that is no whole period. Without
 recordings it also makes the data."""
 LARGEST_DELAY = 0.06
-ANCHORS = 10.0
+PRIOR_REPLAY = 10.0
 """The tasks stand upright, where no recording was: there the prior is to stand alone. Of 0, 1, 10, 30 and 100 the one
 with the least validation error of the MOPGRNN (docs/disk.md)."""
 
@@ -86,9 +86,9 @@ scenario = Scenario(
             teacher_steps=400,
             free_run_steps=60,
             tasks=("swing_up", "track_up"),
-            anchors=ANCHORS,
+            prior_replay=PRIOR_REPLAY,
         ),
-        "full": replace(DEFAULT_BUDGETS["full"], anchors=ANCHORS),
+        "full": replace(DEFAULT_BUDGETS["full"], prior_replay=PRIOR_REPLAY),
     },
     benchmark=BenchmarkSpec(
         {

@@ -84,7 +84,7 @@ def test_gain_is_the_derivative_of_the_controller_s_own_answer(blocks):
     plan, z = np.tile(u, (10, 1)), np.tile(np.concatenate([x, h]), (11, 1))
 
     def first(x, h, d, before, r):
-        prepared = controller.linearise(plan, z, np.zeros(1), before, np.ones((11, 2)))
+        prepared = controller.linearize(plan, z, np.zeros(1), before, np.ones((11, 2)))
         estimate = Estimate(0.0, x, h, d, np.eye(7), np.zeros(1), 0.0)
         answer = controller.feedback(prepared, estimate, r[None])
         assert answer.status.name == "SOLVED"

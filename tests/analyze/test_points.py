@@ -1,4 +1,4 @@
-"""Linearisations, points of rest, friction and schedules against closed forms and python-control."""
+"""Linearizations, points of rest, friction and schedules against closed forms and python-control."""
 
 import control
 import numpy as np

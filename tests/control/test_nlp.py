@@ -60,7 +60,7 @@ def test_converged_iterations_are_ipopts_answer(z, bound, du_max, x0):
     z0 = np.concatenate([e.x, e.h])
     u, cost = ipopt_plan(model, ocp, ocp.terminal_weight(model), z0, e.d, reference, np.zeros(1))
     assert solution.status is Status.SOLVED
-    # Gauss-Newton contracts: after 40 linearisations the trajectory is the model's own to rounding ...
+    # Gauss-Newton contracts: after 40 linearizations the trajectory is the model's own to rounding ...
     assert solution.defect < 1e-9
     # ... and the inputs are the NLP's to DAQP's tolerance of 1e-6 of half the range, times ten.
     np.testing.assert_allclose(solution.u, u, atol=1e-5 * bound)
@@ -82,7 +82,7 @@ def test_real_time_iterations_converge_along_a_closed_loop():
         e, _ = start(model, x), defects.append(solution.defect)
     full = CondensedController(model, ocp, iterations=30).solve(solution, e, np.zeros((1, 2)))
     once = controller.solve(solution, e, np.zeros((1, 2)))
-    # RTI: the defects fade, and one linearisation a period is as good as thirty.
+    # RTI: the defects fade, and one linearization a period is as good as thirty.
     assert max(defects[-5:]) < 1e-2 * max(defects)
     np.testing.assert_allclose(once.u[0], full.u[0], atol=1e-3)  # 0.1 % of the bound's size
 

@@ -118,7 +118,7 @@ def test_derivatives_of_expressions_are_those_of_finite_differences():
     ocp = OCP(3, [1.0, 1.0], [1.0] * 2, [0.0] * 2, [-9.0] * 2, [9.0] * 2, x_max=[np.inf, 0.5], soft=[bound])
     rows, rng = SoftRows(ocp), np.random.default_rng(0)
     xs, us = rng.normal(size=(4, 2)), rng.normal(size=(3, 2))
-    value, by_x, by_u = rows.linearise(xs, us)
+    value, by_x, by_u = rows.linearize(xs, us)
     assert len(rows) == 3 + 9
     dx, du = rng.normal(size=(4, 2)), rng.normal(size=(3, 2))
     step = 1e-6

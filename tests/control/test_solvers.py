@@ -89,7 +89,7 @@ def test_a_stroke_from_rest_where_undamped_iterations_go_astray():
     target = plain.problem.target(reference, weight)
     carried_out = plain.problem.cost(plain.problem.run(z0, first.u), first.u, np.zeros(1), target)
     got, want = (s.solve(s.initial(e), e, reference, weight) for s in (c(model, ocp) for c in SOLVERS))
-    assert carried_out > 100 * got.cost  # one linearisation at rest is no plan for a large motion
+    assert carried_out > 100 * got.cost  # one linearization at rest is no plan for a large motion
     assert got.cost <= want.cost * (1 + 1e-6)
     # An error of e at the hit costs 1e4 * dt * q e^2 = 200 e_speed^2; the effort it saves is of the plan's cost.
     assert np.abs(got.x[40, 1] - 2.0) < 0.02

@@ -35,7 +35,7 @@ def test_the_site_builds_and_a_broken_link_stops_it(tmp_path):
     build = [sys.executable, "-m", "mkdocs", "build", "--site-dir"]
     done = subprocess.run([*build, tmp_path / "site"], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    page = (tmp_path / "site" / "api" / "mpc.html").read_text()
+    page = (tmp_path / "site" / "api" / "control.html").read_text()
     assert "CondensedController" in page
     assert "&gt;&gt;&gt;" in page  # examples are shown as code
     settings = (ROOT / "mkdocs.yml").read_text().replace("docs_dir: docs", f"docs_dir: {tmp_path}/docs")

@@ -148,12 +148,15 @@ def test_the_exported_model_carries_the_values_and_the_fitted_priors_balance(dat
 def test_fixed_trainings_keep_the_key_of_their_checkpoints(data):
     settings = replace(SHORT, prior_parameters="fixed")
     before = asdict(settings)
-    del before["prior_parameters"], before["anchors"]  # the settings as they were before there was a choice
+    del (
+        before["prior_parameters"],
+        before["prior_replay"],
+    )  # the settings as they were before there was a choice
     digest = sha256(json.dumps([before, Pendulum().values], sort_keys=True).encode())
     for run in (*data[0], *data[1]):
         digest.update(run.x.tobytes() + run.u.tobytes())
     assert _key(settings, *data, Pendulum()) == digest.hexdigest()
-    for other in (SHORT, replace(settings, anchors=1.0)):
+    for other in (SHORT, replace(settings, prior_replay=1.0)):
         assert _key(other, *data, Pendulum()) != digest.hexdigest()
 
 

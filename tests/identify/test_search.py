@@ -171,12 +171,12 @@ def test_trials_are_counted_in_all_and_a_timeout_ends_after_the_trial(quick, who
 
 def test_anchors_are_searched_when_asked_for_and_else_leave_no_trace():
     space = SearchSpace(
-        hidden=None, learning_rate=None, free_run_learning_rate=None, decay=None, anchors=(1.0, 100.0)
+        hidden=None, learning_rate=None, free_run_learning_rate=None, decay=None, prior_replay=(1.0, 100.0)
     )
-    assert space.apply(BASE, {"anchors": 7.0}).anchors == 7.0
-    assert "anchors" not in _without_default(BASE) | _without_default(SPACE)
-    assert _without_default(replace(BASE, anchors=7.0))["anchors"] == 7.0
-    assert _without_default(space)["anchors"] == (1.0, 100.0)
+    assert space.apply(BASE, {"prior_replay": 7.0}).prior_replay == 7.0
+    assert "prior_replay" not in _without_default(BASE) | _without_default(SPACE)
+    assert _without_default(replace(BASE, prior_replay=7.0))["prior_replay"] == 7.0
+    assert _without_default(space)["prior_replay"] == (1.0, 100.0)
 
 
 def test_a_journal_of_another_search_is_refused_by_what_differs(whole, data):

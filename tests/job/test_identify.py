@@ -34,7 +34,7 @@ def test_a_training_is_read_back_as_it_was(faults, tmp_path, monkeypatch):
 @pytest.fixture
 def kept(tmp_path):
     """Networks of one kind in a folder."""
-    settings = TrainingSettings("pgrnn", 4, 2, 10, 5, seed=3, warm=2, anchors=2.0)
+    settings = TrainingSettings("pgrnn", 4, 2, 10, 5, seed=3, warm=2, prior_replay=2.0)
     one = Trained(
         settings, Scaling((1.0,), (1.0,), (1.0,), (1.0,)), {"w": np.eye(2)}, np.ones(2), {}, np.zeros(2)
     )
@@ -46,5 +46,5 @@ def test_finished_networks_are_taken_for_their_own_settings_only(kept):
     folder, settings = kept
     assert is_trained(folder, settings)
     assert not is_trained(folder, replace(settings, kind="mopgrnn"))
-    with pytest.raises(InputError, match=r"anchors 2.0 instead of 5.0.*choose another --out"):
-        is_trained(folder, replace(settings, anchors=5.0))
+    with pytest.raises(InputError, match=r"prior_replay 2.0 instead of 5.0.*choose another --out"):
+        is_trained(folder, replace(settings, prior_replay=5.0))

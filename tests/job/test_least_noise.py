@@ -57,4 +57,4 @@ def test_noise_of_an_artifact_is_raised_too():
 def test_the_disk_stands_where_no_recording_was():
     disk = load_scenario("unbalanced_disk")
     assert disk.beyond_recordings
-    assert all(budget.anchors > 0 for budget in disk.budgets.values())
+    assert all(budget.prior_replay > 0 for budget in disk.budgets.values())

@@ -101,9 +101,9 @@ def test_the_recommended_model_is_best_on_validation_and_on_runs_of_full_length(
 
 
 def test_networks_are_trained_with_what_the_budget_says():
-    budget = BenchmarkBudget(4, 2, teacher_steps=5, free_run_steps=5, horizon=10, decay=7.0, anchors=3.0)
+    budget = BenchmarkBudget(4, 2, teacher_steps=5, free_run_steps=5, horizon=10, decay=7.0, prior_replay=3.0)
     settings = networks.settings_of("pgrnn", budget, seed=1, warm=4)
-    assert (settings.decay, settings.anchors, settings.seed, settings.warm) == (7.0, 3.0, 1, 4)
+    assert (settings.decay, settings.prior_replay, settings.seed, settings.warm) == (7.0, 3.0, 1, 4)
 
 
 def test_a_model_made_before_gives_the_same_figures_and_an_interrupted_run_goes_on(machine, made, tmp_path):

@@ -151,23 +151,25 @@ def test_a_run_without_such_a_file_is_what_it_has_always_been(tmp_path):
 
 
 def test_a_search_without_anchors_is_what_it_has_always_been():
-    assert "anchors" not in SearchSettings("golf_robot").identity()["space"]
-    assert SearchSettings("golf_robot", space=parsed_space(["anchors"])).identity()["space"]["anchors"] == (
+    assert "prior_replay" not in SearchSettings("golf_robot").identity()["space"]
+    assert SearchSettings("golf_robot", space=parsed_space(["prior_replay"])).identity()["space"][
+        "prior_replay"
+    ] == (
         0.3,
         300.0,
     )
     with pytest.raises(InputError, match="an rnn has no prior to be anchored to"):
-        SearchSettings("golf_robot", kind="rnn", space=parsed_space(["anchors"]))
+        SearchSettings("golf_robot", kind="rnn", space=parsed_space(["prior_replay"]))
 
 
 def test_anchors_reach_the_training_from_budget_and_file(tmp_path):
     scenario = load_scenario("unbalanced_disk")
     plain = training_settings(Context(RunSettings("unbalanced_disk"), scenario, tmp_path), "mopgrnn")
-    assert plain.anchors == 10.0
+    assert plain.prior_replay == 10.0
     path = tmp_path / "settings.json"
-    path.write_text('{"anchors": 0}')
+    path.write_text('{"prior_replay": 0}')
     settings = RunSettings("unbalanced_disk", network_file=path)
-    assert training_settings(Context(settings, scenario, tmp_path), "mopgrnn").anchors == 0
+    assert training_settings(Context(settings, scenario, tmp_path), "mopgrnn").prior_replay == 0
 
 
 def test_a_run_is_bound_to_the_content_of_its_file(tmp_path):

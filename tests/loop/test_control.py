@@ -169,7 +169,7 @@ def test_a_limit_on_the_speed_is_kept_in_closed_loop():
     slow = loop(model, plant, step, 2.0, safe=SafeController(CondensedController(model, ocp)),
                 estimator=TrueState(model))  # fmt: skip
     assert np.max(fast.x[:, 1]) > 3.0
-    assert np.max(slow.x[:, 1]) == pytest.approx(1.5, abs=1e-3)  # one linearisation a period
+    assert np.max(slow.x[:, 1]) == pytest.approx(1.5, abs=1e-3)  # one linearization a period
     assert set(slow.source) == {"MPC"}
 
 

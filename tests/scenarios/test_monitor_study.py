@@ -107,7 +107,7 @@ def stand_in(monkeypatch):
         asked.append(job)
         return row_of(job)
 
-    model = SimpleNamespace(dt=0.02, n_p=1, waiting=0)
+    model = SimpleNamespace(dt=0.02, n_p=1, delay_states=0)
     scales = (0.01, 0.0, 0.0, 0.0)
     learned = Judges(
         Detector(0.02, (scales,), scales, 2.0, 1.0, 1.0), {"forces": (3.0, 0.5)}, (1e-3,), 1.0, 700

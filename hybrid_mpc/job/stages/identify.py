@@ -15,7 +15,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_document, read_document_arrays, write_document
 from hybrid_mpc.identify.settings import TrainingSettings
 from hybrid_mpc.identify.step import Scaling
-from hybrid_mpc.identify.train import Fault, Trained
+from hybrid_mpc.identify.train import Trained, TrainingFailure
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.engine import WORKERS, run_jobs
 from hybrid_mpc.records import plain, record
@@ -40,7 +40,7 @@ class _Note:
 
     settings: TrainingSettings
     scaling: Scaling
-    faults: tuple[Fault, ...]
+    faults: tuple[TrainingFailure, ...]
 
 
 def save_trained(folder: Path, trained: Trained) -> None:
@@ -352,7 +352,7 @@ def training_settings(context: Context, kind: str) -> TrainingSettings:
         seed=context.settings.seed,
         warm=context.warm,
         decay=b.decay,
-        anchors=b.anchors,
+        prior_replay=b.prior_replay,
     )
     return replace(settings, **context.settings.network())
 

@@ -1,4 +1,4 @@
-"""Stages monitor and analysis: online plausibility on recordings, and the linearised models."""
+"""Stages monitor and analysis: online plausibility on recordings, and the linearized models."""
 
 from __future__ import annotations
 
@@ -206,7 +206,7 @@ def _calibrate(
 
 
 def analysis_stage(context: Context) -> None:
-    """Linearise prior and hybrid at rest and at working speed; poles, PBH tests, frequency responses."""
+    """Linearize prior and hybrid at rest and at working speed; poles, PBH tests, frequency responses."""
     from hybrid_mpc.analyze.linearize import fixed_point, linearize
     from hybrid_mpc.analyze.properties import analyze, frequency_response
 
@@ -224,7 +224,7 @@ def analysis_stage(context: Context) -> None:
             result[name]["fixed_point"] = x.tolist()
         except InputError as none:  # a learned correction may leave no point of rest near zero
             h = hidden_fixed_point(model, x, u)
-            result[name]["fixed_point_reason"] = f"linearised at x = 0 instead: {none}"
+            result[name]["fixed_point_reason"] = f"linearized at x = 0 instead: {none}"
         systems = {"rest": linearize(model, x, u, h)}
         if context.scenario.control is not None:
             moving = x + working_point(model, context.scenario.control)[0]

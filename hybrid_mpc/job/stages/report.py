@@ -479,7 +479,7 @@ def _notes(context: Context, results: dict[str, Any]) -> dict[str, dict[str, tup
         after["estimation"] = (f"Not tested: {'; '.join(dict.fromkeys(without))}.",)
     if results["data"]["details"]["warnings"]:
         after["data"] = tuple(f"Warning: {text}" for text in results["data"]["details"]["warnings"])
-    after["training"] = _anchor_words(training_settings(context, "mopgrnn").anchors)
+    after["training"] = _prior_replay_text(training_settings(context, "mopgrnn").prior_replay)
     warnings = context.result("prior")["warnings"]
     if warnings:
         after["models"] = ("Warnings of the fit: " + "; ".join(warnings) + ".",)
@@ -501,15 +501,15 @@ def _notes(context: Context, results: dict[str, Any]) -> dict[str, dict[str, tup
     return {"instead": instead, "after": after}
 
 
-def _anchor_words(weight: float) -> tuple[str, ...]:
-    """What the report says of anchors.
+def _prior_replay_text(weight: float) -> tuple[str, ...]:
+    """What the report says of prior_replay.
 
     Example:
-        >>> _anchor_words(0.0), len(_anchor_words(10.0))
+        >>> _prior_replay_text(0.0), len(_prior_replay_text(10.0))
         ((), 1)
     """
     words = "Corrections were asked to fade where no recording comes near; the prior stands alone there"
-    return (f"{words} (anchors, weight {weight:g}).",) if weight else ()
+    return (f"{words} (prior_replay, weight {weight:g}).",) if weight else ()
 
 
 def _dict(value: Any) -> dict[str, Any]:
@@ -679,4 +679,4 @@ def _pole_table(results: dict[str, Any]) -> Table:
                     list(zip(a["frequency_rad_s"], a["damping"], strict=True))[:2] if w is not None]  # fmt: skip
             rows.append((model, point, ", ".join(slow), a["stable"], a["stabilisable"], a["detectable"]))
     columns = ("model", "point", "slowest poles: rad/s (damping)", "stable", "stabilisable", "detectable")
-    return Table(columns, rows, "Linearisations at rest and at working speed.")
+    return Table(columns, rows, "Linearizations at rest and at working speed.")

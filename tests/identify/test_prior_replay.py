@@ -8,10 +8,12 @@ import torch
 from simulated_pendulum import TRUTH, Killed, Pendulum, dragged, same_training
 
 from hybrid_mpc import DEFAULT_BUDGETS, BenchmarkBudget, InputError, TrainingSettings, train
-from hybrid_mpc.identify.prior_replay import COUNTED, FOLLOWED, RUNS, anchor_penalty, make_anchors
+from hybrid_mpc.identify.prior_replay import COUNTED, FOLLOWED, RUNS, make_prior_replay, prior_replay_penalty
 from hybrid_mpc.identify.train import TrainingRun
 
-SMALL = TrainingSettings("pgrnn", 4, 2, 20, 20, seed=3, warm=10, horizon=20, batch=8, every=10, anchors=10.0)
+SMALL = TrainingSettings(
+    "pgrnn", 4, 2, 20, 20, seed=3, warm=10, horizon=20, batch=8, every=10, prior_replay=10.0
+)
 PRIOR = Pendulum(TRUTH)
 
 
@@ -21,24 +23,24 @@ def data():
 
 
 @pytest.fixture(scope="module")
-def anchors(data):
-    return make_anchors(PRIOR, data[0], seed=0)
+def prior_replay(data):
+    return make_prior_replay(PRIOR, data[0], seed=0)
 
 
-def test_they_are_the_priors_own_motion_under_recorded_inputs(data, anchors):
+def test_they_are_the_priors_own_motion_under_recorded_inputs(data, prior_replay):
     from hybrid_mpc import PriorStep
 
     step = PriorStep(PRIOR, data[0][0].dt)
-    x, _ = step(anchors.x[:-1], torch.zeros(*anchors.x.shape[:-1], 0)[:-1], anchors.u[:-1])
-    torch.testing.assert_close(x, anchors.x[1:], rtol=0, atol=1e-12)
+    x, _ = step(prior_replay.x[:-1], torch.zeros(*prior_replay.x.shape[:-1], 0)[:-1], prior_replay.u[:-1])
+    torch.testing.assert_close(x, prior_replay.x[1:], rtol=0, atol=1e-12)
     recorded = np.unique(np.concatenate([t.u for t in data[0]]))
-    assert np.isin(anchors.u.numpy(), recorded).all()
-    assert anchors.x.shape[:2] == (FOLLOWED + COUNTED, RUNS)
+    assert np.isin(prior_replay.u.numpy(), recorded).all()
+    assert prior_replay.x.shape[:2] == (FOLLOWED + COUNTED, RUNS)
 
 
-def test_what_was_measured_has_no_weight_and_what_lies_far_off_has(data, anchors):
+def test_what_was_measured_has_no_weight_and_what_lies_far_off_has(data, prior_replay):
     measured = np.concatenate([t.x for t in data[0]])
-    weight, x = anchors.weight.numpy(), anchors.x.numpy()
+    weight, x = prior_replay.weight.numpy(), prior_replay.x.numpy()
     assert ((weight >= 0) & (weight <= 1)).all()
     # a window's distance from its nearest sample, in the units that the module's text names
     places = [np.column_stack([np.sin(a[:, 0]), np.cos(a[:, 0]), a[:, 1] / np.sqrt(np.mean(measured[:, 1] ** 2))])
@@ -54,24 +56,25 @@ def test_what_was_measured_has_no_weight_and_what_lies_far_off_has(data, anchors
 
 def test_an_angle_counts_all_the_way_round_and_a_full_turn_is_no_distance(data):
     shifted = [replace(t, x=t.x + np.array([2 * np.pi, 0.0])) for t in data[0]]
-    one, two = (make_anchors(PRIOR, part, seed=0).weight for part in (data[0], shifted))
+    one, two = (make_prior_replay(PRIOR, part, seed=0).weight for part in (data[0], shifted))
     torch.testing.assert_close(one, two, rtol=0, atol=1e-9)
 
 
-def test_corrections_fade_there_and_still_explain_the_data(data, anchors):
-    """Of networks as ``train`` hands them over: the best by validation, which does not know the anchors."""
+def test_corrections_fade_there_and_still_explain_the_data(data, prior_replay):
+    """Of networks as ``train`` hands them over: the best by validation, which does not know the prior_replay."""
 
     def trained(weight):
-        settings = replace(SMALL, teacher_steps=150, free_run_steps=0, anchors=weight)
+        settings = replace(SMALL, teacher_steps=150, free_run_steps=0, prior_replay=weight)
         run = TrainingRun(PRIOR, *data, settings)
         best = train(PRIOR, *data, settings)
         run._load({name: torch.tensor(value) for name, value in best.weights.items()})
         with torch.no_grad():
-            return anchor_penalty(run.step, anchors).sqrt(), best
+            return prior_replay_penalty(run.step, prior_replay).sqrt(), best
 
     (without, plain), (anchored, faded) = trained(0.0), trained(10.0)
     assert (anchored < 0.4 * without).all()
-    # six seconds of motion are thin, so anchors beside them cost; networks that correct nothing have the first error
+    # six seconds of motion are thin, so prior_replay beside them cost; networks that correct nothing have the first
+    # error
     assert (plain.validation < faded.validation).all()
     assert (faded.validation < 0.9 * faded.curve["validation"][0].min()).all()
 
@@ -88,7 +91,7 @@ def test_corrections_fade_there_and_still_explain_the_data(data, anchors):
     ids=str,
 )
 def test_every_kind_of_network_can_be_anchored(data, changed):
-    one, two = (train(PRIOR, *data, replace(SMALL, anchors=w, **changed)) for w in (0.0, 10.0))
+    one, two = (train(PRIOR, *data, replace(SMALL, prior_replay=w, **changed)) for w in (0.0, 10.0))
     assert np.isfinite(two.validation).all()
     assert two.skipped.sum() == 0
     assert any(not np.array_equal(one.weights[name], two.weights[name]) for name in one.weights)
@@ -104,12 +107,12 @@ def test_an_anchored_training_resumes_to_the_same_bits(data, tmp_path):
         train(PRIOR, *data, SMALL, checkpoint=file, on_progress=kill)
     same_training(train(PRIOR, *data, SMALL, checkpoint=file), whole)
     with pytest.raises(InputError, match="other settings or data"):
-        train(PRIOR, *data, replace(SMALL, anchors=5.0), checkpoint=file)
+        train(PRIOR, *data, replace(SMALL, prior_replay=5.0), checkpoint=file)
 
 
 def test_an_rnn_has_nothing_to_fall_back_on(data):
     settings = replace(SMALL, kind="rnn")
-    one, two = train(PRIOR, *data, settings), train(PRIOR, *data, replace(settings, anchors=0.0))
+    one, two = train(PRIOR, *data, settings), train(PRIOR, *data, replace(settings, prior_replay=0.0))
     for name, weights in one.weights.items():
         np.testing.assert_array_equal(weights, two.weights[name])
 
@@ -120,29 +123,34 @@ def test_a_prior_that_runs_away_costs_no_update(data, strength):
         def acceleration(self, x, u):
             return strength * x[..., 1:2] ** 3 + super().acceleration(x, u)
 
-    anchors = make_anchors(Bursting(TRUTH), data[0], seed=0)
+    prior_replay = make_prior_replay(Bursting(TRUTH), data[0], seed=0)
     v = np.concatenate([t.x[:, 1] for t in data[0]])
     span = v.max() - v.min()
-    assert torch.isfinite(anchors.x).all()
-    assert v.min() - 10 * span <= anchors.x[..., 1].min() <= anchors.x[..., 1].max() <= v.max() + 10 * span
-    assert (anchors.weight > 0.9).any()
-    run = TrainingRun(Bursting(TRUTH), *data, replace(SMALL, anchors=10.0))
-    penalty = anchor_penalty(run.step, run.anchors)
+    assert torch.isfinite(prior_replay.x).all()
+    assert (
+        v.min() - 10 * span
+        <= prior_replay.x[..., 1].min()
+        <= prior_replay.x[..., 1].max()
+        <= v.max() + 10 * span
+    )
+    assert (prior_replay.weight > 0.9).any()
+    run = TrainingRun(Bursting(TRUTH), *data, replace(SMALL, prior_replay=10.0))
+    penalty = prior_replay_penalty(run.step, run.prior_replay)
     penalty.sum().backward()
     assert all(w.grad is None or torch.isfinite(w.grad).all() for w in run.weights.values())
 
 
 @pytest.mark.parametrize("weight", [-1.0, float("nan"), float("inf")])
 @pytest.mark.parametrize("make", [
-    lambda weight: replace(SMALL, anchors=weight),
-    lambda weight: replace(DEFAULT_BUDGETS["quick"], anchors=weight),
-    lambda weight: BenchmarkBudget(4, 1, 1, 1, 1, anchors=weight),
+    lambda weight: replace(SMALL, prior_replay=weight),
+    lambda weight: replace(DEFAULT_BUDGETS["quick"], prior_replay=weight),
+    lambda weight: BenchmarkBudget(4, 1, 1, 1, 1, prior_replay=weight),
 ], ids=["training", "budget", "benchmark"])  # fmt: skip
 def test_a_weight_that_is_none_is_refused(make, weight):
-    with pytest.raises(InputError, match="anchors must be a weight of 0 or more"):
+    with pytest.raises(InputError, match="prior_replay must be a weight of 0 or more"):
         make(weight)
 
 
 def test_the_literal_form_cannot_be_anchored():
-    with pytest.raises(InputError, match="leave anchors 0"):
+    with pytest.raises(InputError, match="leave prior_replay 0"):
         replace(SMALL, form="literal")
