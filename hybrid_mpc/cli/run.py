@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hybrid_mpc.cli.options import Device, InputColumns, OutputColumns, Recordings, ScenarioName, TimeColumn
 from hybrid_mpc.records import MOST_SEED
+
+if TYPE_CHECKING:
+    from hybrid_mpc.job.stages.results import Guard, Results
 
 INCOMPLETE = 1
 """Exit code of a run whose report lacks a part."""
@@ -18,7 +21,8 @@ EXAMPLES = (
     "  hybrid-mpc run golf_robot --out runs/golf\n\n"
     "  hybrid-mpc run torque_pendulum --data swing1.csv --data swing2.csv --out runs/pendulum\n\n"
     "  hybrid-mpc run my_machine.py --data mine.csv --budget full --out runs/mine\n\n"
-    "  hybrid-mpc run my_machine.py --data mine.csv --budget full --out runs/mine --resume"
+    "  hybrid-mpc run my_machine.py --data mine.csv --budget full --out runs/mine --resume\n\n"
+    "  hybrid-mpc run my_machine.py --data mine.csv --out runs/mine --resume --only control"
 )
 
 
@@ -30,7 +34,13 @@ def run(
         int, typer.Option(help="Seed of data, training and closed loops.", min=0, max=MOST_SEED)
     ] = 0,
     budget: Annotated[str, typer.Option(help="Effort: quick or full.")] = "quick",
-    resume: Annotated[bool, typer.Option("--resume", help="Finish the run that the folder holds.")] = False,
+    resume: Annotated[
+        bool,
+        typer.Option(
+            "--resume",
+            help="Go on with the run that the folder holds: finish it, or make anew what has changed.",
+        ),
+    ] = False,
     time_column: TimeColumn = "",
     input_column: InputColumns = None,
     output_column: OutputColumns = None,
@@ -39,13 +49,22 @@ def run(
         typer.Option("--settings", help="JSON file of network settings, as hybrid-mpc search leaves it."),
     ] = None,
     device: Device = "cpu",
+    only: Annotated[
+        list[str] | None,
+        typer.Option(help="Stage that may run, once for each; the others are taken as they are."),
+    ] = None,
+    skip: Annotated[
+        list[str] | None, typer.Option(help="Stage after the export that is not to run, once for each.")
+    ] = None,
 ) -> None:
     """Fit the prior, train, export, close the loop, monitor, learn the guard, analyze, and write a report.
 
-    Exit code 1 if a stage after the export could not run; the report then says why.
+    The stages are data, prior, training, evaluation, export, noise, control, estimation, monitor, guard, analysis and
+    report. With --resume a stage runs again only where something that it reads has changed. Exit code 1 if a stage
+    after the export could not run; the report then says why.
     """
     from hybrid_mpc.cli.progress import make_progress
-    from hybrid_mpc.job.context import failed_stages
+    from hybrid_mpc.job.run import failed_stages
     from hybrid_mpc.job.run import run as run_job
     from hybrid_mpc.job.settings import RunSettings
 
@@ -62,7 +81,9 @@ def run(
         device,
     )
     with make_progress() as progress:
-        results = run_job(settings, folder, resume=resume, progress=progress)
+        results = run_job(
+            settings, folder, resume=resume, only=only or (), skip=skip or (), progress=progress,
+        )  # fmt: skip
     for line in summary(results):
         print(line)
     print(f"report: {(folder / 'report.html').resolve()}")
@@ -72,29 +93,25 @@ def run(
         raise typer.Exit(INCOMPLETE)
 
 
-def summary(results: dict[str, object]) -> list[str]:
+def summary(results: Results) -> list[str]:
     """The figures of a run that are worth a line on the terminal."""
-    identification, control = results["identification"], results["control"]
-    assert isinstance(identification, dict)
-    assert isinstance(control, dict)
-    known = [errors for errors in identification["rmse"].values() if isinstance(errors, dict)]
+    found = results.identification
+    known = [errors for errors in found.rmse.values() if isinstance(errors, Mapping)]
     signal = next(iter(known[0])) if known else "output"
     lines = [f"free runs on unseen data:    E_sim      RMSE {signal}   energy violation [W]"]
-    for name, e_sim in identification["e_sim_s"].items():
-        rmse, balance = identification["rmse"][name], identification["balance_violation"][name]
-        lines.append(f"  {name:22} {_number(e_sim)} {_number(rmse)} {_number(balance)}")
+    for name, e_sim in found.e_sim_s.items():
+        if name in found.rmse and not name.endswith("_reason"):
+            rmse, balance = found.rmse[name], found.balance_violation[name]
+            lines.append(f"  {name:22} {_number(e_sim)} {_number(rmse)} {_number(balance)}")
     for name in ("prior", "hybrid", "oracle"):
-        loop = control[name]
-        if loop["cost"] is not None:
+        loop = getattr(results.control, name)
+        if loop.cost is not None:
             lines.append(
-                f"closed loop, {name:8} cost {loop['cost']:.4g}, tracking {tracking(loop['tracking_rmse'])}"
+                f"closed loop, {name:8} cost {loop.cost:.4g}, tracking {tracking(loop.tracking_rmse)}"
             )
-    monitor = results["monitor"]
-    assert isinstance(monitor, dict)
-    if monitor["alarms"] is None:
-        lines.append(f"energy monitor: {monitor['reason']}")
-    lines += guard_lines(results["guard"])
-    return lines
+    if results.monitor.alarms is None:
+        lines.append(f"energy monitor: {results.monitor.reason}")
+    return lines + guard_lines(results.guard)
 
 
 def tracking(errors: Mapping[str, float]) -> str:
@@ -112,21 +129,17 @@ def tracking(errors: Mapping[str, float]) -> str:
     return f"{name} {value:.4g} {unit.strip('[]')}"
 
 
-def guard_lines(guard: Any) -> list[str]:
-    """What the run says of its energy guard.
-
-    Args:
-        guard: The group of that name in the results.
-    """
-    if guard["data_hash"] is None:
-        return [f"energy guard: {guard['reason']}"]
+def guard_lines(guard: Guard) -> list[str]:
+    """What the run says of its energy guard."""
+    if guard.data_hash is None or guard.hours is None:
+        return [f"energy guard: {guard.reason}"]
     lines = [
-        f"energy guard: learned from {60 * guard['hours']:.1f} min for {guard['false_alarms_per_hour']:g} false alarms "
+        f"energy guard: learned from {60 * guard.hours:.1f} min for {guard.false_alarms_per_hour:g} false alarms "
         "an hour"
     ]
-    for row in guard["faults"] or ():
-        seen = "never seen" if row["delay_s"] is None else f"seen after {row['delay_s']:.2f} s"
-        lines.append(f"  {row['fault']}: {seen}" + (f": {row['diagnosis']}" if row["diagnosis"] else ""))
+    for row in guard.faults or ():
+        seen = "never seen" if row.delay_s is None else f"seen after {row.delay_s:.2f} s"
+        lines.append(f"  {row.fault}: {seen}" + (f": {row.diagnosis}" if row.diagnosis else ""))
     return lines
 
 

@@ -30,10 +30,9 @@ from hybrid_mpc.job.benchmark_runs import (
     warm_samples,
 )
 from hybrid_mpc.job.check import check_scenario
-from hybrid_mpc.job.context import Progress, Silent
+from hybrid_mpc.job.context import Progress, Silent, versions
 from hybrid_mpc.job.engine import run_jobs
 from hybrid_mpc.job.folder import JobNote, check_same_job
-from hybrid_mpc.job.stages.export import versions
 from hybrid_mpc.job.stages.identify import is_trained, load_trained, save_trained
 from hybrid_mpc.machine.specification import BenchmarkBudget
 from hybrid_mpc.machine.torch_prior import Prior

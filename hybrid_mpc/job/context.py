@@ -1,30 +1,33 @@
-"""What the stages of a run share: settings, folder, data, and the results of the stages before."""
+"""A run in its folder: settings, scenario, data, and the results of its stages."""
 
 from __future__ import annotations
 
 import math
+import platform
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 
+from hybrid_mpc import __version__
 from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import read_document, read_document_arrays, write_document
+from hybrid_mpc.files import digest
 from hybrid_mpc.job.settings import RunSettings
+from hybrid_mpc.job.stage import Absent, Stage, Stored, read_stage, write_stage
 from hybrid_mpc.kit.artifact import Kit, load
 from hybrid_mpc.machine.specification import DataSpec
 from hybrid_mpc.scenario import Budget, Scenario
 
-STAGES = (
-    "data", "prior", "training", "evaluation", "export", "control", "estimation", "monitor", "guard", "analysis",
-    "report",
-)  # fmt: skip
-"""Stages of the main job in their order; each may read what those before it have left."""
+if TYPE_CHECKING:
+    from hybrid_mpc.job.stages.identify import PriorResult
+
+R = TypeVar("R")
 
 
 class Progress(Protocol):
@@ -74,6 +77,7 @@ class Context:
     scenario: Scenario
     out: Path
     progress: Progress = field(default_factory=Silent)
+    _read: dict[str, Stored[Any]] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def budget(self) -> Budget:
@@ -99,11 +103,23 @@ class Context:
         """Samples of the warm-up."""
         return round(self.spec.warm_up / self.spec.dt)
 
+    @property
+    def files(self) -> list[Path]:
+        """The user's recordings, or those that the simulated machine made."""
+        made = self.out / "data"
+        return list(self.settings.data) or sorted(made.glob("*.csv")) or sorted(made.glob("*.npz"))
+
+    def forget_data(self) -> None:
+        """Remove recordings that a simulated machine made before."""
+        self.__dict__.pop("dataset", None)
+        if not self.settings.data:
+            for path in self.files:
+                path.unlink()
+
     @cached_property
     def dataset(self) -> Dataset:
-        """All trajectories of the user's files, or of those that the simulated machine recorded."""
-        made = self.out / "data"
-        files = list(self.settings.data) or sorted(made.glob("*.csv")) or sorted(made.glob("*.npz"))
+        """All trajectories of the run's recordings."""
+        files = self.files
         prior = self.scenario.prior()
         return load_trajectories(
             files, self.spec, outputs=prior.outputs, inputs=prior.inputs, states=prior.states
@@ -130,82 +146,87 @@ class Context:
         return self._with_states([self._late(t) for t in self.trajectories(role)])
 
     @property
-    def delay(self) -> float:
-        """Delay of the input [s] that was fitted with the prior; zero for none."""
-        return float(self.result("prior").get("delay", 0.0))
+    def prior(self) -> PriorResult:
+        """The fitted prior."""
+        from hybrid_mpc.job.stages.identify import PRIOR
+
+        return self.read(PRIOR)
 
     def _with_states(self, trajectories: list[Trajectory]) -> list[Trajectory]:
-        arrays = self.arrays("prior")
+        arrays = self.prior.arrays
         return [replace(t, x=arrays[f"{t.name}/x"], xdot=arrays[f"{t.name}/xdot"]) for t in trajectories]
 
     def _acting(self, trajectories: list[Trajectory]) -> list[Trajectory]:
-        if not self.delay:
+        if not self.prior.delay:
             return trajectories
         from hybrid_mpc.identify.delay import delayed
 
-        return [delayed(t, self.delay) for t in trajectories]
+        return [delayed(t, self.prior.delay) for t in trajectories]
 
     def _late(self, t: Trajectory) -> Trajectory:
-        lost = math.ceil(self.delay / t.dt - 1e-6)
+        lost = math.ceil(self.prior.delay / t.dt - 1e-6)
         return t.part(np.arange(len(t.t)) >= lost, t.name, t.role) if lost else t
-
-    def save(self, stage: str, result: Mapping[str, Any], arrays: Mapping[str, Any] | None = None) -> None:
-        """Keep a stage's result; its JSON is written last and means that the stage is done."""
-        write_document(self._path(stage), result, arrays)
-
-    def fail(self, stage: str, why: str) -> None:
-        """Note that a stage could not run, and why: those after it go on without, and the report says so."""
-        self.save(stage, {"reason": why, "failed": True}, {})
 
     @property
     def kit(self) -> Kit:
         """The run's artifact as it is now, with the control problems that the scenario now states."""
         return load(self.out / "model").on(self.scenario)
 
-    def done(self, stage: str) -> bool:
-        """Whether a stage's result is there."""
-        return self._path(stage).is_file()
+    @cached_property
+    def versions(self) -> dict[str, str]:
+        """Versions of what a result depends on."""
+        return versions()
 
-    def result(self, stage: str) -> Any:
-        """Result of a stage that is done.
-
-        Raises:
-            InputError: If its file is damaged; it names the files to delete.
-        """
-        return read_document(self._path(stage), self._remedy(stage))
-
-    def arrays(self, stage: str) -> dict[str, Any]:
-        """Arrays of a stage that is done.
-
-        Raises:
-            InputError: If their file is damaged; it names the files to delete.
-        """
-        return read_document_arrays(self._path(stage), self._remedy(stage))
-
-    def _path(self, stage: str) -> Path:
+    def path(self, stage: str) -> Path:
+        """File of a stage."""
         return self.out / "checkpoints" / f"{stage}.json"
 
-    def _remedy(self, stage: str) -> str:
-        later = STAGES[STAGES.index(stage) :] if stage in STAGES else (stage,)
-        return (
-            f"delete what the stage {stage} left and what stands on it ({', '.join(f'{name}.*' for name in later)} in "
-            f"{self.out / 'checkpoints'}), and --resume computes it anew"
-        )
+    def stored(self, stage: Stage[R]) -> Stored[R] | None:
+        """What the folder holds of a stage; None for nothing.
+
+        Raises:
+            InputError: If its file is damaged; it names what to delete.
+        """
+        if stage.name not in self._read:
+            path = self.path(stage.name)
+            if not path.is_file():
+                return None
+            remedy = f"delete {stage.name}.* in {path.parent}, and --resume computes it anew"
+            self._read[stage.name] = read_stage(path, stage, remedy)
+        return self._read[stage.name]
+
+    def keep(self, stage: Stage[R], keys: Mapping[str, str], result: R | Absent) -> None:
+        """Write a stage's result."""
+        self._read[stage.name] = write_stage(self.path(stage.name), stage, keys, result)
+
+    def leave_out(self, stage: Stage[Any], reason: str) -> None:
+        """Go on without a stage; its file, if there is one, stays."""
+        self._read[stage.name] = Stored({}, Absent(reason), digest(reason))
+
+    def find(self, stage: Stage[R]) -> R | Absent:
+        """Result of a stage, or why there is none."""
+        stored = self.stored(stage)
+        return Absent(f"stage {stage.name} has not run") if stored is None else stored.result
+
+    def read(self, stage: Stage[R]) -> R:
+        """Result of a stage.
+
+        Raises:
+            InputError: If there is none, with the reason.
+        """
+        found = self.find(stage)
+        if isinstance(found, Absent):
+            raise InputError(found.reason)
+        return found
+
+    def digest_of(self, stage: Stage[Any]) -> str:
+        """Digest of a stage's result, or of why there is none."""
+        stored = self.stored(stage)
+        return "" if stored is None else stored.content
 
 
-def failed_stages(out: Path) -> dict[str, str]:
-    """Why stages of a run could not run, by stage; empty where all did.
-
-    Args:
-        out: The run's folder.
-
-    Raises:
-        InputError: If a checkpoint is damaged.
-
-    Example:
-        >>> failed_stages(Path("nowhere"))
-        {}
-    """
-    paths = {stage: out / "checkpoints" / f"{stage}.json" for stage in STAGES}
-    found = {stage: read_document(path) for stage, path in paths.items() if path.is_file()}
-    return {stage: str(result["reason"]) for stage, result in found.items() if result.get("failed")}
+def versions() -> dict[str, str]:
+    """Versions of what a result depends on."""
+    packages = ("casadi", "numpy", "scipy", "safetensors", "torch", "control", "pandas")
+    own = {"hybrid-mpc": __version__, "python": platform.python_version()}
+    return own | {name: version(name) for name in packages}

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import check_folder, write_json
+from hybrid_mpc.job.context import versions
 from hybrid_mpc.job.controllers import CONTENDERS, ORACLES, find_noise
 from hybrid_mpc.job.loops import (
     MODEL,
@@ -25,7 +26,6 @@ from hybrid_mpc.job.loops import (
     check_kit,
     summaries,
 )
-from hybrid_mpc.job.stages.export import versions
 from hybrid_mpc.kit.artifact import Kit, artifact_folder, load
 from hybrid_mpc.kit.assembly import SOLVERS, adaptable
 from hybrid_mpc.loop.faults import Fault

@@ -1,59 +1,60 @@
-"""The main job: data, prior, training, evaluation, export, control, estimation, monitor, guard, analysis, report."""
+"""The main job: its stages in their order, each computed only where what it reads has changed."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from hybrid_mpc.errors import InputError, StorageError
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import read_object
 from hybrid_mpc.job.check import check_scenario
 from hybrid_mpc.job.context import Context, Progress, Silent
 from hybrid_mpc.job.folder import open_folder
-from hybrid_mpc.job.settings import RunSettings, check_device, claim
-from hybrid_mpc.job.stages import export as deploy
-from hybrid_mpc.job.stages import identify
-from hybrid_mpc.job.stages import monitor as judge
-from hybrid_mpc.job.stages.estimate import estimation_stage
-from hybrid_mpc.job.stages.guard import guard_stage
-from hybrid_mpc.job.stages.report import report_stage
+from hybrid_mpc.job.settings import RunSettings, check_device, run_note
+from hybrid_mpc.job.stage import Absent, Stage, bring_up_to_date, changed
+from hybrid_mpc.job.stages.analyze import ANALYSIS
+from hybrid_mpc.job.stages.compare import CONTROL
+from hybrid_mpc.job.stages.estimate import ESTIMATION
+from hybrid_mpc.job.stages.export import EXPORT, NOISE
+from hybrid_mpc.job.stages.guard import GUARD
+from hybrid_mpc.job.stages.identify import DATA, EVALUATION, PRIOR, TRAINING, check_data
+from hybrid_mpc.job.stages.monitor import MONITOR
+from hybrid_mpc.job.stages.report import REPORT
+from hybrid_mpc.job.stages.results import Results, read_results
+from hybrid_mpc.records import known
 from hybrid_mpc.scenario import load_scenario
 
-STAGES: tuple[tuple[str, str, Callable[[Context], None]], ...] = (
-    ("data", "reading the measurements", identify.data_stage),
-    ("prior", "fitting the prior", identify.prior_stage),
-    ("training", "training the networks", identify.training_stage),
-    ("evaluation", "free runs on unseen data", identify.evaluation_stage),
-    ("export", "exporting to CasADi", deploy.export_stage),
-    ("control", "closing the loop", deploy.control_stage),
-    ("estimation", "testing the observers", estimation_stage),
-    ("monitor", "calibrating the energy monitor", judge.monitor_stage),
-    ("guard", "learning the energy guard", guard_stage),
-    ("analysis", "linear analysis", judge.analysis_stage),
-    ("report", "writing the report", report_stage),
-)
-
-OPTIONAL = ("control", "estimation", "monitor", "guard", "analysis")
-"""Stages without which there is still a model, and a report on it: one that cannot run leaves its reason there."""
+STAGES: tuple[Stage[Any], ...] = (
+    DATA, PRIOR, TRAINING, EVALUATION, EXPORT, NOISE, CONTROL, ESTIMATION, MONITOR, GUARD, ANALYSIS, REPORT,
+)  # fmt: skip
+"""Stages in their order."""
+NAMES = tuple(stage.name for stage in STAGES)
 
 
 def run(
-    settings: RunSettings, out: Path, *, resume: bool = False, progress: Progress | None = None
-) -> dict[str, Any]:
-    """Run the main job into the folder ``out`` and return what stands in its ``results.json``.
+    settings: RunSettings,
+    out: Path,
+    *,
+    resume: bool = False,
+    only: Sequence[str] = (),
+    skip: Sequence[str] = (),
+    progress: Progress | None = None,
+) -> Results:
+    """Run the main job into the folder ``out``; the results stand in its ``results.json``, too.
 
-    Every stage leaves a checkpoint in ``out/checkpoints``; a run that was interrupted, at any point, is
-    finished by ``resume=True`` and then equals one that was not. A stage after the export that cannot run (a monitor
-    for which the recordings are too short, say) costs its own part of the report, which then has the reason.
+    Every stage leaves its result in ``out/checkpoints``. With ``resume`` a stage runs again only where something that
+    it reads has changed: after an interruption the run goes on, after an edit of a task its loops and the report are
+    made anew, and nothing is trained again. A stage after the export that cannot run costs its own part of the report,
+    which then has the reason.
 
     Args:
         settings: What to compute.
         out: Folder to make; it must be new or empty unless ``resume``.
-        resume: Finish the run that ``out`` holds.
+        resume: Go on with the run that ``out`` holds.
+        only: Names of the stages that may run, and the report; the others are taken as they are. Default: all.
+        skip: Names of stages after the export that are not to run. Default: none.
         progress: Where to report; default: nowhere.
-
-    Returns:
-        The results (docs/results-schema.md).
 
     Raises:
         InputError: For any bad input; nothing half-written is left behind that a later run would trip over.
@@ -62,26 +63,73 @@ def run(
     Example:
         >>> results = run(RunSettings("golf_robot"), Path("out"))  # doctest: +SKIP
     """
+    check_choice(only, skip)
     scenario = load_scenario(settings.scenario)
     context = Context(settings, scenario, out, progress or Silent())
     check_scenario(scenario, context.budget)
-    identify.check_data(context)
+    check_data(context)
     check_device(settings.device)
-    with open_folder(out, claim(settings), resume=resume):
-        for name, title, stage in STAGES:
-            context.progress.start(title)
-            if context.done(name):
-                context.progress.finish("done before")
-                continue
-            try:
-                stage(context)
-            except StorageError:
-                raise
-            except InputError as error:  # what was found before is worth a report
-                if name not in OPTIONAL:
-                    raise
-                context.fail(name, str(error))
-                context.progress.warn(f"stage {name} could not run: {error}")
-            context.progress.finish("")
-    result: dict[str, Any] = context.result("report")
-    return result
+    note = run_note(settings)
+    with open_folder(out, note, resume=resume):
+        note.write(out)
+        for stage in STAGES:
+            context.progress.start(stage.title)
+            if only and stage.name not in (*only, REPORT.name):
+                context.progress.finish(_as_it_is(context, stage))
+            else:
+                context.progress.finish(bring_up_to_date(context, stage, stage.name in skip))
+    return read_results(read_object(out / "results.json"), str(out / "results.json"))
+
+
+def check_choice(only: Sequence[str], skip: Sequence[str]) -> None:
+    """Refuse names that are no stages, and leaving out what all others need.
+
+    Raises:
+        InputError: With the names that there are.
+
+    Example:
+        >>> check_choice((), ("prior",))
+        Traceback (most recent call last):
+        hybrid_mpc.errors.InputError: --skip prior: without it there is no model; what can be left out: noise, ...
+    """
+    for name in (*only, *skip):
+        known(name, NAMES, "stage")
+    optional = [stage.name for stage in STAGES if stage.optional]
+    needed = [name for name in skip if name not in optional]
+    if needed:
+        raise InputError(
+            f"--skip {needed[0]}: without it there is no model; what can be left out: {', '.join(optional)}"
+        )
+
+
+def _as_it_is(context: Context, stage: Stage[Any]) -> str:
+    """Take a stage as the folder holds it."""
+    stored = context.stored(stage)
+    if stored is None:
+        if not stage.optional:
+            raise InputError(f"stage {stage.name} has not run in {context.out}; leave --only out")
+        context.leave_out(stage, f"stage {stage.name} was left out")
+        return "left out"
+    why = changed(stored.keys, stage.keys(context))
+    if why:
+        context.progress.warn(f"stage {stage.name} is out of date: {why}")
+    return "taken as it is"
+
+
+def failed_stages(out: Path) -> dict[str, str]:
+    """Why stages of a run could not run, by stage; empty where all did.
+
+    Args:
+        out: The run's folder.
+
+    Raises:
+        InputError: If a file is damaged.
+
+    Example:
+        >>> failed_stages(Path("nowhere"))
+        {}
+    """
+    context = Context(RunSettings(""), None, out)  # type: ignore[arg-type]
+    found = {stage.name: context.stored(stage) for stage in STAGES}
+    absent = {name: stored.result for name, stored in found.items() if stored is not None}
+    return {name: a.reason for name, a in absent.items() if isinstance(a, Absent) and a.failed}

@@ -1,4 +1,4 @@
-"""Where networks can be trained."""
+"""Settings of a run: what decides what it computes, networks from a file, the device."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from typing import Any, Protocol
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_json, read_object, sha256, write_json
 from hybrid_mpc.job.folder import JobNote
-
-# Settings of a run, those of its networks from a file, and the folder that holds it.
 
 FILE = "run.json"
 WHOLE = ("hidden", "networks", "teacher_steps", "free_run_steps", "horizon", "validation_horizon", "batch")
@@ -106,20 +104,29 @@ def read_network(path: Path) -> dict[str, Any]:
 
 
 class Identified(Protocol):
-    """Settings that tell whether two runs are the same."""
+    """Settings that tell whether two jobs are the same."""
 
     def identity(self) -> dict[str, Any]:
         """Settings as plain data."""
 
 
 def claim(settings: Identified) -> JobNote:
-    """What a run's folder says of it: its settings, in ``run.json``.
+    """What a job's folder says of it: its settings, in ``run.json``.
+
+    Args:
+        settings: What the job computes.
+    """
+    identity = settings.identity()
+    return JobNote("run", FILE, identity, lambda out: write_json(out / FILE, {"settings": identity}), _held)
+
+
+def run_note(settings: RunSettings) -> JobNote:
+    """What the folder of the main job says of it: its settings. Only the machine must stay; stages see the rest.
 
     Args:
         settings: What the run computes.
     """
-    identity = settings.identity()
-    return JobNote("run", FILE, identity, lambda out: write_json(out / FILE, {"settings": identity}), _held)
+    return replace(claim(settings), identity={"scenario": Path(settings.scenario).name}, held=_held_machine)
 
 
 def _held(out: Path) -> Mapping[str, Any]:
@@ -128,6 +135,10 @@ def _held(out: Path) -> Mapping[str, Any]:
     if not isinstance(before, dict):
         raise InputError(f"{out / FILE} is damaged: no settings in it; choose another --out")
     return before
+
+
+def _held_machine(out: Path) -> Mapping[str, Any]:
+    return {"scenario": str(_held(out).get("scenario")).split(" ")[0]}
 
 
 def check_device(device: str) -> None:

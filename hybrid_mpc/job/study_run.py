@@ -21,13 +21,12 @@ import numpy as np
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import MOST_CONTENT, read_bytes, sha256
-from hybrid_mpc.job.context import Progress, Silent
+from hybrid_mpc.job.context import Progress, Silent, versions
 from hybrid_mpc.job.control import ControlSettings, prepared
 from hybrid_mpc.job.controllers import CONTENDERS
 from hybrid_mpc.job.engine import Engine, Lost, make_engine
 from hybrid_mpc.job.folder import JobNote, check_folder, open_folder
 from hybrid_mpc.job.loops import Bench, LoopSpec, check_faults, varied
-from hybrid_mpc.job.stages.export import versions
 from hybrid_mpc.job.study import RandomFaults, Study
 from hybrid_mpc.job.study_log import FILE as NOTE
 from hybrid_mpc.job.study_log import (

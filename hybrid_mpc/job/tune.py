@@ -14,21 +14,17 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import write_json, write_text
 from hybrid_mpc.identify.tune import SearchSpace
 from hybrid_mpc.job.check import check_scenario
-from hybrid_mpc.job.context import Context, Progress, Silent
+from hybrid_mpc.job.context import Context, Progress, Silent, versions
 from hybrid_mpc.job.folder import open_folder
 from hybrid_mpc.job.settings import RunSettings, claim
-from hybrid_mpc.job.stages import identify
-from hybrid_mpc.job.stages.export import versions
+from hybrid_mpc.job.stage import bring_up_to_date
+from hybrid_mpc.job.stages.identify import DATA, MODELS, PRIOR, check_data, training_settings
 from hybrid_mpc.scenario import load_scenario
 
 if TYPE_CHECKING:
     from hybrid_mpc.identify.tune import SearchResult, TrialRow
 
 SCHEMA_VERSION = 1
-STAGES = (
-    ("data", "reading the measurements", identify.data_stage),
-    ("prior", "fitting the prior", identify.prior_stage),
-)
 RATES = ("learning_rate", "free_run_learning_rate")
 
 
@@ -53,7 +49,7 @@ class SearchSettings(RunSettings):
     space: SearchSpace = field(default_factory=SearchSpace)
 
     def __post_init__(self) -> None:
-        kinds = [name for name in identify.MODELS if not name.startswith("phy")]
+        kinds = [name for name in MODELS if not name.startswith("phy")]
         if self.kind not in kinds:
             raise InputError(f"kind has no {self.kind!r}; there are: {', '.join(kinds)}")
         if self.kind == "rnn" and self.space.prior_replay is not None:
@@ -102,19 +98,17 @@ def run_search(
     check_numbers(trials, settings.seed, timeout)
     context = Context(settings, load_scenario(settings.scenario), out, progress or Silent())
     check_scenario(context.scenario, context.budget)
-    identify.check_data(context)
+    check_data(context)
     with open_folder(out, claim(settings), resume=resume):
-        for name, title, stage in STAGES:
-            context.progress.start(title)
-            if not context.done(name):
-                stage(context)
-            context.progress.finish("")
+        for stage in (DATA, PRIOR):
+            context.progress.start(stage.title)
+            context.progress.finish(bring_up_to_date(context, stage))
         context.progress.start(f"searching, {trials} trials")
         found = search(
-            context.scenario.prior(context.result("prior")["values"]),
+            context.scenario.prior(context.prior.fit.values),
             context.smoothed("train"),
             context.smoothed("valid"),
-            identify.training_settings(context, settings.kind),
+            training_settings(context, settings.kind),
             settings.space,
             trials=trials,
             storage=out / "search.jsonl",
@@ -166,7 +160,7 @@ def _write(context: Context, settings: SearchSettings, found: SearchResult) -> d
     from hybrid_mpc.plots.style import save
 
     out, space, best = context.out, settings.space, overrides(found, settings.space)
-    data = context.result("data")
+    data = context.read(DATA)
     rows = [_plain(row) for row in found.trials]
     results = {
         "schema": "hybrid-mpc search",
@@ -176,9 +170,9 @@ def _write(context: Context, settings: SearchSettings, found: SearchResult) -> d
         "budget": settings.budget,
         "kind": settings.kind,
         "space": {name: space.bounds(name) for name in space.names},
-        "base_settings": asdict(identify.training_settings(context, settings.kind)),
+        "base_settings": asdict(training_settings(context, settings.kind)),
         "versions": versions(),
-        "data": {"hash": data["hash"], "warnings": data.get("warnings", [])},  # older searches have none
+        "data": {"hash": data.hash, "warnings": data.warnings},
         "base_value": found.base,
         "best": _plain(found.best),
         "settings": best,

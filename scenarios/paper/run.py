@@ -15,11 +15,10 @@ import numpy as np
 from hybrid_mpc.data.trajectories import Dataset, Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_arrays, read_json, write_json, write_text
-from hybrid_mpc.job.context import Progress, Silent
+from hybrid_mpc.job.context import Progress, Silent, versions
 from hybrid_mpc.job.engine import WORKERS, run_jobs
 from hybrid_mpc.job.folder import open_folder
 from hybrid_mpc.job.settings import check_device, claim
-from hybrid_mpc.job.stages.export import versions
 from hybrid_mpc.scenario import Scenario, load_scenario
 from scenarios.paper.experiment import Effort, Experiment
 from scenarios.paper.jobs import RULE, Case, Ruler, ensemble_job, fit_job, physics_job, sindy_job

@@ -2,26 +2,40 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.files import digest
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import digest, read_document, read_document_arrays, write_document
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.controllers import CONTENDERS, ORACLES
 from hybrid_mpc.job.engine import WORKERS, run_jobs
 from hybrid_mpc.job.loops import MODEL, Bench, LoopRow, LoopSpec, tasks_of
-from hybrid_mpc.kit.artifact import load, loop_settings, read_description
+from hybrid_mpc.job.stage import UNKNOWN, Absent, Stage, source_of
+from hybrid_mpc.job.stages.export import EXPORT, NOISE, observed
+from hybrid_mpc.kit.artifact import LoopSettings, load, loop_settings, read_description, write_description
+from hybrid_mpc.loop.loop import Loop
 from hybrid_mpc.loop.simulate import Step
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import Budget, Scenario, Task, load_scenario
 
+if TYPE_CHECKING:
+    from hybrid_mpc.control.safeguard import SafeController
+    from hybrid_mpc.data.trajectories import Trajectory
+    from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
+    from hybrid_mpc.estimate.switching import SwitchingFilter
+    from hybrid_mpc.monitor.energy import EnergyMonitor
+
 Array = NDArray[np.float64]
+TIMED_PERIODS = 1000
+"""Periods timed on recordings, where there is no plant; enough for a 99th percentile."""
 TIMED = ("prior_observer", "hybrid_observer")
 """Contenders whose first seed runs alone on the machine, so that the durations of its steps count."""
 SHOWN = ("t", "x", "u", "reference")
@@ -76,7 +90,43 @@ def parts_of(scenario: Scenario, budget: Budget) -> list[Part]:
     return parts
 
 
-def contest(context: Context) -> list[LoopRow]:
+@dataclass(frozen=True)
+class ControlResult:
+    """The closed loops of a run.
+
+    Args:
+        rows: The loops by task, controller and seed.
+        reason: Why there are none, where only steps could be timed. Default: there are loops.
+        arrays: Signals that are drawn, ``"TASK/CONTROLLER/SEED/NAME"``; without loops ``step_ms``.
+    """
+
+    rows: tuple[LoopRow, ...]
+    reason: str = ""
+    arrays: Mapping[str, Array] = field(default_factory=dict)
+
+    @property
+    def drawn(self) -> list[LoopRow]:
+        """The loops with their signals."""
+        return [with_arrays(row, self.arrays) for row in self.rows]
+
+
+def control_stage(context: Context) -> ControlResult | Absent:
+    """Closed loops of every task with prior, hybrid and oracle; or only timing where there is no plant."""
+    if context.scenario.control is None:
+        return Absent(f"scenario {context.scenario.name} defines no control problem")
+    context.read(NOISE)
+    if context.scenario.plant is None:
+        return _only_timing(context)
+    folder = context.out / "model"
+    held = read_description(folder)
+    if held.calibration is not None:
+        # of a run before; these loops run without it, and the monitor's stage puts it back
+        write_description(folder, replace(held, calibration=None))
+    rows = compare(context)
+    return ControlResult(tuple(replace(row, arrays={}) for row in rows), "", arrays_of(rows))
+
+
+def compare(context: Context) -> list[LoopRow]:
     """Run all loops on the run's model; the timed ones alone, the others side by side in processes.
 
     Every part is kept as it ends; what a run that was killed has kept is not run again.
@@ -100,6 +150,41 @@ def contest(context: Context) -> list[LoopRow]:
     rows = [row for part in parts for row in kept(context, part.stage)]
     order = [task.name for task in tasks_of(context.scenario, context.budget.tasks)]
     return sorted(rows, key=lambda row: (order.index(row.task), row.controller, row.seed))
+
+
+def _only_timing(context: Context) -> ControlResult:
+    kit, whole = context.kit, context.dataset.whole
+    most = max(2, TIMED_PERIODS // len(whole))
+    controller, estimator, durations = kit.controller(), kit.observer(), []
+    for i, recording in enumerate(whole):
+        context.progress.update("recordings", i, len(whole), f"timing on {recording.name}")
+        monitor = kit.monitor(kind="own")
+        durations.append(time_on_recording(controller, estimator, monitor, recording, most))
+    reason = f"scenario {context.scenario.name} has no plant to close the loop with"
+    return ControlResult((), reason, {"step_ms": np.concatenate(durations)})
+
+
+def time_on_recording(
+    controller: SafeController,
+    estimator: ExtendedKalmanFilter | SwitchingFilter,
+    monitor: EnergyMonitor,
+    trajectory: Trajectory,
+    most: int,
+) -> Array:
+    """Durations [ms] of a loop's steps on at most ``most`` recorded samples, without a plant.
+
+    The controller is asked to hold the rest position from wherever the recording is; the loop takes the recorded input
+    as the one that acted, not its own.
+    """
+    loop = Loop(estimator, controller, monitor=monitor)
+    loop.start(trajectory.y[0])
+    durations = []
+    for k in range(1, min(most, len(trajectory.t))):
+        loop.finish()
+        loop.step(trajectory.y[k], applied=trajectory.u[k - 1])
+        loop.finish()
+        durations.append(1e3 * sum(loop.spent.values()))
+    return np.array(durations)
 
 
 def _seeds(name: str, scenario: Scenario, seeds: int, oracle_seeds: int) -> int:
@@ -159,32 +244,33 @@ def run_parts(context: Context, parts: Mapping[str, list[LoopSpec]]) -> None:
     )
 
 
-def keep(context: Context, stage: str, rows: list[LoopRow], specs: Sequence[LoopSpec] = ()) -> None:
-    """Write rows as a checkpoint, with what they are of.
+def keep(context: Context, part: str, rows: list[LoopRow], specs: Sequence[LoopSpec] = ()) -> None:
+    """Write rows into ``checkpoints``, with what they are of.
 
     Args:
         context: The run.
-        stage: Name of the checkpoint.
+        part: Name of the file.
         rows: The loops.
         specs: Their specifications, to know them again. Default: unknown.
     """
-    told = [row.plain() for row in rows]
-    context.save(stage, {"rows": told, "of": identity(context, specs)}, arrays_of(rows))
+    held = {"rows": [row.plain() for row in rows], "of": identity(context, specs)}
+    write_document(context.path(part), held, arrays_of(rows))
 
 
-def is_kept(context: Context, stage: str, specs: Sequence[LoopSpec]) -> bool:
-    """Whether a checkpoint holds these loops of the run's present model, noise and control problem.
+def is_kept(context: Context, part: str, specs: Sequence[LoopSpec]) -> bool:
+    """Whether ``checkpoints`` holds these loops of the run's present model, noise, machine and control problem.
 
     Args:
         context: The run.
-        stage: Name of the checkpoint.
+        part: Name of the file.
         specs: The loops.
     """
-    return context.done(stage) and context.result(stage).get("of") == identity(context, specs)
+    path = context.path(part)
+    return path.is_file() and read_document(path, _remedy(path)).get("of") == identity(context, specs)
 
 
 def identity(context: Context, specs: Sequence[LoopSpec]) -> str:
-    """Digest of all that decides what loops of a run compute: their specifications, and the run's model.
+    """Digest of all that decides what loops of a run compute: their specifications, machine, tasks and model.
 
     Args:
         context: The run.
@@ -193,34 +279,112 @@ def identity(context: Context, specs: Sequence[LoopSpec]) -> str:
     model = read_description(context.out / "model")
     rest = None if model.calibration is None else model.calibration.rest_speed
     of_monitor = rest if any(spec.monitor == "readings" for spec in specs) else None
-    loop = loop_settings(context.scenario, model.loop.process_noise)
-    return digest([[spec.id for spec in specs], model.programs_sha256, plain(loop), of_monitor])
+    scenario = context.scenario
+    tasks = {task.name: task for task in scenario.tasks}
+    loop = loop_settings(scenario, model.loop.process_noise)
+    oracle = source_of(scenario.oracle) if any(spec.controller in ORACLES for spec in specs) else None
+    read = (
+        [task_content(tasks[spec.task], context.spec.dt, loop) for spec in specs],
+        source_of(scenario.plant),
+        oracle,
+    )
+    if any(value is UNKNOWN for value in (*read[1:], *(v for content in read[0] for v in content.values()))):
+        return f"unknown {time.monotonic_ns()}"
+    return digest(
+        [
+            [spec.id for spec in specs],
+            model.programs_sha256,
+            plain(replace(loop, control={})),
+            of_monitor,
+            read,
+        ]
+    )
 
 
-def kept(context: Context, stage: str) -> list[LoopRow]:
+def task_content(task: Task, dt: float, loop: LoopSettings) -> dict[str, object]:
+    """All of a task that decides how its loops go: its references sampled on the grid, its control problem.
+
+    Args:
+        task: The task.
+        dt: Period of the model [s].
+        loop: The control problems by task.
+    """
+    problem = loop.control.get(task.name, loop.control.get(""))
+    horizon = 0 if problem is None else problem.horizon
+    t = np.arange(round(task.duration / dt) + horizon + 1, dtype=np.float64) * dt
+    return {
+        "name": task.name,
+        "duration": task.duration,
+        "x0": task.x0,
+        "faults": task.faults,
+        "reference": np.asarray(task.reference(t)),
+        "weight": None if task.weight is None else np.asarray(task.weight(t)),
+        "control problem": problem,
+        "figures": source_of(task.figures),
+    }
+
+
+def kept(context: Context, part: str) -> list[LoopRow]:
     """Rows that :func:`keep` wrote.
 
     Args:
         context: The run.
-        stage: Name of the checkpoint.
+        part: Name of the file.
 
     Raises:
-        InputError: If the checkpoint is damaged.
+        InputError: If the file is damaged.
     """
-    rows = [record(LoopRow, row, f"checkpoints/{stage}.json") for row in context.result(stage)["rows"]]
-    arrays = context.arrays(stage)
-    return [replace(row, arrays=_own(arrays, row)) for row in rows]
+    path = context.path(part)
+    held, arrays = read_document(path, _remedy(path)), read_document_arrays(path, _remedy(path))
+    if "rows" not in held:
+        raise InputError(f"{path} holds no loops; {_remedy(path)}")
+    return [with_arrays(record(LoopRow, row, str(path)), arrays) for row in held["rows"]]
 
 
-def arrays_of(rows: list[LoopRow]) -> dict[str, Array]:
+def _remedy(path: Path) -> str:
+    return f"delete {path.stem}.* in {path.parent}, and --resume runs these loops anew"
+
+
+def arrays_of(rows: Sequence[LoopRow]) -> dict[str, Array]:
     """The arrays of rows by ``task/controller/seed/name``."""
     return {f"{_place(row)}/{name}": values for row in rows for name, values in row.arrays.items()}
 
 
-def _own(arrays: Mapping[str, Array], row: LoopRow) -> dict[str, Array]:
+def with_arrays(row: LoopRow, arrays: Mapping[str, Array]) -> LoopRow:
+    """A row with its own of the arrays of many."""
     start = f"{_place(row)}/"
-    return {key.removeprefix(start): values for key, values in arrays.items() if key.startswith(start)}
+    own = {key.removeprefix(start): values for key, values in arrays.items() if key.startswith(start)}
+    return replace(row, arrays=own)
 
 
 def _place(row: LoopRow) -> str:
     return f"{row.task}/{row.controller}/{row.seed}"
+
+
+def what_loops_read(context: Context) -> dict[str, object]:
+    """The machine, its tasks, and how many loops there are."""
+    scenario, budget = context.scenario, context.budget
+    loop = loop_settings(scenario)
+    read: dict[str, object] = {
+        **observed(context),
+        "control problem": scenario.control,
+        "plant": source_of(scenario.plant),
+        "seed": context.settings.seed,
+        "number of loops": (budget.seeds, budget.oracle_seeds, budget.tasks),
+        "safe input": scenario.safe_input,
+    }
+    for task in tasks_of(scenario, budget.tasks) if scenario.plant is not None else ():
+        content = task_content(task, context.spec.dt, loop)
+        read[f"task {task.name}"] = UNKNOWN if UNKNOWN in content.values() else content
+    return read
+
+
+CONTROL = Stage(
+    "control",
+    "closing the loop",
+    ControlResult,
+    control_stage,
+    what_loops_read,
+    (EXPORT, NOISE),
+    optional=True,
+)

@@ -2,71 +2,118 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.consistency import Consistency, consistency
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.controllers import CONTENDERS
-from hybrid_mpc.job.stages.results import OBSERVERS
+from hybrid_mpc.job.stage import Absent, Stage
+from hybrid_mpc.job.stages.export import EXPORT, NOISE, observed
+from hybrid_mpc.job.stages.identify import DATA
 
 if TYPE_CHECKING:
     from hybrid_mpc.data.trajectories import Trajectory
 
-JUDGED_PERIODS = 1000
-JUDGED_RECORDINGS = 4
-"""So many periods of so many test recordings are judged: a few seconds of computing for both observers."""
+Array = NDArray[np.float64]
+OBSERVERS = ("prior_observer", "hybrid_observer")
+PERIODS = 1000
+RECORDINGS = 4
+"""So many periods of so many test recordings are looked at: a few seconds of computing for both observers."""
 
 
-def estimation_stage(context: Context) -> None:
+@dataclass(frozen=True)
+class ObserverTest:
+    """What the innovations of an observer say; see :func:`~hybrid_mpc.estimate.consistency.consistency`.
+
+    Args:
+        mean_nis: Mean normalised innovation squared; 1 for an observer that believes what it should.
+        nis_low: Lower end of its 95 % band.
+        nis_high: Upper end.
+        nis_inside: Share of samples below the 95 % quantile.
+        ljung_box: Statistic of their autocorrelation.
+        ljung_box_limit: Its 95 % quantile for white innovations.
+        samples: Samples looked at.
+        correlation_band: 95 % band of one autocorrelation.
+    """
+
+    mean_nis: float
+    nis_low: float
+    nis_high: float
+    nis_inside: float
+    ljung_box: float
+    ljung_box_limit: float
+    samples: int
+    correlation_band: float
+
+
+@dataclass(frozen=True)
+class TestedRecording:
+    """A recording, or its beginning, that the observers were tested on."""
+
+    name: str
+    samples: int
+
+
+@dataclass(frozen=True)
+class EstimationResult:
+    """Tests of the observers.
+
+    Args:
+        recordings: What they were tested on.
+        observers: What was found, by observer, or why nothing.
+        arrays: ``"OBSERVER/autocorrelation"``, and ``"OBSERVER/nis/k"`` of recording ``k``.
+    """
+
+    recordings: tuple[TestedRecording, ...]
+    observers: Mapping[str, ObserverTest | Absent]
+    arrays: Mapping[str, Array]
+
+
+def estimation_stage(context: Context) -> EstimationResult | Absent:
     """Test the innovations of the observers on prior and hybrid; skipped where no control problem tunes them."""
-    control = context.scenario.control
-    if control is None:
-        reason = "the observers need the scenario's control problem (input range, sensor noise)"
-        context.save("estimation", {"reason": reason}, {})
-        return
-    kit = context.kit
-    parts = judged_parts(context.trajectories("test"))
-    result: dict[str, Any] = {"recordings": [{"name": p.name, "samples": len(p.t)} for p in parts]}
-    arrays: dict[str, Any] = {}
+    if context.scenario.control is None:
+        return Absent("the observers need the scenario's control problem (input range, sensor noise)")
+    context.read(NOISE)
+    kit, parts = context.kit, tested_parts(context.trajectories("test"))
+    found: dict[str, ObserverTest | Absent] = {}
+    arrays: dict[str, Array] = {}
     for i, name in enumerate(OBSERVERS):
         context.progress.update("observers", i, len(OBSERVERS), name)
         estimator = kit.observer(CONTENDERS[name].model, load=CONTENDERS[name].observer)
         try:
-            found = consistency(estimator, parts)
+            tested = consistency(estimator, parts)
         except InputError as too_short:
-            result[name] = {"reason": str(too_short)}
+            found[name] = Absent(str(too_short))
             continue
-        result[name] = figures_of(found)
-        arrays[f"{name}/autocorrelation"] = found.autocorrelation
-        arrays |= {f"{name}/nis/{k}": run.nis for k, run in enumerate(found.runs)}
-    context.save("estimation", result, arrays)
+        found[name] = figures_of(tested)
+        arrays[f"{name}/autocorrelation"] = tested.autocorrelation
+        arrays |= {f"{name}/nis/{k}": run.nis for k, run in enumerate(tested.runs)}
+    return EstimationResult(tuple(TestedRecording(p.name, len(p.t)) for p in parts), found, arrays)
 
 
-def judged_parts(recordings: Sequence[Trajectory]) -> list[Trajectory]:
-    """The first samples of a few recordings, evenly chosen, that the tests can take the time for.
-
-    Args:
-        recordings: Test recordings.
-    """
-    places = np.linspace(0, len(recordings) - 1, min(JUDGED_RECORDINGS, len(recordings))).round().astype(int)
+def tested_parts(recordings: Sequence[Trajectory]) -> list[Trajectory]:
+    """The first samples of a few recordings, evenly chosen, that the tests can take the time for."""
+    places = np.linspace(0, len(recordings) - 1, min(RECORDINGS, len(recordings))).round().astype(int)
     chosen = [recordings[i] for i in dict.fromkeys(places.tolist())]
-    most = JUDGED_PERIODS // max(1, len(chosen))
+    most = PERIODS // max(1, len(chosen))
     return [r.part(np.arange(len(r.t)) < most, r.name, r.role) for r in chosen]
 
 
-def figures_of(found: Consistency) -> dict[str, Any]:
-    """What ``results.json`` holds of one observer, and the band of one autocorrelation."""
-    return {
-        "mean_nis": found.mean_nis,
-        "nis_low": found.nis_band[0],
-        "nis_high": found.nis_band[1],
-        "nis_inside": found.nis_inside,
-        "ljung_box": found.ljung_box,
-        "ljung_box_limit": found.ljung_box_limit,
-        "samples": found.samples,
-        "correlation_band": found.correlation_band,
-    }
+def figures_of(found: Consistency) -> ObserverTest:
+    """The numbers of a test."""
+    return ObserverTest(
+        found.mean_nis, *found.nis_band, found.nis_inside, found.ljung_box, found.ljung_box_limit, found.samples,
+        found.correlation_band,
+    )  # fmt: skip
+
+
+ESTIMATION = Stage(
+    "estimation", "testing the observers", EstimationResult, estimation_stage, observed, (DATA, EXPORT, NOISE),
+    optional=True,
+)  # fmt: skip

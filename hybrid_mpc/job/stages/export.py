@@ -1,59 +1,58 @@
-"""Stages export and control: the artifact, and closed loops with the models that it holds."""
+"""Stages export and noise: the artifact of the hybrid and the fitted prior, and what their estimators assume."""
 
 from __future__ import annotations
 
-import platform
-from dataclasses import replace
-from importlib.metadata import version
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
-from hybrid_mpc import __version__
-from hybrid_mpc.control.safeguard import SafeController
-from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
-from hybrid_mpc.estimate.switching import SwitchingFilter
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.identify.export import check_parity, model_info, trace_model
+from hybrid_mpc.identify.step import PriorStep, RecurrentStep
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.controllers import noise_of
-from hybrid_mpc.job.stages.compare import contest, keep
-from hybrid_mpc.kit.artifact import Kit, Provenance, loop_settings, save_artifact, set_process_noise
-from hybrid_mpc.loop.loop import Loop
-from hybrid_mpc.monitor.energy import EnergyMonitor
-
-if TYPE_CHECKING:
-    from hybrid_mpc.data.trajectories import Trajectory
-
-Array = NDArray[np.float64]
-DEPLOYED = "mopgrnn"
-TIMED_PERIODS = 1000
-"""Periods timed on recordings, where there is no plant; enough for a 99th percentile."""
+from hybrid_mpc.job.stage import Absent, Stage, source_of
+from hybrid_mpc.job.stages.identify import DATA, DEPLOYED, EVALUATION, PRIOR, TRAINING, trained_models
+from hybrid_mpc.kit.artifact import (
+    Provenance,
+    loop_settings,
+    read_description,
+    save_artifact,
+    write_description,
+)
 
 
-def versions() -> dict[str, str]:
-    """Versions of what a result depends on."""
-    packages = ("casadi", "numpy", "scipy", "safetensors", "torch", "control", "pandas")
-    own = {"hybrid-mpc": __version__, "python": platform.python_version()}
-    return own | {name: version(name) for name in packages}
+@dataclass(frozen=True)
+class ExportResult:
+    """The artifact, and how far its models lie from PyTorch.
+
+    Args:
+        parity_max_abs_error: Largest difference of values, relative to the outputs' scale.
+        jacobian_max_abs_error: Largest difference of Jacobians, alike.
+        programs_sha256: Hash of the exported programs.
+    """
+
+    parity_max_abs_error: float
+    jacobian_max_abs_error: float
+    programs_sha256: str
 
 
-def export_stage(context: Context) -> None:
-    """Write the hybrid and the fitted prior as one artifact; measure both against torch."""
-    from hybrid_mpc.identify.export import check_parity, model_info, trace_model
-    from hybrid_mpc.identify.prior_result import PriorFit
-    from hybrid_mpc.identify.step import PriorStep, RecurrentStep
-    from hybrid_mpc.job.stages.identify import trained_models as load_trained
+@dataclass(frozen=True)
+class NoiseResult:
+    """Process noise of the estimators: standard deviations per period ``(n_x,)`` [state units] by estimator."""
 
-    dt, settings = context.spec.dt, context.settings
-    phy = context.scenario.prior(context.result("prior")["values"])
+    process_noise: Mapping[str, tuple[float, ...]]
+
+
+def export_stage(context: Context) -> ExportResult:
+    """Write the hybrid and the fitted prior as one artifact; compare both with torch."""
+    dt, settings, prior = context.spec.dt, context.settings, context.prior
+    phy = context.scenario.prior(prior.fit.values)
     steps: dict[str, RecurrentStep | PriorStep] = {
-        "hybrid": load_trained(context, DEPLOYED).step(phy, dt),
+        "hybrid": trained_models(context, DEPLOYED).step(phy, dt),
         "prior": PriorStep(phy, dt),
     }
-    found = context.result("prior")
-    fit = PriorFit(found["values"], found["standard_errors"], (), (), found["correlations"])
-    info = model_info(phy, dt, fit.covariance(phy.parameters_spec))
-    deployed = replace(info, input_delay=context.delay, time_unit=context.time_unit)
+    info = model_info(phy, dt, prior.fit.covariance(phy.parameters_spec))
+    deployed = replace(info, input_delay=prior.delay, time_unit=context.time_unit)
     programs, parities = {}, []
     for i, (name, step) in enumerate(steps.items()):
         context.progress.update("models", i, len(steps), name)
@@ -62,70 +61,63 @@ def export_stage(context: Context) -> None:
             check_parity(step, programs[name], info, context.smoothed("train"), seed=settings.seed)
         )
     provenance = Provenance(
-        context.scenario.name,
-        settings.seed,
-        settings.budget,
-        context.result("data")["hash"],
-        versions(),
-        phy.values,
-        context.result("evaluation")["scores"][DEPLOYED]["best"],
-    )
-    save_artifact(
-        context.out / "model", programs, deployed, provenance=provenance, loop=loop_settings(context.scenario)
-    )
-    context.save(
-        "export",
-        {
-            "parity_max_abs_error": max(p.max_abs_error for p in parities),
-            "jacobian_max_abs_error": max(p.jacobian_max_abs_error for p in parities),
-        },
+        context.scenario.name, settings.seed, settings.budget, context.read(DATA).hash, context.versions,
+        phy.values, vars(context.read(EVALUATION).scores[DEPLOYED].best),
+    )  # fmt: skip
+    folder = context.out / "model"
+    save_artifact(folder, programs, deployed, provenance=provenance, loop=loop_settings(context.scenario))
+    return ExportResult(
+        max(p.max_abs_error for p in parities),
+        max(p.jacobian_max_abs_error for p in parities),
+        read_description(folder).programs_sha256,
     )
 
 
-def control_stage(context: Context) -> None:
-    """Closed loops of every task with prior, hybrid and oracle; or only timing where there is no plant."""
-    folder, scenario = context.out / "model", context.scenario
-    if scenario.control is None:
-        context.save("control", {"reason": f"scenario {scenario.name} defines no control problem"}, {})
-        return
-    noise = noise_of(scenario, context.kit, context.commanded("train"))
-    set_process_noise(folder, noise)
-    if scenario.plant is None:
-        _only_timing(context, context.kit)
-    else:
-        keep(context, "control", contest(context))
+def artifact_is_there(context: Context, found: ExportResult) -> str:
+    """Whether the artifact lies where the run left it; a text if not."""
+    try:
+        same = read_description(context.out / "model").programs_sha256 == found.programs_sha256
+    except InputError as damaged:
+        return str(damaged)
+    return "" if same else "the artifact was changed"
 
 
-def _only_timing(context: Context, kit: Kit) -> None:
-    whole = context.dataset.whole
-    most = max(2, TIMED_PERIODS // len(whole))
-    controller, estimator, durations = kit.controller(), kit.observer(), []
-    for i, recording in enumerate(whole):
-        context.progress.update("recordings", i, len(whole), f"timing on {recording.name}")
-        monitor = kit.monitor(kind="own")
-        durations.append(time_on_recording(controller, estimator, monitor, recording, most))
-    reason = f"scenario {context.scenario.name} has no plant to close the loop with"
-    context.save("control", {"reason": reason}, {"step_ms": np.concatenate(durations)})
+def noise_stage(context: Context) -> NoiseResult | Absent:
+    """Tune the estimators on training recordings, by maximum likelihood."""
+    if context.scenario.control is None:
+        return Absent(f"scenario {context.scenario.name} defines no control problem")
+    found = noise_of(context.scenario, context.kit, context.commanded("train"))
+    result = NoiseResult({name: tuple(sigma.tolist()) for name, sigma in found.items()})
+    put_noise(context, result)
+    return result
 
 
-def time_on_recording(
-    controller: SafeController,
-    estimator: ExtendedKalmanFilter | SwitchingFilter,
-    monitor: EnergyMonitor,
-    trajectory: Trajectory,
-    most: int,
-) -> Array:
-    """Durations [ms] of a loop's steps on at most ``most`` recorded samples, without a plant.
+def put_noise(context: Context, found: NoiseResult) -> str:
+    """Write the scenario's control problems and the noise into the artifact."""
+    folder = context.out / "model"
+    held = read_description(folder)
+    loop = loop_settings(context.scenario, found.process_noise)
+    if loop != held.loop:
+        write_description(folder, replace(held, loop=loop))
+    return ""
 
-    The controller is asked to hold the rest position from wherever the recording is; the loop is told
-    that the recorded input acted, not its own.
-    """
-    loop = Loop(estimator, controller, monitor=monitor)
-    loop.start(trajectory.y[0])
-    durations = []
-    for k in range(1, min(most, len(trajectory.t))):
-        loop.finish()
-        loop.step(trajectory.y[k], applied=trajectory.u[k - 1])
-        loop.finish()
-        durations.append(1e3 * sum(loop.spent.values()))
-    return np.array(durations)
+
+def observed(context: Context) -> dict[str, object]:
+    """What estimators of the scenario's loops are made of."""
+    scenario, control = context.scenario, context.scenario.control
+    return {
+        "sensors": (scenario.sensor_sigma, scenario.first_sigma),
+        "limits of the input": None if control is None else (control.u_min, control.u_max),
+        "beyond recordings": scenario.beyond_recordings,
+        "oracle": source_of(scenario.oracle),
+    }
+
+
+EXPORT = Stage(
+    "export", "exporting to CasADi", ExportResult, export_stage,
+    lambda context: {"seed": context.settings.seed}, (DATA, PRIOR, TRAINING, EVALUATION), restore=artifact_is_there,
+)  # fmt: skip
+NOISE = Stage(
+    "noise", "tuning the observers", NoiseResult, noise_stage, observed, (DATA, PRIOR, EXPORT), optional=True,
+    restore=put_noise,
+)  # fmt: skip

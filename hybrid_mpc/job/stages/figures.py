@@ -1,4 +1,4 @@
-"""The main job's pictures, drawn from the stages' checkpoints."""
+"""The main job's pictures, drawn from the results of its stages."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ from matplotlib.figure import Figure
 from hybrid_mpc.identify.settings import KINDS
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.loops import summaries, tasks_of
-from hybrid_mpc.job.stages.compare import kept
-from hybrid_mpc.job.stages.guard import read_trace
-from hybrid_mpc.job.stages.identify import trained_models as load_trained
-from hybrid_mpc.job.stages.monitor import clean_windows, run_calibration
-from hybrid_mpc.job.stages.results import MODELS, OBSERVERS, REPORTED, step_times
+from hybrid_mpc.job.stage import Absent
+from hybrid_mpc.job.stages.analyze import ANALYSIS
+from hybrid_mpc.job.stages.compare import CONTROL
+from hybrid_mpc.job.stages.estimate import ESTIMATION, OBSERVERS
+from hybrid_mpc.job.stages.guard import GUARD, read_trace
+from hybrid_mpc.job.stages.identify import EVALUATION, MODELS, trained_models
+from hybrid_mpc.job.stages.monitor import MONITOR, clean_windows
+from hybrid_mpc.job.stages.results import REPORTED, step_times
+from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.plots import analysis, animation, data, estimation, fit, loops, monitor
-from hybrid_mpc.plots import fit as training
-from hybrid_mpc.plots import loops as tasks
-from hybrid_mpc.plots.monitor import overview
 from hybrid_mpc.plots.style import save
 
 Figures = dict[str, list[tuple[Path, str]]]
@@ -35,8 +36,9 @@ SHOWN_RECORDINGS = 4
 
 def draw_all(context: Context) -> Figures:
     """Draw every figure that the run's stages allow into ``figures/``."""
-    judged = _estimation, _timing, _monitor, guard_figures, _analysis
-    parts = (_data, _training, _free_runs, _overview, _loops, *judged)
+    parts = (
+        _data, _training, _free_runs, _overview, _loops, _estimation, _timing, _monitor, guard_figures, _analysis,
+    )  # fmt: skip
     figures: Figures = {}
     for i, part in enumerate(parts):
         context.progress.update("figures", i, len(parts), part.__name__.strip("_"))
@@ -61,7 +63,7 @@ def _training(context: Context) -> Any:
     curves: dict[str, dict[str, Any]] = {}
     starts: dict[str, float] = {}
     for kind in reversed(KINDS):
-        trained = load_trained(context, kind)
+        trained = trained_models(context, kind)
         names = ["loss_error", "validation"]
         if kind == "mopgrnn":
             names += ["loss_energy", "bound_error", "bound_energy"]
@@ -69,7 +71,7 @@ def _training(context: Context) -> Any:
         curves[kind] = {"step": trained.curve["step"][:, best]}
         curves[kind] |= {name: trained.curve[name][:, best] for name in names}
         starts[kind] = float(trained.settings.teacher_steps)
-    figure = training.curves(curves, free_run_start=starts, units=("mixed SI", "W", "mixed SI"))
+    figure = fit.curves(curves, free_run_start=starts, units=("mixed SI", "W", "mixed SI"))
     caption = (
         "Objectives and bounds of the deployed network of each kind, on a fixed set of training windows."
     )
@@ -77,8 +79,9 @@ def _training(context: Context) -> Any:
 
 
 def _free_runs(context: Context) -> Any:
-    arrays, prior = context.arrays("evaluation"), context.scenario.prior()
-    for run in context.result("evaluation")["runs"][:SHOWN_RUNS]:
+    found, prior = context.read(EVALUATION), context.scenario.prior()
+    arrays = found.arrays
+    for run in found.runs[:SHOWN_RUNS]:
         own = {m: {k: arrays[f"{m}/{run}/{k}"] for k in ("x_hat", "energy_model_w")} for m in MODELS}
         shared = {k: arrays[f"mopgrnn/{run}/{k}"] for k in ("t", "x", "u", "energy_measured_w")}
         shown = ("phy_nominal", "phy", "rnn", "mopgrnn")
@@ -100,13 +103,13 @@ def _free_runs(context: Context) -> Any:
             figure,
             f"Free run over the unseen piece {run}; the warm-up before it is left out.",
         )
-    scores = context.result("evaluation")["scores"]
     keys = ("e_sim_s", "rmse_rad", "energy_violation_w")
-    finite = {m: {k: _finite(scores[m]["best"][k]) for k in keys} for m in MODELS}
+    finite = {m: {k: _finite(getattr(found.scores[m].best, k)) for k in keys} for m in MODELS}
+    values = {m: {k: [getattr(n, k) for n in found.scores[m].networks] for k in keys} for m in KINDS}
     spread: dict[str, dict[str, float]] = {
-        m: {k: float(np.std([float(n[k]) for n in scores[m]["networks"]])) for k in keys}
-        for m in KINDS
-        if all(np.isfinite(float(n[k])) for n in scores[m]["networks"] for k in keys)
+        m: {k: float(np.std(v)) for k, v in by.items()}
+        for m, by in values.items()
+        if all(np.isfinite(v).all() for v in by.values())
     }
     metrics = {**fit.METRICS, "rmse_rad": f"free-run RMSE [{context.scenario.prior().outputs[0].unit}]"}
     yield (
@@ -120,10 +123,12 @@ def _finite(value: Any) -> float | None:
 
 
 def _loops(context: Context) -> Any:
-    scenario = context.scenario
-    if "reason" in context.result("control") or scenario.control is None:
+    scenario, found = context.scenario, context.find(CONTROL)
+    if isinstance(found, Absent) or scenario.control is None:
         return
-    prior, drawn = scenario.prior(), [row for row in kept(context, "control") if row.arrays]
+    prior, drawn = scenario.prior(), [row for row in found.drawn if row.arrays]
+    if not drawn:
+        return
     for task in tasks_of(scenario, context.budget.tasks):
         own = {row.controller: row.arrays for row in drawn if row.task == task.name}
         names = {short: n for short, n in REPORTED.items() if n in own}
@@ -141,13 +146,14 @@ def _loops(context: Context) -> Any:
 
 
 def _overview(context: Context) -> Any:
-    """Costs of all contenders, errors of the strokes."""
-    if "reason" in context.result("control"):
+    """Costs of all controllers, errors of the strokes."""
+    found = context.find(CONTROL)
+    if isinstance(found, Absent) or not found.rows:
         return
-    rows = kept(context, "control")
+    rows = found.rows
     table = {
         task: {name: (cell.cost.mean, cell.cost.ci95) for name, cell in cells.items()}
-        for task, cells in summaries(rows).items()
+        for task, cells in summaries(list(rows)).items()
     }
     if any("oracle" in row for row in table.values()):
         finite = {
@@ -157,7 +163,7 @@ def _overview(context: Context) -> Any:
         yield (
             "control",
             "costs",
-            tasks.costs(finite),
+            loops.costs(finite),
             (
                 "Closed-loop cost of every controller over the measuring oracle's, with 95 % intervals over the seeds."
             ),
@@ -171,7 +177,7 @@ def _overview(context: Context) -> Any:
         yield (
             "control",
             "strokes",
-            tasks.strokes(strokes),
+            loops.strokes(strokes),
             "Strokes at the true crossing; bands: 1 % and 10 ms.",
         )
 
@@ -182,15 +188,15 @@ def _number(value: float | None) -> float:
 
 def _moving(context: Context) -> list[tuple[Path, str]]:
     """One loop of the hybrid as a moving picture, with what it planned at every instant."""
-    scenario = context.scenario
-    if scenario.draw is None or scenario.control is None or "reason" in context.result("control"):
+    scenario, found = context.scenario, context.find(CONTROL)
+    if scenario.draw is None or scenario.control is None or isinstance(found, Absent) or not found.rows:
         return []
     run = tasks_of(scenario, context.budget.tasks)
     task = next((t for t in run if t.weight is not None), run[0])
     control, prior = task.control or scenario.control, scenario.prior()
     own = next(
         row.arrays
-        for row in kept(context, "control")
+        for row in found.drawn
         if (row.task, row.controller) == (task.name, REPORTED["hybrid"]) and "plans" in row.arrays
     )
     path = animation.animate(
@@ -202,18 +208,21 @@ def _moving(context: Context) -> list[tuple[Path, str]]:
 
 
 def _estimation(context: Context) -> Any:
-    result, arrays = context.result("estimation"), context.arrays("estimation")
+    found = context.find(ESTIMATION)
+    if isinstance(found, Absent):
+        return
+    arrays = found.arrays
     for name in OBSERVERS:
-        own = result.get(name)
-        if own is None or "reason" in own:
+        own = found.observers[name]
+        if isinstance(own, Absent):
             continue
         figure = estimation.innovations(
-            [arrays[f"{name}/nis/{i}"] for i in range(len(result["recordings"]))],
+            [arrays[f"{name}/nis/{i}"] for i in range(len(found.recordings))],
             arrays[f"{name}/autocorrelation"],
             dt=context.spec.dt,
             outputs=context.scenario.prior().outputs,
-            mean_band=(own["nis_low"], own["nis_high"]),
-            correlation_band=own["correlation_band"],
+            mean_band=(own.nis_low, own.nis_high),
+            correlation_band=own.correlation_band,
             title=OBSERVER_TITLES[name],
         )
         caption = f"{OBSERVER_TITLES[name]}: how surprised it was by test recordings."
@@ -230,11 +239,13 @@ def _timing(context: Context) -> Any:
 
 
 def _monitor(context: Context) -> Any:
-    result = context.result("monitor")
-    if "reason" in result:
+    found = context.find(MONITOR)
+    if isinstance(found, Absent) or found.reason:
         return
-    arrays, output = context.arrays("monitor"), context.scenario.prior().outputs[0]
-    unit = "N m" if output.unit == "rad" else "N"
+    arrays, output, calibration = found.arrays, context.scenario.prior().outputs[0], found.calibration
+    power, force = calibration.threshold_w, calibration.residual_threshold
+    assert power is not None
+    assert force is not None
     for recording in _worth_showing(context):
         keys = ("t", "violation_w", "level_w", "residual_level", "alarm", "y")
         own = {k: arrays[f"{recording.name}/{k}"] for k in keys}
@@ -242,40 +253,40 @@ def _monitor(context: Context) -> Any:
             own["t"],
             own["violation_w"],
             own["level_w"],
-            result["calibration"]["threshold_w"],
+            power,
             own["alarm"],
             own["y"],
             output=output,
             windows=clean_windows(context, recording, ("train", "valid", "test", "nominal")),
-            residual=(own["residual_level"], result["calibration"]["residual_threshold"], unit),
+            residual=(own["residual_level"], force, force_unit(output)),
             title=recording.name,
         )
         name = recording.name.replace("#", "-")
         yield "monitor", f"monitor_{name}", figure, f"The monitor over the whole recording {recording.name}."
-    if "load" in result:
-        load = result["load"]
+    if found.load is not None:
+        load = found.load
         own = {k: arrays[f"load/{k}"] for k in ("t", "violation", "level", "alarm", "x")}
         figure = monitor.trace(
             own["t"],
             own["violation"],
             own["level"],
-            result["calibration"]["threshold_w"],
+            power,
             own["alarm"],
             own["x"][:, 0],
             output=output,
-            windows=((0.0, load["start_s"]),),
-            title=f"closed loop, {load['task']}: an unknown load from {load['start_s']:g} s on",
+            windows=((0.0, load.start_s),),
+            title=f"closed loop, {load.task}: an unknown load from {load.start_s:g} s on",
         )
         unit = context.scenario.prior().inputs[0].unit
         caption = (
-            f"The monitor inside the loop: a constant load of {load['load']:g} {unit} at the input sets in."
+            f"The monitor inside the loop: a constant load of {load.load:g} {unit} at the input sets in."
         )
         yield "monitor", "monitor_load", figure, caption
 
 
 def _worth_showing(context: Context) -> list[Any]:
     """Recordings with alarms first, then test recordings, a few in all."""
-    alarmed = {alarm["file"] for alarm in context.result("monitor")["alarms"]}
+    alarmed = {alarm.file for alarm in context.read(MONITOR).alarms}
     tested = {t.name.split("#")[0] for t in context.trajectories("test")}
     ranked = sorted(
         context.dataset.whole, key=lambda r: (r.name not in alarmed, r.name.split("#")[0] not in tested)
@@ -284,11 +295,11 @@ def _worth_showing(context: Context) -> list[Any]:
 
 
 def _analysis(context: Context) -> Any:
-    result, arrays = context.result("analysis"), context.arrays("analysis")
-    if "reason" in result:
+    found = context.find(ANALYSIS)
+    if isinstance(found, Absent):
         return
-    colours = {"prior": "phy", "hybrid": "mopgrnn"}
-    poles = {c: np.array([complex(*z) for z in result[n]["rest"]["poles"]]) for n, c in colours.items()}
+    arrays, colours = found.arrays, {"prior": "phy", "hybrid": "mopgrnn"}
+    poles = {c: np.array([complex(*z) for z in found.models[n].rest.poles]) for n, c in colours.items()}
     yield (
         "analysis",
         "poles",
@@ -298,10 +309,10 @@ def _analysis(context: Context) -> Any:
     prior = context.scenario.prior()
     titles = {"rest": "at rest, where the slope of dry friction dominates", "moving": "at working speed"}
     for point in ("rest", "moving"):
-        if point not in result["prior"]:
+        if point not in found.models["prior"].points:
             continue
         responses = {
-            c: tuple(arrays[f"{n}/{point}/{key}"] for key in ("omega", "magnitude", "phase"))
+            c: (arrays[f"{n}/{point}/omega"], arrays[f"{n}/{point}/magnitude"], arrays[f"{n}/{point}/phase"])
             for n, c in colours.items()
         }
         figure = analysis.bode(
@@ -315,40 +326,46 @@ def _analysis(context: Context) -> Any:
 
 def guard_figures(context: Context) -> Iterator[tuple[str, str, Figure, str]]:
     """Each loop in which something breaks; of a machine without plant a recording with test data."""
-    found = context.result("guard")
-    if "faults" not in found and "shown" not in found:
+    found = context.find(GUARD)
+    if isinstance(found, Absent) or not (found.faults or found.shown):
         return
-    arrays, output = context.arrays("guard"), context.scenario.prior().outputs[0]
-    unit = "N m" if output.unit == "rad" else "N"
-    for row in found.get("faults", ()):
-        start, name = row["start_s"], row["fault"]
+    arrays, output = found.arrays, context.scenario.prior().outputs[0]
+    unit = force_unit(output)
+    for row in found.faults or ():
         marks = [
-            (start, row["title"]),
-            *((s["t_s"], f"guard: {s['after'].lower()}") for s in row["switches"]),
+            (row.start_s, row.title),
+            *((s.t_s, f"guard: {s.after.lower()}") for s in row.switches),
         ]
-        figure = overview(
-            read_trace(arrays, name), arrays[f"{name}/y"], output=output, force_unit=unit, marks=marks,
-            title=f"{row['task']}: {row['title']} at {start:g} s",
+        figure = monitor.overview(
+            read_trace(arrays, row.fault), arrays[f"{row.fault}/y"], output=output, force_unit=unit, marks=marks,
+            title=f"{row.task}: {row.title} at {row.start_s:g} s",
         )  # fmt: skip
-        seen = "without an alarm" if row["delay_s"] is None else f"alarm after {row['delay_s']:.2f} s"
-        told = f"; the diagnosis: {row['diagnosis']}" if row["diagnosis"] else ""
-        yield "guard", f"guard_{name}", figure, f"{row['title'].capitalize()}: {seen}{told}."
-    if "faults" not in found:
-        shown, limits = found["shown"], {}
-        if "detector" not in found:
-            stored = run_calibration(context)
-            known = {"violation": stored.threshold_w, "residual": stored.residual_threshold}
+        seen = "without an alarm" if row.delay_s is None else f"alarm after {row.delay_s:.2f} s"
+        cause = f"; the diagnosis: {row.diagnosis}" if row.diagnosis else ""
+        yield "guard", f"guard_{row.fault}", figure, f"{row.title.capitalize()}: {seen}{cause}."
+    if found.faults is None and found.shown:
+        limits: dict[str, float] = {}
+        stored = context.find(MONITOR)
+        if found.detector is None and not isinstance(stored, Absent):
+            calibration = stored.calibration
+            known = {"violation": calibration.threshold_w, "residual": calibration.residual_threshold}
             limits = {name: limit for name, limit in known.items() if limit is not None}
-        figure = overview(
+        figure = monitor.overview(
             read_trace(arrays, "recorded"), arrays["recorded/y"], output=output, force_unit=unit,
-            thresholds=limits, title=shown,
+            thresholds=limits, title=found.shown,
         )  # fmt: skip
-        by = "learned detector" if "detector" in found else "thresholds of the section before"
-        if not (limits or "detector" in found):
-            by = "monitor, which has no thresholds to judge by"
-        yield (
-            "guard",
-            "guard_recorded",
-            figure,
-            f"The recording {shown}, of which test data come, by the {by}.",
-        )
+        by = "thresholds of the section before" if found.detector is None else "learned detector"
+        if not limits and found.detector is None:
+            by = "monitor, which has no thresholds"
+        caption = f"The recording {found.shown}, of which test data come, by the {by}."
+        yield "guard", "guard_recorded", figure, caption
+
+
+def force_unit(output: Signal) -> str:
+    """Unit of a residual force: energy over the unit of what it acts on; J/rad is N m, J/m is N.
+
+    Example:
+        >>> force_unit(Signal("phi", "rad"))
+        'J/rad'
+    """
+    return f"J/{output.unit}"

@@ -1,4 +1,4 @@
-"""Stage guard: detector and plausibility of the energy guard, learned, kept in the artifact, and tried out."""
+"""Stage guard: the detector of the energy guard, learned, kept in the artifact, and tried out."""
 
 from __future__ import annotations
 
@@ -14,21 +14,22 @@ from scipy.stats import chi2
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.job.context import Context
-from hybrid_mpc.job.loops import MODEL, Bench, LoopSpec
+from hybrid_mpc.job.loops import MODEL, Bench, LoopSpec, ModeChange
 from hybrid_mpc.job.monitor import explained
-from hybrid_mpc.job.stages.compare import is_kept, run_parts
+from hybrid_mpc.job.stage import Absent, Stage
+from hybrid_mpc.job.stages.compare import is_kept, run_parts, what_loops_read
 from hybrid_mpc.job.stages.compare import kept as rows_of
-from hybrid_mpc.job.stages.monitor import RATES, clean_windows, run_calibration
-from hybrid_mpc.kit.artifact import Kit, set_calibration
+from hybrid_mpc.job.stages.export import EXPORT, NOISE
+from hybrid_mpc.job.stages.identify import DATA
+from hybrid_mpc.job.stages.monitor import MONITOR, RATES, clean_windows
+from hybrid_mpc.kit.artifact import Kit, read_description, set_calibration
 from hybrid_mpc.loop.faults import Fault, install
 from hybrid_mpc.model.model import HybridModel
-from hybrid_mpc.monitor.calibrate import MAX_EXTRAPOLATION, MIN_BLOCKS, alarm_intervals
+from hybrid_mpc.monitor.calibrate import MAX_EXTRAPOLATION, MIN_BLOCKS, Calibration, alarm_intervals
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.learn import DRIFT, guard_monitor, learn_detector
 from hybrid_mpc.monitor.lengths import BLOCK_S, REST_SPEED, SETTLING_S, block_seconds, samples, seconds
-from hybrid_mpc.monitor.plausibility import learn_plausibility
 from hybrid_mpc.monitor.replay import MonitorTrace, along, replay
-from hybrid_mpc.records import plain
 from hybrid_mpc.scenario import Budget, Scenario, Task
 
 # Nominal loops that the energy guard is learned from: the tasks, over and over, under the hybrid MPC.
@@ -108,7 +109,7 @@ def nominal_loops(
 
 
 def stage_of(spec: LoopSpec) -> str:
-    """Name of a nominal loop's checkpoint.
+    """Name of a nominal loop's file in ``checkpoints``.
 
     Args:
         spec: The loop.
@@ -178,9 +179,38 @@ def cases(scenario: Scenario) -> tuple[Case, ...]:
     return FRICTION if knows(scenario, FRICTION.target) else DRIVE, FREEZE
 
 
+@dataclass(frozen=True)
+class FaultedLoop:
+    """A loop in which something breaks, watched by the learned guard.
+
+    Args:
+        fault: Short name of what breaks.
+        title: In words.
+        target: Of the fault.
+        value: Its size.
+        task: Name of the task.
+        start_s: When it breaks [s].
+        delay_s: Time to the alarm [s]; None: never.
+        diagnosis: What the diagnosis takes it for; empty where it says nothing.
+        false_alarms: Alarms before it breaks.
+        switches: Changes of the guard's mode.
+    """
+
+    fault: str
+    title: str
+    target: str
+    value: float
+    task: str
+    start_s: float
+    delay_s: float | None
+    diagnosis: str
+    false_alarms: int
+    switches: tuple[ModeChange, ...] = ()
+
+
 def faulted(
     bench: Bench, named: str, run_seed: int, causes: Mapping[str, tuple[str, ...]]
-) -> tuple[list[dict[str, Any]], dict[str, Array]]:
+) -> tuple[tuple[FaultedLoop, ...], dict[str, Array]]:
     """A loop of each case on the first tracking task, in which something breaks from the middle on.
 
     Args:
@@ -190,15 +220,14 @@ def faulted(
         causes: What may break, by name.
 
     Returns:
-        A row each: what breaks and when, ``delay_s`` to the alarm (None: never), what the diagnosis says, false alarms
-        before, changes of the guard's mode; and the traces for the report, see :func:`read_trace`.
+        The loops, and their traces for the report, see :func:`read_trace`.
     """
     scenario, kit = bench.scenario, bench.kits[MODEL]
     dt = kit.models["hybrid"].dt
     task = nominal_tasks(scenario)[0]
     start = dt * round(0.5 * task.duration / dt)
     monitor = kit.monitor(kind="guard", task=task.name, diagnose=True)
-    rows: list[dict[str, Any]] = []
+    loops: list[FaultedLoop] = []
     arrays: dict[str, Array] = {}
     for case in cases(scenario):
         fault = Fault(start, math.inf, case.target, case.value)
@@ -210,27 +239,19 @@ def faulted(
         # The estimator is deterministic: over the record it says again what it said in the loop.
         samples = Samples(result.t, result.y, result.u)
         trace, alarms = explained(monitor, bench.parts(spec)[0], samples, causes, prior=kit.models["prior"])
-        rows.append({**_told(case, task.name, start, trace, alarms), "switches": plain(row.switches)})
+        after = np.flatnonzero(trace.alarm & (trace.t >= start - 1e-9))
+        seen = [alarm for alarm in alarms if alarm["end_s"] >= start - 1e-9]
+        loops.append(
+            FaultedLoop(
+                case.name, case.title, case.target, case.value, task.name, start,
+                float(trace.t[after[0]]) - start if after.size else None,
+                seen[0]["diagnosis"] if seen else "",
+                len(alarm_intervals(trace.alarm[trace.t < start - 1e-9], 1.0)),
+                tuple(row.switches),
+            )
+        )  # fmt: skip
         arrays |= kept(case.name, trace, result.y)
-    return rows, arrays
-
-
-def _told(
-    case: Case, task: str, start: float, trace: MonitorTrace, alarms: list[dict[str, Any]]
-) -> dict[str, Any]:
-    after = np.flatnonzero(trace.alarm & (trace.t >= start - 1e-9))
-    seen = [alarm for alarm in alarms if alarm["end_s"] >= start - 1e-9]
-    return {
-        "fault": case.name,
-        "title": case.title,
-        "target": case.target,
-        "value": case.value,
-        "task": task,
-        "start_s": start,
-        "delay_s": float(trace.t[after[0]]) - start if after.size else None,
-        "diagnosis": seen[0]["diagnosis"] if seen else "",
-        "false_alarms": len(alarm_intervals(trace.alarm[trace.t < start - 1e-9], 1.0)),
-    }
+    return tuple(loops), arrays
 
 
 def kept(name: str, trace: MonitorTrace, y: Array) -> dict[str, Array]:
@@ -257,6 +278,25 @@ HELD = ("valid", "nominal")
 
 
 @dataclass(frozen=True)
+class NominalLoop:
+    """A loop that the detector was learned from.
+
+    Args:
+        task: Name of the task.
+        seed: Number of the loop.
+        friction: Share to which friction drifts.
+        seconds: Length [s].
+        cost: Its cost.
+    """
+
+    task: str
+    seed: int
+    friction: float
+    seconds: float
+    cost: float
+
+
+@dataclass(frozen=True)
 class NominalData:
     """What the detector is learned from.
 
@@ -270,46 +310,101 @@ class NominalData:
     runs: Sequence[Array]
     source: str
     data_hash: str
-    loops: tuple[dict[str, Any], ...] = field(default=())
+    loops: tuple[NominalLoop, ...] = ()
 
 
-def guard_stage(context: Context) -> None:
-    """Learn detector and plausibility, put them into the artifact, and try them on faults and test recordings."""
-    scenario, folder = context.scenario, context.out / "model"
+@dataclass(frozen=True)
+class ExplainedAlarm:
+    """An alarm on a recording with test data: file, from and to [s], what the diagnosis takes it for."""
+
+    file: str
+    start_s: float
+    end_s: float
+    diagnosis: str
+
+
+@dataclass(frozen=True)
+class GuardTest:
+    """The guard's monitor on test recordings.
+
+    Args:
+        seconds: Time that was monitored [s].
+        alarms: Alarms that begin in it.
+        list: Alarms over the recordings that hold test data, all of each.
+        at_most_per_hour: Rate [1/h] that the alarms stay below, at 95 %; None where nothing was monitored.
+    """
+
+    seconds: float
+    alarms: int
+    list: tuple[ExplainedAlarm, ...]
+    at_most_per_hour: float | None = None
+
+
+@dataclass(frozen=True)
+class GuardResult:
+    """The learned guard, and what it says of recordings and of loops in which something breaks.
+
+    Args:
+        source: What it was learned from, in words.
+        loops: Loops that it was learned from; none for recordings.
+        test: What it says of test recordings.
+        detector: The detector; None where none could be learned.
+        reason: Why none. Default: there is one.
+        faults: Loops in which something breaks; None without a plant or without a calm task.
+        shown: Name of the recording whose trace is kept; empty for none.
+        arrays: Traces, see :func:`read_trace`.
+    """
+
+    source: str
+    loops: tuple[NominalLoop, ...]
+    test: GuardTest
+    detector: Detector | None = None
+    reason: str = ""
+    faults: tuple[FaultedLoop, ...] | None = None
+    shown: str = ""
+    arrays: Mapping[str, Array] = field(default_factory=dict)
+
+
+def guard_stage(context: Context) -> GuardResult | Absent:
+    """Learn the detector, put it into the artifact, and try it on faults and test recordings."""
+    scenario = context.scenario
     if scenario.control is None:
-        reason = "the guard's estimator needs the scenario's control problem (input range, sensor noise)"
-        context.save("guard", {"reason": reason}, {})
-        return
+        return Absent(
+            "the guard's estimator needs the scenario's control problem (input range, sensor noise)"
+        )
+    context.read(NOISE)
     kit = context.kit
-    model, calibration = kit.models["hybrid"], run_calibration(context)
+    model, monitor = kit.models["hybrid"], context.find(MONITOR)
+    calibration = Calibration.without(monitor.reason) if isinstance(monitor, Absent) else monitor.calibration
     rest = calibration.rest_speed or (REST_SPEED,)
     data = _nominal_data(context, kit, rest)
-    result: dict[str, Any] = {"source": data.source, "loops": data.loops}
-    found: dict[str, Any] = {}
+    detector, reason, faults = None, "", None
     try:
-        found["detector"] = learned(
+        detector = learned(
             data.runs, model.dt, model.n_y, data.data_hash, rest_speed=rest,
             time_unit=model.time_unit,
         )  # fmt: skip
     except InputError as none:
-        result["reason"] = f"no detector could be learned from {data.source}: {none}"
-    try:
-        found["plausibility"] = learn_plausibility(
-            model, context.smoothed("train"), data_hash=context.dataset.hash
-        )
-    except InputError as none:
-        result["plausibility_reason"] = str(none)
-    set_calibration(folder, replace(calibration, **found))
-    result |= {name: plain(part) for name, part in found.items()}
-    kit, detector = context.kit, found.get("detector")
-    recorded, arrays = _recorded(context, kit, detector)
-    result |= recorded
+        reason = f"no detector could be learned from {data.source}: {none}"
+    set_calibration(context.out / "model", replace(calibration, detector=detector))
+    kit = context.kit
+    test, shown, arrays = _recorded(context, kit, detector)
     if detector is not None and scenario.plant is not None and any(not t.faults for t in scenario.tasks):
         context.progress.update("faults", 0, 1, "loops in which something breaks")
         bench, s = Bench(scenario, {MODEL: kit}), context.settings
-        result["faults"], more = faulted(bench, s.scenario, s.seed, scenario.causes)
+        faults, more = faulted(bench, s.scenario, s.seed, scenario.causes)
         arrays |= more
-    context.save("guard", result, arrays)
+    return GuardResult(data.source, data.loops, test, detector, reason, faults, shown, arrays)
+
+
+def put_detector(context: Context, found: GuardResult) -> str:
+    """Write the detector into the artifact."""
+    held = read_description(context.out / "model").calibration
+    if held is None:
+        return "the artifact holds no calibration"
+    if held.detector != found.detector:
+        set_calibration(context.out / "model", replace(held, detector=found.detector))
+    return ""
 
 
 def learned(
@@ -419,30 +514,22 @@ def _from_loops(context: Context, model: HybridModel) -> NominalData:
     parts = {stage_of(spec): [spec] for spec in wanted}
     run_parts(context, {stage: part for stage, part in parts.items() if not is_kept(context, stage, part)})
     content, runs = hashlib.sha256(), []
-    told: list[dict[str, Any]] = []
+    loops: list[NominalLoop] = []
     for spec in wanted:
         (row,) = rows_of(context, stage_of(spec))
         friction = spec.faults[0].value if spec.faults else 1.0
-        told.append(
-            {
-                "task": row.task,
-                "seed": row.seed,
-                "friction": friction,
-                "seconds": row.seconds,
-                "cost": row.cost,
-            }
-        )
+        loops.append(NominalLoop(row.task, row.seed, friction, row.seconds, row.cost))
         runs.append(row.arrays["numbers"][samples(SETTLING_S, model) :])
         for name in ("y", "u"):
             content.update(np.ascontiguousarray(row.arrays[name], dtype="<f8").tobytes())
-    minutes = sum(row["seconds"] for row in told) / 60
-    source = f"{len(told)} loops of the simulated machine under the hybrid MPC, {minutes:.1f} min"
-    return NominalData(runs, source, content.hexdigest(), tuple(told))
+    minutes = sum(row.seconds for row in loops) / 60
+    source = f"{len(loops)} loops of the simulated machine under the hybrid MPC, {minutes:.1f} min"
+    return NominalData(runs, source, content.hexdigest(), tuple(loops))
 
 
 def _recorded(
     context: Context, kit: Kit, detector: Detector | None
-) -> tuple[dict[str, Any], dict[str, Array]]:
+) -> tuple[GuardTest, str, dict[str, Array]]:
     """Recordings with test windows, watched by the guard's monitor, or without detector by that of the thresholds.
 
     Without either the readings are kept and nothing but a blind monitor alarms.
@@ -451,14 +538,14 @@ def _recorded(
     monitor = kit.monitor(kind="energy" if detector is None else "guard", diagnose=True)
     estimator = kit.observer()
     tested = [r for r in context.dataset.whole if clean_windows(context, r, ("test",))]
-    found: list[dict[str, Any]] = []
+    found: list[ExplainedAlarm] = []
     arrays: dict[str, Array] = {}
-    watched, starts = 0.0, 0
+    watched, starts, shown = 0.0, 0, ""
     for recording, say in along(tested, context.progress.update):
         trace, alarms = explained(
             monitor, estimator, recording, context.scenario.causes, say, prior=kit.models["prior"]
         )
-        found += [{"file": recording.name, **alarm} for alarm in alarms]
+        found += [ExplainedAlarm(recording.name, **alarm) for alarm in alarms]
         edges = np.diff(trace.alarm.astype(int), prepend=0) == 1
         for window in clean_windows(context, recording, ("test",)):
             inside = _settled(recording.t, *window, model)
@@ -467,9 +554,16 @@ def _recorded(
         if not arrays or (alarms and not arrays["recorded/alarm"].any()):  # one is shown, best with an alarm
             arrays = kept("recorded", trace, recording.y)
             shown = recording.name
-    result: dict[str, Any] = {"test": {"seconds": watched, "alarms": starts, "list": found}}
-    if watched > 0:
-        result["test"]["at_most_per_hour"] = 0.5 * float(chi2.ppf(0.95, 2 * starts + 2)) / (watched / 3600)
-    if arrays:
-        result["shown"] = shown
-    return result, arrays
+    most = 0.5 * float(chi2.ppf(0.95, 2 * starts + 2)) / (watched / 3600) if watched > 0 else None
+    return GuardTest(watched, starts, tuple(found), most), shown, arrays
+
+
+def what_guard_reads(context: Context) -> dict[str, object]:
+    """The loops that it is learned from, and what may break."""
+    return {**what_loops_read(context), "causes": context.scenario.causes}
+
+
+GUARD = Stage(
+    "guard", "learning the energy guard", GuardResult, guard_stage, what_guard_reads,
+    (DATA, EXPORT, NOISE, MONITOR), optional=True, restore=put_detector,
+)  # fmt: skip

@@ -1,25 +1,31 @@
-"""Stages data, prior, training and evaluation: from CSV files to judged models."""
+"""Stages data, prior, training and evaluation: from recordings to models whose errors on unseen data are known."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybrid_mpc.data.excitation import check_excitation
 from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import read_document, read_document_arrays, write_document
+from hybrid_mpc.files import digest, read_document, read_document_arrays, sha256, write_document
+from hybrid_mpc.identify.evaluate import Scores
+from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.settings import TrainingSettings
 from hybrid_mpc.identify.step import Scaling
 from hybrid_mpc.identify.train import Trained, TrainingFailure
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.engine import WORKERS, run_jobs
+from hybrid_mpc.job.stage import Stage, source_of
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import load_scenario
+
+Array = NDArray[Any]
 
 if TYPE_CHECKING:
     from hybrid_mpc.data.trajectories import Trajectory
@@ -100,45 +106,119 @@ def load_trained(folder: Path, kind: str) -> Trained:
     )
 
 
-# Stage prior of a machine whose input acts later: parameters and delay together.
-
+ROUNDS = ("polynomially smoothed", "smoothed by the prior")
+"""States that the prior is fitted to, one after the other."""
+MODELS = ("phy_nominal", "phy", "rnn", "pgrnn", "mopgrnn")
+"""Models that are evaluated: the prior with its nominal parameters, the fitted prior, the networks."""
+DEPLOYED = "mopgrnn"
+"""The kind of network that is exported."""
 DELAY_RUNS = 5.0
 """Longest free runs [the machine's seconds] that parameters and delay are fitted to: a swing near the top multiplies
 every error."""
 
 
-def prior_with_delay(context: Context) -> None:
-    """Fit the prior's parameters and the input's delay together, to free runs, and smooth the measurements."""
-    from hybrid_mpc.identify.delay import fit_physics, smoothed
+@dataclass(frozen=True)
+class DataResult:
+    """The recordings of a run.
 
-    make, spec = context.scenario.prior, context.spec
-    train, valid, test = (context.trajectories(role) for role in ("train", "valid", "test"))
-    physics = fit_physics(
-        make, train, valid, dt=spec.dt, length=DELAY_RUNS * context.time_unit, largest_delay=spec.largest_delay,
-        on_progress=lambda done, total, text: context.progress.update("free runs", done, total, text),
-    )  # fmt: skip
-    every = smoothed(make, physics, [*train, *valid, *test], spec.dt)
-    notes = {
-        "nominal": make().values,
-        "units": {p.name: p.unit for p in make().parameters_spec},
-        "smoother": {"sigma": physics.sigma, "walk": physics.walk},
-        "delay": physics.delay,
-    }
-    arrays = {f"{t.name}/{key}": getattr(t, key) for t in every for key in ("x", "xdot")}
-    context.save("prior", {**asdict(physics.fit), **notes}, arrays)
-    for warning in physics.fit.warnings:
-        context.progress.warn(f"fit of the prior: {warning}")
+    Args:
+        files: Names of the files.
+        hash: Hash of their contents.
+        cuts: What is not used as it was recorded, and why.
+        pieces: Number of trajectories by role.
+        seconds: Their length [s] by role.
+        warnings: What is doubtful about the recordings.
+    """
+
+    files: tuple[str, ...]
+    hash: str
+    cuts: tuple[CutPart, ...]
+    pieces: Mapping[str, int]
+    seconds: Mapping[str, float]
+    warnings: tuple[str, ...]
 
 
-ROUNDS = ("polynomially smoothed", "smoothed by the prior")
-"""States that the prior is fitted to, one after the other."""
-MODELS = ("phy_nominal", "phy", "rnn", "pgrnn", "mopgrnn")
+@dataclass(frozen=True)
+class CutPart:
+    """A part of a recording that is not used as it was recorded: its file, from and to [s], and why."""
+
+    file: str
+    start_s: float
+    end_s: float
+    why: str
+
+
+@dataclass(frozen=True)
+class PriorResult:
+    """The fitted prior, and the states that its equations smooth the recordings to.
+
+    Args:
+        fit: Parameters with their standard errors.
+        nominal: Parameters before the fit.
+        units: Units of the parameters.
+        sigma: Standard deviation of each sensor that the smoother assumes [output units].
+        walk: Random walk of the unexplained acceleration that it assumes, by degree of freedom.
+        delay: Delay of the input [s]; zero for none.
+        arrays: States and their rates, ``"TRAJECTORY/x"`` and ``"TRAJECTORY/xdot"`` ``(n, n_x)``.
+    """
+
+    fit: PriorFit
+    nominal: Mapping[str, float]
+    units: Mapping[str, str]
+    sigma: tuple[float, ...]
+    walk: tuple[float, ...]
+    delay: float
+    arrays: Mapping[str, Array]
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """The trained networks; their weights lie in files of their own.
+
+    Args:
+        folder: Folder of the weights in ``checkpoints/training``.
+        validation_e_sim_s: Validation error [s] of the best network by kind.
+        skipped_updates: Updates that were skipped because a number was not finite, by kind.
+        failures: What went wrong in a training, by kind.
+        weights: Digest of the weights by kind.
+    """
+
+    folder: str
+    validation_e_sim_s: Mapping[str, float]
+    skipped_updates: Mapping[str, int]
+    failures: Mapping[str, tuple[TrainingFailure, ...]]
+    weights: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class ModelScores:
+    """Errors of a model on unseen data: of the network that validation chose, and of all of its kind."""
+
+    best: Scores
+    networks: tuple[Scores, ...]
+
+
+@dataclass(frozen=True)
+class EvaluationResult:
+    """Free runs of every model over the test recordings.
+
+    Args:
+        scores: Errors by model.
+        by_file: Errors by model and recording.
+        runs: Names of the free runs.
+        arrays: Signals of each run, ``"MODEL/RUN/SIGNAL"``.
+    """
+
+    scores: Mapping[str, ModelScores]
+    by_file: Mapping[str, Mapping[str, Scores]]
+    runs: tuple[str, ...]
+    arrays: Mapping[str, Array]
 
 
 def check_data(context: Context) -> None:
     """Read the user's recordings before anything is written: bad ones leave no folder behind."""
     if context.settings.data:
-        doubts(context)  # reads, checks and keeps the recordings
+        doubts(context)  # reads and checks the recordings
     elif context.scenario.make_data is None:
         raise InputError(
             f"scenario {context.scenario.name} is a real machine: give its recordings with --data FILE.csv "
@@ -146,34 +226,49 @@ def check_data(context: Context) -> None:
         )
 
 
-def data_stage(context: Context) -> None:
+def what_data_reads(context: Context) -> dict[str, object]:
+    """What the recordings and their roles are made of."""
+    prior, settings = context.scenario.prior(), context.settings
+    read: dict[str, object] = {
+        "data specification": context.spec,
+        "signals of the prior": (prior.states, prior.inputs, prior.outputs),
+    }
+    if settings.data:
+        return {**read, "recordings": [(path.name, sha256(path)) for path in settings.data]}
+    make = source_of(context.scenario.make_data)
+    return {**read, "seed": settings.seed, "budget": settings.budget, "how recordings are made": make}
+
+
+def data_stage(context: Context) -> DataResult:
     """Take the user's recordings, or let a simulated machine make its own; note what is in them, and all doubts."""
     if not context.settings.data:
         assert context.scenario.make_data is not None
         context.progress.update("files", 0, 1, "recording the simulated machine")
+        context.forget_data()
         context.scenario.make_data(context.out / "data", context.settings.seed, context.settings.budget)
     dataset, warnings = context.dataset, doubts(context)
-    roles = ("train", "valid", "test")
-    context.save(
-        "data",
-        {
-            "files": dataset.files,
-            "hash": dataset.hash,
-            "cuts": [{"file": c.file, "from_s": c.start, "to_s": c.end, "why": c.why} for c in dataset.cuts],
-            "pieces": {role: len(context.trajectories(role)) for role in roles},
-            "seconds": {role: sum(len(t.t) * t.dt for t in context.trajectories(role)) for role in roles},
-            "warnings": list(warnings),
-        },
-    )
     for warning in warnings:
         context.progress.warn(warning)
+    roles = ("train", "valid", "test")
+    return DataResult(
+        tuple(dataset.files),
+        dataset.hash,
+        tuple(CutPart(*cut) for cut in dataset.cuts),
+        {role: len(context.trajectories(role)) for role in roles},
+        {role: sum(len(t.t) * t.dt for t in context.trajectories(role)) for role in roles},
+        warnings,
+    )
+
+
+def recordings_are_there(context: Context, found: DataResult) -> str:
+    """Whether the recordings of a simulated machine lie where the run left them; a text if not."""
+    if context.settings.data or (context.files and context.dataset.hash == found.hash):
+        return ""
+    return "the recordings are gone or were changed"
 
 
 def doubts(context: Context) -> tuple[str, ...]:
     """What is doubtful about the recordings, and what the training ones do not excite; some of it is refused.
-
-    Args:
-        context: The run.
 
     Raises:
         InputError: If a recording is bad, an input does nothing in those for training, or an output.
@@ -190,32 +285,55 @@ def doubts(context: Context) -> tuple[str, ...]:
     )
 
 
-def prior_stage(context: Context) -> None:
+def what_prior_reads(context: Context) -> dict[str, object]:
+    """The prior's equations as a traced program, and its parameters."""
+    from hybrid_mpc.identify.export import trace_model
+    from hybrid_mpc.identify.step import PriorStep
+    from nn_export.program import to_json
+
+    prior = context.scenario.prior()
+    programs = trace_model(PriorStep(prior, context.spec.dt))
+    return {
+        "equations of the prior": {name: to_json(program) for name, program in programs.items()},
+        "parameters of the prior": prior.parameters_spec,
+        "largest delay": context.spec.largest_delay,
+    }
+
+
+def prior_stage(context: Context) -> PriorResult:
     """Fit the prior's parameters, let it smooth the measurements, fit it to these, smooth once more."""
-    make = context.scenario.prior
-    if context.spec.largest_delay:
-        prior_with_delay(context)
-        return
-    fit, smoother, train, valid = fit_and_smooth(
-        make,
-        context.trajectories("train"),
-        context.trajectories("valid"),
-        context.spec.dt,
-        on_progress=context.progress.update,
-    )
-    arrays = {
-        f"{t.name}/{key}": getattr(t, key)
-        for t in (*train, *valid, *smoother.smooth(context.trajectories("test")))
-        for key in ("x", "xdot")
-    }
-    notes = {
-        "nominal": make().values,
-        "units": {p.name: p.unit for p in make().parameters_spec},
-        "smoother": {"sigma": smoother.sigma, "walk": smoother.walk},
-    }
-    context.save("prior", {**asdict(fit), **notes}, arrays)
+    make, spec = context.scenario.prior, context.spec
+    train, valid, test = (context.trajectories(role) for role in ("train", "valid", "test"))
+    if spec.largest_delay:
+        from hybrid_mpc.identify.delay import fit_physics, smoothed
+
+        physics = fit_physics(
+            make, train, valid, dt=spec.dt, length=DELAY_RUNS * context.time_unit, largest_delay=spec.largest_delay,
+            on_progress=lambda done, total, text: context.progress.update("free runs", done, total, text),
+        )  # fmt: skip
+        fit, sigma, walk, delay = physics.fit, physics.sigma, physics.walk, physics.delay
+        every = smoothed(make, physics, [*train, *valid, *test], spec.dt)
+    else:
+        fit, smoother, train, valid = fit_and_smooth(
+            make, train, valid, spec.dt, on_progress=context.progress.update
+        )
+        sigma, walk, delay, every = (
+            smoother.sigma,
+            smoother.walk,
+            0.0,
+            [*train, *valid, *smoother.smooth(test)],
+        )
     for warning in fit.warnings:
         context.progress.warn(f"fit of the prior: {warning}")
+    return PriorResult(
+        fit,
+        make().values,
+        {p.name: p.unit for p in make().parameters_spec},
+        tuple(sigma),
+        tuple(walk),
+        float(delay),
+        {f"{t.name}/{key}": getattr(t, key) for t in every for key in ("x", "xdot")},
+    )
 
 
 def fit_and_smooth(
@@ -256,12 +374,26 @@ def fit_and_smooth(
     return fit, smoother, list(train), list(valid)
 
 
-def training_stage(context: Context) -> None:
+def what_training_reads(context: Context) -> dict[str, object]:
+    """Settings of the networks, the device, and the windows of the recordings."""
+    from hybrid_mpc.identify.settings import KINDS
+
+    return {
+        "settings of the networks": {kind: training_settings(context, kind) for kind in KINDS},
+        "device": context.settings.device,
+        "period": context.spec.dt,
+    }
+
+
+def training_stage(context: Context) -> TrainingResult:
     """Train the networks of every kind, two kinds side by side."""
     from hybrid_mpc.identify.settings import KINDS
 
-    folder = context.out / "checkpoints" / "training"
-    values = context.result("prior")["values"]
+    name = digest(TRAINING.keys(context))[
+        :12
+    ]  # networks of other settings or data lie in a folder of their own
+    folder = context.out / "checkpoints" / "training" / name
+    values = context.prior.fit.values
     todo = [k for k in reversed(KINDS) if not is_trained(folder, training_settings(context, k))]
     jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
         kind: (
@@ -272,45 +404,57 @@ def training_stage(context: Context) -> None:
         for kind in todo
     }  # fmt: skip
     run_jobs(jobs, context.progress.update, WORKERS)
-    trained = {kind: trained_models(context, kind) for kind in KINDS}
-    best = {k: float(t.validation.min()) for k, t in trained.items()}
-    skipped = {k: int(t.skipped.sum()) for k, t in trained.items()}
-    faults = {k: [asdict(f) for f in t.faults] for k, t in trained.items()}
-    context.save("training", {"validation_e_sim_s": best, "skipped_updates": skipped, "faults": faults})
+    trained = {kind: load_trained(folder, kind) for kind in KINDS}
+    return TrainingResult(
+        name,
+        {k: float(t.validation.min()) for k, t in trained.items()},
+        {k: int(t.skipped.sum()) for k, t in trained.items()},
+        {k: t.faults for k, t in trained.items()},
+        {k: sha256(folder / f"{k}.json") for k in trained},
+    )
+
+
+def networks_are_there(context: Context, found: TrainingResult) -> str:
+    """Whether the weights lie where the training left them; a text if not."""
+    folder = context.out / "checkpoints" / "training" / found.folder
+    for kind, content in found.weights.items():
+        path = folder / f"{kind}.json"
+        if not path.is_file() or sha256(path) != content:
+            return f"networks {kind} are gone or were changed"
+    return ""
 
 
 def trained_models(context: Context, kind: str) -> Trained:
-    """A finished training from the run's folder."""
-    return load_trained(context.out / "checkpoints" / "training", kind)
+    """The trained networks of one kind."""
+    return load_trained(context.out / "checkpoints" / "training" / context.read(TRAINING).folder, kind)
 
 
-def evaluation_stage(context: Context) -> None:
+def evaluation_stage(context: Context) -> EvaluationResult:
     """Free runs of every model over the test trajectories; the figures show them whole."""
     from hybrid_mpc.identify.evaluate import free_runs, judged, score
     from hybrid_mpc.identify.smooth import Smoother
 
-    prior, spec = context.result("prior"), context.spec
-    phy = context.scenario.prior(prior["values"])
-    smoother = Smoother(phy, spec.dt, tuple(prior["smoother"]["sigma"]), tuple(prior["smoother"]["walk"]))
+    prior, spec = context.prior, context.spec
+    phy = context.scenario.prior(prior.fit.values)
+    smoother = Smoother(phy, spec.dt, prior.sigma, prior.walk)
     whole = context.smoothed("test")
     shown, test = (judged(whole, smoother, context.warm, length) for length in (None, spec.free_run))
-    scores: dict[str, Any] = {}
-    files: dict[str, Any] = {}
+    scores: dict[str, ModelScores] = {}
+    files: dict[str, dict[str, Scores]] = {}
     arrays: dict[str, Any] = {}
     for i, name in enumerate(MODELS):
         context.progress.update("models", i, len(MODELS), name)
-        members = _members(context, name, phy)
-        all_scores = []
-        for k, (step, h0) in enumerate(members):
+        found = []
+        for k, (step, h0) in enumerate(_members(context, name, phy)):
             runs = free_runs(step, phy, test, context.warm, h0)
-            all_scores.append(asdict(score(runs)))
+            found.append(score(runs))
             if k == 0:
-                files[name] = {f: asdict(score(part)) for f, part in _by_file(runs).items()}
+                files[name] = {f: score(part) for f, part in _by_file(runs).items()}
                 for run in free_runs(step, phy, shown, context.warm, h0):
                     for key in ("t", "u", "x", "x_hat", "y", "energy_measured_w", "energy_model_w"):
                         arrays[f"{name}/{run.name}/{key}"] = getattr(run, key)
-        scores[name] = {"best": all_scores[0], "networks": all_scores}
-    context.save("evaluation", {"scores": scores, "by_file": files, "runs": [t.name for t in whole]}, arrays)
+        scores[name] = ModelScores(found[0], tuple(found))
+    return EvaluationResult(scores, files, tuple(t.name for t in whole), arrays)
 
 
 def _by_file(runs: Sequence[FreeRun]) -> dict[str, list[FreeRun]]:
@@ -381,3 +525,17 @@ def _train_kind(
         on_progress=lambda done, total, error: report(done, total, f"validation E_sim {error:.4g}"),
     )
     save_trained(folder, trained)
+
+
+DATA = Stage(
+    "data", "reading the measurements", DataResult, data_stage, what_data_reads, restore=recordings_are_there
+)
+PRIOR = Stage("prior", "fitting the prior", PriorResult, prior_stage, what_prior_reads, (DATA,))
+TRAINING = Stage(
+    "training", "training the networks", TrainingResult, training_stage, what_training_reads, (DATA, PRIOR),
+    restore=networks_are_there,
+)  # fmt: skip
+EVALUATION = Stage(
+    "evaluation", "free runs on unseen data", EvaluationResult, evaluation_stage,
+    lambda context: {"free runs": (context.warm, context.spec.free_run)}, (DATA, PRIOR, TRAINING),
+)  # fmt: skip

@@ -1,9 +1,10 @@
-"""Stages monitor and analysis: online plausibility on recordings, and the linearized models."""
+"""Stage monitor: the energy monitor calibrated on recordings, and tried on them and in a closed loop."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,16 +13,18 @@ from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.loops import MODEL, Bench, LoopSpec
-from hybrid_mpc.kit.artifact import Kit, set_calibration
-from hybrid_mpc.kit.assembly import make_monitor, working_point
+from hybrid_mpc.job.stage import Absent, Stage
+from hybrid_mpc.job.stages.compare import what_loops_read
+from hybrid_mpc.job.stages.export import EXPORT, NOISE
+from hybrid_mpc.job.stages.identify import DATA
+from hybrid_mpc.kit.artifact import Kit, read_description, set_calibration
+from hybrid_mpc.kit.assembly import make_monitor
 from hybrid_mpc.loop.faults import Fault
 from hybrid_mpc.loop.simulate import ClosedLoopResult
 from hybrid_mpc.model.model import HybridModel
-from hybrid_mpc.model.riccati import hidden_fixed_point
 from hybrid_mpc.monitor.calibrate import Calibration, alarm_intervals, calibrate, with_residual
 from hybrid_mpc.monitor.lengths import block_seconds, rest_speeds
 from hybrid_mpc.monitor.replay import along, judge, replay
-from hybrid_mpc.records import plain, record
 
 if TYPE_CHECKING:
     from hybrid_mpc.data.trajectories import Trajectory
@@ -49,25 +52,90 @@ def rates(model: HybridModel) -> tuple[float, ...]:
     return tuple(rate / model.time_unit for rate in RATES)
 
 
-def monitor_stage(context: Context) -> None:
+@dataclass(frozen=True)
+class RecordedAlarm:
+    """An alarm on a recording: its file, from and to [s]."""
+
+    file: str
+    start_s: float
+    end_s: float
+
+
+@dataclass(frozen=True)
+class CleanAlarms:
+    """Alarms where nothing disturbs the machine.
+
+    Args:
+        seconds: Time known to be undisturbed [s].
+        alarms: Alarms that begin in it.
+        test_seconds: The part of it in test data [s].
+        test_alarms: Alarms that begin there.
+    """
+
+    seconds: float = 0.0
+    alarms: int = 0
+    test_seconds: float = 0.0
+    test_alarms: int = 0
+
+
+@dataclass(frozen=True)
+class UnknownLoad:
+    """The closed loop in which an unknown load sets in.
+
+    Args:
+        task: Name of the task.
+        load: The load [unit of the first input].
+        start_s: When it sets in [s].
+        delay_s: Time to the alarm [s]; None: never.
+        false_alarms: Alarms before it.
+    """
+
+    task: str
+    load: float
+    start_s: float
+    delay_s: float | None
+    false_alarms: int
+
+
+@dataclass(frozen=True)
+class MonitorResult:
+    """The calibrated monitor, and what it says of the recordings.
+
+    Args:
+        calibration: Its thresholds; none where nothing could be calibrated.
+        recordings: Seconds that were monitored and that were not, by recording and reason.
+        reason: Why nothing could be calibrated. Default: it could.
+        alarms: Alarms on whole recordings.
+        clean: Alarms where nothing disturbs the machine; None where nothing could be calibrated.
+        load: The loop with an unknown load; None without a plant.
+        arrays: ``"RECORDING/SIGNAL"``, and ``"load/SIGNAL"`` of the loop.
+    """
+
+    calibration: Calibration
+    recordings: tuple[Mapping[str, float | str], ...]
+    reason: str = ""
+    alarms: tuple[RecordedAlarm, ...] = ()
+    clean: CleanAlarms | None = None
+    load: UnknownLoad | None = None
+    arrays: Mapping[str, Array] = field(default_factory=dict)
+
+
+def monitor_stage(context: Context) -> MonitorResult | Absent:
     """Calibrate on training and validation stretches, then replay the monitor over whole recordings.
 
-    Where nothing can be calibrated the result holds the reason and no calibration; the artifact then keeps the rest
-    speeds alone.
+    Where nothing can be calibrated the result holds the reason; the artifact then keeps the rest speeds alone.
     """
     if context.scenario.control is None:
-        reason = "the monitor's estimator needs the scenario's control problem (input range, sensor noise)"
-        context.save("monitor", {"reason": reason}, {})
-        return
-    kit = context.kit
-    model = kit.models["hybrid"]
-    whole = context.dataset.whole
-    known: dict[str, Any] = {}  # the rest speeds, and what hinders the calibration
+        return Absent(
+            "the monitor's estimator needs the scenario's control problem (input range, sensor noise)"
+        )
+    context.read(NOISE)
+    kit, whole = context.kit, context.dataset.whole
+    model, reason, rest = kit.models["hybrid"], "", None
     try:
-        known["rest_speed"] = nominal_rest(context, model)
+        rest = nominal_rest(context, model)
     except InputError as short:
-        known["reason"] = f"the monitor could not be calibrated: {short}"
-    rest = known.get("rest_speed")
+        reason = f"the monitor could not be calibrated: {short}"
     power, residual, traces = [], [], []
     # the estimator of the closed loops; the monitor ignores its disturbance estimate
     watching, estimator = make_monitor(model, None, rest_speed=rest), kit.observer()
@@ -77,7 +145,9 @@ def monitor_stage(context: Context) -> None:
         nominal = _inside(context, recording, NOMINAL)
         power.append(np.where(nominal, trace.level_w, np.nan))
         residual.append(np.where(nominal, trace.residual_level, np.nan))
-    covered = [{"file": r.name, **t.coverage(model.dt)} for r, t in zip(whole, traces, strict=True)]
+    covered: tuple[Mapping[str, float | str], ...] = tuple(
+        {"file": r.name, **t.coverage(model.dt)} for r, t in zip(whole, traces, strict=True)
+    )
     try:
         calibration = with_residual(
             *(
@@ -86,34 +156,46 @@ def monitor_stage(context: Context) -> None:
             )
         )
     except InputError as none:
-        known.setdefault("reason", f"the monitor could not be calibrated: {none}")
-    if "reason" in known:
-        set_calibration(context.out / "model", Calibration.without(known["reason"], rest))
-        context.save("monitor", {**known, "recordings": covered}, {})
-        return
-    set_calibration(context.out / "model", calibration)
-    alarms, arrays, clean = [], {}, {"seconds": 0.0, "alarms": 0, "test_seconds": 0.0, "test_alarms": 0}
+        reason = reason or f"the monitor could not be calibrated: {none}"
+    if reason:
+        result = MonitorResult(Calibration.without(reason, rest), covered, reason)
+        put_calibration(context, result)
+        return result
+    alarms, arrays, clean = [], {}, CleanAlarms()
     for recording, levels in zip(whole, traces, strict=True):
         trace = judge(make_monitor(model, calibration), levels)
-        alarms += [{"file": recording.name, "start_s": a, "end_s": b} for a, b in trace.intervals()]
+        alarms += [RecordedAlarm(recording.name, a, b) for a, b in trace.intervals()]
         for key in ("t", "violation_w", "level_w", "residual_level", "alarm"):
             arrays[f"{recording.name}/{key}"] = getattr(trace, key)
         arrays[f"{recording.name}/y"] = recording.y[:, 0]
-        for prefix, roles in (("", ("train", "valid", "nominal", "test")), ("test_", ("test",))):
-            inside = _inside(context, recording, roles)
-            clean[f"{prefix}seconds"] += float(inside.sum() * model.dt)
-            # one that a disturbance raised before the stretch may end in it: what counts is where it starts
-            starts = np.diff(trace.alarm.astype(int), prepend=0) == 1
-            clean[f"{prefix}alarms"] += int((starts & inside).sum())
-    result = {
-        "calibration": plain(calibration), "alarms": alarms, "clean": clean, "recordings": covered,
-    }  # fmt: skip
+        # one that a disturbance raised before the stretch may end in it: what counts is where it starts
+        starts = np.diff(trace.alarm.astype(int), prepend=0) == 1
+        every, test = (
+            _inside(context, recording, roles) for roles in (("train", "valid", "nominal", "test"), ("test",))
+        )
+        clean = CleanAlarms(
+            clean.seconds + float(every.sum() * model.dt),
+            clean.alarms + int((starts & every).sum()),
+            clean.test_seconds + float(test.sum() * model.dt),
+            clean.test_alarms + int((starts & test).sum()),
+        )
+    load = None
     if context.scenario.plant is not None and context.scenario.tasks:
-        result["load"], loop = _load_loop(context, replace(kit, calibration=calibration))
+        load, loop = _load_loop(context, replace(kit, calibration=calibration))
         arrays |= {
             f"load/{key}": getattr(loop, key) for key in ("t", "violation", "level", "alarm", "x", "u")
         }
-    context.save("monitor", result, arrays)
+    result = MonitorResult(calibration, covered, "", tuple(alarms), clean, load, arrays)
+    put_calibration(context, result)
+    return result
+
+
+def put_calibration(context: Context, found: MonitorResult) -> str:
+    """Write the calibration into the artifact, unless it is there with a detector."""
+    held = read_description(context.out / "model").calibration
+    if held is None or replace(held, detector=None) != found.calibration:
+        set_calibration(context.out / "model", found.calibration)
+    return ""
 
 
 def nominal_rest(context: Context, model: HybridModel) -> tuple[float, ...]:
@@ -121,15 +203,7 @@ def nominal_rest(context: Context, model: HybridModel) -> tuple[float, ...]:
     return rest_speeds([t for t in context.dataset.trajectories if t.role in NOMINAL], model)
 
 
-def run_calibration(context: Context) -> Calibration:
-    """What stage monitor found: thresholds and rest speeds, or rest speeds alone, with the reason."""
-    found = context.result("monitor")
-    if "calibration" in found:
-        return record(Calibration, found["calibration"], "checkpoints/monitor.json")
-    return Calibration.without(found["reason"], found.get("rest_speed"))
-
-
-def _load_loop(context: Context, kit: Kit) -> tuple[dict[str, Any], ClosedLoopResult]:
+def _load_loop(context: Context, kit: Kit) -> tuple[UnknownLoad, ClosedLoopResult]:
     """The first task with an unknown constant load from its middle on: does the monitor see it?"""
     task, settings = context.scenario.tasks[0], context.settings
     start, added = 0.5 * task.duration, unknown_load(kit.problem(task.name))
@@ -141,10 +215,7 @@ def _load_loop(context: Context, kit: Kit) -> tuple[dict[str, Any], ClosedLoopRe
     result = Bench(context.scenario, {MODEL: kit}).run(spec, task=calm)[1]
     before, after = result.alarm[result.t < start], np.flatnonzero(result.alarm & (result.t >= start))
     delay = float(result.t[after[0]] - start) if after.size else None
-    return {
-        "task": task.name, "load": added, "start_s": start, "delay_s": delay,
-        "false_alarms": len(alarm_intervals(before, result.dt)),
-    }, result  # fmt: skip
+    return UnknownLoad(task.name, added, start, delay, len(alarm_intervals(before, result.dt))), result
 
 
 def unknown_load(control: OCP) -> float:
@@ -205,36 +276,7 @@ def _calibrate(
     return Calibration(threshold, release, rate, finite.size, hours, method, data_hash, rest_speed=rest)
 
 
-def analysis_stage(context: Context) -> None:
-    """Linearize prior and hybrid at rest and at working speed; poles, PBH tests, frequency responses."""
-    from hybrid_mpc.analyze.linearize import fixed_point, linearize
-    from hybrid_mpc.analyze.properties import analyze, frequency_response
-
-    artifact = context.kit
-    result: dict[str, Any] = {}
-    arrays: dict[str, Any] = {}
-    for i, (name, model) in enumerate(artifact.models.items()):
-        context.progress.update("models", i, len(artifact.models), name)
-        control = context.scenario.control
-        u = np.zeros(model.n_u) if control is None else control.rest_input
-        x = np.zeros(model.n_x)
-        result[name] = {}
-        try:
-            x, h = fixed_point(model, u, x)
-            result[name]["fixed_point"] = x.tolist()
-        except InputError as none:  # a learned correction may leave no point of rest near zero
-            h = hidden_fixed_point(model, x, u)
-            result[name]["fixed_point_reason"] = f"linearized at x = 0 instead: {none}"
-        systems = {"rest": linearize(model, x, u, h)}
-        if context.scenario.control is not None:
-            moving = x + working_point(model, context.scenario.control)[0]
-            systems["moving"] = linearize(model, moving, u, hidden_fixed_point(model, moving, u))
-            result["working_speed"] = moving[model.n_x // 2 :].tolist()
-        for point, system in systems.items():
-            omega = np.geomspace(0.1 / model.time_unit, np.pi / model.dt, 300)
-            response = frequency_response(system, omega)
-            arrays[f"{name}/{point}/omega"] = omega
-            arrays[f"{name}/{point}/magnitude"] = response.magnitude[0, 0]
-            arrays[f"{name}/{point}/phase"] = response.phase[0, 0]
-            result[name][point] = analyze(system).to_dict()
-    context.save("analysis", result, arrays)
+MONITOR = Stage(
+    "monitor", "calibrating the energy monitor", MonitorResult, monitor_stage, what_loops_read,
+    (DATA, EXPORT, NOISE), optional=True, restore=put_calibration,
+)  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from markupsafe import Markup
@@ -11,10 +12,36 @@ from markupsafe import Markup
 from hybrid_mpc.files import write_json
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.controllers import CONTENDERS
-from hybrid_mpc.job.stages.figures import OBSERVER_TITLES, Figures, draw_all
-from hybrid_mpc.job.stages.identify import training_settings
-from hybrid_mpc.job.stages.monitor import RATES
-from hybrid_mpc.job.stages.results import CONTROLLERS, MODELS, OBSERVERS, collect
+from hybrid_mpc.job.loops import Summary
+from hybrid_mpc.job.stage import Stage, source_of
+from hybrid_mpc.job.stages.analyze import ANALYSIS
+from hybrid_mpc.job.stages.compare import CONTROL
+from hybrid_mpc.job.stages.estimate import ESTIMATION, OBSERVERS
+from hybrid_mpc.job.stages.export import EXPORT
+from hybrid_mpc.job.stages.figures import OBSERVER_TITLES, Figures, draw_all, force_unit
+from hybrid_mpc.job.stages.guard import GUARD, FaultedLoop
+from hybrid_mpc.job.stages.identify import (
+    DATA,
+    DEPLOYED,
+    EVALUATION,
+    MODELS,
+    PRIOR,
+    TRAINING,
+    training_settings,
+)
+from hybrid_mpc.job.stages.monitor import MONITOR, RATES, MonitorResult
+from hybrid_mpc.job.stages.results import (
+    Analysis,
+    Control,
+    Data,
+    Export,
+    Gap,
+    Guard,
+    Monitor,
+    Results,
+    Timing,
+    collect,
+)
 from hybrid_mpc.plots.style import name_of
 from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, write_report
 
@@ -259,95 +286,79 @@ def paragraphs(section: str) -> tuple[Markup, ...]:
 # What a run says of its energy guard: in results.json, and as a section of the report.
 
 
-def guard_tables(results: dict[str, Any]) -> list[Table]:
+def guard_tables(guard: Guard) -> list[Table]:
     """Thresholds, faults, and alarms in the recordings with test data."""
-    guard = results["guard"]
-    if guard["data_hash"] is None:
+    detector, test = guard.details.detector, guard.details.test
+    if detector is None or test is None:
         return []
-    detector = guard["details"]["detector"]
-    low = detector["interval"]
+    low = detector.interval
     rows: list[tuple[Any, ...]] = [
-        ("sum of residual forces [deviations]", guard["force_threshold"], f"{low[0]:.3g} to {low[1]:.3g}"),
-        ("power of the free run [deviations]", guard["energy_threshold"], f"{low[2]:.3g} to {low[3]:.3g}"),
+        ("sum of residual forces [deviations]", detector.force_threshold, f"{low[0]:.3g} to {low[1]:.3g}"),
+        ("power of the free run [deviations]", detector.energy_threshold, f"{low[2]:.3g} to {low[3]:.3g}"),
     ]
     caption = (
-        f"Thresholds for {guard['false_alarms_per_hour']:g} false alarms an hour, both together; learned from "
-        f"{60 * guard['hours']:.1f} min with hash {guard['data_hash'][:16]}."
+        f"Thresholds for {detector.false_alarms_per_hour:g} false alarms an hour, both together; learned from "
+        f"{60 * detector.hours:.1f} min with hash {detector.data_hash[:16]}."
     )
     tables = [Table(("what is compared", "threshold", "5 to 95 % of a bootstrap"), rows, caption)]
-    if guard["faults"] is not None:
-        tables.append(_fault_table(guard["details"]["faults"]))
-    alarms = guard["details"]["test"]["list"]
-    if alarms:
+    if guard.details.faults is not None:
+        tables.append(_fault_table(guard.details.faults))
+    if test.list:
         tables.append(
             Table(
                 ("recording", "from [s]", "to [s]", "what explains it"),
-                [(a["file"], a["start_s"], a["end_s"], a["diagnosis"] or None) for a in alarms],
+                [(a.file, a.start_s, a.end_s, a.diagnosis or None) for a in test.list],
                 "Alarms over the recordings that hold test data, all of each.",
             )
         )
     return tables
 
 
-def _fault_table(faults: list[dict[str, Any]]) -> Table:
+def _fault_table(faults: Sequence[FaultedLoop]) -> Table:
     rows = [
         (
-            row["title"],
-            row["start_s"],
-            "never" if row["delay_s"] is None else f"{row['delay_s']:.2f}",
-            row["false_alarms"],
-            row["diagnosis"] or None,
-            ", ".join(f"{s['after'].lower()} at {s['t_s']:.2f} s" for s in row["switches"]) or "stays normal",
+            row.title,
+            row.start_s,
+            "never" if row.delay_s is None else f"{row.delay_s:.2f}",
+            row.false_alarms,
+            row.diagnosis or None,
+            ", ".join(f"{s.after.lower()} at {s.t_s:.2f} s" for s in row.switches) or "stays normal",
         )
         for row in faults
     ]
     columns = (
-        "what breaks",
-        "from [s]",
-        "alarm after [s]",
-        "alarms before",
-        "what the diagnosis says",
-        "guard",
-    )
-    return Table(columns, rows, f"Loops of the task {faults[0]['task']} in which something breaks, one each.")
+        "what breaks", "from [s]", "alarm after [s]", "alarms before", "what the diagnosis says", "guard",
+    )  # fmt: skip
+    return Table(columns, rows, f"Loops of the task {faults[0].task} in which something breaks, one each.")
 
 
-def guard_words(results: dict[str, Any]) -> tuple[str, ...]:
-    """What this run's detector was learned from, what it does not promise, and the plan's plausibility."""
-    guard, details = results["guard"], results["guard"].get("details", {})
-    if guard["data_hash"] is None:
-        words = [f"{guard['reason'][0].upper()}{guard['reason'][1:]}."]
-    else:
-        rate, wanted = guard["false_alarms_per_hour"], RATES[0] / details["detector"].get("time_unit", 1.0)
-        words = [f"The detector was learned from {details['source']}."]
-        if rate > wanted:
-            alarms = "one false alarm" if wanted == 1 else f"{wanted:g} false alarms"
-            words[0] += (
-                f" They are too short for {alarms} an hour, so the thresholds are for {rate:g}; a longer run "
-                f"(budget full), or recordings of the machine with hybrid-mpc monitor --learn {wanted:g}, give better "
-                "ones."
-            )
-        test = details["test"]
-        if test["seconds"] > 0:
-            words.append(
-                f"In {test['seconds']:.0f} s of test recordings it alarmed {_times(test['alarms'])}; that bounds its "
-                f"rate there at {test['at_most_per_hour']:.3g} an hour (95 %)."
-            )
-            if details["loops"]:
-                words[-1] += (
-                    " They were driven otherwise, and wider, than the loops: an alarm there says that the model is "
-                    "less right where the loops do not go."
-                )
-        else:
-            words.append("No test recording is long enough to try it on.")
-    if "plausibility" in details:
-        ordinary = details["plausibility"]
-        words.append(
-            f"For bounds in the plan: {100 * ordinary['quantile']:g} % of {ordinary['samples']} training samples have "
-            f"a model balance within a bound of {ordinary['tolerance_w']:.3g} W in the median."
+def guard_words(guard: Guard) -> tuple[str, ...]:
+    """What this run's detector was learned from, and what it does not promise."""
+    details = guard.details
+    detector, test = details.detector, details.test
+    if detector is None or test is None:
+        return (f"{guard.reason[0].upper()}{guard.reason[1:]}.",)
+    rate, wanted = detector.false_alarms_per_hour, RATES[0] / detector.time_unit
+    words = [f"The detector was learned from {details.source}."]
+    if rate > wanted:
+        alarms = "one false alarm" if wanted == 1 else f"{wanted:g} false alarms"
+        words[0] += (
+            f" They are too short for {alarms} an hour, so the thresholds are for {rate:g}; a longer run "
+            f"(budget full), or recordings of the machine with hybrid-mpc monitor --learn {wanted:g}, give better "
+            "ones."
         )
-    elif "plausibility_reason" in details:
-        words.append(f"There is no plausibility for the plan: {details['plausibility_reason']}.")
+    if test.seconds > 0:
+        words.append(
+            f"In {test.seconds:.0f} s of test recordings it alarmed {_times(test.alarms)}; that bounds its "
+            f"rate there at {test.at_most_per_hour:.3g} an hour (95 %)."
+        )
+        if details.loops:
+            words[-1] += (
+                " They were driven otherwise, and wider, than the loops: an alarm there says that the model is "
+                "less right where the loops do not go."
+            )
+    else:
+        words.append("No test recording is long enough to try it on.")
     return tuple(words)
 
 
@@ -355,13 +366,39 @@ def _times(n: int) -> str:
     return {0: "never", 1: "once", 2: "twice"}.get(n, f"{n} times")
 
 
-def report_stage(context: Context) -> None:
+@dataclass(frozen=True)
+class ReportResult:
+    """The report: its file, and the pictures in it."""
+
+    file: str
+    figures: tuple[str, ...]
+
+
+def report_stage(context: Context) -> ReportResult:
     """Draw, write the report, and last the results."""
     results = collect(context)
     figures = draw_all(context)
     write_report(context.out / "report.html", _report(context, results, figures))
-    write_json(context.out / "results.json", results)
-    context.save("report", results)
+    write_json(context.out / "results.json", results.plain())
+    drawn = tuple(path.name for group in figures.values() for path, _ in group)
+    return ReportResult("report.html", drawn)
+
+
+def report_is_there(context: Context, found: ReportResult) -> str:
+    """Whether the report and the results lie where the run left them; a text if not."""
+    there = all((context.out / name).is_file() for name in (found.file, "results.json"))
+    return "" if there else "the report is gone"
+
+
+def what_report_reads(context: Context) -> dict[str, object]:
+    """What the report says of the machine beside the results."""
+    scenario, prior = context.scenario, context.scenario.prior()
+    return {
+        "titles": (scenario.title, scenario.description, [task.title for task in scenario.tasks]),
+        "labels": (prior.states, prior.inputs, prior.outputs, prior.parameters_spec),
+        "drawing": source_of(scenario.draw),
+        "command": command(context),
+    }
 
 
 def command(context: Context) -> str:
@@ -375,30 +412,31 @@ def command(context: Context) -> str:
     return shlex.join([*words, "--seed", str(s.seed), "--budget", s.budget])
 
 
-def _report(context: Context, results: dict[str, Any], figures: Figures) -> Report:
-    tables: dict[str, Table | None] = {
-        "data": _data_table(results),
-        "models": _prior_table(context),
-        "free_run": _score_table(results),
-        "export": _export_table(results),
-        "control": _control_table(results),
-        "estimation": _observer_table(results),
-        "timing": _timing_table(results),
-        "monitor": _alarm_table(results),
-        "analysis": _pole_table(results),
+def _report(context: Context, results: Results, figures: Figures) -> Report:
+    tables: dict[str, Sequence[Table | None]] = {
+        "data": [_data_table(results.data)],
+        "models": [_prior_table(context)],
+        "free_run": [_score_table(results)],
+        "export": [_export_table(results.export)],
+        "control": [_control_table(results.control)],
+        "estimation": [_observer_table(results)],
+        "timing": [_timing_table(results.timing)],
+        "monitor": [_alarm_table(context, results.monitor)],
+        "guard": guard_tables(results.guard),
+        "analysis": [_pole_table(results.analysis)],
     }
-    notes, several = _notes(context, results), {"guard": guard_tables(results)}
+    instead, after = _notes(context, results)
     sections = tuple(
         Section(
             TITLES[key],
-            notes["instead"].get(key, paragraphs(key)),
+            instead.get(key, paragraphs(key)),
             figures.get(key, ()),
-            [t for t in (tables.get(key), *several.get(key, ())) if t is not None and t.rows],
-            notes["after"].get(key, ()),
+            [t for t in tables.get(key, ()) if t is not None and t.rows],
+            after.get(key, ()),
         )
         for key in TITLES
     )
-    versions = ", ".join(f"{name} {v}" for name, v in results["versions"].items())
+    versions = ", ".join(f"{name} {v}" for name, v in results.versions.items())
     return Report(
         f"hybrid-mpc: {context.scenario.name}",
         context.scenario.title,
@@ -406,51 +444,49 @@ def _report(context: Context, results: dict[str, Any], figures: Figures) -> Repo
         command(context),
         _summary(context, results),
         sections,
-        f"seed {results['seed']}, budget {results['budget']}; {versions}",
+        f"seed {results.seed}, budget {results.budget}; {versions}",
     )
 
 
-def _summary(context: Context, results: dict[str, Any]) -> list[KeyFigure]:
-    identification, timing = results["identification"], results["timing"]
-    output = context.scenario.prior().outputs[0]
-    rmse = {m: _first(value) for m, value in identification["rmse"].items() if m in MODELS}
-    ratio = identification["details"]["hybrid_over_phy"]
-    e_sim = identification["e_sim_s"]
+def _summary(context: Context, results: Results) -> list[KeyFigure]:
+    found, timing, control = results.identification, results.timing, results.control
+    unit = context.scenario.prior().outputs[0].unit
+    rmse = {m: _first(found.rmse[m]) for m in MODELS}
+    e_sim = {m: _first(found.e_sim_s[m]) for m in MODELS}
+    ratio = found.details.hybrid_over_phy
     summary = [
         KeyFigure(
-            "Free-run error (RMSE) of the hybrid on unseen data", rmse["mopgrnn"], output.unit,
-            f"fitted prior: {_text(rmse['phy'])} {output.unit}", _verdict(ratio["rmse"], 1.0),
+            "Free-run error (RMSE) of the hybrid on unseen data", rmse["mopgrnn"], unit,
+            f"fitted prior: {_text(rmse['phy'])} {unit}", _verdict(ratio["rmse"], 1.0),
         ),
         KeyFigure(
             "Simulation error E_sim of the hybrid", e_sim["mopgrnn"], "s",
             f"fitted prior: {_text(e_sim['phy'])}, RNN: {_text(e_sim['rnn'])}", _verdict(ratio["e_sim_s"], 1.0),
         ),
     ]  # fmt: skip
-    control = results["control"]
-    if control["gap_closed"] is not None:
-        costs = ", ".join(f"{n} {_text(control[n]['cost'])}" for n in CONTROLLERS)
-        gap = control["gap_closed"]
+    gap = control.gap_closed
+    if gap is not None:
+        named = {"prior": control.prior, "hybrid": control.hybrid, "oracle": control.oracle}
+        costs = ", ".join(f"{name} {_text(of.cost)}" for name, of in named.items())
         summary.append(
             KeyFigure(
-                "Gap from prior to oracle closed by the hybrid",
-                gap,
-                "",
+                "Gap from prior to oracle closed by the hybrid", gap, "",
                 f"mean over the tasks that tell controllers apart; summed costs: {costs}",
                 "good" if gap > 0 else "bad",
             )
-        )
-    if timing["misses"] is not None:
-        p99 = timing["controller_step_ms"]["p99"]
-        summary.append(
-            KeyFigure("Controller step, 99th percentile", p99, "ms", f"period: {timing['period_ms']:g} ms",
-                      _verdict(p99 / timing["period_ms"], 1.0))
         )  # fmt: skip
-    if results["monitor"]["alarms"] is not None:
-        clean = results["monitor"]["details"]["clean"]
+    p99 = timing.controller_step_ms.p99
+    if p99 is not None:
         summary.append(
-            KeyFigure("Alarms of the energy monitor", len(results["monitor"]["alarms"]), "",
-                      f"{clean['alarms']} of them in {clean['seconds']:.0f} s known to be undisturbed",
-                      "good" if clean["alarms"] == 0 else "bad")
+            KeyFigure("Controller step, 99th percentile", p99, "ms", f"period: {timing.period_ms:g} ms",
+                      _verdict(p99 / timing.period_ms, 1.0))
+        )  # fmt: skip
+    alarms, clean = results.monitor.alarms, results.monitor.details.clean
+    if alarms is not None and clean is not None:
+        summary.append(
+            KeyFigure("Alarms of the energy monitor", len(alarms), "",
+                      f"{clean.alarms} of them in {clean.seconds:.0f} s known to be undisturbed",
+                      "good" if clean.alarms == 0 else "bad")
         )  # fmt: skip
     return summary
 
@@ -463,46 +499,54 @@ def _text(value: float | None) -> str:
     return "diverged" if value is None else f"{value:.3g}"
 
 
-def _notes(context: Context, results: dict[str, Any]) -> dict[str, dict[str, tuple[str, ...]]]:
-    instead: dict[str, tuple[str, ...]] = {}
-    after: dict[str, tuple[str, ...]] = {}
-    if results["control"]["gap_closed"] is None:
-        reason = results["control"]["gap_closed_reason"]
-        if results["control"]["hybrid"]["cost"] is None:
-            instead["control"] = (f"There is no closed loop here: {reason}. The controller was built and timed "
-                                  "on recorded states instead.",)  # fmt: skip
+Notes = dict[str, tuple[str, ...]]
+
+
+def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
+    """Paragraphs by section: those that replace the usual ones, and those after tables and pictures."""
+    instead: Notes = {}
+    after: Notes = {}
+    control = results.control
+    if control.gap_closed is None:
+        reason = control.gap_closed_reason.rstrip(".")
+        if control.hybrid.cost is None:
+            timed = (
+                ""
+                if results.timing.misses is None
+                else " The controller was built and timed on recordings instead."
+            )
+            instead["control"] = (f"There is no closed loop here: {reason}.{timed}",)
         else:
             after["control"] = (f"The gap closed is not defined: {reason}.",)
-    tested = results["estimation"]
-    without = [r["reason"] for r in (tested, *(tested[n] for n in OBSERVERS)) if r and "reason" in r]
+    tested = results.estimation
+    observers = (tested.prior_observer, tested.hybrid_observer)
+    without = [text for text in (tested.reason, *(o.reason for o in observers if o is not None)) if text]
     if without:
         after["estimation"] = (f"Not tested: {'; '.join(dict.fromkeys(without))}.",)
-    if results["data"]["details"]["warnings"]:
-        after["data"] = tuple(f"Warning: {text}" for text in results["data"]["details"]["warnings"])
-    after["training"] = _prior_replay_text(training_settings(context, "mopgrnn").prior_replay)
-    warnings = context.result("prior")["warnings"]
-    if warnings:
-        after["models"] = ("Warnings of the fit: " + "; ".join(warnings) + ".",)
-    if results["monitor"]["alarms"] is not None:
-        method = results["monitor"]["details"]["calibration"]["method"]
-        after["monitor"] = (_monitor_words(context, results), f"Calibration: {method}.")
+    after["data"] = tuple(f"Warning: {text}" for text in results.data.details.warnings)
+    after["training"] = _prior_replay_text(training_settings(context, DEPLOYED).prior_replay)
+    if context.prior.fit.warnings:
+        after["models"] = ("Warnings of the fit: " + "; ".join(context.prior.fit.warnings) + ".",)
+    monitor = results.monitor
+    if monitor.details.calibration is None:
+        after["monitor"] = (f"No alarms here: {monitor.reason.rstrip('.')}.",)
     else:
-        after["monitor"] = (f"No alarms here: {results['monitor']['reason'].rstrip('.')}.",)
-    after["monitor"] += coverage_words(results["monitor"]["details"].get("recordings", ()))
-    after["guard"] = guard_words(results)
-    points = results["analysis"]["details"]
-    if "reason" in results["analysis"]:
-        instead["analysis"] = (f"There is no analysis here: {results['analysis']['reason'].rstrip('.')}.",)
-    reasons = [
-        f"{m}: {points[m]['fixed_point_reason']}" for m in points if "fixed_point_reason" in _dict(points[m])
-    ]
-    if reasons:
-        after["analysis"] = tuple(reasons)
-    return {"instead": instead, "after": after}
+        method = monitor.details.calibration.method
+        after["monitor"] = (_monitor_words(context.read(MONITOR)), f"Calibration: {method}.")
+    after["monitor"] += coverage_words(monitor.details.recordings)
+    after["guard"] = guard_words(results.guard)
+    if results.analysis.details is None:
+        instead["analysis"] = (f"There is no analysis here: {results.analysis.reason.rstrip('.')}.",)
+    else:
+        models = results.analysis.details.models
+        after["analysis"] = tuple(
+            f"{name}: {m.fixed_point_reason}" for name, m in models.items() if m.fixed_point_reason
+        )
+    return instead, after
 
 
 def _prior_replay_text(weight: float) -> tuple[str, ...]:
-    """What the report says of prior_replay.
+    """What the report says of the prior replay.
 
     Example:
         >>> _prior_replay_text(0.0), len(_prior_replay_text(10.0))
@@ -512,68 +556,66 @@ def _prior_replay_text(weight: float) -> tuple[str, ...]:
     return (f"{words} (prior_replay, weight {weight:g}).",) if weight else ()
 
 
-def _dict(value: Any) -> dict[str, Any]:
-    return value if isinstance(value, dict) else {}
-
-
-def _monitor_words(context: Context, results: dict[str, Any]) -> str:
-    clean = results["monitor"]["details"]["clean"]
+def _monitor_words(found: MonitorResult) -> str:
+    assert found.clean is not None
+    clean, load = found.clean, found.load
     words = (
-        f"In {clean['seconds']:.0f} s known to be undisturbed there were {clean['alarms']} alarms, "
-        f"in the {clean['test_seconds']:.0f} s of test data among them {clean['test_alarms']}."
+        f"In {clean.seconds:.0f} s known to be undisturbed there were {clean.alarms} alarms, "
+        f"in the {clean.test_seconds:.0f} s of test data among them {clean.test_alarms}."
     )
-    load = context.result("monitor").get("load")
     if load is None:
         return words
-    seen = "never" if load["delay_s"] is None else f"after {load['delay_s']:.2f} s"
+    seen = "never" if load.delay_s is None else f"after {load.delay_s:.2f} s"
     return f"{words} The unknown load in the closed loop was reported {seen}."
 
 
 def coverage_words(recordings: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
-    """What the monitor could not judge, in a sentence; nothing if that is but the warm-up.
+    """What the monitor could not see, in a sentence; nothing if that is but the warm-up.
 
     Args:
-        recordings: Of each the seconds that were judged and that were not, by reason.
+        recordings: Of each the seconds that were monitored and that were not, by reason.
 
     Example:
         >>> coverage_words([{"judged_s": 4.0, "warm_up_s": 0.3, "missing_s": 0.0, "not_finite_s": 2.0}])
-        ('Not judged: 2 s in which model or estimator gave no finite number.',)
+        ('Not monitored: 2 s in which model or estimator gave no finite number.',)
     """
     why = {
         "missing_s": "with missing samples",
         "not_finite_s": "in which model or estimator gave no finite number",
     }
     sums = {key: sum(float(row[key]) for row in recordings) for key in why}
-    told = [f"{sums[key]:.3g} s {words}" for key, words in why.items() if sums[key] > 0]
-    return (f"Not judged: {', '.join(told)}.",) if told else ()
+    parts = [f"{sums[key]:.3g} s {words}" for key, words in why.items() if sums[key] > 0]
+    return (f"Not monitored: {', '.join(parts)}.",) if parts else ()
 
 
-def _data_table(results: dict[str, Any]) -> Table:
-    data = results["data"]
-    rows: list[tuple[Any, ...]] = [(role, seconds) for role, seconds in data["details"]["seconds"].items()]
+def _data_table(data: Data) -> Table:
+    rows: list[tuple[Any, ...]] = list(data.details.seconds.items())
     rows += [
-        (f"cut: {c['file']}, {c['start_s']:.2f} to {c['end_s']:.2f} s: {why}", c["end_s"] - c["start_s"])
-        for c, why in zip(data["cuts"], data["details"]["why_cut"], strict=True)
+        (f"cut: {c.file}, {c.start_s:.2f} to {c.end_s:.2f} s: {why}", c.end_s - c.start_s)
+        for c, why in zip(data.cuts, data.details.why_cut, strict=True)
     ]
-    caption = f"{len(data['files'])} files; content hash {data['hash'][:16]}."
+    caption = f"{len(data.files)} files; content hash {data.hash[:16]}."
     return Table(("part", "length [s]"), rows, caption)
 
 
 def _prior_table(context: Context) -> Table:
-    prior = context.result("prior")
+    prior = context.prior
     rows = [
-        (p.label, p.description, prior["nominal"][p.name], prior["values"][p.name],
-         prior["standard_errors"].get(p.name, "fixed"))
+        (p.label, p.description, prior.nominal[p.name], prior.fit.values[p.name],
+         prior.fit.standard_errors.get(p.name, "fixed"))
         for p in context.scenario.prior().parameters_spec
     ]  # fmt: skip
     caption = "Parameters of the prior. Standard errors suppose that the prior's structure is right."
     return Table(("parameter", "meaning", "nominal", "fitted", "standard error"), rows, caption)
 
 
-def _score_table(results: dict[str, Any]) -> Table:
-    found = results["identification"]
-    groups = [{m: _first(found[key][m]) for m in MODELS} for key in ("e_sim_s", "rmse", "balance_violation")]
-    unit = next((k for m in MODELS for k in found["rmse"][m] or ()), "[-]").partition(" ")[2]
+def _score_table(results: Results) -> Table:
+    found = results.identification
+    groups = [
+        {m: _first(by[m]) for m in MODELS} for by in (found.e_sim_s, found.rmse, found.balance_violation)
+    ]
+    named = (value for value in found.rmse.values() if isinstance(value, Mapping))
+    unit = next((label for by in named for label in by), "[-]").partition(" ")[2]
     base = [group["phy"] for group in groups]
     rows = [
         (name_of(m), *(g[m] for g in groups), *(_percent(g[m], b) for g, b in zip(groups, base, strict=True)))
@@ -592,26 +634,23 @@ def _percent(value: float | None, base: float | None) -> str:
     return "–" if value is None or not base else f"{100 * (value / base - 1):+.0f} %"
 
 
-def _export_table(results: dict[str, Any]) -> Table:
-    e = results["export"]
+def _export_table(export: Export) -> Table:
     rows = [
-        ("values", e["parity_max_abs_error"], "1e-12"),
-        ("Jacobians", e["jacobian_max_abs_error"], "1e-10"),
+        ("values", f"{export.parity_max_abs_error:.1e}", "1e-12"),
+        ("Jacobians", f"{export.jacobian_max_abs_error:.1e}", "1e-10"),
     ]
     caption = "Largest difference between the exported models and PyTorch, relative to the outputs' scale."
-    return Table(
-        ("compared", "largest difference", "allowed"), [(a, f"{b:.1e}", c) for a, b, c in rows], caption
-    )
+    return Table(("compared", "largest difference", "allowed"), rows, caption)
 
 
-def _control_table(results: dict[str, Any]) -> Table | None:
-    if results["control"]["hybrid"]["cost"] is None:
+def _control_table(control: Control) -> Table | None:
+    details = control.details
+    if details is None:
         return None
-    details = results["control"]["details"]
-    names = [n for n in CONTENDERS if any(n in cells for cells in details["tasks"].values())]
+    names = [n for n in CONTENDERS if any(n in cells for cells in details.tasks.values())]
     rows = [
-        (task, *(_cost(cells.get(name)) for name in names), _gap(details["gap_closed_by_task"][task]))
-        for task, cells in details["tasks"].items()
+        (task, *(_cost(cells.get(name)) for name in names), _gap(details.gap_closed_by_task[task]))
+        for task, cells in details.tasks.items()
     ]
     caption = (
         "Closed-loop cost J on the true state: mean over seeds with its 95 % interval (none for one seed). Gap: "
@@ -621,62 +660,67 @@ def _control_table(results: dict[str, Any]) -> Table | None:
     return Table(("task", *(n.replace("_", ", ") for n in names), "gap closed"), rows, caption)
 
 
-def _cost(cell: dict[str, Any] | None) -> str:
+def _cost(cell: Summary | None) -> str:
     if cell is None:
         return "–"
-    mean, half = cell["cost"]["mean"], cell["cost"]["ci95"]
+    mean, half = cell.cost.mean, cell.cost.ci95
     if mean is None:
         return "diverged"
     return f"{mean:.3g}" + (f" ± {half:.1g}" if half is not None else "")
 
 
-def _gap(gap: dict[str, Any]) -> str:
-    return "–" if gap["value"] is None else f"{gap['value']:.2f}"
+def _gap(gap: Gap) -> str:
+    return "–" if gap.value is None else f"{gap.value:.2f}"
 
 
-def _observer_table(results: dict[str, Any]) -> Table:
-    found = {OBSERVER_TITLES[n]: results["estimation"][n] for n in OBSERVERS}
+def _observer_table(results: Results) -> Table:
+    found = {name: getattr(results.estimation, name) for name in OBSERVERS}
     rows = [
-        (title, r["mean_nis"], f"{r['nis_low']:.2f} to {r['nis_high']:.2f}", f"{100 * r['nis_inside']:.0f} %",
-         f"{r['ljung_box']:.0f}", f"{r['ljung_box_limit']:.0f}", r["samples"])
-        for title, r in found.items()
-        if r is not None and r["mean_nis"] is not None
+        (OBSERVER_TITLES[name], r.mean_nis, f"{r.nis_low:.2f} to {r.nis_high:.2f}", f"{100 * r.nis_inside:.0f} %",
+         f"{r.ljung_box:.0f}", f"{r.ljung_box_limit:.0f}", r.samples)
+        for name, r in found.items()
+        if r is not None and r.mean_nis is not None
     ]  # fmt: skip
     columns = ("observer", "mean NIS", "consistent", "below 95 %", "Ljung-Box", "white below", "samples")
     return Table(columns, rows, "Innovations on test recordings, the first 25 samples of each left out.")
 
 
-def _timing_table(results: dict[str, Any]) -> Table | None:
-    timing = results["timing"]
-    if timing["misses"] is None:
+def _timing_table(timing: Timing) -> Table | None:
+    if timing.misses is None:
         return None
-    ms = timing["controller_step_ms"]
-    row = (ms["median"], ms["p95"], ms["p99"], ms["max"], timing["period_ms"], timing["misses"])
+    ms = timing.controller_step_ms
+    row = (ms.median, ms.p95, ms.p99, ms.max, timing.period_ms, timing.misses)
     return Table(("median [ms]", "p95 [ms]", "p99 [ms]", "max [ms]", "period [ms]", "misses"), (row,))
 
 
-def _alarm_table(results: dict[str, Any]) -> Table | None:
-    if results["monitor"]["alarms"] is None:
+def _alarm_table(context: Context, monitor: Monitor) -> Table | None:
+    calibration = monitor.details.calibration
+    if monitor.alarms is None or calibration is None:
         return None
-    rows = [(a["file"], a["start_s"], a["end_s"]) for a in results["monitor"]["alarms"]]
-    calibration = results["monitor"]["details"]["calibration"]
+    rows = [(a.file, a.start_s, a.end_s) for a in monitor.alarms]
+    unit = force_unit(context.scenario.prior().outputs[0])
     caption = (
-        f"Alarms over the whole recordings; thresholds {calibration['threshold_w']:.3g} W and "
-        f"{calibration['residual_threshold']:.3g} N m (N for a slider)."
+        f"Alarms over the whole recordings; thresholds {calibration.threshold_w:.3g} W and "
+        f"{calibration.residual_threshold:.3g} {unit}."
     )
     return Table(("recording", "from [s]", "to [s]"), rows, caption)
 
 
-def _pole_table(results: dict[str, Any]) -> Table:
+def _pole_table(analysis: Analysis) -> Table | None:
+    if analysis.details is None:
+        return None
     rows = []
-    for model, points in results["analysis"]["details"].items():  # empty where the stage could not run
-        if not isinstance(points, dict):
-            continue
-        for point, a in points.items():
-            if point.startswith("fixed_point"):
-                continue
+    for model, found in analysis.details.models.items():
+        for point, a in found.points.items():
             slow = [f"{w:.2f} ({z:.2f})" for w, z in
-                    list(zip(a["frequency_rad_s"], a["damping"], strict=True))[:2] if w is not None]  # fmt: skip
-            rows.append((model, point, ", ".join(slow), a["stable"], a["stabilisable"], a["detectable"]))
+                    list(zip(a.frequency_rad_s, a.damping, strict=True))[:2] if w is not None]  # fmt: skip
+            rows.append((model, point, ", ".join(slow), a.stable, a.stabilisable, a.detectable))
     columns = ("model", "point", "slowest poles: rad/s (damping)", "stable", "stabilisable", "detectable")
     return Table(columns, rows, "Linearizations at rest and at working speed.")
+
+
+REPORT = Stage(
+    "report", "writing the report", ReportResult, report_stage, what_report_reads,
+    (DATA, PRIOR, TRAINING, EVALUATION, EXPORT, CONTROL, ESTIMATION, MONITOR, GUARD, ANALYSIS),
+    restore=report_is_there,
+)  # fmt: skip

@@ -1,348 +1,471 @@
-"""What a run found, as ``results.json`` holds it (docs/results-schema.md)."""
+"""What a run found, as ``results.json`` holds it: the dataclasses below, field by field.
+
+A value that a run does not have is null, and its reason stands beside it as ``NAME_reason``, or as ``reason`` for the
+whole object. Signals and balances are named with their unit, ``"phi [rad]"``.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.identify.evaluate import Scores
 from hybrid_mpc.job.context import Context
-from hybrid_mpc.job.loops import LoopRow, by_task, summaries
-from hybrid_mpc.job.stages.compare import kept
-from hybrid_mpc.job.stages.export import versions
-from hybrid_mpc.records import plain
+from hybrid_mpc.job.loops import LoopRow, Summary, by_task, summaries
+from hybrid_mpc.job.stage import Absent
+from hybrid_mpc.job.stages.analyze import ANALYSIS, ModelAnalysis
+from hybrid_mpc.job.stages.compare import CONTROL
+from hybrid_mpc.job.stages.estimate import ESTIMATION, OBSERVERS, ObserverTest, TestedRecording
+from hybrid_mpc.job.stages.export import EXPORT
+from hybrid_mpc.job.stages.guard import GUARD, FaultedLoop, GuardTest, NominalLoop
+from hybrid_mpc.job.stages.identify import DATA, EVALUATION, MODELS
+from hybrid_mpc.job.stages.monitor import MONITOR, CleanAlarms, RecordedAlarm
+from hybrid_mpc.monitor.calibrate import Calibration
+from hybrid_mpc.monitor.detector import Detector
+from hybrid_mpc.records import plain, record
 
-# The schema of ``results.json``; ``docs/results-schema.md`` describes it in words.
-
+Array = NDArray[np.float64]
 SCHEMA_VERSION = 4
-MODELS = ("phy_nominal", "phy", "rnn", "pgrnn", "mopgrnn")
 CONTROLLERS = ("prior", "hybrid", "oracle")
-OBSERVERS = ("prior_observer", "hybrid_observer")
-
-
-@dataclass(frozen=True)
-class Leaf:
-    """A value of the schema.
-
-    Args:
-        kind: What it must be, in words.
-        fits: Whether a value is of that kind.
-        nullable: True if a scenario may have none; then it is null and its reason stands beside it.
-    """
-
-    kind: str
-    fits: Callable[[Any], bool]
-    nullable: bool = True
-
-
-@dataclass(frozen=True)
-class Group:
-    """An object of the schema.
-
-    Args:
-        keys: Its keys, all of them required.
-        nullable: True if a scenario may have none of it.
-    """
-
-    keys: Mapping[str, Group | Leaf]
-    nullable: bool = True
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _is_count(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
-
-
-def _is_text(value: Any) -> bool:
-    return isinstance(value, str) and bool(value.strip())
-
-
-def _is_named(value: Any) -> bool:
-    return _is_text(value) and value.endswith("]") and " [" in value
-
-
-def _is_interval(value: Any) -> bool:
-    keys = {"file", "start_s", "end_s"}
-    return (
-        isinstance(value, Mapping)
-        and set(value) == keys
-        and _is_text(value["file"])
-        and all(_is_number(value[key]) for key in ("start_s", "end_s"))
-        and value["start_s"] <= value["end_s"]
-    )
-
-
-def _is_broken(value: Any) -> bool:
-    keys = {"fault", "start_s", "delay_s", "diagnosis"}
-    return (
-        isinstance(value, Mapping)
-        and set(value) == keys
-        and _is_text(value["fault"])
-        and isinstance(value["diagnosis"], str)
-        and _is_number(value["start_s"])
-        and (value["delay_s"] is None or (_is_number(value["delay_s"]) and value["delay_s"] >= 0))
-    )
-
-
-def _is_pair(value: Any) -> bool:
-    return isinstance(value, list | tuple) and len(value) == 2 and all(_is_number(v) for v in value)
-
-
-def _list_of(fits: Callable[[Any], bool]) -> Callable[[Any], bool]:
-    return lambda value: isinstance(value, list | tuple) and all(fits(v) for v in value)
-
-
-def _number(*, positive: bool = False) -> Leaf:
-    if positive:
-        return Leaf("a finite number, zero or above", lambda v: _is_number(v) and v >= 0)
-    return Leaf("a finite number", _is_number)
-
-
-def _fixed(kind: str, fits: Callable[[Any], bool]) -> Leaf:
-    return Leaf(kind, fits, nullable=False)
-
-
-_TEXT = _fixed("a text that is not empty", _is_text)
-_SIZE = _number(positive=True)
-_COUNT = Leaf("a whole number, zero or above", _is_count)
-_SHARE = Leaf("a number between 0 and 1", lambda v: _is_number(v) and 0 <= v <= 1)
-_TRUTH = Leaf("true or false", lambda v: isinstance(v, bool))
-_INTERVALS = "a list of {file, start_s, end_s} with start_s <= end_s"
-_SIZES = Leaf(
-    "an object of finite numbers, zero or above, by name with unit",
-    lambda v: (
-        isinstance(v, Mapping)
-        and bool(v)
-        and all(_is_named(k) and _is_number(x) and x >= 0 for k, x in v.items())
-    ),
-)
-_PER_MODEL = Group(dict.fromkeys(MODELS, _SIZE))
-_SIZES_PER_MODEL = Group(dict.fromkeys(MODELS, _SIZES))
-
-SCHEMA = Group(
-    {
-        "schema_version": _fixed(
-            f"the number {SCHEMA_VERSION}", lambda v: v == SCHEMA_VERSION and _is_count(v)
-        ),
-        "scenario": _TEXT,
-        "seed": _fixed("a whole number, zero or above", _is_count),
-        "budget": _TEXT,
-        "versions": _fixed(
-            "an object of texts by package name",
-            lambda v: isinstance(v, Mapping) and all(_is_text(one) for one in v.values()),
-        ),
-        "data": Group(
-            {
-                "files": _fixed("a list of file names", _list_of(_is_text)),
-                "hash": _TEXT,
-                "cuts": _fixed(_INTERVALS, _list_of(_is_interval)),
-            },
-            nullable=False,
-        ),
-        "identification": Group(
-            {"e_sim_s": _PER_MODEL, "rmse": _SIZES_PER_MODEL, "balance_violation": _SIZES_PER_MODEL}
-        ),
-        "export": Group({"parity_max_abs_error": _SIZE, "jacobian_max_abs_error": _SIZE}),
-        "control": Group(
-            {
-                **{name: Group({"cost": _number(), "tracking_rmse": _SIZES}) for name in CONTROLLERS},
-                "gap_closed": _number(),
-            }
-        ),
-        "estimation": Group(
-            {
-                name: Group(
-                    {
-                        **dict.fromkeys(("mean_nis", "nis_low", "nis_high"), _SIZE),
-                        "nis_inside": _SHARE,
-                        **dict.fromkeys(("ljung_box", "ljung_box_limit"), _SIZE),
-                        "samples": _COUNT,
-                    }
-                )
-                for name in OBSERVERS
-            }
-        ),
-        "timing": Group(
-            {
-                "controller_step_ms": Group(dict.fromkeys(("median", "p95", "p99", "max"), _SIZE)),
-                "period_ms": _SIZE,
-                "misses": _COUNT,
-            }
-        ),
-        "monitor": Group(
-            {
-                "threshold": _SIZES,
-                "false_alarms_per_hour": _SIZE,
-                "alarms": Leaf(_INTERVALS, _list_of(_is_interval)),
-            }
-        ),
-        "guard": Group(
-            {
-                **dict.fromkeys(
-                    ("false_alarms_per_hour", "hours", "force_threshold", "energy_threshold"), _SIZE
-                ),
-                "data_hash": Leaf("a text that is not empty", _is_text),
-                "test_seconds": _SIZE,
-                "test_alarms": _COUNT,
-                "faults": Leaf("a list of {fault, start_s, delay_s, diagnosis}", _list_of(_is_broken)),
-            }
-        ),
-        "analysis": Group(
-            {
-                "eigenvalues": Leaf("a list of [real part, imaginary part]", _list_of(_is_pair)),
-                "stabilisable": _TRUTH,
-                "detectable": _TRUTH,
-            }
-        ),
-    },
-    nullable=False,
-)
-
-
-def validate_results(results: Mapping[str, Any]) -> None:
-    """Check results against the schema.
-
-    Args:
-        results: The content of ``results.json``. Every key of the schema is there. A value that the
-            scenario cannot have is None, with the reason beside it: ``"<key>_reason"``, or ``"reason"``
-            for the whole object. Further keys lie under ``"details"`` of any object.
-
-    Raises:
-        InputError: With the path of the first key that is missing, unknown or of the wrong kind.
-
-    Example:
-        >>> validate_results({"schema_version": 4, "seed": 0})
-        Traceback (most recent call last):
-        ...
-        hybrid_mpc.errors.InputError: results: 'scenario' is missing; it must be a text that is not empty
-    """
-    _check(results, SCHEMA, "", {})
-
-
-def _check(value: Any, spec: Group | Leaf, path: str, parent: Mapping[str, Any]) -> None:
-    key = path.rpartition(".")[2]
-    if value is None and spec.nullable:
-        if not (_is_text(parent.get(f"{key}_reason")) or _is_text(parent.get("reason"))):
-            raise InputError(
-                f"results: {path!r} is null without a reason; put '{key}_reason' or 'reason' beside it"
-            )
-        return
-    if isinstance(spec, Leaf):
-        if not spec.fits(value):
-            raise InputError(f"results: {path!r} is {_short(value)}; it must be {spec.kind}")
-        return
-    if not isinstance(value, Mapping):
-        raise InputError(f"results: {path or 'all of it'!r} is {_short(value)}; it must be an object")
-    prefix = f"{path}." if path else ""
-    for name, inner in spec.keys.items():
-        if name not in value:
-            kind = inner.kind if isinstance(inner, Leaf) else "an object with " + ", ".join(inner.keys)
-            raise InputError(f"results: '{prefix}{name}' is missing; it must be {kind}")
-        _check(value[name], inner, prefix + name, value)
-    for name in value:
-        if name not in spec.keys and name not in _beside(spec):
-            raise InputError(
-                f"results: {prefix + str(name)!r} is no key of the schema; put it under 'details'"
-            )
-
-
-def _beside(group: Group) -> set[str]:
-    return {"details", "reason", *(f"{name}_reason" for name in group.keys)}
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
-LOOP_FIGURES = ("cost", "tracking_rmse")
 ENERGY = "energy [W]"
 """Name of the only balance that there is so far, with the unit of its rate."""
 BASELINES = ("prior", "prior_observer")
 REPORTED = {"prior": "prior_observer", "hybrid": "hybrid_observer", "oracle": "oracle"}
-"""Contenders behind the three names of the schema: all with the same kind of estimator."""
+"""Controllers behind the three names of ``results.json``: all with the same kind of estimator."""
+Errors = Mapping[str, Mapping[str, float] | str | None]
+"""Error by model, each by signal with unit; a model without one has null, and ``MODEL_reason``."""
 
 
-def collect(context: Context) -> dict[str, Any]:
-    """Results of all stages in the schema's form; checked before they are returned."""
-    data = context.result("data")
-    results = {
-        "schema_version": SCHEMA_VERSION,
-        "scenario": context.scenario.name,
-        "seed": context.settings.seed,
-        "budget": context.settings.budget,
-        "versions": versions(),
-        "data": {
-            "files": data["files"],
-            "hash": data["hash"],
-            "cuts": [{"file": c["file"], "start_s": c["from_s"], "end_s": c["to_s"]} for c in data["cuts"]],
-            "details": {
-                "seconds": data["seconds"],
-                "why_cut": [c["why"] for c in data["cuts"]],
-                "warnings": data.get("warnings", []),  # older runs have none
-            },
-        },
-        "identification": _identification(context),
-        "export": context.result("export"),
-        "control": _control(context),
-        "estimation": _estimation(context),
-        "timing": _timing(context),
-        "monitor": _monitor(context),
-        "guard": guard_results(context),
-        "analysis": _analysis(context),
+@dataclass(frozen=True)
+class CutInterval:
+    """A part of a recording that is not used as it was recorded: its file, from and to [s]."""
+
+    file: str
+    start_s: float
+    end_s: float
+
+
+@dataclass(frozen=True)
+class DataDetails:
+    """Seconds by role, why each cut was made, and what is doubtful about the recordings."""
+
+    seconds: Mapping[str, float]
+    why_cut: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Data:
+    """The recordings: names of the files, hash of their contents, and what is not used of them."""
+
+    files: tuple[str, ...]
+    hash: str
+    cuts: tuple[CutInterval, ...]
+    details: DataDetails
+
+
+@dataclass(frozen=True)
+class FittedPrior:
+    """Parameters of the fitted prior, their standard errors, those before the fit, warnings, and each stage's error."""
+
+    values: Mapping[str, float]
+    standard_errors: Mapping[str, float]
+    nominal: Mapping[str, float]
+    warnings: tuple[str, ...]
+    stages: tuple[Mapping[str, Any], ...]
+
+
+@dataclass(frozen=True)
+class SmootherNoise:
+    """What the smoother assumes: noise of each sensor, and the random walk of the unexplained acceleration."""
+
+    sigma: tuple[float, ...]
+    walk: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class IdentificationDetails:
+    """Behind the errors.
+
+    Args:
+        prior_parameters: The fitted prior.
+        scores_of_all_networks: Errors of every network of a kind, by model.
+        by_file: Root mean square error of the first output by recording and model; None where a run diverged.
+        smoother: What the smoother assumes.
+        hybrid_over_phy: Error of the hybrid over that of the fitted prior.
+        network_settings: What replaced the budget's settings of the networks. Default: nothing.
+    """
+
+    prior_parameters: FittedPrior
+    scores_of_all_networks: Mapping[str, tuple[Scores, ...]]
+    by_file: Mapping[str, Mapping[str, float | None]]
+    smoother: SmootherNoise
+    hybrid_over_phy: Mapping[str, float | None]
+    network_settings: Mapping[str, Any] | None = None
+
+
+@dataclass(frozen=True)
+class Identification:
+    """Errors of free runs on unseen data.
+
+    Args:
+        e_sim_s: Simulation error [s] by model.
+        rmse: Root mean square error of the first output.
+        balance_violation: Mean absolute violation of each balance.
+        details: Behind the errors.
+    """
+
+    e_sim_s: Mapping[str, float | str | None]
+    rmse: Errors
+    balance_violation: Errors
+    details: IdentificationDetails
+
+
+@dataclass(frozen=True)
+class Export:
+    """Largest differences between the exported models and PyTorch, relative to the outputs' scale."""
+
+    parity_max_abs_error: float
+    jacobian_max_abs_error: float
+
+
+@dataclass(frozen=True)
+class ControllerCosts:
+    """Cost on the plant's true state, summed over the tasks, and tracking error by state."""
+
+    cost: float | None
+    tracking_rmse: Mapping[str, float] | None
+    cost_reason: str = ""
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Share of the distance from the better baseline to the oracle that the hybrid covers; or why there is none."""
+
+    value: float | None
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class ControlDetails:
+    """Figures by task and controller, and the gap closed by task."""
+
+    tasks: Mapping[str, Mapping[str, Summary]]
+    gap_closed_by_task: Mapping[str, Gap]
+
+
+@dataclass(frozen=True)
+class Control:
+    """Closed loops: the three controllers, and the gap closed, a mean over the tasks."""
+
+    prior: ControllerCosts
+    hybrid: ControllerCosts
+    oracle: ControllerCosts
+    gap_closed: float | None
+    gap_closed_reason: str = ""
+    details: ControlDetails | None = None
+
+
+@dataclass(frozen=True)
+class EstimationDetails:
+    """What the observers were tested on."""
+
+    recordings: tuple[TestedRecording, ...]
+
+
+@dataclass(frozen=True)
+class ObserverFigures:
+    """What the innovations of an observer say; see :class:`~hybrid_mpc.job.stages.estimate.ObserverTest`."""
+
+    mean_nis: float | None = None
+    nis_low: float | None = None
+    nis_high: float | None = None
+    nis_inside: float | None = None
+    ljung_box: float | None = None
+    ljung_box_limit: float | None = None
+    samples: int | None = None
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Estimation:
+    """Tests of the observers on test recordings."""
+
+    prior_observer: ObserverFigures | None
+    hybrid_observer: ObserverFigures | None
+    details: EstimationDetails | None = None
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class StepTimes:
+    """Durations of whole controller steps [ms]."""
+
+    median: float | None = None
+    p95: float | None = None
+    p99: float | None = None
+    max: float | None = None
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Durations of the hybrid's steps, the period [ms], and how many steps took longer."""
+
+    controller_step_ms: StepTimes
+    period_ms: float
+    misses: int | None
+    misses_reason: str = ""
+
+
+@dataclass(frozen=True)
+class MonitorDetails:
+    """The monitor's thresholds, alarms where nothing disturbs the machine, and how much of each recording it saw."""
+
+    recordings: tuple[Mapping[str, float | str], ...] = ()
+    calibration: Calibration | None = None
+    clean: CleanAlarms | None = None
+
+
+@dataclass(frozen=True)
+class Monitor:
+    """The energy monitor: threshold by balance, false alarms an hour, alarms on the recordings."""
+
+    threshold: Mapping[str, float] | None
+    false_alarms_per_hour: float | None
+    alarms: tuple[RecordedAlarm, ...] | None
+    details: MonitorDetails = MonitorDetails()
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class BrokenLoop:
+    """A loop in which something breaks: what and when, time to the alarm (None: never), what it is taken for."""
+
+    fault: str
+    start_s: float
+    delay_s: float | None
+    diagnosis: str
+
+
+@dataclass(frozen=True)
+class GuardDetails:
+    """What the guard was learned from, its detector, test recordings, and loops in which something breaks."""
+
+    source: str = ""
+    loops: tuple[NominalLoop, ...] = ()
+    detector: Detector | None = None
+    test: GuardTest | None = None
+    faults: tuple[FaultedLoop, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Guard:
+    """The energy guard's detector, alarms on test recordings, and loops in which something breaks.
+
+    Args:
+        false_alarms_per_hour: Wanted rate on nominal data [1/h].
+        hours: Length of the nominal data [h].
+        force_threshold: Sum of scaled residual forces above which an alarm starts.
+        energy_threshold: Scaled violation above which one starts.
+        data_hash: Hash of the nominal data.
+        test_seconds: Test recordings that were monitored [s].
+        test_alarms: Alarms that began in them.
+        faults: Loops in which something breaks.
+    """
+
+    false_alarms_per_hour: float | None = None
+    hours: float | None = None
+    force_threshold: float | None = None
+    energy_threshold: float | None = None
+    data_hash: str | None = None
+    test_seconds: float | None = None
+    test_alarms: int | None = None
+    faults: tuple[BrokenLoop, ...] | None = None
+    faults_reason: str = ""
+    details: GuardDetails = GuardDetails()
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class AnalysisDetails:
+    """The models by name at rest and at working speed, and that speed."""
+
+    models: Mapping[str, ModelAnalysis]
+    working_speed: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """The hybrid at rest: eigenvalues as (real part, imaginary part), and its properties."""
+
+    eigenvalues: tuple[tuple[float, float], ...] | None = None
+    stabilisable: bool | None = None
+    detectable: bool | None = None
+    details: AnalysisDetails | None = None
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Results:
+    """The content of ``results.json``.
+
+    Args:
+        schema_version: Number of this form.
+        scenario: Name of the machine.
+        seed: Seed of data, training and loops.
+        budget: Name of the budget.
+        versions: Versions of the packages.
+        data: The recordings.
+        identification: Errors of free runs on unseen data.
+        export: Parity with PyTorch.
+        control: Closed loops.
+        estimation: Tests of the observers.
+        timing: Durations of the controller's steps.
+        monitor: The energy monitor.
+        guard: The energy guard.
+        analysis: The linear analysis.
+    """
+
+    schema_version: int
+    scenario: str
+    seed: int
+    budget: str
+    versions: Mapping[str, str]
+    data: Data
+    identification: Identification
+    export: Export
+    control: Control
+    estimation: Estimation
+    timing: Timing
+    monitor: Monitor
+    guard: Guard
+    analysis: Analysis
+
+    def plain(self) -> dict[str, Any]:
+        """The results in JSON's own types; empty reasons and details are left out."""
+        found: dict[str, Any] = _without_empty(plain(self))
+        return found
+
+
+def _without_empty(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_without_empty(v) for v in value]
+    if not isinstance(value, Mapping):
+        return value
+    return {
+        key: _without_empty(v)
+        for key, v in value.items()
+        if not (v == "" and (key == "reason" or key.endswith("_reason")))
+        and not (v is None and key == "details")
     }
-    validate_results(results)
+
+
+def read_results(values: Mapping[str, Any], where: str = "results") -> Results:
+    """Results from the content of ``results.json``, checked.
+
+    Args:
+        values: The content.
+        where: The file, for messages.
+
+    Raises:
+        InputError: Naming what is missing, unknown or of the wrong kind, or null without a reason.
+
+    Example:
+        >>> read_results({"schema_version": 4, "seed": 0})
+        Traceback (most recent call last):
+        ...
+        hybrid_mpc.errors.InputError: results: scenario is missing; budget is missing; versions is missing; ...
+    """
+    results = record(Results, values, where)
+    if results.schema_version != SCHEMA_VERSION:
+        raise InputError(
+            f"{where}: schema_version is {results.schema_version}; this version reads {SCHEMA_VERSION}"
+        )
+    for group in ("identification", "control", "estimation", "timing", "monitor", "guard", "analysis"):
+        _check_reasons(values[group], group, where)
     return results
 
 
-def _identification(context: Context) -> dict[str, Any]:
-    scores, prior = context.result("evaluation")["scores"], context.result("prior")
-    output = context.scenario.prior().outputs[0].label
-    own = {
-        key: {name: _finite(scores[name]["best"][found]) for name in MODELS}
-        for key, found in (
-            ("e_sim_s", "e_sim_s"),
-            ("rmse", "rmse_rad"),
-            ("balance_violation", "energy_violation_w"),
-        )
-    }
-    figures = {
-        "e_sim_s": _or_reason(own["e_sim_s"]),
-        "rmse": _or_reason(own["rmse"], output),
-        "balance_violation": _or_reason(own["balance_violation"], ENERGY),
-    }
-    details = {
-        "prior_parameters": {
-            k: prior[k] for k in ("values", "standard_errors", "nominal", "warnings", "stages")
-        },
-        "scores_of_all_networks": {name: scores[name]["networks"] for name in MODELS},
-        "by_file": {
-            stem: {m: _finite(context.result("evaluation")["by_file"][m][stem]["rmse_rad"]) for m in MODELS}
-            for stem in context.result("evaluation")["by_file"]["phy"]
-        },
-        "smoother": prior["smoother"],
-        "hybrid_over_phy": {key: _ratio(own[key]["mopgrnn"], own[key]["phy"]) for key in ("e_sim_s", "rmse")},
-    }
-    if network := context.settings.network():  # what replaced the budget's
-        details["network_settings"] = network
-    return {**figures, "details": details}
+def _check_reasons(values: Mapping[str, Any], path: str, where: str) -> None:
+    for key, value in values.items():
+        if value is None and not (values.get(f"{key}_reason") or values.get("reason")):
+            raise InputError(
+                f"{where}: {path}.{key} is null without a reason; put '{key}_reason' or 'reason' beside it"
+            )
+        if isinstance(value, Mapping) and key != "details":
+            _check_reasons(value, f"{path}.{key}", where)
 
 
-def _or_reason(values: Mapping[str, float | None], label: str = "") -> dict[str, Any]:
-    """Values by model, under a label where one is given; those that are none with their reason."""
-    group: dict[str, Any] = {}
-    for name, value in values.items():
-        group[name] = {label: value} if label and value is not None else value
-        if value is None:
-            group[f"{name}_reason"] = "a free run diverged"
-    return group
+def collect(context: Context) -> Results:
+    """Results of all stages."""
+    data = context.read(DATA)
+    return Results(
+        SCHEMA_VERSION,
+        context.scenario.name,
+        context.settings.seed,
+        context.settings.budget,
+        context.versions,
+        Data(
+            data.files,
+            data.hash,
+            tuple(CutInterval(c.file, c.start_s, c.end_s) for c in data.cuts),
+            DataDetails(data.seconds, tuple(c.why for c in data.cuts), data.warnings),
+        ),
+        _identification(context),
+        Export(context.read(EXPORT).parity_max_abs_error, context.read(EXPORT).jacobian_max_abs_error),
+        _control(context),
+        _estimation(context),
+        _timing(context),
+        _monitor(context),
+        _guard(context),
+        _analysis(context),
+    )
+
+
+def _identification(context: Context) -> Identification:
+    found, prior = context.read(EVALUATION), context.prior
+    output, network = context.scenario.prior().outputs[0].label, context.settings.network()
+    best = {name: found.scores[name].best for name in MODELS}
+    e_sim = {name: _finite(scores.e_sim_s) for name, scores in best.items()}
+    rmse = {name: _finite(scores.rmse_rad) for name, scores in best.items()}
+    violation = {name: _finite(scores.energy_violation_w) for name, scores in best.items()}
+    details = IdentificationDetails(
+        FittedPrior(
+            prior.fit.values, prior.fit.standard_errors, prior.nominal, prior.fit.warnings, prior.fit.stages
+        ),
+        {name: found.scores[name].networks for name in MODELS},
+        {
+            stem: {m: _finite(found.by_file[m][stem].rmse_rad) for m in MODELS}
+            for stem in found.by_file["phy"]
+        },
+        SmootherNoise(prior.sigma, prior.walk),
+        {
+            "e_sim_s": _ratio(e_sim["mopgrnn"], e_sim["phy"]),
+            "rmse": _ratio(rmse["mopgrnn"], rmse["phy"]),
+        },
+        network or None,
+    )
+    return Identification(
+        _with_reasons(e_sim),
+        _with_reasons({name: None if value is None else {output: value} for name, value in rmse.items()}),
+        _with_reasons(
+            {name: None if value is None else {ENERGY: value} for name, value in violation.items()}
+        ),
+        details,
+    )
+
+
+def _with_reasons(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values by model; those that are none with their reason."""
+    return dict(values) | {f"{name}_reason": "a free run diverged" for name, v in values.items() if v is None}
 
 
 def _finite(value: float) -> float | None:
@@ -353,44 +476,41 @@ def _ratio(value: float | None, baseline: float | None) -> float | None:
     return None if value is None or not baseline else value / baseline
 
 
-def _control(context: Context) -> dict[str, Any]:
-    control = context.result("control")
-    if "reason" in control:
-        groups: dict[str, Any] = {
-            name: dict.fromkeys(LOOP_FIGURES) | {"reason": control["reason"]} for name in CONTROLLERS
-        }
-        return {**groups, "gap_closed": None, "gap_closed_reason": control["reason"]}
-    rows = kept(context, "control")
-    table, found = by_task(rows), summaries(rows)
-    out: dict[str, Any] = {}
-    for name, contender in REPORTED.items():
-        own = [cells[contender] for cells in found.values() if contender in cells]
-        loops = [row for row in rows if row.controller == contender]
-        if own:
-            costs = [cell.cost.mean for cell in own]
-            out[name] = {
-                "cost": None if None in costs else float(sum(c for c in costs if c is not None)),
-                "tracking_rmse": {
-                    signal: _root_mean_square([row.tracking_rmse[signal] for row in loops])
-                    for signal in loops[0].tracking_rmse
-                },
-            }
-            if None in costs:
-                out[name]["cost_reason"] = "a loop diverged"
-        else:
-            out[name] = dict.fromkeys(LOOP_FIGURES) | {"reason": "the scenario has no oracle"}
-    gaps = {task: gap_closed(cells) for task, cells in table.items()}
-    defined = [gap for gap, _ in gaps.values() if gap is not None]
-    out["gap_closed"] = float(np.mean(defined)) if defined else None
-    if not defined:
-        out["gap_closed_reason"] = "; ".join(dict.fromkeys(why for _, why in gaps.values()))
-    details = {
-        "tasks": plain(found),
-        "gap_closed_by_task": {
-            t: {"value": gap, **({"reason": why} if why else {})} for t, (gap, why) in gaps.items()
-        },
+def _control(context: Context) -> Control:
+    found = context.find(CONTROL)
+    if found.reason:
+        none = ControllerCosts(None, None, reason=found.reason)
+        return Control(none, none, none, None, found.reason)
+    assert not isinstance(found, Absent)
+    rows = found.rows
+    table, means = by_task(list(rows)), summaries(list(rows))
+    costs = {name: _costs(controller, rows, means) for name, controller in REPORTED.items()}
+    gaps = {task: Gap(*gap_closed(cells)) for task, cells in table.items()}
+    defined = [gap.value for gap in gaps.values() if gap.value is not None]
+    return Control(
+        **costs,
+        gap_closed=float(np.mean(defined)) if defined else None,
+        gap_closed_reason="" if defined else "; ".join(dict.fromkeys(gap.reason for gap in gaps.values())),
+        details=ControlDetails(means, gaps),
+    )
+
+
+def _costs(
+    controller: str, rows: Sequence[LoopRow], means: Mapping[str, Mapping[str, Summary]]
+) -> ControllerCosts:
+    own = [cells[controller].cost.mean for cells in means.values() if controller in cells]
+    loops = [row for row in rows if row.controller == controller]
+    if not own:
+        return ControllerCosts(None, None, reason="the scenario has no oracle")
+    tracking = {
+        signal: _root_mean_square([row.tracking_rmse[signal] for row in loops])
+        for signal in loops[0].tracking_rmse
     }
-    return {**out, "details": details}
+    known = [cost for cost in own if cost is not None]
+    diverged = len(known) < len(own)
+    return ControllerCosts(
+        None if diverged else float(sum(known)), tracking, "a loop diverged" if diverged else ""
+    )
 
 
 def _root_mean_square(values: Sequence[float]) -> float:
@@ -404,7 +524,7 @@ def gap_closed(cells: Mapping[str, Sequence[LoopRow]]) -> tuple[float | None, st
     with a reason, where the distance is below twice its standard error; one seed has no standard error.
 
     Args:
-        cells: Loops by contender.
+        cells: Loops by controller.
     """
     if "oracle" not in cells:
         return None, "the scenario has no oracle"
@@ -422,113 +542,92 @@ def gap_closed(cells: Mapping[str, Sequence[LoopRow]]) -> tuple[float | None, st
     return float(baseline.mean() - hybrid.mean()) / gap, ""
 
 
-def _estimation(context: Context) -> dict[str, Any]:
-    found = context.result("estimation")
-    if "reason" in found:
-        return {**dict.fromkeys(OBSERVERS), "reason": found["reason"]}
-    out: dict[str, Any] = {}
-    for name in OBSERVERS:
-        keys = _keys("estimation", name)
-        own = found[name]
-        out[name] = dict.fromkeys(keys) | own if "reason" in own else {key: own[key] for key in keys}
-    return {**out, "details": {"recordings": found["recordings"]}}
+def _estimation(context: Context) -> Estimation:
+    found = context.find(ESTIMATION)
+    if isinstance(found, Absent):
+        return Estimation(None, None, reason=found.reason)
+    own = {name: _observer(found.observers[name]) for name in OBSERVERS}
+    return Estimation(own["prior_observer"], own["hybrid_observer"], EstimationDetails(found.recordings))
 
 
-def _keys(*path: str) -> tuple[str, ...]:
-    group: Any = SCHEMA
-    for key in path:
-        group = group.keys[key]
-    return tuple(group.keys)
+def _observer(test: ObserverTest | Absent) -> ObserverFigures:
+    if isinstance(test, Absent):
+        return ObserverFigures(reason=test.reason)
+    return ObserverFigures(
+        test.mean_nis, test.nis_low, test.nis_high, test.nis_inside, test.ljung_box, test.ljung_box_limit,
+        test.samples,
+    )  # fmt: skip
 
 
-def step_times(context: Context) -> dict[str, Any]:
+def step_times(context: Context) -> dict[str, Array]:
     """Durations [ms] of whole controller steps by controller."""
-    arrays = context.arrays("control")
-    if "step_ms" in arrays:
-        return {"hybrid": arrays["step_ms"]}
-    if "reason" in context.result("control"):
+    found = context.find(CONTROL)
+    if isinstance(found, Absent):
         return {}
-    timed = [row for row in kept(context, "control") if "step_ms" in row.arrays]
+    if "step_ms" in found.arrays:
+        return {"hybrid": found.arrays["step_ms"]}
+    timed = [row for row in found.drawn if "step_ms" in row.arrays]
     own = {
         n: [r.arrays["step_ms"] for r in timed if r.controller == REPORTED[n]] for n in ("prior", "hybrid")
     }
     return {name: np.concatenate(times) for name, times in own.items() if times}
 
 
-def _timing(context: Context) -> dict[str, Any]:
+def _timing(context: Context) -> Timing:
     period = 1e3 * context.spec.dt
     ms = step_times(context).get("hybrid")
     if ms is None:
-        reason = context.result("control")["reason"]
-        none = dict.fromkeys(("median", "p95", "p99", "max"))
-        return {"controller_step_ms": {**none, "reason": reason}, "period_ms": period, "misses": None,
-                "misses_reason": reason}  # fmt: skip
-    quantiles = {
-        name: float(np.quantile(ms, q)) for name, q in (("median", 0.5), ("p95", 0.95), ("p99", 0.99))
-    }
-    return {
-        "controller_step_ms": {**quantiles, "max": float(ms.max())},
-        "period_ms": period,
-        "misses": int((ms > period).sum()),
-    }
+        reason = context.find(CONTROL).reason
+        return Timing(StepTimes(reason=reason), period, None, reason)
+    median, p95, p99 = (float(np.quantile(ms, q)) for q in (0.5, 0.95, 0.99))
+    return Timing(StepTimes(median, p95, p99, float(ms.max())), period, int((ms > period).sum()))
 
 
-def _monitor(context: Context) -> dict[str, Any]:
-    monitor = context.result("monitor")
-    # how much of each recording was judged, and how much not; runs of earlier versions did not count it
-    covered = {"recordings": monitor["recordings"]} if "recordings" in monitor else {}
-    if "reason" in monitor:
-        return {
-            **dict.fromkeys(("threshold", "false_alarms_per_hour", "alarms")),
-            "reason": monitor["reason"],
-            "details": covered,
-        }
-    clean = monitor["clean"]
-    return {
-        "threshold": {ENERGY: monitor["calibration"]["threshold_w"]},
-        "false_alarms_per_hour": clean["alarms"] / (clean["seconds"] / 3600.0),
-        "alarms": monitor["alarms"],
-        "details": {"calibration": monitor["calibration"], "clean": clean, **covered},
-    }
+def _monitor(context: Context) -> Monitor:
+    found = context.find(MONITOR)
+    if isinstance(found, Absent):
+        return Monitor(None, None, None, reason=found.reason)
+    threshold, clean = found.calibration.threshold_w, found.clean
+    if found.reason or threshold is None or clean is None:
+        return Monitor(None, None, None, MonitorDetails(found.recordings), found.reason)
+    return Monitor(
+        {ENERGY: threshold},
+        clean.alarms / (clean.seconds / 3600.0),
+        found.alarms,
+        MonitorDetails(found.recordings, found.calibration, clean),
+    )
 
 
-def _analysis(context: Context) -> dict[str, Any]:
-    analysis = context.result("analysis")
-    if "reason" in analysis:
-        none = dict.fromkeys(("eigenvalues", "stabilisable", "detectable"))
-        return {**none, "reason": analysis["reason"], "details": {}}
-    hybrid = analysis["hybrid"]["rest"]
-    return {
-        "eigenvalues": hybrid["poles"],
-        "stabilisable": hybrid["stabilisable"],
-        "detectable": hybrid["detectable"],
-        "details": analysis,
-    }
+def _guard(context: Context) -> Guard:
+    found = context.find(GUARD)
+    if isinstance(found, Absent):
+        return Guard(reason=found.reason)
+    detector = found.detector
+    if detector is None:
+        return Guard(reason=found.reason, details=GuardDetails(found.source, test=found.test))
+    lacks = "plant that could break" if context.scenario.plant is None else "task in which nothing goes wrong"
+    loops = found.faults or ()
+    return Guard(
+        detector.false_alarms_per_hour,
+        detector.hours,
+        detector.force_threshold,
+        detector.energy_threshold,
+        detector.data_hash,
+        found.test.seconds,
+        found.test.alarms,
+        None
+        if found.faults is None
+        else tuple(BrokenLoop(row.fault, row.start_s, row.delay_s, row.diagnosis) for row in loops),
+        f"scenario {context.scenario.name} has no {lacks}" if found.faults is None else "",
+        GuardDetails(found.source, found.loops, detector, found.test, found.faults),
+    )
 
 
-LEARNED = ("false_alarms_per_hour", "hours", "force_threshold", "energy_threshold", "data_hash")
-"""Fields of the detector that the schema names."""
-
-
-def guard_results(context: Context) -> dict[str, Any]:
-    """The group ``guard`` of results.json."""
-    found = context.result("guard")
-    if "detector" not in found:
-        none = dict.fromkeys((*LEARNED, "test_seconds", "test_alarms", "faults"))
-        details = {
-            key: found[key] for key in ("source", "plausibility", "plausibility_reason") if key in found
-        }
-        return {**none, "reason": found["reason"], "details": details}
-    detector, test = found["detector"], found["test"]
-    out = {key: detector[key] for key in LEARNED}
-    out |= {"test_seconds": test["seconds"], "test_alarms": test["alarms"], "faults": None}
-    if "faults" in found:
-        keys = ("fault", "start_s", "delay_s", "diagnosis")
-        out["faults"] = [{key: row[key] for key in keys} for row in found["faults"]]
-    else:
-        lacks = (
-            "plant that could break" if context.scenario.plant is None else "task in which nothing goes wrong"
-        )
-        out["faults_reason"] = f"scenario {context.scenario.name} has no {lacks}"
-    kept = ("source", "loops", "detector", "plausibility", "plausibility_reason", "test", "faults")
-    return {**out, "details": {key: found[key] for key in kept if key in found}}
+def _analysis(context: Context) -> Analysis:
+    found = context.find(ANALYSIS)
+    if isinstance(found, Absent):
+        return Analysis(reason=found.reason)
+    rest = found.models["hybrid"].rest
+    return Analysis(
+        rest.poles, rest.stabilisable, rest.detectable, AnalysisDetails(found.models, found.working_speed)
+    )
