@@ -41,7 +41,6 @@ from hybrid_mpc import (
     simulate,
     with_parameter_states,
 )
-from hybrid_mpc.job.stages import results as schema
 from hybrid_mpc.kit.artifact import build_model
 from hybrid_mpc.records import record
 
@@ -525,20 +524,6 @@ def run_real_time(m):
 
 
 # ---- results.json
-
-
-def schema_lines():
-    """The schema of ``results.json``: a line ``path: kind`` a value, those that may be null with a question mark."""
-
-    def lines(path, spec):
-        mark = "?" if spec.nullable else ""
-        if isinstance(spec, schema.Leaf):
-            return [f"{path}{mark}: {spec.kind}"]
-        own = [f"{path}{mark}: an object"] if path else []
-        prefix = f"{path}." if path else ""
-        return own + [line for name, inner in spec.keys.items() for line in lines(prefix + name, inner)]
-
-    return sorted(lines("", schema.SCHEMA))
 
 
 def key_lines(value):

@@ -3,7 +3,7 @@
 make_golden.py freeze MACHINE RUN     the folder MACHINE from the folder of a finished hybrid-mpc run
 make_golden.py arrays MACHINE [FILE]  arrays.npz and loops.json: replays, kernels and closed loops
 make_golden.py costs MACHINE [FILE]   costs.json: ten seeds of every closed loop
-make_golden.py keys RUN               results_keys.txt and results_schema.txt
+make_golden.py keys RUN               results_keys.txt
 make_golden.py artifact MACHINE       model.json anew, from golden.json, in the artifact's present form
 make_golden.py compare FILE FILE      largest differences between two arrays.npz
 """
@@ -266,7 +266,6 @@ def make_keys(run):
     """Keys of a run's results, and the schema."""
     results = json.loads((Path(run) / "results.json").read_text())
     (HERE / "results_keys.txt").write_text("\n".join(parts.key_lines(results)) + "\n")
-    (HERE / "results_schema.txt").write_text("\n".join(parts.schema_lines()) + "\n")
 
 
 def make_artifact(name):

@@ -12,7 +12,7 @@ from hybrid_mpc import InputError, RunSettings, Signal, load_scenario, set_proce
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.controllers import CONTENDERS, ORACLES
 from hybrid_mpc.job.loops import by_task, interval, limits_used, summaries, tasks_of
-from hybrid_mpc.job.stages.compare import TIMED, _seeds, contest, parts_of
+from hybrid_mpc.job.stages.compare import TIMED, _seeds, compare, parts_of
 from hybrid_mpc.job.stages.results import gap_closed
 
 GOLF = load_scenario("golf_robot")
@@ -155,14 +155,14 @@ scenario = replace(scenario, tasks=(task,), oracle=None, budgets={"quick": budge
 """
 
 
-def test_a_contest_that_was_killed_goes_on_from_what_it_kept(golf_artifact, tmp_path):
+def test_a_comparison_that_was_killed_goes_on_from_what_it_kept(golf_artifact, tmp_path):
     out, file = tmp_path / "run", tmp_path / "short.py"
     file.write_text(SHORT)
     shutil.copytree(golf_artifact, out / "model")
     scenario = load_scenario(str(file))
     context = Context(RunSettings(str(file)), scenario, out)
     set_process_noise(out / "model", {name: np.array([1e-4, 1e-2]) for name in CONTENDERS})
-    rows = contest(context)
+    rows = compare(context)
     assert [(r.controller, r.seed) for r in rows] == [
         (name, seed) for name in sorted(set(CONTENDERS) - set(ORACLES)) for seed in (0, 1)
     ]
@@ -171,7 +171,7 @@ def test_a_contest_that_was_killed_goes_on_from_what_it_kept(golf_artifact, tmp_
     for lost in kept[1::3]:  # as a kill in between leaves them: arrays perhaps, but no JSON
         lost.unlink()
     stamps = {path: path.stat().st_mtime_ns for path in kept if path.exists()}
-    again = contest(context)
+    again = compare(context)
     untimed = [[replace(r, timing_ms={}) for r in found] for found in (rows, again)]
     assert untimed[0] == untimed[1]
     for one, other in zip(rows, again, strict=True):
@@ -183,6 +183,6 @@ def test_a_contest_that_was_killed_goes_on_from_what_it_kept(golf_artifact, tmp_
     assert all(path.is_file() for path in kept)
     assert stamps == {path: path.stat().st_mtime_ns for path in stamps}
     set_process_noise(out / "model", {name: np.array([1e-4, 2e-2]) for name in CONTENDERS})
-    other = contest(context)  # loops of another filter: none of those that are kept
+    other = compare(context)  # loops of another filter: none of those that are kept
     assert [r.controller for r in other] == [r.controller for r in rows]
     assert all(a.cost != b.cost for a, b in zip(other, rows, strict=True))

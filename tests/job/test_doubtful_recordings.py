@@ -12,7 +12,6 @@ from hybrid_mpc.cli.progress import Bars, Lines
 from hybrid_mpc.job.benchmark import BenchmarkSettings, _read
 from hybrid_mpc.job.context import Silent
 from hybrid_mpc.job.run import run as job
-from hybrid_mpc.job.stages import identify
 
 from .conftest import recording, write
 
@@ -122,12 +121,6 @@ def test_inputs_and_outputs_that_do_nothing_are_refused_together(call, machine, 
     assert code == 2
     for part in ("2 problems", "input tau is 0.1 throughout", "output phi is 0.2 throughout"):
         assert part in message
-
-
-def test_the_search_hears_it_through_the_same_stages():
-    from hybrid_mpc.job import tune as search_job
-
-    assert [stage for *_, stage in search_job.STAGES] == [identify.data_stage, identify.prior_stage]
 
 
 def test_the_benchmark_tells_doubts_of_all_its_files_and_refuses_all_bad_ones(tmp_path):

@@ -2,13 +2,14 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import pytest
 
 from hybrid_mpc import InputError
 from hybrid_mpc.errors import StorageError
-from hybrid_mpc.job.context import STAGES, failed_stages
-from hybrid_mpc.job.run import run as job
+from hybrid_mpc.job import run as job
+from hybrid_mpc.job.run import NAMES, failed_stages
 
 
 def broken(stages, name, error):
@@ -17,13 +18,13 @@ def broken(stages, name, error):
     def raises(context):
         raise error
 
-    return tuple((n, title, raises if n == name else stage) for n, title, stage in stages)
+    return tuple(replace(s, compute=raises) if s.name == name else s for s in stages)
 
 
 def without(finished, tmp_path, name):
     """A finished run from before a stage."""
     out = shutil.copytree(finished, tmp_path / "run")
-    for stage in STAGES[STAGES.index(name) :]:
+    for stage in NAMES[NAMES.index(name) :]:
         (out / "checkpoints" / f"{stage}.json").unlink()
     (out / "report.html").unlink()
     return out

@@ -12,10 +12,8 @@ from closed_loop_parts import loop_row
 from hybrid_mpc import (
     Bench,
     Calibration,
-    Detector,
     Fault,
     InputError,
-    Plausibility,
     RunSettings,
     load,
     load_scenario,
@@ -28,11 +26,12 @@ from hybrid_mpc.job.loops import repeated
 from hybrid_mpc.job.stages import guard as guard_job
 from hybrid_mpc.job.stages import guard as nominal_loops
 from hybrid_mpc.job.stages.compare import keep, kept
+from hybrid_mpc.job.stages.export import NOISE, NoiseResult
 from hybrid_mpc.job.stages.figures import guard_figures
-from hybrid_mpc.job.stages.guard import guard_stage, learned
+from hybrid_mpc.job.stages.guard import GUARD, guard_stage, learned
+from hybrid_mpc.job.stages.monitor import MONITOR, MonitorResult
 from hybrid_mpc.job.stages.report import guard_tables, guard_words
-from hybrid_mpc.job.stages.results import SCHEMA, _check, guard_results
-from hybrid_mpc.records import plain, record
+from hybrid_mpc.job.stages.results import _guard as guard_results
 from scenarios.golf_robot.rig import Rig
 
 GOLF = load_scenario("golf_robot")
@@ -111,18 +110,14 @@ def test_a_nominal_loop_is_what_the_guard_would_read(golf_artifact, monkeypatch)
     assert row.cost < 100.0  # it follows the task; a club that hangs still costs 1e4 x 0.1 rad^2 x 6 s
 
 
-def test_the_artifact_keeps_detector_and_plausibility(golf_artifact, tmp_path):
+def test_the_artifact_keeps_the_detector(golf_artifact, tmp_path):
     folder = shutil.copytree(golf_artifact, tmp_path / "model")
     detector = learned([numbers(36)], DT, 1, "hash of the data")
-    unit = Plausibility(
-        0.99, (1.0,) * 5, (0.1, 0.1), (0.0,) * 3, tuple(map(tuple, np.eye(3).tolist())), 4.0, 1.0
-    )
-    set_calibration(folder, replace(CALIBRATION, detector=detector, plausibility=unit))
+    set_calibration(folder, replace(CALIBRATION, detector=detector))
     found = load(folder).calibration
     assert found.detector == detector
     assert found.detector.data_hash == "hash of the data"
-    assert found.plausibility == unit
-    assert replace(found, detector=None, plausibility=None) == CALIBRATION
+    assert replace(found, detector=None) == CALIBRATION
 
 
 @pytest.fixture(scope="module")
@@ -140,10 +135,9 @@ def context(golf_artifact, tmp_path_factory):
     write_csv(out / "data" / "swing.csv", columns)
     scenario = replace(GOLF, data=replace(GOLF.data, windows={}))
     made = Context(RunSettings("golf_robot"), scenario, out)
-    smooth = {f"{t.name}/{key}": getattr(t, key) for t in made.trajectories("train") for key in ("x", "xdot")}
-    made.save("prior", {}, smooth)
     set_process_noise(out / "model", SIGMA)
-    made.save("monitor", {"calibration": plain(CALIBRATION)}, {})
+    made.keep(NOISE, {}, NoiseResult({name: tuple(sigma) for name, sigma in SIGMA.items()}))
+    made.keep(MONITOR, {}, MonitorResult(CALIBRATION, ()))
     set_calibration(out / "model", CALIBRATION)
     for i, spec in enumerate(nominal_loops.nominal_loops(scenario, made.budget, MODEL)):
         read = np.vstack([np.full((50, 11), np.nan), numbers(nominal_loops.BLOCKS, i)])  # a second settles
@@ -160,18 +154,16 @@ def resumed(context):
         patch.setattr(
             guard_job, "run_parts", lambda context, parts: parts and pytest.fail(f"runs {list(parts)} again")
         )
-        guard_stage(context)
-    return context.result("guard")
+        context.keep(GUARD, {}, guard_stage(context))
+    return context.read(GUARD)
 
 
 def test_the_stage_learns_from_what_is_kept_and_fills_the_artifact(context, resumed):
     stored = load(context.out / "model").calibration
-    assert stored.detector == record(Detector, resumed["detector"], "")
+    assert stored.detector == resumed.detector
     assert stored.detector.false_alarms_per_hour == 2.0
     assert re.fullmatch("[0-9a-f]{64}", stored.detector.data_hash)
     assert stored.threshold_w == CALIBRATION.threshold_w
-    assert stored.plausibility.data_hash == context.dataset.hash
-    assert stored.plausibility.samples == sum(len(t.t) for t in context.trajectories("train"))
     spec = nominal_loops.nominal_loops(context.scenario, context.budget, MODEL)[0]
     (row,) = kept(context, "guard/track_sine-500")
     other = replace(row, arrays=row.arrays | {"y": row.arrays["y"] + 1})
@@ -181,21 +173,20 @@ def test_the_stage_learns_from_what_is_kept_and_fills_the_artifact(context, resu
     assert guard_job._from_loops(context, MODEL).data_hash == stored.detector.data_hash != changed
 
 
-def test_the_faulted_loops_are_told(context, resumed):
-    friction, freeze = resumed["faults"]
-    assert (friction["fault"], freeze["fault"]) == ("friction", "freeze")
-    assert freeze["start_s"] == pytest.approx(3.0)
+def test_the_faulted_loops_are_reported(context, resumed):
+    friction, freeze = resumed.faults
+    assert (friction.fault, freeze.fault) == ("friction", "freeze")
+    assert freeze.start_s == pytest.approx(3.0)
     # In motion: the estimator predicts three steps of the sensor, 5 mrad, within a few periods at some 1 rad/s.
-    assert 0 <= freeze["delay_s"] < 0.5
-    assert freeze["switches"][-1]["after"] == "REST"
-    assert freeze["diagnosis"] == "the sensor repeats itself while motion is predicted"
+    assert 0 <= freeze.delay_s < 0.5
+    assert freeze.switches[-1].after == "REST"
+    assert freeze.diagnosis == "the sensor repeats itself while motion is predicted"
     group = guard_results(context)
-    _check({"guard": group}, type(SCHEMA)({"guard": SCHEMA.keys["guard"]}), "", {})
-    assert [row["fault"] for row in group["faults"]] == ["friction", "freeze"]
-    tables = guard_tables({"guard": group})
+    assert [row.fault for row in group.faults] == ["friction", "freeze"]
+    tables = guard_tables(group)
     assert "2 false alarms an hour" in tables[0].caption
-    assert group["data_hash"][:16] in tables[0].caption
-    assert "too short for one false alarm an hour" in " ".join(guard_words({"guard": group}))
+    assert group.data_hash[:16] in tables[0].caption
+    assert "too short for one false alarm an hour" in " ".join(guard_words(group))
     drawn = {name: caption for _, name, _, caption in guard_figures(context)}
     assert set(drawn) == {"guard_friction", "guard_freeze"}
     assert "alarm after" in drawn["guard_freeze"]
@@ -204,13 +195,10 @@ def test_the_faulted_loops_are_told(context, resumed):
 def test_without_a_detector_the_recording_is_shown_and_how_much_is_missing(context, resumed, tmp_path):
     out = shutil.copytree(context.out, tmp_path / "run")
     real = Context(context.settings, replace(context.scenario, plant=None), out)
-    guard_stage(real)
+    real.keep(GUARD, {}, guard_stage(real))
     group = guard_results(real)
-    _check({"guard": group}, type(SCHEMA)({"guard": SCHEMA.keys["guard"]}), "", {})
-    assert group["false_alarms_per_hour"] is None
-    assert "10 false alarms an hour need 2.5 min" in group["reason"]  # of 24 s
+    assert group.false_alarms_per_hour is None
+    assert "10 false alarms an hour need 2.5 min" in group.reason  # of 24 s
     assert load(out / "model").calibration.detector is None
-    assert guard_words({"guard": group})[0].startswith(
-        "No detector could be learned from undisturbed recordings"
-    )
+    assert guard_words(group)[0].startswith("No detector could be learned from undisturbed recordings")
     assert [name for _, name, _, _ in guard_figures(real)] == ["guard_recorded"]

@@ -1,19 +1,17 @@
 """What a training leaves in the run's folder is read back whole."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from hybrid_mpc import InputError, Scaling, TrainingSettings
-from hybrid_mpc.identify.train import Fault, Trained
-from hybrid_mpc.identify.train import train as training
-from hybrid_mpc.job.stages.identify import _train_kind, is_trained, save_trained
-from hybrid_mpc.job.stages.identify import trained_models as load_trained
+from hybrid_mpc.identify import train as training
+from hybrid_mpc.identify.train import Trained, TrainingFailure
+from hybrid_mpc.job.stages.identify import _train_kind, is_trained, load_trained, save_trained
 
 
-@pytest.mark.parametrize("faults", [(), (Fault(1, "energy", 30, True),)])
+@pytest.mark.parametrize("faults", [(), (TrainingFailure(1, "energy", 30, True),)])
 def test_a_training_is_read_back_as_it_was(faults, tmp_path, monkeypatch):
     settings = TrainingSettings("mopgrnn", 4, 2, 10, 5, seed=3, warm=2, cell="lstm")
     trained = Trained(
@@ -24,7 +22,7 @@ def test_a_training_is_read_back_as_it_was(faults, tmp_path, monkeypatch):
     folder = tmp_path / "checkpoints" / "training"
     folder.mkdir(parents=True)
     _train_kind("pendulum", {}, [], [], settings, folder, "cpu", lambda *a: None)
-    found = load_trained(SimpleNamespace(out=tmp_path), "mopgrnn")
+    found = load_trained(folder, "mopgrnn")
     assert (found.settings, found.scaling, found.faults) == (settings, trained.scaling, faults)
     np.testing.assert_equal(found.weights["w"], trained.weights["w"])
     np.testing.assert_equal(found.validation, trained.validation)

@@ -18,13 +18,16 @@ from hybrid_mpc import (
     write_csv,
 )
 from hybrid_mpc.cli.main import app
+from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.job.context import Context
+from hybrid_mpc.job.stages.export import NOISE, NoiseResult
 from hybrid_mpc.job.stages.figures import _monitor as monitor_figures
 from hybrid_mpc.job.stages.figures import guard_figures
-from hybrid_mpc.job.stages.guard import guard_stage
-from hybrid_mpc.job.stages.monitor import monitor_stage
+from hybrid_mpc.job.stages.guard import GUARD, guard_stage
+from hybrid_mpc.job.stages.identify import PRIOR, PriorResult
+from hybrid_mpc.job.stages.monitor import MONITOR, monitor_stage
 from hybrid_mpc.job.stages.report import guard_tables, guard_words
-from hybrid_mpc.job.stages.results import SCHEMA, _check, guard_results
+from hybrid_mpc.job.stages.results import _guard as guard_results
 from hybrid_mpc.job.stages.results import _monitor as monitor_results
 from hybrid_mpc.kit.artifact import read_description, write_description
 
@@ -113,82 +116,79 @@ def context(machine, samples, out, warm_up):
     info = replace(model_info(prior, machine.dt), time_unit=made.time_unit)
     save_artifact(out / "model", {"hybrid": programs, "prior": programs}, info)
     noise = [machine.noise, 1e-3 * machine.speed]
-    set_process_noise(out / "model", {"hybrid_observer": noise, "prior_observer": noise})
+    found = {"hybrid_observer": tuple(noise), "prior_observer": tuple(noise)}
+    set_process_noise(out / "model", found)
+    made.keep(NOISE, {}, NoiseResult(found))
     train = made.trajectories("train")
-    made.save("prior", {}, {f"{t.name}/{key}": getattr(t, key) for t in train for key in ("x", "xdot")})
+    states = {f"{t.name}/{key}": getattr(t, key) for t in train for key in ("x", "xdot")}
+    made.keep(PRIOR, {}, PriorResult(PriorFit({}, {}, (), ()), {}, {}, (), (), 0.0, states))
     return made
-
-
-def group(name, values):
-    """What results.json would hold, checked against its schema."""
-    _check({name: values}, type(SCHEMA)({name: SCHEMA.keys[name]}), "", {})
-    return values
 
 
 @pytest.fixture(scope="module")
 def slow(tmp_path_factory):
     run = context(SLOW, (1200, 900), tmp_path_factory.mktemp("slow"), warm_up=10.0)
-    monitor_stage(run)
-    guard_stage(run)
+    for stage, compute in ((MONITOR, monitor_stage), (GUARD, guard_stage)):
+        run.keep(stage, {}, compute(run))
     return run
 
 
 def test_an_axis_of_millimetres_a_second_is_calibrated(slow):
-    found = slow.result("monitor")
-    assert "reason" not in found
-    (rest,) = found["calibration"]["rest_speed"]
+    found = slow.read(MONITOR)
+    assert found.reason == ""
+    (rest,) = found.calibration.rest_speed
     top = max(np.abs(t.x[:, 1]).max() for t in slow.dataset.whole)
     assert top < 5e-3
     assert 0.03 * top < rest < 0.07 * top
     # what dry friction may hold is 0.1 N: a residual that is always within the dead band would leave a threshold of 0
-    assert 0 < found["calibration"]["residual_threshold"] < 0.5
-    assert group("monitor", monitor_results(slow))["threshold"]["energy [W]"] > 0
+    assert 0 < found.calibration.residual_threshold < 0.5
+    assert monitor_results(slow).threshold["energy [W]"] > 0
     model = load(slow.out / "model").models["hybrid"]
     assert model.time_unit == slow.time_unit > 5.0
-    covered = found["recordings"][0]
+    covered = found.recordings[0]
     assert covered["judged_s"] > 500
     assert covered["not_finite_s"] == covered["missing_s"] == 0.0
 
 
 def test_monitor_and_guard_take_the_same_rest_speed(slow):
     artifact = load(slow.out / "model")
-    (rest,) = slow.result("monitor")["calibration"]["rest_speed"]
+    (rest,) = slow.read(MONITOR).calibration.rest_speed
     assert artifact.rest_speed == (rest,)
     # 17 min are too little for the slowest rate of so slow a machine
     block = 5 * slow.time_unit
-    assert f"in whole blocks of {block:g} s are too little" in guard_results(slow)["reason"]
+    assert f"in whole blocks of {block:g} s are too little" in guard_results(slow).reason
 
 
 @pytest.fixture(scope="module")
 def short(tmp_path_factory):
     """Recordings of 0.18 s, whose parts are shorter than the guard's window; training needs 20 ms for each part."""
     run = context(QUICK, (180, 180), tmp_path_factory.mktemp("short"), warm_up=0.01)
-    monitor_stage(run)
-    guard_stage(run)
+    for stage, compute in ((MONITOR, monitor_stage), (GUARD, guard_stage)):
+        run.keep(stage, {}, compute(run))
     return run
 
 
 def test_recordings_shorter_than_the_windows_give_a_reason_and_the_run_goes_on(short):
-    found = short.result("monitor")
-    assert "calibration" not in found
+    found = short.read(MONITOR)
+    assert found.calibration.threshold_w is None
     window = 2 * round(0.1 * short.time_unit / QUICK.dt) + 1
-    assert f"no recording has the {window} samples ({window * QUICK.dt:g} s)" in found["reason"]
-    assert found["recordings"][0]["judged_s"] == 0.0
-    told = group("monitor", monitor_results(short))
-    assert told["alarms"] is None
-    assert found["reason"] == told["reason"]
-    assert told["details"]["recordings"][1]["warm_up_s"] == pytest.approx(0.179)
+    assert f"no recording has the {window} samples ({window * QUICK.dt:g} s)" in found.reason
+    assert found.recordings[0]["judged_s"] == 0.0
+    said = monitor_results(short)
+    assert said.alarms is None
+    assert found.reason == said.reason
+    assert said.details.recordings[1]["warm_up_s"] == pytest.approx(0.179)
     assert list(monitor_figures(short)) == []
 
 
 def test_the_guard_copes_without_a_calibration(short):
-    told = group("guard", guard_results(short))
-    assert "too little" in told["reason"]
-    assert guard_tables({"guard": told}) == []
-    assert guard_words({"guard": told})[0].startswith("No detector could be learned")
+    said = guard_results(short)
+    assert "too little" in said.reason
+    assert guard_tables(said) == []
+    assert guard_words(said)[0].startswith("No detector could be learned")
     captions = [caption for *_, caption in guard_figures(short)]
     assert captions == [
-        "The recording run0, of which test data come, by the monitor, which has no thresholds to judge by."
+        "The recording run0, of which test data come, by the monitor, which has no thresholds."
     ]
     artifact = load(short.out / "model")
     assert artifact.calibration.threshold_w is None

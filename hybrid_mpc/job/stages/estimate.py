@@ -53,7 +53,7 @@ class ObserverTest:
 
 
 @dataclass(frozen=True)
-class TestedRecording:
+class ObservedRecording:
     """A recording, or its beginning, that the observers were tested on."""
 
     name: str
@@ -70,7 +70,7 @@ class EstimationResult:
         arrays: ``"OBSERVER/autocorrelation"``, and ``"OBSERVER/nis/k"`` of recording ``k``.
     """
 
-    recordings: tuple[TestedRecording, ...]
+    recordings: tuple[ObservedRecording, ...]
     observers: Mapping[str, ObserverTest | Absent]
     arrays: Mapping[str, Array]
 
@@ -80,7 +80,7 @@ def estimation_stage(context: Context) -> EstimationResult | Absent:
     if context.scenario.control is None:
         return Absent("the observers need the scenario's control problem (input range, sensor noise)")
     context.read(NOISE)
-    kit, parts = context.kit, tested_parts(context.trajectories("test"))
+    kit, parts = context.kit, parts_for_tests(context.trajectories("test"))
     found: dict[str, ObserverTest | Absent] = {}
     arrays: dict[str, Array] = {}
     for i, name in enumerate(OBSERVERS):
@@ -94,10 +94,10 @@ def estimation_stage(context: Context) -> EstimationResult | Absent:
         found[name] = figures_of(tested)
         arrays[f"{name}/autocorrelation"] = tested.autocorrelation
         arrays |= {f"{name}/nis/{k}": run.nis for k, run in enumerate(tested.runs)}
-    return EstimationResult(tuple(TestedRecording(p.name, len(p.t)) for p in parts), found, arrays)
+    return EstimationResult(tuple(ObservedRecording(p.name, len(p.t)) for p in parts), found, arrays)
 
 
-def tested_parts(recordings: Sequence[Trajectory]) -> list[Trajectory]:
+def parts_for_tests(recordings: Sequence[Trajectory]) -> list[Trajectory]:
     """The first samples of a few recordings, evenly chosen, that the tests can take the time for."""
     places = np.linspace(0, len(recordings) - 1, min(RECORDINGS, len(recordings))).round().astype(int)
     chosen = [recordings[i] for i in dict.fromkeys(places.tolist())]

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import sha256
 from hybrid_mpc.identify.export import check_parity, model_info, trace_model
 from hybrid_mpc.identify.step import PriorStep, RecurrentStep
 from hybrid_mpc.job.context import Context
@@ -75,11 +76,12 @@ def export_stage(context: Context) -> ExportResult:
 
 def artifact_is_there(context: Context, found: ExportResult) -> str:
     """Whether the artifact lies where the run left it; a text if not."""
+    folder = context.out / "model"
     try:
-        same = read_description(context.out / "model").programs_sha256 == found.programs_sha256
+        held = {read_description(folder).programs_sha256, sha256(folder / "programs.json")}
     except InputError as damaged:
         return str(damaged)
-    return "" if same else "the artifact was changed"
+    return "" if held == {found.programs_sha256} else "the artifact was changed"
 
 
 def noise_stage(context: Context) -> NoiseResult | Absent:

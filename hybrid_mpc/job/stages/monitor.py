@@ -60,6 +60,12 @@ class RecordedAlarm:
     start_s: float
     end_s: float
 
+    def __post_init__(self) -> None:
+        if not self.start_s <= self.end_s:
+            raise InputError(
+                f"an alarm on {self.file} ends at {self.end_s} s, before it starts at {self.start_s} s"
+            )
+
 
 @dataclass(frozen=True)
 class CleanAlarms:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
@@ -397,14 +398,19 @@ def what_report_reads(context: Context) -> dict[str, object]:
         "titles": (scenario.title, scenario.description, [task.title for task in scenario.tasks]),
         "labels": (prior.states, prior.inputs, prior.outputs, prior.parameters_spec),
         "drawing": source_of(scenario.draw),
-        "command": command(context),
+        "command": command(context, Path(context.settings.scenario).name),
     }
 
 
-def command(context: Context) -> str:
-    """The command line that makes this run."""
+def command(context: Context, scenario: str = "") -> str:
+    """The command line that makes this run.
+
+    Args:
+        context: The run.
+        scenario: What stands for the scenario. Default: as it was given.
+    """
     s = context.settings
-    words = ["hybrid-mpc", "run", s.scenario, *(w for f in s.data for w in ("--data", f.name))]
+    words = ["hybrid-mpc", "run", scenario or s.scenario, *(w for f in s.data for w in ("--data", f.name))]
     for option, values in (("--input-column", s.inputs), ("--output-column", s.outputs)):
         words += [w for v in values for w in (option, v)]
     words += ["--time-column", s.time] if s.time else []

@@ -21,7 +21,7 @@ from hybrid_mpc.job.loops import LoopRow, Summary, by_task, summaries
 from hybrid_mpc.job.stage import Absent
 from hybrid_mpc.job.stages.analyze import ANALYSIS, ModelAnalysis
 from hybrid_mpc.job.stages.compare import CONTROL
-from hybrid_mpc.job.stages.estimate import ESTIMATION, OBSERVERS, ObserverTest, TestedRecording
+from hybrid_mpc.job.stages.estimate import ESTIMATION, OBSERVERS, ObservedRecording, ObserverTest
 from hybrid_mpc.job.stages.export import EXPORT
 from hybrid_mpc.job.stages.guard import GUARD, FaultedLoop, GuardTest, NominalLoop
 from hybrid_mpc.job.stages.identify import DATA, EVALUATION, MODELS
@@ -177,7 +177,7 @@ class Control:
 class EstimationDetails:
     """What the observers were tested on."""
 
-    recordings: tuple[TestedRecording, ...]
+    recordings: tuple[ObservedRecording, ...]
 
 
 @dataclass(frozen=True)
@@ -390,18 +390,20 @@ def read_results(values: Mapping[str, Any], where: str = "results") -> Results:
             f"{where}: schema_version is {results.schema_version}; this version reads {SCHEMA_VERSION}"
         )
     for group in ("identification", "control", "estimation", "timing", "monitor", "guard", "analysis"):
-        _check_reasons(values[group], group, where)
+        _check_values(values[group], group, where)
     return results
 
 
-def _check_reasons(values: Mapping[str, Any], path: str, where: str) -> None:
+def _check_values(values: Mapping[str, Any], path: str, where: str) -> None:
     for key, value in values.items():
         if value is None and not (values.get(f"{key}_reason") or values.get("reason")):
             raise InputError(
                 f"{where}: {path}.{key} is null without a reason; put '{key}_reason' or 'reason' beside it"
             )
+        if isinstance(value, float) and not math.isfinite(value):
+            raise InputError(f"{where}: {path}.{key} is {value}; it must be a finite number")
         if isinstance(value, Mapping) and key != "details":
-            _check_reasons(value, f"{path}.{key}", where)
+            _check_values(value, f"{path}.{key}", where)
 
 
 def collect(context: Context) -> Results:

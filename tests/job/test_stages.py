@@ -1,0 +1,231 @@
+"""Stages run again only where what they read has changed; what they found is read back as it was."""
+
+import json
+import re
+import shutil
+import sys
+from dataclasses import dataclass, replace
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybrid_mpc import InputError, RunSettings, load, load_scenario
+from hybrid_mpc.job.context import Context
+from hybrid_mpc.job.run import NAMES, STAGES
+from hybrid_mpc.job.stage import (
+    UNKNOWN,
+    Absent,
+    Stage,
+    bring_up_to_date,
+    changed,
+    read_stage,
+    source_of,
+    write_stage,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Sum:
+    """A result with arrays."""
+
+    total: float
+    names: tuple[str, ...]
+    arrays: dict
+
+
+def stamps(out):
+    return {name: (out / "checkpoints" / f"{name}.json").stat().st_mtime_ns for name in NAMES}
+
+
+def rerun(before, after):
+    return [name for name in NAMES if before[name] != after[name]]
+
+
+@pytest.fixture
+def own(machine, finished, arguments, tmp_path):
+    """A finished run, and its machine's file to edit."""
+    source = shutil.copy(machine / "my_machine.py", tmp_path / "my_machine.py")
+    out = shutil.copytree(finished, tmp_path / "run")
+    return Path(source), out, ["run", source, *arguments[2:], "--out", str(out), "--resume"]
+
+
+@pytest.mark.parametrize(
+    ("pattern", "put", "stages"),
+    [
+        (r'title="[^"]*"|"My machine[^"]*"', None, ["report"]),
+        (r"q=\(", "q=(2.0 * ", ["control", "monitor", "guard", "analysis", "report"]),
+        ("$", "\n# a remark\n", []),
+    ],
+    ids=["title", "weight", "comment"],
+)
+def test_an_edit_runs_what_reads_it(own, call, pattern, put, stages):
+    source, out, command = own
+    text = source.read_text()
+    if put is None:  # another title
+        put = "\nscenario = dataclasses.replace(scenario, title='Another')\n"
+        source.write_text(text + put)
+    else:
+        found = re.search(pattern, text)
+        assert found
+        source.write_text(text[: found.start()] + put + text[found.end() :])
+    before = stamps(out)
+    code, said, message = call(*command)
+    assert code == 0, message
+    assert rerun(before, stamps(out)) == stages, said
+    if "control" in stages:
+        assert "stage control runs again: control problem has changed" in said + message
+    assert "Another" in (out / "report.html").read_text() or stages != ["report"]
+
+
+def test_only_and_skip(own, call):
+    _, out, command = own
+    (out / "checkpoints" / "guard.json").unlink()
+    before = {"guard": 0} | {
+        name: (out / "checkpoints" / f"{name}.json").stat().st_mtime_ns for name in NAMES if name != "guard"
+    }
+    code, _, message = call(*command, "--skip", "guard")
+    assert code == 0, message
+    assert not (out / "checkpoints" / "guard.json").exists()
+    results = json.loads((out / "results.json").read_text())
+    assert results["guard"]["reason"] == "stage guard was left out"
+    code, _, message = call(*command, "--only", "guard")
+    assert code == 0, message
+    after = stamps(out)
+    assert [name for name in NAMES if after[name] != before[name]] == ["guard", "report"]
+    for words, told in (
+        (("--skip", "prior"), "without it there is no model"),
+        (("--only", "prio"), "did you mean 'prior'"),
+    ):
+        code, _, message = call(*command, *words)
+        assert (code, told in message.replace("\n", " ")) == (2, True)
+
+
+def test_what_lies_outside_the_stage_s_file_is_missed(own, call):
+    _, out, command = own
+    (out / "model" / "programs.json").write_text("{}")
+    (out / "report.html").unlink()
+    before = stamps(out)
+    code, said, message = call(*command)
+    assert code == 0, message
+    again = rerun(before, stamps(out))
+    assert again[0] == "export"
+    assert "training" not in again
+    assert load(out / "model").calibration is not None
+    assert (out / "report.html").is_file()
+    assert "stage export runs again" in said + message
+
+
+def test_every_result_is_read_back_as_it_was(finished, tmp_path):
+    context = Context(RunSettings("pendulum"), load_scenario("pendulum"), finished)
+    for stage in STAGES:
+        stored = context.stored(stage)
+        again = write_stage(tmp_path / f"{stage.name}.json", stage, stored.keys, stored.result)
+        assert again.content == stored.content, stage.name
+        assert read_stage(tmp_path / f"{stage.name}.json", stage, "").content == stored.content
+
+
+def one(compute, reads=lambda context: {"seed": context.settings.seed}, **named):
+    return Stage("sum", "adding up", Sum, compute, reads, **named)
+
+
+@pytest.fixture
+def context(tmp_path):
+    return Context(RunSettings("pendulum"), load_scenario("pendulum"), tmp_path)
+
+
+def test_a_stage_is_computed_once_and_again_where_what_it_reads_has_changed(context):
+    calls = []
+
+    def compute(context):
+        calls.append(context.settings.seed)
+        return Sum(float(context.settings.seed), ("a",), {"x": np.arange(3.0), "on": np.array([True])})
+
+    stage = one(compute)
+    assert bring_up_to_date(context, stage) == ""
+    fresh = Context(context.settings, context.scenario, context.out)
+    assert bring_up_to_date(fresh, stage) == "up to date"
+    found = fresh.read(stage)
+    assert (found.total, found.names, found.arrays["on"].dtype) == (0.0, ("a",), np.dtype(bool))
+    np.testing.assert_array_equal(found.arrays["x"], np.arange(3.0))
+    other = Context(replace(context.settings, seed=5), context.scenario, context.out)
+    bring_up_to_date(other, stage)
+    unknown = one(compute, reads=lambda context: {"seed": UNKNOWN})
+    for _ in range(2):
+        bring_up_to_date(Context(context.settings, context.scenario, context.out), unknown)
+    assert calls == [0, 5, 0, 0]
+
+
+def test_a_stage_reads_others_by_what_they_found(context):
+    first, calls = one(lambda context: Sum(1.0, (), {})), []
+
+    def compute(context):
+        calls.append(context.read(first).total)
+        return Sum(2.0, (), {})
+
+    second = Stage("twice", "twice", Sum, compute, lambda context: {}, (first,))
+    for seed in (0, 5):  # the first is computed again, and finds the same
+        again = Context(replace(context.settings, seed=seed), context.scenario, context.out)
+        bring_up_to_date(again, first)
+        bring_up_to_date(again, second)
+    assert calls == [1.0]
+
+
+def test_a_failure_costs_an_optional_stage_alone_and_is_tried_again(context):
+    def breaks(context):
+        raise ZeroDivisionError("by nothing")
+
+    stage = one(breaks, optional=True)
+    assert "could not run: ZeroDivisionError: by nothing" in bring_up_to_date(context, stage)
+    assert "ZeroDivisionError" in (context.out / "checkpoints" / "sum.error.txt").read_text()
+    assert context.find(stage).failed
+    with pytest.raises(InputError, match="by nothing"):
+        context.read(stage)
+    mended = one(lambda context: Sum(1.0, (), {}), optional=True)
+    bring_up_to_date(Context(context.settings, context.scenario, context.out), mended)
+    assert context.find(one(breaks)) != mended
+    with pytest.raises(ZeroDivisionError):
+        bring_up_to_date(Context(context.settings, context.scenario, context.out / "b"), one(breaks))
+    none = one(lambda context: Absent("the machine has none"), optional=True)
+    fresh = Context(context.settings, context.scenario, context.out / "c")
+    bring_up_to_date(fresh, none)
+    assert (
+        bring_up_to_date(Context(context.settings, context.scenario, context.out / "c"), none) == "up to date"
+    )
+
+
+PLANT = '''
+"""A plant."""
+{extra}
+class Plant:
+    """Falls."""
+    def step(self, state):
+        return state - {g}
+
+
+scenario = {title!r}
+'''
+
+
+def test_source_is_code_without_words(tmp_path):
+    def made(**given):
+        text = PLANT.format(**{"extra": "", "g": 9.81, "title": "a", **given})
+        (tmp_path / "falling.py").write_text(text)
+        spec = spec_from_file_location("falling", tmp_path / "falling.py")
+        module = module_from_spec(spec)
+        sys.modules["falling"] = module
+        spec.loader.exec_module(module)
+        return source_of(module.Plant)
+
+    same = made()
+    assert made(title="b", extra="# a remark") == same
+    assert made(g=1.62) != same
+    assert made(extra="G = 1") != same
+    sys.modules.pop("falling")
+    assert source_of(None) is None
+
+
+def test_changes_are_named():
+    assert changed({"a": "1", "b": "2"}, {"a": "3", "c": "4"}) == "a, c, b have changed"
+    assert changed({}, {"plant": ""}) == "nobody knows whether plant has changed"
