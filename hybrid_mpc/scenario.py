@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,8 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.machine.specification import BenchmarkSpec, DataSpec, check_prior_replay
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from hybrid_mpc.control.ocp import OCP
     from hybrid_mpc.loop.faults import Fault
     from hybrid_mpc.loop.plant import Plant
@@ -128,6 +130,8 @@ class Scenario:
         tasks: Closed-loop tasks.
         budgets: Effort by name.
         draw: ``x (n_x,) -> polylines (m, 2) [m]`` of the machine, for moving pictures; default: none.
+        figures: ``rows -> {file name: (figure, caption)}``, the machine's own figures of the comparison; a row is a
+            :class:`~hybrid_mpc.job.loops.LoopRow` (``task``, ``controller``, ``figures``). Default: none.
         causes: What may break, by name: the prior's parameters (or ``"gain of <input>"``) that change together then,
             for :class:`~hybrid_mpc.monitor.diagnose.Diagnoser`. Default: each by itself.
         benchmark: How ``hybrid-mpc benchmark`` judges the machine on recordings; default: not at all.
@@ -157,6 +161,7 @@ class Scenario:
     tasks: tuple[Task, ...] = ()
     budgets: Mapping[str, Budget] = field(default_factory=lambda: DEFAULT_BUDGETS)
     draw: Callable[[Array], Sequence[Array]] | None = None
+    figures: Callable[[Sequence[Any]], Mapping[str, tuple[Figure, str]]] | None = None
     causes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     benchmark: BenchmarkSpec | None = None
     beyond_recordings: bool = False

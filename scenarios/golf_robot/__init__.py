@@ -12,6 +12,7 @@ from scenarios.golf_robot.experiment import DATA, EXPERIMENT
 from scenarios.golf_robot.faults import CAUSES
 from scenarios.golf_robot.oracle import oracle
 from scenarios.golf_robot.rig import Rig
+from scenarios.golf_robot.strokes import figures
 from scenarios.golf_robot.tasks import CONTROL, QUICK_TASKS, TASKS
 from scenarios.paper.experiment import PaperScenario
 
@@ -48,6 +49,7 @@ scenario = PaperScenario(
     first_sigma=(0.1,),
     tasks=TASKS,
     draw=draw,
+    figures=figures,
     experiment=EXPERIMENT,
     causes=CAUSES,
     budgets={

@@ -11,6 +11,7 @@ import torch
 
 from hybrid_mpc import InputError
 from hybrid_mpc.data.differentiate import local_polynomial
+from hybrid_mpc.plots import save
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.data import make_data, record, stems
 from scenarios.golf_robot.effects import measure_effects, smoothing
@@ -269,3 +270,45 @@ def test_an_impact_is_read_off_the_true_crossing():
     assert figures["effort_nm2s"] == pytest.approx(0.25 * 1.6)
     never = impact(SimpleNamespace(t=t, x=0 * x - 1.0, u=np.zeros((150, 1))), 0.8)
     assert never["speed_error_rel"] == np.inf
+
+
+def stroke(controller="hybrid", speed=1.2, error=0.004, timing=0.003):
+    figures = {"speed_rad_s": speed, "speed_error_rel": error, "timing_error_s": timing, "effort_nm2s": 1.0}
+    return SimpleNamespace(controller=controller, figures=figures)
+
+
+def legend(figure):
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_the_figure_of_the_strokes_shows_units_targets_and_mean_absolute_errors(tmp_path):
+    rows = [
+        stroke(error=0.004, timing=0.002),
+        stroke(error=-0.002, timing=-0.006),
+        stroke(error=np.inf, timing=np.inf),
+        stroke("prior", 1.9, -0.4, 0.02),
+        stroke("oracle", error=np.inf, timing=np.inf),
+        SimpleNamespace(controller="hybrid", figures={}),  # a task that is no stroke
+    ]
+    figure, _ = scenario.figures(rows)["strokes"]
+    upper, lower = figure.axes
+    assert [ax.get_ylabel() for ax in (upper, lower)] == ["speed error [%]", "timing error [ms]"]
+    assert [text.get_text() for text in lower.get_xticklabels()] == ["1.2", "1.9"]
+    for ax, target in ((upper, 1.0), (lower, 10.0)):
+        box = ax.patches[0].get_window_extent().transformed(ax.transData.inverted())
+        np.testing.assert_allclose([box.y0, box.y1], [-target, target], atol=1e-9)
+    assert legend(figure) == [
+        "MOPGRNN (hybrid): 0.3 %, 4 ms, 1 of 3 missed",
+        "prior, fitted: 40 %, 20 ms",
+        "oracle: all 1 missed",
+    ]
+    means = [
+        line.get_ydata()[0] for line in upper.lines if line.get_marker() == "o" and len(line.get_ydata())
+    ]
+    assert means == pytest.approx([0.1, -40.0])  # signed
+    assert (upper.get_yscale(), lower.get_yscale()) == ("symlog", "linear")  # more than ten bands
+    assert upper.get_ylim()[1] > 40
+    assert save(figure, tmp_path / "strokes.png").exists()
+    figure, _ = scenario.figures(rows[4:5])["strokes"]  # no stroke hit at all
+    assert save(figure, tmp_path / "missed.png").exists()
+    assert scenario.figures(rows[5:]) == {}
