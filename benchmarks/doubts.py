@@ -17,8 +17,9 @@ import numpy as np
 
 from hybrid_mpc import Scenario, load_scenario
 from hybrid_mpc.data import doubts as stillness
-from hybrid_mpc.data.doubts import Finding, doubts_of
-from hybrid_mpc.data.tables import Table, read_tables
+from hybrid_mpc.data.doubts import doubts_of
+from hybrid_mpc.data.tables import Finding, Table, read_tables
+from hybrid_mpc.errors import refuse
 
 FROZEN = (0.1, 0.3, 1.0)
 TIMES = 20
@@ -26,7 +27,8 @@ TIMES = 20
 
 def findings(scenario: Scenario, tables: Sequence[Table]) -> tuple[Finding, ...]:
     """What is doubtful; speeds are left out."""
-    return doubts_of(tables, [[] for _ in tables], scenario.data, outputs=scenario.prior().outputs)
+    none = np.zeros(0), np.zeros((0, 0))
+    return doubts_of(tables, [none] * len(tables), scenario.data, outputs=scenario.prior().outputs)
 
 
 def nearest(scenario: Scenario, tables: Sequence[Table]) -> float:
@@ -73,7 +75,8 @@ def main() -> None:
     given = parser.parse_args()
     scenario = load_scenario(given.machine)
     prior = scenario.prior()
-    tables = read_tables(given.files, scenario.data, outputs=prior.outputs, inputs=prior.inputs)
+    tables, problems = read_tables(given.files, scenario.data, outputs=prior.outputs, inputs=prior.inputs)
+    refuse(problems)
     cells = [len(tables), sum(len(t.t) for t in tables), len(findings(scenario, tables))]
     cells += [f"{nearest(scenario, tables):.2f}"]
     faults = [frozen(scenario, tables, seconds) for seconds in FROZEN] + [clipped(scenario, tables)]

@@ -1,23 +1,25 @@
-"""Read recordings into checked tables, with messages that a user can act on."""
+"""Recordings as checked tables: columns found, units turned into the signals' own, times and ranges checked.
+
+:func:`read_table` reads one file. Everything that is wrong with the files of a run is named in one message.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.data.doubts import Finding, unwrapped, wrapped
-from hybrid_mpc.data.files import Columns, MissingColumn, Source, csv_source, mat_source, npz_source
+from hybrid_mpc.data.files import Columns, MissingColumn, Source, opened
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.machine.specification import DataSpec
 
-# Units that recordings come in, and what turns them into the signals' own.
-
+Array = NDArray[np.float64]
 TURN = 2 * math.pi
 UNITS: Mapping[str, Mapping[str, float]] = {
     "s": {"ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0},
@@ -39,82 +41,45 @@ FILLED = 0.01
 SHARE = 0.05
 """Share of the samples beyond the range from which on a unit is proposed: a wrong unit is wrong in all rows."""
 BEYOND = 4.0
-"""Times the range's limit that a column must reach for a wrong unit to be proposed: less may be a wrong range."""
-
-
-def factor(column: str, unit: str | float, signal: Signal) -> float:
-    """What a column's numbers are multiplied by to be in the signal's unit.
-
-    Args:
-        column: Name of the column, for messages.
-        unit: The column's unit by name, or the factor itself, e.g. 35.15 N/V for a force recorded as a voltage.
-        signal: What the column is.
-
-    Raises:
-        InputError: If the unit is none of the signal's quantity, or the factor is zero or not finite.
-
-    Example:
-        >>> factor("time_ms", "ms", Signal("time", "s"))
-        0.001
-    """
-    if isinstance(unit, str):
-        known = {signal.unit: 1.0, **UNITS.get(signal.unit, {})}
-        if unit in known:
-            return known[unit]
-        raise InputError(
-            f"data specification: unit {unit!r} of column {column!r} is none for {signal.label}; there are: "
-            f"{', '.join(known)}. Or give the factor to {signal.unit} as a number."
-        )
-    if not math.isfinite(unit) or unit == 0:
-        raise InputError(
-            f"data specification: factor {unit} of column {column!r} to {signal.label} must be finite and not zero"
-        )
-    return float(unit)
-
-
-def likely_unit(column: NDArray[np.float64], signal: Signal) -> str:
-    """Unit in which a column that leaves its signal's plausible range would be plausible; empty if there is none.
-
-    It speaks only of a column that is beyond the range in many rows, far beyond (``BEYOND``), and that, in the other
-    unit, keeps to the range and fills a hundredth of it at least: a value of 1e300 is in no unit.
-
-    Args:
-        column: The numbers ``(m,)``; what is not finite is in no unit.
-        signal: What the column is.
-
-    Example:
-        >>> phi = Signal("phi", "rad", -3.2, 3.2)
-        >>> likely_unit(np.array([0.0, 90.0, -120.0]), phi), likely_unit(np.array([0.0, 1e307]), phi)
-        ('deg', '')
-    """
-    limit = max(abs(signal.lower), abs(signal.upper))
-    largest = float(np.abs(column).max(initial=0.0))
-    beyond = float(((column < signal.lower) | (column > signal.upper)).mean())
-    if beyond < SHARE or not BEYOND * limit < largest < math.inf:
-        return ""
-    for unit, size in UNITS.get(signal.unit, {}).items():
-        low, high = size * float(column.min()), size * float(column.max())
-        if size * largest >= FILLED * limit and signal.lower <= low and high <= signal.upper:
-            return unit
-    return ""
-
-
-def turn_of(signal: Signal) -> float | None:
-    """A full turn in the signal's unit; None if the signal is no angle.
-
-    Example:
-        >>> turn_of(Signal("phi", "deg")), turn_of(Signal("q", "m"))
-        (360.0, None)
-    """
-    radians = {"rad": 1.0, **UNITS["rad"]}.get(signal.unit)
-    return None if radians is None else TURN / radians
-
-
-Array = NDArray[np.float64]
+"""Times the range's limit that a column must reach for a unit to be proposed: less may be a wrong range."""
+NEARLY = 0.25
+"""Share of a full turn within which a jump is one: what the angle truly moves from one sample to the next is less."""
+SPAN = 1.05
+"""Turns that a wrapped angle spans at most: one, and some noise. An angle that counts on and turns fast spans more."""
 MIN_SCORED = 10
 """Fewest samples after the warm-up that make a piece worth a free run."""
 ABSURD = 1e100
-"""No machine has a value beyond: its square, and the square of that, could not be computed with."""
+"""No machine has a value beyond: the square of its square must be finite."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What is doubtful about one channel of one recording.
+
+    Args:
+        kind: ``"wrapped"``, ``"frozen"``, ``"clipped"`` or ``"speed"``.
+        file: Name of the file.
+        channel: Column.
+        start: Time of the first sample concerned [s], in the recording's own time.
+        count: Samples concerned; of a wrapped angle, its jumps.
+        message: What was found, what is the likely cause, and what to do.
+        refused: Whether nothing can be identified from the recording as it is. Default: no.
+
+    Example:
+        >>> print(Finding("frozen", "monday.csv", "phi", 3.0, 200, "column 'phi' repeats itself"))
+        monday.csv: column 'phi' repeats itself
+    """
+
+    kind: Literal["wrapped", "frozen", "clipped", "speed"]
+    file: str
+    channel: str
+    start: float
+    count: int
+    message: str
+    refused: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.file}: {self.message}"
 
 
 @dataclass(frozen=True)
@@ -128,7 +93,7 @@ class Table:
         t: Time stamps ``(m,)`` [s], strictly increasing.
         u: Inputs ``(m, n_u)``, held from each time stamp to the next.
         y: Measured outputs ``(m, n_y)``; those of periodic signals count on.
-        findings: What reading had to change: angles that were wrapped. Default: nothing.
+        findings: Angles that were wrapped. Default: none.
     """
 
     name: str
@@ -148,19 +113,12 @@ class Table:
 def read_table(
     path: Path | str, spec: DataSpec, *, outputs: Sequence[Signal], inputs: Sequence[Signal]
 ) -> Table:
-    """Read one recording, whose ending tells its format, and check what would mislead an identification.
+    """Read one recording (CSV, ``.npz`` or ``.mat``) and check what would mislead an identification.
 
-    Columns that ``spec`` does not name are ignored; ``spec.units`` are turned into the signals' own. An angle that
-    jumps by full turns is made to count on if its signal is ``periodic``.
-
-    ==========  ========================================================================================
-    ``.npz``    named vectors (``numpy.savez``); objects are refused
-    ``.mat``    MATLAB's vectors, ``save`` with ``-v4``, ``-v6`` or ``-v7``, not 7.3; a struct's fields are
-                ``struct.field``, or ``field`` where that is unambiguous
-    any other   CSV: a comma between cells, decimals with a point, the first line the header, UTF-8
-    ==========  ========================================================================================
-
-    Where the time is a single number in ``.npz`` or ``.mat`` it is the sampling time, and time begins at 0.
+    Columns that ``spec`` does not name are ignored; ``spec.units`` are turned into the signals' own. A wrapped angle is
+    made to count on if its signal is ``periodic``. A single number as the time, in ``.npz`` or ``.mat``, is the
+    sampling time; time then begins at 0. Rows are counted from 1, as an editor or MATLAB shows them (in CSV the header
+    is row 1), the indices of ``.npz`` from 0.
 
     Args:
         path: The file.
@@ -173,10 +131,9 @@ def read_table(
 
     Raises:
         InputError: If the file or a column is missing, a cell is no finite number, columns differ in length,
-            time stamps repeat or decrease, values are implausible, an angle jumps by full turns and its signal is
+            time stamps repeat or decrease, values are implausible, an angle is wrapped and its signal is
             not ``periodic``, the sampling is coarser than ``max_gap`` throughout, or there are fewer samples than
-            a window or the warm-up needs; all that is wrong is told at once. Rows are counted from 1 as an
-            editor or MATLAB shows them (in CSV the header is row 1), the indices of ``.npz`` from 0.
+            a window or the warm-up needs.
 
     Example:
         >>> import tempfile
@@ -189,82 +146,40 @@ def read_table(
         >>> table.name, round(float(table.t[-1]), 6), round(float(table.y[0, 0]), 6)
         ('run', 3.9, 1.570796)
     """
-    return _only(_tables([(Path(path), source_of)], spec, outputs, inputs))
-
-
-def read_csv(
-    path: Path | str, spec: DataSpec, *, outputs: Sequence[Signal], inputs: Sequence[Signal]
-) -> Table:
-    """Read one recording as CSV, whatever its ending; otherwise as :func:`read_table`.
-
-    Example:
-        >>> import tempfile
-        >>> from hybrid_mpc.data.files import write_csv
-        >>> spec = DataSpec("t", ("tau",), ("phi",), dt=0.1, max_gap=0.2, smoothing=0.5, warm_up=0.5)
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     t = 0.1 * np.arange(40)
-        ...     file = write_csv(Path(folder) / "run.csv", {"t": t, "tau": 0 * t, "phi": np.sin(t)})
-        ...     table = read_csv(file, spec, outputs=[Signal("phi", "rad")], inputs=[Signal("tau", "N m")])
-        >>> table.name, table.y.shape
-        ('run', (40, 1))
-    """
-    return _only(_tables([(Path(path), csv_source)], spec, outputs, inputs))
+    tables, problems = read_tables([path], spec, outputs=outputs, inputs=inputs)
+    refuse(problems)
+    return tables[0]
 
 
 def read_tables(
     paths: Sequence[Path | str], spec: DataSpec, *, outputs: Sequence[Signal], inputs: Sequence[Signal]
-) -> list[Table]:
+) -> tuple[list[Table], list[str]]:
     """Read the recordings of one run: :func:`read_table` for each, with ``spec.inputs_of`` for those it names.
 
     They may differ in format, length and sampling, and in columns that ``spec`` does not name.
 
+    Returns:
+        The tables of the files that can be read, and all problems of the others.
+
     Raises:
-        InputError: If one of them is bad, a column is in some of them and not in others, or two have one stem.
+        InputError: If ``spec`` does not name a column for each signal.
 
     Example:
         >>> spec = DataSpec("t", ("u",), ("y",), dt=0.1, max_gap=0.2, smoothing=0.5, warm_up=0.5)
         >>> read_tables([], spec, outputs=[Signal("y", "rad")], inputs=[Signal("u", "N m")])
-        []
+        ([], [])
     """
-    tables, problems = checked_tables(paths, spec, outputs=outputs, inputs=inputs)
-    refuse(problems)
-    return tables
-
-
-def checked_tables(
-    paths: Sequence[Path | str], spec: DataSpec, *, outputs: Sequence[Signal], inputs: Sequence[Signal]
-) -> tuple[list[Table], list[str]]:
-    """The recordings of one run that can be read, and all problems of the others.
-
-    Args:
-        paths: The files.
-        spec: As in :func:`read_tables`.
-        outputs: Signals of ``spec.outputs``.
-        inputs: Signals of ``spec.inputs``.
-    """
-    tables, problems = _tables([(Path(path), source_of) for path in paths], spec, outputs, inputs)
-    stems = [Path(path).stem for path in paths]
-    if len(set(stems)) < len(stems):
-        problems.append(
-            f"two recordings have the same file stem: {', '.join(sorted(stems))}. Give each file once, or "
-            "rename one: pieces and windows are named by the stem."
+    if len(spec.outputs) != len(outputs) or len(spec.inputs) != len(inputs):
+        raise InputError(
+            f"data specification: {len(spec.inputs)} input and {len(spec.outputs)} output columns for a "
+            f"prior with {len(inputs)} inputs and {len(outputs)} outputs; "
+            "name one column for each, in its order"
         )
-    return tables, problems
-
-
-def _tables(
-    files: Sequence[tuple[Path, Callable[[Path], Source]]],
-    spec: DataSpec,
-    outputs: Sequence[Signal],
-    inputs: Sequence[Signal],
-) -> tuple[list[Table], list[str]]:
-    """Tables of the files that can be read, and the problems of the others."""
-    _check_columns(spec, outputs, inputs)
     tables: list[Table] = []
     problems: list[str] = []
     there: dict[str, list[str]] = {}
     missing: dict[str, list[str]] = {}
-    for path, opened in files:
+    for path in map(Path, paths):
         own = replace(spec, inputs=spec.inputs_of.get(path.stem, spec.inputs))
         try:
             source = opened(path)
@@ -274,66 +189,46 @@ def _tables(
                 tables.append(_table(source, own, names, outputs, inputs))
         except InputError as error:
             problems += error.problems
-    differ = _unequal(there, missing)
-    return tables, [*([differ] if differ else []), *problems]
-
-
-def _only(read: tuple[list[Table], list[str]]) -> Table:
-    """The one table that was read."""
-    refuse(read[1])
-    return read[0][0]
-
-
-def _check_columns(spec: DataSpec, outputs: Sequence[Signal], inputs: Sequence[Signal]) -> None:
-    if len(spec.outputs) != len(outputs) or len(spec.inputs) != len(inputs):
-        raise InputError(
-            f"data specification: {len(spec.inputs)} input and {len(spec.outputs)} output columns for a "
-            f"prior with {len(inputs)} inputs and {len(outputs)} outputs; "
-            "name one column for each, in its order"
+    differ = "".join(
+        f"\n  {name!r} is in {', '.join(there[name])} and not in {', '.join(files)}"
+        for name, files in missing.items()
+        if name in there
+    )
+    if differ:
+        problems.insert(
+            0,
+            "Columns differ between the recordings. All need those that the DataSpec names; inputs_of names other "
+            f"inputs for single recordings:{differ}",
         )
+    stems = [Path(path).stem for path in paths]
+    if len(set(stems)) < len(stems):
+        problems.append(
+            f"two recordings have the same file stem: {', '.join(sorted(stems))}. Give each file once, or "
+            "rename one: pieces and windows are named by the stem."
+        )
+    return tables, problems
 
 
 def _found(
     source: Source, spec: DataSpec, there: dict[str, list[str]], missing: dict[str, list[str]]
 ) -> tuple[list[str], list[str]]:
-    """Full names of the columns, and what is wrong with those that have none; notes what is there and what is not."""
+    """Full names of the columns, and what is wrong with the others; notes which files have which column."""
     names, problems = [], []
     for name in (spec.time, *spec.inputs, *spec.outputs):
         try:
             names.append(source.find(name))
             there.setdefault(name, []).append(source.path.name)
-        except MissingColumn as error:
-            problems.append(str(error))
-            missing.setdefault(name, []).append(source.path.name)
         except InputError as error:
             problems.append(str(error))
+            if isinstance(error, MissingColumn):
+                missing.setdefault(name, []).append(source.path.name)
     return names, problems
-
-
-def _unequal(there: Mapping[str, Sequence[str]], missing: Mapping[str, Sequence[str]]) -> str:
-    """Columns that some of the recordings have and others lack, for a message; nothing if there are none."""
-    lines = "".join(
-        f"\n  {name!r} is in {', '.join(there[name])} and not in {', '.join(files)}"
-        for name, files in missing.items()
-        if name in there
-    )
-    remedy = "All need those that the DataSpec names; inputs_of names other inputs for single recordings:"
-    return f"Columns differ between the recordings. {remedy}{lines}" if lines else ""
-
-
-def source_of(path: Path) -> Source:
-    """Open a recording's file by its ending.
-
-    Raises:
-        InputError: If it is missing, empty, damaged or not of the format that its ending says.
-    """
-    return {".npz": npz_source, ".mat": mat_source}.get(path.suffix.lower(), csv_source)(path)
 
 
 def _table(
     source: Source, spec: DataSpec, found: Sequence[str], outputs: Sequence[Signal], inputs: Sequence[Signal]
 ) -> Table:
-    """The table of columns that are all there; every check is made, and what fails is told together."""
+    """The table of columns that are all there; every check is made, and all that fails is named."""
     path = source.path
     names = (spec.time, *spec.inputs, *spec.outputs)
     signals = (Signal("time", "s"), *inputs, *outputs)
@@ -344,25 +239,29 @@ def _table(
     with np.errstate(over="ignore"):  # what overflows is out of its range
         for j, (name, signal) in enumerate(zip(names, signals, strict=True)):
             if name in spec.units:
-                values[:, j] *= factor(name, spec.units[name], signal)
+                values[:, j] *= _factor(name, spec.units[name], signal)
     t = values[:, 0]
-    if (np.abs(t) <= ABSURD).all():  # what is not is told with the ranges, or as no number
+    if (np.abs(t) <= ABSURD).all():  # the ranges tell of the others, and of what is no number
         problems += _time_problems(t, columns, spec, path.stem)
     clean = not problems and bool((np.abs(values) <= ABSURD).all())
     for j, (signal, name) in enumerate(zip(signals, names, strict=True)):
-        note = ""
-        turn = turn_of(signal) if clean and j >= split else None
-        if turn is not None:
+        note, turn = "", _turn(signal)
+        if clean and j >= split and turn is not None:
             angle, jumps = unwrapped(t, values[:, j], turn, spec.max_gap)
             if len(jumps):
-                findings.append(wrapped(path.name, name, signal, t, values[:, j], jumps))
-            if len(jumps) and signal.periodic:
-                values[:, j] = angle
-                note = f", with {len(jumps)} jumps of a full turn taken out"
+                findings.append(_wrapped(path.name, name, signal, t, values[:, j], jumps))
+                if signal.periodic:
+                    values[:, j] = angle
+                    note = f", with {len(jumps)} jumps of a full turn taken out"
         problems += _range_problems(signal, name, values[:, j], columns, note)
     problems += [finding.message for finding in findings if finding.refused]
     refuse([f"{path}: {problem}" for problem in problems])
     return Table(path.stem, path, source.sha256, t, values[:, 1:split], values[:, split:], tuple(findings))
+
+
+def gaps(t: Array, max_gap: float) -> NDArray[np.bool_]:
+    """Which of the steps ``(m - 1,)`` between time stamps ``(m,)`` are longer than ``max_gap`` [s]."""
+    return np.asarray(np.diff(t) > max_gap * (1 + 1e-6))
 
 
 def _time_problems(t: Array, columns: Columns, spec: DataSpec, stem: str) -> list[str]:
@@ -380,7 +279,7 @@ def _time_problems(t: Array, columns: Columns, spec: DataSpec, stem: str) -> lis
             "split the file into recordings."
         ]
     problems = []
-    if steps.min() > spec.max_gap * (1 + 1e-6):
+    if gaps(t, spec.max_gap).all():
         problems.append(
             f"sampling is {np.median(steps):g} s, declared max_gap is {spec.max_gap:g} s: every step "
             f"is a gap. Record faster, raise max_gap, or check that column {spec.time!r} is in seconds "
@@ -394,33 +293,115 @@ def _time_problems(t: Array, columns: Columns, spec: DataSpec, stem: str) -> lis
             f"({spec.warm_up:g} s) and {MIN_SCORED} periods need. Give a longer recording, or check that "
             f"column {spec.time!r} is in seconds (DataSpec.units names another unit)."
         )
-    problems += [
+    return problems + [
         f"the {window.role} window {window.start:g} to {window.end:g} s is not within the "
         f"recording ({t[0]:g} to {t[-1]:g} s). Give the whole recording or change the window."
         for window in spec.windows.get(stem, ())
         if window.start < t[0] - spec.dt or window.end > t[-1] + spec.dt
     ]
-    return problems
 
 
 def _range_problems(signal: Signal, name: str, column: Array, columns: Columns, note: str) -> list[str]:
     """What is wrong with values that are there but implausible."""
     lower, upper = max(signal.lower, -ABSURD), min(signal.upper, ABSURD)
-    bad = np.flatnonzero((column < lower) | (column > upper))  # NaN is neither, and told before
+    bad = np.flatnonzero((column < lower) | (column > upper))  # not NaN, which is a problem already
     if not len(bad):
         return []
     first, worst = int(bad[0]), int(bad[np.argmax(np.abs(column[bad]))])
-    such = (
-        f" ({len(bad)} such rows, the largest {column[worst]:g} in {columns.place(worst)})"
-        if len(bad) > 1
-        else ""
-    )
-    unit = likely_unit(column[~np.isnan(column)], signal)
-    hint = (
-        f" In {unit} it would be plausible: say units={{{name!r}: {unit!r}}} in the DataSpec." if unit else ""
-    )
+    such = f" ({len(bad)} such rows, the largest {column[worst]:g} in {columns.place(worst)})"
+    unit = _likely_unit(column[~np.isnan(column)], signal)
+    hint = f" In {unit} it would be plausible: say units={{{name!r}: {unit!r}}} in the DataSpec."
     return [
         f"{columns.place(first)}, column {name!r}: {column[first]:g} is outside the plausible range "
-        f"{lower:g} to {upper:g} {signal.unit} of {signal.name}{note}{such}."
-        f"{hint} Check unit and sign, repair the rows, or widen the range of the signal in the scenario's prior."
+        f"{lower:g} to {upper:g} {signal.unit} of {signal.name}{note}{such if len(bad) > 1 else ''}."
+        f"{hint if unit else ''} Check unit and sign, repair the rows, or widen the range of the signal in the "
+        "scenario's prior."
     ]
+
+
+# Units
+
+
+def _factor(column: str, unit: str | float, signal: Signal) -> float:
+    """What a column's numbers are multiplied by to be in the signal's unit."""
+    if isinstance(unit, str):
+        known = {signal.unit: 1.0, **UNITS.get(signal.unit, {})}
+        if unit in known:
+            return known[unit]
+        raise InputError(
+            f"data specification: unit {unit!r} of column {column!r} is none for {signal.label}; there are: "
+            f"{', '.join(known)}. Or give the factor to {signal.unit} as a number."
+        )
+    if not math.isfinite(unit) or unit == 0:
+        raise InputError(
+            f"data specification: factor {unit} of column {column!r} to {signal.label} must be finite and not zero"
+        )
+    return float(unit)
+
+
+def _likely_unit(column: Array, signal: Signal) -> str:
+    """Unit in which a column that leaves its signal's plausible range would keep to it; empty if there is none."""
+    limit = max(abs(signal.lower), abs(signal.upper))
+    largest = float(np.abs(column).max(initial=0.0))
+    beyond = float(((column < signal.lower) | (column > signal.upper)).mean())
+    if beyond < SHARE or not BEYOND * limit < largest < math.inf:
+        return ""
+    for unit, size in UNITS.get(signal.unit, {}).items():
+        low, high = size * float(column.min()), size * float(column.max())
+        if size * largest >= FILLED * limit and signal.lower <= low and high <= signal.upper:
+            return unit
+    return ""
+
+
+# Wrapped angles
+
+
+def _turn(signal: Signal) -> float | None:
+    """A full turn in the signal's unit; None if the unit is none of an angle."""
+    radians = {"rad": 1.0, **UNITS["rad"]}.get(signal.unit)
+    return None if radians is None else TURN / radians
+
+
+def unwrapped(t: Array, angle: Array, turn: float, max_gap: float) -> tuple[Array, NDArray[np.intp]]:
+    """An angle that counts on, and the places where it jumped by about a full turn.
+
+    An angle is wrapped if it keeps within one turn and jumps by about one between neighbouring samples.
+
+    Args:
+        t: Time stamps ``(m,)`` [s].
+        angle: The angle ``(m,)``.
+        turn: A full turn in its unit.
+        max_gap: Distance [s] beyond which two samples are no neighbours.
+
+    Returns:
+        The angle ``(m,)``, equal to the given one but for whole turns, and the indices of the samples after a jump.
+
+    Example:
+        >>> angle = np.array([2.0, 2.6, 3.1, -2.7, -2.2, -2.8, 3.0])
+        >>> angle, jumps = unwrapped(np.arange(7.0), angle, 2 * np.pi, 1.5)
+        >>> angle.round(2).tolist(), jumps.tolist()
+        ([2.0, 2.6, 3.1, 3.58, 4.08, 3.48, 3.0], [3, 6])
+    """
+    step = np.diff(angle)
+    jumps = ~gaps(t, max_gap) & (np.abs(np.abs(step) - turn) <= NEARLY * turn)
+    if not jumps.any() or np.ptp(angle) > SPAN * turn:
+        return angle, np.zeros(0, dtype=np.intp)
+    turns = np.cumsum(np.r_[0.0, np.where(jumps, np.sign(step), 0.0)])
+    return angle - turn * turns, np.flatnonzero(jumps) + 1
+
+
+def _wrapped(file: str, name: str, signal: Signal, t: Array, raw: Array, jumps: NDArray[np.intp]) -> Finding:
+    """The finding of an angle as it was recorded ``raw`` ``(m,)`` that jumps."""
+    k, count = int(jumps[0]), len(jumps)
+    what = (
+        f"column {name!r} jumps {count} time{'s' * (count > 1)} by about a full turn (first from {raw[k - 1]:.4g} to "
+        f"{raw[k]:.4g} {signal.unit} at {t[k]:.6g} s): a wrapped angle"
+    )
+    remedy = (
+        f". {signal.name} is periodic, so the turns were added up and the angle counts on. An estimator or monitor "
+        "that runs on the sensor itself needs an angle that counts on, too."
+        if signal.periodic
+        else f", which no smooth motion explains. Declare Signal(..., periodic=True) for {signal.name} in the prior, "
+        "and it is made to count on; or record an angle that does."
+    )
+    return Finding("wrapped", file, name, float(t[k]), count, what + remedy, refused=not signal.periodic)

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from hybrid_mpc.data.differentiate import local_polynomial, window_samples
-from hybrid_mpc.data.doubts import Finding, doubts_of
-from hybrid_mpc.data.tables import MIN_SCORED, Table, checked_tables
+from hybrid_mpc.data.doubts import doubts_of
+from hybrid_mpc.data.tables import MIN_SCORED, Finding, Table, gaps, read_tables
 from hybrid_mpc.errors import SHOWN, InputError, refuse
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.machine.specification import DataSpec, Role, Window
@@ -107,10 +107,9 @@ def load_trajectories(
 ) -> Dataset:
     """Read recordings, cut them at gaps, smooth and differentiate, resample to ``spec.dt``, give roles.
 
-    The outputs are the positions ``q``; velocities and accelerations are their derivatives. Smoothing
-    comes before resampling and before the split, never across a gap: a sample's ``x`` and ``xdot`` know at
-    most half of ``spec.smoothing`` of the time before and after it. Parts by ``fractions`` keep that much
-    distance from each other; whoever writes ``windows`` should too.
+    The outputs are the positions ``q``; velocities and accelerations are their derivatives. Smoothing comes before
+    resampling and the split, never across a gap: a sample's ``x`` and ``xdot`` know half of ``spec.smoothing`` of the
+    time before and after it. Parts by ``fractions`` keep ``spec.smoothing`` apart; ``windows`` should, too.
 
     Args:
         paths: CSV, ``.npz`` or ``.mat`` files with different stems, of any lengths.
@@ -122,18 +121,16 @@ def load_trajectories(
         needed: Roles that must not be empty. Default: all three.
 
     Returns:
-        The data set; it has at least one trajectory of each role that is needed. What is doubtful about the recordings
-        stands in its ``findings``.
+        The data set; it has at least one trajectory of each role that is needed.
 
     Raises:
-        InputError: If recordings are bad (see :func:`~hybrid_mpc.data.tables.read_table`), columns
-            differ between recordings, windows of different roles overlap, a role gets no trajectory,
-            the sampling is too coarse or too uneven for ``smoothing``, or the speeds are beyond all that is
-            plausible. It names all that is wrong with all files.
+        InputError: If recordings are bad (see :func:`~hybrid_mpc.data.tables.read_table`), columns differ between
+            them, windows overlap, a role gets no trajectory, the sampling is too coarse or too uneven for
+            ``smoothing``, or the speeds are beyond all that is plausible. It names all that is wrong with all files.
 
     Example:
         >>> import tempfile
-        >>> from hybrid_mpc.data.files import write_csv
+        >>> from hybrid_mpc import write_csv
         >>> spec = DataSpec("t", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.5)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     t = 0.01 * np.arange(1000)
@@ -146,44 +143,48 @@ def load_trajectories(
     if not paths:
         raise InputError("no recordings given; name at least one file with --data")
     _check_windows(spec)
-    tables, problems = checked_tables(paths, spec, outputs=outputs, inputs=inputs)
+    tables, problems = read_tables(paths, spec, outputs=outputs, inputs=inputs)
     trajectories: list[Trajectory] = []
-    segments: list[list[Trajectory]] = []
+    whole: list[Trajectory] = []
+    motions: list[tuple[Array, Array]] = []
     cuts: list[Cut] = []
     for table in tables:
+        own: list[Trajectory] = []
         try:
-            segments.append(list(_segments(table, spec, cuts)))
-            trajectories += _pieces(table, segments[-1], spec, cuts)
+            own = list(_segments(table, spec, cuts))
+            trajectories += _pieces(table, own, spec, cuts)
         except InputError as error:
             problems.append(f"{table.path}: {error}")
-            segments.append([])
-    findings = doubts_of(tables, segments, spec, outputs=outputs, states=states)
+        whole += own
+        t, x = [piece.t for piece in own], [piece.x for piece in own]
+        motions.append((np.concatenate(t), np.concatenate(x)) if own else (np.zeros(0), np.zeros((0, 0))))
+    findings = doubts_of(tables, motions, spec, outputs=outputs, states=states)
     paths_of = {table.path.name: table.path for table in tables}
     problems += [f"{paths_of[finding.file]}: {finding.message}" for finding in findings if finding.refused]
     refuse(problems)
     _check_roles(trajectories, cuts, spec, needed)
     return Dataset(
         trajectories=tuple(trajectories),
-        whole=tuple(segment for own in segments for segment in own),
+        whole=tuple(whole),
         cuts=tuple(cuts),
         files=tuple(table.path.name for table in tables),
         sha256=tuple(table.sha256 for table in tables),
-        hash=_hash(tables),
+        hash=hashlib.sha256("".join(sorted(f"{t.name} {t.sha256}\n" for t in tables)).encode()).hexdigest(),
         findings=findings,
     )
 
 
 def _segments(table: Table, spec: DataSpec, cuts: list[Cut]) -> Iterator[Trajectory]:
     """Smoothed and resampled parts between gaps, numbered; too short ones become cuts."""
-    gaps = np.flatnonzero(np.diff(table.t) > spec.max_gap * (1 + 1e-6))
-    for k in gaps:
+    ends = np.flatnonzero(gaps(table.t, spec.max_gap))
+    for k in ends:
         why = f"gap of {table.t[k + 1] - table.t[k]:.4g} s is longer than max_gap {spec.max_gap:g} s"
         cuts.append(Cut(table.path.name, float(table.t[k]), float(table.t[k + 1]), why))
     samples = window_samples(spec.smoothing, table.dt)
     _check_sampling(table, samples, spec)
     shortest = max((samples - 1) * table.dt, (_fewest(spec) - 1) * spec.dt) + spec.dt
     number = 0
-    for rows in np.split(np.arange(len(table.t)), gaps + 1):
+    for rows in np.split(np.arange(len(table.t)), ends + 1):
         t = table.t[rows]
         if t[-1] - t[0] < shortest - TINY:
             cuts.append(Cut(table.path.name, float(t[0]), float(t[-1]), _too_short(shortest, spec)))
@@ -195,7 +196,7 @@ def _segments(table: Table, spec: DataSpec, cuts: list[Cut]) -> Iterator[Traject
 def _check_sampling(table: Table, samples: int, spec: DataSpec) -> None:
     """Refuse sampling that smoothing would take gigabytes or minutes for."""
     steps = np.diff(table.t)
-    mean = float(steps[steps <= spec.max_gap * (1 + 1e-6)].mean())
+    mean = float(steps[~gaps(table.t, spec.max_gap)].mean())
     if mean > UNEVEN * table.dt:
         raise InputError(
             f"sampling is uneven: the time stamps are {table.dt:.3g} s apart in the median and {mean:.3g} s in "
@@ -337,8 +338,3 @@ def _too_short(need: float, spec: DataSpec) -> str:
 
 def _numbered(stem: str, number: int) -> str:
     return stem if number == 1 else f"{stem}#{number}"
-
-
-def _hash(tables: list[Table]) -> str:
-    lines = sorted(f"{table.name} {table.sha256}\n" for table in tables)
-    return hashlib.sha256("".join(lines).encode()).hexdigest()

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybrid_mpc import DataSpec, InputError, Signal, Window, write_csv
-from hybrid_mpc.data.tables import read_csv
+from hybrid_mpc.data.tables import read_table
 
 SPEC = DataSpec("time_s", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.2)
 SIGNALS = {"outputs": (Signal("phi", "rad", -10, 10),), "inputs": (Signal("torque", "N m", -5, 5),)}
@@ -25,7 +25,7 @@ def refused(tmp_path, text, match, spec=SPEC):
     path = tmp_path / "run.csv"
     path.write_text(text if isinstance(text, str) else "\n".join(text))
     with pytest.raises(InputError, match=match) as caught:
-        read_csv(path, spec, **SIGNALS)
+        read_table(path, spec, **SIGNALS)
     assert "run.csv" in str(caught.value)
 
 
@@ -33,7 +33,7 @@ def test_round_trip_and_same_bytes(tmp_path):
     one, two = write_csv(tmp_path / "a.csv", GOOD), write_csv(tmp_path / "sub" / "b.csv", GOOD)
     assert one.read_bytes() == two.read_bytes()
     assert [p.name for p in tmp_path.iterdir() if p.is_file()] == ["a.csv"]  # no part file is left
-    table = read_csv(one, SPEC, **SIGNALS)
+    table = read_table(one, SPEC, **SIGNALS)
     np.testing.assert_allclose(table.y[:, 0], np.sin(T), rtol=1e-9)  # ten digits are written
     np.testing.assert_allclose(table.u[:, 0], np.cos(T), rtol=1e-9)
     assert table.name == "a"
@@ -82,10 +82,10 @@ def test_an_absurd_value_is_named_where_its_signal_has_no_range(tmp_path):
     with pytest.raises(
         InputError, match=r"row 42, column 'phi': -1e\+307 is outside the plausible range -1e\+100"
     ):
-        read_csv(path, SPEC, **free)
+        read_table(path, SPEC, **free)
     write_csv(path, {**columns, "phi": np.sin(T), "time_s": np.where(np.arange(60) == 59, 1e307, T)})
     with pytest.raises(InputError, match=r"row 61, column 'time_s': 1e\+307"):
-        read_csv(path, SPEC, **free)
+        read_table(path, SPEC, **free)
 
 
 def test_all_that_is_wrong_with_a_file_is_told_at_once(tmp_path):
@@ -119,7 +119,7 @@ def test_bad_files(tmp_path):
     late = replace(SPEC, windows={"run": (Window(0, 9, "train"),)})
     refused(tmp_path, rows, "window 0 to 9 s is not within", late)
     with pytest.raises(InputError, match=r"no such file; that folder has: run.csv"):
-        read_csv(tmp_path / "walk.csv", SPEC, **SIGNALS)
+        read_table(tmp_path / "walk.csv", SPEC, **SIGNALS)
 
 
 @settings(max_examples=150, deadline=None)
@@ -131,7 +131,7 @@ def test_damage_gives_an_input_error_or_finite_increasing_data(place, removed, i
         damaged = content[:place] + inserted + content[place + removed :]
         path.write_bytes(damaged)
         try:
-            table = read_csv(path, SPEC, **SIGNALS)
+            table = read_table(path, SPEC, **SIGNALS)
         except InputError as error:
             assert "run.csv" in str(error)  # noqa: PT017  (both outcomes are right)
             return
