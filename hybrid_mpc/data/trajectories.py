@@ -54,6 +54,11 @@ class Trajectory:
     x: Array
     xdot: Array
 
+    @property
+    def file(self) -> str:
+        """Stem of the file that it comes from."""
+        return self.name.split("#")[0]
+
     def part(self, keep: NDArray[np.bool_], name: str, role: str) -> Trajectory:
         """The samples where ``keep`` ``(n,)`` holds (one contiguous run), under a new name and role."""
         arrays = {key: getattr(self, key)[keep] for key in ("t", "u", "y", "x", "xdot")}

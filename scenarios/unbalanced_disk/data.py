@@ -28,12 +28,12 @@ ROLES: tuple[Role, ...] = ("train", "valid", "test")
 
 
 def _multisine(rng: np.random.Generator, t: Array) -> Array:
-    u = multisine(t, rng.uniform(0.6, 1.0) * PEAK, 0.56, 2.6, lower=-PEAK, upper=PEAK)
+    u = multisine(t, rng.uniform(0.6, 1.0) * PEAK, 0.56, 2.6)
     return np.roll(u, int(rng.integers(len(t))))
 
 
 def _wide(rng: np.random.Generator, t: Array) -> Array:
-    u = multisine(t, rng.uniform(0.8, 1.0) * PEAK, 0.5, 10.6, lower=-PEAK, upper=PEAK)
+    u = multisine(t, rng.uniform(0.8, 1.0) * PEAK, 0.5, 10.6)
     return np.roll(u, int(rng.integers(len(t))))
 
 
