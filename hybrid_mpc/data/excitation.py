@@ -164,7 +164,7 @@ def multisine(
     Example:
         >>> u = multisine(0.01 * np.arange(1000), 0.5, 0.2, 3.0)
         >>> round(float(abs(u).max()), 12), round(float(abs(u).max() / u.std()), 1)
-        (0.5, 1.7)
+        (0.5, 1.9)
     """
     t = np.asarray(t, dtype=float)
     s, dt = t - t[0], _period_of("multisine", t)

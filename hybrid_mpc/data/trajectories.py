@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from hybrid_mpc.data.differentiate import local_polynomial, window_samples
-from hybrid_mpc.data.doubts import doubts_of
-from hybrid_mpc.data.tables import MIN_SCORED, Finding, Table, gaps, read_tables
+from hybrid_mpc.data.findings import findings_of
+from hybrid_mpc.data.recording import MIN_SCORED, Finding, Recording, gaps, read_recordings
 from hybrid_mpc.errors import SHOWN, InputError, refuse
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.machine.specification import DataSpec, Role, Window
@@ -85,7 +85,7 @@ class Dataset:
         files: File names, in the order given.
         sha256: SHA-256 of each file, in the same order.
         hash: One hash of all files' names and contents; it does not depend on their order or folder.
-        findings: What is doubtful about the recordings (:func:`~hybrid_mpc.data.doubts.doubts_of`). Default: nothing.
+        findings: What is doubtful about the recordings (:mod:`hybrid_mpc.data.findings`). Default: nothing.
     """
 
     trajectories: tuple[Trajectory, ...]
@@ -129,8 +129,8 @@ def load_trajectories(
         The data set; it has at least one trajectory of each role that is needed.
 
     Raises:
-        InputError: If recordings are bad (see :func:`~hybrid_mpc.data.tables.read_table`), columns differ between
-            them, windows overlap, a role gets no trajectory, the sampling is too coarse or too uneven for
+        InputError: If recordings are bad (see :func:`~hybrid_mpc.data.recording.read_recording`), columns differ
+            between them, windows overlap, a role gets no trajectory, the sampling is too coarse or too uneven for
             ``smoothing``, or the speeds are beyond all that is plausible. It names all that is wrong with all files.
 
     Example:
@@ -148,23 +148,23 @@ def load_trajectories(
     if not paths:
         raise InputError("no recordings given; name at least one file with --data")
     _check_windows(spec)
-    tables, problems = read_tables(paths, spec, outputs=outputs, inputs=inputs)
+    recordings, problems = read_recordings(paths, spec, outputs=outputs, inputs=inputs)
     trajectories: list[Trajectory] = []
     whole: list[Trajectory] = []
     motions: list[tuple[Array, Array]] = []
     cuts: list[Cut] = []
-    for table in tables:
+    for recording in recordings:
         own: list[Trajectory] = []
         try:
-            own = list(_segments(table, spec, cuts))
-            trajectories += _pieces(table, own, spec, cuts)
+            own = list(_segments(recording, spec, cuts))
+            trajectories += _pieces(recording, own, spec, cuts)
         except InputError as error:
-            problems.append(f"{table.path}: {error}")
+            problems.append(f"{recording.path}: {error}")
         whole += own
         t, x = [piece.t for piece in own], [piece.x for piece in own]
         motions.append((np.concatenate(t), np.concatenate(x)) if own else (np.zeros(0), np.zeros((0, 0))))
-    findings = doubts_of(tables, motions, spec, outputs=outputs, states=states)
-    paths_of = {table.path.name: table.path for table in tables}
+    findings = findings_of(recordings, motions, spec, outputs=outputs, states=states)
+    paths_of = {recording.path.name: recording.path for recording in recordings}
     problems += [f"{paths_of[finding.file]}: {finding.message}" for finding in findings if finding.refused]
     refuse(problems)
     _check_roles(trajectories, cuts, spec, needed)
@@ -172,54 +172,56 @@ def load_trajectories(
         trajectories=tuple(trajectories),
         whole=tuple(whole),
         cuts=tuple(cuts),
-        files=tuple(table.path.name for table in tables),
-        sha256=tuple(table.sha256 for table in tables),
-        hash=hashlib.sha256("".join(sorted(f"{t.name} {t.sha256}\n" for t in tables)).encode()).hexdigest(),
+        files=tuple(recording.path.name for recording in recordings),
+        sha256=tuple(recording.sha256 for recording in recordings),
+        hash=hashlib.sha256(
+            "".join(sorted(f"{t.name} {t.sha256}\n" for t in recordings)).encode()
+        ).hexdigest(),
         findings=findings,
     )
 
 
-def _segments(table: Table, spec: DataSpec, cuts: list[Cut]) -> Iterator[Trajectory]:
+def _segments(recording: Recording, spec: DataSpec, cuts: list[Cut]) -> Iterator[Trajectory]:
     """Smoothed and resampled parts between gaps, numbered; too short ones become cuts."""
-    ends = np.flatnonzero(gaps(table.t, spec.max_gap))
+    ends = np.flatnonzero(gaps(recording.t, spec.max_gap))
     for k in ends:
-        why = f"gap of {table.t[k + 1] - table.t[k]:.4g} s is longer than max_gap {spec.max_gap:g} s"
-        cuts.append(Cut(table.path.name, float(table.t[k]), float(table.t[k + 1]), why))
-    samples = window_samples(spec.smoothing, table.dt)
-    _check_sampling(table, samples, spec)
-    shortest = max((samples - 1) * table.dt, (_fewest(spec) - 1) * spec.dt) + spec.dt
+        why = f"gap of {recording.t[k + 1] - recording.t[k]:.4g} s is longer than max_gap {spec.max_gap:g} s"
+        cuts.append(Cut(recording.path.name, float(recording.t[k]), float(recording.t[k + 1]), why))
+    samples = window_samples(spec.smoothing, recording.dt)
+    _check_sampling(recording, samples, spec)
+    shortest = max((samples - 1) * recording.dt, (_fewest(spec) - 1) * spec.dt) + spec.dt
     number = 0
-    for rows in np.split(np.arange(len(table.t)), ends + 1):
-        t = table.t[rows]
+    for rows in np.split(np.arange(len(recording.t)), ends + 1):
+        t = recording.t[rows]
         if t[-1] - t[0] < shortest - TINY:
-            cuts.append(Cut(table.path.name, float(t[0]), float(t[-1]), _too_short(shortest, spec)))
+            cuts.append(Cut(recording.path.name, float(t[0]), float(t[-1]), _too_short(shortest, spec)))
             continue
         number += 1
-        yield _resample(table, rows, spec, _numbered(table.name, number))
+        yield _resample(recording, rows, spec, _numbered(recording.name, number))
 
 
-def _check_sampling(table: Table, samples: int, spec: DataSpec) -> None:
+def _check_sampling(recording: Recording, samples: int, spec: DataSpec) -> None:
     """Refuse sampling that smoothing would take gigabytes or minutes for."""
-    steps = np.diff(table.t)
-    mean = float(steps[~gaps(table.t, spec.max_gap)].mean())
-    if mean > UNEVEN * table.dt:
+    steps = np.diff(recording.t)
+    mean = float(steps[~gaps(recording.t, spec.max_gap)].mean())
+    if mean > UNEVEN * recording.dt:
         raise InputError(
-            f"sampling is uneven: the time stamps are {table.dt:.3g} s apart in the median and {mean:.3g} s in "
+            f"sampling is uneven: the time stamps are {recording.dt:.3g} s apart in the median and {mean:.3g} s in "
             "the mean. Record at one rate, or check the time stamps."
         )
-    if samples * len(table.t) * mean / table.dt > WORK:
+    if samples * len(recording.t) * mean / recording.dt > WORK:
         raise InputError(
-            f"smoothing of {spec.smoothing:g} s holds {samples} of {len(table.t)} samples, too many to work "
+            f"smoothing of {spec.smoothing:g} s holds {samples} of {len(recording.t)} samples, too many to work "
             f"with. The model's period is {spec.dt:g} s: give every tenth or hundredth row, or split the recording."
         )
 
 
-def _resample(table: Table, rows: NDArray[np.intp], spec: DataSpec, name: str) -> Trajectory:
-    t, y, u = table.t[rows], table.y[rows], table.u[rows]
+def _resample(recording: Recording, rows: NDArray[np.intp], spec: DataSpec, name: str) -> Trajectory:
+    t, y, u = recording.t[rows], recording.y[rows], recording.u[rows]
     n = int(np.floor((t[-1] - t[0]) / spec.dt + TINY))
     grid = t[0] + spec.dt * np.arange(n)
-    fine = t[0] + table.dt * np.arange(int(np.floor((t[-1] - t[0]) / table.dt + TINY)) + 1)
-    smooth = local_polynomial(_interpolate(t, y, fine), table.dt, spec.smoothing)
+    fine = t[0] + recording.dt * np.arange(int(np.floor((t[-1] - t[0]) / recording.dt + TINY)) + 1)
+    smooth = local_polynomial(_interpolate(t, y, fine), recording.dt, spec.smoothing)
     q, v, a = (CubicSpline(fine, z)(grid) for z in (smooth.value, smooth.first, smooth.second))
     return Trajectory(
         name=name,
@@ -259,28 +261,30 @@ def _interpolate(t: Array, z: Array, grid: Array) -> Array:
     return np.column_stack([np.interp(grid, t, column) for column in z.T])
 
 
-def _pieces(table: Table, segments: list[Trajectory], spec: DataSpec, cuts: list[Cut]) -> list[Trajectory]:
+def _pieces(
+    recording: Recording, segments: list[Trajectory], spec: DataSpec, cuts: list[Cut]
+) -> list[Trajectory]:
     """Intersections of windows and segments, in order of time; too short ones become cuts."""
     pieces: list[Trajectory] = []
-    for window in sorted(_windows(table, spec), key=lambda window: window.start):
+    for window in sorted(_windows(recording, spec), key=lambda window: window.start):
         for segment in segments:
             keep = (segment.t >= window.start - TINY) & (segment.t + spec.dt <= window.end + TINY)
             if not keep.any():
                 continue
-            piece = segment.part(keep, _numbered(table.name, len(pieces) + 1), window.role)
+            piece = segment.part(keep, _numbered(recording.name, len(pieces) + 1), window.role)
             if len(piece.t) >= _fewest(spec):
                 pieces.append(piece)
             else:
                 why = f"{window.role}: " + _too_short(_fewest(spec) * spec.dt, spec)
-                cuts.append(Cut(table.path.name, float(piece.t[0]), float(piece.t[-1]), why))
+                cuts.append(Cut(recording.path.name, float(piece.t[0]), float(piece.t[-1]), why))
     return pieces
 
 
-def _windows(table: Table, spec: DataSpec) -> tuple[Window, ...]:
+def _windows(recording: Recording, spec: DataSpec) -> tuple[Window, ...]:
     """The file's named windows, or its parts by fractions with the smoothing length between them."""
-    if table.name in spec.windows:
-        return tuple(spec.windows[table.name])
-    start, length = float(table.t[0]), float(table.t[-1] - table.t[0])
+    if recording.name in spec.windows:
+        return tuple(spec.windows[recording.name])
+    start, length = float(recording.t[0]), float(recording.t[-1] - recording.t[0])
     windows: list[Window] = []
     for role, fraction in zip(ROLES, spec.fractions, strict=True):
         if fraction > 0:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from hybrid_mpc import Budget, DataSpec
+from scenarios.common import LazyPrior
 from scenarios.paper.experiment import PaperScenario
 from scenarios.pendulum.data import make_data, windows
 from scenarios.pendulum.experiment import EXPERIMENT
@@ -12,18 +11,7 @@ from scenarios.pendulum.oracle import oracle
 from scenarios.pendulum.plant import DampedPendulum
 from scenarios.pendulum.tasks import CONTROL, TASKS
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from hybrid_mpc import Prior
-
 __all__ = ["scenario"]
-
-
-def _prior(values: Mapping[str, float] | None = None) -> Prior:
-    from scenarios.pendulum.prior import PublishedPendulumPrior
-
-    return PublishedPendulumPrior(values)
 
 
 scenario = PaperScenario(
@@ -34,7 +22,7 @@ scenario = PaperScenario(
         "hangs down. The prior is the paper's: 50 mm, and 5 % less damping. It is not fitted, here as there: with "
         "both free, a fit finds the plant itself, and no network could add to it."
     ),
-    prior=_prior,
+    prior=LazyPrior("scenarios.pendulum.prior", "PublishedPendulumPrior"),
     data=DataSpec(
         time="time_s",
         inputs=("u_nm",),

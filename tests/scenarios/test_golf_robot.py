@@ -1,7 +1,5 @@
 """The golf robot's scenario: prior, oracle, data, tasks, and that it is worth learning."""
 
-import subprocess
-import sys
 from types import SimpleNamespace
 
 import casadi as ca
@@ -21,36 +19,6 @@ from scenarios.golf_robot.oracle import oracle
 from scenarios.golf_robot.prior import GolfRobotPrior
 from scenarios.golf_robot.rig import Rig
 from scenarios.golf_robot.tasks import FOLLOW_THROUGH, IMPACT, LONG_FOLLOW_THROUGH, impact
-
-WITHOUT_TORCH = """
-import sys
-class Refuse:
-    def find_spec(self, name, *rest):
-        if name.split(".")[0] == "torch":
-            raise ImportError("torch is refused here")
-sys.meta_path.insert(0, Refuse())
-import numpy as np
-import scenarios.golf_robot as s
-from scenarios.golf_robot.faults import catalogue
-rig = s.scenario.plant().with_faults(catalogue()[0].faults)
-rig.step(rig.reset(np.zeros(2), 0), np.zeros(1), 0.02)
-s.scenario.oracle(0.02)
-"""
-
-
-def test_scenario_works_without_torch():
-    subprocess.run([sys.executable, "-c", WITHOUT_TORCH], check=True)
-
-
-def test_prior_loses_energy_to_nothing_along_its_own_flow():
-    prior = scenario.prior()
-    gen = torch.Generator().manual_seed(0)
-    x = torch.randn(5, 4, 2, generator=gen, dtype=torch.float64)
-    u = torch.randn(5, 4, 1, generator=gen, dtype=torch.float64)
-    xdot = prior(x, u)
-    assert xdot.shape == (5, 4, 2)
-    assert prior.energy_balance(x, xdot, u).abs().max() < 1e-13  # rounding of terms of order 10 W
-    assert torch.equal(prior(x[2, 1], u[2, 1]), xdot[2, 1])  # one sample as in a batch
 
 
 def test_prior_agrees_with_the_oracle_s_energy_balance():

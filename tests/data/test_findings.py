@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import DataSpec, InputError, Signal, load_scenario, load_trajectories, write_csv
-from hybrid_mpc.data.tables import read_table
+from hybrid_mpc.data.recording import read_recording
 
 RECORDINGS = Path(__file__).parents[3] / "shared" / "data"
 SPEC = DataSpec("t", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.2)
@@ -111,7 +111,7 @@ def test_wrapped_angles_count_on_where_the_signal_is_periodic(tmp_path):
     assert one.start == pytest.approx(T[1 + np.argmax(np.abs(np.diff(wrapped)) > np.pi)])
     assert f"jumps {jumps} times by about a full turn" in str(one)
     file = tmp_path / "run.csv"
-    read = read_table(file, SPEC, outputs=TURNS["outputs"], inputs=TURNS["inputs"])
+    read = read_recording(file, SPEC, outputs=TURNS["outputs"], inputs=TURNS["inputs"])
     np.testing.assert_allclose(read.y[:, 0], turning, atol=1e-8)  # ten digits in the file
     # the same in degrees, and from 0 to 360
     spec = replace(SPEC, units={"phi": "deg"})
@@ -135,7 +135,7 @@ def test_angles_that_count_on_are_left_as_they_are(tmp_path):
         phi = speed * t + 0.1 * np.sin(t)
         spec = replace(SPEC, smoothing=0.2)
         assert findings(tmp_path, phi, t=t, tau=TAU[::2], signals=fast, spec=spec) == ()
-        read = read_table(tmp_path / "run.csv", SPEC, outputs=fast["outputs"], inputs=fast["inputs"])
+        read = read_recording(tmp_path / "run.csv", SPEC, outputs=fast["outputs"], inputs=fast["inputs"])
         np.testing.assert_allclose(read.y[:, 0], phi, rtol=1e-9)
     # an angle that trembles about where it is wrapped, and one that jumps by a turn over a gap in time
     upright = np.pi + 0.01 * np.sin(9 * T)

@@ -1,6 +1,6 @@
-"""Recordings as checked tables: columns found, units turned into the signals' own, times and ranges checked.
+"""Recordings read: columns found, units turned into the signals' own, times and ranges checked.
 
-:func:`read_table` reads one file. Everything that is wrong with the files of a run is named in one message.
+:func:`read_recording` reads one file. Everything that is wrong with the files of a run is named in one message.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Table:
+class Recording:
     """One recording as it was written, checked.
 
     Args:
@@ -110,9 +110,9 @@ class Table:
         return float(np.median(np.diff(self.t)))
 
 
-def read_table(
+def read_recording(
     path: Path | str, spec: DataSpec, *, outputs: Sequence[Signal], inputs: Sequence[Signal]
-) -> Table:
+) -> Recording:
     """Read one recording (CSV, ``.npz`` or ``.mat``) and check what would mislead an identification.
 
     Columns that ``spec`` does not name are ignored; ``spec.units`` are turned into the signals' own. A wrapped angle is
@@ -127,7 +127,7 @@ def read_table(
         inputs: Signals of ``spec.inputs``, with their plausible ranges.
 
     Returns:
-        The table with ``m`` rows.
+        The recording, ``m`` samples.
 
     Raises:
         InputError: If the file or a column is missing, a cell is no finite number, columns differ in length,
@@ -142,31 +142,31 @@ def read_table(
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     file = Path(folder) / "run.npz"
         ...     np.savez(file, Ts=0.1, tau=np.zeros(40), phi=np.full(40, 90.0))
-        ...     table = read_table(file, spec, outputs=[Signal("phi", "rad")], inputs=[Signal("tau", "N m")])
-        >>> table.name, round(float(table.t[-1]), 6), round(float(table.y[0, 0]), 6)
+        ...     run = read_recording(file, spec, outputs=[Signal("phi", "rad")], inputs=[Signal("tau", "N m")])
+        >>> run.name, round(float(run.t[-1]), 6), round(float(run.y[0, 0]), 6)
         ('run', 3.9, 1.570796)
     """
-    tables, problems = read_tables([path], spec, outputs=outputs, inputs=inputs)
+    recordings, problems = read_recordings([path], spec, outputs=outputs, inputs=inputs)
     refuse(problems)
-    return tables[0]
+    return recordings[0]
 
 
-def read_tables(
+def read_recordings(
     paths: Sequence[Path | str], spec: DataSpec, *, outputs: Sequence[Signal], inputs: Sequence[Signal]
-) -> tuple[list[Table], list[str]]:
-    """Read the recordings of one run: :func:`read_table` for each, with ``spec.inputs_of`` for those it names.
+) -> tuple[list[Recording], list[str]]:
+    """Read the recordings of one run: :func:`read_recording` for each, with ``spec.inputs_of`` for those it names.
 
     They may differ in format, length and sampling, and in columns that ``spec`` does not name.
 
     Returns:
-        The tables of the files that can be read, and all problems of the others.
+        The recordings that can be read, and all problems of the others.
 
     Raises:
         InputError: If ``spec`` does not name a column for each signal.
 
     Example:
         >>> spec = DataSpec("t", ("u",), ("y",), dt=0.1, max_gap=0.2, smoothing=0.5, warm_up=0.5)
-        >>> read_tables([], spec, outputs=[Signal("y", "rad")], inputs=[Signal("u", "N m")])
+        >>> read_recordings([], spec, outputs=[Signal("y", "rad")], inputs=[Signal("u", "N m")])
         ([], [])
     """
     if len(spec.outputs) != len(outputs) or len(spec.inputs) != len(inputs):
@@ -175,7 +175,7 @@ def read_tables(
             f"prior with {len(inputs)} inputs and {len(outputs)} outputs; "
             "name one column for each, in its order"
         )
-    tables: list[Table] = []
+    recordings: list[Recording] = []
     problems: list[str] = []
     there: dict[str, list[str]] = {}
     missing: dict[str, list[str]] = {}
@@ -186,7 +186,7 @@ def read_tables(
             names, lacking = _found(source, own, there, missing)
             problems += lacking
             if not lacking:
-                tables.append(_table(source, own, names, outputs, inputs))
+                recordings.append(_recording(source, own, names, outputs, inputs))
         except InputError as error:
             problems += error.problems
     differ = "".join(
@@ -206,7 +206,7 @@ def read_tables(
             f"two recordings have the same file stem: {', '.join(sorted(stems))}. Give each file once, or "
             "rename one: pieces and windows are named by the stem."
         )
-    return tables, problems
+    return recordings, problems
 
 
 def _found(
@@ -225,10 +225,10 @@ def _found(
     return names, problems
 
 
-def _table(
+def _recording(
     source: Source, spec: DataSpec, found: Sequence[str], outputs: Sequence[Signal], inputs: Sequence[Signal]
-) -> Table:
-    """The table of columns that are all there; every check is made, and all that fails is named."""
+) -> Recording:
+    """A recording whose columns are all there; every check is made, and all that fails is named."""
     path = source.path
     names = (spec.time, *spec.inputs, *spec.outputs)
     signals = (Signal("time", "s"), *inputs, *outputs)
@@ -256,7 +256,9 @@ def _table(
         problems += _range_problems(signal, name, values[:, j], columns, note)
     problems += [finding.message for finding in findings if finding.refused]
     refuse([f"{path}: {problem}" for problem in problems])
-    return Table(path.stem, path, source.sha256, t, values[:, 1:split], values[:, split:], tuple(findings))
+    return Recording(
+        path.stem, path, source.sha256, t, values[:, 1:split], values[:, split:], tuple(findings)
+    )
 
 
 def gaps(t: Array, max_gap: float) -> NDArray[np.bool_]:

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.data.tables import Finding, Table, gaps
+from hybrid_mpc.data.recording import Finding, Recording, gaps
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.machine.specification import DataSpec
 
@@ -51,8 +51,8 @@ LENGTHS = 5.0
 LEAVE_OUT = "Leave such stretches out (windows in the DataSpec, or delete the rows: longer gaps are cut out), or record"
 
 
-def doubts_of(
-    tables: Sequence[Table],
+def findings_of(
+    recordings: Sequence[Recording],
     motions: Sequence[tuple[Array, Array]],
     spec: DataSpec,
     *,
@@ -62,9 +62,9 @@ def doubts_of(
     """All that is doubtful about the recordings of one run, file by file.
 
     Args:
-        tables: The recordings as they were read; their own findings are among the result.
-        motions: Times ``(n,)`` [s] and states ``(n, n_x)``, smoothed and differentiated, of each table; of a table that
-            could not be smoothed none, ``n = 0``.
+        recordings: The recordings as they were read; their own findings are among the result.
+        motions: Times ``(n,)`` [s] and states ``(n, n_x)``, smoothed and differentiated, of each recording; ``n = 0``
+            where it could not be smoothed.
         spec: Columns, ``max_gap`` and ``smoothing`` [s].
         outputs: Signals of the outputs.
         states: Signals of the prior's states, for the plausible ranges of the outputs' rates among them. Default:
@@ -73,19 +73,28 @@ def doubts_of(
     Returns:
         The findings.
     """
-    spreads = np.std(np.concatenate([table.u for table in tables]), axis=0) if tables else np.zeros(0)
-    patience = [_patience(tables, j, spec) for j in range(len(outputs))]
+    spreads = (
+        np.std(np.concatenate([recording.u for recording in recordings]), axis=0)
+        if recordings
+        else np.zeros(0)
+    )
+    patience = [_patience(recordings, j, spec) for j in range(len(outputs))]
     found: list[Finding] = []
-    for table, (t, x) in zip(tables, motions, strict=True):
-        found += table.findings
+    for recording, (t, x) in zip(recordings, motions, strict=True):
+        found += recording.findings
         for j, (name, signal) in enumerate(zip(spec.outputs, outputs, strict=True)):
             still = still_stretches(
-                table.t, table.y[:, j], table.u, max_gap=spec.max_gap, patience=patience[j], spreads=spreads
+                recording.t,
+                recording.y[:, j],
+                recording.u,
+                max_gap=spec.max_gap,
+                patience=patience[j],
+                spreads=spreads,
             )
-            found += _stuck(table, name, signal, table.y[:, j], still)
+            found += _stuck(recording, name, signal, recording.y[:, j], still)
         if len(t):
             for j, speed in enumerate(_speeds_of(states, outputs)):
-                found += _too_fast(table, spec.outputs[j], speed, t, x[:, len(outputs) + j])
+                found += _too_fast(recording, spec.outputs[j], speed, t, x[:, len(outputs) + j])
     return tuple(found)
 
 
@@ -95,13 +104,13 @@ def _speeds_of(states: Sequence[Signal], outputs: Sequence[Signal]) -> tuple[Sig
     return rates if [s.unit for s in rates] == [f"{s.unit}/s" for s in outputs] else ()
 
 
-def _patience(tables: Sequence[Table], j: int, spec: DataSpec) -> float:
+def _patience(recordings: Sequence[Recording], j: int, spec: DataSpec) -> float:
     """Time [s] that a driven machine may rest, by the times between two changes of an output in all recordings."""
     waits = []
-    for table in tables:
-        changes = np.flatnonzero(np.diff(table.y[:, j])) + 1
+    for recording in recordings:
+        changes = np.flatnonzero(np.diff(recording.y[:, j])) + 1
         if len(changes):
-            waits.append(np.diff(table.t[np.r_[0, changes, len(table.t) - 1]]))
+            waits.append(np.diff(recording.t[np.r_[0, changes, len(recording.t) - 1]]))
     ordinary = float(np.quantile(np.concatenate(waits), ORDINARY)) if waits else 0.0
     return max(PATIENCE * ordinary, LENGTHS * spec.smoothing)
 
@@ -245,42 +254,45 @@ def _driven(u: Array, spreads: Array) -> bool:
     return bool(moving.any() and (np.std(u, axis=0)[moving] >= STIRRED * spreads[moving]).all())
 
 
-def _stuck(table: Table, name: str, signal: Signal, y: Array, still: Sequence[Still]) -> list[Finding]:
+def _stuck(
+    recording: Recording, name: str, signal: Signal, y: Array, still: Sequence[Still]
+) -> list[Finding]:
     """Clipped at the largest and smallest value, and frozen anywhere else."""
     found: list[Finding] = []
     largest, smallest = (y.max(), y.min()) if np.ptp(y) > 0 else (np.inf, -np.inf)
     for word, value in (("largest", largest), ("smallest", smallest)):
         there = [s for s in still if y[s.first] == value]
         if there:
-            found.append(_clipped(table, name, signal, y, there[0], word))
+            found.append(_clipped(recording, name, signal, y, there[0], word))
     rest = [s for s in still if y[s.first] not in (largest, smallest)]
     if rest:
-        found.append(_frozen(table, name, signal, y, rest))
+        found.append(_frozen(recording, name, signal, y, rest))
     return sorted(found, key=lambda finding: finding.start)
 
 
-def _clipped(table: Table, name: str, signal: Signal, y: Array, first: Still, word: str) -> Finding:
-    value = y[first.first]
+def _clipped(recording: Recording, name: str, signal: Signal, y: Array, first: Still, word: str) -> Finding:
+    value, start = y[first.first], float(recording.t[first.first])
     count = int((y == value).sum())
     message = (
         f"column {name!r} stands at its {word} value, {value:.6g} {signal.unit}, for {count} samples, first from "
-        f"{table.t[first.first]:.6g} to {table.t[first.last]:.6g} s, {_why(first, signal)}. The sensor is clipped, or "
+        f"{start:.6g} to {recording.t[first.last]:.6g} s, {_why(first, signal)}. The sensor is clipped, or "
         f"the machine rests against a stop, which a prior does not know of. {LEAVE_OUT} within the sensor's range."
     )
-    return Finding("clipped", table.path.name, name, float(table.t[first.first]), count, message)
+    return Finding("clipped", recording.path.name, name, start, count, message)
 
 
-def _frozen(table: Table, name: str, signal: Signal, y: Array, still: Sequence[Still]) -> Finding:
-    longest = max(still, key=lambda s: table.t[s.last] - table.t[s.first])
+def _frozen(recording: Recording, name: str, signal: Signal, y: Array, still: Sequence[Still]) -> Finding:
+    t = recording.t
+    longest = max(still, key=lambda s: t[s.last] - t[s.first])
     count = sum(s.last - s.first + 1 for s in still)
     others = len(still) - 1
     more = f" ({others} more such stretch{'es' * (others > 1)}, {count} samples in all)" if others else ""
     message = (
-        f"column {name!r} repeats {y[longest.first]:.6g} {signal.unit} from {table.t[longest.first]:.6g} to "
-        f"{table.t[longest.last]:.6g} s, {longest.last - longest.first + 1} samples{more}, {_why(longest, signal)}. "
+        f"column {name!r} repeats {y[longest.first]:.6g} {signal.unit} from {t[longest.first]:.6g} to "
+        f"{t[longest.last]:.6g} s, {longest.last - longest.first + 1} samples{more}, {_why(longest, signal)}. "
         f"The sensor is frozen, telegrams are lost, or the machine is blocked. {LEAVE_OUT} again."
     )
-    return Finding("frozen", table.path.name, name, float(table.t[still[0].first]), count, message)
+    return Finding("frozen", recording.path.name, name, float(t[still[0].first]), count, message)
 
 
 def _why(still: Still, signal: Signal) -> str:
@@ -294,7 +306,7 @@ def _why(still: Still, signal: Signal) -> str:
     return "while the inputs move as they do elsewhere"
 
 
-def _too_fast(table: Table, name: str, speed: Signal, t: Array, v: Array) -> list[Finding]:
+def _too_fast(recording: Recording, name: str, speed: Signal, t: Array, v: Array) -> list[Finding]:
     """Speeds ``v`` ``(n,)`` out of their plausible range; refused where even the mean one (rms) is."""
     bad = np.flatnonzero((v < speed.lower) | (v > speed.upper))
     if not len(bad):
@@ -309,4 +321,4 @@ def _too_fast(table: Table, name: str, speed: Signal, t: Array, v: Array) -> lis
         "rad, rpm, ms for s): name it in DataSpec.units. Else look for jumps of the sensor, or widen the range in the "
         "prior."
     )
-    return [Finding("speed", table.path.name, name, float(t[bad[0]]), len(bad), message, refused=absurd)]
+    return [Finding("speed", recording.path.name, name, float(t[bad[0]]), len(bad), message, refused=absurd)]
