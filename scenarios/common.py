@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING
@@ -11,10 +11,14 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_mpc import Role, Window
+
 if TYPE_CHECKING:
     from hybrid_mpc import Prior
 
 Array = NDArray[np.float64]
+ROLES: tuple[Role, ...] = ("train", "valid", "test")
+"""Roles of simulated recordings; their order enters the seeds."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,20 @@ class LazyPrior:
         """The prior with the given parameter values."""
         prior: Prior = getattr(import_module(self.module), self.name)(values)
         return prior
+
+
+def whole_windows(stems: Iterable[str], seconds: float) -> dict[str, tuple[Window, ...]]:
+    """Windows of recordings each of which has one role, with which its stem begins.
+
+    Args:
+        stems: File stems, e.g. ``train_01``.
+        seconds: Their length [s].
+
+    Example:
+        >>> whole_windows(["test_01_sine"], 20.0)
+        {'test_01_sine': (Window(start=0.0, end=20.0, role='test'),)}
+    """
+    return {stem: (Window(0.0, seconds, role),) for role in ROLES for stem in stems if stem.startswith(role)}
 
 
 def faded_sines(t: Array, waves: tuple[tuple[float, float], ...], fade_s: float = 1.0) -> Array:
@@ -97,7 +115,7 @@ def moves(t: Array, levels: tuple[float, ...], hold_s: float, move_s: float) -> 
     return np.column_stack([before + rise * share, rise * (slope / move_s)])
 
 
-def rk4(f: ca.Function, s: ca.SX, u: ca.SX, h: ca.SX) -> ca.SX:
+def rk4(f: ca.Function, s: ca.SX, u: ca.SX, h: ca.SX | float) -> ca.SX:
     """One classical Runge-Kutta step of ``s_dot = f(s, u)`` over ``h`` [s]; order 4.
 
     Example:

@@ -37,12 +37,7 @@ def one_step(p: RigParameters, *, faulty: bool = False) -> ca.Function:
 
 
 def steps(p: RigParameters, n: int, *, faulty: bool = False) -> ca.Function:
-    """Function ``(s, q, h) -> s`` of ``n`` times :func:`one_step` with the same ``q`` and ``h``.
-
-    Example:
-        >>> steps(RigParameters(), 10)(ca.DM.zeros(6), 0.1, 1e-4).shape
-        (6, 1)
-    """
+    """Function ``(s, q, h) -> s`` of ``n`` times :func:`one_step` with the same ``q`` and ``h``."""
     return repeated(one_step(p, faulty=faulty), n)
 
 

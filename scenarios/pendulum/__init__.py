@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from hybrid_mpc import Budget, DataSpec
-from scenarios.common import LazyPrior
+from scenarios.common import LazyPrior, whole_windows
 from scenarios.paper.experiment import PaperScenario
-from scenarios.pendulum.data import make_data, windows
+from scenarios.pendulum.data import DURATION, make_data, stems
 from scenarios.pendulum.experiment import EXPERIMENT
 from scenarios.pendulum.oracle import oracle
 from scenarios.pendulum.plant import DampedPendulum
@@ -31,7 +31,7 @@ scenario = PaperScenario(
         max_gap=0.005,
         smoothing=0.06,
         warm_up=0.1,
-        windows=windows(),
+        windows=whole_windows(stems("full"), DURATION),
     ),
     make_data=make_data,
     plant=DampedPendulum,

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc import DEFAULT_BUDGETS, BenchmarkBudget, BenchmarkSpec, DataSpec, Scenario
-from scenarios.common import LazyPrior
-from scenarios.unbalanced_disk.data import make_data, windows
+from scenarios.common import LazyPrior, whole_windows
+from scenarios.unbalanced_disk.data import SAMPLES, make_data, stems
 from scenarios.unbalanced_disk.nominal import DT
 from scenarios.unbalanced_disk.plant import DiskPlant
 from scenarios.unbalanced_disk.tasks import CONTROL, TASKS
@@ -59,7 +59,7 @@ scenario = Scenario(
         warm_up=1.225,
         fractions=(0.7, 0.15, 0.15),
         free_run=25.0,
-        windows=windows(),
+        windows=whole_windows(stems("full"), SAMPLES * DT),
         largest_delay=LARGEST_DELAY,
     ),
     make_data=make_data,
