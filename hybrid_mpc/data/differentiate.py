@@ -156,8 +156,8 @@ def window_samples(length: float, dt: float, order: int = 4) -> int:
 def local_polynomial(y: Array, dt: float, length: float, order: int = 4) -> Derivatives:
     """Value, first and second derivative of a local polynomial fitted around each sample.
 
-    Exact for polynomials up to ``order``. It looks ahead by half of ``length`` at most; within half a
-    window of the ends the first or last whole window's polynomial is evaluated (noisier there).
+    Exact for polynomials up to ``order``. Within half a window of the ends the first or last whole window's polynomial
+    is evaluated (noisier there).
 
     Args:
         y: Samples ``(n,)`` or ``(n, n_y)`` on a uniform grid.
@@ -364,7 +364,7 @@ def gcv_cutoff(y: Array, dt: float) -> float:
     """Cutoff [Hz] of a smoothing spline by generalised cross-validation: for white noise of unknown size.
 
     It minimises ``n |y - y_hat|^2 / (n - tr)^2``, where the trace of the smoother is the sum of its gains over the
-    frequencies ``k / (2 n dt)``. Quantisation is no white noise where the signal is slow: look at the result.
+    frequencies ``k / (2 n dt)``. Quantisation is no white noise where the signal is slow.
 
     Args:
         y: Samples ``(n,)``.

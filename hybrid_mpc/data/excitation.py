@@ -94,8 +94,7 @@ def random_steps(
 ) -> Array:
     """Random levels, uniform in ``[lower, upper]``, each held for a random time.
 
-    Most power lies below ``0.44`` over the mean hold [Hz]; above, the amplitude falls with ``1 / f``. Levels between
-    the bounds show what depends on the size of the input, as two levels do not.
+    Most power lies below ``0.44`` over the mean hold [Hz]; above, the amplitude falls with ``1 / f``.
 
     Args:
         t: Times ``(n,)`` [s], increasing.
@@ -140,8 +139,8 @@ def multisine(
 ) -> Array:
     """Sum of cosines of one size at all multiples of ``1 / period`` in a band, with Schroeder's phases.
 
-    Power lies at these lines alone, evenly; over whole periods an FFT shows them without leakage, and what it shows
-    between them is noise and what the machine's nonlinearity makes. Phases ``-pi i (i - 1) / n`` keep the peaks low:
+    Power lies at these lines alone, evenly. Between them an FFT over whole periods shows noise and what the machine's
+    nonlinearity makes. Phases ``-pi i (i - 1) / n`` keep the peaks low:
     the crest factor is 1.6 to 2 for ten lines or more, where random phases mostly give above 2.3.
 
     Args:

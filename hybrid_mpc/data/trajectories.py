@@ -240,13 +240,12 @@ def hold_mean(t: Array, u: Array, grid: Array, dt: float) -> Array:
 
     Args:
         t: Recorded time stamps ``(m,)`` [s].
-        u: Recorded inputs ``(m, n_u)``, each held until the next time stamp.
-        grid: Times ``T_k`` ``(n,)`` [s] within the recording; before its start or after its end the
-            integral is constant, that is, the input counts as zero.
+        u: Recorded inputs ``(m, n_u)``, each held until the next time stamp; zero outside the recording.
+        grid: Times ``T_k`` ``(n,)`` [s].
         dt: Period [s].
 
     Returns:
-        Means ``(n, n_u)``; their integral over the grid is the recording's.
+        Means ``(n, n_u)``.
 
     Example:
         >>> hold_mean(np.array([0.0, 0.1, 0.2]), np.array([[1.0], [3.0], [9.0]]), np.array([0.0]), 0.2)
@@ -317,23 +316,20 @@ def _check_roles(
     trajectories: list[Trajectory], cuts: list[Cut], spec: DataSpec, needed: Sequence[Role]
 ) -> None:
     missing = [role for role in needed if all(piece.role != role for piece in trajectories)]
-    if missing:
-        dropped = "".join(f"\n  {cut.file} {cut.start:g} to {cut.end:g} s: {cut.why}" for cut in cuts[:SHOWN])
-        dropped += f"\n  and {len(cuts) - SHOWN} more" if len(cuts) > SHOWN else ""
-        raise InputError(
-            f"no piece of {_fewest(spec) * spec.dt:g} s or more is left for {' and '.join(missing)}. "
-            "Give more or longer recordings, or change windows, fractions or max_gap in the DataSpec; a recording "
-            f"without gaps that is split by fractions needs {_splittable(spec):.3g} s."
-            + (f" Cut out:{dropped}" if dropped else "")
-        )
-
-
-def _splittable(spec: DataSpec) -> float:
-    """Length [s] of a recording whose parts by fractions are all long enough."""
+    if not missing:
+        return
+    dropped = "".join(f"\n  {cut.file} {cut.start:g} to {cut.end:g} s: {cut.why}" for cut in cuts[:SHOWN])
+    dropped += f"\n  and {len(cuts) - SHOWN} more" if len(cuts) > SHOWN else ""
     used = [fraction for fraction in spec.fractions if fraction > 0]
     distances = [0.0, *(spec.smoothing for _ in used[1:])]
-    pieces = zip(used, distances, strict=True)
-    return max(((_fewest(spec) + 1) * spec.dt + distance) / fraction for fraction, distance in pieces)
+    least = (_fewest(spec) + 1) * spec.dt
+    needed_s = max((least + distance) / fraction for fraction, distance in zip(used, distances, strict=True))
+    raise InputError(
+        f"no piece of {_fewest(spec) * spec.dt:g} s or more is left for {' and '.join(missing)}. "
+        "Give more or longer recordings, or change windows, fractions or max_gap in the DataSpec; a recording "
+        f"without gaps that is split by fractions needs {needed_s:.3g} s."
+        + (f" Cut out:{dropped}" if dropped else "")
+    )
 
 
 def _fewest(spec: DataSpec) -> int:

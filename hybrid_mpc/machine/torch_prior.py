@@ -291,7 +291,7 @@ def with_friction(base: type[Prior], *terms: FrictionTerm) -> type[Prior]:
         ...         return self.J
         >>> rubbing = with_friction(Disk, Viscous(Parameter("d", 0.1, "N m s/rad", 0.0, 1.0)))({"d": 0.2})
         >>> rubbing(torch.tensor([0.0, 1.0]), torch.tensor([0.0])).tolist()
-        [1.0, -0.4000000059604645]
+        [1.0, -0.4]
     """
     _check(base, terms)
     added = tuple(p for term in terms for p in term.parameters)
