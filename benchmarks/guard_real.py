@@ -97,9 +97,9 @@ def picture(found: HeldOut, y, path: Path, title: str) -> None:
     """Everything the monitor says, alarms shaded; clean windows as bars at the top."""
     from hybrid_mpc.plots.monitor import overview
     from hybrid_mpc.plots.style import save
-    from scenarios.torque_pendulum import make_prior
+    from scenarios.torque_pendulum.prior import TorquePendulumPrior
 
-    figure = overview(found.trace, y, output=make_prior().outputs[0], title=title)
+    figure = overview(found.trace, y, output=TorquePendulumPrior.outputs[0], title=title)
     for start, end in CLEAN[found.name]:
         for ax in figure.axes:
             ax.axvspan(start, min(end, found.trace.t[-1]), ymin=0.94, color="#009E73", alpha=0.7, linewidth=0)

@@ -8,8 +8,7 @@ from collections.abc import Sequence
 class InputError(ValueError):
     """Bad input of the user: a file, a field, a setting. The command line answers it with exit code 2.
 
-    Its message names what was given (file, row, field), what is needed, and a remedy; ``problems`` are the single ones
-    where there are several.
+    Its message names what was given (file, row, field), what is needed, and a remedy.
 
     Example:
         >>> raise InputError("run.csv: no column 'pos_rad'; it has 'time_s', 'angle'. Rename one.")
@@ -31,10 +30,7 @@ SHOWN = 20
 
 
 def refuse(problems: Sequence[str]) -> None:
-    """Raise one error that names all problems, so that they are mended in one go; none is no error.
-
-    Args:
-        problems: Each as a message of its own: what was given, what is needed, a remedy.
+    """Raise one error that names all problems, each a message of its own; no problem is no error.
 
     Raises:
         InputError: If there is a problem.
@@ -48,14 +44,14 @@ def refuse(problems: Sequence[str]) -> None:
           a.csv: is empty. Record it again.
           b.csv: is empty. Record it again.
     """
-    told = list(dict.fromkeys(problems))
-    if not told:
+    distinct = tuple(dict.fromkeys(problems))
+    if not distinct:
         return
-    if len(told) == 1:
-        raise InputError(told[0])
-    more = [f"and {len(told) - SHOWN} more"] if len(told) > SHOWN else []
-    error = InputError("\n  ".join([f"{len(told)} problems:", *told[:SHOWN], *more]))
-    error._problems = tuple(told)
+    if len(distinct) == 1:
+        raise InputError(distinct[0])
+    more = [f"and {len(distinct) - SHOWN} more"] if len(distinct) > SHOWN else []
+    error = InputError("\n  ".join([f"{len(distinct)} problems:", *distinct[:SHOWN], *more]))
+    error._problems = distinct
     raise error
 
 

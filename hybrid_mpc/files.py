@@ -1,9 +1,7 @@
-"""Files: written whole or not at all, read as data alone, within limits; folders that one job at a time may hold.
+"""Files: written whole or not at all, read as data alone and within limits; folders that one job at a time may hold.
 
-Everything that the library writes goes through :func:`replacing`, and every JSON file and every array of its own that
-it reads through :func:`read_json` and :func:`read_arrays`. What cannot be read is an
-:class:`~hybrid_mpc.errors.InputError`, what cannot be written a :class:`~hybrid_mpc.errors.StorageError`: what, where
-and why.
+Everything that the library writes goes through :func:`replacing`; its own JSON files and arrays are read by
+:func:`read_json` and :func:`read_arrays`.
 """
 
 from __future__ import annotations
@@ -30,15 +28,15 @@ from hybrid_mpc.errors import InputError, StorageError
 from hybrid_mpc.records import plain, shown
 
 MOST_JSON = 16 * 2**20
-"""Largest JSON file [bytes] that is read. A model's own is a few KiB, the longest results are a few hundred."""
+"""Largest JSON file [byte]. A model's own is a few KiB, the longest results are a few hundred."""
 MOST_ARRAYS = 2**30
-"""Largest content [bytes] of a file of arrays, unpacked."""
+"""Largest content of a file of arrays, unpacked [byte]."""
 MOST_CONTENT = 2**31
-"""Largest recording [bytes] that is read."""
+"""Largest file of a user that is read [byte]."""
 MOST_MEMBERS = 10_000
 """Most arrays in a file."""
 HEADER = 10_100
-"""Bytes of an array's begin that hold its header: numpy reads none of more than 10 000 characters [byte]."""
+"""First bytes of an array, which hold its header: numpy reads none of more than 10 000 characters [byte]."""
 HASH, ARRAYS_HASH = "sha256", "arrays_sha256"
 """Fields of a document that hold hashes: of its content, of the arrays beside it."""
 LOCK = ".lock"
@@ -46,12 +44,9 @@ LOCK = ".lock"
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[IO[bytes]]:
-    """An open binary file that takes the place of ``path`` when the block ends well.
+    """An open binary file that takes the place of ``path`` when the block ends well; folders are made.
 
-    A kill at any moment, a full disk or a second writer leave the old file or a new one, whole. Folders are made.
-
-    Args:
-        path: The file.
+    A kill at any moment, a full disk or a second writer leave the old file or a new one, whole.
 
     Raises:
         StorageError: If it cannot be written.
@@ -100,11 +95,10 @@ def read_json(path: Path) -> Any:
     Raises:
         InputError: If it is missing, no regular file, larger than 16 MiB, or no JSON.
     """
+    content = read_bytes(path, MOST_JSON)
     try:
-        return nn_export.files.parse_json(read_bytes(path, MOST_JSON))
+        return nn_export.files.parse_json(content)
     except ValueError as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(f"{path} is damaged: {error}") from error
 
 
@@ -153,8 +147,7 @@ def write_document(
     Args:
         path: The file, ``.json``.
         value: The object.
-        arrays: Arrays that belong to it; written before it, beside it as ``.npz``, with their hash in the JSON.
-            Default: none.
+        arrays: Arrays that belong to it, written beside it as ``.npz``, with their hash in the JSON. Default: none.
 
     Raises:
         StorageError: If it cannot be written.
@@ -174,11 +167,7 @@ def write_document(
 
 
 def read_document(path: Path, remedy: str = "") -> dict[str, Any]:
-    """The object of a file that :func:`write_document` wrote.
-
-    Args:
-        path: The file.
-        remedy: What the user can do where it is damaged. Default: nothing is said.
+    """The object of a file that :func:`write_document` wrote; ``remedy`` says what to do where it is damaged.
 
     Raises:
         InputError: If it is missing, damaged, or was changed since.
@@ -189,11 +178,7 @@ def read_document(path: Path, remedy: str = "") -> dict[str, Any]:
 
 
 def read_document_arrays(path: Path, remedy: str = "") -> dict[str, NDArray[Any]]:
-    """The arrays that belong to a file that :func:`write_document` wrote.
-
-    Args:
-        path: The JSON file.
-        remedy: What the user can do where it is damaged. Default: nothing is said.
+    """The arrays that belong to a JSON file that :func:`write_document` wrote.
 
     Raises:
         InputError: If they are missing, damaged, or not those that were written with it.
@@ -227,11 +212,11 @@ def check_npz(content: bytes, budget: int, names: Sequence[str] | None = None) -
     Args:
         content: The ``.npz`` file.
         budget: Most bytes of numbers in these arrays, each counted as 8 of them at least [byte].
-        names: Arrays that are to be read. Default: all; others may hold anything.
+        names: Arrays that are to be read; others may hold anything. Default: all.
 
     Raises:
-        ValueError: If there are too many members, one is packed in a way that numpy does not pack, is no array, or
-            holds another number of bytes than its shape declares, or they are larger than the budget.
+        ValueError: If there are too many members, one is not packed as numpy packs, is no array, or holds another
+            number of bytes than its shape declares, or they are larger than the budget.
         zipfile.BadZipFile: If it is no archive, or a damaged one.
         KeyError: If there is no array of such a name.
 
@@ -312,18 +297,13 @@ def _exists(path: Path) -> bool:
         return False
 
 
-def sha256(path: Path, limit: int = MOST_CONTENT) -> str:
+def sha256(path: Path) -> str:
     """SHA-256 of a regular file's content.
 
     Raises:
-        InputError: If it cannot be read.
-
-    Example:
-        >>> sha256(Path(tempfile.mkdtemp()) / "none")
-        Traceback (most recent call last):
-        hybrid_mpc.errors.InputError: ... is missing
+        InputError: If it is missing or cannot be read.
     """
-    return hashlib.sha256(read_bytes(path, limit)).hexdigest()
+    return hashlib.sha256(read_bytes(path, MOST_CONTENT)).hexdigest()
 
 
 def digest(value: Any) -> str:
@@ -391,9 +371,6 @@ def locked(folder: Path) -> Iterator[None]:
     """Hold a folder, which is made if missing, against other jobs; what killed writers have left in it is removed.
 
     The system lets go of it when the process ends, however it ends.
-
-    Args:
-        folder: The folder.
 
     Raises:
         InputError: If another job holds it, or it cannot be written.

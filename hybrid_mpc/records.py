@@ -1,7 +1,6 @@
 """Dataclasses to plain data and back: what JSON, YAML and checkpoints hold is checked field by field when read.
 
-Expressions (CasADi functions of scalar operations) are written as programs of ``nn_export``, operators and numbers, and
-built again when they are read: nothing in the data can execute.
+CasADi functions are written as programs of ``nn_export`` (operators and numbers): nothing in the data can execute.
 """
 
 from __future__ import annotations
@@ -29,14 +28,14 @@ MOST_SEED = 2**31 - 1
 LONGEST = 40
 """Characters of a text that a message shows."""
 MOST_NAMED = 20
-"""So many problems of one file are named; a damaged one may have thousands."""
+"""Most problems of one file that are named; a damaged one may have thousands."""
 
 
 def plain(value: Any) -> Any:
     """``value`` in JSON's own types.
 
-    Dataclasses and mappings become objects, sequences and arrays lists, paths texts, and numbers that JSON does not
-    know ``"inf"``, ``"-inf"`` and ``"nan"``. A CasADi function becomes the program that it states.
+    Dataclasses and mappings become objects, sequences and arrays lists, paths texts, numbers that JSON does not know
+    ``"inf"``, ``"-inf"`` and ``"nan"``, and a CasADi function its program.
 
     Raises:
         InputError: If a CasADi function cannot be stated as a program, with what hinders it.
@@ -58,17 +57,17 @@ def plain(value: Any) -> Any:
     if isinstance(value, Path):
         return str(value)
     if type(value) is _function():
-        return _stated(value)
+        return _program(value)
     return value
 
 
 def _function() -> Any:
-    """The type of expressions; where casadi is not loaded there are none."""
+    """The type of CasADi functions; where casadi is not loaded there are none."""
     casadi = sys.modules.get("casadi")
     return None if casadi is None else casadi.Function
 
 
-def _stated(function: Any) -> Any:
+def _program(function: Any) -> Any:
     from nn_export import ExportError, program_of
     from nn_export.program import to_json
 
@@ -81,9 +80,8 @@ def _stated(function: Any) -> Any:
 def record(kind: type[T], data: object, where: str) -> T:
     """The dataclass ``kind`` from plain data, as :func:`plain` makes it or a user writes it.
 
-    Every field is held against its annotation: numbers, texts, flags, None, ``Literal``, tuples, sequences, arrays,
-    mappings with text keys, expressions, unions of these, and dataclasses of them. A whole number fits a float;
-    ``"inf"``, ``"-inf"`` and ``"nan"`` are floats too. ``Any`` takes everything.
+    Every field is checked against its annotation: numbers, texts, flags, None, ``Literal``, tuples, sequences, arrays,
+    mappings with text keys, CasADi functions, unions and dataclasses of these, ``Any``. A whole number fits a float.
 
     Args:
         kind: The dataclass.
@@ -113,12 +111,7 @@ upper, periodic; name is missing; unit: a text is needed, got 3
 
 
 def known(word: object, names: Iterable[str], what: str) -> str:
-    """``word`` if it is one of ``names``.
-
-    Args:
-        word: What was given.
-        names: What there is.
-        what: Says what kind of name it is, for the message.
+    """``word`` if it is one of ``names``; ``what`` says what they name, for the message.
 
     Raises:
         InputError: If it is none of them; with the nearest one, and all.
@@ -214,7 +207,7 @@ def _value(kind: Any, value: object, where: str, problems: list[str]) -> Any:
             return array
         needed = "numbers in a list, or in lists of the same length,"
     elif kind is _function():
-        return _expression(value, where, problems)
+        return _built(value, where, problems)
     elif dataclasses.is_dataclass(kind):
         return _dataclass(kind, value, where, problems)  # type: ignore[arg-type]
     elif origin in (tuple, list, Sequence) or kind in (tuple, list, Sequence):
@@ -283,8 +276,8 @@ def _array(value: object) -> Any:
     return np.stack(fit) if len(fit) == len(value) else None
 
 
-def _expression(value: object, where: str, problems: list[str]) -> Any:
-    """A CasADi function from the program that it states, in scalar code."""
+def _built(value: object, where: str, problems: list[str]) -> Any:
+    """A CasADi function from its program, in scalar code."""
     from nn_export import ExportError, build
     from nn_export.program import from_json
 

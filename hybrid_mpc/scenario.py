@@ -1,4 +1,4 @@
-"""A scenario: everything the main job needs to know about one machine. No torch in here."""
+"""A scenario: everything that the jobs need to know about one machine. No torch in here."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,8 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.machine.specification import BenchmarkSpec, DataSpec, check_prior_replay
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from hybrid_mpc.control.ocp import OCP
     from hybrid_mpc.loop.faults import Fault
     from hybrid_mpc.loop.plant import Plant
@@ -38,8 +40,8 @@ class Task:
         x0: Initial state ``(n_x,)`` [SI], at rest.
         reference: ``t (n,) [s] -> x_ref (n, n_x)`` [SI]; the controller previews it.
         weight: ``t (n,) [s] -> (n, n_x)``, factors on the control problem's ``q``, not negative, previewed like
-            the reference: zero where a state does not matter, large where it must be met. An instant that
-            is to be met must lie on the grid of model periods. Default: 1 throughout.
+            the reference: zero where a state does not matter, large where it must be met. Instants lie on the grid of
+            model periods. Default: 1 throughout.
         control: The task's own control problem, e.g. with other limits. Default: the scenario's.
         faults: What disturbs the machine in this task; no controller knows it. Default: nothing.
         figures: ``result -> {name with unit: number}``, figures of the task's own beside the cost. Default: none.
@@ -75,8 +77,8 @@ class Budget:
         seeds: Closed loops per task and controller.
         oracle_seeds: Closed loops per task of the oracles, which are slow.
         tasks: Names of the tasks to run. Default: all.
-        decay: Weight decay times the number of training samples. The less data, the more of it is needed to
-            keep a network from learning their noise; large recordings do not notice the default.
+        decay: Weight decay times the number of training samples: the less data, the more is needed to keep a network
+            from learning their noise. Default: 300.
         prior_replay: Weight of fading corrections where nothing was measured: see ``TrainingSettings``. For a machine
             whose tasks go where its recordings do not. Default: zero, none.
     """
@@ -119,24 +121,22 @@ class Scenario:
         sensor_sigma: Standard deviations of the sensors ``(n_y,)`` [output units], as estimators assume them. Needed
             where there is a control problem.
         first_sigma: Standard deviations of the states that are not measured ``(n_x - n_y,)`` [state units] at the
-            estimator's start. Default: ``sqrt(2) sensor_sigma / dt``, what the first two samples tell of speeds: a
-            start at rest then counts as much as they do, and after five samples of a start in motion it has 5 % of the
-            weight.
-        safe_input: Input ``(n_u,)`` [input units] that the machine is left with where nothing is known: before the
-            first plan, on a sensor that is lost, at the end of a run. Default: zero, or the limit next to it; a machine
-            that would fall or run away needs its own.
+            estimator's start. Default: ``sqrt(2) sensor_sigma / dt``, what the first two samples tell of speeds.
+        safe_input: Input ``(n_u,)`` [input units] that the machine is left with before the first plan, when a sensor is
+            lost, and at the end of a run. Default: zero, or the limit next to it; a machine that would fall or run
+            away needs its own.
         tasks: Closed-loop tasks.
         budgets: Effort by name.
         draw: ``x (n_x,) -> polylines (m, 2) [m]`` of the machine, for moving pictures; default: none.
+        figures: ``rows -> {file name: (figure, caption)}``, the machine's own figures of the comparison; a row is a
+            :class:`~hybrid_mpc.job.loops.LoopRow` (``task``, ``controller``, ``figures``). Default: none.
         causes: What may break, by name: the prior's parameters (or ``"gain of <input>"``) that change together then,
             for :class:`~hybrid_mpc.monitor.diagnose.Diagnoser`. Default: each by itself.
         benchmark: How ``hybrid-mpc benchmark`` judges the machine on recordings; default: not at all.
-        beyond_recordings: Whether tasks go where no recording was. A network knows nothing there, so the filters on the
-            hybrid then assume no less process noise than those on the prior; see also ``Budget.prior_replay``.
-            Default: no.
+        beyond_recordings: Whether tasks go where no recording was. The filters on the hybrid then assume no less
+            process noise than those on the prior; see also ``Budget.prior_replay``. Default: no.
 
     Example:
-        >>> import numpy as np
         >>> spec = DataSpec("time_s", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.5)
         >>> Scenario("mine", "My machine", "", prior=lambda values=None: None, data=spec).tasks
         ()
@@ -157,6 +157,7 @@ class Scenario:
     tasks: tuple[Task, ...] = ()
     budgets: Mapping[str, Budget] = field(default_factory=lambda: DEFAULT_BUDGETS)
     draw: Callable[[Array], Sequence[Array]] | None = None
+    figures: Callable[[Sequence[Any]], Mapping[str, tuple[Figure, str]]] | None = None
     causes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     benchmark: BenchmarkSpec | None = None
     beyond_recordings: bool = False
@@ -173,7 +174,7 @@ def scenario_of(named: str, where: Path, given: str = "") -> Scenario | None:
     Args:
         named: The name in the file; empty for none.
         where: The file, for messages.
-        given: What the user himself says, a registered name or a Python file; it is taken first.
+        given: The user's own registered name or Python file; it is taken first. Default: none.
 
     Returns:
         The scenario; None where neither names one.
@@ -207,8 +208,8 @@ yours, give its file: --scenario FILE.py
 def load_scenario(name_or_path: str) -> Scenario:
     """The scenario of a registered name or of a user's Python file (which defines ``scenario``).
 
-    A scenario file is the user's own program: loading it runs it. So only what the user has typed himself may come
-    here; for a name that stands in a file there is :func:`scenario_of`.
+    Loading a Python file runs it, so only a name that the user has typed may come here; for one that stands in a file
+    there is :func:`scenario_of`.
 
     Raises:
         InputError: If there is no such name or file, the file fails, or defines no ``scenario``.
@@ -253,6 +254,7 @@ def _checked(scenario: object, where: str) -> Scenario:
 
 
 def _line_in(error: BaseException, path: Path) -> str:
+    """``:LINE`` of a file at which an error arose, for a message."""
     if isinstance(error, SyntaxError):
         return f":{error.lineno}"
     line, trace = "", error.__traceback__

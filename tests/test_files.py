@@ -105,19 +105,10 @@ def test_what_the_file_system_refuses_is_one_clear_line(tmp_path):
 @pytest.mark.parametrize(
     "text",
     [
-        "",
-        "{",
-        "[1,]",
-        "nul",
-        '{"a": NaN}',
-        "1e999",
-        "9" * 5000,
-        "[" * 100_000,
-        '"\\ud800"',
-        '{"a": 1, "a": 2}',
+        "", "{", "[1,]", "nul", '{"a": NaN}', "1e999", "9" * 5000, "[" * 100_000, '"\\ud800"', '{"a": 1, "a": 2}',
         "\xff",
     ],
-)
+)  # fmt: skip
 def test_json_that_is_none(tmp_path, text):
     path = tmp_path / "a.json"
     path.write_bytes(text.encode("latin-1"))
@@ -219,18 +210,10 @@ def test_a_folder_for_results_is_checked_and_not_made(tmp_path):
 
 def test_a_full_disk_ends_a_command_with_a_line_and_no_damage(tmp_path):
     """``data`` writes recordings of more than 20 kB: the first is refused, whole, and the command says so."""
-    command = [
-        sys.executable,
-        "-c",
-        LIMITED,
-        "data",
-        "golf_robot",
-        "--out",
-        str(tmp_path / "out"),
-        "--budget",
-        "quick",
-    ]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    words = ["data", "golf_robot", "--out", str(tmp_path / "out"), "--budget", "quick"]
+    done = subprocess.run(
+        [sys.executable, "-c", LIMITED, *words], capture_output=True, text=True, timeout=120
+    )
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
     assert "File too large" in done.stderr

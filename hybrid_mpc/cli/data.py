@@ -12,7 +12,7 @@ import numpy as np
 import typer
 
 from hybrid_mpc.cli.options import EmptyFolder, ScenarioName
-from hybrid_mpc.data.differentiate import bandwidth
+from hybrid_mpc.data.differentiate import LocalPolynomial
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import check_folder, write_text
 from hybrid_mpc.records import MOST_SEED
@@ -52,12 +52,6 @@ def write_data(scenario: Scenario, out: Path, seed: int, budget: str, data_set: 
 
     Raises:
         InputError: If the scenario makes no data, has no such budget or data set, or the folder is not empty.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     len(write_data(load_scenario("golf_robot"), Path(folder), 0, "quick"))
-        15
     """
     make = scenario.make_data
     if make is None:
@@ -66,8 +60,7 @@ def write_data(scenario: Scenario, out: Path, seed: int, budget: str, data_set: 
         )
     if budget not in scenario.budgets:
         raise InputError(f"{scenario.name} has no budget {budget!r}; it has: {', '.join(scenario.budgets)}")
-    several = "data_set" in inspect.signature(make).parameters
-    if data_set and not several:
+    if data_set and "data_set" not in inspect.signature(make).parameters:
         raise InputError(f"{scenario.name} has one data set only; leave --set {data_set} out")
     check_folder(out)
     options = {"data_set": data_set} if data_set else {}
@@ -79,16 +72,11 @@ def write_data(scenario: Scenario, out: Path, seed: int, budget: str, data_set: 
 
 
 def readme(scenario: Scenario, files: Sequence[Path], command: str) -> str:
-    """What a reader of the files must know, sampling and jitter as they are in the files.
-
-    Args:
-        scenario: The machine.
-        files: Its recordings.
-        command: What wrote them.
-    """
+    """What a reader of ``files`` must know, and the ``command`` that wrote them; sampling as it is in the files."""
     spec, prior = scenario.data, scenario.prior()
     signals = [*zip(spec.inputs, prior.inputs, strict=True), *zip(spec.outputs, prior.outputs, strict=True)]
     period, spread = _sampling(files, spec.time)
+    band = LocalPolynomial(spec.smoothing).bandwidth(period)
     arrays = all(path.suffix == ".npz" for path in files)
     stamp = "one number, the sampling time" if arrays else "time stamp of the row, as it was sampled"
     lines = [
@@ -103,8 +91,7 @@ def readme(scenario: Scenario, files: Sequence[Path], command: str) -> str:
         "(one standard deviation). Commas separate, points mark decimals, the first row is the header.",
         "",
         f"'hybrid-mpc run' first smooths and differentiates the outputs by a local quartic over "
-        f"{spec.smoothing:g} s (-3 dB at {bandwidth(period, spec.smoothing):.1f} Hz) and brings them to "
-        f"{1e3 * spec.dt:g} ms.",
+        f"{spec.smoothing:g} s (-3 dB at {band:.1f} Hz) and brings them to {1e3 * spec.dt:g} ms.",
         "", "| file | role |", "| --- | --- |",
         *(f"| {path.name} | {_role(scenario, path)} |" for path in files), "",
     ]  # fmt: skip

@@ -1,4 +1,7 @@
-"""Named vectors of ``.npz`` and MATLAB ``.mat`` files as columns. Nothing in these files is executed."""
+"""A recording's file as named columns, and CSV files written. Nothing in these files is executed.
+
+:func:`opened` takes CSV, ``.npz`` and ``.mat``. What would take too much memory is refused before it is unpacked.
+"""
 
 from __future__ import annotations
 
@@ -28,20 +31,21 @@ from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import check_npz, write_text
 from hybrid_mpc.records import LONGEST, shown
 
-# What a recording's file holds, whatever its format: names of columns, and numbers on request.
-
 Array = NDArray[np.float64]
+Row = tuple[int, list[str]]
 ENDINGS = (".csv", ".npz", ".mat")
 """Formats with a reader of their own; any other ending is read as CSV."""
 LARGEST = 2**31
-"""Most bytes of a file, and of the numbers in it [byte]: three columns at 1 kHz for a day."""
+"""Largest file, and most bytes of numbers in it [byte]: three columns at 1 kHz for a day."""
 SMALL = 2**26
 """Bytes of numbers that any file may hold [byte], however well they are compressed: 8 million numbers."""
 PACKED = 20
-"""Beyond ``SMALL``, most bytes of numbers for one byte of a file. Recorded motions are compressed to a tenth at best; a
-thousand to one is what zeros, and bombs, come to."""
+"""Beyond ``SMALL``, most bytes of numbers for one byte of a file. Recorded motions are compressed to a tenth at best,
+zeros to a thousandth."""
 CHUNK = 2**20
-"""Bytes of a file that are looked at in one go [byte]."""
+"""Bytes of a file that are checked at a time [byte]."""
+LONGEST_ROW = 2**20
+"""Longest row of a CSV file [byte]: ten thousand columns of a hundred characters."""
 LISTED = 30
 """Most names that a message lists."""
 COMPARED = 1000
@@ -83,7 +87,7 @@ class Source:
         sha256: SHA-256 of its bytes, in hexadecimal.
         header: Names of its columns, in its order.
         read: ``(full names) -> Columns``, the first one being the time.
-        note: What else a user should know who misses a column; default: nothing.
+        note: What else a user should know who misses a column. Default: nothing.
     """
 
     path: Path
@@ -102,7 +106,8 @@ class Source:
         count = self.header.count(name)
         if count == 1:
             return name
-        there = listed(self.header)
+        more = f" and {len(self.header) - LISTED} more" if len(self.header) > LISTED else ""
+        there = ", ".join(map(shown, self.header[:LISTED])) + more or "none"
         if count > 1:
             raise InputError(
                 f"{self.path}: column {name!r} appears {count} times in {there}. Rename all but one."
@@ -123,48 +128,54 @@ class Source:
         )
 
 
-def content_of(path: Path, check: Callable[[bytes], None] | None = None) -> bytes:
-    """The file's bytes, at least one of which says something.
+def opened(path: Path) -> Source:
+    """Open a recording's file by its ending.
 
-    Only a regular file is read: nothing else says how long it is, and a pipe or a device may never end. It is opened
-    without waiting.
-
-    Args:
-        path: The file.
-        check: Called with one piece of at most ``CHUNK`` after the other before anything is kept; it raises where the
-            rest is not worth reading. Default: no check.
+    ==========  ========================================================================================
+    ``.npz``    named vectors (``numpy.savez``); objects are refused
+    ``.mat``    MATLAB's vectors, ``save`` with ``-v4``, ``-v6`` or ``-v7``, not 7.3; a struct's fields are
+                ``struct.field``
+    any other   CSV: a comma between cells, decimals with a point, the first line the header, UTF-8
+    ==========  ========================================================================================
 
     Raises:
-        InputError: If it is missing, no regular file, too large, cannot be read or is empty.
+        InputError: If it is missing, no regular file, too large, empty, damaged or not of the format that its ending
+            says.
+    """
+    return {".npz": _npz, ".mat": _mat}.get(path.suffix.lower(), _csv)(path)
+
+
+def _content(path: Path, check: Callable[[bytes], None] = lambda piece: None) -> bytes:
+    """The bytes of a regular file; ``check`` sees them piece by piece before any is kept.
+
+    Pipes and devices are refused: nothing says how long they are, and they may never end.
     """
     try:
         with nn_export.files.opened(path, LARGEST) as (file, size):
             left = size
-            while check is not None and left > 0 and (piece := file.read(min(CHUNK, left))):
+            while left > 0 and (piece := file.read(min(CHUNK, left))):
                 check(piece)
                 left -= len(piece)
             file.seek(0)
-            content = file.read(size)  # what is written to it by now is left for the next time
+            content = file.read(size)
     except FileNotFoundError:
         raise InputError(
             f"{path}: there is no such file{_beside(path)}. Check the path given with --data."
         ) from None
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}). {_instead(error)}") from error
+        remedy = (
+            "Split the recording, or leave out columns that are not needed."
+            if error.errno == errno.EFBIG
+            else "Give a readable CSV, npz or mat file."
+        )
+        raise InputError(f"{path}: cannot be read ({error.strerror}). {remedy}") from error
     if not content or content.isspace():
         raise InputError(f"{path}: the file is empty. It needs a header line and rows of numbers.")
     return content
 
 
-def _instead(error: OSError) -> str:
-    """What to do about it."""
-    if error.errno == errno.EFBIG:
-        return "Split the recording, or leave out columns that are not needed."
-    return "Give a readable CSV, npz or mat file."
-
-
 def _beside(path: Path) -> str:
-    """What recordings the folder of a missing one has, for a message."""
+    """Recordings in the folder of a missing one, for a message."""
     try:
         near = sorted(p.name for p in path.parent.iterdir() if p.suffix.lower() in ENDINGS)
     except OSError:
@@ -172,76 +183,127 @@ def _beside(path: Path) -> str:
     return f"; that folder has: {', '.join(near[:LISTED])}" if near else ""
 
 
-def budget_of(content: bytes) -> int:
-    """Bytes of numbers that a file of this content may hold [byte].
-
-    Example:
-        >>> budget_of(bytes(100)) == SMALL, budget_of(bytes(10_000_000)) == 200_000_000
-        (True, True)
-    """
-    return min(LARGEST, max(SMALL, PACKED * len(content)))
-
-
-def megabytes(size: int) -> str:
-    """A number of bytes for a message.
-
-    Example:
-        >>> megabytes(2_500_000)
-        '2.5 MB'
-    """
+def _megabytes(size: int) -> str:
     return f"{size / 1e6:.4g} MB"
 
 
-def listed(names: Sequence[str]) -> str:
-    """Names in quotes for a message, the first of many.
-
-    Example:
-        >>> listed(["t", "phi"]), listed([])
-        ("'t', 'phi'", 'none')
-    """
-    more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
-    return ", ".join(shown(name) for name in names[:LISTED]) + more or "none"
+def _line(error: BaseException) -> str:
+    """The first line of an error's message, or its kind."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
 
 
-def digest_of(content: bytes) -> str:
-    """SHA-256 in hexadecimal.
-
-    Example:
-        >>> digest_of(b"a")[:8]
-        'ca978112'
-    """
-    return hashlib.sha256(content).hexdigest()
+# CSV
 
 
-# CSV files, read into columns and written.
-
-Row = tuple[int, list[str]]
-LONGEST_ROW = 2**20
-"""Most bytes of a row [byte]: ten thousand columns of a hundred characters."""
-
-
-def csv_source(path: Path) -> Source:
-    """Open a CSV file: comma, decimal point, first line the header, UTF-8.
-
-    Raises:
-        InputError: If the file is missing, no regular file, too large, empty, no UTF-8 text or no table.
-    """
+def _csv(path: Path) -> Source:
     text = _Text(path)
-    content = content_of(path, text.check)
-    text.finish()
-    header_row, header = next(_rows(path, content), (1, []))
-    names = [name.strip() for name in header]
+    content = _content(path, text.check)
+    text.check(b"", last=True)
+    line, header = next(_rows(path, content), (1, []))
+    names = tuple(name.strip() for name in header)
 
     def read(wanted: Sequence[str]) -> Columns:
-        return _columns(path, _rows(path, content), (header_row, names), wanted)
+        rows = _rows(path, content)
+        next(rows, None)
+        return _parsed(path, rows, line, names, wanted)
 
-    return Source(path, digest_of(content), tuple(names), read)
+    return Source(path, hashlib.sha256(content).hexdigest(), names, read)
+
+
+class _Text:
+    """Checks piece by piece that bytes are UTF-8 text with rows of a bearable length."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._decoder = codecs.getincrementaldecoder("utf-8")()
+        self._row, self._length = 1, 0
+
+    def check(self, piece: bytes, last: bool = False) -> None:
+        codes = np.frombuffer(piece, dtype=np.uint8)
+        ends = np.flatnonzero((codes == ord("\n")) | (codes == ord("\r")))
+        lengths = np.diff(ends, prepend=-1 - self._length)
+        rest = len(piece) - 1 - int(ends[-1]) if len(ends) else self._length + len(piece)
+        if max(int(lengths.max(initial=0)), rest) > LONGEST_ROW:
+            raise InputError(
+                f"{self._path}: has a row of more than {_megabytes(LONGEST_ROW)}. Write one line a sample, with "
+                "the columns that are needed."
+            )
+        try:
+            self._decoder.decode(piece, last)
+        except UnicodeDecodeError as error:
+            row = self._row + error.object[: error.start].count(b"\n")
+            raise InputError(
+                f"{self._path}: row {row} is no UTF-8 text. Export the table as CSV (UTF-8), or name the file .npz or "
+                ".mat if it is one; unpack it if it is packed."
+            ) from error
+        self._row, self._length = self._row + piece.count(b"\n"), rest
+
+
+def _rows(path: Path, content: bytes) -> Iterator[Row]:
+    """Number and cells of each row; blank ones are skipped but counted."""
+    reader = csv.reader(io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline=""))
+    try:
+        for row in reader:
+            if any(cell.strip() for cell in row):
+                yield reader.line_num, row
+    except csv.Error as error:
+        raise InputError(f"{path}: row {reader.line_num}: {error}. Export the table as plain CSV.") from error
+
+
+def _parsed(
+    path: Path, rows: Iterator[Row], header: int, names: Sequence[str], wanted: Sequence[str]
+) -> Columns:
+    """Numbers of the wanted columns; a row of another length than the header is an error of the whole file."""
+    places = [names.index(name) for name in wanted]
+    columns, numbers = [array("d") for _ in places], array("q")
+    bad = [0] * len(places)  # cells of each column that are no number, and the first of them
+    first_bad = [(0, "")] * len(places)
+    unequal, first_unequal = 0, (0, 0)
+    most = LARGEST // 8 // (len(places) + 1)
+    for line, cells in rows:
+        if len(cells) != len(names):
+            first_unequal = first_unequal if unequal else (line, len(cells))
+            unequal += 1
+            continue
+        if len(numbers) == most:
+            raise InputError(f"{path}: has more than {most} rows, more than are read. Split the recording.")
+        numbers.append(line)
+        for j, place in enumerate(places):
+            value = _number(cells[place])
+            columns[j].append(value)
+            if value != value:
+                first_bad[j] = first_bad[j] if bad[j] else (line, cells[place].strip())
+                bad[j] += 1
+    if unequal:
+        line, count = first_unequal
+        such = f" ({unequal} such rows)" if unequal > 1 else ""
+        raise InputError(
+            f"{path}: row {line} has {count} cells, the header (row {header}) has {len(names)}{such}. "
+            "Separate cells by commas, write decimals with a point, and complete or delete the row."
+        )
+    problems = []
+    for name, count, (line, cell) in zip(wanted, bad, first_bad, strict=True):
+        if count:
+            what = f"is {shown(cell)}, not a finite number" if cell else "is empty"
+            such = f" ({count} such rows)" if count > 1 else ""
+            problems.append(
+                f"row {line}, column {shown(name)} {what}{such}. Delete the row (longer gaps are cut out) or repair "
+                "the value."
+            )
+    return Columns(np.column_stack([np.array(column) for column in columns]), "row", numbers, tuple(problems))
+
+
+def _number(cell: str) -> float:
+    """The number in a cell; NaN for what is no finite one."""
+    try:
+        value = float(cell)
+    except ValueError:
+        return math.nan
+    return value if math.isfinite(value) and "_" not in cell else math.nan
 
 
 def write_csv(path: Path | str, columns: Mapping[str, Array], *, decimals: int | None = None) -> Path:
     r"""Write columns of equal length as CSV: all of it or nothing, the same data as the same bytes.
-
-    The file appears under its name only when complete.
 
     Args:
         path: File to write; its folder is made if need be, an old file of that name is replaced.
@@ -268,138 +330,18 @@ def write_csv(path: Path | str, columns: Mapping[str, Array], *, decimals: int |
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(arrays)
-    writer.writerows(
-        [_written(value, decimals) for value in row] for row in zip(*arrays.values(), strict=True)
-    )
+    for row in zip(*arrays.values(), strict=True):
+        # + 0.0: no "-0"
+        writer.writerow([f"{x + 0.0:.10g}" if decimals is None else f"{x:.{decimals}f}" for x in row])
     write_text(path, text.getvalue())
     return path
 
 
-def _written(value: float, decimals: int | None) -> str:
-    return f"{value + 0.0:.10g}" if decimals is None else f"{value:.{decimals}f}"  # + 0.0: no "-0"
+# Vectors of .npz and .mat
 
 
-class _Text:
-    """Whether bytes are UTF-8 text with rows of a bearable length, told piece by piece."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._decoder = codecs.getincrementaldecoder("utf-8")()
-        self._row, self._length = 1, 0
-
-    def check(self, piece: bytes) -> None:
-        """Look at the next piece of the file.
-
-        Raises:
-            InputError: If it is no text, or a row is too long.
-        """
-        codes = np.frombuffer(piece, dtype=np.uint8)
-        ends = np.flatnonzero((codes == ord("\n")) | (codes == ord("\r")))
-        lengths = np.diff(ends, prepend=-1 - self._length)
-        rest = len(piece) - 1 - int(ends[-1]) if len(ends) else self._length + len(piece)
-        if max(int(lengths.max(initial=0)), rest) > LONGEST_ROW:
-            raise InputError(
-                f"{self._path}: has a row of more than {megabytes(LONGEST_ROW)}. Write one line a sample, with "
-                "the columns that are needed."
-            )
-        self._decode(piece)
-        self._row, self._length = self._row + piece.count(b"\n"), rest
-
-    def finish(self) -> None:
-        """Nothing follows.
-
-        Raises:
-            InputError: If the text ends within a character.
-        """
-        self._decode(b"", last=True)
-
-    def _decode(self, piece: bytes, last: bool = False) -> None:
-        try:
-            self._decoder.decode(piece, last)
-        except UnicodeDecodeError as error:
-            row = self._row + error.object[: error.start].count(b"\n")
-            raise InputError(
-                f"{self._path}: row {row} is no UTF-8 text. Export the table as CSV (UTF-8), or name the file .npz or "
-                ".mat if it is one; unpack it if it is packed."
-            ) from error
-
-
-def _rows(path: Path, content: bytes) -> Iterator[Row]:
-    """Number and cells of each row; blank ones are skipped but counted."""
-    reader = csv.reader(io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline=""))
-    try:
-        for row in reader:
-            if any(cell.strip() for cell in row):
-                yield reader.line_num, row
-    except csv.Error as error:
-        raise InputError(f"{path}: row {reader.line_num}: {error}. Export the table as plain CSV.") from error
-
-
-def _columns(
-    path: Path, rows: Iterator[Row], header: tuple[int, list[str]], wanted: Sequence[str]
-) -> Columns:
-    """Numbers of the wanted columns; a row of another length than the header is an error of the whole file."""
-    names = header[1]
-    next(rows, None)
-    places = [names.index(name) for name in wanted]
-    columns, numbers = [array("d") for _ in places], array("q")
-    bad: list[tuple[int, str, int] | None] = [None] * len(places)
-    unequal: tuple[int, int, int] | None = None
-    most = LARGEST // 8 // (len(places) + 1)
-    for line, cells in rows:
-        if len(cells) != len(names):
-            unequal = (unequal[0], unequal[1], unequal[2] + 1) if unequal else (line, len(cells), 1)
-            continue
-        if len(numbers) == most:
-            raise InputError(f"{path}: has more than {most} rows, more than are read. Split the recording.")
-        numbers.append(line)
-        for j, place in enumerate(places):
-            value = _number(cells[place])
-            columns[j].append(value)
-            if value != value:
-                first = bad[j]
-                bad[j] = (first[0], first[1], first[2] + 1) if first else (line, cells[place].strip(), 1)
-    if unequal:
-        line, count, times = unequal
-        raise InputError(
-            f"{path}: row {line} has {count} cells, the header (row {header[0]}) has {len(names)}"
-            f"{f' ({times} such rows)' if times > 1 else ''}. "
-            "Separate cells by commas, write decimals with a point, and complete or delete the row."
-        )
-    values = np.column_stack([np.array(column) for column in columns])
-    problems = tuple(_told(name, *one) for name, one in zip(wanted, bad, strict=True) if one)
-    return Columns(values, "row", numbers, problems)
-
-
-def _number(cell: str) -> float:
-    """The number in a cell; NaN for what is no finite one."""
-    try:
-        value = float(cell)
-    except ValueError:
-        return math.nan
-    return value if math.isfinite(value) and "_" not in cell else math.nan
-
-
-def _told(name: str, line: int, cell: str, count: int) -> str:
-    """What is wrong with a column that has other cells than numbers."""
-    what = f"is {shown(cell)}, not a finite number" if cell else "is empty"
-    such = f" ({count} such rows)" if count > 1 else ""
-    return (
-        f"row {line}, column {shown(name)} {what}{such}. Delete the row (longer gaps are cut out) or repair "
-        "the value."
-    )
-
-
-Lookup = Callable[[str], NDArray[Any]]
-
-
-def npz_source(path: Path) -> Source:
-    """Open a ``.npz`` file of named vectors; object arrays (pickles) are refused, not loaded.
-
-    Raises:
-        InputError: If the file is missing, no regular file, too large, empty, damaged or no ``.npz``.
-    """
-    content = content_of(path)
+def _npz(path: Path) -> Source:
+    content = _content(path)
     if content.startswith(npy.MAGIC_PREFIX):
         raise InputError(
             f"{path}: is no .npz file but one array without a name. Write named vectors with numpy.savez(file, "
@@ -415,7 +357,7 @@ def npz_source(path: Path) -> Source:
 
     def lookup(name: str) -> NDArray[Any]:
         try:
-            check_npz(content, budget_of(content), (name,))
+            check_npz(content, _budget(content), (name,))
             return np.asarray(file[name])
         except Exception as error:
             raise InputError(
@@ -423,23 +365,18 @@ def npz_source(path: Path) -> Source:
                 "ones with numpy.savez and not packed; objects are refused, since loading them could run code."
             ) from error
 
-    return Source(path, digest_of(content), tuple(file.files), _reader(path, content, lookup, "index", 0))
+    return _vectors(path, content, tuple(file.files), lookup, "index", 0)
 
 
-def mat_source(path: Path) -> Source:
-    """Open a ``.mat`` file (MATLAB's -v4, -v6 or -v7): its vectors, and those in its structs as ``struct.field``.
-
-    Raises:
-        InputError: If the file is missing, empty, damaged, no ``.mat`` or one of version 7.3 (HDF5).
-    """
-    content = content_of(path)
+def _mat(path: Path) -> Source:
+    content = _content(path)
     if version(content) == "7.3":
         raise InputError(
             f"{path}: is a .mat file of version 7.3 (HDF5), which is not read. Save it in MATLAB with "
             f"save('{path.name}', ..., '-v7')."
         )
     try:
-        check_structure(content, budget_of(content))
+        check_structure(content, _budget(content))
         with warnings.catch_warnings():
             warnings.simplefilter("error", MatReadWarning)  # two variables of one name, for one
             variables = loadmat(io.BytesIO(content), struct_as_record=True)
@@ -448,32 +385,24 @@ def mat_source(path: Path) -> Source:
             f"{path}: is no .mat file, damaged or too large ({_line(error)}). Save it again in MATLAB with "
             f"save('{path.name}', ..., '-v7'), large vectors with '-v6'."
         ) from error
-    vectors, note = _fields({name: v for name, v in variables.items() if not name.startswith("__")})
-    return Source(
-        path, digest_of(content), tuple(vectors), _reader(path, content, vectors.__getitem__, "row", 1), note
-    )
-
-
-def _fields(variables: Mapping[str, Any]) -> tuple[dict[str, NDArray[Any]], str]:
-    """Variables and the fields of structs, by name; a note on what a user may miss among them."""
-    found: dict[str, NDArray[Any]] = {}
-    left: set[str] = set()
+    vectors: dict[str, NDArray[Any]] = {}
+    unread: set[str] = set()
     for name, value in variables.items():
-        what = _unread(value)
-        if what:
-            left.add(what)
+        if name.startswith("__"):
+            continue
+        if what := _unread(value):
+            unread.add(what)
         elif value.dtype.names is None:
-            found[name] = value
+            vectors[name] = value
         else:
             for field in value.dtype.names:
                 inner = value[field].item()
-                what = _unread(inner) or ("structs in structs" if inner.dtype.names else "")
-                if what:
-                    left.add(what)
+                if what := _unread(inner) or ("structs in structs" if inner.dtype.names else ""):
+                    unread.add(what)
                 else:
-                    found[f"{name}.{field}"] = inner
-    note = f" Not read are {' and '.join(sorted(left))}: save their vectors as variables." if left else ""
-    return found, note
+                    vectors[f"{name}.{field}"] = inner
+    note = f" Not read are {' and '.join(sorted(unread))}: save their vectors as variables." if unread else ""
+    return _vectors(path, content, tuple(vectors), vectors.__getitem__, "row", 1, note)
 
 
 def _unread(value: Any) -> str:
@@ -485,22 +414,36 @@ def _unread(value: Any) -> str:
     return "" if isinstance(value, np.ndarray) else "sparse matrices"
 
 
-def _reader(
-    path: Path, content: bytes, lookup: Lookup, row: str, first: int
-) -> Callable[[Sequence[str]], Columns]:
-    """A source's ``read``: vectors of one length; a single number as the time is the sampling time."""
+def _budget(content: bytes) -> int:
+    """Bytes of numbers that a file of this content may hold [byte]."""
+    return min(LARGEST, max(SMALL, PACKED * len(content)))
+
+
+def _vectors(
+    path: Path,
+    content: bytes,
+    header: tuple[str, ...],
+    lookup: Callable[[str], NDArray[Any]],
+    row: str,
+    first: int,
+    note: str = "",
+) -> Source:
+    """A source of vectors of one length, whose rows are counted from ``first``.
+
+    A single number as the time is the sampling time.
+    """
 
     def read(names: Sequence[str]) -> Columns:
         columns: list[Array] = []
         problems: list[str] = []
-        left = budget_of(content)
+        left = _budget(content)
         for name in names:
             try:
                 array = lookup(name)
                 left -= 8 * array.size
                 if left < 0:
                     raise InputError(
-                        f"{path}: its columns take more than the {megabytes(budget_of(content))} of numbers that are "
+                        f"{path}: its columns take more than the {_megabytes(_budget(content))} of numbers that are "
                         "read from a file of this length. Save it unpacked, or split the recording."
                     )
                 columns.append(_vector(path, name, array))
@@ -511,8 +454,8 @@ def _reader(
             columns[0] = _uniform(path, names[0], columns[0].item(), len(columns[1]))
         lengths = dict(zip(names, map(len, columns), strict=True))
         if len(set(lengths.values())) > 1:
-            told = ", ".join(f"{shown(name)} {length}" for name, length in lengths.items())
-            raise InputError(f"{path}: columns differ in length: {told}. Save vectors of one length.")
+            each = ", ".join(f"{shown(name)} {length}" for name, length in lengths.items())
+            raise InputError(f"{path}: columns differ in length: {each}. Save vectors of one length.")
         values = np.column_stack(columns)
         found = []
         for name, column in zip(names, values.T, strict=True):
@@ -525,7 +468,7 @@ def _reader(
         values[~np.isfinite(values)] = np.nan
         return Columns(values, row, range(first, first + len(values)), tuple(found))
 
-    return read
+    return Source(path, hashlib.sha256(content).hexdigest(), header, read, note)
 
 
 def _vector(path: Path, name: str, array: NDArray[Any]) -> Array:
@@ -550,8 +493,3 @@ def _uniform(path: Path, name: str, dt: float, m: int) -> Array:
             "Give that, or a vector of time stamps."
         )
     return dt * np.arange(m, dtype=np.float64)
-
-
-def _line(error: BaseException) -> str:
-    """The first line of an error's message, or its kind."""
-    return (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")

@@ -1,4 +1,4 @@
-"""Whether a ``.mat`` file is built as its format says. ``scipy.io.loadmat`` trusts that, and crashes where it is not.
+"""Checks that a ``.mat`` file is built as its format says: ``scipy.io.loadmat`` trusts that, and crashes if it is not.
 
 Source: MathWorks, *MAT-File Format*, chapter 1 (level 5): an element is a tag of 8 bytes (type, number of bytes) and
 its data, padded to 8 bytes; up to 4 bytes of data stand in the tag itself. Chapter 2 (level 4): a variable is a header
@@ -22,7 +22,7 @@ NUMERIC_CLASSES = range(6, 16)
 CELL, STRUCT, OBJECT, CHAR, SPARSE, OPAQUE = 1, 2, 3, 4, 5, 17
 COMPLEX = 0x08
 DEEPEST = 32
-"""Matrices in matrices (cells, structs) that are followed: no recording has more than a few."""
+"""Deepest matrices in matrices (cells, structs); a recording has a few."""
 ELEMENTS = 200_000
 """Most elements of a file, four and more a variable, cell or field: some seconds of work."""
 SIZES_4 = (8, 4, 4, 2, 2, 1)
@@ -30,16 +30,11 @@ SIZES_4 = (8, 4, 4, 2, 2, 1)
 
 
 class Left:
-    """What a file may still hold.
+    """What a file may still hold: ``size`` bytes of numbers, each counted as 8 of them, and ``count`` elements."""
 
-    Args:
-        size: Bytes of numbers, each counted as 8 of them [byte].
-        count: Elements.
-    """
-
-    def __init__(self, size: int, count: int = ELEMENTS) -> None:
-        self.size, self.count = size, count
-        self._most = size, count
+    def __init__(self, size: int) -> None:
+        self.size, self.count = size, ELEMENTS
+        self._most = size
 
     def take(self, size: int = 0, count: int = 0) -> None:
         """Use some of it up.
@@ -49,9 +44,9 @@ class Left:
         """
         self.size, self.count = self.size - size, self.count - count
         if self.count < 0:
-            raise ValueError(f"it has more than {self._most[1]} elements")
+            raise ValueError(f"it has more than {ELEMENTS} elements")
         if self.size < 0:
-            raise ValueError(f"it declares more than {self._most[0] / 1e6:.4g} MB of numbers")
+            raise ValueError(f"it declares more than {self._most / 1e6:.4g} MB of numbers")
 
 
 class Element(NamedTuple):
@@ -78,12 +73,10 @@ def version(content: bytes) -> str:
 
 
 def check_structure(content: bytes, budget: int) -> None:
-    """Follow all elements of a file of level 5, or all variables of one of level 4.
-
-    A compressed variable is decompressed up to what is left of the budget and no further.
+    """Follow all elements of a file; a compressed variable is decompressed as far as the budget allows.
 
     Args:
-        content: The file.
+        content: The file, of level 4 or 5.
         budget: Most bytes of numbers that it may hold, each counted as 8 of them [byte].
 
     Raises:
@@ -113,7 +106,6 @@ def check_structure(content: bytes, budget: int) -> None:
 
 
 def _unpacked(data: memoryview, left: Left) -> bytes:
-    """What a compressed variable holds, if that is not too much."""
     stream = zlib.decompressobj()
     try:
         inner = stream.decompress(data, left.size + 1)
@@ -127,7 +119,6 @@ def _unpacked(data: memoryview, left: Left) -> bytes:
 
 
 def _check_4(content: bytes, left: Left) -> None:
-    """Follow the variables of a file of level 4."""
     order = "<" if len(content) < 4 or 0 <= struct.unpack_from("<i", content)[0] <= 5000 else ">"
     begin = 0
     while begin < len(content):
@@ -199,18 +190,14 @@ def _check_head(parts: list[Element]) -> None:
 
 def _check_body(kind: int, rest: list[int], is_complex: bool) -> None:
     """Types of the elements after the name: each kind of variable has its own."""
-    if kind == CELL:
-        fits = all(one == MATRIX for one in rest)
-    elif kind == STRUCT:
-        fits = rest[:2] in ([5, 1], [6, 1]) and all(one == MATRIX for one in rest[2:])
-    elif kind == OBJECT:
-        fits = rest[:3] in ([1, 5, 1], [1, 6, 1]) and all(one == MATRIX for one in rest[3:])
+    if kind in (CELL, STRUCT, OBJECT):
+        heads = {CELL: ([],), STRUCT: ([5, 1], [6, 1]), OBJECT: ([1, 5, 1], [1, 6, 1])}[kind]
+        head = len(heads[0])
+        fits = rest[:head] in heads and all(one == MATRIX for one in rest[head:])
     elif kind == CHAR:
         fits = len(rest) == 1 and rest[0] in NUMBERS + TEXT
-    elif kind == SPARSE:
-        fits = len(rest) == 3 + is_complex and all(one in NUMBERS for one in rest)
-    elif kind in NUMERIC_CLASSES:
-        fits = len(rest) == 1 + is_complex and all(one in NUMBERS for one in rest)
+    elif kind == SPARSE or kind in NUMERIC_CLASSES:
+        fits = len(rest) == (3 if kind == SPARSE else 1) + is_complex and all(one in NUMBERS for one in rest)
     else:
         fits = True  # functions and newer objects, of which scipy gives the raw bytes at best
     if not fits:
@@ -218,7 +205,7 @@ def _check_body(kind: int, rest: list[int], is_complex: bool) -> None:
 
 
 def _declared(data: bytes, kind: int, parts: list[Element], order: str) -> int:
-    """Bytes of what a variable's dimensions declare [byte]: a number, a character, a cell or a field as 8 of them."""
+    """Bytes that a variable's dimensions declare [byte]: a number, a character, a cell or a field takes 8."""
     if kind == SPARSE:  # its dimensions are not what is stored
         return 0
     dimensions = struct.unpack_from(f"{order}{(parts[1].end - parts[1].begin) // 4}i", data, parts[1].begin)

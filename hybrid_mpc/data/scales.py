@@ -11,17 +11,16 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 FASTEST, SLOWEST = 0.25, 4.0
-"""Time scales [s] between which a machine's second is a second. The lengths of the library that are written in seconds
-(free runs that a fit goes through, the monitor's windows, blocks of false alarms) were argued and tried on machines of
-0.5 s (unbalanced disk) to 2 s (torque pendulum, :func:`time_scale`); half and twice that are left to either side."""
+"""Time scales [s] between which a machine's second is a second. The library's lengths in seconds (free runs of a fit,
+windows of the monitor, blocks of false alarms) were tried on machines of 0.5 to 2 s; half and twice that are left to
+either side."""
 COARSEST = 10
-"""Fewest periods in a machine's second: its shortest length, the tenth of a second that the guard averages over, is
-then one of them."""
+"""Fewest periods in a machine's second: the shortest length, a tenth of a second, is then one of them."""
 SHORTEST = 5
 """Half the samples of the first window in which accelerations are looked for: ten periods."""
 NOISY = 0.02
-"""Share of noise in the power of the acceleration from which on the window is too short to tell: the steps of a coarse
-sensor are no white noise, and up to half of what they make would pass for motion."""
+"""Share of noise in the power of the acceleration from which on the window is too short: the steps of a coarse sensor
+are no white noise, and up to half of what they make would pass for motion."""
 
 
 class Outputs(Protocol):
@@ -54,14 +53,13 @@ def noise_of(recordings: Sequence[Outputs]) -> Array:
     return np.asarray(np.std(third, axis=0) / math.sqrt(20.0))
 
 
-def speeds_of(recording: Outputs, dt: float, half: int, order: int = 1) -> Array:
-    """Speeds ``(m, n_y)`` at the centres of cubics through ``2 half + 1`` samples each; accelerations with ``order`` 2.
+def speeds_of(recording: Outputs, dt: float, half: int) -> Array:
+    """Speeds ``(m, n_y)`` at the centres of cubics through ``2 half + 1`` samples each.
 
     Args:
         recording: Positions.
         dt: Period [s].
         half: Samples to either side of a centre.
-        order: 1 for speeds (default), 2 for accelerations.
 
     Example:
         >>> from types import SimpleNamespace
@@ -69,14 +67,16 @@ def speeds_of(recording: Outputs, dt: float, half: int, order: int = 1) -> Array
         >>> speeds_of(run, 0.1, 3)[:2].ravel().round(6).tolist()  # of t^2 at 0.3 and 0.4 s
         [0.6, 0.8]
     """
+    return _derivatives(recording.y, dt, half, 1)
+
+
+def _derivatives(y: Array, dt: float, half: int, order: int) -> Array:
     window = 2 * half + 1
-    if len(recording.y) < window:
-        return np.zeros((0, recording.y.shape[1]))
+    if len(y) < window:
+        return np.zeros((0, y.shape[1]))
     from scipy.signal import savgol_filter  # slow to import, and monitors import this module
 
-    found = savgol_filter(recording.y, window, 3, deriv=order, delta=dt, axis=0)[
-        half : len(recording.y) - half
-    ]
+    found = savgol_filter(y, window, 3, deriv=order, delta=dt, axis=0)[half : len(y) - half]
     return np.asarray(found[np.isfinite(found).all(axis=1)])
 
 
@@ -119,10 +119,26 @@ def time_scale(recordings: Sequence[Outputs], dt: float) -> float:
     """
     if not recordings:
         return math.nan
-    sigma = noise_of(recordings)
-    found = [_time_scale(recordings, dt, i, float(s)) for i, s in enumerate(sigma)]
-    known = [value for value in found if math.isfinite(value)]
-    return min(known) if known else math.nan
+    found = [_time_scale(recordings, dt, i, float(s)) for i, s in enumerate(noise_of(recordings))]
+    return min((value for value in found if math.isfinite(value)), default=math.nan)
+
+
+def _time_scale(recordings: Sequence[Outputs], dt: float, i: int, sigma: float) -> float:
+    """Time scale of one output; NaN where its acceleration never stands out of the noise."""
+    half, longest = SHORTEST, max(len(r.y) for r in recordings)
+    while 2 * half + 1 <= longest:
+        speed, acceleration = (
+            [_derivatives(r.y[:, i : i + 1], dt, half, order) for r in recordings] for order in (1, 2)
+        )
+        v = np.concatenate([part - part.mean() for part in speed if len(part)] or [np.zeros((0, 1))])
+        a = np.concatenate(acceleration)
+        noise = [sigma * speed_gain(dt, half, order) for order in (1, 2)]
+        power = float(np.mean(a**2)) if len(a) else 0.0
+        if power > 0 and noise[1] ** 2 < NOISY * power:
+            moved = max(float(np.mean(v**2)) - noise[0] ** 2, 0.0)
+            return 2 * math.pi * math.sqrt(moved / (power - noise[1] ** 2))
+        half *= 2
+    return math.nan
 
 
 def time_unit(recordings: Sequence[Outputs], dt: float) -> float:
@@ -160,28 +176,3 @@ def periods(seconds: float, dt: float, fewest: int = 1) -> int:
         (25, 1)
     """
     return max(fewest, round(seconds / dt))
-
-
-def _time_scale(recordings: Sequence[Outputs], dt: float, i: int, sigma: float) -> float:
-    """Time scale of one output; NaN where its acceleration never stands out of the noise."""
-    half, longest = SHORTEST, max(len(r.y) for r in recordings)
-    while 2 * half + 1 <= longest:
-        speed, acceleration = (
-            [speeds_of(_Column(r.y[:, i : i + 1]), dt, half, order) for r in recordings] for order in (1, 2)
-        )
-        v = np.concatenate([part - part.mean() for part in speed if len(part)] or [np.zeros((0, 1))])
-        a = np.concatenate(acceleration)
-        noise = [sigma * speed_gain(dt, half, order) for order in (1, 2)]
-        power = float(np.mean(a**2)) if len(a) else 0.0
-        if power > 0 and noise[1] ** 2 < NOISY * power:
-            moved = max(float(np.mean(v**2)) - noise[0] ** 2, 0.0)
-            return 2 * math.pi * math.sqrt(moved / (power - noise[1] ** 2))
-        half *= 2
-    return math.nan
-
-
-class _Column:
-    """One output of a recording."""
-
-    def __init__(self, y: Array) -> None:
-        self.y = y

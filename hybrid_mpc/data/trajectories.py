@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from hybrid_mpc.data.differentiate import local_polynomial, window_samples
-from hybrid_mpc.data.doubts import Finding, doubts_of
-from hybrid_mpc.data.tables import MIN_SCORED, Table, checked_tables
+from hybrid_mpc.data.findings import findings_of
+from hybrid_mpc.data.recording import MIN_SCORED, Finding, Recording, gaps, read_recordings
 from hybrid_mpc.errors import SHOWN, InputError, refuse
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.machine.specification import DataSpec, Role, Window
@@ -54,6 +54,11 @@ class Trajectory:
     x: Array
     xdot: Array
 
+    @property
+    def file(self) -> str:
+        """Stem of the file that it comes from."""
+        return self.name.split("#")[0]
+
     def part(self, keep: NDArray[np.bool_], name: str, role: str) -> Trajectory:
         """The samples where ``keep`` ``(n,)`` holds (one contiguous run), under a new name and role."""
         arrays = {key: getattr(self, key)[keep] for key in ("t", "u", "y", "x", "xdot")}
@@ -80,7 +85,7 @@ class Dataset:
         files: File names, in the order given.
         sha256: SHA-256 of each file, in the same order.
         hash: One hash of all files' names and contents; it does not depend on their order or folder.
-        findings: What is doubtful about the recordings (:func:`~hybrid_mpc.data.doubts.doubts_of`). Default: nothing.
+        findings: What is doubtful about the recordings (:mod:`hybrid_mpc.data.findings`). Default: nothing.
     """
 
     trajectories: tuple[Trajectory, ...]
@@ -107,10 +112,9 @@ def load_trajectories(
 ) -> Dataset:
     """Read recordings, cut them at gaps, smooth and differentiate, resample to ``spec.dt``, give roles.
 
-    The outputs are the positions ``q``; velocities and accelerations are their derivatives. Smoothing
-    comes before resampling and before the split, never across a gap: a sample's ``x`` and ``xdot`` know at
-    most half of ``spec.smoothing`` of the time before and after it. Parts by ``fractions`` keep that much
-    distance from each other; whoever writes ``windows`` should too.
+    The outputs are the positions ``q``; velocities and accelerations are their derivatives. Smoothing comes before
+    resampling and the split, never across a gap: a sample's ``x`` and ``xdot`` know half of ``spec.smoothing`` of the
+    time before and after it. Parts by ``fractions`` keep ``spec.smoothing`` apart; ``windows`` should, too.
 
     Args:
         paths: CSV, ``.npz`` or ``.mat`` files with different stems, of any lengths.
@@ -122,18 +126,16 @@ def load_trajectories(
         needed: Roles that must not be empty. Default: all three.
 
     Returns:
-        The data set; it has at least one trajectory of each role that is needed. What is doubtful about the recordings
-        stands in its ``findings``.
+        The data set; it has at least one trajectory of each role that is needed.
 
     Raises:
-        InputError: If recordings are bad (see :func:`~hybrid_mpc.data.tables.read_table`), columns
-            differ between recordings, windows of different roles overlap, a role gets no trajectory,
-            the sampling is too coarse or too uneven for ``smoothing``, or the speeds are beyond all that is
-            plausible. It names all that is wrong with all files.
+        InputError: If recordings are bad (see :func:`~hybrid_mpc.data.recording.read_recording`), columns differ
+            between them, windows overlap, a role gets no trajectory, the sampling is too coarse or too uneven for
+            ``smoothing``, or the speeds are beyond all that is plausible. It names all that is wrong with all files.
 
     Example:
         >>> import tempfile
-        >>> from hybrid_mpc.data.files import write_csv
+        >>> from hybrid_mpc import write_csv
         >>> spec = DataSpec("t", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.5)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     t = 0.01 * np.arange(1000)
@@ -146,74 +148,80 @@ def load_trajectories(
     if not paths:
         raise InputError("no recordings given; name at least one file with --data")
     _check_windows(spec)
-    tables, problems = checked_tables(paths, spec, outputs=outputs, inputs=inputs)
+    recordings, problems = read_recordings(paths, spec, outputs=outputs, inputs=inputs)
     trajectories: list[Trajectory] = []
-    segments: list[list[Trajectory]] = []
+    whole: list[Trajectory] = []
+    motions: list[tuple[Array, Array]] = []
     cuts: list[Cut] = []
-    for table in tables:
+    for recording in recordings:
+        own: list[Trajectory] = []
         try:
-            segments.append(list(_segments(table, spec, cuts)))
-            trajectories += _pieces(table, segments[-1], spec, cuts)
+            own = list(_segments(recording, spec, cuts))
+            trajectories += _pieces(recording, own, spec, cuts)
         except InputError as error:
-            problems.append(f"{table.path}: {error}")
-            segments.append([])
-    findings = doubts_of(tables, segments, spec, outputs=outputs, states=states)
-    paths_of = {table.path.name: table.path for table in tables}
+            problems.append(f"{recording.path}: {error}")
+        whole += own
+        t, x = [piece.t for piece in own], [piece.x for piece in own]
+        motions.append((np.concatenate(t), np.concatenate(x)) if own else (np.zeros(0), np.zeros((0, 0))))
+    findings = findings_of(recordings, motions, spec, outputs=outputs, states=states)
+    paths_of = {recording.path.name: recording.path for recording in recordings}
     problems += [f"{paths_of[finding.file]}: {finding.message}" for finding in findings if finding.refused]
     refuse(problems)
     _check_roles(trajectories, cuts, spec, needed)
     return Dataset(
         trajectories=tuple(trajectories),
-        whole=tuple(segment for own in segments for segment in own),
+        whole=tuple(whole),
         cuts=tuple(cuts),
-        files=tuple(table.path.name for table in tables),
-        sha256=tuple(table.sha256 for table in tables),
-        hash=_hash(tables),
+        files=tuple(recording.path.name for recording in recordings),
+        sha256=tuple(recording.sha256 for recording in recordings),
+        hash=hashlib.sha256(
+            "".join(sorted(f"{t.name} {t.sha256}\n" for t in recordings)).encode()
+        ).hexdigest(),
         findings=findings,
     )
 
 
-def _segments(table: Table, spec: DataSpec, cuts: list[Cut]) -> Iterator[Trajectory]:
+def _segments(recording: Recording, spec: DataSpec, cuts: list[Cut]) -> Iterator[Trajectory]:
     """Smoothed and resampled parts between gaps, numbered; too short ones become cuts."""
-    gaps = np.flatnonzero(np.diff(table.t) > spec.max_gap * (1 + 1e-6))
-    for k in gaps:
-        why = f"gap of {table.t[k + 1] - table.t[k]:.4g} s is longer than max_gap {spec.max_gap:g} s"
-        cuts.append(Cut(table.path.name, float(table.t[k]), float(table.t[k + 1]), why))
-    samples = window_samples(spec.smoothing, table.dt)
-    _check_sampling(table, samples, spec)
-    shortest = max((samples - 1) * table.dt, (_fewest(spec) - 1) * spec.dt) + spec.dt
+    ends = np.flatnonzero(gaps(recording.t, spec.max_gap))
+    for k in ends:
+        why = f"gap of {recording.t[k + 1] - recording.t[k]:.4g} s is longer than max_gap {spec.max_gap:g} s"
+        cuts.append(Cut(recording.path.name, float(recording.t[k]), float(recording.t[k + 1]), why))
+    samples = window_samples(spec.smoothing, recording.dt)
+    _check_sampling(recording, samples, spec)
+    shortest = max((samples - 1) * recording.dt, (_fewest(spec) - 1) * spec.dt) + spec.dt
     number = 0
-    for rows in np.split(np.arange(len(table.t)), gaps + 1):
-        t = table.t[rows]
+    for rows in np.split(np.arange(len(recording.t)), ends + 1):
+        t = recording.t[rows]
         if t[-1] - t[0] < shortest - TINY:
-            cuts.append(Cut(table.path.name, float(t[0]), float(t[-1]), _too_short(shortest, spec)))
+            cuts.append(Cut(recording.path.name, float(t[0]), float(t[-1]), _too_short(shortest, spec)))
             continue
         number += 1
-        yield _resample(table, rows, spec, _numbered(table.name, number))
+        yield _resample(recording, rows, spec, _numbered(recording.name, number))
 
 
-def _check_sampling(table: Table, samples: int, spec: DataSpec) -> None:
+def _check_sampling(recording: Recording, samples: int, spec: DataSpec) -> None:
     """Refuse sampling that smoothing would take gigabytes or minutes for."""
-    steps = np.diff(table.t)
-    mean = float(steps[steps <= spec.max_gap * (1 + 1e-6)].mean())
-    if mean > UNEVEN * table.dt:
+    steps = np.diff(recording.t)
+    mean = float(steps[~gaps(recording.t, spec.max_gap)].mean())
+    if mean > UNEVEN * recording.dt:
         raise InputError(
-            f"sampling is uneven: the time stamps are {table.dt:.3g} s apart in the median and {mean:.3g} s in "
+            f"sampling is uneven: the time stamps are {recording.dt:.3g} s apart in the median and {mean:.3g} s in "
             "the mean. Record at one rate, or check the time stamps."
         )
-    if samples * len(table.t) * mean / table.dt > WORK:
+    if samples * len(recording.t) * mean / recording.dt > WORK:
         raise InputError(
-            f"smoothing of {spec.smoothing:g} s holds {samples} of {len(table.t)} samples, too many to work "
+            f"smoothing of {spec.smoothing:g} s holds {samples} of {len(recording.t)} samples, too many to work "
             f"with. The model's period is {spec.dt:g} s: give every tenth or hundredth row, or split the recording."
         )
 
 
-def _resample(table: Table, rows: NDArray[np.intp], spec: DataSpec, name: str) -> Trajectory:
-    t, y, u = table.t[rows], table.y[rows], table.u[rows]
+def _resample(recording: Recording, rows: NDArray[np.intp], spec: DataSpec, name: str) -> Trajectory:
+    t, y, u = recording.t[rows], recording.y[rows], recording.u[rows]
     n = int(np.floor((t[-1] - t[0]) / spec.dt + TINY))
     grid = t[0] + spec.dt * np.arange(n)
-    fine = t[0] + table.dt * np.arange(int(np.floor((t[-1] - t[0]) / table.dt + TINY)) + 1)
-    smooth = local_polynomial(_interpolate(t, y, fine), table.dt, spec.smoothing)
+    fine = t[0] + recording.dt * np.arange(int(np.floor((t[-1] - t[0]) / recording.dt + TINY)) + 1)
+    smooth = local_polynomial(_interpolate(t, y, fine), recording.dt, spec.smoothing)
     q, v, a = (CubicSpline(fine, z)(grid) for z in (smooth.value, smooth.first, smooth.second))
     return Trajectory(
         name=name,
@@ -232,13 +240,12 @@ def hold_mean(t: Array, u: Array, grid: Array, dt: float) -> Array:
 
     Args:
         t: Recorded time stamps ``(m,)`` [s].
-        u: Recorded inputs ``(m, n_u)``, each held until the next time stamp.
-        grid: Times ``T_k`` ``(n,)`` [s] within the recording; before its start or after its end the
-            integral is constant, that is, the input counts as zero.
+        u: Recorded inputs ``(m, n_u)``, each held until the next time stamp; zero outside the recording.
+        grid: Times ``T_k`` ``(n,)`` [s].
         dt: Period [s].
 
     Returns:
-        Means ``(n, n_u)``; their integral over the grid is the recording's.
+        Means ``(n, n_u)``.
 
     Example:
         >>> hold_mean(np.array([0.0, 0.1, 0.2]), np.array([[1.0], [3.0], [9.0]]), np.array([0.0]), 0.2)
@@ -253,28 +260,30 @@ def _interpolate(t: Array, z: Array, grid: Array) -> Array:
     return np.column_stack([np.interp(grid, t, column) for column in z.T])
 
 
-def _pieces(table: Table, segments: list[Trajectory], spec: DataSpec, cuts: list[Cut]) -> list[Trajectory]:
+def _pieces(
+    recording: Recording, segments: list[Trajectory], spec: DataSpec, cuts: list[Cut]
+) -> list[Trajectory]:
     """Intersections of windows and segments, in order of time; too short ones become cuts."""
     pieces: list[Trajectory] = []
-    for window in sorted(_windows(table, spec), key=lambda window: window.start):
+    for window in sorted(_windows(recording, spec), key=lambda window: window.start):
         for segment in segments:
             keep = (segment.t >= window.start - TINY) & (segment.t + spec.dt <= window.end + TINY)
             if not keep.any():
                 continue
-            piece = segment.part(keep, _numbered(table.name, len(pieces) + 1), window.role)
+            piece = segment.part(keep, _numbered(recording.name, len(pieces) + 1), window.role)
             if len(piece.t) >= _fewest(spec):
                 pieces.append(piece)
             else:
                 why = f"{window.role}: " + _too_short(_fewest(spec) * spec.dt, spec)
-                cuts.append(Cut(table.path.name, float(piece.t[0]), float(piece.t[-1]), why))
+                cuts.append(Cut(recording.path.name, float(piece.t[0]), float(piece.t[-1]), why))
     return pieces
 
 
-def _windows(table: Table, spec: DataSpec) -> tuple[Window, ...]:
+def _windows(recording: Recording, spec: DataSpec) -> tuple[Window, ...]:
     """The file's named windows, or its parts by fractions with the smoothing length between them."""
-    if table.name in spec.windows:
-        return tuple(spec.windows[table.name])
-    start, length = float(table.t[0]), float(table.t[-1] - table.t[0])
+    if recording.name in spec.windows:
+        return tuple(spec.windows[recording.name])
+    start, length = float(recording.t[0]), float(recording.t[-1] - recording.t[0])
     windows: list[Window] = []
     for role, fraction in zip(ROLES, spec.fractions, strict=True):
         if fraction > 0:
@@ -307,23 +316,20 @@ def _check_roles(
     trajectories: list[Trajectory], cuts: list[Cut], spec: DataSpec, needed: Sequence[Role]
 ) -> None:
     missing = [role for role in needed if all(piece.role != role for piece in trajectories)]
-    if missing:
-        dropped = "".join(f"\n  {cut.file} {cut.start:g} to {cut.end:g} s: {cut.why}" for cut in cuts[:SHOWN])
-        dropped += f"\n  and {len(cuts) - SHOWN} more" if len(cuts) > SHOWN else ""
-        raise InputError(
-            f"no piece of {_fewest(spec) * spec.dt:g} s or more is left for {' and '.join(missing)}. "
-            "Give more or longer recordings, or change windows, fractions or max_gap in the DataSpec; a recording "
-            f"without gaps that is split by fractions needs {_splittable(spec):.3g} s."
-            + (f" Cut out:{dropped}" if dropped else "")
-        )
-
-
-def _splittable(spec: DataSpec) -> float:
-    """Length [s] of a recording whose parts by fractions are all long enough."""
+    if not missing:
+        return
+    dropped = "".join(f"\n  {cut.file} {cut.start:g} to {cut.end:g} s: {cut.why}" for cut in cuts[:SHOWN])
+    dropped += f"\n  and {len(cuts) - SHOWN} more" if len(cuts) > SHOWN else ""
     used = [fraction for fraction in spec.fractions if fraction > 0]
     distances = [0.0, *(spec.smoothing for _ in used[1:])]
-    pieces = zip(used, distances, strict=True)
-    return max(((_fewest(spec) + 1) * spec.dt + distance) / fraction for fraction, distance in pieces)
+    least = (_fewest(spec) + 1) * spec.dt
+    needed_s = max((least + distance) / fraction for fraction, distance in zip(used, distances, strict=True))
+    raise InputError(
+        f"no piece of {_fewest(spec) * spec.dt:g} s or more is left for {' and '.join(missing)}. "
+        "Give more or longer recordings, or change windows, fractions or max_gap in the DataSpec; a recording "
+        f"without gaps that is split by fractions needs {needed_s:.3g} s."
+        + (f" Cut out:{dropped}" if dropped else "")
+    )
 
 
 def _fewest(spec: DataSpec) -> int:
@@ -337,8 +343,3 @@ def _too_short(need: float, spec: DataSpec) -> str:
 
 def _numbered(stem: str, number: int) -> str:
     return stem if number == 1 else f"{stem}#{number}"
-
-
-def _hash(tables: list[Table]) -> str:
-    lines = sorted(f"{table.name} {table.sha256}\n" for table in tables)
-    return hashlib.sha256("".join(lines).encode()).hexdigest()

@@ -210,7 +210,7 @@ def in_turn(trajectory: Trajectory, spec: BenchmarkSpec, distance: float) -> tup
     Example:
         >>> z = np.zeros((400, 1))
         >>> run = Trajectory("run", "", 0.1, 0.1 * np.arange(400), z, z, np.zeros((400, 2)), np.zeros((400, 2)))
-        >>> spec = BenchmarkSpec(piece=10.0, cycle=("train", "valid"))
+        >>> spec = BenchmarkSpec(unit="rad", piece=10.0, cycle=("train", "valid"))
         >>> [(p.role, len(p.t)) for p in in_turn(run, spec, 0.4)]
         [('train', 96), ('valid', 96), ('train', 96), ('valid', 96)]
     """

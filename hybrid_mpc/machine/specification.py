@@ -1,4 +1,4 @@
-"""How a machine is judged on recordings, and with what effort: the part of a scenario that ``benchmark`` reads."""
+"""How a machine's recordings are read, and how ``hybrid-mpc benchmark`` judges models by them."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from hybrid_mpc.errors import InputError
-
-# How a machine's recordings are read, and what their parts are used for.
 
 Role = Literal["train", "valid", "test", "nominal"]
 """What a part of a recording is used for, see :class:`Window`."""
@@ -47,14 +45,13 @@ class DataSpec:
             it, and none of it is scored.
         windows: Known windows by file stem. A recording that is not named here is split by ``fractions``.
         fractions: Shares of training, validation and test samples, in this order of time.
-        free_run: Length [s] of the free runs that judge a model, started every fifth of it. Default: each
-            test trajectory as a whole. Where an unstable point multiplies every error, short runs from many
-            starts say more than one long one.
+        free_run: Length [s] of the free runs that judge a model, started every fifth of it. Default: each test
+            trajectory as a whole. Where an unstable point multiplies every error, many short runs say more.
         inputs_of: Input columns of single recordings, by file stem, where they differ from ``inputs``.
         units: Units of columns that are not in seconds or in their signal's unit, by column: ``"ms"``, ``"deg"``, or
-            the factor as a number (:mod:`hybrid_mpc.data.tables`).
-        largest_delay: Longest delay [s] of the inputs that the main job searches for, with the prior's parameters, and
-            then gives the deployed models. Default 0: none is searched, the input acts at once.
+            the factor as a number (:mod:`hybrid_mpc.data.recording`).
+        largest_delay: Longest delay [s] of the inputs that is fitted with the prior's parameters. Default 0: the input
+            acts at once.
 
     Raises:
         InputError: If a length is not positive, the delay is negative, or the fractions do not sum to one.
@@ -139,22 +136,20 @@ def check_prior_replay(weight: float) -> None:
 class BenchmarkSpec:
     """How a machine's models are judged by free runs over recordings that they have not seen.
 
-    What is given at the start of a run is the scenario's ``warm_up``. The whole recording after it is one run, or
-    its first ``length`` seconds.
+    A run starts from the scenario's ``warm_up``; it is the whole recording after that, or its first ``length`` seconds.
 
     Args:
         budgets: Effort by name, ``"quick"`` and ``"full"``.
-        unit: Unit of the figures. Default: ``"rad"``.
-        scale: Figures' units in an SI unit of the output. Default: 1.
+        unit: Unit of the figures, e.g. ``"mm"`` for an output in metres.
+        scale: Its number in a unit of the output, e.g. 1000. Default: 1.
         largest_delay: Longest delay [s] of the input that is searched for; zero: none. Default: 0.
         length: Length [s] of a run after what is given. Default: the whole recording.
         piece: Length [s] of the pieces that long training recordings are cut into. Default: 25 s.
         cycle: Roles of these pieces, again and again in order of time, where a recording's parts are not alike and
             its last ones would not be a fair sample. Default: none, the data specification splits.
-        valid_every: Of several training files every so many-th, in the order of their names, validates from its first
-            sample to its last, and the others train as wholes. For short runs: the last second of a run that was
-            trained on is no sample of a free run over another one. Nothing is held back then, and the files must
-            not have windows in the data specification. Fewer files than that are split by it. Default: zero, never.
+        valid_every: Of several training files every so many-th, in the order of their names, validates as a whole, and
+            the others train as wholes. For short runs, whose last second is no fair sample. The files must not have
+            windows in the data specification. Fewer files than that are split by it. Default: zero, never.
 
     Raises:
         InputError: If a length, the scale or the delay is out of its range, a cycle lacks a role that is needed, or
@@ -166,7 +161,7 @@ class BenchmarkSpec:
     """
 
     budgets: Mapping[str, BenchmarkBudget] = field(default_factory=dict)
-    unit: str = "rad"
+    unit: str = field(kw_only=True)
     scale: float = 1.0
     largest_delay: float = 0.0
     length: float | None = None

@@ -1,15 +1,12 @@
-"""Friction as an option of any prior: blocks that are added to its equation of motion and to its energy balance.
-
-``with_friction(PendulumPrior, Coulomb(...), Stribeck(...))`` is a prior class like any other: it is fitted, trained on
-and exported as one. Every block gives the torque (or force) that opposes the velocity of one axis; what it takes from
-the machine is that times the velocity, never negative.
-"""
+"""Priors written in torch, and friction as blocks that any of them can be given."""
 
 from __future__ import annotations
 
+import dataclasses
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -17,18 +14,14 @@ from torch import Tensor, nn
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.machine.signals import Parameter, Signal
 
-# The prior: the ODE that explains most of a machine, written once (torch).
-#
-# The same code trains on any batch and is exported for one sample, because it indexes the last axis.
-
 
 class Prior(nn.Module):
     """A mechanical ODE prior with its output equation and its energy balance.
 
     The state is ``x = [q, v]``: positions first, then their velocities, so that ``q_dot = v`` is exact. ``n_extra``
-    states of another kind (a lagging input, say) may follow, whose rates :meth:`extra_rates` gives.
-    A subclass names its signals and parameters as class attributes and writes two methods. Every
-    parameter becomes a float64 ``nn.Parameter`` of shape ``()`` under its name.
+    states of another kind (a lagging input, say) may follow, whose rates :meth:`extra_rates` gives. A subclass names
+    its signals and parameters as class attributes and writes ``acceleration`` and ``inertia``; both index the last axis
+    of their arguments. Every parameter becomes a float64 ``nn.Parameter`` of shape ``()`` under its name.
 
     Args:
         values: Parameter values [SI] by name that replace the nominal ones, e.g. fitted ones.
@@ -58,8 +51,7 @@ class Prior(nn.Module):
 
     def __init__(self, values: Mapping[str, float] | None = None) -> None:
         super().__init__()
-        if (len(self.states) - self.n_extra) % 2:
-            found = len(self.states) - self.n_extra
+        if (found := len(self.states) - self.n_extra) % 2:
             raise InputError(f"{type(self).__name__}: states must be [q, v] in pairs, got {found}")
         values = dict(values or {})
         for spec in self.parameters_spec:
@@ -108,9 +100,8 @@ class Prior(nn.Module):
     def energy_balance(self, x: Tensor, xdot: Tensor, u: Tensor) -> Tensor:
         """Energy balance ΔE [W], shape ``(...)``: zero along the prior's own flow.
 
-        The velocity comes from the state ``x``, the acceleration from ``xdot``. By default it is the equation
-        of motion times the velocity, ``inertia * (v_dot - acceleration(x, u)) * v``: the same number as the
-        balance written out term by term, and no equation is written twice.
+        By default the equation of motion times the velocity, ``inertia * (v_dot - acceleration(x, u)) * v``: what the
+        balance written out term by term comes to. ``v`` is taken from ``x``, ``v_dot`` from ``xdot``.
         """
         v, v_dot = self._velocity(x), self._velocity(xdot)
         return (self.inertia(x) * (v_dot - self.acceleration(x, u)) * v).sum(-1)
@@ -120,50 +111,49 @@ class Prior(nn.Module):
         return x[..., self.n_q : 2 * self.n_q] if self.n_extra else x[..., self.n_q :]
 
 
-class FrictionTerm(Protocol):
-    """A block: its parameters, its axis, and its torque."""
+class FrictionTerm(ABC):
+    """A torque (or force) that opposes the velocity of one axis; a dataclass whose parameters the prior takes over.
+
+    What it takes from the machine, torque times velocity, is never negative.
+    """
+
+    axis: int
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Its parameters, which the prior takes among its own."""
+        """Its parameters, in the order of its fields."""
+        fields = [getattr(self, field.name) for field in dataclasses.fields(self)]  # type: ignore[arg-type]
+        return tuple(value for value in fields if isinstance(value, Parameter))
 
-    @property
-    def axis(self) -> int:
-        """Number of the degree of freedom that it brakes."""
-
+    @abstractmethod
     def torque(self, prior: Prior, x: Tensor, v: Tensor) -> Tensor:
         """Torque against the motion ``(...)`` [SI] at states ``x`` ``(..., n_x)`` and the axis' velocity ``v``."""
 
+    def values(self, prior: Prior) -> tuple[Tensor, ...]:
+        """The prior's present values of :attr:`parameters`."""
+        return tuple(getattr(prior, parameter.name) for parameter in self.parameters)
+
 
 @dataclass(frozen=True)
-class Viscous:
+class Viscous(FrictionTerm):
     """``d v``.
 
     Args:
         d: Damping [N m s/rad], not negative.
         axis: Degree of freedom. Default: the first.
-
-    Example:
-        >>> damping = Parameter("d_2", 0.1, "N m s/rad", 0.0, 1.0)
-        >>> viscous(torch.tensor(3.0), torch.tensor(0.5)).item()
-        1.5
     """
 
     d: Parameter
     axis: int = 0
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Damping."""
-        return (self.d,)
-
     def torque(self, prior: Prior, x: Tensor, v: Tensor) -> Tensor:
-        """See :func:`viscous`."""
-        return viscous(v, _of(prior, self.d))
+        """See :class:`FrictionTerm`."""
+        (d,) = self.values(prior)
+        return d * v
 
 
 @dataclass(frozen=True)
-class Coulomb:
+class Coulomb(FrictionTerm):
     """``F_c tanh(gamma v)``: dry friction, smooth at rest.
 
     ``gamma F_c / inertia`` is the rate at which it stops the machine near rest, and the prior's sub-steps follow it:
@@ -179,18 +169,13 @@ class Coulomb:
     steepness: Parameter
     axis: int = 0
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Level and steepness."""
-        return self.level, self.steepness
-
     def torque(self, prior: Prior, x: Tensor, v: Tensor) -> Tensor:
-        """See :func:`coulomb`."""
-        return coulomb(v, _of(prior, self.level), _of(prior, self.steepness))
+        """See :class:`FrictionTerm`."""
+        return coulomb(v, *self.values(prior))
 
 
 @dataclass(frozen=True)
-class Stribeck:
+class Stribeck(FrictionTerm):
     """``(F_c + (F_s - F_c) exp(-(v / v_s)^2)) tanh(gamma v)``: more friction near rest than in motion.
 
     Args:
@@ -210,18 +195,13 @@ class Stribeck:
     steepness: Parameter
     axis: int = 0
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Level, static level, Stribeck speed, steepness."""
-        return self.level, self.static, self.speed, self.steepness
-
     def torque(self, prior: Prior, x: Tensor, v: Tensor) -> Tensor:
-        """See :func:`stribeck`."""
-        return stribeck(v, *(_of(prior, p) for p in self.parameters))
+        """See :class:`FrictionTerm`."""
+        return stribeck(v, *self.values(prior))
 
 
 @dataclass(frozen=True)
-class LoadDependent:
+class LoadDependent(FrictionTerm):
     """``rho tanh(gamma v) |load(x)|``: Coulomb friction of a bearing that carries a load.
 
     Args:
@@ -238,14 +218,9 @@ class LoadDependent:
     load: Callable[[Prior, Tensor], Tensor]
     axis: int = 0
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Arm and steepness."""
-        return self.arm, self.steepness
-
     def torque(self, prior: Prior, x: Tensor, v: Tensor) -> Tensor:
-        """See :func:`load_dependent`."""
-        return load_dependent(v, self.load(prior, x), _of(prior, self.arm), _of(prior, self.steepness))
+        """See :class:`FrictionTerm`."""
+        return load_dependent(v, self.load(prior, x), *self.values(prior))
 
 
 @dataclass(frozen=True)
@@ -266,11 +241,6 @@ class PendulumLoad:
         """The load ``(...)`` [N] at ``x`` ``(..., n_x)``."""
         m, length, g = (getattr(prior, name) for name in (self.mass, self.length, self.gravity))
         return m * x[..., 1] * x[..., 1] * length + m * g * torch.cos(x[..., 0])
-
-
-def viscous(v: Tensor, d: Tensor) -> Tensor:
-    """``d v``, any shape."""
-    return d * v
 
 
 def coulomb(v: Tensor, level: Tensor, steepness: Tensor) -> Tensor:
@@ -295,10 +265,10 @@ def load_dependent(v: Tensor, load: Tensor, arm: Tensor, steepness: Tensor) -> T
 
 
 def with_friction(base: type[Prior], *terms: FrictionTerm) -> type[Prior]:
-    """A prior class that has the terms beside what ``base`` has; its balance stays zero along its own flow.
+    """A prior class with friction beside what ``base`` has; it is fitted, trained on and exported like any other.
 
     ``M v_dot = M base_acceleration(x, u) - sum of torques``, and the torques times the velocities join the energy
-    balance. The terms' parameters come after those of ``base``, with their own bounds for the fit.
+    balance. The terms' parameters come after those of ``base``.
 
     Args:
         base: Prior class with ``inertia(x)``.
@@ -312,11 +282,16 @@ def with_friction(base: type[Prior], *terms: FrictionTerm) -> type[Prior]:
             is no such axis.
 
     Example:
-        >>> from scenarios.pendulum.prior import PendulumPrior
-        >>> level = Parameter("F_c", 0.5, "N m", 0.0, 2.0)
-        >>> rubbing = with_friction(PendulumPrior, Coulomb(level, Parameter("gamma", 20.0, "s/rad", 1.0, 50.0)))
-        >>> rubbing({"F_c": 0.3}).values["F_c"]
-        0.3
+        >>> class Disk(Prior):
+        ...     states, outputs = (Signal("phi", "rad"), Signal("phi_dot", "rad/s")), (Signal("phi", "rad"),)
+        ...     inputs, parameters_spec = (Signal("torque", "N m"),), (Parameter("J", 0.5, "kg m^2", 0.1, 1.0),)
+        ...     def acceleration(self, x, u):
+        ...         return u / self.J
+        ...     def inertia(self, x):
+        ...         return self.J
+        >>> rubbing = with_friction(Disk, Viscous(Parameter("d", 0.1, "N m s/rad", 0.0, 1.0)))({"d": 0.2})
+        >>> rubbing(torch.tensor([0.0, 1.0]), torch.tensor([0.0])).tolist()
+        [1.0, -0.4]
     """
     _check(base, terms)
     added = tuple(p for term in terms for p in term.parameters)
@@ -357,11 +332,6 @@ def _named(made: Any, base: type[Prior], name: str) -> type[Prior]:
     made.__module__, made.__doc__ = base.__module__, base.__doc__
     result: type[Prior] = made
     return result
-
-
-def _of(prior: Prior, parameter: Parameter) -> Tensor:
-    value: Tensor = getattr(prior, parameter.name)
-    return value
 
 
 def _check(base: type[Prior], terms: Sequence[FrictionTerm]) -> None:

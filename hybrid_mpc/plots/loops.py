@@ -1,4 +1,4 @@
-"""Figures of the tasks: what each controller costs beside the oracle, and how well strokes hit."""
+"""Figures of the closed loops: tracking, the time of a step, and what each controller costs beside the oracle."""
 
 from __future__ import annotations
 
@@ -190,8 +190,6 @@ CONTROLLERS: Mapping[str, tuple[str, str, str, bool]] = MappingProxyType(
         "oracle_state": ("oracle, true state", "oracle", "D", False),
     }
 )
-SPEED_TARGET = 1.0  # [%]
-TIMING_TARGET = 10.0  # [ms]
 
 Costs = Mapping[str, Mapping[str, tuple[float, float]]]
 
@@ -266,111 +264,6 @@ def _relative(row: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, 
     }
 
 
-def strokes(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Errors of speed and instant at the ball over the target speed: every stroke, and the mean of its speed.
-
-    Bands show the targets of 1 % and 10 ms. The legend gives each controller's mean absolute errors over all
-    speeds, and how many strokes never came past the ball (NaN or None; in no mean). An axis is logarithmic
-    beyond the band on both sides where the errors span more than ten times of it.
-
-    Args:
-        rows: One mapping a stroke: ``controller``, ``speed_rad_s`` (the target, positive),
-            ``speed_error_rel`` (signed, a share of the target) and ``timing_error_s`` (positive: late).
-
-    Returns:
-        The figure: speed error [%] above, timing error [ms] below.
-
-    Raises:
-        InputError: If there is no stroke, a key is missing, or a target speed is not positive.
-
-    Example:
-        >>> row = {"controller": "hybrid", "speed_rad_s": 1.2, "speed_error_rel": 0.005, "timing_error_s": 2e-3}
-        >>> [ax.get_ylabel() for ax in strokes([row]).axes]
-        ['speed error [%]', 'timing error [ms]']
-    """
-    data = _by_controller(rows)
-    present = _ordered(set(data))
-    figure, axes = new_figure(2, 1, sharex=True, size=(9, 6.0))
-    panels = (
-        (axes[0, 0], 1, "speed error [%]", SPEED_TARGET, "%"),
-        (axes[1, 0], 2, "timing error [ms]", TIMING_TARGET, "ms"),
-    )
-    speeds = np.unique(np.concatenate([values[:, 0] for values in data.values()]))
-    for ax, column, label, target, unit in panels:
-        ax.axhspan(-target, target, color="#009E73", alpha=0.13, linewidth=0)
-        title_axes(ax, f"band: target, within {target:g} {unit}; large: mean of a target speed")
-        ax.axhline(0.0, color=FAINT, linewidth=0.8)
-        for i, name in enumerate(present):
-            beside = 0.72 * ((i + 0.5) / len(present) - 0.5)
-            place = np.searchsorted(speeds, data[name][:, 0]).astype(np.float64) + beside
-            _cloud(ax, place, data[name][:, column], name)
-        ax.set_ylabel(label)
-        _scale(ax, np.concatenate([values[:, column] for values in data.values()]), target)
-    axes[1, 0].set_xlabel("target speed of the club [rad/s]")
-    axes[1, 0].set_xticks(range(len(speeds)), [f"{v:g}" for v in speeds])
-    axes[1, 0].set_xlim(-0.5, len(speeds) - 0.5)
-    figure.align_ylabels([axes[0, 0], axes[1, 0]])
-    _legend(figure, axes[0, 0], present, {name: _note(data[name]) for name in present}, columns=2)
-    figure.legends[0].set_title("mean absolute errors of the strokes that met the ball")
-    return figure
-
-
-def _note(values: Array) -> str:
-    """Mean absolute errors of a controller's strokes, and how many never came past the ball."""
-    found = values[np.all(np.isfinite(values), axis=1)]
-    missed = f", {len(values) - len(found)} of {len(values)} missed" if len(found) < len(values) else ""
-    if not len(found):
-        return f": all {len(values)} missed"
-    speed, timing = (number(float(mean)) for mean in np.mean(np.abs(found[:, 1:]), axis=0))
-    return f": {speed} %, {timing} ms{missed}"
-
-
-def _by_controller(rows: Sequence[Mapping[str, Any]]) -> dict[str, Array]:
-    """Target speed [rad/s], speed error [%] and timing error [ms] ``(n, 3)`` of each controller's strokes."""
-    keys = ("controller", "speed_rad_s", "speed_error_rel", "timing_error_s")
-    for row in rows:
-        if missing := [key for key in keys if key not in row]:
-            raise InputError(
-                f"plot of the strokes: a row has no {', '.join(missing)}; it has {', '.join(row)}"
-            )
-        if not (math.isfinite(row["speed_rad_s"]) and row["speed_rad_s"] > 0):
-            raise InputError(
-                f"plot of the strokes: a target speed must be positive, got {row['speed_rad_s']}"
-            )
-    if not rows:
-        raise InputError("plot of the strokes: there is no stroke to draw")
-    scale = np.array([1.0, 100.0, 1000.0])
-    data: dict[str, list[list[float]]] = {}
-    for row in rows:
-        values = [math.nan if row[key] is None else float(row[key]) for key in keys[1:]]
-        data.setdefault(str(row["controller"]), []).append(values)
-    return {name: np.array(values) * scale for name, values in data.items()}
-
-
-def _cloud(ax: Axes, place: Array, error: Array, name: str) -> None:
-    """Every stroke small and pale; the mean of each place large."""
-    ink = _style(name)["color"]
-    found = np.isfinite(error)
-    ax.plot(place[found], error[found], ".", color=ink, markersize=4, alpha=0.45, zorder=2.6)
-    for at in np.unique(place[found]):
-        mean = float(np.mean(error[found & (place == at)]))
-        ax.plot(at, mean, linestyle="", zorder=4, **_style(name))
-
-
-def _scale(ax: Axes, errors: Array, target: float) -> None:
-    """Room for the band; logarithmic beyond it where the errors span much more."""
-    errors = errors[np.isfinite(errors)]
-    top = max(1.5 * target, 1.15 * float(np.max(np.abs(errors), initial=0.0)))
-    if top > 10 * target:
-        ax.set_yscale("symlog", linthresh=target, linscale=1.0)
-        steps = target * np.array([s * 10.0**k for k in range(8) for s in (1, 3)])
-        ticks = steps[steps <= top]
-        ticks = np.concatenate([-ticks[::-1], [0.0], ticks])
-        ax.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
-        ax.minorticks_off()
-    ax.set_ylim(-top, top)
-
-
 def _ordered(names: set[str]) -> list[str]:
     """The known controllers in their order, then others by name."""
     return [name for name in CONTROLLERS if name in names] + sorted(names - set(CONTROLLERS))
@@ -383,15 +276,9 @@ def _style(name: str) -> dict[str, Any]:
     return {"color": ink, "marker": marker, "markersize": 7, "markerfacecolor": face, "markeredgewidth": 1.5}
 
 
-def _legend(
-    figure: Figure,
-    ax: Axes,
-    present: Sequence[str],
-    notes: Mapping[str, str] = MappingProxyType({}),
-    columns: int = 3,
-) -> None:
-    """A legend in the order of the controllers, whichever task or stroke each of them has."""
+def _legend(figure: Figure, ax: Axes, present: Sequence[str]) -> None:
+    """A legend in the order of the controllers, whichever task each of them has."""
     for name in present:
         label = CONTROLLERS[name][0] if name in CONTROLLERS else plain(name)
-        ax.plot([], [], linestyle="", label=label + notes.get(name, ""), **_style(name))
-    shared_legend(figure, columns=columns)
+        ax.plot([], [], linestyle="", label=label, **_style(name))
+    shared_legend(figure, columns=3)

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
-
 from hybrid_mpc import BenchmarkBudget, BenchmarkSpec, DataSpec, Scenario
-
-if TYPE_CHECKING:
-    from hybrid_mpc import Prior
+from scenarios.common import LazyPrior
 
 DESCRIPTION = """\
 A motor drives a carriage along a rail through a ball screw; recorded in closed loop at 1 kHz. The input is the motor's
@@ -20,18 +15,11 @@ NEWTON_PER_VOLT = 35.15065188248547
 """``gtau`` of the file."""
 
 
-def make_prior(values: Mapping[str, float] | None = None) -> Prior:
-    """The prior with the given parameter values; torch is imported here and not before."""
-    from scenarios.emps.prior import EmpsPrior
-
-    return EmpsPrior(values)
-
-
 scenario = Scenario(
     name="emps",
     title="Electro-mechanical positioning system (real recording)",
     description=DESCRIPTION,
-    prior=make_prior,
+    prior=LazyPrior("scenarios.emps.prior", "EmpsPrior"),
     data=DataSpec(
         time="t",
         inputs=("vir",),

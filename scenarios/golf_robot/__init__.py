@@ -3,30 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from hybrid_mpc import DEFAULT_BUDGETS
+from scenarios.common import LazyPrior
 from scenarios.golf_robot.data import make_data
 from scenarios.golf_robot.drawing import draw
 from scenarios.golf_robot.experiment import DATA, EXPERIMENT
 from scenarios.golf_robot.faults import CAUSES
 from scenarios.golf_robot.oracle import oracle
 from scenarios.golf_robot.rig import Rig
+from scenarios.golf_robot.strokes import figures
 from scenarios.golf_robot.tasks import CONTROL, QUICK_TASKS, TASKS
 from scenarios.paper.experiment import PaperScenario
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from hybrid_mpc import Prior
-
 __all__ = ["scenario"]
-
-
-def _prior(values: Mapping[str, float] | None = None) -> Prior:
-    from scenarios.golf_robot.prior import GolfRobotPrior
-
-    return GolfRobotPrior(values)
 
 
 scenario = PaperScenario(
@@ -38,7 +28,7 @@ scenario = PaperScenario(
         "a soft belt with backlash, torque lag, cogging, drag and parameters some per cent off. Only the "
         "club's angle is measured. The data are simulated, since the paper's are not public."
     ),
-    prior=_prior,
+    prior=LazyPrior("scenarios.golf_robot.prior", "GolfRobotPrior"),
     data=DATA,
     make_data=make_data,
     plant=Rig,
@@ -48,6 +38,7 @@ scenario = PaperScenario(
     first_sigma=(0.1,),
     tasks=TASKS,
     draw=draw,
+    figures=figures,
     experiment=EXPERIMENT,
     causes=CAUSES,
     budgets={

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc import InputError, Role, Window, write_csv
+from scenarios.common import ROLES, whole_windows
 from scenarios.golf_robot.excitation import excitation
 from scenarios.golf_robot.rig import Rig, RigState
 
@@ -25,7 +26,6 @@ SIZES: Mapping[str, Mapping[Role, int]] = {
     "quick": {"train": 8, "valid": 3, "test": 4},
     "full": {"train": 15, "valid": 6, "test": 15},
 }
-ROLES: tuple[Role, ...] = ("train", "valid", "test")
 TRAIN = {
     "a": ("step", "chirp", "stair", "pulse", "fastchirp"),
     "b": ("sine", "step", "chirp", "stair", "pulse", "fastsine", "fastchirp"),
@@ -57,14 +57,8 @@ def stems(budget: str, data_set: str = "b") -> list[str]:
 
 
 def windows() -> dict[str, tuple[Window, ...]]:
-    """Role of every recording by its stem: all of it is training, validation or test.
-
-    Example:
-        >>> windows()["test_01_sine"]
-        (Window(start=0.0, end=20.0, role='test'),)
-    """
-    names = {name for data_set in TRAIN for name in stems("full", data_set)}
-    return {s: (Window(0.0, DURATION, role),) for role in ROLES for s in sorted(names) if s.startswith(role)}
+    """Role of every recording of both data sets by its stem."""
+    return whole_windows(sorted({name for data_set in TRAIN for name in stems("full", data_set)}), DURATION)
 
 
 def simulate(rig: Rig, x0: Array, u: Array, times: Array) -> list[RigState]:

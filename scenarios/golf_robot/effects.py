@@ -13,7 +13,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.optimize import least_squares
 from scipy.signal import savgol_coeffs
 
-from hybrid_mpc import LocalPolynomial, differentiate
+from hybrid_mpc import LocalPolynomial
 from scenarios.golf_robot.data import DURATION, RECORD, recordings
 from scenarios.golf_robot.dynamics import N_STATES, RigParameters, rhs
 from scenarios.golf_robot.nominal import GEAR, PARAMETERS
@@ -228,45 +228,6 @@ def table(effects: Effects) -> str:
     )
 
 
-def differentiation_error(runs: list[tuple[str, Array, Array]], window: float) -> tuple[float, float, float]:
-    """Noise, bias and both [N m] of an acceleration differentiated from recordings, times J.
-
-    Means over a period of 20 ms, as the identification compares them; half a window at the ends is left out.
-
-    Args:
-        runs: Stem, table and true states of recordings.
-        window: Length [s] of the local quartic.
-    """
-    method = LocalPolynomial(window)
-    n, noises, biases = 2 * method.reach(RECORD) + 1, [], []
-    for _, table, states in runs:
-        t, grid = table[:, 0], RECORD * np.arange(round(DURATION / RECORD) + 1)
-        path = CubicHermiteSpline(t, states[:, 0], states[:, 1])
-        inside = np.clip(grid, t[0], t[-1])
-        phi, v, measured = path(inside), path(inside, 1), np.interp(grid, t, table[:, 1])
-        clean, noisy = (differentiate(y, RECORD, method).first for y in (phi, measured))
-        true, clean, noisy = ((y[2::2] - y[:-2:2])[n:-n] / (2 * RECORD) for y in (v, clean, noisy))
-        noises.append(noisy - clean)
-        biases.append(clean - true)
-    j = RigParameters().J
-    both = [noise + bias for noise, bias in zip(noises, biases, strict=True)]
-    return j * _rms(noises), j * _rms(biases), j * _rms(both)
-
-
-def window_table(seed: int, budget: str, data_set: str) -> str:
-    """Rows of a Markdown table: window, noise, bias and both, over the training runs, then over each kind."""
-    runs = [run for run in recordings(seed, budget, data_set) if run[0].startswith("train")]
-    chosen = [(f"{window:g}", runs, window) for window in (0.16, 0.2, 0.22, 0.25, 0.28, 0.32)]
-    for kind in dict.fromkeys(run[0].split("_")[2] for run in runs):
-        of_kind = [run for run in runs if run[0].split("_")[2] == kind]
-        chosen.append((f"{SMOOTHING:g}, {kind}", of_kind, SMOOTHING))
-    rows = []
-    for name, some, window in chosen:
-        errors = (f"{1e3 * error:.1f}" for error in differentiation_error(some, window))
-        rows.append(f"| {name} | {' | '.join(errors)} |")
-    return "\n".join(rows)
-
-
 def main() -> None:
     """Print the table; with ``--figures DIR`` draw the pictures of docs/golf-robot.md too."""
     parser = argparse.ArgumentParser(description=main.__doc__)
@@ -274,11 +235,7 @@ def main() -> None:
     parser.add_argument("--budget", default="quick", help="quick or full")
     parser.add_argument("--set", default="b", dest="data_set", help="a: no sinusoids in training; b: with")
     parser.add_argument("--figures", type=Path, help="folder for the pictures")
-    parser.add_argument("--windows", action="store_true", help="compare windows of the differentiation")
     given = parser.parse_args()
-    if given.windows:
-        print(window_table(given.seed, given.budget, given.data_set))
-        return
     print(table(measure_effects(given.seed, given.budget, given.data_set)))
     if given.figures is not None:
         from scenarios.golf_robot.figures import draw

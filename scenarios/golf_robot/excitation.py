@@ -18,10 +18,8 @@ ROUNDED = 0.2  # [s]
 def excitation(kind: str, rng: np.random.Generator, t: Array) -> Array:
     """Motor torque ``(n,)`` [N m] of one of the kinds.
 
-    Sines, steps and chirps are of the paper's size. A controller may use the whole 0.5 N m and goes to 0.9 rad
-    and 4 rad/s, so there are four further kinds with up to 0.5 N m. A step of that size from rest would swing
-    the club over the top; these do not: stairs go up in parts and reach the far angles slowly; pulses are long
-    enough for 4 rad/s and too short to get far; fast sines and chirps stay above the pendulum's 0.64 Hz.
+    Sines, steps and chirps are of the paper's size. A controller may use 0.5 N m and goes to 0.9 rad and 4 rad/s, so
+    four further kinds have up to 0.5 N m and yet do not swing the club over the top.
 
     =============  ==========================================================================
     ``sine``       0.08 to 0.16 N m, 0.15 to 0.9 Hz

@@ -9,25 +9,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from scenarios.common import repeated, rk4
 from scenarios.golf_robot.dynamics import HEALTHY, N_STATES, Conditions, RigParameters, rhs
 
 Array = NDArray[np.float64]
-
-
-def rk4(f: ca.Function, s: ca.SX, u: ca.SX, h: ca.SX) -> ca.SX:
-    """One classical Runge-Kutta step of ``s_dot = f(s, u)`` over ``h`` [s]; order 4.
-
-    Example:
-        >>> s, u = ca.SX.sym("s"), ca.SX.sym("u")
-        >>> decay = ca.Function("f", [s, u], [-s])
-        >>> round(float(rk4(decay, ca.DM(1.0), ca.DM(0.0), ca.DM(0.1))), 6)
-        0.904837
-    """
-    k1 = f(s, u)
-    k2 = f(s + h / 2 * k1, u)
-    k3 = f(s + h / 2 * k2, u)
-    k4 = f(s + h * k3, u)
-    return s + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
 def one_step(p: RigParameters, *, faulty: bool = False) -> ca.Function:
@@ -52,15 +37,8 @@ def one_step(p: RigParameters, *, faulty: bool = False) -> ca.Function:
 
 
 def steps(p: RigParameters, n: int, *, faulty: bool = False) -> ca.Function:
-    """Function ``(s, q, h) -> s`` of ``n`` times :func:`one_step` with the same ``q`` and ``h``.
-
-    Example:
-        >>> steps(RigParameters(), 10)(ca.DM.zeros(6), 0.1, 1e-4).shape
-        (6, 1)
-    """
-    one = one_step(p, faulty=faulty)
-    s, q, h = ca.MX.sym("s", N_STATES), ca.MX.sym("q", one.size1_in(1)), ca.MX.sym("h")
-    return ca.Function("steps", [s, q, h], [one.fold(n)(s, ca.repmat(q, 1, n), ca.repmat(h, 1, n))])
+    """Function ``(s, q, h) -> s`` of ``n`` times :func:`one_step` with the same ``q`` and ``h``."""
+    return repeated(one_step(p, faulty=faulty), n)
 
 
 def steps_with_jacobian(p: RigParameters, n: int) -> ca.Function:
@@ -88,7 +66,7 @@ def steps_with_jacobian(p: RigParameters, n: int) -> ca.Function:
     one = ca.Function("one", [both, u, h], [rk4(f, both, u, h)])
     z, q, step = ca.MX.sym("z", N_STATES), ca.MX.sym("q"), ca.MX.sym("h")
     unit = np.eye(N_STATES, N_STATES + 1)
-    end = one.fold(n)(ca.vertcat(z, ca.vec(ca.MX(unit))), ca.repmat(q, 1, n), ca.repmat(step, 1, n))
+    end = repeated(one, n)(ca.vertcat(z, ca.vec(ca.MX(unit))), q, step)
     slopes = ca.reshape(end[N_STATES:], N_STATES, N_STATES + 1)
     results = [end[:N_STATES], slopes[:, :N_STATES], slopes[:, N_STATES]]
     return ca.Function("steps_with_jacobian", [z, q, step], results)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc import OCP, ClosedLoopResult, Fault, Task
-from scenarios.references import faded_sines
+from scenarios.common import faded_sines, moves
 
 Array = NDArray[np.float64]
 
@@ -52,6 +53,7 @@ STEPS = (0.0, 0.3, -0.2, 0.4, 0.0)
 HEAVY_STEPS = (0.0, 0.3, -0.2, 0.5, 0.0)
 STEP_TIME = 1.3
 MOVE_TIME = 0.8
+"""Time of a move [s], which the motor can follow at two thirds of its torque and more."""
 
 
 def sine_reference(t: Array) -> Array:
@@ -77,28 +79,6 @@ def swing_reference(t: Array) -> Array:
         [[0.0, 0.0]]
     """
     return faded_sines(t, ((0.3, 0.35),))
-
-
-def steps(levels: tuple[float, ...]) -> Callable[[Array], Array]:
-    """Reference ``t (n,) -> (n, 2)`` that goes from level to level [rad], each for ``STEP_TIME``.
-
-    A bare jump cannot be followed by anyone, and what it costs hides all differences; so a move takes
-    ``MOVE_TIME`` along a quintic, which the motor can follow at two thirds of its torque and more.
-
-    Example:
-        >>> steps((0.0, 0.4))(np.array([0.0, 1.3, 1.7, 2.2])).round(2).tolist()
-        [[0.0, 0.0], [0.0, 0.0], [0.2, 0.94], [0.4, 0.0]]
-    """
-
-    def reference(t: Array) -> Array:
-        index = np.clip(np.floor(t / STEP_TIME + 1e-9).astype(int), 0, len(levels) - 1)
-        before = np.array(levels)[np.maximum(index - 1, 0)]
-        rise = np.array(levels)[index] - before
-        s = np.clip((t - index * STEP_TIME) / MOVE_TIME, 0.0, 1.0)
-        share, slope = s**3 * (10 - 15 * s + 6 * s**2), 30 * s**2 * (1 - s) ** 2 / MOVE_TIME
-        return np.column_stack([before + rise * share, rise * slope])
-
-    return reference
 
 
 def stroke(
@@ -142,14 +122,7 @@ def impact(result: ClosedLoopResult, speed: float) -> dict[str, float]:
     effort = float(np.sum(u[t < IMPACT] ** 2) * (t[1] - t[0]))
     crossings = np.flatnonzero((x[:-1, 0] < 0) & (x[1:, 0] >= 0))
     times = [_crossing(t[k : k + 2], x[k : k + 2]) for k in crossings]
-    if not times:
-        return {
-            "speed_rad_s": speed,
-            "speed_error_rel": np.inf,
-            "timing_error_s": np.inf,
-            "effort_nm2s": effort,
-        }
-    at, reached = min(times, key=lambda c: abs(c[0] - IMPACT))
+    at, reached = min(times, key=lambda c: abs(c[0] - IMPACT), default=(np.inf, np.inf))
     error = {"speed_error_rel": reached / speed - 1.0, "timing_error_s": at - IMPACT}
     return {"speed_rad_s": speed, **error, "effort_nm2s": effort}
 
@@ -179,7 +152,8 @@ def _stroke_task(speed: float, control: OCP) -> Task:
 
 TASKS = (
     Task("track_sine", "Follow two sinusoids of 0.5 and 0.2 rad", 6.0, (0.0, 0.0), sine_reference),
-    Task("track_step", "Follow moves of up to 0.6 rad in 0.8 s", STEP_TIME * len(STEPS), (0.0, 0.0), steps(STEPS),
+    Task("track_step", "Follow moves of up to 0.6 rad in 0.8 s", STEP_TIME * len(STEPS), (0.0, 0.0),
+         partial(moves, levels=STEPS, hold_s=STEP_TIME, move_s=MOVE_TIME),
          control=SLOW),
     *(_stroke_task(speed, PUTT) for speed in PUTTS),
     *(_stroke_task(speed, HARD_STROKE) for speed in HARD_STROKES),
@@ -188,7 +162,8 @@ TASKS = (
     Task("reject_load", "Swing on against an unknown constant load", 5.0, (0.0, 0.0), swing_reference,
          control=GENTLE, faults=(Fault(2.0, np.inf, "input_offset", -0.08),)),
     Task("reject_heavy", "Follow moves with a club 20 % heavier", STEP_TIME * len(HEAVY_STEPS),
-         (0.0, 0.0), steps(HEAVY_STEPS), faults=(Fault(0.0, np.inf, "plant_mass", 1.2),)),
+         (0.0, 0.0), partial(moves, levels=HEAVY_STEPS, hold_s=STEP_TIME, move_s=MOVE_TIME),
+         faults=(Fault(0.0, np.inf, "plant_mass", 1.2),)),
 )  # fmt: skip
 
 QUICK_TASKS = ("track_sine", "stroke_1.4", "reject_load")

@@ -2,28 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from hybrid_mpc import Budget, DataSpec
+from scenarios.common import LazyPrior, whole_windows
 from scenarios.paper.experiment import PaperScenario
-from scenarios.pendulum.data import make_data, windows
+from scenarios.pendulum.data import DURATION, make_data, stems
 from scenarios.pendulum.experiment import EXPERIMENT
 from scenarios.pendulum.oracle import oracle
 from scenarios.pendulum.plant import DampedPendulum
 from scenarios.pendulum.tasks import CONTROL, TASKS
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from hybrid_mpc import Prior
-
 __all__ = ["scenario"]
-
-
-def _prior(values: Mapping[str, float] | None = None) -> Prior:
-    from scenarios.pendulum.prior import PublishedPendulumPrior
-
-    return PublishedPendulumPrior(values)
 
 
 scenario = PaperScenario(
@@ -34,7 +22,7 @@ scenario = PaperScenario(
         "hangs down. The prior is the paper's: 50 mm, and 5 % less damping. It is not fitted, here as there: with "
         "both free, a fit finds the plant itself, and no network could add to it."
     ),
-    prior=_prior,
+    prior=LazyPrior("scenarios.pendulum.prior", "PublishedPendulumPrior"),
     data=DataSpec(
         time="time_s",
         inputs=("u_nm",),
@@ -43,7 +31,7 @@ scenario = PaperScenario(
         max_gap=0.005,
         smoothing=0.06,
         warm_up=0.1,
-        windows=windows(),
+        windows=whole_windows(stems("full"), DURATION),
     ),
     make_data=make_data,
     plant=DampedPendulum,

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc import InputError, Role, Trajectory, Window, sinusoid, write_csv
+from hybrid_mpc import InputError, Role, Trajectory, sinusoid, write_csv
+from scenarios.common import ROLES
 from scenarios.pendulum.plant import DampedPendulum
 
 Array = NDArray[np.float64]
@@ -24,7 +25,6 @@ SIZES: Mapping[str, Mapping[Role, int]] = {
     "quick": {"train": 6, "valid": 3, "test": 4},
     "full": {"train": 15, "valid": 5, "test": 10},
 }
-ROLES: tuple[Role, ...] = ("train", "valid", "test")
 
 
 def stems(budget: str) -> list[str]:
@@ -40,16 +40,6 @@ def stems(budget: str) -> list[str]:
     if budget not in SIZES:
         raise InputError(f"pendulum: no budget {budget!r}; it has: {', '.join(SIZES)}")
     return [f"{role}_{k + 1:02d}" for role, n in SIZES[budget].items() for k in range(n)]
-
-
-def windows() -> dict[str, tuple[Window, ...]]:
-    """Role of every recording by its stem: all of it is training, validation or test.
-
-    Example:
-        >>> windows()["test_01"]
-        (Window(start=0.0, end=5.0, role='test'),)
-    """
-    return {s: (Window(0.0, DURATION, role),) for role in ROLES for s in stems("full") if s.startswith(role)}
 
 
 def simulate(plant: DampedPendulum, x0: Array, u: Array) -> Array:
@@ -74,7 +64,7 @@ def simulate(plant: DampedPendulum, x0: Array, u: Array) -> Array:
 def run(plant: DampedPendulum, role: Role, number: int, seed: int) -> tuple[Array, Array, Array]:
     """One run of 5 s: a sinusoidal torque of random size, frequency and phase from a random x0.
 
-    The torque is held for a model period of 10 ms, as a controller would: a discrete-time model can then be exact.
+    The torque is held for a model period of 10 ms: a discrete-time model can then be exact.
 
     Args:
         plant: The pendulum.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import casadi as ca
 
 from hybrid_mpc import HybridModel
+from scenarios.common import rk4
 from scenarios.pendulum.nominal import INPUTS, OUTPUTS, PUBLISHED, STATES
 from scenarios.pendulum.plant import PendulumParameters
 
@@ -26,17 +27,10 @@ def oracle(dt: float, parameters: PendulumParameters | None = None, sub_steps: i
     """
     p = parameters or PendulumParameters()
     x, u, rate = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("rate", 2)
-
-    def rates(z: ca.SX) -> ca.SX:
-        return ca.vertcat(z[1], (u - p.gravity * ca.sin(z[0]) - p.d * z[1]) / p.inertia)
-
-    z, s = x, dt / sub_steps
+    xdot = ca.vertcat(x[1], (u - p.gravity * ca.sin(x[0]) - p.d * x[1]) / p.inertia)
+    rates, z = ca.Function("rates", [x, u], [xdot]), x
     for _ in range(sub_steps):
-        k1 = rates(z)
-        k2 = rates(z + s / 2 * k1)
-        k3 = rates(z + s / 2 * k2)
-        k4 = rates(z + s * k3)
-        z = z + s / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        z = rk4(rates, z, u, dt / sub_steps)
     published = {spec.name: spec.value for spec in PUBLISHED}
     m, length, d, g = (published[name] for name in ("m", "l", "d", "g"))
     torque = m * length**2 * rate[1] + m * g * length * ca.sin(x[0]) + d * x[1] - u
@@ -49,7 +43,7 @@ def oracle(dt: float, parameters: PendulumParameters | None = None, sub_steps: i
         x=x,
         u=u,
         x_next=z,
-        xdot=rates(x),
+        xdot=xdot,
         y=x[0],
         rate=rate,
         energy=x[1] * torque,

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc import OCP, Fault, Task
-from scenarios.references import faded_sines, quintic
+from scenarios.common import faded_sines, moves
 
 Array = NDArray[np.float64]
 
@@ -49,23 +51,10 @@ def swing_reference(t: Array) -> Array:
     return faded_sines(t, ((0.3, 0.5),), fade_s=0.5)
 
 
-def step_reference(t: Array) -> Array:
-    """``(n, 2)``: from level to level [rad], each for ``STEP_TIME``, along a quintic of ``MOVE_TIME``.
-
-    Example:
-        >>> step_reference(np.array([0.0, 0.8, 1.0, 1.2])).round(2).tolist()
-        [[0.0, 0.0], [0.0, 0.0], [0.25, 2.34], [0.5, 0.0]]
-    """
-    index = np.clip(np.floor(t / STEP_TIME + 1e-9).astype(int), 0, len(STEPS) - 1)
-    before = np.array(STEPS)[np.maximum(index - 1, 0)]
-    rise = np.array(STEPS)[index] - before
-    share, slope = quintic((t - index * STEP_TIME) / MOVE_TIME)
-    return np.column_stack([before + rise * share, rise * slope / MOVE_TIME])
-
-
 TASKS = (
     Task("track_sine", "Follow two sinusoids of 0.4 and 0.15 rad", 4.0, (0.0, 0.0), sine_reference),
-    Task("track_step", "Follow moves of up to 1 rad in 0.4 s", 4.0, (0.0, 0.0), step_reference),
+    Task("track_step", "Follow moves of up to 1 rad in 0.4 s", 4.0, (0.0, 0.0),
+         partial(moves, levels=STEPS, hold_s=STEP_TIME, move_s=MOVE_TIME)),
     Task("reject_load", "Swing on against an unknown constant load", 4.0, (0.0, 0.0), swing_reference,
          faults=(Fault(1.5, np.inf, "input_offset", LOAD),)),
 )  # fmt: skip

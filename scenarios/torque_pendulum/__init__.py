@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 from hybrid_mpc import OCP, BenchmarkBudget, BenchmarkSpec, Budget, DataSpec, Scenario, Window
-
-if TYPE_CHECKING:
-    from hybrid_mpc import Prior
+from scenarios.common import LazyPrior
 
 DESCRIPTION = """\
 A point mass of 0.546 kg on a rod of 0.5 m, driven through a 6:1 gear; phi = 0 hangs down. Recordings:
@@ -50,18 +47,11 @@ since only together they tell torque constant and friction apart; the later swin
 kept for validation and test, and so is all of the two further recordings."""
 
 
-def make_prior(values: Mapping[str, float] | None = None) -> Prior:
-    """The prior with the given parameter values; torch is imported here and not before."""
-    from scenarios.torque_pendulum.prior import TorquePendulumPrior
-
-    return TorquePendulumPrior(values)
-
-
 scenario = Scenario(
     name="torque_pendulum",
     title="Torque-driven pendulum (real recordings)",
     description=DESCRIPTION,
-    prior=make_prior,
+    prior=LazyPrior("scenarios.torque_pendulum.prior", "TorquePendulumPrior"),
     data=DataSpec(
         time="time_s",
         inputs=("tau_cmd_Nm",),
@@ -98,6 +88,7 @@ scenario = Scenario(
             "quick": BenchmarkBudget(16, 4, teacher_steps=300, free_run_steps=400, horizon=50, decay=6000.0),
             "full": BenchmarkBudget(16, 16, teacher_steps=300, free_run_steps=1200, horizon=50, decay=6000.0),
         },
+        unit="rad",
         length=2.5,  # a swing-up, from hanging down
     ),
 )

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from math import cos, sin
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc import DEFAULT_BUDGETS, BenchmarkBudget, BenchmarkSpec, DataSpec, Scenario
-from scenarios.unbalanced_disk.data import make_data, windows
+from scenarios.common import LazyPrior, whole_windows
+from scenarios.unbalanced_disk.data import SAMPLES, make_data, stems
 from scenarios.unbalanced_disk.nominal import DT
 from scenarios.unbalanced_disk.plant import DiskPlant
 from scenarios.unbalanced_disk.tasks import CONTROL, TASKS
-
-if TYPE_CHECKING:
-    from hybrid_mpc import Prior
 
 DESCRIPTION = """\
 A small motor turns a disk with a mass off its centre; phi = 0 hangs down, the input is the motor's voltage, only the
@@ -31,13 +28,6 @@ LARGEST_DELAY = 0.06
 PRIOR_REPLAY = 10.0
 """The tasks stand upright, where no recording was: there the prior is to stand alone. Of 0, 1, 10, 30 and 100 the one
 with the least validation error of the MOPGRNN (docs/disk.md)."""
-
-
-def make_prior(values: Mapping[str, float] | None = None) -> Prior:
-    """The prior with the given parameter values; torch is imported here and not before."""
-    from scenarios.unbalanced_disk.prior import UnbalancedDiskPrior
-
-    return UnbalancedDiskPrior(values)
 
 
 def draw(x: NDArray[np.float64]) -> Sequence[NDArray[np.float64]]:
@@ -57,7 +47,7 @@ scenario = Scenario(
     name="unbalanced_disk",
     title="Unbalanced disk: a voltage-driven disk with a mass off its centre",
     description=DESCRIPTION,
-    prior=make_prior,
+    prior=LazyPrior("scenarios.unbalanced_disk.prior", "UnbalancedDiskPrior"),
     data=DataSpec(
         time="dt",  # one number, the sampling time
         inputs=("u",),
@@ -69,7 +59,7 @@ scenario = Scenario(
         warm_up=1.225,
         fractions=(0.7, 0.15, 0.15),
         free_run=25.0,
-        windows=windows(),
+        windows=whole_windows(stems("full"), SAMPLES * DT),
         largest_delay=LARGEST_DELAY,
     ),
     make_data=make_data,
@@ -95,6 +85,7 @@ scenario = Scenario(
             "quick": BenchmarkBudget(16, 2, teacher_steps=200, free_run_steps=200, horizon=60, batch=32),
             "full": BenchmarkBudget(32, 4, teacher_steps=500, free_run_steps=1500, horizon=80, batch=48),
         },
+        unit="rad",
         largest_delay=LARGEST_DELAY,
         # the swings grow along the recordings (standard deviation 0.47, 0.49, 0.52 rad over their first 70, next 15 and
         # last 15 %), so the last part is no fair sample: every seventh piece chooses, every seventh is held back

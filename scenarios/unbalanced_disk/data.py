@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc import InputError, Role, Window, chirp, multisine, random_steps, write_arrays
+from hybrid_mpc import InputError, Role, chirp, multisine, random_steps, write_arrays
+from scenarios.common import ROLES
 from scenarios.unbalanced_disk.nominal import DT
 from scenarios.unbalanced_disk.plant import DiskPlant
 
@@ -24,16 +25,15 @@ SIZES: Mapping[str, Mapping[Role, int]] = {
     "quick": {"train": 8, "valid": 3, "test": 4},
     "full": {"train": 20, "valid": 6, "test": 8},
 }
-ROLES: tuple[Role, ...] = ("train", "valid", "test")
 
 
 def _multisine(rng: np.random.Generator, t: Array) -> Array:
-    u = multisine(t, rng.uniform(0.6, 1.0) * PEAK, 0.56, 2.6, lower=-PEAK, upper=PEAK)
+    u = multisine(t, rng.uniform(0.6, 1.0) * PEAK, 0.56, 2.6)
     return np.roll(u, int(rng.integers(len(t))))
 
 
 def _wide(rng: np.random.Generator, t: Array) -> Array:
-    u = multisine(t, rng.uniform(0.8, 1.0) * PEAK, 0.5, 10.6, lower=-PEAK, upper=PEAK)
+    u = multisine(t, rng.uniform(0.8, 1.0) * PEAK, 0.5, 10.6)
     return np.roll(u, int(rng.integers(len(t))))
 
 
@@ -69,17 +69,6 @@ def stems(budget: str) -> list[str]:
     return [
         f"{role}_{k + 1:02d}_{kinds[k % len(kinds)]}" for role, n in SIZES[budget].items() for k in range(n)
     ]
-
-
-def windows() -> dict[str, tuple[Window, ...]]:
-    """Role of every simulated recording by its stem: all of it is training, validation or test.
-
-    Example:
-        >>> windows()["test_01_multisine"]
-        (Window(start=0.0, end=25.0, role='test'),)
-    """
-    end = SAMPLES * DT
-    return {s: (Window(0.0, end, role),) for role in ROLES for s in stems("full") if s.startswith(role)}
 
 
 def record(plant: DiskPlant, kind: str, seed: tuple[int, ...]) -> tuple[Array, Array]:

@@ -8,6 +8,7 @@ from math import isfinite
 import casadi as ca
 
 from hybrid_mpc import InputError
+from scenarios.common import repeated, rk4
 
 N_STATES = 4
 """phi [rad], phi_dot [rad/s], motor current [A], deflection of the bristle [rad]."""
@@ -105,15 +106,6 @@ def rhs(s: ca.SX, u: ca.SX, p: DiskParameters) -> ca.SX:
     return ca.vertcat(v, torque / p.J, current, v - ca.fabs(v) * z / (p.bristle * level))
 
 
-def rk4(f: ca.Function, s: ca.SX, u: ca.SX, h: ca.SX) -> ca.SX:
-    """One classical Runge-Kutta step of ``s_dot = f(s, u)`` over ``h`` [s]; order 4."""
-    k1 = f(s, u)
-    k2 = f(s + h / 2 * k1, u)
-    k3 = f(s + h / 2 * k2, u)
-    k4 = f(s + h * k3, u)
-    return s + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-
-
 def steps(p: DiskParameters, n: int) -> ca.Function:
     """Function ``(s, u, h) -> s`` of ``n`` Runge-Kutta steps of ``h`` [s] each.
 
@@ -123,9 +115,4 @@ def steps(p: DiskParameters, n: int) -> ca.Function:
     """
     s, u, h = ca.SX.sym("s", N_STATES), ca.SX.sym("u"), ca.SX.sym("h")
     f = ca.Function("f", [s, u], [rhs(s, u, p)])
-    return _repeated(ca.Function("one", [s, u, h], [rk4(f, s, u, h)]), n, "steps")
-
-
-def _repeated(one: ca.Function, n: int, name: str) -> ca.Function:
-    s, u, h = (ca.MX.sym(label, one.size1_in(i)) for i, label in enumerate("suh"))
-    return ca.Function(name, [s, u, h], [one.fold(n)(s, ca.repmat(u, 1, n), ca.repmat(h, 1, n))])
+    return repeated(ca.Function("one", [s, u, h], [rk4(f, s, u, h)]), n)

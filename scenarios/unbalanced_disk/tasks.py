@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc import OCP, ClosedLoopResult, Fault, Task
-from scenarios.references import faded_sines
+from scenarios.common import faded_sines
 from scenarios.unbalanced_disk.nominal import DT
 
 Array = NDArray[np.float64]

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
-
 from hybrid_mpc import BenchmarkBudget, BenchmarkSpec, DataSpec, Scenario
-
-if TYPE_CHECKING:
-    from hybrid_mpc import Prior
+from scenarios.common import LazyPrior
 
 DESCRIPTION = """\
 0.49 kg at 0.10 m on a small servo, phi = 0 hangs down. Recordings: Rhoban/bam (Apache-2.0); Duclusaud, Passault,
@@ -18,18 +13,11 @@ switched on: in the lift-and-drop runs it lets the pendulum fall after two secon
 part of the model: the runs are open loop, from the duty that was recorded."""
 
 
-def make_prior(values: Mapping[str, float] | None = None) -> Prior:
-    """The prior with the given parameter values; torch is imported here and not before."""
-    from scenarios.xl330_pendulum.prior import Xl330PendulumPrior
-
-    return Xl330PendulumPrior(values)
-
-
 scenario = Scenario(
     name="xl330_pendulum",
     title="Pendulum on an XL330 servo (real recordings)",
     description=DESCRIPTION,
-    prior=make_prior,
+    prior=LazyPrior("scenarios.xl330_pendulum.prior", "Xl330PendulumPrior"),
     data=DataSpec(
         time="time_s",
         inputs=("duty", "supply_V", "torque_enable"),
@@ -49,6 +37,7 @@ scenario = Scenario(
                 32, 4, teacher_steps=500, free_run_steps=2000, horizon=250, batch=32, decay=1000.0
             ),
         },
+        unit="rad",
         valid_every=3,
     ),
 )

@@ -13,7 +13,7 @@ import pytest
 import recording_bombs as bombs
 
 from hybrid_mpc import InputError
-from hybrid_mpc.data.tables import read_table
+from hybrid_mpc.data.recording import read_recording
 from hybrid_mpc.files import check_npz
 
 ROOT = Path(__file__).parents[2]
@@ -60,14 +60,14 @@ def test_two_million_rows_are_read(tmp_path):
     path = tmp_path / "long.csv"
     rows = np.c_[t, np.round(np.cos(3 * t), 4), np.round(np.sin(3 * t), 4)]
     np.savetxt(path, rows, delimiter=",", header="time_s,tau,phi", comments="", fmt=("%.3f", "%.4f", "%.4f"))
-    table = read_table(path, bombs.SPEC, **bombs.SIGNALS)
+    table = read_recording(path, bombs.SPEC, **bombs.SIGNALS)
     assert table.y.shape == (m, 1)
     np.testing.assert_array_equal(table.t, np.round(t, 3))
 
 
 def refused(path, match):
     with pytest.raises(InputError, match=match):
-        read_table(path, bombs.SPEC, **bombs.SIGNALS)
+        read_recording(path, bombs.SPEC, **bombs.SIGNALS)
 
 
 @pytest.mark.parametrize("ending", ["csv", "npz", "mat"])

@@ -1,16 +1,33 @@
+"""Signals have the spectra that they promise, and recordings that excite too little are noticed."""
+
 import numpy as np
 import pytest
 
-from hybrid_mpc import InputError, chirp, multisine, prbs, random_steps, sinusoid
-from hybrid_mpc.data.excitation import crest_factor, hann_spectrum, line_spectrum
+from hybrid_mpc import (
+    InputError,
+    Signal,
+    Trajectory,
+    check_excitation,
+    chirp,
+    excitation_of,
+    multisine,
+    prbs,
+    random_steps,
+)
+
+DT = 0.02
+INPUT, OUTPUT = (Signal("torque", "N m", -0.5, 0.5),), (Signal("phi", "rad", -3, 3),)
 
 
-def test_chirp_has_the_stated_frequencies_at_its_ends():
-    t = np.linspace(0, 20, 20001)
-    crossings = t[1:][np.diff(np.sign(chirp(t, 1.0, 0.5, 2.0))) != 0]
-    # half periods: 1/(2 f) up to the change of f within one half period (7.5 % at 0.5 Hz)
-    assert crossings[1] - crossings[0] == pytest.approx(1.0, rel=0.15)
-    assert crossings[-1] - crossings[-2] == pytest.approx(0.25, rel=0.02)
+def crest_factor(u):
+    return np.abs(u - u.mean()).max() / u.std()
+
+
+def line_spectrum(u, dt):
+    """Frequencies [Hz] and amplitudes of the sines of which a whole number of periods fits the record."""
+    size = np.abs(np.fft.rfft(u)) / len(u)
+    size[1 : (len(u) + 1) // 2] *= 2
+    return np.fft.rfftfreq(len(u), dt), size
 
 
 def test_steps_keep_bounds_and_hold_times_and_repeat_with_the_seed():
@@ -25,12 +42,15 @@ def test_steps_keep_bounds_and_hold_times_and_repeat_with_the_seed():
     np.testing.assert_array_equal(u, again)
 
 
-def test_bounds_are_refused_not_clipped():
-    t = np.linspace(0, 1, 11)
-    with pytest.raises(InputError, match="Lower the amplitude"):
-        sinusoid(t, 1.0, 1.0, offset=0.2, upper=1.0)
-    with pytest.raises(InputError, match="hold"):
-        random_steps(t, 0, 1, hold=(0.0, 1.0), rng=np.random.default_rng(0))
+def test_steps_have_their_power_at_low_frequencies():
+    t = 0.01 * np.arange(100_000)
+    u = random_steps(t, -1.0, 1.0, hold=(0.5, 1.5), rng=np.random.default_rng(5))
+    f, amplitude = line_spectrum(u, 0.01)
+    power = amplitude[1:] ** 2
+    low = f[1:] < 0.44
+    assert 0.6 < power[low].sum() / power.sum() < 0.85  # 0.72 for equal holds
+    decade = [power[(f[1:] > a) & (f[1:] < 1.5 * a)].mean() for a in (2.0, 8.0)]
+    assert decade[0] / decade[1] == pytest.approx(16, rel=0.3)  # amplitude ~ 1/f; 1000 lines scatter by 3 %
 
 
 def test_multisine_has_its_lines_all_of_one_size_and_nothing_else():
@@ -51,20 +71,14 @@ def test_multisine_repeats_and_may_leave_out_even_lines():
     np.testing.assert_allclose(u[500:], u[:-500], atol=1e-12)
     _, amplitude = line_spectrum(u[:500], 0.01)
     assert np.flatnonzero(amplitude > 1e-9).tolist() == [1, 3, 5, 7, 9]
-    np.testing.assert_allclose(
-        u[250:500], -u[:250], atol=1e-12
-    )  # odd lines: half a period later the opposite
+    np.testing.assert_allclose(u[250:500], -u[:250], atol=1e-12)  # half a period later the opposite
 
 
 @pytest.mark.parametrize("first", [1, 20])
-@pytest.mark.parametrize("count", [10, 20, 57, 200])
+@pytest.mark.parametrize("count", [10, 57, 200])
 def test_schroeder_phases_keep_the_crest_factor_low(count, first):
     t = 0.005 * np.arange(4000)
-    u = multisine(t, 1.0, first / 20, (first + count - 1) / 20)
-    assert 1.6 < crest_factor(u) < 2.0
-    rng, line = np.random.default_rng(count), 2 * np.pi * np.arange(first, first + count)[:, None] / 20
-    random = [np.cos(line * t + rng.uniform(0, 2 * np.pi, (count, 1))).sum(axis=0) for _ in range(15)]
-    assert np.median([crest_factor(v) for v in random]) > 2.3
+    assert 1.6 < crest_factor(multisine(t, 1.0, first / 20, (first + count - 1) / 20)) < 2.0
 
 
 @pytest.mark.parametrize("bits", [3, 5, 7, 10])
@@ -83,7 +97,7 @@ def test_prbs_has_the_levels_mean_and_lines_of_theory(bits):
     half = np.interp(0.44 / (per * dt), f[k], hold)
     assert half == pytest.approx(
         np.sqrt(0.5), abs=0.02
-    )  # between two lines, which are n to the clock's frequency
+    )  # between two lines; n of them to the clock's frequency
     assert crest_factor(u) < 1 + 1.5 / n  # two levels, the mean a little off their middle
 
 
@@ -104,50 +118,98 @@ def test_prbs_holds_for_a_clock_and_repeats_only_after_its_length():
 
 def test_chirp_is_flat_between_its_frequencies():
     t = 0.005 * np.arange(16000)
-    f, amplitude = line_spectrum(chirp(t, 0.8, 0.5, 4.5), 0.005)
-    band = (f > 1.0) & (f < 4.0)
+    u = chirp(t, 0.8, 0.5, 4.5)
+    f, amplitude = line_spectrum(u, 0.005)
     flat = 0.8 / np.sqrt(80 * 4.0)
-    assert np.median(amplitude[band]) == pytest.approx(
-        flat, rel=0.05
-    )  # Fresnel ripples die away from the ends
+    middle = amplitude[(f > 1.0) & (f < 4.0)]
+    assert np.median(middle) == pytest.approx(flat, rel=0.05)  # Fresnel ripples die away from the ends
     assert (amplitude[(f < 0.3) | (f > 5.0)] < 0.2 * flat).all()
-    assert crest_factor(chirp(t, 0.8, 0.5, 4.5)) == pytest.approx(np.sqrt(2), abs=0.02)
-
-
-def test_steps_have_their_power_at_low_frequencies():
-    t = 0.01 * np.arange(100_000)
-    f, amplitude = line_spectrum(
-        random_steps(t, -1.0, 1.0, hold=(0.5, 1.5), rng=np.random.default_rng(5)), 0.01
-    )
-    power = amplitude[1:] ** 2
-    low = f[1:] < 0.44
-    assert 0.6 < power[low].sum() / power.sum() < 0.85  # 0.72 for equal holds
-    decade = [power[(f[1:] > a) & (f[1:] < 1.5 * a)].mean() for a in (2.0, 8.0)]
-    assert decade[0] / decade[1] == pytest.approx(16, rel=0.3)  # amplitude ~ 1/f; 1000 lines scatter by 3 %
-
-
-def test_hann_spectrum_shows_a_sine_of_any_frequency():
-    t = 0.01 * np.arange(1000)
-    for f0 in (2.0, 2.03, 2.05):
-        f, amplitude = hann_spectrum(5.0 + 0.7 * np.sin(2 * np.pi * f0 * t), 0.01)
-        k = int(np.argmax(amplitude))
-        assert abs(f[k] - f0) <= 0.05 + 1e-9
-        assert 0.84 * 0.7 < amplitude[k] < 1.001 * 0.7
-        assert np.delete(amplitude, range(k - 2, k + 3)).max() < 0.03 * 0.7
+    assert crest_factor(u) == pytest.approx(np.sqrt(2), abs=0.02)
+    crossings = t[1:][np.diff(np.sign(u)) != 0]
+    assert crossings[-1] - crossings[-2] == pytest.approx(
+        1 / (2 * 4.5), abs=0.005
+    )  # half a period, one sample
 
 
 def test_what_cannot_be_made_is_refused():
     t = 0.01 * np.arange(1000)
     for make, match in (
-        (lambda: multisine(t, 1.0, 0.2, 3.0, upper=0.9), "Lower the amplitude"),
         (lambda: multisine(t, 1.0, 0.2, 60.0), "half the sampling"),
         (lambda: multisine(t, 1.0, 0.21, 0.29), "no line between 0.21 and 0.29 Hz; they are 0.1 Hz apart"),
         (lambda: multisine(t, 1.0, 0.2, 0.2, odd=True), "odd multiples only"),
         (lambda: multisine(t[:1], 1.0, 0.2, 3.0), "more than one instant"),
+        (lambda: chirp(t[:1], 1.0, 0.2, 3.0), "more than one instant"),
         (lambda: prbs(t, 1.0, 0.0, clock=0.1), "lower < upper"),
         (lambda: prbs(t, 0.0, 1.0, clock=0.001), "at least the sampling time 0.01 s"),
         (lambda: prbs(t, 0.0, 1.0, clock=0.1, bits=40), "2 to 32 bits, got 40"),
-        (lambda: crest_factor(np.ones(5)), "constant"),
+        (lambda: random_steps(t, 0, 1, hold=(0.0, 1.0), rng=np.random.default_rng(0)), "hold"),
+        (lambda: check_excitation([]), "no trajectories"),
     ):
         with pytest.raises(InputError, match=match):
             make()
+
+
+def run(u, y=None, name="run"):
+    u = np.asarray(u, dtype=float).reshape(len(u), -1)
+    t = DT * np.arange(len(u))
+    y = np.sin(t)[:, None] if y is None else y
+    return Trajectory(name, "train", DT, t, u, y, np.hstack([y, y]), np.hstack([y, y]))
+
+
+def sine(f, seconds=20.0, amplitude=0.1):
+    return amplitude * np.sin(2 * np.pi * f * DT * np.arange(round(seconds / DT)) + 1.0)
+
+
+@pytest.mark.parametrize("f", [0.5, 0.52, 0.525, 1.3])
+def test_a_sine_is_one_line_wherever_it_lies_between_bins(f):
+    (found,) = excitation_of([run(0.3 + sine(f))], INPUT)
+    assert found.name == "torque"
+    assert found.spread == pytest.approx(
+        0.1 / np.sqrt(2), rel=0.02
+    )  # of whole periods; others differ a little
+    assert len(found.lines) == 1
+    assert found.lines[0] == pytest.approx(f, abs=0.025 + 1e-9)  # half a bin of 20 s
+
+
+def test_lines_of_one_and_of_several_runs_are_counted_once():
+    together = run(sine(0.5) + sine(1.0) + 0.5 * sine(2.0))
+    assert len(excitation_of([together])[0].lines) == 3
+    apart = [run(sine(f, seconds), name=str(f)) for f, seconds in ((0.5, 20.0), (1.0, 30.0), (0.5, 40.0))]
+    np.testing.assert_allclose(excitation_of(apart)[0].lines, [0.5, 1.0], atol=0.01)
+    weak = run(sine(0.5) + 0.05 * sine(2.0))  # below a tenth: not counted
+    assert len(excitation_of([weak])[0].lines) == 1
+
+
+def test_broad_signals_have_many_lines():
+    t = DT * np.arange(2000)
+    white = 0.1 * np.random.default_rng(0).standard_normal(2000)
+    for u in (multisine(t, 0.1, 0.1, 3.0), prbs(t, -0.1, 0.1, clock=0.2), white):
+        assert len(excitation_of([run(u)])[0].lines) >= 10
+    assert check_excitation([run(multisine(t, 0.1, 0.1, 3.0))], parameters=12) == ()
+
+
+def test_a_constant_input_is_refused_unless_another_run_moves_it():
+    still = run(np.full(500, 0.2), name="monday#2")
+    with pytest.raises(InputError, match=r"monday: the input torque is 0.2 throughout"):
+        check_excitation([still], inputs=INPUT, outputs=OUTPUT)
+    tiny = run(1e-9 * np.random.default_rng(0).standard_normal(500))
+    with pytest.raises(InputError, match="the input torque"):  # rounding is no excitation
+        check_excitation([tiny], inputs=INPUT)
+    with pytest.raises(InputError, match="input 2 is 0 throughout"):
+        check_excitation([run(np.c_[sine(0.5), 0 * sine(0.5)])])
+    assert check_excitation([still, run(sine(0.5))], inputs=INPUT, outputs=OUTPUT) == ()
+    two_levels = [still, run(np.full(500, -0.2), name="tuesday")]
+    assert check_excitation(two_levels, inputs=INPUT) == ()  # each constant, but not the same
+    assert excitation_of(two_levels)[0].lines == ()
+    stuck = run(sine(0.5), np.full((1000, 1), 0.7))
+    with pytest.raises(InputError, match=r"run: the output phi is 0.7 throughout: the machine never moved"):
+        check_excitation([stuck], inputs=INPUT, outputs=OUTPUT)
+
+
+def test_too_few_lines_are_a_warning_by_name():
+    u = sine(0.5) + sine(1.5)
+    assert check_excitation([run(u)], inputs=INPUT, parameters=4) == ()
+    (warning,) = check_excitation([run(u)], inputs=INPUT, parameters=5)
+    assert "torque has 2 lines (0.5, 1.5 Hz), 5 parameters of a linear model need 3" in warning
+    (warning,) = check_excitation([run(np.r_[np.zeros(3), 1.0])], inputs=INPUT, parameters=1)
+    assert "no line" in warning  # four samples tell no frequency

@@ -52,12 +52,7 @@ def test_gap_cuts_and_nothing_leaks_across_it(tmp_path):
 
 
 def test_windows_give_disjoint_roles_and_short_ones_are_reported(tmp_path):
-    windows = (
-        Window(0, 2, "train"),
-        Window(2.2, 2.4, "train"),
-        Window(3, 4, "valid"),
-        Window(4.2, 6, "test"),
-    )
+    windows = Window(0, 2, "train"), Window(2.2, 2.4, "train"), Window(3, 4, "valid"), Window(4.2, 6, "test")
     spec = replace(SPEC, windows={"a": windows})
     data = load_trajectories([record(tmp_path / "a.csv", np.arange(0, 6.01, 0.01))], spec, **SIGNALS)
     times = np.concatenate([piece.t for piece in data.trajectories])
@@ -156,33 +151,21 @@ def test_the_main_job_reads_mat_files(tmp_path):
 
 
 def test_roles_that_are_not_needed_may_be_empty(tmp_path):
-    t = 0.01 * np.arange(1000)
-    file = write_csv(tmp_path / "run.csv", {"t": t, "tau": 0 * t, "phi": np.sin(t)})
-    whole = DataSpec(
-        "t",
-        ("tau",),
-        ("phi",),
-        dt=0.02,
-        max_gap=0.05,
-        smoothing=0.1,
-        warm_up=0.5,
-        fractions=(0.75, 0.25, 0.0),
-    )
-    signals = {"outputs": (Signal("phi", "rad"),), "inputs": (Signal("tau", "N m"),)}
+    file = record(tmp_path / "run.csv", 0.01 * np.arange(1000))
+    spec = replace(SPEC, fractions=(0.75, 0.25, 0.0))
     with pytest.raises(InputError, match="left for test"):
-        load_trajectories([file], whole, **signals)
-    data = load_trajectories([file], whole, **signals, needed=("train", "valid"))
+        load_trajectories([file], spec, **SIGNALS)
+    data = load_trajectories([file], spec, **SIGNALS, needed=("train", "valid"))
     assert [piece.role for piece in data.trajectories] == ["train", "valid"]
 
 
 def test_too_short_a_recording_is_told_how_long_one_must_be(tmp_path):
     """By the default shares of 60, 20 and 20 %; a sample more than said is enough, two less are not."""
-    spec = DataSpec("t", ("u",), ("y",), dt=0.02, max_gap=0.05, smoothing=0.2, warm_up=0.5)
+    spec = replace(SPEC, smoothing=0.2, warm_up=0.5)
 
     def read(seconds):
         t = 0.02 * np.arange(round(seconds / 0.02) + 1)
-        file = write_csv(tmp_path / f"run{len(t)}.csv", {"t": t, "u": np.sin(t), "y": np.cos(t)})
-        return load_trajectories([file], spec, outputs=(Signal("y", "m"),), inputs=(Signal("u", "N"),))
+        return load_trajectories([record(tmp_path / f"run{len(t)}.csv", t)], spec, **SIGNALS)
 
     with pytest.raises(InputError, match=r"split by fractions needs (\S+) s") as short:
         read(2.0)

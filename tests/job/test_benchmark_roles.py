@@ -108,4 +108,4 @@ def test_what_begins_after_a_gap_is_no_run_of_full_length(machine, tmp_path):
 )
 def test_a_bad_choice_of_validating_files_is_refused(given):
     with pytest.raises(InputError, match="valid_every must be 2 or more"):
-        BenchmarkSpec({}, **given)
+        BenchmarkSpec({}, unit="rad", **given)

@@ -1,7 +1,5 @@
 """The golf robot's scenario: prior, oracle, data, tasks, and that it is worth learning."""
 
-import subprocess
-import sys
 from types import SimpleNamespace
 
 import casadi as ca
@@ -11,6 +9,7 @@ import torch
 
 from hybrid_mpc import InputError
 from hybrid_mpc.data.differentiate import local_polynomial
+from hybrid_mpc.plots import save
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.data import make_data, record, stems
 from scenarios.golf_robot.effects import measure_effects, smoothing
@@ -20,36 +19,6 @@ from scenarios.golf_robot.oracle import oracle
 from scenarios.golf_robot.prior import GolfRobotPrior
 from scenarios.golf_robot.rig import Rig
 from scenarios.golf_robot.tasks import FOLLOW_THROUGH, IMPACT, LONG_FOLLOW_THROUGH, impact
-
-WITHOUT_TORCH = """
-import sys
-class Refuse:
-    def find_spec(self, name, *rest):
-        if name.split(".")[0] == "torch":
-            raise ImportError("torch is refused here")
-sys.meta_path.insert(0, Refuse())
-import numpy as np
-import scenarios.golf_robot as s
-from scenarios.golf_robot.faults import catalogue
-rig = s.scenario.plant().with_faults(catalogue()[0].faults)
-rig.step(rig.reset(np.zeros(2), 0), np.zeros(1), 0.02)
-s.scenario.oracle(0.02)
-"""
-
-
-def test_scenario_works_without_torch():
-    subprocess.run([sys.executable, "-c", WITHOUT_TORCH], check=True)
-
-
-def test_prior_loses_energy_to_nothing_along_its_own_flow():
-    prior = scenario.prior()
-    gen = torch.Generator().manual_seed(0)
-    x = torch.randn(5, 4, 2, generator=gen, dtype=torch.float64)
-    u = torch.randn(5, 4, 1, generator=gen, dtype=torch.float64)
-    xdot = prior(x, u)
-    assert xdot.shape == (5, 4, 2)
-    assert prior.energy_balance(x, xdot, u).abs().max() < 1e-13  # rounding of terms of order 10 W
-    assert torch.equal(prior(x[2, 1], u[2, 1]), xdot[2, 1])  # one sample as in a batch
 
 
 def test_prior_agrees_with_the_oracle_s_energy_balance():
@@ -157,33 +126,25 @@ def test_every_recording_has_a_window(budget, data_set):
 
 
 def test_full_data_are_as_many_as_the_paper_s_comparison_needs():
-    counts = {
-        role: sum(stem.startswith(role) for stem in stems("full")) for role in ("train", "valid", "test")
-    }
-    assert counts == {"train": 15, "valid": 6, "test": 15}
+    roles = [stem.split("_")[0] for stem in stems("full")]
+    assert {role: roles.count(role) for role in set(roles)} == {"train": 15, "valid": 6, "test": 15}
     with pytest.raises(InputError, match="quick"):
         stems("huge")
     with pytest.raises(InputError, match="a, b"):
         stems("full", "c")
 
 
-def test_torques_keep_to_the_motor_s_range():
+@pytest.mark.parametrize("kind", KINDS)
+def test_torques_keep_to_the_motor_s_range(kind):
     t = 0.02 * np.arange(1001)
-    for kind in KINDS:
-        sizes = [np.abs(excitation(kind, np.random.default_rng(seed), t)).max() for seed in range(20)]
-        assert max(sizes) <= 0.5 * (1 + 1e-12), kind
-        assert max(sizes) > (0.4 if kind in ("stair", "pulse", "fastsine", "fastchirp") else 0.1), kind
+    torques = [excitation(kind, np.random.default_rng(seed), t) for seed in range(20)]
+    largest = np.abs(torques).max()
+    assert largest <= 0.5 * (1 + 1e-12)
+    assert largest > (0.4 if kind in ("stair", "pulse", "fastsine", "fastchirp") else 0.1)
+    if kind in ("stair", "pulse"):  # rounded: at most the steepest of half a cosine
+        assert np.abs(np.diff(torques)).max() < 1.0 * np.pi / 2 * 0.02 / 0.2 + 1e-9
     with pytest.raises(InputError, match="fastchirp"):
         excitation("noise", np.random.default_rng(0), t)
-
-
-def test_rounded_torques_do_not_jump():
-    t = 0.02 * np.arange(1001)
-    for kind in ("stair", "pulse"):
-        u = excitation(kind, np.random.default_rng(0), t)
-        assert np.abs(np.diff(u)).max() < 1.0 * np.pi / 2 * 0.02 / 0.2 + 1e-9, (
-            kind
-        )  # steepest of half a cosine
 
 
 def test_a_recording_that_goes_too_far_is_repeated_with_less_torque(monkeypatch):
@@ -269,3 +230,45 @@ def test_an_impact_is_read_off_the_true_crossing():
     assert figures["effort_nm2s"] == pytest.approx(0.25 * 1.6)
     never = impact(SimpleNamespace(t=t, x=0 * x - 1.0, u=np.zeros((150, 1))), 0.8)
     assert never["speed_error_rel"] == np.inf
+
+
+def stroke(controller="hybrid", speed=1.2, error=0.004, timing=0.003):
+    figures = {"speed_rad_s": speed, "speed_error_rel": error, "timing_error_s": timing, "effort_nm2s": 1.0}
+    return SimpleNamespace(controller=controller, figures=figures)
+
+
+def legend(figure):
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_the_figure_of_the_strokes_shows_units_targets_and_mean_absolute_errors(tmp_path):
+    rows = [
+        stroke(error=0.004, timing=0.002),
+        stroke(error=-0.002, timing=-0.006),
+        stroke(error=np.inf, timing=np.inf),
+        stroke("prior", 1.9, -0.4, 0.02),
+        stroke("oracle", error=np.inf, timing=np.inf),
+        SimpleNamespace(controller="hybrid", figures={}),  # a task that is no stroke
+    ]
+    figure, _ = scenario.figures(rows)["strokes"]
+    upper, lower = figure.axes
+    assert [ax.get_ylabel() for ax in (upper, lower)] == ["speed error [%]", "timing error [ms]"]
+    assert [text.get_text() for text in lower.get_xticklabels()] == ["1.2", "1.9"]
+    for ax, target in ((upper, 1.0), (lower, 10.0)):
+        box = ax.patches[0].get_window_extent().transformed(ax.transData.inverted())
+        np.testing.assert_allclose([box.y0, box.y1], [-target, target], atol=1e-9)
+    assert legend(figure) == [
+        "MOPGRNN (hybrid): 0.3 %, 4 ms, 1 of 3 missed",
+        "prior, fitted: 40 %, 20 ms",
+        "oracle: all 1 missed",
+    ]
+    means = [
+        line.get_ydata()[0] for line in upper.lines if line.get_marker() == "o" and len(line.get_ydata())
+    ]
+    assert means == pytest.approx([0.1, -40.0])  # signed
+    assert (upper.get_yscale(), lower.get_yscale()) == ("symlog", "linear")  # more than ten bands
+    assert upper.get_ylim()[1] > 40
+    assert save(figure, tmp_path / "strokes.png").exists()
+    figure, _ = scenario.figures(rows[4:5])["strokes"]  # no stroke hit at all
+    assert save(figure, tmp_path / "missed.png").exists()
+    assert scenario.figures(rows[5:]) == {}

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import InputError
+from scenarios.common import rk4
 from scenarios.golf_robot.dynamics import (
     LOSSES,
     N_STATES,
@@ -18,7 +19,6 @@ from scenarios.golf_robot.dynamics import (
     rhs,
     stored_energy,
 )
-from scenarios.golf_robot.integration import rk4
 from scenarios.golf_robot.nominal import GEAR
 from scenarios.golf_robot.rig import Rig
 

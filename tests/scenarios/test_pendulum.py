@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from hybrid_mpc import InputError, Scenario, load_scenario, load_trajectories
+from hybrid_mpc import InputError, load_trajectories
 from hybrid_mpc.job.stages.results import read_results
 from scenarios.pendulum import scenario
 from scenarios.pendulum.data import (
@@ -30,16 +30,6 @@ P = PendulumParameters()
 DT = scenario.data.dt
 QUIET = DampedPendulum(noise=0.0)
 S_AS_PRIOR = PendulumPrior({"l": P.l, "d": P.d})
-
-
-def test_scenario_needs_no_torch():
-    code = "import sys, scenarios.pendulum as s; s.oracle(0.01); assert 'torch' not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True)
-    assert isinstance(scenario, Scenario)
-
-
-def test_it_is_registered():
-    assert load_scenario("pendulum") is scenario
 
 
 def test_parameters_are_the_paper_s():

@@ -1,18 +1,14 @@
 """The unbalanced disk in simulation: plant of another structure than the prior, recordings, closed loops."""
 
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from hybrid_mpc import (
     InputError,
     PriorStep,
     load,
-    load_scenario,
     load_trajectories,
     make_controller,
     make_estimator,
@@ -34,12 +30,6 @@ FITTED = {"w_0": 11.67, "gamma": 1.113, "F_c": 6.36, "K_u": 28.55, "phi_0": -0.0
 DELAY = 0.0248
 NOISE = np.array([8e-4, 0.08])
 """Process noise a period: the prior's error over a period on the plant is of this size."""
-
-
-def test_plant_and_tasks_need_no_torch():
-    code = "import sys, scenarios.unbalanced_disk as s; s.DiskPlant(); assert 'torch' not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True)
-    assert load_scenario("unbalanced_disk") is scenario
 
 
 def end_of_a_turn(sub_step):
@@ -90,20 +80,6 @@ def test_its_structure_is_not_the_prior_s():
         weight = plant.parameters.weight * np.sin(phi - 0.034) / plant.parameters.J
         slower.append((before - plant.step(state, np.zeros(1), 2e-3).z[1]) / 2e-3 - weight)
     assert slower[0] - slower[1] > 0.5  # rad/s^2; 15 % of friction either way are 1.7
-
-
-def test_the_prior_keeps_its_own_energy_balance():
-    prior, rng = UnbalancedDiskPrior(FITTED), np.random.default_rng(0)
-    x = torch.tensor(rng.uniform(-10, 10, (50, 2)))
-    u = torch.tensor(rng.uniform(-PEAK, PEAK, (50, 1)))
-    own = prior.energy_balance(x, prior(x, u), u)
-    assert own.abs().max() < 1e-12  # rounding of terms of up to 0.5 W
-    # by hand, in watts: J v (a - what the prior says of a)
-    rates = torch.tensor(rng.uniform(-100, 100, (50, 2)))
-    phi, v = x[:, 0], x[:, 1]
-    a = 28.55 * u[:, 0] - 11.67**2 * torch.sin(phi - 0.034) - 1.113 * v - 6.36 * torch.tanh(v / 0.05)
-    balance = prior.energy_balance(x, rates, u)
-    torch.testing.assert_close(balance, 2.44e-4 * v * (rates[:, 1] - a), rtol=0, atol=1e-12)
 
 
 def test_bad_parameters_are_refused():

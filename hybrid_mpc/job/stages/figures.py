@@ -146,7 +146,8 @@ def _loops(context: Context) -> Any:
 
 
 def _overview(context: Context) -> Any:
-    """Costs of all controllers, errors of the strokes."""
+    """Costs of all controllers, and the scenario's own figures."""
+    scenario = context.scenario
     found = context.find(CONTROL)
     if isinstance(found, Absent) or not found.rows:
         return
@@ -168,18 +169,9 @@ def _overview(context: Context) -> Any:
                 "Closed-loop cost of every controller over the measuring oracle's, with 95 % intervals over the seeds."
             ),
         )
-    strokes = [
-        {"controller": row.controller, **{k: _finite(v) for k, v in row.figures.items()}}
-        for row in rows
-        if row.figures
-    ]
-    if strokes and all({"speed_error_rel", "timing_error_s"} <= set(row) for row in strokes):
-        yield (
-            "control",
-            "strokes",
-            loops.strokes(strokes),
-            "Strokes at the true crossing; bands: 1 % and 10 ms.",
-        )
+    if scenario.figures is not None:
+        for name, (figure, caption) in scenario.figures(rows).items():
+            yield "control", name, figure, caption
 
 
 def _number(value: float | None) -> float:

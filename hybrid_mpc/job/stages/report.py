@@ -397,7 +397,7 @@ def what_report_reads(context: Context) -> dict[str, object]:
     return {
         "titles": (scenario.title, scenario.description, [task.title for task in scenario.tasks]),
         "labels": (prior.states, prior.inputs, prior.outputs, prior.parameters_spec),
-        "drawing": source_of(scenario.draw),
+        "drawing": (source_of(scenario.draw), source_of(scenario.figures)),
         "command": command(context, Path(context.settings.scenario).name),
     }
 

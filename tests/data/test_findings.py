@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import DataSpec, InputError, Signal, load_scenario, load_trajectories, write_csv
-from hybrid_mpc.data.tables import read_table
+from hybrid_mpc.data.recording import read_recording
 
 RECORDINGS = Path(__file__).parents[3] / "shared" / "data"
 SPEC = DataSpec("t", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.2)
@@ -61,19 +61,11 @@ def test_frozen_sensors(tmp_path, sensor):
     phi[500:620] = phi[500]
     phi[900:930] = phi[900]
     (one,) = findings(tmp_path, phi, signals=FREE)  # where it ends its speed is beyond all bounds, too
-    assert (one.kind, one.file, one.channel, one.count, one.refused) == (
-        "frozen",
-        "run.csv",
-        "phi",
-        150,
-        False,
-    )
-    assert one.start == 5.0
+    told = one.kind, one.file, one.channel, one.count, one.start, one.refused
+    assert told == ("frozen", "run.csv", "phi", 150, 5.0, False)
     for words in (
-        "run.csv: column 'phi' repeats",
-        "from 5 to 6.19 s, 120 samples (1 more such stretch, 150",
-        "delete",
-    ):
+        "run.csv: column 'phi' repeats", "from 5 to 6.19 s, 120 samples (1 more such stretch, 150", "delete",
+    ):  # fmt: skip
         assert words in str(one)
 
 
@@ -111,20 +103,18 @@ def test_wrapped_angles_count_on_where_the_signal_is_periodic(tmp_path):
     assert one.start == pytest.approx(T[1 + np.argmax(np.abs(np.diff(wrapped)) > np.pi)])
     assert f"jumps {jumps} times by about a full turn" in str(one)
     file = tmp_path / "run.csv"
-    read = read_table(file, SPEC, outputs=TURNS["outputs"], inputs=TURNS["inputs"])
+    read = read_recording(file, SPEC, outputs=TURNS["outputs"], inputs=TURNS["inputs"])
     np.testing.assert_allclose(read.y[:, 0], turning, atol=1e-8)  # ten digits in the file
     # the same in degrees, and from 0 to 360
     spec = replace(SPEC, units={"phi": "deg"})
     (same,) = findings(tmp_path, np.rad2deg(turning) % 360, signals=TURNS, spec=spec)
     assert same.kind == "wrapped"
-    with pytest.raises(
-        InputError, match=r"run.csv: column 'phi' jumps \d+ times .* Declare Signal.*periodic=True"
-    ):
+    match = r"run.csv: column 'phi' jumps \d+ times .* Declare Signal.*periodic=True"
+    with pytest.raises(InputError, match=match):
         findings(tmp_path, wrapped)
     near = replace(PHI, periodic=True, lower=-8, upper=8)
-    with pytest.raises(
-        InputError, match=r"8\.\d+ is outside .* of phi, with \d+ jumps of a full turn taken out"
-    ):
+    match = r"8\.\d+ is outside .* of phi, with \d+ jumps of a full turn taken out"
+    with pytest.raises(InputError, match=match):
         findings(tmp_path, wrapped, signals={**TURNS, "outputs": (near,)})
 
 
@@ -135,22 +125,17 @@ def test_angles_that_count_on_are_left_as_they_are(tmp_path):
         phi = speed * t + 0.1 * np.sin(t)
         spec = replace(SPEC, smoothing=0.2)
         assert findings(tmp_path, phi, t=t, tau=TAU[::2], signals=fast, spec=spec) == ()
-        read = read_table(tmp_path / "run.csv", SPEC, outputs=fast["outputs"], inputs=fast["inputs"])
+        read = read_recording(tmp_path / "run.csv", SPEC, outputs=fast["outputs"], inputs=fast["inputs"])
         np.testing.assert_allclose(read.y[:, 0], phi, rtol=1e-9)
     # an angle that trembles about where it is wrapped, and one that jumps by a turn over a gap in time
     upright = np.pi + 0.01 * np.sin(9 * T)
     (one,) = findings(tmp_path, (upright + np.pi) % (2 * np.pi) - np.pi, signals=TURNS)
     assert one.kind == "wrapped"
-    np.testing.assert_allclose(
-        np.ptp(load_trajectories([tmp_path / "run.csv"], SPEC, **TURNS).whole[0].y), 0.02, rtol=1e-2
-    )
+    (whole,) = load_trajectories([tmp_path / "run.csv"], SPEC, **TURNS).whole
+    np.testing.assert_allclose(np.ptp(whole.y), 0.02, rtol=1e-2)
     gap = np.r_[T[:900], T[1000:]]
-    assert (
-        findings(
-            tmp_path, np.where(gap < 9.5, SWING[0] + gap, gap - 6.28), t=gap, tau=np.sin(gap), signals=TURNS
-        )
-        == ()
-    )
+    jumping = np.where(gap < 9.5, SWING[0] + gap, gap - 6.28)
+    assert findings(tmp_path, jumping, t=gap, tau=np.sin(gap), signals=TURNS) == ()
 
 
 def test_a_length_is_no_angle(tmp_path):
@@ -169,10 +154,10 @@ def test_speeds_beyond_what_is_plausible(tmp_path):
     for words in ("reaches", "rad/s at", "-20 to 20 rad/s", "unit is wrong", "DataSpec.units"):
         assert words in str(one)
     # degrees that a wide range of the position lets pass
-    with pytest.raises(
-        InputError, match=r"run.csv: column 'phi', differentiated, reaches .* so is its mean, .*\(rms\)"
-    ):
-        findings(tmp_path, np.rad2deg(SWING), signals={**SIGNALS, "outputs": (Signal("phi", "rad"),)})
+    free = {**SIGNALS, "outputs": (Signal("phi", "rad"),)}
+    match = r"run.csv: column 'phi', differentiated, reaches .* so is its mean, .*\(rms\)"
+    with pytest.raises(InputError, match=match):
+        findings(tmp_path, np.rad2deg(SWING), signals=free)
     other = (PHI, Signal("n", "rpm", -1, 1))  # no rate of a radian: nothing to compare with
     assert findings(tmp_path, SWING + NOISE, signals={**SIGNALS, "states": other}) == ()
 

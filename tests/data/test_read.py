@@ -1,0 +1,280 @@
+"""One recording read: the same data and the same checks from CSV, ``.npz`` and ``.mat``."""
+
+import io
+import math
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from recording_bombs import GOOD, SIGNALS, SPEC, T
+from scipy.io import savemat
+from scipy.sparse import csc_array
+
+from hybrid_mpc import InputError, Signal, Window, write_csv
+from hybrid_mpc.data.mat_structure import check_structure, version
+from hybrid_mpc.data.recording import read_recording
+
+MORE = {**GOOD, "note": T}
+WRITERS = {
+    "csv": write_csv,
+    "npz": lambda path, columns: np.savez(path, **columns),
+    "mat": lambda path, columns: savemat(path, columns, do_compression=True),
+}
+FIRST = {"csv": ("row", 2), "npz": ("index", 0), "mat": ("row", 1)}
+
+
+@pytest.fixture(params=WRITERS)
+def kind(request):
+    return request.param
+
+
+@pytest.fixture(params=["npz", "mat"])
+def vectors(request):
+    return request.param
+
+
+def wrote(tmp_path, kind, columns):
+    path = tmp_path / f"run.{kind}"
+    WRITERS[kind](path, columns)
+    return path
+
+
+def refused(path, match, spec=SPEC, signals=SIGNALS):
+    with pytest.raises(InputError, match=match) as caught:
+        read_recording(path, spec, **signals)
+    assert path.name in str(caught.value)
+
+
+def test_the_numbers_are_those_that_were_written(tmp_path, kind):
+    path = wrote(tmp_path, kind, MORE)
+    table = read_recording(path, SPEC, **SIGNALS)
+    assert table.name == "run"
+    for read, written in ((table.t, T), (table.u[:, 0], np.cos(T)), (table.y[:, 0], np.sin(T))):
+        np.testing.assert_allclose(read, written, rtol=1e-9 if kind == "csv" else 0)  # CSV has ten digits
+    first = path.read_bytes()
+    assert wrote(tmp_path, kind, {**MORE, "note": 2 * T}).read_bytes() != first
+    assert read_recording(path, SPEC, **SIGNALS).sha256 != table.sha256
+
+
+def test_csv_is_written_whole_and_the_same_bytes(tmp_path):
+    one, two = write_csv(tmp_path / "a.csv", MORE), write_csv(tmp_path / "sub" / "b.csv", MORE)
+    assert one.read_bytes() == two.read_bytes()
+    assert [p.name for p in tmp_path.iterdir() if p.is_file()] == ["a.csv"]  # no part file is left
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "match"),
+    [
+        ("phi", np.nan, "column 'phi' is '?nan'?, not a finite number"),
+        ("tau", np.inf, "column 'tau' is '?inf"),
+        ("phi", 11.0, r"column 'phi': 11 is outside the plausible range -10 to 10 rad of phi\. Check"),
+        ("phi", 90.0, r"column 'phi': 90 is outside .*rad of phi\. Check"),  # one row is no wrong unit
+        ("phi", 1e307, r"column 'phi': 1e\+307 is outside the plausible range -10 to 10 rad of phi\. Check"),
+        ("time_s", 0.1, "column 'time_s': time repeats"),
+        ("time_s", 0.05, "column 'time_s': time decreases"),
+    ],
+)
+def test_a_bad_number_is_named_as_the_files_own_tools_count(tmp_path, kind, name, value, match):
+    columns = {key: column.copy() for key, column in GOOD.items()}
+    columns[name][11] = value
+    word, first = FIRST[kind]
+    refused(wrote(tmp_path, kind, columns), rf"{word} {11 + first}, {match}")
+
+
+def test_bad_columns(tmp_path, kind):
+    path = wrote(tmp_path, kind, {"time_s": T, "tau": T, "ph": T, "note": T})
+    refused(path, "no column 'phi'; it has .*'ph'.* Did you mean 'ph'")
+    refused(wrote(tmp_path, kind, {name: np.zeros(0) for name in GOOD}), "0 row")
+    refused(wrote(tmp_path, kind, {name: column[:30] for name, column in GOOD.items()}), "fewer than")
+    path = wrote(tmp_path, kind, GOOD)
+    refused(path, "sampling is 0.01 s, declared max_gap", replace(SPEC, max_gap=0.005))
+    late = replace(SPEC, windows={"run": (Window(0, 9, "train"),)})
+    refused(path, "window 0 to 9 s is not within the recording", late)
+    path.rename(tmp_path / "walk.csv")
+    refused(path, "no such file; that folder has: walk.csv")
+
+
+@pytest.mark.parametrize(
+    ("phi", "match"),
+    [
+        (np.rad2deg(np.sin(3 * T)), r"In deg it would be plausible: say units=\{'phi': 'deg'\}"),
+        (
+            np.where(np.arange(60) == 40, 1e307, np.rad2deg(np.sin(3 * T))),
+            r"1e\+307 in row 42\)\. Check unit",
+        ),
+        (12 * np.sin(3 * T), r"of phi \(\d+ such rows, the largest 1\d.* in row \d+\)\. Check unit"),
+        (1e7 * np.sin(3 * T), r"in row \d+\)\. Check unit"),
+    ],
+)
+def test_a_unit_is_proposed_where_it_would_explain_the_column(tmp_path, phi, match):
+    refused(wrote(tmp_path, "csv", {**GOOD, "phi": phi}), match)
+
+
+@pytest.mark.parametrize(("name", "place", "row"), [("phi", 40, 42), ("time_s", 59, 61)])
+def test_an_absurd_value_is_named_where_its_signal_has_no_range(tmp_path, name, place, row):
+    free = {"outputs": (Signal("phi", "rad"),), "inputs": (Signal("torque", "N m"),)}
+    columns = {**GOOD, name: np.where(np.arange(60) == place, 1e307, GOOD[name])}
+    match = rf"row {row}, column '{name}': 1e\+307 is outside the plausible range -1e\+100"
+    refused(wrote(tmp_path, "csv", columns), match, signals=free)
+
+
+def test_bad_rows_of_csv(tmp_path):
+    path = tmp_path / "run.csv"
+    rows = write_csv(path, MORE).read_text().splitlines()
+
+    def with_rows(changed):
+        path.write_text("\n".join(changed.get(i, row) for i, row in enumerate(rows)))
+        return path
+
+    refused(with_rows({11: "0.1,1,abc,0"}), "row 12, column 'phi' is 'abc'")
+    refused(with_rows({11: "0.1,1,,0"}), "row 12, column 'phi' is empty")
+    refused(with_rows({0: "time_s,tau,phi,phi"}), "appears 2 times")
+    refused(with_rows({5: "1,2", 6: "1,2"}), r"row 6 has 2 cells, .* has 4 \(2 such rows\)")
+    refused(with_rows({0: "time_s,ta,ph,note"}), r"2 problems:\n.*no column 'tau'.*\n.*no column 'phi'")
+    several = {5: "0.04,broken,0.1,0", 11: "0.1,0.9,nan,0", 12: "0.11,0.9,,0", 20: "0.19,77,0.1,0"}
+    refused(
+        with_rows(several),
+        r"3 problems:\n.*row 6, column 'tau' is 'broken'(.|\n)*row 12, column 'phi' is 'nan'.*\(2 such rows\)(.|\n)*"
+        r"row 21, column 'tau': 77 is outside",
+    )
+
+
+def test_bad_vectors(tmp_path, vectors):
+    for columns, match in (
+        ({**GOOD, "phi": T[:-1]}, "differ in length: 'time_s' 60, 'tau' 60, 'phi' 59"),
+        ({**GOOD, "phi": np.ones((60, 2))}, r"column 'phi' has the shape \(60, 2\)"),
+        ({**GOOD, "phi": T + 1j}, "'phi' holds complex numbers"),
+        ({**GOOD, "phi": "text"}, "'phi' holds text"),
+        ({**GOOD, "time_s": 0.0}, "as a sampling time .* must be positive"),
+    ):
+        refused(wrote(tmp_path, vectors, columns), match)
+
+
+def test_integers_singles_directions_and_a_sampling_time(tmp_path, vectors):
+    columns = {"time_s": 0.01, "tau": np.arange(60, dtype=np.uint8)[None] % 3, "phi": np.float32(T)[:, None]}
+    table = read_recording(wrote(tmp_path, vectors, columns), SPEC, **SIGNALS)
+    assert table.u.dtype == table.y.dtype == np.float64
+    np.testing.assert_array_equal(table.u[:4, 0], [0, 1, 2, 0])
+    np.testing.assert_allclose(table.t, T, atol=1e-15)  # the same product
+
+
+def test_objects_are_refused_and_never_loaded(tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return (open, (str(tmp_path / "ran"), "w"))
+
+    path, trap = tmp_path / "run.npz", np.array([Trap()], dtype=object)
+    np.savez(path, allow_pickle=True, **{**GOOD, "phi": trap})
+    refused(path, "column 'phi' cannot be read .*objects are refused")
+    for array, match in ((trap, "is no .npz file"), (T, "one array without a name")):
+        with path.open("wb") as file:
+            np.save(file, array, allow_pickle=True)
+        refused(path, match)
+    assert not (tmp_path / "ran").exists()
+    np.savez(path, allow_pickle=True, **GOOD, log=trap)
+    assert read_recording(path, SPEC, **SIGNALS).y.shape == (60, 1)  # what nobody names is not touched
+
+
+def test_fields_of_structs(tmp_path):
+    path = tmp_path / "run.mat"
+    run = {**GOOD, "deep": {"phi": T}}
+    savemat(path, {"run": run})
+    assert read_recording(path, SPEC, **SIGNALS).y.shape == (60, 1)
+    savemat(path, {"run": run, "old": {"phi": T}})
+    refused(path, "column 'phi' may be 'run.phi' or 'old.phi'")
+    table = read_recording(path, replace(SPEC, outputs=("old.phi",)), **SIGNALS)
+    np.testing.assert_array_equal(table.y[:, 0], T)
+    refused(path, "no column 'deep.*Not read are structs in structs", replace(SPEC, outputs=("deep",)))
+    two = np.array([(1.0,), (2.0,)], dtype=[("phi", object)])
+    savemat(path, {"time_s": T, "tau": T, "runs": two, "sparse": csc_array(np.eye(3))})
+    refused(path, "no column 'phi'.*Not read are arrays of structs and sparse matrices")
+
+
+def test_no_such_format(tmp_path, vectors):
+    path = tmp_path / f"run.{vectors}"
+    for content in (b"time_s,tau,phi\n0,0,0\n", b"\xff" * 300, b"PK\x03\x04" + bytes(200), bytes(300)):
+        path.write_bytes(content)
+        refused(path, "damaged|empty|no column")
+    path.write_bytes(b"")
+    refused(path, "empty")
+    whole = wrote(tmp_path, vectors, GOOD).read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    refused(path, "damaged|cannot be read")
+    path.rename(tmp_path / "run.csv")
+    refused(tmp_path / "run.csv", "no UTF-8 text.*name the file .npz or .mat|cells|no column")
+
+
+def test_versions_of_mat(tmp_path):
+    path = tmp_path / "run.mat"
+    header = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(116) + bytes(8) + b"\x00\x02IM"
+    path.write_bytes(header.ljust(512, b"\0") + b"\x89HDF\r\n\x1a\n" + bytes(100))
+    refused(path, r"version 7.3 \(HDF5\).*save\('run.mat', ..., '-v7'\)")
+    path.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(600))
+    refused(path, "version 7.3")
+    begin = b"MATLAB 5.0 MAT-file".ljust(124)
+    for number, said in ((1, "5"), (2, "7.3")):
+        assert version(begin + bytes([0, number]) + b"IM") == said
+        assert version(begin + bytes([number, 0]) + b"MI") == said  # the other order of bytes
+    assert version(bytes(20)) == "4"
+
+
+def test_bytes_that_crash_loadmat_are_refused_before_it(tmp_path):
+    """Each of these ends the process in scipy 1.17: flags, type of the numbers, dimensions of a text."""
+    text = io.BytesIO()
+    savemat(text, {"t": T, "note": "ab"})
+    whole = text.getvalue()
+    assert version(whole) == "5"
+    check_structure(whole, 10**6)
+    path = tmp_path / "run.mat"
+    size = whole.index(b"note") - 16  # the number of bytes of its dimensions
+    for place, value in ((145, 255), (176, 0), (177, 255), (size, 0), (size, 14)):
+        damaged = bytearray(whole)
+        assert damaged[place] != value
+        damaged[place] = value
+        path.write_bytes(bytes(damaged))
+        refused(path, "damaged")
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(0, 2000), st.integers(0, 12), st.binary(max_size=6))
+def test_damaged_csv_is_an_input_error_or_finite_increasing_data(place, removed, inserted):
+    with tempfile.TemporaryDirectory() as folder:
+        path = write_csv(Path(folder) / "run.csv", MORE)
+        content = path.read_bytes()
+        path.write_bytes(content[:place] + inserted + content[place + removed :])
+        try:
+            table = read_recording(path, SPEC, **SIGNALS)
+        except InputError as error:
+            assert "run.csv" in str(error)  # noqa: PT017  (both outcomes are right)
+            return
+        assert (np.diff(table.t) > 0).all()
+        assert np.abs(table.y).max() <= 10
+        assert math.isfinite(table.u.sum())
+        # a few bytes touch a few rows: all others are read as they were written
+        same = np.isin(np.round(table.t, 9), np.round(T, 9)).sum()
+        assert same >= len(T) - 6
+
+
+def test_damaged_vectors_are_an_input_error_or_what_was_written(tmp_path, vectors):
+    rng = np.random.default_rng(0)
+    whole = wrote(tmp_path, vectors, GOOD).read_bytes()
+    path, outcomes = tmp_path / f"run.{vectors}", set()
+    for _ in range(150):
+        damaged = bytearray(whole)
+        for place in rng.integers(0, len(whole), 2):
+            damaged[place] = rng.integers(256)
+        path.write_bytes(bytes(damaged))
+        try:
+            table = read_recording(path, SPEC, **SIGNALS)
+        except InputError as error:
+            assert path.name in str(error)  # noqa: PT017  (both outcomes are right)
+            outcomes.add("refused")
+            continue
+        np.testing.assert_array_equal(table.t, T)  # checksums: what is read is what was written
+        np.testing.assert_array_equal(table.y[:, 0], np.sin(T))
+        outcomes.add("read")
+    assert "refused" in outcomes
