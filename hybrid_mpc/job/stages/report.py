@@ -397,7 +397,8 @@ def what_report_reads(context: Context) -> dict[str, object]:
     return {
         "titles": (scenario.title, scenario.description, [task.title for task in scenario.tasks]),
         "labels": (prior.states, prior.inputs, prior.outputs, prior.parameters_spec),
-        "drawing": (source_of(scenario.draw), source_of(scenario.figures)),
+        "drawing": source_of(scenario.draw),
+        "own figures": source_of(scenario.figures),
         "command": command(context, Path(context.settings.scenario).name),
     }
 
