@@ -26,8 +26,8 @@ from hybrid_mpc.cli import data as data_command
 from hybrid_mpc.cli import monitor as monitor_command
 from hybrid_mpc.cli import run as run_command
 from hybrid_mpc.cli import scenarios as scenarios_command
-from hybrid_mpc.cli import search as search_command
 from hybrid_mpc.cli import study as study_command
+from hybrid_mpc.cli import tune as tune_command
 from hybrid_mpc.errors import InputError, StorageError
 from hybrid_mpc.files import reason
 
@@ -38,7 +38,7 @@ KEPT = {
     "benchmark": "what is fitted and trained is kept: the same command goes on",
     "control": "loops are kept at the end only, there is nothing to resume: the same command starts them anew (with "
     "another --out if something lies in it already)",
-    "search": "finished trials are kept: the same command with --resume goes on",
+    "tune": "finished trials are kept: the same command with --resume goes on",
     "study": "finished runs are kept: the same command with --resume goes on",
     "analyze": "figures and tables are not complete: the same command with another --out makes them anew",
     "monitor": "tables and pictures are not complete: the same command with another --out makes them anew",
@@ -59,7 +59,7 @@ app.command("control", epilog=control_command.EXAMPLES)(control_command.control)
 app.command("analyze", epilog=analyze_command.EXAMPLES)(analyze_command.analyze)
 app.command("benchmark", epilog=benchmark_command.EXAMPLES)(benchmark_command.benchmark)
 app.command("data", epilog=data_command.EXAMPLES)(data_command.data)
-app.command("search", epilog=search_command.EXAMPLES)(search_command.search)
+app.command("tune", epilog=tune_command.EXAMPLES)(tune_command.tune)
 app.command("monitor", epilog=monitor_command.EXAMPLES)(monitor_command.monitor)
 app.command("scenarios")(scenarios_command.scenarios)
 app.add_typer(study_command.app, name="study")

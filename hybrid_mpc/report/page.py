@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import base64
+import csv
+import io
 import re
 import struct
 from collections.abc import Sequence
@@ -78,6 +80,17 @@ class Table:
                     f"table {self.caption!r}: row {i} has {len(row)} cells, "
                     f"its {len(self.columns)} columns need one each"
                 )
+
+    def csv(self) -> str:
+        r"""The table as CSV: a header, numbers with all their digits, nothing for None.
+
+        Example:
+            >>> Table(("model", "x [rad]"), (("prior", 0.1), ("a, b", None))).csv()
+            'model,x [rad]\nprior,0.1\n"a, b",\n'
+        """
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows([self.columns, *self.rows])
+        return text.getvalue()
 
 
 @dataclass(frozen=True)
