@@ -16,7 +16,7 @@ from hybrid_mpc.job.folder import open_folder
 from hybrid_mpc.job.settings import RunSettings, claim
 from hybrid_mpc.job.stages import identify
 from hybrid_mpc.job.stages.export import versions
-from hybrid_mpc.report.page import Table
+from hybrid_mpc.report.page import Cell, Table
 from hybrid_mpc.scenario import load_scenario
 
 if TYPE_CHECKING:
@@ -160,7 +160,7 @@ def _write(context: Context, settings: TuneSettings, found: SearchResult) -> Non
         "importance": dict(found.importance),
         "trials": [asdict(row) for row in found.trials],
     }
-    rows = [
+    rows: list[tuple[Cell, ...]] = [
         (t.number, t.state, t.value, t.mean, t.steps, t.duration, *(t.values[n] for n in names))
         for t in found.trials
     ]

@@ -14,6 +14,7 @@ from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
@@ -140,6 +141,18 @@ def axis_label(signal: Signal) -> str:
     return f"{_SYMBOLS.get(signal.name, plain(signal.name.replace('_', ' ')))} [{signal.unit}]"
 
 
+def ratio_unit(numerator: Signal, denominator: Signal) -> str:
+    """Unit of one signal per unit of another.
+
+    Example:
+        >>> phi, tau = Signal("phi", "rad"), Signal("tau", "N m")
+        >>> ratio_unit(phi, tau), ratio_unit(tau, phi)
+        ('rad/(N m)', 'N m/rad')
+    """
+    over, under = numerator.unit, denominator.unit
+    return f"{f'({over})' if '/' in over else over}/{f'({under})' if set(' /') & set(under) else under}"
+
+
 def new_figure(
     rows: int,
     cols: int,
@@ -199,12 +212,19 @@ def title_axes(ax: Axes, text: str) -> None:
     ax.set_title(text, loc="left", fontsize=10, color=INK)
 
 
-def shared_legend(figure: Figure, *, columns: int = 7) -> None:
-    """One legend beneath all axes of a figure, each name once, in order of first appearance."""
+def shared_legend(figure: Figure, *, columns: int = 7, ink: bool = False) -> None:
+    """One legend beneath all axes of a figure, each name once, in order of first appearance.
+
+    Args:
+        figure: The figure.
+        columns: Most columns.
+        ink: True: the legend shows the dashes of lines and not their colours.
+    """
     seen: dict[str, Any] = {}
     for ax in figure.axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
-            seen.setdefault(label, handle)
+            shown = Line2D([], [], color=INK, linestyle=handle.get_linestyle()) if ink else handle  # type: ignore[attr-defined]
+            seen.setdefault(label, shown)
     figure.legend(
         list(seen.values()),
         list(seen),

@@ -60,7 +60,7 @@ def test_a_figure_is_png_only(tmp_path):
 
 def test_no_global_figure_and_no_torch():
     code = (
-        "import sys; import hybrid_mpc.report; from hybrid_mpc.plots import data, fit, loops, training, "
+        "import sys; import hybrid_mpc.report; from hybrid_mpc.plots import data, fit, loops, "
         "monitor, analysis; assert not {'torch', 'matplotlib.pyplot', 'casadi'} & set(sys.modules), "
         "'a forbidden import'"
     )
