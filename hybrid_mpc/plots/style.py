@@ -26,7 +26,8 @@ Array = NDArray[np.float64]
 Share = bool | Literal["none", "all", "row", "col"]
 
 DPI = 110
-INK, FAINT, ALARM = "#222222", "#8a8a8a", "#CC79A7"
+INK, FAINT, PALE = "#222222", "#8a8a8a", "#9a9a9a"
+ALARM, GOOD = "#CC79A7", "#009E73"
 
 COLOURS: Mapping[str, str] = MappingProxyType(
     {
@@ -192,6 +193,49 @@ def new_figure(
     if title:
         figure.suptitle(title, fontsize=12, fontweight="bold", color=INK)
     return figure, axes
+
+
+def new_column(
+    heights: Sequence[float], *, height: float = 1.2, title: str = ""
+) -> tuple[Figure, list[Axes]]:
+    """An empty figure of panels one above the other that share their horizontal axis.
+
+    Args:
+        heights: Relative heights of the panels.
+        height: Height [inch] of a panel of relative height 1.
+        title: Title over all panels. Default: none.
+
+    Example:
+        >>> figure, panels = new_column([2.0, 1.0])
+        >>> len(panels)
+        2
+    """
+    size = (10.0, 0.8 + height * sum(heights))
+    figure, axes = new_figure(len(heights), 1, sharex=True, heights=heights, title=title, size=size)
+    return figure, list(axes[:, 0])
+
+
+def finish_column(figure: Figure, panels: Sequence[Axes], *, columns: int = 7) -> None:
+    """Complete a column of panels over time: no margins, time axis, aligned labels, one legend.
+
+    Args:
+        figure: The figure.
+        panels: Its panels.
+        columns: Most columns of the legend.
+    """
+    for ax in panels:
+        ax.margins(x=0)
+    panels[-1].set_xlabel("time [s]")
+    figure.align_ylabels(list(panels))
+    shared_legend(figure, columns=columns)
+
+
+def plot_inputs(panels: Sequence[Axes], t: Array, u: Array, inputs: Sequence[Signal], **style: Any) -> None:
+    """Inputs ``(n, n_u)``, held between samples, one panel each."""
+    look: dict[str, Any] = {"color": INK, "linewidth": 1.0} | style
+    for ax, values, signal in zip(panels, u.T, inputs, strict=True):
+        ax.plot(t, values, drawstyle="steps-post", **look)
+        ax.set_ylabel(axis_label(signal))
 
 
 def dress(ax: Axes) -> None:

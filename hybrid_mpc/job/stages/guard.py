@@ -15,7 +15,7 @@ from scipy.stats import chi2
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.loops import MODEL, Bench, LoopSpec
-from hybrid_mpc.job.monitor import explained
+from hybrid_mpc.job.monitor import Alarm, explained
 from hybrid_mpc.job.stages.compare import is_kept, run_parts
 from hybrid_mpc.job.stages.compare import kept as rows_of
 from hybrid_mpc.job.stages.monitor import RATES, clean_windows, run_calibration
@@ -216,10 +216,10 @@ def faulted(
 
 
 def _told(
-    case: Case, task: str, start: float, trace: MonitorTrace, alarms: list[dict[str, Any]]
+    case: Case, task: str, start: float, trace: MonitorTrace, alarms: Sequence[Alarm]
 ) -> dict[str, Any]:
     after = np.flatnonzero(trace.alarm & (trace.t >= start - 1e-9))
-    seen = [alarm for alarm in alarms if alarm["end_s"] >= start - 1e-9]
+    seen = [alarm for alarm in alarms if alarm.end_s >= start - 1e-9]
     return {
         "fault": case.name,
         "title": case.title,
@@ -228,7 +228,7 @@ def _told(
         "task": task,
         "start_s": start,
         "delay_s": float(trace.t[after[0]]) - start if after.size else None,
-        "diagnosis": seen[0]["diagnosis"] if seen else "",
+        "diagnosis": seen[0].diagnosis if seen else "",
         "false_alarms": len(alarm_intervals(trace.alarm[trace.t < start - 1e-9], 1.0)),
     }
 
@@ -458,7 +458,7 @@ def _recorded(
         trace, alarms = explained(
             monitor, estimator, recording, context.scenario.causes, say, prior=kit.models["prior"]
         )
-        found += [{"file": recording.name, **alarm} for alarm in alarms]
+        found += [{"file": recording.name, **vars(alarm)} for alarm in alarms]
         edges = np.diff(trace.alarm.astype(int), prepend=0) == 1
         for window in clean_windows(context, recording, ("test",)):
             inside = _settled(recording.t, *window, model)
