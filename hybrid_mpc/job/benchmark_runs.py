@@ -1,11 +1,11 @@
-"""Free runs of all models over recordings by a machine's convention, and the figures that judge them."""
+"""A benchmark's recordings with their roles, free runs of all models over them, and the errors of these."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
 
-# Recordings of a benchmark: training files in pieces with roles, test files as whole runs.
-
+Array = NDArray[np.float64]
+MODELS = ("phy", *KINDS)
 LONGEST = 60.0
 """Most of a recording in :attr:`Recordings.long` [the machine's seconds]: a model that drifts shows it by then."""
 SCORED = 50
@@ -245,13 +245,9 @@ def pieces(trajectory: Trajectory, seconds: float) -> tuple[Trajectory, ...]:
     )
 
 
-Array = NDArray[np.float64]
-MODELS = ("phy", *KINDS)
-
-
 @dataclass(frozen=True)
-class Run:
-    """What is known of one free run.
+class BenchmarkRun:
+    """A free run of all candidates over one trajectory.
 
     Args:
         name: Of the trajectory.
@@ -276,7 +272,7 @@ def run_freely(
     *,
     warm_up: float,
     length: float | None,
-) -> list[Run]:
+) -> list[BenchmarkRun]:
     """Free runs of the prior, of the best network of each kind, and of the mean over the networks of each kind.
 
     Of a trajectory only what lies within ``warm_up`` is known: from it comes the state that all models start from,
@@ -315,7 +311,7 @@ def run_freely(
             for name, x in found.items()
         }
     return [
-        Run(
+        BenchmarkRun(
             t.name,
             t.t[warm + 1 :],
             t.u[warm + 1 :],
@@ -326,19 +322,33 @@ def run_freely(
     ]
 
 
-def figures_of(runs: Sequence[Run], name: str, *, unit: str, scale: float) -> dict[str, Any]:
-    """RMSE over all scored samples, and its share of the measured output's standard deviation.
+@dataclass(frozen=True)
+class RunError:
+    """Error of a model's free runs over one file.
+
+    Args:
+        rmse: Root mean square error of the first output over all scored samples [unit]; infinite if a run diverged.
+        relative: Its share of the measured output's standard deviation [-].
+        unit: Unit of the benchmark.
+    """
+
+    rmse: float
+    relative: float
+    unit: str
+
+
+def run_error(runs: Sequence[BenchmarkRun], name: str, spec: BenchmarkSpec) -> RunError:
+    """Error of one candidate over all runs.
 
     Args:
         runs: Free runs over one file.
         name: The candidate.
-        unit: Unit of the figures.
-        scale: Figures' units in an SI unit.
+        spec: The benchmark's unit and scale.
 
     Example:
         >>> y = np.array([[0.0], [1.0], [2.0]])
-        >>> run = Run("run", np.arange(3.0), y, y, {"phy": y + 0.1})
-        >>> figures_of([run], "phy", unit="mm", scale=1e3)["rmse"].__round__(6)
+        >>> run = BenchmarkRun("run", np.arange(3.0), y, y, {"phy": y + 0.1})
+        >>> run_error([run], "phy", BenchmarkSpec(unit="mm", scale=1e3)).rmse.__round__(6)
         100.0
     """
     error = np.concatenate([run.y_hat[name][:, 0] - run.y[:, 0] for run in runs])
@@ -346,8 +356,7 @@ def figures_of(runs: Sequence[Run], name: str, *, unit: str, scale: float) -> di
     rmse = float(np.sqrt(np.mean(error**2)))
     if not np.isfinite(rmse):
         rmse = float("inf")
-    relative = rmse / spread if spread > 0 else float("inf")
-    return {"rmse": scale * rmse, "relative": relative, "unit": unit}
+    return RunError(spec.scale * rmse, rmse / spread if spread > 0 else float("inf"), spec.unit)
 
 
 def warm_samples(warm_up: float, delay: float, dt: float) -> int:
