@@ -2,8 +2,6 @@
 
 import hashlib
 import math
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -158,14 +156,6 @@ def test_strokes_beyond_ten_bands_are_drawn_on_a_logarithmic_axis():
 def test_bad_strokes_are_refused(rows):
     with pytest.raises(InputError, match="strokes"):
         strokes(rows)
-
-
-def test_no_global_figure_and_no_torch():
-    code = (
-        "import sys; from hybrid_mpc.plots import animation, loops as tasks; "
-        "assert not {'torch', 'matplotlib.pyplot', 'casadi'} & set(sys.modules), 'a forbidden import'"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_same_data_same_bytes(tmp_path):
