@@ -1,4 +1,4 @@
-"""Figures of the estimators: whether their innovations are what they believe them to be."""
+"""Figures of the estimators: the consistency of their innovations."""
 
 from __future__ import annotations
 
@@ -96,8 +96,8 @@ def innovations(
     )
     width = 0.7 / n_y
     for i, signal in enumerate(outputs):
-        beside = (i + 0.5) / n_y * 0.7 - 0.35
-        bottom.bar(np.arange(1, lags + 1) + beside, r[:, i], width=width, label=plain(signal.name))
+        offset = (i + 0.5) / n_y * 0.7 - 0.35
+        bottom.bar(np.arange(1, lags + 1) + offset, r[:, i], width=width, label=plain(signal.name))
     bottom.axhspan(-correlation_band, correlation_band, color=GOOD, alpha=0.15, linewidth=0)
     bottom.axhline(0.0, color=FAINT, linewidth=0.8)
     bottom.xaxis.set_major_locator(MaxNLocator(integer=True))

@@ -61,7 +61,7 @@ def free_run(
     energy_model: Array,
     title: str = "",
 ) -> Figure:
-    """A free run beside the measurement, with the energy balances (the paper's Fig. 6).
+    """A free run and the measurement, with the energy balances (the paper's Fig. 6).
 
     Args:
         t: Times ``(n,)`` [s].

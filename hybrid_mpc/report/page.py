@@ -1,4 +1,4 @@
-"""The report: one HTML file that needs nothing beside it."""
+"""The page of a report: one self-contained HTML file of key figures, text, tables and embedded figures."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class KeyFigure:
         label: What it is, e.g. ``"Free-run error, hybrid against fitted prior"``.
         value: The number (or a word); None shows a dash, say why in ``comment``.
         unit: Its unit. Default: none.
-        comment: A few words of judgement, e.g. ``"target: at most 0.8"``.
-        verdict: ``"good"``, ``"bad"`` or ``"plain"`` (no judgement).
+        comment: A few words, e.g. ``"target: at most 0.8"``.
+        verdict: ``"good"``, ``"bad"`` or ``"plain"`` (neither).
 
     Example:
         >>> KeyFigure("Period", 20.0, "ms").text
@@ -212,7 +212,7 @@ def cell(value: Cell) -> str:
         return "–"
     if isinstance(value, bool):
         return "yes" if value else "no"
-    # a per cent sign stays beside its number
+    # a per cent sign stays with its number
     return number(value) if isinstance(value, float) else str(value).replace(" %", "\u00a0%")
 
 
