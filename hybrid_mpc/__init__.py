@@ -78,7 +78,7 @@ if TYPE_CHECKING:
     from hybrid_mpc.identify.smooth import fit_smoother
     from hybrid_mpc.identify.step import HybridStep, PriorStep, Scaling, n_features
     from hybrid_mpc.identify.train import train
-    from hybrid_mpc.identify.tune import SearchSpace, search
+    from hybrid_mpc.identify.tune import SearchSpace, tune
     from hybrid_mpc.job.controllers import find_noise
     from hybrid_mpc.job.loops import Bench, LoopRow, LoopSpec, varied
     from hybrid_mpc.job.run import run
@@ -284,7 +284,6 @@ __all__ = [
     "run_study",
     "save_artifact",
     "score",
-    "search",
     "set_calibration",
     "set_process_noise",
     "simulate",
@@ -294,6 +293,7 @@ __all__ = [
     "trace_model",
     "train",
     "train_output",
+    "tune",
     "varied",
     "with_friction",
     "with_input_delay",
@@ -352,7 +352,7 @@ _ROOMS = {
     "identify.smooth": ("fit_smoother",),
     "identify.step": ("HybridStep", "PriorStep", "Scaling", "n_features"),
     "identify.train": ("train",),
-    "identify.tune": ("SearchSpace", "search"),
+    "identify.tune": ("SearchSpace", "tune"),
     "job.controllers": ("find_noise",),
     "job.loops": ("Bench", "LoopRow", "LoopSpec", "varied"),
     "job.run": ("run",),

@@ -28,7 +28,7 @@ from hybrid_mpc import (
     make_resting_guard,
     simulate,
 )
-from hybrid_mpc.job.analyze import _inputs, _outer, _range, drive, measured_part
+from hybrid_mpc.job.analyze import driving_input, input_range, responses_of, state_range, whole_range
 from hybrid_mpc.job.check import check_scenario
 from hybrid_mpc.job.loops import excess, limits_used
 from hybrid_mpc.job.stages.monitor import unknown_load
@@ -246,24 +246,24 @@ def test_a_scenario_whose_limits_cross_ends_before_anything_is_computed(call, tm
 def test_ranges_that_are_analysed_never_cross(signal, inside):
     one = Signal("T", "K", *signal)
     model = SimpleNamespace(states=(one, one), inputs=(one,), n_x=2)
-    np.testing.assert_array_equal(_outer(model), [inside, inside])
-    np.testing.assert_array_equal(_inputs(model, None), [inside])
-    np.testing.assert_array_equal(_range(model, None), [inside, inside])
+    np.testing.assert_array_equal(whole_range(model), [inside, inside])
+    np.testing.assert_array_equal(input_range(model, None), [inside])
+    np.testing.assert_array_equal(state_range(model, None), [inside, inside])
 
 
 def test_working_ranges_take_each_limit_that_there_is():
     one = Signal("T", "K", -4.0)
     model = SimpleNamespace(states=(one, one), inputs=(one,), n_x=2)
     control = CONTROL.changed(u_min=(0.0,), u_max=(5.0,), x_min=(2.0, -INF), x_max=None)
-    np.testing.assert_array_equal(_range(model, control), [(2.0, 3.0), (-4.0, 1.0)])
-    np.testing.assert_array_equal(_inputs(model, control), [(0.0, 5.0)])
+    np.testing.assert_array_equal(state_range(model, control), [(2.0, 3.0), (-4.0, 1.0)])
+    np.testing.assert_array_equal(input_range(model, control), [(0.0, 5.0)])
     above = control.changed(u_max=(INF,))  # the signal has no upper bound either: what the weights tolerate
-    np.testing.assert_allclose(_inputs(model, above), [(0.0, TOLERATED / 2)])
+    np.testing.assert_allclose(input_range(model, above), [(0.0, TOLERATED / 2)])
 
 
 def test_a_study_drives_inputs_within_their_ranges():
-    subject = SimpleNamespace(u_range=np.array([(0.0, 5.0), (-4.0, 0.0), (-1.0, 1.0)]))
-    u = drive(subject, SimpleNamespace(dt=0.02, n_u=3), 30.0)
+    given = SimpleNamespace(u_range=np.array([(0.0, 5.0), (-4.0, 0.0), (-1.0, 1.0)]))
+    u = driving_input(given, SimpleNamespace(dt=0.02, n_u=3), 30.0)
     np.testing.assert_allclose(u.max(axis=0) - u.min(axis=0), 0.5 * np.array([5.0, 4.0, 2.0]), rtol=0.1)
     np.testing.assert_allclose(u.mean(axis=0), [2.5, -2.0, 0.0], atol=0.05)
     assert np.all((u >= [0.0, -4.0, -1.0]) & (u <= [5.0, 0.0, 1.0]))
@@ -286,10 +286,10 @@ def test_a_machine_is_driven_within_its_inputs_range():
 
     a, b = np.array([[0.9, 0.0], [0.3, 0.7]]), np.array([[0.1], [0.0]])
     model, plant = linear_model(a, b, [[0.0, 1.0]], dt=0.1), Lag()
-    subject = SimpleNamespace(
+    given = SimpleNamespace(
         models={"prior": model}, recordings=(), plant=plant, u_range=np.array([(2.0, 6.0)])
     )
-    result, _ = measured_part(subject)
+    found = responses_of(given)
     assert (min(plant.inputs), max(plant.inputs)) == pytest.approx((3.0, 5.0), abs=0.2)
-    assert result["source"].startswith("odd multisine of 1 - around 4, ")
-    assert result["prior"]["largest_relative_error"] < 1e-6  # the model is the machine
+    assert found.source.startswith("odd multisine of 1 - around 4 -, ")
+    assert found.errors["prior"].largest < 1e-6  # the model is the machine

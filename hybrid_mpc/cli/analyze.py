@@ -1,16 +1,18 @@
-"""``hybrid-mpc analyze``: the linear analysis of a model that exists."""
+"""``hybrid-mpc analyze``: the linear analysis of a trained model."""
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hybrid_mpc.cli.options import ArtifactFolder, EmptyFolder
 from hybrid_mpc.records import MOST_SEED
 
 if TYPE_CHECKING:
-    from hybrid_mpc.job.analyze import Request
+    from hybrid_mpc.job.analyze import AnalysisSettings
 
 EXAMPLES = (
     "Examples:\n\n"
@@ -20,8 +22,8 @@ EXAMPLES = (
 
 
 def analyze(
-    model: Annotated[Path, typer.Argument(help="Artifact folder: model/ of a finished run.")],
-    out: Annotated[Path, typer.Option(help="Folder to make; an existing one must be empty.")],
+    model: ArtifactFolder,
+    out: EmptyFolder,
     scenario: Annotated[
         str,
         typer.Option(
@@ -33,42 +35,41 @@ def analyze(
         typer.Option(help="A recording to take a frequency response from; may be repeated."),
     ] = None,
     speed: Annotated[
-        float | None, typer.Option(help="Size of the motions that friction is linearized for [units of v].")
+        float | None, typer.Option(help="Size of the motions that friction is linearized for [unit of v].")
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of what is drawn at random.", min=0, max=MOST_SEED)] = 0,
 ) -> None:
     """Poles, Bode plots, margins of the control loop and more, as tables, pictures and a page."""
-    from hybrid_mpc.cli.progress import make_progress
+    from hybrid_mpc.cli.progress import make_progress, print_summary
     from hybrid_mpc.files import check_folder
-    from hybrid_mpc.job.analyze import Request, study, subject_of
+    from hybrid_mpc.job.analyze import AnalysisSettings, analysis_input, analyze_models
     from hybrid_mpc.job.analyze_page import write_analysis
 
     check_folder(out)
-    request = Request(model, scenario, tuple(data or ()), speed, seed)
+    settings = AnalysisSettings(model, scenario, tuple(data or ()), speed, seed)
     with make_progress() as progress:
         progress.start("reading the model")
-        subject, notes = subject_of(request)
+        given, notes = analysis_input(settings)
         progress.finish("; ".join(notes))
         progress.start("analyzing")
-        findings = study(subject, progress.update)
+        result = analyze_models(given, progress.update)
         progress.finish("")
         progress.start("drawing")
-        files = write_analysis(out, subject, findings, notes, command(request, out))
+        files = write_analysis(out, given, result, notes, command(settings, out))
         progress.finish(f"{len(files)} files")
-    print(f"page: {(out / 'analysis.html').resolve()}")
+    print_summary((), out / "analysis.html", "page")
 
 
-def command(request: Request, out: Path) -> str:
-    """The command line that repeats this analysis, with folders by their last names.
+def command(settings: AnalysisSettings, out: Path) -> str:
+    """The command line that repeats this analysis, with full paths.
 
     Args:
-        request: What was asked for.
+        settings: What was asked for.
         out: Where it was written.
     """
-    folder = f"{request.folder.parent.name}/{request.folder.name}".lstrip("/")
-    words = ["hybrid-mpc analyze", folder, f"--out {out.name}"]
-    words += [f"--scenario {request.scenario}"] if request.scenario else []
-    words += [f"--data {path.name}" for path in request.data]
-    words += [f"--speed {request.speed:g}"] if request.speed is not None else []
-    words += [f"--seed {request.seed}"] if request.seed else []
-    return " ".join(words)
+    words = ["hybrid-mpc", "analyze", str(settings.folder.resolve()), "--out", str(out.resolve())]
+    words += ["--scenario", settings.scenario] if settings.scenario else []
+    words += [word for path in settings.data for word in ("--data", str(path.resolve()))]
+    words += ["--speed", f"{settings.speed!r}"] if settings.speed is not None else []
+    words += ["--seed", str(settings.seed)] if settings.seed else []
+    return shlex.join(words)

@@ -1,4 +1,4 @@
-"""``hybrid-mpc benchmark``: a machine's models judged on recordings that they have not seen."""
+"""``hybrid-mpc benchmark``: free runs of a machine's models over recordings that they have not seen."""
 
 from __future__ import annotations
 
@@ -25,10 +25,11 @@ def benchmark(
     ] = None,
     test: Annotated[
         list[Path] | None,
-        typer.Option(help="A recording to judge on. Default: what the training holds back."),
+        typer.Option(help="A recording to evaluate on. Default: what the training holds back."),
     ] = None,
     model: Annotated[
-        Path | None, typer.Option(help="Folder of a benchmark made before: judge its model, train nothing.")
+        Path | None,
+        typer.Option(help="Folder of a benchmark made before: evaluate its model, train nothing."),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder to make. Default: runs/MACHINE-benchmark.")] = None,
     budget: Annotated[str, typer.Option(help="Effort: quick or full.")] = "quick",
@@ -39,10 +40,10 @@ def benchmark(
             help="A machine that has changed: fit the prior anew to so many seconds of each test file."
         ),
     ] = None,
-    workers: Annotated[int, typer.Option(help="Kinds of networks trained side by side.", min=1)] = 2,
+    workers: Annotated[int, typer.Option(help="Kinds of networks trained at the same time.", min=1)] = 2,
 ) -> None:
-    """Fit the prior, train networks on it, and judge free runs over unseen recordings."""
-    from hybrid_mpc.cli.progress import make_progress
+    """Fit the prior, train networks on it, and evaluate free runs over unseen recordings."""
+    from hybrid_mpc.cli.progress import make_progress, print_summary
     from hybrid_mpc.job.benchmark import BenchmarkSettings, draw, table
     from hybrid_mpc.job.benchmark import benchmark as run_job
     from hybrid_mpc.scenario import load_scenario
@@ -52,8 +53,6 @@ def benchmark(
         machine, tuple(data or ()), tuple(test or ()), model, budget, seed, workers, refit
     )
     with make_progress() as progress:
-        results, runs = run_job(settings, folder, progress=progress)
-        draw(load_scenario(machine), results, runs, folder)
-    for line in table(results):
-        print(line)
-    print(f"results: {(folder / 'results.json').resolve()}")
+        results = run_job(settings, folder, progress=progress)
+        draw(load_scenario(machine), results, folder)
+    print_summary(table(results), folder / "results.json")

@@ -26,20 +26,20 @@ from hybrid_mpc.cli import data as data_command
 from hybrid_mpc.cli import monitor as monitor_command
 from hybrid_mpc.cli import run as run_command
 from hybrid_mpc.cli import scenarios as scenarios_command
-from hybrid_mpc.cli import search as search_command
 from hybrid_mpc.cli import study as study_command
+from hybrid_mpc.cli import tune as tune_command
 from hybrid_mpc.errors import InputError, StorageError
 from hybrid_mpc.files import reason
 
 BAD_INPUT, CTRL_C = 2, 130
-KEPT = {
-    "run": "finished stages are kept: the same command with --resume goes on",
-    "reproduce": "what is done is kept: the same command with --resume goes on",
-    "benchmark": "what is fitted and trained is kept: the same command goes on",
-    "control": "loops are kept at the end only, there is nothing to resume: the same command starts them anew (with "
+SAVED = {
+    "run": "finished stages are saved: the same command with --resume goes on",
+    "reproduce": "what is done is saved: the same command with --resume goes on",
+    "benchmark": "what is fitted and trained is saved: the same command goes on",
+    "control": "loops are saved at the end only, there is nothing to resume: the same command starts them anew (with "
     "another --out if something lies in it already)",
-    "search": "finished trials are kept: the same command with --resume goes on",
-    "study": "finished runs are kept: the same command with --resume goes on",
+    "tune": "finished trials are saved: the same command with --resume goes on",
+    "study": "finished runs are saved: the same command with --resume goes on",
     "analyze": "figures and tables are not complete: the same command with another --out makes them anew",
     "monitor": "tables and pictures are not complete: the same command with another --out makes them anew",
     "data": "the recordings are not complete: the same command with another --out makes them anew",
@@ -59,7 +59,7 @@ app.command("control", epilog=control_command.EXAMPLES)(control_command.control)
 app.command("analyze", epilog=analyze_command.EXAMPLES)(analyze_command.analyze)
 app.command("benchmark", epilog=benchmark_command.EXAMPLES)(benchmark_command.benchmark)
 app.command("data", epilog=data_command.EXAMPLES)(data_command.data)
-app.command("search", epilog=search_command.EXAMPLES)(search_command.search)
+app.command("tune", epilog=tune_command.EXAMPLES)(tune_command.tune)
 app.command("monitor", epilog=monitor_command.EXAMPLES)(monitor_command.monitor)
 app.command("scenarios")(scenarios_command.scenarios)
 app.add_typer(study_command.app, name="study")
@@ -90,7 +90,7 @@ def main() -> None:
         app()
     except StorageError as error:
         errors.print(f"[bold red]error:[/] {_escape(str(error))}")
-        _say_what_is_kept(errors)
+        _say_what_is_saved(errors)
         sys.exit(BAD_INPUT)
     except InputError as error:
         errors.print(f"[bold red]error:[/] {_escape(str(error))}")
@@ -101,19 +101,19 @@ def main() -> None:
     except OSError as error:
         place = f" {error.filename}" if error.filename is not None else ""
         errors.print(f"[bold red]error:[/] the file system refused{_escape(place)}: {reason(error)}")
-        _say_what_is_kept(errors)
+        _say_what_is_saved(errors)
         sys.exit(BAD_INPUT)
     except SystemExit as stop:
         if stop.code == CTRL_C:  # typer takes the KeyboardInterrupt and says nothing
             errors.print("interrupted")
-            _say_what_is_kept(errors)
+            _say_what_is_saved(errors)
         raise
 
 
-def _say_what_is_kept(errors: Console) -> None:
-    command = next((word for word in sys.argv[1:] if word in KEPT), "")
+def _say_what_is_saved(errors: Console) -> None:
+    command = next((word for word in sys.argv[1:] if word in SAVED), "")
     if command:
-        errors.print(KEPT[command])
+        errors.print(SAVED[command])
 
 
 def _escape(text: str) -> str:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hybrid_mpc.cli.options import ArtifactFolder, EmptyFolder
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.scenario import scenario_of
 
 if TYPE_CHECKING:
-    from hybrid_mpc.job.monitor import MonitorJob
+    from hybrid_mpc.job.monitor import MonitorJob, MonitorResult, RecordingResult
 
 EXAMPLES = (
     "Examples:\n\n"
@@ -23,9 +24,9 @@ EXAMPLES = (
 
 
 def monitor(
-    model: Annotated[Path, typer.Argument(help="Artifact folder: model/ of a finished run.")],
+    model: ArtifactFolder,
     recordings: Annotated[list[Path], typer.Argument(help="Recordings: CSV, .npz or .mat.")],
-    out: Annotated[Path, typer.Option(help="Folder to make; an existing one must be empty.")],
+    out: EmptyFolder,
     scenario: Annotated[
         str, typer.Option(help="Columns and period: a name or a .py file. Default: the model's own.")
     ] = "",
@@ -47,7 +48,7 @@ def monitor(
 
     Exit code 1 if nothing of a recording could be judged.
     """
-    from hybrid_mpc.cli.progress import make_progress
+    from hybrid_mpc.cli.progress import make_progress, print_summary
     from hybrid_mpc.files import check_folder
     from hybrid_mpc.job.monitor import learn as learn_job
     from hybrid_mpc.job.monitor import prepared, watch
@@ -67,18 +68,14 @@ def monitor(
     if learn:
         with make_progress() as progress:
             found = learn_job(job, learn, out, progress)
-        print(
-            f"learned from {60 * found.hours:.1f} min, for {found.false_alarms_per_hour:g} false alarms an hour"
-        )
-        print(f"detector: {(out / 'calibration.json').resolve()}")
+        line = f"learned from {60 * found.hours:.1f} min, for {found.false_alarms_per_hour:g} false alarms an hour"
+        print_summary([line], out / "calibration.json", "detector")
         return
     print(watching(job))
     with make_progress() as progress:
-        results = watch(job, out, progress)
-    for line in summary(results):
-        print(line)
-    print(f"results: {(out / 'monitor.json').resolve()}")
-    if any(not row["judged_s"] for row in results["recordings"]):
+        result = watch(job, out, progress)
+    print_summary(summary(result), out / "monitor.json")
+    if any(not row.judged_s for row in result.recordings):
         raise typer.Exit(1)
 
 
@@ -89,54 +86,50 @@ def watching(job: MonitorJob) -> str:
         job: The job.
     """
     detector, calibration = job.detector, job.monitor.calibration
-    if detector is None and (calibration is None or calibration.threshold_w is None):
+    if detector is not None:
+        return (
+            f"watched with a detector for {detector.false_alarms_per_hour:g} false alarms an hour, learned from "
+            f"{60 * detector.hours:.1f} min (hash {detector.data_hash[:16] or 'unknown'})"
+        )
+    if calibration is None or calibration.threshold_w is None:
         why = f" ({calibration.method.rstrip('.')})" if calibration is not None else ""
         return (
             f"the artifact holds no detector and no thresholds{why}: nothing alarms but a monitor that cannot judge "
             "(see --learn)"
         )
-    if detector is None:
-        return "watched with the artifact's thresholds of violation and residual; it holds no detector (see --learn)"
     return (
-        f"watched with a detector for {detector.false_alarms_per_hour:g} false alarms an hour, learned from "
-        f"{60 * detector.hours:.1f} min (hash {detector.data_hash[:16] or 'unknown'})"
+        "watched with the artifact's thresholds of violation and residual; it holds no detector (see --learn)"
     )
 
 
-def summary(results: dict[str, Any]) -> list[str]:
+def summary(result: MonitorResult) -> list[str]:
     """One line a recording and alarm.
 
     Args:
-        results: What monitor.json holds.
+        result: What was found.
     """
     lines = []
-    for row in results["recordings"]:
-        n = len(row["alarms"])
+    for row in result.recordings:
+        n = len(row.alarms)
         lines.append(
-            f"{row['recording']}: {row['seconds']:.1f} s, {n} alarm{'' if n == 1 else 's'}{_blind(row)}"
+            f"{row.recording}: {row.seconds:.1f} s, {n} alarm{'' if n == 1 else 's'}{_not_judged(row)}"
         )
-        for alarm in row["alarms"]:
-            why = f": {alarm['diagnosis']}" if alarm["diagnosis"] else ""
-            lines.append(f"  {alarm['start_s']:.2f} to {alarm['end_s']:.2f} s{why}")
-    lines += [
-        f"gap in {cut['file']}: {cut['start']:.2f} to {cut['end']:.2f} s, {cut['why']}"
-        for cut in results["gaps"]
-    ]
-    lines += [
-        f"not watched in {cut['file']}: {cut['start']:.2f} to {cut['end']:.2f} s, {cut['why']}"
-        for cut in results["not_watched"]
-    ]
+        for alarm in row.alarms:
+            why = f": {alarm.diagnosis}" if alarm.diagnosis else ""
+            lines.append(f"  {alarm.start_s:.2f} to {alarm.end_s:.2f} s{why}")
+    for what, cuts in (("gap", result.gaps), ("not watched", result.not_watched)):
+        lines += [f"{what} in {cut.file}: {cut.start:.2f} to {cut.end:.2f} s, {cut.why}" for cut in cuts]
     return lines
 
 
-def _blind(row: dict[str, Any]) -> str:
+def _not_judged(row: RecordingResult) -> str:
     """What of a recording was not judged, and why."""
-    why = {
-        "warm_up_s": "warm-up",
-        "missing_s": "samples are missing",
-        "not_finite_s": "model or estimator gives no finite number",
-    }
-    told = ", ".join(f"{row[key]:.2f} s {words}" for key, words in why.items() if row[key])
-    if not row["judged_s"]:
-        return f"; NOTHING COULD BE JUDGED: {told}"
-    return f"; not judged: {told}" if told else ""
+    parts = (
+        (row.warm_up_s, "warm-up"),
+        (row.missing_s, "samples are missing"),
+        (row.not_finite_s, "model or estimator gives no finite number"),
+    )
+    text = ", ".join(f"{seconds:.2f} s {why}" for seconds, why in parts if seconds)
+    if not row.judged_s:
+        return f"; NOTHING COULD BE JUDGED: {text}"
+    return f"; not judged: {text}" if text else ""

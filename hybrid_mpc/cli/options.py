@@ -1,4 +1,4 @@
-"""Words that several commands take; a default is the command's own."""
+"""Arguments and options that several commands take; a default is the command's own."""
 
 from __future__ import annotations
 
@@ -21,4 +21,5 @@ OutputColumns: TypeAlias = Annotated[
     list[str] | None, typer.Option(help="Column of a measured position, in the prior's order.")
 ]
 Device: TypeAlias = Annotated[str, typer.Option(help="Where networks are trained: cpu, cuda, cuda:1, ...")]
+ArtifactFolder: TypeAlias = Annotated[Path, typer.Argument(help="Artifact folder: model/ of a finished run.")]
 EmptyFolder: TypeAlias = Annotated[Path, typer.Option(help="Folder to make; an existing one must be empty.")]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
+from pathlib import Path
 from types import TracebackType
 from typing import Self
 
@@ -103,3 +105,16 @@ def make_progress() -> Bars | Lines:
     """Bars on a terminal, lines elsewhere."""
     console = Console()
     return Bars(console) if console.is_terminal else Lines()
+
+
+def print_summary(lines: Iterable[str], result: Path, name: str = "results") -> None:
+    """Print what a command found, and where it wrote it.
+
+    Args:
+        lines: The summary.
+        result: The file.
+        name: What the file holds.
+    """
+    for line in lines:
+        print(line)
+    print(f"{name}: {result.resolve()}")

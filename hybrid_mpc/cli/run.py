@@ -46,7 +46,7 @@ def run(
     output_column: OutputColumns = None,
     network_settings: Annotated[
         Path | None,
-        typer.Option("--settings", help="JSON file of network settings, as hybrid-mpc search leaves it."),
+        typer.Option("--settings", help="JSON file of network settings, as hybrid-mpc tune leaves it."),
     ] = None,
     device: Device = "cpu",
     only: Annotated[

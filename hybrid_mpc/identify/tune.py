@@ -186,7 +186,7 @@ def _checked(name: str, bounds: Sequence[float]) -> tuple[float, float]:
 
 # The journal of a search: Optuna's, in lines of JSON, bound to its search.
 
-STUDY = "hybrid-mpc search"
+STUDY = "hybrid-mpc tune"
 
 
 def open_study(storage: Path, identity: Mapping[str, str]) -> optuna.Study:
@@ -202,7 +202,7 @@ def open_study(storage: Path, identity: Mapping[str, str]) -> optuna.Study:
     Example:
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     open_study(Path(folder) / "search.jsonl", {"seed": "0"}).user_attrs
+        ...     open_study(Path(folder) / "tune.jsonl", {"seed": "0"}).user_attrs
         {'identity': {'seed': '0'}}
     """
     storage.parent.mkdir(parents=True, exist_ok=True)
@@ -254,7 +254,7 @@ def _quiet() -> Iterator[None]:
         optuna.logging.set_verbosity(before)
 
 
-__all__ = ["search", "SearchSpace", "SearchResult", "TrialRow", "Progress"]
+__all__ = ["tune", "SearchSpace", "SearchResult", "TrialRow", "Progress"]
 
 Progress = Callable[[int, int, int, float], None]
 STARTUP = 6
@@ -313,7 +313,7 @@ class SearchResult:
     importance: Mapping[str, float]
 
 
-def search(
+def tune(
     prior: Prior,
     training: Sequence[Trajectory],
     validation: Sequence[Trajectory],
@@ -350,8 +350,8 @@ def search(
             the data are such that :func:`~hybrid_mpc.identify.train.train` refuses them.
 
     Example:
-        >>> found = search(prior, train_runs, valid_runs, base, SearchSpace(), trials=20,
-        ...                storage=Path("search.jsonl"))  # doctest: +SKIP
+        >>> found = tune(prior, train_runs, valid_runs, base, SearchSpace(), trials=20,
+        ...              storage=Path("tune.jsonl"))  # doctest: +SKIP
         >>> train(prior, train_runs, valid_runs, found.settings)  # doctest: +SKIP
     """
     check_numbers(trials, seed, timeout)

@@ -1,14 +1,17 @@
-"""The benchmark from files to ``results.json``."""
+"""``hybrid-mpc benchmark``: fit, train and choose on some recordings, and evaluate free runs over others.
+
+What is chosen (settings, networks, the recommended model) depends on training and validation parts alone.
+"""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,15 +20,16 @@ from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import check_writable, digest, locked, read_document, write_document, write_json
 from hybrid_mpc.identify.delay import OutputErrorFit, Physics, cut_runs, fit_physics, shifted, smoothed
 from hybrid_mpc.identify.settings import KINDS, TrainingSettings
-from hybrid_mpc.identify.train import Trained, train
+from hybrid_mpc.identify.train import Trained
 from hybrid_mpc.job.benchmark_runs import (
     MODELS,
+    BenchmarkRun,
     Recordings,
-    Run,
+    RunError,
     benchmark_of,
-    figures_of,
     read_test,
     read_training,
+    run_error,
     run_freely,
     warm_samples,
 )
@@ -33,19 +37,324 @@ from hybrid_mpc.job.check import check_scenario
 from hybrid_mpc.job.context import Progress, Silent, versions
 from hybrid_mpc.job.engine import run_jobs
 from hybrid_mpc.job.folder import JobNote, check_same_job
-from hybrid_mpc.job.stages.identify import is_trained, load_trained, save_trained
+from hybrid_mpc.job.stages.identify import is_trained, load_trained, save_trained, train_kind
 from hybrid_mpc.machine.specification import BenchmarkBudget
-from hybrid_mpc.machine.torch_prior import Prior
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import Scenario, load_scenario
 
-# Which model a benchmark recommends, from free runs that no test file enters.
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
-IN_MOTION = 0.1
-"""Least length [s] that is given of a validation piece: it begins in motion, while a recording that gives less (EMPS,
-20 ms) begins at rest, and two samples tell no speed beside an unknown acceleration."""
+    from hybrid_mpc.machine.torch_prior import Prior
+
+SCHEMA = 1
+NOTE = "benchmark.json"
+"""Says which benchmark a folder holds."""
+MODEL_NOTE = "benchmark_model.json"
 CANDIDATES = ("phy", "pgrnn", "mopgrnn", "pgrnn mean", "mopgrnn mean")
 """What may be recommended."""
+IN_MOTION = 0.1
+"""Least length [s] that is given of a validation piece: it begins in motion, while a recording that gives less (EMPS,
+20 ms) begins at rest, and two samples tell no speed next to an unknown acceleration."""
+REFIT_LENGTHS = (0.5, 1.0)
+"""Free runs [s] of a refit, the short ones first: from parameters that are far off a long one leads nowhere."""
+REFIT_EVALUATIONS = 15
+FEWEST_RUNS = 3
+"""Free runs of a refit at least: one alone would be fitted by any parameters."""
+
+
+@dataclass(frozen=True)
+class BenchmarkSettings:
+    """What one benchmark computes.
+
+    Args:
+        scenario: Registered name or path of a user's Python file.
+        data: Training files.
+        test: Files to evaluate on. Default: what the training holds back.
+        model: Folder of a model made before; then nothing is trained. Default: none.
+        budget: Name of the machine's budget. Default: quick.
+        seed: Of the networks.
+        workers: Kinds of networks trained at the same time.
+        refit: Length [s] of each test file's start that the prior's parameters are fitted to anew, for a machine that
+            has changed; the rest is evaluated with the old parameters and with the new ones. Default: none.
+    """
+
+    scenario: str
+    data: tuple[Path, ...] = ()
+    test: tuple[Path, ...] = ()
+    model: Path | None = None
+    budget: str = "quick"
+    seed: int = 0
+    workers: int = 1
+    refit: float | None = None
+
+
+@dataclass(frozen=True)
+class _Description:
+    """What the JSON file next to the networks holds, see :class:`BenchmarkModel`."""
+
+    scenario: str
+    dt: float
+    physics: Physics
+    hybrid: str
+    validation: Mapping[str, float]
+    long: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class BenchmarkModel(_Description):
+    """Everything that a free run over another recording needs.
+
+    Args:
+        scenario: Name of the machine.
+        dt: Model period [s].
+        physics: The fitted prior with its delay and smoother.
+        hybrid: The recommended model, e.g. ``"mopgrnn mean"``.
+        validation: Error of every candidate on the validation pieces [unit of the benchmark].
+        long: The same over :attr:`Recordings.long`; may be empty.
+        networks: Trained networks by kind.
+    """
+
+    networks: Mapping[str, Trained]
+
+
+@dataclass(frozen=True)
+class Refit:
+    """A changed machine: errors over what follows a recording's first seconds.
+
+    Args:
+        seconds: Length [s] that the prior was fitted to anew.
+        prior: Its new parameters, a row each.
+        before: Errors with the old parameters, of ``"phy"`` and ``"hybrid"``.
+        after: With the new ones.
+    """
+
+    seconds: float
+    prior: Sequence[Mapping[str, Any]]
+    before: Mapping[str, RunError]
+    after: Mapping[str, RunError]
+
+
+@dataclass(frozen=True)
+class FileResult:
+    """A test file.
+
+    Args:
+        runs: The free runs.
+        errors: By model, and of ``"hybrid"``, the recommended one.
+        scored_s: Length [s] that the errors count.
+        refit: Where one was asked for.
+    """
+
+    runs: Sequence[BenchmarkRun]
+    errors: Mapping[str, RunError]
+    scored_s: float
+    refit: Refit | None = None
+
+
+@dataclass(frozen=True)
+class BenchmarkResults:
+    """The model of a benchmark, and what its free runs over each test file came to."""
+
+    model: BenchmarkModel
+    test: Mapping[str, FileResult]
+
+
+def benchmark(
+    settings: BenchmarkSettings, out: Path, *, progress: Progress | None = None
+) -> BenchmarkResults:
+    """Fit, train and evaluate; or evaluate a model made before. The same command goes on where it was interrupted.
+
+    Args:
+        settings: What to compute.
+        out: Folder for ``results.json`` and, if something is trained, ``model/`` and ``checkpoints/``.
+        progress: Where to report; default: nowhere.
+
+    Raises:
+        InputError: If a file, the model, the budget or the folder does not fit.
+    """
+    progress, scenario = progress or Silent(), load_scenario(settings.scenario)
+    _check(settings, scenario)
+    check_scenario(scenario)
+    data, tests, warnings = _read(settings, scenario)
+    for warning in warnings:
+        progress.warn(warning)
+    check_writable(out)
+    with locked(out):
+        started = time.monotonic()
+        if data is None:
+            assert settings.model is not None
+            model = load_model(settings.model, scenario.name)
+        else:
+            model = _make(settings, scenario, data, out, progress)
+            tests = tests or ({"held back": data.held_back} if data.held_back else {})
+        for warning in model.physics.fit.warnings:
+            progress.warn(f"fit of the prior: {warning}")
+        progress.start("free runs over the test files")
+        found = {}
+        for i, (name, trajectories) in enumerate(tests.items()):
+            progress.update("files", i, len(tests), name)
+            found[name] = _evaluate(scenario, model, trajectories, settings.refit)
+        progress.finish("")
+        results = BenchmarkResults(model, found)
+        document = _document(settings, scenario, data, results, warnings)
+        write_json(out / "results.json", {**document, "timing": {"seconds": time.monotonic() - started}})
+        return results
+
+
+def _check(settings: BenchmarkSettings, scenario: Scenario) -> None:
+    budgets = benchmark_of(scenario).budgets
+    if settings.budget not in budgets:
+        raise InputError(
+            f"scenario {scenario.name} has no benchmark budget {settings.budget!r}; it has: {', '.join(budgets)}"
+        )
+    if settings.model is None and not settings.data:
+        raise InputError(
+            "give recordings to train on with --data FILE, or a model made before with --model DIR"
+        )
+    if settings.model is not None and settings.data:
+        raise InputError(
+            "--model is evaluated as it is: leave --data out, or leave --model out to train anew"
+        )
+    if settings.model is not None and not settings.test:
+        raise InputError("a model made before needs recordings to be evaluated on: --test FILE")
+    names = [path.name for path in settings.test]
+    if len(set(names)) < len(names):
+        raise InputError(f"two test files have the same name: {', '.join(sorted(names))}; rename one")
+
+
+def _read(
+    settings: BenchmarkSettings, scenario: Scenario
+) -> tuple[Recordings | None, dict[str, tuple[Trajectory, ...]], list[str]]:
+    """Training files if there are to be some, test files by name, and warnings about them."""
+    data: Recordings | None = None
+    tests: dict[str, tuple[Trajectory, ...]] = {}
+    problems: list[str] = []
+    warnings: list[str] = []
+    if settings.model is None:
+        try:
+            data = read_training(scenario, settings.data)
+            warnings += [str(finding) for finding in data.dataset.findings]
+        except InputError as error:
+            problems += error.problems
+    for path in settings.test:
+        try:
+            tests[path.name] = read_test(scenario, path, warnings.append)
+        except InputError as error:
+            problems += error.problems
+    refuse(problems)
+    return data, tests, list(dict.fromkeys(warnings))
+
+
+# The model: fitted, trained and chosen, or what the folder holds of it.
+
+
+def _make(
+    settings: BenchmarkSettings, scenario: Scenario, data: Recordings, out: Path, progress: Progress
+) -> BenchmarkModel:
+    _claim(out, settings, data)
+    spec, warm_up, dt = benchmark_of(scenario), scenario.data.warm_up, scenario.data.dt
+    progress.start("fitting the prior")
+    physics = _physics(scenario, data, out, progress)
+    progress.finish("")
+    progress.start("training the networks")
+    warm = warm_samples(warm_up, physics.delay, dt)
+    networks = _networks(
+        settings,
+        physics,
+        [smoothed(scenario.prior, physics, part, dt) for part in (data.train, data.valid)],
+        lambda kind: training_settings(kind, spec.budgets[settings.budget], seed=settings.seed, warm=warm),
+        out / "checkpoints",
+        progress,
+    )
+    progress.finish("")
+    errors = partial(candidate_errors, scenario, physics, networks)
+    validation = errors(data.valid, max(warm_up, IN_MOTION))
+    long = errors(data.long, warm_up) if data.long else {}
+    hybrid = recommended(validation, long)
+    model = BenchmarkModel(scenario.name, dt, physics, hybrid, validation, long, networks)
+    save_model(out / "model", model)
+    return model
+
+
+def _claim(out: Path, settings: BenchmarkSettings, data: Recordings) -> None:
+    """Note in ``out`` what is trained there; another training in the same folder is refused."""
+    own = {
+        "scenario": settings.scenario,
+        "data": data.dataset.hash,
+        "budget": settings.budget,
+        "seed": settings.seed,
+        "pieces": digest(
+            [[p.role, p.name, p.t[0], p.t[-1]] for p in (*data.train, *data.valid, *data.held_back)]
+        ),
+    }
+    note = JobNote(
+        "benchmark", NOTE, own, lambda folder: write_document(folder / NOTE, own),
+        lambda folder: read_document(folder / NOTE),
+    )  # fmt: skip
+    there = (out / NOTE).is_file()
+    check_same_job(out, note, resume=there)
+    if not there:
+        note.write(out)
+
+
+def _physics(scenario: Scenario, data: Recordings, out: Path, progress: Progress) -> Physics:
+    """The fitted prior; a fit that ``out`` holds is not made again."""
+    note, spec = out / "checkpoints" / "physics.json", benchmark_of(scenario)
+    if note.is_file():
+        held = read_document(note, "delete it, and the same command fits the prior anew")
+        return record(Physics, held, str(note))
+    physics = fit_physics(
+        scenario.prior,
+        data.train,
+        data.valid,
+        dt=scenario.data.dt,
+        length=spec.length or spec.piece,
+        largest_delay=spec.largest_delay,
+        on_progress=partial(progress.update, "prior"),
+    )
+    write_document(note, plain(physics))
+    return physics
+
+
+def training_settings(kind: str, budget: BenchmarkBudget, *, seed: int, warm: int) -> TrainingSettings:
+    """Settings of one kind: free runs are trained on the error of the position, which the benchmark scores.
+
+    Example:
+        >>> budget = BenchmarkBudget(16, 2, teacher_steps=100, free_run_steps=200, horizon=40)
+        >>> training_settings("mopgrnn", budget, seed=0, warm=10).objectives
+        ('position', 'energy')
+    """
+    return TrainingSettings(
+        kind=kind,  # type: ignore[arg-type]
+        seed=seed,
+        warm=warm,
+        objectives=("position", "energy"),
+        fused=True,
+        **asdict(budget),
+    )
+
+
+def _networks(
+    settings: BenchmarkSettings,
+    physics: Physics,
+    parts: Sequence[Sequence[Trajectory]],
+    settings_of: Callable[[str], TrainingSettings],
+    folder: Path,
+    progress: Progress,
+) -> dict[str, Trained]:
+    """Networks of every kind, trained where ``folder`` does not hold them yet; an interrupted training goes on."""
+    train, valid = (list(part) for part in parts)
+    jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
+        kind: (
+            train_kind,
+            (settings.scenario, dict(physics.fit.values), train, valid, settings_of(kind), folder, "cpu"),
+        )
+        for kind in reversed(KINDS)
+        if not is_trained(folder, settings_of(kind))
+    }
+    run_jobs(jobs, progress.update, settings.workers)
+    return {str(kind): load_trained(folder, kind) for kind in KINDS}
 
 
 def candidate_errors(
@@ -66,14 +375,14 @@ def candidate_errors(
     """
     spec, prior = benchmark_of(scenario), scenario.prior(physics.fit.values)
     runs = run_freely(prior, physics, networks, trajectories, warm_up=warm_up, length=spec.length)
-    return {name: figures_of(runs, name, unit=spec.unit, scale=spec.scale)["rmse"] for name in runs[0].y_hat}
+    return {name: run_error(runs, name, spec).rmse for name in runs[0].y_hat}
 
 
 def recommended(validation: Mapping[str, float], long: Mapping[str, float]) -> str:
     """The candidate whose larger error, over the prior's, is least: on validation pieces and on runs of full length.
 
-    Validation pieces are what nothing was trained on, but they may be shorter than the runs that judge, and then say
-    nothing of a drift.
+    Nothing was trained on validation pieces, but they may be shorter than the runs of the test, and then do not show
+    drift.
 
     Args:
         validation: Errors on the validation pieces.
@@ -85,184 +394,21 @@ def recommended(validation: Mapping[str, float], long: Mapping[str, float]) -> s
         ('pgrnn', 'mopgrnn')
     """
 
-    def worse(name: str) -> float:
+    def larger(name: str) -> float:
         over_prior = [
             1.0 if name == "phy" else part[name] / part["phy"] for part in (validation, long) if part
         ]
         return max(math.inf if math.isnan(v) else v for v in over_prior)  # NaN: both have diverged
 
-    return min(CANDIDATES, key=worse)
-
-
-# The free runs of a benchmark as pictures, one for each test file.
-
-
-def draw(
-    scenario: Scenario, results: Mapping[str, Any], runs: Mapping[str, Sequence[Run]], out: Path
-) -> list[Path]:
-    """Draw the longest free run of every test file into ``out/figures``.
-
-    Args:
-        scenario: The machine.
-        results: What stands in ``results.json``.
-        runs: Free runs by test file.
-        out: The benchmark's folder.
-
-    Returns:
-        The files.
-    """
-    from hybrid_mpc.plots.fit import benchmark_run
-    from hybrid_mpc.plots.style import save
-
-    kind, _, mean = results["model"]["hybrid"].partition(" ")
-    chosen = "fitted prior" if kind == "phy" else kind.upper() + (", mean" if mean else "")
-    made, prior, spec = [], scenario.prior(), benchmark_of(scenario)
-    for file, parts in runs.items():
-        run = max(parts, key=lambda part: len(part.t))
-        shown = {
-            "phy": run.y_hat["phy"],
-            "rnn": run.y_hat["rnn"],
-            "hybrid": run.y_hat[results["model"]["hybrid"]],
-        }
-        figure = benchmark_run(
-            run.t, run.y[:, 0], {name: y[:, 0] for name, y in shown.items()}, run.u,
-            output=prior.outputs[0], inputs=prior.inputs, unit=spec.unit, scale=spec.scale,
-            title=f"{scenario.title}: free run over {file}", names={"hybrid": f"hybrid ({chosen})"},
-        )  # fmt: skip
-        made.append(save(figure, out / "figures" / f"{Path(file).stem}.png"))
-    return made
-
-
-# The networks of a benchmark: settings from the budget, training in processes of their own.
-
-Report = Callable[[str, int, int, str], None]
-
-
-def settings_of(kind: str, budget: BenchmarkBudget, *, seed: int, warm: int) -> TrainingSettings:
-    """Settings of one kind: free runs are trained on the error of the position, by which they are judged.
-
-    Example:
-        >>> budget = BenchmarkBudget(16, 2, teacher_steps=100, free_run_steps=200, horizon=40)
-        >>> settings_of("mopgrnn", budget, seed=0, warm=10).objectives
-        ('position', 'energy')
-    """
-    return TrainingSettings(
-        kind=kind,  # type: ignore[arg-type]
-        hidden=budget.hidden,
-        networks=budget.networks,
-        teacher_steps=budget.teacher_steps,
-        free_run_steps=budget.free_run_steps,
-        seed=seed,
-        warm=warm,
-        horizon=budget.horizon,
-        batch=budget.batch,
-        decay=budget.decay,
-        prior_replay=budget.prior_replay,
-        objectives=("position", "energy"),
-        fused=True,
-    )
-
-
-def train_all(
-    scenario: str,
-    values: Mapping[str, float],
-    training: Sequence[Trajectory],
-    validation: Sequence[Trajectory],
-    settings: Callable[[str], TrainingSettings],
-    folder: Path,
-    *,
-    workers: int,
-    on_progress: Report = lambda key, done, total, text: None,
-) -> dict[str, Trained]:
-    """Train the networks of every kind that ``folder`` does not hold yet; an interrupted one goes on.
-
-    Args:
-        scenario: Registered name or path, which every process loads for itself.
-        values: Parameters of the fitted prior.
-        training: Smoothed training pieces.
-        validation: Smoothed validation pieces.
-        settings: ``kind -> settings``.
-        folder: Where checkpoints and finished networks lie.
-        workers: Kinds trained side by side.
-        on_progress: ``(kind, done, total, text)``.
-    """
-    jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
-        kind: (_train, (scenario, dict(values), list(training), list(validation), settings(kind), folder))
-        for kind in reversed(KINDS)
-        if not is_trained(folder, settings(kind))
-    }
-    run_jobs(jobs, on_progress, workers)
-    return {str(kind): load_trained(folder, kind) for kind in KINDS}
-
-
-def _train(
-    scenario: str,
-    values: dict[str, float],
-    training: Sequence[Trajectory],
-    validation: Sequence[Trajectory],
-    settings: TrainingSettings,
-    folder: Path,
-    report: Callable[[int, int, str], None],
-) -> None:
-    trained = train(
-        load_scenario(scenario).prior(values),
-        training,
-        validation,
-        settings,
-        checkpoint=folder / f"{settings.kind}.safetensors",
-        on_progress=lambda done, total, error: report(done, total, f"validation RMSE {error:.4g}"),
-    )
-    save_trained(folder, trained)
-
-
-# A benchmark's model on disk: parameters, delay, smoother and networks as JSON and plain arrays.
-
-MODEL_NOTE = "benchmark_model.json"
-SCHEMA = 1
-
-
-@dataclass(frozen=True)
-class BenchmarkModel:
-    """Everything that a free run over another recording needs.
-
-    Args:
-        scenario: Name of the machine.
-        dt: Model period [s].
-        physics: The fitted prior with its delay and smoother.
-        networks: Trained networks by kind.
-        hybrid: The model that validation recommends, e.g. ``"mopgrnn mean"``.
-        validation: Error of every candidate on the validation pieces [unit of the benchmark].
-        long: The same over whole recordings, most of which was trained on; empty where none was split in order of time.
-    """
-
-    scenario: str
-    dt: float
-    physics: Physics
-    networks: Mapping[str, Trained]
-    hybrid: str
-    validation: Mapping[str, float]
-    long: Mapping[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class _Note:
-    """What stands in the JSON file beside the networks."""
-
-    schema: int
-    scenario: str
-    dt: float
-    physics: Physics
-    hybrid: str
-    validation: Mapping[str, float]
-    long: Mapping[str, float]
+    return min(CANDIDATES, key=larger)
 
 
 def save_model(folder: Path, model: BenchmarkModel) -> None:
     """Write a model; the note comes last, so a folder that has it is whole."""
     for trained in model.networks.values():
         save_trained(folder, trained)
-    note = _Note(SCHEMA, model.scenario, model.dt, model.physics, model.hybrid, model.validation, model.long)
-    write_document(folder / MODEL_NOTE, plain(note))
+    description = {f.name: getattr(model, f.name) for f in fields(_Description)}
+    write_document(folder / MODEL_NOTE, {"schema": SCHEMA, **plain(description)})
 
 
 def load_model(folder: Path, scenario: str) -> BenchmarkModel:
@@ -272,41 +418,62 @@ def load_model(folder: Path, scenario: str) -> BenchmarkModel:
         InputError: If there is none, it is damaged, or of another machine.
     """
     folder = folder if (folder / MODEL_NOTE).is_file() else folder / "model"
-    if not (folder / MODEL_NOTE).is_file():
+    path = folder / MODEL_NOTE
+    if not path.is_file():
         raise InputError(
             f"{folder.parent} holds no model of a benchmark; give the folder that 'hybrid-mpc benchmark {scenario} "
             "--data FILE --out DIR' has made"
         )
-    document = read_document(folder / MODEL_NOTE, "make the benchmark anew")
-    if document.get("schema") != SCHEMA:
-        raise InputError(
-            f"{folder / MODEL_NOTE}: schema {document.get('schema')}, this version reads {SCHEMA}; train anew"
-        )
-    note = record(_Note, document, str(folder / MODEL_NOTE))
-    if note.scenario != scenario:
-        raise InputError(f"{folder} holds a model of {note.scenario}, not of {scenario}")
-    networks: dict[str, Trained] = {kind: load_trained(folder, kind) for kind in KINDS}
-    return BenchmarkModel(
-        note.scenario, note.dt, note.physics, networks, note.hybrid, note.validation, note.long
+    document = read_document(path, "make the benchmark anew")
+    schema = document.pop("schema", None)
+    if schema != SCHEMA:
+        raise InputError(f"{path}: schema {schema}, this version reads {SCHEMA}; train anew")
+    found = record(_Description, document, str(path))
+    if found.scenario != scenario:
+        raise InputError(f"{folder} holds a model of {found.scenario}, not of {scenario}")
+    return BenchmarkModel(**vars(found), networks={kind: load_trained(folder, kind) for kind in KINDS})
+
+
+# The evaluation.
+
+
+def _evaluate(
+    scenario: Scenario, model: BenchmarkModel, trajectories: Sequence[Trajectory], refit: float | None
+) -> FileResult:
+    runs = _runs(scenario, model, model.physics, trajectories)
+    spec, names = benchmark_of(scenario), {**{m: m for m in MODELS}, "hybrid": model.hybrid}
+    return FileResult(
+        runs,
+        {name: run_error(runs, candidate, spec) for name, candidate in names.items()},
+        sum(len(run.t) for run in runs) * model.dt,
+        None if refit is None else _refit(scenario, model, trajectories[0], refit),
     )
 
 
-# A machine that has changed: the prior's parameters again, from a few seconds of its motion, and nothing else.
+def _runs(
+    scenario: Scenario, model: BenchmarkModel, physics: Physics, trajectories: Sequence[Trajectory]
+) -> list[BenchmarkRun]:
+    prior, length = scenario.prior(physics.fit.values), benchmark_of(scenario).length
+    warm_up = scenario.data.warm_up
+    return run_freely(prior, physics, model.networks, trajectories, warm_up=warm_up, length=length)
 
-LENGTHS = (0.5, 1.0)
-"""Free runs [s] that are fitted, the short ones first: from parameters that are far off a long one leads nowhere."""
-EVALUATIONS = 15
-FEWEST = 3
-"""Free runs at least: one alone would be fitted by any parameters."""
+
+def _refit(scenario: Scenario, model: BenchmarkModel, whole: Trajectory, seconds: float) -> Refit:
+    physics, rest = refitted(scenario.prior, model.physics, whole, seconds=seconds, dt=model.dt)
+    spec, errors = benchmark_of(scenario), []
+    for own in (model.physics, physics):
+        runs = _runs(scenario, model, own, [rest])
+        errors.append({"phy": run_error(runs, "phy", spec), "hybrid": run_error(runs, model.hybrid, spec)})
+    return Refit(seconds, physics.fit.rows(scenario.prior().parameters_spec), *errors)
 
 
 def refitted(
     make: Callable[..., Prior], physics: Physics, trajectory: Trajectory, *, seconds: float, dt: float
 ) -> tuple[Physics, Trajectory]:
-    """Fit the parameters to the first seconds of a recording, starting from those of the machine as it was.
+    """Fit the parameters to the first seconds of a recording of a changed machine, starting from the old ones.
 
-    The delay stays what it is. The free runs start from states that the old prior smooths, then from those of the new
-    one: its noise is fitted to what it did not know, so a wrong prior costs little there.
+    The delay stays. The free runs start from states that the old prior smooths, then from those of the new one: its
+    noise is fitted to what it did not know, so a wrong prior costs little there.
 
     Args:
         make: Prior class or factory ``(values=None) -> Prior``.
@@ -321,11 +488,11 @@ def refitted(
     Raises:
         InputError: If the recording is no longer than what is to be fitted, or that is too short.
     """
-    n = round(seconds / dt)
-    if n >= len(trajectory.t) - 1 or seconds < FEWEST * LENGTHS[0]:
+    n, least = round(seconds / dt), FEWEST_RUNS * REFIT_LENGTHS[0]
+    if n >= len(trajectory.t) - 1 or seconds < least:
         raise InputError(
-            f"{trajectory.name}: {seconds:g} s are to be fitted; that takes at least {FEWEST * LENGTHS[0]:g} s and a "
-            f"recording that is longer than it ({len(trajectory.t) * dt:g} s)"
+            f"{trajectory.name}: {seconds:g} s are to be fitted; that takes at least {least:g} s and a recording that "
+            f"is longer than it ({len(trajectory.t) * dt:g} s)"
         )
     index = np.arange(len(trajectory.t))
     first = trajectory.part(index < n, trajectory.name, trajectory.role)
@@ -334,149 +501,67 @@ def refitted(
     values = physics.fit.values
     theta, slope = np.array([values[p.name] for p in fit.free]) / fit.unit, np.zeros((0, 0))
     stages = []
-    for length in LENGTHS:
-        smoother = physics.smoother(make(values), dt)
-        known = smoother.smooth(shifted([first], physics.delay))
+    for length in REFIT_LENGTHS:
+        known = physics.smoother(make(values), dt).smooth(shifted([first], physics.delay))
         runs = cut_runs(known, round(length / dt), 0, len(first.t))
-        theta, slope = fit.fit(theta, runs, EVALUATIONS, robust=True)
+        theta, slope = fit.fit(theta, runs, REFIT_EVALUATIONS, robust=True)
         values = fit.values(theta)
         stages.append({"stage": f"free runs of {length:g} s", "validation_error": fit.rmse(theta, runs)})
     return replace(physics, fit=fit.result(theta, slope, stages)), rest
 
 
-NOTE = "benchmark.json"
-"""What says which benchmark a folder holds."""
+# What is written and printed.
 
 
-@dataclass(frozen=True)
-class BenchmarkSettings:
-    """What one benchmark computes.
-
-    Args:
-        scenario: Registered name or path of a user's Python file.
-        data: Training files.
-        test: Files to judge on.
-        model: Folder of a model made before; then nothing is trained. Default: none.
-        budget: Name of the machine's effort. Default: quick.
-        seed: Of the networks.
-        workers: Kinds of networks trained side by side.
-        refit: Length [s] of each test file's start that the prior's parameters are fitted to anew, for a machine that
-            has changed; the rest is then judged with the old parameters and with the new ones. Default: none.
-    """
-
-    scenario: str
-    data: tuple[Path, ...] = ()
-    test: tuple[Path, ...] = ()
-    model: Path | None = None
-    budget: str = "quick"
-    seed: int = 0
-    workers: int = 1
-    refit: float | None = None
-
-
-def benchmark(
-    settings: BenchmarkSettings, out: Path, *, progress: Progress | None = None
-) -> tuple[dict[str, Any], dict[str, list[Run]]]:
-    """Fit, train, and judge; or judge a model made before.
-
-    The same command goes on where it was interrupted. Settings, the choice among networks and the recommended model
-    know the training files' training and validation parts and nothing else.
-
-    Args:
-        settings: What to compute.
-        out: Folder for ``results.json`` and, if something is trained, ``model/`` and ``checkpoints/``.
-        progress: Where to report; default: nowhere.
-
-    Returns:
-        What stands in ``results.json``, and the free runs by test file.
-
-    Raises:
-        InputError: If a file, the model, the budget or the folder does not fit.
-    """
-    progress, scenario = progress or Silent(), load_scenario(settings.scenario)
-    _check(settings, scenario)
-    check_scenario(scenario)
-    data, tests, doubts = _read(settings, scenario)
-    for doubt in doubts:
-        progress.warn(doubt)
-    check_writable(out)
-    with locked(out):
-        return _made_and_judged(settings, scenario, data, tests, doubts, out, progress)
-
-
-def _made_and_judged(
+def _document(
     settings: BenchmarkSettings,
     scenario: Scenario,
     data: Recordings | None,
-    tests: dict[str, tuple[Trajectory, ...]],
-    doubts: list[str],
-    out: Path,
-    progress: Progress,
-) -> tuple[dict[str, Any], dict[str, list[Run]]]:
-    spec, started = benchmark_of(scenario), time.monotonic()
-    notes: dict[str, Any] = {}
-    if data is None:
-        assert settings.model is not None
-        model = load_model(settings.model, scenario.name)
-    else:
-        model, notes = _made(settings, scenario, data, out, progress)
-    for warning in model.physics.fit.warnings:
-        progress.warn(f"fit of the prior: {warning}")
-    prior = scenario.prior(model.physics.fit.values)
-    if data is not None and not tests and data.held_back:
-        tests = {"held back": data.held_back}
-    progress.start("free runs over the test files")
-    runs: dict[str, list[Run]] = {}
-    test: dict[str, Any] = {}
-    for i, (name, trajectories) in enumerate(tests.items()):
-        progress.update("files", i, len(tests), name)
-        runs[name] = run_freely(
-            prior,
-            model.physics,
-            model.networks,
-            trajectories,
-            warm_up=scenario.data.warm_up,
-            length=spec.length,
-        )
-        test[name] = {m: figures_of(runs[name], m, unit=spec.unit, scale=spec.scale) for m in MODELS}
-        test[name]["hybrid"] = figures_of(runs[name], model.hybrid, unit=spec.unit, scale=spec.scale)
-        if settings.refit is not None:
-            test[name]["refit"] = _changed(scenario, model, trajectories[0], settings.refit)
-        test[name]["scored_s"] = sum(len(run.t) for run in runs[name]) * model.dt
-    progress.finish("")
-    results = {
+    results: BenchmarkResults,
+    warnings: Sequence[str],
+) -> dict[str, Any]:
+    """The content of ``results.json`` but for the time it took."""
+    trained = settings.model is None
+    notes = {}
+    if data is not None:
+        parts = {"train": data.train, "valid": data.valid, "held_back": data.held_back}
+        notes["data"] = {
+            "files": data.dataset.files,
+            "hash": data.dataset.hash,
+            "seconds": {role: sum(len(t.t) for t in part) * results.model.dt for role, part in parts.items()},
+            "validated_on": [piece.name for piece in data.valid],
+        }
+    test = {
+        name: {
+            **plain(row.errors),
+            **({} if row.refit is None else {"refit": _refit_document(row.refit)}),
+            "scored_s": row.scored_s,
+        }
+        for name, row in results.test.items()
+    }
+    return {
         "schema": SCHEMA,
         "machine": scenario.name,
-        "budget": settings.budget if settings.model is None else None,
-        "seed": settings.seed if settings.model is None else None,
+        "budget": settings.budget if trained else None,
+        "seed": settings.seed if trained else None,
         **notes,
-        "warnings": doubts,
-        "model": describe(model, scenario),
+        "warnings": warnings,
+        "model": describe(results.model, scenario),
         "test": test,
         "versions": versions(),
-        "timing": {"seconds": time.monotonic() - started},
     }
-    write_json(out / "results.json", results)
-    return results, runs
 
 
-def _changed(scenario: Scenario, model: BenchmarkModel, whole: Trajectory, seconds: float) -> dict[str, Any]:
-    """Figures over what follows a recording's first seconds, with the old parameters and with those fitted to them."""
-    spec, data = benchmark_of(scenario), scenario.data
-    physics, rest = refitted(scenario.prior, model.physics, whole, seconds=seconds, dt=model.dt)
-    found: dict[str, Any] = {"seconds": seconds, "prior": physics.fit.rows(scenario.prior().parameters_spec)}
-    for key, own in (("before", model.physics), ("after", physics)):
-        prior = scenario.prior(own.fit.values)
-        runs = run_freely(prior, own, model.networks, [rest], warm_up=data.warm_up, length=spec.length)
-        found[key] = {
-            name: figures_of(runs, candidate, unit=spec.unit, scale=spec.scale)
-            for name, candidate in (("phy", "phy"), ("hybrid", model.hybrid))
-        }
-    return found
+def _refit_document(refit: Refit) -> dict[str, Any]:
+    return {
+        "seconds": refit.seconds,
+        "prior": refit.prior,
+        **plain({k: getattr(refit, k) for k in ("before", "after")}),
+    }
 
 
 def describe(model: BenchmarkModel, scenario: Scenario) -> dict[str, Any]:
-    """What is worth knowing of a model, in plain data."""
+    """A model in plain data: parameters, delay, smoother, errors by candidate and network."""
     fit, spec = model.physics.fit, benchmark_of(scenario)
     return {
         "prior": fit.rows(scenario.prior().parameters_spec),
@@ -491,150 +576,41 @@ def describe(model: BenchmarkModel, scenario: Scenario) -> dict[str, Any]:
     }
 
 
-def _read(
-    settings: BenchmarkSettings, scenario: Scenario
-) -> tuple[Recordings | None, dict[str, tuple[Trajectory, ...]], list[str]]:
-    """Training files if there are to be some, test files by name, and what is doubtful about them."""
-    data: Recordings | None = None
-    tests: dict[str, tuple[Trajectory, ...]] = {}
-    problems: list[str] = []
-    doubts: list[str] = []
-    if settings.model is None:
-        try:
-            data = read_training(scenario, settings.data)
-            doubts += [str(finding) for finding in data.dataset.findings]
-        except InputError as error:
-            problems += error.problems
-    for path in settings.test:
-        try:
-            tests[path.name] = read_test(scenario, path, doubts.append)
-        except InputError as error:
-            problems += error.problems
-    refuse(problems)
-    return data, tests, list(dict.fromkeys(doubts))
+def draw(scenario: Scenario, results: BenchmarkResults, out: Path) -> list[Path]:
+    """Draw the longest free run of every test file into ``out/figures``.
 
+    Args:
+        scenario: The machine.
+        results: What was found.
+        out: The benchmark's folder.
 
-def _made(
-    settings: BenchmarkSettings, scenario: Scenario, data: Recordings, out: Path, progress: Progress
-) -> tuple[BenchmarkModel, dict[str, Any]]:
-    """Fit and train, or take what ``out`` holds of it; and what is known of the data."""
-    _claim(out, settings, data)
-    spec, warm_up, dt = benchmark_of(scenario), scenario.data.warm_up, scenario.data.dt
-    progress.start("fitting the prior")
-    physics = _physics(scenario, data, out, progress)
-    train, valid = (smoothed(scenario.prior, physics, part, dt) for part in (data.train, data.valid))
-    progress.finish("")
-    progress.start("training the networks")
-    warm = warm_samples(warm_up, physics.delay, dt)
-    budget = spec.budgets[settings.budget]
-    networks = train_all(
-        settings.scenario,
-        physics.fit.values,
-        train,
-        valid,
-        lambda kind: settings_of(kind, budget, seed=settings.seed, warm=warm),
-        out / "checkpoints",
-        workers=settings.workers,
-        on_progress=progress.update,
-    )
-    progress.finish("")
-    errors = partial(candidate_errors, scenario, physics, networks)
-    validation = errors(data.valid, max(warm_up, IN_MOTION))
-    long = errors(data.long, warm_up) if data.long else {}
-    model = BenchmarkModel(
-        scenario.name, dt, physics, networks, recommended(validation, long), validation, long
-    )
-    save_model(out / "model", model)
-    seconds = {
-        role: sum(len(t.t) for t in part) * dt
-        for role, part in (("train", data.train), ("valid", data.valid), ("held_back", data.held_back))
-    }
-    notes = {
-        "files": data.dataset.files,
-        "hash": data.dataset.hash,
-        "seconds": seconds,
-        "validated_on": [piece.name for piece in data.valid],
-    }
-    return model, {"data": notes}
-
-
-def _physics(scenario: Scenario, data: Recordings, out: Path, progress: Progress) -> Physics:
-    """The fitted prior; a fit that ``out`` holds is not made again."""
-    note, spec = out / "checkpoints" / "physics.json", benchmark_of(scenario)
-    if note.is_file():
-        held = read_document(note, "delete it, and the same command fits the prior anew")
-        return record(Physics, held, str(note))
-    physics = fit_physics(
-        scenario.prior,
-        data.train,
-        data.valid,
-        dt=scenario.data.dt,
-        length=spec.length or spec.piece,
-        largest_delay=spec.largest_delay,
-        on_progress=lambda done, total, text: progress.update("prior", done, total, text),
-    )
-    write_document(note, plain(physics))
-    return physics
-
-
-def _check(settings: BenchmarkSettings, scenario: Scenario) -> None:
-    budgets = benchmark_of(scenario).budgets
-    if settings.budget not in budgets:
-        raise InputError(
-            f"scenario {scenario.name} has no benchmark budget {settings.budget!r}; it has: {', '.join(budgets)}"
-        )
-    if settings.model is None and not settings.data:
-        raise InputError(
-            "give recordings to train on with --data FILE, or a model made before with --model DIR"
-        )
-    if settings.model is not None and settings.data:
-        raise InputError("--model is judged as it is: leave --data out, or leave --model out to train anew")
-    if settings.model is not None and not settings.test:
-        raise InputError("a model made before needs recordings to be judged on: --test FILE")
-    names = [path.name for path in settings.test]
-    if len(set(names)) < len(names):
-        raise InputError(f"two test files have the same name: {', '.join(sorted(names))}; rename one")
-
-
-def _claim(out: Path, settings: BenchmarkSettings, data: Recordings) -> None:
-    """Note in ``out`` what is trained there; another training in the same folder is refused."""
-    own = {
-        "scenario": settings.scenario,
-        "data": data.dataset.hash,
-        "budget": settings.budget,
-        "seed": settings.seed,
-        "pieces": digest(
-            [[p.role, p.name, p.t[0], p.t[-1]] for p in (*data.train, *data.valid, *data.held_back)]
-        ),
-    }
-    claim = JobNote(
-        "benchmark", NOTE, own, lambda folder: write_document(folder / NOTE, own),
-        lambda folder: read_document(folder / NOTE),
-    )  # fmt: skip
-    there = (out / NOTE).is_file()
-    check_same_job(out, claim, resume=there)
-    if not there:
-        claim.write(out)
-
-
-def table(results: dict[str, Any]) -> list[str]:
-    """The results as lines: a row for each test file and model.
-
-    Example:
-        >>> figures = {"rmse": 0.02, "relative": 0.04, "unit": "rad"}
-        >>> for line in table({"test": {"a.csv": {"phy": figures, "scored_s": 5.0}}, "model": {"hybrid": "phy"}}):
-        ...     print(line)
-        file                         model      RMSE         share of the motion
-        a.csv                        phy        0.02 rad     0.04
-        hybrid: phy
+    Returns:
+        The files.
     """
+    from hybrid_mpc.plots.fit import benchmark_run
+    from hybrid_mpc.plots.style import save
+
+    hybrid = results.model.hybrid
+    kind, _, mean = hybrid.partition(" ")
+    chosen = "fitted prior" if kind == "phy" else kind.upper() + (", mean" if mean else "")
+    made, prior, spec = [], scenario.prior(), benchmark_of(scenario)
+    for file, found in results.test.items():
+        run = max(found.runs, key=lambda part: len(part.t))
+        shown = {name: run.y_hat[m][:, 0] for name, m in (("phy", "phy"), ("rnn", "rnn"), ("hybrid", hybrid))}
+        figure = benchmark_run(
+            run.t, run.y[:, 0], shown, run.u,
+            output=prior.outputs[0], inputs=prior.inputs, unit=spec.unit, scale=spec.scale,
+            title=f"{scenario.title}: free run over {file}", names={"hybrid": f"hybrid ({chosen})"},
+        )  # fmt: skip
+        made.append(save(figure, out / "figures" / f"{Path(file).stem}.png"))
+    return made
+
+
+def table(results: BenchmarkResults) -> list[str]:
+    """The results as lines: a row for each test file and model."""
     lines = [f"{'file':28} {'model':10} {'RMSE':12} share of the motion"]
-    for file, row in results["test"].items():
-        for name in (*MODELS, "hybrid"):
-            if name in row:
-                rmse = f"{float(row[name]['rmse']):.4g} {row[name]['unit']}"
-                lines.append(f"{file:28} {name:10} {rmse:12} {float(row[name]['relative']):.4g}")
-    return [*lines, f"hybrid: {results['model']['hybrid']}"]
-
-
-__all__ = ["BenchmarkSettings", "benchmark", "describe", "table", "KINDS"]
+    for file, row in results.test.items():
+        for name, error in row.errors.items():
+            rmse = f"{error.rmse:.4g} {error.unit}"
+            lines.append(f"{file:28} {name:10} {rmse:12} {error.relative:.4g}")
+    return [*lines, f"hybrid: {results.model.hybrid}"]

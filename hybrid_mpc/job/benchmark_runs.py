@@ -1,11 +1,11 @@
-"""Free runs of all models over recordings by a machine's convention, and the figures that judge them."""
+"""A benchmark's recordings with their roles, free runs of all models over them, and the errors of these."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
 
-# Recordings of a benchmark: training files in pieces with roles, test files as whole runs.
-
+Array = NDArray[np.float64]
+MODELS = ("phy", *KINDS)
 LONGEST = 60.0
-"""Most of a recording in :attr:`Recordings.long` [the machine's seconds]: a model that drifts shows it by then."""
+"""Most of a recording in :attr:`Recordings.long` [the machine's seconds]: drift shows by then."""
 SCORED = 50
 """Fewest periods of a piece after its warm-up."""
 
@@ -39,12 +39,11 @@ class Recordings:
     """The training files of a benchmark.
 
     Args:
-        train: Pieces that are fitted and trained on.
+        train: Pieces for fit and training.
         valid: Pieces that choose; nothing is fitted to them.
-        held_back: Pieces that neither fit nor choose; may be none.
-        long: Recordings that were split in order of time and are judged whole, from their first sample to where
-            validation ends, at most a minute (of the machine's own seconds). Most or all of them was trained on, so
-            they tell drift and not how good a model is.
+        held_back: Pieces for the test; may be none.
+        long: Whole recordings that were split in order of time, from the first sample to where validation ends, at
+            most a minute (of the machine's own seconds). They were mostly trained on: they show drift, not accuracy.
         dataset: The files as they were read.
     """
 
@@ -56,15 +55,10 @@ class Recordings:
 
 
 def benchmark_of(scenario: Scenario) -> BenchmarkSpec:
-    """The scenario's convention.
+    """The scenario's benchmark specification.
 
     Raises:
         InputError: If it has none.
-
-    Example:
-        >>> from scenarios.torque_pendulum import scenario
-        >>> benchmark_of(scenario).length
-        2.5
     """
     if scenario.benchmark is None:
         raise InputError(
@@ -74,11 +68,11 @@ def benchmark_of(scenario: Scenario) -> BenchmarkSpec:
 
 
 def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
-    """Read training files; long ones are cut into pieces of the benchmark's length.
+    """Read training files; long ones are cut into pieces.
 
     Raises:
-        InputError: If a file is bad, has windows where whole files are to validate, or no piece is left for training or
-            validation.
+        InputError: If a file is bad, has windows where whole files validate, or nothing is left to train or validate
+            on.
     """
     prior, spec = scenario.prior(), benchmark_of(scenario)
     uncut = 0 < spec.valid_every <= len(paths)
@@ -126,7 +120,7 @@ def until_validated(dataset: Dataset, windows: Container[str]) -> tuple[Trajecto
 
     Args:
         dataset: Recordings and their pieces.
-        windows: Stems of files whose pieces are named windows; what lies between these may be anything.
+        windows: Stems of files with named windows; what lies between these may be anything.
 
     Example:
         >>> t = 0.1 * np.arange(10)
@@ -140,7 +134,7 @@ def until_validated(dataset: Dataset, windows: Container[str]) -> tuple[Trajecto
     stems, found = {Path(file).stem for file in dataset.files}, []
     longest = LONGEST * time_unit(dataset.whole, dataset.whole[0].dt) if dataset.whole else 0.0
     for whole in dataset.whole:
-        # one that begins after a gap begins in motion, and a run that judges does not
+        # after a gap a recording begins in motion, and a test run does not
         if whole.name not in stems or whole.name in windows:
             continue
         ends = [p.t[-1] for p in dataset.by_role("valid") if _stem(p.name, stems) == whole.name]
@@ -180,12 +174,12 @@ def whole_runs(dataset: Dataset, every: int) -> tuple[Trajectory, ...]:
 def read_test(
     scenario: Scenario, path: Path, warn: Callable[[str], None] = lambda text: None
 ) -> tuple[Trajectory, ...]:
-    """A test file as whole runs, one for each side of a gap; windows known for a file's name are not looked at.
+    """A test file as whole runs, one for each side of a gap; windows of the data specification are ignored.
 
     Args:
         scenario: The machine.
         path: The file.
-        warn: Takes what is doubtful about it. Default: nobody does.
+        warn: Called with each warning. Default: nobody is told.
 
     Raises:
         InputError: If the file is bad or nothing of it is long enough.
@@ -205,7 +199,7 @@ def read_test(
 
 
 def in_turn(trajectory: Trajectory, spec: BenchmarkSpec, distance: float) -> tuple[Trajectory, ...]:
-    """Pieces of a whole recording with the cycle's roles in turn; ``distance`` [s] between them is in none of them.
+    """Pieces of a whole recording with the cycle's roles in turn, ``distance`` [s] apart.
 
     Example:
         >>> z = np.zeros((400, 1))
@@ -225,7 +219,7 @@ def in_turn(trajectory: Trajectory, spec: BenchmarkSpec, distance: float) -> tup
 
 
 def pieces(trajectory: Trajectory, seconds: float) -> tuple[Trajectory, ...]:
-    """Equal pieces of about ``seconds``; a few samples at the end may be left over.
+    """Equal pieces of about ``seconds`` each; a few samples at the end may be left over.
 
     Example:
         >>> z = np.zeros((101, 1))
@@ -245,13 +239,9 @@ def pieces(trajectory: Trajectory, seconds: float) -> tuple[Trajectory, ...]:
     )
 
 
-Array = NDArray[np.float64]
-MODELS = ("phy", *KINDS)
-
-
 @dataclass(frozen=True)
-class Run:
-    """What is known of one free run.
+class BenchmarkRun:
+    """A free run of all candidates over one trajectory.
 
     Args:
         name: Of the trajectory.
@@ -276,11 +266,11 @@ def run_freely(
     *,
     warm_up: float,
     length: float | None,
-) -> list[Run]:
+) -> list[BenchmarkRun]:
     """Free runs of the prior, of the best network of each kind, and of the mean over the networks of each kind.
 
-    Of a trajectory only what lies within ``warm_up`` is known: from it comes the state that all models start from,
-    and the networks' hidden states. Everything after it is scored.
+    Only what lies within ``warm_up`` is given: it yields the state that all models start from, and the networks'
+    hidden states. Everything after it is scored.
 
     Args:
         prior: The fitted prior.
@@ -315,7 +305,7 @@ def run_freely(
             for name, x in found.items()
         }
     return [
-        Run(
+        BenchmarkRun(
             t.name,
             t.t[warm + 1 :],
             t.u[warm + 1 :],
@@ -326,19 +316,33 @@ def run_freely(
     ]
 
 
-def figures_of(runs: Sequence[Run], name: str, *, unit: str, scale: float) -> dict[str, Any]:
-    """RMSE over all scored samples, and its share of the measured output's standard deviation.
+@dataclass(frozen=True)
+class RunError:
+    """Error of a model's free runs over one file.
+
+    Args:
+        rmse: Root mean square error of the first output over all scored samples [unit]; infinite if a run diverged.
+        relative: Its share of the measured output's standard deviation [-].
+        unit: Unit of the benchmark.
+    """
+
+    rmse: float
+    relative: float
+    unit: str
+
+
+def run_error(runs: Sequence[BenchmarkRun], name: str, spec: BenchmarkSpec) -> RunError:
+    """Error of one candidate over all runs.
 
     Args:
         runs: Free runs over one file.
         name: The candidate.
-        unit: Unit of the figures.
-        scale: Figures' units in an SI unit.
+        spec: The benchmark's unit and scale.
 
     Example:
         >>> y = np.array([[0.0], [1.0], [2.0]])
-        >>> run = Run("run", np.arange(3.0), y, y, {"phy": y + 0.1})
-        >>> figures_of([run], "phy", unit="mm", scale=1e3)["rmse"].__round__(6)
+        >>> run = BenchmarkRun("run", np.arange(3.0), y, y, {"phy": y + 0.1})
+        >>> run_error([run], "phy", BenchmarkSpec(unit="mm", scale=1e3)).rmse.__round__(6)
         100.0
     """
     error = np.concatenate([run.y_hat[name][:, 0] - run.y[:, 0] for run in runs])
@@ -346,8 +350,7 @@ def figures_of(runs: Sequence[Run], name: str, *, unit: str, scale: float) -> di
     rmse = float(np.sqrt(np.mean(error**2)))
     if not np.isfinite(rmse):
         rmse = float("inf")
-    relative = rmse / spread if spread > 0 else float("inf")
-    return {"rmse": scale * rmse, "relative": relative, "unit": unit}
+    return RunError(spec.scale * rmse, rmse / spread if spread > 0 else float("inf"), spec.unit)
 
 
 def warm_samples(warm_up: float, delay: float, dt: float) -> int:

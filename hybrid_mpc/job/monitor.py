@@ -1,22 +1,23 @@
-"""The energy monitor over recordings of an artifact's machine, or its detector learned from them."""
+"""``hybrid-mpc monitor``: the energy monitor over recordings, or a detector learned from them."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
+from hybrid_mpc.data.trajectories import Cut, Dataset, Trajectory, load_trajectories
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_object, write_json, write_text
 from hybrid_mpc.job.context import Progress, Silent
 from hybrid_mpc.job.controllers import find_noise
 from hybrid_mpc.kit.artifact import Kit, artifact_folder, load
 from hybrid_mpc.kit.assembly import make_monitor, sensor_steps
+from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.diagnose import Diagnoser
@@ -27,14 +28,70 @@ from hybrid_mpc.monitor.replay import EstimatorLike, MonitorTrace, TrajectoryLik
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import Scenario
 
-Array = NDArray[np.float64]
 FROZEN = "the sensor repeats itself while motion is predicted"
 BLIND = {
     Verdict.WARM_UP: "nothing can be judged: the monitor's window is not full",
     Verdict.MISSING: "nothing can be judged: samples are missing",
     Verdict.NOT_FINITE: "nothing can be judged: model or estimator gives no finite number",
 }
-"""What is said of an alarm that the monitor raises because it is blind."""
+"""Diagnosis of an alarm that the monitor raises because it cannot judge."""
+COLUMNS = (
+    "dE_model_w", "dE_measured_w", "violation_w", "level_w", "residual_level", "energy_j", "energy_s"
+)  # fmt: skip
+"""Numbers of a trace that its CSV holds."""
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """An alarm and what explains it.
+
+    Args:
+        start_s: First sample [s], in the recording's own time.
+        end_s: Last sample [s].
+        diagnosis: What explains it; empty where nothing can say.
+    """
+
+    start_s: float
+    end_s: float
+    diagnosis: str
+
+
+@dataclass(frozen=True)
+class RecordingResult:
+    """What the monitor found in a recording, and how much of it was judged.
+
+    Args:
+        recording: Its name.
+        seconds: Its length [s].
+        judged_s: Length [s] that was judged.
+        warm_up_s: Length [s] in which the window was not full.
+        missing_s: Length [s] in which samples were missing.
+        not_finite_s: Length [s] in which model or estimator gave no finite number.
+        alarms: The alarms.
+    """
+
+    recording: str
+    seconds: float
+    judged_s: float
+    warm_up_s: float
+    missing_s: float
+    not_finite_s: float
+    alarms: tuple[Alarm, ...]
+
+
+@dataclass(frozen=True)
+class MonitorResult:
+    """What :func:`watch` found.
+
+    Args:
+        recordings: Each recording.
+        gaps: Gaps in recordings.
+        not_watched: Parts too short to be watched.
+    """
+
+    recordings: tuple[RecordingResult, ...]
+    gaps: tuple[Cut, ...]
+    not_watched: tuple[Cut, ...]
 
 
 @dataclass(frozen=True)
@@ -153,63 +210,64 @@ def learn(job: MonitorJob, rate: float, out: Path, progress: Progress | None = N
     return detector
 
 
-def watch(job: MonitorJob, out: Path, progress: Progress | None = None) -> dict[str, Any]:
+def watch(job: MonitorJob, out: Path, progress: Progress | None = None) -> MonitorResult:
     """Replay the monitor over each recording: ``NAME.csv`` and ``NAME.png``, and last ``monitor.json``.
 
     Args:
         job: The job.
         out: Folder.
         progress: Where to report; default: nowhere.
-
-    Returns:
-        What ``monitor.json`` holds: of each recording its alarms, and how much of it was judged and how much not, by
-        reason.
     """
     from hybrid_mpc.plots.monitor import overview
     from hybrid_mpc.plots.style import save
 
-    rows, output, tell = [], job.kit.models["hybrid"].outputs[0], progress or Silent()
-    tell.start("replaying the recordings")
-    for recording, say in along(job.data.whole, tell.update):
-        trace, alarms = watched(job, recording, say)
-        length = {"seconds": len(trace.t) * recording.dt, **trace.coverage(recording.dt)}
-        rows.append({"recording": recording.name, **length, "alarms": alarms})
+    rows, progress, model = [], progress or Silent(), job.kit.models["hybrid"]
+    calibration = job.monitor.calibration
+    limits = {}
+    if calibration is not None:
+        known = {"violation": calibration.threshold_w, "residual": calibration.residual_threshold}
+        limits = {name: limit for name, limit in known.items() if limit is not None}
+    progress.start("replaying the recordings")
+    for recording, report in along(job.data.whole, progress.update):
+        trace, alarms = watched(job, recording, report)
+        seconds = len(trace.t) * recording.dt
+        rows.append(RecordingResult(recording.name, seconds, **trace.coverage(recording.dt), alarms=alarms))
         name = recording.name.replace("#", "_")
-        write_text(out / f"{name}.csv", table(trace, recording, job.kit.models["hybrid"].outputs))
-        limits, calibration = {}, job.monitor.calibration
-        if calibration is not None:
-            found = {"violation": calibration.threshold_w, "residual": calibration.residual_threshold}
-            limits = {name: limit for name, limit in found.items() if limit is not None}
-        notes = [(a["start_s"], a["diagnosis"]) for a in alarms if a["diagnosis"]]
-        unit = {"rad": "N m", "m": "N"}.get(output.unit, "SI")
+        write_text(out / f"{name}.csv", table(trace, recording, model.outputs))
         figure = overview(
-            trace,
-            recording.y[:, 0],
-            output=output,
-            force_unit=unit,
-            thresholds=limits,
-            notes=notes,
-            title=name,
-        )
+            trace, recording.y[:, 0], output=model.outputs[0], force_unit=force_unit(model), thresholds=limits,
+            notes=[(alarm.start_s, alarm.diagnosis) for alarm in alarms if alarm.diagnosis], title=name,
+        )  # fmt: skip
         save(figure, out / f"{name}.png")
-    tell.finish("")
+    progress.finish("")
+    gaps, short = ([cut for cut in job.data.cuts if ("gap" in cut.why) is gap] for gap in (True, False))
     result = {
-        "recordings": rows,
+        "recordings": plain(rows),
         "warnings": [str(finding) for finding in job.data.findings],
-        "gaps": [cut._asdict() for cut in job.data.cuts if "gap" in cut.why],
-        "not_watched": [cut._asdict() for cut in job.data.cuts if "gap" not in cut.why],
+        "gaps": [cut._asdict() for cut in gaps],
+        "not_watched": [cut._asdict() for cut in short],
         "detector": plain(job.detector),
-        "thresholds": plain(job.monitor.calibration),
+        "thresholds": plain(calibration),
         "data_hash": job.data.hash,
     }
     write_json(out / "monitor.json", result)
-    return result
+    return MonitorResult(tuple(rows), tuple(gaps), tuple(short))
+
+
+def force_unit(model: HybridModel) -> str:
+    """Unit of the residual force: the stored energy over the first position.
+
+    Args:
+        model: The model, with a balance of energy.
+    """
+    energy = next(balance for balance in model.balances if balance.name == "energy")
+    return f"{energy.unit}/{model.states[0].unit}"
 
 
 def watched(
     job: MonitorJob, recording: Trajectory, on_progress: Callable[[int, int], None] = lambda done, total: None
-) -> tuple[MonitorTrace, list[dict[str, Any]]]:
-    """Trace of a recording, and its alarms with what explains them (empty where nothing can say)."""
+) -> tuple[MonitorTrace, tuple[Alarm, ...]]:
+    """Trace of a recording, and its alarms."""
     return explained(
         job.monitor, job.estimator, recording, job.kit.causes, on_progress, prior=job.kit.models.get("prior")
     )
@@ -223,73 +281,56 @@ def explained(
     on_progress: Callable[[int, int], None] = lambda done, total: None,
     *,
     prior: HybridModel | None = None,
-) -> tuple[MonitorTrace, list[dict[str, Any]]]:
-    """Replay a monitor, and say of each alarm what explains it.
+) -> tuple[MonitorTrace, tuple[Alarm, ...]]:
+    """Replay a monitor, and diagnose each alarm.
 
     Args:
-        monitor: The monitor; with history and detector its alarms are explained.
+        monitor: The monitor; only with history and detector its alarms are explained.
         estimator: The estimator of the closed loops.
         recording: On the model's grid.
         causes: What may break, see :class:`~hybrid_mpc.monitor.diagnose.Diagnoser`. Empty: each parameter by itself.
         on_progress: ``(done, total)`` samples.
         prior: Model of the prior alone, see there.
-
-    Returns:
-        The trace, and ``{start_s, end_s, diagnosis}`` of each alarm; no diagnosis where nothing can say.
     """
     can = monitor.layout.history and monitor.detector is not None
     diagnoser = Diagnoser(monitor, causes or None, prior=prior) if can else None
     dt, last = monitor.model.dt, len(recording.t) - 1
     later = samples(HISTORY_S, monitor.model)  # by then the history holds nothing from before the alarm
     texts: dict[int, str] = {}
-    began: list[int] = []
+    starts: list[int] = []
+    active = False
 
     def look(k: int, state: Any, reading: Any) -> None:
-        if reading.alarm and (not began or began[-1] < 0):
-            began.append(k)
-        if not began or began[-1] < 0:
+        nonlocal active
+        if reading.alarm and not active:
+            starts.append(k)
+        elif not active:
             return
-        start = began[-1]
+        active, start = reading.alarm, starts[-1]
         if reading.frozen:
             texts[start] = FROZEN
         elif reading.blind:
             texts.setdefault(start, BLIND[reading.verdict])
-        due = not reading.alarm or k == start + later or k == last
+        due = not active or k == start + later or k == last
         if due and diagnoser is not None and start not in texts:
             texts[start] = diagnoser.diagnose(state, (k - start) * dt).text
-        if not reading.alarm:
-            began.append(-1)
 
     trace = replay(monitor, estimator, recording, look, on_progress=on_progress)
-    alarms = [
-        {"start_s": float(trace.t[a]), "end_s": end, "diagnosis": texts.get(a, "")}
-        for a, (_, end) in zip([k for k in began if k >= 0], trace.intervals(), strict=True)
-    ]
-    return trace, alarms
+    ends = (end for _, end in trace.intervals())
+    return trace, tuple(
+        Alarm(float(trace.t[k]), end, texts.get(k, "")) for k, end in zip(starts, ends, strict=True)
+    )
 
 
-def table(trace: MonitorTrace, recording: Trajectory, outputs: Sequence[Any]) -> str:
+def table(trace: MonitorTrace, recording: Trajectory, outputs: Sequence[Signal]) -> str:
     """The trace as CSV, one row a sample, columns with units."""
     columns: dict[str, Any] = {"t_s": trace.t}
-    for i, signal in enumerate(outputs):
-        columns[f"{signal.name}_{signal.unit}"] = recording.y[:, i]
-    for name in (
-        "dE_model_w",
-        "dE_measured_w",
-        "violation_w",
-        "level_w",
-        "residual_level",
-        "energy_j",
-        "energy_s",
-    ):
-        columns[name] = getattr(trace, name)
+    columns |= {f"{s.name}_{s.unit}": recording.y[:, i] for i, s in enumerate(outputs)}
+    columns |= {name: getattr(trace, name) for name in COLUMNS}
     if trace.scores.size:
         columns |= {"force_score": trace.scores[:, 0], "power_score": trace.scores[:, 1]}
-    columns |= {"judged": (trace.verdict == Verdict.JUDGED).astype(int)}
-    columns |= {"frozen": trace.frozen.astype(int), "alarm": trace.alarm.astype(int)}
-    row = ",".join(["%.9g"] * len(columns))
-    lines = [
-        ",".join(columns),
-        *(row % tuple(values) for values in np.column_stack([*columns.values()]).tolist()),
-    ]
-    return "\n".join(lines) + "\n"
+    columns |= {"judged": trace.verdict == Verdict.JUDGED, "frozen": trace.frozen, "alarm": trace.alarm}
+    text = io.StringIO()
+    rows = np.column_stack([*columns.values()])
+    np.savetxt(text, rows, fmt="%.9g", delimiter=",", header=",".join(columns), comments="")
+    return text.getvalue()

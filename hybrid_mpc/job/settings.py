@@ -34,8 +34,8 @@ class RunSettings:
         inputs: Columns that replace the scenario's inputs; default: the scenario's.
         outputs: Columns that replace the scenario's outputs; default: the scenario's.
         time: Column that replaces the scenario's time; default: the scenario's.
-        network_file: JSON object with settings of the networks that replace the budget's, as a search leaves them;
-            default: none.
+        network_file: JSON object with settings of the networks that replace the budget's, as ``hybrid-mpc tune``
+            writes them; default: none.
         device: Where the networks are trained, ``"cpu"`` or e.g. ``"cuda"``. Default: cpu.
     """
 

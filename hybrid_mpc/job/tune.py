@@ -1,12 +1,9 @@
-"""``hybrid-mpc search``: the main job's data and prior, then a search of the networks' settings; its files."""
+"""``hybrid-mpc tune``: data and prior of the main job, then trainings of one kind of network with other settings."""
 
 from __future__ import annotations
 
-import csv
-import io
 import shlex
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,28 +16,29 @@ from hybrid_mpc.job.folder import open_folder
 from hybrid_mpc.job.settings import RunSettings, claim
 from hybrid_mpc.job.stage import bring_up_to_date
 from hybrid_mpc.job.stages.identify import DATA, MODELS, PRIOR, check_data, training_settings
+from hybrid_mpc.report.page import Cell, Table
 from hybrid_mpc.scenario import load_scenario
 
 if TYPE_CHECKING:
-    from hybrid_mpc.identify.tune import SearchResult, TrialRow
+    from hybrid_mpc.identify.tune import SearchResult
 
 SCHEMA_VERSION = 1
 RATES = ("learning_rate", "free_run_learning_rate")
 
 
 @dataclass(frozen=True)
-class SearchSettings(RunSettings):
-    """What ``hybrid-mpc search`` computes: a run's settings, of which the networks' are the first trial, and these.
+class TuneSettings(RunSettings):
+    """What ``hybrid-mpc tune`` computes: the settings of a run, whose networks are the first trial, and these.
 
     Args:
         kind: ``"rnn"``, ``"pgrnn"`` or ``"mopgrnn"``.
         space: What is searched.
 
     Raises:
-        InputError: If there is no such kind, or an rnn is to be anchored to a prior that it does not have.
+        InputError: If there is no such kind, or an rnn is to replay a prior that it does not have.
 
     Example:
-        >>> SearchSettings("golf_robot", kind="gru")
+        >>> TuneSettings("golf_robot", kind="gru")
         Traceback (most recent call last):
         hybrid_mpc.errors.InputError: kind has no 'gru'; there are: rnn, pgrnn, mopgrnn
     """
@@ -53,47 +51,35 @@ class SearchSettings(RunSettings):
         if self.kind not in kinds:
             raise InputError(f"kind has no {self.kind!r}; there are: {', '.join(kinds)}")
         if self.kind == "rnn" and self.space.prior_replay is not None:
-            raise InputError(
-                "an rnn has no prior to be anchored to; leave prior_replay out of what is varied"
-            )
-
-    def identity(self) -> dict[str, Any]:
-        """Settings as plain data; without prior_replay where they are not searched, as in searches from before."""
-        plain = super().identity()
-        if plain["space"]["prior_replay"] is None:
-            del plain["space"]["prior_replay"]
-        return plain
+            raise InputError("an rnn has no prior to replay; leave prior_replay out of what is varied")
 
 
-def run_search(
-    settings: SearchSettings,
+def run_tuning(
+    settings: TuneSettings,
     out: Path,
     *,
     trials: int = 20,
     timeout: float | None = None,
     resume: bool = False,
     progress: Progress | None = None,
-) -> dict[str, Any]:
-    """Search the settings of one kind of network and leave tables and figures in ``out``.
+) -> SearchResult:
+    """Search the settings of one kind of network, and write settings, tables and figures into ``out``.
 
-    Data and prior are the main job's stages with the same seed, so a run with the settings found trains what the
-    search trained. Only training and validation recordings are looked at.
+    Data and prior are the main job's stages with the same seed: a run with the settings found trains what the best
+    trial trained. Only training and validation recordings are read.
 
     Args:
         settings: What to compute.
         out: Folder to make; new or empty unless ``resume``.
-        trials: Trials in all; a search that is resumed may be given more.
+        trials: Trials in all; a resumed search may be given more.
         timeout: No further trial starts after this time of searching [s]. Default: none.
-        resume: Go on with the search that ``out`` holds.
+        resume: Go on with the search in ``out``.
         progress: Where to report; default: nowhere.
-
-    Returns:
-        What ``results.json`` holds (docs/search.md).
 
     Raises:
         InputError: For any bad input.
     """
-    from hybrid_mpc.identify.tune import check_numbers, search
+    from hybrid_mpc.identify.tune import check_numbers, tune
 
     check_numbers(trials, settings.seed, timeout)
     context = Context(settings, load_scenario(settings.scenario), out, progress or Silent())
@@ -104,14 +90,14 @@ def run_search(
             context.progress.start(stage.title)
             context.progress.finish(bring_up_to_date(context, stage))
         context.progress.start(f"searching, {trials} trials")
-        found = search(
+        found = tune(
             context.scenario.prior(context.prior.fit.values),
             context.smoothed("train"),
             context.smoothed("valid"),
             training_settings(context, settings.kind),
             settings.space,
             trials=trials,
-            storage=out / "search.jsonl",
+            storage=out / "tune.jsonl",
             seed=settings.seed,
             timeout=timeout,
             on_progress=lambda number, done, total, error: context.progress.update(
@@ -122,15 +108,8 @@ def run_search(
             ),
         )
         context.progress.finish(f"{len(found.trials)} trials")
-        return _write(context, settings, found)
-
-
-def overrides(found: SearchResult, space: SearchSpace) -> dict[str, Any]:
-    """The best settings as a file of network settings holds them: what was searched and what goes with it."""
-    names = {"learning_rates" if name in RATES else name: None for name in space.names}
-    if "horizon" in names:
-        names["validation_horizon"] = None
-    return {name: getattr(found.settings, name) for name in names}
+        _write(context, settings, found)
+        return found
 
 
 def usage(settings: RunSettings, out: Path) -> str:
@@ -143,49 +122,45 @@ def usage(settings: RunSettings, out: Path) -> str:
     return shlex.join([*words, "--settings", str(out / "settings.json"), "--out", f"{out}-run"])
 
 
-def table(rows: Sequence[TrialRow], names: Sequence[str]) -> str:
-    """The trials as CSV."""
-    text = io.StringIO()
-    own = [f.name for f in fields(rows[0]) if f.name != "values"]
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*(f"{n}_s" if n == "duration" else n for n in own), *names])
-    for row in rows:
-        writer.writerow([*(getattr(row, n) for n in own), *(row.values[n] for n in names)])
-    return text.getvalue()
+def best_settings(found: SearchResult, space: SearchSpace) -> dict[str, Any]:
+    """The best settings as ``settings.json`` holds them: what was searched and what goes with it."""
+    names = {"learning_rates" if name in RATES else name: None for name in space.names}
+    if "horizon" in names:
+        names["validation_horizon"] = None
+    return {name: getattr(found.settings, name) for name in names}
 
 
-def _write(context: Context, settings: SearchSettings, found: SearchResult) -> dict[str, Any]:
+def _write(context: Context, settings: TuneSettings, found: SearchResult) -> None:
     """Settings, table, figures, and results.json last."""
     from hybrid_mpc.plots import tune as plots
     from hybrid_mpc.plots.style import save
 
-    out, space, best = context.out, settings.space, overrides(found, settings.space)
+    out, names, best = context.out, settings.space.names, best_settings(found, settings.space)
     data = context.read(DATA)
-    rows = [_plain(row) for row in found.trials]
     results = {
-        "schema": "hybrid-mpc search",
+        "schema": "hybrid-mpc tune",
         "schema_version": SCHEMA_VERSION,
         "scenario": context.scenario.name,
         "seed": settings.seed,
         "budget": settings.budget,
         "kind": settings.kind,
-        "space": {name: space.bounds(name) for name in space.names},
+        "space": {name: settings.space.bounds(name) for name in names},
         "base_settings": asdict(training_settings(context, settings.kind)),
         "versions": versions(),
         "data": {"hash": data.hash, "warnings": data.warnings},
         "base_value": found.base,
-        "best": _plain(found.best),
+        "best": asdict(found.best),
         "settings": best,
         "importance": dict(found.importance),
-        "trials": rows,
+        "trials": [asdict(row) for row in found.trials],
     }
-    write_text(out / "trials.csv", table(found.trials, space.names))
-    save(plots.history(rows, base=found.base), out / "figures" / "search_history.png")
-    save(plots.settings(rows, space.names), out / "figures" / "search_settings.png")
+    rows: list[tuple[Cell, ...]] = [
+        (t.number, t.state, t.value, t.mean, t.steps, t.duration, *(t.values[n] for n in names))
+        for t in found.trials
+    ]
+    columns = ("number", "state", "value", "mean", "steps", "duration_s", *names)
+    write_text(out / "trials.csv", Table(columns, rows).csv())
+    save(plots.history(found.trials, base=found.base), out / "figures" / "tune_history.png")
+    save(plots.settings(found.trials, names), out / "figures" / "tune_settings.png")
     write_json(out / "settings.json", best)
     write_json(out / "results.json", results)
-    return results
-
-
-def _plain(row: TrialRow) -> Mapping[str, Any]:
-    return asdict(row)

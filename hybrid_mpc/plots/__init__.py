@@ -1,8 +1,7 @@
-"""Figures of the main job: one module a domain, plain arrays in, matplotlib figures out. No torch in here.
+"""Figures: one module a domain, plain arrays in, matplotlib figures out. No torch in here.
 
-``data``, ``fit``, ``loops``, ``animation``, ``estimation``, ``monitor``, ``analysis``, ``tune``, ``studies``; and
-``style``: colours, names, saving. What a figure of one's own in the same look needs stands here, and the figures that
-other things than the job draw, too; those are imported when they are used.
+The domains are ``data``, ``fit``, ``loops``, ``animation``, ``estimation``, ``monitor``, ``analysis``, ``tune`` and
+``studies``; ``style`` has what they share: colours, names, panels, legends, saving. Figures are imported when used.
 """
 
 import importlib

@@ -1,4 +1,4 @@
-"""Figures of the linear analysis of models: against a machine's response, in time, friction, sensitivities."""
+"""Figures of the linear analysis: poles, frequency and step responses, loops, gain schedules, friction, parameters."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MultipleLocator
+from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.machine.signals import Signal
@@ -26,14 +26,21 @@ from hybrid_mpc.plots.style import (
     new_figure,
     plain,
     plain_log,
+    ratio_unit,
     shared_legend,
     title_axes,
 )
 
-# Figures of the linear analysis: poles in the z-plane, Bode plot.
-
 _MARKERS = {"phy": "x", "prior": "x", "mopgrnn": "o", "hybrid": "o", "oracle": "s"}
 _DAMPING = (0.1, 0.3, 0.5, 0.7, 0.9)
+_COLOURS = ("#0072B2", "#D55E00", "#CC79A7", "#009E73", "#E69F00", "#56B4E9")
+_DASHES = ("-", "--", ":", "-.")
+_POINTS = {
+    "rest": "tangent at rest",
+    "working": "friction of working size",
+    "moving": "tangent in motion",
+    "driven": "mean of a driven run",
+}
 
 
 def pole_map(poles: Mapping[str, Any], dt: float, *, zeros: Mapping[str, Any] | None = None) -> Figure:
@@ -193,8 +200,7 @@ def bode(
             ax.axvline(nyquist, color=FAINT, linestyle=":", label="Nyquist frequency")
         ax.grid(True, which="minor", color="#eeeeee", linewidth=0.4)
         ax.margins(x=0)
-    unit = "/".join(f"({s.unit})" if " " in s.unit else s.unit for s in (output_signal, input_signal))
-    magnitude_ax.set_ylabel(f"magnitude\n[{unit}]")
+    magnitude_ax.set_ylabel(f"magnitude\n[{ratio_unit(output_signal, input_signal)}]")
     phase_ax.set_ylabel("phase [°]")
     phase_ax.set_xlabel("angular frequency [rad/s]")
     title_axes(magnitude_ax, f"from {axis_label(input_signal)} to {axis_label(output_signal)}")
@@ -204,20 +210,12 @@ def bode(
     return figure
 
 
-# Figures of linearized loops: sensitivity functions, Nyquist curves, gain schedules.
-
-_POINTS = {"rest": ", tangent at rest", "working": ", friction of working size"}
-_COLOURS = ("#0072B2", "#D55E00", "#CC79A7", "#009E73", "#E69F00", "#56B4E9")
-_DASHES = ("-", "--", ":", "-.")
-
-
-def sensitivity_functions(loops: Mapping[str, Mapping[str, Array]], *, title: str = "") -> Figure:
+def sensitivity_functions(loops: Mapping[str, Mapping[str, NDArray[Any]]]) -> Figure:
     """Sensitivity and complementary sensitivity of loops at the plant's input.
 
     Args:
         loops: By loop: ``omega`` ``(n,)`` [rad/s], complex ``S`` and ``T`` ``(n,)``. Names that differ after their last
             comma only (``"prior on prior, quiet"``) share a colour.
-        title: Title over the figure. Default: none.
 
     Raises:
         InputError: If there is no loop or lengths differ.
@@ -229,7 +227,7 @@ def sensitivity_functions(loops: Mapping[str, Mapping[str, Array]], *, title: st
     """
     if not loops:
         raise InputError("sensitivity functions: there is no loop to draw")
-    figure, axes = new_figure(1, 2, sharex=True, sharey=True, size=(10, 4.2), title=title)
+    figure, axes = new_figure(1, 2, sharex=True, sharey=True, size=(10, 4.2))
     texts = ("S: what is left of a load", "T: what the input takes of it")
     looks = _looks(loops)
     for ax, key, text in zip(axes[0], "ST", texts, strict=True):
@@ -267,7 +265,7 @@ def _looks(names: Iterable[str]) -> dict[str, dict[str, Any]]:
     return looks
 
 
-def nyquist(loops: Mapping[str, Array], *, modulus: float | None = None) -> Figure:
+def nyquist(loops: Mapping[str, NDArray[np.complex128]], *, modulus: float | None = None) -> Figure:
     """Nyquist curves of loops in negative-feedback sign, around -1.
 
     Args:
@@ -311,6 +309,7 @@ def gain_schedules(
     *,
     position: Signal,
     states: tuple[Signal, ...],
+    input_signal: Signal,
 ) -> Figure:
     """LQR gains of the physical states over the position.
 
@@ -318,6 +317,7 @@ def gain_schedules(
         schedules: By model, then by point (``"rest"``, ``"working"``): positions ``(n,)`` and gains ``(n, n_x)``.
         position: The position.
         states: Signals of the states.
+        input_signal: The input.
 
     Raises:
         InputError: If there is nothing to draw or shapes differ.
@@ -325,7 +325,7 @@ def gain_schedules(
     Example:
         >>> q, x = Signal("q", "m"), (Signal("q", "m"), Signal("v", "m/s"))
         >>> curve = {"prior": {"rest": (np.array([0.0, 1.0]), np.ones((2, 2)))}}
-        >>> len(gain_schedules(curve, position=q, states=x).axes)
+        >>> len(gain_schedules(curve, position=q, states=x, input_signal=Signal("F", "N")).axes)
         2
     """
     if not schedules:
@@ -336,24 +336,16 @@ def gain_schedules(
             values = checked(f"gains of {name}", gain, len(q), len(states))
             style: dict[str, Any] = {
                 "color": colour(name), "linestyle": ":" if point == "rest" else "-", "marker": ".", "markersize": 4,
-                "label": name_of(name) + _POINTS.get(point, ""),
+                "label": f"{name_of(name)}, {_POINTS.get(point, point)}",
             }  # fmt: skip
             for ax, column in zip(axes[0], values.T, strict=True):
                 ax.plot(q, column, **style)
     for ax, signal in zip(axes[0], states, strict=True):
         ax.set_xlabel(axis_label(position))
-        title_axes(ax, f"gain of {axis_label(signal)}")
-    axes[0, 0].set_ylabel("input per unit of state")
+        ax.set_ylabel(f"gain [{ratio_unit(input_signal, signal)}]")
+        title_axes(ax, f"from {axis_label(signal)} to {axis_label(input_signal)}")
     shared_legend(figure, columns=2)
     return figure
-
-
-_RESPONSE_POINTS = {
-    "rest": "tangent at rest",
-    "working": "friction of working size",
-    "moving": "tangent in motion",
-    "driven": "mean of a driven run",
-}
 
 
 def measured_bode(
@@ -401,8 +393,7 @@ def measured_bode(
         upper.loglog(w, size, **style)
         middle.semilogx(w, np.degrees(np.unwrap(np.angle(g[shown]))), **style)
         lower.semilogx(w, np.asarray(one["coherence"], dtype=float)[shown], **style)
-    unit = "/".join(f"({s.unit})" if " " in s.unit else s.unit for s in (output_signal, input_signal))
-    upper.set_ylabel(f"magnitude\n[{unit}]")
+    upper.set_ylabel(f"magnitude\n[{ratio_unit(output_signal, input_signal)}]")
     middle.set_ylabel("phase [°]")
     middle.yaxis.set_major_locator(MultipleLocator(90))
     lower.set_ylabel("coherence [-]")
@@ -442,8 +433,8 @@ def step_responses(
         for name, (t, y) in models.items():
             ax.plot(t, checked(f"step response of {name}", y, len(t)), **line_style(name))
         ax.set_xlabel("time [s]")
-        title_axes(ax, _RESPONSE_POINTS.get(point, point))
-    axes[0, 0].set_ylabel(f"{axis_label(output_signal)}\nper {input_signal.unit}")
+        title_axes(ax, _POINTS.get(point, point))
+    axes[0, 0].set_ylabel(f"{plain(output_signal.name)} [{ratio_unit(output_signal, input_signal)}]")
     shared_legend(figure)
     return figure
 
@@ -496,20 +487,8 @@ def friction_damping(curves: Mapping[str, Mapping[str, Array]], *, working_speed
     low = min(float(np.nanmin(np.asarray(c["secant"], dtype=float))) for c in curves.values())
     axes[0, 0].set_ylim(bottom=0.1 * max(low, 1e-6))
     axes[0, 0].set_ylabel("damping: acceleration over speed [1/s]")
-    _one_legend(figure)
+    shared_legend(figure, ink=True)  # the panels' colours tell models apart, not kinds
     return figure
-
-
-def _one_legend(figure: Figure) -> None:
-    """The kinds of lines once, in ink: the panels' colours tell models apart, not kinds."""
-    seen: dict[str, Any] = {}
-    for ax in figure.axes:
-        for line in ax.get_lines():
-            label = str(line.get_label())
-            if not label.startswith("_"):
-                seen.setdefault(label, line.get_linestyle())
-    handles = [Line2D([], [], color=INK, linestyle=dashes) for dashes in seen.values()]
-    figure.legend(handles, list(seen), loc="outside lower center", ncols=len(seen), frameon=False, fontsize=9)
 
 
 def sensitivities(

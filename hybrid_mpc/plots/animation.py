@@ -22,19 +22,19 @@ from hybrid_mpc.files import replacing
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.plots.style import FAINT, INK, Array, axis_label, checked, colour, dress, plain, shared_legend
 
-# The picture of a moving machine: what stays is drawn once, each frame's lines over a copy of it.
-
 Draw = Callable[[Array], Sequence[Array]]
 
 DPI = 96
 SIZE = (8.0, 4.1)  # [inch]
 GHOSTS = 6  # planned positions drawn at most
 PLAN = colour("hybrid")
+MOST_FRAMES = 250  # of a longer loop fewer frames a second are drawn; it still plays in real time
+LAST = 1.2  # [s] for which the last frame stays before the loop starts again
 
 
 @dataclass(frozen=True)
-class Loop:
-    """Checked arguments of an animation; ``lines[k]`` are the machine's polylines in the state ``x[k]``."""
+class AnimatedLoop:
+    """Checked arguments of an animation; ``moving`` says which polylines a state moves."""
 
     t: Array
     x: Array
@@ -50,7 +50,7 @@ class Scene:
 
     def __init__(
         self,
-        loop: Loop,
+        loop: AnimatedLoop,
         title: str,
         position: Signal,
         inputs: Sequence[Signal],
@@ -213,10 +213,6 @@ def _closed(line: Array) -> bool:
     return len(line) > 2 and bool(np.allclose(line[0], line[-1], rtol=0.0, atol=1e-9))
 
 
-MOST_FRAMES = 250  # of a longer loop fewer frames a second are drawn; it still plays in real time
-LAST = 1.2  # [s] for which the last frame stays before the loop starts again
-
-
 def animate(
     path: str | Path,
     t: Array,
@@ -291,7 +287,7 @@ def animate(
     return path
 
 
-def _checked(path: Path, t: Array, x: Array, plans: Array, dt: float, draw: Draw, u: Array) -> Loop:
+def _checked(path: Path, t: Array, x: Array, plans: Array, dt: float, draw: Draw, u: Array) -> AnimatedLoop:
     t, x, u = (np.asarray(a, dtype=float) for a in (t, x, u))
     plans = np.asarray(plans, dtype=float)
     n = len(t) if t.ndim == 1 else 0
@@ -310,7 +306,7 @@ def _checked(path: Path, t: Array, x: Array, plans: Array, dt: float, draw: Draw
     if any(len(lines) != len(first) for lines in others):
         raise InputError(f"animation {path}: draw must return the same number of lines for every state")
     moving = tuple(any(not np.array_equal(o[i], line) for o in others) for i, line in enumerate(first))
-    return Loop(t, x, u, plans, dt, draw, moving)
+    return AnimatedLoop(t, x, u, plans, dt, draw, moving)
 
 
 def _frames(t: Array, fps: float) -> list[int]:

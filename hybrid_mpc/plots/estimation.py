@@ -1,4 +1,4 @@
-"""Figures of the estimators: whether their innovations are what they believe them to be."""
+"""Figures of the estimators: the consistency of their innovations."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.plots.style import (
     COLOURS,
     FAINT,
+    GOOD,
     INK,
+    PALE,
     Array,
     checked,
     new_figure,
@@ -24,7 +26,7 @@ from hybrid_mpc.plots.style import (
 )
 
 WINDOW = 50
-BAND = "#009E73"
+"""Samples of a running mean."""
 
 
 def innovations(
@@ -71,12 +73,12 @@ def innovations(
     t = dt * np.arange(len(values))
     figure, axes = new_figure(2, 1, heights=(1.5, 1.0), size=(10, 6.2), title=plain(title))
     top, bottom = axes[:, 0]
-    top.plot(t, values, ".", color="#9a9a9a", markersize=2.5, label="NIS")
+    top.plot(t, values, ".", color=PALE, markersize=2.5, label="NIS")
     mean = np.array([np.nanmean(v) if np.isfinite(v).any() else np.nan for v in _windows(values)])
     top.plot(t[: len(mean)] + 0.5 * WINDOW * dt, mean, color=COLOURS["hybrid"], linewidth=1.3,
              label=f"mean over {WINDOW} samples")  # fmt: skip
     low, high = (float(chi2.ppf(p, WINDOW * n_y)) / WINDOW for p in (0.025, 0.975))
-    top.axhspan(low, high, color=BAND, alpha=0.15, linewidth=0, label=f"95 % band of a mean over {WINDOW}")
+    top.axhspan(low, high, color=GOOD, alpha=0.15, linewidth=0, label=f"95 % band of a mean over {WINDOW}")
     top.axhline(
         float(chi2.ppf(0.95, n_y)), color=INK, linestyle=":", linewidth=1.1, label="95 % of single NIS"
     )
@@ -94,9 +96,9 @@ def innovations(
     )
     width = 0.7 / n_y
     for i, signal in enumerate(outputs):
-        beside = (i + 0.5) / n_y * 0.7 - 0.35
-        bottom.bar(np.arange(1, lags + 1) + beside, r[:, i], width=width, label=plain(signal.name))
-    bottom.axhspan(-correlation_band, correlation_band, color=BAND, alpha=0.15, linewidth=0)
+        offset = (i + 0.5) / n_y * 0.7 - 0.35
+        bottom.bar(np.arange(1, lags + 1) + offset, r[:, i], width=width, label=plain(signal.name))
+    bottom.axhspan(-correlation_band, correlation_band, color=GOOD, alpha=0.15, linewidth=0)
     bottom.axhline(0.0, color=FAINT, linewidth=0.8)
     bottom.xaxis.set_major_locator(MaxNLocator(integer=True))
     bottom.set_xlabel("lag [samples]")

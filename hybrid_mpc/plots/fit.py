@@ -1,4 +1,4 @@
-"""Figures of the training: both objectives, their bounds, and the validation metric."""
+"""Figures of the identification: training curves, free runs, errors by model, parity of the export."""
 
 from __future__ import annotations
 
@@ -18,22 +18,35 @@ from hybrid_mpc.plots.style import (
     axis_label,
     checked,
     colour,
+    finish_column,
     line_style,
     name_of,
+    new_column,
     new_figure,
     number,
     plain_log,
+    plot_inputs,
     shared_legend,
     title_axes,
 )
 
-# Figures of the identified models: free runs, errors by model, parity of the export.
-
 METRICS: Mapping[str, str] = {
     "e_sim_s": "simulation error $E_{sim}$ [s]",
-    "rmse_rad": "free-run RMSE [rad]",
+    "rmse_rad": "free-run RMSE [unit of the output]",
     "energy_violation_w": "mean violation [W]",
 }
+"""Axis labels by metric; a caller that knows the output puts its unit into that of the RMSE."""
+ENERGY = "mopgrnn"
+"""The model whose energy balance is drawn."""
+SHOWN = 20.0
+"""Length [s] of a benchmark's run that is drawn sample by sample; the rest is in the errors' course."""
+COURSE = 200
+"""Points of the course of the errors over the whole run."""
+_ROWS = (
+    ("loss_error", "bound_error", "error objective [-]"),
+    ("loss_energy", "bound_energy", "energy objective [-]"),
+    ("validation", None, "validation [-]"),
+)
 
 
 def free_run(
@@ -46,12 +59,9 @@ def free_run(
     inputs: Sequence[Signal],
     energy_measured: Array,
     energy_model: Array,
-    energy_name: str = "mopgrnn",
-    violation: Array | None = None,
-    warm_up: float = 0.0,
     title: str = "",
 ) -> Figure:
-    """A free run beside the measurement, with the energy balances (the paper's Fig. 6).
+    """A free run and the measurement, with the energy balances (the paper's Fig. 6).
 
     Args:
         t: Times ``(n,)`` [s].
@@ -61,10 +71,7 @@ def free_run(
         states: Signals of ``x``.
         inputs: Signals of ``u``.
         energy_measured: Energy balance of the measured system, ``(n,)`` [W].
-        energy_model: Energy balance of the model ``energy_name``, ``(n,)`` [W].
-        energy_name: Whose balance it is. Default: ``"mopgrnn"``.
-        violation: ``|energy_model - energy_measured|`` if computed elsewhere, ``(n,)`` [W].
-        warm_up: Length [s] of the measured past at the start that is not scored; shaded.
+        energy_model: Energy balance of the MOPGRNN, ``(n,)`` [W].
         title: Title. Default: none.
 
     Returns:
@@ -83,41 +90,27 @@ def free_run(
     """
     t = np.asarray(t, dtype=float)
     balances = [checked("energy balance", e, len(t)) for e in (energy_measured, energy_model)]
-    gap = np.abs(balances[1] - balances[0]) if violation is None else checked("violation", violation, len(t))
-    rows = len(states) + len(inputs) + 2
+    gap = np.abs(balances[1] - balances[0])
     heights = [1.6] * len(states) + [0.9] * len(inputs) + [1.2, 0.9]
-    figure, axes = new_figure(
-        rows, 1, sharex=True, heights=heights, title=title, size=(10, 0.8 + 1.2 * sum(heights))
-    )
-    column = axes[:, 0]
-    _states(column, t, x, predictions, states)
-    for i, (ax, signal) in enumerate(zip(column[len(states) :], inputs, strict=False)):
-        values = checked("u", u, len(t), len(inputs))[:, i]
-        ax.plot(t, values, color=INK, linewidth=1.0, drawstyle="steps-post")
-        ax.set_ylabel(axis_label(signal))
-    column[-2].plot(t, balances[0], **(line_style("measured") | {"linewidth": 1.0}))
-    column[-2].plot(t, balances[1], **line_style(energy_name))
-    column[-2].set_ylabel("balance\n" r"$\Delta E$ [W]")
-    column[-1].fill_between(t, gap, color=colour(energy_name), alpha=0.35, linewidth=0)
-    column[-1].plot(t, gap, color=colour(energy_name), linewidth=0.8)
-    column[-1].set_ylabel("violation\n" r"$\Delta$ [W]")
-    for ax in column:
-        if warm_up > 0:
-            ax.axvspan(t[0], t[0] + warm_up, color="#dddddd", lw=0, zorder=0, label="warm-up, not scored")
-        ax.margins(x=0)
-    column[-1].set_xlabel("time [s]")
-    figure.align_ylabels(list(column))
-    shared_legend(figure, columns=6)
+    figure, panels = new_column(heights, title=title)
+    _states(panels, t, x, predictions, states)
+    plot_inputs(panels[len(states) : -2], t, checked("u", u, len(t), len(inputs)), inputs)
+    panels[-2].plot(t, balances[0], **(line_style("measured") | {"linewidth": 1.0}))
+    panels[-2].plot(t, balances[1], **line_style(ENERGY))
+    panels[-2].set_ylabel("balance\n" r"$\Delta E$ [W]")
+    panels[-1].fill_between(t, gap, color=colour(ENERGY), alpha=0.35, linewidth=0)
+    panels[-1].plot(t, gap, color=colour(ENERGY), linewidth=0.8)
+    panels[-1].set_ylabel("violation\n" r"$\Delta$ [W]")
+    finish_column(figure, panels, columns=6)
     return figure
 
 
 def _states(
-    column: Any, t: Array, x: Array, predictions: Mapping[str, Array], states: Sequence[Signal]
+    panels: Sequence[Axes], t: Array, x: Array, predictions: Mapping[str, Array], states: Sequence[Signal]
 ) -> None:
     measured = checked("x", x, len(t), len(states))
     runs = {m: checked(f"free run of {m}", values, len(t), len(states)) for m, values in predictions.items()}
-    for i, signal in enumerate(states):
-        ax = column[i]
+    for i, (ax, signal) in enumerate(zip(panels, states, strict=False)):
         ax.plot(t, measured[:, i], **(line_style("measured") | {"linewidth": 2.2, "alpha": 0.85}))
         for model, run in runs.items():
             ax.plot(t, run[:, i], **line_style(model))
@@ -133,7 +126,6 @@ def errors_bar(
     *,
     spread: Mapping[str, Mapping[str, float]] | None = None,
     metrics: Mapping[str, str] = METRICS,
-    reference: str = "phy",
 ) -> Figure:
     """Errors of the models, one panel a metric, with the fitted prior as the line to beat.
 
@@ -141,7 +133,6 @@ def errors_bar(
         errors: ``{model: {metric: value}}``; a missing value or None leaves a gap.
         spread: Standard deviation over the trained networks in the same form. Default: none drawn.
         metrics: Axis label with unit by metric name. Default: the three of ``results.json``.
-        reference: Model whose value is drawn as a line. Default: ``"phy"``.
 
     Returns:
         The figure. A bar far above all others is cut and marked; its number stays.
@@ -157,16 +148,14 @@ def errors_bar(
     if not shown:
         raise InputError(f"plot of the errors: no model has any of {', '.join(metrics)}")
     figure, axes = new_figure(1, len(shown), size=(max(5.0, 3.4 * len(shown)), 4.2))
-    line = f"{name_of(reference)}: the line to beat"
+    line = f"{name_of('phy')}: the line to beat"
     for ax, metric in zip(axes[0], shown, strict=True):
         found = {model: v.get(metric) for model, v in errors.items()}
         values = {model: value for model, value in found.items() if value is not None}
         bars = {model: (spread or {}).get(model, {}).get(metric, 0.0) for model in values}
         _bars(ax, values, bars)
-        if reference in values:
-            ax.axhline(
-                values[reference], color=colour(reference), linestyle="--", lw=1.1, zorder=4, label=line
-            )
+        if "phy" in values:
+            ax.axhline(values["phy"], color=colour("phy"), linestyle="--", lw=1.1, zorder=4, label=line)
         ax.set_ylabel(metrics[metric])
         ax.set_xticks([])
         ax.grid(False, axis="x")
@@ -235,14 +224,6 @@ def parity(errors: Mapping[str, Array], tolerances: Mapping[str, float]) -> Figu
     return figure
 
 
-# Free runs over unseen recordings of a machine, beside the measurement.
-
-SHOWN = 20.0
-"""Length [s] of what is drawn sample by sample; of a longer run the rest is in the errors' course."""
-COURSE = 200
-"""Points of the course of the errors over the whole run."""
-
-
 def benchmark_run(
     t: Array,
     y: Array,
@@ -290,7 +271,7 @@ def benchmark_run(
     figure, axes = new_figure(
         len(heights), 1, heights=heights, title=title, size=(10, 0.8 + 1.3 * sum(heights))
     )
-    column, near = axes[:, 0], t <= t[0] + SHOWN
+    column, near = list(axes[:, 0]), t <= t[0] + SHOWN
     column[0].plot(t[near], y[near], **(line_style("measured") | {"linewidth": 2.2, "alpha": 0.85}))
     room = 0.3 * max(float(np.ptp(y[near])), 1e-9)
     for name, run in runs.items():
@@ -308,17 +289,16 @@ def benchmark_run(
     column[0].set_ylabel(axis_label(output))
     column[1].set_ylabel(f"error [{unit}]")
     column[-1].set_ylabel(f"RMS error [{unit}]")
-    for i, signal in enumerate(inputs):
-        column[2 + i].plot(t[near], u[near, i], color=INK, linewidth=0.9, drawstyle="steps-post")
-        column[2 + i].set_ylabel(axis_label(signal))
-        size = max(float(np.abs(u[near, i]).max()), 1e-9)
-        if np.ptp(u[near, i]) < 1e-6 * size:  # a constant input is drawn as one, not its rounding
-            column[2 + i].set_ylim(float(u[near, i].mean()) - size, float(u[near, i].mean()) + size)
+    plot_inputs(column[2:-1], t[near], u[near], inputs)
+    for ax, values in zip(column[2:-1], u[near].T, strict=True):
+        size = max(float(np.abs(values).max()), 1e-9)
+        if np.ptp(values) < 1e-6 * size:  # a constant input is drawn as one, not its rounding
+            ax.set_ylim(float(values.mean()) - size, float(values.mean()) + size)
     for ax in column:
         ax.margins(x=0)
     column[-2].set_xlabel("time [s]")
     column[-1].set_xlabel("time [s], the whole run")
-    figure.align_ylabels(list(column))
+    figure.align_ylabels(column)
     shared_legend(figure, columns=6)
     return figure
 
@@ -328,13 +308,6 @@ def _course(t: Array, error: Array) -> tuple[Array, Array]:
     parts = np.array_split(np.arange(len(t)), min(COURSE, max(1, len(t) // 5)))
     rms = np.array([np.sqrt(np.mean(error[part] ** 2)) for part in parts])
     return np.array([t[part].mean() for part in parts]), np.maximum(rms, 1e-12)
-
-
-_ROWS = (
-    ("loss_error", "bound_error", "error objective [-]"),
-    ("loss_energy", "bound_energy", "energy objective [-]"),
-    ("validation", None, "validation [-]"),
-)
 
 
 def curves(
@@ -370,10 +343,7 @@ def curves(
         if "step" not in data:
             raise InputError(f"plot of the training of {model}: no array 'step'; it has {', '.join(data)}")
         step = np.asarray(data["step"], dtype=float)
-        for (
-            ax,
-            (loss, bound, _),
-        ) in zip(column, _ROWS, strict=True):
+        for ax, (loss, bound, _) in zip(column, _ROWS, strict=True):
             _curve(ax, model, step, data.get(loss), loss)
             if bound is not None and data.get(bound) is not None:
                 values = checked(f"{bound} of {model}", data[bound], len(step))

@@ -21,17 +21,18 @@ from hybrid_mpc.plots.style import (
     axis_label,
     checked,
     colour,
+    finish_column,
     line_style,
     name_of,
+    new_column,
     new_figure,
     number,
     plain,
     plain_log,
+    plot_inputs,
     shared_legend,
     title_axes,
 )
-
-# Figures of the closed loops: tracking of each controller, and the time a step takes.
 
 
 @dataclass(frozen=True)
@@ -93,36 +94,27 @@ def closed_loops(
     target = checked("reference", reference, len(t), len(states))
     n_x, n_q = len(states), max(1, len(states) // 2)
     heights = [1.6] * n_x + [1.1] * (n_q + len(inputs))
-    figure, axes = new_figure(
-        len(heights), 1, sharex=True, heights=heights, title=title, size=(10, 0.8 + 1.15 * sum(heights))
-    )
-    column = axes[:, 0]
+    figure, panels = new_column(heights, height=1.15, title=title)
+    errors, below = panels[n_x : n_x + n_q], panels[n_x + n_q :]
     for controller, loop in results.items():
         x = checked(f"x of {controller}", loop.x, len(loop.t), n_x)
         u = checked(f"u of {controller}", loop.u, len(loop.t), len(inputs))
         line = line_style(controller)
-        for i in range(n_x):
-            column[i].plot(loop.t, x[:, i], **line)
-        for i in range(n_q):
-            column[n_x + i].plot(loop.t, x[:, i] - np.interp(loop.t, t, target[:, i]), **line)
-        for i in range(len(inputs)):
-            column[n_x + n_q + i].plot(loop.t, u[:, i], drawstyle="steps-post", **line)
-    for i, signal in enumerate(states):
-        column[i].plot(t, target[:, i], **(line_style("reference") | {"zorder": 4}))
-        column[i].set_ylabel(axis_label(signal))
-    for i, signal in enumerate(states[:n_q]):
-        column[n_x + i].axhline(0.0, color=FAINT, linewidth=0.8)
-        column[n_x + i].set_ylabel(f"error of\n{axis_label(signal)}")
-    for i, signal in enumerate(inputs):
-        ax = column[n_x + n_q + i]
+        for ax, values in zip(panels, x.T, strict=False):
+            ax.plot(loop.t, values, **line)
+        for i, ax in enumerate(errors):
+            ax.plot(loop.t, x[:, i] - np.interp(loop.t, t, target[:, i]), **line)
+        plot_inputs(below, loop.t, u, inputs, **line)
+    for ax, values, signal in zip(panels, target.T, states, strict=False):
+        ax.plot(t, values, **(line_style("reference") | {"zorder": 4}))
         ax.set_ylabel(axis_label(signal))
+    for ax, signal in zip(errors, states, strict=False):
+        ax.axhline(0.0, color=FAINT, linewidth=0.8)
+        ax.set_ylabel(f"error of\n{axis_label(signal)}")
+    for i, ax in enumerate(below):
         for bound in filter(math.isfinite, (limits[0][i], limits[1][i]) if limits is not None else ()):
             ax.axhline(bound, color=INK, linestyle=":", linewidth=1.1, label="input limits")
-    column[-1].set_xlabel("time [s]")
-    for ax in column:
-        ax.margins(x=0)
-    figure.align_ylabels(list(column))
-    shared_legend(figure)
+    finish_column(figure, panels)
     return figure
 
 
@@ -166,7 +158,6 @@ def solve_times(times_ms: Mapping[str, Array], period_ms: float) -> Figure:
         ax.set_xscale("log")
         ax.set_xlim(bins[0], bins[-1])
         ax.set_xlabel("duration of a controller step [ms]")
-    for ax in (left, right):
         plain_log(ax.xaxis, bins[0], bins[-1])
     left.set_ylabel("share of steps [%]")
     right.set_yscale("log")

@@ -14,6 +14,7 @@ from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
@@ -25,7 +26,8 @@ Array = NDArray[np.float64]
 Share = bool | Literal["none", "all", "row", "col"]
 
 DPI = 110
-INK, FAINT, ALARM = "#222222", "#8a8a8a", "#CC79A7"
+INK, FAINT, PALE = "#222222", "#8a8a8a", "#9a9a9a"
+ALARM, GOOD = "#CC79A7", "#009E73"
 
 COLOURS: Mapping[str, str] = MappingProxyType(
     {
@@ -140,6 +142,18 @@ def axis_label(signal: Signal) -> str:
     return f"{_SYMBOLS.get(signal.name, plain(signal.name.replace('_', ' ')))} [{signal.unit}]"
 
 
+def ratio_unit(numerator: Signal, denominator: Signal) -> str:
+    """Unit of one signal per unit of another.
+
+    Example:
+        >>> phi, tau = Signal("phi", "rad"), Signal("tau", "N m")
+        >>> ratio_unit(phi, tau), ratio_unit(tau, phi)
+        ('rad/(N m)', 'N m/rad')
+    """
+    over, under = numerator.unit, denominator.unit
+    return f"{f'({over})' if '/' in over else over}/{f'({under})' if set(' /') & set(under) else under}"
+
+
 def new_figure(
     rows: int,
     cols: int,
@@ -181,6 +195,49 @@ def new_figure(
     return figure, axes
 
 
+def new_column(
+    heights: Sequence[float], *, height: float = 1.2, title: str = ""
+) -> tuple[Figure, list[Axes]]:
+    """An empty figure of panels one above the other that share their horizontal axis.
+
+    Args:
+        heights: Relative heights of the panels.
+        height: Height [inch] of a panel of relative height 1.
+        title: Title over all panels. Default: none.
+
+    Example:
+        >>> figure, panels = new_column([2.0, 1.0])
+        >>> len(panels)
+        2
+    """
+    size = (10.0, 0.8 + height * sum(heights))
+    figure, axes = new_figure(len(heights), 1, sharex=True, heights=heights, title=title, size=size)
+    return figure, list(axes[:, 0])
+
+
+def finish_column(figure: Figure, panels: Sequence[Axes], *, columns: int = 7) -> None:
+    """Complete a column of panels over time: no margins, time axis, aligned labels, one legend.
+
+    Args:
+        figure: The figure.
+        panels: Its panels.
+        columns: Most columns of the legend.
+    """
+    for ax in panels:
+        ax.margins(x=0)
+    panels[-1].set_xlabel("time [s]")
+    figure.align_ylabels(list(panels))
+    shared_legend(figure, columns=columns)
+
+
+def plot_inputs(panels: Sequence[Axes], t: Array, u: Array, inputs: Sequence[Signal], **style: Any) -> None:
+    """Inputs ``(n, n_u)``, held between samples, one panel each."""
+    look: dict[str, Any] = {"color": INK, "linewidth": 1.0} | style
+    for ax, values, signal in zip(panels, u.T, inputs, strict=True):
+        ax.plot(t, values, drawstyle="steps-post", **look)
+        ax.set_ylabel(axis_label(signal))
+
+
 def dress(ax: Axes) -> None:
     """Give axes the project's look: two spines, a faint grid, small ticks."""
     for side in ("top", "right"):
@@ -199,12 +256,19 @@ def title_axes(ax: Axes, text: str) -> None:
     ax.set_title(text, loc="left", fontsize=10, color=INK)
 
 
-def shared_legend(figure: Figure, *, columns: int = 7) -> None:
-    """One legend beneath all axes of a figure, each name once, in order of first appearance."""
+def shared_legend(figure: Figure, *, columns: int = 7, ink: bool = False) -> None:
+    """One legend beneath all axes of a figure, each name once, in order of first appearance.
+
+    Args:
+        figure: The figure.
+        columns: Most columns.
+        ink: True: the legend shows the dashes of lines and not their colours.
+    """
     seen: dict[str, Any] = {}
     for ax in figure.axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
-            seen.setdefault(label, handle)
+            shown = Line2D([], [], color=INK, linestyle=handle.get_linestyle()) if ink else handle  # type: ignore[attr-defined]
+            seen.setdefault(label, shown)
     figure.legend(
         list(seen.values()),
         list(seen),

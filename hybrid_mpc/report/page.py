@@ -1,8 +1,10 @@
-"""The report: one HTML file that needs nothing beside it."""
+"""The page of a report: one self-contained HTML file of key figures, text, tables and embedded figures."""
 
 from __future__ import annotations
 
 import base64
+import csv
+import io
 import re
 import struct
 from collections.abc import Sequence
@@ -30,8 +32,8 @@ class KeyFigure:
         label: What it is, e.g. ``"Free-run error, hybrid against fitted prior"``.
         value: The number (or a word); None shows a dash, say why in ``comment``.
         unit: Its unit. Default: none.
-        comment: A few words of judgement, e.g. ``"target: at most 0.8"``.
-        verdict: ``"good"``, ``"bad"`` or ``"plain"`` (no judgement).
+        comment: A few words, e.g. ``"target: at most 0.8"``.
+        verdict: ``"good"``, ``"bad"`` or ``"plain"`` (neither).
 
     Example:
         >>> KeyFigure("Period", 20.0, "ms").text
@@ -78,6 +80,17 @@ class Table:
                     f"table {self.caption!r}: row {i} has {len(row)} cells, "
                     f"its {len(self.columns)} columns need one each"
                 )
+
+    def csv(self) -> str:
+        r"""The table as CSV: a header, numbers with all their digits, nothing for None.
+
+        Example:
+            >>> Table(("model", "x [rad]"), (("prior", 0.1), ("a, b", None))).csv()
+            'model,x [rad]\nprior,0.1\n"a, b",\n'
+        """
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows([self.columns, *self.rows])
+        return text.getvalue()
 
 
 @dataclass(frozen=True)
@@ -199,7 +212,7 @@ def cell(value: Cell) -> str:
         return "–"
     if isinstance(value, bool):
         return "yes" if value else "no"
-    # a per cent sign stays beside its number
+    # a per cent sign stays with its number
     return number(value) if isinstance(value, float) else str(value).replace(" %", "\u00a0%")
 
 

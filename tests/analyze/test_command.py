@@ -1,24 +1,21 @@
-"""The study of an artifact's models, its tables and figures, and the command."""
+"""The analysis of an artifact's models, its tables and figures, and the command."""
 
 import csv
-import doctest
-import importlib
 import json
-import pkgutil
 import shutil
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-import hybrid_mpc.analyze
 from hybrid_mpc import (
     InputError,
     load,
     make_controller,
+    make_ocp,
     multisine,
     run_model,
     set_process_noise,
@@ -26,9 +23,18 @@ from hybrid_mpc import (
     write_csv,
 )
 from hybrid_mpc.analyze.linearize import control_toolbox
+from hybrid_mpc.cli.analyze import command
 from hybrid_mpc.cli.main import app
-from hybrid_mpc.job.analyze import Request, Subject, loops_part, measured_part, study, subject_of
-from hybrid_mpc.job.analyze_page import write_analysis
+from hybrid_mpc.job.analyze import (
+    AnalysisInput,
+    AnalysisSettings,
+    Missing,
+    analysis_input,
+    analyze_models,
+    loops_of,
+    responses_of,
+)
+from hybrid_mpc.job.analyze_page import tables_of, write_analysis
 from hybrid_mpc.kit.artifact import loop_settings, read_description, write_description
 from nn_export import load_programs
 from scenarios.golf_robot import scenario
@@ -46,40 +52,52 @@ def noisy(model, tmp_path):
 @pytest.fixture(scope="module")
 def prior_alone(golf_artifact):
     artifact = load(golf_artifact)
-    return Subject(
+    return AnalysisInput(
         {"prior": artifact.models["prior"]}, load_programs(golf_artifact), np.array([[-0.85, 0.85], [-2.5, 2.5]]),
         np.array([[-0.5, 0.5]]), np.array([0.25]), plant=scenario.plant(),
     )  # fmt: skip
 
 
-def test_a_study_without_a_control_problem_says_what_it_leaves_out(prior_alone, tmp_path):
-    said = []
-    findings = study(prior_alone, lambda *words: said.append(words[3]))
-    assert tuple(said) == PARTS == tuple(findings.result)
-    assert {p for p in PARTS if "reason" in findings.result[p]} == {"schedule", "loops"}
-    assert findings.result["friction"]["prior"]["tangent_1_s"] > 50
-    assert findings.result["measured"]["prior"]["median_relative_error"] < 0.5
-    files = write_analysis(tmp_path, prior_alone, findings, ("a test",), "hybrid-mpc analyze")
+def test_an_analysis_without_a_control_problem_says_what_it_leaves_out(prior_alone, tmp_path):
+    told = []
+    result = analyze_models(prior_alone, lambda *words: told.append(words[3]))
+    assert tuple(told) == PARTS == tuple(f.name for f in fields(result))
+    assert {part for part in PARTS if isinstance(getattr(result, part), Missing)} == {"schedule", "loops"}
+    assert result.friction["prior"].working.tangent > 50
+    assert result.measured.errors["prior"].median < 0.5
+    files = write_analysis(tmp_path, prior_alone, result, ("a test",), "hybrid-mpc analyze")
     assert all(path.is_file() for path in files)
-    page = (tmp_path / "analysis.html").read_text()
-    assert "Left out: loops need" in page
+    assert "Left out: loops need" in (tmp_path / "analysis.html").read_text()
     with (tmp_path / "modes.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    poles = [
-        complex(float(r["pole, real"]), float(r["pole, imaginary"])) for r in rows if r["point"] == "rest"
-    ]
-    assert np.array_equal(poles, findings.arrays["linear/prior/rest/poles"])  # all digits
-    omega, size = (findings.arrays[f"linear/prior/rest/{key}"] for key in ("omega", "magnitude"))
-    zeros, poles = (findings.arrays[f"linear/prior/rest/{key}"] for key in ("zeros", "poles"))
-    z = np.exp(1j * omega * 0.02)[:, None]
-    product = np.prod(np.abs(z - zeros), axis=1) / np.prod(np.abs(z - poles), axis=1)
+        rows = [r for r in csv.DictReader(file) if r["point"] == "rest"]
+    written = [complex(float(r["pole, real [-]"]), float(r["pole, imaginary [-]"])) for r in rows]
+    at_rest = result.linear["prior"]["rest"]
+    assert np.array_equal(written, at_rest.poles)  # all digits
+    z = np.exp(1j * at_rest.response.omega * 0.02)[:, None]
+    product = np.prod(np.abs(z - at_rest.zeros), axis=1) / np.prod(np.abs(z - at_rest.poles), axis=1)
     # Poles and zeros are the response but for a factor; near the Nyquist frequency it is 1e-3 of the largest.
-    assert np.ptp(size[0, 0] / product) < 1e-9 * np.max(size[0, 0] / product)
-    kept = json.loads((tmp_path / "analysis.json").read_text())
-    assert kept["equilibria"]["prior"]["points"][0]["stability"] == "stable"
+    factor = at_rest.response.magnitude[0, 0] / product
+    assert np.ptp(factor) < 1e-9 * np.max(factor)
+    numbers = json.loads((tmp_path / "analysis.json").read_text())
+    assert numbers["equilibria"]["prior"]["points"][0]["stability"] == "stable"
+    with np.load(tmp_path / "curves.npz") as curves:
+        assert np.array_equal(curves["linear/prior/rest/poles"], at_rest.poles)
     for picture in (tmp_path / "figures").glob("*.png"):
         with Image.open(picture) as image:
             assert min(image.size) > 300
+
+
+def test_every_number_of_the_page_has_a_unit(prior_alone):
+    given = replace(prior_alone, ocp=make_ocp(prior_alone.models["prior"], scenario.control))
+    result = replace(
+        analyze_models(replace(given, plant=None)), loops=Missing("none"), sensitivity=Missing("none")
+    )
+    tables = tables_of(given, result)
+    assert set(tables) == {"equilibria", "friction", "modes", "gain_schedule", "memory"}
+    words = {"model", "point", "stability", "hits", "contraction certified", "positions that no input holds"}
+    for table in tables.values():
+        assert all(column.endswith("]") for column in table.columns if column not in words), table.columns
+    assert tables["gain_schedule"].columns[2] == "gain of phi, lowest [N m/rad]"
 
 
 def test_recordings_are_taken_before_the_simulated_machine(golf_artifact, prior_alone, tmp_path):
@@ -88,15 +106,15 @@ def test_recordings_are_taken_before_the_simulated_machine(golf_artifact, prior_
     phi = run_model(model, [0.0, 0.0])(u)
     file = write_csv(tmp_path / "run.csv", {"time_s": t, "u_nm": u, "phi_rad": phi})
     folder = noisy(golf_artifact, tmp_path)
-    subject, notes = subject_of(Request(folder, "golf_robot", (file,)))
-    assert len(subject.recordings) == 1
+    given, notes = analysis_input(AnalysisSettings(folder, "golf_robot", (file,)))
+    assert len(given.recordings) == 1
     assert "the model's own" in notes[1]
-    assert set(subject.filters) == {(m, f) for m in ("prior", "hybrid") for f in ("quiet", "jump")}
-    result, curves = measured_part(replace(prior_alone, recordings=subject.recordings))
+    assert set(given.filters) == {(m, f) for m in ("prior", "hybrid") for f in ("quiet", "jump")}
+    found = responses_of(replace(prior_alone, recordings=given.recordings))
     # The "machine" is the model itself, but for its first speed, which is smoothed from the recording.
-    assert result["prior"]["median_relative_error"] < 0.02
-    assert np.median(curves["measured/coherence"][:20]) > 0.9
-    assert "1 recordings" in result["source"]
+    assert found.errors["prior"].median < 0.02
+    assert np.median(found.machine.coherence[:20]) > 0.9
+    assert "1 recordings" in found.source
 
 
 def test_a_folder_alone_has_loops_where_it_holds_what_they_need(golf_artifact, tmp_path):
@@ -104,13 +122,21 @@ def test_a_folder_alone_has_loops_where_it_holds_what_they_need(golf_artifact, t
     note = read_description(folder)
     anonymous = replace(note, loop=loop_settings(scenario), provenance=replace(note.provenance, scenario=""))
     write_description(folder, anonymous)
-    subject, notes = subject_of(Request(folder))
-    assert subject.filters == {}
+    given, notes = analysis_input(AnalysisSettings(folder))
+    assert given.filters == {}
     assert "holds no process noise" in notes[1]
     set_process_noise(folder, {name: [1e-4, 2e-2] for name in ("prior_observer", "hybrid_observer")})
-    subject, notes = subject_of(Request(folder))
-    assert set(subject.filters) == {(m, f) for m in ("prior", "hybrid") for f in ("quiet", "jump")}
+    given, notes = analysis_input(AnalysisSettings(folder))
+    assert set(given.filters) == {(m, f) for m in ("prior", "hybrid") for f in ("quiet", "jump")}
     assert notes[1] == "filters' noise: the model's own"
+
+
+def test_the_command_of_the_page_repeats_the_analysis(tmp_path):
+    data = tmp_path / "a run.csv"
+    settings = AnalysisSettings(tmp_path / "model", "golf_robot", (data,), 0.25)
+    assert command(settings, tmp_path / "out") == (
+        f"hybrid-mpc analyze {tmp_path}/model --out {tmp_path}/out --scenario golf_robot --data '{data}' --speed 0.25"
+    )
 
 
 def test_without_python_control_it_is_said_what_to_install(monkeypatch):
@@ -119,21 +145,13 @@ def test_without_python_control_it_is_said_what_to_install(monkeypatch):
         control_toolbox()
 
 
-MODULES = sorted(m.name for m in pkgutil.iter_modules(hybrid_mpc.analyze.__path__, "hybrid_mpc.analyze."))
-
-
-@pytest.mark.parametrize("name", [*MODULES, *(f"hybrid_mpc.plots.analysis_{m}" for m in ("loops", "models"))])
-def test_examples(name):
-    assert doctest.testmod(importlib.import_module(name)).failed == 0
-
-
 def test_what_does_not_fit_is_refused(golf_artifact, tmp_path):
     with pytest.raises(InputError, match="needed is an artifact folder"):
-        subject_of(Request(tmp_path))
+        analysis_input(AnalysisSettings(tmp_path))
     with pytest.raises(InputError, match="--scenario"):
-        subject_of(Request(golf_artifact, data=(tmp_path / "a.csv",)))
+        analysis_input(AnalysisSettings(golf_artifact, data=(tmp_path / "a.csv",)))
     with pytest.raises(InputError, match="positive"):
-        subject_of(Request(golf_artifact, speed=0.0))
+        analysis_input(AnalysisSettings(golf_artifact, speed=0.0))
 
 
 @pytest.mark.full
@@ -160,18 +178,18 @@ def test_the_command_analyses_prior_and_hybrid_with_their_loops(golf_artifact, t
 @pytest.mark.full
 def test_the_delay_that_the_margins_allow_is_the_delay_that_the_rig_stands(golf_artifact, tmp_path):
     folder = noisy(golf_artifact, tmp_path)
-    subject, _ = subject_of(Request(folder, "golf_robot"))
-    filters = {key: f for key, f in subject.filters.items() if key[0] == "prior"}
-    subject = replace(subject, models={"prior": subject.models["prior"]}, filters=filters)
-    loops, _ = loops_part(subject, {"prior": (np.zeros(2), np.zeros(0))})
-    controller = make_controller(subject.models["prior"], subject.models["prior"], scenario.control)
+    given, _ = analysis_input(AnalysisSettings(folder, "golf_robot"))
+    filters = {key: f for key, f in given.filters.items() if key[0] == "prior"}
+    given = replace(given, models={"prior": given.models["prior"]}, filters=filters)
+    loops = loops_of(given, {"prior": (np.zeros(2), np.zeros(0))})
+    controller = make_controller(given.models["prior"], given.models["prior"], scenario.control)
     task = next(t for t in scenario.tasks if t.name == "track_sine")
     for mode in ("quiet", "jump"):
-        allowed = loops["prior on prior"]["driven"][mode]["margins"]["delay_periods"]
+        allowed = loops["prior on prior"]["driven"][mode].margins.delay_periods
         restless = []
         for delay in (0, allowed, allowed + 1):
             run = simulate(
-                scenario.plant(), subject.filters["prior", mode], controller, task.reference, dt=0.02, duration=4.0,
+                scenario.plant(), given.filters["prior", mode], controller, task.reference, dt=0.02, duration=4.0,
                 x0=np.array(task.x0), seed=0, input_delay=delay,
             )  # fmt: skip
             restless.append(np.sqrt(np.mean(np.diff(run.u[50:, 0]) ** 2)))

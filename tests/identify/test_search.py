@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from simulated_pendulum import TRUTH, Pendulum, record
 
-from hybrid_mpc import InputError, SearchSpace, TrainingSettings, search, train
+from hybrid_mpc import InputError, SearchSpace, TrainingSettings, train, tune
 from hybrid_mpc.identify import tune as module
 from hybrid_mpc.identify.tune import _without_default, parsed_space
 
@@ -49,7 +49,7 @@ def quick(monkeypatch):
 
 
 def run(data, storage, trials=TRIALS, base=BASE, space=SPACE, **options):
-    return search(PRIOR, *data, base, space, trials=trials, storage=storage, **options)
+    return tune(PRIOR, *data, base, space, trials=trials, storage=storage, **options)
 
 
 def core(result):
@@ -195,7 +195,7 @@ def test_a_journal_of_another_search_is_refused_by_what_differs(whole, data):
             run(**({"data": data} | arguments), storage=storage)
         assert storage.read_bytes() == before
     with pytest.raises(InputError, match=r"\(prior differ\)"):
-        search(Pendulum(TRUTH | {"d": 0.06}), *data, BASE, SPACE, trials=2, storage=storage)
+        tune(Pendulum(TRUTH | {"d": 0.06}), *data, BASE, SPACE, trials=2, storage=storage)
 
 
 @pytest.mark.parametrize("content", ["not json\nat all\n", '{"a": 1}\n', "[1]\n[2]\n"])

@@ -16,7 +16,7 @@ from hybrid_mpc import (
 from hybrid_mpc.identify.delay import Physics
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.job.benchmark import refitted
-from hybrid_mpc.job.benchmark_runs import figures_of, pieces, read_test, run_freely
+from hybrid_mpc.job.benchmark_runs import pieces, read_test, run_error, run_freely
 from hybrid_mpc.kit.artifact import build_model
 from hybrid_mpc.monitor.calibrate import calibrate, with_residual
 from hybrid_mpc.monitor.replay import judge
@@ -65,7 +65,7 @@ def machines(tmp_path_factory):
 def rmse(physics, trajectory):
     prior = scenario.prior(physics.fit.values)
     runs = run_freely(prior, physics, {}, [trajectory], warm_up=scenario.data.warm_up, length=2.5)
-    return figures_of(runs, "phy", unit="rad", scale=1.0)["rmse"]
+    return run_error(runs, "phy", scenario.benchmark).rmse
 
 
 def test_three_seconds_make_the_prior_know_the_heavier_mass(machines):

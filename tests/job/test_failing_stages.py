@@ -59,5 +59,5 @@ def test_a_full_disk_is_no_reason_to_go_on(call, arguments, finished, tmp_path, 
     code, _, message = call(*arguments, "--out", out, "--resume")
     assert code == 2
     assert "No space left" in message
-    assert "finished stages are kept: the same command with --resume goes on" in message
+    assert "finished stages are saved: the same command with --resume goes on" in message
     assert not (out / "checkpoints" / "monitor.json").exists()

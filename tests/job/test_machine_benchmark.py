@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from cart import DELAY, TRUE, recording, written
 
-from hybrid_mpc import BenchmarkBudget, InputError, load_scenario
+from hybrid_mpc import BenchmarkBudget, BenchmarkSpec, InputError, load_scenario
 from hybrid_mpc.files import read_document, write_document
 from hybrid_mpc.identify.dataset import cut_windows
 from hybrid_mpc.identify.delay import fit_physics, shifted
-from hybrid_mpc.job.benchmark import BenchmarkSettings, benchmark, load_model
-from hybrid_mpc.job.benchmark import benchmark as networks
-from hybrid_mpc.job.benchmark_runs import figures_of, read_test, read_training, run_freely
+from hybrid_mpc.job import benchmark as benchmark_job
+from hybrid_mpc.job.benchmark import BenchmarkSettings, benchmark, load_model, training_settings
+from hybrid_mpc.job.benchmark_runs import BenchmarkRun, read_test, read_training, run_error, run_freely
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def trained_here():
             function(*arguments, lambda *told, name=name: on_progress(name, *told))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(networks, "run_jobs", one_by_one)
+        patch.setattr(benchmark_job, "run_jobs", one_by_one)
         yield
 
 
@@ -40,8 +40,7 @@ def made(machine, tmp_path_factory):
     scenario, train, test = machine
     out = tmp_path_factory.mktemp("out") / "run"
     settings = BenchmarkSettings(str(scenario), (train,), (test,))
-    results, runs = benchmark(settings, out)
-    return out, results, runs
+    return out, benchmark(settings, out)
 
 
 def test_the_delay_and_the_parameters_are_found(machine):
@@ -57,20 +56,22 @@ def test_the_delay_and_the_parameters_are_found(machine):
 
 
 def test_a_test_file_is_judged_after_what_is_given_and_on_nothing_before(machine, made):
-    out, results, runs = made
-    assert set(results["test"]) == {"test.csv"}
-    run = runs["test.csv"][0]
+    out, results = made
+    (name,), (row,) = results.test, results.test.values()
+    assert name == "test.csv"
+    run = row.runs[0]
     # 10 periods of warm-up: 11 samples are given, the next one is the first that counts
     assert run.t[0] == pytest.approx(1.1)
     assert len(run.t) == 400 - 11 - 1  # the last sample's input has no period after it
-    row = results["test"]["test.csv"]
-    assert set(row) == {"phy", "rnn", "pgrnn", "mopgrnn", "hybrid", "scored_s"}
-    for name in ("phy", "hybrid"):
-        assert row[name]["unit"] == "mm"
-        assert 0 < row[name]["relative"] < 0.3  # the prior knows the machine but for its cubic spring
+    assert set(row.errors) == {"phy", "rnn", "pgrnn", "mopgrnn", "hybrid"}
+    for model in ("phy", "hybrid"):
+        assert row.errors[model].unit == "mm"
+        assert 0 < row.errors[model].relative < 0.3  # the prior knows the machine but for its cubic spring
     error = 1e3 * (run.y_hat["phy"] - run.y)[:, 0]
-    assert row["phy"]["rmse"] == pytest.approx(np.sqrt(np.mean(error**2)))
-    assert json.loads((out / "results.json").read_text())["test"]["test.csv"]["phy"] == row["phy"]
+    assert row.errors["phy"].rmse == pytest.approx(np.sqrt(np.mean(error**2)))
+    written = json.loads((out / "results.json").read_text())
+    assert written["test"]["test.csv"]["phy"] == vars(row.errors["phy"])
+    assert written["data"]["seconds"]["train"] > written["data"]["seconds"]["valid"] > 0
 
 
 def test_nothing_after_the_warm_up_is_known_to_a_free_run(machine, made, tmp_path):
@@ -93,40 +94,39 @@ def test_nothing_after_the_warm_up_is_known_to_a_free_run(machine, made, tmp_pat
 
 
 def test_the_recommended_model_is_best_on_validation_and_on_runs_of_full_length(made):
-    _, results, _ = made
-    validation, long = (results["model"]["validation"][key] for key in ("rmse", "long_rmse"))
+    model = made[1].model
+    validation, long = model.validation, model.long
     names = ("phy", "pgrnn", "mopgrnn", "pgrnn mean", "mopgrnn mean")
     worse = {n: max(part[n] / part["phy"] for part in (validation, long)) for n in names}
-    assert results["model"]["hybrid"] == min(worse, key=worse.get)
+    assert model.hybrid == min(worse, key=worse.get)
 
 
 def test_networks_are_trained_with_what_the_budget_says():
     budget = BenchmarkBudget(4, 2, teacher_steps=5, free_run_steps=5, horizon=10, decay=7.0, prior_replay=3.0)
-    settings = networks.settings_of("pgrnn", budget, seed=1, warm=4)
+    settings = training_settings("pgrnn", budget, seed=1, warm=4)
     assert (settings.decay, settings.prior_replay, settings.seed, settings.warm) == (7.0, 3.0, 1, 4)
 
 
 def test_a_model_made_before_gives_the_same_figures_and_an_interrupted_run_goes_on(machine, made, tmp_path):
     scenario, train, test = machine
-    out, results, _ = made
-    again, _ = benchmark(BenchmarkSettings(str(scenario), test=(test,), model=out), tmp_path / "again")
-    assert again["test"] == results["test"]
+    out, results = made
+    again = benchmark(BenchmarkSettings(str(scenario), test=(test,), model=out), tmp_path / "again")
+    assert again.test["test.csv"].errors == results.test["test.csv"].errors
     (out / "checkpoints" / "pgrnn.json").unlink()  # as if it had been killed before this was written
     (out / "checkpoints" / "pgrnn.npz").unlink()
-    resumed, _ = benchmark(BenchmarkSettings(str(scenario), (train,), (test,)), out)
-    assert resumed["test"] == results["test"]
+    resumed = benchmark(BenchmarkSettings(str(scenario), (train,), (test,)), out)
+    assert resumed.test["test.csv"].errors == results.test["test.csv"].errors
 
 
 def test_a_changed_machine_is_known_again_after_a_few_seconds(machine, made, tmp_path):
     scenario, _, _ = machine
     changed = recording(tmp_path / "changed.csv", seed=2, seconds=40.0, k=7.0)
     settings = BenchmarkSettings(str(scenario), test=(changed,), model=made[0], refit=10.0)
-    results, _ = benchmark(settings, tmp_path / "judged")
-    found = results["test"]["changed.csv"]["refit"]
-    values = {row["parameter"]: row["fitted"] for row in found["prior"]}
+    found = benchmark(settings, tmp_path / "judged").test["changed.csv"].refit
+    values = {row["parameter"]: row["fitted"] for row in found.prior}
     assert 7.0 < values["k"] < 7.75  # the cubic spring counts as at most 3 * 0.5 * 0.7^2 more
     for name in ("phy", "hybrid"):
-        assert found["after"][name]["rmse"] < 0.25 * found["before"][name]["rmse"]
+        assert found.after[name].rmse < 0.25 * found.before[name].rmse
     with pytest.raises(InputError, match="longer than it"):
         benchmark(
             BenchmarkSettings(str(scenario), test=(changed,), model=made[0], refit=50.0), tmp_path / "no"
@@ -143,11 +143,9 @@ def test_the_delay_takes_samples_from_the_start_only(machine):
 
 
 def test_a_diverging_run_is_infinite_and_not_nan():
-    from hybrid_mpc.job.benchmark_runs import Run
-
     y = np.array([[0.0], [1.0]])
-    run = Run("run", np.arange(2.0), y, y, {"rnn": np.array([[0.0], [np.nan]])})
-    assert figures_of([run], "rnn", unit="rad", scale=1.0)["rmse"] == float("inf")
+    run = BenchmarkRun("run", np.arange(2.0), y, y, {"rnn": np.array([[0.0], [np.nan]])})
+    assert run_error([run], "rnn", BenchmarkSpec()).rmse == float("inf")
 
 
 @pytest.fixture

@@ -72,7 +72,7 @@ def free_run_figure():
     measured = 0.03 * np.sin(2.4 * t) ** 2 + 0.004 * rng.standard_normal(len(t))
     model = 0.028 * np.sin(2.4 * t + 0.1) ** 2
     return fit.free_run(
-        t, x, runs, u, states=STATES, inputs=INPUTS, energy_measured=measured, energy_model=model, warm_up=0.5
+        t, x, runs, u, states=STATES, inputs=INPUTS, energy_measured=measured, energy_model=model
     )
 
 
@@ -175,7 +175,14 @@ def guard_figure():
         t, t, t, 0.02 * late, 0.01 * late, 0.1 * late, scores[:, 0] > 1, 0.2 * late, late, late < 0, scores
     )
     marks = ((3.0, "friction doubles"), (3.1, "guard: rest"))
-    return overview(seen, np.sin(2 * t), output=OUTPUTS[0], marks=marks, title="something breaks at 3 s")
+    return overview(
+        seen,
+        np.sin(2 * t),
+        output=OUTPUTS[0],
+        force_unit="J/rad",
+        marks=marks,
+        title="something breaks at 3 s",
+    )
 
 
 FIGURES = {

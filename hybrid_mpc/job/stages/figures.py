@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from hybrid_mpc.identify.settings import KINDS
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.loops import summaries, tasks_of
+from hybrid_mpc.job.monitor import force_unit
 from hybrid_mpc.job.stage import Absent
 from hybrid_mpc.job.stages.analyze import ANALYSIS
 from hybrid_mpc.job.stages.compare import CONTROL
@@ -20,7 +21,6 @@ from hybrid_mpc.job.stages.guard import GUARD, read_trace
 from hybrid_mpc.job.stages.identify import EVALUATION, MODELS, trained_models
 from hybrid_mpc.job.stages.monitor import MONITOR, clean_windows
 from hybrid_mpc.job.stages.results import REPORTED, step_times
-from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.plots import analysis, animation, data, estimation, fit, loops, monitor
 from hybrid_mpc.plots.style import save
 
@@ -250,7 +250,7 @@ def _monitor(context: Context) -> Any:
             own["y"],
             output=output,
             windows=clean_windows(context, recording, ("train", "valid", "test", "nominal")),
-            residual=(own["residual_level"], force, force_unit(output)),
+            residual=(own["residual_level"], force, force_unit(context.kit.models["prior"])),
             title=recording.name,
         )
         name = recording.name.replace("#", "-")
@@ -322,7 +322,7 @@ def guard_figures(context: Context) -> Iterator[tuple[str, str, Figure, str]]:
     if isinstance(found, Absent) or not (found.faults or found.shown):
         return
     arrays, output = found.arrays, context.scenario.prior().outputs[0]
-    unit = force_unit(output)
+    unit = force_unit(context.kit.models["prior"])
     for row in found.faults or ():
         marks = [
             (row.start_s, row.title),
@@ -351,13 +351,3 @@ def guard_figures(context: Context) -> Iterator[tuple[str, str, Figure, str]]:
             by = "monitor, which has no thresholds"
         caption = f"The recording {found.shown}, of which test data come, by the {by}."
         yield "guard", "guard_recorded", figure, caption
-
-
-def force_unit(output: Signal) -> str:
-    """Unit of a residual force: energy over the unit of what it acts on; J/rad is N m, J/m is N.
-
-    Example:
-        >>> force_unit(Signal("phi", "rad"))
-        'J/rad'
-    """
-    return f"J/{output.unit}"

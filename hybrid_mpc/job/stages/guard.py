@@ -240,12 +240,12 @@ def faulted(
         samples = Samples(result.t, result.y, result.u)
         trace, alarms = explained(monitor, bench.parts(spec)[0], samples, causes, prior=kit.models["prior"])
         after = np.flatnonzero(trace.alarm & (trace.t >= start - 1e-9))
-        seen = [alarm for alarm in alarms if alarm["end_s"] >= start - 1e-9]
+        seen = [alarm for alarm in alarms if alarm.end_s >= start - 1e-9]
         loops.append(
             FaultedLoop(
                 case.name, case.title, case.target, case.value, task.name, start,
                 float(trace.t[after[0]]) - start if after.size else None,
-                seen[0]["diagnosis"] if seen else "",
+                seen[0].diagnosis if seen else "",
                 len(alarm_intervals(trace.alarm[trace.t < start - 1e-9], 1.0)),
                 tuple(row.switches),
             )
@@ -545,7 +545,7 @@ def _recorded(
         trace, alarms = explained(
             monitor, estimator, recording, context.scenario.causes, say, prior=kit.models["prior"]
         )
-        found += [ExplainedAlarm(recording.name, **alarm) for alarm in alarms]
+        found += [ExplainedAlarm(recording.name, **vars(alarm)) for alarm in alarms]
         edges = np.diff(trace.alarm.astype(int), prepend=0) == 1
         for window in clean_windows(context, recording, ("test",)):
             inside = _settled(recording.t, *window, model)

@@ -397,7 +397,7 @@ def training_stage(context: Context) -> TrainingResult:
     todo = [k for k in reversed(KINDS) if not is_trained(folder, training_settings(context, k))]
     jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
         kind: (
-            _train_kind,
+            train_kind,
             (context.settings.scenario, values, context.smoothed("train"), context.smoothed("valid"),
              training_settings(context, kind), folder, context.settings.device),
         )
@@ -501,7 +501,7 @@ def training_settings(context: Context, kind: str) -> TrainingSettings:
     return replace(settings, **context.settings.network())
 
 
-def _train_kind(
+def train_kind(
     scenario: str,
     values: dict[str, float],
     training: Sequence[Trajectory],
@@ -522,7 +522,7 @@ def _train_kind(
         settings,
         checkpoint=folder / f"{settings.kind}.safetensors",
         device=device,
-        on_progress=lambda done, total, error: report(done, total, f"validation E_sim {error:.4g}"),
+        on_progress=lambda done, total, error: report(done, total, f"validation error {error:.4g}"),
     )
     save_trained(folder, trained)
 

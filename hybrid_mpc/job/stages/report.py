@@ -14,12 +14,13 @@ from hybrid_mpc.files import write_json
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.controllers import CONTENDERS
 from hybrid_mpc.job.loops import Summary
+from hybrid_mpc.job.monitor import force_unit
 from hybrid_mpc.job.stage import Stage, source_of
 from hybrid_mpc.job.stages.analyze import ANALYSIS
 from hybrid_mpc.job.stages.compare import CONTROL
 from hybrid_mpc.job.stages.estimate import ESTIMATION, OBSERVERS
 from hybrid_mpc.job.stages.export import EXPORT
-from hybrid_mpc.job.stages.figures import OBSERVER_TITLES, Figures, draw_all, force_unit
+from hybrid_mpc.job.stages.figures import OBSERVER_TITLES, Figures, draw_all
 from hybrid_mpc.job.stages.guard import GUARD, FaultedLoop
 from hybrid_mpc.job.stages.identify import (
     DATA,
@@ -705,7 +706,7 @@ def _alarm_table(context: Context, monitor: Monitor) -> Table | None:
     if monitor.alarms is None or calibration is None:
         return None
     rows = [(a.file, a.start_s, a.end_s) for a in monitor.alarms]
-    unit = force_unit(context.scenario.prior().outputs[0])
+    unit = force_unit(context.kit.models["prior"])
     caption = (
         f"Alarms over the whole recordings; thresholds {calibration.threshold_w:.3g} W and "
         f"{calibration.residual_threshold:.3g} {unit}."

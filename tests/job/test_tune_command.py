@@ -1,37 +1,26 @@
-"""``hybrid-mpc search``: its files, resuming, what it refuses, and a run with the settings found."""
+"""``hybrid-mpc tune``: its files, resuming, what it refuses, and a run with the settings found."""
 
 import csv
 import dataclasses
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from hybrid_mpc import InputError, RunSettings, SearchSpace, load_scenario
-from hybrid_mpc.cli.main import main
+from hybrid_mpc.cli.main import app
 from hybrid_mpc.files import LOCK
 from hybrid_mpc.identify.tune import parsed_space
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.folder import open_folder
 from hybrid_mpc.job.settings import claim, read_network
 from hybrid_mpc.job.stages.identify import training_settings
-from hybrid_mpc.job.tune import SearchSettings, usage
+from hybrid_mpc.job.tune import TuneSettings, usage
 
 pytestmark = pytest.mark.full  # these share one search of 20 s
 PNG = b"\x89PNG"
-
-
-def called(*words):
-    """Exit code of the command line in this process."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["hybrid-mpc", *map(str, words)])
-        try:
-            main()
-        except SystemExit as stop:
-            return stop.code or 0
-    return 0
 
 
 @pytest.fixture(scope="module")
@@ -39,13 +28,14 @@ def words(machine):
     """A search of two trials on one recording without its --out."""
     data = ["--data", machine / "monday.csv"]
     vary = ["--vary", "hidden=2:8", "--vary", "horizon=20:60", "--vary", "learning_rate"]
-    return ["search", machine / "my_machine.py", *data, *vary]
+    return ["tune", machine / "my_machine.py", *data, *vary]
 
 
 @pytest.fixture(scope="module")
 def searched(words, tmp_path_factory):
     out = tmp_path_factory.mktemp("search") / "out"
-    assert called(*words, "--trials", 2, "--out", out) == 0
+    done = CliRunner().invoke(app, [*map(str, words), "--trials", "2", "--out", str(out)])
+    assert done.exit_code == 0, done.output
     return out
 
 
@@ -55,7 +45,7 @@ def trials(results):
 
 def test_it_leaves_settings_a_table_and_figures(searched, machine):
     results = json.loads((searched / "results.json").read_text())
-    assert (results["schema"], results["kind"], len(results["trials"])) == ("hybrid-mpc search", "mopgrnn", 2)
+    assert (results["schema"], results["kind"], len(results["trials"])) == ("hybrid-mpc tune", "mopgrnn", 2)
     assert results["base_value"] == results["trials"][0]["value"] >= results["best"]["value"]
     with (searched / "trials.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -64,10 +54,10 @@ def test_it_leaves_settings_a_table_and_figures(searched, machine):
     settings = json.loads((searched / "settings.json").read_text())
     assert settings == results["settings"]
     assert set(settings) == {"hidden", "horizon", "learning_rates", "validation_horizon"}
-    for name in ("search_history.png", "search_settings.png"):
+    for name in ("tune_history.png", "tune_settings.png"):
         assert (searched / "figures" / name).read_bytes().startswith(PNG)
     assert {p.name for p in searched.iterdir()} - {LOCK} == {
-        "run.json", "checkpoints", "search.jsonl", "results.json", "settings.json", "trials.csv", "figures",
+        "run.json", "checkpoints", "tune.jsonl", "results.json", "settings.json", "trials.csv", "figures",
     }  # fmt: skip
     # a run with this file trains what the best trial trained
     settings = RunSettings(str(machine / "my_machine.py"), network_file=searched / "settings.json")
@@ -82,11 +72,11 @@ def test_it_leaves_settings_a_table_and_figures(searched, machine):
     assert used == best
 
 
-def test_a_search_goes_on_with_more_trials(searched, words, tmp_path, capsys):
+def test_a_search_goes_on_with_more_trials(searched, words, tmp_path, call):
     out = tmp_path / "out"
     shutil.copytree(searched, out)
-    assert called(*words, "--trials", 3, "--out", out, "--resume") == 0
-    told = capsys.readouterr().out
+    code, told, _ = call(*words, "--trials", 3, "--out", out, "--resume")
+    assert code == 0
     assert f"--settings {out}/settings.json" in told
     assert "best: trial" in told
     before, after = (json.loads((d / "results.json").read_text()) for d in (searched, out))
@@ -94,7 +84,7 @@ def test_a_search_goes_on_with_more_trials(searched, words, tmp_path, capsys):
     assert len(after["trials"]) == 3
 
 
-def test_what_is_refused(searched, words, arguments, tmp_path, capsys):
+def test_what_is_refused(searched, words, arguments, tmp_path, call):
     new = ["--out", tmp_path / "new"]
     for given, message in (
         ([*words, "--out", searched], "already holds a run"),
@@ -110,8 +100,9 @@ def test_what_is_refused(searched, words, arguments, tmp_path, capsys):
         ([*words, *new, "--budget", "huge"], "no budget 'huge'"),
         ([*arguments, *new, "--settings", tmp_path / "none.json"], "none.json is missing"),
     ):
-        assert called(*given) == 2, given
-        assert message in capsys.readouterr().err.replace("\n", " "), given
+        code, _, told = call(*given)
+        assert code == 2, given
+        assert message in told, given
         assert not list(tmp_path.iterdir())
 
 
@@ -150,19 +141,12 @@ def test_a_run_without_such_a_file_is_what_it_has_always_been(tmp_path):
     assert (plain.hidden, plain.horizon, plain.batch, plain.validation_horizon) == (16, 50, 32, None)
 
 
-def test_a_search_without_anchors_is_what_it_has_always_been():
-    assert "prior_replay" not in SearchSettings("golf_robot").identity()["space"]
-    assert SearchSettings("golf_robot", space=parsed_space(["prior_replay"])).identity()["space"][
-        "prior_replay"
-    ] == (
-        0.3,
-        300.0,
-    )
-    with pytest.raises(InputError, match="an rnn has no prior to be anchored to"):
-        SearchSettings("golf_robot", kind="rnn", space=parsed_space(["prior_replay"]))
+def test_an_rnn_has_no_prior_to_replay():
+    with pytest.raises(InputError, match="an rnn has no prior to replay"):
+        TuneSettings("golf_robot", kind="rnn", space=parsed_space(["prior_replay"]))
 
 
-def test_anchors_reach_the_training_from_budget_and_file(tmp_path):
+def test_prior_replay_reaches_the_training_from_budget_and_file(tmp_path):
     scenario = load_scenario("unbalanced_disk")
     plain = training_settings(Context(RunSettings("unbalanced_disk"), scenario, tmp_path), "mopgrnn")
     assert plain.prior_replay == 10.0
@@ -191,7 +175,7 @@ def test_a_run_is_bound_to_the_content_of_its_file(tmp_path):
 
 
 def test_the_line_to_use_it():
-    settings = SearchSettings("a b.py", seed=3, budget="full", time="t")
+    settings = TuneSettings("a b.py", seed=3, budget="full", time="t")
     assert usage(settings, Path("runs/s")) == (
         "hybrid-mpc run 'a b.py' --time-column t --seed 3 --budget full --settings runs/s/settings.json "
         "--out runs/s-run"

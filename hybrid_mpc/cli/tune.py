@@ -1,28 +1,31 @@
-"""``hybrid-mpc search``: settings of the networks, judged by validation."""
+"""``hybrid-mpc tune``: settings of the networks, chosen by validation."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hybrid_mpc.cli.options import InputColumns, OutputColumns, Recordings, ScenarioName, TimeColumn
 from hybrid_mpc.records import MOST_SEED
 
+if TYPE_CHECKING:
+    from hybrid_mpc.identify.tune import SearchResult
+
 EXAMPLES = (
     "Examples:\n\n"
-    "  hybrid-mpc search golf_robot --out runs/search\n\n"
-    "  hybrid-mpc search golf_robot --trials 40 --vary hidden=8:64 --vary horizon=25:100 --out runs/search\n\n"
-    "  hybrid-mpc search my_machine.py --data mine.csv --timeout 3600 --out runs/search --resume\n\n"
-    "  hybrid-mpc run golf_robot --settings runs/search/settings.json --out runs/golf"
+    "  hybrid-mpc tune golf_robot --out runs/tune\n\n"
+    "  hybrid-mpc tune golf_robot --trials 40 --vary hidden=8:64 --vary horizon=25:100 --out runs/tune\n\n"
+    "  hybrid-mpc tune my_machine.py --data mine.csv --timeout 3600 --out runs/tune --resume\n\n"
+    "  hybrid-mpc run golf_robot --settings runs/tune/settings.json --out runs/golf"
 )
 
 
-def search(
+def tune(
     scenario: ScenarioName,
     data: Recordings = None,
-    out: Annotated[Path | None, typer.Option(help="Folder to make. Default: runs/search-SCENARIO.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder to make. Default: runs/tune-SCENARIO.")] = None,
     trials: Annotated[int, typer.Option(help="Trainings in all.", min=1)] = 20,
     budget: Annotated[str, typer.Option(help="Effort of a training: quick or full.")] = "quick",
     kind: Annotated[str, typer.Option(help="rnn, pgrnn or mopgrnn.")] = "mopgrnn",
@@ -45,12 +48,12 @@ def search(
     output_column: OutputColumns = None,
 ) -> None:
     """Search hidden units and other settings of the networks by the validation error of free runs."""
-    from hybrid_mpc.cli.progress import make_progress
+    from hybrid_mpc.cli.progress import make_progress, print_summary
     from hybrid_mpc.identify.tune import parsed_space
-    from hybrid_mpc.job.tune import SearchSettings, run_search, usage
+    from hybrid_mpc.job.tune import TuneSettings, run_tuning, usage
 
-    folder = out or Path("runs") / f"search-{Path(scenario).stem}"
-    settings = SearchSettings(
+    folder = out or Path("runs") / f"tune-{Path(scenario).stem}"
+    settings = TuneSettings(
         scenario,
         tuple(data or ()),
         seed,
@@ -62,28 +65,22 @@ def search(
         space=parsed_space(vary or ()),
     )
     with make_progress() as progress:
-        results = run_search(
-            settings, folder, trials=trials, timeout=timeout, resume=resume, progress=progress
-        )
-    for line in summary(results):
-        print(line)
-    print(f"results: {(folder / 'results.json').resolve()}")
+        found = run_tuning(settings, folder, trials=trials, timeout=timeout, resume=resume, progress=progress)
+    print_summary(summary(found, settings.space.names), folder / "results.json")
     print(f"a run with these settings: {usage(settings, folder)}")
 
 
-def summary(results: dict[str, Any]) -> list[str]:
+def summary(found: SearchResult, names: tuple[str, ...]) -> list[str]:
     """One line a trial, then the best.
 
     Args:
-        results: What results.json holds.
+        found: The search's result.
+        names: Searched settings.
     """
-    names = list(results["space"])
     lines = ["  ".join(["trial", f"{'state':8}", f"{'E_sim':>8}", "   s", *names])]
-    for row in results["trials"]:
-        values = [f"{row['values'][name]:>{len(name)}.3g}" for name in names]
-        head = [f"{row['number']:5}", f"{row['state']:8}", f"{row['value']:8.4g}", f"{row['duration']:4.0f}"]
+    for row in found.trials:
+        values = [f"{row.values[name]:>{len(name)}.3g}" for name in names]
+        head = [f"{row.number:5}", f"{row.state:8}", f"{row.value:8.4g}", f"{row.duration:4.0f}"]
         lines.append("  ".join(head + values))
-    best, base = results["best"], results["base_value"]
-    against = "" if base is None else f"; the settings it started from {base:.4g}"
-    lines.append(f"best: trial {best['number']} with {best['value']:.4g} on validation{against}")
-    return lines
+    base = "" if found.base is None else f"; first settings {found.base:.4g}"
+    return [*lines, f"best: trial {found.best.number} with {found.best.value:.4g} on validation{base}"]

@@ -1,6 +1,7 @@
 """Figures of a search: what lies where, and what cannot be drawn."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,16 +10,15 @@ from hybrid_mpc import InputError
 from hybrid_mpc.plots.tune import STATES, history, settings
 
 ROWS = [
-    {"number": n, "state": state, "value": value, "values": {"hidden": 4 * 2**n, "decay": 10.0**n}}
+    SimpleNamespace(number=n, state=state, value=value, values={"hidden": 4 * 2**n, "decay": 10.0**n})
     for n, (state, value) in enumerate(
         [("complete", 0.3), ("diverged", math.inf), ("complete", 0.5), ("pruned", 0.6), ("complete", 0.1)]
     )
 ]
 
 
-def points(ax, state):
-    """Points of a state, in the order of the trials."""
-    (line,) = [line for line in ax.lines if line.get_label() == STATES[state][2]]
+def points(ax, label):
+    (line,) = [line for line in ax.lines if line.get_label() == STATES.get(label, ("", "", label))[2]]
     return np.column_stack(line.get_data()).tolist()
 
 
@@ -27,10 +27,8 @@ def test_every_trial_is_a_point_and_the_best_never_rises():
     assert points(ax, "complete") == [[0, 0.3], [2, 0.5], [4, 0.1]]
     assert points(ax, "pruned") == [[3, 0.6]]
     assert points(ax, "diverged") == [[1, ax.get_ylim()[1]]]
-    (best,) = [line for line in ax.lines if line.get_label() == "best so far"]
-    assert np.column_stack(best.get_data()).tolist() == [[0, 0.3], [2, 0.3], [4, 0.1]]
-    (base,) = [line for line in ax.lines if line.get_label() == "settings it started from"]
-    assert set(base.get_ydata()) == {0.3}
+    assert points(ax, "best so far") == [[0, 0.3], [2, 0.3], [4, 0.1]]
+    assert {y for _, y in points(ax, "settings it started from")} == {0.3}
 
 
 def test_a_panel_a_setting():
