@@ -15,7 +15,9 @@ import numpy as np
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import check_writable, digest, locked, read_document, write_document, write_json
-from hybrid_mpc.identify.delay import OutputErrorFit, Physics, cut_runs, fit_physics, shifted, smoothed
+from hybrid_mpc.identify.delay import shifted
+from hybrid_mpc.identify.output_error import OutputErrorFit, cut_runs
+from hybrid_mpc.identify.prior import Physics, fit_physics, smoothed
 from hybrid_mpc.identify.settings import KINDS, TrainingSettings
 from hybrid_mpc.identify.train import Trained, train
 from hybrid_mpc.job.benchmark_runs import (
@@ -488,7 +490,7 @@ def describe(model: BenchmarkModel, scenario: Scenario) -> dict[str, Any]:
         "hybrid": model.hybrid,
         "validation": {"unit": spec.unit, "rmse": dict(model.validation), "long_rmse": dict(model.long)},
         "networks": {kind: trained.validation for kind, trained in model.networks.items()},
-        "faults": {kind: [asdict(f) for f in trained.faults] for kind, trained in model.networks.items()},
+        "faults": {kind: [asdict(f) for f in trained.failures] for kind, trained in model.networks.items()},
     }
 
 

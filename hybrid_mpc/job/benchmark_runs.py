@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,18 +13,15 @@ from numpy.typing import NDArray
 from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.identify.delay import Physics, lost_samples, shifted
-from hybrid_mpc.identify.evaluate import judged
+from hybrid_mpc.identify.delay import lost_samples, shifted
+from hybrid_mpc.identify.evaluate import evaluation_trajectories, model_states
+from hybrid_mpc.identify.prior import Physics
 from hybrid_mpc.identify.settings import KINDS
 from hybrid_mpc.identify.step import PriorStep
-from hybrid_mpc.identify.train import Trained, stack_for, step_for
+from hybrid_mpc.identify.train import Trained
 from hybrid_mpc.machine.specification import BenchmarkSpec, Role
 from hybrid_mpc.machine.torch_prior import Prior
 from hybrid_mpc.scenario import Scenario
-
-if TYPE_CHECKING:
-    from torch import Tensor, nn
-
 
 # Recordings of a benchmark: training files in pieces with roles, test files as whole runs.
 
@@ -297,18 +294,20 @@ def run_freely(
 
     dt = trajectories[0].dt
     warm = warm_samples(warm_up, physics.delay, dt)
-    starts = judged(shifted(trajectories, physics.delay), physics.smoother(prior, dt), warm)
+    starts = evaluation_trajectories(shifted(trajectories, physics.delay), physics.smoother(prior, dt), warm)
     if length is not None:
-        starts = [_first(t, warm + round(length / dt) + 1) for t in starts]
-    found = {
-        "phy": _simulate(PriorStep(prior, dt), torch.zeros(1, 1, 0, dtype=torch.float64), starts, warm)[0]
-    }
+        n = warm + round(length / dt) + 1
+        starts = [t.part(np.arange(len(t.t)) < n, t.name, t.role) for t in starts]
+    after = slice(
+        1, -1
+    )  # states of the samples after the warm-up: neither the start nor what follows the last input
+    none = torch.zeros(0, dtype=torch.float64)
+    found = {"phy": model_states(PriorStep(prior, dt), starts, warm, none)[:, after]}
     for kind, trained in networks.items():
-        stack = stack_for(prior, trained.settings)
-        stack.load_state_dict({name: torch.tensor(value) for name, value in trained.weights.items()})
-        step = step_for(prior, stack, trained.scaling, dt, trained.settings)
-        all_runs = _simulate(step, stack.initial(1), starts, warm)
-        found |= {kind: all_runs[trained.best], f"{kind} mean": all_runs.mean(0)}
+        step = trained.stacked_step(prior, dt)
+        h0 = torch.zeros(trained.settings.networks, 1, step.n_h, dtype=torch.float64)
+        states = model_states(step, starts, warm, h0)[:, :, after]
+        found |= {kind: states[trained.best], f"{kind} mean": states.mean(0)}
     with torch.no_grad():
         outputs = {
             name: prior.output(torch.tensor(x), torch.zeros(len(prior.inputs))).numpy()
@@ -358,34 +357,3 @@ def warm_samples(warm_up: float, delay: float, dt: float) -> int:
         (49, 47)
     """
     return max(1, round(warm_up / dt) - lost_samples(delay, dt))
-
-
-def _first(trajectory: Trajectory, n: int) -> Trajectory:
-    arrays = {key: getattr(trajectory, key)[:n] for key in ("t", "u", "y", "x", "xdot")}
-    return replace(trajectory, **arrays)
-
-
-def _simulate(step: nn.Module, h0: Tensor, trajectories: Sequence[Trajectory], warm: int) -> Array:
-    """States ``(networks, runs, n, n_x)`` of the samples after ``warm``; shorter runs go on under their last input."""
-    import torch
-
-    longest = max(len(t.t) for t in trajectories)
-    x_all, u_all = (
-        torch.tensor(np.stack([_padded(getattr(t, key), longest) for t in trajectories]))
-        for key in ("x", "u")
-    )
-    networks, runs = h0.shape[0], len(trajectories)
-    with torch.no_grad():
-        h, states = h0.expand(networks, runs, -1), []
-        wide = [a.expand(networks, *a.shape) for a in (x_all, u_all)]
-        for k in range(warm):
-            _, h = step(wide[0][:, :, k], h, wide[1][:, :, k])
-        x = wide[0][:, :, warm]
-        for k in range(warm, longest - 1):
-            x, h = step(x, h, wide[1][:, :, k])
-            states.append(x)
-    return torch.stack(states, 2).numpy()
-
-
-def _padded(values: Array, length: int) -> Array:
-    return np.concatenate([values, np.repeat(values[-1:], length - len(values), axis=0)])

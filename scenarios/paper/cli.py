@@ -29,7 +29,7 @@ def reproduce(
     ] = "",
     budget: Annotated[str, typer.Option(help="Effort: quick or full.")] = "full",
     form: Annotated[
-        str, typer.Option(help="hybrid, or literal: the paper's whole derivative and explicit Euler.")
+        str, typer.Option(help="hybrid, or paper: the network gives the whole derivative and explicit Euler.")
     ] = "hybrid",
     seed: Annotated[int, typer.Option(help="Seed of data and training.", min=0, max=MOST_SEED)] = 0,
     out: Annotated[

@@ -22,7 +22,7 @@ from hybrid_mpc.job.settings import check_device, claim
 from hybrid_mpc.job.stages.export import versions
 from hybrid_mpc.scenario import Scenario, load_scenario
 from scenarios.paper.experiment import Effort, Experiment
-from scenarios.paper.jobs import RULE, Case, Ruler, ensemble_job, fit_job, physics_job, sindy_job
+from scenarios.paper.jobs import RULE, Case, EvaluationSet, ensemble_job, fit_job, physics_job, sindy_job
 from scenarios.paper.settings import ReproductionSettings, case_key, experiment_of
 from scenarios.paper.table import METRICS, Row, Table, said
 
@@ -74,7 +74,7 @@ DRAWN = ("phy", "mopgrnn")
 
 
 def write_outputs(work: Work) -> dict[str, Any]:
-    """Collect what the jobs left, judge the claims, write tables and figures.
+    """Collect what the jobs left, check the claims, write tables and figures.
 
     Args:
         work: A reproduction whose jobs are all done.
@@ -276,7 +276,7 @@ def reproduce(
         stages: tuple[tuple[str, Callable[[Work], None]], ...] = (
             ("recording the machine", record_stage),
             ("fitting the priors", fit_stage),
-            ("judging the priors", physics_stage),
+            ("evaluating the priors", physics_stage),
             ("training the networks", ensemble_stage),
         )
         for title, stage in stages:
@@ -361,18 +361,18 @@ class Work:
         return result
 
     @cached_property
-    def ruler(self) -> Ruler:
-        """What judges all models: prior and smoother of the most data of the last data set."""
+    def evaluation(self) -> EvaluationSet:
+        """What all models are evaluated on: prior and smoother of the most data of the last data set."""
         name, count = self.experiment.reference, self.effort.sequences[-1]
         test, fit = self.trajectories(name, "test", self.effort.test), self.fit(name, count)
         if self.experiment.measured:
-            from hybrid_mpc.identify.evaluate import judged
+            from hybrid_mpc.identify.evaluate import evaluation_trajectories
             from hybrid_mpc.identify.smooth import Smoother
 
             prior, levels = self.scenario.prior(fit["values"]), fit["smoother"]
             smoother = Smoother(prior, self.scenario.data.dt, tuple(levels["sigma"]), tuple(levels["walk"]))
-            test = judged(smoother.smooth(test), smoother, self.warm)
-        return Ruler(test, fit["values"], self.warm, self.experiment.shown)
+            test = evaluation_trajectories(smoother.smooth(test), smoother, self.warm)
+        return EvaluationSet(test, fit["values"], self.warm, self.experiment.shown)
 
     def case(self, data_set: str, count: int) -> Case:
         """Data and prior of one amount of training data."""
@@ -389,9 +389,10 @@ class Work:
             valid,
             fit["values"],
             fit["smoother"],
-            self.ruler,
+            self.evaluation,
             self.folder,
             self.settings.device,
+            self.settings.form,
         )
 
     def training(self, model: str) -> TrainingSettings:
@@ -410,7 +411,6 @@ class Work:
             batch=e.batch,
             decay=e.decay,
             every=e.every,
-            form=self.settings.form,  # type: ignore[arg-type]
             fused=True,
         )
 
@@ -475,7 +475,7 @@ def fit_stage(work: Work) -> None:
 
 
 def physics_stage(work: Work) -> None:
-    """Judge the priors."""
+    """Evaluate the priors."""
     if work.done("physics"):
         return
     cases = [(work.case(*case), case[1]) for case in work.cases]
@@ -483,7 +483,7 @@ def physics_stage(work: Work) -> None:
 
 
 def ensemble_stage(work: Work) -> None:
-    """Train and judge every ensemble, and identify the sparse equations."""
+    """Train and evaluate every ensemble, and identify the sparse equations."""
     jobs: Jobs = {}
     models = NETWORKS if missing_for_sindy() else (*NETWORKS, "sindy")
     for data_set, count in work.cases:
@@ -502,10 +502,7 @@ def ensemble_stage(work: Work) -> None:
 
 def missing_for_sindy() -> str:
     """What the row ``sindy`` needs and is not there; empty if it can be made."""
-    for name in ("hybrid_mpc.identify.sindy", "pysindy"):
-        if importlib.util.find_spec(name) is None:
-            return name
-    return ""
+    return "" if importlib.util.find_spec("pysindy") else "pysindy"
 
 
 def _with_states(trajectories: Sequence[Trajectory], arrays: Mapping[str, Any]) -> list[Trajectory]:

@@ -1,6 +1,6 @@
 """Claims of the paper and goals of this project, beside what was found. No torch in here.
 
-A check is made by one of the static methods of :class:`Claim` and judges a
+A check is made by one of the static methods of :class:`Claim` and looks at a
 :class:`~scenarios.paper.table.Table`. It compares means over the networks that did not diverge; a model of
 which all diverged is infinitely worse than any other. A model that is claimed to be better, and of which a network
 diverged, is not better.
@@ -24,7 +24,7 @@ MODELS = ("phy_nominal", "phy", "rnn", "pgrnn", "mopgrnn", "hybrid", "sindy")
 METRICS: Mapping[str, str] = {
     "e_sim_s": "E_sim [s]",
     "e_sim_lambda1_s": "E_sim, λ = 1 [s]",
-    "e_sim_literal_s": "E_sim, literal [s]",
+    "e_sim_paper_s": "E_sim, paper form [s]",
     "rmse_rad": "RMSE [rad]",
     "energy_violation_w": "violation [W]",
 }
@@ -235,7 +235,7 @@ Check = Callable[[Table], Verdict]
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim and how it is judged.
+    """A claim and how it is checked.
 
     Args:
         name: Short and unique within an experiment.

@@ -3,10 +3,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from hybrid_mpc.identify.residuals import ParameterFit
 from simulated_pendulum import DT, TRUTH, Pendulum, record
 
 from hybrid_mpc import InputError, fit_prior
-from hybrid_mpc.identify.residuals import ParameterFit
 
 NOISE = 2e-3
 

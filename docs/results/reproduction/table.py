@@ -2,7 +2,7 @@
 
 ``python docs/results/reproduction/table.py`` prints the tables of all that are here;
 ``python docs/results/reproduction/table.py --take runs/reproduce_pendulum`` first takes the results of a folder that
-``hybrid-mpc reproduce`` wrote: ``SCENARIO_BUDGET[_literal].json`` (all networks, without the details of their
+``hybrid-mpc reproduce`` wrote: ``SCENARIO_BUDGET[_paper].json`` (all networks, without the details of their
 trainings), ``.csv`` (means, standard deviations, medians) and the figures.
 """
 

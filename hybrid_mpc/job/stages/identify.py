@@ -1,4 +1,4 @@
-"""Stages data, prior, training and evaluation: from CSV files to judged models."""
+"""Stages data, prior, training and evaluation: from recordings to models and their free runs."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hybrid_mpc.data.excitation import check_excitation
-from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_document, read_document_arrays, write_document
-from hybrid_mpc.identify.settings import TrainingSettings
+from hybrid_mpc.identify.settings import KINDS, TrainingSettings
 from hybrid_mpc.identify.step import Scaling
 from hybrid_mpc.identify.train import Trained, TrainingFailure
 from hybrid_mpc.job.context import Context
@@ -24,14 +23,7 @@ from hybrid_mpc.scenario import load_scenario
 if TYPE_CHECKING:
     from hybrid_mpc.data.trajectories import Trajectory
     from hybrid_mpc.identify.evaluate import FreeRun
-    from hybrid_mpc.identify.prior_result import PriorFit
-    from hybrid_mpc.identify.settings import TrainingSettings
-    from hybrid_mpc.identify.smooth import Smoother
-    from hybrid_mpc.identify.train import Trained
     from hybrid_mpc.machine.torch_prior import Prior
-
-
-# Trained networks on disk, as the jobs keep them between their stages: JSON and plain arrays, a pair a kind.
 
 
 @dataclass(frozen=True)
@@ -40,7 +32,7 @@ class _Note:
 
     settings: TrainingSettings
     scaling: Scaling
-    faults: tuple[TrainingFailure, ...]
+    failures: tuple[TrainingFailure, ...]
 
 
 def save_trained(folder: Path, trained: Trained) -> None:
@@ -49,7 +41,7 @@ def save_trained(folder: Path, trained: Trained) -> None:
     arrays: dict[str, Any] = {f"weights.{n}": v for n, v in trained.weights.items()}
     arrays |= {f"curve.{n}": v for n, v in trained.curve.items()}
     arrays |= {"own.validation": trained.validation, "own.skipped": trained.skipped}
-    note = _Note(trained.settings, trained.scaling, trained.faults)
+    note = _Note(trained.settings, trained.scaling, trained.failures)
     write_document(folder / f"{kind}.json", plain(note), arrays)
 
 
@@ -65,8 +57,8 @@ def is_trained(folder: Path, settings: TrainingSettings) -> bool:
     """
     if not (folder / f"{settings.kind}.json").is_file():
         return False
-    held, own = (asdict(s) for s in (load_trained(folder, settings.kind).settings, settings))
-    changed = [f"{name} {held[name]} instead of {own[name]}" for name in own if held[name] != own[name]]
+    found, own = (asdict(s) for s in (load_trained(folder, settings.kind).settings, settings))
+    changed = [f"{name} {found[name]} instead of {own[name]}" for name in own if found[name] != own[name]]
     if changed:
         raise InputError(
             f"{folder} holds finished networks of other settings ({settings.kind}: {'; '.join(changed)}), from another "
@@ -96,42 +88,13 @@ def load_trained(folder: Path, kind: str) -> Trained:
         part["own"]["validation"],
         part["curve"],
         part["own"]["skipped"],
-        note.faults,
+        note.failures,
     )
 
-
-# Stage prior of a machine whose input acts later: parameters and delay together.
 
 DELAY_RUNS = 5.0
 """Longest free runs [the machine's seconds] that parameters and delay are fitted to: a swing near the top multiplies
 every error."""
-
-
-def prior_with_delay(context: Context) -> None:
-    """Fit the prior's parameters and the input's delay together, to free runs, and smooth the measurements."""
-    from hybrid_mpc.identify.delay import fit_physics, smoothed
-
-    make, spec = context.scenario.prior, context.spec
-    train, valid, test = (context.trajectories(role) for role in ("train", "valid", "test"))
-    physics = fit_physics(
-        make, train, valid, dt=spec.dt, length=DELAY_RUNS * context.time_unit, largest_delay=spec.largest_delay,
-        on_progress=lambda done, total, text: context.progress.update("free runs", done, total, text),
-    )  # fmt: skip
-    every = smoothed(make, physics, [*train, *valid, *test], spec.dt)
-    notes = {
-        "nominal": make().values,
-        "units": {p.name: p.unit for p in make().parameters_spec},
-        "smoother": {"sigma": physics.sigma, "walk": physics.walk},
-        "delay": physics.delay,
-    }
-    arrays = {f"{t.name}/{key}": getattr(t, key) for t in every for key in ("x", "xdot")}
-    context.save("prior", {**asdict(physics.fit), **notes}, arrays)
-    for warning in physics.fit.warnings:
-        context.progress.warn(f"fit of the prior: {warning}")
-
-
-ROUNDS = ("polynomially smoothed", "smoothed by the prior")
-"""States that the prior is fitted to, one after the other."""
 MODELS = ("phy_nominal", "phy", "rnn", "pgrnn", "mopgrnn")
 
 
@@ -191,75 +154,33 @@ def doubts(context: Context) -> tuple[str, ...]:
 
 
 def prior_stage(context: Context) -> None:
-    """Fit the prior's parameters, let it smooth the measurements, fit it to these, smooth once more."""
-    make = context.scenario.prior
-    if context.spec.largest_delay:
-        prior_with_delay(context)
-        return
-    fit, smoother, train, valid = fit_and_smooth(
-        make,
-        context.trajectories("train"),
-        context.trajectories("valid"),
-        context.spec.dt,
-        on_progress=context.progress.update,
-    )
-    arrays = {
-        f"{t.name}/{key}": getattr(t, key)
-        for t in (*train, *valid, *smoother.smooth(context.trajectories("test")))
-        for key in ("x", "xdot")
-    }
+    """Fit the prior's parameters, and the input's delay where there may be one, and smooth all recordings by it."""
+    from hybrid_mpc.identify.prior import fit_and_smooth, fit_physics, smoothed
+
+    make, spec = context.scenario.prior, context.spec
+    train, valid, test = (context.trajectories(role) for role in ("train", "valid", "test"))
+    if spec.largest_delay:
+        physics = fit_physics(
+            make, train, valid, dt=spec.dt, length=DELAY_RUNS * context.time_unit, largest_delay=spec.largest_delay,
+            on_progress=lambda done, total, text: context.progress.update("free runs", done, total, text),
+        )  # fmt: skip
+    else:
+        physics = fit_and_smooth(make, train, valid, spec.dt, on_progress=context.progress.update)
+    parts = [smoothed(make, physics, part, spec.dt) for part in (train, valid, test)]
     notes = {
         "nominal": make().values,
         "units": {p.name: p.unit for p in make().parameters_spec},
-        "smoother": {"sigma": smoother.sigma, "walk": smoother.walk},
+        "smoother": {"sigma": physics.sigma, "walk": physics.walk},
+        "delay": physics.delay,
     }
-    context.save("prior", {**asdict(fit), **notes}, arrays)
-    for warning in fit.warnings:
+    arrays = {f"{t.name}/{key}": getattr(t, key) for part in parts for t in part for key in ("x", "xdot")}
+    context.save("prior", {**asdict(physics.fit), **notes}, arrays)
+    for warning in physics.fit.warnings:
         context.progress.warn(f"fit of the prior: {warning}")
 
 
-def fit_and_smooth(
-    make: Callable[..., Prior],
-    train: Sequence[Trajectory],
-    valid: Sequence[Trajectory],
-    dt: float,
-    *,
-    methods: Sequence[str] | None = None,
-    on_progress: Callable[[str, int, int, str], None] = lambda key, done, total, text: None,
-) -> tuple[PriorFit, Smoother, list[Trajectory], list[Trajectory]]:
-    """Fit a prior to polynomially smoothed states, smooth by it, fit it to these, smooth once more.
-
-    Args:
-        make: Prior class or factory ``(values=None) -> Prior``.
-        train: Training trajectories.
-        valid: Validation trajectories.
-        dt: Model period [s].
-        methods: Methods of the fit. Default: those of :func:`~hybrid_mpc.identify.fit.fit_prior`.
-        on_progress: ``(round, done, total, text)`` with a title of ``ROUNDS``.
-
-    Returns:
-        The last fit, the last smoother, and training and validation trajectories smoothed by it.
-    """
-    from hybrid_mpc.identify.fit import DEFAULT_METHODS, fit_prior
-    from hybrid_mpc.identify.smooth import fit_smoother
-
-    fit: PriorFit | None = None
-    unit = time_unit(train, dt)
-    for title in ROUNDS:
-        fit = fit_prior(
-            make, train, valid, dt=dt, before=fit, methods=methods or DEFAULT_METHODS, time_unit=unit,
-            on_progress=lambda done, total, text, key=title: on_progress(key, done, total, text),  # type: ignore[misc]
-        )  # fmt: skip
-        smoother = fit_smoother(make(fit.values), [*train, *valid], dt, time_unit=unit)
-        train, valid = smoother.smooth(train), smoother.smooth(valid)
-    assert fit is not None
-    return fit, smoother, list(train), list(valid)
-
-
 def training_stage(context: Context) -> None:
-    """Train the networks of every kind, two kinds side by side."""
-    from hybrid_mpc.identify.settings import KINDS
-
+    """Train the networks of every kind, two kinds at once."""
     folder = context.out / "checkpoints" / "training"
     values = context.result("prior")["values"]
     todo = [k for k in reversed(KINDS) if not is_trained(folder, training_settings(context, k))]
@@ -274,9 +195,7 @@ def training_stage(context: Context) -> None:
     run_jobs(jobs, context.progress.update, WORKERS)
     trained = {kind: trained_models(context, kind) for kind in KINDS}
     best = {k: float(t.validation.min()) for k, t in trained.items()}
-    skipped = {k: int(t.skipped.sum()) for k, t in trained.items()}
-    faults = {k: [asdict(f) for f in t.faults] for k, t in trained.items()}
-    context.save("training", {"validation_e_sim_s": best, "skipped_updates": skipped, "faults": faults})
+    context.save("training", {"validation_e_sim_s": best})
 
 
 def trained_models(context: Context, kind: str) -> Trained:
@@ -286,14 +205,16 @@ def trained_models(context: Context, kind: str) -> Trained:
 
 def evaluation_stage(context: Context) -> None:
     """Free runs of every model over the test trajectories; the figures show them whole."""
-    from hybrid_mpc.identify.evaluate import free_runs, judged, score
+    from hybrid_mpc.identify.evaluate import evaluation_trajectories, free_runs, score
     from hybrid_mpc.identify.smooth import Smoother
 
     prior, spec = context.result("prior"), context.spec
     phy = context.scenario.prior(prior["values"])
     smoother = Smoother(phy, spec.dt, tuple(prior["smoother"]["sigma"]), tuple(prior["smoother"]["walk"]))
     whole = context.smoothed("test")
-    shown, test = (judged(whole, smoother, context.warm, length) for length in (None, spec.free_run))
+    shown, test = (
+        evaluation_trajectories(whole, smoother, context.warm, length) for length in (None, spec.free_run)
+    )
     scores: dict[str, Any] = {}
     files: dict[str, Any] = {}
     arrays: dict[str, Any] = {}
@@ -326,7 +247,6 @@ def _members(context: Context, name: str, phy: Prior) -> list[tuple[Any, Any]]:
     import torch
 
     from hybrid_mpc.identify.step import PriorStep
-    from hybrid_mpc.identify.train import stack_for
 
     dt, double = context.spec.dt, torch.float64
     if name in ("phy_nominal", "phy"):
@@ -334,14 +254,12 @@ def _members(context: Context, name: str, phy: Prior) -> list[tuple[Any, Any]]:
         return [(PriorStep(prior, dt), torch.zeros(0, dtype=double))]
     trained = trained_models(context, name)
     order = np.argsort(trained.validation, kind="stable")
-    h0 = torch.zeros(stack_for(phy, trained.settings).n_h, dtype=double)
-    return [(trained.step(phy, dt, int(i)), h0) for i in order]
+    steps = [trained.step(phy, dt, int(i)) for i in order]
+    return [(step, torch.zeros(step.n_h, dtype=double)) for step in steps]
 
 
 def training_settings(context: Context, kind: str) -> TrainingSettings:
     """What the networks of a kind are trained with: the budget, and what the run's own file replaces of it."""
-    from hybrid_mpc.identify.settings import TrainingSettings
-
     b = context.budget
     settings = TrainingSettings(
         kind=kind,  # type: ignore[arg-type]
