@@ -100,14 +100,14 @@ class ParameterFit:
         return float(residual.abs().mean()) if bool(torch.isfinite(residual).all()) else float("inf")
 
     def confidence(self, theta: Array, jacobian: Any) -> tuple[dict[str, float], list[str]]:
-        """Standard errors [SI] by name and what the data do not tell, from a Jacobian as the fits return it."""
+        """Standard errors [SI] by name and warnings, from a Jacobian as the fits return it."""
         if jacobian is None:
             return {}, ["no fit improved on the nominal parameters"]
         warnings = []
         _, singular, rows = np.linalg.svd(jacobian, full_matrices=False)
         if singular[-1] < 1e-6 * singular[0]:
             names = [p.name for p, w in zip(self.free, np.abs(rows[-1]), strict=True) if w > 0.2]
-            warnings.append(f"the data do not tell apart: {', '.join(names)}")
+            warnings.append(f"the data cannot tell apart: {', '.join(names)}")
         errors = np.sqrt(np.diag(_covariance(singular, rows))) * self.unit
         for p, value, low, high in zip(self.free, theta, self.lower, self.upper, strict=True):
             if min(value - low, high - value) < 1e-3 * (high - low):

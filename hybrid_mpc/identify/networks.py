@@ -149,7 +149,7 @@ def fused_states(s: Tensor, h: Tensor, w_ih: Tensor, w_hh: Tensor, b_ih: Tensor,
         h: Hidden states at the start ``(networks, batch, z)``.
         w_ih: Weights of the features ``(networks, n_in, 3 z)``, gates r, z and candidate.
         w_hh: Weights of the hidden state ``(networks, z, 3 z)``.
-        b_ih: Bias beside the features ``(networks, 1, 3 z)``.
+        b_ih: Bias next to the features ``(networks, 1, 3 z)``.
         b_hh: Bias inside the reset product ``(networks, 1, 3 z)``.
 
     Example:

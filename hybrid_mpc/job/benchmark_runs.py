@@ -1,4 +1,4 @@
-"""Free runs of all models over recordings by a machine's convention, and the figures that judge them."""
+"""Free runs of all models over recordings by a machine's convention, and their figures."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ class Recordings:
         train: Pieces that are fitted and trained on.
         valid: Pieces that choose; nothing is fitted to them.
         held_back: Pieces that neither fit nor choose; may be none.
-        long: Recordings that were split in order of time and are judged whole, from their first sample to where
+        long: Recordings that were split in order of time and are evaluated whole, from their first sample to where
             validation ends, at most a minute (of the machine's own seconds). Most or all of them was trained on, so
-            they tell drift and not how good a model is.
+            they show drift and not how good a model is.
         dataset: The files as they were read.
     """
 
@@ -90,7 +90,9 @@ def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
         paths, scenario.data, outputs=prior.outputs, inputs=prior.inputs, states=prior.states, needed=needed
     )
     parts = _parts(dataset, scenario, uncut)
-    train, valid, held = (tuple(p for p in parts if p.role == role) for role in ("train", "valid", "test"))
+    train, valid, held_back = (
+        tuple(p for p in parts if p.role == role) for role in ("train", "valid", "test")
+    )
     if not (train and valid):
         cut = "".join(f"\n  {c.file} {c.start:g} to {c.end:g} s: {c.why}" for c in dataset.cuts)
         raise InputError(
@@ -99,7 +101,7 @@ def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
         )
     in_order = not (spec.cycle or uncut) and spec.length is None
     long = until_validated(dataset, scenario.data.windows) if in_order else ()
-    return Recordings(train, valid, held, long, dataset)
+    return Recordings(train, valid, held_back, long, dataset)
 
 
 def _parts(dataset: Dataset, scenario: Scenario, uncut: bool) -> list[Trajectory]:
@@ -137,7 +139,7 @@ def until_validated(dataset: Dataset, windows: Container[str]) -> tuple[Trajecto
     stems, found = {Path(file).stem for file in dataset.files}, []
     longest = LONGEST * time_unit(dataset.whole, dataset.whole[0].dt) if dataset.whole else 0.0
     for whole in dataset.whole:
-        # one that begins after a gap begins in motion, and a run that judges does not
+        # one that begins after a gap begins in motion, and a run that is scored does not
         if whole.name not in stems or whole.name in windows:
             continue
         ends = [p.t[-1] for p in dataset.by_role("valid") if _stem(p.name, stems) == whole.name]

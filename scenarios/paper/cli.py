@@ -40,7 +40,7 @@ def reproduce(
     ] = False,
     device: Device = "cpu",
 ) -> None:
-    """Rebuild the paper's experiment on a machine: tables, figures, and its claims beside what was found."""
+    """Rebuild the paper's experiment on a machine: tables, figures, and its claims with what was found."""
     from hybrid_mpc.cli.progress import make_progress
     from scenarios.paper.run import claim_lines, text_table
     from scenarios.paper.run import reproduce as run_job

@@ -1,4 +1,7 @@
-"""``hybrid-mpc reproduce``: data, priors, ensembles, tables, figures and claims, resumable at any point."""
+"""``hybrid-mpc reproduce``: data, priors, ensembles, tables, figures and claims, resumable at any point.
+
+From top to bottom: the job, its stages, what it writes. No torch in here.
+"""
 
 from __future__ import annotations
 
@@ -24,216 +27,19 @@ from hybrid_mpc.scenario import Scenario, load_scenario
 from scenarios.paper.experiment import Effort, Experiment
 from scenarios.paper.jobs import RULE, Case, EvaluationSet, ensemble_job, fit_job, physics_job, sindy_job
 from scenarios.paper.settings import ReproductionSettings, case_key, experiment_of
-from scenarios.paper.table import METRICS, Row, Table, said
+from scenarios.paper.table import METRICS, Row, Table, Verdict, verdict_line
 
 if TYPE_CHECKING:
     from hybrid_mpc.identify.settings import TrainingSettings
-
-
-# Which process a job runs in, as the terminal shows it. No torch in here.
-
-
-class Slots:
-    """Gives every running job a place, so that the terminal has a bar a process and not one a job.
-
-    Args:
-        count: Processes side by side.
-
-    Example:
-        >>> slots = Slots(2)
-        >>> slots.name("one"), slots.name("two"), slots.name("one")
-        ('process 1', 'process 2', 'process 1')
-        >>> slots.free("one")
-        >>> slots.name("three")
-        'process 1'
-    """
-
-    def __init__(self, count: int) -> None:
-        self._held: dict[int, str] = {}
-        self._count = count
-
-    def name(self, key: str) -> str:
-        """Place of a job; a new one takes the first that is free."""
-        slot = next((i for i, held in self._held.items() if held == key), None)
-        if slot is None:
-            slot = next((i for i in range(self._count) if i not in self._held), self._count)
-            self._held[slot] = key
-        return f"process {slot + 1}"
-
-    def free(self, key: str) -> None:
-        """The job is over."""
-        self._held = {i: held for i, held in self._held.items() if held != key}
-
-
-# What a reproduction writes: results.json, results.csv, the claims and figures. No torch in here.
-
-SCHEMA = "hybrid-mpc reproduction"
-SCHEMA_VERSION = 1
-DRAWN = ("phy", "mopgrnn")
-"""Models whose free run is drawn beside the measurement."""
-
-
-def write_outputs(work: Work) -> dict[str, Any]:
-    """Collect what the jobs left, check the claims, write tables and figures.
-
-    Args:
-        work: A reproduction whose jobs are all done.
-
-    Returns:
-        What ``results.json`` holds.
-    """
-    rows = work.rows()
-    table = Table(rows)
-    results = collected(work, rows, table)
-    draw(work, table)
-    write_text(work.out / "results.csv", table.csv())
-    write_text(work.out / "claims.txt", "".join(f"{line}\n" for line in claim_lines(results)))
-    write_json(work.out / "results.json", results)
-    return read_results(work.out / "results.json")
-
-
-def collected(work: Work, rows: Sequence[Row], table: Table) -> dict[str, Any]:
-    """The results in the form of the schema; ``timing`` is the only part that two equal runs do not share."""
-    experiment, jobs = work.experiment, {p.stem: read_json(p) for p in sorted(work.folder.glob("*.json"))}
-    claims = []
-    for each in experiment.claims:
-        verdict = each.check(table)
-        claims.append({"name": each.name, "text": each.text, "source": each.source, **asdict(verdict)})
-    priors = {key: {"values": job["values"], "standard_errors": job["standard_errors"], "smoother": job["smoother"]}
-              for key, job in jobs.items() if key.endswith("_prior")}  # fmt: skip
-    return {
-        "schema": SCHEMA,
-        "schema_version": SCHEMA_VERSION,
-        "scenario": work.scenario.name,
-        "figure": experiment.figure,
-        "data_sets": dict(experiment.data_sets),
-        "settings": work.settings.identity(),
-        "versions": versions(),
-        "data": {name: _hash(work, name) for name in experiment.data_sets},
-        "divergence_rule": RULE,
-        "notes": work.notes(),
-        "priors": priors,
-        "summary": table.summary(),
-        "claims": claims,
-        "rows": [row.plain() for row in rows],
-        "details": {key: job["details"] for key, job in jobs.items() if job.get("details")},
-        "timing": {"seconds_of_jobs": {key: job["seconds"] for key, job in jobs.items()}},
-    }
-
-
-def read_results(path: Path) -> dict[str, Any]:
-    """Results of a reproduction.
-
-    Raises:
-        InputError: If the file is missing, damaged, something else, or of another version of the schema.
-    """
-    results = read_json(path)
-    if not isinstance(results, dict) or results.get("schema") != SCHEMA:
-        raise InputError(f"{path} holds no results of 'hybrid-mpc reproduce'")
-    if results.get("schema_version") != SCHEMA_VERSION:
-        raise InputError(
-            f"{path} has schema version {results.get('schema_version')}, this program reads {SCHEMA_VERSION}; "
-            "use the program that wrote it, or run 'hybrid-mpc reproduce' anew"
-        )
-    return results
-
-
-def table_of(results: Mapping[str, Any]) -> Table:
-    """The table of results that were read."""
-    return Table([Row.of(row) for row in results["rows"]])
-
-
-def claim_lines(results: Mapping[str, Any]) -> list[str]:
-    """A line a claim, then a line a note."""
-    from scenarios.paper.table import Verdict
-
-    lines = [said(c["text"], c["source"], Verdict(c["holds"], c["found"])) for c in results["claims"]]
-    return [*lines, *results["notes"]]
-
-
-def draw(work: Work, table: Table) -> None:
-    """E_sim, RMSE and violation over the amount of data, and a free run of the last data set's most data."""
-    from hybrid_mpc.plots.style import save
-    from scenarios.paper.plots import errors_over_sequences, shown_free_run
-
-    folder, titles = work.out / "figures", work.experiment.data_sets
-    for i, metric in enumerate(("e_sim_s", "rmse_rad", "energy_violation_w")):
-        work.progress.update("figures", i, 3 + len(titles), metric)
-        figure = errors_over_sequences(panels(table, titles, metric), METRICS[metric])
-        save(figure, folder / f"{metric.rsplit('_', 1)[0]}.png")
-    for name, title in titles.items():
-        runs = {model: _shown(work, name, model) for model in DRAWN}
-        prior = work.scenario.prior()
-        figure = shown_free_run(runs, prior.states, prior.inputs, model=DRAWN[-1], title=title)
-        save(figure, folder / f"free_run_{name}.png")
-
-
-def panels(table: Table, titles: Mapping[str, str], metric: str) -> dict[str, dict[str, dict[str, Any]]]:
-    """Curves by panel title and model: amounts, means, standard deviations, and diverged networks of how many."""
-    drawn: dict[str, dict[str, dict[str, Any]]] = {}
-    for data_set, title in titles.items():
-        curves = drawn.setdefault(title, {})
-        for model in table.models:
-            cells = {
-                n: c for n in table.sequences if (c := table.cell(data_set, n, model, metric)) is not None
-            }
-            curves[model] = {
-                "sequences": list(cells),
-                "mean": [np.nan if c.mean is None else c.mean for c in cells.values()],
-                "std": [0.0 if c.std is None else c.std for c in cells.values()],
-                "diverged": [c.diverged for c in cells.values()],
-                "networks": [c.networks for c in cells.values()],
-            }
-    return drawn
-
-
-def _shown(work: Work, data_set: str, model: str) -> dict[str, Any]:
-    """The drawn run of a model trained on most data; of an ensemble the network best on validation runs."""
-    key = case_key(data_set, work.effort.sequences[-1], model)
-    if model.startswith("phy"):
-        arrays, prefix = read_arrays(work.folder / "physics.npz"), f"{key}/"
-    else:
-        arrays, prefix = read_arrays(work.folder / f"{key}.npz"), "shown."
-    return {name.removeprefix(prefix): a for name, a in arrays.items() if name.startswith(prefix)}
-
-
-def _hash(work: Work, data_set: str) -> str:
-    digest = hashlib.sha256()
-    for t in work.recorded[data_set]:
-        digest.update(t.name.encode())
-        for array in (t.u, t.y):
-            digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
-
-
-def text_table(results: Mapping[str, Any]) -> list[str]:
-    """E_sim of all rows as lines for a terminal: mean ± standard deviation, and diverged networks."""
-    table = table_of(results)
-    lines = []
-    for data_set in table.data_sets:
-        lines.append(f"E_sim [s] on test runs, {results['data_sets'][data_set]}")
-        lines.append(f"  {'sequences':14}" + "".join(f"{n:>22}" for n in table.sequences))
-        for model in table.models:
-            cells = [said_cell(table, data_set, n, model) for n in table.sequences]
-            lines.append(f"  {model:14}" + "".join(f"{cell:>22}" for cell in cells))
-    return lines
-
-
-def said_cell(table: Table, data_set: str, sequences: int, model: str, metric: str = "e_sim_s") -> str:
-    """A figure as tables print it: mean ± standard deviation, and how many networks diverged."""
-    cell = table.cell(data_set, sequences, model, metric)
-    if cell is None:
-        return "-"
-    if cell.mean is None:
-        return "all diverged"
-    text = f"{cell.mean:.4g}" + ("" if cell.std is None else f" ± {cell.std:.2g}")
-    return text + (f" ({cell.diverged} diverged)" if cell.diverged else "")
-
 
 Jobs = dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]
 NETWORKS = ("hybrid", "mopgrnn", "pgrnn", "rnn")
 """Models that are ensembles, the slowest first."""
 WITHOUT_SINDY = "sindy is left out: {} is not installed (pip install 'hybrid-mpc[sindy]')"
+SCHEMA = "hybrid-mpc reproduction"
+SCHEMA_VERSION = 1
+DRAWN = ("phy", "mopgrnn")
+"""Models whose free run is drawn with the measurement."""
 
 
 def reproduce(
@@ -255,7 +61,7 @@ def reproduce(
         out: Folder to make; it must be new or empty unless ``resume``.
         resume: Finish the reproduction that ``out`` holds.
         progress: Where to report. Default: nowhere.
-        workers: Processes side by side; 0 runs the jobs in this one. Default: two.
+        workers: Processes at once; 0 runs the jobs in this one. Default: two.
 
     Returns:
         The results (docs/reproduction.md).
@@ -300,7 +106,7 @@ class Work:
         effort: How much of it.
         out: The folder.
         progress: Where to report.
-        workers: Processes side by side; 0 for none.
+        workers: Processes at once; 0 for none.
     """
 
     settings: ReproductionSettings
@@ -440,15 +246,15 @@ class Work:
             slots.free(key)
             self.progress.update("jobs", finished, total, f"{key} is done")
 
-        def told(key: str, done: int, of: int, text: str) -> None:
+        def report(key: str, done: int, of: int, text: str) -> None:
             self.progress.update(slots.name(key), done, of, f"{key}: {text}")
 
         self.progress.update("jobs", finished, total, "")
         if self.workers:
-            run_jobs(todo, told, self.workers, ended)
+            run_jobs(todo, report, self.workers, ended)
             return
         for key, (function, args) in todo.items():
-            ended(key, function(*args, partial(told, key)))
+            ended(key, function(*args, partial(report, key)))
 
 
 def record_stage(work: Work) -> None:
@@ -507,3 +313,190 @@ def missing_for_sindy() -> str:
 
 def _with_states(trajectories: Sequence[Trajectory], arrays: Mapping[str, Any]) -> list[Trajectory]:
     return [replace(t, x=arrays[f"{t.name}/x"], xdot=arrays[f"{t.name}/xdot"]) for t in trajectories]
+
+
+class Slots:
+    """Gives every running job a place, so that the terminal has a bar a process and not one a job.
+
+    Args:
+        count: Processes at once.
+
+    Example:
+        >>> slots = Slots(2)
+        >>> slots.name("one"), slots.name("two"), slots.name("one")
+        ('process 1', 'process 2', 'process 1')
+        >>> slots.free("one")
+        >>> slots.name("three")
+        'process 1'
+    """
+
+    def __init__(self, count: int) -> None:
+        self._jobs: dict[int, str] = {}
+        self._count = count
+
+    def name(self, key: str) -> str:
+        """Place of a job; a new one takes the first that is free."""
+        slot = next((i for i, job in self._jobs.items() if job == key), None)
+        if slot is None:
+            slot = next((i for i in range(self._count) if i not in self._jobs), self._count)
+            self._jobs[slot] = key
+        return f"process {slot + 1}"
+
+    def free(self, key: str) -> None:
+        """The job is over."""
+        self._jobs = {i: job for i, job in self._jobs.items() if job != key}
+
+
+def write_outputs(work: Work) -> dict[str, Any]:
+    """Collect what the jobs left, check the claims, write tables and figures.
+
+    Args:
+        work: A reproduction whose jobs are all done.
+
+    Returns:
+        What ``results.json`` holds.
+    """
+    rows = work.rows()
+    table = Table(rows)
+    results = collected(work, rows, table)
+    draw(work, table)
+    write_text(work.out / "results.csv", table.csv())
+    write_text(work.out / "claims.txt", "".join(f"{line}\n" for line in claim_lines(results)))
+    write_json(work.out / "results.json", results)
+    return read_results(work.out / "results.json")
+
+
+def collected(work: Work, rows: Sequence[Row], table: Table) -> dict[str, Any]:
+    """The results in the form of the schema; ``timing`` is the only part that two equal runs do not share."""
+    experiment, jobs = work.experiment, {p.stem: read_json(p) for p in sorted(work.folder.glob("*.json"))}
+    claims = []
+    for each in experiment.claims:
+        verdict = each.check(table)
+        claims.append({"name": each.name, "text": each.text, "source": each.source, **asdict(verdict)})
+    priors = {key: {"values": job["values"], "standard_errors": job["standard_errors"], "smoother": job["smoother"]}
+              for key, job in jobs.items() if key.endswith("_prior")}  # fmt: skip
+    return {
+        "schema": SCHEMA,
+        "schema_version": SCHEMA_VERSION,
+        "scenario": work.scenario.name,
+        "figure": experiment.figure,
+        "data_sets": dict(experiment.data_sets),
+        "settings": work.settings.identity(),
+        "versions": versions(),
+        "data": {name: _hash(work, name) for name in experiment.data_sets},
+        "divergence_rule": RULE,
+        "notes": work.notes(),
+        "priors": priors,
+        "summary": table.summary(),
+        "claims": claims,
+        "rows": [row.plain() for row in rows],
+        "details": {key: job["details"] for key, job in jobs.items() if job.get("details")},
+        "timing": {"seconds_of_jobs": {key: job["seconds"] for key, job in jobs.items()}},
+    }
+
+
+def read_results(path: Path) -> dict[str, Any]:
+    """Results of a reproduction.
+
+    Raises:
+        InputError: If the file is missing, damaged, something else, or of another version of the schema.
+    """
+    results = read_json(path)
+    if not isinstance(results, dict) or results.get("schema") != SCHEMA:
+        raise InputError(f"{path} holds no results of 'hybrid-mpc reproduce'")
+    if results.get("schema_version") != SCHEMA_VERSION:
+        raise InputError(
+            f"{path} has schema version {results.get('schema_version')}, this program reads {SCHEMA_VERSION}; "
+            "use the program that wrote it, or run 'hybrid-mpc reproduce' anew"
+        )
+    return results
+
+
+def table_of(results: Mapping[str, Any]) -> Table:
+    """The table of results that were read."""
+    return Table([Row.of(row) for row in results["rows"]])
+
+
+def claim_lines(results: Mapping[str, Any]) -> list[str]:
+    """A line a claim, then a line a note."""
+    lines = [verdict_line(c["text"], c["source"], Verdict(c["holds"], c["found"])) for c in results["claims"]]
+    return [*lines, *results["notes"]]
+
+
+def draw(work: Work, table: Table) -> None:
+    """E_sim, RMSE and violation over the amount of data, and a free run of the last data set's most data."""
+    from hybrid_mpc.plots.style import save
+    from scenarios.paper.plots import errors_over_sequences, shown_free_run
+
+    folder, titles = work.out / "figures", work.experiment.data_sets
+    for i, metric in enumerate(("e_sim_s", "rmse_rad", "energy_violation_w")):
+        work.progress.update("figures", i, 3 + len(titles), metric)
+        figure = errors_over_sequences(panels(table, titles, metric), METRICS[metric])
+        save(figure, folder / f"{metric.rsplit('_', 1)[0]}.png")
+    for name, title in titles.items():
+        runs = {model: _shown(work, name, model) for model in DRAWN}
+        prior = work.scenario.prior()
+        figure = shown_free_run(runs, prior.states, prior.inputs, model=DRAWN[-1], title=title)
+        save(figure, folder / f"free_run_{name}.png")
+
+
+def panels(table: Table, titles: Mapping[str, str], metric: str) -> dict[str, dict[str, dict[str, Any]]]:
+    """Curves by panel title and model: amounts, means, standard deviations, and diverged networks of how many."""
+    drawn: dict[str, dict[str, dict[str, Any]]] = {}
+    for data_set, title in titles.items():
+        curves = drawn.setdefault(title, {})
+        for model in table.models:
+            cells = {
+                n: c for n in table.sequences if (c := table.cell(data_set, n, model, metric)) is not None
+            }
+            curves[model] = {
+                "sequences": list(cells),
+                "mean": [np.nan if c.mean is None else c.mean for c in cells.values()],
+                "std": [0.0 if c.std is None else c.std for c in cells.values()],
+                "diverged": [c.diverged for c in cells.values()],
+                "networks": [c.networks for c in cells.values()],
+            }
+    return drawn
+
+
+def _shown(work: Work, data_set: str, model: str) -> dict[str, Any]:
+    """The drawn run of a model trained on most data; of an ensemble the network best on validation runs."""
+    key = case_key(data_set, work.effort.sequences[-1], model)
+    if model.startswith("phy"):
+        arrays, prefix = read_arrays(work.folder / "physics.npz"), f"{key}/"
+    else:
+        arrays, prefix = read_arrays(work.folder / f"{key}.npz"), "shown."
+    return {name.removeprefix(prefix): a for name, a in arrays.items() if name.startswith(prefix)}
+
+
+def _hash(work: Work, data_set: str) -> str:
+    digest = hashlib.sha256()
+    for t in work.recorded[data_set]:
+        digest.update(t.name.encode())
+        for array in (t.u, t.y):
+            digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def text_table(results: Mapping[str, Any]) -> list[str]:
+    """E_sim of all rows as lines for a terminal: mean ± standard deviation, and diverged networks."""
+    table = table_of(results)
+    lines = []
+    for data_set in table.data_sets:
+        lines.append(f"E_sim [s] on test runs, {results['data_sets'][data_set]}")
+        lines.append(f"  {'sequences':14}" + "".join(f"{n:>22}" for n in table.sequences))
+        for model in table.models:
+            cells = [cell_text(table, data_set, n, model) for n in table.sequences]
+            lines.append(f"  {model:14}" + "".join(f"{cell:>22}" for cell in cells))
+    return lines
+
+
+def cell_text(table: Table, data_set: str, sequences: int, model: str, metric: str = "e_sim_s") -> str:
+    """A figure as tables print it: mean ± standard deviation, and how many networks diverged."""
+    cell = table.cell(data_set, sequences, model, metric)
+    if cell is None:
+        return "-"
+    if cell.mean is None:
+        return "all diverged"
+    text = f"{cell.mean:.4g}" + ("" if cell.std is None else f" ± {cell.std:.2g}")
+    return text + (f" ({cell.diverged} diverged)" if cell.diverged else "")

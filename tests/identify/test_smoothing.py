@@ -1,4 +1,4 @@
-"""The smoother with the prior's equations: noise found again, jumps kept sharp, nothing known of the future."""
+"""The smoother with the prior's equations: noise found again, jumps stay sharp, nothing known of the future."""
 
 from dataclasses import replace
 

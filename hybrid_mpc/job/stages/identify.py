@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class _Note:
-    """What stands in the JSON file beside the arrays."""
+    """What the JSON file holds; the arrays are in a file next to it."""
 
     settings: TrainingSettings
     scaling: Scaling
@@ -101,7 +101,7 @@ MODELS = ("phy_nominal", "phy", "rnn", "pgrnn", "mopgrnn")
 def check_data(context: Context) -> None:
     """Read the user's recordings before anything is written: bad ones leave no folder behind."""
     if context.settings.data:
-        doubts(context)  # reads, checks and keeps the recordings
+        doubts(context)  # reads and checks the recordings
     elif context.scenario.make_data is None:
         raise InputError(
             f"scenario {context.scenario.name} is a real machine: give its recordings with --data FILE.csv "

@@ -128,7 +128,7 @@ def call(call):
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "named"),
     [
         (["golf_robott"], ["golf_robott", "pendulum"]),
         (["torque_pendulum"], ["no experiment", "golf_robot, pendulum"]),
@@ -140,10 +140,10 @@ def call(call):
         (["pendulum", "--form", "other"], ["other", "paper"]),
     ],
 )
-def test_bad_settings(call, tmp_path, words, told):
+def test_bad_settings(call, tmp_path, words, named):
     code, _, message = call(*words, "--out", tmp_path / "o")
     assert code == 2
-    for word in told:
+    for word in named:
         assert word in message
     assert not (tmp_path / "o").exists()
 

@@ -27,12 +27,12 @@ from scenarios.paper.step import PaperStep
 class Copier(torch.nn.Module):
     """A network that hands on some of its features."""
 
-    def __init__(self, keep):
+    def __init__(self, chosen):
         super().__init__()
-        self.keep = keep
+        self.chosen = chosen
 
     def forward(self, s, h):
-        return s[..., self.keep], h
+        return s[..., self.chosen], h
 
 
 SCALES = Scaling(x=(2.0, 3.0), u=(0.5,), acceleration=(4.0, 5.0), correction=(4.0, 5.0))
@@ -61,10 +61,10 @@ def test_features_are_as_many_as_the_form_says(use_prior):
 def test_euler_feeds_energy_into_a_pendulum_and_the_hybrid_step_does_not():
     """The reason for the hybrid step: the same network, the paper's integrator and ours."""
     prior = Pendulum({"J": 0.1, "mgl": 1.2, "d": 0.0})
-    literal = PaperStep(prior, Copier(slice(3, 5)), SCALES, DT)
+    paper = PaperStep(prior, Copier(slice(3, 5)), SCALES, DT)
     exact = PriorStep(prior, DT)
     energies = []
-    for step in (literal, exact):
+    for step in (paper, exact):
         x = torch.tensor([0.5, 0.0]).double()
         for _ in range(250):
             x, _ = step(x, H, torch.zeros(1).double())
