@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.identify.smooth import Smoother
+from hybrid_mpc.identify.step import Step
 from hybrid_mpc.identify.train import Trained
 from hybrid_mpc.machine.torch_prior import Prior
 
@@ -94,23 +95,23 @@ def evaluation_trajectories(
 
 
 def free_runs(
-    step: nn.Module, prior: Prior, trajectories: Sequence[Trajectory], warm: int, h0: Tensor
+    step: Step, prior: Prior, trajectories: Sequence[Trajectory], warm: int, h0: Tensor | None = None
 ) -> list[FreeRun]:
     """Free runs of one model over trajectories; the warm-up is given and not scored.
 
     Args:
-        step: ``(x, h, u) -> (x_next, h_next)``, one network, any batch.
+        step: The model.
         prior: The prior whose energy balance and output count (the fitted one).
         trajectories: The trajectories (:func:`evaluation_trajectories`); they may differ in length.
         warm: Samples of the warm-up.
-        h0: Hidden state before the warm-up ``(n_h,)``.
+        h0: Hidden state before the warm-up ``(n_h,)``. Default: zero.
 
     Example:
-        >>> from hybrid_mpc.identify.step import PriorStep
+        >>> from hybrid_mpc import PriorStep
         >>> from scenarios.pendulum.data import exact_runs
         >>> from scenarios.pendulum.prior import PendulumPrior
-        >>> prior, none = PendulumPrior(), torch.zeros(0, dtype=torch.float64)
-        >>> runs = free_runs(PriorStep(prior, 0.01), prior, exact_runs("test", 1), 10, none)
+        >>> prior = PendulumPrior()
+        >>> runs = free_runs(PriorStep(prior, 0.01), prior, exact_runs("test", 1), warm=10)
         >>> runs[0].x_hat.shape
         (490, 2)
     """
@@ -132,20 +133,22 @@ def stacked_free_runs(
         warm: Samples of the warm-up.
     """
     step = trained.stacked_step(prior, dt)
-    h0 = torch.zeros(trained.settings.networks, 1, step.n_h, dtype=torch.float64)
-    x_hat = model_states(step, trajectories, warm, h0)
+    x_hat = model_states(step, trajectories, warm)
     return [[_free_run(balance, t, x[i], warm) for i, t in enumerate(trajectories)] for x in x_hat]
 
 
-def model_states(step: nn.Module, trajectories: Sequence[Trajectory], warm: int, h0: Tensor) -> Array:
+def model_states(
+    step: Step, trajectories: Sequence[Trajectory], warm: int, h0: Tensor | None = None
+) -> Array:
     """States of a model that runs freely from sample ``warm`` on, ``(..., runs, samples - warm + 1, n_x)``.
 
     Args:
-        step: ``(x, h, u) -> (x_next, h_next)``.
+        step: The model, or a stack of networks (:meth:`~hybrid_mpc.identify.train.Trained.stacked_step`).
         trajectories: The trajectories. Those that are shorter go on under their last input.
         warm: Samples of the warm-up, in which h follows the measured states.
-        h0: Hidden state before the warm-up ``(n_h,)``, or ``(networks, 1, n_h)`` of a stack.
+        h0: Hidden state before the warm-up ``(n_h,)``, or ``(networks, 1, n_h)`` of a stack. Default: zero.
     """
+    h0 = step.h0 if h0 is None else h0
     longest = max(len(t.t) for t in trajectories)
     h = h0.expand(*h0.shape[:-2], len(trajectories), h0.shape[-1])
     x_all, u_all = (

@@ -19,6 +19,7 @@ from torch.func import functional_call, vmap
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.dataset import Windows
+from hybrid_mpc.identify.networks import StackedGRU
 from hybrid_mpc.machine.torch_prior import Prior
 
 MAX_SUBSTEPS = 20
@@ -93,6 +94,11 @@ class Step(nn.Module):
     def n_h(self) -> int:
         """Size of the hidden state; none by default."""
         return 0
+
+    @property
+    def h0(self) -> Tensor:
+        """Zero hidden state ``(n_h,)``; of a stack of networks ``(networks, 1, n_h)``."""
+        return torch.zeros(self.n_h, dtype=torch.float64)
 
     def forward(self, x: Tensor, h: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         """Next state ``(..., n_x)`` and next hidden state ``(..., n_h)``, with ``u`` held over the period."""
@@ -219,6 +225,11 @@ class RecurrentStep(Step):
         """Size of the network's hidden state."""
         network: Any = self.network
         return int(network.n_h)
+
+    @property
+    def h0(self) -> Tensor:
+        """Zero hidden state ``(n_h,)``; of a stack of networks ``(networks, 1, n_h)``."""
+        return self.network.initial(1) if isinstance(self.network, StackedGRU) else super().h0
 
     @property
     def physics(self) -> Prior | StackedPrior:

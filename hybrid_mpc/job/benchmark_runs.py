@@ -303,12 +303,9 @@ def run_freely(
     after = slice(
         1, -1
     )  # states of the samples after the warm-up: neither the start nor what follows the last input
-    none = torch.zeros(0, dtype=torch.float64)
-    found = {"phy": model_states(PriorStep(prior, dt), starts, warm, none)[:, after]}
+    found = {"phy": model_states(PriorStep(prior, dt), starts, warm)[:, after]}
     for kind, trained in networks.items():
-        step = trained.stacked_step(prior, dt)
-        h0 = torch.zeros(trained.settings.networks, 1, step.n_h, dtype=torch.float64)
-        states = model_states(step, starts, warm, h0)[:, :, after]
+        states = model_states(trained.stacked_step(prior, dt), starts, warm)[:, :, after]
         found |= {kind: states[trained.best], f"{kind} mean": states.mean(0)}
     with torch.no_grad():
         outputs = {

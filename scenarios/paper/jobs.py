@@ -207,8 +207,6 @@ def physics_job(cases: Sequence[tuple[Case, int]], path: Path, report: Progress)
         path: File to write, without ending.
         report: Takes progress.
     """
-    import torch
-
     from hybrid_mpc.identify.evaluate import free_runs
     from hybrid_mpc.identify.step import PriorStep
 
@@ -218,8 +216,8 @@ def physics_job(cases: Sequence[tuple[Case, int]], path: Path, report: Progress)
         report(i, len(cases), f"{case.data_set}, {count} sequences")
         make, evaluation = load_scenario(case.scenario).prior, case.evaluation
         for model, values in (("phy_nominal", None), ("phy", case.values)):
-            step, empty = PriorStep(make(values), case.dt), torch.zeros(0, dtype=torch.float64)
-            runs = free_runs(step, make(evaluation.values), evaluation.test, evaluation.warm, empty)
+            step = PriorStep(make(values), case.dt)
+            runs = free_runs(step, make(evaluation.values), evaluation.test, evaluation.warm)
             rows.append(Row(case.data_set, count, model, (network_figures(runs),)))
             arrays |= {
                 f"{case.data_set}_{count:02d}_{model}/{k}": v
@@ -276,8 +274,6 @@ def ensemble_job(
 
 def sindy_job(case: Case, count: int, key: str, report: Progress) -> None:
     """Identify a sparse equation on one amount of data and evaluate it."""
-    import torch
-
     from hybrid_mpc.identify.evaluate import evaluation_trajectories, free_runs
     from hybrid_mpc.identify.smooth import Smoother
 
@@ -290,9 +286,8 @@ def sindy_job(case: Case, count: int, key: str, report: Progress) -> None:
         validation = evaluation_trajectories(validation, smoother, evaluation.warm)
     fit_sindy = importlib.import_module("scenarios.paper.sindy").fit_sindy
     step = fit_sindy(case.training, prior, case.dt, validation=validation, warm=evaluation.warm)
-    empty = torch.zeros(0, dtype=torch.float64)
     with np.errstate(over="ignore", invalid="ignore"):
-        runs = free_runs(step, make(evaluation.values), evaluation.test, evaluation.warm, empty)
+        runs = free_runs(step, make(evaluation.values), evaluation.test, evaluation.warm)
         network = network_figures(runs)
     write_arrays(
         path.with_suffix(".npz"), {f"shown.{k}": v for k, v in shown_run(runs, evaluation.shown).items()}

@@ -438,9 +438,8 @@ def _scored(
     if stable:
         stacked = torch.tensor(np.repeat([found[i][1] for i in stable], len(validation), axis=0))
         step = SindyStep(prior, library, stacked, dt, max(substeps))
-        empty = torch.zeros(0, dtype=torch.float64)
         with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges is scored as infinite
-            runs = free_runs(step, prior, list(validation) * len(stable), warm, empty)
+            runs = free_runs(step, prior, list(validation) * len(stable), warm)
             for k, i in enumerate(stable):
                 errors[i] = score(runs[k * len(validation) : (k + 1) * len(validation)]).e_sim_s
     return [

@@ -2,33 +2,260 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from hybrid_mpc.data.excitation import check_excitation
+from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_document, read_document_arrays, write_document
+from hybrid_mpc.identify.evaluate import FreeRun, evaluation_trajectories, free_runs, score
+from hybrid_mpc.identify.prior import fit_and_smooth, fit_physics, smoothed
 from hybrid_mpc.identify.settings import KINDS, TrainingSettings
-from hybrid_mpc.identify.step import Scaling
-from hybrid_mpc.identify.train import Trained, TrainingFailure
+from hybrid_mpc.identify.smooth import Smoother
+from hybrid_mpc.identify.step import PriorStep, Scaling, Step
+from hybrid_mpc.identify.train import Trained, TrainingFailure, train
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.engine import WORKERS, run_jobs
+from hybrid_mpc.machine.torch_prior import Prior
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import load_scenario
 
-if TYPE_CHECKING:
-    from hybrid_mpc.data.trajectories import Trajectory
-    from hybrid_mpc.identify.evaluate import FreeRun
-    from hybrid_mpc.machine.torch_prior import Prior
+DELAY_RUNS = 5.0
+"""Longest free runs [the machine's seconds] that parameters and delay are fitted to: a swing near the top multiplies
+every error."""
+MODELS = ("phy_nominal", "phy", *KINDS)
+"""Models that are evaluated."""
+ERRORS = {"error": "E_sim", "position": "RMSE", "energy": "energy violation"}
+"""What the validation of a training is called, by its first objective."""
+
+
+def check_data(context: Context) -> None:
+    """Read the user's recordings before anything is written: bad ones leave no folder behind."""
+    if context.settings.data:
+        doubts(context)  # reads and checks the recordings
+    elif context.scenario.make_data is None:
+        raise InputError(
+            f"scenario {context.scenario.name} is a real machine: give its recordings with --data FILE.csv "
+            f"(once for each file)"
+        )
+
+
+def data_stage(context: Context) -> None:
+    """Take the user's recordings, or let a simulated machine make its own; note what is in them, and all doubts."""
+    if not context.settings.data:
+        assert context.scenario.make_data is not None
+        context.progress.update("files", 0, 1, "recording the simulated machine")
+        context.scenario.make_data(context.out / "data", context.settings.seed, context.settings.budget)
+    dataset, warnings = context.dataset, doubts(context)
+    roles = ("train", "valid", "test")
+    context.save(
+        "data",
+        {
+            "files": dataset.files,
+            "hash": dataset.hash,
+            "cuts": [{"file": c.file, "from_s": c.start, "to_s": c.end, "why": c.why} for c in dataset.cuts],
+            "pieces": {role: len(context.trajectories(role)) for role in roles},
+            "seconds": {role: sum(len(t.t) * t.dt for t in context.trajectories(role)) for role in roles},
+            "warnings": list(warnings),
+        },
+    )
+    for warning in warnings:
+        context.progress.warn(warning)
+
+
+def doubts(context: Context) -> tuple[str, ...]:
+    """What is doubtful about the recordings, and what the training ones do not excite; some of it is refused.
+
+    Args:
+        context: The run.
+
+    Raises:
+        InputError: If a recording is bad, an input does nothing in those for training, or an output.
+    """
+    found = tuple(str(finding) for finding in context.dataset.findings)
+    prior = context.scenario.prior()
+    free = sum(not p.fixed for p in prior.parameters_spec)
+    train = context.trajectories("train")
+    if not train:  # the prior's fit says so
+        return found
+    return (
+        *found,
+        *check_excitation(train, inputs=prior.inputs, outputs=prior.outputs, parameters=free),
+    )
+
+
+def prior_stage(context: Context) -> None:
+    """Fit the prior's parameters, and the input's delay where there may be one, and smooth all recordings by it."""
+    make, spec = context.scenario.prior, context.spec
+    train, valid, test = (context.trajectories(role) for role in ("train", "valid", "test"))
+    if spec.largest_delay:
+        physics = fit_physics(
+            make, train, valid, dt=spec.dt, length=DELAY_RUNS * context.time_unit, largest_delay=spec.largest_delay,
+            on_progress=lambda done, total, text: context.progress.update("free runs", done, total, text),
+        )  # fmt: skip
+    else:
+        physics = fit_and_smooth(make, train, valid, spec.dt, on_progress=context.progress.update)
+    parts = [smoothed(make, physics, part, spec.dt) for part in (train, valid, test)]
+    notes = {
+        "nominal": make().values,
+        "units": {p.name: p.unit for p in make().parameters_spec},
+        "smoother": {"sigma": physics.sigma, "walk": physics.walk},
+        "delay": physics.delay,
+    }
+    arrays = {f"{t.name}/{key}": getattr(t, key) for part in parts for t in part for key in ("x", "xdot")}
+    context.save("prior", {**asdict(physics.fit), **notes}, arrays)
+    for warning in physics.fit.warnings:
+        context.progress.warn(f"fit of the prior: {warning}")
+
+
+def training_stage(context: Context) -> None:
+    """Train the networks of every kind, two kinds at once."""
+    trained = train_kinds(
+        context.settings.scenario,
+        context.result("prior")["values"],
+        context.smoothed("train"),
+        context.smoothed("valid"),
+        {kind: training_settings(context, kind) for kind in KINDS},
+        context.out / "checkpoints" / "training",
+        device=context.settings.device,
+        on_progress=context.progress.update,
+    )
+    best = {kind: float(one.validation.min()) for kind, one in trained.items()}
+    context.save("training", {"validation_e_sim_s": best})
+
+
+def train_kinds(
+    scenario: str,
+    values: Mapping[str, float],
+    training: Sequence[Trajectory],
+    validation: Sequence[Trajectory],
+    settings: Mapping[str, TrainingSettings],
+    folder: Path,
+    *,
+    device: str = "cpu",
+    workers: int = WORKERS,
+    on_progress: Callable[[str, int, int, str], None] = lambda key, done, total, text: None,
+) -> dict[str, Trained]:
+    """Train the networks of every kind that ``folder`` does not hold yet; an interrupted training is resumed.
+
+    Args:
+        scenario: Registered name or path, which every process loads for itself.
+        values: Parameters of the fitted prior.
+        training: Smoothed training trajectories.
+        validation: Smoothed validation trajectories.
+        settings: Settings of each kind.
+        folder: Where checkpoints and finished networks lie.
+        device: Where the networks are trained. Default: cpu.
+        workers: Kinds trained at once.
+        on_progress: ``(kind, done, total, text)``.
+    """
+    jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
+        kind: (_train_kind, (scenario, dict(values), training, validation, settings[kind], folder, device))
+        for kind in reversed(list(settings))
+        if not is_trained(folder, settings[kind])
+    }
+    run_jobs(jobs, on_progress, workers)
+    return {kind: load_trained(folder, kind) for kind in settings}
+
+
+def _train_kind(
+    scenario: str,
+    values: dict[str, float],
+    training: Sequence[Trajectory],
+    validation: Sequence[Trajectory],
+    settings: TrainingSettings,
+    folder: Path,
+    device: str,
+    report: Callable[[int, int, str], None],
+) -> None:
+    """Job of one process: train one kind and leave its files."""
+    label = ERRORS.get(settings.objectives[0], settings.objectives[0])
+    trained = train(
+        load_scenario(scenario).prior(values),
+        training,
+        validation,
+        settings,
+        checkpoint=folder / f"{settings.kind}.safetensors",
+        device=device,
+        on_progress=lambda done, total, error: report(done, total, f"validation {label} {error:.4g}"),
+    )
+    save_trained(folder, trained)
+
+
+def trained_models(context: Context, kind: str) -> Trained:
+    """A finished training from the run's folder."""
+    return load_trained(context.out / "checkpoints" / "training", kind)
+
+
+def evaluation_stage(context: Context) -> None:
+    """Free runs of every model over the test trajectories; the figures show them whole."""
+    prior, spec = context.result("prior"), context.spec
+    phy = context.scenario.prior(prior["values"])
+    smoother = Smoother(phy, spec.dt, tuple(prior["smoother"]["sigma"]), tuple(prior["smoother"]["walk"]))
+    whole = context.smoothed("test")
+    shown, test = (
+        evaluation_trajectories(whole, smoother, context.warm, length) for length in (None, spec.free_run)
+    )
+    scores: dict[str, Any] = {}
+    files: dict[str, Any] = {}
+    arrays: dict[str, Any] = {}
+    for i, name in enumerate(MODELS):
+        context.progress.update("models", i, len(MODELS), name)
+        all_scores = []
+        for k, step in enumerate(_members(context, name, phy)):
+            runs = free_runs(step, phy, test, context.warm)
+            all_scores.append(asdict(score(runs)))
+            if k == 0:
+                files[name] = {f: asdict(score(part)) for f, part in _by_file(runs).items()}
+                for run in free_runs(step, phy, shown, context.warm):
+                    for key in ("t", "u", "x", "x_hat", "y", "energy_measured_w", "energy_model_w"):
+                        arrays[f"{name}/{run.name}/{key}"] = getattr(run, key)
+        scores[name] = {"best": all_scores[0], "networks": all_scores}
+    context.save("evaluation", {"scores": scores, "by_file": files, "runs": [t.name for t in whole]}, arrays)
+
+
+def _by_file(runs: Sequence[FreeRun]) -> dict[str, list[FreeRun]]:
+    """Free runs by the stem of the recording they come from."""
+    files: dict[str, list[FreeRun]] = {}
+    for run in runs:
+        files.setdefault(run.name.split("#")[0], []).append(run)
+    return files
+
+
+def _members(context: Context, name: str, phy: Prior) -> Sequence[Step]:
+    """Steps of one model, that of the best network by validation first."""
+    dt = context.spec.dt
+    if name in ("phy_nominal", "phy"):
+        return [PriorStep(phy if name == "phy" else context.scenario.prior(), dt)]
+    trained = trained_models(context, name)
+    return [trained.step(phy, dt, int(i)) for i in np.argsort(trained.validation, kind="stable")]
+
+
+def training_settings(context: Context, kind: str) -> TrainingSettings:
+    """What the networks of a kind are trained with: the budget, and what the run's own file replaces of it."""
+    b = context.budget
+    settings = TrainingSettings(
+        kind=kind,  # type: ignore[arg-type]
+        hidden=b.hidden,
+        networks=b.networks,
+        teacher_steps=b.teacher_steps,
+        free_run_steps=b.free_run_steps,
+        seed=context.settings.seed,
+        warm=context.warm,
+        decay=b.decay,
+        prior_replay=b.prior_replay,
+    )
+    return replace(settings, **context.settings.network())
 
 
 @dataclass(frozen=True)
 class _Note:
-    """What the JSON file holds; the arrays are in a file next to it."""
+    """What the JSON file of trained networks holds; the arrays are in a file next to it."""
 
     settings: TrainingSettings
     scaling: Scaling
@@ -90,212 +317,3 @@ def load_trained(folder: Path, kind: str) -> Trained:
         part["own"]["skipped"],
         note.failures,
     )
-
-
-DELAY_RUNS = 5.0
-"""Longest free runs [the machine's seconds] that parameters and delay are fitted to: a swing near the top multiplies
-every error."""
-MODELS = ("phy_nominal", "phy", "rnn", "pgrnn", "mopgrnn")
-
-
-def check_data(context: Context) -> None:
-    """Read the user's recordings before anything is written: bad ones leave no folder behind."""
-    if context.settings.data:
-        doubts(context)  # reads and checks the recordings
-    elif context.scenario.make_data is None:
-        raise InputError(
-            f"scenario {context.scenario.name} is a real machine: give its recordings with --data FILE.csv "
-            f"(once for each file)"
-        )
-
-
-def data_stage(context: Context) -> None:
-    """Take the user's recordings, or let a simulated machine make its own; note what is in them, and all doubts."""
-    if not context.settings.data:
-        assert context.scenario.make_data is not None
-        context.progress.update("files", 0, 1, "recording the simulated machine")
-        context.scenario.make_data(context.out / "data", context.settings.seed, context.settings.budget)
-    dataset, warnings = context.dataset, doubts(context)
-    roles = ("train", "valid", "test")
-    context.save(
-        "data",
-        {
-            "files": dataset.files,
-            "hash": dataset.hash,
-            "cuts": [{"file": c.file, "from_s": c.start, "to_s": c.end, "why": c.why} for c in dataset.cuts],
-            "pieces": {role: len(context.trajectories(role)) for role in roles},
-            "seconds": {role: sum(len(t.t) * t.dt for t in context.trajectories(role)) for role in roles},
-            "warnings": list(warnings),
-        },
-    )
-    for warning in warnings:
-        context.progress.warn(warning)
-
-
-def doubts(context: Context) -> tuple[str, ...]:
-    """What is doubtful about the recordings, and what the training ones do not excite; some of it is refused.
-
-    Args:
-        context: The run.
-
-    Raises:
-        InputError: If a recording is bad, an input does nothing in those for training, or an output.
-    """
-    found = tuple(str(finding) for finding in context.dataset.findings)
-    prior = context.scenario.prior()
-    free = sum(not p.fixed for p in prior.parameters_spec)
-    train = context.trajectories("train")
-    if not train:  # the prior's fit says so
-        return found
-    return (
-        *found,
-        *check_excitation(train, inputs=prior.inputs, outputs=prior.outputs, parameters=free),
-    )
-
-
-def prior_stage(context: Context) -> None:
-    """Fit the prior's parameters, and the input's delay where there may be one, and smooth all recordings by it."""
-    from hybrid_mpc.identify.prior import fit_and_smooth, fit_physics, smoothed
-
-    make, spec = context.scenario.prior, context.spec
-    train, valid, test = (context.trajectories(role) for role in ("train", "valid", "test"))
-    if spec.largest_delay:
-        physics = fit_physics(
-            make, train, valid, dt=spec.dt, length=DELAY_RUNS * context.time_unit, largest_delay=spec.largest_delay,
-            on_progress=lambda done, total, text: context.progress.update("free runs", done, total, text),
-        )  # fmt: skip
-    else:
-        physics = fit_and_smooth(make, train, valid, spec.dt, on_progress=context.progress.update)
-    parts = [smoothed(make, physics, part, spec.dt) for part in (train, valid, test)]
-    notes = {
-        "nominal": make().values,
-        "units": {p.name: p.unit for p in make().parameters_spec},
-        "smoother": {"sigma": physics.sigma, "walk": physics.walk},
-        "delay": physics.delay,
-    }
-    arrays = {f"{t.name}/{key}": getattr(t, key) for part in parts for t in part for key in ("x", "xdot")}
-    context.save("prior", {**asdict(physics.fit), **notes}, arrays)
-    for warning in physics.fit.warnings:
-        context.progress.warn(f"fit of the prior: {warning}")
-
-
-def training_stage(context: Context) -> None:
-    """Train the networks of every kind, two kinds at once."""
-    folder = context.out / "checkpoints" / "training"
-    values = context.result("prior")["values"]
-    todo = [k for k in reversed(KINDS) if not is_trained(folder, training_settings(context, k))]
-    jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
-        kind: (
-            _train_kind,
-            (context.settings.scenario, values, context.smoothed("train"), context.smoothed("valid"),
-             training_settings(context, kind), folder, context.settings.device),
-        )
-        for kind in todo
-    }  # fmt: skip
-    run_jobs(jobs, context.progress.update, WORKERS)
-    trained = {kind: trained_models(context, kind) for kind in KINDS}
-    best = {k: float(t.validation.min()) for k, t in trained.items()}
-    context.save("training", {"validation_e_sim_s": best})
-
-
-def trained_models(context: Context, kind: str) -> Trained:
-    """A finished training from the run's folder."""
-    return load_trained(context.out / "checkpoints" / "training", kind)
-
-
-def evaluation_stage(context: Context) -> None:
-    """Free runs of every model over the test trajectories; the figures show them whole."""
-    from hybrid_mpc.identify.evaluate import evaluation_trajectories, free_runs, score
-    from hybrid_mpc.identify.smooth import Smoother
-
-    prior, spec = context.result("prior"), context.spec
-    phy = context.scenario.prior(prior["values"])
-    smoother = Smoother(phy, spec.dt, tuple(prior["smoother"]["sigma"]), tuple(prior["smoother"]["walk"]))
-    whole = context.smoothed("test")
-    shown, test = (
-        evaluation_trajectories(whole, smoother, context.warm, length) for length in (None, spec.free_run)
-    )
-    scores: dict[str, Any] = {}
-    files: dict[str, Any] = {}
-    arrays: dict[str, Any] = {}
-    for i, name in enumerate(MODELS):
-        context.progress.update("models", i, len(MODELS), name)
-        members = _members(context, name, phy)
-        all_scores = []
-        for k, (step, h0) in enumerate(members):
-            runs = free_runs(step, phy, test, context.warm, h0)
-            all_scores.append(asdict(score(runs)))
-            if k == 0:
-                files[name] = {f: asdict(score(part)) for f, part in _by_file(runs).items()}
-                for run in free_runs(step, phy, shown, context.warm, h0):
-                    for key in ("t", "u", "x", "x_hat", "y", "energy_measured_w", "energy_model_w"):
-                        arrays[f"{name}/{run.name}/{key}"] = getattr(run, key)
-        scores[name] = {"best": all_scores[0], "networks": all_scores}
-    context.save("evaluation", {"scores": scores, "by_file": files, "runs": [t.name for t in whole]}, arrays)
-
-
-def _by_file(runs: Sequence[FreeRun]) -> dict[str, list[FreeRun]]:
-    """Free runs by the stem of the recording they come from."""
-    files: dict[str, list[FreeRun]] = {}
-    for run in runs:
-        files.setdefault(run.name.split("#")[0], []).append(run)
-    return files
-
-
-def _members(context: Context, name: str, phy: Prior) -> list[tuple[Any, Any]]:
-    """Steps of one model with their initial hidden states, the deployed one first."""
-    import torch
-
-    from hybrid_mpc.identify.step import PriorStep
-
-    dt, double = context.spec.dt, torch.float64
-    if name in ("phy_nominal", "phy"):
-        prior = phy if name == "phy" else context.scenario.prior()
-        return [(PriorStep(prior, dt), torch.zeros(0, dtype=double))]
-    trained = trained_models(context, name)
-    order = np.argsort(trained.validation, kind="stable")
-    steps = [trained.step(phy, dt, int(i)) for i in order]
-    return [(step, torch.zeros(step.n_h, dtype=double)) for step in steps]
-
-
-def training_settings(context: Context, kind: str) -> TrainingSettings:
-    """What the networks of a kind are trained with: the budget, and what the run's own file replaces of it."""
-    b = context.budget
-    settings = TrainingSettings(
-        kind=kind,  # type: ignore[arg-type]
-        hidden=b.hidden,
-        networks=b.networks,
-        teacher_steps=b.teacher_steps,
-        free_run_steps=b.free_run_steps,
-        seed=context.settings.seed,
-        warm=context.warm,
-        decay=b.decay,
-        prior_replay=b.prior_replay,
-    )
-    return replace(settings, **context.settings.network())
-
-
-def _train_kind(
-    scenario: str,
-    values: dict[str, float],
-    training: Sequence[Trajectory],
-    validation: Sequence[Trajectory],
-    settings: TrainingSettings,
-    folder: Path,
-    device: str,
-    report: Callable[[int, int, str], None],
-) -> None:
-    """Job of one process: train one kind and leave its files."""
-    from hybrid_mpc.identify.train import train
-
-    prior = load_scenario(scenario).prior(values)
-    trained = train(
-        prior,
-        training,
-        validation,
-        settings,
-        checkpoint=folder / f"{settings.kind}.safetensors",
-        device=device,
-        on_progress=lambda done, total, error: report(done, total, f"validation E_sim {error:.4g}"),
-    )
-    save_trained(folder, trained)
