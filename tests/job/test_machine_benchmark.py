@@ -10,7 +10,8 @@ from cart import DELAY, TRUE, recording, written
 from hybrid_mpc import BenchmarkBudget, InputError, load_scenario
 from hybrid_mpc.files import read_document, write_document
 from hybrid_mpc.identify.dataset import cut_windows
-from hybrid_mpc.identify.delay import fit_physics, shifted
+from hybrid_mpc.identify.delay import shifted
+from hybrid_mpc.identify.prior import fit_physics
 from hybrid_mpc.job.benchmark import BenchmarkSettings, benchmark, load_model
 from hybrid_mpc.job.benchmark import benchmark as networks
 from hybrid_mpc.job.benchmark_runs import figures_of, read_test, read_training, run_freely
