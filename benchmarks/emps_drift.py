@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_mpc import Trajectory
-from hybrid_mpc.identify.delay import OutputErrorFit, cut_runs
+from hybrid_mpc.identify.output_error import OutputErrorFit, cut_runs
 from hybrid_mpc.job.benchmark_runs import read_test
 from scenarios.emps import scenario
 

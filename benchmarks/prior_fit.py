@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from hybrid_mpc import Trajectory
 from hybrid_mpc.identify.dataset import cut_windows
-from hybrid_mpc.identify.fit import STAGES, cut_segments, multiple_shooting
-from hybrid_mpc.identify.residuals import ParameterFit
-from hybrid_mpc.identify.swarm import SwarmSettings, particle_swarm
+from hybrid_mpc.identify.fit import STAGES, ParameterFit, cut_segments, multiple_shooting
+from scenarios.paper.swarm import SwarmSettings, particle_swarm
 from scenarios.pendulum.data import run
 from scenarios.pendulum.plant import DampedPendulum
 from scenarios.pendulum.prior import PendulumPrior

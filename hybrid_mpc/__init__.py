@@ -67,14 +67,11 @@ if TYPE_CHECKING:
     from hybrid_mpc.estimate.switching import SwitchingFilter
     from hybrid_mpc.estimate.tuning import process_noise
     from hybrid_mpc.files import write_arrays
-    from hybrid_mpc.identify.delay import with_input_lag
-    from hybrid_mpc.identify.evaluate import free_runs, judged, score
+    from hybrid_mpc.identify.evaluate import evaluation_trajectories, free_runs, score
     from hybrid_mpc.identify.export import check_parity, model_info, trace_model
     from hybrid_mpc.identify.fit import fit_prior
     from hybrid_mpc.identify.networks import GRUNetwork
-    from hybrid_mpc.identify.output_network import train_output, with_output
     from hybrid_mpc.identify.settings import TrainingSettings
-    from hybrid_mpc.identify.sindy import fit_sindy
     from hybrid_mpc.identify.smooth import fit_smoother
     from hybrid_mpc.identify.step import HybridStep, PriorStep, Scaling, n_features
     from hybrid_mpc.identify.train import train
@@ -226,12 +223,12 @@ __all__ = [
     "differentiate",
     "dry_run",
     "equilibria",
+    "evaluation_trajectories",
     "excess_bound",
     "excitation_of",
     "feature_box",
     "find_noise",
     "fit_prior",
-    "fit_sindy",
     "fit_smoother",
     "free_runs",
     "frequency_response",
@@ -241,7 +238,6 @@ __all__ = [
     "guard_monitor",
     "holding_input",
     "jacobians",
-    "judged",
     "learn_from",
     "learn_plausibility",
     "linearize",
@@ -292,13 +288,10 @@ __all__ = [
     "system_structure",
     "trace_model",
     "train",
-    "train_output",
     "tune",
     "varied",
     "with_friction",
     "with_input_delay",
-    "with_input_lag",
-    "with_output",
     "with_parameter_states",
     "write_arrays",
     "write_csv",
@@ -341,14 +334,11 @@ _ROOMS = {
     "estimate.switching": ("SwitchingFilter",),
     "estimate.tuning": ("process_noise",),
     "files": ("write_arrays",),
-    "identify.delay": ("with_input_lag",),
-    "identify.evaluate": ("free_runs", "judged", "score"),
+    "identify.evaluate": ("evaluation_trajectories", "free_runs", "score"),
     "identify.export": ("check_parity", "model_info", "trace_model"),
     "identify.fit": ("fit_prior",),
     "identify.networks": ("GRUNetwork",),
-    "identify.output_network": ("train_output", "with_output"),
     "identify.settings": ("TrainingSettings",),
-    "identify.sindy": ("fit_sindy",),
     "identify.smooth": ("fit_smoother",),
     "identify.step": ("HybridStep", "PriorStep", "Scaling", "n_features"),
     "identify.train": ("train",),

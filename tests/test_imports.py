@@ -50,6 +50,9 @@ TORCH = (
     "nn_export/torch_bridge.py",
     "hybrid_mpc/machine/torch_prior.py",
     "hybrid_mpc/identify/",
+    "scenarios/paper/sindy.py",
+    "scenarios/paper/step.py",
+    "scenarios/paper/swarm.py",
 )
 # rooms that run beside a machine and so must not even import torch lazily
 ONLINE = ("model", "estimate", "control", "loop", "monitor", "analyze", "kit", "plots", "report")

@@ -1,4 +1,4 @@
-"""Trajectories as tensors: windows for training, whole runs for evaluation."""
+"""Windows of trajectories as tensors: what fits and trainings take."""
 
 from __future__ import annotations
 
@@ -11,11 +11,6 @@ from torch import Tensor
 
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.identify.step import Scaling
-from hybrid_mpc.machine.torch_prior import Prior
-
-SPAN = 10
-"""Periods over which the correction is averaged to find its scale."""
 
 
 @dataclass(frozen=True)
@@ -99,37 +94,8 @@ def fitting_horizon(trajectories: Sequence[Trajectory], warm: int, most: int) ->
     return max(1, min(most, max(min(lengths), min(most // 2, max(lengths)))))
 
 
-def scaling_of(prior: Prior, windows: Windows, dt: float, *, use_prior: bool) -> Scaling:
-    """Scaling from training windows: root mean squares of signals and of what the network must give.
-
-    What it must give is averaged over ``SPAN`` periods first: the noise of a twice differentiated position
-    would set the scale otherwise, and networks on so large a scale learn noise.
-    """
-    x, u = windows.x[:, :-1].reshape(-1, windows.x.shape[-1]), windows.u.reshape(-1, windows.u.shape[-1])
-    n_q = prior.n_q
-    measured = (windows.x[:, 1:, n_q:] - windows.x[:, :-1, n_q:]) / dt
-    predicted = prior.acceleration(x, u)
-    residual = measured - predicted.reshape(measured.shape) if use_prior else measured
-    whole = residual[:, : residual.shape[1] // SPAN * SPAN] if residual.shape[1] >= SPAN else residual
-    averaged = whole.unflatten(1, (-1, min(SPAN, whole.shape[1]))).mean(2).reshape(-1, n_q)
-
-    return Scaling(x=_rms(x), u=_rms(u), acceleration=_rms(predicted), correction=_rms(averaged))
-
-
-def literal_scaling_of(prior: Prior, windows: Windows) -> Scaling:
-    """Scaling of the paper's literal form: root mean squares of signals, of the prior's xdot and of xdot."""
-    x, u = windows.x[:, :-1].flatten(0, 1), windows.u.flatten(0, 1)
-    return Scaling(
-        x=_rms(x), u=_rms(u), acceleration=_rms(prior(x, u)), correction=_rms(windows.xdot.flatten(0, 1))
-    )
-
-
-def _rms(values: Tensor) -> tuple[float, ...]:
-    return tuple(float(v) for v in values.square().mean(0).sqrt().clamp_min(1e-9))
-
-
 def check_rates(trajectories: Sequence[Trajectory]) -> None:
-    """Refuse trajectories whose derivative is not known: the literal form is trained on it.
+    """Refuse trajectories whose derivative is not known: the paper form is trained on it.
 
     Raises:
         InputError: If xdot holds a value that is not finite.

@@ -1,4 +1,4 @@
-"""Free runs of a model over whole trajectories and the figures that judge them."""
+"""Free runs of models over whole trajectories, and their figures."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.identify.smooth import Smoother
-from hybrid_mpc.identify.train import Trained, stack_for, step_for
+from hybrid_mpc.identify.step import Step
+from hybrid_mpc.identify.train import Trained
 from hybrid_mpc.machine.torch_prior import Prior
 
 Array = NDArray[np.float64]
@@ -22,13 +23,13 @@ STARTS = 5
 
 @dataclass(frozen=True)
 class FreeRun:
-    """A free run over one trajectory after its warm-up, beside the measurement; n scored periods.
+    """A free run over one trajectory after its warm-up, and the measurement; n scored periods.
 
     Args:
         name: The trajectory's name.
         t: Times [s] ``(n,)``.
         u: Inputs ``(n, n_u)``.
-        x: Measured (smoothed) states ``(n, n_x)``; x_hat: the model's.
+        x: Measured (smoothed) states ``(n, n_x)``.
         x_hat: States of the model ``(n, n_x)``.
         y: Measured outputs ``(n, n_y)``, not smoothed.
         y_hat: Outputs of the model ``(n, n_y)``.
@@ -56,37 +57,30 @@ class Scores:
     """Figures of one model over several free runs; a diverging run makes them infinite.
 
     Args:
-        e_sim_s: Simulation error in duration form, λ = 0: mean over runs of the time mean of
-            ``|xdot - xdot_hat|_1``.
-        e_sim_lambda1_s: The same discounted by ``1 / (1 + λ t)`` with λ = 1 1/s.
-        e_sim_literal_s: The paper's literal form: integral over the run divided by its number of samples.
+        e_sim_s: Simulation error in duration form: mean over runs of the time mean of ``|xdot - xdot_hat|_1``.
         rmse_rad: Root mean square of the first output's error (rad for an angle).
         energy_violation_w: Time mean of ``|ΔE_M - ΔE_S|`` [W].
-        amplitude_ratio: Largest ``|y_hat|`` over largest ``|y|``, the largest over runs.
     """
 
     e_sim_s: float
-    e_sim_lambda1_s: float
-    e_sim_literal_s: float
     rmse_rad: float
     energy_violation_w: float
-    amplitude_ratio: float
 
 
-def judged(
+def evaluation_trajectories(
     trajectories: Sequence[Trajectory], smoother: Smoother, warm: int, length: float | None = None
 ) -> list[Trajectory]:
-    """The runs that judge a model: what is known at their start was smoothed from their warm-up alone.
+    """The trajectories that a model is evaluated on: their starts are smoothed from their warm-ups alone.
 
     Args:
-        trajectories: Test trajectories, smoothed as a whole (what the models' rates are compared with).
+        trajectories: Test trajectories, smoothed with all their samples (the models' rates are compared with these).
         smoother: Smoother of the warm-ups; the same for every model.
         warm: Samples of the warm-up.
-        length: Length [s] of a run after its warm-up; one starts every fifth of it. A trajectory that is
-            shorter is one run. Default: every trajectory is one run.
+        length: Length [s] of a run after its warm-up; one starts every fifth of it. A shorter trajectory is one run.
+            Default: every trajectory is one run.
 
     Returns:
-        Runs whose first ``warm + 1`` states know the measurements up to sample ``warm`` and none after it.
+        Trajectories whose first ``warm + 1`` states know the measurements up to sample ``warm`` and none after it.
     """
     pieces = []
     for t in trajectories:
@@ -101,26 +95,32 @@ def judged(
 
 
 def free_runs(
-    step: nn.Module, prior: Prior, trajectories: Sequence[Trajectory], warm: int, h0: Tensor
+    step: Step, prior: Prior, trajectories: Sequence[Trajectory], warm: int, h0: Tensor | None = None
 ) -> list[FreeRun]:
-    """Free runs of one step over trajectories; the warm-up is measured and not scored.
-
-    h is warmed up on the samples before ``warm``; there the run leaves the measurement.
+    """Free runs of one model over trajectories; the warm-up is given and not scored.
 
     Args:
-        step: ``(x, h, u) -> (x_next, h_next)``, one network, any batch.
-        prior: The prior whose energy balance judges (the fitted one).
-        trajectories: The runs (see :func:`judged`); they may differ in length.
+        step: The model.
+        prior: The prior whose energy balance and output count (the fitted one).
+        trajectories: The trajectories (:func:`evaluation_trajectories`); they may differ in length.
         warm: Samples of the warm-up.
-        h0: Hidden state before the warm-up ``(n_h,)``.
+        h0: Hidden state before the warm-up ``(n_h,)``. Default: zero.
+
+    Example:
+        >>> from hybrid_mpc import PriorStep
+        >>> from scenarios.pendulum.data import exact_runs
+        >>> from scenarios.pendulum.prior import PendulumPrior
+        >>> prior = PendulumPrior()
+        >>> runs = free_runs(PriorStep(prior, 0.01), prior, exact_runs("test", 1), warm=10)
+        >>> runs[0].x_hat.shape
+        (490, 2)
     """
-    x_all, u_all = _padded(trajectories)
-    x_hat = _states(step, x_all, u_all, warm, h0.expand(len(trajectories), -1))
+    x_hat = model_states(step, trajectories, warm, h0)
     return [_free_run(prior, t, x_hat[i], warm) for i, t in enumerate(trajectories)]
 
 
 def stacked_free_runs(
-    trained: Trained, prior: Prior, dt: float, judge: Prior, trajectories: Sequence[Trajectory], warm: int
+    trained: Trained, prior: Prior, dt: float, balance: Prior, trajectories: Sequence[Trajectory], warm: int
 ) -> list[list[FreeRun]]:
     """:func:`free_runs` of all networks of a training at once: those of the first network, the second, ...
 
@@ -128,66 +128,54 @@ def stacked_free_runs(
         trained: The training.
         prior: The prior that the networks correct.
         dt: Model period [s].
-        judge: The prior whose energy balance judges.
-        trajectories: The runs; they may differ in length.
+        balance: The prior whose energy balance and output count.
+        trajectories: The trajectories; they may differ in length.
         warm: Samples of the warm-up.
     """
-    stack = stack_for(prior, trained.settings)
-    stack.load_state_dict({name: torch.tensor(value) for name, value in trained.weights.items()})
-    step = step_for(prior, stack, trained.scaling, dt, trained.settings)
-    x_all, u_all = (a.expand(stack.networks, *a.shape) for a in _padded(trajectories))
-    with torch.no_grad():
-        x_hat = _states(step, x_all, u_all, warm, stack.initial(len(trajectories)))
-    return [
-        [_free_run(judge, t, x_hat[k, i], warm) for i, t in enumerate(trajectories)]
-        for k in range(len(x_hat))
-    ]
+    step = trained.stacked_step(prior, dt)
+    x_hat = model_states(step, trajectories, warm)
+    return [[_free_run(balance, t, x[i], warm) for i, t in enumerate(trajectories)] for x in x_hat]
 
 
-def _padded(trajectories: Sequence[Trajectory]) -> tuple[Tensor, Tensor]:
-    """States and inputs ``(runs, samples, n)``, short ones prolonged by their last sample."""
+def model_states(
+    step: Step, trajectories: Sequence[Trajectory], warm: int, h0: Tensor | None = None
+) -> Array:
+    """States of a model that runs freely from sample ``warm`` on, ``(..., runs, samples - warm + 1, n_x)``.
+
+    Args:
+        step: The model, or a stack of networks (:meth:`~hybrid_mpc.identify.train.Trained.stacked_step`).
+        trajectories: The trajectories. Those that are shorter go on under their last input.
+        warm: Samples of the warm-up, in which h follows the measured states.
+        h0: Hidden state before the warm-up ``(n_h,)``, or ``(networks, 1, n_h)`` of a stack. Default: zero.
+    """
+    h0 = step.h0 if h0 is None else h0
     longest = max(len(t.t) for t in trajectories)
+    h = h0.expand(*h0.shape[:-2], len(trajectories), h0.shape[-1])
     x_all, u_all = (
-        torch.tensor(np.stack([_pad(a, longest) for a in arrays]))
-        for arrays in ([t.x for t in trajectories], [t.u for t in trajectories])
+        torch.tensor(np.stack([_padded(getattr(t, key), longest) for t in trajectories]))
+        for key in ("x", "u")
     )
-    return x_all, u_all
-
-
-def _states(step: nn.Module, x_all: Tensor, u_all: Tensor, warm: int, h: Tensor) -> Array:
-    """States of the model from sample ``warm`` on, ``(..., samples - warm + 1, n_x)``."""
+    x_all, u_all = (a.expand(*h.shape[:-2], *a.shape) for a in (x_all, u_all))
     with torch.no_grad():
         for k in range(warm):
             _, h = step(x_all[..., k, :], h, u_all[..., k, :])
-        x, states = x_all[..., warm, :], []
-        for k in range(warm, x_all.shape[-2]):
-            states.append(x)
+        x = x_all[..., warm, :]
+        states = [x]
+        for k in range(warm, longest):
             x, h = step(x, h, u_all[..., k, :])
-        states.append(x)
+            states.append(x)
     x_hat: Array = torch.stack(states, -2).numpy()
     return x_hat
 
 
 def score(runs: Sequence[FreeRun]) -> Scores:
     """Figures over free runs (paper: E_sim, energy violation)."""
-    e0, e1, literal, square, energy, amplitude = [], [], [], [], [], []
+    e_sim, square, energy = [], [], []
     for run in runs:
-        error = np.abs(run.xdot_hat - run.xdot).sum(1)
-        t, dt = run.t - run.t[0], float(np.mean(np.diff(run.t)))
-        e0.append(error.mean())
-        e1.append((error / (1.0 + t)).mean())
-        literal.append(error.mean() * dt)
+        e_sim.append(np.abs(run.xdot_hat - run.xdot).sum(1).mean())
         square.append(((run.y_hat[:, 0] - run.y[:, 0]) ** 2).mean())
         energy.append(np.abs(run.energy_model_w - run.energy_measured_w).mean())
-        amplitude.append(np.abs(run.y_hat).max() / np.abs(run.y).max())
-    figures = (
-        np.mean(e0),
-        np.mean(e1),
-        np.mean(literal),
-        np.sqrt(np.mean(square)),
-        np.mean(energy),
-        np.max(amplitude),
-    )
+    figures = np.mean(e_sim), np.sqrt(np.mean(square)), np.mean(energy)
     return Scores(*(float(v) if np.isfinite(v) else float("inf") for v in figures))
 
 
@@ -196,25 +184,15 @@ def _free_run(prior: Prior, trajectory: Trajectory, x_hat: Array, warm: int) -> 
     part = slice(warm, warm + n)
     u, x = trajectory.u[part], trajectory.x[part]
     xdot, xdot_hat = np.diff(trajectory.x[warm:], axis=0) / dt, np.diff(x_hat[: n + 1], axis=0) / dt
-    tensors = (torch.tensor(a) for a in (x, xdot, u, x_hat[:n], xdot_hat))
+    x_t, xdot_t, u_t, x_hat_t, xdot_hat_t = (torch.tensor(a) for a in (x, xdot, u, x_hat[:n], xdot_hat))
     with torch.no_grad():
-        x_t, xdot_t, u_t, x_hat_t, xdot_hat_t = tensors
         measured = prior.energy_balance(x_t, xdot_t, u_t).numpy()
         model = prior.energy_balance(x_hat_t, xdot_hat_t, u_t).numpy()
         y_hat = prior.output(x_hat_t, u_t).numpy()
     return FreeRun(
-        trajectory.name,
-        trajectory.t[part],
-        u,
-        x,
-        x_hat[:n],
-        trajectory.y[part],
-        y_hat,
-        xdot,
-        xdot_hat,
-        measured,
-        model,
-    )
+        trajectory.name, trajectory.t[part], u, x, x_hat[:n], trajectory.y[part], y_hat, xdot, xdot_hat,
+        measured, model,
+    )  # fmt: skip
 
 
 def _samples(trajectory: Trajectory, keep: slice) -> Trajectory:
@@ -222,5 +200,5 @@ def _samples(trajectory: Trajectory, keep: slice) -> Trajectory:
     return replace(trajectory, **arrays)
 
 
-def _pad(values: Array, length: int) -> Array:
+def _padded(values: Array, length: int) -> Array:
     return np.concatenate([values, np.repeat(values[-1:], length - len(values), axis=0)])

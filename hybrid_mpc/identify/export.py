@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias, cast
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -13,16 +13,11 @@ from torch import Tensor, nn
 
 import nn_export
 from hybrid_mpc.data.trajectories import Trajectory
-from hybrid_mpc.identify.networks import Network
-from hybrid_mpc.identify.output_network import OutputModel
-from hybrid_mpc.identify.sindy import SindyStep
-from hybrid_mpc.identify.step import PriorStep, RecurrentStep
+from hybrid_mpc.identify.step import RecurrentStep, Step
 from hybrid_mpc.kit.artifact import INPUTS, OUTPUTS, BalanceInfo, ModelInfo, build_model
 from hybrid_mpc.machine.torch_prior import Prior
 from hybrid_mpc.model.model import STEP_INPUTS, STEP_OUTPUTS, step_symbols
 
-Step: TypeAlias = RecurrentStep | PriorStep | SindyStep
-"""What can be exported: every model as a step ``(x, h, u) -> (x_next, h_next)``."""
 ENERGY = BalanceInfo("energy", "J", "W")
 """The balance that every prior states."""
 
@@ -55,9 +50,8 @@ class _Method(nn.Module):
 class _WithParameters(nn.Module):
     """A function of a model with the prior's parameters as its last input ``p``, in the order of its specification.
 
-    What the prior says changes with ``p``. What a network adds stays as it is: it has learned beside the fitted prior,
-    whose values are among its features. Parameters that were trained along with a network are moved by as much as ``p``
-    is from the fitted ones.
+    The prior changes with ``p``; what a network adds does not: it was trained next to the fitted prior. Parameters
+    that were trained along with a network move by as much as ``p`` differs from the fitted ones.
     """
 
     def __init__(self, prior: Prior, dynamics: nn.Module | None = None) -> None:
@@ -100,15 +94,15 @@ class _Xdot(_OfStep):
 
 
 class _Output(_WithParameters):
-    """``output`` of a prior, with what a network G adds."""
+    """``output`` of a prior."""
 
-    def __init__(self, prior: Prior, network: OutputModel | None) -> None:
+    def __init__(self, prior: Prior) -> None:
         super().__init__(prior)
-        self.part, self.network = _Method(prior, "output"), network
+        self.part = _Method(prior, "output")
 
     def forward(self, x: Tensor, u: Tensor, w: Tensor, p: Tensor) -> Tensor:
         y: Tensor = self.at(self.part, "owner.", p, x, u)
-        return y if self.network is None else y + self.network.correction(x, u)
+        return y
 
 
 class _Energy(_WithParameters):
@@ -123,17 +117,16 @@ class _Energy(_WithParameters):
         return balance
 
 
-def trace_model(step: Step, output: OutputModel | None = None) -> dict[str, nn_export.Program]:
+def trace_model(step: Step) -> dict[str, nn_export.Program]:
     """Programs ``step, xdot, output`` of one model, and of its prior's balances.
 
     Args:
         step: The model.
-        output: Its output, with a network G in it. Default: the prior's output.
     """
     modules: dict[str, nn.Module] = {
         "step": _OfStep(step, "forward", "integrate"),
         "xdot": _Xdot(step, "xdot", "derivative"),
-        "output": _Output(step.prior, output),
+        "output": _Output(step.prior),
         ENERGY.program: _Energy(step.prior),
     }
     examples = _examples(step)
@@ -188,8 +181,7 @@ def check_parity(
 
 
 def _examples(step: Step) -> dict[str, Tensor]:
-    n_h = cast(Network, step.network).n_h if isinstance(step, RecurrentStep) else 0
     n_x, n_u = len(step.prior.states), len(step.prior.inputs)
-    shapes = {"x": n_x, "h": n_h, "u": n_u, "w": 0, "xdot": n_x}
+    shapes = {"x": n_x, "h": step.n_h, "u": n_u, "w": 0, "xdot": n_x}
     zeros = {name: torch.zeros(n, dtype=torch.float64) for name, n in shapes.items()}
     return {**zeros, "p": torch.tensor(list(step.prior.values.values()), dtype=torch.float64)}

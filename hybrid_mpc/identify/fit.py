@@ -1,8 +1,11 @@
-"""Fit of the prior's parameters to the training trajectories: the honest baseline ``phy``."""
+"""Fit of a prior's parameters to states: equation error, output error over free runs, multiple shooting.
+
+Residuals are errors of free runs over the states' spread, with exact derivatives (forward mode through the integrator).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -18,17 +21,146 @@ from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.dataset import Windows, cut_windows
 from hybrid_mpc.identify.prior_result import PriorFit
-from hybrid_mpc.identify.residuals import LARGEST, ParameterFit, spread_of
 from hybrid_mpc.identify.step import required_substeps, rk4
-from hybrid_mpc.identify.swarm import SwarmSettings, particle_swarm
 from hybrid_mpc.machine.torch_prior import Prior
 
-# What all fits of a prior share: scaled parameters, residuals of free runs with exact derivatives, confidence.
-
 Array = NDArray[np.float64]
+LARGEST = 1e3
+"""Residuals beyond this many spreads of the data count as much: a free run that diverges stays finite."""
 
 
-# Output error by multiple shooting: the states at the segments' starts are unknowns beside the parameters.
+class ParameterFit:
+    """A prior's free parameters ``theta``, each over its nominal size, and the residuals that are fitted.
+
+    Args:
+        make: Prior class or factory ``(values=None) -> Prior``.
+        dt: Model period [s].
+    """
+
+    def __init__(self, make: Callable[..., Prior], dt: float) -> None:
+        self.make, self.prior, self.dt = make, make(), dt
+        self.free = [p for p in self.prior.parameters_spec if not p.fixed]
+        self.unit = np.array([abs(p.value) if p.value else (p.upper - p.lower) for p in self.free])
+        self.nominal = np.array([p.value for p in self.free]) / self.unit
+        self.lower = np.array([p.lower for p in self.free]) / self.unit
+        self.upper = np.array([p.upper for p in self.free]) / self.unit
+
+    def values(self, theta: Array) -> dict[str, float]:
+        """Values [SI] of all parameters by name, fixed ones included."""
+        fitted = {p.name: float(v) for p, v in zip(self.free, theta * self.unit, strict=True)}
+        return {**self.prior.values, **fitted}
+
+    def scaled(self, values: Mapping[str, float]) -> Array:
+        """The free ones of ``values`` [SI] as ``theta``."""
+        return np.array([values[p.name] for p in self.free]) / self.unit
+
+    def inside(self, theta: Array) -> Array:
+        """``theta`` just within its bounds: a start on one would stall a trust-region reflective search."""
+        return np.clip(theta, self.lower + 1e-6, self.upper - 1e-6)
+
+    def equation_error(self, windows: Windows) -> tuple[Array, Any]:
+        """Fit from the nominal values to windows of one period: the state a period later is all there is."""
+        return self.output_error(self.nominal, windows, 40)
+
+    def output_error(self, start: Array, windows: Windows, evaluations: int) -> tuple[Array, Any]:
+        """Fit from ``start`` to free runs over the windows, each from its first measured state.
+
+        Returns:
+            ``theta`` and the Jacobian of the residuals over their standard deviation.
+        """
+        run = self.residual_function(windows, start)
+        derivative = torch.func.jacfwd(run)
+
+        def residual(theta: Array) -> Array:
+            return run(torch.tensor(theta)).numpy()
+
+        def jacobian(theta: Array) -> Array:
+            return derivative(torch.tensor(theta)).numpy()
+
+        result = least_squares(
+            residual,
+            self.inside(start),
+            jac=jacobian,
+            bounds=(self.lower, self.upper),
+            loss="soft_l1",
+            max_nfev=evaluations,
+        )
+        return result.x, result.jac / np.sqrt(max(2 * result.cost / max(1, result.fun.size), 1e-30))
+
+    def jacobian(self, theta: Array, windows: Windows) -> Array:
+        """Jacobian at ``theta`` of the residuals over their standard deviation, for :meth:`confidence`."""
+        run = self.residual_function(windows, theta)
+        residual = run(torch.tensor(theta))
+        slope = torch.func.jacfwd(run)(torch.tensor(theta)).numpy()
+        return np.asarray(slope / max(float(residual.square().mean().sqrt()), 1e-15))
+
+    def error(self, theta: Array, windows: Windows) -> float:
+        """Mean absolute error of free runs over the windows [spreads of the data]; infinite if one diverges."""
+        residual = self.residual_function(windows, theta)(torch.tensor(theta))
+        return float(residual.abs().mean()) if bool(torch.isfinite(residual).all()) else float("inf")
+
+    def confidence(self, theta: Array, jacobian: Any) -> tuple[dict[str, float], list[str]]:
+        """Standard errors [SI] by name and warnings, from a Jacobian as the fits return it."""
+        if jacobian is None:
+            return {}, ["no fit improved on the nominal parameters"]
+        warnings = []
+        _, singular, rows = np.linalg.svd(jacobian, full_matrices=False)
+        if singular[-1] < 1e-6 * singular[0]:
+            names = [p.name for p, w in zip(self.free, np.abs(rows[-1]), strict=True) if w > 0.2]
+            warnings.append(f"the data cannot tell apart: {', '.join(names)}")
+        errors = np.sqrt(np.diag(_covariance(singular, rows))) * self.unit
+        for p, value, low, high in zip(self.free, theta, self.lower, self.upper, strict=True):
+            if min(value - low, high - value) < 1e-3 * (high - low):
+                warnings.append(f"{p.label} ends at a bound ({value * abs(p.value or 1):.4g})")
+        return {p.name: float(e) for p, e in zip(self.free, errors, strict=True)}, warnings
+
+    def correlations(self, jacobian: Any) -> dict[str, float]:
+        """Correlation of the errors of every two fitted parameters, by ``"a, b"``."""
+        if jacobian is None:
+            return {}
+        _, singular, rows = np.linalg.svd(jacobian, full_matrices=False)
+        covariance = _covariance(singular, rows)
+        sigma = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+        names = [p.name for p in self.free]
+        return {
+            f"{names[i]}, {names[j]}": float(covariance[i, j] / (sigma[i] * sigma[j]))
+            for i in range(len(names))
+            for j in range(i + 1, len(names))
+        }
+
+    def residual_function(self, windows: Windows, near: Array, most: int = 0) -> Callable[[Tensor], Tensor]:
+        """``theta -> `` errors of all states of all free runs over the states' spread, as one vector.
+
+        Args:
+            windows: Free runs from their first states.
+            near: Parameters whose stiffness decides the sub-steps.
+            most: Sub-steps instead, if not zero.
+        """
+        spread = spread_of(windows)
+        unit, names = torch.tensor(self.unit), [p.name for p in self.free]
+        inputs = windows.u.transpose(0, 1)
+        substeps = most or required_substeps(self.make(self.values(near)), self.dt)
+
+        def residual(theta: Tensor) -> Tensor:
+            values = dict(zip(names, theta * unit, strict=True))
+            x, states = windows.x[:, 0], []
+            for u in inputs:
+                x = rk4(lambda z, u=u: functional_call(self.prior, values, (z, u)), x, self.dt, substeps)  # type: ignore[misc]
+                states.append(x)
+            errors = (torch.stack(states, 1) - windows.x[:, 1:]) / spread
+            return errors.clamp(-LARGEST, LARGEST).reshape(-1)
+
+        return residual
+
+
+def spread_of(windows: Windows) -> Tensor:
+    """Standard deviation of each state over all windows ``(n_x,)`` [SI]: the unit of all residuals."""
+    return windows.x.reshape(-1, windows.x.shape[-1]).std(0).clamp_min(1e-9)
+
+
+def _covariance(singular: Array, rows: Array) -> Array:
+    return np.asarray((rows.T / np.maximum(singular, 1e-12 * singular[0]) ** 2) @ rows)
+
 
 MOST_SEGMENTS = 60
 """Unknown states grow with the segments, and the time of a step with their cube."""
@@ -205,14 +337,11 @@ def _limited(values: Tensor) -> Tensor:
 
 STAGES = ((0.5, 20), (2.0, 10), (5.0, 6))
 """Lengths [the machine's seconds, :func:`~hybrid_mpc.data.scales.time_unit`] of the free runs that are fitted, from
-short (convex) to long (what is judged), each with its most evaluations: the long ones start near their optimum."""
+short (convex) to long (what counts), each with its most evaluations: the long ones start near their optimum."""
 MAX_WINDOWS = 48
-METHODS = ("equation_error", "output_error", "multiple_shooting", "particle_swarm")
+METHODS = ("equation_error", "output_error", "multiple_shooting")
 """What :func:`fit_prior` can do."""
 DEFAULT_METHODS = ("equation_error", "output_error")
-SWARM_SECONDS = 2.0
-SWARM_WINDOWS = 24
-"""The swarm simulates every set of parameters over so many free runs of at most this length [the machine's seconds]."""
 SEGMENT = 0.5
 """Length [the machine's seconds] of a segment of multiple shooting: that of the first free runs."""
 Candidate: TypeAlias = tuple[str, NDArray[np.float64], Any]
@@ -227,22 +356,19 @@ def fit_prior(
     dt: float,
     before: PriorFit | None = None,
     methods: Sequence[str] = DEFAULT_METHODS,
-    swarm: SwarmSettings | None = None,
+    start: Mapping[str, float] | None = None,
     time_unit: float | None = None,
     on_progress: Callable[[int, int, str], None] = lambda done, total, text: None,
 ) -> PriorFit:
     """Fit by each of the methods; the best of all on free runs of the validation trajectories wins.
 
     ``equation_error``: states one period ahead. ``output_error``: longer and longer free runs from measured
-    states. ``multiple_shooting``: adjacent segments of 0.5 s whose first states are unknowns too.
-    ``particle_swarm``: free runs of up to 2 s, searched between the bounds without derivatives (the paper's; an
-    optional extra). They run in the order swarm, equation error, output error, shooting, whatever the order given;
-    output error and shooting start from the best so far. Residuals are the states' errors over their spread in the
-    data, with exact derivatives (forward mode through the integrator). A prior without free parameters stays as it is.
+    states. ``multiple_shooting``: adjacent segments of 0.5 s whose first states are unknowns too. They run in this
+    order; output error and shooting start from the best so far. Residuals are the states' errors over their spread in
+    the data. A prior without free parameters stays as it is.
 
-    The lengths are in the machine's seconds (:func:`~hybrid_mpc.data.scales.time_unit`): they are seconds on machines
-    that
-    swing in 0.25 to 4 s, and longer or shorter on slower or faster ones.
+    The lengths are in the machine's seconds (:func:`~hybrid_mpc.data.scales.time_unit`): seconds on machines that swing
+    in 0.25 to 4 s, and longer or shorter on slower or faster ones.
 
     Args:
         make: Prior class or factory ``(values=None) -> Prior``.
@@ -250,16 +376,25 @@ def fit_prior(
         valid: Validation trajectories (chosen by, not fitted to).
         dt: Model period [s].
         before: An earlier fit to the same recordings, smoothed otherwise: only the length of free run that
-            was best then is fitted, from its parameters on (or multiple shooting, if that was; a swarm does not
-            search again). Default: all lengths, from the nominal ones.
+            was best then is fitted, from its parameters on (or multiple shooting, if that was). Default: all lengths,
+            from the nominal ones.
         methods: Some of ``METHODS``. Default: equation error and output error.
-        swarm: Effort of the particle swarm. Default: 24 particles, 40 generations.
+        start: Values [SI] by name to try as a start besides the nominal ones, e.g. those of a global search; fixed
+            parameters are left out. Default: none.
         time_unit: The machine's second [s]. Default: that of the training trajectories.
         on_progress: ``(done, total, text)`` after every stage.
 
     Raises:
-        InputError: If no trajectory is long enough, the inputs leave every parameter undetermined, there is no such
-            method, or the particle swarm is asked for and pymoo is not installed.
+        InputError: If no trajectory is long enough, the prior diverges with all parameters tried, or there is no such
+            method.
+
+    Example:
+        >>> from scenarios.pendulum.data import exact_runs
+        >>> from scenarios.pendulum.prior import PendulumPrior
+        >>> runs = exact_runs("train", 1)
+        >>> fit = fit_prior(PendulumPrior, runs, runs, dt=0.01, methods=("equation_error",))
+        >>> round(fit.values["l"], 3)
+        0.045
     """
     _check_methods(methods)
     fit = ParameterFit(make, dt)
@@ -268,15 +403,18 @@ def fit_prior(
     stages = [s for s in stages if _fits(train, s[0], dt)] or [(_shortest(train, dt), 20)]
     lengths = [s for s, _ in stages]
     longest = scales.periods(_longest(valid or train, lengths), dt)
-    judge = _sample(cut_windows(valid or train, 0, longest, scales.periods(unit * STAGES[0][0], dt)))
+    scored = _sample(cut_windows(valid or train, 0, longest, scales.periods(unit * STAGES[0][0], dt)))
     if not fit.free:
-        row = {"stage": "nominal", "validation_error": fit.judge(fit.nominal, judge)}
+        row = {"stage": "nominal", "validation_error": fit.error(fit.nominal, scored)}
         return PriorFit(fit.prior.values, {}, (), (row,))
     candidates: list[Candidate]
     if before is None:
         candidates = [("nominal", fit.nominal, None)]
-        found = _first_searches(fit, train, methods, swarm or SwarmSettings(), lengths, unit, on_progress)
-        candidates += found
+        if start is not None:
+            candidates.append(("start", fit.scaled(start), None))
+        if "equation_error" in methods:
+            theta, jacobian = fit.equation_error(_sample(cut_windows(train, 0, 1, 3), 4000))
+            candidates.append(("equation error", theta, jacobian))
     else:
         candidates = [("the fit before", fit.scaled(before.values), None)]
         stages, methods = _again(before, stages, methods)
@@ -285,21 +423,21 @@ def fit_prior(
     for i, (length, evaluations) in enumerate(stages):
         on_progress(i, len(stages), f"output error over {length:g} s")
         windows = _sample(cut_windows(train, 0, scales.periods(length, dt), scales.periods(length / 4, dt)))
-        start = min(candidates, key=lambda c: fit.judge(c[1], windows))[1]
-        theta, jacobian = fit.output_error(start, windows, evaluations)
+        best = min(candidates, key=lambda c: fit.error(c[1], windows))[1]
+        theta, jacobian = fit.output_error(best, windows, evaluations)
         candidates.append((f"output error {length:g} s", theta, jacobian))
     if "multiple_shooting" in methods:
         on_progress(len(stages), len(stages) + 1, "multiple shooting")
         candidates.append(_shooting(fit, train, candidates, min(unit * SEGMENT, *lengths)))
     on_progress(len(stages), len(stages), "done")
-    return _winner(fit, candidates, judge, before)
+    return _winner(fit, candidates, scored, before)
 
 
 def _winner(
-    fit: ParameterFit, candidates: Sequence[Candidate], judge: Windows, before: PriorFit | None
+    fit: ParameterFit, candidates: Sequence[Candidate], scored: Windows, before: PriorFit | None
 ) -> PriorFit:
     """The candidate with the least validation error, with what is known of its confidence."""
-    scores = [fit.judge(theta, judge) for _, theta, _ in candidates]
+    scores = [fit.error(theta, scored) for _, theta, _ in candidates]
     if not np.isfinite(min(scores)):
         raise InputError("the prior diverges with every set of parameters tried; check its signs and units")
     best = int(np.argmin(scores))
@@ -314,37 +452,12 @@ def _winner(
     return PriorFit(fit.values(theta), errors, tuple(warnings), table, correlations)
 
 
-def _first_searches(
-    fit: ParameterFit,
-    train: Sequence[Trajectory],
-    methods: Sequence[str],
-    swarm: SwarmSettings,
-    lengths: Sequence[float],
-    unit: float,
-    on_progress: Callable[[int, int, str], None],
-) -> list[Candidate]:
-    """What needs no start: the particle swarm and the equation error."""
-    found: list[Candidate] = []
-    if "particle_swarm" in methods:
-        length = max((s for s in lengths if s <= unit * SWARM_SECONDS), default=min(lengths))
-        periods = scales.periods(length, fit.dt)
-        windows = _sample(cut_windows(train, 0, periods, max(1, periods // 4)), SWARM_WINDOWS)
-        theta = particle_swarm(
-            fit, windows, swarm, lambda done, total: on_progress(done, total, "particle swarm")
-        )
-        found.append(("particle swarm", theta, fit.jacobian(theta, windows)))
-    if "equation_error" in methods:
-        theta, jacobian = fit.equation_error(_sample(cut_windows(train, 0, 1, 3), 4000))
-        found.append(("equation error", theta, jacobian))
-    return found
-
-
 def _shooting(
     fit: ParameterFit, train: Sequence[Trajectory], candidates: Sequence[Candidate], length: float
 ) -> Candidate:
     """Multiple shooting over segments of ``length`` [s] from the candidate that is best on them."""
     segments = cut_segments(train, scales.periods(length, fit.dt))
-    start = min(candidates, key=lambda c: fit.judge(c[1], segments.windows))[1]
+    start = min(candidates, key=lambda c: fit.error(c[1], segments.windows))[1]
     return (f"multiple shooting {length:g} s", *multiple_shooting(fit, start, segments))
 
 

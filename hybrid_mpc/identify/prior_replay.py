@@ -1,9 +1,8 @@
-"""PriorReplay: where nothing was measured a learned correction is asked to fade, and the prior stands alone.
+"""Prior replay: where nothing was measured, the training asks a network for no correction.
 
-A network extrapolates as it likes. Beyond its recordings, upright on a pendulum that has only been swung, say, its
-correction is a number that no datum has asked for, and a controller that goes there takes it for knowledge. PriorReplay
-are short runs of the prior from states anywhere in the measured range, all the way round for an angle. Where they pass
-through states that no recording comes near, the training asks for no correction.
+A network extrapolates freely: upright, on a pendulum that was only swung, its correction is arbitrary. Prior replay are
+short runs of the prior from states anywhere in the measured range, all the way round for an angle. Where they pass
+through states that no recording comes near, the training penalises the correction.
 """
 
 from __future__ import annotations
@@ -19,23 +18,25 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from hybrid_mpc.data.trajectories import Trajectory
-from hybrid_mpc.identify.networks import StackedNetwork
+from hybrid_mpc.identify.networks import StackedGRU
 from hybrid_mpc.identify.step import PriorStep, RecurrentStep
 from hybrid_mpc.machine.torch_prior import Prior
 
 Array = NDArray[np.float64]
 RUNS = 2000
+"""Runs in all."""
 BATCH = 64
 """Runs a training step."""
 FOLLOWED = 10
 """Periods that the hidden state is given to follow a run before its corrections count."""
 COUNTED = 20
+"""Periods whose corrections count."""
 HELD = 5
 """Periods that an input is held; each is one that was recorded."""
 AWAY = 10.0
 """Ranges beyond the measured one of a state that is no angle at which a run ends: a prior may run away."""
 NEAR = 0.1
-"""Distance from measured states at which an anchor has 0.63 of its weight: each state over its root mean square in the
+"""Distance from measured states at which a state has 0.63 of its weight: each state over its root mean square in the
 recordings, an angle by sine and cosine."""
 
 
@@ -65,12 +66,12 @@ class PriorReplay:
 
 
 def make_prior_replay(prior: Prior, training: Sequence[Trajectory], seed: int) -> PriorReplay:
-    """PriorReplay around training trajectories.
+    """Prior replay around training trajectories.
 
     Args:
         prior: The fitted prior.
         training: Training trajectories.
-        seed: Of starts and inputs; the same seed and data give the same prior_replay.
+        seed: Of starts and inputs; the same seed and data give the same runs.
 
     Example:
         >>> from scenarios.unbalanced_disk import scenario
@@ -101,8 +102,8 @@ def make_prior_replay(prior: Prior, training: Sequence[Trajectory], seed: int) -
 
 
 def prior_replay_penalty(step: RecurrentStep, prior_replay: PriorReplay) -> Tensor:
-    """Mean over all prior_replay of weight times squared correction over its scale, a value per network."""
-    stack = cast(StackedNetwork, step.network)
+    """Mean over all runs of weight times squared correction over its scale, a value per network."""
+    stack = cast(StackedGRU, step.network)
     features = step.stacked_features(prior_replay.x, prior_replay.u)
     out, _ = stack.sequence(features, stack.initial(prior_replay.x.shape[1]))
     weight = prior_replay.weight[FOLLOWED:, None, :, None]

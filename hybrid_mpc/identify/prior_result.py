@@ -1,4 +1,4 @@
-"""What a fit of the prior gives: values, standard errors, and what the data do not tell. No torch in here."""
+"""What a fit of the prior gives: values, standard errors, and what the data do not identify. No torch in here."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CORRELATED = 0.99
-"""Two parameters whose errors are correlated by more are hardly told apart."""
-TOLD = 2.0
-"""A parameter below so many standard errors is not told from zero."""
+"""Two parameters whose errors are correlated by more can hardly be told apart."""
+LEAST_T = 2.0
+"""A parameter below so many standard errors may be zero."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class PriorFit:
         values: Fitted values [SI] by name, fixed ones included.
         standard_errors: Standard errors [SI] of the fitted ones, from the last fit's Jacobian (they hold
             for a model without structural error, so read them as lower bounds).
-        warnings: Parameters at a bound, or ones the data do not tell apart.
+        warnings: Parameters at a bound, or ones that the data do not identify.
         stages: One row per stage: its name and the validation error that chose the winner.
         correlations: Correlation of the errors of every two fitted parameters, by ``"a, b"``. Default: none known.
 
@@ -36,8 +36,8 @@ class PriorFit:
         >>> fit.t_ratios
         {'J': 11.0, 'd': 0.5}
         >>> for line in fit.identifiability: print(line)
-        J and d are hardly told apart: their errors are correlated by 0.995
-        d is not told from zero: 0.5 standard errors
+        J and d can hardly be told apart: their errors are correlated by 0.995
+        d may be zero: 0.5 standard errors
     """
 
     values: dict[str, float]
@@ -61,27 +61,27 @@ class PriorFit:
 
     @property
     def identifiability(self) -> tuple[str, ...]:
-        """What the data do not tell: :attr:`warnings`, correlations above 0.99, t-ratios below 2."""
+        """What the data do not identify: :attr:`warnings`, correlations above 0.99, t-ratios below 2."""
         close = [
-            f"{names.replace(', ', ' and ')} are hardly told apart: their errors are correlated by {value:.3f}"
+            f"{names.replace(', ', ' and ')} can hardly be told apart: their errors are correlated by {value:.3f}"
             for names, value in self.correlations.items()
             if abs(value) > CORRELATED
         ]
         small = [
-            f"{name} is not told from zero: {abs(ratio):.1f} standard errors"
+            f"{name} may be zero: {abs(ratio):.1f} standard errors"
             for name, ratio in self.t_ratios.items()
-            if abs(ratio) < TOLD
+            if abs(ratio) < LEAST_T
         ]
         return (*self.warnings, *close, *small)
 
     def covariance(self, parameters: Sequence[Parameter]) -> tuple[tuple[float, ...], ...]:
-        """Rows of the covariance of the fitted values, as an artifact holds it; fixed parameters have none.
+        """Rows of the covariance of the fitted values, as an artifact stores it; fixed parameters have none.
 
         Args:
             parameters: The prior's ``parameters_spec``.
 
         Returns:
-            ``(n_p, n_p)``; empty where the fit does not tell the errors of all that are free.
+            ``(n_p, n_p)``; empty where an error of a free one is unknown.
 
         Example:
             >>> fit = PriorFit({"J": 0.11, "d": 0.01}, {"J": 0.01, "d": 0.02}, (), (), {"J, d": 0.5})
@@ -100,7 +100,7 @@ class PriorFit:
         """One row a parameter: name, unit, nominal, fitted, standard error, t-ratio, largest correlation.
 
         Args:
-            parameters: The prior's ``parameters_spec``. What a fit does not tell of a fixed one is None.
+            parameters: The prior's ``parameters_spec``. What is unknown of a fixed one is None.
 
         Example:
             >>> fit = PriorFit({"J": 0.11}, {"J": 0.01}, (), ())
@@ -122,7 +122,7 @@ class PriorFit:
         ]
 
     def table(self, parameters: Sequence[Parameter]) -> pd.DataFrame:
-        """:meth:`rows` as a data frame, by parameter; ``fit.table(prior.parameters_spec).to_csv(path)`` keeps it.
+        """:meth:`rows` as a data frame, by parameter; ``fit.table(prior.parameters_spec).to_csv(path)`` writes it.
 
         Raises:
             InputError: If pandas is not installed.

@@ -79,12 +79,12 @@ class Smoother:
         z = np.concatenate([y, np.gradient(y, self.dt, axis=1), np.zeros_like(y)], axis=-1)
         sums = (0.0, 0.0)
         for _ in range(SWEEPS):
-            predicted, slope = self._linearise(z[:, :-1], u[:, :-1])
+            predicted, slope = self._linearize(z[:, :-1], u[:, :-1])
             offset = predicted - (slope @ z[:, :-1, :, None])[..., 0]
             z, sums = self._sweep(offset, slope, y)
         return z, sums
 
-    def _linearise(self, z: Array, u: Array) -> tuple[Array, Array]:
+    def _linearize(self, z: Array, u: Array) -> tuple[Array, Array]:
         """Next ``(q, v, d)`` from each ``z`` ``(b, n, 3 n_q)``, and its Jacobian."""
         n_x, substeps = len(self.prior.states), required_substeps(self.prior, self.dt)
 
@@ -109,7 +109,7 @@ class Smoother:
         start = np.concatenate([r, r / self.dt**2, np.square(self.walk) + r / self.dt**2])
         z = np.concatenate([y[:, 0], np.zeros((b, 2 * n_q))], axis=-1)
         p = np.broadcast_to(np.diag(IGNORANCE**2 * start), (b, 3 * n_q, 3 * n_q))
-        kept: list[tuple[Array, Array, Array, Array]] = []
+        rows: list[tuple[Array, Array, Array, Array]] = []
         squares = logs = 0.0
         for k in range(n):
             if k:
@@ -124,11 +124,11 @@ class Smoother:
             z = z + (gain @ e[..., None])[..., 0]
             p = p - gain @ p[:, :n_q]
             p = 0.5 * (p + p.swapaxes(1, 2))
-            kept.append((z, p, *ahead))
-        smooth = np.stack([row[0] for row in kept], axis=1)
+            rows.append((z, p, *ahead))
+        smooth = np.stack([row[0] for row in rows], axis=1)
         for k in range(n - 2, -1, -1):
-            back = np.linalg.solve(kept[k + 1][3], slope[:, k] @ kept[k][1]).swapaxes(1, 2)
-            smooth[:, k] += (back @ (smooth[:, k + 1] - kept[k + 1][2])[..., None])[..., 0]
+            back = np.linalg.solve(rows[k + 1][3], slope[:, k] @ rows[k][1]).swapaxes(1, 2)
+            smooth[:, k] += (back @ (smooth[:, k + 1] - rows[k + 1][2])[..., None])[..., 0]
         return smooth, (squares, logs)
 
 

@@ -1,8 +1,6 @@
-"""Models as steps: the prior alone, the hybrid step, and the paper's literal form.
+"""Models as steps ``(x, h, u) -> (x_next, h_next)`` over one period: the prior alone, and prior plus network.
 
-The hybrid step has exact kinematics, prior plus learned correction of the acceleration, Runge-Kutta. In the literal
-form the network gives the whole derivative of the state and explicit Euler integrates it. One code for training (any
-batch) and for export (one sample).
+One code for training (any batch) and for export (one sample).
 """
 
 from __future__ import annotations
@@ -11,6 +9,7 @@ import copy
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -19,12 +18,14 @@ from torch import Tensor, nn
 from torch.func import functional_call, vmap
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.identify.dataset import Windows
+from hybrid_mpc.identify.networks import StackedGRU
 from hybrid_mpc.machine.torch_prior import Prior
-
-# Runge-Kutta of order 4 in torch, and the sub-steps that a model's stiffness asks for.
 
 MAX_SUBSTEPS = 20
 """A prior stiffer than this many Runge-Kutta sub-steps a period can follow needs another dt."""
+SPAN = 10
+"""Periods over which the correction is averaged to find its scale."""
 
 
 def rk4(f: Callable[[Tensor], Tensor], x: Tensor, dt: float, substeps: int) -> Tensor:
@@ -77,7 +78,284 @@ def substeps_for(f: Callable[[Tensor, Tensor], Tensor], n_x: int, n_u: int, dt: 
     return substeps
 
 
-# Parameters of a prior that are trained along with the networks: each stacked network has its own.
+class Step(nn.Module):
+    """What every model is: a step over one period, its derivative, and the prior that names its signals.
+
+    Args:
+        prior: The ODE prior; names, output and energy balance are its own.
+        dt: Model period [s].
+    """
+
+    def __init__(self, prior: Prior, dt: float) -> None:
+        super().__init__()
+        self.prior, self.dt = prior, dt
+
+    @property
+    def n_h(self) -> int:
+        """Size of the hidden state; none by default."""
+        return 0
+
+    @property
+    def h0(self) -> Tensor:
+        """Zero hidden state ``(n_h,)``; of a stack of networks ``(networks, 1, n_h)``."""
+        return torch.zeros(self.n_h, dtype=torch.float64)
+
+    def forward(self, x: Tensor, h: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        """Next state ``(..., n_x)`` and next hidden state ``(..., n_h)``, with ``u`` held over the period."""
+        raise NotImplementedError(f"{type(self).__name__} must define forward(x, h, u)")
+
+    def xdot(self, x: Tensor, h: Tensor, u: Tensor) -> Tensor:
+        """Derivative of the state ``(..., n_x)`` at the instant."""
+        raise NotImplementedError(f"{type(self).__name__} must define xdot(x, h, u)")
+
+
+class PriorStep(Step):
+    """The prior alone, by Runge-Kutta of order 4; its hidden state is empty.
+
+    Args:
+        prior: The ODE prior.
+        dt: Model period [s].
+
+    Raises:
+        InputError: If the prior is too stiff for the period.
+    """
+
+    def __init__(self, prior: Prior, dt: float) -> None:
+        super().__init__(prior, dt)
+        self.substeps = required_substeps(prior, dt)
+
+    def forward(self, x: Tensor, h: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        """Next state and the hidden state as it came."""
+        return rk4(lambda z: self.prior(z, u), x, self.dt, self.substeps), h
+
+    def xdot(self, x: Tensor, h: Tensor, u: Tensor) -> Tensor:
+        """Derivative of the state at the instant."""
+        return self.prior(x, u)
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """Magnitudes that make features and outputs of order one; part of the model.
+
+    Args:
+        x: Scale of each state ``(n_x,)``.
+        u: Scale of each input ``(n_u,)``.
+        acceleration: Scale of what the prior gives as a feature: its acceleration ``(n_q,)``.
+        correction: Scale of the network's output ``(n_q,)``.
+    """
+
+    x: tuple[float, ...]
+    u: tuple[float, ...]
+    acceleration: tuple[float, ...]
+    correction: tuple[float, ...]
+
+
+class RecurrentStep(Step):
+    """A step with a network in it. A subclass is a form of model that :func:`~hybrid_mpc.identify.train.train` takes.
+
+    A subclass says what the network sees and gives (``sizes``, ``scaling_of``, ``features``) and what becomes of it
+    (``integrate``, ``derivative``, ``rate``, ``measured_rate``).
+
+    Args:
+        prior: The ODE prior; it also names the states.
+        network: ``(s, h) -> (output, h_next)``, one network or a stack.
+        scaling: Magnitudes of features and outputs.
+        dt: Model period [s].
+        use_prior: False makes the plain recurrent network (RNN) of the paper's comparison, which sees no prior.
+        dynamics: The prior's equation with parameters that were, or are, trained along; names, output and energy
+            balance stay those of ``prior``. Default: ``prior``.
+    """
+
+    corrects_prior: ClassVar[bool]
+    """Whether a zero output is the prior itself: the training then starts there."""
+    needs_rates: ClassVar[bool] = False
+    """Whether it is trained on the recorded derivatives, which then have to be known."""
+    scale_x: Tensor
+    scale_u: Tensor
+    scale_acceleration: Tensor
+    scale_correction: Tensor
+
+    def __init__(
+        self,
+        prior: Prior,
+        network: nn.Module,
+        scaling: Scaling,
+        dt: float,
+        *,
+        use_prior: bool = True,
+        dynamics: Prior | StackedPrior | None = None,
+    ) -> None:
+        super().__init__(prior, dt)
+        self.network, self.use_prior, self.dynamics = network, use_prior, dynamics
+        for name in ("x", "u", "acceleration", "correction"):
+            self.register_buffer(f"scale_{name}", torch.tensor(getattr(scaling, name), dtype=torch.float64))
+
+    @classmethod
+    def sizes(cls, prior: Prior, use_prior: bool) -> tuple[int, int]:
+        """Number of features and of outputs of its network."""
+        raise NotImplementedError(f"{cls.__name__} must define sizes(prior, use_prior)")
+
+    @classmethod
+    def scaling_of(cls, prior: Prior, windows: Windows, dt: float, *, use_prior: bool) -> Scaling:
+        """Scaling from training windows."""
+        raise NotImplementedError(f"{cls.__name__} must define scaling_of(prior, windows, dt, use_prior=...)")
+
+    def features(self, x: Tensor, u: Tensor) -> Tensor:
+        """Network inputs ``s``, scaled."""
+        raise NotImplementedError(f"{type(self).__name__} must define features(x, u)")
+
+    def integrate(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
+        """Next state with ``correction`` and ``u`` held over the period."""
+        raise NotImplementedError(f"{type(self).__name__} must define integrate(x, u, correction)")
+
+    def derivative(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
+        """Derivative of the state at the instant, ``(..., n_x)``."""
+        raise NotImplementedError(f"{type(self).__name__} must define derivative(x, u, correction)")
+
+    def rate(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
+        """Rate of change over the period that the training compares with :meth:`measured_rate`."""
+        raise NotImplementedError(f"{type(self).__name__} must define rate(x, u, correction)")
+
+    def measured_rate(self, x: Tensor, x_next: Tensor, xdot: Tensor) -> Tensor:
+        """The measured rate, from states and their recorded derivative."""
+        raise NotImplementedError(f"{type(self).__name__} must define measured_rate(x, x_next, xdot)")
+
+    @property
+    def n_h(self) -> int:
+        """Size of the network's hidden state."""
+        network: Any = self.network
+        return int(network.n_h)
+
+    @property
+    def h0(self) -> Tensor:
+        """Zero hidden state ``(n_h,)``; of a stack of networks ``(networks, 1, n_h)``."""
+        return self.network.initial(1) if isinstance(self.network, StackedGRU) else super().h0
+
+    @property
+    def physics(self) -> Prior | StackedPrior:
+        """Whose equation of motion it is: ``dynamics``, or the prior."""
+        return self.prior if self.dynamics is None else self.dynamics
+
+    def stacked_features(self, x: Tensor, u: Tensor) -> Tensor:
+        """Features of a stack ``(T, 1 or networks, n, n_in)`` at ``x`` ``(T, n, n_x)`` and ``u``, the same for all."""
+        if isinstance(self.dynamics, StackedPrior):
+            shape = (-1, self.dynamics.networks, -1, -1)
+            return self.features(x.unsqueeze(1).expand(shape), u.unsqueeze(1).expand(shape))
+        return self.features(x, u).unsqueeze(1)
+
+    def correction(self, x: Tensor, h: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        """What the network gives [SI] (hybrid: acceleration ``(..., n_q)``), and the next hidden state."""
+        out, h_next = self.network(self.features(x, u), h)
+        return out * self.scale_correction, h_next
+
+    def forward(self, x: Tensor, h: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        """Next state ``(..., n_x)`` and next hidden state."""
+        correction, h_next = self.correction(x, h, u)
+        return self.integrate(x, u, correction), h_next
+
+    def xdot(self, x: Tensor, h: Tensor, u: Tensor) -> Tensor:
+        """Derivative of the state at the instant, with the correction that ``(x, h, u)`` gives."""
+        return self.derivative(x, u, self.correction(x, h, u)[0])
+
+
+class HybridStep(RecurrentStep):
+    """Prior plus recurrent correction of its acceleration.
+
+    ``h`` is updated once at ``(x_k, u_k)``; the correction is held over ``dt``; the kinematics are exact; Runge-Kutta
+    of order 4 integrates. Rates are means over the period, so that an input that jumps at a sample counts in the period
+    it acts in. Without the prior (``use_prior=False``) the network gives the whole acceleration.
+
+    Args:
+        prior: The ODE prior; it also names the states.
+        network: ``(s, h) -> (output, h_next)``, one network or a stack.
+        scaling: Magnitudes of features and outputs.
+        dt: Model period [s].
+        use_prior: False for the plain recurrent network (RNN) of the paper's comparison.
+        dynamics: See :class:`RecurrentStep`.
+
+    Raises:
+        InputError: If the prior is too stiff for the period.
+    """
+
+    corrects_prior = True
+
+    def __init__(
+        self,
+        prior: Prior,
+        network: nn.Module,
+        scaling: Scaling,
+        dt: float,
+        *,
+        use_prior: bool = True,
+        dynamics: Prior | StackedPrior | None = None,
+    ) -> None:
+        super().__init__(prior, network, scaling, dt, use_prior=use_prior, dynamics=dynamics)
+        self.substeps = required_substeps(prior, dt) if use_prior else 1
+
+    @classmethod
+    def sizes(cls, prior: Prior, use_prior: bool) -> tuple[int, int]:
+        """Number of features and of outputs of its network."""
+        return n_features(prior, use_prior), prior.n_q
+
+    @classmethod
+    def scaling_of(cls, prior: Prior, windows: Windows, dt: float, *, use_prior: bool) -> Scaling:
+        """Root mean squares of signals and of what the network must give.
+
+        The latter is averaged over ``SPAN`` periods first: the noise of a twice differentiated position would set the
+        scale otherwise, and networks on so large a scale learn noise.
+        """
+        x, u = windows.x[:, :-1].reshape(-1, windows.x.shape[-1]), windows.u.reshape(-1, windows.u.shape[-1])
+        n_q = prior.n_q
+        measured = (windows.x[:, 1:, n_q:] - windows.x[:, :-1, n_q:]) / dt
+        predicted = prior.acceleration(x, u)
+        residual = measured - predicted.reshape(measured.shape) if use_prior else measured
+        uncut = residual[:, : residual.shape[1] // SPAN * SPAN] if residual.shape[1] >= SPAN else residual
+        averaged = uncut.unflatten(1, (-1, min(SPAN, uncut.shape[1]))).mean(2).reshape(-1, n_q)
+        return Scaling(x=rms(x), u=rms(u), acceleration=rms(predicted), correction=rms(averaged))
+
+    def features(self, x: Tensor, u: Tensor) -> Tensor:
+        """Network inputs ``s = [x, u, prior acceleration]``, scaled; an angle that turns as sin and cos."""
+        parts = []
+        for i, signal in enumerate(self.prior.states):
+            component = x[..., i : i + 1]
+            if signal.periodic:
+                parts += [torch.sin(component), torch.cos(component)]
+            else:
+                parts.append(component / self.scale_x[i : i + 1])
+        parts.append(u / self.scale_u)
+        if self.use_prior:
+            parts.append(self.physics.acceleration(x, u) / self.scale_acceleration)
+        return torch.cat(parts, dim=-1)
+
+    def integrate(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
+        """Next state with ``correction`` and ``u`` held over the period."""
+        return rk4(lambda z: self.derivative(z, u, correction), x, self.dt, self.substeps)
+
+    def derivative(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
+        """Derivative of the state at the instant: exact kinematics, prior plus correction."""
+        acceleration = self.physics.acceleration(x, u) + correction if self.use_prior else correction
+        velocity = x[..., self.prior.n_q :]
+        return torch.cat([velocity, acceleration.expand(velocity.shape)], dim=-1)
+
+    def rate(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
+        """Mean rate over the period, ``(x_{k+1} - x_k) / dt``."""
+        return (self.integrate(x.expand(*correction.shape[:-1], -1), u, correction) - x) / self.dt
+
+    def measured_rate(self, x: Tensor, x_next: Tensor, xdot: Tensor) -> Tensor:
+        """Mean rate between two measured states; their derivative is not used."""
+        return (x_next - x) / self.dt
+
+
+def n_features(prior: Prior, use_prior: bool) -> int:
+    """Number of features of a :class:`HybridStep`'s network."""
+    angles = sum(signal.periodic for signal in prior.states)
+    return len(prior.states) + angles + len(prior.inputs) + (prior.n_q if use_prior else 0)
+
+
+def rms(values: Tensor) -> tuple[float, ...]:
+    """Root mean square of each column, at least 1e-9."""
+    return tuple(float(v) for v in values.square().mean(0).sqrt().clamp_min(1e-9))
+
 
 PREFIX = "prior."
 """What the names of trained parameters begin with among a training's weights."""
@@ -183,242 +461,3 @@ def with_values(prior: Prior, values: Mapping[str, float]) -> Prior:
         for name, value in values.items():
             getattr(copied, name).fill_(value)
     return copied
-
-
-@dataclass(frozen=True)
-class Scaling:
-    """Magnitudes that make features and outputs of order one; part of the model.
-
-    Args:
-        x: Scale of each state ``(n_x,)``.
-        u: Scale of each input ``(n_u,)``.
-        acceleration: Scale of the prior's acceleration as a feature ``(n_q,)``; literal form: of its whole
-            xdot ``(n_x,)``.
-        correction: Scale of the network's output ``(n_q,)``; literal form: of xdot ``(n_x,)``.
-    """
-
-    x: tuple[float, ...]
-    u: tuple[float, ...]
-    acceleration: tuple[float, ...]
-    correction: tuple[float, ...]
-
-
-class PriorStep(nn.Module):
-    """The prior alone as a step ``(x, h, u) -> (x_next, h_next)`` with an empty hidden state.
-
-    Args:
-        prior: The ODE prior.
-        dt: Model period [s].
-        substeps: Runge-Kutta steps a period; default: what the prior's stiffness asks for.
-    """
-
-    def __init__(self, prior: Prior, dt: float, substeps: int | None = None) -> None:
-        super().__init__()
-        self.prior, self.dt = prior, dt
-        self.substeps = substeps or required_substeps(prior, dt)
-
-    def forward(self, x: Tensor, h: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Next state ``(..., n_x)`` and the hidden state as it came."""
-        return rk4(lambda z: self.prior(z, u), x, self.dt, self.substeps), h
-
-    def xdot(self, x: Tensor, h: Tensor, u: Tensor) -> Tensor:
-        """Derivative of the state at the instant."""
-        return self.prior(x, u)
-
-
-class RecurrentStep(nn.Module):
-    """A step ``(x, h, u) -> (x_next, h_next)`` with a network in it: what every form of it can do.
-
-    A subclass defines ``features``, ``integrate``, ``derivative``, ``rate`` and ``measured_rate``.
-
-    Args:
-        prior: The ODE prior; it also names the states.
-        network: ``(s, h) -> (output, h_next)``, one network or a stack.
-        scaling: Magnitudes of features and outputs.
-        dt: Model period [s].
-        use_prior: False makes the plain recurrent network (RNN) of the paper's comparison.
-        dynamics: The prior's equation with parameters that were, or are, trained along; names, output and energy
-            balance stay those of ``prior``. Default: ``prior``.
-    """
-
-    scale_x: Tensor
-    scale_u: Tensor
-    scale_acceleration: Tensor
-    scale_correction: Tensor
-
-    def __init__(
-        self,
-        prior: Prior,
-        network: nn.Module,
-        scaling: Scaling,
-        dt: float,
-        *,
-        use_prior: bool = True,
-        dynamics: Prior | StackedPrior | None = None,
-    ) -> None:
-        super().__init__()
-        self.prior, self.network, self.dt, self.use_prior = prior, network, dt, use_prior
-        self.dynamics = dynamics
-        for name in ("x", "u", "acceleration", "correction"):
-            self.register_buffer(f"scale_{name}", torch.tensor(getattr(scaling, name), dtype=torch.float64))
-
-    def features(self, x: Tensor, u: Tensor) -> Tensor:
-        """Network inputs ``s``, scaled."""
-        raise NotImplementedError(f"{type(self).__name__} must define features(x, u)")
-
-    def stacked_features(self, x: Tensor, u: Tensor) -> Tensor:
-        """Features of a stack ``(T, 1 or networks, n, n_in)`` at ``x`` ``(T, n, n_x)`` and ``u``, the same for all."""
-        if isinstance(self.dynamics, StackedPrior):
-            shape = (-1, self.dynamics.networks, -1, -1)
-            return self.features(x.unsqueeze(1).expand(shape), u.unsqueeze(1).expand(shape))
-        return self.features(x, u).unsqueeze(1)
-
-    @property
-    def physics(self) -> Prior | StackedPrior:
-        """Whose equation of motion it is: ``dynamics``, or the prior."""
-        return self.prior if self.dynamics is None else self.dynamics
-
-    def correction(self, x: Tensor, h: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        """What the network gives [SI] (hybrid: acceleration ``(..., n_q)``), and the next hidden state."""
-        out, h_next = self.network(self.features(x, u), h)
-        return out * self.scale_correction, h_next
-
-    def integrate(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
-        """Next state with ``correction`` and ``u`` held over the period."""
-        raise NotImplementedError(f"{type(self).__name__} must define integrate(x, u, correction)")
-
-    def derivative(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
-        """Derivative of the state at the instant, ``(..., n_x)``."""
-        raise NotImplementedError(f"{type(self).__name__} must define derivative(x, u, correction)")
-
-    def rate(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
-        """Rate of change over the period that the training compares with :meth:`measured_rate`."""
-        raise NotImplementedError(f"{type(self).__name__} must define rate(x, u, correction)")
-
-    def measured_rate(self, x: Tensor, x_next: Tensor, xdot: Tensor) -> Tensor:
-        """What the model's rate is compared with, from measured states and their smoothed derivative."""
-        raise NotImplementedError(f"{type(self).__name__} must define measured_rate(x, x_next, xdot)")
-
-    def forward(self, x: Tensor, h: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Next state ``(..., n_x)`` and next hidden state."""
-        correction, h_next = self.correction(x, h, u)
-        return self.integrate(x, u, correction), h_next
-
-    def xdot(self, x: Tensor, h: Tensor, u: Tensor) -> Tensor:
-        """Derivative of the state at the instant, with the correction that ``(x, h, u)`` gives."""
-        return self.derivative(x, u, self.correction(x, h, u)[0])
-
-
-class HybridStep(RecurrentStep):
-    """Prior and recurrent correction as a step ``(x, h, u) -> (x_next, h_next)`` (blueprint's hybrid step).
-
-    ``h`` is updated once at ``(x_k, u_k)``; the correction of the acceleration is held over ``dt``; prior
-    and correction are integrated by Runge-Kutta of order 4. Rates are means over the period, so that an
-    input that jumps at a sample is credited to the period it acts in.
-
-    Args:
-        prior: The ODE prior; it also names the states.
-        network: ``(s, h) -> (output, h_next)``, one network or a stack.
-        scaling: Magnitudes of features and outputs.
-        dt: Model period [s].
-        use_prior: False makes the plain recurrent network (RNN) of the paper's comparison: it sees no
-            prior and gives the whole acceleration; the kinematics stay exact.
-        substeps: Runge-Kutta steps a period. Default: what the prior's stiffness asks for.
-        dynamics: See :class:`RecurrentStep`.
-    """
-
-    def __init__(
-        self,
-        prior: Prior,
-        network: nn.Module,
-        scaling: Scaling,
-        dt: float,
-        *,
-        use_prior: bool = True,
-        substeps: int | None = None,
-        dynamics: Prior | StackedPrior | None = None,
-    ) -> None:
-        super().__init__(prior, network, scaling, dt, use_prior=use_prior, dynamics=dynamics)
-        self.substeps = (substeps or required_substeps(prior, dt)) if use_prior else 1
-
-    def features(self, x: Tensor, u: Tensor) -> Tensor:
-        """Network inputs ``s = [x, u, prior acceleration]``, scaled; an angle that turns as sin and cos."""
-        parts = []
-        for i, signal in enumerate(self.prior.states):
-            component = x[..., i : i + 1]
-            if signal.periodic:
-                parts += [torch.sin(component), torch.cos(component)]
-            else:
-                parts.append(component / self.scale_x[i : i + 1])
-        parts.append(u / self.scale_u)
-        if self.use_prior:
-            parts.append(self.physics.acceleration(x, u) / self.scale_acceleration)
-        return torch.cat(parts, dim=-1)
-
-    def integrate(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
-        """Next state with ``correction`` and ``u`` held over the period."""
-        return rk4(lambda z: self.derivative(z, u, correction), x, self.dt, self.substeps)
-
-    def derivative(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
-        """Derivative of the state at the instant: exact kinematics, prior plus correction."""
-        acceleration = self.physics.acceleration(x, u) + correction if self.use_prior else correction
-        velocity = x[..., self.prior.n_q :]
-        return torch.cat([velocity, acceleration.expand(velocity.shape)], dim=-1)
-
-    def rate(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
-        """Mean rate over the period, ``(x_{k+1} - x_k) / dt``."""
-        return (self.integrate(x.expand(*correction.shape[:-1], -1), u, correction) - x) / self.dt
-
-    def measured_rate(self, x: Tensor, x_next: Tensor, xdot: Tensor) -> Tensor:
-        """Mean rate between two measured states; their derivative is not used."""
-        return (x_next - x) / self.dt
-
-
-class LiteralStep(RecurrentStep):
-    """The paper's literal form: the network gives the whole xdot, explicit Euler integrates it.
-
-    Features are ``[x, u, prior xdot]`` as they are (an angle that turns is no sine and cosine); the target
-    of teacher forcing is the derivative xdot of the recording at the sample, not a mean over the period.
-    Nothing ties ``q_dot`` to ``v``, and Euler feeds energy into an oscillation: both are the paper's.
-
-    Args:
-        prior: The ODE prior; it also names the states.
-        network: ``(s, h) -> (output, h_next)`` with n_x outputs, one network or a stack.
-        scaling: Magnitudes of features and outputs, those of xdot ``(n_x,)``.
-        dt: Period of the data [s].
-        use_prior: False leaves the prior's xdot out of the features (RNN).
-
-    Source: Schön, Götte, Timmermann: Multi-Objective Physics-Guided Recurrent Neural Networks for
-    Identifying Non-Autonomous Dynamical Systems (IFAC ALCOS 2022), Fig. 1.
-    """
-
-    def features(self, x: Tensor, u: Tensor) -> Tensor:
-        """Network inputs ``s = [x, u, prior xdot]``, scaled."""
-        parts = [x / self.scale_x, u / self.scale_u]
-        if self.use_prior:
-            parts.append(self.physics(x, u) / self.scale_acceleration)
-        return torch.cat(parts, dim=-1)
-
-    def integrate(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
-        """Next state by explicit Euler."""
-        return x + self.dt * correction
-
-    def derivative(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
-        """What the network gave."""
-        return correction
-
-    def rate(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
-        """What the network gave."""
-        return correction
-
-    def measured_rate(self, x: Tensor, x_next: Tensor, xdot: Tensor) -> Tensor:
-        """The derivative of the recording at the sample."""
-        return xdot
-
-
-def n_features(prior: Prior, use_prior: bool, *, literal: bool = False) -> int:
-    """Number of features of :meth:`HybridStep.features`, or :meth:`LiteralStep.features` if ``literal``."""
-    if literal:
-        return len(prior.states) * (2 if use_prior else 1) + len(prior.inputs)
-    angles = sum(signal.periodic for signal in prior.states)
-    return len(prior.states) + angles + len(prior.inputs) + (prior.n_q if use_prior else 0)

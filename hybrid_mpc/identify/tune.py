@@ -1,43 +1,45 @@
-"""Search of training settings by the validation error of free runs (Optuna): resumable, pruned, repeatable."""
+"""Search of training settings by the validation error of free runs (Optuna): resumable, pruned, repeatable.
+
+What may vary (:class:`SearchSpace`), the search, and its journal: Optuna's, in lines of JSON, bound to its search.
+"""
 
 from __future__ import annotations
-
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
-from typing import TYPE_CHECKING
-
-from hybrid_mpc.errors import InputError
-
-if TYPE_CHECKING:
-    from optuna.distributions import BaseDistribution
-
-    from hybrid_mpc.identify.settings import TrainingSettings
 
 import hashlib
 import math
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import optuna
+from optuna.distributions import BaseDistribution, FloatDistribution, IntDistribution
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, Trial, TrialState
 
 from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import MOST_CONTENT, digest, read_bytes
 from hybrid_mpc.identify.settings import TrainingSettings
 from hybrid_mpc.identify.train import Trained, train
 from hybrid_mpc.machine.torch_prior import Prior
 
-# What a search of settings may change, and between which bounds. No torch in here.
-
 Values = Mapping[str, float]
+Progress = Callable[[int, int, int, float], None]
+STUDY = "hybrid-mpc tune"
+STARTUP = 6
+"""Trials at random before the sampler looks at their results."""
+FINISHED = 4
+"""Finished trainings that a median is taken of before one is pruned by it."""
+PATIENCE = 0.2
+"""Share of the optimiser steps that every training gets: a good setting may start slowly."""
+ENOUGH = 8
+"""Finished trainings from which the settings' importance is estimated."""
 WHOLE = ("hidden", "batch", "horizon")
 """Settings that are whole numbers."""
 USUAL: Mapping[str, tuple[float, float]] = {
@@ -65,8 +67,8 @@ class SearchSpace:
         batch: Windows a step, whole numbers. Default: not searched; twice the batch is twice the work.
         horizon: Most scored periods of a free-run window, whole numbers. Default: not searched; twice the
             horizon is twice the work.
-        prior_replay: Weight of fading corrections where nothing was measured. Default: not searched. Zero, none, is
-            on no logarithmic scale: whoever has none compares with a search without them.
+        prior_replay: Weight of prior replay. Default: not searched. Zero is on no logarithmic scale: compare with a
+            search without it.
 
     Raises:
         InputError: If nothing is searched, or bounds are not positive, not rising, or not whole where they must be.
@@ -123,17 +125,13 @@ class SearchSpace:
 
     def distributions(self) -> dict[str, BaseDistribution]:
         """Optuna's distributions of the searched settings."""
-        from optuna.distributions import FloatDistribution, IntDistribution
-
         made: dict[str, BaseDistribution] = {}
         for name in self.names:
             low, high = self.bounds(name)
-            whole = name in WHOLE
-            made[name] = (
-                IntDistribution(int(low), int(high), log=True)
-                if whole
-                else FloatDistribution(low, high, log=True)
-            )
+            if name in WHOLE:
+                made[name] = IntDistribution(int(low), int(high), log=True)
+            else:
+                made[name] = FloatDistribution(low, high, log=True)
         return made
 
 
@@ -184,89 +182,6 @@ def _checked(name: str, bounds: Sequence[float]) -> tuple[float, float]:
     return int(bounds[0]), int(bounds[1])
 
 
-# The journal of a search: Optuna's, in lines of JSON, bound to its search.
-
-STUDY = "hybrid-mpc tune"
-
-
-def open_study(storage: Path, identity: Mapping[str, str]) -> optuna.Study:
-    """The study of a journal, whose trials are all finished or given up.
-
-    Args:
-        storage: The journal; made if missing.
-        identity: Hashes by name of everything that decides what the trials are.
-
-    Raises:
-        InputError: If the journal is damaged or another search's.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     open_study(Path(folder) / "tune.jsonl", {"seed": "0"}).user_attrs
-        {'identity': {'seed': '0'}}
-    """
-    storage.parent.mkdir(parents=True, exist_ok=True)
-    _mend(storage)
-    try:
-        # whole path: a lock is a link to it, which has to lead somewhere
-        journal = JournalStorage(JournalFileBackend(str(storage.resolve())))
-        names = optuna.get_all_study_names(journal)
-        with _quiet():
-            make = optuna.load_study if STUDY in names else optuna.create_study
-            study = make(storage=journal, study_name=STUDY)
-        held = study.user_attrs.get("identity", {})
-    except (ValueError, KeyError, TypeError, AttributeError, OSError) as error:
-        raise InputError(
-            f"{storage} is no journal of a search or is damaged ({type(error).__name__}: {error}); choose another "
-            "file or delete it to search anew"
-        ) from error
-    if not held and not study.trials:  # new, or killed before it was named
-        study.set_user_attr("identity", dict(identity))
-    elif differ := [name for name in identity if held.get(name) != identity[name]]:
-        raise InputError(
-            f"{storage} holds another search ({', '.join(differ)} differ); go on with the same ones or choose "
-            "another file"
-        )
-    for _ in study.get_trials(states=(TrialState.WAITING,)):  # drawn, not begun, when the search was ended
-        study.ask()
-    for trial in study.get_trials(states=(TrialState.RUNNING,)):
-        study.tell(trial.number, state=TrialState.FAIL)
-    return study
-
-
-def _mend(storage: Path) -> None:
-    """Cut off a line that a kill left unfinished."""
-    if storage.is_file():
-        content = read_bytes(storage, MOST_CONTENT)
-        whole = content.rfind(b"\n") + 1
-        if whole < len(content):
-            os.truncate(storage, whole)
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Without Optuna's word that a study was made or found."""
-    before = optuna.logging.get_verbosity()
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-    try:
-        yield
-    finally:
-        optuna.logging.set_verbosity(before)
-
-
-__all__ = ["tune", "SearchSpace", "SearchResult", "TrialRow", "Progress"]
-
-Progress = Callable[[int, int, int, float], None]
-STARTUP = 6
-"""Trials at random before the sampler looks at their results."""
-JUDGES = 4
-"""Finished trainings that a median is taken of before one is pruned by it."""
-PATIENCE = 0.2
-"""Share of the optimiser steps that every training gets: a good setting may start slowly."""
-ENOUGH = 8
-"""Finished trainings from which the settings' importance is estimated."""
-
-
 @dataclass(frozen=True)
 class TrialRow:
     """One training of a search.
@@ -275,7 +190,7 @@ class TrialRow:
         number: 0, 1, ...
         state: ``"complete"``, ``"pruned"`` (stopped while worse than the median of the finished ones at the same
             step) or ``"diverged"`` (no network had a finite validation error).
-        value: Validation error of the best network [E_sim's unit]; of a pruned training that at its end, of a
+        value: Validation error of the best network [unit of E_sim]; of a pruned training that at its end, of a
             diverged one infinite.
         mean: Mean of the networks' validation errors; NaN for a pruned training.
         steps: Optimiser steps done.
@@ -289,7 +204,7 @@ class TrialRow:
     mean: float
     steps: int
     duration: float
-    values: Mapping[str, float]
+    values: Values
 
 
 @dataclass(frozen=True)
@@ -329,9 +244,9 @@ def tune(
     """Search settings by the validation error of free runs, the best network of each training counting.
 
     The first training has the settings ``base``, if the space holds them. Settings are drawn from (seed, number of
-    the trial, results so far), and a training that was interrupted is drawn again: a search that was killed and goes
-    on is the search that was not. Every finished trial stands in ``storage`` at once. Validation chooses here what
-    it also chooses within a training, so the best value is too good to be true by some; judge on test runs.
+    the trial, results so far), and an interrupted training is drawn again: a search that was killed and resumed is the
+    search that was not. Validation also chooses the weights within a training, so the best value is somewhat too
+    good; evaluate on test runs.
 
     Args:
         prior: The fitted prior.
@@ -340,7 +255,7 @@ def tune(
         base: All settings that are not searched, and the first trial's.
         space: What is searched.
         trials: Trials in all, those in ``storage`` counted.
-        storage: Journal: JSON lines, made if missing, gone on with if there. One search at a time.
+        storage: Journal (JSON lines), made if missing, resumed if there. One search at a time.
         seed: Seed of the search; weights and batches have that of ``base``.
         on_progress: ``(number of the trial, steps done, steps in all, best validation error)``.
         timeout: No further trial starts after this time of the call [s]; one trial is made in any case. Default: none.
@@ -355,16 +270,16 @@ def tune(
         >>> train(prior, train_runs, valid_runs, found.settings)  # doctest: +SKIP
     """
     check_numbers(trials, seed, timeout)
-    if space.horizon is not None:  # trials must be judged by windows of the same length
+    if space.horizon is not None:  # trials must be compared on windows of the same length
         base = replace(base, validation_horizon=base.validation_horizon or 5 * base.horizon)
     study = open_study(storage, _identity(prior, training, validation, base, space, seed))
     warm_up = math.ceil(PATIENCE * (base.teacher_steps + base.free_run_steps))
-    study.pruner = optuna.pruners.MedianPruner(JUDGES, warm_up)
+    study.pruner = optuna.pruners.MedianPruner(FINISHED, warm_up)
     start = time.monotonic()
     while (number := len(_finished(study))) < trials:
         trial = _ask(study, number, base, space, seed)
         settings = space.apply(base, trial.params)
-        with _kept(study, trial, partial(on_progress, number)) as report:
+        with _recorded(study, trial, partial(on_progress, number)) as report:
             report.trained = train(prior, training, validation, settings, on_progress=report)
         if timeout is not None and time.monotonic() - start >= timeout:
             break
@@ -399,10 +314,10 @@ class _Report:
 
 
 @contextmanager
-def _kept(
+def _recorded(
     study: optuna.Study, trial: Trial, on_progress: Callable[[int, int, float], None]
 ) -> Iterator[_Report]:
-    """A trial's training is noted as it ended; one that is interrupted stays open and is drawn again."""
+    """Store how a trial ended; one that is interrupted stays open and is drawn again."""
     report = _Report(trial, on_progress)
     try:
         yield report
@@ -441,15 +356,10 @@ def _identity(
     return {
         "data": data.hexdigest(),
         "prior": digest([type(prior).__name__, prior.values]),
-        "base settings": digest(_without_default(base)),
-        "space": digest(_without_default(space)),
+        "base settings": digest(asdict(base)),
+        "space": digest(asdict(space)),
         "seed": digest(seed),
     }
-
-
-def _without_default(settings: TrainingSettings | SearchSpace) -> dict[str, Any]:
-    """As plain data; without prior_replay, where there are none, as in searches from before there were any."""
-    return {name: value for name, value in asdict(settings).items() if name != "prior_replay" or value}
 
 
 def _finished(study: optuna.Study) -> list[FrozenTrial]:
@@ -489,3 +399,59 @@ def _row(number: int, trial: FrozenTrial) -> TrialRow:
         trial.duration.total_seconds(),
         dict(trial.params),
     )
+
+
+def open_study(storage: Path, identity: Mapping[str, str]) -> optuna.Study:
+    """The study of a journal, whose trials are all finished or given up.
+
+    Args:
+        storage: The journal; made if missing.
+        identity: Hashes by name of everything that decides what the trials are.
+
+    Raises:
+        InputError: If the journal is damaged or another search's.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     open_study(Path(folder) / "tune.jsonl", {"seed": "0"}).user_attrs
+        {'identity': {'seed': '0'}}
+    """
+    storage.parent.mkdir(parents=True, exist_ok=True)
+    _mend(storage)
+    verbosity = optuna.logging.get_verbosity()
+    optuna.logging.set_verbosity(optuna.logging.WARNING)  # not that a study was made or found
+    try:
+        # whole path: a lock is a link to it, which has to lead somewhere
+        journal = JournalStorage(JournalFileBackend(str(storage.resolve())))
+        make = optuna.load_study if STUDY in optuna.get_all_study_names(journal) else optuna.create_study
+        study = make(storage=journal, study_name=STUDY)
+        found = study.user_attrs.get("identity", {})
+    except (ValueError, KeyError, TypeError, AttributeError, OSError) as error:
+        raise InputError(
+            f"{storage} is no journal of a search or is damaged ({type(error).__name__}: {error}); choose another "
+            "file or delete it to search anew"
+        ) from error
+    finally:
+        optuna.logging.set_verbosity(verbosity)
+    if not found and not study.trials:  # new, or killed before it was named
+        study.set_user_attr("identity", dict(identity))
+    elif differ := [name for name in identity if found.get(name) != identity[name]]:
+        raise InputError(
+            f"{storage} holds another search ({', '.join(differ)} differ); go on with the same ones or choose "
+            "another file"
+        )
+    for _ in study.get_trials(states=(TrialState.WAITING,)):  # drawn, not begun, when the search was ended
+        study.ask()
+    for trial in study.get_trials(states=(TrialState.RUNNING,)):
+        study.tell(trial.number, state=TrialState.FAIL)
+    return study
+
+
+def _mend(storage: Path) -> None:
+    """Cut off a line that a kill left unfinished."""
+    if storage.is_file():
+        content = read_bytes(storage, MOST_CONTENT)
+        whole = content.rfind(b"\n") + 1
+        if whole < len(content):
+            os.truncate(storage, whole)

@@ -18,7 +18,9 @@ import numpy as np
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import check_writable, digest, locked, read_document, write_document, write_json
-from hybrid_mpc.identify.delay import OutputErrorFit, Physics, cut_runs, fit_physics, shifted, smoothed
+from hybrid_mpc.identify.delay import shifted
+from hybrid_mpc.identify.output_error import OutputErrorFit, cut_runs
+from hybrid_mpc.identify.prior import Physics, fit_physics, smoothed
 from hybrid_mpc.identify.settings import KINDS, TrainingSettings
 from hybrid_mpc.identify.train import Trained
 from hybrid_mpc.job.benchmark_runs import (
@@ -35,9 +37,8 @@ from hybrid_mpc.job.benchmark_runs import (
 )
 from hybrid_mpc.job.check import check_scenario
 from hybrid_mpc.job.context import Progress, Silent, versions
-from hybrid_mpc.job.engine import run_jobs
 from hybrid_mpc.job.folder import JobNote, check_same_job
-from hybrid_mpc.job.stages.identify import is_trained, load_trained, save_trained, train_kind
+from hybrid_mpc.job.stages.identify import load_trained, save_trained, train_kinds
 from hybrid_mpc.machine.specification import BenchmarkBudget
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import Scenario, load_scenario
@@ -345,16 +346,10 @@ def _networks(
 ) -> dict[str, Trained]:
     """Networks of every kind, trained where ``folder`` does not hold them yet; an interrupted training goes on."""
     train, valid = (list(part) for part in parts)
-    jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
-        kind: (
-            train_kind,
-            (settings.scenario, dict(physics.fit.values), train, valid, settings_of(kind), folder, "cpu"),
-        )
-        for kind in reversed(KINDS)
-        if not is_trained(folder, settings_of(kind))
-    }
-    run_jobs(jobs, progress.update, settings.workers)
-    return {str(kind): load_trained(folder, kind) for kind in KINDS}
+    return train_kinds(
+        settings.scenario, physics.fit.values, train, valid, {kind: settings_of(kind) for kind in KINDS}, folder,
+        workers=settings.workers, on_progress=progress.update,
+    )  # fmt: skip
 
 
 def candidate_errors(
@@ -572,7 +567,7 @@ def describe(model: BenchmarkModel, scenario: Scenario) -> dict[str, Any]:
         "hybrid": model.hybrid,
         "validation": {"unit": spec.unit, "rmse": dict(model.validation), "long_rmse": dict(model.long)},
         "networks": {kind: trained.validation for kind, trained in model.networks.items()},
-        "faults": {kind: [asdict(f) for f in trained.faults] for kind, trained in model.networks.items()},
+        "faults": {kind: [asdict(f) for f in trained.failures] for kind, trained in model.networks.items()},
     }
 
 

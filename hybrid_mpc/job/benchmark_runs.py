@@ -13,17 +13,18 @@ from numpy.typing import NDArray
 from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.identify.delay import Physics, lost_samples, shifted
-from hybrid_mpc.identify.evaluate import judged
+from hybrid_mpc.identify.delay import lost_samples, shifted
+from hybrid_mpc.identify.evaluate import evaluation_trajectories, model_states
+from hybrid_mpc.identify.prior import Physics
 from hybrid_mpc.identify.settings import KINDS
 from hybrid_mpc.identify.step import PriorStep
-from hybrid_mpc.identify.train import Trained, stack_for, step_for
+from hybrid_mpc.identify.train import Trained
 from hybrid_mpc.machine.specification import BenchmarkSpec, Role
 from hybrid_mpc.machine.torch_prior import Prior
 from hybrid_mpc.scenario import Scenario
 
 if TYPE_CHECKING:
-    from torch import Tensor, nn
+    pass
 
 
 Array = NDArray[np.float64]
@@ -87,7 +88,9 @@ def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
         paths, scenario.data, outputs=prior.outputs, inputs=prior.inputs, states=prior.states, needed=needed
     )
     parts = _parts(dataset, scenario, uncut)
-    train, valid, held = (tuple(p for p in parts if p.role == role) for role in ("train", "valid", "test"))
+    train, valid, held_back = (
+        tuple(p for p in parts if p.role == role) for role in ("train", "valid", "test")
+    )
     if not (train and valid):
         cut = "".join(f"\n  {c.file} {c.start:g} to {c.end:g} s: {c.why}" for c in dataset.cuts)
         raise InputError(
@@ -96,7 +99,7 @@ def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
         )
     in_order = not (spec.cycle or uncut) and spec.length is None
     long = until_validated(dataset, scenario.data.windows) if in_order else ()
-    return Recordings(train, valid, held, long, dataset)
+    return Recordings(train, valid, held_back, long, dataset)
 
 
 def _parts(dataset: Dataset, scenario: Scenario, uncut: bool) -> list[Trajectory]:
@@ -287,18 +290,17 @@ def run_freely(
 
     dt = trajectories[0].dt
     warm = warm_samples(warm_up, physics.delay, dt)
-    starts = judged(shifted(trajectories, physics.delay), physics.smoother(prior, dt), warm)
+    starts = evaluation_trajectories(shifted(trajectories, physics.delay), physics.smoother(prior, dt), warm)
     if length is not None:
-        starts = [_first(t, warm + round(length / dt) + 1) for t in starts]
-    found = {
-        "phy": _simulate(PriorStep(prior, dt), torch.zeros(1, 1, 0, dtype=torch.float64), starts, warm)[0]
-    }
+        n = warm + round(length / dt) + 1
+        starts = [t.part(np.arange(len(t.t)) < n, t.name, t.role) for t in starts]
+    after = slice(
+        1, -1
+    )  # states of the samples after the warm-up: neither the start nor what follows the last input
+    found = {"phy": model_states(PriorStep(prior, dt), starts, warm)[:, after]}
     for kind, trained in networks.items():
-        stack = stack_for(prior, trained.settings)
-        stack.load_state_dict({name: torch.tensor(value) for name, value in trained.weights.items()})
-        step = step_for(prior, stack, trained.scaling, dt, trained.settings)
-        all_runs = _simulate(step, stack.initial(1), starts, warm)
-        found |= {kind: all_runs[trained.best], f"{kind} mean": all_runs.mean(0)}
+        states = model_states(trained.stacked_step(prior, dt), starts, warm)[:, :, after]
+        found |= {kind: states[trained.best], f"{kind} mean": states.mean(0)}
     with torch.no_grad():
         outputs = {
             name: prior.output(torch.tensor(x), torch.zeros(len(prior.inputs))).numpy()
@@ -361,34 +363,3 @@ def warm_samples(warm_up: float, delay: float, dt: float) -> int:
         (49, 47)
     """
     return max(1, round(warm_up / dt) - lost_samples(delay, dt))
-
-
-def _first(trajectory: Trajectory, n: int) -> Trajectory:
-    arrays = {key: getattr(trajectory, key)[:n] for key in ("t", "u", "y", "x", "xdot")}
-    return replace(trajectory, **arrays)
-
-
-def _simulate(step: nn.Module, h0: Tensor, trajectories: Sequence[Trajectory], warm: int) -> Array:
-    """States ``(networks, runs, n, n_x)`` of the samples after ``warm``; shorter runs go on under their last input."""
-    import torch
-
-    longest = max(len(t.t) for t in trajectories)
-    x_all, u_all = (
-        torch.tensor(np.stack([_padded(getattr(t, key), longest) for t in trajectories]))
-        for key in ("x", "u")
-    )
-    networks, runs = h0.shape[0], len(trajectories)
-    with torch.no_grad():
-        h, states = h0.expand(networks, runs, -1), []
-        wide = [a.expand(networks, *a.shape) for a in (x_all, u_all)]
-        for k in range(warm):
-            _, h = step(wide[0][:, :, k], h, wide[1][:, :, k])
-        x = wide[0][:, :, warm]
-        for k in range(warm, longest - 1):
-            x, h = step(x, h, wide[1][:, :, k])
-            states.append(x)
-    return torch.stack(states, 2).numpy()
-
-
-def _padded(values: Array, length: int) -> Array:
-    return np.concatenate([values, np.repeat(values[-1:], length - len(values), axis=0)])

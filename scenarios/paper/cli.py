@@ -29,7 +29,7 @@ def reproduce(
     ] = "",
     budget: Annotated[str, typer.Option(help="Effort: quick or full.")] = "full",
     form: Annotated[
-        str, typer.Option(help="hybrid, or literal: the paper's whole derivative and explicit Euler.")
+        str, typer.Option(help="hybrid, or paper: the network gives the whole derivative and explicit Euler.")
     ] = "hybrid",
     seed: Annotated[int, typer.Option(help="Seed of data and training.", min=0, max=MOST_SEED)] = 0,
     out: Annotated[
@@ -40,7 +40,7 @@ def reproduce(
     ] = False,
     device: Device = "cpu",
 ) -> None:
-    """Rebuild the paper's experiment on a machine: tables, figures, and its claims beside what was found."""
+    """Rebuild the paper's experiment on a machine: tables, figures, and its claims with what was found."""
     from hybrid_mpc.cli.progress import make_progress
     from scenarios.paper.run import claim_lines, text_table
     from scenarios.paper.run import reproduce as run_job

@@ -26,7 +26,8 @@ class Effort:
         every: Steps between evaluations on validation free runs. Default 100.
         batch: Windows a step. Default 32.
         decay: Weight decay of AdamW times the number of training samples; 0 is the paper's Adam. Default 0.
-        fit: Methods that the prior is fitted by, where it is fitted. Default: those of the main job.
+        fit: Methods that the prior is fitted by, where it is fitted: those of ``fit_prior``, and ``"particle_swarm"``.
+            Default: those of the main job.
 
     Example:
         >>> Effort(networks=2, sequences=(3, 6), steps=100, free_run_steps=20, valid=1, test=1).hidden
@@ -55,7 +56,7 @@ class Experiment:
         data_sets: Title of each data set by its name. Validation and test runs are the same in all of them.
         most: Training runs that there are.
         runs: ``(data set, seed, folder) -> trajectories`` of all roles in order, or the data set that recordings were
-            read as, whose findings are told; files go into ``folder``.
+            read as, whose findings are reported; files go into ``folder``.
         measured: True: the states are not measured. Then the prior is fitted to every amount of training data
             anew, and its equations smooth them. False: states are exact and the prior is taken as it is.
         shown: Name of the test run that is drawn (the paper's Fig. 6).
@@ -79,7 +80,7 @@ class Experiment:
 
     @property
     def reference(self) -> str:
-        """The last data set; with most training data it gives the ruler that all models are judged by."""
+        """The last data set; with most training data it gives what all models are evaluated on."""
         return list(self.data_sets)[-1]
 
 

@@ -2,37 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict
+import importlib
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scenarios.paper.table import METRICS, Divergence, Network
-
-if TYPE_CHECKING:
-    from hybrid_mpc.identify.evaluate import FreeRun
-    from hybrid_mpc.identify.train import Trained
-
-import importlib
-import time
-from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
-
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.files import write_arrays, write_json
 from hybrid_mpc.scenario import load_scenario
-from scenarios.paper.table import Row
+from scenarios.paper.table import Divergence, Network, Row
 
 if TYPE_CHECKING:
+    from hybrid_mpc.identify.evaluate import FreeRun
     from hybrid_mpc.identify.settings import TrainingSettings
+    from hybrid_mpc.identify.step import RecurrentStep
+    from hybrid_mpc.identify.train import Trained
 
-
-# Free runs of all networks of an ensemble on the test runs: their figures, and which of them diverged (torch).
-
+Progress = Callable[[int, int, str], None]
 Array = NDArray[np.float64]
 BEYOND = 10.0
 """An output beyond so many times the largest one measured in any test run counts as diverged."""
@@ -65,7 +56,7 @@ def divergence(runs: Sequence[FreeRun]) -> Divergence | None:
     return Divergence(run.name, step, float(run.t[step] - run.t[0]), len(found))
 
 
-def judged_network(
+def network_figures(
     runs: Sequence[FreeRun], validation: float | None = None, converged: int | None = None
 ) -> Network:
     """Figures of one network, or where it diverged.
@@ -75,12 +66,28 @@ def judged_network(
         validation: Its best validation error. Default: there was none.
         converged: Optimiser steps until it had converged. Default: not known.
     """
-    from hybrid_mpc.identify.evaluate import score
-
     where = divergence(runs)
-    figures = {} if where is not None else {k: v for k, v in asdict(score(runs)).items() if k in METRICS}
+    figures = {} if where is not None else figures_of(runs)
     known = validation if validation is not None and np.isfinite(validation) else None
     return Network(figures, known, converged if known is not None else None, where)
+
+
+def figures_of(runs: Sequence[FreeRun]) -> dict[str, float]:
+    """All figures of free runs by name (``METRICS``): those of the main job, and two that only the paper needs.
+
+    ``e_sim_lambda1_s`` discounts the error by ``1 / (1 + λ t)`` with λ = 1 1/s; ``e_sim_paper_s`` is the paper's form,
+    the integral over a run divided by its number of samples.
+    """
+    from hybrid_mpc.identify.evaluate import score
+
+    discounted, paper = [], []
+    for run in runs:
+        error = np.abs(run.xdot_hat - run.xdot).sum(1)
+        t, dt = run.t - run.t[0], float(np.mean(np.diff(run.t)))
+        discounted.append((error / (1.0 + t)).mean())
+        paper.append(error.mean() * dt)
+    own = {"e_sim_lambda1_s": float(np.mean(discounted)), "e_sim_paper_s": float(np.mean(paper))}
+    return asdict(score(runs)) | {name: v if np.isfinite(v) else float("inf") for name, v in own.items()}
 
 
 def converged_steps(trained: Trained) -> list[int]:
@@ -96,18 +103,15 @@ def shown_run(runs: Sequence[FreeRun], name: str) -> dict[str, Any]:
     return {key: getattr(run, key) for key in SHOWN}
 
 
-Report = Callable[[int, int, str], None]
-
-
 @dataclass(frozen=True)
-class Ruler:
-    """What judges all models alike.
+class EvaluationSet:
+    """What all models of a reproduction are evaluated on.
 
     Args:
         test: Test runs; their starts are smoothed from their warm-ups alone.
         values: Parameters of the prior whose energy balance counts.
         warm: Samples of the warm-up.
-        shown: Name of the run that is kept for a figure.
+        shown: Name of the run that is drawn.
     """
 
     test: Sequence[Trajectory]
@@ -127,9 +131,10 @@ class Case:
         validation: Validation trajectories, smoothed by the same.
         values: Parameters of the prior fitted to them.
         smoother: ``sigma`` and ``walk`` of the smoother; None where states are exact.
-        ruler: What judges.
+        evaluation: What all models are evaluated on.
         folder: Where the files go.
-        device: Where the networks are trained.
+        device: Where the networks are trained. Default: cpu.
+        form: Form of the networks' models, ``"hybrid"`` or ``"paper"``. Default: hybrid.
     """
 
     scenario: str
@@ -138,14 +143,23 @@ class Case:
     validation: Sequence[Trajectory]
     values: dict[str, float]
     smoother: dict[str, tuple[float, ...]] | None
-    ruler: Ruler
+    evaluation: EvaluationSet
     folder: Path
     device: str = "cpu"
+    form: str = "hybrid"
 
     @property
     def dt(self) -> float:
         """Model period [s]."""
         return self.training[0].dt
+
+
+def step_class(form: str) -> type[RecurrentStep]:
+    """The class of a form's steps."""
+    from hybrid_mpc.identify.step import HybridStep
+    from scenarios.paper.step import PaperStep
+
+    return PaperStep if form == "paper" else HybridStep
 
 
 def fit_job(
@@ -154,19 +168,30 @@ def fit_job(
     valid: Sequence[Trajectory],
     methods: tuple[str, ...],
     path: Path,
-    report: Report,
+    report: Progress,
 ) -> None:
-    """Fit the prior to one amount of training data and smooth by it, as the main job does."""
-    from hybrid_mpc.job.stages.identify import ROUNDS, fit_and_smooth
+    """Fit the prior to one amount of training data and smooth by it, as the main job does.
 
-    start = time.monotonic()
-    fit, smoother, train, valid = fit_and_smooth(
-        load_scenario(scenario).prior, train, valid, train[0].dt, methods=methods,
+    ``"particle_swarm"`` among the methods is the paper's: what it finds is where the others start.
+    """
+    from hybrid_mpc.identify.prior import ROUNDS, fit_and_smooth, smoothed
+
+    started, make, dt = time.monotonic(), load_scenario(scenario).prior, train[0].dt
+    start, others = None, tuple(method for method in methods if method != "particle_swarm")
+    if others != methods:
+        from scenarios.paper.swarm import swarm_values
+
+        start = swarm_values(
+            make, train, dt, on_progress=lambda done, total: report(done, total, "particle swarm")
+        )
+    physics = fit_and_smooth(
+        make, train, valid, dt, methods=others, start=start,
         on_progress=lambda key, done, total, text: report(ROUNDS.index(key), len(ROUNDS), text),
     )  # fmt: skip
-    write_arrays(path.with_suffix(".npz"), smoothed_arrays([*train, *valid]))
-    note = {**asdict(fit), "smoother": {"sigma": smoother.sigma, "walk": smoother.walk}}
-    write_json(path.with_suffix(".json"), {**note, "seconds": time.monotonic() - start})
+    parts = [smoothed(make, physics, part, dt) for part in (train, valid)]
+    write_arrays(path.with_suffix(".npz"), smoothed_arrays([t for part in parts for t in part]))
+    note = {**asdict(physics.fit), "smoother": {"sigma": physics.sigma, "walk": physics.walk}}
+    write_json(path.with_suffix(".json"), {**note, "seconds": time.monotonic() - started})
 
 
 def smoothed_arrays(trajectories: Sequence[Trajectory]) -> dict[str, Any]:
@@ -174,16 +199,14 @@ def smoothed_arrays(trajectories: Sequence[Trajectory]) -> dict[str, Any]:
     return {f"{t.name}/{key}": getattr(t, key) for t in trajectories for key in ("x", "xdot")}
 
 
-def physics_job(cases: Sequence[tuple[Case, int]], path: Path, report: Report) -> None:
-    """Judge the nominal and the fitted prior of all amounts of training data.
+def physics_job(cases: Sequence[tuple[Case, int]], path: Path, report: Progress) -> None:
+    """Evaluate the nominal and the fitted prior of all amounts of training data.
 
     Args:
         cases: Each amount of training data, and its number of sequences.
         path: File to write, without ending.
         report: Takes progress.
     """
-    import torch
-
     from hybrid_mpc.identify.evaluate import free_runs
     from hybrid_mpc.identify.step import PriorStep
 
@@ -191,22 +214,23 @@ def physics_job(cases: Sequence[tuple[Case, int]], path: Path, report: Report) -
     arrays: dict[str, Any] = {}
     for i, (case, count) in enumerate(cases):
         report(i, len(cases), f"{case.data_set}, {count} sequences")
-        make, ruler = load_scenario(case.scenario).prior, case.ruler
+        make, evaluation = load_scenario(case.scenario).prior, case.evaluation
         for model, values in (("phy_nominal", None), ("phy", case.values)):
-            step, empty = PriorStep(make(values), case.dt), torch.zeros(0, dtype=torch.float64)
-            runs = free_runs(step, make(ruler.values), ruler.test, ruler.warm, empty)
-            rows.append(Row(case.data_set, count, model, (judged_network(runs),)))
+            step = PriorStep(make(values), case.dt)
+            runs = free_runs(step, make(evaluation.values), evaluation.test, evaluation.warm)
+            rows.append(Row(case.data_set, count, model, (network_figures(runs),)))
             arrays |= {
-                f"{case.data_set}_{count:02d}_{model}/{k}": v for k, v in shown_run(runs, ruler.shown).items()
+                f"{case.data_set}_{count:02d}_{model}/{k}": v
+                for k, v in shown_run(runs, evaluation.shown).items()
             }
     write_arrays(path.with_suffix(".npz"), arrays)
     _finish(path, rows, {}, start)
 
 
 def ensemble_job(
-    case: Case, count: int, model: str, settings: TrainingSettings, key: str, report: Report
+    case: Case, count: int, model: str, settings: TrainingSettings, key: str, report: Progress
 ) -> None:
-    """Train the networks of one model on one amount of data and judge all of them.
+    """Train the networks of one model on one amount of data and evaluate all of them.
 
     Args:
         case: Data and prior.
@@ -220,53 +244,54 @@ def ensemble_job(
     from hybrid_mpc.identify.train import train
 
     start, path = time.monotonic(), case.folder / key
-    make, ruler = load_scenario(case.scenario).prior, case.ruler
+    make, evaluation = load_scenario(case.scenario).prior, case.evaluation
     prior = make(case.values)
     trained = train(
-        prior, case.training, case.validation, settings,
+        prior, case.training, case.validation, settings, form=step_class(case.form),
         checkpoint=case.folder / f"{key}.safetensors", device=case.device,
         on_progress=lambda done, total, error: report(done, total, f"validation E_sim {error:.4g}"),
     )  # fmt: skip
-    with np.errstate(over="ignore", invalid="ignore"):  # a network that diverges is judged as such
-        runs = stacked_free_runs(trained, prior, case.dt, make(ruler.values), ruler.test, ruler.warm)
+    with np.errstate(over="ignore", invalid="ignore"):  # a network that diverges counts as such
+        runs = stacked_free_runs(
+            trained, prior, case.dt, make(evaluation.values), evaluation.test, evaluation.warm
+        )
         networks = tuple(
-            judged_network(own, float(error), steps)
+            network_figures(own, float(error), steps)
             for own, error, steps in zip(runs, trained.validation, converged_steps(trained), strict=True)
         )
     arrays = {f"weights.{name}": value for name, value in trained.weights.items()}
     arrays |= {f"curve.{name}": value for name, value in trained.curve.items()}
-    arrays |= {f"shown.{k}": v for k, v in shown_run(runs[trained.best], ruler.shown).items()}
+    arrays |= {f"shown.{k}": v for k, v in shown_run(runs[trained.best], evaluation.shown).items()}
     write_arrays(path.with_suffix(".npz"), arrays)
     details = {
         "scaling": asdict(trained.scaling),
         "skipped": trained.skipped.tolist(),
-        "faults": [asdict(fault) for fault in trained.faults],
+        "failures": [asdict(failure) for failure in trained.failures],
         "best_by_validation": trained.best,
     }
     _finish(path, [Row(case.data_set, count, model, networks)], details, start)
 
 
-def sindy_job(case: Case, count: int, key: str, report: Report) -> None:
-    """Identify a sparse equation on one amount of data and judge it."""
-    import torch
-
-    from hybrid_mpc.identify.evaluate import free_runs, judged
+def sindy_job(case: Case, count: int, key: str, report: Progress) -> None:
+    """Identify a sparse equation on one amount of data and evaluate it."""
+    from hybrid_mpc.identify.evaluate import evaluation_trajectories, free_runs
     from hybrid_mpc.identify.smooth import Smoother
 
     start, path = time.monotonic(), case.folder / key
-    make, ruler = load_scenario(case.scenario).prior, case.ruler
+    make, evaluation = load_scenario(case.scenario).prior, case.evaluation
     prior, validation = make(case.values), list(case.validation)
     report(0, 1, "searching libraries of terms")
     if case.smoother is not None:
         smoother = Smoother(prior, case.dt, tuple(case.smoother["sigma"]), tuple(case.smoother["walk"]))
-        validation = judged(validation, smoother, ruler.warm)
-    fit_sindy = importlib.import_module("hybrid_mpc.identify.sindy").fit_sindy
-    step = fit_sindy(case.training, prior, case.dt, validation=validation, warm=ruler.warm)
-    empty = torch.zeros(0, dtype=torch.float64)
+        validation = evaluation_trajectories(validation, smoother, evaluation.warm)
+    fit_sindy = importlib.import_module("scenarios.paper.sindy").fit_sindy
+    step = fit_sindy(case.training, prior, case.dt, validation=validation, warm=evaluation.warm)
     with np.errstate(over="ignore", invalid="ignore"):
-        runs = free_runs(step, make(ruler.values), ruler.test, ruler.warm, empty)
-        network = judged_network(runs)
-    write_arrays(path.with_suffix(".npz"), {f"shown.{k}": v for k, v in shown_run(runs, ruler.shown).items()})
+        runs = free_runs(step, make(evaluation.values), evaluation.test, evaluation.warm)
+        network = network_figures(runs)
+    write_arrays(
+        path.with_suffix(".npz"), {f"shown.{k}": v for k, v in shown_run(runs, evaluation.shown).items()}
+    )
     _finish(path, [Row(case.data_set, count, "sindy", (network,))], {"equations": step.equations()}, start)
 
 

@@ -89,7 +89,7 @@ def errors_over_sequences(panels: Mapping[str, Mapping[str, Mapping[str, Any]]],
 
 
 def _curve(ax: Axes, model: str, curve: Mapping[str, Any], shift: float, *, upper: bool) -> None:
-    """Means with standard deviations; how many networks diverged is written beside them in the upper row."""
+    """Means with standard deviations; how many networks diverged stands next to them in the upper row."""
     tint, dashes, marker, name = LOOKS.get(model, (colour(model), "-", "o", model))
     n = len(curve["sequences"])
     x = np.asarray(curve["sequences"], float) + (shift if marker else 0.0)

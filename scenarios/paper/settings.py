@@ -11,7 +11,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.scenario import Scenario, load_scenario, registered_scenarios
 from scenarios.paper.experiment import Effort, Experiment, PaperScenario
 
-FORMS = ("hybrid", "literal")
+FORMS = ("hybrid", "paper")
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class ReproductionSettings:
         networks: Networks of each ensemble. Default: the budget's.
         sequences: Amounts of training data, in runs. Default: the budget's.
         seed: Seed of data and training.
-        form: ``"hybrid"`` (exact kinematics, the network corrects the prior's acceleration) or ``"literal"``
+        form: ``"hybrid"`` (exact kinematics, the network corrects the prior's acceleration) or ``"paper"``
             (the paper's: it gives the whole derivative, explicit Euler integrates).
         device: Where the networks are trained, ``"cpu"`` or e.g. ``"cuda"``. Default: cpu.
 
@@ -57,7 +57,7 @@ class ReproductionSettings:
         networks = effort.networks if self.networks is None else self.networks
         if networks < 1:
             raise InputError(
-                f"{networks} networks cannot be judged; give --networks at least 1 (the paper has 16)"
+                f"{networks} networks cannot be evaluated; give --networks at least 1 (the paper has 16)"
             )
         return replace(effort, networks=networks, sequences=self._sequences(experiment, effort))
 
@@ -68,8 +68,6 @@ class ReproductionSettings:
             scenario = f"{path.name} {hashlib.sha256(path.read_bytes()).hexdigest()}"
         effort = self.effort(experiment_of(load_scenario(self.scenario)))
         own = {"command": "reproduce", **asdict(replace(self, scenario=scenario)), "effort": asdict(effort)}
-        if self.device == "cpu":
-            del own["device"]  # as in reproductions from before there was a choice
         return own | {"networks": effort.networks, "sequences": effort.sequences}
 
     def _sequences(self, experiment: Experiment, effort: Effort) -> tuple[int, ...]:

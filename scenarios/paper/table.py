@@ -1,6 +1,6 @@
-"""Claims of the paper and goals of this project, beside what was found. No torch in here.
+"""Figures of all networks of a reproduction, and the claims that they are held against. No torch in here.
 
-A check is made by one of the static methods of :class:`Claim` and judges a
+A check is made by one of the static methods of :class:`Claim` and looks at a
 :class:`~scenarios.paper.table.Table`. It compares means over the networks that did not diverge; a model of
 which all diverged is infinitely worse than any other. A model that is claimed to be better, and of which a network
 diverged, is not better.
@@ -17,14 +17,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-# Figures of all networks of a reproduction: means, standard deviations, and how many diverged. No torch in here.
-
 MODELS = ("phy_nominal", "phy", "rnn", "pgrnn", "mopgrnn", "hybrid", "sindy")
 """Rows in their order. ``hybrid`` is the MOPGRNN trained on free runs too."""
 METRICS: Mapping[str, str] = {
     "e_sim_s": "E_sim [s]",
     "e_sim_lambda1_s": "E_sim, λ = 1 [s]",
-    "e_sim_literal_s": "E_sim, literal [s]",
+    "e_sim_paper_s": "E_sim, paper form [s]",
     "rmse_rad": "RMSE [rad]",
     "energy_violation_w": "violation [W]",
 }
@@ -171,15 +169,15 @@ class Table:
         row = self._rows.get((data_set, sequences, model))
         if row is None:
             return None
-        kept = [n for n in row.networks if n.diverged is None]
+        converging = [n for n in row.networks if n.diverged is None]
         if metric == "converged_step":
-            found = [None if n.converged_step is None else float(n.converged_step) for n in kept]
+            found = [None if n.converged_step is None else float(n.converged_step) for n in converging]
         else:
-            found = [n.figures.get(metric) for n in kept]
+            found = [n.figures.get(metric) for n in converging]
         values = [v for v in found if v is not None]
-        if len(values) < len(kept):
+        if len(values) < len(converging):
             return None
-        n, diverged = len(row.networks), len(row.networks) - len(kept)
+        n, diverged = len(row.networks), len(row.networks) - len(converging)
         median = float(np.median([*values, *[math.inf] * diverged]))
         return Cell(
             float(np.mean(values)) if values else None,
@@ -235,13 +233,13 @@ Check = Callable[[Table], Verdict]
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim and how it is judged.
+    """A claim and how it is checked.
 
     Args:
         name: Short and unique within an experiment.
         text: In words, with its numbers.
-        source: Who says so, e.g. ``"paper, Fig. 3"``.
-        check: Judges it; made by :meth:`below`, :meth:`above`, :meth:`level`, ... or by a function of one's own.
+        source: Where it stands, e.g. ``"paper, Fig. 3"``.
+        check: Checks it; made by :meth:`below`, :meth:`above`, :meth:`level`, ... or by a function of one's own.
 
     Example:
         >>> from scenarios.paper.table import Network, Row
@@ -258,7 +256,7 @@ class Claim:
 
     def line(self, table: Table) -> str:
         """One line: verdict, claim, numbers."""
-        return said(self.text, self.source, self.check(table))
+        return verdict_line(self.text, self.source, self.check(table))
 
     @staticmethod
     def below(
@@ -282,7 +280,8 @@ class Claim:
             fine = [change <= -share for change in changes.values()]
             clean = not any(_cell(table, data_set, n, model, metric).diverged for n in changes)
             return Verdict(
-                (any(fine) if at == "some" else all(fine)) and clean, _told(model, reference, changes, note)
+                (any(fine) if at == "some" else all(fine)) and clean,
+                _numbers(model, reference, changes, note),
             )
 
         return check
@@ -295,7 +294,9 @@ class Claim:
             changes, note = _changes(table, data_set, model, reference, "e_sim_s", at)
             if not changes:
                 return Verdict(None, note)
-            return Verdict(all(c >= share for c in changes.values()), _told(model, reference, changes, note))
+            return Verdict(
+                all(c >= share for c in changes.values()), _numbers(model, reference, changes, note)
+            )
 
         return check
 
@@ -308,7 +309,7 @@ class Claim:
             if not changes:
                 return Verdict(None, note)
             return Verdict(
-                all(abs(c) <= share for c in changes.values()), _told(model, reference, changes, note)
+                all(abs(c) <= share for c in changes.values()), _numbers(model, reference, changes, note)
             )
 
         return check
@@ -388,7 +389,7 @@ class Claim:
         return check
 
 
-def said(text: str, source: str, verdict: Verdict) -> str:
+def verdict_line(text: str, source: str, verdict: Verdict) -> str:
     """A claim with its verdict as one line."""
     word = {True: "reproduced", False: "not reproduced", None: "not tested"}[verdict.holds]
     return f"{word}: {text} ({source}). Found: {verdict.found}."
@@ -413,7 +414,7 @@ def _changes(
     return changes, _diverged(table, data_set, model, reference)
 
 
-def _told(model: str, reference: str, changes: dict[int, float], note: str) -> str:
+def _numbers(model: str, reference: str, changes: dict[int, float], note: str) -> str:
     numbers = ", ".join(_percent(c) for c in changes.values())
     counts = ", ".join(map(str, changes))
     return f"{model} to {reference} {numbers} (with {counts} sequences)" + note

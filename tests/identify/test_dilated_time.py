@@ -76,8 +76,8 @@ def test_the_smoother_finds_the_states_at_any_sampling_period(runs, k):
     assert error[1] < 1e-2
 
 
-def test_today_s_lengths_are_what_they_were(runs):
-    """At 20 ms free runs of 0.5 and 2 s: 25 and 100 periods; the recordings are too short for 5 s."""
+def test_free_runs_are_of_half_a_second_and_two_at_20_ms(runs):
+    """25 and 100 periods; the recordings are too short for 5 s."""
     assert time_unit(runs, DT) == 1.0
     fit = fit_prior(Pendulum, runs[:1], runs[1:2], dt=DT, methods=("output_error",))
     assert [row["stage"] for row in fit.stages] == ["nominal", "output error 0.5 s", "output error 2 s"]

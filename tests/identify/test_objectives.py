@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from simulated_pendulum import DT, Pendulum, record
 
 from hybrid_mpc import HybridStep, n_features
-from hybrid_mpc.identify.dataset import cut_windows, literal_scaling_of, scaling_of
+from hybrid_mpc.identify.dataset import cut_windows
 from hybrid_mpc.identify.networks import StackedGRU
 from hybrid_mpc.identify.objectives import (
     OBJECTIVES,
@@ -20,14 +20,13 @@ from hybrid_mpc.identify.objectives import (
     position_objective,
     teacher_forced,
 )
-from hybrid_mpc.identify.step import LiteralStep
 
 losses = st.lists(st.lists(st.floats(1e-6, 1e6), min_size=2, max_size=2), min_size=1, max_size=8)
 
 
 def hybrid(windows, networks=3):
     prior = Pendulum()
-    scaling = scaling_of(prior, windows, DT, use_prior=True)
+    scaling = HybridStep.scaling_of(prior, windows, DT, use_prior=True)
     return HybridStep(prior, StackedGRU(networks, n_features(prior, True), 4, 1, seed=0), scaling, DT)
 
 
@@ -104,22 +103,6 @@ def test_predictions_stay_on_their_device():
     for predict in (teacher_forced, free_run):
         for objective in OBJECTIVES.values():
             assert objective(step, predict(step, there)).device.type == "meta"
-
-
-def test_the_literal_form_is_judged_by_the_recorded_derivative():
-    run = record(0)
-    windows = cut_windows([run], warm=5, horizon=3, stride=7)
-    prior = Pendulum()
-    scaling = literal_scaling_of(prior, windows)
-    stack = StackedGRU(2, n_features(prior, True, literal=True), 4, 2, seed=0)
-    step = LiteralStep(prior, stack, scaling, DT)
-    with torch.no_grad():
-        forced, free = teacher_forced(step, windows), free_run(step, windows)
-    assert forced.xdot[0, 0, 1].tolist() == run.xdot[7 + 5].tolist()
-    torch.testing.assert_close(free.xdot, forced.xdot, rtol=0, atol=0)
-    # the first period starts at the measurement in both; rounding of states of order one over dt = 0.02
-    torch.testing.assert_close(free.xdot_hat[0], forced.xdot_hat[0], rtol=0, atol=1e-12)
-    torch.testing.assert_close(free.x_hat[1], free.x_hat[0] + DT * forced.xdot_hat[0], rtol=0, atol=1e-14)
 
 
 def test_the_position_objective_is_the_rms_error_a_period_later():

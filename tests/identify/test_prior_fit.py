@@ -6,7 +6,7 @@ import torch
 from simulated_pendulum import DT, TRUTH, Pendulum, record
 
 from hybrid_mpc import InputError, fit_prior
-from hybrid_mpc.identify.residuals import ParameterFit
+from hybrid_mpc.identify.fit import ParameterFit
 
 NOISE = 2e-3
 
@@ -38,7 +38,7 @@ def test_a_parameter_without_effect_is_named(fit):
     at_rest = record(0, seconds=1.0)
     for array in (at_rest.u, at_rest.x, at_rest.y, at_rest.xdot):
         array[:] = 0.0
-    at_rest.u[::2] = 1e-12  # nothing moves: no parameter can be told
+    at_rest.u[::2] = 1e-12  # nothing moves: no parameter can be found
     with torch.no_grad():
         dull = fit_prior(Pendulum, [at_rest], [at_rest], dt=DT)
     assert dull.warnings
@@ -77,18 +77,25 @@ def test_methods_are_those_asked_for_and_the_best_wins():
     assert two.best == "multiple shooting 0.5 s"  # of the two the one that knows of noise in the states
     again = fit_prior(Pendulum, train, valid, dt=DT, before=two, methods=("multiple_shooting",))
     assert [row["stage"] for row in again.stages] == ["the fit before", "multiple shooting 0.5 s"]
-    kept = fit_prior(Pendulum, train, valid, dt=DT, before=two, methods=("equation_error",))
-    assert (kept.values, kept.standard_errors, kept.correlations) == (
+    same = fit_prior(Pendulum, train, valid, dt=DT, before=two, methods=("equation_error",))
+    assert (same.values, same.standard_errors, same.correlations) == (
         two.values,
         two.standard_errors,
         two.correlations,
     )
 
 
-@pytest.mark.parametrize("methods", [("swarm",), (), "output_error"])
+@pytest.mark.parametrize("methods", [("particle_swarm",), (), "output_error"])
 def test_methods_that_are_none_are_refused(methods):
-    with pytest.raises(InputError, match="multiple_shooting, particle_swarm"):
+    with pytest.raises(InputError, match="equation_error, output_error, multiple_shooting"):
         fit_prior(Pendulum, [], [], dt=DT, methods=methods)
+
+
+def test_a_start_of_ones_own_is_tried_besides_the_nominal_parameters():
+    train = [record(0, seconds=1.0)]
+    fit = fit_prior(Pendulum, train, train, dt=DT, methods=("output_error",), start=TRUTH)
+    assert [row["stage"] for row in fit.stages][:2] == ["nominal", "start"]
+    assert fit.stages[1]["validation_error"] < 1e-3 * fit.stages[0]["validation_error"]  # it is the truth
 
 
 def test_a_prior_without_free_parameters_stays_as_it_is():
@@ -96,11 +103,11 @@ def test_a_prior_without_free_parameters_stays_as_it_is():
         parameters_spec = tuple(replace(p, lower=p.value, upper=p.value) for p in Pendulum.parameters_spec)
 
     train = [record(0, seconds=1.0)]
-    kept = fit_prior(Fixed, train, train, dt=DT)
-    assert kept.values == Fixed().values
-    assert (kept.best, kept.standard_errors, kept.warnings) == ("nominal", {}, ())
-    assert kept.stages[0]["validation_error"] > 0.01  # J is 50 % off
-    assert fit_prior(Fixed, train, train, dt=DT, before=kept) == kept
+    same = fit_prior(Fixed, train, train, dt=DT)
+    assert same.values == Fixed().values
+    assert (same.best, same.standard_errors, same.warnings) == ("nominal", {}, ())
+    assert same.stages[0]["validation_error"] > 0.01  # J is 50 % off
+    assert fit_prior(Fixed, train, train, dt=DT, before=same) == same
 
 
 def test_correlations_and_t_ratios_are_those_of_the_covariance(fit):
@@ -114,16 +121,16 @@ def test_correlations_and_t_ratios_are_those_of_the_covariance(fit):
     assert found["mgl, d"] == pytest.approx(covariance[1, 2] / sigma[1] / sigma[2], rel=1e-6, abs=1e-9)
     assert set(fit.correlations) == {"J, mgl", "J, d", "mgl, d"}
     assert fit.t_ratios["J"] == fit.values["J"] / fit.standard_errors["J"]
-    assert fit.identifiability == fit.warnings == ()  # these data tell all three
+    assert fit.identifiability == fit.warnings == ()  # these data identify all three
     assert any("J and mgl" in line for line in replace(fit, correlations=found).identifiability)
 
 
-def test_a_motion_that_hides_the_scale_is_told(fit):
+def test_a_motion_that_hides_the_scale_is_reported(fit):
     # almost no torque: only the ratios of J, mgl and d show, and their errors go together
     train = [record(seed, seconds=3.0, size=1e-3, noise=NOISE) for seed in range(3)]
     valid = [record(9, seconds=3.0, size=1e-3, role="valid", noise=NOISE)]
     hidden = fit_prior(Pendulum, train, valid, dt=DT)
-    assert "J and mgl are hardly told apart" in " ".join(hidden.identifiability)
+    assert "J and mgl can hardly be told apart" in " ".join(hidden.identifiability)
 
 
 def test_the_table_has_a_row_a_parameter(fit):

@@ -4,8 +4,7 @@ from scipy.optimize._numdiff import approx_derivative
 from simulated_pendulum import DT, TRUTH, Pendulum, record
 
 from hybrid_mpc import InputError
-from hybrid_mpc.identify.fit import _Problem, cut_segments, multiple_shooting
-from hybrid_mpc.identify.residuals import ParameterFit
+from hybrid_mpc.identify.fit import ParameterFit, _Problem, cut_segments, multiple_shooting
 
 NOISE = 5e-3
 

@@ -1,6 +1,4 @@
-import json
-from dataclasses import asdict, replace
-from hashlib import sha256
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,7 +17,7 @@ from hybrid_mpc import (
     train,
 )
 from hybrid_mpc.identify.step import StackedPrior, with_values
-from hybrid_mpc.identify.train import TrainingRun, _key
+from hybrid_mpc.identify.train import TrainingRun
 from hybrid_mpc.kit.artifact import build_model
 from scenarios.pendulum.prior import PublishedPendulumPrior
 
@@ -94,9 +92,8 @@ def test_bounds_hold(data):
     assert values["d"].tolist() == pytest.approx([0.01, 0.01], rel=1e-15)
 
 
-@pytest.mark.parametrize("form", ["hybrid", "literal"])
-def test_the_step_made_of_it_is_the_one_that_was_trained(data, form):
-    settings = replace(SHORT, teacher_steps=10, free_run_steps=5, form=form)
+def test_the_step_made_of_it_is_the_one_that_was_trained(data):
+    settings = replace(SHORT, teacher_steps=10, free_run_steps=5)
     run = TrainingRun(Pendulum(), *data, settings)
     while not run.over:
         if run.done in (0, 10):
@@ -143,21 +140,6 @@ def test_the_exported_model_carries_the_values_and_the_fitted_priors_balance(dat
     assert abs(bare.step(prior, DT).xdot(x, h, u) - step.xdot(x, h, u)).max() > 1.0
     ours, theirs = (score(free_runs(s, prior, data[1], 10, h)).e_sim_s for s in (step, bare.step(prior, DT)))
     assert ours < theirs
-
-
-def test_fixed_trainings_keep_the_key_of_their_checkpoints(data):
-    settings = replace(SHORT, prior_parameters="fixed")
-    before = asdict(settings)
-    del (
-        before["prior_parameters"],
-        before["prior_replay"],
-    )  # the settings as they were before there was a choice
-    digest = sha256(json.dumps([before, Pendulum().values], sort_keys=True).encode())
-    for run in (*data[0], *data[1]):
-        digest.update(run.x.tobytes() + run.u.tobytes())
-    assert _key(settings, *data, Pendulum()) == digest.hexdigest()
-    for other in (SHORT, replace(settings, prior_replay=1.0)):
-        assert _key(other, *data, Pendulum()) != digest.hexdigest()
 
 
 def test_what_cannot_be_trained_along_is_refused(data, trained):

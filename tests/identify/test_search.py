@@ -1,4 +1,4 @@
-"""The search of settings: repeatable, resumable, judged by validation alone, and what it refuses."""
+"""The search of settings: repeatable, resumable, decided by validation alone, and what it refuses."""
 
 import json
 import math
@@ -7,11 +7,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from simulated_pendulum import TRUTH, Pendulum, record
+from simulated_pendulum import TRUTH, Pendulum, dragged
 
 from hybrid_mpc import InputError, SearchSpace, TrainingSettings, train, tune
 from hybrid_mpc.identify import tune as module
-from hybrid_mpc.identify.tune import _without_default, parsed_space
+from hybrid_mpc.identify.tune import parsed_space
 
 SMALL = TrainingSettings("mopgrnn", 4, 2, 20, 20, seed=3, warm=10, horizon=20, batch=8, every=10)
 BASE = replace(SMALL, hidden=16, batch=32, teacher_steps=200, free_run_steps=200, every=20)
@@ -21,15 +21,9 @@ PRIOR = Pendulum(TRUTH)
 TRIALS = 25
 
 
-def drag(phi, v):
-    """A torque [N m] that the prior lacks."""
-    return -0.08 * np.tanh(v / 0.5)
-
-
 @pytest.fixture(scope="module")
 def data():
-    runs = [record(seed, seconds=3.0, extra=drag) for seed in range(3)]
-    return [*runs[:2]], [replace(runs[2], role="valid")]
+    return dragged()
 
 
 def fake(prior, training, validation, settings, *, on_progress):
@@ -104,7 +98,7 @@ def test_bad_settings_are_pruned_and_good_ones_are_not(whole):
     assert pruned
     for r in pruned:
         assert module.PATIENCE * TOTAL <= r.steps < TOTAL
-        assert r.number >= module.JUDGES
+        assert r.number >= module.FINISHED
         assert math.isnan(r.mean)
     complete = [r for r in result.trials if r.state == "complete"]
     assert all(r.steps == TOTAL for r in complete)
@@ -169,14 +163,10 @@ def test_trials_are_counted_in_all_and_a_timeout_ends_after_the_trial(quick, who
     assert core(run(data, tmp_path / "search.jsonl", 4)) == core(result)[:4]
 
 
-def test_anchors_are_searched_when_asked_for_and_else_leave_no_trace():
-    space = SearchSpace(
-        hidden=None, learning_rate=None, free_run_learning_rate=None, decay=None, prior_replay=(1.0, 100.0)
-    )
+def test_prior_replay_is_searched_when_asked_for():
+    space = parsed_space(["prior_replay=1:100"])
+    assert space.names == ("prior_replay",)
     assert space.apply(BASE, {"prior_replay": 7.0}).prior_replay == 7.0
-    assert "prior_replay" not in _without_default(BASE) | _without_default(SPACE)
-    assert _without_default(replace(BASE, prior_replay=7.0))["prior_replay"] == 7.0
-    assert _without_default(space)["prior_replay"] == (1.0, 100.0)
 
 
 def test_a_journal_of_another_search_is_refused_by_what_differs(whole, data):
@@ -219,7 +209,7 @@ def diverging(monkeypatch, wrong):
     monkeypatch.setattr(module, "train", trained)
 
 
-def test_a_diverged_training_is_kept_and_the_search_goes_on(whole, data, tmp_path, monkeypatch):
+def test_a_diverged_training_is_recorded_and_the_search_goes_on(whole, data, tmp_path, monkeypatch):
     diverging(monkeypatch, {1})
     result = run(data, tmp_path / "search.jsonl", 3)
     assert [r.state for r in result.trials] == ["complete", "diverged", "complete"]
@@ -234,7 +224,7 @@ def test_a_search_in_which_all_diverge_says_so(data, tmp_path, monkeypatch):
         run(data, tmp_path / "search.jsonl", 2)
 
 
-def test_trials_with_other_horizons_are_judged_by_the_same_windows(data, tmp_path, monkeypatch):
+def test_trials_with_other_horizons_are_compared_on_the_same_windows(data, tmp_path, monkeypatch):
     used = []
 
     def trained(prior, training, validation, settings, *, on_progress):

@@ -39,11 +39,11 @@ RECORDED = {
     "pgrnn": ([0.8462809587132868, 0.8848871100683532], 1.6580522341213275, -0.26096452807369064),
     "mopgrnn": ([0.8127013276690178, 0.8423556541541719], 1.6486293874673361, -0.26694627526826575),
 }
-"""Validation and a print of ``w_hh`` and ``w_out`` before cells, forms and combinations could be chosen."""
+"""Validation, and weighted sums of ``w_hh`` and ``w_out``."""
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_training_with_defaults_is_what_it_has_always_been(data, kind):
+def test_a_training_gives_the_recorded_numbers(data, kind):
     validation, *prints = RECORDED[kind]
     trained = train(PRIOR, *data, replace(SMALL, kind=kind))
     weights = (trained.weights[name].ravel() for name in ("w_hh", "w_out"))
@@ -151,9 +151,9 @@ def failing(monkeypatch, broken):
 def test_a_loss_that_is_no_number_again_and_again_stops_its_network_alone(data, whole, monkeypatch, tmp_path):
     failing(monkeypatch, lambda k: k >= 12)
     trained = train(PRIOR, *data, SMALL, checkpoint=tmp_path / "c")
-    (fault,) = trained.faults
-    assert (fault.network, fault.objective, fault.stopped) == (0, "energy", True)
-    assert fault.step == 12 + REPEATS - 1
+    (failure,) = trained.failures
+    assert (failure.network, failure.objective, failure.stopped) == (0, "energy", True)
+    assert failure.step == 12 + REPEATS - 1
     assert trained.skipped.tolist() == [REPEATS, 0]
     assert all(np.isfinite(w).all() for w in trained.weights.values())
     for name, w in trained.weights.items():  # the other one has noticed nothing
@@ -163,14 +163,14 @@ def test_a_loss_that_is_no_number_again_and_again_stops_its_network_alone(data, 
     assert np.ptp(trained.curve["validation"][late, 0]) == 0.0
     assert trained.curve["validation"][-1, 0] == trained.validation[0]
     same_training(trained, train(PRIOR, *data, SMALL, checkpoint=tmp_path / "c"))
-    assert train(PRIOR, *data, SMALL, checkpoint=tmp_path / "c").faults == trained.faults
+    assert train(PRIOR, *data, SMALL, checkpoint=tmp_path / "c").failures == trained.failures
 
 
 def test_a_single_loss_that_is_no_number_is_named_and_training_goes_on(data, monkeypatch):
     failing(monkeypatch, lambda k: k in (3, 9))
     trained = train(PRIOR, *data, SMALL)
-    (fault,) = trained.faults
-    assert (fault.network, fault.objective, fault.step, fault.stopped) == (0, "energy", 9, False)
+    (failure,) = trained.failures
+    assert (failure.network, failure.objective, failure.step, failure.stopped) == (0, "energy", 9, False)
     assert trained.skipped.tolist() == [2, 0]
     assert trained.curve["step"][-1, 0] == 40
 
@@ -178,7 +178,7 @@ def test_a_single_loss_that_is_no_number_is_named_and_training_goes_on(data, mon
 def test_a_training_without_a_network_left_ends(data, monkeypatch):
     failing(monkeypatch, lambda k: True)
     trained = train(PRIOR, *data, replace(SMALL, networks=1))
-    assert trained.faults[0].stopped
+    assert trained.failures[0].stopped
     assert trained.curve["step"][-1, 0] == 10  # the evaluation after the stop is the last
     assert trained.validation[0] == trained.curve["validation"][0, 0]
 

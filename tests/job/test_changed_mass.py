@@ -13,7 +13,7 @@ from hybrid_mpc import (
     trace_model,
     write_csv,
 )
-from hybrid_mpc.identify.delay import Physics
+from hybrid_mpc.identify.prior import Physics
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.job.benchmark import refitted
 from hybrid_mpc.job.benchmark_runs import pieces, read_test, run_error, run_freely

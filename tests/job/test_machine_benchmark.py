@@ -10,7 +10,8 @@ from cart import DELAY, TRUE, recording, written
 from hybrid_mpc import BenchmarkBudget, BenchmarkSpec, InputError, load_scenario
 from hybrid_mpc.files import read_document, write_document
 from hybrid_mpc.identify.dataset import cut_windows
-from hybrid_mpc.identify.delay import fit_physics, shifted
+from hybrid_mpc.identify.delay import shifted
+from hybrid_mpc.identify.prior import fit_physics
 from hybrid_mpc.job import benchmark as benchmark_job
 from hybrid_mpc.job.benchmark import BenchmarkSettings, benchmark, load_model, training_settings
 from hybrid_mpc.job.benchmark_runs import BenchmarkRun, read_test, read_training, run_error, run_freely

@@ -85,9 +85,6 @@ def test_costs_without_an_oracle_are_refused(table):
         costs(table)
 
 
-
-
-
 def test_same_data_same_bytes(tmp_path):
     files = [save(costs({"track": ROW}), tmp_path / f"{i}.png") for i in range(2)]
     assert files[0].read_bytes() == files[1].read_bytes()

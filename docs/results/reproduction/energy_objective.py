@@ -19,7 +19,7 @@ from hybrid_mpc.files import read_arrays, read_json
 from hybrid_mpc.identify.evaluate import stacked_free_runs
 from hybrid_mpc.identify.train import Trained
 from hybrid_mpc.job.context import Silent
-from scenarios.paper.jobs import Case
+from scenarios.paper.jobs import Case, step_class
 from scenarios.paper.run import Work
 from scenarios.paper.settings import ReproductionSettings, case_key, experiment_of
 
@@ -37,10 +37,11 @@ def samples(work: Work, case: Case, count: int, model: str) -> list[np.ndarray]:
     }
     scaling = Scaling(**{name: tuple(value) for name, value in details["scaling"].items()})
     none = np.zeros(0)
-    trained = Trained(work.training(model), scaling, weights, none, {}, np.zeros(0, dtype=np.int64))
-    make, ruler = load_scenario(case.scenario).prior, case.ruler
+    form, skipped = step_class(case.form), np.zeros(0, dtype=np.int64)
+    trained = Trained(work.training(model), scaling, weights, none, {}, skipped, form=form)
+    make, evaluation = load_scenario(case.scenario).prior, case.evaluation
     networks = stacked_free_runs(
-        trained, make(case.values), case.dt, make(ruler.values), ruler.test, ruler.warm
+        trained, make(case.values), case.dt, make(evaluation.values), evaluation.test, evaluation.warm
     )
     found = []
     for runs in networks:

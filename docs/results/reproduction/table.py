@@ -2,7 +2,7 @@
 
 ``python docs/results/reproduction/table.py`` prints the tables of all that are here;
 ``python docs/results/reproduction/table.py --take runs/reproduce_pendulum`` first takes the results of a folder that
-``hybrid-mpc reproduce`` wrote: ``SCENARIO_BUDGET[_literal].json`` (all networks, without the details of their
+``hybrid-mpc reproduce`` wrote: ``SCENARIO_BUDGET[_paper].json`` (all networks, without the details of their
 trainings), ``.csv`` (means, standard deviations, medians) and the figures.
 """
 
@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from hybrid_mpc.files import write_text
-from scenarios.paper.run import claim_lines, read_results, said_cell, table_of
+from scenarios.paper.run import cell_text, claim_lines, read_results, table_of
 from scenarios.paper.table import METRICS
 
 HERE = Path(__file__).parent
@@ -62,7 +62,7 @@ def tables(results: dict[str, Any]) -> list[str]:
             lines += [f"{title}: {METRICS[metric]}", "", f"| model | {' | '.join(map(str, counts))} |"]
             lines.append("|" + " --- |" * (len(counts) + 1))
             for model in table.models:
-                cells = [said_cell(table, data_set, n, model, metric) for n in counts]
+                cells = [cell_text(table, data_set, n, model, metric) for n in counts]
                 lines.append(f"| {model} | {' | '.join(cells)} |")
             lines.append("")
     return lines

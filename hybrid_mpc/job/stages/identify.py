@@ -1,120 +1,46 @@
-"""Stages data, prior, training and evaluation: from recordings to models whose errors on unseen data are known."""
+"""Stages data, prior, training and evaluation: from recordings to models and their free runs."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.data.excitation import check_excitation
-from hybrid_mpc.data.scales import time_unit
+from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import digest, read_document, read_document_arrays, sha256, write_document
-from hybrid_mpc.identify.evaluate import Scores
+from hybrid_mpc.identify.evaluate import FreeRun, Scores, evaluation_trajectories, free_runs, score
+from hybrid_mpc.identify.export import trace_model
+from hybrid_mpc.identify.prior import fit_and_smooth, fit_physics, smoothed
 from hybrid_mpc.identify.prior_result import PriorFit
-from hybrid_mpc.identify.settings import TrainingSettings
-from hybrid_mpc.identify.step import Scaling
-from hybrid_mpc.identify.train import Trained, TrainingFailure
+from hybrid_mpc.identify.settings import KINDS, TrainingSettings
+from hybrid_mpc.identify.smooth import Smoother
+from hybrid_mpc.identify.step import PriorStep, Scaling, Step
+from hybrid_mpc.identify.train import Trained, TrainingFailure, train
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.engine import WORKERS, run_jobs
 from hybrid_mpc.job.stage import Stage, source_of
+from hybrid_mpc.machine.torch_prior import Prior
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import load_scenario
+from nn_export.program import to_json
 
 Array = NDArray[Any]
 
-if TYPE_CHECKING:
-    from hybrid_mpc.data.trajectories import Trajectory
-    from hybrid_mpc.identify.evaluate import FreeRun
-    from hybrid_mpc.identify.prior_result import PriorFit
-    from hybrid_mpc.identify.settings import TrainingSettings
-    from hybrid_mpc.identify.smooth import Smoother
-    from hybrid_mpc.identify.train import Trained
-    from hybrid_mpc.machine.torch_prior import Prior
-
-
-# Trained networks on disk, as the jobs keep them between their stages: JSON and plain arrays, a pair a kind.
-
-
-@dataclass(frozen=True)
-class _Note:
-    """What stands in the JSON file beside the arrays."""
-
-    settings: TrainingSettings
-    scaling: Scaling
-    faults: tuple[TrainingFailure, ...]
-
-
-def save_trained(folder: Path, trained: Trained) -> None:
-    """Write the networks of one kind."""
-    kind = trained.settings.kind
-    arrays: dict[str, Any] = {f"weights.{n}": v for n, v in trained.weights.items()}
-    arrays |= {f"curve.{n}": v for n, v in trained.curve.items()}
-    arrays |= {"own.validation": trained.validation, "own.skipped": trained.skipped}
-    note = _Note(trained.settings, trained.scaling, trained.faults)
-    write_document(folder / f"{kind}.json", plain(note), arrays)
-
-
-def is_trained(folder: Path, settings: TrainingSettings) -> bool:
-    """Whether a folder holds finished networks of these settings.
-
-    Raises:
-        InputError: If it holds networks of the same kind and other settings.
-
-    Example:
-        >>> is_trained(Path("nowhere"), TrainingSettings("pgrnn", 4, 1, 5, 5, seed=0, warm=2))
-        False
-    """
-    if not (folder / f"{settings.kind}.json").is_file():
-        return False
-    held, own = (asdict(s) for s in (load_trained(folder, settings.kind).settings, settings))
-    changed = [f"{name} {held[name]} instead of {own[name]}" for name in own if held[name] != own[name]]
-    if changed:
-        raise InputError(
-            f"{folder} holds finished networks of other settings ({settings.kind}: {'; '.join(changed)}), from another "
-            "version or scenario; choose another --out"
-        )
-    return True
-
-
-def load_trained(folder: Path, kind: str) -> Trained:
-    """Read the networks of one kind.
-
-    Raises:
-        InputError: If a file is missing or damaged.
-    """
-    path = folder / f"{kind}.json"
-    remedy = f"delete {kind}.* in {folder}, and the same command trains these networks anew"
-    note = record(_Note, read_document(path, remedy), str(path))
-    arrays = read_document_arrays(path, remedy)
-    part: dict[str, dict[str, Any]] = {"weights": {}, "curve": {}, "own": {}}
-    for name, value in arrays.items():
-        group, _, key = name.partition(".")
-        part[group][key] = value
-    return Trained(
-        note.settings,
-        note.scaling,
-        part["weights"],
-        part["own"]["validation"],
-        part["curve"],
-        part["own"]["skipped"],
-        note.faults,
-    )
-
-
-ROUNDS = ("polynomially smoothed", "smoothed by the prior")
-"""States that the prior is fitted to, one after the other."""
-MODELS = ("phy_nominal", "phy", "rnn", "pgrnn", "mopgrnn")
-"""Models that are evaluated: the prior with its nominal parameters, the fitted prior, the networks."""
-DEPLOYED = "mopgrnn"
-"""The kind of network that is exported."""
 DELAY_RUNS = 5.0
 """Longest free runs [the machine's seconds] that parameters and delay are fitted to: a swing near the top multiplies
 every error."""
+MODELS = ("phy_nominal", "phy", *KINDS)
+"""Models that are evaluated."""
+DEPLOYED = "mopgrnn"
+"""The kind of network that is exported."""
+ERRORS = {"error": "E_sim", "position": "RMSE", "energy": "energy violation"}
+"""What the validation of a training is called, by its first objective."""
 
 
 @dataclass(frozen=True)
@@ -287,10 +213,6 @@ def doubts(context: Context) -> tuple[str, ...]:
 
 def what_prior_reads(context: Context) -> dict[str, object]:
     """The prior's equations as a traced program, and its parameters."""
-    from hybrid_mpc.identify.export import trace_model
-    from hybrid_mpc.identify.step import PriorStep
-    from nn_export.program import to_json
-
     prior = context.scenario.prior()
     programs = trace_model(PriorStep(prior, context.spec.dt))
     return {
@@ -301,83 +223,32 @@ def what_prior_reads(context: Context) -> dict[str, object]:
 
 
 def prior_stage(context: Context) -> PriorResult:
-    """Fit the prior's parameters, let it smooth the measurements, fit it to these, smooth once more."""
+    """Fit the prior's parameters, and the input's delay where there may be one, and smooth all recordings by it."""
     make, spec = context.scenario.prior, context.spec
     train, valid, test = (context.trajectories(role) for role in ("train", "valid", "test"))
     if spec.largest_delay:
-        from hybrid_mpc.identify.delay import fit_physics, smoothed
-
         physics = fit_physics(
             make, train, valid, dt=spec.dt, length=DELAY_RUNS * context.time_unit, largest_delay=spec.largest_delay,
             on_progress=lambda done, total, text: context.progress.update("free runs", done, total, text),
         )  # fmt: skip
-        fit, sigma, walk, delay = physics.fit, physics.sigma, physics.walk, physics.delay
-        every = smoothed(make, physics, [*train, *valid, *test], spec.dt)
     else:
-        fit, smoother, train, valid = fit_and_smooth(
-            make, train, valid, spec.dt, on_progress=context.progress.update
-        )
-        sigma, walk, delay, every = (
-            smoother.sigma,
-            smoother.walk,
-            0.0,
-            [*train, *valid, *smoother.smooth(test)],
-        )
-    for warning in fit.warnings:
+        physics = fit_and_smooth(make, train, valid, spec.dt, on_progress=context.progress.update)
+    parts = [smoothed(make, physics, part, spec.dt) for part in (train, valid, test)]
+    for warning in physics.fit.warnings:
         context.progress.warn(f"fit of the prior: {warning}")
     return PriorResult(
-        fit,
+        physics.fit,
         make().values,
         {p.name: p.unit for p in make().parameters_spec},
-        tuple(sigma),
-        tuple(walk),
-        float(delay),
-        {f"{t.name}/{key}": getattr(t, key) for t in every for key in ("x", "xdot")},
+        tuple(physics.sigma),
+        tuple(physics.walk),
+        float(physics.delay),
+        {f"{t.name}/{key}": getattr(t, key) for part in parts for t in part for key in ("x", "xdot")},
     )
 
 
-def fit_and_smooth(
-    make: Callable[..., Prior],
-    train: Sequence[Trajectory],
-    valid: Sequence[Trajectory],
-    dt: float,
-    *,
-    methods: Sequence[str] | None = None,
-    on_progress: Callable[[str, int, int, str], None] = lambda key, done, total, text: None,
-) -> tuple[PriorFit, Smoother, list[Trajectory], list[Trajectory]]:
-    """Fit a prior to polynomially smoothed states, smooth by it, fit it to these, smooth once more.
-
-    Args:
-        make: Prior class or factory ``(values=None) -> Prior``.
-        train: Training trajectories.
-        valid: Validation trajectories.
-        dt: Model period [s].
-        methods: Methods of the fit. Default: those of :func:`~hybrid_mpc.identify.fit.fit_prior`.
-        on_progress: ``(round, done, total, text)`` with a title of ``ROUNDS``.
-
-    Returns:
-        The last fit, the last smoother, and training and validation trajectories smoothed by it.
-    """
-    from hybrid_mpc.identify.fit import DEFAULT_METHODS, fit_prior
-    from hybrid_mpc.identify.smooth import fit_smoother
-
-    fit: PriorFit | None = None
-    unit = time_unit(train, dt)
-    for title in ROUNDS:
-        fit = fit_prior(
-            make, train, valid, dt=dt, before=fit, methods=methods or DEFAULT_METHODS, time_unit=unit,
-            on_progress=lambda done, total, text, key=title: on_progress(key, done, total, text),  # type: ignore[misc]
-        )  # fmt: skip
-        smoother = fit_smoother(make(fit.values), [*train, *valid], dt, time_unit=unit)
-        train, valid = smoother.smooth(train), smoother.smooth(valid)
-    assert fit is not None
-    return fit, smoother, list(train), list(valid)
-
-
 def what_training_reads(context: Context) -> dict[str, object]:
-    """Settings of the networks, the device, and the windows of the recordings."""
-    from hybrid_mpc.identify.settings import KINDS
-
+    """Settings of the networks, the device, and the period of the recordings."""
     return {
         "settings of the networks": {kind: training_settings(context, kind) for kind in KINDS},
         "device": context.settings.device,
@@ -386,32 +257,86 @@ def what_training_reads(context: Context) -> dict[str, object]:
 
 
 def training_stage(context: Context) -> TrainingResult:
-    """Train the networks of every kind, two kinds side by side."""
-    from hybrid_mpc.identify.settings import KINDS
-
+    """Train the networks of every kind, two kinds at once."""
     name = digest(TRAINING.keys(context))[
         :12
     ]  # networks of other settings or data lie in a folder of their own
     folder = context.out / "checkpoints" / "training" / name
-    values = context.prior.fit.values
-    todo = [k for k in reversed(KINDS) if not is_trained(folder, training_settings(context, k))]
-    jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
-        kind: (
-            train_kind,
-            (context.settings.scenario, values, context.smoothed("train"), context.smoothed("valid"),
-             training_settings(context, kind), folder, context.settings.device),
-        )
-        for kind in todo
-    }  # fmt: skip
-    run_jobs(jobs, context.progress.update, WORKERS)
-    trained = {kind: load_trained(folder, kind) for kind in KINDS}
+    trained = train_kinds(
+        context.settings.scenario,
+        context.prior.fit.values,
+        context.smoothed("train"),
+        context.smoothed("valid"),
+        {kind: training_settings(context, kind) for kind in KINDS},
+        folder,
+        device=context.settings.device,
+        on_progress=context.progress.update,
+    )
     return TrainingResult(
         name,
         {k: float(t.validation.min()) for k, t in trained.items()},
         {k: int(t.skipped.sum()) for k, t in trained.items()},
-        {k: t.faults for k, t in trained.items()},
+        {k: t.failures for k, t in trained.items()},
         {k: sha256(folder / f"{k}.json") for k in trained},
     )
+
+
+def train_kinds(
+    scenario: str,
+    values: Mapping[str, float],
+    training: Sequence[Trajectory],
+    validation: Sequence[Trajectory],
+    settings: Mapping[str, TrainingSettings],
+    folder: Path,
+    *,
+    device: str = "cpu",
+    workers: int = WORKERS,
+    on_progress: Callable[[str, int, int, str], None] = lambda key, done, total, text: None,
+) -> dict[str, Trained]:
+    """Train the networks of every kind that ``folder`` does not hold yet; an interrupted training is resumed.
+
+    Args:
+        scenario: Registered name or path, which every process loads for itself.
+        values: Parameters of the fitted prior.
+        training: Smoothed training trajectories.
+        validation: Smoothed validation trajectories.
+        settings: Settings of each kind.
+        folder: Where checkpoints and finished networks lie.
+        device: Where the networks are trained. Default: cpu.
+        workers: Kinds trained at once.
+        on_progress: ``(kind, done, total, text)``.
+    """
+    jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
+        kind: (_train_kind, (scenario, dict(values), training, validation, settings[kind], folder, device))
+        for kind in reversed(list(settings))
+        if not is_trained(folder, settings[kind])
+    }
+    run_jobs(jobs, on_progress, workers)
+    return {kind: load_trained(folder, kind) for kind in settings}
+
+
+def _train_kind(
+    scenario: str,
+    values: dict[str, float],
+    training: Sequence[Trajectory],
+    validation: Sequence[Trajectory],
+    settings: TrainingSettings,
+    folder: Path,
+    device: str,
+    report: Callable[[int, int, str], None],
+) -> None:
+    """Job of one process: train one kind and leave its files."""
+    label = ERRORS.get(settings.objectives[0], settings.objectives[0])
+    trained = train(
+        load_scenario(scenario).prior(values),
+        training,
+        validation,
+        settings,
+        checkpoint=folder / f"{settings.kind}.safetensors",
+        device=device,
+        on_progress=lambda done, total, error: report(done, total, f"validation {label} {error:.4g}"),
+    )
+    save_trained(folder, trained)
 
 
 def networks_are_there(context: Context, found: TrainingResult) -> str:
@@ -431,26 +356,25 @@ def trained_models(context: Context, kind: str) -> Trained:
 
 def evaluation_stage(context: Context) -> EvaluationResult:
     """Free runs of every model over the test trajectories; the figures show them whole."""
-    from hybrid_mpc.identify.evaluate import free_runs, judged, score
-    from hybrid_mpc.identify.smooth import Smoother
-
     prior, spec = context.prior, context.spec
     phy = context.scenario.prior(prior.fit.values)
     smoother = Smoother(phy, spec.dt, prior.sigma, prior.walk)
     whole = context.smoothed("test")
-    shown, test = (judged(whole, smoother, context.warm, length) for length in (None, spec.free_run))
+    shown, test = (
+        evaluation_trajectories(whole, smoother, context.warm, length) for length in (None, spec.free_run)
+    )
     scores: dict[str, ModelScores] = {}
     files: dict[str, dict[str, Scores]] = {}
-    arrays: dict[str, Any] = {}
+    arrays: dict[str, Array] = {}
     for i, name in enumerate(MODELS):
         context.progress.update("models", i, len(MODELS), name)
         found = []
-        for k, (step, h0) in enumerate(_members(context, name, phy)):
-            runs = free_runs(step, phy, test, context.warm, h0)
+        for k, step in enumerate(_members(context, name, phy)):
+            runs = free_runs(step, phy, test, context.warm)
             found.append(score(runs))
             if k == 0:
                 files[name] = {f: score(part) for f, part in _by_file(runs).items()}
-                for run in free_runs(step, phy, shown, context.warm, h0):
+                for run in free_runs(step, phy, shown, context.warm):
                     for key in ("t", "u", "x", "x_hat", "y", "energy_measured_w", "energy_model_w"):
                         arrays[f"{name}/{run.name}/{key}"] = getattr(run, key)
         scores[name] = ModelScores(found[0], tuple(found))
@@ -465,27 +389,17 @@ def _by_file(runs: Sequence[FreeRun]) -> dict[str, list[FreeRun]]:
     return files
 
 
-def _members(context: Context, name: str, phy: Prior) -> list[tuple[Any, Any]]:
-    """Steps of one model with their initial hidden states, the deployed one first."""
-    import torch
-
-    from hybrid_mpc.identify.step import PriorStep
-    from hybrid_mpc.identify.train import stack_for
-
-    dt, double = context.spec.dt, torch.float64
+def _members(context: Context, name: str, phy: Prior) -> Sequence[Step]:
+    """Steps of one model, that of the best network by validation first."""
+    dt = context.spec.dt
     if name in ("phy_nominal", "phy"):
-        prior = phy if name == "phy" else context.scenario.prior()
-        return [(PriorStep(prior, dt), torch.zeros(0, dtype=double))]
+        return [PriorStep(phy if name == "phy" else context.scenario.prior(), dt)]
     trained = trained_models(context, name)
-    order = np.argsort(trained.validation, kind="stable")
-    h0 = torch.zeros(stack_for(phy, trained.settings).n_h, dtype=double)
-    return [(trained.step(phy, dt, int(i)), h0) for i in order]
+    return [trained.step(phy, dt, int(i)) for i in np.argsort(trained.validation, kind="stable")]
 
 
 def training_settings(context: Context, kind: str) -> TrainingSettings:
     """What the networks of a kind are trained with: the budget, and what the run's own file replaces of it."""
-    from hybrid_mpc.identify.settings import TrainingSettings
-
     b = context.budget
     settings = TrainingSettings(
         kind=kind,  # type: ignore[arg-type]
@@ -501,30 +415,70 @@ def training_settings(context: Context, kind: str) -> TrainingSettings:
     return replace(settings, **context.settings.network())
 
 
-def train_kind(
-    scenario: str,
-    values: dict[str, float],
-    training: Sequence[Trajectory],
-    validation: Sequence[Trajectory],
-    settings: TrainingSettings,
-    folder: Path,
-    device: str,
-    report: Callable[[int, int, str], None],
-) -> None:
-    """Job of one process: train one kind and leave its files."""
-    from hybrid_mpc.identify.train import train
+@dataclass(frozen=True)
+class _Note:
+    """What the JSON file of trained networks holds; the arrays are in a file next to it."""
 
-    prior = load_scenario(scenario).prior(values)
-    trained = train(
-        prior,
-        training,
-        validation,
-        settings,
-        checkpoint=folder / f"{settings.kind}.safetensors",
-        device=device,
-        on_progress=lambda done, total, error: report(done, total, f"validation error {error:.4g}"),
+    settings: TrainingSettings
+    scaling: Scaling
+    failures: tuple[TrainingFailure, ...]
+
+
+def save_trained(folder: Path, trained: Trained) -> None:
+    """Write the networks of one kind."""
+    kind = trained.settings.kind
+    arrays: dict[str, Any] = {f"weights.{n}": v for n, v in trained.weights.items()}
+    arrays |= {f"curve.{n}": v for n, v in trained.curve.items()}
+    arrays |= {"own.validation": trained.validation, "own.skipped": trained.skipped}
+    note = _Note(trained.settings, trained.scaling, trained.failures)
+    write_document(folder / f"{kind}.json", plain(note), arrays)
+
+
+def is_trained(folder: Path, settings: TrainingSettings) -> bool:
+    """Whether a folder holds finished networks of these settings.
+
+    Raises:
+        InputError: If it holds networks of the same kind and other settings.
+
+    Example:
+        >>> is_trained(Path("nowhere"), TrainingSettings("pgrnn", 4, 1, 5, 5, seed=0, warm=2))
+        False
+    """
+    if not (folder / f"{settings.kind}.json").is_file():
+        return False
+    found, own = (asdict(s) for s in (load_trained(folder, settings.kind).settings, settings))
+    changed = [f"{name} {found[name]} instead of {own[name]}" for name in own if found[name] != own[name]]
+    if changed:
+        raise InputError(
+            f"{folder} holds finished networks of other settings ({settings.kind}: {'; '.join(changed)}), from another "
+            "version or scenario; choose another --out"
+        )
+    return True
+
+
+def load_trained(folder: Path, kind: str) -> Trained:
+    """Read the networks of one kind.
+
+    Raises:
+        InputError: If a file is missing or damaged.
+    """
+    path = folder / f"{kind}.json"
+    remedy = f"delete {kind}.* in {folder}, and the same command trains these networks anew"
+    note = record(_Note, read_document(path, remedy), str(path))
+    arrays = read_document_arrays(path, remedy)
+    part: dict[str, dict[str, Any]] = {"weights": {}, "curve": {}, "own": {}}
+    for name, value in arrays.items():
+        group, _, key = name.partition(".")
+        part[group][key] = value
+    return Trained(
+        note.settings,
+        note.scaling,
+        part["weights"],
+        part["own"]["validation"],
+        part["curve"],
+        part["own"]["skipped"],
+        note.failures,
     )
-    save_trained(folder, trained)
 
 
 DATA = Stage(

@@ -11,7 +11,7 @@ from scenarios.paper.settings import ReproductionSettings
 
 EXACT = """
 from dataclasses import replace
-from hybrid_mpc import Effort
+from scenarios.paper.experiment import Effort
 from scenarios.pendulum import scenario
 effort = Effort(2, (1, 2), steps=20, free_run_steps=5, valid=1, test=2, hidden=4, every=5, batch=4)
 scenario = replace(scenario, experiment=replace(scenario.experiment, efforts={"full": effort}))
@@ -19,7 +19,7 @@ scenario = replace(scenario, experiment=replace(scenario.experiment, efforts={"f
 MEASURED = """
 from dataclasses import replace
 from hybrid_mpc import load_trajectories
-from hybrid_mpc import Effort
+from scenarios.paper.experiment import Effort
 from scenarios.pendulum import scenario
 from scenarios.pendulum.data import make_data
 from scenarios.pendulum.nominal import INPUTS, OUTPUTS

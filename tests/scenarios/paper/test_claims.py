@@ -47,7 +47,7 @@ def table(figures, spread=0.0, steps=None):
         (Claim.steady("pgrnn", 0.1, "a"), False),  # 40 %
     ],
 )
-def test_a_claim_is_judged_by_its_numbers(check, holds):
+def test_a_claim_is_checked_by_its_numbers(check, holds):
     assert check(table(CALM)).holds is holds
 
 

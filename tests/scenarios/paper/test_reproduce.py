@@ -98,7 +98,7 @@ def test_sindy_has_a_row_where_it_is_there(exact, tmp_path, monkeypatch):
 
     fake = types.ModuleType("sindy")
     fake.fit_sindy = fit
-    monkeypatch.setitem(sys.modules, "hybrid_mpc.identify.sindy", fake)
+    monkeypatch.setitem(sys.modules, "scenarios.paper.sindy", fake)
     monkeypatch.setattr(run_module, "missing_for_sindy", lambda: "")
     monkeypatch.setattr(run_module, "NETWORKS", ("mopgrnn",))
     settings = ReproductionSettings(exact, sequences=(1,), networks=1)
@@ -128,7 +128,7 @@ def call(call):
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "named"),
     [
         (["golf_robott"], ["golf_robott", "pendulum"]),
         (["torque_pendulum"], ["no experiment", "golf_robot, pendulum"]),
@@ -137,13 +137,13 @@ def call(call):
         (["pendulum", "--sequences", "three"], ["three", "whole numbers"]),
         (["pendulum", "--networks", "0"], ["0 networks", "--networks"]),
         (["pendulum", "--budget", "huge"], ["huge", "quick, full"]),
-        (["pendulum", "--form", "other"], ["other", "literal"]),
+        (["pendulum", "--form", "other"], ["other", "paper"]),
     ],
 )
-def test_bad_settings(call, tmp_path, words, told):
+def test_bad_settings(call, tmp_path, words, named):
     code, _, message = call(*words, "--out", tmp_path / "o")
     assert code == 2
-    for word in told:
+    for word in named:
         assert word in message
     assert not (tmp_path / "o").exists()
 
@@ -152,7 +152,7 @@ def test_folder_of_another_reproduction_or_of_something_else(call, exact, finish
     code, _, message = call(exact, "--out", finished)
     assert code == 2
     assert "--resume" in message
-    for option in (["--seed", "7"], ["--networks", "1"], ["--form", "literal"], ["--sequences", "1"]):
+    for option in (["--seed", "7"], ["--networks", "1"], ["--form", "paper"], ["--sequences", "1"]):
         code, _, message = call(exact, "--out", finished, "--resume", *option)
         assert code == 2
         assert option[0].lstrip("-") in message

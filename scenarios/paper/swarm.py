@@ -1,9 +1,12 @@
-"""Fit of a prior's parameters by particle swarm, as in the paper (pymoo, an optional extra)."""
+"""Fit of a prior's parameters by particle swarm, as in the paper (pymoo, an optional extra).
+
+:func:`~hybrid_mpc.identify.fit.fit_prior` takes what it finds as a ``start``.
+"""
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,14 +15,20 @@ import torch
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
+from hybrid_mpc.data import scales
+from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.identify.dataset import Windows
-from hybrid_mpc.identify.residuals import ParameterFit
+from hybrid_mpc.identify.dataset import Windows, cut_windows
+from hybrid_mpc.identify.fit import ParameterFit
 from hybrid_mpc.identify.step import required_substeps
+from hybrid_mpc.machine.torch_prior import Prior
 
 Array = NDArray[np.float64]
 DIVERGED = 1e9
-"""Error that the swarm is told of parameters whose free runs diverge: it computes with it, so it must be finite."""
+"""Error of parameters whose free runs diverge: the swarm computes with it, so it must be finite."""
+SECONDS = 2.0
+WINDOWS = 24
+"""Every set of parameters is simulated over so many free runs of at most ``SECONDS`` [the machine's seconds]."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +60,36 @@ class SwarmSettings:
             )
 
 
+def swarm_values(
+    make: Callable[..., Prior],
+    train: Sequence[Trajectory],
+    dt: float,
+    settings: SwarmSettings | None = None,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> dict[str, float]:
+    """Values [SI] of a prior's parameters that free runs of up to 2 s follow best, searched between the bounds.
+
+    Args:
+        make: Prior class or factory ``(values=None) -> Prior``.
+        train: Training trajectories.
+        dt: Model period [s].
+        settings: Effort. Default: 24 particles, 40 generations.
+        on_progress: ``(done, total)`` generations.
+
+    Raises:
+        InputError: If pymoo is not installed, or no particle's free runs stay finite.
+
+    Example:
+        >>> start = swarm_values(PendulumPrior, train, 0.01)  # doctest: +SKIP
+        >>> fit_prior(PendulumPrior, train, valid, dt=0.01, methods=("output_error",), start=start)  # doctest: +SKIP
+    """
+    fit, longest = ParameterFit(make, dt), max(len(t.t) for t in train) - 1
+    n = max(1, min(scales.periods(scales.time_unit(train, dt) * SECONDS, dt), longest // 2))
+    windows = cut_windows(train, 0, n, max(1, n // 4))
+    chosen = torch.linspace(0, len(windows) - 1, min(WINDOWS, len(windows))).round().long()
+    return fit.values(particle_swarm(fit, windows.take(chosen), settings or SwarmSettings(), on_progress))
+
+
 def particle_swarm(
     fit: ParameterFit,
     windows: Windows,
@@ -59,7 +98,7 @@ def particle_swarm(
 ) -> Array:
     """``theta`` of the least mean absolute error of free runs over the windows, searched between the bounds.
 
-    The swarm starts from the nominal parameters and a Latin hypercube. All particles run side by side. It needs no
+    The swarm starts from the nominal parameters and a Latin hypercube. All particles run at once. It needs no
     derivative and no good start, and many more simulations than a fit with derivatives.
 
     Args:
@@ -104,7 +143,7 @@ def particle_swarm(
 
 
 def errors_of(fit: ParameterFit, thetas: Array, windows: Windows) -> Array:
-    """Mean absolute error [spreads of the data] of each row of ``thetas`` ``(n, p)``, side by side.
+    """Mean absolute error [spreads of the data] of each row of ``thetas`` ``(n, p)``, all at once.
 
     Infinite where free runs diverge, or where the prior is too stiff for the period.
     """
@@ -134,5 +173,5 @@ def _pymoo() -> tuple[Any, Any]:
     except ImportError as missing:
         raise InputError(
             "the fit by particle swarm needs pymoo, which is not installed: pip install 'hybrid-mpc[swarm]' (or "
-            "pip install 'pymoo>=0.6.1'). Or leave 'particle_swarm' out of methods."
+            "pip install 'pymoo>=0.6.1')"
         ) from missing

@@ -1,4 +1,3 @@
-import importlib
 import sys
 from importlib.util import find_spec
 
@@ -9,8 +8,8 @@ from simulated_pendulum import DT, TRUTH, Pendulum, record
 
 from hybrid_mpc import InputError, fit_prior
 from hybrid_mpc.identify.dataset import cut_windows
-from hybrid_mpc.identify.residuals import ParameterFit
-from hybrid_mpc.identify.swarm import SwarmSettings, errors_of, particle_swarm
+from hybrid_mpc.identify.fit import ParameterFit
+from scenarios.paper.swarm import SwarmSettings, errors_of, particle_swarm, swarm_values
 
 needs_pymoo = pytest.mark.skipif(find_spec("pymoo") is None, reason="pymoo (extra swarm) is not installed")
 
@@ -29,21 +28,13 @@ def test_without_pymoo_the_remedy_is_told(fit, windows, monkeypatch):
     monkeypatch.setitem(sys.modules, "pymoo.algorithms.soo.nonconvex.pso", None)
     with pytest.raises(InputError, match=r"pip install 'hybrid-mpc\[swarm\]'"):
         particle_swarm(fit, windows, SwarmSettings())
-    train = [record(0, seconds=1.0)]
-    with pytest.raises(InputError, match="particle_swarm"):
-        fit_prior(Pendulum, train, train, dt=DT, methods=("particle_swarm",))
-
-
-def test_it_is_imported_only_when_used():
-    module = importlib.import_module("hybrid_mpc.identify.fit")
-    assert "pymoo" not in vars(module)
 
 
 def test_errors_side_by_side_are_those_one_by_one(fit, windows):
     rng = np.random.default_rng(0)
     thetas = fit.lower + rng.random((6, 3)) * (fit.upper - fit.lower)
     together = errors_of(fit, thetas, windows)
-    alone = [fit.judge(theta, windows) for theta in thetas]
+    alone = [fit.error(theta, windows) for theta in thetas]
     np.testing.assert_allclose(together, alone, rtol=1e-12)  # another order of the sums
 
 
@@ -81,12 +72,11 @@ def test_the_swarm_finds_the_parameters_and_repeats(fit, windows):
 
 
 @needs_pymoo
-def test_the_swarm_is_one_of_the_methods():
+def test_a_fit_goes_on_from_what_the_swarm_found():
     train = [record(seed, seconds=2.0) for seed in range(2)]
-    found = fit_prior(
-        Pendulum, train, train, dt=DT, methods=("particle_swarm", "output_error"), swarm=SwarmSettings(8, 6)
-    )
+    start = swarm_values(Pendulum, train, DT, SwarmSettings(8, 6))
+    found = fit_prior(Pendulum, train, train, dt=DT, methods=("output_error",), start=start)
     names = [row["stage"] for row in found.stages]
-    assert names[:2] == ["nominal", "particle swarm"]
+    assert names[:2] == ["nominal", "start"]
     assert found.stages[1]["validation_error"] < found.stages[0]["validation_error"]
     assert found.best.startswith("output error")  # derivatives go on from where the swarm stopped

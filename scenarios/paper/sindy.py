@@ -12,13 +12,13 @@ from typing import Any, Literal, get_args
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.dataset import Windows, check_rates, cut_windows
 from hybrid_mpc.identify.evaluate import free_runs, score
-from hybrid_mpc.identify.step import MAX_SUBSTEPS, rk4, substeps_for
+from hybrid_mpc.identify.step import MAX_SUBSTEPS, Step, rk4, substeps_for
 from hybrid_mpc.machine.torch_prior import Prior
 
 # Libraries of candidate terms, and the model that a sparse regression over them gives, as a step (torch).
@@ -107,7 +107,7 @@ class Library:
         return tuple(" ".join(factor.label for factor in term) or "1" for term in self.terms)
 
 
-class SindyStep(nn.Module):
+class SindyStep(Step):
     """An identified equation as a step ``(x, h, u) -> (x_next, h_next)`` with an empty hidden state.
 
     Kinematics are exact, the acceleration is the sum of terms times coefficients, Runge-Kutta of order 4 integrates
@@ -146,8 +146,8 @@ class SindyStep(nn.Module):
         substeps: int | None = None,
         candidates: tuple[SindyCandidate, ...] = (),
     ) -> None:
-        super().__init__()
-        self.prior, self.library, self.dt, self.candidates = prior, library, dt, candidates
+        super().__init__(prior, dt)
+        self.library, self.candidates = library, candidates
         self._names = signal_names(prior, library)
         if coefficients.shape[-2:] != (len(library.terms), prior.n_q):
             raise InputError(
@@ -196,7 +196,7 @@ class SindyStep(nn.Module):
 
 @dataclass(frozen=True)
 class SindyCandidate:
-    """One fit that was judged.
+    """One fit of a library with a threshold.
 
     Args:
         library: Name of its library.
@@ -289,8 +289,6 @@ def machine_libraries(prior: Prior) -> tuple[Library, ...]:
     return tuple(libraries)
 
 
-__all__ = ["fit_sindy", "SindyStep", "SindyCandidate", "Library", "Factor", "machine_libraries", "Target"]
-
 Array = NDArray[np.float64]
 Target = Literal["mean_rate", "derivative"]
 THRESHOLDS = (0.0, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1)
@@ -324,11 +322,12 @@ def fit_sindy(
 
     Args:
         training: Training trajectories.
-        prior: Names the signals; its energy balance and output judge the free runs. Its equation of motion is not used.
+        prior: Names the signals; its energy balance and output are those of the free runs. Its equation of motion is
+            not used.
         dt: Model period [s], that of the trajectories.
         validation: Validation trajectories, which alone choose library and threshold. Use
-            :func:`~hybrid_mpc.identify.evaluate.judged` on noisy ones.
-        libraries: Default: :func:`~hybrid_mpc.identify.sindy.machine_libraries`.
+            :func:`~hybrid_mpc.identify.evaluate.evaluation_trajectories` on noisy ones.
+        libraries: Default: :func:`machine_libraries`.
         thresholds: Default: ``THRESHOLDS``.
         target: What is regressed: ``"mean_rate"``, the acceleration's mean over each period, against the terms' mean
             over it with the input held (Simpson's rule, the state between two samples from the cubic through both),
@@ -369,7 +368,7 @@ def fit_sindy(
     for library in libraries or machine_libraries(prior):
         theta, rate = _regression(library, prior, windows, dt, target)
         found = _sparse(pysindy, theta, rate, thresholds, ridge)
-        fits += _judged(prior, library, found, validation, dt, warm)
+        fits += _scored(prior, library, found, validation, dt, warm)
     best = _choice(fits, validation)
     return _pruned(prior, best, dt, tuple(fit.candidate for fit in fits))
 
@@ -419,7 +418,7 @@ def _sparse(
     return list(found.values())
 
 
-def _judged(
+def _scored(
     prior: Prior,
     library: Library,
     found: list[tuple[float, Array, float]],
@@ -427,7 +426,7 @@ def _judged(
     dt: float,
     warm: int,
 ) -> list[_Fit]:
-    """E_sim of each fit's validation free runs; those of one library run side by side."""
+    """E_sim of each fit's validation free runs; those of one library run at once."""
     substeps = []
     for _, coefficients, _ in found:
         try:
@@ -439,9 +438,8 @@ def _judged(
     if stable:
         stacked = torch.tensor(np.repeat([found[i][1] for i in stable], len(validation), axis=0))
         step = SindyStep(prior, library, stacked, dt, max(substeps))
-        empty = torch.zeros(0, dtype=torch.float64)
         with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges is scored as infinite
-            runs = free_runs(step, prior, list(validation) * len(stable), warm, empty)
+            runs = free_runs(step, prior, list(validation) * len(stable), warm)
             for k, i in enumerate(stable):
                 errors[i] = score(runs[k * len(validation) : (k + 1) * len(validation)]).e_sim_s
     return [
@@ -489,10 +487,6 @@ def _rms(values: Array) -> Array:
 
 
 def _check(training: Sequence[Trajectory], validation: Sequence[Trajectory], prior: Prior, dt: float) -> None:
-    if prior.n_extra:
-        raise InputError(
-            f"{type(prior).__name__} has states beside [q, v]; SINDy identifies accelerations only"
-        )
     if not training or not validation:
         raise InputError("SINDy needs training and validation trajectories, at least one of each")
     sizes = {"x": len(prior.states), "u": len(prior.inputs)}

@@ -9,7 +9,7 @@ import torch
 
 from hybrid_mpc import TrainingSettings, free_runs, train
 from hybrid_mpc.identify.evaluate import FreeRun, stacked_free_runs
-from scenarios.paper.jobs import BEYOND, converged_steps, divergence, judged_network
+from scenarios.paper.jobs import BEYOND, converged_steps, divergence, figures_of, network_figures, step_class
 from scenarios.pendulum.data import exact_runs
 from scenarios.pendulum.prior import PublishedPendulumPrior
 
@@ -23,7 +23,7 @@ def run(name, n=50):
 
 
 def test_a_good_network_has_not_diverged():
-    network = judged_network([run("one"), run("two")])
+    network = network_figures([run("one"), run("two")])
     assert network.diverged is None
     assert network.figures["e_sim_s"] == 0.0
 
@@ -33,7 +33,7 @@ def test_where_a_state_is_lost(value):
     good, bad = run("one"), run("two")
     x_hat, y_hat = bad.x_hat.copy(), bad.y_hat.copy()
     x_hat[30:], y_hat[30:] = value, value
-    network = judged_network([good, replace(bad, x_hat=x_hat, y_hat=y_hat)], validation=0.1, converged=5)
+    network = network_figures([good, replace(bad, x_hat=x_hat, y_hat=y_hat)], validation=0.1, converged=5)
     assert network.figures == {}
     where = network.diverged
     assert (where.run, where.step, where.runs) == ("two", 30, 1)
@@ -49,13 +49,12 @@ def test_the_bound_is_that_of_the_largest_measured_output():
         assert (divergence([good, replace(off, y_hat=y_hat)]) is not None) is lost
 
 
-@pytest.mark.parametrize("form", ["hybrid", "literal"])
+@pytest.mark.parametrize("form", ["hybrid", "paper"])
 def test_all_networks_at_once_are_the_networks_one_by_one(form):
     prior, warm = PublishedPendulumPrior(), 10
-    settings = TrainingSettings(
-        "pgrnn", 4, 3, 5, 0, seed=0, warm=warm, batch=4, every=5, fused=True, form=form
-    )
-    trained = train(prior, exact_runs("train", 1), exact_runs("valid", 1), settings)
+    settings = TrainingSettings("pgrnn", 4, 3, 5, 0, seed=0, warm=warm, batch=4, every=5, fused=True)
+    data = exact_runs("train", 1), exact_runs("valid", 1)
+    trained = train(prior, *data, settings, form=step_class(form))
     test = exact_runs("test", 2)
     test[1] = test[1].part(np.arange(501) < 300, "short", "test")  # runs may differ in length
     stacked = stacked_free_runs(trained, prior, 0.01, prior, test, warm)
@@ -74,3 +73,17 @@ def test_when_a_training_has_converged():
     step = np.repeat([[0.0], [10.0], [20.0], [30.0], [40.0]], 2, axis=1)
     curve = {"validation": validation, "step": step}
     assert converged_steps(SimpleNamespace(curve=curve)) == [20, 30]  # 1.05 is within 10 % of 1; 4 of 4
+
+
+@pytest.mark.parametrize("dt", [0.02, 0.01])
+def test_two_figures_that_only_the_paper_needs(dt):
+    n, off = round(2.0 / dt), np.array([0.0, -3.0])
+    z = np.zeros((n, 2))
+    made = FreeRun("r", dt * np.arange(n), z[:, :1], z, z, z, z, z, z + off, z[:, 0], z[:, 0])
+    figures = figures_of([made])
+    assert figures["e_sim_s"] == pytest.approx(3.0, rel=1e-12)
+    assert figures["e_sim_paper_s"] == pytest.approx(
+        3.0 * 2.0 / n, rel=1e-12
+    )  # integral over 2 s / n samples
+    # 1/T integral of 3 / (1 + t) over T = 2 s; the sum over left ends errs by dt / 2 (f(0) - f(T)) / T
+    assert figures["e_sim_lambda1_s"] == pytest.approx(1.5 * np.log(3.0), abs=dt / 2 * 1.05)

@@ -12,13 +12,12 @@ from hybrid_mpc import (
     InputError,
     PriorStep,
     check_parity,
-    fit_sindy,
     free_runs,
     model_info,
     score,
     trace_model,
 )
-from hybrid_mpc.identify.sindy import Factor, Library, SindyStep, machine_libraries
+from scenarios.paper.sindy import Factor, Library, SindyStep, fit_sindy, machine_libraries
 from scenarios.pendulum.data import exact_runs
 from scenarios.pendulum.plant import DampedPendulum
 from scenarios.pendulum.prior import PendulumPrior
@@ -172,7 +171,7 @@ def test_it_exports_at_rounding():
 
 
 def test_nothing_is_imported_before_it_is_used():
-    assert "pysindy" not in vars(importlib.import_module("hybrid_mpc.identify.sindy"))
+    assert "pysindy" not in vars(importlib.import_module("scenarios.paper.sindy"))
 
 
 def test_without_pysindy_the_remedy_is_told(runs, monkeypatch):
