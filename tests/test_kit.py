@@ -81,7 +81,8 @@ def test_every_part_is_made_from_the_folder(run, tmp_path):
     np.testing.assert_array_equal(kit.controller().safe_input, [0.0])
     limited = next(task for task in GOLF.tasks if task.control is not None)
     assert kit.problem(limited.name) == limited.control
-    assert kit.problem("another") == GOLF.control
+    plain = next(task for task in GOLF.tasks if task.control is None)
+    assert kit.problem(plain.name) == GOLF.control
     assert kit.controller(task=limited.name).controller.ocp.u_max == limited.control.u_max
 
 
@@ -166,6 +167,13 @@ def test_expressions_go_along(run, tmp_path):
         ),
         ({"causes": {}}, lambda kit: kit.guard(adapt=True), "needs causes"),
         ({}, lambda kit: kit.observer("hybird"), "did you mean 'hybrid'"),
+        (
+            {},
+            lambda kit: kit.problem("track_sin"),
+            r"no task 'track_sin'; did you mean 'track_sine'\? There are: ",
+        ),
+        ({}, lambda kit: kit.controller(task="mistyped"), "no task 'mistyped'"),
+        ({"tasks": (), "control": {}}, lambda kit: kit.guard(adapt=True, task="any"), "there are: none"),
         ({"sensor_sigma": (1.0, 1.0)}, lambda kit: kit.observer(), "needs 1 standard deviations"),
     ],
 )

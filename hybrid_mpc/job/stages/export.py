@@ -68,7 +68,6 @@ def export_stage(context: Context) -> None:
         context.result("data")["hash"],
         versions(),
         phy.values,
-        context.result("evaluation")["scores"][DEPLOYED]["best"],
     )
     save_artifact(
         context.out / "model", programs, deployed, provenance=provenance, loop=loop_settings(context.scenario)
