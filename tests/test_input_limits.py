@@ -132,7 +132,11 @@ def carts(tmp_path_factory):
     )
 
 
-@pytest.mark.parametrize("limits", (FINITE | OPEN).values(), ids=(FINITE | OPEN).keys())
+SIGNS = ("from zero", "positive", "negative", "up to zero", "none")
+"""Limits of every sign, of which the long loops run."""
+
+
+@pytest.mark.parametrize("limits", [(FINITE | OPEN)[name] for name in SIGNS], ids=SIGNS)
 def test_a_cart_is_brought_to_what_its_limits_allow(carts, limits):
     scenario, model = carts
     control = OCP(20, (400.0, 1.0), (1e-3,), (0.1,), limits[:1], limits[1:])

@@ -192,13 +192,6 @@ def test_impossible_settings_are_refused():
         hm.load("nowhere")
 
 
-def test_public_names_are_there():
-    for name in hm.__all__:
-        assert getattr(hm, name) is not None
-    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
-        _ = hm.nothing
-
-
 def test_parts_of_two_models_are_refused_before_the_loop_begins(run):
     kit = hm.load(run)
     with pytest.raises(hm.InputError, match=r"the monitor's model hybrid has .*give both the same"):

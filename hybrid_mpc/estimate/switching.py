@@ -14,24 +14,22 @@ from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
 NEGLIGIBLE = 0.01
-"""Share of a mode's past below which another mode does not enter it: the wide covariance of an improbable jump would
-make the quiet filter a little restless all the time."""
+"""Share of a mode's past below which another mode is not mixed in: the wide covariance of an improbable jump would keep
+the quiet filter from becoming quiet."""
 SLIP = 10.0
 """Process noise over the quiet one while a machine slips: sticking friction that breaks, backlash, an impact."""
 SWITCHES = ((0.9795, 0.02, 0.0005), (0.5, 0.4995, 0.0005), (0.45, 0.05, 0.5))
-"""Probability per period to go from one of three modes (quiet, slip, and a jump or break) to another: a slip every
-second, a load that comes or goes or a part that breaks in 40 s, and either lasts a period or two."""
+"""Probability per period to go from one of three modes (quiet, slip, jump) to another. At 50 Hz: a slip every second, a
+load that comes or goes or a part that breaks every 40 s; each lasts a period or two."""
 
 
 @dataclass(frozen=True)
 class SwitchingEstimate(Estimate):
-    """What several filters believe together; its own fields are their means, weighted by probability.
-
-    Its ``nis`` is the mean of theirs: what the modes, the probable ones most, leave unexplained.
+    """Estimate of several filters: its own fields are their means, weighted by probability.
 
     Args:
         modes: Estimate of each filter.
-        probability: Of each filter's assumptions ``(m,)``; they sum to one.
+        probability: Of each mode ``(m,)``; they sum to one.
     """
 
     modes: tuple[Estimate, ...]
@@ -39,19 +37,18 @@ class SwitchingEstimate(Estimate):
 
 
 class SwitchingFilter:
-    """Interacting multiple models: filters on one model that differ in what they take for possible.
+    """Interacting multiple models: filters on one model that differ in the noise that they assume.
 
-    One Kalman filter is either quiet or quick: the step that it allows a disturbance makes it follow a sudden
-    load, and lets the sensor's noise through at all times. Here each filter assumes one mode of the noise
-    (quiet; drifting; a jump), a Markov chain says how often modes change, and the measurements say which of
-    them is now. No method changes the object. With one filter it is that filter.
+    One Kalman filter is either quiet or quick: the step that it allows a disturbance makes it follow a sudden load, and
+    lets the sensor's noise through at all times. Here each filter assumes one mode of the noise, a Markov chain says
+    how often modes change, and the measurements say which one is likely now. No method changes the object.
 
     Args:
         filters: The modes; same model.
         transition: Probability per period ``(m, m)`` to go from mode i (row) to mode j.
 
     Raises:
-        InputError: If the filters' models differ, or the rows of ``transition`` are no probabilities.
+        InputError: If there are no filters, their models differ, or the rows of ``transition`` are no probabilities.
 
     Source: Blom and Bar-Shalom, *The interacting multiple model algorithm for systems with Markovian switching
     coefficients*, IEEE Trans. Automatic Control 33 (1988).

@@ -15,7 +15,7 @@ from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
 ROUNDING = 1e-9
-"""Share of a state's size below which a model's error is rounding: no filter is to believe itself more exact."""
+"""Share of a state's size below which a model's error is rounding: no filter assumes less noise."""
 
 
 class Recording(Protocol):
@@ -31,7 +31,7 @@ class Recording(Protocol):
 
 
 class Known(Recording, Protocol):
-    """A recording whose states are known, smoothed for instance."""
+    """A recording with known states, e.g. smoothed ones."""
 
     @property
     def x(self) -> Array:
@@ -39,7 +39,7 @@ class Known(Recording, Protocol):
 
 
 class Assessor(Protocol):
-    """A filter that can say how likely its measurements are."""
+    """A filter that knows the likelihood of its measurements."""
 
     def start(self, y: Array) -> Estimate:
         """First estimate from the first measurement."""
@@ -74,7 +74,7 @@ def process_noise(model: HybridModel, recordings: Sequence[Known], most: int = 4
             x_next, h = (
                 m.full().ravel() for m in model.step(recording.x[k], h, recording.u[k], model.w, model.p)
             )
-            if k >= model.delay_states:  # before, nobody knows what was under way
+            if k >= model.delay_states:  # before, the inputs under way are unknown
                 errors.append(x_next - recording.x[k + 1])
         if len(errors) >= most:
             break
@@ -93,7 +93,7 @@ def log_likelihood(estimator: Assessor, recording: Recording, skip: int = 25) ->
     Args:
         estimator: The filter; an extended Kalman filter or several that switch.
         recording: Inputs and measurements.
-        skip: Samples at the start that only end the filter's ignorance. Default 25.
+        skip: Samples left out at the start, while the filter settles. Default 25.
 
     Returns:
         The sum over samples, without the constant; minus infinity where the filter is lost.
@@ -118,7 +118,7 @@ def most_likely(
 
     Args:
         make: Builds the filter for a scale of its process noise.
-        recordings: Undisturbed recordings that nothing is judged on.
+        recordings: Undisturbed recordings, e.g. the training ones.
         scales: Scales to try.
 
     Example:

@@ -1,4 +1,4 @@
-"""Discrete algebraic Riccati equation and LQR gains of a deployed model."""
+"""Linearization of a model at a point: Riccati equation, LQR gain, hidden state at its fixed point."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The model along a horizon with its Jacobians: all periods side by side, or as one run."""
+"""The model along a horizon with its Jacobians: all periods at once, or as one run."""
 
 from __future__ import annotations
 
@@ -38,13 +38,12 @@ class Linearization(Protocol):
 
 
 def stages(model: HybridModel, n: int, *, compiled: bool = False) -> Linearization:
-    """The fastest way that a model has: all periods at once where it can, else one after the other.
+    """The fastest way that a model has: all periods at once with ``side_by_side``, else one after the other.
 
     Args:
         model: The model.
         n: Periods N.
-        compiled: Whether what is evaluated period by period is compiled as C. Default: no; that needs no
-            compiler.
+        compiled: Whether what is evaluated period by period is compiled as C. Default: no.
 
     Raises:
         InputError: If it is to be compiled and there is no compiler, or it fails.
@@ -54,7 +53,7 @@ def stages(model: HybridModel, n: int, *, compiled: bool = False) -> Linearizati
 
 
 class Stages:
-    """One period after the other in CasADi's machine, or compiled.
+    """One period after the other, interpreted by CasADi or compiled.
 
     Args:
         model: The model.
@@ -111,7 +110,7 @@ class Stages:
 
 
 class VectorisedStages:
-    """All periods at once, of a model with a ``side_by_side``; a run is one of ``step`` alone, then all at once.
+    """All periods at once, of a model with ``side_by_side``; a run is one of ``step``.
 
     Args:
         model: The model.
@@ -181,7 +180,7 @@ def _point(model: HybridModel, z: ca.MX, u: ca.MX) -> list[ca.MX]:
 def _compiled(stage: ca.Function) -> ca.Function:
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error", RuntimeWarning)  # that is how a missing compiler is told
+            warnings.simplefilter("error", RuntimeWarning)  # a missing compiler is a warning
             return compile_function(stage)
     except (RuntimeWarning, CompileError) as error:
         raise InputError(
