@@ -17,6 +17,7 @@ from hybrid_mpc.model.model import (
     HybridModel,
     ManyPoints,
     SideBySide,
+    inlined,
     prior_acceleration,
     step_function,
     step_symbols,
@@ -89,7 +90,7 @@ def with_parameter_states(
     x, _, u, w, p = step_symbols(model)
     h = ca.MX.sym("h", model.n_h + n_g)
     own, theta = h[: model.n_h], h[model.n_h :]
-    x_next, h_next = model.step.call([x, own, u, w, p], model.step.is_a("MXFunction"), False)
+    x_next, h_next = inlined(model.step, [x, own, u, w, p])
     dx = change(0.5 * (x + x_next), theta, u, w, p)[0]
     more = acceleration(x, u, theta, w, p) - acceleration(x, u, ca.DM.zeros(n_g), w, p)
     xdot = model.xdot(x, own, u, w, p) + ca.vertcat(ca.MX.zeros(*more.shape), more)
@@ -246,7 +247,7 @@ def _with_jacobian(model: HybridModel, change: ca.Function, n_g: int) -> ca.Func
     own, theta = h[: model.n_h], h[model.n_h :]
     f, n_x, n_h = model.with_jacobian, model.n_x, model.n_h
     assert f is not None
-    x_next, h_next, a, b = f.call([x, own, u, w, p], f.is_a("MXFunction"), False)
+    x_next, h_next, a, b = inlined(f, [x, own, u, w, p])
     dx, slopes = change(0.5 * (x + x_next), theta, u, w, p)
     by_x, by_theta, by_u = ca.horzsplit(slopes, [0, n_x, n_x + n_g, slopes.size2()])
     onto = ca.DM.eye(n_x) + 0.5 * by_x  # what the model's own step passes on, moved to the middle

@@ -16,6 +16,7 @@ from hybrid_mpc.model.model import (
     HybridModel,
     ManyPoints,
     SideBySide,
+    inlined,
     step_function,
     step_symbols,
 )
@@ -69,9 +70,8 @@ def with_input_delay(model: HybridModel, delay: float) -> HybridModel:
     inputs = ca.vertcat(h[: queue.size], u)
     own, acting, later = h[queue.size :], ca.DM(queue.share) @ inputs, inputs[model.n_u :]
     assert model.with_jacobian is not None
-    inline = model.step.is_a("MXFunction"), model.with_jacobian.is_a("MXFunction")
-    x_next, h_next = model.step.call([x, own, acting, w, p], inline[0], False)
-    x_slope, h_slope, a, b = model.with_jacobian.call([x, own, acting, w, p], inline[1], False)
+    x_next, h_next = inlined(model.step, [x, own, acting, w, p])
+    x_slope, h_slope, a, b = inlined(model.with_jacobian, [x, own, acting, w, p])
     point, slopes = [x, h, u, w, p], queue.slopes(model.n_x, a, b)
     return replace(
         model,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.buffered import BufferedFunction
-from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.model.model import HybridModel, inlined
 from nn_export import compile_function
 from nn_export.errors import CompileError
 
@@ -151,9 +151,7 @@ class VectorisedStages:
 
 def _run(model: HybridModel, n: int, compiled: bool) -> BufferedFunction:
     z, u = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("u", model.n_u)
-    inline = model.step.is_a("MXFunction")  # a call less a stage
-    z_next = ca.vertcat(*model.step.call(_point(model, z, u), inline, False))
-    step = ca.Function("z_step", [z, u], [z_next])
+    step = ca.Function("z_step", [z, u], [ca.vertcat(*inlined(model.step, _point(model, z, u)))])
     return BufferedFunction((_compiled(step) if compiled else step).mapaccum("run", n))
 
 
@@ -166,9 +164,7 @@ def _trajectory(f: BufferedFunction, z0: Array, u: Array) -> Array:
 def _stage(model: HybridModel) -> ca.Function:
     z, u = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("u", model.n_u)
     assert model.with_jacobian is not None
-    # Written into the caller's graph where that is possible: a call less a stage.
-    inline = model.with_jacobian.is_a("MXFunction")
-    x_next, h_next, a, b = model.with_jacobian.call(_point(model, z, u), inline, False)
+    x_next, h_next, a, b = inlined(model.with_jacobian, _point(model, z, u))
     return ca.Function("stage", [z, u], [ca.vertcat(x_next, h_next), ca.densify(a), ca.densify(b)])
 
 
