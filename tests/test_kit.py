@@ -110,15 +110,6 @@ def test_a_scenario_s_problem_is_taken_as_it_now_is(run):
     np.testing.assert_array_equal(kit.noise("hybrid"), NOISE["hybrid"])  # learned, so the model's
 
 
-def test_a_guarded_loop(run):
-    kit = hm.load(run)
-    result = closed(
-        kit.observer(), kit.controller(), monitor=kit.monitor(), guard=kit.guard(),
-        faults=[Fault(0.4, 0.8, "measurement_freeze")],
-    )  # fmt: skip
-    assert [s.after for s in result.switches][:1] == [Mode.REST]
-
-
 def test_the_lines_of_the_readme(run, monkeypatch):
     """They are run as they stand, around the simulated machine."""
     blocks = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.S)
@@ -185,11 +176,15 @@ def test_what_is_missing_is_named(run, tmp_path, change, use, told):
         use(hm.load(model))
 
 
-def test_impossible_settings_are_refused():
+def test_impossible_settings_and_models_are_refused(run):
     with pytest.raises(hm.InputError, match="not negative"):
         LoopSettings(process_noise={"prior": (-1.0,)})
     with pytest.raises(hm.InputError, match="does not exist"):
         hm.load("nowhere")
+    info = read_description(run / "model").model
+    for change in ({"dt": 0.0}, {"dt": np.inf}, {"time_unit": -1.0}, {"input_delay": -0.1}):
+        with pytest.raises(hm.InputError, match=next(iter(change))):
+            replace(info, **change)
 
 
 def test_parts_of_two_models_are_refused_before_the_loop_begins(run):

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
-from hybrid_mpc.estimate.switching import SwitchingFilter
+from hybrid_mpc.estimate.switching import Filter, SwitchingFilter
 from hybrid_mpc.estimate.tuning import Recording
 
 Array = NDArray[np.float64]
@@ -76,7 +75,7 @@ class Consistency:
 
 
 def consistency(
-    estimator: ExtendedKalmanFilter | SwitchingFilter,
+    estimator: Filter,
     recordings: Sequence[Recording],
     *,
     skip: int = 25,
@@ -135,9 +134,7 @@ def consistency(
     )
 
 
-def innovations(
-    estimator: ExtendedKalmanFilter | SwitchingFilter, recording: Recording, skip: int = 25
-) -> Innovations:
+def innovations(estimator: Filter, recording: Recording, skip: int = 25) -> Innovations:
     """Innovations of a filter along a recording.
 
     Args:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -177,6 +178,10 @@ class SwitchingFilter:
         if not isinstance(estimate, SwitchingEstimate) or len(estimate.modes) != len(self._filters):
             raise InputError("SwitchingFilter goes on from its own estimates only; begin with start()")
         return estimate
+
+
+Filter: TypeAlias = ExtendedKalmanFilter | SwitchingFilter
+"""A filter on one model: it predicts, corrects, and knows the likelihood of its measurements."""
 
 
 def _mixed(modes: Sequence[Estimate], share: Array) -> Estimate:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimate.kalman import Estimate
+from hybrid_mpc.estimate.switching import Filter
 from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
@@ -36,19 +36,6 @@ class Known(Recording, Protocol):
     @property
     def x(self) -> Array:
         """States ``(n, n_x)``."""
-
-
-class Assessor(Protocol):
-    """A filter that knows the likelihood of its measurements."""
-
-    def start(self, y: Array) -> Estimate:
-        """First estimate from the first measurement."""
-
-    def predict(self, estimate: Estimate, u: Array) -> Estimate:
-        """Estimate one period later with ``u`` held."""
-
-    def assess(self, estimate: Estimate, y: Array, u: Array) -> tuple[Estimate, float]:
-        """Estimate after a measurement, and its log-likelihood."""
 
 
 def process_noise(model: HybridModel, recordings: Sequence[Known], most: int = 4000) -> Array:
@@ -87,7 +74,7 @@ def process_noise(model: HybridModel, recordings: Sequence[Known], most: int = 4
     return np.maximum(np.sqrt(np.mean(np.square(errors), axis=0)), least)
 
 
-def log_likelihood(estimator: Assessor, recording: Recording, skip: int = 25) -> float:
+def log_likelihood(estimator: Filter, recording: Recording, skip: int = 25) -> float:
     """Log-likelihood of the measured outputs under a filter's own innovations and their variances.
 
     Args:
@@ -112,7 +99,7 @@ def log_likelihood(estimator: Assessor, recording: Recording, skip: int = 25) ->
 
 
 def most_likely(
-    make: Callable[[float], Assessor], recordings: Sequence[Recording], scales: Sequence[float]
+    make: Callable[[float], Filter], recordings: Sequence[Recording], scales: Sequence[float]
 ) -> float:
     """The one of ``scales`` whose filter ``make(scale)`` makes the recordings most likely.
 

@@ -30,8 +30,7 @@ from hybrid_mpc.records import known, plain, record
 
 if TYPE_CHECKING:
     from hybrid_mpc.control.safeguard import SafeController
-    from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
-    from hybrid_mpc.estimate.switching import SwitchingFilter
+    from hybrid_mpc.estimate.switching import Filter
     from hybrid_mpc.loop.guard import Guard
     from hybrid_mpc.monitor.energy import EnergyMonitor
     from hybrid_mpc.scenario import Scenario
@@ -525,9 +524,7 @@ class Kit:
             )
         return found
 
-    def observer(
-        self, model: str = "hybrid", *, task: str = "", load: bool = True
-    ) -> ExtendedKalmanFilter | SwitchingFilter:
+    def observer(self, model: str = "hybrid", *, task: str = "", load: bool = True) -> Filter:
         """The estimator of a model's state, hidden state and, with ``load``, an unknown load at its inputs.
 
         Args:

@@ -17,7 +17,7 @@ from hybrid_mpc.control.sqp import SQPController
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimator, ExtendedKalmanFilter
 from hybrid_mpc.estimate.parameters import parameter_filter, with_parameter_states
-from hybrid_mpc.estimate.switching import SLIP, SWITCHES, SwitchingFilter
+from hybrid_mpc.estimate.switching import SLIP, SWITCHES, Filter, SwitchingFilter
 from hybrid_mpc.estimate.tuning import most_likely
 from hybrid_mpc.loop.guard import Guard, Mode
 from hybrid_mpc.model.model import HybridModel
@@ -119,7 +119,7 @@ def make_estimator(
     control: OCP | None = None,
     *,
     observer: bool = True,
-) -> ExtendedKalmanFilter | SwitchingFilter:
+) -> Filter:
     """The estimator that all controllers share.
 
     With observer it switches between three filters (:data:`MODES`): one filter that is quick enough for a push lets
