@@ -29,7 +29,6 @@ from hybrid_mpc import (
     simulate,
 )
 from hybrid_mpc.files import read_json
-from hybrid_mpc.kit.assembly import freezing
 from hybrid_mpc.records import record
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.monitor_study.detection import Judges
@@ -51,8 +50,9 @@ def main() -> None:
     hybrid, prior = artifact.models["hybrid"], artifact.models["prior"]
     noise, _ = find_noise(scenario, artifact, ("hybrid_observer",), 0, None)
     judges = record(Judges, read_json(given.study / "judges.json"), "judges.json")
-    told = {**freezing(scenario, CONTROL), "resolution": judges.resolution}
-    monitor = guard_monitor(hybrid, judges.detector_at(RATE), **told)
+    monitor = guard_monitor(
+        hybrid, judges.detector_at(RATE), resolution=judges.resolution, input_range=CONTROL.input_range
+    )
     parts = (
         make_estimator(hybrid, scenario, np.asarray(noise["hybrid_observer"])),
         make_controller(hybrid, prior, CONTROL),

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from hybrid_mpc import HybridModel, Signal
+from hybrid_mpc import ExtendedKalmanFilter, HybridModel, Signal
 
 
 def linear_model(a, b, c, dt=0.1, n_h=0):
@@ -33,6 +33,15 @@ def random_linear(seed, n_x=3, n_u=2, n_y=1, n_h=0, radius=0.98):
     a *= radius / np.max(np.abs(np.linalg.eigvals(a)))
     b, c = rng.normal(size=(n_z, n_u)), rng.normal(size=(n_y, n_x))
     return linear_model(a, b, c, n_h=n_h), a, b, c
+
+
+def make_filter(model, **changes):
+    """A filter of deviations that are the same for all states, outputs and inputs."""
+    sigma = {
+        "sigma_y": np.full(model.n_y, 0.1), "sigma_x": np.full(model.n_x, 0.05), "sigma_d": np.full(model.n_u, 0.02),
+        "sigma_x0": np.full(model.n_x, 0.3), "sigma_d0": np.full(model.n_u, 0.2),
+    }  # fmt: skip
+    return ExtendedKalmanFilter(model, **{**sigma, **changes})
 
 
 def pendulum_rhs(x, u, *, inertia=0.14, gravity=2.4, damping=0.02, friction=0.05, slope=20.0):

@@ -19,11 +19,11 @@ def step(model, x, h, u):
     return tuple(v.full().ravel() for v in model.step(x, h, u, model.w, model.p))
 
 
-@pytest.mark.parametrize(("delay", "waiting"), [(0.4, 1), (1.0, 1), (1.6, 2), (2.0, 2)])
-def test_the_input_of_a_period_is_the_mean_of_what_acts_in_it(delay, waiting):
+@pytest.mark.parametrize(("delay", "states"), [(0.4, 1), (1.0, 1), (1.6, 2), (2.0, 2)])
+def test_the_input_of_a_period_is_the_mean_of_what_acts_in_it(delay, states):
     model = pendulum_model(z=3, dt=DT)
     late = with_input_delay(model, delay * DT)
-    assert (late.delay_states, late.n_h) == (waiting, 3 + waiting)
+    assert (late.delay_states, late.n_h) == (states, 3 + states)
     u = np.random.default_rng(0).normal(size=20)
     x, h = np.array([0.3, 0.0]), np.zeros(late.n_h)
     own_x, own_h = x, np.zeros(3)
@@ -36,7 +36,7 @@ def test_the_input_of_a_period_is_the_mean_of_what_acts_in_it(delay, waiting):
         x, h = step(late, x, h, u[k])
         # the same operations but for the rounding of one weighted sum
         np.testing.assert_allclose(
-            np.concatenate([x, h[waiting:]]), np.concatenate([own_x, own_h]), atol=1e-13
+            np.concatenate([x, h[states:]]), np.concatenate([own_x, own_h]), atol=1e-13
         )
 
 
@@ -90,7 +90,7 @@ def test_what_cannot_be_is_refused():
     for delay in (0.0, -0.01, np.nan):
         with pytest.raises(InputError, match="must be positive"):
             with_input_delay(model, delay)
-    with pytest.raises(InputError, match="wait already"):
+    with pytest.raises(InputError, match="delay states already"):
         with_input_delay(with_input_delay(model, DT), DT)
     with pytest.raises(InputError, match="delay_states must be whole inputs"):
         replace(model, delay_states=1)
@@ -100,7 +100,8 @@ def test_a_delay_of_too_many_periods_is_refused_at_once():
     model = pendulum_model(dt=DT)
     for periods in (MOST_DELAY_STATES + 1, 1e9, 1e308):
         with pytest.raises(
-            InputError, match=f"inputs would wait, at most {MOST_DELAY_STATES} can; give it in seconds"
+            InputError,
+            match=f"delay states would be needed, at most {MOST_DELAY_STATES} can be; give it in seconds",
         ):
             with_input_delay(model, periods * DT)
     assert with_input_delay(model, MOST_DELAY_STATES * DT).delay_states == MOST_DELAY_STATES
@@ -114,13 +115,13 @@ def test_an_artifact_keeps_the_delay(tmp_path):
     programs, info = {"prior": trace_model(PriorStep(prior, 0.01))}, model_info(prior, 0.01)
     for name, delay in (("none", 0.0), ("late", 0.0125), ("years", 1e9)):
         save_artifact(tmp_path / name, programs, replace(info, input_delay=delay))
-    assert json.loads((tmp_path / "none" / FILE).read_text())["input_delay_s"] == 0.0
+    assert json.loads((tmp_path / "none" / FILE).read_text())["model"]["input_delay"] == 0.0
     at_once, late = (load(tmp_path / name).models["prior"] for name in ("none", "late"))
     assert (at_once.delay_states, late.delay_states) == (0, 2)
     x, u = np.array([0.2, 0.1]), np.array([4.0, 8.0, 9.0])  # the last one comes too late for this period
     np.testing.assert_array_equal(step(late, x, u[:2], u[2])[0], step(at_once, x, [], 0.25 * 4 + 0.75 * 8)[0])
     assert step(late, x, u[:2], u[2])[1].tolist() == [8.0, 9.0]
     with pytest.raises(
-        InputError, match=r"1e\+09 s is 1e\+11 periods of 0.01 s, so that 1e\+11 inputs would wait"
+        InputError, match=r"1e\+09 s is 1e\+11 periods of 0.01 s, so that 1e\+11 delay states would be needed"
     ):
         load(tmp_path / "years")

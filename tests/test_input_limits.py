@@ -32,7 +32,7 @@ from hybrid_mpc.job.analyze import driving_input, input_range, responses_of, sta
 from hybrid_mpc.job.check import check_scenario
 from hybrid_mpc.job.loops import excess, limits_used
 from hybrid_mpc.job.stages.monitor import unknown_load
-from hybrid_mpc.kit.assembly import freezing, working_point
+from hybrid_mpc.kit.assembly import sensor_steps, working_point
 from hybrid_mpc.model.limits import share_used
 from hybrid_mpc.plots.loops import Motion, closed_loops
 
@@ -73,7 +73,9 @@ def test_a_whole_loop_with_its_figures(limits):
     result = simulate(
         PendulumPlant(), estimator, controller, lambda t: np.tile([0.3, 0.0], (len(t), 1)), dt=0.02,
         duration=1.0, x0=[0.0, 0.0], seed=0, guard=make_resting_guard(model),
-        monitor=guard_monitor(model, **freezing(machine, control)),
+        monitor=guard_monitor(
+            model, resolution=sensor_steps(machine.sensor_sigma), input_range=control.input_range
+        ),
     )  # fmt: skip
     assert np.all(np.isfinite(result.x_hat))
     assert result.source.count("MPC") > 0.9 * len(result.source)
@@ -130,7 +132,11 @@ def carts(tmp_path_factory):
     )
 
 
-@pytest.mark.parametrize("limits", (FINITE | OPEN).values(), ids=(FINITE | OPEN).keys())
+SIGNS = ("from zero", "positive", "negative", "up to zero", "none")
+"""Limits of every sign, of which the long loops run."""
+
+
+@pytest.mark.parametrize("limits", [(FINITE | OPEN)[name] for name in SIGNS], ids=SIGNS)
 def test_a_cart_is_brought_to_what_its_limits_allow(carts, limits):
     scenario, model = carts
     control = OCP(20, (400.0, 1.0), (1e-3,), (0.1,), limits[:1], limits[1:])

@@ -81,7 +81,8 @@ def test_every_part_is_made_from_the_folder(run, tmp_path):
     np.testing.assert_array_equal(kit.controller().safe_input, [0.0])
     limited = next(task for task in GOLF.tasks if task.control is not None)
     assert kit.problem(limited.name) == limited.control
-    assert kit.problem("another") == GOLF.control
+    plain = next(task for task in GOLF.tasks if task.control is None)
+    assert kit.problem(plain.name) == GOLF.control
     assert kit.controller(task=limited.name).controller.ocp.u_max == limited.control.u_max
 
 
@@ -107,15 +108,6 @@ def test_a_scenario_s_problem_is_taken_as_it_now_is(run):
     assert kit.controller().controller.ocp.horizon == 7
     assert kit.sensor_sigma == (2e-3,)
     np.testing.assert_array_equal(kit.noise("hybrid"), NOISE["hybrid"])  # learned, so the model's
-
-
-def test_a_guarded_loop(run):
-    kit = hm.load(run)
-    result = closed(
-        kit.observer(), kit.controller(), monitor=kit.monitor(), guard=kit.guard(),
-        faults=[Fault(0.4, 0.8, "measurement_freeze")],
-    )  # fmt: skip
-    assert [s.after for s in result.switches][:1] == [Mode.REST]
 
 
 def test_the_lines_of_the_readme(run, monkeypatch):
@@ -166,6 +158,13 @@ def test_expressions_go_along(run, tmp_path):
         ),
         ({"causes": {}}, lambda kit: kit.guard(adapt=True), "needs causes"),
         ({}, lambda kit: kit.observer("hybird"), "did you mean 'hybrid'"),
+        (
+            {},
+            lambda kit: kit.problem("track_sin"),
+            r"no task 'track_sin'; did you mean 'track_sine'\? There are: ",
+        ),
+        ({}, lambda kit: kit.controller(task="mistyped"), "no task 'mistyped'"),
+        ({"tasks": (), "control": {}}, lambda kit: kit.guard(adapt=True, task="any"), "there are: none"),
         ({"sensor_sigma": (1.0, 1.0)}, lambda kit: kit.observer(), "needs 1 standard deviations"),
     ],
 )
@@ -177,18 +176,15 @@ def test_what_is_missing_is_named(run, tmp_path, change, use, told):
         use(hm.load(model))
 
 
-def test_impossible_settings_are_refused():
+def test_impossible_settings_and_models_are_refused(run):
     with pytest.raises(hm.InputError, match="not negative"):
         LoopSettings(process_noise={"prior": (-1.0,)})
     with pytest.raises(hm.InputError, match="does not exist"):
         hm.load("nowhere")
-
-
-def test_public_names_are_there():
-    for name in hm.__all__:
-        assert getattr(hm, name) is not None
-    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
-        _ = hm.nothing
+    info = read_description(run / "model").model
+    for change in ({"dt": 0.0}, {"dt": np.inf}, {"time_unit": -1.0}, {"input_delay": -0.1}):
+        with pytest.raises(hm.InputError, match=next(iter(change))):
+            replace(info, **change)
 
 
 def test_parts_of_two_models_are_refused_before_the_loop_begins(run):

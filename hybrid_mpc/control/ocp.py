@@ -180,7 +180,7 @@ class OCP:
             model. With a steep friction law take a moving point (see :func:`hybrid_mpc.model.riccati.lqr`). Default:
             zero,
             the input within its limits; the loops of a scenario take a moving one
-            (:func:`hybrid_mpc.job.make_ocp`).
+            (:func:`hybrid_mpc.kit.assembly.make_ocp`).
         x_min: Soft lower bounds of the states ``(n_x,)``; ``-inf`` for none. Default: none.
         x_max: Soft upper bounds of the states ``(n_x,)``; ``inf`` for none. Default: none.
         slack_linear: Penalties ``(n_x,)`` [cost/s/unit], not negative. Default: ``1000 sqrt(q)``.

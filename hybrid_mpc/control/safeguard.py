@@ -112,9 +112,9 @@ class SafeController:
                 )
             rest = np.zeros(ocp.n_x), ocp.rest_input
             point = working_point or ocp.working_point or rest
-            feedback = lqr(fallback, *rest, ocp.q, ocp.r + ocp.r_delta, working_point=point)
-            self._gain = feedback.gain[:, : ocp.n_x]
-            self._late = feedback.gain[:, ocp.n_x : ocp.n_x + fallback.delay_states]
+            gain = lqr(fallback, *rest, ocp.q, ocp.r + ocp.r_delta, working_point=point)
+            self._gain = gain[:, : ocp.n_x]
+            self._late = gain[:, ocp.n_x : ocp.n_x + fallback.delay_states]
             self._fallback = _equilibrium_input(fallback)
             self._fallback(np.zeros(ocp.n_x))  # a CasADi function's first call is slow
 

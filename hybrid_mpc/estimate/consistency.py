@@ -1,4 +1,4 @@
-"""Does a filter believe what it should: its innovations on recordings against what its own covariances say."""
+"""Consistency of a filter: its innovations on recordings against what its own covariances say of them."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
-from hybrid_mpc.estimate.switching import SwitchingFilter
+from hybrid_mpc.estimate.switching import Filter, SwitchingFilter
 from hybrid_mpc.estimate.tuning import Recording
 
 Array = NDArray[np.float64]
@@ -26,8 +25,8 @@ class Innovations:
         t: Times ``(n,)`` [s] since the recording's begin.
         normalised: ``L^-1 (y - y_predicted)`` with ``L L' = C P C' + R``, ``(n, n_y)`` [-]; white with unit
             variance if the filter's assumptions hold; NaN in rows with a missing output.
-        nis: Normalised innovations squared ``(n,)`` [-]; NaN without a measurement. A switching filter's are those of
-            its mixture's mean and covariance: its own ``nis`` favours whichever mode fits.
+        nis: Normalised innovations squared ``(n,)`` [-]; NaN without a measurement. Of a switching filter they are
+            those of the mixture's mean and covariance: its own ``nis`` favours the mode that fits.
         degrees: Outputs measured ``(n,)``: degrees of freedom of each NIS.
     """
 
@@ -45,8 +44,8 @@ class Consistency:
         runs: Innovations of each recording.
         samples: Samples with a measurement.
         mean_nis: Mean NIS [-].
-        nis_band: 95 % band of the mean NIS of a consistent filter. Above it the filter is too sure of itself (noise
-            assumed too small, or a wrong model), below it too unsure.
+        nis_band: 95 % band of the mean NIS of a consistent filter. Above it the filter assumes too little noise (or its
+            model is wrong), below it too much.
         nis_inside: Share of single NIS below the 95 % point of their own distribution.
         autocorrelation: Of the normalised innovations at lags 1, 2, ..., ``(lags, n_y)`` [-].
         correlation_band: Half width of the 95 % band of one autocorrelation of white innovations.
@@ -76,7 +75,7 @@ class Consistency:
 
 
 def consistency(
-    estimator: ExtendedKalmanFilter | SwitchingFilter,
+    estimator: Filter,
     recordings: Sequence[Recording],
     *,
     skip: int = 25,
@@ -84,19 +83,16 @@ def consistency(
 ) -> Consistency:
     """Test a filter on recordings, which should be others than those it was tuned on.
 
-    The mean NIS is compared with the band that the chi-square distribution gives it, the autocorrelations of the
-    normalised innovations with those of white ones (about zero, not about their mean: an offset is a failure too).
-    On a nonlinear model both hold approximately. A consistent switching filter has the same mean NIS, but its
-    single NIS scatter more than the band and ``nis_inside`` suppose: its innovations are a mixture of Gaussians.
+    The mean NIS is compared with its chi-square band, the autocorrelations of the normalised innovations with those of
+    white noise (about zero, not about their mean: an offset fails too). On a nonlinear model both hold approximately. A
+    consistent switching filter has the same mean NIS, but its single NIS scatter more than band and ``nis_inside``
+    assume: its innovations are a mixture of Gaussians.
 
     Args:
         estimator: The filter.
         recordings: Inputs ``u (n, n_u)`` and measurements ``y (n, n_y)`` on the model's grid; NaN where missing.
-        skip: Samples at the start of each that only end the filter's ignorance. Default 25.
+        skip: Samples left out at the start of each, while the filter settles. Default 25.
         lags: Largest lag [samples]. Default 20.
-
-    Returns:
-        Statistics with their bands, and the innovations.
 
     Raises:
         InputError: If ``skip`` or ``lags`` is not positive, or too few samples are left (five times ``lags``).
@@ -112,8 +108,8 @@ def consistency(
     if skip < 1 or lags < 1:
         raise InputError(f"consistency: skip and lags must be 1 or more, got {skip} and {lags}")
     runs = tuple(innovations(estimator, recording, skip) for recording in recordings)
-    nis = np.concatenate([run.nis for run in runs]) if runs else np.zeros(0)
-    degrees = np.concatenate([run.degrees for run in runs]) if runs else np.zeros(0, dtype=int)
+    nis = np.concatenate([np.zeros(0), *(run.nis for run in runs)])
+    degrees = np.concatenate([np.zeros(0, dtype=int), *(run.degrees for run in runs)])
     seen = np.isfinite(nis)
     n, freedom = int(seen.sum()), int(degrees[seen].sum())
     if n < 5 * lags:
@@ -138,9 +134,7 @@ def consistency(
     )
 
 
-def innovations(
-    estimator: ExtendedKalmanFilter | SwitchingFilter, recording: Recording, skip: int = 25
-) -> Innovations:
+def innovations(estimator: Filter, recording: Recording, skip: int = 25) -> Innovations:
     """Innovations of a filter along a recording.
 
     Args:
@@ -183,10 +177,7 @@ def innovations(
 
 
 def _autocorrelation(runs: Sequence[Array], lags: int) -> tuple[Array, Array]:
-    """Autocorrelations ``(lags, n_y)`` over all runs, never across them, and the pairs behind each lag.
-
-    A missing sample leaves its pairs out; each lag's sum is scaled to the pairs that a whole run would have.
-    """
+    """Autocorrelations ``(lags, n_y)`` over all runs, never across them, and the pairs of samples at each lag."""
     n_y = runs[0].shape[1]
     finite = [np.all(np.isfinite(e), axis=1) for e in runs]
     power = sum((np.sum(e[f] ** 2, axis=0) for e, f in zip(runs, finite, strict=True)), np.zeros(n_y))

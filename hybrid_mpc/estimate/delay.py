@@ -1,4 +1,4 @@
-"""Estimates for loops with delays: filter what has arrived, predict to the instant at which the input acts."""
+"""Estimates for loops with delays: filter what has arrived, then predict to the instant at which the input acts."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Predictor(Estimator, Protocol):
 
 @dataclass(frozen=True)
 class DelayedEstimate(Estimate):
-    """An estimate of the instant at which the next input acts, and where it comes from.
+    """An estimate of the instant at which the next input acts, and what it was predicted from.
 
     Args:
         filtered: Estimate of the instant of the last measurement that has arrived.
@@ -41,15 +41,14 @@ class DelayedEstimate(Estimate):
 
 
 class DelayCompensation:
-    """Makes an estimator right for a loop with delays.
+    """An estimator for a loop with delays, around one for the loop without.
 
-    A measurement arrives ``sensor_delay`` periods after it was taken, an input acts ``input_delay`` periods
-    after it was decided. The wrapped estimator runs on the measurements at their own instants; its model
-    then runs on the inputs that are known but not yet measured, ``sensor_delay + input_delay`` periods
-    ahead. Missing measurements (NaN) leave the prediction, as without delays. No method changes the object.
+    A measurement arrives ``sensor_delay`` periods after it was taken, an input acts ``input_delay`` periods after it
+    was decided. The wrapped estimator runs on the measurements at their own instants; its model then predicts
+    ``sensor_delay + input_delay`` periods ahead with the inputs decided since. No method changes the object.
 
-    At the start the machine has rested: the first measurement counts for the start itself, those that
-    follow until the sensor has caught up are not used, and an input of zero was held.
+    Before the start the machine rests under an input of zero: the first measurement counts for the start itself, those
+    that follow until the sensor has caught up are not used.
 
     Args:
         estimator: The estimator of the loop without delays.
@@ -119,11 +118,11 @@ class DelayCompensation:
 
 
 def filtered(estimate: Estimate) -> Estimate:
-    """The estimate of the instant of the last measurement: of a delayed one, where it was predicted from."""
+    """The estimate of the instant of the last measurement: what a delayed one was predicted from."""
     return estimate.filtered if isinstance(estimate, DelayedEstimate) else estimate
 
 
 def sees_truth(estimator: Estimator) -> bool:
-    """True for an oracle's estimator, which is handed the true state."""
+    """Whether an estimator is an oracle's, which gets the true state."""
     inner = estimator.estimator if isinstance(estimator, DelayCompensation) else estimator
     return isinstance(inner, TrueState)

@@ -1,8 +1,7 @@
-"""The estimator of an oracle: it is told the plant's truth."""
+"""Extended Kalman filter over state, hidden state and input disturbance; and the estimator that gets the truth."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -15,20 +14,17 @@ from hybrid_mpc.model.buffered import BufferedFunction
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.model.riccati import hidden_fixed_point, vector
 
-# Extended Kalman filter over the state, the hidden state and an input disturbance.
-
 Array = NDArray[np.float64]
 START_LIMIT = 25
 """Most periods at rest that the first estimate runs the hidden state through: as many as training warms it up on.
 Longer makes a loop's first step late. Closed loops with a network depend on it (docs/results/README.md)."""
-
-# A variance that has grown this much leaves few digits of a covariance: nothing is known any more.
 LOST = 1e12
+"""Growth of a variance that leaves few digits of a covariance: nothing is known any more."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What is believed of a machine at one instant.
+    """Estimate of a machine's state at one instant.
 
     Args:
         t: Time [s].
@@ -37,8 +33,8 @@ class Estimate:
         d: Input disturbance ``(n_u,)`` [input units]: the machine acts as if its input were ``u + d``.
         P: Covariance of ``(x, h, d)``, ``(n_x + n_h + n_u,) * 2``.
         innovation: Measured minus predicted outputs ``(n_y,)``; NaN where nothing was measured.
-        nis: Normalised innovation squared [-]; chi-square with n_y degrees of freedom if the filter's
-            assumptions hold; NaN without a measurement.
+        nis: Normalised innovation squared [-], chi-square with n_y degrees of freedom if the filter's assumptions hold;
+            NaN without a measurement.
     """
 
     t: float
@@ -67,14 +63,13 @@ class Estimator(Protocol):
 class ExtendedKalmanFilter:
     """Extended Kalman filter over ``(x, h, d)`` with the model's exact Jacobian.
 
-    The input disturbance ``d`` is a random walk; a network's hidden state carries no noise of its own, it
-    follows the state. Hidden states that are parameters do
-    (:func:`~hybrid_mpc.estimate.parameters.with_parameter_states`). On a linear model this is the Kalman filter. No
-    method
-    changes what the object gives; not for several threads at once (it reuses its buffers).
+    The input disturbance ``d`` is a random walk. A network's hidden state has no noise of its own, it follows the
+    state; hidden states that are parameters have (:func:`~hybrid_mpc.estimate.parameters.with_parameter_states`). On a
+    linear model this is the Kalman filter. No method changes what the object gives; not for several threads at once (it
+    reuses its buffers).
 
-    A prediction that is not finite, or whose deviation is a million times the largest one given here, is
-    lost (an unstable model without measurements for long, an absurd one): the next measurement starts anew.
+    A prediction is lost if it is not finite, or a deviation is a million times the largest one given here (an unstable
+    model long without measurements, an absurd measurement). The next measurement then starts anew.
 
     Args:
         model: The deployed model.
@@ -82,8 +77,8 @@ class ExtendedKalmanFilter:
         sigma_x: Standard deviations of the process noise per period ``(n_x,)`` [state units].
         sigma_x0: Standard deviations of the first state ``(n_x,)``.
         sigma_d: Standard deviations of the step of ``d`` per period ``(n_u,)`` [input units]. Default: zero.
-        sigma_d0: Standard deviations of the first disturbance ``(n_u,)``. Default: zero. Without both there
-            is no disturbance observer: ``d`` stays exactly zero.
+        sigma_d0: Standard deviations of the first disturbance ``(n_u,)``. Default: zero. Without both ``d`` stays
+            exactly zero.
         sigma_h: Standard deviations of the step of the hidden states per period ``(n_h,)``. Default: zero.
         sigma_h0: Standard deviations of the first hidden states ``(n_h,)``. Default: zero.
 
@@ -145,19 +140,14 @@ class ExtendedKalmanFilter:
         """Variances of the process noise of ``(x, h, d)`` a period ``(n,)``, and of the measurement ``(n_y,)``."""
         return self._noise.copy(), self._noise_y.copy()
 
-    @property
-    def limit(self) -> float:
-        """Variance above which nothing is known any more."""
-        return float(self._lost)
-
     def lost(self, estimate: Estimate) -> bool:
-        """True if an estimate is not finite or so uncertain that nothing is known any more."""
+        """Whether an estimate is not finite, or so uncertain that nothing is known any more."""
         mean = np.concatenate([estimate.x, estimate.h, estimate.d])
         known = np.all(np.isfinite(mean)) and np.max(np.diag(estimate.P)) <= self._lost
         return not known
 
     def start(self, y: ArrayLike, t: float = 0.0) -> Estimate:
-        """Estimate at rest at ``y`` ``(n_y,)``: the smallest state with this output, ``d`` zero.
+        """Estimate at rest: the smallest state with the output ``y`` ``(n_y,)``, ``d`` zero.
 
         Elements of ``y`` that are not finite count as the output at the state zero.
         """
@@ -206,8 +196,7 @@ class ExtendedKalmanFilter:
     def assess(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> tuple[Estimate, float]:
         """:meth:`correct`, and the log-likelihood of the measurement, without its constant.
 
-        Source of the likelihood: Schweppe, *Evaluation of likelihood functions for Gaussian signals*, IEEE
-        T-IT 11 (1965).
+        Source: Schweppe, *Evaluation of likelihood functions for Gaussian signals*, IEEE T-IT 11 (1965).
         """
         n_x, n_h, _, n_y = self._sizes
         y = np.asarray(y, dtype=float).ravel()
@@ -289,7 +278,7 @@ class ExtendedKalmanFilter:
         return estimates
 
 
-def _variance(sigma: ArrayLike | Sequence[float], size: int, name: str) -> Array:
+def _variance(sigma: ArrayLike, size: int, name: str) -> Array:
     values = vector(sigma, size, name)
     if np.any(values < 0):
         raise InputError(f"{name} must not be negative, got {values}")
@@ -314,7 +303,7 @@ def output_with_jacobian(model: HybridModel) -> ca.Function:
 class TrueState:
     """The estimator of an oracle: its "measurement" is the plant's truth ``(x, hidden)``.
 
-    ``closed_loop.simulate`` hands it the true states instead of the sensors' outputs.
+    :func:`~hybrid_mpc.loop.simulate.simulate` gives it the true states instead of the sensors' outputs.
 
     Args:
         model: The oracle model, whose hidden states are the plant's own (a prior has none).
@@ -347,7 +336,7 @@ class TrueState:
         return Estimate(float(t), z[: m.n_x], z[m.n_x : n_z], np.zeros(m.n_u), p, empty, float("nan"))
 
     def predict(self, estimate: Estimate, u: ArrayLike) -> Estimate:
-        """The model's own step with ``u`` ``(n_u,)`` held: what an oracle knows of the time ahead."""
+        """The model's own step with ``u`` ``(n_u,)`` held."""
         m = self._model
         x, h = (
             v.full().ravel() for v in m.step(estimate.x, estimate.h, np.asarray(u, dtype=float), m.w, m.p)

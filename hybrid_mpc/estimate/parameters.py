@@ -1,4 +1,4 @@
-"""Physical parameters as constant states, which a filter estimates and a controller plans with."""
+"""Parameters of the prior as constant states: a filter estimates them, a controller plans with them."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from hybrid_mpc.model.model import (
     HybridModel,
     ManyPoints,
     SideBySide,
+    inlined,
     prior_acceleration,
     step_function,
     step_symbols,
@@ -36,19 +37,18 @@ def with_parameter_states(
     prior: HybridModel | None = None,
     most: float = 4.0,
 ) -> HybridModel:
-    """The same model with states that the prior's parameters follow, one for each group of them.
+    """The same model with one further hidden state for each group of the prior's parameters.
 
-    The states ``theta`` ``(n_g,)`` are constant hidden states after the model's own ``h``. The parameters of group i
-    are multiplied by ``exp(L tanh(theta_i / L))`` with ``L = log(most)``: a small ``theta`` is the relative change, and
-    no estimate leaves the bounds. A period adds what that changes in the prior's acceleration,
-    ``a(x, u, p(theta)) - a(x, u, p)`` in the middle of the model's own step, held over the period and damped as the
-    changed prior damps it (linearly implicit, so that steep friction stays stable); what the network adds stays as it
-    is. At zero the model is the one given, to the last bit.
+    The states ``theta`` ``(n_g,)`` are constant and stand after the model's own ``h``. The parameters of group i are
+    multiplied by ``exp(L tanh(theta_i / L))`` with ``L = log(most)``: a small ``theta`` is the relative change, and no
+    estimate leaves the bounds. A step adds the change of the prior's acceleration, ``a(x, u, p(theta)) - a(x, u, p)``
+    in the middle of the model's own step, held over the period and damped as the changed prior damps it (linearly
+    implicit, so that steep friction stays stable). What the network adds stays as it is. At zero the model is the one
+    given, to the last bit.
 
-    A filter estimates ``theta`` if it is told how uncertain hidden states are
-    (:class:`ExtendedKalmanFilter`, ``sigma_h`` and ``sigma_h0``), and a controller on this model plans with the
-    estimate. Nothing controls these states, so there is no LQR with them: give the problem the terminal weight of
-    the given model, ``OCP.terminal_weight(model)``.
+    A filter estimates ``theta`` with ``sigma_h`` and ``sigma_h0`` (:class:`ExtendedKalmanFilter`); a controller on this
+    model plans with the estimate. No input controls these states, so there is no LQR with them: give the problem the
+    terminal weight of the given model, ``OCP.terminal_weight(model)``.
 
     Args:
         model: A model that knows its parameters.
@@ -90,7 +90,7 @@ def with_parameter_states(
     x, _, u, w, p = step_symbols(model)
     h = ca.MX.sym("h", model.n_h + n_g)
     own, theta = h[: model.n_h], h[model.n_h :]
-    x_next, h_next = model.step.call([x, own, u, w, p], model.step.is_a("MXFunction"), False)
+    x_next, h_next = inlined(model.step, [x, own, u, w, p])
     dx = change(0.5 * (x + x_next), theta, u, w, p)[0]
     more = acceleration(x, u, theta, w, p) - acceleration(x, u, ca.DM.zeros(n_g), w, p)
     xdot = model.xdot(x, own, u, w, p) + ca.vertcat(ca.MX.zeros(*more.shape), more)
@@ -121,10 +121,9 @@ def parameter_filter(
 ) -> SwitchingFilter:
     """The filter of a model with parameter states: quiet while nothing happens, quick when something breaks.
 
-    One filter that follows a broken machine within half a second lets noise into its parameters at all times. This one
-    switches between three: quiet, slip (process noise ten times as large), and break, in which parameters step.
-    Keep ``sigma_d`` small: a load and heavier friction are the same until the motion turns round, and what a quick
-    disturbance has explained no parameter learns.
+    It switches between three filters: quiet, slip (ten times the process noise), and break, in which parameters step.
+    Keep ``sigma_d`` small: a load and heavier friction are the same until the motion turns round, and no parameter
+    learns what a quick disturbance has explained.
 
     Args:
         model: What :func:`with_parameter_states` made.
@@ -134,12 +133,11 @@ def parameter_filter(
         sigma_x0: Likewise.
         sigma_d: Likewise. Default: no disturbance.
         sigma_d0: Likewise.
-        drift: Step of the parameter states per period while nothing happens [-], about the relative change.
-            Default 0.001.
+        drift: Step of the parameter states per period while nothing happens, a relative change [-]. Default 0.001.
         step: Their step per period of a break [-]; a break lasts two periods on average. Default 0.1.
 
     Raises:
-        InputError: If there are not so many hidden states, or a deviation does not fit.
+        InputError: If there are fewer hidden states, or a deviation does not fit.
 
     Example: ``parameter_filter(adaptive, 2, sigma_y=[5e-4], sigma_x=[2e-5, 2e-3], sigma_x0=[5e-4, 0.1])``
     """
@@ -160,7 +158,7 @@ def parameter_filter(
 
 
 def parameter_factors(theta: ArrayLike, most: float = 4.0) -> Array:
-    """Factors on the groups' parameters of states ``theta`` ``(..., n_g)``; see :func:`with_parameter_states`.
+    """Factors on the parameters from states ``theta`` ``(..., n_g)``, see :func:`with_parameter_states`.
 
     Example:
         >>> parameter_factors([0.0, 0.1, 99.0]).round(3)
@@ -171,7 +169,7 @@ def parameter_factors(theta: ArrayLike, most: float = 4.0) -> Array:
 
 
 def parameter_states(factors: ArrayLike, most: float = 4.0) -> Array:
-    """States ``theta`` ``(..., n_g)`` of factors, which :func:`parameter_factors` gives back; the bounds are cut.
+    """States ``theta`` ``(..., n_g)`` of factors on the parameters, cut to the bounds.
 
     Raises:
         InputError: If a factor is not positive.
@@ -249,7 +247,7 @@ def _with_jacobian(model: HybridModel, change: ca.Function, n_g: int) -> ca.Func
     own, theta = h[: model.n_h], h[model.n_h :]
     f, n_x, n_h = model.with_jacobian, model.n_x, model.n_h
     assert f is not None
-    x_next, h_next, a, b = f.call([x, own, u, w, p], f.is_a("MXFunction"), False)
+    x_next, h_next, a, b = inlined(f, [x, own, u, w, p])
     dx, slopes = change(0.5 * (x + x_next), theta, u, w, p)
     by_x, by_theta, by_u = ca.horzsplit(slopes, [0, n_x, n_x + n_g, slopes.size2()])
     onto = ca.DM.eye(n_x) + 0.5 * by_x  # what the model's own step passes on, moved to the middle

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimate.kalman import Estimate
+from hybrid_mpc.estimate.switching import Filter
 from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
 ROUNDING = 1e-9
-"""Share of a state's size below which a model's error is rounding: no filter is to believe itself more exact."""
+"""Share of a state's size below which a model's error is rounding: no filter assumes less noise."""
 
 
 class Recording(Protocol):
@@ -31,24 +31,11 @@ class Recording(Protocol):
 
 
 class Known(Recording, Protocol):
-    """A recording whose states are known, smoothed for instance."""
+    """A recording with known states, e.g. smoothed ones."""
 
     @property
     def x(self) -> Array:
         """States ``(n, n_x)``."""
-
-
-class Assessor(Protocol):
-    """A filter that can say how likely its measurements are."""
-
-    def start(self, y: Array) -> Estimate:
-        """First estimate from the first measurement."""
-
-    def predict(self, estimate: Estimate, u: Array) -> Estimate:
-        """Estimate one period later with ``u`` held."""
-
-    def assess(self, estimate: Estimate, y: Array, u: Array) -> tuple[Estimate, float]:
-        """Estimate after a measurement, and its log-likelihood."""
 
 
 def process_noise(model: HybridModel, recordings: Sequence[Known], most: int = 4000) -> Array:
@@ -74,7 +61,7 @@ def process_noise(model: HybridModel, recordings: Sequence[Known], most: int = 4
             x_next, h = (
                 m.full().ravel() for m in model.step(recording.x[k], h, recording.u[k], model.w, model.p)
             )
-            if k >= model.delay_states:  # before, nobody knows what was under way
+            if k >= model.delay_states:  # before, the inputs under way are unknown
                 errors.append(x_next - recording.x[k + 1])
         if len(errors) >= most:
             break
@@ -87,13 +74,13 @@ def process_noise(model: HybridModel, recordings: Sequence[Known], most: int = 4
     return np.maximum(np.sqrt(np.mean(np.square(errors), axis=0)), least)
 
 
-def log_likelihood(estimator: Assessor, recording: Recording, skip: int = 25) -> float:
+def log_likelihood(estimator: Filter, recording: Recording, skip: int = 25) -> float:
     """Log-likelihood of the measured outputs under a filter's own innovations and their variances.
 
     Args:
         estimator: The filter; an extended Kalman filter or several that switch.
         recording: Inputs and measurements.
-        skip: Samples at the start that only end the filter's ignorance. Default 25.
+        skip: Samples left out at the start, while the filter settles. Default 25.
 
     Returns:
         The sum over samples, without the constant; minus infinity where the filter is lost.
@@ -112,13 +99,13 @@ def log_likelihood(estimator: Assessor, recording: Recording, skip: int = 25) ->
 
 
 def most_likely(
-    make: Callable[[float], Assessor], recordings: Sequence[Recording], scales: Sequence[float]
+    make: Callable[[float], Filter], recordings: Sequence[Recording], scales: Sequence[float]
 ) -> float:
     """The one of ``scales`` whose filter ``make(scale)`` makes the recordings most likely.
 
     Args:
         make: Builds the filter for a scale of its process noise.
-        recordings: Undisturbed recordings that nothing is judged on.
+        recordings: Undisturbed recordings, e.g. the training ones.
         scales: Scales to try.
 
     Example:

@@ -6,7 +6,7 @@ import math
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -24,7 +24,7 @@ from hybrid_mpc.loop.faults import Fault, check_channels, install
 from hybrid_mpc.loop.guard import Guard
 from hybrid_mpc.loop.plant import Plant
 from hybrid_mpc.loop.realtime import percentiles
-from hybrid_mpc.loop.simulate import ClosedLoopResult, Simulation, Step, simulate_together
+from hybrid_mpc.loop.simulate import ClosedLoopResult, Step, simulate
 from hybrid_mpc.model.limits import share_used
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.monitor.calibrate import alarm_intervals
@@ -496,75 +496,16 @@ class Bench:
             Its row, and its whole record.
         """
         plans: list[Array] = []
-        run = self._simulation(spec, task, monitor, _noting(spec, plans, on_step), None)
-        return self._told(spec, task, run.run(), plans)
-
-    def run_together(
-        self,
-        specs: Sequence[LoopSpec],
-        *,
-        tasks: Sequence[Task] | None = None,
-        monitor: EnergyMonitor | None = None,
-    ) -> list[tuple[LoopRow, ClosedLoopResult]]:
-        """Run loops of one controller and length side by side, their filters in one array: quicker, equal to rounding.
-
-        Args:
-            specs: The loops.
-            tasks: In place of the tasks that they name.
-            monitor: In place of the one that they name.
-
-        Returns:
-            What :meth:`run` returns of each.
-
-        Raises:
-            InputError: If estimators, controllers or lengths differ, or there are not as many tasks as loops.
-        """
-        given = [None] * len(specs) if tasks is None else tasks
-        if len(given) != len(specs):
-            raise InputError(f"{len(specs)} loops and {len(given)} tasks given; needed: a task for each loop")
-        if not specs:
-            return []
-        parts = self.parts(specs[0])
-        other = next((spec for spec in specs if self.parts(spec) is not parts), None)
-        if other is not None:
-            raise InputError(
-                f"loops of different parts given: {_parts_text(specs[0])}, and {_parts_text(other)}; side by side "
-                "they must share estimator and controller: group them, or run them one by one"
-            )
-        plans: list[list[Array]] = [[] for _ in specs]
-        made = [
-            partial(self._simulation, spec, task, monitor, _noting(spec, kept, None))
-            for spec, task, kept in zip(specs, given, plans, strict=True)
-        ]
-        results = simulate_together(parts[0], made)
-        return [
-            self._told(spec, task, result, kept)
-            for spec, task, result, kept in zip(specs, given, results, plans, strict=True)
-        ]
-
-    def _simulation(
-        self,
-        spec: LoopSpec,
-        task: Task | None,
-        monitor: EnergyMonitor | None,
-        on_step: Callable[[Step], None] | None,
-        estimator: Estimator | None,
-    ) -> Simulation:
-        own, controller = self.parts(spec)
         task = self.task(spec) if task is None else task
+        estimator, controller = self.parts(spec)
         late = spec.late
-        return Simulation(
-            self.plant(spec), estimator or own, controller, task.reference, weight=task.weight,
+        result = simulate(
+            self.plant(spec), estimator, controller, task.reference, weight=task.weight,
             dt=self.kit(spec).models["prior"].dt, duration=task.duration, x0=np.array(task.x0),
             seed=spec.noise_seed, monitor=monitor or self.monitor(spec), guard=self.guard(spec),
-            faults=(*task.faults, *spec.faults, *spec.drawn_faults), on_step=on_step,
+            faults=(*task.faults, *spec.faults, *spec.drawn_faults), on_step=_noting(spec, plans, on_step),
             late=(lambda t: any(a - 1e-9 <= t < b - 1e-9 for a, b in late)) if late else None,
         )  # fmt: skip
-
-    def _told(
-        self, spec: LoopSpec, task: Task | None, result: ClosedLoopResult, plans: list[Array]
-    ) -> tuple[LoopRow, ClosedLoopResult]:
-        task = self.task(spec) if task is None else task
         row = row_of(spec, task, self.problem(spec), self.kit(spec).models["prior"], result)
         derived = {"step_ms": result.timing_ms["total"], "plans": np.array(plans)}
         kept = {name: derived[name] if name in derived else getattr(result, name) for name in spec.keep}
@@ -584,14 +525,6 @@ def _noting(
             on_step(step)
 
     return note
-
-
-def _parts_text(spec: LoopSpec) -> str:
-    horizon = "the task's own" if spec.horizon is None else spec.horizon
-    return (
-        f"controller {spec.controller} of model {spec.model} for task {spec.task}, solver {spec.solver}, "
-        f"horizon {horizon}"
-    )
 
 
 def row_of(spec: LoopSpec, task: Task, problem: OCP, model: HybridModel, result: ClosedLoopResult) -> LoopRow:

@@ -1,4 +1,8 @@
-"""The artifact: a folder of the deployed models as data. Loading needs no torch and runs nothing."""
+"""The artifact: a folder of deployed models as data, and the kit of a loop's parts that is made of it.
+
+``model.json`` describes, ``programs.json`` and ``weights.safetensors`` hold the models' functions. Loading needs no
+torch and executes nothing from the folder.
+"""
 
 from __future__ import annotations
 
@@ -26,16 +30,15 @@ from hybrid_mpc.records import known, plain, record
 
 if TYPE_CHECKING:
     from hybrid_mpc.control.safeguard import SafeController
-    from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
-    from hybrid_mpc.estimate.switching import SwitchingFilter
+    from hybrid_mpc.estimate.switching import Filter
     from hybrid_mpc.loop.guard import Guard
     from hybrid_mpc.monitor.energy import EnergyMonitor
     from hybrid_mpc.scenario import Scenario
 
 SCHEMA_VERSION = 3
-FILE = "model.json"
-FILES = (FILE, "programs.json", "weights.safetensors")
-"""All files of an artifact; whatever else lies in its folder is none of it."""
+FILE, PROGRAMS = "model.json", "programs.json"
+FILES = (FILE, PROGRAMS, "weights.safetensors")
+"""All files of an artifact; others in its folder do not belong to it."""
 MOST_MODELS = 16
 """Models that an artifact may hold: prior, hybrid, and a few to compare them with."""
 FUNCTIONS = ("step", "xdot", "output")
@@ -47,15 +50,10 @@ INPUTS = {
     "output": ("x", "u", "w", "p"),
     BALANCE: ("x", "xdot", "u", "w", "p"),
 }
-OUTPUTS = {
-    "step": STEP_OUTPUTS,
-    "xdot": ("xdot",),
-    "output": ("y",),
-    BALANCE: ("residual",),
-}
+OUTPUTS = {"step": STEP_OUTPUTS, "xdot": ("xdot",), "output": ("y",), BALANCE: ("residual",)}
+JACOBIANS = {"A": ("x", "h"), "B": ("u",)}
 WATCHES = ("own", "energy", "readings", "guard")
 """Kinds of monitor, see :meth:`Kit.monitor`."""
-JACOBIANS = {"A": ("x", "h"), "B": ("u",)}
 
 
 @dataclass(frozen=True)
@@ -80,7 +78,7 @@ class BalanceInfo:
 
 @dataclass(frozen=True)
 class ModelInfo:
-    """What a model's programs do not say themselves.
+    """What the models' programs do not say themselves; the same for all models of an artifact.
 
     Args:
         dt: Model period [s].
@@ -93,7 +91,10 @@ class ModelInfo:
         disturbances: Signals of w. Default: none.
         nominal_w: What is taken for w where none is given. Default: zeros.
         covariance: Rows of the covariance of the fitted values. Default: unknown.
-        balances: Balances whose programs there are. Default: none.
+        balances: Balances that have programs. Default: none.
+
+    Raises:
+        InputError: If a time is not finite, the period or the machine's second not positive, or the delay negative.
     """
 
     dt: float
@@ -108,6 +109,13 @@ class ModelInfo:
     covariance: tuple[tuple[float, ...], ...] = ()
     balances: tuple[BalanceInfo, ...] = ()
 
+    def __post_init__(self) -> None:
+        for name, value in (("dt", self.dt), ("time_unit", self.time_unit)):
+            if not 0 < value < math.inf:
+                raise InputError(f"{name}: a positive number of seconds is needed, got {value}")
+        if not 0 <= self.input_delay < math.inf:
+            raise InputError(f"input_delay: a number of seconds is needed, got {self.input_delay}")
+
 
 @dataclass(frozen=True)
 class Provenance:
@@ -120,7 +128,6 @@ class Provenance:
         data_hash: Hash of the recordings.
         versions: Versions of the packages.
         prior_parameters: Fitted values [SI] of the prior's parameters by name.
-        test_scores: Errors of the hybrid's free runs on test data by name.
     """
 
     scenario: str = ""
@@ -129,12 +136,11 @@ class Provenance:
     data_hash: str = ""
     versions: Mapping[str, str] = field(default_factory=dict)
     prior_parameters: Mapping[str, float] = field(default_factory=dict)
-    test_scores: Mapping[str, float | None] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """What loops on a folder's models need beside them.
+    """What loops need beside the models.
 
     Args:
         control: Control problems by task; under ``""`` the one of all tasks that have none of their own. Default: none.
@@ -144,6 +150,10 @@ class LoopSettings:
             behind it where the estimator follows an unknown load.
         causes: What may break, by name: the parameters that change together then.
         safe_input: Input ``(n_u,)`` that the machine is left with. Default: zero, or the limit next to it.
+        tasks: Names of the tasks, with or without a control problem of their own. Default: those of ``control``.
+
+    Raises:
+        InputError: If a deviation is negative or not finite, or the safe input is outside a problem's limits.
     """
 
     control: Mapping[str, OCP] = field(default_factory=dict)
@@ -152,6 +162,7 @@ class LoopSettings:
     process_noise: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     causes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     safe_input: tuple[float, ...] | None = None
+    tasks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         sigmas = self.sensor_sigma, self.first_sigma or (), *self.process_noise.values()
@@ -172,6 +183,33 @@ def _within(u: tuple[float, ...], problem: OCP) -> bool:
     )
 
 
+def loop_settings(
+    scenario: Scenario, process_noise: Mapping[str, tuple[float, ...]] | None = None
+) -> LoopSettings:
+    """What a scenario's loops need beside the models.
+
+    Args:
+        scenario: The machine.
+        process_noise: By estimator. Default: none; it is estimated later.
+
+    Example:
+        >>> from scenarios.golf_robot import scenario
+        >>> sorted(loop_settings(scenario).control)[:2]
+        ['', 'reject_load']
+    """
+    problems = {"": scenario.control} | {task.name: task.control for task in scenario.tasks}
+    safe = scenario.safe_input
+    return LoopSettings(
+        {name: problem for name, problem in problems.items() if problem is not None},
+        scenario.sensor_sigma,
+        scenario.first_sigma,
+        dict(process_noise or {}),
+        dict(scenario.causes),
+        None if safe is None else tuple(numbers(safe, "safe_input").tolist()),
+        tuple(task.name for task in scenario.tasks),
+    )
+
+
 @dataclass(frozen=True)
 class Description:
     """What ``model.json`` holds beside its schema version and its hash.
@@ -179,51 +217,189 @@ class Description:
     Args:
         models: Names of the models, whose programs ``programs.json`` holds.
         programs_sha256: Hash of ``programs.json``: a pair that does not belong together is refused.
-        dt_s: Model period [s].
-        states: Signals of x.
-        inputs: Signals of u.
-        outputs: Signals of y.
-        disturbances: Signals of w.
-        nominal_w: What is taken for w where none is given.
-        parameters: The prior's parameters with their fitted values, in the order of p.
-        covariance: Rows of the covariance of the fitted values; empty: unknown.
-        balances: Names and units of the balances.
-        input_delay_s: Time [s] from a command to the input that the programs take.
-        time_unit_s: The machine's second [s], see :attr:`HybridModel.time_unit`.
+        model: Period, signals, parameters and balances of the models.
         calibration: Calibration of the energy monitor, or None.
         provenance: What the models were made from.
         loop: Control problems, noise and what else loops need. Default: nothing.
 
     Raises:
-        InputError: If a number or the models' names cannot be.
+        InputError: If there are no models, too many, or two of one name.
     """
 
     models: tuple[str, ...]
     programs_sha256: str
-    dt_s: float
-    states: tuple[Signal, ...]
-    inputs: tuple[Signal, ...]
-    outputs: tuple[Signal, ...]
-    disturbances: tuple[Signal, ...]
-    nominal_w: tuple[float, ...]
-    parameters: tuple[Parameter, ...]
-    covariance: tuple[tuple[float, ...], ...]
-    balances: tuple[BalanceInfo, ...]
-    input_delay_s: float
-    time_unit_s: float
+    model: ModelInfo
     calibration: Calibration | None
     provenance: Provenance
     loop: LoopSettings = field(default_factory=LoopSettings)
 
     def __post_init__(self) -> None:
-        if not 0 < self.dt_s < math.inf:
-            raise InputError(f"dt_s: a positive number of seconds is needed, got {self.dt_s}")
-        if not 0 < self.time_unit_s < math.inf:
-            raise InputError(f"time_unit_s: a positive number of seconds is needed, got {self.time_unit_s}")
-        if not 0 <= self.input_delay_s < math.inf:
-            raise InputError(f"input_delay_s: a number of seconds is needed, got {self.input_delay_s}")
         if not 0 < len(set(self.models)) == len(self.models) <= MOST_MODELS:
             raise InputError(f"models: 1 to {MOST_MODELS} different names are needed, got {len(self.models)}")
+
+
+def save_artifact(
+    folder: Path,
+    programs: Mapping[str, Mapping[str, nn_export.Program]],
+    info: ModelInfo,
+    *,
+    calibration: Calibration | None = None,
+    provenance: Provenance | None = None,
+    loop: LoopSettings | None = None,
+) -> None:
+    """Write models to ``folder``; ``model.json`` comes last.
+
+    Args:
+        folder: Made if missing.
+        programs: Program of each function of each model, e.g. ``programs["hybrid"]["step"]``, and of each of its
+            balances, ``programs["hybrid"]["balance/energy"]``.
+        info: Period and signals, the same for all models.
+        calibration: Calibration of the monitor.
+        provenance: What the models were made from.
+        loop: What loops need beside the models.
+
+    Raises:
+        InputError: If an expression of a control problem cannot be stated as a program.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    flat = {f"{model}/{name}": p for model, functions in programs.items() for name, p in functions.items()}
+    nn_export.save_programs(folder, flat)
+    digest, origin = sha256(folder / PROGRAMS), provenance or Provenance()
+    write_description(
+        folder, Description(tuple(programs), digest, info, calibration, origin, loop or LoopSettings())
+    )
+
+
+def set_calibration(folder: Path, calibration: Calibration) -> None:
+    """Put the monitor's calibration into an artifact.
+
+    Raises:
+        InputError: If the folder holds no artifact.
+        StorageError: If it cannot be written.
+    """
+    write_description(folder, replace(read_description(folder), calibration=calibration))
+
+
+def set_process_noise(folder: Path, noise: Mapping[str, ArrayLike]) -> None:
+    """Put the process noise of the estimators into an artifact.
+
+    Args:
+        folder: The artifact.
+        noise: Standard deviations per period ``(n_x,)``, see :class:`LoopSettings`.
+
+    Raises:
+        InputError: If the folder holds no artifact.
+        StorageError: If it cannot be written.
+    """
+    found = read_description(folder)
+    write_description(folder, replace(found, loop=replace(found.loop, process_noise=_tuples(noise))))
+
+
+def _tuples(noise: Mapping[str, ArrayLike]) -> dict[str, tuple[float, ...]]:
+    return {name: tuple(np.asarray(sigma, dtype=float).tolist()) for name, sigma in noise.items()}
+
+
+def write_description(folder: Path, description: Description) -> None:
+    """Write ``model.json`` with the hash of its content.
+
+    Raises:
+        StorageError: If it cannot be written.
+    """
+    write_document(folder / FILE, {"schema_version": SCHEMA_VERSION, **plain(description)})
+
+
+def read_description(folder: Path) -> Description:
+    """What an artifact says of itself, checked.
+
+    Raises:
+        InputError: If it is missing, damaged, changed by hand, or of another schema.
+    """
+    path = folder / FILE
+    if read_object(path).get("schema_version") != SCHEMA_VERSION:
+        raise InputError(
+            f"{path} is no artifact of schema version {SCHEMA_VERSION} (field schema_version): this version of "
+            "hybrid-mpc reads no other; train it anew"
+        )
+    document = read_document(path, "take the folder from its run again, or train it anew")
+    del document["schema_version"]
+    return record(Description, document, str(path))
+
+
+def artifact_folder(folder: Path) -> Path:
+    """The artifact's folder, given it or the folder of a run that holds it as ``model``.
+
+    Raises:
+        InputError: If neither holds one.
+
+    Example:
+        >>> artifact_folder(Path("nowhere"))
+        Traceback (most recent call last):
+        hybrid_mpc.errors.InputError: nowhere does not exist; needed is an artifact folder, such as model/ of a ...
+    """
+    for place in (folder, folder / "model"):
+        if (place / FILE).is_file():
+            return place
+    state = "holds no model.json" if folder.is_dir() else "is a file" if folder.exists() else "does not exist"
+    raise InputError(
+        f"{folder} {state}; needed is an artifact folder, such as model/ of a finished run, or the run's own folder"
+    )
+
+
+def build_model(name: str, programs: Mapping[str, nn_export.Program], info: ModelInfo) -> HybridModel:
+    """The model of ``programs["<name>/step"]`` and its siblings, with the input's delay.
+
+    Args:
+        name: Name of the model.
+        programs: Programs of all models, by ``<model>/<function>``.
+        info: Period, signals, parameters and balances.
+
+    Raises:
+        KeyError: If a program is missing.
+        nn_export.ExportError: If a program cannot be built.
+        InputError: If it does not fit the signals.
+    """
+    step, xdot, output = (nn_export.build(programs[f"{name}/{f}"], f) for f in FUNCTIONS)
+    balances = tuple(
+        Balance(b.name, b.unit, b.rate_unit, nn_export.build(programs[f"{name}/{b.program}"], BALANCE))
+        for b in info.balances
+    )
+    program = programs[f"{name}/step"]
+    model = HybridModel(
+        name, info.dt, info.states, info.inputs, info.outputs, step, xdot, output,
+        with_jacobian=nn_export.with_jacobian(program, JACOBIANS),
+        side_by_side=partial(nn_export.SideBySide, program),
+        disturbances=info.disturbances, nominal_w=info.nominal_w, parameters=info.parameters,
+        covariance=info.covariance, balances=balances, time_unit=info.time_unit,
+    )  # fmt: skip
+    return with_input_delay(model, info.input_delay) if info.input_delay else model
+
+
+def load(folder: str | Path) -> Kit:
+    """The kit of an artifact: models, and all that loops on them need.
+
+    Args:
+        folder: The run's folder, or its ``model``.
+
+    Raises:
+        InputError: If there is none, or a file is missing, damaged, of another schema, or does not fit the others.
+
+    Example:
+        ``kit = hm.load("runs/mine")``
+    """
+    folder = artifact_folder(Path(folder))
+    found = read_description(folder)
+    if sha256(folder / PROGRAMS) != found.programs_sha256:
+        raise InputError(
+            f"{folder}: {PROGRAMS} is not the one that {FILE} was saved with; take the folder from its run again"
+        )
+    try:
+        programs = nn_export.load_programs(folder)
+        models = {name: build_model(name, programs, found.model) for name in found.models}
+    except KeyError as error:
+        raise InputError(f"{folder}: {PROGRAMS} lacks {error}, which {FILE} names") from error
+    except nn_export.ExportError as error:
+        raise InputError(f"{folder}: {error}") from error
+    return Kit(models, found.calibration, found.provenance, found.model.input_delay, found.loop)
 
 
 @dataclass(frozen=True)
@@ -281,20 +457,37 @@ class Kit:
 
     @property
     def rest_speed(self) -> tuple[float, ...] | None:
-        """Speeds ``(n_q,)`` below which friction may stick, as recordings tell; None if they do not tell."""
+        """Speeds ``(n_q,)`` below which friction may stick, learned from recordings; None: unknown."""
         return None if self.calibration is None else self.calibration.rest_speed
 
-    def detector(self) -> Detector:
-        """The detector that the guard listens to.
+    def with_noise(self, noise: Mapping[str, ArrayLike]) -> Kit:
+        """The kit with other process noise, by estimator (see :meth:`noise`)."""
+        return replace(self, loop=replace(self.loop, process_noise=_tuples(noise)))
+
+    def on(self, scenario: Scenario) -> Kit:
+        """The kit with the control problems, tasks, sensors and causes that a scenario states now.
+
+        Args:
+            scenario: The machine.
+        """
+        return replace(self, loop=loop_settings(scenario, self.loop.process_noise))
+
+    def problem(self, task: str = "") -> OCP:
+        """The control problem of a task.
+
+        Args:
+            task: Its name; a task without a problem of its own has the common one. Default: the common one.
 
         Raises:
-            InputError: If the folder holds none.
+            InputError: If there is no such task, or no control problem.
         """
-        found = None if self.calibration is None else self.calibration.detector
+        if task:
+            known(task, sorted({*self.loop.tasks, *self.loop.control} - {""}), "task")
+        found = self.loop.control.get(task, self.control)
         if found is None:
             raise InputError(
-                f"{self._whose} holds no detector for the guard: an earlier version made it, or its run had too little "
-                "nominal data (its report says why); run the main job again"
+                f"{self._whose} was saved without a control problem: define one in the scenario (control=OCP(...)) "
+                "and run it again"
             )
         return found
 
@@ -317,64 +510,43 @@ class Kit:
             raise InputError(f"the model's process noise of {estimator} must be {n_x} numbers; train it anew")
         return sigma
 
-    def with_noise(self, noise: Mapping[str, ArrayLike]) -> Kit:
-        """The kit with other process noise.
-
-        Args:
-            noise: By estimator, see :meth:`noise`.
-        """
-        return replace(self, loop=replace(self.loop, process_noise=_tuples(noise)))
-
-    def on(self, scenario: Scenario) -> Kit:
-        """The kit with a scenario's control problems, sensors and causes, as the scenario now states them.
-
-        Args:
-            scenario: The machine.
-        """
-        return replace(self, loop=loop_settings(scenario, self.loop.process_noise))
-
-    def problem(self, task: str = "") -> OCP:
-        """The control problem of a task.
-
-        Args:
-            task: Its name; without a problem of its own it has the common one. Default: the common one.
+    def detector(self) -> Detector:
+        """The detector that the guard listens to.
 
         Raises:
             InputError: If the folder holds none.
         """
-        found = self.loop.control.get(task, self.control)
+        found = None if self.calibration is None else self.calibration.detector
         if found is None:
             raise InputError(
-                f"{self._whose} was saved without a control problem: define one in the scenario (control=OCP(...)) "
-                "and run it again"
+                f"{self._whose} holds no detector for the guard: its run had too little nominal data, or did not come "
+                "to the stage guard (its report says why); run the main job again"
             )
         return found
 
-    def observer(
-        self, model: str = "hybrid", *, task: str = "", load: bool = True
-    ) -> ExtendedKalmanFilter | SwitchingFilter:
+    def observer(self, model: str = "hybrid", *, task: str = "", load: bool = True) -> Filter:
         """The estimator of a model's state, hidden state and, with ``load``, an unknown load at its inputs.
 
         Args:
             model: Name of the model. Default: the hybrid.
-            task: Whose control problem tells what a large load is. Default: the common one.
+            task: Whose control problem says how large a load may be. Default: the common one.
             load: Whether it follows a load: without, a steady one leaves an offset. Default: yes.
 
         Raises:
-            InputError: If there is no such model, no control problem, or no noise for this estimator.
+            InputError: If there is no such model or task, no control problem, or no noise for this estimator.
 
         Example:
             ``hm.load("runs/mine").observer()``
         """
         from hybrid_mpc.kit.assembly import make_estimator
 
-        held, key = self._model(model), f"{model}_observer" if load else model
-        return make_estimator(held, self, self.noise(key), self.problem(task), observer=load)
+        found, noise = self._model(model), self.noise(f"{model}_observer" if load else model)
+        return make_estimator(found, self, noise, self.problem(task), observer=load)
 
     def controller(
         self, model: str = "hybrid", *, task: str = "", solver: str = "rti", iterations: int = 1
     ) -> SafeController:
-        """The MPC of a model with its safeguards, which stand on the prior.
+        """The MPC of a model; its safeguards use the prior.
 
         Args:
             model: Name of the model that plans. Default: the hybrid.
@@ -383,7 +555,7 @@ class Kit:
             iterations: Linearizations a period of ``rti``. Default: one.
 
         Raises:
-            InputError: If there is no such model or solver, or no control problem.
+            InputError: If there is no such model, task or solver, or no control problem.
 
         Example:
             ``hm.load("runs/mine").controller()``
@@ -391,13 +563,9 @@ class Kit:
         from hybrid_mpc.kit.assembly import make_controller
 
         return make_controller(
-            self._model(model),
-            self._model("prior"),
-            self.problem(task),
-            solver=solver,
-            iterations=iterations,
+            self._model(model), self._model("prior"), self.problem(task), solver=solver, iterations=iterations,
             safe_input=self.safe_input,
-        )
+        )  # fmt: skip
 
     def monitor(
         self, model: str = "hybrid", *, kind: str = "", task: str = "", diagnose: bool = False
@@ -405,59 +573,57 @@ class Kit:
         """The energy monitor with what the run has learned.
 
         Args:
-            model: Name of the model that is held against the machine. Default: the hybrid.
+            model: Name of the model that is compared with the machine. Default: the hybrid.
             kind: ``"guard"``: alarms by the detector, and finds frozen sensors; ``"energy"``: alarms by thresholds, if
                 there are any; ``"own"``: records levels; ``"readings"``: what a detector reads, without one. Default:
                 the detector, else thresholds.
-            task: Whose control problem tells the inputs' ranges. Default: the common one.
+            task: Whose control problem gives the inputs' ranges. Default: the common one.
             diagnose: Whether it remembers what a diagnosis of its alarms needs. Default: no.
 
         Raises:
-            InputError: If there is no such model or kind, or no detector where one is asked for.
+            InputError: If there is no such model, task or kind, or no detector where one is asked for.
 
         Example:
             ``hm.load("runs/mine").monitor()``
         """
-        from hybrid_mpc.kit.assembly import freezing, make_monitor
+        from hybrid_mpc.kit.assembly import make_monitor, sensor_steps
         from hybrid_mpc.monitor.learn import guard_monitor
 
-        held, found = self._model(model), self.calibration
-        detects = found is not None and found.detector is not None and self.control is not None
+        watched, learned = self._model(model), self.calibration
+        detects = learned is not None and learned.detector is not None and self.control is not None
         kind = known(kind or ("guard" if detects else "energy"), WATCHES, "kind of monitor")
         if kind == "energy":
-            return make_monitor(held, found)
+            return make_monitor(watched, learned)
         if kind == "own":
-            return make_monitor(held, None, rest_speed=self.rest_speed)
+            return make_monitor(watched, None, rest_speed=self.rest_speed)
         if kind == "readings":
-            return guard_monitor(held, rest_speed=self.rest_speed)
-        ranges = freezing(self, self.problem(task))
-        return guard_monitor(held, self.detector(), **ranges, diagnose=diagnose and held.n_p > 0)
+            return guard_monitor(watched, rest_speed=self.rest_speed)
+        return guard_monitor(
+            watched, self.detector(), resolution=sensor_steps(self.sensor_sigma),
+            input_range=self.problem(task).input_range, diagnose=diagnose and watched.n_p > 0,
+        )  # fmt: skip
 
     def guard(self, *, adapt: bool = False, task: str = "") -> Guard:
         """What a loop does on alarms: no input while the sensor is frozen; the rest is recorded, or adapted to.
 
         Args:
-            adapt: Whether a backup takes over that estimates what has become of the prior's parameters, once an alarm
-                has lasted. Default: no.
+            adapt: Whether a backup that estimates the prior's changed parameters takes over once an alarm has lasted.
+                Default: no.
             task: Whose control problem the backup solves. Default: the common one.
 
         Raises:
-            InputError: If a backup is asked for and its model, noise or causes are missing.
+            InputError: If a backup is asked for and its model, noise, causes or task are missing.
 
         Example:
             ``simulate(..., monitor=kit.monitor(), guard=kit.guard())``
         """
         from hybrid_mpc.kit.assembly import make_adaptive_guard, make_resting_guard
 
+        hybrid = self._model("hybrid")
         if not adapt:
-            return make_resting_guard(self._model("hybrid"))
-        return make_adaptive_guard(
-            self._model("hybrid"),
-            self._model("prior"),
-            self,
-            self.noise("hybrid_observer"),
-            self.problem(task),
-        )
+            return make_resting_guard(hybrid)
+        noise, problem = self.noise("hybrid_observer"), self.problem(task)
+        return make_adaptive_guard(hybrid, self._model("prior"), self, noise, problem)
 
     @property
     def _whose(self) -> str:
@@ -465,193 +631,3 @@ class Kit:
 
     def _model(self, name: str) -> HybridModel:
         return self.models[known(name, self.models, "model")]
-
-
-def save_artifact(
-    folder: Path,
-    programs: Mapping[str, Mapping[str, nn_export.Program]],
-    info: ModelInfo,
-    *,
-    calibration: Calibration | None = None,
-    provenance: Provenance | None = None,
-    loop: LoopSettings | None = None,
-) -> None:
-    """Write models to ``folder``: ``programs.json``, ``weights.safetensors`` and, last, ``model.json``.
-
-    Args:
-        folder: Made if missing.
-        programs: Program of each function of each model, e.g. ``programs["hybrid"]["step"]``, and of each of its
-            balances, ``programs["hybrid"]["balance/energy"]``.
-        info: Period and signals, the same for all models.
-        calibration: Calibration of the monitor.
-        provenance: What the models were made from.
-        loop: What loops need beside the models.
-
-    Raises:
-        InputError: If an expression of a control problem cannot be stated as a program.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    flat = {f"{model}/{name}": p for model, functions in programs.items() for name, p in functions.items()}
-    nn_export.save_programs(folder, flat)
-    write_description(
-        folder,
-        Description(
-            tuple(programs), sha256(folder / "programs.json"), info.dt, info.states, info.inputs, info.outputs,
-            info.disturbances, info.nominal_w, info.parameters, info.covariance, info.balances, info.input_delay,
-            info.time_unit, calibration, provenance or Provenance(), loop or LoopSettings(),
-        ),
-    )  # fmt: skip
-
-
-def loop_settings(
-    scenario: Scenario, process_noise: Mapping[str, tuple[float, ...]] | None = None
-) -> LoopSettings:
-    """What a scenario's loops need beside the models.
-
-    Args:
-        scenario: The machine.
-        process_noise: By estimator. Default: none; it is estimated later.
-
-    Example:
-        >>> from scenarios.golf_robot import scenario
-        >>> sorted(loop_settings(scenario).control)[:2]
-        ['', 'reject_load']
-    """
-    problems = {"": scenario.control} | {task.name: task.control for task in scenario.tasks}
-    given = {name: problem for name, problem in problems.items() if problem is not None}
-    safe = None if scenario.safe_input is None else tuple(numbers(scenario.safe_input, "safe_input").tolist())
-    return LoopSettings(
-        given,
-        scenario.sensor_sigma,
-        scenario.first_sigma,
-        dict(process_noise or {}),
-        dict(scenario.causes),
-        safe,
-    )
-
-
-def set_calibration(folder: Path, calibration: Calibration) -> None:
-    """Put the monitor's calibration into an artifact.
-
-    Raises:
-        InputError: If the folder holds none, or cannot be written.
-    """
-    write_description(folder, replace(read_description(folder), calibration=calibration))
-
-
-def set_process_noise(folder: Path, noise: Mapping[str, ArrayLike]) -> None:
-    """Put the process noise of the estimators into an artifact.
-
-    Args:
-        folder: The artifact.
-        noise: Standard deviations per period ``(n_x,)``, see :class:`LoopSettings`.
-
-    Raises:
-        InputError: If the folder holds none, or cannot be written.
-    """
-    description = read_description(folder)
-    write_description(
-        folder, replace(description, loop=replace(description.loop, process_noise=_tuples(noise)))
-    )
-
-
-def _tuples(noise: Mapping[str, ArrayLike]) -> dict[str, tuple[float, ...]]:
-    return {name: tuple(np.asarray(sigma, dtype=float).tolist()) for name, sigma in noise.items()}
-
-
-def write_description(folder: Path, description: Description) -> None:
-    """Write ``model.json`` with the hash of its content.
-
-    Raises:
-        StorageError: If it cannot be written.
-    """
-    write_document(folder / FILE, {"schema_version": SCHEMA_VERSION, **plain(description)})
-
-
-def artifact_folder(folder: Path) -> Path:
-    """The artifact's folder, given it or the folder of a run that holds it as ``model``.
-
-    Raises:
-        InputError: If neither holds one.
-
-    Example:
-        >>> artifact_folder(Path("nowhere"))
-        Traceback (most recent call last):
-        hybrid_mpc.errors.InputError: nowhere does not exist; needed is an artifact folder, such as model/ of a ...
-    """
-    for place in (folder, folder / "model"):
-        if (place / FILE).is_file():
-            return place
-    state = "holds no model.json" if folder.is_dir() else "is a file" if folder.exists() else "does not exist"
-    raise InputError(
-        f"{folder} {state}; needed is an artifact folder, such as model/ of a finished run, or the run's own folder"
-    )
-
-
-def read_description(folder: Path) -> Description:
-    """What an artifact says of itself, checked.
-
-    Raises:
-        InputError: If it is missing, damaged, changed by hand, or of another schema.
-    """
-    path = folder / FILE
-    if read_object(path).get("schema_version") != SCHEMA_VERSION:
-        raise InputError(
-            f"{path} is no artifact of schema version {SCHEMA_VERSION} (field schema_version): this version of "
-            "hybrid-mpc reads no other; train it anew"
-        )
-    document = read_document(path, "take the folder from its run again, or train it anew")
-    del document["schema_version"]
-    return record(Description, document, str(path))
-
-
-def load(folder: str | Path) -> Kit:
-    """What a run has left for controllers: models, and all that loops on them need.
-
-    Nothing in the folder is executed: models are operators and numbers, built as CasADi functions.
-
-    Args:
-        folder: The run's folder, or its ``model``.
-
-    Raises:
-        InputError: If there is none, or a file is missing, damaged, of another schema, or does not fit the others.
-
-    Example:
-        ``kit = hm.load("runs/mine")``
-    """
-    folder = artifact_folder(Path(folder))
-    d = read_description(folder)
-    info = ModelInfo(
-        d.dt_s, d.states, d.inputs, d.outputs, d.parameters, d.input_delay_s, d.time_unit_s, d.disturbances,
-        d.nominal_w, d.covariance, d.balances,
-    )  # fmt: skip
-    if sha256(folder / "programs.json") != d.programs_sha256:
-        raise InputError(
-            f"{folder}: programs.json is not the one that {FILE} was saved with; take the folder from its run again"
-        )
-    try:
-        programs = nn_export.load_programs(folder)
-        models = {name: build_model(name, programs, info) for name in d.models}
-    except KeyError as error:
-        raise InputError(f"{folder}: programs.json lacks {error}, which {FILE} names") from error
-    except nn_export.ExportError as error:
-        raise InputError(f"{folder}: {error}") from error
-    return Kit(models, d.calibration, d.provenance, d.input_delay_s, d.loop)
-
-
-def build_model(name: str, programs: Mapping[str, nn_export.Program], info: ModelInfo) -> HybridModel:
-    """The :class:`HybridModel` of ``programs["<name>/step"]`` and its siblings, with the input's delay."""
-    step, xdot, output = (nn_export.build(programs[f"{name}/{f}"], f) for f in FUNCTIONS)
-    balances = tuple(
-        Balance(b.name, b.unit, b.rate_unit, nn_export.build(programs[f"{name}/{b.program}"], BALANCE))
-        for b in info.balances
-    )
-    program = programs[f"{name}/step"]
-    model = HybridModel(
-        name, info.dt, info.states, info.inputs, info.outputs, step, xdot, output,
-        with_jacobian=nn_export.with_jacobian(program, JACOBIANS),
-        side_by_side=partial(nn_export.SideBySide, program),
-        disturbances=info.disturbances, nominal_w=info.nominal_w, parameters=info.parameters,
-        covariance=info.covariance, balances=balances, time_unit=info.time_unit,
-    )  # fmt: skip
-    return with_input_delay(model, info.input_delay) if info.input_delay else model

@@ -1,9 +1,9 @@
-"""Assembly: estimator, controller, monitor and guard from models, noise and a control problem. No torch in here."""
+"""Assembly: estimator, controller, monitor and guard from models, noise and a control problem."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,7 +17,7 @@ from hybrid_mpc.control.sqp import SQPController
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimator, ExtendedKalmanFilter
 from hybrid_mpc.estimate.parameters import parameter_filter, with_parameter_states
-from hybrid_mpc.estimate.switching import SLIP, SWITCHES, SwitchingFilter
+from hybrid_mpc.estimate.switching import SLIP, SWITCHES, Filter, SwitchingFilter
 from hybrid_mpc.estimate.tuning import most_likely
 from hybrid_mpc.loop.guard import Guard, Mode
 from hybrid_mpc.model.model import HybridModel
@@ -30,46 +30,44 @@ if TYPE_CHECKING:
     from hybrid_mpc.data.trajectories import Trajectory
 
 Array = NDArray[np.float64]
-QUIET_SHARE = 0.0003
-JUMP_SHARE = 0.05
-"""Step of the estimated input disturbance per period, as a share of the input's range: while nothing happens (drift,
-temperature), and when a load comes or goes. A load of a twentieth of what the drive can do is an ordinary one;
-a larger one takes a few periods."""
 MODES = ("quiet", "slip", "jump")
-"""Of its observer, in the order of :data:`~hybrid_mpc.estimate.switching.SWITCHES`."""
+"""Modes of the observer, in the order of :data:`~hybrid_mpc.estimate.switching.SWITCHES`."""
+QUIET_SHARE = 0.0003
+"""Step of the estimated load per period while nothing happens (drift, temperature), as a share of the input's range."""
+JUMP_SHARE = 0.05
+"""The same when a load comes or goes. A load of a twentieth of what the drive can do is ordinary; for a larger one
+the filter needs a few periods."""
 FIRST_LOAD = 0.001
-"""Deviation of the first disturbance, as a share of the input's range. Small: a machine that sticks at rest shows
-nothing of its load, and what an observer makes of it there is wrong when it moves."""
-
+"""Deviation of the first load, as a share of the input's range. Small: a machine that sticks at rest shows nothing of
+its load, and what an observer makes of it there is wrong when it moves."""
 SCALES = (1.0, 3.0)
 """Process noise over the model's one-period errors; the most likely one is taken."""
-TUNED_PERIODS = 500
-TUNED_RECORDINGS = 3
+TUNED_PERIODS, TUNED_RECORDINGS = 500, 3
 """So many periods of so many training recordings decide."""
-
-
 DWELL_S, QUIET_S = 0.5, 1.0
 """A guard's shortest time in a mode, and the time without alarm before it goes back [the machine's seconds]."""
 PATIENCE_S = 0.8
 """[The machine's seconds.] A push of 0.2 s raised alarms for up to 0.7 s, through the monitor's windows and what the
 observer makes of it; a backup that takes it for a heavier machine costs more than it saves (docs/energy-guard.md)."""
 GAIN = "gain of "
+SOLVERS = ("rti", "sqp", "ipopt")
+"""The condensed real-time iteration; sequential quadratic programs to convergence; the same by IPOPT."""
 
 
-class Machine(Protocol):
-    """What estimators and guards assume of a machine: a scenario, or a loaded artifact."""
+class LoopAssumptions(Protocol):
+    """What estimators and guards assume of a machine: a scenario states it, a kit has it from its folder."""
 
     @property
     def name(self) -> str:
-        """Its name."""
+        """Name of the machine."""
 
     @property
     def sensor_sigma(self) -> tuple[float, ...]:
-        """Standard deviations of the sensors ``(n_y,)``."""
+        """Standard deviations of the sensors ``(n_y,)`` [output units]."""
 
     @property
     def first_sigma(self) -> tuple[float, ...] | None:
-        """Those of what is not measured at an estimator's start; None: by the sensors'."""
+        """Standard deviations of what is not measured at an estimator's start; None: by the sensors'."""
 
     @property
     def control(self) -> OCP | None:
@@ -77,22 +75,27 @@ class Machine(Protocol):
 
     @property
     def safe_input(self) -> tuple[float, ...] | None:
-        """What it is left with where nothing is known ``(n_u,)``; None: zero, or the limit next to it."""
+        """Input ``(n_u,)`` where nothing is known; None: zero, or the limit next to it."""
 
     @property
     def causes(self) -> Mapping[str, tuple[str, ...]]:
-        """What may break, by name."""
+        """What may break, by name: the parameters that change together then."""
 
 
 def tuned_noise(
-    model: HybridModel, scenario: Machine, base: Array, recordings: Sequence[Trajectory], *, observer: bool
+    model: HybridModel,
+    scenario: LoopAssumptions,
+    base: Array,
+    recordings: Sequence[Trajectory],
+    *,
+    observer: bool,
 ) -> Array:
-    """Process noise ``(n_x,)``: ``base`` times the scale under which undisturbed recordings are most likely.
+    """Process noise ``(n_x,)`` per period: ``base`` times the scale that makes undisturbed recordings most likely.
 
     Args:
         model: The model to estimate with.
-        scenario: Sensor noise, and the control problem's input range.
-        base: Its one-period errors, see :func:`~hybrid_mpc.estimate.tuning.process_noise`.
+        scenario: The machine: sensor noise, and the control problem's input range.
+        base: The model's one-period errors ``(n_x,)``, see :func:`~hybrid_mpc.estimate.tuning.process_noise`.
         recordings: Training recordings.
         observer: Whether the estimator follows an unknown load.
 
@@ -111,22 +114,22 @@ def tuned_noise(
 
 def make_estimator(
     model: HybridModel,
-    scenario: Machine,
+    scenario: LoopAssumptions,
     sigma_x: Array,
     control: OCP | None = None,
     *,
     observer: bool = True,
-) -> ExtendedKalmanFilter | SwitchingFilter:
-    """The estimator that all controllers share, tuned by the model's own one-period errors.
+) -> Filter:
+    """The estimator that all controllers share.
 
-    With observer it switches between three filters (``MODES``): one filter that is quick enough for a push lets
+    With observer it switches between three filters (:data:`MODES`): one filter that is quick enough for a push lets
     the encoder's steps through at all times, and one that is quiet takes a push for noise.
 
     Args:
         model: The model to estimate with.
-        scenario: The machine, whose sensors' noise it assumes.
+        scenario: The machine, a scenario or a kit: its sensors' noise.
         sigma_x: Process noise ``(n_x,)`` per period, see :func:`~hybrid_mpc.estimate.tuning.process_noise`.
-        control: The control problem, by whose ``input_range`` a load is small or large. Default: the scenario's.
+        control: The control problem; its ``input_range`` says what a large load is. Default: the scenario's.
         observer: Whether it estimates an unknown load at the input. Default: yes.
 
     Raises:
@@ -158,12 +161,12 @@ def make_estimator(
     return SwitchingFilter(modes, SWITCHES)
 
 
-def first_deviations(model: HybridModel, scenario: Machine) -> Array:
-    """Standard deviations ``(n_x,)`` of the state at the estimator's start: at rest where the sensors say.
+def first_deviations(model: HybridModel, scenario: LoopAssumptions) -> Array:
+    """Standard deviations ``(n_x,)`` of the state at the estimator's start, at rest where the sensors say.
 
     Args:
         model: The model.
-        scenario: Sensor noise, and how uncertain is at first what is not measured.
+        scenario: The machine: its ``sensor_sigma`` and ``first_sigma``.
 
     Raises:
         InputError: If ``sensor_sigma`` or ``first_sigma`` does not fit the model.
@@ -185,10 +188,6 @@ def first_deviations(model: HybridModel, scenario: Machine) -> Array:
     return np.array([*sigma, *others], dtype=np.float64)
 
 
-SOLVERS = ("rti", "sqp", "ipopt")
-"""The condensed real-time iteration; sequential quadratic programs to convergence; the same by IPOPT."""
-
-
 def make_controller(
     model: HybridModel,
     prior: HybridModel,
@@ -198,10 +197,9 @@ def make_controller(
     iterations: int = 1,
     safe_input: ArrayLike | None = None,
 ) -> SafeController:
-    """A model's controller behind the safeguards that stand on the prior.
+    """A model's controller with its safeguards, which use the prior.
 
-    The first plan of ``rti``, made before the loop starts, is converged, from every start that the control problem
-    names.
+    The first plan of ``rti`` is made before the loop starts: it is converged, from every start of the control problem.
 
     Args:
         model: The model to plan with.
@@ -209,7 +207,7 @@ def make_controller(
         control: The control problem.
         solver: Name in :data:`SOLVERS`.
         iterations: Linearizations a period of ``rti``. Default: one.
-        safe_input: What the machine is left with where nothing is known. Default: zero, or the limit next to it.
+        safe_input: Input ``(n_u,)`` where nothing is known. Default: zero, or the limit next to it.
 
     Raises:
         InputError: If there is no such solver.
@@ -227,13 +225,13 @@ def make_controller(
 
 
 def first_controller(model: HybridModel, ocp: OCP) -> SQPController | BestOf:
-    """What makes the first plan: SQP, from each of the problem's starts where it names some."""
+    """What makes the first plan: SQP, from each of the problem's starts if there are any."""
     sqp = SQPController(model, ocp)
     return BestOf(sqp, starts=ocp.starts) if ocp.starts else sqp
 
 
 def make_ocp(prior: HybridModel, control: OCP) -> OCP:
-    """The problem with a working point: terminal weight (and the fallback) are linearized in motion if it names none.
+    """The problem with a working point, at which terminal weight and fallback are linearized: in motion if it has none.
 
     At rest the slope of dry friction would pass for strong damping.
 
@@ -248,11 +246,11 @@ def make_ocp(prior: HybridModel, control: OCP) -> OCP:
 
 
 def working_point(model: HybridModel, control: OCP) -> tuple[Array, Array]:
-    """``(x, u)`` that the problem names, else in motion at the position zero: speeds of ``1 / sqrt(q)``, no input.
+    """Working point of the problem, ``(x, u)``, else in motion at the position zero: speeds ``1 / sqrt(q)``, no input.
 
     Args:
-        model: The model, state ``[q, v]`` if the problem names no point.
-        control: The control problem; a speed without weight is what crosses the position's own acceptable deviation
+        model: The model; its state is ``[q, v]`` where the problem has no working point.
+        control: The control problem. A speed without weight is the one that crosses the position's acceptable deviation
             ``1 / sqrt(q)`` within the horizon.
 
     Example:
@@ -272,10 +270,10 @@ def working_point(model: HybridModel, control: OCP) -> tuple[Array, Array]:
 def make_monitor(
     model: HybridModel, calibration: Calibration | None, *, rest_speed: ArrayLike | None = None
 ) -> EnergyMonitor:
-    """The energy monitor with its default window: about 0.3 s (the machine's) for the derivative and for the level.
+    """The energy monitor with its default window: about 0.3 of the machine's seconds for derivative and level.
 
     Args:
-        model: The model that is held against the machine.
+        model: The model that is compared with the machine.
         calibration: Its thresholds; None: its levels raise no alarm.
         rest_speed: Speeds ``(n_q,)`` below which friction may stick. Default: the calibration's.
 
@@ -292,12 +290,12 @@ def make_monitor(
 
 
 def sensor_steps(sensor_sigma: Sequence[float]) -> tuple[float, ...]:
-    """Steps of the sensors, at most: what an even error within a step makes the deviation that filters assume.
+    """Largest steps ``(n_y,)`` of the sensors: an error spread evenly over such a step has the deviation given.
 
-    A real one may be finer; then a frozen sensor is found a little later.
+    A real step may be finer; then a frozen sensor is found a little later.
 
     Args:
-        sensor_sigma: Standard deviations of the sensors, as a scenario's.
+        sensor_sigma: Standard deviations of the sensors ``(n_y,)``.
 
     Example:
         >>> [round(step, 6) for step in sensor_steps((0.001,))]
@@ -306,27 +304,11 @@ def sensor_steps(sensor_sigma: Sequence[float]) -> tuple[float, ...]:
     return tuple(float(np.sqrt(12.0) * sigma) for sigma in sensor_sigma)
 
 
-def freezing(scenario: Machine, control: OCP) -> dict[str, Any]:
-    """What a monitor's test for a frozen sensor needs to know: steps of the sensors, ranges of the inputs.
-
-    Args:
-        scenario: The machine with its sensors.
-        control: The control problem.
-
-    Example:
-        ``guard_monitor(model, detector, **freezing(scenario, scenario.control))``
-    """
-    return {
-        "resolution": sensor_steps(scenario.sensor_sigma),
-        "input_range": tuple(control.input_range.tolist()),
-    }
-
-
 def make_resting_guard(model: HybridModel) -> Guard:
     """A guard that records where the model does not describe the machine, and rests where the sensor is frozen.
 
     Args:
-        model: The model, whose unit of time its times are in.
+        model: The model; the guard's times count in its ``time_unit``.
 
     Example:
         ``simulate(..., monitor=monitor, guard=make_resting_guard(hybrid))``
@@ -339,7 +321,7 @@ def make_backup_guard(controller: SafeController, estimator: Estimator) -> Guard
     """A guard that hands over to another controller where the model does not describe the machine.
 
     Args:
-        controller: The backup, e.g. that of the fitted prior; its model's unit of time counts.
+        controller: The backup, e.g. that of the fitted prior; times count in its model's ``time_unit``.
         estimator: Its estimator.
 
     Example:
@@ -355,26 +337,25 @@ def make_backup_guard(controller: SafeController, estimator: Estimator) -> Guard
 def make_adaptive_guard(
     model: HybridModel,
     prior: HybridModel,
-    scenario: Machine,
+    scenario: LoopAssumptions,
     sigma_x: Array,
     control: OCP | None = None,
     *,
     patience: float | None = None,
 ) -> Guard:
-    """A guard whose backup estimates what has become of the prior's parameters, and plans with it.
+    """A guard whose backup estimates how the prior's parameters have changed, and plans with that.
 
-    The backup's filter runs all the time, so it has found the change when the guard switches. A frozen sensor takes
-    the input away.
+    The backup's filter runs all the time, so it has found the change when the guard switches. On a frozen sensor the
+    input is the safe one.
 
     Args:
         model: The model that the normal controller plans with; it must know its parameters.
-        prior: The fitted prior, whose parameters change, for terminal weight and fallback.
+        prior: The fitted prior, whose parameters change; terminal weight and fallback are made of it.
         scenario: The machine: its sensors' noise, and as ``causes`` the parameters that change together, by name. Gains
-            of inputs are left out where there are other causes: a weaker motor is a heavier machine, but for its
-            friction.
+            of inputs are left out where there are other causes: but for friction, a weaker motor is a heavier machine.
         sigma_x: Process noise ``(n_x,)`` per period of the model's estimator.
         control: The control problem. Default: the scenario's.
-        patience: Time [s] for which the model must have been in doubt. Default: 0.8 of the machine's seconds.
+        patience: Time [s] that an alarm must have lasted. Default: 0.8 of the machine's seconds.
 
     Raises:
         InputError: If there are no causes or no control problem, the model does not know its parameters, or one of
@@ -407,10 +388,14 @@ def make_adaptive_guard(
 
 
 def adaptable(model: HybridModel, causes: Mapping[str, Sequence[str]]) -> dict[str, tuple[str, ...]]:
-    """Those of the causes that a backup adapts to.
+    """Those of the causes that a backup adapts to: gains of inputs only where there is nothing else.
+
+    Args:
+        model: The model that the backup plans with.
+        causes: Parameters that change together, by name.
 
     Raises:
-        InputError: If there are none, the model does not know its parameters, or its inputs act later.
+        InputError: If there are no causes, the model does not know its parameters, or its inputs act later.
 
     Example:
         ``adaptable(hybrid, {"mass": ("m", "J"), "motor": ("gain of u",)})`` is ``{"mass": ("m", "J")}``.
@@ -430,7 +415,8 @@ def adaptable(model: HybridModel, causes: Mapping[str, Sequence[str]]) -> dict[s
         raise InputError(
             f"a guard that adapts needs a model whose inputs act at once; those of model {model.name} act later"
         )
-    return {name: names for name, names in groups.items() if not _is_gain(names)} or groups
+    others = {name: names for name, names in groups.items() if not _is_gain(names)}
+    return others or groups
 
 
 def _is_gain(names: Sequence[str]) -> bool:

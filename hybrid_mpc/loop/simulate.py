@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from time import perf_counter
 from typing import NamedTuple
 
 from numpy.typing import ArrayLike
@@ -29,7 +28,6 @@ from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.problem import Controller
 from hybrid_mpc.control.safeguard import Decision, SafeController
 from hybrid_mpc.estimate.kalman import Estimate, Estimator
-from hybrid_mpc.estimate.switching import FilterBank, SwitchingFilter, measures_first_states
 from hybrid_mpc.loop.faults import Fault, check_channels, install
 from hybrid_mpc.loop.guard import Guard
 from hybrid_mpc.loop.loop import TIMED, Loop, Monitor, Reading, preview_of
@@ -247,7 +245,7 @@ def simulate(
 
 
 class Simulation:
-    """A plant in a loop, a period at a time: what :func:`simulate` drives, and what drives several side by side.
+    """A plant in a loop, a period at a time: what :func:`simulate` drives.
 
     Args: as :func:`simulate`.
 
@@ -293,58 +291,39 @@ class Simulation:
         self._machine = Machine(self._plant, rest, seed, model.n_y, faults, dt, sensor_delay, input_delay)
         self._late, self._on_step = late, on_step
         self._rows: list[_Row] = []
-        self._x, self.y = rest, np.full(model.n_y, np.nan)
-
-    @property
-    def held(self) -> Array:
-        """Input ``(n_u,)`` that the controller has given for the period before the one in hand."""
-        return self.loop.decision.u
 
     def run(self) -> ClosedLoopResult:
-        """All periods that are left; returns the record."""
+        """All periods; returns the record."""
         while self._k < self.periods:
-            self.measure()
-            self.go_on()
-        return self.result()
+            self._period()
+        return self._result()
 
-    def measure(self) -> Array:
-        """The sample ``(n_y,)`` of the period that begins."""
-        self._x = fitting(self._plant.truth(self._machine.state), self.loop.ocp.n_x, "the plant's truth")
-        self.y = self._machine.measure(self._k * self._dt)
-        return self.y
-
-    def go_on(self, estimating: float = 0.0) -> None:
-        """Decide on the sample, hold the input for a period, and note what happened.
-
-        Args:
-            estimating: Time [s] that was spent on the estimate before, outside the loop. Default: none.
-        """
+    def _period(self) -> None:
+        """Measure, decide, hold the input for a period, and note what happened."""
         loop, machine, t = self.loop, self._machine, self._k * self._dt
-        truth = np.concatenate([self._x, self._plant.hidden(machine.state)])
+        x = fitting(self._plant.truth(machine.state), loop.ocp.n_x, "the plant's truth")
+        y = machine.measure(t)
+        truth = np.concatenate([x, self._plant.hidden(machine.state)])
         in_time = None if self._late is None else partial(_is_in_time, self._late, t)
         if self._k == 0:
-            loop.start(self.y, truth=truth, in_time=in_time)
+            loop.start(y, truth=truth, in_time=in_time)
             machine.rest(loop.state.held[0])
         else:
-            loop.step(self.y, truth=truth, in_time=in_time)
+            loop.step(y, truth=truth, in_time=in_time)
         u, u_prev = machine.command(loop.decision.u)
         loop.finish()
         x_ref, factors = loop.previewed if self._acting is None else self._acting(t)
         now_factors = 1.0 if factors is None else factors[0]
         with np.errstate(over="ignore", invalid="ignore"):  # an absurd reference costs infinitely much
-            stage = float(
-                self._cost.stage_cost(self._x, u, x_ref[0, : self._x.size], u - u_prev, now_factors)
-            )
-        step = Step(self._k, t, self._x, self.y, loop.estimate, loop.decision, loop.reading)
-        spent = {**loop.spent, "estimate": loop.spent["estimate"] + estimating}
-        self._rows.append(_row(step, x_ref[0, : self._x.size].copy(), stage, spent))
+            stage = float(self._cost.stage_cost(x, u, x_ref[0, : x.size], u - u_prev, now_factors))
+        step = Step(self._k, t, x, y, loop.estimate, loop.decision, loop.reading)
+        self._rows.append(_row(step, x_ref[0, : x.size].copy(), stage, loop.spent))
         if self._on_step is not None:
             self._on_step(step)
         machine.advance(t)
         self._k += 1
 
-    def result(self) -> ClosedLoopResult:
-        """The record of the periods until now."""
+    def _result(self) -> ClosedLoopResult:
         rows = self._rows
         readings = [row.reading for row in rows]
         timing = {name: 1e3 * np.array([row.spent[name] for row in rows]) for name in TIMED}
@@ -361,72 +340,6 @@ class Simulation:
             switches=self.loop.switches,
             numbers=np.array([getattr(r, "numbers", ()) for r in readings], dtype=np.float64),
         )
-
-
-def simulate_together(
-    estimator: Estimator, make: Sequence[Callable[[Estimator], Simulation]]
-) -> list[ClosedLoopResult]:
-    """Run simulations of one estimator and length side by side; each is what it is alone, to rounding.
-
-    Switching filters on a model whose outputs are its first states go through each operation together, which is
-    quicker; other estimators take turns. The time of what they do together is shared out evenly.
-
-    Args:
-        estimator: The estimator of all.
-        make: Makes each simulation with the estimator that it is handed.
-
-    Returns:
-        Their records.
-
-    Raises:
-        InputError: If their numbers of periods differ.
-
-    Example: ``simulate_together(ekf, [lambda e, s=s: Simulation(plant, e, mpc, ref, seed=s, ...) for s in range(9)])``
-    """
-    if not (isinstance(estimator, SwitchingFilter) and measures_first_states(estimator.model)):
-        return [run.run() for run in _of_one_length([one(estimator) for one in make])]
-    told = [_Told(estimator.model) for _ in make]
-    runs = _of_one_length([one(each) for one, each in zip(make, told, strict=True)])
-    bank = None
-    for _ in range(runs[0].periods if runs else 0):
-        y, spent = np.array([run.measure() for run in runs]), 0.0
-        if bank is None:
-            bank = FilterBank(estimator, y)
-            estimates = bank.estimates(np.full_like(y, np.nan), np.full(len(y), np.nan))
-        else:
-            begin = perf_counter()
-            estimates = bank.update(y, np.array([run.held for run in runs]))
-            spent = (perf_counter() - begin) / len(runs)
-        for run, each, estimate in zip(runs, told, estimates, strict=True):
-            each.estimate = estimate
-            run.go_on(spent)
-    return [run.result() for run in runs]
-
-
-def _of_one_length(runs: list[Simulation]) -> list[Simulation]:
-    lengths = sorted({run.periods for run in runs})
-    if len(lengths) > 1:
-        raise InputError(
-            f"loops of {', '.join(map(str, lengths))} periods given; side by side they must be of one length: give "
-            "all the same duration, or run them one by one"
-        )
-    return runs
-
-
-class _Told:
-    """An estimator whose estimates come from a bank of filters."""
-
-    def __init__(self, model: HybridModel) -> None:
-        self.model = model
-        self.estimate: Estimate | None = None
-
-    def start(self, y: ArrayLike, t: float = 0.0) -> Estimate:
-        assert self.estimate is not None
-        return self.estimate
-
-    def update(self, estimate: Estimate, y: ArrayLike, u: ArrayLike) -> Estimate:
-        assert self.estimate is not None
-        return self.estimate
 
 
 class _Row(NamedTuple):

@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 
 class BufferedFunction:
-    """A CasADi function whose arguments and results are numpy arrays that stay where they are.
+    """A CasADi function whose arguments and results are numpy arrays that stay the same.
 
     Fill :attr:`inputs`, call, read :attr:`outputs`; the next call overwrites them. Not for several threads
     at once.

@@ -1,4 +1,4 @@
-"""A deployed model whose input acts later: the inputs on their way are part of its hidden state. No torch in here."""
+"""A model whose input acts later: the inputs on their way are delay states, the first entries of ``h``."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from hybrid_mpc.model.model import (
     HybridModel,
     ManyPoints,
     SideBySide,
+    inlined,
     step_function,
     step_symbols,
 )
@@ -24,12 +25,12 @@ Array = NDArray[np.float64]
 TINY = 1e-9
 """Share of a period below which a delay's rest counts as none."""
 MOST_DELAY_STATES = 1000
-"""Inputs that may wait: an estimator can still work with matrices of a thousand rows. It is 10 s of one input at 100
-Hz; a delay for which more would wait is a slip in its unit, or a damaged file."""
+"""Most inputs on their way: an estimator can still work with matrices of a thousand rows. It is 10 s of one input at
+100 Hz; a longer delay is a slip in its unit, or a damaged file."""
 
 
 def with_input_delay(model: HybridModel, delay: float) -> HybridModel:
-    """The model with an input that acts ``delay`` later, any delay: ``h = [waiting inputs, the oldest first; h]``.
+    """The model with an input that acts ``delay`` later, any delay: ``h = [delayed inputs, the oldest first; h]``.
 
     A delay of ``m`` periods and a share ``f`` makes ``(1 - f) u_{k-m} + f u_{k-m-1}`` act in period ``k``, the mean
     over the period: what :func:`hybrid_mpc.identify.delay.delayed` gives the training. Estimator, controller and
@@ -38,10 +39,10 @@ def with_input_delay(model: HybridModel, delay: float) -> HybridModel:
 
     Args:
         model: The model without delay.
-        delay: Of the input [s], positive; at most :data:`MOST_DELAY_STATES` inputs (periods times inputs) may wait.
+        delay: Of the input [s], positive; at most :data:`MOST_DELAY_STATES` delay states (periods times inputs).
 
     Raises:
-        InputError: If the delay is not positive or too long, or the model has inputs that wait already.
+        InputError: If the delay is not positive or too long, or the model has delay states already.
 
     Example:
         >>> from hybrid_mpc.machine.signals import Signal
@@ -58,20 +59,19 @@ def with_input_delay(model: HybridModel, delay: float) -> HybridModel:
     if not periods * model.n_u <= MOST_DELAY_STATES:
         raise InputError(
             f"model {model.name}: an input's delay of {delay:g} s is {periods:.4g} periods of {model.dt:g} s, so that "
-            f"{periods * model.n_u:.4g} inputs would wait, at most {MOST_DELAY_STATES} can; give it in seconds, or "
-            "take a model of a longer period"
+            f"{periods * model.n_u:.4g} delay states would be needed, at most {MOST_DELAY_STATES} can be; give it in "
+            "seconds, or take a model of a longer period"
         )
     if model.delay_states:
-        raise InputError(f"model {model.name} has inputs that wait already; give the one without delay")
+        raise InputError(f"model {model.name} has delay states already; give the one without delay")
     queue = _Queue(periods, model.n_u)
     x, _, u, w, p = step_symbols(model)
     h = ca.MX.sym("h", queue.size + model.n_h)
-    waiting = ca.vertcat(h[: queue.size], u)
-    own, acting, later = h[queue.size :], ca.DM(queue.share) @ waiting, waiting[model.n_u :]
+    inputs = ca.vertcat(h[: queue.size], u)
+    own, acting, later = h[queue.size :], ca.DM(queue.share) @ inputs, inputs[model.n_u :]
     assert model.with_jacobian is not None
-    inline = model.step.is_a("MXFunction"), model.with_jacobian.is_a("MXFunction")
-    x_next, h_next = model.step.call([x, own, acting, w, p], inline[0], False)
-    x_slope, h_slope, a, b = model.with_jacobian.call([x, own, acting, w, p], inline[1], False)
+    x_next, h_next = inlined(model.step, [x, own, acting, w, p])
+    x_slope, h_slope, a, b = inlined(model.with_jacobian, [x, own, acting, w, p])
     point, slopes = [x, h, u, w, p], queue.slopes(model.n_x, a, b)
     return replace(
         model,
@@ -86,7 +86,7 @@ def with_input_delay(model: HybridModel, delay: float) -> HybridModel:
 
 
 class _Queue:
-    """Waiting inputs: how many entries, and how much of each (and of the new input) acts.
+    """Delay states: how many, and the share of each (and of the new input) that acts.
 
     Args:
         periods: Delay in periods.
@@ -126,8 +126,8 @@ def _side_by_side(inner: SideBySide, n_x: int, queue: _Queue) -> SideBySide:
         moved = np.eye(size, size + n_u, n_u)
 
         def evaluate(x: Array, h: Array, u: Array, w: Array, p: Array) -> tuple[Array, ...]:
-            waiting = np.hstack([h[:, :size], u])
-            x_next, h_next, by_x, by_h, by_u = many(x, h[:, size:], waiting @ queue.share.T, w, p)
+            inputs = np.hstack([h[:, :size], u])
+            x_next, h_next, by_x, by_h, by_u = many(x, h[:, size:], inputs @ queue.share.T, w, p)
             by_queue = by_u @ queue.share
             zero_x, zero_h = np.zeros((n, size, by_x.shape[2])), np.zeros((n, size, by_h.shape[2]))
             shift = np.broadcast_to(moved, (n, *moved.shape))
@@ -140,7 +140,7 @@ def _side_by_side(inner: SideBySide, n_x: int, queue: _Queue) -> SideBySide:
                 ),
             }
             slopes = (np.concatenate([columns[name] for name in names], axis=2) for names in blocks.values())
-            return x_next, np.hstack([waiting[:, n_u:], h_next]), *slopes
+            return x_next, np.hstack([inputs[:, n_u:], h_next]), *slopes
 
         return evaluate
 
@@ -148,5 +148,5 @@ def _side_by_side(inner: SideBySide, n_x: int, queue: _Queue) -> SideBySide:
 
 
 def _inserted(rows: Array, n_x: int, queue: Array) -> Array:
-    """Rows of a Jacobian ``(n, n_x + n_h, columns)`` with those of the waiting inputs after the states'."""
+    """Rows of a Jacobian ``(n, n_x + n_h, columns)`` with those of the delay states after the states'."""
     return np.concatenate([rows[:, :n_x], queue, rows[:, n_x:]], axis=1)

@@ -1,4 +1,4 @@
-"""Limits of inputs and states, of any sign, on one side or both: what is checked of them, and measured by them."""
+"""Limits of inputs and states, of any sign, on one side or both."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ Array = NDArray[np.float64]
 
 
 def input_limits(u_min: ArrayLike, u_max: ArrayLike, n_u: int) -> tuple[Array, Array]:
-    """Limits ``(n_u,)`` of the inputs that do not cross; ``-inf`` and ``inf`` for none.
+    """Checked limits ``(n_u,)`` of the inputs; ``-inf`` and ``inf`` for none.
 
     Raises:
-        InputError: If there is another number of them, one is NaN or no number, or a lower one is not below its upper
-            one.
+        InputError: If they are not ``n_u`` numbers, one is NaN, or a lower limit is not below its upper one.
 
     Example:
         >>> input_limits((0.0,), (5.0,), 1)
@@ -32,7 +31,7 @@ def input_limits(u_min: ArrayLike, u_max: ArrayLike, n_u: int) -> tuple[Array, A
 
 
 def numbers(values: ArrayLike, name: str) -> Array:
-    """Numbers in a row ``(n,)``, a copy; infinite ones and NaN too.
+    """``values`` as a vector ``(n,)``, a copy; infinite ones and NaN too.
 
     Raises:
         InputError: If they are no numbers.
@@ -48,7 +47,7 @@ def numbers(values: ArrayLike, name: str) -> Array:
 
 
 def at_rest(lower: ArrayLike, upper: ArrayLike) -> Array:
-    """Zero where the limits ``(n,)`` let it be, else the limit next to it: what is applied where nothing is known.
+    """Zero, or where limits ``(n,)`` exclude it the limit next to it: the input where nothing is known.
 
     Example:
         >>> at_rest([-1.0, 2.0, -5.0], [1.0, 3.0, -4.0])
@@ -58,10 +57,9 @@ def at_rest(lower: ArrayLike, upper: ArrayLike) -> Array:
 
 
 def share_used(values: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> float:
-    """Largest share that values ``(m, n)`` use of the way from rest to a limit ``(n,)``: 1 at the limit, more beyond.
+    """Largest share of the way from rest to a limit ``(n,)`` that values ``(m, n)`` use: 1 at the limit, more beyond.
 
-    A limit at rest itself leaves no way: beyond it the whole range is the measure, and counts from 1 on. Where there
-    is no range either, anything beyond is infinitely much.
+    Beyond a limit that is at rest itself the share is 1 plus that of the whole range; infinite without a range.
 
     Example:
         >>> share_used([[0.1], [-0.4]], [-0.5], [0.5]), share_used([[0.0], [1.0]], [0.0], [4.0])

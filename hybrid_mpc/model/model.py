@@ -1,4 +1,4 @@
-"""HybridModel: the deployed model of a machine as CasADi functions. No torch in here."""
+"""HybridModel: the deployed model of a machine as CasADi functions, and what is made of one model alone."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ Expression: TypeAlias = Any
 ManyPoints: TypeAlias = Callable[..., tuple[Array, ...]]
 """``(x, h, u, w, p)``, each ``(n, size)``, to ``(x_next, h_next)`` and Jacobians ``(n, n_z, columns)``."""
 SideBySide: TypeAlias = Callable[[int, Mapping[str, Sequence[str]]], ManyPoints]
-"""Makes such a function: from ``n`` and, for each Jacobian, which of ``x, h, u`` it is by, ``{"A": ("x", "h")}``."""
+"""Makes such a function for ``n`` points; the mapping names each Jacobian's variables, ``{"A": ("x", "h")}``."""
 STEP_INPUTS = ("x", "h", "u", "w", "p")
 STEP_OUTPUTS = ("x_next", "h_next")
 
 
 @dataclass(frozen=True)
 class Balance:
-    """A balance of what a machine stores, e.g. of its energy: what the prior says is stored, supplied and lost.
+    """A balance of what a machine stores, e.g. of its energy, as the prior has it.
 
     Args:
         name: E.g. ``"energy"``.
         unit: Of the storage, e.g. ``"J"``.
         rate_unit: Of its rate, e.g. ``"W"``.
-        residual: ``(x, xdot, u, w, p) -> residual`` [rate_unit]: by how much the balance is violated if the state
-            changes at ``xdot``; zero along the prior's own flow.
+        residual: ``(x, xdot, u, w, p) -> residual`` [rate_unit]: the violation of the balance if the state changes at
+            ``xdot``; zero along the prior's own flow.
 
     Example:
         >>> x, xdot, u, w, p = (ca.SX.sym(name, n) for name, n in (("x", 2), ("xdot", 2), ("u", 1), ("w", 0), ("p", 1)))
@@ -54,10 +54,10 @@ class Balance:
 class HybridModel:
     """A discrete-time model over the state ``x`` and the hidden state ``h``, all in SI units.
 
-    ``h`` is the hidden state before ``(x_k, u_k)``; it is empty (``n_h = 0``, 0 x 1) for a prior. ``w`` are
-    disturbances, measured but not commanded; ``p`` are the prior's parameters. Both may be empty; where nobody gives
-    them, :attr:`w` and :attr:`p` are taken. The fitted prior, the hybrid and an oracle share this interface.
-    :meth:`of` makes one of expressions.
+    ``h`` is the hidden state before ``(x_k, u_k)``; a prior's is empty (``n_h = 0``, 0 x 1). ``w`` are disturbances,
+    measured but not commanded; ``p`` are the prior's parameters. Both may be empty; :attr:`w` and :attr:`p` are their
+    usual values. The fitted prior, the hybrid and an oracle share this interface. :meth:`of` makes a model of
+    expressions.
 
     Args:
         name: e.g. ``"mopgrnn"``.
@@ -66,23 +66,22 @@ class HybridModel:
         inputs: Signals of ``u``.
         outputs: Signals of ``y``.
         step: ``(x, h, u, w, p) -> (x_next, h_next)``, columns n_x, n_h, n_u, n_w, n_p.
-        xdot: ``(x, h, u, w, p) -> xdot`` at the instant, with the correction that ``(x, h, u)`` gives.
+        xdot: ``(x, h, u, w, p) -> xdot`` at the instant, with the network's correction.
         output: ``(x, u, w, p) -> y``.
         with_jacobian: ``(x, h, u, w, p) -> (x_next, h_next, A, B)`` with ``A`` of ``(x_next, h_next)`` by
             ``(x, h)`` and ``B`` by ``u``. Default: made from ``step`` by CasADi's own derivatives.
-        side_by_side: The same at many points in one call, where the model has a faster way than one call a
-            point: what :class:`nn_export.SideBySide` makes of a program. Default: none.
+        side_by_side: The same at many points in one call, where that is faster than one call a point, e.g.
+            :class:`nn_export.SideBySide` of a program. Default: none.
         disturbances: Signals of ``w``. Default: none.
         nominal_w: What is taken for ``w`` where none is given ``(n_w,)`` [their units]. Default: zeros.
-        parameters: The prior's parameters with their fitted values and bounds: ``p`` in this order. What the prior
-            says changes with ``p``; what a network adds does not. Default: none; then nobody can tell what broke.
+        parameters: The prior's parameters with their fitted values and bounds: ``p`` in this order. What a network adds
+            does not depend on them. Default: none; then no diagnosis can name what has changed.
         covariance: Rows ``(n_p, n_p)`` of the covariance of the fitted values. Default: unknown.
-        balances: What the prior says of stored energy, mass, heat, ... Default: nothing.
+        balances: Balances of energy, mass, heat, ... Default: none.
         delay_states: Leading entries of ``h`` that are inputs on their way to the machine, the oldest first; ``xdot``
-            and the balances then take the input that acts. Default 0: none waits.
-        time_unit: The machine's second [s] (:func:`~hybrid_mpc.data.scales.time_unit`): what the lengths of monitor
-            and guard
-            are counted in. Default 1.
+            and the balances then take the input that acts. Default 0.
+        time_unit: The machine's second [s] (:func:`~hybrid_mpc.data.scales.time_unit`): the unit of the lengths of
+            monitor and guard. Default 1.
 
     Raises:
         InputError: If the functions' shapes do not fit the signals and parameters.
@@ -166,7 +165,7 @@ class HybridModel:
         nominal_w: Sequence[float] = (),
         parameters: Sequence[Parameter] = (),
     ) -> HybridModel:
-        """A model of CasADi expressions: what it has none of is left out, and the functions are made of the rest.
+        """A model of CasADi expressions, of MX or of SX.
 
         Args:
             name: Its name.
@@ -176,15 +175,15 @@ class HybridModel:
             outputs: Signals of ``y``.
             x: Symbol of the state ``(n_x,)``.
             u: Symbol of the input ``(n_u,)``.
-            x_next: The state one period on.
+            x_next: The state one period later.
             xdot: Its rate at the instant.
             y: The outputs.
-            h: Symbol of the hidden state ``(n_h,)``. Default: there is none.
-            h_next: The hidden state one period on. Default: as it is.
-            w: Symbol of the disturbances ``(n_w,)``. Default: there are none.
-            p: Symbol of the parameters ``(n_p,)``. Default: there are none.
+            h: Symbol of the hidden state ``(n_h,)``. Default: none.
+            h_next: The hidden state one period later. Default: as it is.
+            w: Symbol of the disturbances ``(n_w,)``. Default: none.
+            p: Symbol of the parameters ``(n_p,)``. Default: none.
             rate: Symbol ``(n_x,)`` of any rate of the state, for ``energy``.
-            energy: Residual [W] of the balance of energy if the state changes at ``rate``. Default: no balance.
+            energy: Residual [W] of the energy balance if the state changes at ``rate``. Default: no balance.
             with_jacobian: See :class:`HybridModel`.
             disturbances: Signals of ``w``.
             nominal_w: See :class:`HybridModel`.
@@ -269,10 +268,10 @@ class HybridModel:
 def longer_period(model: HybridModel, periods: int) -> HybridModel:
     """The same model with a period that is a multiple of its own; input and disturbance are held all the while.
 
-    One step is ``periods`` steps of the model, the hidden state in each of them, and its Jacobian the chain of
-    theirs, so nothing is discretised anew. Estimator, controller, terminal weight and closed loop made of it all run
-    at the longer period: costs count its instants, ``du_max`` and ``r_delta`` its changes, and bounds on states hold
-    at its instants, not between them. A filter's noise per period is that of the longer one.
+    One step is ``periods`` steps of the model and its Jacobian their chain: nothing is discretised anew. Estimator,
+    controller and closed loop made of it run at the longer period: costs count its instants, ``du_max`` and ``r_delta``
+    its changes, bounds on states hold at its instants, not between them, and a filter's noise is that of a longer
+    period.
 
     Args:
         model: The deployed model.
@@ -293,12 +292,11 @@ def longer_period(model: HybridModel, periods: int) -> HybridModel:
         raise InputError(f"model {model.name}: periods must be a whole number of at least 1, got {periods}")
     point = step_symbols(model)
     assert model.with_jacobian is not None
-    inline = model.step.is_a("MXFunction"), model.with_jacobian.is_a("MXFunction")
     by_value, by_jacobian, held = point[:2], point[:2], point[2:]
     a, b = ca.MX.eye(model.n_x + model.n_h), ca.MX.zeros(model.n_x + model.n_h, model.n_u)
     for _ in range(periods):
-        by_value = model.step.call([*by_value, *held], inline[0], False)
-        *by_jacobian, a_k, b_k = model.with_jacobian.call([*by_jacobian, *held], inline[1], False)
+        by_value = inlined(model.step, [*by_value, *held])
+        *by_jacobian, a_k, b_k = inlined(model.with_jacobian, [*by_jacobian, *held])
         a, b = a_k @ a, a_k @ b + b_k
     return replace(
         model,
@@ -310,7 +308,7 @@ def longer_period(model: HybridModel, periods: int) -> HybridModel:
 
 
 def prior_acceleration(model: HybridModel, prior: HybridModel | None = None) -> ca.Function:
-    """``(x, u, w, p) -> a`` ``(n_q,)``: what the prior behind a model says, without what a network adds.
+    """Acceleration ``(x, u, w, p) -> a`` ``(n_q,)`` of the prior behind a model, without what a network adds.
 
     Args:
         model: The model, state ``[q, v]``.
@@ -353,11 +351,15 @@ def step_function(name: str, point: Sequence[ca.MX], values: Sequence[ca.MX]) ->
     return ca.Function(name, list(point), list(values), [*STEP_INPUTS], outputs)
 
 
+def inlined(f: ca.Function, point: Sequence[Expression]) -> list[Expression]:
+    """Results of a function at symbols, written into the caller's graph if it is a graph of matrices: a call less."""
+    return list(f.call(list(point), f.is_a("MXFunction"), False))
+
+
 def _with_jacobian(step: ca.Function) -> ca.Function:
     point = [ca.MX.sym(name, step.size1_in(i)) for i, name in enumerate(STEP_INPUTS)]
     x, h, u = point[:3]
-    # Differentiated inside the caller's graph where it is a graph of matrices: twice as fast as a call.
-    x_next, h_next = step.call(point, step.is_a("MXFunction"), False)
+    x_next, h_next = inlined(step, point)  # twice as fast as the derivative of a call
     z = ca.vertcat(x_next, h_next)
     a = ca.densify(ca.horzcat(ca.jacobian(z, x), ca.jacobian(z, h)))
     b = ca.densify(ca.jacobian(z, u))

@@ -1,8 +1,6 @@
-"""Discrete algebraic Riccati equation and LQR gains of a deployed model."""
+"""Linearization of a model at a point: Riccati equation, LQR gain, hidden state at its fixed point."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,25 +10,8 @@ from hybrid_mpc.model.limits import numbers
 from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Lqr:
-    """A stabilising state feedback ``u = u_target - gain @ (z - z_target)`` with ``z = (x, h)``.
-
-    Args:
-        gain: ``(n_u, n_x + n_h)`` [input unit / state unit].
-        cost_to_go: Riccati matrix ``(n_x + n_h, n_x + n_h)``.
-        x_target: ``(n_x,)``.
-        h_target: Hidden state at its fixed point ``(n_h,)``.
-        u_target: ``(n_u,)``.
-    """
-
-    gain: Array
-    cost_to_go: Array
-    x_target: Array
-    h_target: Array
-    u_target: Array
+SETTLED = 1e-10
+"""Largest change in a step of a hidden state that counts as settled."""
 
 
 def dare(a: ArrayLike, b: ArrayLike, q: ArrayLike, r: ArrayLike) -> tuple[Array, Array]:
@@ -73,13 +54,11 @@ def dare(a: ArrayLike, b: ArrayLike, q: ArrayLike, r: ArrayLike) -> tuple[Array,
     return p, k
 
 
-def hidden_fixed_point(
-    model: HybridModel, x: Array, u: Array, *, tol: float = 1e-10, limit: int = 2000
-) -> Array:
+def hidden_fixed_point(model: HybridModel, x: Array, u: Array, *, limit: int = 2000) -> Array:
     """Hidden state ``(n_h,)`` that the step reaches with ``x`` ``(n_x,)`` and ``u`` ``(n_u,)`` held.
 
-    The iteration starts at zero and ends when no element moves by more than ``tol``, or after
-    ``limit`` steps with the last value.
+    The iteration starts at zero. It ends when no element moves by more than 1e-10, or after ``limit`` steps with the
+    last value.
 
     Example:
         >>> import casadi as ca
@@ -94,7 +73,7 @@ def hidden_fixed_point(
     for _ in range(limit if model.n_h else 0):
         h_next = model.step(x, h, u, model.w, model.p)[1].full().ravel()
         moved, h = np.max(np.abs(h_next - h)), h_next
-        if not moved > tol:
+        if not moved > SETTLED:
             break
     return h
 
@@ -115,11 +94,12 @@ def lqr(
     r: ArrayLike,
     *,
     working_point: tuple[ArrayLike, ArrayLike] | None = None,
-) -> Lqr:
-    """LQR of a model, linearized with its exact Jacobian and its hidden state at the fixed point.
+) -> Array:
+    """Gain ``K`` ``(n_u, n_x + n_h)`` of ``u = u_target - K (z - z_target)`` with ``z = (x, h)``.
 
-    At rest the steep slope of a smoothed friction law (tanh) dominates the linearization: it shows the
-    machine as if it stood in honey. ``working_point`` takes the linearization from a moving point.
+    The model is linearized with its exact Jacobian, its hidden state at the fixed point. At rest the steep slope of a
+    smoothed friction law (tanh) dominates the linearization and passes for strong damping; ``working_point`` takes the
+    linearization from a moving point.
 
     Args:
         model: The model; ``n_h`` may be 0.
@@ -137,18 +117,15 @@ def lqr(
         >>> from hybrid_mpc.machine.signals import Signal
         >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
         >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
-        >>> lqr(model, [0.0], [0.0], [1.0], [1.0]).gain.round(6)
+        >>> lqr(model, [0.0], [0.0], [1.0], [1.0]).round(6)
         array([[0.618034]])
     """
-    x_t, u_t = vector(x_target, model.n_x, "x_target"), vector(u_target, model.n_u, "u_target")
+    target = vector(x_target, model.n_x, "x_target"), vector(u_target, model.n_u, "u_target")
     q_v, r_v = vector(q, model.n_x, "q"), vector(r, model.n_u, "r")
-    point = working_point if working_point is not None else (x_t, u_t)
-    x_w = vector(point[0], model.n_x, "working_point x")
-    u_w = vector(point[1], model.n_u, "working_point u")
-    a, b, _ = linearization(model, x_w, u_w)
-    weights = np.diag(np.concatenate([q_v, np.zeros(model.n_h)]))
-    p, k = dare(a, b, weights, np.diag(r_v))
-    return Lqr(k, p, x_t, hidden_fixed_point(model, x_t, u_t), u_t)
+    x, u = target if working_point is None else working_point
+    x, u = vector(x, model.n_x, "working_point x"), vector(u, model.n_u, "working_point u")
+    a, b, _ = linearization(model, x, u)
+    return dare(a, b, np.diag(np.concatenate([q_v, np.zeros(model.n_h)])), np.diag(r_v))[1]
 
 
 def vector(value: ArrayLike, size: int, name: str) -> Array:

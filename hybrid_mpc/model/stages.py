@@ -1,4 +1,4 @@
-"""The model along a horizon with its Jacobians: all periods side by side, or as one run."""
+"""The model along a horizon with its Jacobians: all periods at once, or as one run."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.buffered import BufferedFunction
-from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.model.model import HybridModel, inlined
 from nn_export import compile_function
 from nn_export.errors import CompileError
 
@@ -38,13 +38,12 @@ class Linearization(Protocol):
 
 
 def stages(model: HybridModel, n: int, *, compiled: bool = False) -> Linearization:
-    """The fastest way that a model has: all periods at once where it can, else one after the other.
+    """The fastest way that a model has: all periods at once with ``side_by_side``, else one after the other.
 
     Args:
         model: The model.
         n: Periods N.
-        compiled: Whether what is evaluated period by period is compiled as C. Default: no; that needs no
-            compiler.
+        compiled: Whether what is evaluated period by period is compiled as C. Default: no.
 
     Raises:
         InputError: If it is to be compiled and there is no compiler, or it fails.
@@ -54,7 +53,7 @@ def stages(model: HybridModel, n: int, *, compiled: bool = False) -> Linearizati
 
 
 class Stages:
-    """One period after the other in CasADi's machine, or compiled.
+    """One period after the other, interpreted by CasADi or compiled.
 
     Args:
         model: The model.
@@ -111,7 +110,7 @@ class Stages:
 
 
 class VectorisedStages:
-    """All periods at once, of a model with a ``side_by_side``; a run is one of ``step`` alone, then all at once.
+    """All periods at once, of a model with ``side_by_side``; a run is one of ``step``.
 
     Args:
         model: The model.
@@ -152,9 +151,7 @@ class VectorisedStages:
 
 def _run(model: HybridModel, n: int, compiled: bool) -> BufferedFunction:
     z, u = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("u", model.n_u)
-    inline = model.step.is_a("MXFunction")  # a call less a stage
-    z_next = ca.vertcat(*model.step.call(_point(model, z, u), inline, False))
-    step = ca.Function("z_step", [z, u], [z_next])
+    step = ca.Function("z_step", [z, u], [ca.vertcat(*inlined(model.step, _point(model, z, u)))])
     return BufferedFunction((_compiled(step) if compiled else step).mapaccum("run", n))
 
 
@@ -167,9 +164,7 @@ def _trajectory(f: BufferedFunction, z0: Array, u: Array) -> Array:
 def _stage(model: HybridModel) -> ca.Function:
     z, u = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("u", model.n_u)
     assert model.with_jacobian is not None
-    # Written into the caller's graph where that is possible: a call less a stage.
-    inline = model.with_jacobian.is_a("MXFunction")
-    x_next, h_next, a, b = model.with_jacobian.call(_point(model, z, u), inline, False)
+    x_next, h_next, a, b = inlined(model.with_jacobian, _point(model, z, u))
     return ca.Function("stage", [z, u], [ca.vertcat(x_next, h_next), ca.densify(a), ca.densify(b)])
 
 
@@ -181,7 +176,7 @@ def _point(model: HybridModel, z: ca.MX, u: ca.MX) -> list[ca.MX]:
 def _compiled(stage: ca.Function) -> ca.Function:
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error", RuntimeWarning)  # that is how a missing compiler is told
+            warnings.simplefilter("error", RuntimeWarning)  # a missing compiler is a warning
             return compile_function(stage)
     except (RuntimeWarning, CompileError) as error:
         raise InputError(

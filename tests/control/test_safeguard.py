@@ -154,7 +154,7 @@ def test_fallback_is_the_priors_lqr_around_the_held_equilibrium(parts):
     decision = run(safe, [e], goal)[0]
     assert decision.source is Source.FALLBACK
     k = lqr(prior, [0.0, 0.0], [0.0], wide.q, wide.r + wide.r_delta, working_point=POINT)
-    want = 2.4 * np.sin(0.5) - k.gain @ (e.x - goal[0]) - 0.15  # gravity at the goal, by hand
+    want = 2.4 * np.sin(0.5) - k @ (e.x - goal[0]) - 0.15  # gravity at the goal, by hand
     np.testing.assert_allclose(decision.u, want, atol=1e-9)  # least squares damped by 1e-12
 
 

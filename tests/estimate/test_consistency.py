@@ -54,32 +54,21 @@ def test_a_right_filter_passes_at_the_rate_of_the_bands():
     assert np.mean([f.nis_inside for f in found]) == pytest.approx(0.95, abs=0.01)
 
 
-@pytest.mark.parametrize(("scale", "too"), [(0.5, "small"), (2.0, "large")])
-def test_a_wrong_measurement_noise_fails(scale, too):
+def test_wrong_noise_and_an_offset_fail():
     model, *matrices = system()
     runs = [recorded(*matrices, 600, seed) for seed in (1, 2)]
-    found = consistency(make(model, scale_y=scale), runs)
-    assert not found.nis_passes
-    assert (found.mean_nis > found.nis_band[1]) == (too == "small")
-    assert consistency(make(model), runs).nis_passes
-
-
-def test_a_wrong_process_noise_colours_the_innovations():
-    model, *matrices = system()
-    runs = [recorded(*matrices, 1500, 3)]
-    found = consistency(make(model, scale_x=0.02), runs)
-    assert not found.white
-    assert np.abs(found.autocorrelation).max() > 3 * found.correlation_band
-    assert consistency(make(model), runs).white
-
-
-def test_an_offset_is_no_white_noise():
-    model, *matrices = system()
-    run = recorded(*matrices, 600, 4)
-    drifting = make(model)
-    shifted = Run(run.y + 2.0 * np.arange(600)[:, None] / 600, run.u)
-    assert consistency(drifting, [run]).white
-    assert not consistency(drifting, [shifted]).white
+    right = consistency(make(model), runs)
+    assert right.nis_passes
+    assert right.white
+    for scale, too_small in ((0.5, True), (2.0, False)):
+        found = consistency(make(model, scale_y=scale), runs)
+        assert not found.nis_passes
+        assert (found.mean_nis > found.nis_band[1]) == too_small
+    drifting = [Run(run.y + 2.0 * np.arange(600)[:, None] / 600, run.u) for run in runs]
+    assert not consistency(make(model), drifting).white
+    coloured = consistency(make(model, scale_x=0.02), [recorded(*matrices, 1500, 3)])
+    assert not coloured.white
+    assert np.abs(coloured.autocorrelation).max() > 3 * coloured.correlation_band
 
 
 def test_several_outputs_missing_samples_and_recordings():
@@ -110,29 +99,14 @@ def test_the_statistics_by_hand():
     found = consistency(make(model), [run], skip=10, lags=3)
     e = innovations(make(model), run, skip=10).normalised[:, 0]
     assert len(e) == 390
+    nis = [estimate.nis for estimate in make(model).run(run.y, run.u)]  # the filter's own estimates
+    np.testing.assert_array_equal(found.runs[0].nis, nis[10:])
     r = [np.sum(e[k:] * e[:-k]) / np.sum(e**2) for k in (1, 2, 3)]
     np.testing.assert_allclose(found.autocorrelation[:, 0], r, rtol=1e-12)
     q = 390 * 392 * sum(r[k - 1] ** 2 / (390 - k) for k in (1, 2, 3))
     assert found.ljung_box == pytest.approx(q, rel=1e-12)
     assert found.ljung_box_limit == pytest.approx(7.8147, abs=1e-4)  # chi-square table, 3 degrees, 95 %
     assert found.correlation_band == pytest.approx(1.959964 / np.sqrt(390), rel=1e-6)
-
-
-def test_the_estimates_are_those_of_the_filter_itself():
-    model, *matrices = system()
-    run = recorded(*matrices, 120, 6)
-    nis = [e.nis for e in make(model).run(run.y, run.u)]
-    np.testing.assert_array_equal(innovations(make(model), run, skip=1).nis, nis[1:])
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [({"skip": 0}, "skip"), ({"lags": 0}, "lags"), ({"lags": 100}, "at least 500 are needed")],
-)
-def test_bad_options_are_refused(options, words):
-    model, *matrices = system()
-    with pytest.raises(InputError, match=words):
-        consistency(make(model), [recorded(*matrices, 200, 0)], **options)
 
 
 def test_a_switching_filter_is_judged_by_its_mixture():
@@ -155,10 +129,16 @@ def test_a_switching_filter_is_judged_by_its_mixture():
     assert consistency(make(model), runs).mean_nis > 2.0  # a filter that knows the quiet mode only
 
 
-def test_no_recordings_and_bad_shapes_are_refused():
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [({"skip": 0}, "skip"), ({"lags": 0}, "lags"), ({"lags": 100}, "at least 500 are needed")],
+)
+def test_bad_options_and_shapes_are_refused(options, words):
     model, *matrices = system()
+    run = recorded(*matrices, 200, 0)
+    with pytest.raises(InputError, match=words):
+        consistency(make(model), [run], **options)
     with pytest.raises(InputError, match="0 samples are left"):
         consistency(make(model), [])
-    run = recorded(*matrices, 200, 0)
     with pytest.raises(InputError, match="needed"):
         consistency(make(model), [Run(run.y, run.u[:-1])])

@@ -2,16 +2,9 @@
 
 import numpy as np
 import pytest
-from online_models import pendulum_model, random_linear
+from online_models import make_filter, pendulum_model, random_linear
 
-from hybrid_mpc import DelayCompensation, ExtendedKalmanFilter, InputError, TrueState
-
-
-def make_filter(model):
-    return ExtendedKalmanFilter(
-        model, sigma_y=np.full(model.n_y, 0.1), sigma_x=np.full(model.n_x, 0.05),
-        sigma_d=np.full(model.n_u, 0.02), sigma_x0=np.full(model.n_x, 0.3), sigma_d0=np.full(model.n_u, 0.2),
-    )  # fmt: skip
+from hybrid_mpc import DelayCompensation, InputError, TrueState
 
 
 def augmented_filter(a, b, c, ys, us, m, p, delay, seen):
@@ -95,13 +88,10 @@ def test_estimates_are_pure():
     assert e.inputs == ()
 
 
-@pytest.mark.parametrize("change", [{"sensor_delay": -1}, {"input_delay": 0.5}])
-def test_bad_delays_are_refused(change):
-    with pytest.raises(InputError, match="delay: a whole number"):
-        DelayCompensation(make_filter(pendulum_model()), **change)
-
-
-def test_an_estimate_of_another_estimator_is_refused():
+def test_bad_delays_and_other_estimates_are_refused():
     ekf = make_filter(pendulum_model())
+    for change in ({"sensor_delay": -1}, {"input_delay": 0.5}):
+        with pytest.raises(InputError, match="delay: a whole number"):
+            DelayCompensation(ekf, **change)
     with pytest.raises(InputError, match="begin with start"):
         DelayCompensation(ekf, sensor_delay=1).update(ekf.start([0.0]), [0.0], [0.0])

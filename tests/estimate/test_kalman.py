@@ -1,18 +1,11 @@
+"""The filter is the textbook Kalman filter on a linear model, and gets over what no filter can use."""
+
 import numpy as np
 import pytest
-from online_models import PendulumPlant, linear_model, pendulum_model, random_linear
+from online_models import PendulumPlant, linear_model, make_filter, pendulum_model, random_linear
 
 from hybrid_mpc import ExtendedKalmanFilter, InputError, TrueState
 from hybrid_mpc.estimate.kalman import START_LIMIT
-
-
-def make_filter(model, **changes):
-    sigma = {
-        "sigma_y": np.full(model.n_y, 0.1), "sigma_x": np.full(model.n_x, 0.05),
-        "sigma_d": np.full(model.n_u, 0.02),
-        "sigma_x0": np.full(model.n_x, 0.3), "sigma_d0": np.full(model.n_u, 0.2),
-    }  # fmt: skip
-    return ExtendedKalmanFilter(model, **{**sigma, **changes})
 
 
 @pytest.mark.parametrize(("n_h", "n_u"), [(0, 1), (0, 2), (3, 2)])
@@ -136,18 +129,15 @@ def test_true_state_passes_the_truth_on():
         ({"sigma_x0": [np.nan, 1.0]}, "finite"),
     ],
 )
-def test_bad_deviations_are_refused(change, words):
+def test_bad_deviations_and_shapes_are_refused(change, words):
     with pytest.raises(InputError, match=words):
         make_filter(pendulum_model(), **change)
-
-
-def test_run_refuses_shapes_that_do_not_fit():
     with pytest.raises(InputError, match="needed"):
         make_filter(pendulum_model()).run(np.zeros((5, 1)), np.zeros((4, 1)))
 
 
-@pytest.mark.parametrize("seed", range(6))
-@pytest.mark.parametrize("n", [50, 100, 400, 3000])
+@pytest.mark.parametrize("seed", [0, 3])
+@pytest.mark.parametrize("n", [50, 400, 3000])
 def test_an_unstable_model_without_measurements_for_long(n, seed):
     # growth 1.3 per period: the covariance reaches 1e22 (singular to rounding), 1e91, and infinity
     model, *_ = random_linear(seed, n_x=2, n_u=1, n_y=2, radius=1.3)
@@ -163,7 +153,8 @@ def test_an_unstable_model_without_measurements_for_long(n, seed):
     assert np.min(np.linalg.eigvalsh(e.P)) > 0
 
 
-def test_an_absurd_measurement_is_got_over():
+@pytest.mark.filterwarnings("error")
+def test_an_absurd_measurement_is_got_over_without_a_warning():
     ekf = make_filter(pendulum_model(z=3))
     e = ekf.start([0.1])
     for y in (1e308, 1e308, 0.1):
@@ -172,12 +163,6 @@ def test_an_absurd_measurement_is_got_over():
     for _ in range(3):
         e = ekf.update(e, [0.1], [0.0])
     assert abs(e.x[0] - 0.1) < 0.3  # sigma_x0
-
-
-@pytest.mark.filterwarnings("error")
-def test_overflow_prints_no_warning():
-    ekf = make_filter(pendulum_model(z=3))
-    e = ekf.start([0.1])
-    for y in (1e308, -1e308, 1e308, np.inf, 0.1):
+    for y in (-1e308, np.inf, 0.1):
         e = ekf.update(e, [y], [1e300])
     assert np.all(np.isfinite(e.x))

@@ -125,7 +125,7 @@ def freeze(name, run):
     from hybrid_mpc.files import sha256
     from hybrid_mpc.job.controllers import no_surer_than_prior
     from hybrid_mpc.kit.artifact import read_description, write_description
-    from hybrid_mpc.kit.assembly import first_controller, freezing
+    from hybrid_mpc.kit.assembly import first_controller, sensor_steps
 
     folder, run = HERE / name, Path(run)
     folder.mkdir(exist_ok=True)
@@ -185,7 +185,7 @@ def freeze(name, run):
             "transition": plain(observer.transition),
         },
         "level_monitor": {"window": monitor.window, "average": monitor.average},
-        "freezing": plain(freezing(control)),
+        "freezing": plain({"resolution": sensor_steps(scenario.sensor_sigma), "input_range": control.input_range}),
         "problems": problems,
         "replays": REPLAYS[name],
         "loops": LOOPS[name],

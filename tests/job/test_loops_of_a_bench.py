@@ -117,23 +117,6 @@ def test_one_period_has_its_excess(bench):
     assert all(value == 0.0 for name, value in row.excess.items() if name.startswith(("u", "change")))
 
 
-def test_plans_are_kept_together_as_alone(bench):
-    kept = [replace(SPEC, seed=seed, keep=("plans", "u")) for seed in (0, 1)]
-    for spec, (row, _) in zip(kept, bench.run_together(kept), strict=True):
-        alone = bench.run(spec)[0].arrays
-        assert row.arrays["plans"].shape == alone["plans"].shape
-        assert len(row.arrays["plans"]) == len(row.arrays["u"]) > 0
-        np.testing.assert_allclose(
-            row.arrays["plans"], alone["plans"], rtol=0, atol=1e-8
-        )  # sums in another order
-
-
-def test_only_loops_of_the_same_parts_and_length_run_together(bench):
-    for other in (replace(SPEC, horizon=7), replace(SPEC, solver="sqp")):
-        with pytest.raises(InputError, match="loops of different parts given"):
-            bench.run_together([SPEC, other])
-    with pytest.raises(InputError, match="loops of 3, 5 periods given"):
-        bench.run_together([SPEC, replace(SPEC, duration=0.06)])
-    with pytest.raises(InputError, match="1 loops and 0 tasks given"):
-        bench.run_together([SPEC], tasks=[])
-    assert bench.run_together([]) == []
+def test_plans_are_kept(bench):
+    row, _ = bench.run(replace(SPEC, keep=("plans", "u")))
+    assert len(row.arrays["plans"]) == len(row.arrays["u"]) > 0

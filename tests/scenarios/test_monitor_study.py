@@ -2,7 +2,6 @@
 
 import json
 import sys
-from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 import trivial_runs
 
-from hybrid_mpc import Bench, Detector, InputError, LoopSpec, load
+from hybrid_mpc import Detector, InputError
 from hybrid_mpc.job.study_run import run_batch
 from hybrid_mpc.loop.faults import install
 from scenarios.golf_robot import scenario
@@ -21,41 +20,6 @@ from scenarios.golf_robot.monitor_study.plan import CASES, LoopPlan, MonitorStud
 from scenarios.golf_robot.monitor_study.results import roc
 
 SMALL = MonitorStudy("golf_robot", "nowhere", nominal_hours=0.5, seeds=3, guard_seeds=2, rates=(1.0,))
-
-
-def test_loops_together_are_loops_alone(golf_artifact):
-    kit = load(golf_artifact).with_noise({"hybrid_observer": np.array([1e-4, 2e-2])})
-    bench, task = (
-        Bench(scenario, {"model": kit}),
-        replace(scenario.tasks[0], duration=12 * 0.02, figures=None),
-    )
-    drift = LoopPlan("drift_up", "task", 0, 0.3).faults(0.02)
-    specs = [
-        LoopSpec(
-            "golf_robot", "model", task.name, "hybrid_observer", monitor="readings", seed=4 + i, faults=faults
-        )
-        for i, faults in enumerate(((), drift))
-    ]
-    tasks = [task, replace(task, reference=lambda t: -task.reference(t))]
-    together = bench.run_together(specs, tasks=tasks)
-    for spec, follows, (row, side) in zip(specs, tasks, together, strict=True):
-        alone_row, alone = bench.run(spec, task=follows)
-        # sums in another order: rounding, grown over twelve periods of a loop that is stable
-        for name, atol in (
-            ("innovation", 1e-10),
-            ("numbers", 1e-8),
-            ("x", 1e-10),
-            ("u", 1e-8),
-            ("nis", 1e-6),
-        ):
-            found, wanted = getattr(side, name), getattr(alone, name)
-            assert found.shape == wanted.shape
-            assert np.allclose(found, wanted, rtol=0, atol=atol, equal_nan=True), name
-        assert row.cost == pytest.approx(alone_row.cost, rel=1e-9)
-    bare = [replace(spec, controller="hybrid") for spec in specs]  # a filter that does not switch takes turns
-    bench = Bench(scenario, {"model": kit.with_noise({"hybrid": np.array([1e-4, 2e-2])})})
-    for spec, follows, (row, _) in zip(bare, tasks, bench.run_together(bare, tasks=tasks), strict=True):
-        assert row.cost == bench.run(spec, task=follows)[0].cost
 
 
 def test_seeds_are_common_only_where_they_shall_be():

@@ -12,7 +12,7 @@ from hybrid_mpc.identify.step import PriorStep, RecurrentStep
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.controllers import noise_of
 from hybrid_mpc.job.stage import Absent, Stage, source_of
-from hybrid_mpc.job.stages.identify import DATA, DEPLOYED, EVALUATION, PRIOR, TRAINING, trained_models
+from hybrid_mpc.job.stages.identify import DATA, DEPLOYED, PRIOR, TRAINING, trained_models
 from hybrid_mpc.kit.artifact import (
     Provenance,
     loop_settings,
@@ -63,7 +63,7 @@ def export_stage(context: Context) -> ExportResult:
         )
     provenance = Provenance(
         context.scenario.name, settings.seed, settings.budget, context.read(DATA).hash, context.versions,
-        phy.values, vars(context.read(EVALUATION).scores[DEPLOYED].best),
+        phy.values,
     )  # fmt: skip
     folder = context.out / "model"
     save_artifact(folder, programs, deployed, provenance=provenance, loop=loop_settings(context.scenario))
@@ -117,7 +117,7 @@ def observed(context: Context) -> dict[str, object]:
 
 EXPORT = Stage(
     "export", "exporting to CasADi", ExportResult, export_stage,
-    lambda context: {"seed": context.settings.seed}, (DATA, PRIOR, TRAINING, EVALUATION), restore=artifact_is_there,
+    lambda context: {"seed": context.settings.seed}, (DATA, PRIOR, TRAINING), restore=artifact_is_there,
 )  # fmt: skip
 NOISE = Stage(
     "noise", "tuning the observers", NoiseResult, noise_stage, observed, (DATA, PRIOR, EXPORT), optional=True,

@@ -116,10 +116,11 @@ class _Loops:
         )
 
     def _nominal(self, plans: tuple[LoopPlan, ...]) -> list[Trace]:
-        specs = [self._spec(plan, horizon=self._study.horizon) for plan in plans]
-        follow = [self._follows(plan) for plan in plans]
-        found = self._bench.run_together(specs, tasks=follow, monitor=self._monitor())
-        return [trace_of(result) for _, result in found]
+        monitor, traces = self._monitor(), []
+        for plan in plans:
+            spec, task = self._spec(plan, horizon=self._study.horizon), self._follows(plan)
+            traces.append(trace_of(self._bench.run(spec, task=task, monitor=monitor)[1]))
+        return traces
 
     def _fault(self, plan: LoopPlan) -> dict[str, Any]:
         row, result = self._bench.run(self._spec(plan), task=self._follows(plan), monitor=self._monitor())
