@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -12,25 +10,6 @@ from hybrid_mpc.model.limits import numbers
 from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Lqr:
-    """A stabilising state feedback ``u = u_target - gain @ (z - z_target)`` with ``z = (x, h)``.
-
-    Args:
-        gain: ``(n_u, n_x + n_h)`` [input unit / state unit].
-        cost_to_go: Riccati matrix ``(n_x + n_h, n_x + n_h)``.
-        x_target: ``(n_x,)``.
-        h_target: Hidden state at its fixed point ``(n_h,)``.
-        u_target: ``(n_u,)``.
-    """
-
-    gain: Array
-    cost_to_go: Array
-    x_target: Array
-    h_target: Array
-    u_target: Array
 
 
 def dare(a: ArrayLike, b: ArrayLike, q: ArrayLike, r: ArrayLike) -> tuple[Array, Array]:
@@ -107,27 +86,18 @@ def linearization(model: HybridModel, x: Array, u: Array) -> tuple[Array, Array,
     return a.full(), b.full(), h
 
 
-def lqr(
-    model: HybridModel,
-    x_target: ArrayLike,
-    u_target: ArrayLike,
-    q: ArrayLike,
-    r: ArrayLike,
-    *,
-    working_point: tuple[ArrayLike, ArrayLike] | None = None,
-) -> Lqr:
-    """LQR of a model, linearized with its exact Jacobian and its hidden state at the fixed point.
+def lqr(model: HybridModel, x: ArrayLike, u: ArrayLike, q: ArrayLike, r: ArrayLike) -> Array:
+    """Gain ``(n_u, n_x + n_h)`` of a model's LQR, ``u = u_target - gain @ (z - z_target)`` with ``z = (x, h)``.
 
-    At rest the steep slope of a smoothed friction law (tanh) dominates the linearization: it shows the
-    machine as if it stood in honey. ``working_point`` takes the linearization from a moving point.
+    The model is linearized with its exact Jacobian, its hidden state at the fixed point. At rest the steep slope of
+    a smoothed friction law (tanh) dominates the linearization; take a moving point there.
 
     Args:
         model: The model; ``n_h`` may be 0.
-        x_target: ``(n_x,)`` [SI].
-        u_target: ``(n_u,)`` [SI].
+        x: State ``(n_x,)`` to linearize at.
+        u: Input ``(n_u,)`` there.
         q: Weights of the states ``(n_x,)``; the hidden states carry none.
         r: Weights of the inputs ``(n_u,)``, positive.
-        working_point: ``(x, u)`` to linearize at. Default: the target.
 
     Raises:
         InputError: If a shape does not fit, or the linearized model is not stabilisable.
@@ -137,18 +107,13 @@ def lqr(
         >>> from hybrid_mpc.machine.signals import Signal
         >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
         >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
-        >>> lqr(model, [0.0], [0.0], [1.0], [1.0]).gain.round(6)
+        >>> lqr(model, [0.0], [0.0], [1.0], [1.0]).round(6)
         array([[0.618034]])
     """
-    x_t, u_t = vector(x_target, model.n_x, "x_target"), vector(u_target, model.n_u, "u_target")
+    at = vector(x, model.n_x, "x"), vector(u, model.n_u, "u")
     q_v, r_v = vector(q, model.n_x, "q"), vector(r, model.n_u, "r")
-    point = working_point if working_point is not None else (x_t, u_t)
-    x_w = vector(point[0], model.n_x, "working_point x")
-    u_w = vector(point[1], model.n_u, "working_point u")
-    a, b, _ = linearization(model, x_w, u_w)
-    weights = np.diag(np.concatenate([q_v, np.zeros(model.n_h)]))
-    p, k = dare(a, b, weights, np.diag(r_v))
-    return Lqr(k, p, x_t, hidden_fixed_point(model, x_t, u_t), u_t)
+    a, b, _ = linearization(model, *at)
+    return dare(a, b, np.diag(np.concatenate([q_v, np.zeros(model.n_h)])), np.diag(r_v))[1]
 
 
 def vector(value: ArrayLike, size: int, name: str) -> Array:

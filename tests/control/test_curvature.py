@@ -10,7 +10,7 @@ from online_models import pendulum_model
 from hybrid_mpc import OCP, CondensedController, Estimate, SoftBound, SQPController, Status
 from hybrid_mpc.control.curvature import convex
 from hybrid_mpc.control.rti import condense_all, condense_hessians
-from hybrid_mpc.control.sqp import Case, Landscape
+from hybrid_mpc.control.sqp import Case, ReducedCost
 
 POINT = [0.0, 1.0], [0.0]
 X0 = [0.0, 0.02]  # near rest, where the slope of friction changes
@@ -44,7 +44,7 @@ def derivatives(model, ocp, u):
 def model_of_cost(model, ocp, u):
     """The same by the library, Gauss-Newton's Hessian apart from the rest."""
     controller = CondensedController(model, ocp)
-    land, e = Landscape(controller), estimate_of(model)
+    land, e = ReducedCost(controller), estimate_of(model)
     case = Case(e.d, np.array([0.3]), controller.problem.target(np.full((1, 2), 2.0)))
     at = land.at(land.run(np.concatenate([e.x, e.h]), u[:, None], case), case)
     prepared = land.condensed(at, case)
@@ -66,16 +66,16 @@ def test_the_hessian_is_exact(z):
     np.testing.assert_allclose(rest, missing, atol=6e-4 * np.max(np.abs(missing)))
 
 
-def landscape(model, ocp):
-    """Landscape, case and a point of it."""
-    land, e = Landscape(CondensedController(model, ocp)), estimate_of(model)
+def problem_at(model, ocp):
+    """ReducedCost, case and a point of it."""
+    land, e = ReducedCost(CondensedController(model, ocp)), estimate_of(model)
     u = np.random.default_rng(0).uniform(-0.4, 0.2, (ocp.horizon, 1))
     case = Case(e.d, np.array([0.3]), land.problem.target(np.full((1, 2), 2.0)))
     return land, case, land.at(land.run(np.concatenate([e.x, e.h]), u, case), case)
 
 
 def test_the_hidden_states_part_can_be_kept_or_left_out():
-    land, case, at = landscape(pendulum_model(z=2, friction=0.5), problem())
+    land, case, at = problem_at(pendulum_model(z=2, friction=0.5), problem())
     whole = land.curvature(at, case, at.multipliers, np.zeros(0))
     kept = land.curvature(at, case, at.multipliers, np.zeros(0), whole + 1.0)
     np.testing.assert_array_equal(kept[:, :3, :3], whole[:, :3, :3])
@@ -98,7 +98,7 @@ def test_soft_bounds_are_in_the_lagrangian_and_its_hessian():
     ocp = OCP(
         12, [50.0, 0.5], [0.5], [0.2], [-3.0], [3.0], working_point=POINT, soft=[bound], x_max=[9.0, 9.0]
     )
-    land, case, at = landscape(pendulum_model(z=2, friction=0.5), ocp)
+    land, case, at = problem_at(pendulum_model(z=2, friction=0.5), ocp)
     mu, z0 = np.random.default_rng(1).normal(size=36), at.run.z[0]
     shift = 1e-5 * np.random.default_rng(2).normal(size=(12, 1))
 
@@ -121,7 +121,7 @@ def test_soft_bounds_are_in_the_lagrangian_and_its_hessian():
 def test_penalties_and_their_multipliers_bound_each_other():
     x, u = ca.MX.sym("x", 2), ca.MX.sym("u")
     bound = SoftBound(ca.Function("v", [x, u], [x[1]]), [-1.0], [0.5], [2.0], [3.0])
-    land = Landscape(CondensedController(pendulum_model(), replace(problem(), soft=(bound,))))
+    land = ReducedCost(CondensedController(pendulum_model(), replace(problem(), soft=(bound,))))
     rng = np.random.default_rng(0)
     for _ in range(20):
         mu, values, other = rng.normal(size=12), rng.normal(size=12), rng.normal(size=12)

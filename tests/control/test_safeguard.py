@@ -153,8 +153,8 @@ def test_fallback_is_the_priors_lqr_around_the_held_equilibrium(parts):
     goal, e = np.array([[0.5, 0.0]]), estimate_of([0.3, -0.2], d=0.15)
     decision = run(safe, [e], goal)[0]
     assert decision.source is Source.FALLBACK
-    k = lqr(prior, [0.0, 0.0], [0.0], wide.q, wide.r + wide.r_delta, working_point=POINT)
-    want = 2.4 * np.sin(0.5) - k.gain @ (e.x - goal[0]) - 0.15  # gravity at the goal, by hand
+    k = lqr(prior, *POINT, wide.q, wide.r + wide.r_delta)
+    want = 2.4 * np.sin(0.5) - k @ (e.x - goal[0]) - 0.15  # gravity at the goal, by hand
     np.testing.assert_allclose(decision.u, want, atol=1e-9)  # least squares damped by 1e-12
 
 

@@ -7,7 +7,7 @@ from lq_oracle import soft_plan, states
 from online_models import linear_model, pendulum_model, random_linear
 
 from hybrid_mpc import OCP, CondensedController, Estimate, InputError, SoftBound, Status
-from hybrid_mpc.control.soft import SoftRows
+from hybrid_mpc.control.problem import SoftRows
 
 DT = 0.1
 A, B = np.array([[1.0, DT], [0.0, 1.0]]), np.array([[0.5 * DT**2], [DT]])
