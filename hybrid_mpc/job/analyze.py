@@ -10,16 +10,16 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.analyze.equilibria import equilibria
-from hybrid_mpc.analyze.friction import friction_slopes, linearize_secant
+from hybrid_mpc.analyze.equilibria import equilibria, hidden_equilibrium, holding_input
 from hybrid_mpc.analyze.linearize import (
     control_toolbox,
-    hidden_fixed_point,
+    friction_slopes,
     linearize,
     linearize_along,
     linearize_at_speed,
+    linearize_secant,
 )
-from hybrid_mpc.analyze.margins import LinearLoop, mpc_gain, mpc_loop, steady_filter
+from hybrid_mpc.analyze.margins import LinearLoop, gain_schedule, mpc_gain, mpc_loop, steady_filter
 from hybrid_mpc.analyze.measured import (
     MeasuredResponse,
     multisine_response,
@@ -29,7 +29,6 @@ from hybrid_mpc.analyze.measured import (
 )
 from hybrid_mpc.analyze.memory import contraction, feature_box, gru_weights, lyapunov_exponent
 from hybrid_mpc.analyze.properties import frequency_response, physical_states, system_structure
-from hybrid_mpc.analyze.schedule import gain_schedule, holding_input
 from hybrid_mpc.analyze.sensitivity import parameter_sensitivities
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.rti import CondensedController
@@ -243,7 +242,7 @@ def rest(subject: Subject, model: HybridModel) -> tuple[Array, Array]:
         best = min(calm, key=lambda p: float(np.linalg.norm(p.x)))
         return best.x, best.h
     x = np.zeros(model.n_x)
-    return x, hidden_fixed_point(model, x, u)
+    return x, hidden_equilibrium(model, x, u)
 
 
 def pairs(box: Array) -> list[tuple[float, float]]:

@@ -1,10 +1,7 @@
 """The study of an artifact's models, its tables and figures, and the command."""
 
 import csv
-import doctest
-import importlib
 import json
-import pkgutil
 import shutil
 import sys
 from dataclasses import replace
@@ -14,7 +11,6 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-import hybrid_mpc.analyze
 from hybrid_mpc import (
     InputError,
     load,
@@ -117,14 +113,6 @@ def test_without_python_control_it_is_said_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "control", None)
     with pytest.raises(InputError, match=r"hybrid-mpc\[analysis\]"):
         control_toolbox()
-
-
-MODULES = sorted(m.name for m in pkgutil.iter_modules(hybrid_mpc.analyze.__path__, "hybrid_mpc.analyze."))
-
-
-@pytest.mark.parametrize("name", [*MODULES, *(f"hybrid_mpc.plots.analysis_{m}" for m in ("loops", "models"))])
-def test_examples(name):
-    assert doctest.testmod(importlib.import_module(name)).failed == 0
 
 
 def test_what_does_not_fit_is_refused(golf_artifact, tmp_path):
