@@ -41,7 +41,7 @@ def fixed_point(model: HybridModel, u: ArrayLike, x_guess: ArrayLike) -> tuple[A
         ``x, h = fixed_point(model, [0.0], [3.0, 0.0])``
     """
     x0, u0 = vector(x_guess, model.n_x, "x_guess"), vector(u, model.n_u, "u")
-    start = np.concatenate([x0, _settled_hidden(model, x0, u0)])
+    start = np.concatenate([x0, _settled(model, x0, u0)])
     found, size = _newton(_change(model), start, u0)
     if size > RESIDUAL:
         raise InputError(
@@ -67,7 +67,7 @@ def hidden_equilibrium(model: HybridModel, x: ArrayLike, u: ArrayLike) -> Array:
     p = ca.MX.sym("p", model.n_x + model.n_u)
     r = model.step(p[: model.n_x], h, p[model.n_x :], model.w, model.p)[1] - h
     residual = ca.Function("residual", [h, p], [r, ca.densify(ca.jacobian(r, h))])
-    found, size = _newton(residual, _settled_hidden(model, x0, u0), np.concatenate([x0, u0]))
+    found, size = _newton(residual, _settled(model, x0, u0), np.concatenate([x0, u0]))
     if size > RESIDUAL:
         raise InputError(
             f"model {model.name}: the hidden state finds no rest at x = {x0.tolist()} (residual {size:.2g}); give h"
@@ -164,7 +164,7 @@ def equilibria(
     found: list[tuple[Array, float, int]] = []
     converged = 0
     for start in box[:, 0] + (unit + 0.5 / starts) % 1.0 * size:
-        z, error = _newton(residual, np.concatenate([start, _settled_hidden(model, start, held)]), held)
+        z, error = _newton(residual, np.concatenate([start, _settled(model, start, held)]), held)
         z = _turned(model, z, box)
         x = z[: model.n_x]
         edge = SAME * size
@@ -232,9 +232,9 @@ def holding_input(model: HybridModel, q: ArrayLike, *, u_guess: ArrayLike | None
     x_next, h_next = model.step(v, h, u, model.w, model.p)
     unknown, change = ca.vertcat(h, u), ca.vertcat(h_next - h, x_next[n_q:] - v[n_q:])
     residual = ca.Function("hold", [unknown, v], [change, ca.densify(ca.jacobian(change, unknown))])
-    found, size = _newton(residual, np.concatenate([_settled_hidden(model, x, start), start]), x)
+    found, size = _newton(residual, np.concatenate([_settled(model, x, start), start]), x)
     if size > RESIDUAL and model.n_u == 1 and (near := _between(model, x, float(start[0]))) is not None:
-        found, size = _newton(residual, np.concatenate([_settled_hidden(model, x, near), near]), x)
+        found, size = _newton(residual, np.concatenate([_settled(model, x, near), near]), x)
     if size > RESIDUAL:
         raise InputError(
             f"model {model.name}: no input found that holds q = {x[:n_q].tolist()} (residual {size:.2g})"
@@ -248,7 +248,7 @@ def _between(model: HybridModel, x: Array, guess: float) -> Array | None:
 
     def gained(u: float) -> float:
         held = np.array([u])
-        return float(model.step(x, _settled_hidden(model, x, held), held, model.w, model.p)[0][n_q])
+        return float(model.step(x, _settled(model, x, held), held, model.w, model.p)[0][n_q])
 
     for reach in 0.01 * 2.0 ** np.arange(12):
         low, high = guess - reach, guess + reach
@@ -286,6 +286,6 @@ def _newton(residual: ca.Function, z: Array, p: Array) -> tuple[Array, float]:
     return z, size if np.isfinite(size) else float("inf")
 
 
-def _settled_hidden(model: HybridModel, x: Array, u: Array) -> Array:
-    """Hidden state ``(n_h,)`` after 100 periods at held ``x`` and ``u``, from zero: where Newton starts."""
-    return hidden_fixed_point(model, x, u, tol=0.0, limit=100)
+def _settled(model: HybridModel, x: Array, u: Array) -> Array:
+    """Where Newton's method starts: the hidden state ``(n_h,)`` after 100 periods at held ``x`` and ``u``."""
+    return hidden_fixed_point(model, x, u, limit=100)

@@ -9,7 +9,7 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.control.ocp import OCP, Limits
+from hybrid_mpc.control.ocp import Limits, input_plan
 from hybrid_mpc.control.problem import Controller, Solution
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import START_LIMIT, Estimate
@@ -75,7 +75,7 @@ class BestOf(Controller):
                 )
         for start in starts:
             if not callable(start):
-                _checked(start, ocp)
+                input_plan(start, ocp.horizon, ocp.n_u, "start")
         if not starts and not rivals:
             raise InputError("best of one start is the controller itself; give starts or rivals")
         self.problem, self._controller = controller.problem, controller
@@ -116,7 +116,10 @@ class BestOf(Controller):
         self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None,
         limits: Limits | None,
     ) -> list[Array]:  # fmt: skip
-        guesses = [_checked(s(estimate), self.ocp) if callable(s) else s for s in self._starts]
+        guesses = [
+            input_plan(s(estimate) if callable(s) else s, self.ocp.horizon, self.ocp.n_u, "start")
+            for s in self._starts
+        ]
         for rival in self._rivals:
             h = hidden_fixed_point(rival.model, estimate.x, previous.u[0], limit=START_LIMIT)
             own = replace(estimate, h=h)
@@ -124,12 +127,3 @@ class BestOf(Controller):
             if plan.status.ok:
                 guesses.append(plan.u)
         return guesses
-
-
-def _checked(start: Array, ocp: OCP) -> Array:
-    u = np.asarray(start, dtype=float)
-    if u.shape != (ocp.horizon, ocp.n_u) or not np.all(np.isfinite(u)):
-        raise InputError(
-            f"start: finite inputs of shape {(ocp.horizon, ocp.n_u)} needed, got shape {u.shape}"
-        )
-    return u

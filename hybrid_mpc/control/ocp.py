@@ -179,7 +179,8 @@ class OCP:
             "slack_linear": None if slack_linear is None else linear,
             "slack_quadratic": None if slack_quadratic is None else quadratic,
             "soft": tuple(soft), "blocks": None if blocks is None else _block_lengths(blocks, int(horizon)),
-            "economic": economic, "starts": _plans(starts, int(horizon), n_u),
+            "economic": economic,
+            "starts": tuple(input_plan(s, int(horizon), n_u, f"starts[{i}]") for i, s in enumerate(starts)),
         }  # fmt: skip
         for name, value in fields.items():
             for array in value if isinstance(value, tuple) else (value,):
@@ -367,17 +368,14 @@ def _diagonal(values: ArrayLike, name: str) -> Array:
     return array
 
 
-def _plans(values: Sequence[ArrayLike], horizon: int, n_u: int) -> tuple[Array, ...]:
-    """Input plans, each a finite ``(horizon, n_u)``."""
-    found = []
-    for i, value in enumerate(values):
-        array = numbers(value, f"starts[{i}]").reshape(np.shape(value))
-        if array.shape != (horizon, n_u) or not np.all(np.isfinite(array)):
-            raise InputError(
-                f"starts[{i}]: shape {array.shape} given; needed: a finite plan of the inputs ({horizon}, {n_u})"
-            )
-        found.append(array)
-    return tuple(found)
+def input_plan(value: ArrayLike, horizon: int, n_u: int, name: str) -> Array:
+    """A plan of the inputs ``(horizon, n_u)``, finite."""
+    array = numbers(value, name).reshape(np.shape(value))
+    if array.shape != (horizon, n_u) or not np.all(np.isfinite(array)):
+        raise InputError(
+            f"{name}: shape {array.shape} given; needed: a finite plan of the inputs ({horizon}, {n_u})"
+        )
+    return array
 
 
 def _point(value: object, n_x: int, n_u: int) -> tuple[Array, Array]:

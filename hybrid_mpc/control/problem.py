@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybrid_mpc.control.ocp import OCP, Limits
+from hybrid_mpc.control.ocp import OCP, Limits, input_plan
 from hybrid_mpc.control.soft import SoftBound
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
@@ -365,9 +365,7 @@ class Problem:
             InputError: If ``u`` has another shape or is not finite.
         """
         n, ocp = self.ocp.horizon, self.ocp
-        start = np.tile(ocp.rest_input, (n, 1)) if u is None else np.asarray(u, dtype=float)
-        if start.shape != (n, ocp.n_u) or not np.all(np.isfinite(start)):
-            raise InputError(f"u: finite values of shape {(n, ocp.n_u)} needed, got {start}")
+        start = np.tile(ocp.rest_input, (n, 1)) if u is None else input_plan(u, n, ocp.n_u, "u")
         plan = np.clip(start, ocp.u_min, ocp.u_max)
         z = self.run(np.concatenate([estimate.x, estimate.h]), plan + estimate.d)
         if not np.all(np.isfinite(z)):

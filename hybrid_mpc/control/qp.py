@@ -16,14 +16,15 @@ from hybrid_mpc.model.buffered import BufferedFunction
 Array = NDArray[np.float64]
 Soft = tuple[Array, Array] | None
 
-KKT_TOLERANCE = 1e-5  # relative to the gradient's size
-# In DAQP's own scaling, which an ill-conditioned Hessian (weights of 1e4 on one instant) stretches: at the default
-# of 1e-6 it returned bounds violated by 5e-5 of the range.
+KKT_TOLERANCE = 1e-5
+"""Relative to the gradient's size."""
 PRIMAL_TOLERANCE = 1e-9
-# Numbers of soft bounds that QPs are built for, besides all of them.
+"""In DAQP's own scaling, which an ill-conditioned Hessian (weights of 1e4 on one instant) stretches: at the default of
+1e-6 it returned bounds violated by 5e-5 of the range."""
 SOFT_SIZES = (8, 16, 32, 64, 128, 256)
-# Share of an input's or a soft bound's range; what is left of an input's is clipped away.
+"""Numbers of soft bounds that QPs are built for, besides all of them."""
 BOUND_TOLERANCE = 1e-6
+"""Share of an input's or a soft bound's range; what is left of an input's is clipped away."""
 
 
 @dataclass(frozen=True)

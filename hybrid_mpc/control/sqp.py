@@ -229,7 +229,7 @@ class Descent:
             self._go(hessian, found, found.run)
 
     def _go(self, hessian: Array, found: _Step, run: Rollout) -> None:
-        """Make a step, and judge by the QP's multipliers what is left to do there."""
+        """Make a step, and find by the QP's multipliers what is left to do there."""
         answer, cost = found.answer, self._cost
         before = max(answer.kkt, self._residual(hessian, found.hessian @ answer.step))
         gained = self.at.run.cost - run.cost

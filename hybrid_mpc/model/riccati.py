@@ -10,6 +10,8 @@ from hybrid_mpc.model.limits import numbers
 from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
+SETTLED = 1e-10
+"""Largest change in a step of a hidden state that counts as settled."""
 
 
 def dare(a: ArrayLike, b: ArrayLike, q: ArrayLike, r: ArrayLike) -> tuple[Array, Array]:
@@ -52,13 +54,11 @@ def dare(a: ArrayLike, b: ArrayLike, q: ArrayLike, r: ArrayLike) -> tuple[Array,
     return p, k
 
 
-def hidden_fixed_point(
-    model: HybridModel, x: Array, u: Array, *, tol: float = 1e-10, limit: int = 2000
-) -> Array:
+def hidden_fixed_point(model: HybridModel, x: Array, u: Array, *, limit: int = 2000) -> Array:
     """Hidden state ``(n_h,)`` that the step reaches with ``x`` ``(n_x,)`` and ``u`` ``(n_u,)`` held.
 
-    The iteration starts at zero and ends when no element moves by more than ``tol``, or after
-    ``limit`` steps with the last value.
+    The iteration starts at zero. It ends when no element moves by more than 1e-10, or after ``limit`` steps with the
+    last value.
 
     Example:
         >>> import casadi as ca
@@ -73,7 +73,7 @@ def hidden_fixed_point(
     for _ in range(limit if model.n_h else 0):
         h_next = model.step(x, h, u, model.w, model.p)[1].full().ravel()
         moved, h = np.max(np.abs(h_next - h)), h_next
-        if not moved > tol:
+        if not moved > SETTLED:
             break
     return h
 
@@ -86,18 +86,28 @@ def linearization(model: HybridModel, x: Array, u: Array) -> tuple[Array, Array,
     return a.full(), b.full(), h
 
 
-def lqr(model: HybridModel, x: ArrayLike, u: ArrayLike, q: ArrayLike, r: ArrayLike) -> Array:
-    """Gain ``(n_u, n_x + n_h)`` of a model's LQR, ``u = u_target - gain @ (z - z_target)`` with ``z = (x, h)``.
+def lqr(
+    model: HybridModel,
+    x_target: ArrayLike,
+    u_target: ArrayLike,
+    q: ArrayLike,
+    r: ArrayLike,
+    *,
+    working_point: tuple[ArrayLike, ArrayLike] | None = None,
+) -> Array:
+    """Gain ``K`` ``(n_u, n_x + n_h)`` of ``u = u_target - K (z - z_target)`` with ``z = (x, h)``.
 
-    The model is linearized with its exact Jacobian, its hidden state at the fixed point. At rest the steep slope of
-    a smoothed friction law (tanh) dominates the linearization; take a moving point there.
+    The model is linearized with its exact Jacobian, its hidden state at the fixed point. At rest the steep slope of a
+    smoothed friction law (tanh) dominates the linearization and passes for strong damping; ``working_point`` takes the
+    linearization from a moving point.
 
     Args:
         model: The model; ``n_h`` may be 0.
-        x: State ``(n_x,)`` to linearize at.
-        u: Input ``(n_u,)`` there.
+        x_target: ``(n_x,)`` [SI].
+        u_target: ``(n_u,)`` [SI].
         q: Weights of the states ``(n_x,)``; the hidden states carry none.
         r: Weights of the inputs ``(n_u,)``, positive.
+        working_point: ``(x, u)`` to linearize at. Default: the target.
 
     Raises:
         InputError: If a shape does not fit, or the linearized model is not stabilisable.
@@ -110,9 +120,11 @@ def lqr(model: HybridModel, x: ArrayLike, u: ArrayLike, q: ArrayLike, r: ArrayLi
         >>> lqr(model, [0.0], [0.0], [1.0], [1.0]).round(6)
         array([[0.618034]])
     """
-    at = vector(x, model.n_x, "x"), vector(u, model.n_u, "u")
+    target = vector(x_target, model.n_x, "x_target"), vector(u_target, model.n_u, "u_target")
     q_v, r_v = vector(q, model.n_x, "q"), vector(r, model.n_u, "r")
-    a, b, _ = linearization(model, *at)
+    x, u = target if working_point is None else working_point
+    x, u = vector(x, model.n_x, "working_point x"), vector(u, model.n_u, "working_point u")
+    a, b, _ = linearization(model, x, u)
     return dare(a, b, np.diag(np.concatenate([q_v, np.zeros(model.n_h)])), np.diag(r_v))[1]
 
 

@@ -1,3 +1,5 @@
+"""Riccati equation, LQR and the hidden state's fixed point."""
+
 import numpy as np
 import pytest
 from online_models import pendulum_model, random_linear
@@ -6,20 +8,14 @@ from hybrid_mpc import InputError, dare, lqr
 from hybrid_mpc.model.riccati import hidden_fixed_point
 
 
-def test_dare_solves_its_equation_and_stabilises():
+def test_dare_solves_its_equation_and_its_matrix_is_the_cost_of_the_closed_loop():
     _, a, b, _ = random_linear(3, n_x=4, n_u=2, radius=1.3)
     q, r = np.diag([1.0, 0.5, 0.0, 2.0]), np.diag([0.3, 0.7])
     p, k = dare(a, b, q, r)
     residual = q + a.T @ p @ a - a.T @ p @ b @ k - p
     assert np.max(np.abs(residual)) < 1e-9 * np.max(np.abs(p))  # rounding of a 4 x 4 solve
     assert np.max(np.abs(np.linalg.eigvals(a - b @ k))) < 1
-
-
-def test_cost_to_go_is_the_cost_of_the_closed_loop():
-    _, a, b, _ = random_linear(5, n_x=3, n_u=1, radius=1.1)
-    q, r = np.eye(3), np.eye(1)
-    p, k = dare(a, b, q, r)
-    x = np.array([1.0, -2.0, 0.5])
+    x = np.array([1.0, -2.0, 0.5, 0.3])
     want, cost = x @ p @ x, 0.0
     for _ in range(2000):
         u = -k @ x
@@ -45,16 +41,13 @@ def test_hidden_state_at_its_fixed_point():
 
 
 def test_friction_at_rest_dominates_and_a_moving_point_avoids_it():
-    model = pendulum_model(friction=0.3)
-    weights = [10.0, 0.1], [1.0]
-    rest = lqr(model, [0.0, 0.0], [0.0], *weights)
-    moving = lqr(model, [0.0, 2.0], [0.0], *weights)
+    model, target = pendulum_model(friction=0.3), ([0.0, 0.0], [0.0], [10.0, 0.1], [1.0])
+    rest, moving = lqr(model, *target), lqr(model, *target, working_point=([0.0, 2.0], [0.0]))
     assert rest[0, 1] != pytest.approx(moving[0, 1], rel=0.1)
 
 
 def test_lqr_stabilises_the_upright_pendulum():
-    model = pendulum_model()
-    up = np.array([np.pi, 0.0])
+    model, up = pendulum_model(), np.array([np.pi, 0.0])
     k = lqr(model, up, [0.0], [10.0, 1.0], [0.1])
     x = up + np.array([0.05, 0.0])
     for _ in range(500):
