@@ -40,7 +40,7 @@ class BestOf(Controller):
     Example:
         >>> import casadi as ca
         >>> from hybrid_mpc.estimate.kalman import TrueState
-        >>> from hybrid_mpc.control.sqp import SQPController
+        >>> from hybrid_mpc.control.ocp import OCP; from hybrid_mpc.control.sqp import SQPController
         >>> from hybrid_mpc.machine.signals import Signal
         >>> from hybrid_mpc.model.model import HybridModel
         >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
