@@ -15,10 +15,16 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from hybrid_mpc import plots
-    from hybrid_mpc.analyze.equilibria import equilibria
-    from hybrid_mpc.analyze.friction import friction_slopes, linearize_secant
-    from hybrid_mpc.analyze.linearize import jacobians, linearize, linearize_along, linearize_at_speed
-    from hybrid_mpc.analyze.margins import mpc_gain, mpc_loop, steady_filter
+    from hybrid_mpc.analyze.equilibria import equilibria, holding_input
+    from hybrid_mpc.analyze.linearize import (
+        friction_slopes,
+        jacobians,
+        linearize,
+        linearize_along,
+        linearize_at_speed,
+        linearize_secant,
+    )
+    from hybrid_mpc.analyze.margins import gain_schedule, mpc_gain, mpc_loop, steady_filter
     from hybrid_mpc.analyze.measured import multisine_response, run_model, run_plant
     from hybrid_mpc.analyze.memory import contraction, feature_box, gru_weights, lyapunov_exponent
     from hybrid_mpc.analyze.properties import (
@@ -27,7 +33,6 @@ if TYPE_CHECKING:
         physical_states,
         system_structure,
     )
-    from hybrid_mpc.analyze.schedule import gain_schedule, holding_input
     from hybrid_mpc.analyze.sensitivity import parameter_sensitivities
     from hybrid_mpc.control.best_of import BestOf
     from hybrid_mpc.control.nlp import IpoptController
@@ -298,16 +303,16 @@ __all__ = [
     "write_study_report",
 ]
 _ROOMS = {
-    "analyze.equilibria": ("equilibria",),
-    "analyze.friction": ("friction_slopes", "linearize_secant"),
-    "analyze.linearize": ("jacobians", "linearize", "linearize_along", "linearize_at_speed"),
-    "analyze.margins": ("mpc_gain", "mpc_loop", "steady_filter"),
+    "analyze.equilibria": ("equilibria", "holding_input"),
+    "analyze.linearize": (
+        "friction_slopes", "jacobians", "linearize", "linearize_along", "linearize_at_speed", "linearize_secant",
+    ),
+    "analyze.margins": ("gain_schedule", "mpc_gain", "mpc_loop", "steady_filter"),
     "analyze.measured": ("multisine_response", "run_model", "run_plant"),
     "analyze.memory": ("contraction", "feature_box", "gru_weights", "lyapunov_exponent"),
     "analyze.properties": (
         "balanced_truncation", "frequency_response", "physical_states", "system_structure",
     ),
-    "analyze.schedule": ("gain_schedule", "holding_input"),
     "analyze.sensitivity": ("parameter_sensitivities",),
     "control.best_of": ("BestOf",),
     "control.nlp": ("IpoptController",),

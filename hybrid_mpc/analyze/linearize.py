@@ -1,31 +1,27 @@
-"""Linearization along a trajectory: a linear time-varying system."""
+"""Linear models of a nonlinear one: at a point, at a size of motion (friction), along a trajectory."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hybrid_mpc.analyze.equilibria import hidden_equilibrium
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.model.riccati import vector
 
-# python-control, imported only where it is used, and the names of a model's signals in its manner.
+Array = NDArray[np.float64]
+Kind: TypeAlias = Literal["secant", "harmonic"]
+ANGLES = 64
+"""Points of a sinusoid's period over which the harmonic mean is taken; exact for polynomials of degree 62."""
 
 
 def control_toolbox() -> Any:
-    """The module ``control``.
-
-    Raises:
-        InputError: If python-control is not installed.
-
-    Example:
-        >>> control_toolbox().__name__
-        'control'
-    """
+    """The module ``control``; an InputError says how to install it where it is missing."""
     try:
         import control
     except ImportError as missing:
@@ -35,39 +31,20 @@ def control_toolbox() -> Any:
     return control
 
 
-def signal_names(model: HybridModel) -> dict[str, Any]:
-    """Names of system, states, inputs and outputs as keyword arguments of ``control.ss``."""
-    return {
-        "name": model.name,
-        "states": [s.name for s in model.states] + [f"h{i}" for i in range(model.n_h)],
-        "inputs": [s.name for s in model.inputs],
-        "outputs": distinct([s.name for s in model.outputs]),
-    }
-
-
-def distinct(names: Sequence[str]) -> list[str]:
-    """Names that occur several times, numbered.
-
-    Example:
-        >>> distinct(["phi", "phi", "u"])
-        ['phi_0', 'phi_1', 'u']
-    """
-    return [n if names.count(n) == 1 else f"{n}_{i}" for i, n in enumerate(names)]
-
-
 def period(sys: Any) -> float:
-    """Period [s] of a discrete system.
-
-    Raises:
-        InputError: If it is continuous or has no period.
-    """
+    """Period [s] of a discrete system; an InputError for a continuous one."""
     dt = sys.dt
     if dt is None or dt is True or not dt > 0:
         raise InputError(f"linear analysis: needs a discrete system with a period, its dt is {dt}")
     return float(dt)
 
 
-# A, B, C, D as CasADi functions of the operating point.
+def operating_point(
+    model: HybridModel, x: ArrayLike, u: ArrayLike, h: ArrayLike | None
+) -> tuple[Array, Array, Array]:
+    """``x`` ``(n_x,)``, ``u`` ``(n_u,)`` and ``h`` ``(n_h,)``, checked; default of ``h``: its equilibrium."""
+    x0, u0 = vector(x, model.n_x, "x"), vector(u, model.n_u, "u")
+    return x0, u0, hidden_equilibrium(model, x0, u0) if h is None else vector(h, model.n_h, "h")
 
 
 def jacobians(model: HybridModel, *, continuous: bool = False) -> ca.Function:
@@ -111,69 +88,6 @@ def jacobians(model: HybridModel, *, continuous: bool = False) -> ca.Function:
     return ca.Function("jacobians", [x, h, u], results, ["x", "h", "u"], ["A", "B", "C", "D"])
 
 
-# Fixed points and exact linearizations of a model over ``[x; h]``.
-
-Array = NDArray[np.float64]
-RESIDUAL = 1e-10
-ITERATIONS = 50
-
-
-def fixed_point(model: HybridModel, u: ArrayLike, x_guess: ArrayLike) -> tuple[Array, Array]:
-    """State and hidden state that one step under ``u`` leaves where they are.
-
-    Damped Newton on ``step(x, h, u) - (x, h)`` with the exact Jacobian, from ``x_guess`` and the hidden
-    state at rest for it.
-
-    Args:
-        model: The model.
-        u: Held input ``(n_u,)``.
-        x_guess: Start ``(n_x,)``.
-
-    Returns:
-        ``x`` ``(n_x,)`` and ``h`` ``(n_h,)``; largest residual at most 1e-10 in the units of the state.
-
-    Raises:
-        InputError: If a size is wrong or Newton finds none; try another guess or input.
-
-    Example:
-        ``x, h = fixed_point(model, [0.0], [3.0, 0.0])``
-    """
-    x0, u0 = column(model, "x_guess", x_guess, model.n_x), column(model, "u", u, model.n_u)
-    start = np.concatenate([x0, settled_hidden(model, x0, u0)])
-    found, size = newton(rest_residual(model), start, u0)
-    if size > RESIDUAL:
-        raise InputError(
-            f"model {model.name}: no fixed point found from x = {x0.tolist()} under u = {u0.tolist()} "
-            f"(residual {size:.2g}, needed {RESIDUAL:g}); give a nearer x_guess or an input it can rest under"
-        )
-    return found[: model.n_x], found[model.n_x :]
-
-
-def hidden_fixed_point(model: HybridModel, x: ArrayLike, u: ArrayLike) -> Array:
-    """Hidden state ``(n_h,)`` at rest while ``x`` ``(n_x,)`` and ``u`` ``(n_u,)`` are held.
-
-    Raises:
-        InputError: If a size is wrong or none is found (residual above 1e-10).
-
-    Example:
-        ``h = hidden_fixed_point(model, [0.0, 2.0], [0.1])``
-    """
-    x0, u0 = column(model, "x", x, model.n_x), column(model, "u", u, model.n_u)
-    if model.n_h == 0:
-        return np.zeros(0)
-    h = ca.MX.sym("h", model.n_h)
-    p = ca.MX.sym("p", model.n_x + model.n_u)
-    r = model.step(p[: model.n_x], h, p[model.n_x :], model.w, model.p)[1] - h
-    residual = ca.Function("residual", [h, p], [r, ca.densify(ca.jacobian(r, h))])
-    found, size = newton(residual, settled_hidden(model, x0, u0), np.concatenate([x0, u0]))
-    if size > RESIDUAL:
-        raise InputError(
-            f"model {model.name}: the hidden state finds no rest at x = {x0.tolist()} (residual {size:.2g}); "
-            "give h"
-        )
-    return found
-
-
 def linearize(
     model: HybridModel, x: ArrayLike, u: ArrayLike, h: ArrayLike | None = None, *, continuous: bool = False
 ) -> Any:
@@ -183,7 +97,7 @@ def linearize(
         model: The model.
         x: Operating point ``(n_x,)``; it need not be an equilibrium.
         u: Input ``(n_u,)``.
-        h: Hidden state ``(n_h,)``. Default: its fixed point while ``x`` and ``u`` are held.
+        h: Hidden state ``(n_h,)``. Default: its equilibrium while ``x`` and ``u`` are held.
         continuous: The ODE itself instead of its step, where there is no hidden state. Default: no.
 
     Returns:
@@ -196,22 +110,28 @@ def linearize(
     Example:
         ``control.damp(linearize(model, x, u))``
     """
-    control = control_toolbox()
-    x0, u0 = column(model, "x", x, model.n_x), column(model, "u", u, model.n_u)
-    h0 = hidden_fixed_point(model, x0, u0) if h is None else column(model, "h", h, model.n_h)
-    a, b, c, d = (m.full() for m in jacobians(model, continuous=continuous)(x0, h0, u0))
-    return control.ss(
-        a, b, c, d, 0 if continuous else model.dt, remove_useless_states=False, **signal_names(model)
+    x0, u0, h0 = operating_point(model, x, u, h)
+    matrices = (m.full() for m in jacobians(model, continuous=continuous)(x0, h0, u0))
+    return _state_space(model, *matrices, dt=0 if continuous else None)
+
+
+def _state_space(model: HybridModel, *matrices: Array, dt: float | None = None) -> Any:
+    """``control.StateSpace`` over ``[x; h]`` with the signals' names; names that occur several times are numbered."""
+    names = [s.name for s in model.outputs]
+    return control_toolbox().ss(
+        *matrices, model.dt if dt is None else dt, remove_useless_states=False, name=model.name,
+        states=[s.name for s in model.states] + [f"h{i}" for i in range(model.n_h)],
+        inputs=[s.name for s in model.inputs],
+        outputs=[n if names.count(n) == 1 else f"{n}_{i}" for i, n in enumerate(names)],
     )  # fmt: skip
 
 
 def linearize_at_speed(model: HybridModel, q: ArrayLike, v_work: ArrayLike, u: ArrayLike) -> Any:
     """Linearization with friction as it is at working speed, at ``x = (q, v_work)``.
 
-    At rest the slope of a smoothed Coulomb friction ``tanh(v / v_s)`` dominates everything: it is a huge
-    viscous damper that no motion ever feels. At ``|v_work|`` of several ``v_s`` the slope is that of the
-    motion. Models are to be compared at the same ``(q, v_work, u)``; the point is no equilibrium, so the
-    result describes small deviations from the motion over times short against it.
+    At rest the slope of a smoothed Coulomb friction ``tanh(v / v_s)`` is a huge viscous damper that no motion feels. At
+    ``|v_work|`` of several ``v_s`` the slope is that of the motion. The point is no equilibrium: the result describes
+    small deviations from the motion over times short against it. Compare models at the same ``(q, v_work, u)``.
 
     Args:
         model: The model, state ``[q, v]``.
@@ -229,57 +149,141 @@ def linearize_at_speed(model: HybridModel, q: ArrayLike, v_work: ArrayLike, u: A
         ``linearize_at_speed(model, [0.0], [2.0], [0.1])``
     """
     n_q = model.n_x // 2
-    x = np.concatenate([column(model, "q", q, n_q), column(model, "v_work", v_work, n_q)])
+    x = np.concatenate([vector(q, n_q, "q"), vector(v_work, n_q, "v_work")])
     return linearize(model, x, u)
 
 
-def rest_residual(model: HybridModel) -> ca.Function:
-    """``(z, u)`` to what one step changes of ``z = (x, h)``, and its Jacobian by ``z``."""
-    x, h = ca.MX.sym("x", model.n_x), ca.MX.sym("h", model.n_h)
-    z, v = ca.vertcat(x, h), ca.MX.sym("u", model.n_u)
-    r = ca.vertcat(*model.step(x, h, v, model.w, model.p)) - z
-    return ca.Function("residual", [z, v], [r, ca.densify(ca.jacobian(r, z))])
+def linearize_secant(
+    model: HybridModel, x: ArrayLike, u: ArrayLike, speed: ArrayLike, h: ArrayLike | None = None,
+    *, kind: Kind = "harmonic",
+) -> Any:  # fmt: skip
+    """Linearization at rest whose damping is that of motions of a given size.
 
+    A smoothed Coulomb friction has a slope at rest that no motion feels. Here the columns of A by the velocities are
+    chords: of the step from ``v = +speed`` and ``-speed`` (``"secant"``), or the mean over a sinusoid of that
+    amplitude (``"harmonic"``, the describing function; 4/pi of the secant for Coulomb friction). All other columns
+    are the tangents. The point stays a point of rest, so poles, loops and margins of it mean something.
 
-def newton(residual: ca.Function, z: Array, p: Array) -> tuple[Array, float]:
-    """Newton with step halving; the best point and its largest residual (inf if it is not finite)."""
-    r, jacobian = (np.asarray(m.full()) for m in residual(z, p))
-    for _ in range(ITERATIONS):
-        size = float(np.abs(r).max(initial=0.0))
-        if not np.isfinite(size) or size <= 1e-3 * RESIDUAL:
-            break
-        step = np.linalg.lstsq(jacobian, -r.ravel(), rcond=None)[0]
-        scale, improved = 1.0, False
-        while scale > 1e-4 and not improved:
-            trial = z + scale * step
-            r_new, j_new = (np.asarray(m.full()) for m in residual(trial, p))
-            improved = bool(np.linalg.norm(r_new) < np.linalg.norm(r))
-            scale *= 0.5
-        if not improved:
-            break
-        z, r, jacobian = trial, r_new, j_new
-    size = float(np.abs(r).max(initial=0.0))
-    return z, size if np.isfinite(size) else float("inf")
+    Args:
+        model: The model, state ``[q, v]``.
+        x: Operating point ``(n_x,)``, at rest.
+        u: Input ``(n_u,)``.
+        speed: Size of the motion ``(n_x / 2,)`` [units of v], positive.
+        h: Hidden state ``(n_h,)``, held while the speed varies. Default: its equilibrium.
+        kind: See above. Default: ``"harmonic"``.
 
-
-def settled_hidden(model: HybridModel, x: Array, u: Array, steps: int = 100) -> Array:
-    """Hidden state ``(n_h,)`` after some periods at held ``x`` and ``u``, from zero."""
-    h = np.zeros(model.n_h)
-    for _ in range(steps if model.n_h else 0):
-        h = model.step(x, h, u, model.w, model.p)[1].full().ravel()
-    return h
-
-
-def column(model: HybridModel, name: str, value: ArrayLike, n: int) -> Array:
-    """``n`` finite numbers.
+    Returns:
+        ``control.StateSpace`` as from :func:`linearize`.
 
     Raises:
-        InputError: If they are not.
+        InputError: If a size is wrong, a speed is not positive, or the hidden state finds no rest.
+
+    Example:
+        ``linearize_secant(model, [0.0, 0.0], [0.0], [0.5])``
     """
-    array = np.asarray(value, dtype=np.float64).reshape(-1)
-    if array.size != n or not np.isfinite(array).all():
-        raise InputError(f"model {model.name}: {name} must be {n} finite numbers, got {array.tolist()}")
-    return array
+    n_q, n_z = model.n_x // 2, model.n_x + model.n_h
+    size = _positive(speed, n_q)
+    if kind not in ("secant", "harmonic"):
+        raise InputError(f"secant: kind must be 'secant' or 'harmonic', got {kind!r}")
+    x0, u0, h0 = operating_point(model, x, u, h)
+    a, *others = (m.full() for m in jacobians(model)(x0, h0, u0))
+    for j, v in enumerate(size):
+        e = np.eye(model.n_x)[n_q + j]
+
+        def after(w: float, e: Array = e) -> Array:
+            return np.concatenate(
+                [m.full().ravel() for m in model.step(x0 + w * e, h0, u0, model.w, model.p)]
+            )
+
+        a[:, n_q + j] = np.reshape(_chord(after, v, kind), n_z)
+    return _state_space(model, a, *others)
+
+
+@dataclass(frozen=True)
+class FrictionSlopes:
+    """Damping ``-d(acceleration) / d(speed)`` [1/s] of one axis at rest, for motions of sizes ``speed``.
+
+    Times the inertia it is a viscous damping coefficient.
+
+    Args:
+        speed: Speeds ``(n,)`` [unit of v].
+        tangent: Slope at rest, the same for all speeds: what :func:`linearize` takes.
+        secant: ``(n,)``: slope of the line through the accelerations at ``+speed`` and ``-speed``.
+        harmonic: ``(n,)``: describing function of a sinusoid of that amplitude.
+        moving: ``(n,)``: slope at the speed itself, as :func:`linearize_at_speed` takes it.
+        per_input: Acceleration per unit of the input [unit of a / input unit], to turn slopes into input units.
+    """
+
+    speed: Array
+    tangent: float
+    secant: Array
+    harmonic: Array
+    moving: Array
+    per_input: float
+
+
+def friction_slopes(
+    model: HybridModel, q: ArrayLike, speeds: ArrayLike, u: ArrayLike | None = None, *, axis: int = 0
+) -> FrictionSlopes:
+    """Damping of one axis as tangent, secant, describing function and tangent in motion.
+
+    Args:
+        model: The model, state ``[q, v]``.
+        q: Positions ``(n_x / 2,)``.
+        speeds: Sizes of the speed ``(n,)``, positive.
+        u: Input ``(n_u,)``. Default: zero.
+        axis: Number of the axis. Default: the first.
+
+    Raises:
+        InputError: If a size is wrong, a speed is not positive, or the hidden state finds no rest.
+
+    Source: the describing function: Gelb and Vander Velde, *Multiple-Input Describing Functions and Nonlinear System
+    Design*, 1968, section 2.2.
+
+    Example:
+        ``friction_slopes(model, [0.0], [0.1, 1.0]).secant``
+    """
+    n_q = model.n_x // 2
+    size = _positive(speeds, np.size(speeds))
+    if not 0 <= axis < n_q:
+        raise InputError(f"friction: axis {axis} given, model {model.name} has axes 0 to {n_q - 1}")
+    held = np.zeros(model.n_u) if u is None else vector(u, model.n_u, "u")
+    x = np.concatenate([vector(q, n_q, "q"), np.zeros(n_q)])
+    h, i = hidden_equilibrium(model, x, held), n_q + axis
+    e = np.eye(model.n_x)[i]
+
+    def acceleration(v: float) -> float:
+        return float(model.xdot(x + v * e, h, held, model.w, model.p)[i])
+
+    slope = _slope_of(model, i)
+    secant = np.array([_chord(acceleration, v, "secant") for v in size])
+    harmonic = np.array([_chord(acceleration, v, "harmonic") for v in size])
+    moving = np.array([slope(x + v * e, h, held)[0] for v in size])
+    tangent, per_input = slope(x, h, held)
+    return FrictionSlopes(size, -tangent, -secant, -harmonic, -moving, per_input)
+
+
+def _positive(speed: ArrayLike, n: int) -> Array:
+    size = vector(speed, n, "speed")
+    if not n or not np.all(size > 0):
+        raise InputError(f"speed: sizes of a motion must be positive, got {size.tolist()}")
+    return size
+
+
+def _chord(f: Any, v: float, kind: Kind) -> Any:
+    if kind == "secant":
+        return (f(v) - f(-v)) / (2 * v)
+    theta = (np.arange(ANGLES // 2) + 0.5) * (2 * np.pi / ANGLES)  # half the period; the other mirrors it
+    points = v * np.cos(theta)
+    return sum(f(p) * p for p in points) / float(np.sum(points**2))
+
+
+def _slope_of(model: HybridModel, i: int) -> Any:
+    """``(x, h, u)`` to the derivatives of ``xdot[i]`` by ``x[i]`` and by the first input."""
+    x, h, u = ca.MX.sym("x", model.n_x), ca.MX.sym("h", model.n_h), ca.MX.sym("u", model.n_u)
+    rate = model.xdot(x, h, u, model.w, model.p)[i]
+    f = ca.Function("slope", [x, h, u], [ca.jacobian(rate, x)[i], ca.jacobian(rate, u)[0]])
+    return lambda *point: tuple(float(m) for m in f(*point))
 
 
 @dataclass(frozen=True)
@@ -308,15 +312,13 @@ class AlongTrajectory:
 
     def system(self, k: int) -> Any:
         """The frozen system of period ``k`` as ``control.StateSpace``."""
-        matrices = (self.A[k], self.B[k], self.C[k], self.D[k])
-        names = signal_names(self.model)
-        return control_toolbox().ss(*matrices, self.model.dt, remove_useless_states=False, **names)
+        return _state_space(self.model, self.A[k], self.B[k], self.C[k], self.D[k])
 
     def mean(self, skip: int = 0) -> Any:
         """The matrices' means over the trajectory as ``control.StateSpace``: statistical linearization.
 
-        For a deviation that is Gaussian the mean slope is the linear map that predicts a function best; so this is
-        what motions like this one see of a friction, and of all else that is nonlinear, networks included.
+        For a Gaussian deviation the mean slope is the linear map that predicts a function best: what motions like this
+        one see of friction and of all else that is nonlinear, networks included.
 
         Args:
             skip: Periods left out at the start.
@@ -328,9 +330,7 @@ class AlongTrajectory:
         """
         if not 0 <= skip < len(self.A):
             raise InputError(f"mean: {skip} periods to leave out, the trajectory has {len(self.A)}")
-        matrices = (m[skip:].mean(axis=0) for m in (self.A, self.B, self.C, self.D))
-        names = signal_names(self.model)
-        return control_toolbox().ss(*matrices, self.model.dt, remove_useless_states=False, **names)
+        return _state_space(self.model, *(m[skip:].mean(axis=0) for m in (self.A, self.B, self.C, self.D)))
 
     def transition(self, start: int, end: int) -> Array:
         """``A_{end-1} ... A_start`` ``(n_z, n_z)``: what a deviation at ``start`` has become at ``end``.
@@ -362,7 +362,6 @@ def linearize_along(
         InputError: If a shape does not fit, or the free run leaves the numbers.
 
     Example:
-        >>> import casadi as ca
         >>> from hybrid_mpc.machine.signals import Signal
         >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
         >>> model = HybridModel.of("square", 1.0, level, (Signal("u", "-"),), level,

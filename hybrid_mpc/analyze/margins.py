@@ -1,8 +1,8 @@
-"""The linearized control loop: MPC, estimator and plant; margins and sensitivity functions."""
+"""Controllers and estimators to first order, the loop they close with a plant, its margins and sensitivities."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from time import perf_counter
 from types import MappingProxyType
@@ -12,15 +12,26 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_discrete_are
 
-from hybrid_mpc.analyze.linearize import column, control_toolbox, hidden_fixed_point, linearize, period
+from hybrid_mpc.analyze.linearize import (
+    Kind,
+    control_toolbox,
+    linearize,
+    linearize_secant,
+    operating_point,
+    period,
+)
 from hybrid_mpc.analyze.properties import frequency_response
 from hybrid_mpc.control.rti import CondensedController, propagate
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate, ExtendedKalmanFilter
-
-# What controller and estimator are to first order: the gain of the MPC's QP, the steady Kalman filter.
+from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.model.riccati import dare, vector
 
 Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+FREQUENCIES = 2000
+MOST_DELAY = 200
+"""Most whole periods of delay that are tried."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +65,7 @@ def mpc_gain(
         controller: The real-time iteration; its weights, horizon, terminal weight and move blocks are used.
         x: Operating point ``(n_x,)``.
         u: Input there ``(n_u,)``, within the bounds.
-        h: Hidden state ``(n_h,)``. Default: its fixed point.
+        h: Hidden state ``(n_h,)``. Default: its equilibrium.
         system: Linearization over ``(x, h)`` that the prediction is to have, e.g. of :func:`linearize_secant`.
             Default: the tangent at the point.
 
@@ -62,9 +73,8 @@ def mpc_gain(
         InputError: If a size is wrong, the point violates a bound of the inputs or a soft one, or the problem has an
             economic stage cost (its curvature changes along the plan).
 
-    Source: Fiacco, *Introduction to Sensitivity and Stability Analysis in Nonlinear Programming*, 1983, for bounds
-    that do not act; Bemporad, Morari, Dua, Pistikopoulos, *The explicit linear quadratic regulator for constrained
-    systems*, Automatica 38 (2002).
+    Source: Fiacco, *Introduction to Sensitivity and Stability Analysis in Nonlinear Programming*, 1983; Bemporad,
+    Morari, Dua, Pistikopoulos, *The explicit linear quadratic regulator for constrained systems*, Automatica 38 (2002).
 
     Example:
         >>> import casadi as ca
@@ -79,8 +89,7 @@ def mpc_gain(
     """
     model, ocp = controller.model, controller.ocp
     n, n_x, n_u = ocp.horizon, model.n_x, model.n_u
-    x0, u0 = column(model, "x", x, n_x), column(model, "u", u, n_u)
-    h0 = hidden_fixed_point(model, x0, u0) if h is None else column(model, "h", h, model.n_h)
+    x0, u0, h0 = operating_point(model, x, u, h)
     if np.any(u0 <= ocp.u_min) or np.any(u0 >= ocp.u_max):
         raise InputError(
             f"MPC gain: the input {u0.tolist()} lies on or outside the bounds, where it does not move"
@@ -111,17 +120,71 @@ def mpc_gain(
         2 * prepared.weighted.T @ by_z, 2 * prepared.weighted.T @ (prepared.from_u @ every), before,
         -2 * prepared.weighted.T @ hold,
     ])  # fmt: skip
-    hessian, slopes = _blocked(controller, prepared.hessian, slopes)
+    hessian, slopes = controller.qp.blocked_hessian(prepared.hessian), controller.qp.by_blocks(slopes.T).T
     first = -cho_solve(cho_factor(hessian), slopes)[:n_u]
     edges = np.cumsum([len(a), n_u, n_u])
     return MpcGain(*np.split(first, edges, axis=1))
 
 
-def _blocked(controller: CondensedController, hessian: Array, slopes: Array) -> tuple[Array, Array]:
-    if controller.ocp.blocks is None:
-        return hessian, slopes
-    qp = controller.qp
-    return qp.blocked_hessian(hessian), qp.by_blocks(slopes.T).T
+@dataclass(frozen=True)
+class GainSchedule:
+    """LQR gains by operating point: ``du = -gain[k] @ dz`` with ``z = (x, h)``.
+
+    Args:
+        x: Operating points ``(n, n_x)``.
+        u: Inputs there ``(n, n_u)``.
+        gain: ``(n, n_u, n_x + n_h)`` [input unit / state unit].
+        radius: Spectral radius of each closed loop ``(n,)``.
+    """
+
+    x: Array
+    u: Array
+    gain: Array
+    radius: Array
+
+
+def gain_schedule(
+    model: HybridModel, points: Iterable[tuple[ArrayLike, ArrayLike]], q: ArrayLike, r: ArrayLike,
+    *, speed: ArrayLike | None = None, kind: Kind = "harmonic",
+) -> GainSchedule:  # fmt: skip
+    """LQR of the linearization at each point, hidden states (at their equilibrium) without weight.
+
+    Args:
+        model: The model.
+        points: Operating points ``(x, u)``.
+        q: Weights of the states ``(n_x,)``.
+        r: Weights of the inputs ``(n_u,)``, positive.
+        speed: Size of the motion that the friction is linearized for, see :func:`linearize_secant`. Default: the
+            tangent at the point.
+        kind: How, see there.
+
+    Raises:
+        InputError: If there is no point, a size is wrong, or a linearization is not stabilisable.
+
+    Source: Rugh and Shamma, *Research on gain scheduling*, Automatica 36 (2000).
+
+    Example:
+        >>> import casadi as ca
+        >>> from hybrid_mpc.machine.signals import Signal
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
+        >>> gain_schedule(model, [([0.0], [0.0])], [1.0], [1.0]).gain.round(6).ravel()
+        array([0.618034])
+    """
+    given = [operating_point(model, x, u, None) for x, u in points]
+    if not given:
+        raise InputError("gain schedule: no operating point given")
+    weights = np.diag(np.concatenate([vector(q, model.n_x, "q"), np.zeros(model.n_h)]))
+    costs = np.diag(vector(r, model.n_u, "r"))
+    gains, radii = [], []
+    for x, u, h in given:
+        secant = None if speed is None else linearize_secant(model, x, u, speed, h, kind=kind)
+        system = linearize(model, x, u, h) if secant is None else secant
+        _, k = dare(system.A, system.B, weights, costs)
+        gains.append(k)
+        radii.append(float(np.abs(np.linalg.eigvals(system.A - system.B @ k)).max()))
+    xs, us, _ = zip(*given, strict=True)
+    return GainSchedule(np.stack(xs), np.stack(us), np.stack(gains), np.array(radii))
 
 
 @dataclass(frozen=True)
@@ -154,7 +217,7 @@ def steady_filter(
         ekf: The filter; a disturbance that it takes for constant keeps a gain of zero.
         x: Operating point ``(n_x,)``.
         u: Input there ``(n_u,)``.
-        h: Hidden state ``(n_h,)``. Default: its fixed point.
+        h: Hidden state ``(n_h,)``. Default: its equilibrium.
         system: Linearization over ``(x, h)`` instead of the tangent at the point. Default: none.
 
     Raises:
@@ -164,7 +227,6 @@ def steady_filter(
 
     Example:
         >>> import casadi as ca
-        >>> from hybrid_mpc.model.model import HybridModel
         >>> from hybrid_mpc.machine.signals import Signal
         >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
         >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
@@ -173,8 +235,7 @@ def steady_filter(
         array([[0.618034]])
     """
     model = ekf.model
-    x0, u0 = column(model, "x", x, model.n_x), column(model, "u", u, model.n_u)
-    h0 = hidden_fixed_point(model, x0, u0) if h is None else column(model, "h", h, model.n_h)
+    x0, u0, h0 = operating_point(model, x, u, h)
     sys = linearize(model, x0, u0, h0) if system is None else system
     if np.any(np.asarray(sys.D) != 0):
         raise InputError(
@@ -204,12 +265,6 @@ def steady_filter(
     gain[alive] = np.linalg.solve(seen @ before @ seen.T + noise_y, seen @ before).T
     p[where] = before - gain[alive] @ seen @ before
     return SteadyFilter(f, g, c, gain, p)
-
-
-Complex = NDArray[np.complex128]
-FREQUENCIES = 2000
-MOST_DELAY = 200
-"""Most whole periods of delay that are tried."""
 
 
 @dataclass(frozen=True)

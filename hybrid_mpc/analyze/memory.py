@@ -1,4 +1,4 @@
-"""How fast neighbouring free runs part: the largest Lyapunov exponent."""
+"""Does a recurrent model forget? A certificate over a box of inputs, and the Lyapunov exponent of a run."""
 
 from __future__ import annotations
 
@@ -14,16 +14,21 @@ from numpy.typing import ArrayLike, NDArray
 from hybrid_mpc.analyze.linearize import linearize_along
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.model.riccati import vector
 from nn_export import Node, Port, Program, build
-
-# Bounds of a function over a box, by interval arithmetic along its instructions.
 
 Array = NDArray[np.float64]
 Interval = tuple[float, float]
+CELL = "aten.gru_cell.default"
+REFINEMENTS = 50
+"""Times the box of hidden states is narrowed; it settles long before."""
+SETTLE = 0.2
+"""Share of the run in which the tangent vector turns into its direction; it does not count."""
+BLOCKS = 10
 
 
 def interval_bounds(f: ca.Function, lower: ArrayLike, upper: ArrayLike) -> tuple[Array, Array]:
-    """Lower and upper bounds of a function's first output over a box of its first input.
+    """Lower and upper bounds ``(m,)`` of a function's first output over a box of its first input.
 
     Never too small but for rounding (about 1e-15 of the values), mostly too large: a variable that appears twice
     counts as two.
@@ -32,9 +37,6 @@ def interval_bounds(f: ca.Function, lower: ArrayLike, upper: ArrayLike) -> tuple
         f: One input ``(n,)``, one output ``(m,)``; arithmetic, powers of two, tanh, exp, roots, sine, cosine.
         lower: Lower bounds of the input ``(n,)``.
         upper: Upper bounds of the input ``(n,)``.
-
-    Returns:
-        Bounds ``(m,)`` each.
 
     Raises:
         InputError: If a bound is missing or not finite, or the function has an operation that is not known here.
@@ -47,11 +49,7 @@ def interval_bounds(f: ca.Function, lower: ArrayLike, upper: ArrayLike) -> tuple
         >>> low.round(6), high.round(6)
         (array([-1.459698]), array([3.]))
     """
-    low, high = (np.asarray(v, dtype=float).reshape(-1) for v in (lower, upper))
-    if low.size != f.numel_in(0) or high.size != low.size or not np.all(np.isfinite([low, high])):
-        raise InputError(f"interval: {f.numel_in(0)} finite lower and upper bounds needed")
-    if np.any(low > high):
-        raise InputError(f"interval: lower bounds {low.tolist()} lie above upper ones {high.tolist()}")
+    low, high = _box(lower, upper, f.numel_in(0))
     scalar = f if f.is_a("SXFunction") else f.expand()
     work: list[Interval] = [(0.0, 0.0)] * scalar.sz_w()
     result = np.zeros((2, scalar.numel_out(0)))
@@ -69,6 +67,13 @@ def interval_bounds(f: ca.Function, lower: ArrayLike, upper: ArrayLike) -> tuple
         else:
             raise InputError(f"interval: operation {op} of CasADi (casadi.OP_...) is not known here")
     return result[0], result[1]
+
+
+def _box(lower: ArrayLike, upper: ArrayLike, n: int) -> tuple[Array, Array]:
+    low, high = vector(lower, n, "lower bounds"), vector(upper, n, "upper bounds")
+    if np.any(low > high):
+        raise InputError(f"box: lower bounds {low.tolist()} lie above upper ones {high.tolist()}")
+    return low, high
 
 
 def _times(a: Interval, b: Interval) -> Interval:
@@ -127,13 +132,6 @@ _RULES: Mapping[int, Callable[..., Interval]] = MappingProxyType(
         ca.OP_FMIN: lambda a, b: (min(a[0], b[0]), min(a[1], b[1])),
     }
 )
-
-
-# A certificate that a GRU forgets: a sufficient condition on its weights over a box of its inputs.
-
-CELL = "aten.gru_cell.default"
-REFINEMENTS = 50
-"""Times the box of hidden states is narrowed; it settles long before."""
 
 
 @dataclass(frozen=True)
@@ -252,8 +250,7 @@ def contraction(cell: GruWeights, lower: ArrayLike, upper: ArrayLike) -> Contrac
     than ``max_i z_i + (1 - z_i) index < 1``. This is the incremental input-to-state stability of Bonassi et al., for
     torch's cell (they reset the hidden state before the product) and in the best weighting of their norm.
 
-    The condition is sufficient only: most trained networks fail it and forget all the same. Where it fails see
-    :func:`lyapunov_exponent`.
+    Most trained networks fail the condition and forget all the same; see :func:`lyapunov_exponent`.
 
     Args:
         cell: The weights.
@@ -272,13 +269,7 @@ def contraction(cell: GruWeights, lower: ArrayLike, upper: ArrayLike) -> Contrac
         >>> found.certified, round(found.index, 2)
         (True, 0.05)
     """
-    low, high = (np.asarray(v, dtype=float).reshape(-1) for v in (lower, upper))
-    if low.size != cell.w.shape[1] or high.size != low.size or not np.all(np.isfinite([low, high])):
-        raise InputError(
-            f"contraction: {cell.w.shape[1]} finite lower and upper bounds of the cell's inputs needed"
-        )
-    if np.any(low > high):
-        raise InputError("contraction: a lower bound lies above its upper bound")
+    low, high = _box(lower, upper, cell.w.shape[1])
     n = cell.r.shape[1]
     driven = _affine(cell.w, low, high, cell.b_w)
     h = -np.ones(n), np.ones(n)
@@ -326,18 +317,11 @@ def _sigmoid(v: Array) -> Array:
 
 
 def _perron(matrix: Array) -> tuple[float, Array]:
-    """A weighting of the largest-element norm, and the norm of a non-negative matrix in it: its spectral radius, but
-    for the sliver that keeps all weights positive.
-    """
+    """Spectral radius of a non-negative matrix (but for a sliver), and the norm's weights in which it is its norm."""
     padded = matrix + 1e-12 * max(1.0, float(matrix.max(initial=0.0)))
     values, vectors = np.linalg.eig(padded)
     weights = np.abs(vectors[:, int(np.argmax(values.real))].real)
     return float(np.max(padded @ weights / weights)), weights / weights.max()
-
-
-SETTLE = 0.2
-"""Share of the run in which the tangent vector turns into its direction; it does not count."""
-BLOCKS = 10
 
 
 @dataclass(frozen=True)
@@ -357,7 +341,7 @@ class LyapunovExponent:
 
 def lyapunov_exponent(
     model: HybridModel, x: ArrayLike, u: ArrayLike, h: ArrayLike | None = None,
-    *, part: Literal["all", "hidden"] = "all", seed: int = 0,
+    *, part: Literal["all", "hidden"] = "all",
 ) -> LyapunovExponent:  # fmt: skip
     """Largest Lyapunov exponent along a free run (or along a measured trajectory), by its tangent map.
 
@@ -370,7 +354,6 @@ def lyapunov_exponent(
         u: Inputs ``(n, n_u)``.
         h: Hidden state at the start ``(n_h,)``. Default: zero.
         part: ``"all"`` or ``"hidden"``.
-        seed: Of the first tangent vector.
 
     Raises:
         InputError: If the run is shorter than 50 periods or not finite, a shape does not fit, or there is no hidden
@@ -379,7 +362,6 @@ def lyapunov_exponent(
     Source: Benettin, Galgani, Giorgilli, Strelcyn, *Lyapunov characteristic exponents*, Meccanica 15 (1980).
 
     Example:
-        >>> import casadi as ca
         >>> from hybrid_mpc.machine.signals import Signal
         >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
         >>> model = HybridModel.of("lag", 0.1, level, (Signal("u", "-"),), level,
@@ -396,7 +378,7 @@ def lyapunov_exponent(
     n = len(maps)
     if n < 50:
         raise InputError(f"Lyapunov exponent: {n} periods given, at least 50 needed for a mean over time")
-    v: Array = np.asarray(np.random.default_rng(seed).normal(size=maps.shape[1]), dtype=np.float64)
+    v: Array = np.asarray(np.random.default_rng(0).normal(size=maps.shape[1]), dtype=np.float64)
     v = np.asarray(v / np.linalg.norm(v))
     steps = np.empty(n)
     for k, a in enumerate(maps):

@@ -1,4 +1,4 @@
-"""Mode by mode: frequency, damping, how well inputs reach it and outputs show it; Hankel singular values."""
+"""Properties of a linear model: modes, stabilisability, detectability, frequency response, reduction."""
 
 from __future__ import annotations
 
@@ -13,13 +13,76 @@ from hybrid_mpc.analyze.linearize import control_toolbox, linearize, period
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.model import HybridModel
 
-# Poles, stabilisability, detectability and frequency responses of a linearized model.
-
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-# Rank decisions: rounding of an SVD is about n * eps * norm ~ 1e-14; a mode this close (relative to the
-# norm) to uncontrollable would need inputs a hundred million times the others'.
+Matrices = tuple[Array, Array, Array, Array]
 RANK_TOLERANCE = 1e-8
+"""Relative distance below which a mode is not reached. Rounding of an SVD is about 1e-14; a mode this close would need
+inputs a hundred million times the others'."""
+EDGE = 1e-9
+"""Poles closer to the unit circle than this have no Gramian and are kept."""
+NOTHING = 1e-14
+"""Hankel singular values below this share of the largest are rounding: such states are always truncated."""
+
+
+class Mode(NamedTuple):
+    """One mode of a discrete system.
+
+    Args:
+        pole: Eigenvalue of A.
+        frequency: Natural frequency ``|log(z) / dt|`` [rad/s] of the continuous equivalent; infinite for a pole at 0.
+        damping: Damping ratio of the continuous equivalent; 1 for a pole at 0 or 1.
+        reach: Distance from being uncontrollable: smallest singular value of the Popov-Belevitch-Hautus pencil
+            ``[A - z I, B]`` over the largest of ``[A, B]``, B's columns scaled to the norm of A (units must not count).
+        see: Distance from being unobservable, the dual.
+    """
+
+    pole: complex
+    frequency: float
+    damping: float
+    reach: float
+    see: float
+
+
+def modes(sys: Any) -> tuple[Mode, ...]:
+    """Modes of a discrete ``control.StateSpace``, largest pole first.
+
+    Raises:
+        InputError: If the system has no period.
+
+    Example:
+        >>> import control
+        >>> round(modes(control.ss([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.1))[0].frequency, 6)
+        6.931472
+    """
+    dt = period(sys)
+    a, b, c, _ = _matrices(sys)
+    poles = np.linalg.eigvals(a).astype(np.complex128)
+    poles = poles[np.argsort(-np.abs(poles), kind="stable")]
+    frequency, damping = np.full(poles.size, np.inf), np.ones(poles.size)
+    moving = np.abs(poles) > 0
+    s = np.log(poles[moving]) / dt
+    frequency[moving] = np.abs(s)
+    damping[moving] = np.where(s == 0, 1.0, -s.real / np.where(s == 0, 1.0, np.abs(s)))
+    shapes = zip(poles, frequency, damping, strict=True)
+    return tuple(
+        Mode(complex(z), float(w), float(d), _hautus(a, b, z), _hautus(a.T, c.T, z)) for z, w, d in shapes
+    )
+
+
+def _hautus(a: Array, b: Array, z: complex) -> float:
+    size = max(float(np.linalg.norm(a, 2)), 1.0)
+    norms = np.linalg.norm(b, axis=0)
+    scaled = b * np.where(norms > 0, size / np.where(norms > 0, norms, 1.0), 0.0)
+    pencil = np.hstack([a - z * np.eye(len(a)), scaled])
+    smallest = float(np.linalg.svd(pencil, compute_uv=False)[-1])
+    return smallest / float(np.linalg.norm(np.hstack([a, scaled]), 2))
+
+
+def _stabilisable_detectable(found: tuple[Mode, ...]) -> tuple[bool, bool]:
+    """Whether every mode on or outside the unit circle is reached, and whether every such mode is seen."""
+    risky = [m for m in found if abs(m.pole) >= 1.0 - RANK_TOLERANCE]
+    return all(m.reach > RANK_TOLERANCE for m in risky), all(m.see > RANK_TOLERANCE for m in risky)
 
 
 @dataclass(frozen=True)
@@ -29,13 +92,13 @@ class LinearAnalysis:
     Args:
         dt: Period [s].
         poles: Eigenvalues of A ``(n,)``, largest magnitude first.
-        frequency: Natural frequency ``|log(z) / dt|`` ``(n,)`` [rad/s] of the continuous equivalent.
-        damping: Damping ratio ``(n,)`` of the continuous equivalent; 1 for a pole at rest (z = 1).
+        frequency: Natural frequencies ``(n,)`` [rad/s]; see :class:`Mode`.
+        damping: Damping ratios ``(n,)``.
         slow: True where the natural frequency lies below ``split`` ``(n,)``.
-        split: Border [rad/s] between slow and fast poles.
+        split: Border [rad/s] between slow and fast poles: a tenth of the Nyquist frequency.
         stable: All poles inside the unit circle.
-        stabilisable: See :func:`stabilisable`.
-        detectable: See :func:`detectable`.
+        stabilisable: The input reaches every mode on or outside the unit circle.
+        detectable: The output shows every such mode.
     """
 
     dt: float
@@ -63,6 +126,82 @@ class LinearAnalysis:
         }
 
 
+def analyze(sys: Any) -> LinearAnalysis:
+    """Poles and properties of a discrete ``control.StateSpace``.
+
+    Raises:
+        InputError: If the system has no period.
+
+    Example:
+        >>> import control
+        >>> analyze(control.ss([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.1)).stable
+        True
+    """
+    found, dt = modes(sys), period(sys)
+    poles, frequency, damping, _, _ = (np.array(column) for column in zip(*found, strict=True))
+    split = 0.1 * np.pi / dt
+    return LinearAnalysis(
+        dt, poles, frequency, damping, frequency < split, split, bool(np.all(np.abs(poles) < 1.0)),
+        *_stabilisable_detectable(found),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Modes and input-output weight of a discrete system.
+
+    Args:
+        dt: Period [s].
+        modes: Largest pole first.
+        hankel: Hankel singular values ``(n,)`` of the stable part, largest first, inputs and outputs as they are
+            given; infinite for each mode on or outside the unit circle.
+        stabilisable: Every mode on or outside the unit circle is reached.
+        detectable: Every such mode is seen.
+    """
+
+    dt: float
+    modes: tuple[Mode, ...]
+    hankel: Array
+    stabilisable: bool
+    detectable: bool
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain dictionary for JSON; complex as ``[re, im]``."""
+        return {
+            "dt": self.dt,
+            "modes": [
+                {**m._asdict(), "pole": [float(np.real(m.pole)), float(np.imag(m.pole))]} for m in self.modes
+            ],
+            "hankel": self.hankel.tolist(),
+            "stabilisable": self.stabilisable,
+            "detectable": self.detectable,
+        }
+
+
+def system_structure(sys: Any) -> Structure:
+    """Modes of a discrete ``control.StateSpace`` with what PBH tests and Hankel singular values say of them.
+
+    PBH asks whether a mode can be moved (seen) at all; a Hankel singular value how much of the way from past inputs
+    to future outputs goes through a state. Most modes of a network's hidden state pass the first and weigh nothing
+    in the second.
+
+    Args:
+        sys: The system, with a period.
+
+    Raises:
+        InputError: If the system has no period.
+
+    Example:
+        >>> import control
+        >>> found = system_structure(control.ss(np.diag([1.2, 0.5]), [[0.0], [1.0]], [[1.0, 1.0]], 0.0, 0.1,
+        ...     remove_useless_states=False))
+        >>> [round(m.reach, 3) for m in found.modes], found.stabilisable, found.detectable
+        ([0.0, 0.538], False, True)
+    """
+    found = modes(sys)
+    return Structure(period(sys), found, hankel_singular_values(sys), *_stabilisable_detectable(found))
+
+
 @dataclass(frozen=True)
 class FrequencyResponse:
     """Frequency response for Bode plots.
@@ -76,80 +215,6 @@ class FrequencyResponse:
     omega: Array
     magnitude: Array
     phase: Array
-
-
-def analyze(sys: Any, *, split: float | None = None) -> LinearAnalysis:
-    """Poles and properties of a discrete ``control.StateSpace``.
-
-    Args:
-        sys: The system, with a period.
-        split: Border [rad/s] between slow and fast poles. Default: a tenth of the Nyquist frequency.
-
-    Raises:
-        InputError: If the system has no period.
-
-    Example:
-        >>> import control
-        >>> analyze(control.ss([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.1)).stable
-        True
-    """
-    dt = period(sys)
-    poles = np.linalg.eigvals(sys.A).astype(np.complex128)
-    poles = poles[np.argsort(-np.abs(poles), kind="stable")]
-    frequency, damping = np.full(poles.size, np.inf), np.ones(poles.size)
-    moving = np.abs(poles) > 0
-    s = np.log(poles[moving]) / dt
-    frequency[moving] = np.abs(s)
-    damping[moving] = np.where(s == 0, 1.0, -s.real / np.where(s == 0, 1.0, np.abs(s)))
-    border = 0.1 * np.pi / dt if split is None else split
-    return LinearAnalysis(
-        dt,
-        poles,
-        frequency,
-        damping,
-        frequency < border,
-        float(border),
-        bool(np.all(np.abs(poles) < 1.0)),
-        stabilisable(sys),
-        detectable(sys),
-    )
-
-
-def stabilisable(sys: Any) -> bool:
-    """True if the input reaches every mode on or outside the unit circle (Popov-Belevitch-Hautus).
-
-    A mode z counts as unstable if ``|z| >= 1 - 1e-8``; it is reached if the smallest singular value of
-    ``[A - z I, B]`` exceeds 1e-8 of the largest of ``[A, B]``, with B's columns scaled to the norm of A
-    (input units must not decide).
-
-    Args:
-        sys: Discrete ``control.StateSpace``.
-
-    Raises:
-        InputError: If the system has no period.
-
-    Example:
-        >>> import control
-        >>> stabilisable(control.ss([[2.0]], [[0.0]], [[1.0]], [[0.0]], 0.1, remove_useless_states=False))
-        False
-    """
-    period(sys)
-    return _hautus(np.asarray(sys.A), np.asarray(sys.B))
-
-
-def detectable(sys: Any) -> bool:
-    """True if the output shows every mode on or outside the unit circle; the dual of :func:`stabilisable`.
-
-    Raises:
-        InputError: If the system has no period.
-
-    Example:
-        >>> import control
-        >>> detectable(control.ss([[2.0]], [[1.0]], [[1.0]], [[0.0]], 0.1))
-        True
-    """
-    period(sys)
-    return _hautus(np.asarray(sys.A).T, np.asarray(sys.C).T)
 
 
 def frequency_response(sys: Any, omega: ArrayLike) -> FrequencyResponse:
@@ -173,29 +238,6 @@ def frequency_response(sys: Any, omega: ArrayLike) -> FrequencyResponse:
     response = c @ np.linalg.solve(z[:, None, None] * np.eye(a.shape[0]) - a, b.astype(complex)) + d
     g = np.moveaxis(response, 0, -1)
     return FrequencyResponse(w, np.abs(g), np.unwrap(np.angle(g), axis=-1))
-
-
-def _hautus(a: Array, b: Array) -> bool:
-    size = max(float(np.linalg.norm(a, 2)), 1.0)
-    norms = np.linalg.norm(b, axis=0)
-    scaled = b * np.where(norms > 0, size / np.where(norms > 0, norms, 1.0), 0.0)
-    largest = np.linalg.norm(np.hstack([a, scaled]), 2)
-    for z in np.linalg.eigvals(a):
-        if abs(z) < 1.0 - RANK_TOLERANCE:
-            continue
-        pencil = np.hstack([a - z * np.eye(a.shape[0]), scaled])
-        if np.linalg.svd(pencil, compute_uv=False)[-1] <= RANK_TOLERANCE * largest:
-            return False
-    return True
-
-
-# Balanced truncation of discrete systems, also of unstable ones, and back to physical states.
-
-Matrices = tuple[Array, Array, Array, Array]
-EDGE = 1e-9
-"""Poles closer to the unit circle than this have no Gramian and are kept."""
-NOTHING = 1e-14
-"""Hankel singular values below this share of the largest are rounding: such states are always truncated."""
 
 
 @dataclass(frozen=True)
@@ -294,7 +336,7 @@ def physical_states(
         model: The model.
         x: Operating point ``(n_x,)``.
         u: Input ``(n_u,)``.
-        h: Hidden state ``(n_h,)``. Default: its fixed point.
+        h: Hidden state ``(n_h,)``. Default: its equilibrium.
         x_scale: Size of each state that counts as 1 ``(n_x,)``. Default: 1.
         u_scale: Size of each input that counts as 1 ``(n_u,)``. Default: 1.
         system: A linearization over ``(x, h)`` to reduce instead of the tangent at the point. Default: none.
@@ -381,104 +423,3 @@ def _root(gramian: Array) -> Array:
     except np.linalg.LinAlgError:
         values, vectors = np.linalg.eigh(symmetric)
         return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
-
-
-class Mode(NamedTuple):
-    """One mode of a discrete system.
-
-    Fields: ``pole``; ``frequency`` [rad/s] and ``damping`` of the continuous equivalent (infinite and 1 for a pole at
-    zero); ``reach``, distance from being uncontrollable, and ``see``, from being unobservable: smallest singular value
-    of the Popov-Belevitch-Hautus pencil over its largest, input and output units divided out.
-    """
-
-    pole: complex
-    frequency: float
-    damping: float
-    reach: float
-    see: float
-
-
-@dataclass(frozen=True)
-class Structure:
-    """Modes and input-output weight of a discrete system.
-
-    Args:
-        dt: Period [s].
-        modes: Largest pole first.
-        hankel: Hankel singular values ``(n,)`` of the stable part, largest first, inputs and outputs as they are
-            given; infinite for each mode on or outside the unit circle.
-        stabilisable: Every mode on or outside the unit circle is reached.
-        detectable: Every such mode is seen.
-    """
-
-    dt: float
-    modes: tuple[Mode, ...]
-    hankel: Array
-    stabilisable: bool
-    detectable: bool
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain dictionary for JSON; complex as ``[re, im]``."""
-        return {
-            "dt": self.dt,
-            "modes": [
-                {**m._asdict(), "pole": [float(np.real(m.pole)), float(np.imag(m.pole))]} for m in self.modes
-            ],
-            "hankel": self.hankel.tolist(),
-            "stabilisable": self.stabilisable,
-            "detectable": self.detectable,
-        }
-
-
-def system_structure(sys: Any) -> Structure:
-    """Modes of a discrete ``control.StateSpace`` with what PBH tests and Hankel singular values say of them.
-
-    PBH asks whether a mode can be moved (seen) at all; a Hankel singular value how much of the way from past inputs
-    to future outputs goes through a state. A hidden state of a network has mostly modes that pass the first and
-    weigh nothing in the second.
-
-    Args:
-        sys: The system, with a period.
-
-    Raises:
-        InputError: If the system has no period.
-
-    Example:
-        >>> import control
-        >>> found = system_structure(control.ss(np.diag([1.2, 0.5]), [[0.0], [1.0]], [[1.0, 1.0]], 0.0, 0.1,
-        ...     remove_useless_states=False))
-        >>> [round(m.reach, 3) for m in found.modes], found.stabilisable, found.detectable
-        ([0.0, 0.538], False, True)
-    """
-    dt = period(sys)
-    a, b, c = (np.asarray(m, dtype=float) for m in (sys.A, sys.B, sys.C))
-    poles = np.linalg.eigvals(a).astype(np.complex128)
-    poles = poles[np.argsort(-np.abs(poles), kind="stable")]
-    modes = tuple(
-        Mode(complex(z), *_shape(z, dt), _hautus_at(a, b, z), _hautus_at(a.T, c.T, z)) for z in poles
-    )
-    risky = [m for m in modes if abs(m.pole) >= 1.0 - RANK_TOLERANCE]
-    return Structure(
-        dt,
-        modes,
-        hankel_singular_values(sys),
-        all(m.reach > RANK_TOLERANCE for m in risky),
-        all(m.see > RANK_TOLERANCE for m in risky),
-    )
-
-
-def _shape(z: complex, dt: float) -> tuple[float, float]:
-    """Natural frequency [rad/s] and damping of the continuous equivalent."""
-    if z == 0:
-        return float("inf"), 1.0
-    s = complex(np.log(z)) / dt
-    return abs(s), 1.0 if s == 0 else -s.real / abs(s)
-
-
-def _hautus_at(a: Array, b: Array, z: complex) -> float:
-    size = max(float(np.linalg.norm(a, 2)), 1.0)
-    norms = np.linalg.norm(b, axis=0)
-    scaled = b * np.where(norms > 0, size / np.where(norms > 0, norms, 1.0), 0.0)
-    pencil = np.hstack([a - z * np.eye(len(a)), scaled])
-    smallest = float(np.linalg.svd(pencil, compute_uv=False)[-1])
-    return smallest / float(np.linalg.norm(np.hstack([a, scaled]), 2))

@@ -38,7 +38,7 @@ class Sensitivities:
         return self.by * self.values
 
     def apart(self, sigma: ArrayLike, *, share: float = 0.05) -> Sensitivities:
-        """The parameters that this run tells apart: chosen one by one, each by what the ones before do not explain.
+        """The parameters that this run tells apart, chosen one by one, each by what the ones before do not explain.
 
         Args:
             sigma: Standard deviation of each state's error ``(n_x,)``; infinite for states that are not measured.
@@ -64,7 +64,7 @@ class Sensitivities:
         Pairs near 1 or -1 cannot be told apart by it.
 
         Args:
-            sigma: Standard deviation of each state's error ``(n_x,)``; infinite for states that are not measured.
+            sigma: As in :meth:`apart`.
 
         Raises:
             InputError: If the run does not tell the parameters apart at all.
@@ -85,10 +85,7 @@ class Sensitivities:
 def parameter_sensitivities(
     model: HybridModel, x: ArrayLike, u: ArrayLike, *, names: Sequence[str] | None = None
 ) -> Sensitivities:
-    """Exact derivatives of a free run by the prior's parameters.
-
-    Works for a prior and for a hybrid alike; what a hybrid's network adds does not change with the parameters, but for
-    the states that they move.
+    """Exact derivatives of a free run by the prior's parameters, of a prior or of a hybrid.
 
     Args:
         model: The model.

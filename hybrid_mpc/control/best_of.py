@@ -5,38 +5,27 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from time import perf_counter
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.control.ocp import OCP, Limits
-from hybrid_mpc.control.problem import Controller, Problem, Solution
+from hybrid_mpc.control.ocp import Limits, input_plan
+from hybrid_mpc.control.problem import Controller, Solution
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import START_LIMIT, Estimate
-from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.model.riccati import hidden_fixed_point
 
 Array = NDArray[np.float64]
 Start = Callable[[Estimate], Array]
 
 
-class HasProblem(Controller, Protocol):
-    """A controller that can say what a plan costs on its model."""
-
-    @property
-    def problem(self) -> Problem:
-        """Problem and model made ready."""
-
-
-class BestOf:
+class BestOf(Controller):
     """Solves from several first guesses and returns the cheapest plan; slower than real time is fine.
 
-    Guesses are the previous plan, shifted; the given ``starts``; and the plans of ``rivals``, controllers on
-    other models of the same machine: whatever they find, this one starts there too, so that its plan is at
-    most as expensive by its own model as theirs carried out. Plans are compared by their cost on a run of
-    the model itself, not by what a linearization promises. Rivals have no memory here: their hidden state
-    starts at the fixed point at the estimated state, their disturbance is the estimate's own.
+    Guesses are the previous plan, shifted; the given ``starts``; and the plans of ``rivals``, controllers on other
+    models of the same machine. Plans are compared by their cost on a run of the model itself, so the plan is at most
+    as expensive by this model as any rival's. Rivals have no memory here: their hidden state starts at the fixed
+    point at the estimated state, their disturbance is the estimate's own.
 
     Args:
         controller: Solves from every guess, e.g. an :class:`~hybrid_mpc.control.sqp.SQPController`.
@@ -51,8 +40,9 @@ class BestOf:
     Example:
         >>> import casadi as ca
         >>> from hybrid_mpc.estimate.kalman import TrueState
-        >>> from hybrid_mpc.control.sqp import SQPController
+        >>> from hybrid_mpc.control.ocp import OCP; from hybrid_mpc.control.sqp import SQPController
         >>> from hybrid_mpc.machine.signals import Signal
+        >>> from hybrid_mpc.model.model import HybridModel
         >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
         >>> model = HybridModel.of("even", 1.0, level, (Signal("u", "-"),), level,
         ...     x=x, u=u, x_next=x - u**2, xdot=u, y=x)
@@ -67,7 +57,7 @@ class BestOf:
 
     def __init__(
         self,
-        controller: HasProblem,
+        controller: Controller,
         *,
         starts: Sequence[Array | Start] = (),
         rivals: Sequence[Controller] = (),
@@ -85,30 +75,11 @@ class BestOf:
                 )
         for start in starts:
             if not callable(start):
-                _checked(start, ocp)
+                input_plan(start, ocp.horizon, ocp.n_u, "start")
         if not starts and not rivals:
             raise InputError("best of one start is the controller itself; give starts or rivals")
-        self._controller, self._starts, self._rivals = controller, tuple(starts), tuple(rivals)
-        self._most = most
-
-    @property
-    def model(self) -> HybridModel:
-        """The model that predicts."""
-        return self._controller.model
-
-    @property
-    def ocp(self) -> OCP:
-        """The problem."""
-        return self._controller.ocp
-
-    @property
-    def problem(self) -> Problem:
-        """Problem and model made ready."""
-        return self._controller.problem
-
-    def initial(self, estimate: Estimate, u: Array | None = None) -> Solution:
-        """A first plan: the model run freely from the estimate; see :meth:`Problem.initial`."""
-        return self._controller.initial(estimate, u)
+        self.problem, self._controller = controller.problem, controller
+        self._starts, self._rivals, self._most = tuple(starts), tuple(rivals), most
 
     def solve(
         self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,
@@ -116,8 +87,7 @@ class BestOf:
     ) -> Solution:  # fmt: skip
         """The cheapest plan of all guesses; see :meth:`Controller.solve`.
 
-        Its cost is that on a run of the model. If no solve ends well, the one from the previous plan is
-        returned.
+        Its cost is that on a run of the model. If no solve ends well, the one from the previous plan is returned.
         """
         begin = perf_counter()
         known = np.all(np.isfinite(np.concatenate([estimate.x, estimate.h, estimate.d])))
@@ -133,7 +103,7 @@ class BestOf:
         solutions = [first]
         guesses = self._guesses(previous, *given, limits) if known else []
         for guess in sorted(guesses, key=cost_of)[: self._most]:
-            start = self._from(guess, previous, estimate)
+            start = self._controller.initial(estimate, guess).delayed(previous.u[0])  # its shift is the guess
             solutions.append(self._controller.solve(start, *given, limits=limits))
         best, least = first, np.inf
         for s in solutions:
@@ -146,7 +116,10 @@ class BestOf:
         self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None,
         limits: Limits | None,
     ) -> list[Array]:  # fmt: skip
-        guesses = [_checked(s(estimate), self.ocp) if callable(s) else s for s in self._starts]
+        guesses = [
+            input_plan(s(estimate) if callable(s) else s, self.ocp.horizon, self.ocp.n_u, "start")
+            for s in self._starts
+        ]
         for rival in self._rivals:
             h = hidden_fixed_point(rival.model, estimate.x, previous.u[0], limit=START_LIMIT)
             own = replace(estimate, h=h)
@@ -154,16 +127,3 @@ class BestOf:
             if plan.status.ok:
                 guesses.append(plan.u)
         return guesses
-
-    def _from(self, guess: Array, previous: Solution, estimate: Estimate) -> Solution:
-        """A previous plan whose shift is the guess: solves shift what they are given."""
-        return self._controller.initial(estimate, guess).delayed(previous.u[0])
-
-
-def _checked(start: Array, ocp: OCP) -> Array:
-    u = np.asarray(start, dtype=float)
-    if u.shape != (ocp.horizon, ocp.n_u) or not np.all(np.isfinite(u)):
-        raise InputError(
-            f"start: finite inputs of shape {(ocp.horizon, ocp.n_u)} needed, got shape {u.shape}"
-        )
-    return u

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh, solve_triangular
 
 from hybrid_mpc.control.ocp import OCP
+from hybrid_mpc.control.problem import SoftRows
 from hybrid_mpc.control.rti import condense_all, condense_hessians
-from hybrid_mpc.control.soft import SoftRows
 from hybrid_mpc.model.stages import Linearization
 
 Array = NDArray[np.float64]
@@ -27,9 +27,9 @@ AT_ONCE = 200
 class StageCurvature:
     """Second derivatives of the dynamics by ``(x, u, h)``, weighted with the multipliers of the dynamics.
 
-    They are differences of the model's exact Jacobians: ``n_x + n_u`` evaluations for the block by states and
-    inputs, in which friction curves sharply, and ``n_h`` for the blocks by the hidden state. The second
-    derivatives of the expressions of soft bounds, weighted with their multipliers, are added.
+    They are differences of the model's exact Jacobians: ``n_x + n_u`` evaluations for the block by states and inputs,
+    in which friction curves sharply, and ``n_h`` for the blocks by the hidden state. Those of soft bounds, weighted
+    with their multipliers, are added.
 
     Args:
         stages: The model's stages.
@@ -155,15 +155,14 @@ class StageCurvature:
             return curvature
         small = curvature[:, :few, :few]
         hidden = self.condensed(curvature, from_u, by_inputs) - condense_hessians(small, from_u, self._n_x)
-        return small.copy() if share_of(gauss_newton, hidden) < MATTERS else curvature
+        return small.copy() if _share(gauss_newton, hidden) < MATTERS else curvature
 
 
 def convex(gauss_newton: Array, rest: Array, held: NDArray[np.bool_] | None = None) -> Array:
     """``gauss_newton + rest``, positive definite: where the sum curves down or hardly up, its size counts.
 
-    Along every direction the result has at least the share 0.001 of Gauss-Newton's curvature; directions are
-    the joint eigenvectors of the two. Where the sum curves up as long as the ``held`` unknowns stay where they
-    are, only their own block is changed: a step that leaves them there does not feel it.
+    Along every direction the result has at least the share 0.001 of Gauss-Newton's curvature; directions are the joint
+    eigenvectors of the two. Where the sum curves up as long as the ``held`` unknowns stay, only their block is changed.
 
     Example:
         >>> convex(np.eye(2), np.diag([1.0, -3.0]))
@@ -207,13 +206,8 @@ def _convex_in_parts(gauss_newton: Array, rest: Array, held: NDArray[np.bool_]) 
     return whole
 
 
-def share_of(gauss_newton: Array, rest: Array) -> float:
-    """Size of ``rest`` relative to ``gauss_newton``, at least that along any direction.
-
-    Example:
-        >>> round(share_of(2.0 * np.eye(2), np.diag([1.0, 0.0])), 9)
-        0.5
-    """
+def _share(gauss_newton: Array, rest: Array) -> float:
+    """Size of ``rest`` relative to ``gauss_newton``, at least that along any direction."""
     try:
         root = np.linalg.cholesky(gauss_newton)
     except np.linalg.LinAlgError:

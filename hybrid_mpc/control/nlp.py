@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.control.ocp import OCP, Limits
-from hybrid_mpc.control.problem import Problem, Solution, Status
+from hybrid_mpc.control.problem import Controller, Problem, Solution, Status
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
 from hybrid_mpc.model.model import HybridModel, step_symbols
@@ -31,12 +31,12 @@ class Rows(NamedTuple):
     scale: ArrayLike
 
 
-class IpoptController:
+class IpoptController(Controller):
     """Nonlinear MPC by IPOPT on the sparse multiple-shooting problem: the reference, slower than real time.
 
-    Unknowns are the inputs, the states and hidden states of every period, and a slack for every soft bound.
-    Second derivatives are exact. Whatever IPOPT reports, the answer counts only if it is finite and keeps
-    model and limits; it is SOLVED if IPOPT converged or the KKT residual is small, else STOPPED.
+    Unknowns are the inputs, the states and hidden states of every period, and a slack for every soft bound. Second
+    derivatives are exact. Whatever IPOPT reports, the answer counts only if it is finite and keeps model and limits; it
+    is SOLVED if IPOPT converged or the KKT residual is small, else STOPPED.
 
     Args:
         model: The deployed model; ``n_h`` may be 0.
@@ -67,7 +67,7 @@ class IpoptController:
             raise InputError(
                 f"tolerance must be positive and iterations at least 1, got {tolerance} and {iterations}"
             )
-        self._problem = Problem(model, ocp)
+        self.problem = Problem(model, ocp)
         self._bounds: dict[str, Array] = {}
         nlp = self._formulate()
         settings: dict[str, Any] = {"print_time": False, "error_on_fail": False, "calc_lam_p": False}
@@ -85,25 +85,6 @@ class IpoptController:
         slope = ca.gradient(nlp["f"] + ca.dot(multipliers, g), w)
         self._slope = ca.Function("slope", [w, nlp["p"], multipliers], [slope, ca.gradient(nlp["f"], w), g])
 
-    @property
-    def model(self) -> HybridModel:
-        """The model that predicts."""
-        return self._problem.model
-
-    @property
-    def ocp(self) -> OCP:
-        """The problem."""
-        return self._problem.ocp
-
-    @property
-    def problem(self) -> Problem:
-        """Problem and model made ready."""
-        return self._problem
-
-    def initial(self, estimate: Estimate, u: Array | None = None) -> Solution:
-        """A first plan: the model run freely from the estimate; see :meth:`Problem.initial`."""
-        return self._problem.initial(estimate, u)
-
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def solve(
         self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,
@@ -111,7 +92,7 @@ class IpoptController:
     ) -> Solution:  # fmt: skip
         """The plan from now on; see :meth:`Controller.solve`. The previous plan, shifted, is the first guess."""
         start = perf_counter()
-        problem, u_prev = self._problem, previous.u[0]
+        problem, u_prev = self.problem, previous.u[0]
         target = problem.target(reference, weight)
         u = np.vstack([previous.u[1:], previous.u[-1:]])
         z = np.hstack([previous.x, previous.h])
@@ -163,7 +144,7 @@ class IpoptController:
     def _plan(
         self, u: Array, z: Array, d: Array, cost: float, status: Status, kkt: float, start: float, i: int
     ) -> Solution:
-        n_x, soft = self.ocp.n_x, self._problem.soft
+        n_x, soft = self.ocp.n_x, self.problem.soft
         excess = soft.excess(soft.values(z[:, :n_x], u)) if len(soft) else np.zeros(0)
         defect = self._defect(z, u + d)
         spent = {"solve": (perf_counter() - start) * 1e3}
@@ -177,7 +158,7 @@ class IpoptController:
 
     def _formulate(self) -> dict[str, ca.MX]:
         """Problem of ``nlpsol`` over ``(u, z, slacks)``; keeps the bounds of its unknowns and rows."""
-        ocp, model, soft = self.ocp, self.model, self._problem.soft
+        ocp, model, soft = self.ocp, self.model, self.problem.soft
         n, n_x, n_u = ocp.horizon, ocp.n_x, ocp.n_u
         n_z = n_x + model.n_h
         u, z, s = ca.MX.sym("u", n_u, n), ca.MX.sym("z", n_z, n + 1), ca.MX.sym("s", len(soft))
@@ -212,12 +193,12 @@ class IpoptController:
         }
 
     def _objective(self, u: ca.MX, du: ca.MX, error: ca.MX, weight: ca.MX, s: ca.MX) -> ca.MX:
-        ocp, soft = self.ocp, self._problem.soft
+        ocp, soft = self.ocp, self.problem.soft
         last = ca.sqrt(weight[:, -1]) * error[:, -1]
         stages = ca.sum2(weight[:, :-1] * error[:, :-1] ** 2), ca.sum2(u**2), ca.sum2(du**2)
         stage = sum(ca.dot(q, v) for q, v in zip((ocp.q, ocp.r, ocp.r_delta), stages, strict=True))
         penalty = ca.dot(soft.linear, s) + ca.dot(soft.quadratic, s**2)
-        return self.model.dt * (stage + penalty) + last.T @ self._problem.terminal @ last
+        return self.model.dt * (stage + penalty) + last.T @ self.problem.terminal @ last
 
     def _economic(self, x: ca.MX, u: ca.MX, p: ca.MX) -> ca.MX:
         f = self.ocp.economic
@@ -228,7 +209,7 @@ class IpoptController:
         return self.model.dt * ca.sum2(stages)
 
     def _soft_rows(self, u: ca.MX, z: ca.MX, s: ca.MX) -> list[Rows]:
-        soft, rows = self._problem.soft, []
+        soft, rows = self.problem.soft, []
         value = ca.vertcat(*self._soft_values(u, z))
         for bound, sign in ((soft.upper, 1.0), (soft.lower, -1.0)):
             chosen = np.flatnonzero(np.isfinite(bound))

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from hybrid_mpc.model.model import HybridModel
 
 
-# Bounds of the inputs that come and go from solve to solve.
-
 Array = NDArray[np.float64]
 
 
@@ -56,92 +54,6 @@ class Limits:
         object.__setattr__(self, "u_max", upper)
 
 
-# When problems are the same: numbers by value, expressions by the program that they state.
-
-
-# What a control problem is given, checked when it is made.
-
-
-def whole(value: object) -> bool:
-    """Whether a value is a whole number.
-
-    Example:
-        >>> whole(3), whole(3.0), whole(2.5), whole(float("nan")), whole("3")
-        (True, True, False, False, False)
-    """
-    return isinstance(value, int | float | np.number) and bool(np.isfinite(value)) and int(value) == value
-
-
-def diagonal(values: ArrayLike, name: str) -> Array:
-    """Weights as a vector; a matrix is refused."""
-    array = numbers(values, name)
-    shape = np.shape(values)
-    if len(shape) > 1 and max(shape) < array.size:
-        raise InputError(f"{name}: shape {shape} given; needed: the diagonal alone, a weight each")
-    return array
-
-
-def plans(values: Sequence[ArrayLike], horizon: int, n_u: int) -> tuple[Array, ...]:
-    """Input plans, each a finite ``(horizon, n_u)``."""
-    found = []
-    for i, value in enumerate(values):
-        array = numbers(value, f"starts[{i}]").reshape(np.shape(value))
-        if array.shape != (horizon, n_u) or not np.all(np.isfinite(array)):
-            raise InputError(
-                f"starts[{i}]: shape {array.shape} given; needed: a finite plan of the inputs ({horizon}, {n_u})"
-            )
-        found.append(array)
-    return tuple(found)
-
-
-def point(value: object, n_x: int, n_u: int) -> tuple[Array, Array]:
-    """A state ``(n_x,)`` and an input ``(n_u,)``, finite."""
-    if not isinstance(value, tuple | list) or len(value) != 2:
-        raise InputError(f"working_point: {value!r} given; needed: (x, u), a state and an input")
-    return vector(value[0], n_x, "working_point x"), vector(value[1], n_u, "working_point u")
-
-
-def is_stage_cost(f: object) -> bool:
-    """Whether ``f`` is a function ``(x, u) -> scalar`` or ``(x, u, p) -> scalar``."""
-    return isinstance(f, ca.Function) and f.n_in() in (2, 3) and (f.n_out(), f.numel_out(0)) == (1, 1)
-
-
-def block_lengths(blocks: Sequence[int], horizon: int) -> tuple[int, ...]:
-    """Lengths of move blocks that fit the horizon."""
-    lengths = tuple(int(length) for length in blocks if whole(length))
-    if len(lengths) < len(blocks) or min(lengths, default=0) < 1 or sum(lengths) != horizon:
-        raise InputError(
-            f"blocks: {tuple(blocks)} given, {sum(blocks)} periods in all; needed: whole numbers of at least 1 "
-            f"that sum to the horizon of {horizon}"
-        )
-    return lengths
-
-
-def check_weights(weights: dict[str, Array]) -> None:
-    """Refuse weights that are negative, not finite, or leave an input undetermined."""
-    for name, value in weights.items():
-        if value.size == 0 or not np.all(np.isfinite(value)) or np.any(value < 0):
-            raise InputError(f"{name}: weights must be finite and not negative, got {value}")
-    if not np.all(weights["r"] + weights["r_delta"] > 0):
-        raise InputError(
-            "every input needs a positive weight in r or r_delta, otherwise it is not determined"
-        )
-
-
-def terminal_matrix(value: ArrayLike, n_x: int) -> Array:
-    """A finite, symmetric, positive semi-definite ``(n_x, n_x)`` matrix."""
-    if isinstance(value, str):
-        raise InputError(f"terminal: {value!r} given; needed: 'riccati' or an ({n_x}, {n_x}) matrix")
-    matrix = numbers(value, "terminal").reshape(np.shape(value))
-    if matrix.shape != (n_x, n_x) or not np.all(np.isfinite(matrix)) or not np.allclose(matrix, matrix.T):
-        raise InputError(
-            f"terminal: shape {matrix.shape} given; needed: a finite symmetric ({n_x}, {n_x}) matrix"
-        )
-    if np.min(np.linalg.eigvalsh(matrix)) < -1e-9 * max(1.0, float(np.max(np.abs(matrix)))):
-        raise InputError("terminal: the matrix has a negative eigenvalue; needed: positive semi-definite")
-    return matrix
-
-
 @dataclass(frozen=True, eq=False)
 class OCP:
     """A quadratic tracking problem with bounded inputs and softly bounded states.
@@ -150,22 +62,19 @@ class OCP:
     ``stage_k = (x_k - x_ref_k)' diag(q) (x_k - x_ref_k) + u_k' diag(r) u_k + du_k' diag(r_delta) du_k``,
     ``du_k = u_k - u_{k-1}`` and ``k = 0 .. N-1``. Only the stages are multiplied by ``dt``.
 
-    References and weights may vary over time. Where a solve is given weight factors ``w_k`` ``(n_x,)``, ``q``
-    stands for ``w_k q`` at stage k and ``P`` for ``S P S`` with ``S = diag(sqrt(w_N))``. A task like "be at
-    x* at the time t*, no matter how" has factors of zero before ``t*``, large ones at ``t*`` and ordinary
-    ones after it, and a horizon that reaches beyond ``t*`` from the start on: the free part of the window
-    then shrinks by itself as ``t*`` comes near.
+    References and weights may vary over time. With weight factors ``w_k`` ``(n_x,)`` in a solve, ``q`` becomes
+    ``w_k q`` at stage k and ``P`` becomes ``S P S`` with ``S = diag(sqrt(w_N))``. "Be at x* at the time t*, no matter
+    how" has factors of zero before ``t*``, large ones at ``t*``, ordinary ones after it, and a horizon that reaches
+    beyond ``t*`` from the start on.
 
     Bounds on states hold for ``x_1 .. x_N`` and are soft: a violation ``s`` costs ``slack_linear s +
-    slack_quadratic s^2`` per second. Above the hard bound's largest multiplier the linear penalty is exact,
-    so that a bound is violated only where no input can keep it; see :class:`~hybrid_mpc.control.soft.SoftBound`. The
-    default, 1,000 times what the tolerated deviation ``1 / sqrt(q)`` costs, is far above it for weights by
-    Bryson's rule; weight factors of more than 100 ask for larger penalties.
+    slack_quadratic s^2`` per second, see :class:`~hybrid_mpc.control.soft.SoftBound`. The default is 1,000 times
+    what the tolerated deviation ``1 / sqrt(q)`` costs, far above the multipliers of weights by Bryson's rule; weight
+    factors of more than 100 ask for larger penalties.
 
-    A problem is plain data: :func:`hybrid_mpc.records.plain` makes JSON of it, its expressions as programs
-    (:func:`nn_export.program_of`), and ``record(OCP, data, where)`` reads it. Two problems are equal if their numbers
-    are and their expressions state the same program; their arrays cannot be written into.
-    :meth:`changed` makes one that differs.
+    A problem is plain data: :func:`hybrid_mpc.records.plain` makes JSON of it and ``record(OCP, data, where)`` reads
+    it. Two problems are equal if their numbers are and their expressions state the same program. The arrays are
+    read-only; :meth:`changed` makes a problem that differs.
 
     Args:
         horizon: N, number of model periods.
@@ -176,11 +85,8 @@ class OCP:
         u_max: Upper bounds ``(n_u,)``; ``inf`` for none.
         du_max: Largest change per period ``(n_u,)``, positive. Default: none.
         terminal: ``"riccati"``, or a symmetric positive semi-definite ``(n_x, n_x)`` matrix ``P``.
-        working_point: ``(x, u)`` near which the machine works, at which ``"riccati"`` and a fallback linearize the
-            model. With a steep friction law take a moving point (see :func:`hybrid_mpc.model.riccati.lqr`). Default:
-            zero,
-            the input within its limits; the loops of a scenario take a moving one
-            (:func:`hybrid_mpc.kit.assembly.make_ocp`).
+        working_point: ``(x, u)`` at which ``"riccati"`` and a fallback linearize the model. With a steep friction law
+            take a moving point (see :func:`hybrid_mpc.model.riccati.lqr`). Default: zero, the input within its limits.
         x_min: Soft lower bounds of the states ``(n_x,)``; ``-inf`` for none. Default: none.
         x_max: Soft upper bounds of the states ``(n_x,)``; ``inf`` for none. Default: none.
         slack_linear: Penalties ``(n_x,)`` [cost/s/unit], not negative. Default: ``1000 sqrt(q)``.
@@ -188,16 +94,14 @@ class OCP:
             zero, 1 stands for it in both.
         soft: Soft bounds on expressions of ``(x, u)``. Default: none.
         blocks: Move blocking: numbers of periods over which the input is held, one block after the other,
-            e.g. ``(1, 1, 2, 4)`` for a horizon of 8. Every solve starts its first block now: the shifted last
-            plan is only its first guess. Default: every period has an input of its own.
-
+            e.g. ``(1, 1, 2, 4)`` for a horizon of 8. Every solve starts its first block now. Default: none.
         economic: A further stage cost per second, ``(x, u) -> scalar``, twice differentiable, of ``(x_0, u_0) ..
             (x_{N-1}, u_{N-1})``; it may be negative and need not be convex. Where it curves down ``rti`` takes it
             as flat; ``sqp`` and ``ipopt`` know its curvature. With ``(x, u, p) -> scalar`` references have
             ``n_p`` more columns, the values of ``p``: prices, or the outputs' reference
             (:func:`~hybrid_mpc.control.problem.output_cost`). Default: none.
-        starts: Input plans, each ``(horizon, n_u)``, from which the first plan of a loop is sought besides none, for a
-            task with several ways (a swing-up); the cheapest plan is taken. Default: none.
+        starts: Input plans ``(horizon, n_u)`` from which the first plan of a loop is sought, too, for a task with
+            several ways (a swing-up); the cheapest plan is taken. Default: none.
 
     Raises:
         InputError: If shapes do not fit, bounds cross, a weight is negative or not finite, or the blocks'
@@ -250,32 +154,33 @@ class OCP:
         economic: ca.Function | None = None,
         starts: Sequence[ArrayLike] = (),
     ) -> None:
-        if not whole(horizon) or horizon < 1:
+        if not _whole(horizon) or horizon < 1:
             raise InputError(f"horizon must be a whole number of periods, at least 1; got {horizon}")
-        q_v, r_v = diagonal(q, "q"), diagonal(r, "r")
+        q_v, r_v = _diagonal(q, "q"), _diagonal(r, "r")
         n_x, n_u = q_v.size, r_v.size
         weights = {"q": q_v, "r": r_v, "r_delta": vector(r_delta, n_u, "r_delta")}
-        check_weights(weights)
+        _check_weights(weights)
         lower, upper = input_limits(u_min, u_max, n_u)
         if du_max is not None:
             du_max = vector(du_max, n_u, "du_max")
             if not np.all(du_max > 0):
                 raise InputError(f"du_max must be positive, got {du_max}; leave it out for no limit")
         if not (isinstance(terminal, str) and terminal == "riccati"):
-            terminal = terminal_matrix(terminal, n_x)
+            terminal = _terminal_matrix(terminal, n_x)
         low, up, linear, quadratic = state_bounds(q_v, x_min, x_max, slack_linear, slack_quadratic)
         if wrong := [bound for bound in soft if not isinstance(bound, SoftBound)]:
             raise InputError(f"soft: {wrong[0]!r} given; needed: SoftBound(expression, lower, upper, ...)")
-        if economic is not None and not is_stage_cost(economic):
+        if economic is not None and not _is_stage_cost(economic):
             raise InputError(f"economic: {economic} given; needed: a function (x, u) or (x, u, p) -> scalar")
         fields = {
             "horizon": int(horizon), **weights, "u_min": lower, "u_max": upper, "du_max": du_max, "terminal": terminal,
-            "working_point": None if working_point is None else point(working_point, n_x, n_u),
+            "working_point": None if working_point is None else _point(working_point, n_x, n_u),
             "x_min": low, "x_max": up,
             "slack_linear": None if slack_linear is None else linear,
             "slack_quadratic": None if slack_quadratic is None else quadratic,
-            "soft": tuple(soft), "blocks": None if blocks is None else block_lengths(blocks, int(horizon)),
-            "economic": economic, "starts": plans(starts, int(horizon), n_u),
+            "soft": tuple(soft), "blocks": None if blocks is None else _block_lengths(blocks, int(horizon)),
+            "economic": economic,
+            "starts": tuple(input_plan(s, int(horizon), n_u, f"starts[{i}]") for i, s in enumerate(starts)),
         }  # fmt: skip
         for name, value in fields.items():
             for array in value if isinstance(value, tuple) else (value,):
@@ -290,14 +195,8 @@ class OCP:
             InputError: If there is no such field, or the problem would be wrong.
 
         Example:
-            >>> ocp = OCP(20, [1.0], [0.1], [0.0], [-1.0], [1.0])
-            >>> ocp.changed(horizon=30, u_max=[2.0]).u_max
+            >>> OCP(20, [1.0], [0.1], [0.0], [-1.0], [1.0]).changed(horizon=30, u_max=[2.0]).u_max
             array([2.])
-            >>> ocp.changed(horizn=30)
-            Traceback (most recent call last):
-            hybrid_mpc.errors.InputError: no field of a control problem 'horizn'; did you mean 'horizon'? There are: \
-horizon, q, r, r_delta, u_min, u_max, du_max, terminal, working_point, x_min, x_max, slack_linear, slack_quadratic, \
-soft, blocks, economic, starts
         """
         names = [field.name for field in dataclass_fields(self)]
         for name in fields:
@@ -341,27 +240,17 @@ soft, blocks, economic, starts
 
     @property
     def penalties(self) -> tuple[Array, Array]:
-        """Linear and quadratic penalties of the states' bounds, the defaults filled in, ``(n_x,)`` each.
-
-        Example:
-            >>> OCP(5, [4.0], [1.0], [0.0], [-9.0], [9.0], x_max=[1.0]).penalties
-            (array([2000.]), array([4000.]))
-        """
+        """Linear and quadratic penalties of the states' bounds ``(n_x,)`` each, the defaults filled in."""
         return state_bounds(self.q, self.x_min, self.x_max, self.slack_linear, self.slack_quadratic)[2:]
 
     @property
     def input_range(self) -> Array:
-        """By what an input is much or little ``(n_u,)``: its range, or, without one, twice what weights tolerate.
-
-        Example:
-            >>> OCP(5, [1.0], [0.3, 3.0], [0.1, 1.0], [0.0, 0.0], [8.0, np.inf]).input_range
-            array([8., 1.])
-        """
+        """By what an input is much or little ``(n_u,)``: its range, or twice what its weights tolerate."""
         return 2.0 * self.input_scale
 
     @property
     def input_scale(self) -> Array:
-        """Sizes ``(n_u,)`` by which solvers scale the inputs: half the range, or, without one, what weights tolerate.
+        """By what solvers scale the inputs ``(n_u,)``: half the range, or, without one, what their weights tolerate.
 
         Example:
             >>> OCP(5, [1.0], [0.3, 3.0], [0.1, 1.0], [0.0, 0.0], [8.0, np.inf]).input_scale
@@ -397,8 +286,8 @@ soft, blocks, economic, starts
     def bounds(self, u_prev: Array, limits: Limits | None = None) -> tuple[Array, Array]:
         """Lower and upper bounds of a plan's inputs, ``(N, n_u)`` each.
 
-        ``limits`` tighten the problem's own. Where ``du_max`` keeps the input ``u_prev`` from being within them
-        at once, it goes there as fast as ``du_max`` lets it.
+        ``limits`` tighten the problem's own. Where ``du_max`` keeps ``u_prev`` from being within them at once,
+        the bounds go there as fast as ``du_max`` lets them.
 
         Raises:
             InputError: If the limits have another size.
@@ -429,9 +318,7 @@ soft, blocks, economic, starts
         return lower, upper
 
     def saturate(self, u: Array, u_prev: Array, limits: Limits | None = None) -> Array:
-        """``u`` ``(n_u,)`` moved into the bounds and, around ``u_prev``, into the limit of its change.
-
-        ``limits`` tighten the bounds as :meth:`bounds` says.
+        """``u`` ``(n_u,)`` moved within ``du_max`` of ``u_prev`` and into :meth:`bounds`.
 
         Example:
             >>> OCP(5, [1.0], [1.0], [0.0], [-1.0], [1.0], du_max=[0.2]).saturate([3.0], [0.5])
@@ -446,9 +333,8 @@ soft, blocks, economic, starts
     def terminal_weight(self, model: HybridModel) -> Array:
         """Terminal matrix ``(n_x, n_x)`` for a model.
 
-        ``"riccati"``: the cost-to-go of the LQR at the working point. With hidden states it is the
-        cost-to-go minimised over them (Schur complement), so that it needs no target for them. An input
-        change weight is counted as an input weight there: exact for ``r_delta = 0``.
+        ``"riccati"``: the cost-to-go of the LQR at the working point, minimised over the hidden states (Schur
+        complement), so that they need no target. Change weights count as input weights: exact for ``r_delta = 0``.
 
         Raises:
             InputError: If the linearized model is not stabilisable.
@@ -467,3 +353,74 @@ soft, blocks, economic, starts
         )
         values, vectors = np.linalg.eigh(0.5 * (reduced + reduced.T))
         return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+
+
+def _whole(value: object) -> bool:
+    return isinstance(value, int | float | np.number) and bool(np.isfinite(value)) and int(value) == value
+
+
+def _diagonal(values: ArrayLike, name: str) -> Array:
+    """Weights as a vector; a matrix is refused."""
+    array = numbers(values, name)
+    shape = np.shape(values)
+    if len(shape) > 1 and max(shape) < array.size:
+        raise InputError(f"{name}: shape {shape} given; needed: the diagonal alone, a weight each")
+    return array
+
+
+def input_plan(value: ArrayLike, horizon: int, n_u: int, name: str) -> Array:
+    """A plan of the inputs ``(horizon, n_u)``, finite."""
+    array = numbers(value, name).reshape(np.shape(value))
+    if array.shape != (horizon, n_u) or not np.all(np.isfinite(array)):
+        raise InputError(
+            f"{name}: shape {array.shape} given; needed: a finite plan of the inputs ({horizon}, {n_u})"
+        )
+    return array
+
+
+def _point(value: object, n_x: int, n_u: int) -> tuple[Array, Array]:
+    """A state ``(n_x,)`` and an input ``(n_u,)``, finite."""
+    if not isinstance(value, tuple | list) or len(value) != 2:
+        raise InputError(f"working_point: {value!r} given; needed: (x, u), a state and an input")
+    return vector(value[0], n_x, "working_point x"), vector(value[1], n_u, "working_point u")
+
+
+def _is_stage_cost(f: object) -> bool:
+    """Whether ``f`` is a function ``(x, u) -> scalar`` or ``(x, u, p) -> scalar``."""
+    return isinstance(f, ca.Function) and f.n_in() in (2, 3) and (f.n_out(), f.numel_out(0)) == (1, 1)
+
+
+def _block_lengths(blocks: Sequence[int], horizon: int) -> tuple[int, ...]:
+    """Lengths of move blocks that fit the horizon."""
+    lengths = tuple(int(length) for length in blocks if _whole(length))
+    if len(lengths) < len(blocks) or min(lengths, default=0) < 1 or sum(lengths) != horizon:
+        raise InputError(
+            f"blocks: {tuple(blocks)} given, {sum(blocks)} periods in all; needed: whole numbers of at least 1 "
+            f"that sum to the horizon of {horizon}"
+        )
+    return lengths
+
+
+def _check_weights(weights: dict[str, Array]) -> None:
+    """Refuse weights that are negative, not finite, or leave an input undetermined."""
+    for name, value in weights.items():
+        if value.size == 0 or not np.all(np.isfinite(value)) or np.any(value < 0):
+            raise InputError(f"{name}: weights must be finite and not negative, got {value}")
+    if not np.all(weights["r"] + weights["r_delta"] > 0):
+        raise InputError(
+            "every input needs a positive weight in r or r_delta, otherwise it is not determined"
+        )
+
+
+def _terminal_matrix(value: ArrayLike, n_x: int) -> Array:
+    """A finite, symmetric, positive semi-definite ``(n_x, n_x)`` matrix."""
+    if isinstance(value, str):
+        raise InputError(f"terminal: {value!r} given; needed: 'riccati' or an ({n_x}, {n_x}) matrix")
+    matrix = numbers(value, "terminal").reshape(np.shape(value))
+    if matrix.shape != (n_x, n_x) or not np.all(np.isfinite(matrix)) or not np.allclose(matrix, matrix.T):
+        raise InputError(
+            f"terminal: shape {matrix.shape} given; needed: a finite symmetric ({n_x}, {n_x}) matrix"
+        )
+    if np.min(np.linalg.eigvalsh(matrix)) < -1e-9 * max(1.0, float(np.max(np.abs(matrix)))):
+        raise InputError("terminal: the matrix has a negative eigenvalue; needed: positive semi-definite")
+    return matrix

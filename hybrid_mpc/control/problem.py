@@ -5,20 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Protocol
+from typing import Any, Protocol
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybrid_mpc.control.ocp import OCP, Limits
-from hybrid_mpc.control.soft import SoftRows
+from hybrid_mpc.control.ocp import OCP, Limits, input_plan
+from hybrid_mpc.control.soft import SoftBound
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
 from hybrid_mpc.model.buffered import BufferedFunction
 from hybrid_mpc.model.model import HybridModel
-
-# What a solve returns.
 
 Array = NDArray[np.float64]
 
@@ -90,7 +88,110 @@ class Solution:
         return replace(self, u=np.vstack([u_held[None], self.u[:-1]]), x=x, h=h, curvature=c)
 
 
-# Stage costs that are no squares: any smooth expression of state and input.
+class SoftRows:
+    """The M soft bounds of a problem along a trajectory, one row a bound and period.
+
+    Bounds on states hold for ``x_1 .. x_N`` (``x_0`` is given), expressions for ``(x_0, u_0) .. (x_{N-1}, u_{N-1})``.
+
+    Args:
+        ocp: The problem.
+
+    Raises:
+        InputError: If an expression does not take the problem's ``(x, u)``.
+
+    Example:
+        >>> rows = SoftRows(OCP(2, [1.0], [1.0], [0.0], [-9.0], [9.0], x_max=[0.5]))
+        >>> rows.excess(rows.values(np.array([[7.0], [0.6], [0.2]]), np.zeros((2, 1)))).round(6)
+        array([0.1, 0. ])
+    """
+
+    stage: NDArray[np.int64]
+    """State ``(M,)`` of the trajectory that a row looks at."""
+
+    def __init__(self, ocp: OCP) -> None:
+        n = ocp.horizon
+        self._n_x, self._n_u, self._horizon = ocp.n_x, ocp.n_u, n
+        self._states = np.flatnonzero(np.isfinite(ocp.x_min) | np.isfinite(ocp.x_max))
+        chosen = self._states
+        self._expressions = [BufferedFunction(_with_slopes(b, ocp.n_x, ocp.n_u).map(n)) for b in ocp.soft]
+        columns = [[np.tile(v[chosen], n) for v in (ocp.x_min, ocp.x_max, *ocp.penalties)]]
+        columns += [[np.tile(v, n) for v in (b.lower, b.upper, b.linear, b.quadratic)] for b in ocp.soft]
+        self.lower, self.upper, self.linear, self.quadratic = (
+            np.concatenate([c[i] for c in columns]) for i in range(4)
+        )
+        stages = [np.repeat(np.arange(1, n + 1), chosen.size)]
+        stages += [np.repeat(np.arange(n), b.lower.size) for b in ocp.soft]
+        self.stage = np.concatenate(stages)
+        half = 0.5 * (self.upper - self.lower)
+        # One-sided bounds have no range: the violation that costs as much quadratically as linearly, or 1.
+        other = np.where(self.linear > 0, self.linear / self.quadratic, 1.0)
+        self.scale: Array = np.where(np.isfinite(half), half, other)
+
+    def __len__(self) -> int:
+        return int(self.stage.size)
+
+    def values(self, x: Array, u: Array) -> Array:
+        """Bounded values ``(M,)`` along states ``(N + 1, n_x)`` and inputs ``(N, n_u)``."""
+        return self.linearize(x, u)[0]
+
+    def linearize(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
+        """Values ``(M,)`` and their derivatives by the row's state ``(M, n_x)`` and input ``(M, n_u)``."""
+        n = self._horizon
+        by_x = np.tile(np.eye(self._n_x)[self._states], (n, 1))
+        rows = [(x[1:, self._states].ravel(), by_x, np.zeros((by_x.shape[0], self._n_u)))]
+        for f in self._expressions:
+            f.inputs[0][:], f.inputs[1][:] = x[:-1].ravel(), u.ravel()
+            f()
+            e, e_x, e_u = (out.copy() for out in f.outputs)
+            each = e.size // n
+            e_x = e_x.reshape(n, self._n_x, each).transpose(0, 2, 1).reshape(e.size, self._n_x)
+            e_u = e_u.reshape(n, self._n_u, each).transpose(0, 2, 1).reshape(e.size, self._n_u)
+            rows.append((e, e_x, e_u))
+        return (
+            np.concatenate([r[0] for r in rows]),
+            np.vstack([r[1] for r in rows]),
+            np.vstack([r[2] for r in rows]),
+        )
+
+    def condensed(self, x: Array, u: Array, from_u: Array) -> tuple[Array, Array, Array]:
+        """Values ``(M,)`` and their derivatives by the row's state ``(M, n_x)`` and by all inputs ``(M, N n_u)``.
+
+        Args:
+            x: States ``(N + 1, n_x)``.
+            u: Inputs ``(N, n_u)``.
+            from_u: Derivatives of the states by the inputs ``((N + 1) n_x, N n_u)``.
+        """
+        if not len(self):
+            return np.zeros(0), np.zeros((0, self._n_x)), np.zeros((0, u.size))
+        value, by_x, by_u = self.linearize(x, u)
+        states = from_u.reshape(len(x), self._n_x, u.size)[self.stage]
+        slope = (by_x[:, None, :] @ states)[:, 0, :]
+        direct = np.flatnonzero(np.any(by_u != 0, axis=1))
+        for j in range(self._n_u):
+            slope[direct, self.stage[direct] * self._n_u + j] += by_u[direct, j]
+        return value, by_x, slope
+
+    def excess(self, values: Array) -> Array:
+        """Violations ``(M,)``, zero where a bound is kept."""
+        return np.asarray(np.maximum(0.0, np.maximum(values - self.upper, self.lower - values)))
+
+    def penalty(self, excess: Array) -> float:
+        """Cost per second of violations ``(M,)``, summed."""
+        return float(self.linear @ excess + self.quadratic @ excess**2)
+
+
+def _with_slopes(bound: SoftBound, n_x: int, n_u: int) -> ca.Function:
+    """``(x, u)`` to the expression and its derivatives by ``x`` and by ``u``."""
+    f = bound.expression
+    if (f.size_in(0), f.size_in(1)) != ((n_x, 1), (n_u, 1)):
+        raise InputError(f"soft bound: expression {f} does not take (x, u) of {n_x} states and {n_u} inputs")
+    # One Jacobian by both, in scalar code where the expression is some: two would run through its calls twice.
+    kind: Any = ca.SX if f.is_a("SXFunction") else ca.MX
+    z, x, u = kind.sym("z", n_x + n_u), ca.MX.sym("x", n_x), ca.MX.sym("u", n_u)
+    e = f(z[:n_x], z[n_x:])
+    both = ca.Function("both", [z], [ca.densify(e), ca.densify(ca.jacobian(e, z))], {"cse": True})
+    value, slope = both(ca.vertcat(x, u))
+    return ca.Function("soft", [x, u], [value, slope[:, :n_x], slope[:, n_x:]])
 
 
 class EconomicCost:
@@ -129,10 +230,7 @@ class EconomicCost:
         self._derivatives = BufferedFunction(ca.Function("economic_slopes", [x, u, p], outs).map(self._n))
 
     def value(self, x: Array, u: Array, p: Array | None = None) -> float:
-        """Cost of states ``(N + 1, n_x)`` or longer and inputs ``(N, n_u)``; the last state has none.
-
-        ``p`` ``(N + 1, n_p)`` or longer are the parameters' values. Default: the cost has none.
-        """
+        """Cost of states ``(N + 1, n_x)`` or longer, inputs ``(N, n_u)`` and parameters ``(N + 1, n_p)``."""
         if self.function is None:
             return 0.0
         self._fill(self._value, x, u, p)
@@ -148,10 +246,7 @@ class EconomicCost:
         return slope, self._dt * f.outputs[1].reshape(n, slope.shape[1], -1)
 
     def convex(self, x: Array, u: Array, p: Array | None = None) -> tuple[Array, Array]:
-        """The same, second derivatives made positive semi-definite: what curves down counts as flat.
-
-        What is not finite is left as it is.
-        """
+        """The same, second derivatives made positive semi-definite: what curves down counts as flat."""
         slope, curvature = self.derivatives(x, u, p)
         if not np.all(np.isfinite(curvature)):
             return slope, curvature
@@ -168,8 +263,8 @@ class EconomicCost:
 def output_cost(output: ca.Function, q_y: ArrayLike) -> ca.Function:
     """``(x, u, p) -> (y(x, u) - p)' diag(q_y) (y(x, u) - p)``: the economic stage cost that tracks outputs.
 
-    References then have ``n_y`` more columns, the outputs'. For outputs that are no states: with those that are,
-    ``q`` says the same and has a terminal weight.
+    References then have ``n_y`` more columns, the outputs'. It is for outputs that are no states; for states ``q`` says
+    the same and has a terminal weight.
 
     Args:
         output: ``(x, u) -> y``, a column; of a model's own outputs ``(x, u, w, p) -> y`` with its ``w`` and ``p``
@@ -193,41 +288,6 @@ def output_cost(output: ca.Function, q_y: ArrayLike) -> ca.Function:
     x, u = (ca.MX.sym(name, output.size1_in(i)) for i, name in enumerate("xu"))
     p = ca.MX.sym("p", n)
     return ca.Function("output_cost", [x, u, p], [ca.dot(weight, (output(x, u) - p) ** 2)])
-
-
-class Controller(Protocol):
-    """What every solver offers. Built once; no method changes it or raises on the numbers it is given."""
-
-    @property
-    def model(self) -> HybridModel:
-        """The model that predicts."""
-
-    @property
-    def ocp(self) -> OCP:
-        """The problem."""
-
-    def initial(self, estimate: Estimate, u: Array | None = None) -> Solution:
-        """A first plan: the model run freely from the estimate; ``u`` ``(N, n_u)``, see :class:`Problem`."""
-
-    def solve(
-        self,
-        previous: Solution,
-        estimate: Estimate,
-        reference: Array,
-        weight: Array | None = None,
-        *,
-        limits: Limits | None = None,
-    ) -> Solution:
-        """The plan from now on; ``previous.u[0]`` is the input that is being held.
-
-        Args:
-            previous: The last plan; shifted by one period it is the first guess.
-            estimate: The state now; its ``d`` is assumed constant over the horizon.
-            reference: ``(m, n_x)``, from now on in steps of ``dt``; if ``m < N + 1`` its last value holds.
-                Where the economic stage cost has parameters, ``n_p`` more columns are their values.
-            weight: Factors on ``q`` ``(m, n_x)``, not negative, as the reference. Default: 1.
-            limits: Bounds of the inputs for this solve. Default: the problem's own.
-        """
 
 
 @dataclass(frozen=True)
@@ -295,8 +355,8 @@ class Problem:
 
         Args:
             estimate: Where the plan starts.
-            u: Inputs ``(N, n_u)``; ``u[0]`` counts as the input held before the next solve. Default:
-                zero, or the bound next to it.
+            u: Inputs ``(N, n_u)``; ``u[0]`` counts as the input held before the next solve. Default: zero, or the
+                bound next to it.
 
         Returns:
             A plan of status INITIAL. Where the free run diverges, the state is held at the estimate.
@@ -305,9 +365,7 @@ class Problem:
             InputError: If ``u`` has another shape or is not finite.
         """
         n, ocp = self.ocp.horizon, self.ocp
-        start = np.tile(ocp.rest_input, (n, 1)) if u is None else np.asarray(u, dtype=float)
-        if start.shape != (n, ocp.n_u) or not np.all(np.isfinite(start)):
-            raise InputError(f"u: finite values of shape {(n, ocp.n_u)} needed, got {start}")
+        start = np.tile(ocp.rest_input, (n, 1)) if u is None else input_plan(u, n, ocp.n_u, "u")
         plan = np.clip(start, ocp.u_min, ocp.u_max)
         z = self.run(np.concatenate([estimate.x, estimate.h]), plan + estimate.d)
         if not np.all(np.isfinite(z)):
@@ -331,11 +389,7 @@ class Problem:
         return Target(rows[:, : self.ocp.n_x], self.weights(weight), rows[:, self.ocp.n_x :])
 
     def weights(self, weight: ArrayLike | None) -> Array:
-        """Weight factors ``(N + 1, n_x)``; default: 1.
-
-        Raises:
-            InputError: If the shape is not ``(m, n_x)`` with m > 0.
-        """
+        """Weight factors ``(N + 1, n_x)`` from ``(m, n_x)``, the last value held. Default: 1."""
         if weight is None:
             return np.ones((self.ocp.horizon + 1, self.ocp.n_x))
         return self._preview(weight, "weight", self.ocp.n_x)
@@ -379,3 +433,40 @@ def _rollout(model: HybridModel, n: int) -> BufferedFunction:
     z, u = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("u", model.n_u)
     z_next = ca.vertcat(*model.step(z[: model.n_x], z[model.n_x :], u, model.w, model.p))
     return BufferedFunction(ca.Function("z_step", [z, u], [z_next]).mapaccum("rollout", n))
+
+
+class Controller(Protocol):
+    """What every solver offers. Built once; no method changes it or raises on the numbers it is given."""
+
+    problem: Problem
+    """Problem and model made ready."""
+
+    @property
+    def model(self) -> HybridModel:
+        """The model that predicts."""
+        return self.problem.model
+
+    @property
+    def ocp(self) -> OCP:
+        """The problem as plain data."""
+        return self.problem.ocp
+
+    def initial(self, estimate: Estimate, u: Array | None = None) -> Solution:
+        """A first plan: the model run freely from the estimate; see :meth:`Problem.initial`."""
+        return self.problem.initial(estimate, u)
+
+    def solve(
+        self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,
+        *, limits: Limits | None = None,
+    ) -> Solution:  # fmt: skip
+        """The plan from now on; ``previous.u[0]`` is the input that is being held.
+
+        Args:
+            previous: The last plan; shifted by one period it is the first guess.
+            estimate: The state now; its ``d`` is assumed constant over the horizon.
+            reference: ``(m, n_x)``, from now on in steps of ``dt``; if ``m < N + 1`` its last value holds.
+                Where the economic stage cost has parameters, ``n_p`` more columns are their values.
+            weight: Factors on ``q`` ``(m, n_x)``, not negative, as the reference. Default: 1.
+            limits: Bounds of the inputs for this solve. Default: the problem's own.
+        """
+        ...

@@ -10,22 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.control.ocp import OCP, Limits
-from hybrid_mpc.control.problem import Status
-from hybrid_mpc.control.soft import SoftRows
+from hybrid_mpc.control.problem import SoftRows, Status
 from hybrid_mpc.model.buffered import BufferedFunction
 
 Array = NDArray[np.float64]
 Soft = tuple[Array, Array] | None
 
-# Relative to the gradient's size.
 KKT_TOLERANCE = 1e-5
-# In DAQP's own scaling, which an ill-conditioned Hessian (weights of 1e4 on one instant) stretches: at the default
-# of 1e-6 it returned bounds violated by 5e-5 of the range.
+"""Relative to the gradient's size."""
 PRIMAL_TOLERANCE = 1e-9
-# Numbers of soft bounds that QPs are built for, besides all of them.
+"""In DAQP's own scaling, which an ill-conditioned Hessian (weights of 1e4 on one instant) stretches: at the default of
+1e-6 it returned bounds violated by 5e-5 of the range."""
 SOFT_SIZES = (8, 16, 32, 64, 128, 256)
-# Share of an input's or a soft bound's range; what is left of an input's is clipped away.
+"""Numbers of soft bounds that QPs are built for, besides all of them."""
 BOUND_TOLERANCE = 1e-6
+"""Share of an input's or a soft bound's range; what is left of an input's is clipped away."""
 
 
 @dataclass(frozen=True)
@@ -86,24 +85,27 @@ class _Sides:
 class InputQP:
     """``min 1/2 s'Hs + g's + penalties`` over input steps ``s`` within the limits of inputs and changes.
 
-    Where the problem has move blocks, the unknowns are the blocks' inputs; all that comes in and goes out is
-    by period. Inputs are scaled by :attr:`OCP.input_scale`, soft bounds by half their range, the Hessian by its
-    diagonal. The solvers (DAQP, through ``casadi.conic``) are built once; :meth:`solve` checks their answer whatever
-    status they report. Soft bounds cost time only where they act: the QP is first solved without them, and an
-    answer that keeps them all is the answer with them, since its penalty is zero. Else it is solved again
-    with a slack for each of the few bounds that are violated most; an answer that keeps the others is the
-    answer with all of them. Else those that it violates are added, up to all.
+    Where the problem has move blocks, the unknowns are the blocks' inputs; all that comes in and goes out is by
+    period. Inputs are scaled by :attr:`OCP.input_scale`, soft bounds by half their range, the Hessian by its
+    diagonal. The solvers (DAQP, through ``casadi.conic``) are built once; their answer is checked whatever status
+    they report.
+
+    Soft bounds cost time only where they act. The QP is first solved without them: an answer that keeps them all is
+    the answer with them. Else it is solved with a slack for each of the few bounds that are violated most, and those
+    that this answer violates are added, up to all.
 
     Args:
         ocp: The problem whose bounds hold.
+        soft: Its soft bounds. Default: none.
+        dt: Model period [s], by which penalties count. Default: 1.
 
     Source: Arnström, Bemporad, Axehill, *A dual active-set solver for embedded quadratic programming
     using recursive LDL' updates*, IEEE TAC 67 (2022).
 
     Example:
         >>> qp = InputQP(OCP(1, [1.0], [1.0], [0.0], [-1.0], [1.0]))
-        >>> step, status, kkt = qp.solve(np.eye(1), np.array([-3.0]), np.zeros((1, 1)), np.zeros(1))
-        >>> step, status.name
+        >>> answer = qp.solve(np.eye(1), np.array([-3.0]), np.zeros((1, 1)), np.zeros(1))
+        >>> answer.step, answer.status.name
         (array([1.]), 'SOLVED')
     """
 
@@ -111,19 +113,15 @@ class InputQP:
         self._starts, n_u = ocp.block_starts, ocp.n_u
         n = self._starts.size * n_u
         self._ocp, self._dt, self._n = ocp, dt, n
-        self._scale = np.tile(ocp.input_scale, self._starts.size)
+        self.scale: Array = np.tile(ocp.input_scale, self._starts.size)
+        """What 1 means in the scaled QP, by the blocks' inputs ``(M n_u,)`` [input units]."""
         rows = np.eye(n) - np.eye(n, k=-n_u) if ocp.du_max is not None else np.zeros((0, n))
-        self._rows = rows * self._scale / self._scale[:, None] if len(rows) else rows
+        self._rows = rows * self.scale / self.scale[:, None] if len(rows) else rows
         self._solver = _daqp(n, len(rows))
         self._sides = _Sides(soft) if soft is not None else None
         m = 0 if self._sides is None else self._sides.row.size
         sizes = sorted({min(size, m) for size in (*SOFT_SIZES, m)} - {0})
         self._soft_solvers = {size: _daqp(n + size, len(rows) + size) for size in sizes}
-
-    @property
-    def scale(self) -> Array:
-        """What a step of 1 of a block's input means in the scaled QP ``(M n_u,)`` [input units]."""
-        return self._scale
 
     def by_blocks(self, slopes: Array) -> Array:
         """Derivatives by the inputs, the last axis ``N n_u``, as those by the blocks' inputs ``M n_u``.
@@ -143,9 +141,10 @@ class InputQP:
         return hessian if self._ocp.blocks is None else self.by_blocks(self.by_blocks(hessian).T)
 
     def solve(
-        self, hessian: Array, gradient: Array, u: Array, u_prev: Array, soft: Soft = None
-    ) -> tuple[Array, Status, float]:
-        """Step from the plan ``u``, how the solve ended, and the relative KKT residual.
+        self, hessian: Array, gradient: Array, u: Array, u_prev: Array, soft: Soft = None,
+        limits: Limits | None = None,
+    ) -> Answer:  # fmt: skip
+        """Solve from a plan, and check the answer.
 
         Args:
             hessian: ``(N n_u, N n_u)``, symmetric positive definite.
@@ -154,15 +153,8 @@ class InputQP:
             u_prev: Input ``(n_u,)`` held before.
             soft: Values of the soft bounds ``(M,)`` without a step, and their derivatives by the step
                 ``(M, N n_u)``. Default: none.
+            limits: As :meth:`OCP.bounds` has them. Default: the problem's own.
         """
-        answer = self.answer(hessian, gradient, u, u_prev, soft)
-        return answer.step, answer.status, answer.kkt
-
-    def answer(
-        self, hessian: Array, gradient: Array, u: Array, u_prev: Array, soft: Soft = None,
-        limits: Limits | None = None,
-    ) -> Answer:  # fmt: skip
-        """As :meth:`solve`, with the multipliers of the soft bounds; ``limits`` as :meth:`OCP.bounds` has them."""
         if self._ocp.blocks is None:
             return self._solve(hessian, gradient, u, u_prev, soft, limits)
         if soft is not None:
@@ -175,7 +167,7 @@ class InputQP:
     def _solve(
         self, hessian: Array, gradient: Array, u: Array, u_prev: Array, soft: Soft, limits: Limits | None
     ) -> Answer:
-        scale = self._scale
+        scale = self.scale
         bounds = (bound[self._starts] for bound in self._ocp.bounds(u_prev, limits))
         lower, upper = ((bound - u).ravel() / scale for bound in bounds)
         row_lower, row_upper = self._row_bounds(u, u_prev)
@@ -192,7 +184,7 @@ class InputQP:
         sides, n, rows = self._sides, self._n, value.size
         assert sides is not None
         multipliers = np.zeros(rows)
-        value, slope = sides.of(value), sides.of(slope) * self._scale
+        value, slope = sides.of(value), sides.of(slope) * self.scale
         wanted = np.zeros(value.size, dtype=bool)
         for room, solver in self._soft_solvers.items():
             beyond = value + slope @ s[:n]
@@ -211,9 +203,9 @@ class InputQP:
             others = np.ones(value.size, dtype=bool)
             others[nearest] = False
             if not status.ok or not np.any((value + slope @ s[:n])[others] > 0):
-                return Answer(s[:n] * self._scale, status, kkt, multipliers)
+                return Answer(s[:n] * self.scale, status, kkt, multipliers)
             wanted[nearest] = True
-        return Answer(s[:n] * self._scale, Status.SOLVED, kkt, multipliers)
+        return Answer(s[:n] * self.scale, Status.SOLVED, kkt, multipliers)
 
     def _with_slacks(
         self, hard: _Scaled, size: float, value: Array, slope: Array, chosen: NDArray[np.int64]
@@ -241,7 +233,7 @@ class InputQP:
         if self._ocp.du_max is None:
             return np.zeros(0), np.zeros(0)
         du = np.diff(u, axis=0, prepend=u_prev[None])
-        scale = self._scale
+        scale = self.scale
         return (-self._ocp.du_max - du).ravel() / scale, (self._ocp.du_max - du).ravel() / scale
 
 
@@ -252,13 +244,11 @@ def _daqp(n: int, rows: int) -> BufferedFunction:
 
 
 def _solve(solver: BufferedFunction, qp: _Scaled) -> tuple[Array, Array, Array]:
-    """Unknowns and the multipliers of their bounds and of the rows, as the solver leaves them.
-
-    ``casadi.conic`` takes ``h, g, a, lba, uba, lbx, ubx`` and returns ``x, cost, lam_a, lam_x``. Its status is
-    not asked for: it proves nothing that the check does not.
-    """
+    """Unknowns and the multipliers of their bounds and of the rows; the solver's status proves nothing."""
     given = qp.h.ravel(), qp.g, qp.a.T.ravel(), qp.row_lower, qp.row_upper, qp.lower, qp.upper
-    for buffer, values in zip(solver.inputs, given, strict=False):
+    for buffer, values in zip(
+        solver.inputs, given, strict=False
+    ):  # casadi.conic: h, g, a, lba, uba, lbx, ubx, ..
         buffer[:] = values
     solver()
     s, _, lam_a, lam_x = solver.outputs

@@ -11,16 +11,15 @@ from numpy.typing import NDArray
 from scipy.linalg.blas import dgemv
 
 from hybrid_mpc.control.ocp import OCP, Limits
-from hybrid_mpc.control.problem import Problem, Solution, Status, Target, weights_ok
+from hybrid_mpc.control.problem import Controller, Problem, Solution, Status, Target, weights_ok
 from hybrid_mpc.control.qp import InputQP
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
 from hybrid_mpc.model.model import HybridModel
-from hybrid_mpc.model.stages import Derivatives, Linearization, stages
-
-# Condensing: from the stages' Jacobians to the states as functions of the inputs.
+from hybrid_mpc.model.stages import Derivatives, stages
 
 Array = NDArray[np.float64]
+NAN = float("nan")
 GROUP = 10
 """Periods whose second derivatives are condensed by one product."""
 
@@ -29,8 +28,8 @@ GROUP = 10
 class Prepared:
     """Everything of an iteration that needs neither the estimate nor the reference.
 
-    With ``dz = (x, h) - (x_bar, h_bar)`` the linearized prediction is ``dz_{k+1} = A_k dz_k + B_k (du_k +
-    dd) + defect_k``; of it, ``x`` depends on the inputs by ``from_u``.
+    With ``dz = (x, h) - (x_bar, h_bar)`` the linearized prediction is ``dz_{k+1} = A_k dz_k + B_k (du_k + dd) +
+    defect_k``; of it, ``x`` depends on the inputs by ``from_u``.
 
     Args:
         u: Linearization inputs ``(N, n_u)``.
@@ -70,9 +69,8 @@ class Prepared:
 class Condenser:
     """Derivative of the states by the inputs, on scratch memory of its own: not for several threads at once.
 
-    The products run transposed, on contiguous memory: rows of the scratch arrays are inputs, a period's
-    array is written by one product from the one before. They are the condensing's whole arithmetic, ``N^2
-    n_u n_z^2`` operations; of the hidden states' derivatives neither cost nor bounds see anything.
+    The products run transposed, on contiguous memory: a period's array is written by one product from the one before.
+    They cost ``N^2 n_u n_z^2`` operations.
 
     Args:
         n: Periods N.
@@ -87,13 +85,16 @@ class Condenser:
                [1., 1.]])
     """
 
+    by_inputs: Array
+    """Derivatives ``(N + 1, N n_u, n_z)`` of ``z_0 .. z_N`` by the inputs; the next call overwrites them."""
+
     def __init__(self, n: int, n_z: int, n_u: int, n_x: int) -> None:
-        self._by_inputs = np.zeros((n + 1, n * n_u, n_z))  # of z_0 .. z_N; later inputs' rows stay zero
-        self._newest = self._by_inputs[1:].reshape(n, n, n_u, n_z)
+        self.by_inputs = np.zeros((n + 1, n * n_u, n_z))  # later inputs' rows stay zero
+        self._newest = self.by_inputs[1:].reshape(n, n, n_u, n_z)
         self._stages = np.arange(n)
-        self._before = [self._by_inputs[k, : k * n_u] for k in range(1, n)]
-        self._after = [self._by_inputs[k + 1, : k * n_u] for k in range(1, n)]
-        self._states = self._by_inputs[:, :, :n_x].transpose(0, 2, 1)
+        self._before = [self.by_inputs[k, : k * n_u] for k in range(1, n)]
+        self._after = [self.by_inputs[k + 1, : k * n_u] for k in range(1, n)]
+        self._states = self.by_inputs[:, :, :n_x].transpose(0, 2, 1)
         self._shape = (n + 1) * n_x, n * n_u
 
     def __call__(self, a_t: Array, b: Array) -> Array:
@@ -101,14 +102,7 @@ class Condenser:
         self._newest[self._stages, self._stages] = b.transpose(0, 2, 1)
         for before, a, after in zip(self._before, a_t[1:], self._after, strict=True):
             np.dot(before, a, out=after)
-        return np.array(self._states, order="C").reshape(
-            self._shape
-        )  # what is prepared outlives the next call
-
-    @property
-    def by_inputs(self) -> Array:
-        """Derivatives ``(N + 1, N n_u, n_z)`` of ``z_0 .. z_N`` by the inputs; the next call overwrites them."""
-        return self._by_inputs
+        return np.array(self._states, order="C").reshape(self._shape)  # outlives the next call
 
 
 def propagate(a: Sequence[Array], drift: Array, dz0: Array) -> Array:
@@ -199,19 +193,13 @@ def condense_all(stages: Array, by_inputs: Array, n_x: int, n_u: int) -> Array:
     return total
 
 
-NAN = float("nan")
-
-
-class CondensedController:
+class CondensedController(Controller):
     """Nonlinear MPC by Gauss-Newton real-time iterations (RTI).
 
-    A period's work is split: :meth:`prepare` shifts the previous plan, linearizes the model along it in
-    one call and condenses states and hidden states away (their multiple-shooting trajectory and
-    its defects are kept); :meth:`feedback` embeds the new estimate and solves the QP of ``N n_u``
-    unknowns (and a slack for every soft bound and period, where one acts). The QP's answer is checked,
-    whatever status its solver reports. Everything is built here; no method changes the object (apart from
-    scratch buffers: not for several threads at once) or raises on the numbers of an estimate, a reference,
-    a weight or a plan.
+    :meth:`prepare` shifts the previous plan, linearizes the model along it in one call and condenses states and
+    hidden states away; their multiple-shooting trajectory and its defects are kept. :meth:`feedback` embeds the
+    estimate, solves the QP of ``N n_u`` unknowns (and a slack for every soft bound and period where one acts) and
+    checks its answer, whatever status its solver reports. The scratch buffers are not for several threads at once.
 
     Args:
         model: The deployed model; ``n_h`` may be 0.
@@ -244,73 +232,42 @@ class CondensedController:
     def __init__(self, model: HybridModel, ocp: OCP, *, iterations: int = 1, compiled: bool = False) -> None:
         if iterations < 1:
             raise InputError(f"iterations must be at least 1, got {iterations}")
-        self._problem = Problem(model, ocp)
-        self._model, self._ocp, self._iterations = model, ocp, iterations
+        self.problem = Problem(model, ocp)
+        self._iterations, self._n_x = iterations, ocp.n_x
         n, n_u = ocp.horizon, ocp.n_u
-        self._stages = stages(model, n, compiled=compiled)
+        self.stages = stages(model, n, compiled=compiled)
         difference = np.eye(n * n_u) - np.eye(n * n_u, k=-n_u)
         r, r_delta = np.tile(ocp.r, n) * model.dt, np.tile(ocp.r_delta, n) * model.dt
         self._input_hessian = 2 * (np.diag(r) + (difference.T * r_delta) @ difference)
-        self._qp = InputQP(ocp, self._problem.soft, model.dt)
-        self._n_x = ocp.n_x
-        self._condenser = Condenser(n, ocp.n_x + model.n_h, n_u, ocp.n_x)
+        self.qp = InputQP(ocp, self.problem.soft, model.dt)
+        self.condenser = Condenser(n, ocp.n_x + model.n_h, n_u, ocp.n_x)
         self._evaluate_once()
 
-    @property
-    def model(self) -> HybridModel:
-        """The model that predicts."""
-        return self._model
-
-    @property
-    def ocp(self) -> OCP:
-        """The problem."""
-        return self._ocp
-
-    @property
-    def problem(self) -> Problem:
-        """Problem and model made ready; what the plan costs on the model itself."""
-        return self._problem
-
-    @property
-    def stages(self) -> Linearization:
-        """The model along the horizon."""
-        return self._stages
-
-    @property
-    def condenser(self) -> Condenser:
-        """The condensing."""
-        return self._condenser
-
-    @property
-    def qp(self) -> InputQP:
-        """The QP over the inputs."""
-        return self._qp
-
-    def initial(self, estimate: Estimate, u: Array | None = None) -> Solution:
-        """A first plan: the model run freely from the estimate; see :meth:`Problem.initial`."""
-        return self._problem.initial(estimate, u)
-
+    @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def prepare(self, previous: Solution, weight: Array | None = None) -> Prepared:
         """Linearize and condense along the previous plan, shifted by one period.
 
         Args:
             previous: The last plan. ``previous.u[0]`` is the input that is being held; the shifted plan
                 repeats its last input.
-            weight: Factors on ``q`` ``(m, n_x)``, from now on in steps of ``dt``; if ``m < N + 1`` the last
-                value holds. Default: 1.
+            weight: Factors on ``q`` as :meth:`Controller.solve` takes them. Default: 1.
 
         Raises:
             InputError: If the weight has another shape.
         """
-        u = self._ocp.held(np.vstack([previous.u[1:], previous.u[-1:]]))
-        z = np.hstack([previous.x, previous.h])
-        z = np.vstack([z[1:], z[-1:]])
-        weight = self._problem.weights(weight)
-        return self._condense(u, z, previous.d, previous.u[0], weight, shifted=True)
+        start = perf_counter()
+        u = self.ocp.held(np.vstack([previous.u[1:], previous.u[-1:]]))
+        z = np.hstack([previous.x[1:], previous.h[1:]])
+        derivatives = self.stages.at(z, u + previous.d)
+        z = np.vstack([z, derivatives[0][-1:]])  # the appended period starts without a defect
+        weight = self.problem.weights(weight)
+        return self.condense(u, z, previous.d, previous.u[0], weight, derivatives, start)
 
+    @np.errstate(over="ignore", invalid="ignore")
     def linearize(self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array) -> Prepared:
         """Linearize and condense along a trajectory as it is: ``u`` ``(N, n_u)``, ``z`` ``(N + 1, n_z)``."""
-        return self._condense(u, z, d, u_prev, weight, shifted=False)
+        start = perf_counter()
+        return self.condense(u, z, d, u_prev, weight, self.stages.at(z[:-1], u + d), start)
 
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def feedback(
@@ -320,9 +277,8 @@ class CondensedController:
 
         Args:
             prepared: What :meth:`prepare` returned.
-            estimate: The state now; its ``d`` is assumed constant over the horizon.
-            reference: ``(m, n_x)``, from now on in steps of ``dt``; if ``m < N + 1`` its last value holds;
-                see :meth:`Controller.solve`.
+            estimate: The state now.
+            reference: As :meth:`Controller.solve` takes it.
             limits: Bounds of the inputs for this solve. Default: the problem's own.
 
         Returns:
@@ -332,7 +288,7 @@ class CondensedController:
             InputError: If the reference or the limits have another shape.
         """
         start = perf_counter()
-        target = replace(self._problem.target(reference), weight=prepared.weight)
+        target = replace(self.problem.target(reference), weight=prepared.weight)
         hessian, economic = self._at_parameters(prepared, target)
         if not target.ok or not np.all(np.isfinite(hessian)):
             return self._failed(prepared, Status.NOT_FINITE, start)
@@ -353,18 +309,18 @@ class CondensedController:
         soft = self._soft_rows(prepared, free)
         if not (np.all(np.isfinite(gradient)) and (soft is None or np.all(np.isfinite(soft[0])))):
             return self._failed(prepared, Status.NOT_FINITE, start)
-        answer = self._qp.answer(hessian, gradient, prepared.u, prepared.u_prev, soft, limits)
+        answer = self.qp.solve(hessian, gradient, prepared.u, prepared.u_prev, soft, limits)
         step = answer.step
         if not answer.status.ok:
             return self._failed(prepared, answer.status, start, answer.kkt)
         u = (u_bar + step).reshape(prepared.u.shape)
         drift += (prepared.b @ step.reshape(len(u), -1, 1))[:, :, 0]
         z = prepared.z + propagate(matrices, drift, dz0)
-        excess = np.zeros(0) if soft is None else self._problem.soft.excess(soft[0] + soft[1] @ step)
-        cost = self._problem.cost(z, u, prepared.u_prev, target, excess)
+        excess = np.zeros(0) if soft is None else self.problem.soft.excess(soft[0] + soft[1] @ step)
+        cost = self.problem.cost(z, u, prepared.u_prev, target, excess)
         if not np.isfinite(cost):
             return self._failed(prepared, Status.NOT_FINITE, start, answer.kkt)
-        u = np.clip(u, *self._ocp.bounds(prepared.u_prev, limits))  # the QP keeps them to its tolerance only
+        u = np.clip(u, *self.ocp.bounds(prepared.u_prev, limits))  # the QP keeps them to its tolerance only
         return Solution(
             u, z[:, :n_x], z[:, n_x:], estimate.d, cost, answer.status, answer.kkt, _largest(prepared.defects),
             self._timing(prepared, start), float(np.max(excess, initial=0.0)),
@@ -393,16 +349,6 @@ class CondensedController:
             solution = replace(solution, timing=total, iterations=i + 1)
         return solution
 
-    @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
-    def _condense(
-        self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array, *, shifted: bool
-    ) -> Prepared:
-        start = perf_counter()
-        derivatives = self._stages.at(z[:-1], u + d)
-        if shifted:  # the appended period has no trajectory yet: start it without a defect
-            z = np.vstack([z[:-1], derivatives[0][-1:]])
-        return self.condense(u, z, d, u_prev, weight, derivatives, start)
-
     def condense(
         self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array,
         derivatives: Derivatives, start: float, p: Array | None = None,
@@ -412,20 +358,20 @@ class CondensedController:
         ``p`` ``(N + 1, n_p)`` are the values of the economic cost's parameters. Default: none are known yet; where
         the cost has some it is left to the feedback.
         """
-        n, n_x = self._ocp.horizon, self._n_x
+        n, n_x = self.ocp.horizon, self._n_x
         z_next, a_t, b = derivatives
-        from_u = self._condenser(a_t, b)
+        from_u = self.condenser(a_t, b)
         if weights_ok(weight):
-            by_stage, terminal = self._problem.state_weights(weight)
+            by_stage, terminal = self.problem.state_weights(weight)
             weighted = np.empty_like(from_u)
             np.multiply(from_u[: n * n_x], by_stage.reshape(-1, 1), out=weighted[: n * n_x])
             weighted[n * n_x :] = terminal @ from_u[n * n_x :]
         else:
             weighted = np.full_like(from_u, np.nan)
         hessian = 2 * from_u.T @ weighted + self._input_hessian
-        soft = self._problem.soft.condensed(z[:, :n_x], u, from_u)
-        known = self._ocp.economic is not None and (p is not None or not self._ocp.n_p)
-        economic = self._problem.economic.convex(z[:, :n_x], u, p) if known else None
+        soft = self.problem.soft.condensed(z[:, :n_x], u, from_u)
+        known = self.ocp.economic is not None and (p is not None or not self.ocp.n_p)
+        economic = self.problem.economic.convex(z[:, :n_x], u, p) if known else None
         if economic is not None:
             hessian += condense_hessians(economic[1], from_u, n_x)
         spent = (perf_counter() - start) * 1e3
@@ -435,9 +381,9 @@ class CondensedController:
 
     def _at_parameters(self, prepared: Prepared, target: Target) -> tuple[Array, tuple[Array, Array] | None]:
         """Hessian and economic derivatives, those that wait for the parameters' values included."""
-        if not self._ocp.n_p:
+        if not self.ocp.n_p:
             return prepared.hessian, prepared.economic
-        economic = self._problem.economic.convex(prepared.z[:, : self._n_x], prepared.u, target.p)
+        economic = self.problem.economic.convex(prepared.z[:, : self._n_x], prepared.u, target.p)
         return prepared.hessian + condense_hessians(economic[1], prepared.from_u, self._n_x), economic
 
     def _soft_rows(self, prepared: Prepared, free: Array) -> tuple[Array, Array] | None:
@@ -445,26 +391,26 @@ class CondensedController:
         value, by_x, slope = prepared.soft
         if not value.size:
             return None
-        moved = np.sum(by_x * free[self._problem.soft.stage, : self._n_x], axis=1)
+        moved = np.sum(by_x * free[self.problem.soft.stage, : self._n_x], axis=1)
         return value + moved, slope
 
     def _evaluate_once(self) -> None:
         """Solve once at zero, so that no later call is the first of a CasADi function, which is slow."""
-        m = self._model
+        m = self.model
         x, h, d, p = np.zeros(m.n_x), np.zeros(m.n_h), np.zeros(m.n_u), np.zeros((0, 0))
         zero = Estimate(0.0, x, h, d, p, np.zeros(0), NAN)
-        self.solve(self.initial(zero), zero, np.zeros((1, m.n_x + self._ocp.n_p)))
+        self.solve(self.initial(zero), zero, np.zeros((1, m.n_x + self.ocp.n_p)))
 
     def input_gradient(self, u: Array, u_prev: Array) -> Array:
         """Gradient of the input costs at the plan ``u`` ``(N n_u,)``."""
         gradient: Array = self._input_hessian @ u
-        gradient[: u_prev.size] -= 2 * self._model.dt * self._ocp.r_delta * u_prev
+        gradient[: u_prev.size] -= 2 * self.model.dt * self.ocp.r_delta * u_prev
         return gradient
 
     def _failed(self, prepared: Prepared, status: Status, start: float, kkt: float = NAN) -> Solution:
         x, h = prepared.z[:, : self._n_x], prepared.z[:, self._n_x :]
-        return Solution(prepared.u, x, h, prepared.d, NAN, status, kkt, _largest(prepared.defects),
-                        self._timing(prepared, start), NAN)  # fmt: skip
+        defect, spent = _largest(prepared.defects), self._timing(prepared, start)
+        return Solution(prepared.u, x, h, prepared.d, NAN, status, kkt, defect, spent, NAN)
 
     def _timing(self, prepared: Prepared, start: float) -> dict[str, float]:
         return {"prepare": prepared.milliseconds, "feedback": (perf_counter() - start) * 1e3}

@@ -52,16 +52,15 @@ class Decision:
 class SafeController:
     """Guards a controller: checked solution, else the shifted plan, else a fallback, else the safe input.
 
-    Every input is within ``[u_min, u_max]`` and within ``du_max`` of the last one, whatever the solver,
-    the model or the estimate do. The object keeps nothing between calls: what must be remembered
-    (the held input, the plan, its age) is in the :class:`Decision`.
+    Every input is within ``[u_min, u_max]`` and within ``du_max`` of the last one, whatever the solver, the model or
+    the estimate do. The object keeps nothing between calls: the held input, the plan and its age are in the
+    :class:`Decision`.
 
     Args:
         controller: The controller to guard.
-        fallback: Model, usually the fitted prior, whose LQR takes over. Default: none, then zero follows.
+        fallback: Model, usually the fitted prior, whose LQR at the problem's working point takes over. Default: none,
+            then the safe input follows.
         max_age: Periods a plan may be followed without a successful solve.
-        working_point: ``(x, u)`` at which the fallback is linearized; see :func:`hybrid_mpc.model.riccati.lqr`.
-            Default: the problem's own, else zero, the input within its limits.
         first: Controller that makes the first plan, before the loop starts; an
             :class:`~hybrid_mpc.control.sqp.SQPController` converges it. Default: ``controller``.
         safe_input: Input ``(n_u,)`` within the limits that is applied where nothing is known: before the first plan, on
@@ -73,7 +72,6 @@ class SafeController:
 
     Example:
         >>> from hybrid_mpc.estimate.kalman import TrueState
-        >>> from hybrid_mpc.control.ocp import OCP; from hybrid_mpc.control.rti import CondensedController
         >>> from hybrid_mpc.machine.signals import Signal
         >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
         >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
@@ -91,18 +89,22 @@ class SafeController:
         fallback: HybridModel | None = None,
         *,
         max_age: int = 5,
-        working_point: tuple[Array, Array] | None = None,
         first: Controller | None = None,
         safe_input: ArrayLike | None = None,
     ) -> None:
         if max_age < 0:
             raise InputError(f"max_age must not be negative, got {max_age}")
         ocp = controller.ocp
-        self._controller, self._max_age = controller, max_age
+        self.controller, self._max_age = controller, max_age
         self.safe_input = checked_safe_input(safe_input, ocp)
         self._rti = controller if isinstance(controller, CondensedController) else None
         self._first = controller if first is None else first
-        _check_first(self._first, controller)
+        sizes = [(c.model.n_x, c.model.n_h, c.ocp.n_u, c.ocp.horizon) for c in (self._first, controller)]
+        if sizes[0] != sizes[1]:
+            raise InputError(
+                f"first: (n_x, n_h, n_u, N) = {sizes[0]}, the controller has {sizes[1]}; "
+                "give both the same model and problem"
+            )
         self._fallback = None
         if fallback is not None:
             if (fallback.n_x, fallback.n_u) != (ocp.n_x, ocp.n_u):
@@ -110,18 +112,12 @@ class SafeController:
                     f"fallback {fallback.name} has {fallback.n_x} states and {fallback.n_u} inputs, "
                     f"the problem {ocp.n_x} and {ocp.n_u}"
                 )
-            rest = np.zeros(ocp.n_x), ocp.rest_input
-            point = working_point or ocp.working_point or rest
-            gain = lqr(fallback, *rest, ocp.q, ocp.r + ocp.r_delta, working_point=point)
+            x, u = ocp.working_point or (np.zeros(ocp.n_x), ocp.rest_input)
+            gain = lqr(fallback, x, u, ocp.q, ocp.r + ocp.r_delta)
             self._gain = gain[:, : ocp.n_x]
             self._late = gain[:, ocp.n_x : ocp.n_x + fallback.delay_states]
             self._fallback = _equilibrium_input(fallback)
             self._fallback(np.zeros(ocp.n_x))  # a CasADi function's first call is slow
-
-    @property
-    def controller(self) -> Controller:
-        """The guarded controller."""
-        return self._controller
 
     def initial(
         self,
@@ -132,8 +128,8 @@ class SafeController:
     ) -> Decision:
         """Decision before the first: an input is held, and there is a plan to go on from.
 
-        A real-time iteration improves a plan a little in every period; the first plan has no predecessor. So
-        make it here, while the machine rests and no deadline presses.
+        A real-time iteration improves a plan a little in every period, and the first plan has no predecessor: make it
+        here, while the machine rests and no deadline presses.
 
         Args:
             estimate: Where the plan starts.
@@ -145,9 +141,9 @@ class SafeController:
         Raises:
             InputError: If ``u`` has another size or is not finite, or another shape does not fit.
         """
-        ocp = self._controller.ocp
+        ocp = self.controller.ocp
         held = self.safe_input if u is None else np.clip(vector(u, ocp.n_u, "u"), ocp.u_min, ocp.u_max)
-        plan = self._controller.initial(estimate, np.tile(held, (ocp.horizon, 1)))
+        plan = self.controller.initial(estimate, np.tile(held, (ocp.horizon, 1)))
         if reference is not None:
             solution = self._first.solve(plan, estimate, reference, weight)
             plan = solution.delayed(held) if solution.status.ok else plan
@@ -164,16 +160,15 @@ class SafeController:
             estimate: The state now.
             reference: ``(m, n_x)`` from now on in steps of ``dt``.
             weight: Factors on ``q`` ``(m, n_x)``, as the reference. Default: 1.
-            limits: Bounds of the inputs for this period, e.g. those of a guard; where ``du_max`` does not let the
-                input be within them at once, it goes there as fast as it may. Default: the problem's own.
+            limits: Bounds of the inputs for this period, as :meth:`OCP.bounds` has them. Default: the problem's own.
             prepared: What :meth:`prepare` made of ``previous`` and ``weight``. Default: it is made now.
         """
         if prepared is not None and self._rti is not None:
             solution = self._rti.finish(prepared, estimate, reference, limits)
         else:
-            solution = self._controller.solve(previous.solution, estimate, reference, weight, limits=limits)
+            solution = self.controller.solve(previous.solution, estimate, reference, weight, limits=limits)
         if solution.status.ok:
-            u = self._controller.ocp.saturate(solution.u[0], previous.u, limits)
+            u = self.controller.ocp.saturate(solution.u[0], previous.u, limits)
             plan = replace(solution, u=np.vstack([u[None], solution.u[1:]]))
             return Decision(u, Source.MPC, plan, solution.status, 0)
         return self._without(previous, estimate, reference, solution, limits)
@@ -204,13 +199,13 @@ class SafeController:
         limits: Limits | None,
     ) -> Decision:  # fmt: skip
         """The decision where no solution may be applied; ``solution`` holds the shifted plan and why."""
-        ocp, held = self._controller.ocp, previous.u
+        ocp, held = self.controller.ocp, previous.u
         u, source = self._instead(solution, estimate, np.asarray(reference, dtype=float), previous.age + 1)
         u = ocp.saturate(u, held, limits)
         inputs = np.vstack([u[None], solution.u[1:]])
         inputs = np.where(np.isfinite(inputs), inputs, u)
         known = bool(np.all(np.isfinite(np.concatenate([estimate.x, estimate.h, estimate.d]))))
-        plan = self._controller.initial(estimate, inputs) if known else replace(solution, u=inputs)
+        plan = self.controller.initial(estimate, inputs) if known else replace(solution, u=inputs)
         return Decision(u, source, plan, solution.status, previous.age + 1)
 
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
@@ -220,7 +215,7 @@ class SafeController:
         if age <= self._max_age and np.all(np.isfinite(failed.u[0])):
             return failed.u[0], Source.PLAN
         if self._fallback is not None:
-            goal = reference[0, : self._controller.ocp.n_x]
+            goal = reference[0, : self.controller.ocp.n_x]
             goal = goal if np.all(np.isfinite(goal)) else np.zeros_like(goal)
             best = self._fallback(goal).full().ravel()
             u = best - self._gain @ (estimate.x - goal) - estimate.d
@@ -234,17 +229,12 @@ class SafeController:
 
 
 def checked_safe_input(given: ArrayLike | None, ocp: OCP) -> Array:
-    """The safe input ``(n_u,)`` of a problem.
-
-    Args:
-        given: What was declared. Default: zero, or the limit next to it.
-        ocp: The problem, with the limits.
+    """The safe input ``(n_u,)`` of a problem; default: zero, or the limit next to it.
 
     Raises:
         InputError: If it has another size, is not finite, or is outside the limits.
 
     Example:
-        >>> from hybrid_mpc.control.ocp import OCP
         >>> checked_safe_input(None, OCP(5, [1.0], [1.0], [0.0], [2.0], [9.0])).tolist()
         [2.0]
     """
@@ -252,15 +242,6 @@ def checked_safe_input(given: ArrayLike | None, ocp: OCP) -> Array:
     if np.any(u < ocp.u_min) or np.any(u > ocp.u_max):
         raise InputError(f"safe_input {u} is outside the limits {ocp.u_min} to {ocp.u_max}")
     return u
-
-
-def _check_first(first: Controller, controller: Controller) -> None:
-    sizes = [(c.model.n_x, c.model.n_h, c.ocp.n_u, c.ocp.horizon) for c in (first, controller)]
-    if sizes[0] != sizes[1]:
-        raise InputError(
-            f"first: (n_x, n_h, n_u, N) = {sizes[0]}, the controller has {sizes[1]}; "
-            "give both the same model and problem"
-        )
 
 
 def _equilibrium_input(model: HybridModel) -> ca.Function:

@@ -10,15 +10,13 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.control.curvature import StageCurvature, convex
 from hybrid_mpc.control.ocp import OCP, Limits
-from hybrid_mpc.control.problem import Problem, Solution, Status, Target
+from hybrid_mpc.control.problem import Controller, Solution, Status, Target
 from hybrid_mpc.control.qp import Answer
 from hybrid_mpc.control.rti import CondensedController, Prepared, adjoint, condense_hessians
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.model.stages import Derivatives
-
-# Cost and derivatives of a problem along runs of its model.
 
 Array = NDArray[np.float64]
 
@@ -34,7 +32,7 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Run:
+class Rollout:
     """A run of the model on inputs.
 
     Args:
@@ -61,29 +59,29 @@ class Point:
         gradient: Of the cost by the inputs, soft bounds left out ``(N n_u,)``.
     """
 
-    run: Run
+    run: Rollout
     derivatives: Derivatives
     multipliers: Array
     gradient: Array
 
 
-class Landscape:
-    """Cost and derivatives of a problem along runs of its model. Built once, for any number of cases."""
+class ReducedCost:
+    """Cost and derivatives as functions of the inputs alone, the model run on them. Built once for all cases."""
 
     def __init__(self, inner: CondensedController) -> None:
         self.inner, self.problem = inner, inner.problem
         self.stages = StageCurvature(inner.stages, inner.ocp, inner.model.n_h, inner.problem.soft)
         self.metric: Array = np.tile(inner.ocp.input_scale**-2.0, inner.ocp.horizon)
 
-    def run(self, z0: Array, u: Array, case: Case) -> Run:
+    def run(self, z0: Array, u: Array, case: Case) -> Rollout:
         """The run from ``z0`` on ``u``."""
         problem, n_x = self.problem, self.inner.ocp.n_x
         z = self.inner.stages.run(z0, u + case.d)
         soft = problem.soft.linearize(z[:, :n_x], u)
         excess = problem.soft.excess(soft[0])
-        return Run(u, z, soft, problem.cost(z, u, case.u_prev, case.target, excess))
+        return Rollout(u, z, soft, problem.cost(z, u, case.u_prev, case.target, excess))
 
-    def at(self, run: Run, case: Case) -> Point:
+    def at(self, run: Rollout, case: Case) -> Point:
         """What is known along a run."""
         problem, n_x = self.problem, self.inner.ocp.n_x
         derivatives = self.inner.stages.at(run.z[:-1], run.u + case.d)
@@ -114,7 +112,7 @@ class Landscape:
     def curvature(
         self, at: Point, case: Case, multipliers: Array, soft: Array, old: Array | None = None
     ) -> Array:
-        """Second derivatives of the stages, weighted; see :meth:`StageCurvature.of`."""
+        """Weighted second derivatives of the stages; see :meth:`StageCurvature.of`."""
         _, a_t, b = at.derivatives
         inputs = np.stack([at.run.u, at.run.u + case.d])
         return self.stages.of(at.run.z, inputs, a_t, b, multipliers, soft, old)
@@ -160,8 +158,6 @@ class Landscape:
         return rest
 
 
-# One solve of the SQP: the steps from one run of the model to the next.
-
 NAN = float("nan")
 ARMIJO = 1e-4
 KKT = 1e-6
@@ -191,7 +187,7 @@ class _Step:
         own: That model's curvature along the step, in the damping's metric.
     """
 
-    run: Run | None
+    run: Rollout | None
     answer: Answer
     hessian: Array
     promised: float
@@ -202,17 +198,17 @@ class Descent:
     """The steps of one solve, from a first point on.
 
     Args:
-        landscape: Cost and derivatives.
+        cost: Cost and derivatives.
         case: What the solve is given.
         at: The first run; its cost is finite.
         curvature: Second derivatives from the last solve, shifted. Default: taken at the first run.
-        tolerance: See :class:`~hybrid_mpc.control.sqp.SQPController`.
+        tolerance: See :class:`SQPController`.
     """
 
     def __init__(
-        self, landscape: Landscape, case: Case, at: Point, curvature: Array | None, tolerance: float
+        self, cost: ReducedCost, case: Case, at: Point, curvature: Array | None, tolerance: float
     ) -> None:
-        self._land, self._case, self._tolerance = landscape, case, tolerance
+        self._cost, self._case, self._tolerance = cost, case, tolerance
         self.at, self.curvature = at, curvature
         self.count, self.status, self.kkt, self.ended = 0, Status.STOPPED, NAN, False
         self._stale, self._fresh, self._plain, self._taken = curvature is None, False, False, 0
@@ -222,7 +218,7 @@ class Descent:
     def iterate(self) -> None:
         """One linearization, and QPs until the step of one lowers the cost."""
         self.count += 1
-        prepared = self._land.condensed(self.at, self._case)
+        prepared = self._cost.condensed(self.at, self._case)
         hessian = self._hessian(prepared)
         found = self._search(prepared, hessian)
         if not found.answer.status.ok:
@@ -232,14 +228,14 @@ class Descent:
         else:
             self._go(hessian, found, found.run)
 
-    def _go(self, hessian: Array, found: _Step, run: Run) -> None:
-        """Make a step, and judge by the QP's multipliers what is left to do there."""
-        answer, land = found.answer, self._land
+    def _go(self, hessian: Array, found: _Step, run: Rollout) -> None:
+        """Make a step, and find by the QP's multipliers what is left to do there."""
+        answer, cost = found.answer, self._cost
         before = max(answer.kkt, self._residual(hessian, found.hessian @ answer.step))
         gained = self.at.run.cost - run.cost
-        new = land.at(run, self._case)
-        change = land.lagrangian(new, answer.multipliers)[1]
-        change = change - land.lagrangian(self.at, answer.multipliers)[1]
+        new = cost.at(run, self._case)
+        change = cost.lagrangian(new, answer.multipliers)[1]
+        change = change - cost.lagrangian(self.at, answer.multipliers)[1]
         wrong = self._residual(hessian, change - hessian @ answer.step)
         left = change - found.hessian @ answer.step
         after = max(answer.kkt, self._residual(hessian, left))
@@ -258,18 +254,18 @@ class Descent:
         for _ in range(ATTEMPTS):
             damped = hessian
             if self._damping:
-                damped = hessian + np.diag(self._damping * self._land.metric)
+                damped = hessian + np.diag(self._damping * self._cost.metric)
             answer = self._answer(damped, self.at.gradient, prepared.soft[0], prepared.soft[2])
             step = answer.step
-            own = float(step @ (hessian @ step)) / max(float(step**2 @ self._land.metric), 1e-300)
+            own = float(step @ (hessian @ step)) / max(float(step**2 @ self._cost.metric), 1e-300)
             found = _Step(None, answer, damped, self._promised(prepared, hessian, step), own)
-            first = found if first is None else first
+            first = first or found
             if not answer.status.ok:
                 return found
             promised = self._promised(prepared, damped, step)
             run, answer = self._along(prepared, damped, answer, promised)
             if run is not None:
-                return _Step(run, answer, damped, found.promised, own)
+                return replace(found, run=run, answer=answer)
             if promised <= self._enough:
                 break
             self._damping = max(MORE * self._damping, own)
@@ -278,7 +274,7 @@ class Descent:
 
     def _along(
         self, prepared: Prepared, damped: Array, answer: Answer, promised: float
-    ) -> tuple[Run | None, Answer]:
+    ) -> tuple[Rollout | None, Answer]:
         """The run on a step if it lowers the cost enough, or on the step corrected by what it was found to bend."""
         least, before = self.at.run.cost - ARMIJO * promised, np.inf
         for i in range(1 + CORRECTIONS):
@@ -292,9 +288,9 @@ class Descent:
                 break
         return None, answer
 
-    def _corrected(self, prepared: Prepared, damped: Array, answer: Answer, run: Run) -> Answer:
+    def _corrected(self, prepared: Prepared, damped: Array, answer: Answer, run: Rollout) -> Answer:
         """The QP once more, with what states and soft bounds were found to be beside the last answer's line."""
-        old, n_x, (value, _, slope) = self.at.run, self._land.inner.ocp.n_x, prepared.soft
+        old, n_x, (value, _, slope) = self.at.run, self._cost.inner.ocp.n_x, prepared.soft
         bend = (run.z[:, :n_x] - old.z[:, :n_x]).ravel() - prepared.from_u @ answer.step
         if len(slope):
             value = run.soft[0] - slope @ answer.step
@@ -303,31 +299,31 @@ class Descent:
     def _answer(self, hessian: Array, gradient: Array, value: Array, slope: Array) -> Answer:
         soft = (value, slope) if value.size else None
         case = self._case
-        return self._land.inner.qp.answer(hessian, gradient, self.at.run.u, case.u_prev, soft, case.limits)
+        return self._cost.inner.qp.solve(hessian, gradient, self.at.run.u, case.u_prev, soft, case.limits)
 
-    def _trial(self, step: Array) -> Run:
-        run, bounds = self.at.run, self._land.inner.ocp.bounds(self._case.u_prev, self._case.limits)
+    def _trial(self, step: Array) -> Rollout:
+        run, bounds = self.at.run, self._cost.inner.ocp.bounds(self._case.u_prev, self._case.limits)
         u = np.clip(run.u + step.reshape(run.u.shape), *bounds)
-        return self._land.run(run.z[0], u, self._case)
+        return self._cost.run(run.z[0], u, self._case)
 
     def _promised(self, prepared: Prepared, hessian: Array, step: Array) -> float:
         """By how much the convex model falls along a step."""
         value, _, slope = prepared.soft
         lowers = -float(step @ (self.at.gradient + 0.5 * (hessian @ step)))
         if value.size:
-            lowers += self._land.penalty(value) - self._land.penalty(value + slope @ step)
+            lowers += self._cost.penalty(value) - self._cost.penalty(value + slope @ step)
         return lowers
 
     def _promise(self, hessian: Array, left: Array) -> float:
         """What the convex model at the point promises at most (weak duality), ``left`` of the stationarity."""
-        qp = self._land.inner.qp
+        qp = self._cost.inner.qp
         left, hessian = qp.by_blocks(left), qp.blocked_hessian(hessian)
         promise = 0.5 * float(left @ np.linalg.solve(hessian, left))
-        return promise + self._land.gap(self.at.run.soft[0], self._soft)
+        return promise + self._cost.gap(self.at.run.soft[0], self._soft)
 
     def _residual(self, hessian: Array, slope: Array) -> float:
         """A gradient of the cost by the inputs in the QP's scaling."""
-        qp = self._land.inner.qp
+        qp = self._cost.inner.qp
         size = np.max(np.diag(qp.blocked_hessian(hessian)) * qp.scale**2)
         return float(np.max(np.abs(qp.scale * qp.by_blocks(slope))) / size)
 
@@ -338,33 +334,33 @@ class Descent:
     def _hessian(self, prepared: Prepared) -> Array:
         if self._plain:
             return prepared.hessian
-        multipliers, slope = self._land.lagrangian(self.at, self._soft)
+        multipliers, slope = self._cost.lagrangian(self.at, self._soft)
         if self._stale or self.curvature is None:
             self.curvature = self._taken_anew(prepared, multipliers)
         if not np.all(np.isfinite(self.curvature)):
             return prepared.hessian
         return convex(
-            prepared.hessian, self._land.rest(prepared, self.curvature, self._case), self._held(slope)
+            prepared.hessian, self._cost.rest(prepared, self.curvature, self._case), self._held(slope)
         )
 
     def _taken_anew(self, prepared: Prepared, multipliers: Array) -> Array:
         """Second derivatives here; the hidden state's, which change slowly, from the second time on."""
-        land, old = self._land, self.curvature
-        small = old is not None and old.shape[1] < land.stages.size
+        cost, old = self._cost, self.curvature
+        small = old is not None and old.shape[1] < cost.stages.size
         if old is not None and (self._taken in AGAIN if small else self._taken > 0):
             old = None
-        curvature = land.curvature(self.at, self._case, multipliers, self._soft, old)
+        curvature = cost.curvature(self.at, self._case, multipliers, self._soft, old)
         if old is None:
-            curvature = land.without_what_is_small(prepared, curvature)
+            curvature = cost.without_what_is_small(prepared, curvature)
         self._stale, self._fresh, self._taken = False, True, self._taken + 1
         return curvature
 
     def _held(self, slope: Array) -> NDArray[np.bool_] | None:
         """Inputs that lie on a bound against which the cost pushes them."""
-        ocp, u = self._land.inner.ocp, self.at.run.u
+        ocp, u = self._cost.inner.ocp, self.at.run.u
         if ocp.blocks is not None:
             return None
-        s, near = slope.reshape(u.shape), 1e-6 * self._land.inner.qp.scale.reshape(u.shape)
+        s, near = slope.reshape(u.shape), 1e-6 * self._cost.inner.qp.scale.reshape(u.shape)
         lower, upper = ocp.bounds(self._case.u_prev, self._case.limits)
         return (((u <= lower + near) & (s > 0)) | ((u >= upper - near) & (s < 0))).ravel()
 
@@ -384,25 +380,22 @@ class Descent:
             self.status = status if self.count <= 2 else Status.STOPPED
 
 
-class SQPController:
+class SQPController(Controller):
     """Nonlinear MPC by SQP to convergence with exact second derivatives, globalised by damping.
 
-    Every iterate is a run of the model itself: the dynamics hold exactly, limits of inputs and changes are
-    linear and kept by every QP, soft bounds are penalties within the cost. So the cost itself is the merit
-    function, and a step is made when it lowers the cost by a share (1e-4) of what the QP's convex model
-    promises. One that does not is corrected first by what states and soft bounds were found to bend along it
-    (Fletcher's second-order correction: a stiff weight or penalty otherwise cuts every step short), then the QP
-    is solved again with more curvature in all directions (Levenberg and Marquardt's damping), which carries
-    over to the next iteration and falls where steps keep their promise.
+    Every iterate is a run of the model: the dynamics hold exactly, limits of inputs and changes are linear and kept by
+    every QP, soft bounds are penalties within the cost. So the cost is the merit function: a step is made when it
+    lowers the cost by a share (1e-4) of what the QP's convex model promises. One that does not is first corrected by
+    what states and soft bounds were found to bend along it (Fletcher's second-order correction), then the QP is solved
+    again with more curvature in all directions (Levenberg and Marquardt's damping). The damping carries over to the
+    next iteration and falls where steps keep their promise.
 
-    The QP's Hessian is Gauss-Newton's and the second derivatives of the dynamics and of soft bounds by states,
-    inputs and hidden states, weighted with their multipliers: under a steep friction law or a trained network
-    these outweigh Gauss-Newton's, which alone then converges slowly. They are differences of the exact
-    Jacobians (``n_x + n_u + n_h`` evaluations), come along with a plan, shifted by a period, and are taken
-    anew where the Hessian got more than a tenth of the residual wrong, those by the hidden state from the
-    second time in a solve on. Where their sum with Gauss-Newton's is not convex it is made so, if possible in
-    the inputs alone that lie on a bound. The plan is independent of the first guess but for the basin it lies
-    in.
+    The QP's Hessian is Gauss-Newton's and the second derivatives of dynamics and soft bounds, weighted with their
+    multipliers: under a steep friction law or a trained network Gauss-Newton alone converges slowly. They are
+    differences of the exact Jacobians (``n_x + n_u + n_h`` evaluations) and come along with a plan, shifted by a
+    period. They are taken anew where the Hessian got more than a tenth of the residual wrong. Where the sum is not
+    convex it is made so, if possible in the inputs alone that lie on a bound. The plan is independent of the first
+    guess but for the basin it lies in.
 
     Args:
         model: The deployed model; ``n_h`` may be 0. It must not be so unstable that a run over the horizon
@@ -447,28 +440,9 @@ class SQPController:
             raise InputError(
                 f"tolerance must be positive and iterations at least 1, got {tolerance} and {iterations}"
             )
-        self._inner = CondensedController(model, ocp, compiled=compiled)
+        inner = CondensedController(model, ocp, compiled=compiled)
+        self.problem, self._cost = inner.problem, ReducedCost(inner)
         self._tolerance, self._iterations = tolerance, iterations
-        self._landscape = Landscape(self._inner)
-
-    @property
-    def model(self) -> HybridModel:
-        """The model that predicts."""
-        return self._inner.model
-
-    @property
-    def ocp(self) -> OCP:
-        """The problem."""
-        return self._inner.ocp
-
-    @property
-    def problem(self) -> Problem:
-        """Problem and model made ready."""
-        return self._inner.problem
-
-    def initial(self, estimate: Estimate, u: Array | None = None) -> Solution:
-        """A first plan: the model run freely from the estimate; see :meth:`Problem.initial`."""
-        return self._inner.initial(estimate, u)
 
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def solve(
@@ -477,34 +451,29 @@ class SQPController:
     ) -> Solution:  # fmt: skip
         """The plan from now on, converged; see :meth:`Controller.solve`.
 
-        Its ``kkt`` is the residual of the nonlinear problem in the QP's scaling, with the multipliers of the
-        last QP.
+        Its ``kkt`` is the residual of the nonlinear problem in the QP's scaling, with the last QP's multipliers.
         """
         start = perf_counter()
         case = Case(estimate.d, previous.u[0], self.problem.target(reference, weight), limits)
         u = self._admissible(np.vstack([previous.u[1:], previous.u[-1:]]), case)
-        run = self._landscape.run(np.concatenate([estimate.x, estimate.h]), u, case)
-        at = self._landscape.at(run, case)
-        search = Descent(self._landscape, case, at, self._shifted(previous), self._tolerance)
+        run = self._cost.run(np.concatenate([estimate.x, estimate.h]), u, case)
+        at = self._cost.at(run, case)
+        descent = Descent(self._cost, case, at, self._shifted(previous), self._tolerance)
         if not (np.isfinite(run.cost) and np.all(np.isfinite(at.gradient)) and case.target.ok):
-            search.status = Status.NOT_FINITE
-            return replace(self._plan(search, estimate.d), timing=_spent(start))
-        while search.count < self._iterations and not search.ended:
-            search.iterate()
-        return replace(self._plan(search, estimate.d), timing=_spent(start))
+            descent.status, descent.ended = Status.NOT_FINITE, True
+        while descent.count < self._iterations and not descent.ended:
+            descent.iterate()
+        return self._plan(descent, estimate.d, start)
 
     def _shifted(self, previous: Solution) -> Array | None:
         """Second derivatives along the previous plan, a period later; None if it has none that fit."""
         given = previous.curvature
-        if given is None or not self._landscape.stages.fits(given, self.ocp.horizon):
+        if given is None or not self._cost.stages.fits(given, self.ocp.horizon):
             return None
         return np.concatenate([given[1:], given[-1:]]) if np.all(np.isfinite(given)) else None
 
     def _admissible(self, u: Array, case: Case) -> Array:
-        """``u`` held over its blocks and moved into the limits, one input after the other.
-
-        The QPs keep what the first guess keeps.
-        """
+        """``u`` held over its blocks and moved into the limits, one input after the other: QPs keep what it keeps."""
         u_prev = case.u_prev
         lower, upper = self.ocp.bounds(u_prev, case.limits)
         if self.ocp.du_max is None:
@@ -515,14 +484,11 @@ class SQPController:
             rows[start] = u_prev
         return self.ocp.held(rows)
 
-    def _plan(self, search: Descent, d: Array) -> Solution:
-        at, n_x = search.at.run, self.ocp.n_x
+    def _plan(self, descent: Descent, d: Array, start: float) -> Solution:
+        at, n_x = descent.at.run, self.ocp.n_x
         excess = self.problem.soft.excess(at.soft[0])
         return Solution(
-            at.u, at.z[:, :n_x], at.z[:, n_x:], d, at.cost, search.status, search.kkt, 0.0, {},
-            float(np.max(excess, initial=0.0)), search.count, search.curvature,
+            at.u, at.z[:, :n_x], at.z[:, n_x:], d, at.cost, descent.status, descent.kkt, 0.0,
+            {"solve": (perf_counter() - start) * 1e3}, float(np.max(excess, initial=0.0)), descent.count,
+            descent.curvature,
         )  # fmt: skip
-
-
-def _spent(start: float) -> dict[str, float]:
-    return {"solve": (perf_counter() - start) * 1e3}

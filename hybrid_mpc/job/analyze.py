@@ -14,16 +14,25 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.analyze.equilibria import Equilibria, equilibria
-from hybrid_mpc.analyze.friction import FrictionSlopes, friction_slopes, linearize_secant
+from hybrid_mpc.analyze.equilibria import Equilibria, equilibria, hidden_equilibrium, holding_input
 from hybrid_mpc.analyze.linearize import (
+    FrictionSlopes,
     control_toolbox,
-    hidden_fixed_point,
+    friction_slopes,
     linearize,
     linearize_along,
     linearize_at_speed,
+    linearize_secant,
 )
-from hybrid_mpc.analyze.margins import LinearLoop, Margins, mpc_gain, mpc_loop, steady_filter
+from hybrid_mpc.analyze.margins import (
+    GainSchedule,
+    LinearLoop,
+    Margins,
+    gain_schedule,
+    mpc_gain,
+    mpc_loop,
+    steady_filter,
+)
 from hybrid_mpc.analyze.measured import (
     MeasuredResponse,
     multisine_response,
@@ -46,7 +55,6 @@ from hybrid_mpc.analyze.properties import (
     physical_states,
     system_structure,
 )
-from hybrid_mpc.analyze.schedule import GainSchedule, gain_schedule, holding_input
 from hybrid_mpc.analyze.sensitivity import parameter_sensitivities
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.rti import CondensedController
@@ -468,7 +476,7 @@ def resting_point(given: AnalysisInput, model: HybridModel) -> Point:
         best = min(stable, key=lambda p: float(np.linalg.norm(p.x)))
         return best.x, best.h
     x = np.zeros(model.n_x)
-    return x, hidden_fixed_point(model, x, u)
+    return x, hidden_equilibrium(model, x, u)
 
 
 def pairs(box: Array) -> list[tuple[float, float]]:

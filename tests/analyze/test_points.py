@@ -3,6 +3,7 @@
 import control
 import numpy as np
 import pytest
+from analyze_parts import central_differences
 from online_models import linear_model, pendulum_model
 
 from hybrid_mpc import (
@@ -17,7 +18,7 @@ from hybrid_mpc import (
     linearize_secant,
     load,
 )
-from hybrid_mpc.analyze.linearize import fixed_point
+from hybrid_mpc.analyze.equilibria import fixed_point
 from scenarios.golf_robot.nominal import GEAR
 from scenarios.golf_robot.nominal import PARAMETERS as GOLF
 
@@ -64,19 +65,15 @@ def test_a_hidden_state_has_no_continuous_form():
 
 @pytest.mark.parametrize("name", ["prior", "hybrid"])
 def test_symbolic_matrices_agree_with_central_differences(golf, name):
-    model, e = golf[name], 1e-5
+    model = golf[name]
     w0 = np.concatenate([[0.3, 0.2], 0.1 * np.arange(model.n_h), [0.05]])
 
     def f(w):
         x, h, u = np.split(w, [2, 2 + model.n_h])
-        return np.concatenate(
-            [
-                m.full().ravel()
-                for m in (*model.step(x, h, u, model.w, model.p), model.output(x, u, model.w, model.p))
-            ]
-        )
+        after = *model.step(x, h, u, model.w, model.p), model.output(x, u, model.w, model.p)
+        return np.concatenate([m.full().ravel() for m in after])
 
-    numeric = np.column_stack([(f(w0 + e * i) - f(w0 - e * i)) / (2 * e) for i in np.eye(w0.size)])
+    numeric = central_differences(f, w0, 1e-5)
     x, h, u = np.split(w0, [2, 2 + model.n_h])
     a, b, c, d = (m.full() for m in jacobians(model)(x, h, u))
     # Truncation e^2 f''' / 6 with f''' up to 1e3, rounding 1e-16 / e: 1e-7 at most.
@@ -84,7 +81,7 @@ def test_symbolic_matrices_agree_with_central_differences(golf, name):
 
 
 def test_along_a_free_run_the_product_of_the_maps_is_the_run_s_derivative():
-    model, e, u = pendulum_model(3), 1e-6, 0.3 * np.sin(0.3 * np.arange(30))[:, None]
+    model, u = pendulum_model(3), 0.3 * np.sin(0.3 * np.arange(30))[:, None]
 
     def end(x):
         x, h = np.array(x), np.zeros(3)
@@ -93,11 +90,9 @@ def test_along_a_free_run_the_product_of_the_maps_is_the_run_s_derivative():
         return np.concatenate([x, h])
 
     along = linearize_along(model, [0.2, 0.0], u)
-    numeric = [
-        (end(np.array([0.2, 0.0]) + d) - end(np.array([0.2, 0.0]) - d)) / (2 * e) for d in e * np.eye(2)
-    ]
+    numeric = central_differences(end, np.array([0.2, 0.0]), 1e-6)
     # Rounding 1e-16 / 1e-6 times the run's own amplification of about 10.
-    assert np.abs(along.transition(0, 30)[:, :2] - np.array(numeric).T).max() < 1e-6
+    assert np.abs(along.transition(0, 30)[:, :2] - numeric).max() < 1e-6
     here = linearize(model, along.x[7], along.u[7], along.h[7])
     assert np.array_equal(along.system(7).A, here.A)
     assert np.allclose(along.mean(10).A, along.A[10:].mean(axis=0), rtol=0, atol=1e-15)
@@ -136,9 +131,8 @@ def test_points_of_rest_hold_the_hidden_state():
 
 
 def test_a_continuum_of_points_of_rest_is_marginal():
-    found = equilibria(
-        linear_model([[1.0, 0.1], [0.0, 0.9]], [[0.0], [1.0]], [[1.0, 0.0]]), [0.0], [(-1, 1), (-1, 1)]
-    )
+    model = linear_model([[1.0, 0.1], [0.0, 0.9]], [[0.0], [1.0]], [[1.0, 0.0]])
+    found = equilibria(model, [0.0], [(-1, 1), (-1, 1)])
     assert found.points[0].stability == "marginal"
     assert found.unseen > 0.5  # each start ends elsewhere: it says itself that these are not all
 

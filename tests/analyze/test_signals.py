@@ -3,6 +3,7 @@
 import casadi as ca
 import numpy as np
 import pytest
+from analyze_parts import response
 from online_models import linear_model, pendulum_model
 
 import nn_export
@@ -12,7 +13,6 @@ from hybrid_mpc import (
     Signal,
     contraction,
     feature_box,
-    frequency_response,
     gru_weights,
     linearize,
     load,
@@ -28,8 +28,7 @@ LAG = linear_model([[0.95, 0.1], [-0.1, 0.9]], [[0.0], [0.1]], [[1.0, 0.0]], dt=
 
 
 def exact(omega):
-    found = frequency_response(linearize(LAG, [0.0, 0.0], [0.0]), omega)
-    return (found.magnitude * np.exp(1j * found.phase))[0, 0]
+    return response(linearize(LAG, [0.0, 0.0], [0.0]), omega)[0, 0]
 
 
 def test_multisine_finds_the_response_of_a_linear_model():
@@ -69,15 +68,12 @@ def test_too_little_data_is_said():
 
 def test_interval_bounds_hold_and_are_tight_where_each_variable_appears_once():
     x = ca.SX.sym("x", 3)
-    once = ca.vertcat(
-        x[0] * x[1] - 2 * x[2], ca.tanh(x[0]) / (3 + x[1]), ca.fabs(x[0]) + x[2] ** 2, ca.sin(2 * x[1])
-    )
-    f = ca.Function("f", [x], [once])
+    once = x[0] * x[1] - 2 * x[2], ca.tanh(x[0]) / (3 + x[1]), ca.fabs(x[0]) + x[2] ** 2, ca.sin(2 * x[1])
+    f = ca.Function("f", [x], [ca.vertcat(*once)])
     low, high = np.array([-1.0, -0.5, 0.2]), np.array([2.0, 1.0, 0.7])
     bounds = interval_bounds(f, low, high)
-    grid = np.stack(
-        np.meshgrid(*(np.linspace(a, b, 61) for a, b in zip(low, high, strict=True))), -1
-    ).reshape(-1, 3)
+    axes = np.linspace(low, high, 61).T
+    grid = np.stack(np.meshgrid(*axes), -1).reshape(-1, 3)
     values = f.map(len(grid))(grid.T).full()
     assert np.all(values.min(1) >= bounds[0] - 1e-12)
     assert np.all(values.max(1) <= bounds[1] + 1e-12)

@@ -5,24 +5,32 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+from control_parts import estimate_of as estimate_at
+from control_parts import pendulum_problem, plan_of
 from online_models import pendulum_model
 
-from hybrid_mpc import OCP, CondensedController, Estimate, SoftBound, SQPController, Status
+from hybrid_mpc import CondensedController, SoftBound, SQPController, Status
 from hybrid_mpc.control.curvature import convex
 from hybrid_mpc.control.rti import condense_all, condense_hessians
-from hybrid_mpc.control.sqp import Case, Landscape
-
-POINT = [0.0, 1.0], [0.0]
-X0 = [0.0, 0.02]  # near rest, where the slope of friction changes
+from hybrid_mpc.control.sqp import Case, ReducedCost
 
 
-def estimate_of(model, x=X0, d=0.1):
-    size = model.n_x + model.n_h + 1
-    return Estimate(0.0, np.array(x), np.zeros(model.n_h), np.array([d]), np.eye(size), np.zeros(1), 0.0)
+def estimate_of(model, d=0.1):
+    return estimate_at(model, [0.0, 0.02], d)  # near rest, where the slope of friction changes
 
 
-def problem(horizon=12):
-    return OCP(horizon, [50.0, 0.5], [0.5], [0.2], [-3.0], [3.0], working_point=POINT)
+def problem(horizon=12, **others):
+    return pendulum_problem(horizon, 3.0, **others)
+
+
+def problem_at(model, ocp, u):
+    """Cost, case and its point on inputs ``u``."""
+    cost, e = ReducedCost(CondensedController(model, ocp)), estimate_of(model)
+    case = Case(e.d, np.array([0.3]), cost.problem.target(np.full((1, 2), 2.0)))
+    return cost, case, cost.at(cost.run(np.concatenate([e.x, e.h]), u.reshape(-1, 1), case), case)
+
+
+RANDOM = np.random.default_rng(0).uniform(-0.4, 0.2, 12)
 
 
 def derivatives(model, ocp, u):
@@ -41,77 +49,56 @@ def derivatives(model, ocp, u):
     return (m.full() for m in ca.Function("d", [v], [gradient, hessian])(u))
 
 
-def model_of_cost(model, ocp, u):
-    """The same by the library, Gauss-Newton's Hessian apart from the rest."""
-    controller = CondensedController(model, ocp)
-    land, e = Landscape(controller), estimate_of(model)
-    case = Case(e.d, np.array([0.3]), controller.problem.target(np.full((1, 2), 2.0)))
-    at = land.at(land.run(np.concatenate([e.x, e.h]), u[:, None], case), case)
-    prepared = land.condensed(at, case)
-    rest = land.rest(prepared, land.curvature(at, case, at.multipliers, np.zeros(0)), case)
-    return at.gradient, prepared.hessian, rest
-
-
 @pytest.mark.parametrize("z", [0, 4, 7])
 def test_the_hessian_is_exact(z):
     model, ocp = pendulum_model(z=z, friction=0.5), problem()
     u = np.random.default_rng(z).uniform(-0.4, 0.2, ocp.horizon)
     gradient, hessian = derivatives(model, ocp, u)
-    got, gauss_newton, rest = model_of_cost(model, ocp, u)
-    np.testing.assert_allclose(got, gradient.ravel(), rtol=1e-9, atol=1e-12)
-    missing = hessian - gauss_newton
+    cost, case, at = problem_at(model, ocp, u)
+    np.testing.assert_allclose(at.gradient, gradient.ravel(), rtol=1e-9, atol=1e-12)
+    prepared = cost.condensed(at, case)
+    rest = cost.rest(prepared, cost.curvature(at, case, at.multipliers, np.zeros(0)), case)
+    missing = hessian - prepared.hessian
     assert np.max(np.abs(missing)) > 0.02 * np.max(np.abs(hessian))  # there is something to find
     # One-sided differences over 1.4e-5 rad/s (1e-5 of the tolerated deviation) of a friction law whose slope
     # changes within 1/20 rad/s: 3e-4 of a second derivative, and as much again for a factor in it.
     np.testing.assert_allclose(rest, missing, atol=6e-4 * np.max(np.abs(missing)))
 
 
-def landscape(model, ocp):
-    """Landscape, case and a point of it."""
-    land, e = Landscape(CondensedController(model, ocp)), estimate_of(model)
-    u = np.random.default_rng(0).uniform(-0.4, 0.2, (ocp.horizon, 1))
-    case = Case(e.d, np.array([0.3]), land.problem.target(np.full((1, 2), 2.0)))
-    return land, case, land.at(land.run(np.concatenate([e.x, e.h]), u, case), case)
-
-
 def test_the_hidden_states_part_can_be_kept_or_left_out():
-    land, case, at = landscape(pendulum_model(z=2, friction=0.5), problem())
-    whole = land.curvature(at, case, at.multipliers, np.zeros(0))
-    kept = land.curvature(at, case, at.multipliers, np.zeros(0), whole + 1.0)
+    cost, case, at = problem_at(pendulum_model(z=2, friction=0.5), problem(), RANDOM)
+    whole = cost.curvature(at, case, at.multipliers, np.zeros(0))
+    kept = cost.curvature(at, case, at.multipliers, np.zeros(0), whole + 1.0)
     np.testing.assert_array_equal(kept[:, :3, :3], whole[:, :3, :3])
     np.testing.assert_array_equal(kept[:, 3:], whole[:, 3:] + 1.0)
-    few = land.curvature(at, case, at.multipliers, np.zeros(0), whole[:, :3, :3])
+    few = cost.curvature(at, case, at.multipliers, np.zeros(0), whole[:, :3, :3])
     np.testing.assert_array_equal(few, whole[:, :3, :3])
-    prepared = land.condensed(at, case)
+    prepared = cost.condensed(at, case)
     share = 1.0 / np.max(np.abs(whole[:, 3:]))
     for size, shape in ((1e-9 * share, 3), (1e3 * share, 5)):  # far below and above what matters
-        given = whole.copy()
-        given[:, 3:, 3:] *= size
-        given[:, :3, 3:] *= size
-        given[:, 3:, :3] *= size
-        assert land.without_what_is_small(prepared, given).shape == (12, shape, shape)
+        given = whole * size
+        given[:, :3, :3] = whole[:, :3, :3]
+        assert cost.without_what_is_small(prepared, given).shape == (12, shape, shape)
 
 
 def test_soft_bounds_are_in_the_lagrangian_and_its_hessian():
     x, u = ca.MX.sym("x", 2), ca.MX.sym("u")
     bound = SoftBound(ca.Function("power", [x, u], [u * x[1] + x[0] ** 3]), [-9.0], [9.0], [1.0], [1.0])
-    ocp = OCP(
-        12, [50.0, 0.5], [0.5], [0.2], [-3.0], [3.0], working_point=POINT, soft=[bound], x_max=[9.0, 9.0]
-    )
-    land, case, at = landscape(pendulum_model(z=2, friction=0.5), ocp)
+    ocp = problem(soft=[bound], x_max=[9.0, 9.0])
+    cost, case, at = problem_at(pendulum_model(z=2, friction=0.5), ocp, RANDOM)
     mu, z0 = np.random.default_rng(1).normal(size=36), at.run.z[0]
     shift = 1e-5 * np.random.default_rng(2).normal(size=(12, 1))
 
     def lagrangian(u):
-        run = land.run(z0, u, case)
-        return run.cost + mu @ run.soft[0], land.lagrangian(land.at(run, case), mu)[1]
+        run = cost.run(z0, u, case)
+        return run.cost + mu @ run.soft[0], cost.lagrangian(cost.at(run, case), mu)[1]
 
     (up, slope_up), (down, slope_down) = (lagrangian(at.run.u + s * shift) for s in (1.0, -1.0))
-    multipliers, gradient = land.lagrangian(at, mu)
+    multipliers, gradient = cost.lagrangian(at, mu)
     # Central differences over 1e-5: rounding 1e-16 / 1e-5 of the cost of some hundreds.
     assert 2 * float(shift.ravel() @ gradient) == pytest.approx(up - down, rel=1e-5)
-    prepared = land.condensed(at, case)
-    rest = land.rest(prepared, land.curvature(at, case, multipliers, mu), case)
+    prepared = cost.condensed(at, case)
+    rest = cost.rest(prepared, cost.curvature(at, case, multipliers, mu), case)
     # The one-sided differences' 6e-4, see above.
     want = 0.5 * (slope_up - slope_down)
     got = (prepared.hessian + rest) @ shift.ravel()
@@ -121,16 +108,16 @@ def test_soft_bounds_are_in_the_lagrangian_and_its_hessian():
 def test_penalties_and_their_multipliers_bound_each_other():
     x, u = ca.MX.sym("x", 2), ca.MX.sym("u")
     bound = SoftBound(ca.Function("v", [x, u], [x[1]]), [-1.0], [0.5], [2.0], [3.0])
-    land = Landscape(CondensedController(pendulum_model(), replace(problem(), soft=(bound,))))
+    cost = ReducedCost(CondensedController(pendulum_model(), problem(soft=[bound])))
     rng = np.random.default_rng(0)
     for _ in range(20):
         mu, values, other = rng.normal(size=12), rng.normal(size=12), rng.normal(size=12)
         # What any change of the values saves, the multipliers' share of it paid, is at most the gap.
-        saved = land.penalty(values) - land.penalty(other) - mu @ (values - other)
-        assert saved <= land.gap(values, mu) + 1e-12  # rounding
+        saved = cost.penalty(values) - cost.penalty(other) - mu @ (values - other)
+        assert saved <= cost.gap(values, mu) + 1e-12  # rounding
     values = np.full(12, 0.7)
-    mu = np.full(12, land.problem.model.dt * (2.0 + 2 * 3.0 * 0.2))  # the slope of the penalty there
-    assert land.gap(values, mu) == pytest.approx(0.0, abs=1e-14)
+    mu = np.full(12, cost.problem.model.dt * (2.0 + 2 * 3.0 * 0.2))  # the slope of the penalty there
+    assert cost.gap(values, mu) == pytest.approx(0.0, abs=1e-14)
 
 
 @pytest.mark.parametrize(("n", "n_u"), [(1, 1), (5, 2), (23, 1)])
@@ -197,7 +184,7 @@ def test_a_warm_start_converges_in_a_few_iterations():
 def test_a_plans_second_derivatives_are_a_guess_only(bad):
     controller = SQPController(pendulum_model(z=3), problem(30))
     e = estimate_of(controller.model)
-    plan = controller.solve(controller.initial(e), e, np.zeros((1, 2)))
+    plan = plan_of(controller, e, np.zeros((1, 2)))
     wrong = {
         "nan": np.full_like(plan.curvature, np.nan), "shape": plan.curvature[:5],
         "wrong": -50 * plan.curvature, "none": None,

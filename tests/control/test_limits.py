@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from control_parts import POINT, estimate_of, plan_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from online_models import pendulum_model
@@ -10,7 +11,6 @@ from hybrid_mpc import (
     OCP,
     BestOf,
     CondensedController,
-    Estimate,
     InputError,
     IpoptController,
     Limits,
@@ -20,10 +20,8 @@ from hybrid_mpc import (
 )
 from hybrid_mpc.control.safeguard import Source
 
-POINT = [0.0, 1.0], [0.0]
-E0 = Estimate(0.0, np.array([-0.4, 0.0]), np.zeros(0), np.zeros(1), np.eye(3), np.zeros(1), 0.0)
+E0 = estimate_of(pendulum_model(), [-0.4, 0.0])
 GOAL = np.array([[0.5, 0.0]])
-SOLVERS = {"rti": CondensedController, "sqp": SQPController, "ipopt": IpoptController}
 
 
 def problem(**others):
@@ -31,12 +29,12 @@ def problem(**others):
 
 
 @pytest.mark.parametrize("others", [{}, {"du_max": [0.2]}, {"du_max": [0.2], "blocks": (1, 1, 2, 4, 4, 8)}])
-@pytest.mark.parametrize("name", SOLVERS)
-def test_solvers_keep_tighter_limits(name, others):
+@pytest.mark.parametrize("solver", [CondensedController, SQPController, IpoptController])
+def test_solvers_keep_tighter_limits(solver, others):
     ocp = problem(**others)
-    controller, limits = SOLVERS[name](pendulum_model(), ocp), Limits([-0.3], [0.25])
-    start = controller.initial(E0, np.full((20, 1), 0.8))  # held far beyond them
-    free, plan = controller.solve(start, E0, GOAL), controller.solve(start, E0, GOAL, limits=limits)
+    controller, limits = solver(pendulum_model(), ocp), Limits([-0.3], [0.25])
+    start = np.full((20, 1), 0.8)  # held far beyond them
+    free, plan = (plan_of(controller, E0, GOAL, start=start, limits=given) for given in (None, limits))
     assert plan.status is Status.SOLVED
     assert np.max(free.u) > 0.3  # it would want more
     lower, upper = ocp.bounds(np.array([0.8]), limits)
@@ -49,15 +47,15 @@ def test_solvers_keep_tighter_limits(name, others):
 
 
 def test_limits_are_those_of_a_problem_that_has_them():
-    tight = OCP(20, [50.0, 0.5], [0.1], [0.1], [-0.3], [0.25], working_point=POINT)
     model, limits = pendulum_model(), Limits([-0.3], [0.25])
-    wide = SQPController(model, problem())
-    own = SQPController(model, tight)
-    expected = own.solve(own.initial(E0), E0, GOAL)
-    plan = wide.solve(wide.initial(E0), E0, GOAL, limits=limits)
-    assert plan.cost == pytest.approx(expected.cost, rel=1e-9)  # sqp converges to 1e-10 of the cost
+    wide, own = (
+        SQPController(model, problem()),
+        SQPController(model, problem().changed(u_min=[-0.3], u_max=[0.25])),
+    )
+    expected = plan_of(own, E0, GOAL).cost
+    assert plan_of(wide, E0, GOAL, limits=limits).cost == pytest.approx(expected, rel=1e-9)  # sqp's own 1e-10
     best = BestOf(wide, starts=[np.zeros((20, 1))])
-    assert best.solve(wide.initial(E0), E0, GOAL, limits=limits).cost <= expected.cost * (1 + 1e-9)
+    assert plan_of(best, E0, GOAL, limits=limits).cost <= expected * (1 + 1e-9)
 
 
 @settings(max_examples=60, deadline=None)
@@ -68,11 +66,10 @@ def test_there_is_always_an_admissible_plan(u_prev, low, width, du_max):
     lower, upper = ocp.bounds(held, Limits([low], [low + width]))
     assert np.all(lower <= upper)
     assert np.all((ocp.u_min <= lower) & (upper <= ocp.u_max))
-    u, rows = held, []
+    u = held
     for k in range(20):
         reach = (u - du_max, u + du_max) if du_max is not None else (lower[k], upper[k])
         u = np.clip(np.clip(u, lower[k], upper[k]), *reach)
-        rows.append(u)
         assert lower[k] - 1e-12 <= u <= upper[k] + 1e-12  # rounding of k du_max
     first = ocp.saturate(np.array([9.0]), held, Limits([low], [low + width]))
     assert lower[0] <= first <= upper[0]
@@ -84,11 +81,8 @@ def test_a_safe_controller_keeps_them_whatever_happens():
     limits, decision, seen = Limits([-0.1], [0.1]), safe.initial(E0, np.array([0.8])), []
     for k in range(8):
         goal = GOAL if k % 2 else np.full((1, 2), np.nan)  # every other solve fails
-        given = {"limits": limits}
-        held = decision.u
-        decision = (
-            safe.late(decision, E0, GOAL, **given) if k == 5 else safe.decide(decision, E0, goal, **given)
-        )
+        held, decide = decision.u, safe.late if k == 5 else safe.decide
+        decision = decide(decision, E0, goal, limits=limits)
         seen.append(decision.source)
         assert abs(decision.u - held) <= 0.2 + 1e-12  # rounding
         assert abs(decision.u) <= max(0.1, abs(held) - 0.2) + 1e-12
@@ -103,6 +97,5 @@ def test_limits_that_are_none_are_refused(bad):
 
 
 def test_limits_of_another_size_are_refused():
-    controller = CondensedController(pendulum_model(), problem())
     with pytest.raises(InputError, match="limits of 2 inputs given, the problem has 1"):
-        controller.solve(controller.initial(E0), E0, GOAL, limits=Limits([0.0, 0.0], [1.0, 1.0]))
+        problem().bounds(np.zeros(1), Limits([0.0, 0.0], [1.0, 1.0]))

@@ -6,12 +6,12 @@ import casadi as ca
 import numpy as np
 import pytest
 from closed_loop_parts import DT, PendulumPlant, Recorder, make_safe, sine
+from control_parts import estimate_of, plan_of
 from online_models import pendulum_model, random_linear
 
 from hybrid_mpc import (
     OCP,
     CondensedController,
-    Estimate,
     ExtendedKalmanFilter,
     InputError,
     IpoptController,
@@ -41,21 +41,15 @@ class InSteps:
         return getattr(self.plant, name)
 
 
-def estimate_of(model, z):
-    return Estimate(
-        0.0, z[: model.n_x], z[model.n_x :], np.zeros(model.n_u), np.eye(z.size + 1), np.zeros(1), 0.0
-    )
-
-
-@pytest.mark.parametrize("z", [0, 4])
-def test_a_step_is_the_models_own_steps(z):
+@pytest.mark.parametrize(("z", "m"), [(0, M), (4, M), (4, 1)])
+def test_a_step_is_the_models_own_steps(z, m):
     model = pendulum_model(z)
-    slow = longer_period(model, M)
-    assert slow.dt == pytest.approx(M * model.dt, rel=1e-15)
+    slow = longer_period(model, m)
+    assert slow.dt == pytest.approx(m * model.dt, rel=1e-15)
     rng = np.random.default_rng(z)
     x, h, u = np.array([0.4, -1.0]), rng.normal(size=z), np.array([0.7])
     x_m, h_m = x, h
-    for _ in range(M):
+    for _ in range(m):
         x_m, h_m = (v.full().ravel() for v in model.step(x_m, h_m, u, model.w, model.p))
     for f in (slow.step, slow.with_jacobian):  # the same operations in the same order
         x_s, h_s = (v.full().ravel() for v in f(x, h, u, slow.w, slow.p)[:2])
@@ -82,16 +76,6 @@ def test_the_jacobian_by_three_routes(z):
         np.testing.assert_allclose((run(at + e) - run(at - e)) / 2e-6, chain[:, i], atol=1e-7)
 
 
-def test_one_period_is_the_model_itself():
-    model = pendulum_model(4)
-    z = np.linspace(-1, 1, 6)
-    point = z[:2], z[2:], [0.3], model.w, model.p
-    for mine, own in zip(
-        longer_period(model, 1).with_jacobian(*point), model.with_jacobian(*point), strict=True
-    ):
-        np.testing.assert_allclose(mine.full(), own.full(), rtol=1e-14, atol=1e-16)
-
-
 def test_the_lqr_of_the_longer_period():
     model, a, b, _ = random_linear(7, n_u=1)
     slow = longer_period(model, M)
@@ -99,9 +83,8 @@ def test_the_lqr_of_the_longer_period():
     ocp = OCP(10, [1.0, 0.5, 2.0], [0.4], [0.0], [-np.inf], [np.inf])
     _, k = dare(a_m, b_m, np.diag(ocp.q), np.diag(ocp.r))
     e = estimate_of(slow, np.array([0.8, -0.5, 0.3]))
-    controller = CondensedController(slow, ocp)
-    solution = controller.solve(controller.initial(e), e, np.zeros((1, 3)))
-    np.testing.assert_allclose(solution.u[0], -k @ e.x, atol=1e-8)  # rounding, cond(H) about 1e4
+    plan = plan_of(CondensedController(slow, ocp), e, np.zeros((1, 3)))
+    np.testing.assert_allclose(plan.u[0], -k @ e.x, atol=1e-8)  # rounding, cond(H) about 1e4
 
 
 def test_the_same_plan_as_move_blocks_of_the_models_period():
@@ -116,13 +99,11 @@ def test_the_same_plan_as_move_blocks_of_the_models_period():
     start, goal = np.concatenate([[0.6, 0.0], np.zeros(4)]), np.array([[-0.4, 0.0]])
     plans = []
     for own, ocp, factors in ((slow, coarse, None), (model, fine, weight)):
-        controller, e = SQPController(own, ocp), estimate_of(own, start)
-        plans.append(controller.solve(controller.initial(e), e, goal, factors))
+        plans.append(plan_of(SQPController(own, ocp), estimate_of(own, start), goal, factors))
         assert plans[-1].status is Status.SOLVED
     np.testing.assert_allclose(plans[0].u, plans[1].u[::M], atol=1e-5)  # both to 1e-10 of the cost
-    reference = IpoptController(slow, coarse)
-    e = estimate_of(slow, start)
-    assert plans[0].cost == pytest.approx(reference.solve(reference.initial(e), e, goal).cost, rel=1e-6)
+    reference = plan_of(IpoptController(slow, coarse), estimate_of(slow, start), goal)
+    assert plans[0].cost == pytest.approx(reference.cost, rel=1e-6)
 
 
 def test_the_loop_runs_at_the_longer_period_and_holds_the_input():

@@ -3,29 +3,23 @@
 import casadi as ca
 import numpy as np
 import pytest
+from control_parts import estimate_of, pendulum_problem, plan_of
 from lq_oracle import soft_plan, states
 from online_models import linear_model, pendulum_model, random_linear
 
-from hybrid_mpc import OCP, CondensedController, Estimate, InputError, SoftBound, Status
-from hybrid_mpc.control.soft import SoftRows
+from hybrid_mpc import OCP, CondensedController, InputError, SoftBound, Status
+from hybrid_mpc.control.problem import SoftRows
 
 DT = 0.1
 A, B = np.array([[1.0, DT], [0.0, 1.0]]), np.array([[0.5 * DT**2], [DT]])
 
 
-def estimate_of(model, z, d=None):
-    d = np.zeros(model.n_u) if d is None else d
-    return Estimate(0.0, z[: model.n_x], z[model.n_x :], d, np.eye(z.size + d.size), np.zeros(1), 0.0)
-
-
-def solve(model, ocp, z, reference, d=None, weight=None, held=None):
-    controller = CondensedController(model, ocp)
-    e = estimate_of(model, z, d)
+def solve(model, ocp, z, reference, d=0.0, weight=None, held=None):
     start = None if held is None else np.tile(held, (ocp.horizon, 1))
-    return controller.solve(controller.initial(e, start), e, reference, weight)
+    return plan_of(CondensedController(model, ocp), estimate_of(model, z, d), reference, weight, start=start)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 3, 4, 5, 7])
+@pytest.mark.parametrize("seed", [0, 1, 3, 4])
 @pytest.mark.parametrize("penalty", [0.3, 50.0])
 def test_random_problems_are_solved_as_by_ipopt(seed, penalty):
     n_u, n_h = 1 + seed % 2, 2 * (seed % 3 == 0)
@@ -133,13 +127,9 @@ def test_derivatives_of_expressions_are_those_of_finite_differences():
 
 def test_a_nonlinear_model_keeps_its_bounds_when_iterated():
     model = pendulum_model(z=3)
-    ocp = OCP(
-        40, [50.0, 0.5], [0.5], [0.1], [-3.0], [3.0], working_point=([0.0, 1.0], [0.0]),
-        x_max=[0.3, 1.2], x_min=[-np.inf, -1.2],
-    )  # fmt: skip
-    controller = CondensedController(model, ocp, iterations=30)
-    e = estimate_of(model, np.array([-0.3, 0.0, 0.0, 0.0, 0.0]))
-    plan = controller.solve(controller.initial(e), e, np.tile([0.5, 0.0], (41, 1)))
+    ocp = pendulum_problem(40, 3.0, 0.1, x_max=[0.3, 1.2], x_min=[-np.inf, -1.2])
+    controller, e = CondensedController(model, ocp, iterations=30), estimate_of(model, [-0.3, 0.0])
+    plan = plan_of(controller, e, np.array([[0.5, 0.0]]))
     assert plan.status is Status.SOLVED
     run = controller.problem.run(np.concatenate([e.x, e.h]), plan.u)
     # the model's own run keeps them too, to the defects of the last iteration

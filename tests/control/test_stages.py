@@ -6,12 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from control_parts import estimate_of, pendulum_problem, plan_of
 from online_models import pendulum_model
 
 from hybrid_mpc import (
-    OCP,
     CondensedController,
-    Estimate,
     GRUNetwork,
     HybridStep,
     InputError,
@@ -27,7 +26,7 @@ from hybrid_mpc.kit.artifact import build_model
 from hybrid_mpc.model.stages import Stages, VectorisedStages, stages
 from scenarios.golf_robot import scenario
 
-OCP_ = OCP(8, [50.0, 0.5], [0.5], [0.2], [-2.0], [2.0], working_point=([0.0, 1.0], [0.0]))
+OCP_ = pendulum_problem(8)
 
 
 def test_a_run_is_the_models_own_with_the_jacobians_along_it():
@@ -82,12 +81,9 @@ def test_all_periods_at_once_are_as_one_after_the_other(z):
 @pytest.mark.parametrize("kind", [CondensedController, SQPController])
 def test_plans_are_the_same_either_way(kind):
     model = golf_robot(6)
-    e = Estimate(0.0, np.array([0.4, 0.0]), np.zeros(6), np.zeros(1), np.eye(9), np.zeros(1), 0.0)
-    ocp = replace(OCP_, u_min=[-0.5], u_max=[0.5])
-    plans = [
-        c.solve(c.initial(e), e, np.zeros((1, 2)))
-        for c in (kind(m, ocp) for m in (model, replace(model, side_by_side=None)))
-    ]
+    ocp, e = OCP_.changed(u_min=[-0.5], u_max=[0.5]), estimate_of(model, [0.4, 0.0])
+    models = model, replace(model, side_by_side=None)
+    plans = [plan_of(kind(m, ocp), e, np.zeros((1, 2))) for m in models]
     # Roundings of 1e-16, which grow along the iterations and through differences of steps of 1e-5.
     np.testing.assert_allclose(plans[0].u, plans[1].u, rtol=1e-7, atol=1e-9)
     assert kind is CondensedController or plans[0].defect == 0.0  # it is a run of the model itself
@@ -118,11 +114,8 @@ def test_condensing_and_its_adjoint_are_sums_of_products(n, n_u):
 def test_compiled_and_interpreted_models_give_the_same_plans(kind, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     model = pendulum_model(z=3)
-    e = Estimate(0.0, np.array([0.4, 0.0]), np.zeros(3), np.zeros(1), np.eye(6), np.zeros(1), 0.0)
-    plans = [
-        c.solve(c.initial(e), e, np.zeros((1, 2)))
-        for c in (kind(model, OCP_, compiled=v) for v in (True, False))
-    ]
+    e = estimate_of(model, [0.4, 0.0])
+    plans = [plan_of(kind(model, OCP_, compiled=v), e, np.zeros((1, 2))) for v in (True, False)]
     # The same operations; compilers may contract a product and a sum, and 1e-16 grows along the iterations.
     np.testing.assert_allclose(plans[0].u, plans[1].u, rtol=1e-7, atol=1e-9)
     assert list(tmp_path.rglob("*.so")) or list(tmp_path.rglob("*.dylib"))  # it was compiled

@@ -85,7 +85,8 @@ class AnalysisResult:
 
 def analysis_stage(context: Context) -> AnalysisResult:
     """Linearize prior and hybrid at rest and at working speed; poles, PBH tests, frequency responses."""
-    from hybrid_mpc.analyze.linearize import fixed_point, linearize
+    from hybrid_mpc.analyze.equilibria import fixed_point
+    from hybrid_mpc.analyze.linearize import linearize
     from hybrid_mpc.analyze.properties import analyze, frequency_response
 
     models, speed = context.kit.models, None
