@@ -15,7 +15,6 @@ from hybrid_mpc import (
     Detector,
     Fault,
     InputError,
-    Plausibility,
     RunSettings,
     load,
     load_scenario,
@@ -111,18 +110,14 @@ def test_a_nominal_loop_is_what_the_guard_would_read(golf_artifact, monkeypatch)
     assert row.cost < 100.0  # it follows the task; a club that hangs still costs 1e4 x 0.1 rad^2 x 6 s
 
 
-def test_the_artifact_keeps_detector_and_plausibility(golf_artifact, tmp_path):
+def test_the_artifact_keeps_the_detector(golf_artifact, tmp_path):
     folder = shutil.copytree(golf_artifact, tmp_path / "model")
     detector = learned([numbers(36)], DT, 1, "hash of the data")
-    unit = Plausibility(
-        0.99, (1.0,) * 5, (0.1, 0.1), (0.0,) * 3, tuple(map(tuple, np.eye(3).tolist())), 4.0, 1.0
-    )
-    set_calibration(folder, replace(CALIBRATION, detector=detector, plausibility=unit))
+    set_calibration(folder, replace(CALIBRATION, detector=detector))
     found = load(folder).calibration
     assert found.detector == detector
     assert found.detector.data_hash == "hash of the data"
-    assert found.plausibility == unit
-    assert replace(found, detector=None, plausibility=None) == CALIBRATION
+    assert replace(found, detector=None) == CALIBRATION
 
 
 @pytest.fixture(scope="module")
@@ -170,8 +165,6 @@ def test_the_stage_learns_from_what_is_kept_and_fills_the_artifact(context, resu
     assert stored.detector.false_alarms_per_hour == 2.0
     assert re.fullmatch("[0-9a-f]{64}", stored.detector.data_hash)
     assert stored.threshold_w == CALIBRATION.threshold_w
-    assert stored.plausibility.data_hash == context.dataset.hash
-    assert stored.plausibility.samples == sum(len(t.t) for t in context.trajectories("train"))
     spec = nominal_loops.nominal_loops(context.scenario, context.budget, MODEL)[0]
     (row,) = kept(context, "guard/track_sine-500")
     other = replace(row, arrays=row.arrays | {"y": row.arrays["y"] + 1})

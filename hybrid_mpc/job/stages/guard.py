@@ -1,4 +1,4 @@
-"""Stage guard: detector and plausibility of the energy guard, learned, kept in the artifact, and tried out."""
+"""Stage guard: the detector of the energy guard, learned, kept in the artifact, and tried out."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ from hybrid_mpc.monitor.calibrate import MAX_EXTRAPOLATION, MIN_BLOCKS, alarm_in
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.learn import DRIFT, guard_monitor, learn_detector
 from hybrid_mpc.monitor.lengths import BLOCK_S, REST_SPEED, SETTLING_S, block_seconds, samples, seconds
-from hybrid_mpc.monitor.plausibility import learn_plausibility
 from hybrid_mpc.monitor.replay import MonitorTrace, along, replay
 from hybrid_mpc.records import plain
 from hybrid_mpc.scenario import Budget, Scenario, Task
@@ -274,7 +273,7 @@ class NominalData:
 
 
 def guard_stage(context: Context) -> None:
-    """Learn detector and plausibility, put them into the artifact, and try them on faults and test recordings."""
+    """Learn the detector, put it into the artifact, and try it on faults and test recordings."""
     scenario, folder = context.scenario, context.out / "model"
     if scenario.control is None:
         reason = "the guard's estimator needs the scenario's control problem (input range, sensor noise)"
@@ -293,12 +292,6 @@ def guard_stage(context: Context) -> None:
         )  # fmt: skip
     except InputError as none:
         result["reason"] = f"no detector could be learned from {data.source}: {none}"
-    try:
-        found["plausibility"] = learn_plausibility(
-            model, context.smoothed("train"), data_hash=context.dataset.hash
-        )
-    except InputError as none:
-        result["plausibility_reason"] = str(none)
     set_calibration(folder, replace(calibration, **found))
     result |= {name: plain(part) for name, part in found.items()}
     kit, detector = context.kit, found.get("detector")

@@ -313,7 +313,7 @@ def _fault_table(faults: list[dict[str, Any]]) -> Table:
 
 
 def guard_words(results: dict[str, Any]) -> tuple[str, ...]:
-    """What this run's detector was learned from, what it does not promise, and the plan's plausibility."""
+    """What this run's detector was learned from, and what it does not promise."""
     guard, details = results["guard"], results["guard"].get("details", {})
     if guard["data_hash"] is None:
         words = [f"{guard['reason'][0].upper()}{guard['reason'][1:]}."]
@@ -340,14 +340,6 @@ def guard_words(results: dict[str, Any]) -> tuple[str, ...]:
                 )
         else:
             words.append("No test recording is long enough to try it on.")
-    if "plausibility" in details:
-        ordinary = details["plausibility"]
-        words.append(
-            f"For bounds in the plan: {100 * ordinary['quantile']:g} % of {ordinary['samples']} training samples have "
-            f"a model balance within a bound of {ordinary['tolerance_w']:.3g} W in the median."
-        )
-    elif "plausibility_reason" in details:
-        words.append(f"There is no plausibility for the plan: {details['plausibility_reason']}.")
     return tuple(words)
 
 

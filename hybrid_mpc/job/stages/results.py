@@ -515,9 +515,7 @@ def guard_results(context: Context) -> dict[str, Any]:
     found = context.result("guard")
     if "detector" not in found:
         none = dict.fromkeys((*LEARNED, "test_seconds", "test_alarms", "faults"))
-        details = {
-            key: found[key] for key in ("source", "plausibility", "plausibility_reason") if key in found
-        }
+        details = {"source": found["source"]} if "source" in found else {}
         return {**none, "reason": found["reason"], "details": details}
     detector, test = found["detector"], found["test"]
     out = {key: detector[key] for key in LEARNED}
@@ -530,5 +528,5 @@ def guard_results(context: Context) -> dict[str, Any]:
             "plant that could break" if context.scenario.plant is None else "task in which nothing goes wrong"
         )
         out["faults_reason"] = f"scenario {context.scenario.name} has no {lacks}"
-    kept = ("source", "loops", "detector", "plausibility", "plausibility_reason", "test", "faults")
+    kept = ("source", "loops", "detector", "test", "faults")
     return {**out, "details": {key: found[key] for key in kept if key in found}}
