@@ -130,7 +130,6 @@ if TYPE_CHECKING:
     from hybrid_mpc.monitor.energy import EnergyMonitor
     from hybrid_mpc.monitor.learn import guard_monitor, learn_from
     from hybrid_mpc.monitor.lengths import rest_speeds
-    from hybrid_mpc.monitor.plausibility import Plausibility, excess_bound, learn_plausibility, region_bound
     from hybrid_mpc.monitor.replay import replay
     from hybrid_mpc.scenario import DEFAULT_BUDGETS, Budget, Scenario, Task, load_scenario
 
@@ -183,7 +182,6 @@ __all__ = [
     "OCP",
     "Parameter",
     "PendulumLoad",
-    "Plausibility",
     "Prior",
     "PriorStep",
     "Provenance",
@@ -226,7 +224,6 @@ __all__ = [
     "differentiate",
     "dry_run",
     "equilibria",
-    "excess_bound",
     "excitation_of",
     "feature_box",
     "find_noise",
@@ -243,7 +240,6 @@ __all__ = [
     "jacobians",
     "judged",
     "learn_from",
-    "learn_plausibility",
     "linearize",
     "linearize_along",
     "linearize_at_speed",
@@ -275,7 +271,6 @@ __all__ = [
     "prbs",
     "process_noise",
     "random_steps",
-    "region_bound",
     "replay",
     "rest_speeds",
     "run",
@@ -388,7 +383,6 @@ _ROOMS = {
     "monitor.energy": ("EnergyMonitor",),
     "monitor.learn": ("guard_monitor", "learn_from"),
     "monitor.lengths": ("rest_speeds",),
-    "monitor.plausibility": ("Plausibility", "excess_bound", "learn_plausibility", "region_bound"),
     "monitor.replay": ("replay",),
     "scenario": ("Budget", "DEFAULT_BUDGETS", "Scenario", "Task", "load_scenario"),
 }  # fmt: skip

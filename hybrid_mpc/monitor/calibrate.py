@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.lengths import BLOCK_S, REST_SPEED
-from hybrid_mpc.monitor.plausibility import Plausibility
 
 Array = NDArray[np.float64]
 MIN_BLOCKS = 30
@@ -33,7 +32,6 @@ class Calibration:
         residual_threshold: Residual level [N m or N] above which the alarm starts too. Default: never.
         residual_release: Residual level [N m or N] below which that ends.
         detector: Detector of scaled residuals, learned from nominal data. Default: none.
-        plausibility: What is ordinary in the training data, for bounds in the plan. Default: none.
         rest_speed: Speeds ``(n_q,)`` [unit of v] below which friction may stick, or one for all: what every monitor of
             this model is to take. Default 0.2; None where no recording told them.
 
@@ -57,7 +55,6 @@ class Calibration:
     residual_threshold: float | None = None
     residual_release: float | None = None
     detector: Detector | None = None
-    plausibility: Plausibility | None = None
     rest_speed: tuple[float, ...] | None = (REST_SPEED,)
 
     def __post_init__(self) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from monitor_parts import DT, GAMMA, NOISE, Observer, pendulum, simulate
 
-from hybrid_mpc import Calibration, Detector, EnergyMonitor, InputError, Plausibility, replay
+from hybrid_mpc import Calibration, Detector, EnergyMonitor, InputError, replay
 from hybrid_mpc.monitor.learn import detector_levels, learn_detector
 from hybrid_mpc.records import plain, record
 
@@ -123,8 +123,7 @@ def test_levels_are_those_of_the_update(learned):
 
 def test_it_survives_json(learned):
     _, detector = learned
-    ordinary = Plausibility(0.99, (1.0,) * 5, (0.1, 0.1), (0.0, 0.0), ((1.0, 0.0), (0.0, 1.0)), 4.0, 1.0)
-    calibration = Calibration(0.2, 0.1, 1.0, 1000, 0.1, "by hand", detector=detector, plausibility=ordinary)
+    calibration = Calibration(0.2, 0.1, 1.0, 1000, 0.1, "by hand", detector=detector)
     only_forces = replace(detector, energy=(), energy_threshold=np.inf)
     for part in (calibration, replace(calibration, detector=None), only_forces):
         assert record(type(part), json.loads(json.dumps(plain(part))), "") == part
