@@ -24,7 +24,8 @@ from hybrid_mpc.estimate.delay import sees_truth
 from hybrid_mpc.estimate.kalman import Estimate, Estimator
 from hybrid_mpc.loop.guard import Guard, Switch
 from hybrid_mpc.loop.loop import Loop, Monitor, Reading
-from hybrid_mpc.loop.plant import Preview, fitting
+from hybrid_mpc.loop.plant import fitting
+from hybrid_mpc.loop.preview import Preview
 from hybrid_mpc.model.model import HybridModel
 
 # Clocks for the real-time runner, and the record of how it kept time.

@@ -32,8 +32,9 @@ from hybrid_mpc.estimate.kalman import Estimate, Estimator
 from hybrid_mpc.estimate.switching import FilterBank, SwitchingFilter, measures_first_states
 from hybrid_mpc.loop.faults import Fault, check_channels, install
 from hybrid_mpc.loop.guard import Guard
-from hybrid_mpc.loop.loop import TIMED, Loop, Monitor, Reading, preview_of
-from hybrid_mpc.loop.plant import Machine, Plant, Preview, Previews, fitting
+from hybrid_mpc.loop.loop import TIMED, Loop, Monitor, Reading
+from hybrid_mpc.loop.plant import Plant, SimulatedMachine, fitting
+from hybrid_mpc.loop.preview import Preview, Previews
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.model.riccati import vector
 
@@ -286,11 +287,11 @@ class Simulation:
         check_channels(faults, model.n_y, ocp.n_u)
         self._cost = _checked_cost(ocp, ocp if stage_cost is None else stage_cost)
         end = self.periods * dt
-        self._acting = (
-            Previews(preview_of(reference, ocp), weight, ocp, horizon, dt, end) if input_delay else None
-        )
+        self._acting = Previews(reference, weight, ocp, horizon, dt, end) if input_delay else None
         rest = vector(x0, ocp.n_x, "x0")
-        self._machine = Machine(self._plant, rest, seed, model.n_y, faults, dt, sensor_delay, input_delay)
+        self._machine = SimulatedMachine(
+            self._plant, rest, seed, model.n_y, faults, dt, sensor_delay, input_delay
+        )
         self._late, self._on_step = late, on_step
         self._rows: list[_Row] = []
         self._x, self.y = rest, np.full(model.n_y, np.nan)
@@ -324,7 +325,7 @@ class Simulation:
         in_time = None if self._late is None else partial(_is_in_time, self._late, t)
         if self._k == 0:
             loop.start(self.y, truth=truth, in_time=in_time)
-            machine.rest(loop.state.held[0])
+            machine.rest(loop.state.inputs[0])
         else:
             loop.step(self.y, truth=truth, in_time=in_time)
         u, u_prev = machine.command(loop.decision.u)

@@ -66,7 +66,7 @@ def test_what_is_left_undone_the_next_step_does(model, safe):
     every, some = (make_loop(model, safe, monitor=Told([(8, 10)]), guard=guard) for _ in range(2))
     np.testing.assert_array_equal(drive(every), drive(some, finish=lambda k: k % 3 == 0))
     some.finish()
-    for name in ("k", "guard", "monitor", "held", "finished"):
+    for name in ("k", "guard", "monitor", "inputs", "finished"):
         assert getattr(every.state, name) == getattr(some.state, name), name
     assert [s.after for s in every.switches] == [Mode.FALLBACK, Mode.NORMAL]
 
