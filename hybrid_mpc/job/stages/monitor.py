@@ -20,7 +20,7 @@ from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.model.riccati import hidden_fixed_point
 from hybrid_mpc.monitor.calibrate import Calibration, alarm_intervals, calibrate, with_residual
 from hybrid_mpc.monitor.lengths import block_seconds, rest_speeds
-from hybrid_mpc.monitor.replay import along, judge, replay
+from hybrid_mpc.monitor.replay import along, replay, with_alarms
 from hybrid_mpc.records import plain, record
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ def monitor_stage(context: Context) -> None:
     set_calibration(context.out / "model", calibration)
     alarms, arrays, clean = [], {}, {"seconds": 0.0, "alarms": 0, "test_seconds": 0.0, "test_alarms": 0}
     for recording, levels in zip(whole, traces, strict=True):
-        trace = judge(make_monitor(model, calibration), levels)
+        trace = with_alarms(make_monitor(model, calibration), levels)
         alarms += [{"file": recording.name, "start_s": a, "end_s": b} for a, b in trace.intervals()]
         for key in ("t", "violation_w", "level_w", "residual_level", "alarm"):
             arrays[f"{recording.name}/{key}"] = getattr(trace, key)
