@@ -63,7 +63,13 @@ def test_it_switches_once_the_alarm_has_lasted_and_pays():
     safe, estimator = make_controller(model, model, CONTROL), make_estimator(model, SCENARIO, SIGMA_X)
     plain, guarded = (
         run(
-            model, safe, plant=Heavy(), estimator=estimator, monitor=ScriptedMonitor([(5, 10**9)]), guard=g, duration=3.0
+            model,
+            safe,
+            plant=Heavy(),
+            estimator=estimator,
+            monitor=ScriptedMonitor([(5, 10**9)]),
+            guard=g,
+            duration=3.0,
         )
         for g in (None, guard)
     )

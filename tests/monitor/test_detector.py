@@ -14,22 +14,13 @@ from hybrid_mpc.records import plain, record
 WINDOW = {"window": 11, "average": 5, "free_run": 0.6}
 
 
-def numbers(run, monitor):
-    observer, state = Observer(monitor.model), monitor.initial()
-    estimate, rows = observer.start(run.y[0], 0.0), []
-    for k in range(len(run.t)):
-        u_prev = run.u[k - 1] if k else np.zeros(1)
-        if k:
-            estimate = observer.update(estimate, run.y[k], u_prev)
-        state, reading = monitor.update(state, run.y[k], u_prev, estimate)
-        rows.append(reading.numbers)
-    return np.array(rows)[60:]
-
-
 @pytest.fixture(scope="module")
 def learned():
     monitor = EnergyMonitor(pendulum(), **WINDOW)
-    runs = [numbers(simulate(5000, s, noise=NOISE), monitor) for s in range(4)]
+    runs = [
+        replay(monitor, Observer(monitor.model), simulate(5000, s, noise=NOISE)).numbers[60:]
+        for s in range(4)
+    ]
     return runs, learn_detector(runs, DT, 1, drift=1.0, false_alarms_per_hour=30, data_hash="abc")
 
 
@@ -129,7 +120,7 @@ def test_it_survives_json(learned):
         assert record(type(part), json.loads(json.dumps(plain(part))), "") == part
 
 
-def test_bad_input_speaks(learned):
+def test_bad_input_is_refused(learned):
     runs, detector = learned
     with pytest.raises(InputError, match=r"need \d+\.\d min"):
         learn_detector([runs[0][:2000]], DT, 1, false_alarms_per_hour=1)
