@@ -24,6 +24,7 @@ from hybrid_mpc.monitor.energy import EnergyMonitor, Verdict
 from hybrid_mpc.monitor.learn import guard_monitor, learn_from
 from hybrid_mpc.monitor.lengths import HISTORY_S, samples
 from hybrid_mpc.monitor.replay import EstimatorLike, MonitorTrace, TrajectoryLike, along, replay
+from hybrid_mpc.monitor.residuals import force_units
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import Scenario
 
@@ -181,12 +182,11 @@ def watch(job: MonitorJob, out: Path, progress: Progress | None = None) -> dict[
             found = {"violation": calibration.threshold_w, "residual": calibration.residual_threshold}
             limits = {name: limit for name, limit in found.items() if limit is not None}
         notes = [(a["start_s"], a["diagnosis"]) for a in alarms if a["diagnosis"]]
-        unit = {"rad": "N m", "m": "N"}.get(output.unit, "SI")
         figure = overview(
             trace,
             recording.y[:, 0],
             output=output,
-            force_unit=unit,
+            force_unit=force_units(job.kit.models["hybrid"])[0],
             thresholds=limits,
             notes=notes,
             title=name,

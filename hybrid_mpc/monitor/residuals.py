@@ -1,4 +1,4 @@
-"""The monitor's arithmetic as one CasADi function: one-step violation, residual force, free runs, regressors."""
+"""The energy monitor's arithmetic as one CasADi function: violation, residual force, free runs, frozen sensor."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.model.model import Balance, HybridModel
 
 Array = NDArray[np.float64]
 RUNS = 2
@@ -19,8 +19,10 @@ RUN_SUMS = 3
 """Sums of a free run: energy departure, squared speed, squared input."""
 ENERGY = "energy"
 """Name of the balance that is watched."""
+FORCES = {("W", "rad/s"): "N m", ("W", "m/s"): "N"}
+"""Short names of a power over a speed."""
 HELD_SHARE = 0.25
-"""Change of an input, as a share of its plausible range, that no sticking friction is believed to hold."""
+"""Change of an input, as a share of its range, that sticking friction does not hold."""
 
 
 @dataclass(frozen=True)
@@ -125,14 +127,28 @@ def energy_balance(model: HybridModel, x: ca.MX, xdot: ca.MX, u: ca.MX) -> ca.MX
     Raises:
         InputError: If the model has no energy balance.
     """
+    return _energy_of(model).residual(x, xdot, u, model.w, model.p)
+
+
+def _energy_of(model: HybridModel) -> Balance:
     for balance in model.balances:
         if balance.name == ENERGY:
-            return balance.residual(x, xdot, u, model.w, model.p)
+            return balance
     known = ", ".join(b.name for b in model.balances) or "none"
     raise InputError(
         f"energy monitor: model {model.name} has no balance {ENERGY!r} (it has: {known}), so its energy cannot be "
         "watched; give its prior inertia(x), or energy_balance(x, xdot, u), and export it again, or take no monitor"
     )
+
+
+def force_units(model: HybridModel) -> tuple[str, ...]:
+    """Unit of each residual force: that of the balance's rate over that of the speed.
+
+    Raises:
+        InputError: If the model has no energy balance.
+    """
+    rate = _energy_of(model).rate_unit
+    return tuple(FORCES.get((rate, v.unit), f"{rate}/({v.unit})") for v in model.states[model.n_x // 2 :])
 
 
 def inertia_of(model: HybridModel, x: ca.MX, u: ca.MX) -> ca.MX:

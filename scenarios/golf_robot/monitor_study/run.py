@@ -121,11 +121,6 @@ def finish(out: Path) -> dict[str, Any]:
     return results
 
 
-def is_monitor_study(folder: Path) -> bool:
-    """Whether a folder holds this study."""
-    return read_note(folder).kind == KIND
-
-
 class _Todo:
     """What is left of a study, run in its engine."""
 
