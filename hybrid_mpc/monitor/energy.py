@@ -76,7 +76,7 @@ class MonitorState:
         frozen: True while the sensor is held for frozen.
         seen: Samples taken, up to the window's.
         whole: Samples since something was missing, up to the window's.
-        dark: Samples in a row without a reading.
+        invalid: Samples in a row without a reading.
     """
 
     memory: Array
@@ -88,7 +88,7 @@ class MonitorState:
     frozen: bool = False
     seen: int = 0
     whole: int = 0
-    dark: int = 0
+    invalid: int = 0
 
 
 @dataclass(frozen=True)
@@ -226,8 +226,8 @@ class EnergyMonitor:
         self.model, self.window, self.average = model, window, average
         self.calibration, self.detector = calibration, detector
         if rest_speed is None:
-            held = (part.rest_speed for part in (detector, calibration) if part is not None)
-            rest_speed = next((rest for rest in held if rest is not None), REST_SPEED)
+            stored = (part.rest_speed for part in (detector, calibration) if part is not None)
+            rest_speed = next((rest for rest in stored if rest is not None), REST_SPEED)
         self.rest_speed = checked_rest(rest_speed, model.n_x // 2, "energy monitor")
         self._resolution = _positive(resolution, model.n_y)
         if detector is not None:
@@ -283,37 +283,52 @@ class EnergyMonitor:
         ins[0][:], ins[1][:], ins[2][:], ins[3][:], ins[4][:] = state.memory, state.x, state.h, u_prev, y
         left = state.left and self._free_runs(state)
         self._evaluate()
-        memory, place, n_q = self._outs[0].copy(), self.layout.averaged, self.model.n_y
-        middle, end = place + self.average, self.layout.runs
-        level = _mean_of_finite(memory[place:middle])
-        if n_q == 1:
-            residual_level = abs(_mean_of_finite(memory[middle:end]))
-        else:
-            residual_level = _length_of_mean(memory[middle:end].reshape(self.average, n_q))
+        memory, numbers, n_q = self._outs[0].copy(), self._outs[1].tolist(), self.model.n_y
+        level, residual_level = self._levels(memory)
         alarms = self.alarms(level, residual_level, state.alarms)
-        numbers = self._outs[1].tolist()
-        frozen = False
-        for travel, step in zip(numbers[3 + n_q : 3 + 2 * n_q], self._resolution, strict=False):
-            frozen = frozen or abs(travel) > FROZEN_STEPS * step
+        travels = zip(numbers[3 + n_q : 3 + 2 * n_q], self._resolution, strict=False)
+        frozen = any(abs(travel) > FROZEN_STEPS * step for travel, step in travels)
         energy, seconds = self._older(numbers, left) if left else (math.nan, 0.0)
-        scores: tuple[float, ...]
-        found, scores, detected = state.detector, (), False
+        detector, detected = state.detector, False
+        scores: tuple[float, ...] = ()
         if self.detector is not None:
-            found, scores, detected = self.detector.update(found, numbers)
+            detector, scores, detected = self.detector.update(detector, numbers)
         seen = min(state.seen + 1, self.window)
         missing = not math.isfinite(sum(y.tolist()) + (sum(u_prev.tolist()) if state.seen else 0.0))
         whole = 0 if missing else min(state.whole + 1, self.window)
         verdict = self._verdict(numbers[2 : 3 + n_q], seen, whole)
-        dark = state.dark + 1 if verdict else 0
-        blind = dark > self.window + self.average
-        alarm = alarms[0] or alarms[1] or frozen or detected or blind
-        return MonitorState(memory, x, h, alarms, left, found, frozen, seen, whole, dark), MonitorReading(
-            numbers[0], numbers[1], numbers[2], level, self._outs[1][3 : 3 + n_q].copy(), residual_level, alarm,
-            energy, seconds, frozen, scores, tuple(numbers), verdict, blind,
-        )  # fmt: skip
+        invalid = state.invalid + 1 if verdict else 0
+        blind = invalid > self.window + self.average
+        following = MonitorState(memory, x, h, alarms, left, detector, frozen, seen, whole, invalid)
+        reading = MonitorReading(
+            dE_model_w=numbers[0],
+            dE_measured_w=numbers[1],
+            violation_w=numbers[2],
+            level_w=level,
+            residual=self._outs[1][3 : 3 + n_q].copy(),
+            residual_level=residual_level,
+            alarm=alarms[0] or alarms[1] or frozen or detected or blind,
+            energy_j=energy,
+            energy_s=seconds,
+            frozen=frozen,
+            scores=scores,
+            numbers=tuple(numbers),
+            verdict=verdict,
+            blind=blind,
+        )
+        return following, reading
+
+    def _levels(self, memory: Array) -> tuple[float, float]:
+        """Means of the latest violations and residual forces."""
+        first, n_q = self.layout.averaged, self.model.n_y
+        middle, end = first + self.average, self.layout.runs
+        level = _mean_of_finite(memory[first:middle])
+        if n_q == 1:
+            return level, abs(_mean_of_finite(memory[middle:end]))
+        return level, _length_of_mean(memory[middle:end].reshape(self.average, n_q))
 
     def _verdict(self, readings: Sequence[float], seen: int, whole: int) -> Verdict:
-        """Whether violation and residual force are numbers; and if not, what hinders."""
+        """Whether violation and residual force are numbers, and if not, why."""
         if math.isfinite(sum(readings)):
             return Verdict.JUDGED
         if seen < self.window:
@@ -321,7 +336,7 @@ class EnergyMonitor:
         return Verdict.MISSING if whole < self.window else Verdict.NOT_FINITE
 
     def alarms(self, level: float, residual_level: float, were_on: tuple[bool, bool]) -> tuple[bool, bool]:
-        """Whether power and residual alarm at these levels [W], [N m], after having been on or not."""
+        """Whether power and residual alarm at these levels, after having been on or not."""
         c = self.calibration
         if c is None or c.threshold_w is None or c.release_w is None:
             return QUIET
