@@ -15,14 +15,27 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import argparse
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 
-from hybrid_mpc import load, load_trajectories, make_estimator
+from hybrid_mpc import (
+    Detector,
+    InputError,
+    guard_monitor,
+    load,
+    load_trajectories,
+    make_estimator,
+    replay,
+    rest_speeds,
+)
 from hybrid_mpc.files import write_json
-from hybrid_mpc.monitor.held_out import HeldOut, leave_one_out
+from hybrid_mpc.monitor.learn import DRIFT, learn_detector
+from hybrid_mpc.monitor.lengths import SETTLING_S
+from hybrid_mpc.monitor.replay import MonitorTrace
 from hybrid_mpc.records import plain
 from scenarios.torque_pendulum import scenario
 
@@ -41,6 +54,118 @@ BLOCK_S = 1.0
 RATE = 12.0
 """False alarms an hour: the fewest that half a minute of other recordings can be drawn on to (a twentieth of the time
 between two of them must be there, for either alarm)."""
+TINY = 1e-6
+"""Tolerance [s] of comparisons between times: far below a period, above rounding."""
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """A recording, watched with the detector of all others; ``clean`` ``(n,)`` is true in its own clean windows."""
+
+    name: str
+    detector: Detector
+    trace: MonitorTrace
+    clean: np.ndarray
+
+    @property
+    def inside(self) -> list[tuple[float, float]]:
+        """Alarms ``(first, last)`` [s] that begin in a clean window: false ones."""
+        return [a for a in self.trace.intervals() if self._begins_clean(a)]
+
+    @property
+    def outside(self) -> list[tuple[float, float]]:
+        """Alarms ``(first, last)`` [s] that begin outside."""
+        return [a for a in self.trace.intervals() if not self._begins_clean(a)]
+
+    @property
+    def left_over(self) -> int:
+        """Samples of clean windows in which an alarm that began outside is still on."""
+        t, clean = self.trace.t, self.clean
+        inside = sum(int(np.sum(clean & (t >= a) & (t <= b))) for a, b in self.inside)
+        return int(np.sum(self.trace.alarm & clean)) - inside
+
+    @property
+    def highest(self) -> tuple[float, float]:
+        """Largest shares of the thresholds, forces and power, in clean windows but for their beginning."""
+        scores = self.trace.scores[
+            settled_windows(self.trace.t, self.clean, SETTLING_S * self.detector.time_unit)
+        ]
+        return (float(scores[:, 0].max()), float(scores[:, 1].max())) if len(scores) else (0.0, 0.0)
+
+    def _begins_clean(self, interval: tuple[float, float]) -> bool:
+        return bool(self.clean[int(np.argmin(np.abs(self.trace.t - interval[0])))])
+
+
+def leave_one_out(
+    model, estimator, recordings, windows: Mapping[str, Sequence[tuple[float, float]]], *, rate: float,
+    resolution: Sequence[float], block_s: float, data_hash: str,
+) -> list[HeldOut]:  # fmt: skip
+    """Every recording by a detector that was learned from the clean windows of all others.
+
+    Each is replayed as a whole, as it would have run online: what happens between the windows is in the monitor's
+    memory when the next one begins. Nothing is learned from the first of the machine's seconds of a window.
+    """
+    stems = [r.name.split("#")[0] for r in recordings]
+    if len(set(stems)) < 2:
+        raise InputError(f"leave_one_out: {len(recordings)} recordings given, at least two files are needed")
+    if unknown := sorted(set(stems) - set(windows)):
+        raise InputError(
+            f"leave_one_out: no clean windows given for {unknown}; name them, or leave these out"
+        )
+    clean = [clean_samples(np.asarray(r.t), windows[stem]) for r, stem in zip(recordings, stems, strict=True)]
+    undisturbed = [
+        SimpleNamespace(y=y) for r, c in zip(recordings, clean, strict=True) for y in stretches(r.y, c)
+    ]
+    monitor = guard_monitor(model, resolution=resolution, rest_speed=rest_speeds(undisturbed, model))
+    traces = [replay(monitor, estimator, r) for r in recordings]
+    settling = SETTLING_S * model.time_unit
+    runs = [
+        stretches(trace.numbers, settled_windows(trace.t, c, settling))
+        for trace, c in zip(traces, clean, strict=True)
+    ]
+    found = []
+    for recording, stem, trace, inside in zip(recordings, stems, traces, clean, strict=True):
+        others = [run for own, other in zip(runs, stems, strict=True) if other != stem for run in own]
+        detector = learn_detector(
+            others, model.dt, model.n_y, drift=DRIFT, false_alarms_per_hour=rate, rest_speed=monitor.rest_speed,
+            data_hash=data_hash, time_unit=model.time_unit, block_s=block_s,
+        )  # fmt: skip
+        found.append(HeldOut(recording.name, detector, with_detector(detector, trace), inside))
+    return found
+
+
+def with_detector(detector: Detector, trace: MonitorTrace) -> MonitorTrace:
+    """The trace with the scores and alarms of a detector; frozen sensors and blind monitors remain alarms."""
+    state, scores, alarm = detector.initial(), [], []
+    for numbers in trace.numbers.tolist():
+        state, score, detected = detector.update(state, numbers)
+        scores.append(score)
+        alarm.append(detected)
+    return replace(trace, scores=np.array(scores), alarm=np.array(alarm) | trace.frozen | trace.blind)
+
+
+def clean_samples(t, windows: Sequence[tuple[float, float]]):
+    """True where ``t`` ``(n,)`` lies in one of the windows; a window's end is no longer in it."""
+    inside = np.zeros(len(t), dtype=bool)
+    for start, end in windows:
+        inside |= (t >= start - TINY) & (t < end - TINY)
+    return inside
+
+
+def settled_windows(t, clean, settling: float):
+    """The clean samples but for the first ``settling`` seconds of each window, in which the monitor remembers."""
+    begun, settled = float("nan"), np.zeros(len(t), dtype=bool)
+    for k, inside in enumerate(clean):
+        begun = float("nan") if not inside else t[k] if begun != begun else begun
+        settled[k] = inside and t[k] >= begun + settling - TINY
+    return settled
+
+
+def stretches(rows, chosen) -> list:
+    """The rows of each stretch that is chosen."""
+    cuts = np.flatnonzero(np.diff(chosen.astype(int))) + 1
+    pieces = zip(np.split(rows, cuts), np.split(chosen, cuts), strict=True)
+    return [part for part, inside in pieces if inside.any()]
 
 
 def read(folder: Path, model):
@@ -55,7 +180,7 @@ def judge(model, sigma_x, data, rate: float = RATE) -> list[HeldOut]:
     """Every recording, by the detector of the others."""
     return leave_one_out(
         model, make_estimator(model, scenario, np.asarray(sigma_x)), data.whole, CLEAN,
-        false_alarms_per_hour=rate, resolution=[RESOLUTION], block_s=BLOCK_S, data_hash=data.hash,
+        rate=rate, resolution=[RESOLUTION], block_s=BLOCK_S, data_hash=data.hash,
     )  # fmt: skip
 
 

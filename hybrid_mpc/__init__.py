@@ -132,7 +132,6 @@ if TYPE_CHECKING:
     from hybrid_mpc.monitor.energy import EnergyMonitor
     from hybrid_mpc.monitor.learn import guard_monitor, learn_from
     from hybrid_mpc.monitor.lengths import rest_speeds
-    from hybrid_mpc.monitor.plausibility import Plausibility, excess_bound, learn_plausibility, region_bound
     from hybrid_mpc.monitor.replay import replay
     from hybrid_mpc.scenario import DEFAULT_BUDGETS, Budget, Scenario, Task, load_scenario
 
@@ -185,7 +184,6 @@ __all__ = [
     "OCP",
     "Parameter",
     "PendulumLoad",
-    "Plausibility",
     "Prior",
     "PriorStep",
     "Provenance",
@@ -229,7 +227,6 @@ __all__ = [
     "dry_run",
     "equilibria",
     "evaluation_trajectories",
-    "excess_bound",
     "excitation_of",
     "feature_box",
     "find_noise",
@@ -244,7 +241,6 @@ __all__ = [
     "holding_input",
     "jacobians",
     "learn_from",
-    "learn_plausibility",
     "linearize",
     "linearize_along",
     "linearize_at_speed",
@@ -276,7 +272,6 @@ __all__ = [
     "prbs",
     "process_noise",
     "random_steps",
-    "region_bound",
     "replay",
     "rest_speeds",
     "run",
@@ -383,7 +378,6 @@ _ROOMS = {
     "monitor.energy": ("EnergyMonitor",),
     "monitor.learn": ("guard_monitor", "learn_from"),
     "monitor.lengths": ("rest_speeds",),
-    "monitor.plausibility": ("Plausibility", "excess_bound", "learn_plausibility", "region_bound"),
     "monitor.replay": ("replay",),
     "scenario": ("Budget", "DEFAULT_BUDGETS", "Scenario", "Task", "load_scenario"),
 }  # fmt: skip

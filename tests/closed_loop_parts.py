@@ -115,13 +115,26 @@ class Rig:
         self.u.append(u)
 
 
+@dataclass
+class LateRig(Rig):
+    """A rig whose inputs act some periods late; before the first the input was zero."""
+
+    delay: int = 1
+
+    def measure(self):
+        if self.u:
+            acting = self.u[-1 - self.delay] if len(self.u) > self.delay else np.zeros(1)
+            self.state = self.plant.step(self.state, acting, DT)
+        return self.plant.measure(self.state, self.rng)
+
+
 def make_runner(model, safe, rig, clock=None, **options):
     return Runner(rig.measure, rig.actuate, options.pop("estimator", None) or make_ekf(model), safe,
                   options.pop("reference", sine), clock=clock or FakeClock(), **options)  # fmt: skip
 
 
 @dataclass(frozen=True)
-class Said:
+class ScriptedReading:
     """A reading."""
 
     alarm: bool
@@ -130,8 +143,8 @@ class Said:
     level_w: float = 0.0
 
 
-class Told:
-    """A monitor that alarms when it is told to; its state counts periods."""
+class ScriptedMonitor:
+    """A monitor that alarms in the given periods; its state counts them."""
 
     def __init__(self, alarms=(), frozen=()):
         self._alarms, self._frozen = alarms, frozen
@@ -141,4 +154,4 @@ class Told:
 
     def update(self, state, y, u_prev, estimate):
         frozen = any(a <= state < b for a, b in self._frozen)
-        return state + 1, Said(frozen or any(a <= state < b for a, b in self._alarms), frozen)
+        return state + 1, ScriptedReading(frozen or any(a <= state < b for a, b in self._alarms), frozen)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import cart
 import numpy as np
 import pytest
-from closed_loop_parts import Told
+from closed_loop_parts import ScriptedMonitor
 from online_models import PendulumPlant, linear_model, pendulum_model
 
 from hybrid_mpc import (
@@ -187,7 +187,7 @@ def test_a_guard_keeps_to_limits_beside_zero(mode):
     ocp = OCP(10, (30.0, 1.0), [0.05], [0.05], [0.5], [2.0])
     safe = SafeController(CondensedController(model, ocp), model)
     guard = Guard(mode, limits=Limits([-INF], [1.0]))
-    told = Loop(TrueState(model), safe, monitor=Told([(0, 99)]), guard=guard)
+    told = Loop(TrueState(model), safe, monitor=ScriptedMonitor([(0, 99)]), guard=guard)
     truth = [0.5, 0.0]
     told.start([0.5], truth=truth)
     for _ in range(4):

@@ -25,6 +25,7 @@ from hybrid_mpc.monitor.energy import EnergyMonitor, Verdict
 from hybrid_mpc.monitor.learn import guard_monitor, learn_from
 from hybrid_mpc.monitor.lengths import HISTORY_S, samples
 from hybrid_mpc.monitor.replay import EstimatorLike, MonitorTrace, TrajectoryLike, along, replay
+from hybrid_mpc.monitor.residuals import force_units
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import Scenario
 
@@ -235,7 +236,7 @@ def watch(job: MonitorJob, out: Path, progress: Progress | None = None) -> Monit
         name = recording.name.replace("#", "_")
         write_text(out / f"{name}.csv", table(trace, recording, model.outputs))
         figure = overview(
-            trace, recording.y[:, 0], output=model.outputs[0], force_unit=force_unit(model), thresholds=limits,
+            trace, recording.y[:, 0], output=model.outputs[0], force_unit=force_units(model)[0], thresholds=limits,
             notes=[(alarm.start_s, alarm.diagnosis) for alarm in alarms if alarm.diagnosis], title=name,
         )  # fmt: skip
         save(figure, out / f"{name}.png")
@@ -252,16 +253,6 @@ def watch(job: MonitorJob, out: Path, progress: Progress | None = None) -> Monit
     }
     write_json(out / "monitor.json", result)
     return MonitorResult(tuple(rows), tuple(gaps), tuple(short))
-
-
-def force_unit(model: HybridModel) -> str:
-    """Unit of the residual force: the stored energy over the first position.
-
-    Args:
-        model: The model, with a balance of energy.
-    """
-    energy = next(balance for balance in model.balances if balance.name == "energy")
-    return f"{energy.unit}/{model.states[0].unit}"
 
 
 def watched(

@@ -1,4 +1,4 @@
-"""A loop that reacts: on an alarm tighter limits, another controller, or rest; and back, without a bump."""
+"""The guard: on an alarm the loop goes over to tighter limits, another controller or rest, and back without a bump."""
 
 from __future__ import annotations
 
@@ -60,19 +60,18 @@ class Switch:
 class Guard:
     """What a loop does on alarms of its monitor.
 
-    A reading of one period acts in the next. To a more careful mode the guard goes at once; back, when the alarm that
-    asked for it has been off for ``quiet`` and the mode has lasted for ``dwell``. On the way from one controller to
-    another nothing jumps: the input is held within ``du_max`` of the last one, the new controller begins from the old
-    one's plan, and both estimators run all the time. While no alarm comes the loop is the same as without a guard.
+    A reading acts in the next period. The guard goes to a more careful mode at once, and back when the alarm that asked
+    for it has been off for ``quiet`` and the mode has lasted for ``dwell``. Between two controllers nothing jumps: the
+    input stays within ``du_max`` of the last one, the new controller begins from the old one's plan, and both
+    estimators run all the time. Without an alarm the loop is the same as without a guard.
 
-    A frozen sensor and a machine at rest look alike: in ``REST`` the guard stays there until the sensor moves.
-
-    A monitor that judges nothing for longer than its windows (``reading.blind``: samples are missing, or model or
-    estimator gives no number) has failed: that is no quiet, and asks for ``on_model`` as a doubt of the model does.
+    A frozen sensor and a machine at rest look alike: the guard stays in ``REST`` until the sensor moves. A monitor that
+    is blind for longer than its windows (``reading.blind``: samples are missing, or model or estimator gives no number)
+    asks for ``on_model`` as a doubt of the model does.
 
     Args:
         on_model: Mode where the model does not describe the machine, or nobody can say whether it does. Default:
-            ``LIMITED`` or ``BACKUP``, whichever there is something for, else ``FALLBACK``.
+            ``BACKUP`` if there is one, else ``LIMITED`` if there are limits, else ``FALLBACK``.
         on_sensor: Mode where the sensor is frozen (``reading.frozen``). Default ``REST``.
         limits: Bounds of the inputs in every mode but ``NORMAL``. Default: the problem's own.
         backup: Controller of ``BACKUP``; a bare one is guarded without fallback.
@@ -80,8 +79,8 @@ class Guard:
         dwell: Shortest time [s] in a mode before going back. Default 0.5.
         quiet: Time [s] without alarm before going back. Default 1.
         patience: Time [s] for which the model must have been in doubt before ``on_model``; alarms less than ``quiet``
-            apart count as one. A push is over by then, and the normal controller's observer deals with it better than
-            a backup that takes it for a fault. A frozen sensor is never waited for. Default 0: at once.
+            apart count as one. A push is over by then, and the normal controller's observer handles it better than a
+            backup that takes it for a fault. A frozen sensor acts at once, always. Default 0.
 
     Raises:
         InputError: If a mode lacks what it needs, a time is negative, or there is patience without quiet.
@@ -245,8 +244,8 @@ class GuardedController:
             wanted, why = guard.on_sensor, "the sensor repeats itself while motion is predicted"
         elif on and alarm - doubt >= guard.patience - TINY:
             blind = getattr(reading, "blind", False)
-            said = "the monitor cannot judge" if blind else "the model does not describe the machine"
-            wanted, why = guard.on_model, said
+            wanted = guard.on_model
+            why = "the monitor cannot judge" if blind else "the model does not describe the machine"
         else:
             wanted, why = Mode.NORMAL, f"no alarm for {guard.quiet:g} s"
         if wanted < state.mode and t - state.since < guard.dwell - TINY:

@@ -1,4 +1,15 @@
-"""The loop: what happens in one period, in which order, and what is remembered from one to the next."""
+"""The loop: the one place that knows what happens in a period, in which order, and what is remembered.
+
+A period of :class:`Loop` is::
+
+    step(y)   estimate   from the sample, and the input that acted since the one before
+              guard      the mode that the last period asked for begins; its estimator takes the sample too
+              decide     the controller of that mode solves; the safeguards make an admissible input of it
+    (the driver hands the input over)
+    finish()  monitor    compares the model with the sample, the estimate and the input that acted
+              guard      asks for the mode of the next period
+              prepare    the part of the next solve that needs no sample
+"""
 
 from __future__ import annotations
 
@@ -19,7 +30,8 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.delay import filtered, sees_truth
 from hybrid_mpc.estimate.kalman import Estimate, Estimator
 from hybrid_mpc.loop.guard import Guard, GuardedController, GuardState, Switch
-from hybrid_mpc.loop.plant import Preview, Previews, fitting
+from hybrid_mpc.loop.plant import fitting
+from hybrid_mpc.loop.preview import Preview, Previews
 from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
@@ -62,11 +74,11 @@ class LoopState:
     Args:
         k: Number of the period that the last step began.
         y: Its measurement ``(n_y,)``; NaN where there was none.
-        estimate: What is believed; None after a long break, until the next sample.
+        estimate: The estimate; None after a long break, until the next sample.
         decision: The input that is held, and the plan to go on from.
         guard: Modes and the backup's estimate.
         monitor: The monitor's memory; None without one.
-        held: Inputs ``(n_u,)`` that were commanded, the oldest first, back to the one that acted before the sample.
+        inputs: Inputs ``(n_u,)`` from the one that acted before the sample to the last one, the oldest first.
         mode: Who gives the input.
         finished: Whether the monitor has seen the period.
     """
@@ -77,14 +89,14 @@ class LoopState:
     decision: Decision
     guard: GuardState
     monitor: Any
-    held: tuple[Array, ...]
+    inputs: tuple[Array, ...]
     mode: Literal["automatic", "manual"] = "automatic"
     finished: bool = False
 
 
 @dataclass(frozen=True)
-class _Period:
-    """What the step in hand was decided from."""
+class _Basis:
+    """What the decision of this period was made from; :meth:`Loop.late` makes another one from it."""
 
     previous: Decision
     guard: GuardState
@@ -103,9 +115,9 @@ class _Ahead:
 
 
 class Loop:
-    """Estimator, controller and monitor, a period at a time: the one place that knows their order.
+    """Estimator, controller and monitor, a period at a time.
 
-    Whoever drives it has the clock: :func:`~hybrid_mpc.loop.simulate` a virtual one,
+    Its driver has the clock: :func:`~hybrid_mpc.loop.simulate` a virtual one,
     :class:`~hybrid_mpc.loop.realtime.Runner` a real one, or a loop of your own::
 
         loop = Loop(estimator, controller, monitor=monitor, reference=reference)
@@ -116,10 +128,8 @@ class Loop:
             wait()
             u = loop.step(read())
 
-    A step estimates with the sample and with the input that was held since the one before, and decides on the next
-    input; :meth:`finish` monitors, lets the guard choose the next period's mode, and prepares the next solve. Its input
-    is the same whether ``finish`` was called or left to the next step. Numbers never raise: an input is within the
-    limits whatever sample, model or solver say.
+    The inputs are the same whether ``finish`` is called or left to the next step. Numbers never raise: an input is
+    within the limits whatever sample, model or solver say.
 
     Args:
         estimator: Filter, or :class:`~hybrid_mpc.estimate.kalman.TrueState`, which each step has to be given the truth.
@@ -173,110 +183,23 @@ class Loop:
         now: Callable[[], float] = perf_counter,
     ) -> None:
         safe = controller if isinstance(controller, SafeController) else SafeController(controller)
-        self._estimator, self._safe, self._monitor = estimator, safe, monitor
         self.model, self.ocp = estimator.model, safe.controller.ocp
         _check_models(self.model, safe.controller.model)
         _check_monitor(monitor, self.model)
         if guard is not None and monitor is None:
             raise InputError("a guard acts on a monitor's alarms; give monitor= as well")
+        self._estimator, self._safe, self._monitor = estimator, safe, monitor
         self._control = GuardedController(safe, guard)
-        self._delay = whole_delay(input_delay, "input_delay")
-        self._under_way = self._delay + whole_delay(sensor_delay, "sensor_delay") + 1
-        self._previews = Previews(
-            preview_of(reference, self.ocp), weight, self.ocp, horizon, self.model.dt, end
-        )
+        self._delay = _whole_delay(input_delay, "input_delay")
+        self._n_inputs = self._delay + _whole_delay(sensor_delay, "sensor_delay") + 1
+        self._previews = Previews(reference, weight, self.ocp, horizon, self.model.dt, end)
         self._truth, self._now = sees_truth(estimator), now
         self._state: LoopState | None = None
-        self._period: _Period | None = None
+        self._basis: _Basis | None = None
         self._ahead: _Ahead | None = None
         self._reading: Reading | None = None
         self._previewed: tuple[Array, Array | None] = np.zeros((0, self.ocp.n_x)), None
         self._spent = dict.fromkeys(TIMED, 0.0)
-
-    @property
-    def state(self) -> LoopState:
-        """All that the loop remembers.
-
-        Raises:
-            InputError: Before :meth:`start`.
-        """
-        if self._state is None:
-            raise InputError("the loop has not begun; call start() with the first sample")
-        return self._state
-
-    @property
-    def safe_input(self) -> Array:
-        """Input ``(n_u,)`` that the machine is left with where nothing is known, as the controller has it."""
-        return self._safe.safe_input.copy()
-
-    @property
-    def t(self) -> float:
-        """Time [s] of the period in hand, since the start."""
-        return self.state.k * self.model.dt
-
-    @property
-    def estimate(self) -> Estimate:
-        """What is believed in the period in hand."""
-        known = self.state.estimate
-        assert known is not None  # every step makes one
-        return known
-
-    @property
-    def decision(self) -> Decision:
-        """The input that is held, and where it came from."""
-        return self.state.decision
-
-    @property
-    def reading(self) -> Reading | None:
-        """What the monitor said last; None without one."""
-        return self._reading
-
-    @property
-    def previewed(self) -> tuple[Array, Array | None]:
-        """Reference ``(m, n_x)`` and factors on ``q`` (None for 1) that the period in hand was decided on."""
-        return self._previewed
-
-    @property
-    def switches(self) -> tuple[Switch, ...]:
-        """Changes of the guard's mode until now."""
-        return self.state.guard.switches
-
-    @property
-    def spent(self) -> Mapping[str, float]:
-        """Durations [s] of the period in hand, by the names of ``TIMED``."""
-        return self._spent
-
-    @property
-    def mode(self) -> Literal["automatic", "manual"]:
-        """Who gives the input: the controller, or in ``"manual"`` an operator, whose inputs are ``applied``.
-
-        While manual, the estimator goes on with the inputs that really act, so that nothing winds up, and the input
-        that a step returns is the operator's last one. Back in automatic the controller begins from it, within
-        ``du_max``.
-        """
-        return self.state.mode
-
-    @mode.setter
-    def mode(self, mode: Literal["automatic", "manual"]) -> None:
-        if mode not in ("automatic", "manual"):
-            raise InputError(f"mode: 'automatic' or 'manual' needed, got {mode!r}")
-        self._state = replace(self.state, mode=mode)
-
-    def restore(self, state: LoopState) -> Array:
-        """Go on from a state, which a loop of the same parts had.
-
-        Args:
-            state: What :attr:`state` was.
-
-        Returns:
-            The input that is held ``(n_u,)``.
-
-        Raises:
-            InputError: If it is no state, or that of a loop of another model or horizon.
-        """
-        _check_state(state, self.model, self.ocp, self._monitor)
-        self._state, self._period, self._ahead, self._reading = state, None, None, None
-        return state.decision.u
 
     def start(
         self,
@@ -290,7 +213,7 @@ class Loop:
 
         Args:
             y: First sample ``(n_y,)``; None or NaN: missing.
-            truth: What the plant knows, for an estimator that is told it.
+            truth: The true ``(x, h)``, for an estimator that needs it.
             reference: As in :meth:`step`.
             in_time: As in :meth:`step`.
 
@@ -301,9 +224,7 @@ class Loop:
         x_ref, factors = self._preview(0, reference)
         estimate = self._estimator.start(self._seen(sample, truth), 0.0)
         first = self._safe.initial(estimate, None, x_ref, factors)
-        memory = None if self._monitor is None else self._monitor.initial()
-        held = (first.u,) * self._under_way
-        self._state = LoopState(0, sample, estimate, first, GuardState(), memory, held)
+        self._state = self._first_state(sample, estimate, first)
         self._ahead, self._reading, self._spent = None, None, dict.fromkeys(TIMED, 0.0)
         return self._decide(first, x_ref, factors, in_time)
 
@@ -325,7 +246,7 @@ class Loop:
             applied: Input ``(n_u,)`` that really acted since the last step, where the actuator says so; an operator's,
                 in manual mode. Default: the one that the last step returned.
             reference: ``(n_x,)`` or ``(m, n_x)`` from now on in steps of ``dt``, in place of the loop's own.
-            truth: What the plant knows, for an estimator that is told it.
+            truth: The true ``(x, h)``, for an estimator that needs it.
             in_time: Asked before the solve: may it begin? If not, the last plan is followed, as :meth:`late` does.
                 Default: it may.
 
@@ -341,32 +262,51 @@ class Loop:
             raise InputError(
                 f"step: {np.size(w)} measured disturbances given, model {self.model.name} has none"
             )
-        previous, held = state.decision, state.held
+        previous, inputs = state.decision, state.inputs
         if applied is not None:
             previous = _with_input(previous, fitting(applied, self.ocp.n_u, "applied"))
-            held = (*held[:-1], previous.u)
-        k = state.k + 1
-        begin = self._now()
+            inputs = (*inputs[:-1], previous.u)
+        begin, k = self._now(), state.k + 1
         x_ref, factors = self._preview(k, reference)
-        seen, t = self._seen(sample, truth), k * self.model.dt
+        seen = self._seen(sample, truth)
         if state.estimate is None:
-            estimate = self._estimator.start(seen, t)
+            estimate = self._estimator.start(seen, k * self.model.dt)
         else:
             estimate = self._estimator.update(state.estimate, seen, previous.u)
-        self._state = replace(state, k=k, y=sample, estimate=estimate, held=held, finished=False)
+        self._state = replace(state, k=k, y=sample, estimate=estimate, inputs=inputs, finished=False)
         self._spent = {**dict.fromkeys(TIMED, 0.0), "estimate": self._now() - begin}
         return self._decide(previous, x_ref, factors, in_time)
+
+    def _decide(
+        self, previous: Decision, x_ref: Array, factors: Array | None, in_time: Callable[[], bool] | None
+    ) -> Array:
+        """The input of this period, by the controller of the guard's mode or by the operator."""
+        state, estimate = self.state, self.estimate
+        self._previewed = x_ref, factors
+        guard = self._control.measured(state.guard, self.t, state.y, previous.u)
+        self._basis = _Basis(previous, guard, estimate, x_ref)
+        may_solve = in_time is None or in_time()
+        begin = self._now()
+        if state.mode == "manual":
+            decision = self._operated(previous, estimate)
+        elif may_solve:
+            decision, guard = self._control.decide(
+                guard, previous, estimate, x_ref, factors, prepared=self._prepared(previous, factors)
+            )
+        else:
+            decision, guard = self._control.late(guard, previous, estimate, x_ref)
+        self._spent["solve"] = self._now() - begin
+        self._state = replace(state, decision=decision, guard=guard)
+        return decision.u
 
     def late(self) -> Array:
         """The input of this period where the solve has missed its deadline: the last plan, shifted.
 
         To be called after :meth:`step`, in place of the input that it returned.
         """
-        period = self._period
-        if period is not None and self.state.mode == "automatic":
-            decision, guard = self._control.late(
-                period.guard, period.previous, period.estimate, period.reference
-            )
+        basis = self._basis
+        if basis is not None and self.state.mode == "automatic":
+            decision, guard = self._control.late(basis.guard, basis.previous, basis.estimate, basis.reference)
             self._state = replace(self.state, decision=decision, guard=guard)
         return self.state.decision.u
 
@@ -378,16 +318,15 @@ class Loop:
         state = self.state
         if state.finished:
             return
-        self._period = None
+        self._basis = None
         begin, guard, memory = self._now(), state.guard, state.monitor
         if self._monitor is not None:
-            assert state.estimate is not None
             memory, self._reading = self._monitor.update(
-                memory, state.y, state.held[0], filtered(state.estimate)
+                memory, state.y, state.inputs[0], filtered(self.estimate)
             )
             guard = self._control.watched(guard, self.t, self._reading)
-        held = (*state.held[1:], state.decision.u)
-        self._state = state = replace(state, guard=guard, monitor=memory, held=held, finished=True)
+        inputs = (*state.inputs[1:], state.decision.u)
+        self._state = state = replace(state, guard=guard, monitor=memory, inputs=inputs, finished=True)
         middle = self._now()
         if state.mode == "automatic":
             previews = self._previews((state.k + 1 + self._delay) * self.model.dt)
@@ -417,66 +356,122 @@ class Loop:
             for i in range(1, n + 1):
                 estimate = self._estimator.update(estimate, missing, u)
                 guard = self._control.measured(guard, (state.k + i) * self.model.dt, missing, u)
-        held = (*state.held, *([u] * min(n, self._under_way)))[-self._under_way :]
-        self._state = replace(state, k=state.k + n, estimate=estimate, guard=guard, held=held)
+        inputs = (*state.inputs, *([u] * min(n, self._n_inputs)))[-self._n_inputs :]
+        self._state = replace(state, k=state.k + n, estimate=estimate, guard=guard, inputs=inputs)
 
     def warm_up(self) -> None:
         """Call every part once, at rest, and forget it: first calls are slow."""
-        kept = self._state, self._period, self._ahead, self._reading, self._spent
+        before = self._state, self._basis, self._ahead, self._reading, self._spent
         y, truth = np.zeros(self.model.n_y), np.zeros(self.model.n_x + self.model.n_h)
         x_ref, factors = self._preview(0, None)
         estimate = self._estimator.start(truth if self._truth else y, 0.0)
-        memory = None if self._monitor is None else self._monitor.initial()
         first = self._safe.initial(estimate)
-        self._state = LoopState(0, y, estimate, first, GuardState(), memory, (first.u,) * self._under_way)
-        self._ahead = None
+        self._state, self._ahead = self._first_state(y, estimate, first), None
         self._decide(first, x_ref, factors, None)
         self.step(y, truth=truth)
         self.late()
         self.finish()
-        self._state, self._period, self._ahead, self._reading, self._spent = kept
+        self._state, self._basis, self._ahead, self._reading, self._spent = before
 
-    def _decide(
-        self, previous: Decision, x_ref: Array, factors: Array | None, in_time: Callable[[], bool] | None
-    ) -> Array:
-        """The input of this period, by whom the modes say; in the state from here on."""
-        state = self.state
-        assert state.estimate is not None
-        self._previewed = x_ref, factors
-        guard = self._control.measured(state.guard, self.t, state.y, previous.u)
-        self._period = period = _Period(previous, guard, state.estimate, x_ref)
-        in_time_now = in_time is None or in_time()
-        begin = self._now()
-        if state.mode == "manual":
-            decision = self._followed(period)
-        elif in_time_now:
-            decision, guard = self._control.decide(
-                guard, previous, state.estimate, x_ref, factors, prepared=self._ready(previous, factors)
-            )
-        else:
-            decision, guard = self._control.late(guard, previous, state.estimate, x_ref)
-        self._spent["solve"] = self._now() - begin
-        self._state = replace(state, decision=decision, guard=guard)
-        return decision.u
+    def restore(self, state: LoopState) -> Array:
+        """Go on from a state, which a loop of the same parts had.
 
-    def _followed(self, period: _Period) -> Decision:
-        """The operator's input goes on, and so does the plan that automatic would begin from."""
-        u, estimate = period.previous.u, period.estimate
-        known = bool(np.all(np.isfinite(np.concatenate([estimate.x, estimate.h, estimate.d, u]))))
-        plan = period.previous.solution
-        if known:
-            plan = self._safe.controller.initial(estimate, np.tile(u, (self.ocp.horizon, 1)))
-            plan = _held(plan, u)
-        return Decision(u, Source.MANUAL, plan, Status.INITIAL, 0)
+        Args:
+            state: What :attr:`state` was.
 
-    def _ready(self, previous: Decision, weight: Array | None) -> Prepared | None:
-        """What :meth:`finish` has prepared, if it is for this solve."""
-        ahead = self._ahead
-        if ahead is None or ahead.decision is not previous:
-            return None
-        made = ahead.previews[1]
-        alike = made is weight or (made is not None and weight is not None and np.array_equal(made, weight))
-        return ahead.prepared if alike else None
+        Returns:
+            The input that is held ``(n_u,)``.
+
+        Raises:
+            InputError: If it is no state, or that of a loop of another model or horizon.
+        """
+        _check_state(state, self.model, self.ocp, self._monitor)
+        self._state, self._basis, self._ahead, self._reading = state, None, None, None
+        return state.decision.u
+
+    @property
+    def mode(self) -> Literal["automatic", "manual"]:
+        """Who gives the input: the controller, or in ``"manual"`` an operator, whose inputs are ``applied``.
+
+        While manual, the estimator goes on with the inputs that really act, so that nothing winds up, and the input
+        that a step returns is the operator's last one. Back in automatic the controller begins from it, within
+        ``du_max``.
+        """
+        return self.state.mode
+
+    @mode.setter
+    def mode(self, mode: Literal["automatic", "manual"]) -> None:
+        if mode not in ("automatic", "manual"):
+            raise InputError(f"mode: 'automatic' or 'manual' needed, got {mode!r}")
+        self._state = replace(self.state, mode=mode)
+
+    @property
+    def state(self) -> LoopState:
+        """All that the loop remembers.
+
+        Raises:
+            InputError: Before :meth:`start`.
+        """
+        if self._state is None:
+            raise InputError("the loop has not begun; call start() with the first sample")
+        return self._state
+
+    @property
+    def t(self) -> float:
+        """Time [s] of this period, since the start."""
+        return self.state.k * self.model.dt
+
+    @property
+    def estimate(self) -> Estimate:
+        """The estimate of this period."""
+        estimate = self.state.estimate
+        assert estimate is not None  # every step makes one
+        return estimate
+
+    @property
+    def decision(self) -> Decision:
+        """The input that is held, and where it came from."""
+        return self.state.decision
+
+    @property
+    def reading(self) -> Reading | None:
+        """What the monitor said last; None without one."""
+        return self._reading
+
+    @property
+    def switches(self) -> tuple[Switch, ...]:
+        """Changes of the guard's mode until now."""
+        return self.state.guard.switches
+
+    @property
+    def previewed(self) -> tuple[Array, Array | None]:
+        """Reference ``(m, n_x)`` and factors on ``q`` (None for 1) of this period's decision."""
+        return self._previewed
+
+    @property
+    def spent(self) -> Mapping[str, float]:
+        """Durations [s] of this period, by the names of ``TIMED``."""
+        return self._spent
+
+    @property
+    def safe_input(self) -> Array:
+        """Input ``(n_u,)`` that the machine is left with where nothing is known, as the controller has it."""
+        return self._safe.safe_input.copy()
+
+    def _first_state(self, sample: Array, estimate: Estimate, first: Decision) -> LoopState:
+        memory = None if self._monitor is None else self._monitor.initial()
+        return LoopState(0, sample, estimate, first, GuardState(), memory, (first.u,) * self._n_inputs)
+
+    def _sample(self, y: ArrayLike | None) -> Array:
+        return np.full(self.model.n_y, np.nan) if y is None else fitting(y, self.model.n_y, "the measurement")
+
+    def _seen(self, sample: Array, truth: ArrayLike | None) -> Array:
+        """What the estimator takes: the sample, or the truth."""
+        if not self._truth:
+            return sample
+        if truth is None:
+            raise InputError("this estimator takes the true state; give truth=, or take a filter")
+        return np.asarray(truth, dtype=np.float64)
 
     def _preview(self, k: int, reference: ArrayLike | None) -> tuple[Array, Array | None]:
         """Reference and factors of period k, at the instants at which its input acts."""
@@ -488,51 +483,22 @@ class Loop:
             x_ref = np.atleast_2d(np.asarray(reference, dtype=np.float64))
         return x_ref, factors
 
-    def _sample(self, y: ArrayLike | None) -> Array:
-        return np.full(self.model.n_y, np.nan) if y is None else fitting(y, self.model.n_y, "the measurement")
+    def _prepared(self, previous: Decision, weight: Array | None) -> Prepared | None:
+        """What :meth:`finish` has prepared, if it is for this solve."""
+        ahead = self._ahead
+        if ahead is None or ahead.decision is not previous:
+            return None
+        used = ahead.previews[1]
+        same = used is weight or (used is not None and weight is not None and np.array_equal(used, weight))
+        return ahead.prepared if same else None
 
-    def _seen(self, sample: Array, truth: ArrayLike | None) -> Array:
-        if not self._truth:
-            return sample
-        if truth is None:
-            raise InputError("this estimator is told the true state; give truth=, or take a filter")
-        return np.asarray(truth, dtype=np.float64)
-
-
-def preview_of(reference: Preview | ArrayLike | None, ocp: OCP) -> Preview:
-    """A function of time from a reference given as one, as a set-point, or not at all.
-
-    Args:
-        reference: See :class:`Loop`.
-        ocp: The problem, for the sizes.
-
-    Raises:
-        InputError: If a set-point has another size.
-
-    Example:
-        >>> preview_of([0.5], OCP(9, [1.0], [0.1], [0.1], [-1.0], [1.0]))(np.zeros(2)).tolist()
-        [[0.5], [0.5]]
-    """
-    if callable(reference):
-        return reference
-    columns = ocp.n_x + ocp.n_p
-    goal = np.zeros(columns) if reference is None else np.asarray(reference, dtype=np.float64)
-    if goal.shape != (columns,):
-        raise InputError(
-            f"reference: a function of time or a set-point of shape {(columns,)} needed, got shape {goal.shape}"
-        )
-    return lambda t: np.tile(goal, (len(t), 1))
-
-
-def whole_delay(delay: int, name: str) -> int:
-    """A number of periods.
-
-    Raises:
-        InputError: If it is no whole number, or negative.
-    """
-    if int(delay) != delay or delay < 0:
-        raise InputError(f"{name}: a whole number of periods needed, not negative; got {delay}")
-    return int(delay)
+    def _operated(self, previous: Decision, estimate: Estimate) -> Decision:
+        """The operator's input goes on, and so does the plan that automatic would begin from."""
+        u, plan = previous.u, previous.solution
+        if np.all(np.isfinite(np.concatenate([estimate.x, estimate.h, estimate.d, u]))):
+            plan = self._safe.controller.initial(estimate, np.tile(u, (self.ocp.horizon, 1)))
+            plan = _beginning_with(u, plan)
+        return Decision(u, Source.MANUAL, plan, Status.INITIAL, 0)
 
 
 def _with_input(decision: Decision, u: Array) -> Decision:
@@ -540,12 +506,43 @@ def _with_input(decision: Decision, u: Array) -> Decision:
     u = np.where(np.isfinite(u), u, decision.u)
     if np.array_equal(u, decision.u):
         return decision
-    return replace(decision, u=u, solution=_held(decision.solution, u))
+    return replace(decision, u=u, solution=_beginning_with(u, decision.solution))
 
 
-def _held(plan: Any, u: Array) -> Any:
-    """The plan with ``u`` as the input that is held."""
+def _beginning_with(u: Array, plan: Any) -> Any:
+    """The plan with ``u`` as its first input."""
     return replace(plan, u=np.vstack([u[None], plan.u[1:]]))
+
+
+def _whole_delay(delay: int, name: str) -> int:
+    if int(delay) != delay or delay < 0:
+        raise InputError(f"{name}: a whole number of periods needed, not negative; got {delay}")
+    return int(delay)
+
+
+def _check_models(estimated: HybridModel, controlled: HybridModel) -> None:
+    sizes = [(m.n_x, m.n_h, m.n_u) for m in (estimated, controlled)]
+    if sizes[0] != sizes[1]:
+        raise InputError(
+            f"the estimator's model {estimated.name} has (n_x, n_h, n_u) = {sizes[0]}, "
+            f"the controller's model {controlled.name} {sizes[1]}; give both the same model"
+        )
+    if abs(controlled.dt - estimated.dt) > 1e-9 * estimated.dt:
+        raise InputError(
+            f"the estimator's period is {estimated.dt} s, the controller's {controlled.dt} s; they must agree"
+        )
+
+
+def _check_monitor(monitor: Monitor | None, model: HybridModel) -> None:
+    own: HybridModel | None = getattr(monitor, "model", None)
+    if own is None:
+        return
+    sizes = [(m.n_x, m.n_h, m.n_u, m.n_y) for m in (own, model)]
+    if sizes[0] != sizes[1]:
+        raise InputError(
+            f"the monitor's model {own.name} has (n_x, n_h, n_u, n_y) = {sizes[0]}, the estimator's model {model.name} "
+            f"{sizes[1]}; give both the same model, e.g. kit.monitor({model.name!r})"
+        )
 
 
 def _check_state(state: LoopState, model: HybridModel, ocp: OCP, monitor: Monitor | None) -> None:
@@ -570,28 +567,3 @@ def _check_state(state: LoopState, model: HybridModel, ocp: OCP, monitor: Monito
         )
     if wrong:
         raise InputError(f"restore: the state is of a loop of other parts: {'; '.join(wrong)}")
-
-
-def _check_monitor(monitor: Monitor | None, model: HybridModel) -> None:
-    own: HybridModel | None = getattr(monitor, "model", None)
-    if own is None:
-        return
-    sizes = [(m.n_x, m.n_h, m.n_u, m.n_y) for m in (own, model)]
-    if sizes[0] != sizes[1]:
-        raise InputError(
-            f"the monitor's model {own.name} has (n_x, n_h, n_u, n_y) = {sizes[0]}, the estimator's model {model.name} "
-            f"{sizes[1]}; give both the same model, e.g. kit.monitor({model.name!r})"
-        )
-
-
-def _check_models(estimated: HybridModel, controlled: HybridModel) -> None:
-    sizes = [(m.n_x, m.n_h, m.n_u) for m in (estimated, controlled)]
-    if sizes[0] != sizes[1]:
-        raise InputError(
-            f"the estimator's model {estimated.name} has (n_x, n_h, n_u) = {sizes[0]}, "
-            f"the controller's model {controlled.name} {sizes[1]}; give both the same model"
-        )
-    if abs(controlled.dt - estimated.dt) > 1e-9 * estimated.dt:
-        raise InputError(
-            f"the estimator's period is {estimated.dt} s, the controller's {controlled.dt} s; they must agree"
-        )

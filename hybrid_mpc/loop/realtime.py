@@ -1,4 +1,9 @@
-"""The door to hardware: estimator, controller and monitor in step with a real clock."""
+"""The loop in real time: against a machine's callbacks, in step with a clock, and with a safe end.
+
+:class:`Runner` is what a user makes; each of its runs is a :class:`_Run`, which gives a :class:`RunReport`. Whatever
+ends a run, :class:`SafeEnd` hands over the safe input first. So does a clock that does not keep time
+(:class:`CheckedClock`).
+"""
 
 from __future__ import annotations
 
@@ -11,6 +16,7 @@ import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from types import FrameType, TracebackType
 from typing import Any, Protocol
 
@@ -24,101 +30,277 @@ from hybrid_mpc.estimate.delay import sees_truth
 from hybrid_mpc.estimate.kalman import Estimate, Estimator
 from hybrid_mpc.loop.guard import Guard, Switch
 from hybrid_mpc.loop.loop import Loop, Monitor, Reading
-from hybrid_mpc.loop.plant import Preview, fitting
-from hybrid_mpc.model.model import HybridModel
-
-# Clocks for the real-time runner, and the record of how it kept time.
+from hybrid_mpc.loop.plant import fitting
+from hybrid_mpc.loop.preview import Preview
 
 Array = NDArray[np.float64]
 TIMED = ("measure", "estimate", "solve", "actuate", "monitor", "prepare")
 """What of a period is timed, in this order: the input is out after ``actuate``."""
+RECENT = 25
+"""Solves whose fastest tells whether another one still fits before a deadline."""
 QUANTILES = {"median": 0.5, "p95": 0.95, "p99": 0.99, "max": 1.0}
+ENDING = tuple(
+    getattr(signal, name)
+    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGBREAK", "SIGXCPU", "SIGTSTP")
+    if hasattr(signal, name)
+)
+"""Signals that ask a program to end or to stand still, as far as the operating system has them: Ctrl-C, ``kill``, a
+terminal that closes, Ctrl-\\, Ctrl-Break, a used-up limit of computing time, Ctrl-Z."""
+PAUSES_S = (0.0, 0.01, 0.1, 1.0)
+"""Pauses [s] before each further try to hand the safe input over: none after a message that a signal has cut off, then
+what a bus or its driver may need to recover. No more, since a process that is to end must end."""
 EARLY = 1e-3
 """Share of a period by which a wait may end early: rounding, and what no controller notices."""
 WAKES = 10
 """Waits for one instant that may end early, one after the other: a sleep that something woke is slept again."""
 
 
-class Clock(Protocol):
-    """What the runner knows of time."""
+class Runner:
+    """Steps estimator, controller and monitor against a machine's sensors and actuators, in real time.
 
-    def now(self) -> float:
-        """Time [s] on a scale that never goes back."""
+    It drives a :class:`~hybrid_mpc.loop.loop.Loop`. Before the clock starts, while the machine rests: the first sample,
+    and plan and input from it. Each period: wait for its instant, measure, estimate, decide, actuate, then what the
+    loop leaves until after the input (monitor, preparation of the next solve). A missing sample leaves the prediction.
+    A solve is never interrupted: one that comes back after the deadline is dropped, one that cannot be in time any more
+    is not begun, and the shifted plan is applied (:meth:`~hybrid_mpc.control.safeguard.SafeController.late`). After a
+    long delay the run goes on at the grid's nearest instant; the estimator is led through the periods in between
+    without a measurement.
 
-    def sleep_until(self, t: float) -> None:
-        """Return at ``t`` [s] or as soon as possible after it; at once if it has passed."""
+    Numbers never raise. Whatever ends the run, exceptions in callbacks and signals (Ctrl-C, SIGTERM, SIGHUP, ...)
+    included, the safe input is handed to the actuator before anything else (:class:`SafeEnd`); then the exception is
+    raised on, or the signal has its effect. Signals reach Python's main thread alone: in another thread ``stop`` ends
+    a run. What no program can catch (SIGKILL, a hang in a driver, a power cut) takes a watchdog in the actuator;
+    ``docs/control.md`` has one. ``actuate`` may be broken off by a signal, and is then called with the safe input.
 
-
-class RealClock:
-    """The computer's monotonic clock.
-
-    Example:
-        >>> clock = RealClock()
-        >>> until = clock.now() + 0.002
-        >>> clock.sleep_until(until)
-        >>> clock.now() >= until
-        True
-    """
-
-    def now(self) -> float:
-        """Time [s] since some fixed instant."""
-        return time.perf_counter()
-
-    def sleep_until(self, t: float) -> None:
-        """Sleep; the operating system decides how punctual the return is."""
-        while (left := t - time.perf_counter()) > 0:
-            time.sleep(left)
-
-
-class CheckedClock:
-    """A clock that is held to its word: a loop on one that stands still would spin for ever.
+    Without a delay the input is assumed to act from the grid's instant on: keep steps short against the period, or
+    declare the delay (:class:`~hybrid_mpc.estimate.delay.DelayCompensation`).
 
     Args:
-        clock: The clock.
-        dt: Period [s] of the loop, against which it is judged how early a wait ends.
+        measure: ``() -> y (n_y,)``, or None where no sample has come.
+        actuate: Takes the input ``u (n_u,)``, to be held until the next.
+        estimator: Filter on the controller's model.
+        controller: A :class:`~hybrid_mpc.control.safeguard.SafeController`; a bare controller is guarded without
+            fallback.
+        reference: ``t (n,) [s] -> x_ref (n, n_x)``, previewed over the horizon; ``t`` counts from the start.
+        weight: Factors on ``q``, alike. Default: 1.
+        horizon: Periods of preview. Default: the controller's horizon.
+        monitor: Default: none.
+        deadline: Time [s] after a period's instant by which its input must be decided. Default: one period.
+        safe_input: Input ``(n_u,)`` within the limits for the end of the run. Default: the controller's.
+        input_delay: Periods after which an input acts, as the estimator knows it; shifts the preview.
+        sensor_delay: Periods after which a measurement arrives; pairs it with its input for the monitor.
+        clock: Default: the computer's. One that does not wait, stands still, goes back or gives NaN ends the run.
+        on_step: Called at the end of every period with a :class:`RunnerStep`; must be short.
+        guard: What to do on alarms of the monitor, which it needs. Default: nothing.
+        keep: Periods whose rows the report keeps, the last ones. Default 100 000.
 
-    Example:
-        >>> class Dead:
-        ...     def now(self):
-        ...         return 7.0
-        ...     def sleep_until(self, t):
-        ...         pass
-        >>> CheckedClock(Dead(), 0.02).sleep_until(7.5)
-        Traceback (most recent call last):
-        ...
-        hybrid_mpc.errors.InputError: clock: sleep_until(7.5) has come back 10 times, at last at 7.0; it must wait
+    Raises:
+        InputError: If models, deadline, safe input, delays or ``keep`` do not fit, or the estimator wants the truth.
+
+    Example: see ``docs/control.md``; in short::
+
+        runner = Runner(read_encoder, set_torque, ekf, controller, task.reference, weight=task.weight)
+        print(runner.run(duration=6.0).percentiles())
     """
 
-    def __init__(self, clock: Clock, dt: float) -> None:
-        self._clock, self._early, self._last = clock, EARLY * dt, -math.inf
+    def __init__(
+        self,
+        measure: Callable[[], ArrayLike | None],
+        actuate: Callable[[Array], object],
+        estimator: Estimator,
+        controller: SafeController | Controller,
+        reference: Preview,
+        *,
+        weight: Preview | None = None,
+        horizon: int | None = None,
+        monitor: Monitor | None = None,
+        deadline: float | None = None,
+        safe_input: ArrayLike | None = None,
+        input_delay: int = 0,
+        sensor_delay: int = 0,
+        clock: Clock | None = None,
+        on_step: Callable[[RunnerStep], None] | None = None,
+        keep: int = 100_000,
+        guard: Guard | None = None,
+    ) -> None:
+        if sees_truth(estimator):
+            raise InputError("Runner: a machine does not give its true state; give a filter, not TrueState")
+        dt = estimator.model.dt
+        due = dt if deadline is None else float(deadline)
+        if not 0 < due <= dt * (1 + 1e-9):
+            raise InputError(f"Runner: deadline must lie within the period of {dt} s, got {deadline} s")
+        if keep < 1:
+            raise InputError(f"Runner: keep must be 1 or more periods, got {keep}")
+        self._clock, self._dt, self._actuate = clock or RealClock(), dt, actuate
+        self._run = partial(_Run, measure=measure, actuate=actuate, deadline=due, on_step=on_step, keep=keep)
+        self._loop = partial(
+            Loop, estimator, controller, monitor=monitor, reference=reference, weight=weight, guard=guard,
+            horizon=horizon, input_delay=input_delay, sensor_delay=sensor_delay,
+        )  # fmt: skip
+        loop = self._loop()
+        self._safe_input = loop.safe_input if safe_input is None else checked_safe_input(safe_input, loop.ocp)
 
-    def now(self) -> float:
-        """Time [s].
+    @property
+    def safe_input(self) -> Array:
+        """The input handed over at the end of every run ``(n_u,)``."""
+        return self._safe_input.copy()
+
+    def run(self, duration: float | None = None, stop: Callable[[], bool] | None = None) -> RunReport:
+        """Run until the duration has passed or ``stop()`` is true, whichever is first.
+
+        Args:
+            duration: Length [s], rounded to whole periods. Default: none.
+            stop: Asked before every period. Default: never.
+
+        Returns:
+            The statistics and the rows of the last ``keep`` periods.
 
         Raises:
-            InputError: If it is not finite, or before the last one.
+            InputError: If neither end is given, the duration is not positive and finite, a callback returns
+                another shape, or the clock is none. What a callback raises is raised on, after the safe input.
+            SafeInputError: If the actuator did not take the safe input.
         """
-        t = float(self._clock.now())
-        if not math.isfinite(t):
-            raise InputError(f"clock: now() gives {t}; a finite time [s] needed")
-        if t < self._last:
-            raise InputError(f"clock: now() has gone back from {self._last} to {t}; give one that never does")
-        self._last = t
-        return t
+        n = self._periods(duration, stop)
+        clock = CheckedClock(self._clock, self._dt)
+        loop = self._loop(end=math.inf if n is None else n * self._dt, now=clock.now)
+        run = self._run(loop, clock)
+        ended = "duration"
+        with SafeEnd(lambda: self._actuate(self.safe_input)) as end:
+            end.check()
+            loop.warm_up()
+            run.begin()
+            while n is None or run.k < n:
+                end.check()
+                if stop is not None and stop():
+                    ended = "stop"
+                    break
+                run.period()
+            run.wait()
+        return run.report(end.cause or ended)
 
-    def sleep_until(self, t: float) -> None:
-        """Wait until ``t`` [s].
+    def _periods(self, duration: float | None, stop: Callable[[], bool] | None) -> int | None:
+        if duration is None:
+            if stop is None:
+                raise InputError("Runner: give a duration [s], or a function stop() that ends the run")
+            return None
+        dt = self._dt
+        if not (math.isfinite(duration) and round(duration / dt) >= 1):
+            raise InputError(
+                f"Runner: duration {duration} s given; at least one period of {dt} s, and finite, needed"
+            )
+        return round(duration / dt)
 
-        Raises:
-            InputError: If the clock does not wait, or as :meth:`now`.
-        """
-        for _ in range(WAKES):
-            self._clock.sleep_until(t)
-            if self.now() >= t - self._early:
-                return
-        raise InputError(
-            f"clock: sleep_until({t}) has come back {WAKES} times, at last at {self._last}; it must wait"
-        )
+
+class _Run:
+    """One run: its clock, its counts and its last rows; all that the loop remembers is in the loop."""
+
+    def __init__(
+        self,
+        loop: Loop,
+        clock: CheckedClock,
+        measure: Callable[[], ArrayLike | None],
+        actuate: Callable[[Array], object],
+        deadline: float,
+        on_step: Callable[[RunnerStep], None] | None,
+        keep: int,
+    ) -> None:
+        self._loop, self._clock, self._dt = loop, clock, loop.model.dt
+        self._measure, self._actuate, self._deadline, self._on_step = measure, actuate, deadline, on_step
+        self.k = self._periods = self._skipped = self._missing = self._late = self._overruns = 0
+        self._sources: Counter[str] = Counter()
+        self._rows: deque[RunnerStep] = deque(maxlen=keep)
+        self._solves: deque[float] = deque(maxlen=RECENT)
+        self._start = 0.0
+
+    def begin(self) -> None:
+        """Measure, plan and decide while the machine still rests; the first period is then now."""
+        self._loop.start(self._sample())
+        self._start = self._clock.now()
+
+    def wait(self) -> None:
+        """Until the next period's instant, to hold the last input for a whole one."""
+        self._clock.sleep_until(self._start + self.k * self._dt)
+
+    def period(self) -> None:
+        """Wait for the period's instant, and do all of it."""
+        self.wait()
+        loop, clock = self._loop, self._clock
+        due = self._start + self.k * self._dt
+        begin = measured = clock.now()
+        if self._periods:  # the first input was decided before the clock began
+            y = self._sample()
+            measured = clock.now()
+            self._decide(y, due + self._deadline)
+        decided = clock.now()
+        self._actuate(loop.decision.u.copy())
+        acted = clock.now()
+        loop.finish()
+        spent = {"measure": measured - begin, "actuate": acted - decided, **loop.spent}
+        step = RunnerStep(
+            self.k, self.k * self._dt, loop.state.y, loop.estimate, loop.decision, loop.reading, begin - due,
+            acted - due, spent,
+        )  # fmt: skip
+        self._count(step)
+        if self._on_step is not None:
+            self._on_step(step)
+        self._go_on()
+
+    def report(self, stopped: str) -> RunReport:
+        """What happened."""
+        rows, model = list(self._rows), self._loop.model
+        return RunReport(
+            periods=self._periods, sources=dict(self._sources), missing=self._missing, late=self._late,
+            overruns=self._overruns, skipped=self._skipped, stopped=stopped,
+            t=np.array([row.t for row in rows]),
+            y=np.array([row.y for row in rows]).reshape(-1, model.n_y),
+            u=np.array([row.decision.u for row in rows]).reshape(-1, model.n_u),
+            x_hat=np.array([row.estimate.x for row in rows]).reshape(-1, model.n_x),
+            source=tuple(row.decision.source.name for row in rows),
+            status=tuple(row.decision.status.name for row in rows),
+            lateness_ms=1e3 * np.array([row.lateness for row in rows]),
+            applied_ms=1e3 * np.array([row.applied for row in rows]),
+            timing_ms={name: 1e3 * np.array([row.spent[name] for row in rows]) for name in TIMED},
+            alarm=np.array([row.reading is not None and bool(row.reading.alarm) for row in rows], dtype=bool),
+            switches=self._loop.switches if self._periods else (),
+        )  # fmt: skip
+
+    def _sample(self) -> Array | None:
+        y = self._measure()
+        return None if y is None else fitting(y, self._loop.model.n_y, "what measure() returns")
+
+    def _decide(self, y: Array | None, deadline: float) -> None:
+        """A step whose solve is begun where it can be in time, and dropped where it was not."""
+        # Half of the time left is always tried: else a slow spell would end all solving.
+        needed = min(min(self._solves, default=0.0), 0.5 * self._deadline)
+        begun = False
+
+        def in_time() -> bool:
+            nonlocal begun
+            begun = self._clock.now() + needed <= deadline
+            return begun
+
+        self._loop.step(y, in_time=in_time)
+        if begun:
+            self._solves.append(self._loop.spent["solve"])
+            if self._clock.now() > deadline:
+                self._loop.late()
+
+    def _count(self, step: RunnerStep) -> None:
+        self._rows.append(step)
+        self._periods += 1
+        self._sources[step.decision.source.name] += 1
+        self._missing += not np.any(np.isfinite(step.y))
+        self._late += step.decision.status is Status.LATE
+        self._overruns += step.applied > self._deadline
+
+    def _go_on(self) -> None:
+        """To the next instant on the grid, or the nearest to now if that has long passed."""
+        following = max(self.k + 1, round((self._clock.now() - self._start) / self._dt))
+        skipped = following - self.k - 1
+        if skipped:
+            self._loop.skip(skipped)
+        self._skipped += skipped
+        self.k = following
 
 
 @dataclass(frozen=True)
@@ -129,7 +311,7 @@ class RunnerStep:
         k: Its number on the grid; skipped periods have none.
         t: Its time [s] on the grid, since the start.
         y: Measurement ``(n_y,)``; NaN where there was none.
-        estimate: What is believed.
+        estimate: The estimate.
         decision: The input and where it came from.
         reading: What the monitor says, or None.
         lateness: Begin of the period after its instant on the grid [s].
@@ -150,7 +332,7 @@ class RunnerStep:
 
 @dataclass(frozen=True)
 class RunReport:
-    """How a real-time run went; counts are of all periods, rows of the last ones kept.
+    """How a real-time run went; counts are of all periods, rows of the last ``keep``.
 
     Args:
         periods: Periods that ran.
@@ -161,7 +343,7 @@ class RunReport:
         skipped: Periods that did not run at all, since one before them took too long.
         stopped: What ended the run: ``"duration"``, ``"stop"``, the name of a signal that the program survives
             (``"SIGTERM"``), or ``"exit"`` of the interpreter.
-        t: Times ``(n,)`` [s] on the grid, since the start, of the periods kept.
+        t: Times ``(n,)`` [s] on the grid, since the start, of the last ``keep`` periods.
         y: Measurements ``(n, n_y)``; NaN where there was none.
         u: Inputs ``(n, n_u)``.
         x_hat: Estimated states ``(n, n_x)``.
@@ -202,40 +384,6 @@ class RunReport:
         return {name: percentiles(values) for name, values in rows.items()}
 
 
-def make_report(
-    steps: Sequence[RunnerStep], model: HybridModel, *, periods: int, sources: Mapping[str, int],
-    missing: int, late: int, overruns: int, skipped: int, stopped: str, switches: tuple[Switch, ...] = (),
-) -> RunReport:  # fmt: skip
-    """The report of a run from the steps kept and the counts of all.
-
-    Args:
-        steps: The periods kept; may be empty.
-        model: For the sizes.
-        periods: This and the others: see :class:`RunReport`.
-        sources: See there.
-        missing: See there.
-        late: See there.
-        overruns: See there.
-        skipped: See there.
-        stopped: See there.
-        switches: See there.
-    """
-    return RunReport(
-        periods, sources, missing, late, overruns, skipped, stopped,
-        t=np.array([s.t for s in steps]),
-        y=np.array([s.y for s in steps]).reshape(-1, model.n_y),
-        u=np.array([s.decision.u for s in steps]).reshape(-1, model.n_u),
-        x_hat=np.array([s.estimate.x for s in steps]).reshape(-1, model.n_x),
-        source=tuple(s.decision.source.name for s in steps),
-        status=tuple(s.decision.status.name for s in steps),
-        lateness_ms=1e3 * np.array([s.lateness for s in steps]),
-        applied_ms=1e3 * np.array([s.applied for s in steps]),
-        timing_ms={name: 1e3 * np.array([s.spent[name] for s in steps]) for name in TIMED},
-        alarm=np.array([s.reading is not None and bool(s.reading.alarm) for s in steps], dtype=bool),
-        switches=switches,
-    )  # fmt: skip
-
-
 def percentiles(values: Array) -> dict[str, float]:
     """Median, 95th and 99th percentile and maximum of ``values`` ``(n,)``; NaN where there are none.
 
@@ -246,20 +394,6 @@ def percentiles(values: Array) -> dict[str, float]:
     if len(values) == 0:
         return dict.fromkeys(QUANTILES, float("nan"))
     return {name: float(np.quantile(values, q)) for name, q in QUANTILES.items()}
-
-
-# The end of a run on a machine: whatever ends it, the safe input is handed over before anything else.
-
-ENDING = tuple(
-    getattr(signal, name)
-    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGBREAK", "SIGXCPU", "SIGTSTP")
-    if hasattr(signal, name)
-)
-"""Signals that ask a program to end or to stand still, as far as the operating system has them: Ctrl-C, ``kill``, a
-terminal that closes, Ctrl-\\, Ctrl-Break, a used-up limit of computing time, Ctrl-Z."""
-PAUSES_S = (0.0, 0.01, 0.1, 1.0)
-"""Pauses [s] before each further try to hand the safe input over: none after a message that a signal has cut off, then
-what a bus or its driver may need to recover. No more, since a process that is to end must end."""
 
 
 class Ended(BaseException):
@@ -394,257 +528,83 @@ def _deliver(signals: Sequence[int]) -> None:
             _deliver(signals[1:])
 
 
-# A run of the real-time runner: a loop in step with a clock, and what is counted and kept of it.
+class Clock(Protocol):
+    """What the runner knows of time."""
 
-RECENT = 25
-"""Solves whose fastest tells whether another one still fits before a deadline."""
+    def now(self) -> float:
+        """Time [s] on a scale that never goes back."""
 
-
-@dataclass(frozen=True)
-class Parts:
-    """What a run is made of; :class:`~hybrid_mpc.loop.realtime.Runner` says what each is, and has checked it."""
-
-    measure: Callable[[], ArrayLike | None]
-    actuate: Callable[[Array], object]
-    deadline: float
-    on_step: Callable[[RunnerStep], None] | None
-    keep: int
+    def sleep_until(self, t: float) -> None:
+        """Return at ``t`` [s] or as soon as possible after it; at once if it has passed."""
 
 
-class Run:
-    """One run: what is counted and kept; all that the loop itself remembers is in the loop.
+class RealClock:
+    """The computer's monotonic clock.
 
-    Args:
-        parts: Callbacks and settings.
-        loop: A loop that has not begun.
-        clock: The clock, checked.
+    Example:
+        >>> clock = RealClock()
+        >>> until = clock.now() + 0.002
+        >>> clock.sleep_until(until)
+        >>> clock.now() >= until
+        True
     """
 
-    def __init__(self, parts: Parts, loop: Loop, clock: CheckedClock) -> None:
-        self._parts, self._loop, self._clock, self._dt = parts, loop, clock, loop.model.dt
-        self.k = self._skipped = self._missing = self._late = self._overruns = self._count = 0
-        self._sources: Counter[str] = Counter()
-        self._rows: deque[RunnerStep] = deque(maxlen=parts.keep)
-        self._solves: deque[float] = deque(maxlen=RECENT)
-        self._start = 0.0
+    def now(self) -> float:
+        """Time [s] since some fixed instant."""
+        return time.perf_counter()
 
-    def begin(self) -> None:
-        """Measure, plan and decide while the machine still rests; the first period is then now."""
-        self._loop.start(self._sample())
-        self._start = self._clock.now()
-
-    def wait(self) -> None:
-        """Until the next period's instant, to hold the last input for a whole one."""
-        self._clock.sleep_until(self._start + self.k * self._dt)
-
-    def period(self) -> None:
-        """Wait for the period's instant, and do all of it."""
-        self.wait()
-        parts, loop, clock = self._parts, self._loop, self._clock
-        due = self._start + self.k * self._dt
-        begin = measured = clock.now()
-        if self._count:  # the first input was decided before the clock began
-            y = self._sample()
-            measured = clock.now()
-            self._decide(y, due + parts.deadline)
-        decided = clock.now()
-        parts.actuate(loop.decision.u.copy())
-        acted = clock.now()
-        loop.finish()
-        spent = {"measure": measured - begin, "actuate": acted - decided, **loop.spent}
-        step = RunnerStep(
-            self.k, self.k * self._dt, loop.state.y, loop.estimate, loop.decision, loop.reading, begin - due,
-            acted - due, spent,
-        )  # fmt: skip
-        self._note(step)
-        if parts.on_step is not None:
-            parts.on_step(step)
-        self._go_on()
-
-    def _sample(self) -> Array | None:
-        y = self._parts.measure()
-        return None if y is None else fitting(y, self._loop.model.n_y, "what measure() returns")
-
-    def _decide(self, y: Array | None, deadline: float) -> None:
-        """A step whose solve is begun where it can be in time, and dropped where it was not."""
-        # Half of the time left is always tried: else a slow spell would end all solving.
-        needed = min(min(self._solves, default=0.0), 0.5 * self._parts.deadline)
-        begun = []
-
-        def in_time() -> bool:
-            if self._clock.now() + needed > deadline:
-                return False
-            begun.append(True)
-            return True
-
-        self._loop.step(y, in_time=in_time)
-        if begun:
-            self._solves.append(self._loop.spent["solve"])
-            if self._clock.now() > deadline:
-                self._loop.late()
-
-    def _note(self, step: RunnerStep) -> None:
-        self._rows.append(step)
-        self._count += 1
-        self._sources[step.decision.source.name] += 1
-        self._missing += not np.any(np.isfinite(step.y))
-        self._late += step.decision.status is Status.LATE
-        self._overruns += step.applied > self._parts.deadline
-
-    def _go_on(self) -> None:
-        """To the next instant on the grid, or the nearest to now if that has long passed."""
-        following = max(self.k + 1, round((self._clock.now() - self._start) / self._dt))
-        skipped = following - self.k - 1
-        if skipped:
-            self._loop.skip(skipped)
-        self._skipped += skipped
-        self.k = following
-
-    def report(self, stopped: str) -> RunReport:
-        """What happened."""
-        return make_report(
-            list(self._rows), self._loop.model, periods=self._count, sources=dict(self._sources),
-            missing=self._missing, late=self._late, overruns=self._overruns, skipped=self._skipped,
-            stopped=stopped, switches=self._loop.switches if self._count else (),
-        )  # fmt: skip
+    def sleep_until(self, t: float) -> None:
+        """Sleep; the operating system decides how punctual the return is."""
+        while (left := t - time.perf_counter()) > 0:
+            time.sleep(left)
 
 
-class Runner:
-    """Steps estimator, controller and monitor against a machine's sensors and actuators, in real time.
-
-    It drives a :class:`~hybrid_mpc.loop.loop.Loop`. Before the clock starts, while the machine rests: the first
-    sample, and plan and input from it. Each period: wait for its instant, measure, estimate, decide, actuate, then what
-    the loop leaves until after the input (monitor, preparation of the next solve). A missing sample leaves
-    the prediction. A solve that comes back after the deadline is dropped, and one that cannot be in time any more
-    is not begun: the shifted plan is applied (:meth:`~hybrid_mpc.control.safeguard.SafeController.late`). A solve
-    that has begun
-    is not interrupted. After a long delay the run goes on at the grid's nearest instant; the estimator is led
-    through the periods in between without a measurement, with the input that was held.
-
-    Numbers never raise. Whatever ends the run, exceptions in callbacks and signals (Ctrl-C, SIGTERM, SIGHUP, ...)
-    included, the safe input is handed to the actuator before anything else (:class:`SafeEnd`); then the exception is
-    raised on, or the signal has its effect. Signals reach Python's main thread alone: in another thread ``stop`` ends
-    a run. What no program can catch (SIGKILL, a hang in a driver, a power cut) takes a watchdog in the actuator;
-    ``docs/control.md`` has one. ``actuate`` may be broken off by a signal, and is then called with the safe input.
-
-    The input that acts with no delay is assumed to act from the grid's instant on: keep steps short against the
-    period, or declare the delay (:class:`~hybrid_mpc.estimate.delay.DelayCompensation`).
+class CheckedClock:
+    """A clock that is checked: a loop on one that stands still would spin for ever.
 
     Args:
-        measure: ``() -> y (n_y,)``, or None where no sample has come.
-        actuate: Takes the input ``u (n_u,)``, to be held until the next.
-        estimator: Filter on the controller's model.
-        controller: A :class:`~hybrid_mpc.control.safeguard.SafeController`; a bare controller is guarded without
-            fallback.
-        reference: ``t (n,) [s] -> x_ref (n, n_x)``, previewed over the horizon; ``t`` counts from the start.
-        weight: Factors on ``q``, alike. Default: 1.
-        horizon: Periods of preview. Default: the controller's horizon.
-        monitor: Default: none.
-        deadline: Time [s] after a period's instant by which its input must be decided. Default: one period.
-        safe_input: Input ``(n_u,)`` within the limits for the end of the run. Default: the controller's.
-        input_delay: Periods after which an input acts, as the estimator knows it; shifts the preview.
-        sensor_delay: Periods after which a measurement arrives; pairs it with its input for the monitor.
-        clock: Default: the computer's. One that does not wait, stands still, goes back or gives NaN ends the run.
-        on_step: Called at the end of every period with a :class:`RunnerStep`; must be short.
-        guard: What to do on alarms of the monitor, which it needs. Default: nothing.
-        keep: Periods whose rows the report keeps, the last ones. Default 100 000.
+        clock: The clock.
+        dt: Period [s] of the loop, of which a wait may end a small share early.
 
-    Raises:
-        InputError: If models, deadline, safe input, delays or ``keep`` do not fit, or the estimator wants the truth.
-
-    Example: see ``docs/control.md``; in short::
-
-        runner = Runner(read_encoder, set_torque, ekf, controller, task.reference, weight=task.weight)
-        print(runner.run(duration=6.0).percentiles())
+    Example:
+        >>> class Dead:
+        ...     def now(self):
+        ...         return 7.0
+        ...     def sleep_until(self, t):
+        ...         pass
+        >>> CheckedClock(Dead(), 0.02).sleep_until(7.5)
+        Traceback (most recent call last):
+        ...
+        hybrid_mpc.errors.InputError: clock: sleep_until(7.5) has come back 10 times, at last at 7.0; it must wait
     """
 
-    def __init__(
-        self,
-        measure: Callable[[], ArrayLike | None],
-        actuate: Callable[[Array], object],
-        estimator: Estimator,
-        controller: SafeController | Controller,
-        reference: Preview,
-        *,
-        weight: Preview | None = None,
-        horizon: int | None = None,
-        monitor: Monitor | None = None,
-        deadline: float | None = None,
-        safe_input: ArrayLike | None = None,
-        input_delay: int = 0,
-        sensor_delay: int = 0,
-        clock: Clock | None = None,
-        on_step: Callable[[RunnerStep], None] | None = None,
-        keep: int = 100_000,
-        guard: Guard | None = None,
-    ) -> None:
-        if sees_truth(estimator):
-            raise InputError("Runner: a machine does not tell its true state; give a filter, not TrueState")
-        dt = estimator.model.dt
-        due = dt if deadline is None else float(deadline)
-        if not 0 < due <= dt * (1 + 1e-9):
-            raise InputError(f"Runner: deadline must lie within the period of {dt} s, got {deadline} s")
-        if keep < 1:
-            raise InputError(f"Runner: keep must be 1 or more periods, got {keep}")
-        self._clock = clock or RealClock()
-        self._parts = Parts(measure, actuate, due, on_step, keep)
+    def __init__(self, clock: Clock, dt: float) -> None:
+        self._clock, self._early, self._last = clock, EARLY * dt, -math.inf
 
-        def make(end: float, now: Callable[[], float]) -> Loop:
-            return Loop(
-                estimator, controller, monitor=monitor, reference=reference, weight=weight, guard=guard,
-                horizon=horizon, end=end, input_delay=input_delay, sensor_delay=sensor_delay, now=now,
-            )  # fmt: skip
-
-        self._dt, self._make = dt, make
-        loop = make(math.inf, self._clock.now)
-        self._safe_input = loop.safe_input if safe_input is None else checked_safe_input(safe_input, loop.ocp)
-
-    @property
-    def safe_input(self) -> Array:
-        """The input handed over at the end of every run ``(n_u,)``."""
-        return self._safe_input.copy()
-
-    def run(self, duration: float | None = None, stop: Callable[[], bool] | None = None) -> RunReport:
-        """Run until the duration has passed or ``stop()`` is true, whichever is first.
-
-        Args:
-            duration: Length [s], rounded to whole periods. Default: none.
-            stop: Asked before every period. Default: never.
-
-        Returns:
-            The statistics and the rows of the last ``keep`` periods.
+    def now(self) -> float:
+        """Time [s].
 
         Raises:
-            InputError: If neither end is given, the duration is not positive and finite, a callback returns
-                another shape, or the clock is none. What a callback raises is raised on, after the safe input.
-            SafeInputError: If the actuator did not take the safe input.
+            InputError: If it is not finite, or before the last one.
         """
-        n = self._periods(duration, stop)
-        clock = CheckedClock(self._clock, self._dt)
-        loop = self._make(math.inf if n is None else n * self._dt, clock.now)
-        run = Run(self._parts, loop, clock)
-        ended = "duration"
-        with SafeEnd(lambda: self._parts.actuate(self.safe_input)) as end:
-            end.check()
-            loop.warm_up()
-            run.begin()
-            while n is None or run.k < n:
-                end.check()
-                if stop is not None and stop():
-                    ended = "stop"
-                    break
-                run.period()
-            run.wait()
-        return run.report(end.cause or ended)
+        t = float(self._clock.now())
+        if not math.isfinite(t):
+            raise InputError(f"clock: now() gives {t}; a finite time [s] needed")
+        if t < self._last:
+            raise InputError(f"clock: now() has gone back from {self._last} to {t}; give one that never does")
+        self._last = t
+        return t
 
-    def _periods(self, duration: float | None, stop: Callable[[], bool] | None) -> int | None:
-        if duration is None:
-            if stop is None:
-                raise InputError("Runner: give a duration [s], or a function stop() that ends the run")
-            return None
-        dt = self._dt
-        if not (math.isfinite(duration) and round(duration / dt) >= 1):
-            raise InputError(
-                f"Runner: duration {duration} s given; at least one period of {dt} s, and finite, needed"
-            )
-        return round(duration / dt)
+    def sleep_until(self, t: float) -> None:
+        """Wait until ``t`` [s].
+
+        Raises:
+            InputError: If the clock does not wait, or as :meth:`now`.
+        """
+        for _ in range(WAKES):
+            self._clock.sleep_until(t)
+            if self.now() >= t - self._early:
+                return
+        raise InputError(
+            f"clock: sleep_until({t}) has come back {WAKES} times, at last at {self._last}; it must wait"
+        )

@@ -1,44 +1,273 @@
-"""The closed loop: measure, estimate, solve, monitor, hold."""
+"""The loop in simulation: a plant in place of the machine, a virtual clock, and the record of what happened."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-
-from hybrid_mpc.errors import InputError
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from hybrid_mpc.loop.guard import Switch
-    from hybrid_mpc.model.model import HybridModel
-
-import math
-from collections.abc import Callable, Sequence
-from functools import partial
-from typing import NamedTuple
-
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.problem import Controller
 from hybrid_mpc.control.safeguard import Decision, SafeController
+from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate, Estimator
 from hybrid_mpc.loop.faults import Fault, check_channels, install
-from hybrid_mpc.loop.guard import Guard
-from hybrid_mpc.loop.loop import TIMED, Loop, Monitor, Reading, preview_of
-from hybrid_mpc.loop.plant import Machine, Plant, Preview, Previews, fitting
+from hybrid_mpc.loop.guard import Guard, Switch
+from hybrid_mpc.loop.loop import TIMED, Loop, Monitor, Reading
+from hybrid_mpc.loop.plant import Plant, SimulatedMachine, fitting
+from hybrid_mpc.loop.preview import Preview, Previews
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.model.riccati import vector
 
-# The record of a closed loop.
+if TYPE_CHECKING:
+    import pandas as pd
 
 Array = NDArray[np.float64]
 UNITS = {"stage_cost": "1/s", "violation": "W", "level": "W"}
+
+
+@dataclass(frozen=True)
+class Step:
+    """One period as ``on_step`` sees it: number, time [s], truth, measurement, estimate, decision."""
+
+    k: int
+    t: float
+    x: Array
+    y: Array
+    estimate: Estimate
+    decision: Decision
+    reading: Reading | None
+
+
+def simulate(
+    plant: Plant,
+    estimator: Estimator,
+    controller: SafeController | Controller,
+    reference: Preview | ArrayLike,
+    *,
+    dt: float,
+    duration: float,
+    x0: ArrayLike,
+    seed: int,
+    weight: Preview | None = None,
+    horizon: int | None = None,
+    monitor: Monitor | None = None,
+    faults: Sequence[Fault] = (),
+    stage_cost: OCP | None = None,
+    on_step: Callable[[Step], None] | None = None,
+    sensor_delay: int = 0,
+    input_delay: int = 0,
+    late: Callable[[float], bool] | None = None,
+    guard: Guard | None = None,
+) -> ClosedLoopResult:
+    """Run a plant under control; deterministic except for the recorded durations.
+
+    It drives a :class:`~hybrid_mpc.loop.loop.Loop` on a virtual clock. No time passes between measuring and
+    holding but the delays given. Input faults act behind the controller, which does not know of them.
+
+    The preview reaches beyond the end of the run: reference and weight are asked for those times too. Where
+    they are not finite there (a recording that ends), their last value within the run is held.
+
+    With delays the estimate must be that of the instant at which the input will act: give
+    :class:`~hybrid_mpc.estimate.delay.DelayCompensation` as estimator. Before the start the machine has rested
+    at ``x0`` with the first held input, and the sensor has measured it there.
+
+    Args:
+        plant: The machine.
+        estimator: Filter, or :class:`~hybrid_mpc.estimate.kalman.TrueState`, which is handed the truth, undelayed.
+        controller: A :class:`~hybrid_mpc.control.safeguard.SafeController`; a bare controller is guarded without
+            fallback.
+        reference: ``t (n,) -> x_ref (n, n_x)`` or a set-point; see :class:`~hybrid_mpc.loop.loop.Loop`.
+        dt: Period [s]; must be the models' own.
+        duration: Length [s], rounded to whole periods.
+        x0: Initial state ``(n_x,)``.
+        seed: Seed of the plant and of the measurement noise.
+        weight: Factors on ``q``, ``t (n,) -> (n, n_x)``, previewed alike; they count in the recorded cost.
+            Default: 1.
+        horizon: Periods of preview. Default: the controller's horizon.
+        monitor: Default: none.
+        faults: Default: none.
+        stage_cost: Problem whose stage cost is recorded. Default: the controller's.
+        on_step: Called after every period, e.g. to show progress.
+        sensor_delay: Periods after which a measurement arrives; faults of a sensor act on arrival.
+        input_delay: Periods after which an input reaches the plant: computing and transport.
+        late: ``t [s] -> True`` where the solve misses its deadline. Default: never.
+        guard: What to do on alarms of the monitor, which it needs. Default: nothing.
+
+    Returns:
+        The record of ``round(duration / dt)`` periods.
+
+    Raises:
+        InputError: If a period, shape or channel does not fit.
+
+    Example: see ``tests/loop``; with a scenario::
+
+        result = simulate(plant, ekf, controller, task.reference, weight=task.weight, dt=0.02,
+                          duration=task.duration, x0=task.x0, seed=0)
+    """
+    return Simulation(
+        plant, estimator, controller, reference, dt=dt, duration=duration, x0=x0, seed=seed, weight=weight,
+        horizon=horizon, monitor=monitor, faults=faults, stage_cost=stage_cost, on_step=on_step,
+        sensor_delay=sensor_delay, input_delay=input_delay, late=late, guard=guard,
+    ).run()  # fmt: skip
+
+
+class Simulation:
+    """A plant in a loop, a period at a time: what :func:`simulate` drives.
+
+    Args: as :func:`simulate`.
+
+    Example: ``Simulation(plant, ekf, mpc, [0.0, 0.0], dt=0.02, duration=1.0, x0=[0.0, 0.0], seed=0).run()``
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        estimator: Estimator,
+        controller: SafeController | Controller,
+        reference: Preview | ArrayLike,
+        *,
+        dt: float,
+        duration: float,
+        x0: ArrayLike,
+        seed: int,
+        weight: Preview | None = None,
+        horizon: int | None = None,
+        monitor: Monitor | None = None,
+        faults: Sequence[Fault] = (),
+        stage_cost: OCP | None = None,
+        on_step: Callable[[Step], None] | None = None,
+        sensor_delay: int = 0,
+        input_delay: int = 0,
+        late: Callable[[float], bool] | None = None,
+        guard: Guard | None = None,
+    ) -> None:
+        self.loop = loop = Loop(
+            estimator, controller, monitor=monitor, reference=reference, weight=weight, guard=guard, horizon=horizon,
+            end=_end(dt, duration, estimator.model.dt), input_delay=input_delay, sensor_delay=sensor_delay,
+        )  # fmt: skip
+        ocp, model = loop.ocp, loop.model
+        self.periods, self._dt, self._k = round(duration / dt), dt, 0
+        self._plant, faults = install(plant, faults)
+        check_channels(faults, model.n_y, ocp.n_u)
+        self._cost = _checked_cost(ocp, ocp if stage_cost is None else stage_cost)
+        end = self.periods * dt
+        self._acting = Previews(reference, weight, ocp, horizon, dt, end) if input_delay else None
+        rest = vector(x0, ocp.n_x, "x0")
+        self._machine = SimulatedMachine(
+            self._plant, rest, seed, model.n_y, faults, dt, sensor_delay, input_delay
+        )
+        self._late, self._on_step = late, on_step
+        self._rows: list[_Row] = []
+
+    def run(self) -> ClosedLoopResult:
+        """All periods; returns the record."""
+        while self._k < self.periods:
+            self._period()
+        return self._result()
+
+    def _period(self) -> None:
+        """Measure, decide, hold the input for a period, and note what happened."""
+        loop, machine, t = self.loop, self._machine, self._k * self._dt
+        x = fitting(self._plant.truth(machine.state), loop.ocp.n_x, "the plant's truth")
+        y = machine.measure(t)
+        truth = np.concatenate([x, self._plant.hidden(machine.state)])
+        late = self._late
+        in_time = None if late is None else lambda: not late(t)
+        if self._k == 0:
+            loop.start(y, truth=truth, in_time=in_time)
+            machine.rest(loop.state.inputs[0])
+        else:
+            loop.step(y, truth=truth, in_time=in_time)
+        u, u_prev = machine.command(loop.decision.u)
+        loop.finish()
+        x_ref, factors = loop.previewed if self._acting is None else self._acting(t)
+        now_factors = 1.0 if factors is None else factors[0]
+        with np.errstate(over="ignore", invalid="ignore"):  # an absurd reference costs infinitely much
+            stage = float(self._cost.stage_cost(x, u, x_ref[0, : x.size], u - u_prev, now_factors))
+        step = Step(self._k, t, x, y, loop.estimate, loop.decision, loop.reading)
+        self._rows.append(_row(step, x_ref[0, : x.size].copy(), stage, loop.spent))
+        if self._on_step is not None:
+            self._on_step(step)
+        machine.advance(t)
+        self._k += 1
+
+    def _result(self) -> ClosedLoopResult:
+        rows = self._rows
+        readings = [row.reading for row in rows]
+        timing = {name: 1e3 * np.array([row.spent[name] for row in rows]) for name in TIMED}
+        return ClosedLoopResult(
+            dt=self._dt,
+            **{name: np.array([getattr(row, name) for row in rows]) for name in COLUMNS},
+            source=tuple(row.source for row in rows),
+            status=tuple(row.status for row in rows),
+            timing_ms={**timing, "total": np.sum(list(timing.values()), axis=0)},
+            violation=np.array([np.nan if r is None else r.violation_w for r in readings]),
+            level=np.array([np.nan if r is None else r.level_w for r in readings]),
+            alarm=np.array([r is not None and bool(r.alarm) for r in readings]),
+            judged=np.array([r is not None and not getattr(r, "verdict", 0) for r in readings]),
+            switches=self.loop.switches,
+            numbers=np.array([getattr(r, "numbers", ()) for r in readings], dtype=np.float64),
+        )
+
+
+class _Row(NamedTuple):
+    """A period in the record; without plans and covariances, for which a long run has no room."""
+
+    t: float
+    x: Array
+    y: Array
+    u: Array
+    x_hat: Array
+    h: Array
+    d: Array
+    reference: Array
+    stage_cost: float
+    innovation: Array
+    nis: float
+    source: str
+    status: str
+    reading: Reading | None
+    spent: Mapping[str, float]
+
+
+COLUMNS = _Row._fields[:11]
+"""Those that are numbers."""
+
+
+def _row(step: Step, reference: Array, stage: float, spent: Mapping[str, float]) -> _Row:
+    e, d = step.estimate, step.decision
+    return _Row(
+        step.t, step.x, step.y, d.u, e.x, e.h, e.d, reference, stage, e.innovation, e.nis, d.source.name,
+        d.status.name, step.reading, spent,
+    )  # fmt: skip
+
+
+def _checked_cost(ocp: OCP, cost: OCP) -> OCP:
+    if (cost.n_x, cost.n_u) != (ocp.n_x, ocp.n_u):
+        raise InputError(
+            f"stage_cost has {cost.n_x} states and {cost.n_u} inputs, needed: {ocp.n_x} and {ocp.n_u}"
+        )
+    return cost
+
+
+def _end(dt: float, duration: float, period: float) -> float:
+    """End of the run [s].
+
+    Raises:
+        InputError: If a time is not finite, the period another than the models', or the run shorter than one.
+    """
+    if not (math.isfinite(duration) and math.isfinite(dt) and dt > 0):
+        raise InputError(f"dt and duration must be finite and dt positive; got {dt} s and {duration} s")
+    if not abs(dt - period) <= 1e-9 * period:
+        raise InputError(f"dt = {dt} s given, a model's period is {period} s; they must agree")
+    if round(duration / dt) < 1:
+        raise InputError(f"duration {duration} s is shorter than one period of {dt} s")
+    return round(duration / dt) * dt
 
 
 @dataclass(frozen=True)
@@ -156,246 +385,3 @@ def _labels(name: str, n: int, model: HybridModel | None) -> list[str]:
             f"to_pandas: the loop has {n} columns of {name}, the model {model.name} {len(signals)}"
         )
     return [f"{name} {s.name} [{s.unit}]" for s in signals]
-
-
-@dataclass(frozen=True)
-class Step:
-    """One period as ``on_step`` sees it: number, time [s], truth, measurement, estimate, decision."""
-
-    k: int
-    t: float
-    x: Array
-    y: Array
-    estimate: Estimate
-    decision: Decision
-    reading: Reading | None
-
-
-def simulate(
-    plant: Plant,
-    estimator: Estimator,
-    controller: SafeController | Controller,
-    reference: Preview | ArrayLike,
-    *,
-    dt: float,
-    duration: float,
-    x0: ArrayLike,
-    seed: int,
-    weight: Preview | None = None,
-    horizon: int | None = None,
-    monitor: Monitor | None = None,
-    faults: Sequence[Fault] = (),
-    stage_cost: OCP | None = None,
-    on_step: Callable[[Step], None] | None = None,
-    sensor_delay: int = 0,
-    input_delay: int = 0,
-    late: Callable[[float], bool] | None = None,
-    guard: Guard | None = None,
-) -> ClosedLoopResult:
-    """Run a plant under control; deterministic except for the recorded durations.
-
-    It drives a :class:`~hybrid_mpc.loop.loop.Loop` on a virtual clock. No time passes between measuring and
-    holding but the delays given. Input faults act behind the controller, which is not told.
-
-    The preview reaches beyond the end of the run: reference and weight are asked for those times too. Where
-    they are not finite there (a recording that ends), their last value within the run is held.
-
-    With delays the estimate must be that of the instant at which the input will act: give
-    :class:`~hybrid_mpc.estimate.delay.DelayCompensation` as estimator. Before the start the machine has rested
-    at ``x0`` with the first held input, and the sensor has measured it there.
-
-    Args:
-        plant: The machine.
-        estimator: Filter, or :class:`~hybrid_mpc.estimate.kalman.TrueState`, which is handed the truth, undelayed.
-        controller: A :class:`~hybrid_mpc.control.safeguard.SafeController`; a bare controller is guarded without
-            fallback.
-        reference: ``t (n,) -> x_ref (n, n_x)`` or a set-point; see :class:`~hybrid_mpc.loop.loop.Loop`.
-        dt: Period [s]; must be the models' own.
-        duration: Length [s], rounded to whole periods.
-        x0: Initial state ``(n_x,)``.
-        seed: Seed of the plant and of the measurement noise.
-        weight: Factors on ``q``, ``t (n,) -> (n, n_x)``, previewed alike; they count in the recorded cost.
-            Default: 1.
-        horizon: Periods of preview. Default: the controller's horizon.
-        monitor: Default: none.
-        faults: Default: none.
-        stage_cost: Problem whose stage cost is recorded. Default: the controller's.
-        on_step: Called after every period, e.g. to show progress.
-        sensor_delay: Periods after which a measurement arrives; faults of a sensor act on arrival.
-        input_delay: Periods after which an input reaches the plant: computing and transport.
-        late: ``t [s] -> True`` where the solve misses its deadline. Default: never.
-        guard: What to do on alarms of the monitor, which it needs. Default: nothing.
-
-    Returns:
-        The record of ``round(duration / dt)`` periods.
-
-    Raises:
-        InputError: If a period, shape or channel does not fit.
-
-    Example: see ``tests/loop``; with a scenario::
-
-        result = simulate(plant, ekf, controller, task.reference, weight=task.weight, dt=0.02,
-                          duration=task.duration, x0=task.x0, seed=0)
-    """
-    return Simulation(
-        plant, estimator, controller, reference, dt=dt, duration=duration, x0=x0, seed=seed, weight=weight,
-        horizon=horizon, monitor=monitor, faults=faults, stage_cost=stage_cost, on_step=on_step,
-        sensor_delay=sensor_delay, input_delay=input_delay, late=late, guard=guard,
-    ).run()  # fmt: skip
-
-
-class Simulation:
-    """A plant in a loop, a period at a time: what :func:`simulate` drives.
-
-    Args: as :func:`simulate`.
-
-    Example: ``Simulation(plant, ekf, mpc, [0.0, 0.0], dt=0.02, duration=1.0, x0=[0.0, 0.0], seed=0).run()``
-    """
-
-    def __init__(
-        self,
-        plant: Plant,
-        estimator: Estimator,
-        controller: SafeController | Controller,
-        reference: Preview | ArrayLike,
-        *,
-        dt: float,
-        duration: float,
-        x0: ArrayLike,
-        seed: int,
-        weight: Preview | None = None,
-        horizon: int | None = None,
-        monitor: Monitor | None = None,
-        faults: Sequence[Fault] = (),
-        stage_cost: OCP | None = None,
-        on_step: Callable[[Step], None] | None = None,
-        sensor_delay: int = 0,
-        input_delay: int = 0,
-        late: Callable[[float], bool] | None = None,
-        guard: Guard | None = None,
-    ) -> None:
-        self.loop = loop = Loop(
-            estimator, controller, monitor=monitor, reference=reference, weight=weight, guard=guard, horizon=horizon,
-            end=_end(dt, duration, estimator.model.dt), input_delay=input_delay, sensor_delay=sensor_delay,
-        )  # fmt: skip
-        ocp, model = loop.ocp, loop.model
-        self.periods, self._dt, self._k = round(duration / dt), dt, 0
-        self._plant, faults = install(plant, faults)
-        check_channels(faults, model.n_y, ocp.n_u)
-        self._cost = _checked_cost(ocp, ocp if stage_cost is None else stage_cost)
-        end = self.periods * dt
-        self._acting = (
-            Previews(preview_of(reference, ocp), weight, ocp, horizon, dt, end) if input_delay else None
-        )
-        rest = vector(x0, ocp.n_x, "x0")
-        self._machine = Machine(self._plant, rest, seed, model.n_y, faults, dt, sensor_delay, input_delay)
-        self._late, self._on_step = late, on_step
-        self._rows: list[_Row] = []
-
-    def run(self) -> ClosedLoopResult:
-        """All periods; returns the record."""
-        while self._k < self.periods:
-            self._period()
-        return self._result()
-
-    def _period(self) -> None:
-        """Measure, decide, hold the input for a period, and note what happened."""
-        loop, machine, t = self.loop, self._machine, self._k * self._dt
-        x = fitting(self._plant.truth(machine.state), loop.ocp.n_x, "the plant's truth")
-        y = machine.measure(t)
-        truth = np.concatenate([x, self._plant.hidden(machine.state)])
-        in_time = None if self._late is None else partial(_is_in_time, self._late, t)
-        if self._k == 0:
-            loop.start(y, truth=truth, in_time=in_time)
-            machine.rest(loop.state.held[0])
-        else:
-            loop.step(y, truth=truth, in_time=in_time)
-        u, u_prev = machine.command(loop.decision.u)
-        loop.finish()
-        x_ref, factors = loop.previewed if self._acting is None else self._acting(t)
-        now_factors = 1.0 if factors is None else factors[0]
-        with np.errstate(over="ignore", invalid="ignore"):  # an absurd reference costs infinitely much
-            stage = float(self._cost.stage_cost(x, u, x_ref[0, : x.size], u - u_prev, now_factors))
-        step = Step(self._k, t, x, y, loop.estimate, loop.decision, loop.reading)
-        self._rows.append(_row(step, x_ref[0, : x.size].copy(), stage, loop.spent))
-        if self._on_step is not None:
-            self._on_step(step)
-        machine.advance(t)
-        self._k += 1
-
-    def _result(self) -> ClosedLoopResult:
-        rows = self._rows
-        readings = [row.reading for row in rows]
-        timing = {name: 1e3 * np.array([row.spent[name] for row in rows]) for name in TIMED}
-        return ClosedLoopResult(
-            dt=self._dt,
-            **{name: np.array([getattr(row, name) for row in rows]) for name in COLUMNS},
-            source=tuple(row.source for row in rows),
-            status=tuple(row.status for row in rows),
-            timing_ms={**timing, "total": np.sum(list(timing.values()), axis=0)},
-            violation=np.array([np.nan if r is None else r.violation_w for r in readings]),
-            level=np.array([np.nan if r is None else r.level_w for r in readings]),
-            alarm=np.array([r is not None and bool(r.alarm) for r in readings]),
-            judged=np.array([r is not None and not getattr(r, "verdict", 0) for r in readings]),
-            switches=self.loop.switches,
-            numbers=np.array([getattr(r, "numbers", ()) for r in readings], dtype=np.float64),
-        )
-
-
-class _Row(NamedTuple):
-    """What is kept of a period; plans and covariances, which a long run has no room for, are not."""
-
-    t: float
-    x: Array
-    y: Array
-    u: Array
-    x_hat: Array
-    h: Array
-    d: Array
-    reference: Array
-    stage_cost: float
-    innovation: Array
-    nis: float
-    source: str
-    status: str
-    reading: Reading | None
-    spent: Mapping[str, float]
-
-
-COLUMNS = _Row._fields[:11]
-"""Those that are numbers."""
-
-
-def _row(step: Step, reference: Array, stage: float, spent: Mapping[str, float]) -> _Row:
-    e, d = step.estimate, step.decision
-    return _Row(
-        step.t, step.x, step.y, d.u, e.x, e.h, e.d, reference, stage, e.innovation, e.nis, d.source.name,
-        d.status.name, step.reading, spent,
-    )  # fmt: skip
-
-
-def _is_in_time(late: Callable[[float], bool], t: float) -> bool:
-    return not late(t)
-
-
-def _checked_cost(ocp: OCP, cost: OCP) -> OCP:
-    if (cost.n_x, cost.n_u) != (ocp.n_x, ocp.n_u):
-        raise InputError(
-            f"stage_cost has {cost.n_x} states and {cost.n_u} inputs, needed: {ocp.n_x} and {ocp.n_u}"
-        )
-    return cost
-
-
-def _end(dt: float, duration: float, period: float) -> float:
-    """End of the run [s].
-
-    Raises:
-        InputError: If a time is not finite, the period another than the models', or the run shorter than one.
-    """
-    if not (math.isfinite(duration) and math.isfinite(dt) and dt > 0):
-        raise InputError(f"dt and duration must be finite and dt positive; got {dt} s and {duration} s")
-    if not abs(dt - period) <= 1e-9 * period:
-        raise InputError(f"dt = {dt} s given, a model's period is {period} s; they must agree")
-    if round(duration / dt) < 1:
-        raise InputError(f"duration {duration} s is shorter than one period of {dt} s")
-    return round(duration / dt) * dt

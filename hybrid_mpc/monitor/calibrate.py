@@ -11,11 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.lengths import BLOCK_S, REST_SPEED
-from hybrid_mpc.monitor.plausibility import Plausibility
 
 Array = NDArray[np.float64]
 MIN_BLOCKS = 30
+"""Blocks that the two parameters of a tail need."""
 MAX_EXTRAPOLATION = 20.0
+"""Longest mean time between false alarms, in multiples of the nominal data's length."""
 
 
 @dataclass(frozen=True)
@@ -23,19 +24,18 @@ class Calibration:
     """Thresholds of the alarm and what they come from.
 
     Args:
-        threshold_w: Level [W] above which the alarm starts; None where none could be found: then no level alarms.
+        threshold_w: Level [W] above which the alarm starts; None where none was found: then no level alarms.
         release_w: Level [W] below which it ends; at most ``threshold_w``; None with it.
         false_alarms_per_hour: Wanted rate on nominal data [1/h].
         n_samples: Finite levels used.
         hours: Their duration [h].
         method: How the threshold was found, or why not.
         data_hash: Hash of the nominal data.
-        residual_threshold: Residual level [N m or N] above which the alarm starts too. Default: never.
-        residual_release: Residual level [N m or N] below which that ends.
+        residual_threshold: Residual level [unit of force] above which the alarm starts too. Default: never.
+        residual_release: Residual level [unit of force] below which that ends.
         detector: Detector of scaled residuals, learned from nominal data. Default: none.
-        plausibility: What is ordinary in the training data, for bounds in the plan. Default: none.
-        rest_speed: Speeds ``(n_q,)`` [unit of v] below which friction may stick, or one for all: what every monitor of
-            this model is to take. Default 0.2; None where no recording told them.
+        rest_speed: Speeds ``(n_q,)`` [unit of v] below which friction may stick, or one for all, for every monitor of
+            this model. Default 0.2; None where no recording gave them.
 
     Raises:
         InputError: If ``0 < release_w <= threshold_w`` does not hold, or not so for the residual.
@@ -57,7 +57,6 @@ class Calibration:
     residual_threshold: float | None = None
     residual_release: float | None = None
     detector: Detector | None = None
-    plausibility: Plausibility | None = None
     rest_speed: tuple[float, ...] | None = (REST_SPEED,)
 
     def __post_init__(self) -> None:
@@ -79,7 +78,7 @@ class Calibration:
 
     @classmethod
     def without(cls, reason: str, rest_speed: Sequence[float] | None = None) -> Calibration:
-        """A calibration without thresholds: what is known where none could be found.
+        """A calibration without thresholds.
 
         Args:
             reason: Why not.
@@ -104,19 +103,18 @@ def calibrate(
 ) -> Calibration:
     """Threshold that nominal levels pass upwards at the wanted rate.
 
-    The largest level in a block follows a Gumbel distribution with location and scale from its first
-    two L-moments; the threshold has exceedance probability ``1 - exp(-rate * block)`` in a block, that is,
-    ``location + scale * -log(rate * block)``. The alarm is released at half the threshold, but not below
-    the nominal 95 % quantile (or it would hang), nor above the threshold.
+    The largest level in a block follows a Gumbel distribution with location and scale from its first two L-moments. The
+    threshold ``location - scale * log(rate * block)`` is passed at the wanted rate. The alarm is released at half of
+    it, but not below the nominal 95 % quantile (or it would hang), nor above the threshold.
 
     Args:
         levels: ``level_w`` of nominal runs, each ``(n,)`` [W]; NaN are left out.
         dt: Sample period [s].
         false_alarms_per_hour: Wanted rate [1/h]; default 1.
         data_hash: Hash of the data, kept in the result.
-        block_s: Length of a block [s]; much longer than what one sample does to the next. Default 5; of a machine with
-            another second five of these (:func:`~hybrid_mpc.monitor.lengths.block_seconds`).
-        rest_speed: That of the monitor which made the levels (``monitor.rest_speed``). Default 0.2, as the monitor's.
+        block_s: Length of a block [s], much longer than levels are correlated; see
+            :func:`~hybrid_mpc.monitor.lengths.block_seconds`. Default 5.
+        rest_speed: That of the monitor which made the levels. Default 0.2, as the monitor's.
 
     Raises:
         InputError: If ``dt``, the block or the rate is not positive, more alarms are wanted than one in two blocks,
@@ -170,7 +168,7 @@ def with_residual(power: Calibration, residual: Calibration) -> Calibration:
 
     Args:
         power: Calibration on the levels of the violation.
-        residual: Calibration on the levels of the residual force; its thresholds are in N m or N.
+        residual: Calibration on the levels of the residual force.
 
     Example:
         >>> c = with_residual(Calibration(0.2, 0.1, 0.5, 9, 0.1, ""), Calibration(3.0, 2.0, 0.5, 9, 0.1, ""))

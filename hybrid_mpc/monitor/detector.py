@@ -1,4 +1,4 @@
-"""The monitor that a guard listens to, and its detector from nominal recordings."""
+"""The detector of small, lasting departures: residuals in units of their own scatter, summed up."""
 
 from __future__ import annotations
 
@@ -10,17 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.monitor.lengths import (
-    REST_SPEED,
-    SHORTEST_S,
-    checked_rest,
-)
-
-# Detector of small, lasting departures: residuals in units of their own scatter, summed up.
+from hybrid_mpc.monitor.lengths import REST_SPEED, SHORTEST_S, checked_rest
 
 Array = NDArray[np.float64]
 CAP = 1.5
-"""A sum goes no higher than so many thresholds: what has passed is soon forgotten."""
+"""A sum stops at so many thresholds, so that its alarm ends soon after the departure."""
 TERMS = 4
 """Terms of a scale: constant, squared speed, squared input, and rest (force) or one over the time (energy)."""
 
@@ -42,12 +36,11 @@ class DetectorState:
 class Detector:
     """Cumulative sums of scaled residual forces, and a threshold on the scaled power of the free runs.
 
-    A nominal residual grows with speed, input and near rest. Its variance is learned as
-    ``a_0 + a_1 |v|^2 + a_2 |u|^2 + a_3 / (1 + |v / rest_speed|^2)`` with coefficients that are not negative, and
-    ``z`` is the residual over its deviation. ``g = max(0, g + |z| - drift)``, upwards and downwards apart, rises under
-    a lasting departure above ``drift`` and falls otherwise: the sooner over its threshold, the larger the departure.
-    The energy of a free run, over the time it was accumulated in, has the last term ``a_3 / time``; it is an average
-    already and is compared as it is. Either alarm ends at its ``release``.
+    A nominal residual grows with speed, with input and near rest: its variance is
+    ``a_0 + a_1 |v|^2 + a_2 |u|^2 + a_3 / (1 + |v / rest_speed|^2)`` with coefficients that are not negative, and ``z``
+    is the residual over its deviation. ``g = max(0, g + z - drift)``, and the same for ``-z``, rises under a lasting
+    departure above ``drift`` and falls otherwise: the larger the departure, the sooner it passes its threshold. The
+    power of a free run has ``a_3 / time`` as last term; it is an average already and is compared as it is.
 
     Args:
         dt: Period [s] it was learned at.
@@ -57,8 +50,7 @@ class Detector:
         force_threshold: Sum [deviations] above which the force's alarm starts.
         energy_threshold: Scaled power above which the energy's alarm starts; infinite without free runs.
         release: Share of the threshold at which an alarm ends.
-        rest_speed: Speeds ``(n_q,)`` [unit of v] below which friction may stick, or one for all; also of the scale's
-            term at rest. Default 0.2, that of detectors which hold none.
+        rest_speed: Speeds ``(n_q,)`` [unit of v] below which friction may stick, or one for all. Default 0.2.
         false_alarms_per_hour: Wanted rate on nominal data [1/h].
         hours: Duration of the nominal data [h].
         interval: 5 % and 95 % of a block bootstrap of the thresholds: ``(force low, high, energy low, high)``.
@@ -217,6 +209,3 @@ def force_terms(v2: Array, u2: Array, rest_speed: Sequence[float]) -> Array:
 
 def _fit(row: Sequence[float]) -> bool:
     return len(row) == TERMS and all(math.isfinite(a) and a >= 0 for a in row) and any(row)
-
-
-# A detector learned from nominal data: scales of its residuals, thresholds for a wanted rate of false alarms.

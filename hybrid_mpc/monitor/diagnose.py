@@ -18,9 +18,9 @@ from hybrid_mpc.monitor.residuals import inertia_of
 
 Array = NDArray[np.float64]
 LEAST = 0.01
-"""Probability below which what a cause leaves over is held for something else."""
+"""Probability below which what a cause leaves over is something else."""
 ALIKE = 4.0
-"""Causes whose misfits differ by less (2 deviations) cannot be told apart."""
+"""Causes whose misfits differ by less (2 deviations) cannot be distinguished."""
 BLIND = 1e-3
 """Share of the largest singular value below which a direction of causes cannot be seen."""
 FEWEST = 3
@@ -57,39 +57,30 @@ class Diagnosis:
 
     Args:
         text: In words: ``"friction +95 ± 20 %"``, ``"none of the known causes"``, ``"nothing to explain"``.
-        causes: Causes that may be it: one that explains all, or several that together do. Empty where none does.
-        alternatives: Other single causes that explain it as well.
-        single: Every cause as if it were alone.
-        joint: All causes at once, those that can be told apart.
-        covariance: Of ``joint`` ``(n, n)``.
-        blind: Directions that the motion does not show, in words.
-        misfit: Chi-square over its degrees of freedom of what the causes leave over [-].
-        p_value: Probability of such a misfit if they are all there is.
         samples: Independent samples: those at speed over the length of the monitor's window.
+        causes: One cause that explains all, or several that together do. Default: none does.
+        alternatives: Other single causes that explain it as well. Default: none.
+        blind: Directions that the motion does not show, in words. Default: none.
+        p_value: Probability of what the causes leave over, if they are all there is. Default: not known.
     """
 
     text: str
-    causes: tuple[Change, ...]
-    alternatives: tuple[Change, ...]
-    single: tuple[Change, ...]
-    joint: tuple[Change, ...]
-    covariance: Array
-    blind: tuple[str, ...]
-    misfit: float
-    p_value: float
     samples: float
+    causes: tuple[Change, ...] = ()
+    alternatives: tuple[Change, ...] = ()
+    blind: tuple[str, ...] = ()
+    p_value: float = math.nan
 
 
 class Diagnoser:
     """Explains the residual force by changes of the prior's parameters, or says that none of them does.
 
-    If parameters are off by the shares ``c``, the residual force is ``M (a(x, u, p (1 + c)) - a(x, u, p))``. Each
-    cause is a parameter, or several that change by the same share. Weighted Gauss-Newton over the monitor's history
-    at speed gives the shares; the deviations of the residuals are the detector's, and 15 % of the force itself.
-    Residuals of one window overlap, so the covariance and the test count one sample a window. First every cause is
-    tried alone, since two rarely come together; if none passes the chi-square test, all of them at once. Directions
-    that the motion does not excite are left at zero and named. What the prior's form gets wrong (another friction
-    law) is in no deviation.
+    If parameters are off by the shares ``c``, the residual force is ``M (a(x, u, p (1 + c)) - a(x, u, p))``. A cause is
+    a parameter, or several that change by the same share. Weighted Gauss-Newton over the monitor's history at speed
+    gives the shares; the deviations are the detector's, and 15 % of the force itself. Residuals of one window overlap,
+    so covariance and test count one sample a window. Every cause is tried alone first, since two rarely come together;
+    if none passes the chi-square test, all of them at once. Directions that the motion does not excite are left at zero
+    and named.
 
     Args:
         monitor: With ``history`` and a detector.
@@ -144,16 +135,13 @@ class Diagnoser:
 
         def force(shares: Array) -> tuple[Array, Array]:
             predicted, slopes = (
-                m.full() for m in self._many(len(x))(x.T, u.T, np.tile(shares[:, None], len(x)))
+                m.full() for m in self._force.map(len(x))(x.T, u.T, np.tile(shares[:, None], len(x)))
             )
             n, n_q = shares.size, layout.n_q
             slopes = slopes.reshape(n_q, len(x), n).transpose(1, 0, 2)
             return (predicted.T / sigma).ravel(), (slopes / sigma[:, :, None]).reshape(-1, n)
 
-        return explained(force, (residual / sigma).ravel(), self._names, float(layout.window))
-
-    def _many(self, n: int) -> ca.Function:
-        return self._force.map(n)
+        return _explained(force, (residual / sigma).ravel(), self._names, float(layout.window))
 
 
 def _incidence(known: Sequence[str], causes: Mapping[str, Sequence[str]]) -> Array:
@@ -178,72 +166,60 @@ def _force_function(model: HybridModel, acceleration: ca.Function, incidence: Ar
     return ca.Function("force", [x, u, shares], [ca.densify(force), ca.densify(ca.jacobian(force, shares))])
 
 
-def explained(
+def _explained(
     force: Callable[[Array], tuple[Array, Array]], b: Array, names: list[str], overlap: float
 ) -> Diagnosis:
-    """Diagnosis from a scaled force ``shares -> (values (n,), slopes (n, causes))`` and scaled residuals ``(n,)``.
+    """Diagnosis from a scaled force ``shares -> (values (n,), slopes (n, causes))`` and scaled residuals ``b (n,)``.
 
-    Args:
-        force: What the causes would add.
-        b: Residuals over their deviations.
-        names: Of the causes.
-        overlap: Number of samples that count as one.
+    So many samples as ``overlap`` count as one.
     """
     samples = b.size / overlap
-    none: tuple[Change, ...] = ()
     if samples < FEWEST:
-        text = f"too little motion to tell: {samples:.1f} independent samples, {FEWEST} needed"
-        return Diagnosis(text, none, none, none, none, np.zeros((0, 0)), (), math.nan, math.nan, samples)
+        return Diagnosis(
+            f"too little motion to tell: {samples:.1f} independent samples, {FEWEST} needed", samples
+        )
     every = np.arange(len(names))
     alone = [_fitted(force, b, every == i, overlap) for i in every]
-    single = tuple(
+    single = [
         Change(n, float(f[0][i]), float(np.sqrt(f[1][i, i])) if f[2][i] else math.inf)
         for i, (n, f) in enumerate(zip(names, alone, strict=True))
-    )
+    ]
     misfits = np.array([f[3] for f in alone])
     shares, covariance, seen, left, directions = _fitted(force, b, every >= 0, overlap)
     blind = tuple(n for n, ok in zip(names, seen, strict=True) if not ok)
     blind += tuple(_words(row, names) for row in directions)
     sigma = np.sqrt(np.diag(covariance))
-    joint = tuple(
+    joint = [
         Change(n, float(v), float(s)) for n, v, s, ok in zip(names, shares, sigma, seen, strict=True) if ok
-    )
-    nothing = float(b @ b) / overlap
+    ]
 
     def result(
-        text: str, causes: tuple[Change, ...], others: tuple[Change, ...], misfit: float, freedom: float
+        text: str,
+        misfit: float,
+        freedom: float,
+        causes: tuple[Change, ...] = (),
+        others: tuple[Change, ...] = (),
     ) -> Diagnosis:
-        freedom = max(freedom, 1.0)
-        p = float(chdtrc(freedom, misfit))
-        return Diagnosis(
-            text,
-            causes,
-            others,
-            single,
-            joint,
-            covariance[np.ix_(seen, seen)],
-            blind,
-            misfit / freedom,
-            p,
-            samples,
-        )
+        return Diagnosis(text, samples, causes, others, blind, float(chdtrc(max(freedom, 1.0), misfit)))
 
-    if (quiet := result("nothing to explain", none, none, nothing, samples)).p_value > LEAST:
+    nothing = float(b @ b) / overlap
+    if (quiet := result("nothing to explain", nothing, samples)).p_value > LEAST:
         return quiet
     best, *rest = np.argsort(misfits).tolist()
     others = tuple(
         single[i] for i in rest if misfits[i] - misfits[best] < ALIKE and math.isfinite(single[i].sigma)
     )
     text = " or ".join(str(change) for change in (single[best], *others))
-    if (one := result(text, (single[best],), others, float(misfits[best]), samples - 1)).p_value > LEAST:
+    one = result(text, float(misfits[best]), samples - 1, (single[best],), others)
+    if one.p_value > LEAST:
         return one
     causes = tuple(c for c in joint if abs(c.value) > 2 * c.sigma)
-    several = result(" and ".join(map(str, causes)), causes, none, left, samples - len(joint))
+    several = result(" and ".join(map(str, causes)), left, samples - len(joint), causes)
     if causes and several.p_value > LEAST:
         return several
     share = misfits[best] / nothing
     nearest = f"none of the known causes (nearest: {single[best]}, which leaves {share:.0%} unexplained)"
-    return replace(several, text=nearest, causes=none)
+    return replace(several, text=nearest, causes=())
 
 
 def _fitted(
@@ -257,13 +233,13 @@ def _fitted(
         size = np.linalg.norm(slopes, axis=0)
         used = places[size[places] > BLIND * max(float(size[places].max()), 1e-300)]
         _, s, directions = np.linalg.svd(slopes[:, used] / size[used], full_matrices=False)
-        kept = s > BLIND * s[0] if s.size else np.zeros(0, dtype=bool)
-        pseudo = (directions[kept].T / s[kept] ** 2) @ directions[kept]
+        clear = s > BLIND * s[0] if s.size else np.zeros(0, dtype=bool)
+        pseudo = (directions[clear].T / s[clear] ** 2) @ directions[clear]
         step = pseudo @ (slopes[:, used].T @ (b - predicted) / size[used]) / size[used]
         shares[used] = np.clip(shares[used] + step, *RANGE)
-    covariance, blind = np.zeros((n, n)), np.zeros((int(np.sum(~kept)), n))
+    covariance, blind = np.zeros((n, n)), np.zeros((int(np.sum(~clear)), n))
     covariance[np.ix_(used, used)] = overlap * pseudo / np.outer(size[used], size[used])
-    blind[:, used] = directions[~kept]
+    blind[:, used] = directions[~clear]
     seen = np.zeros(n, dtype=bool)
     seen[used] = True
     left = float(np.sum((b - force(shares)[0]) ** 2)) / overlap

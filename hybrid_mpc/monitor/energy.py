@@ -19,10 +19,10 @@ from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.lengths import REST_SPEED, checked_rest
 from hybrid_mpc.monitor.residuals import Layout, check_model, reading_function
 
-# What the energy monitor remembers and what it says.
-
 Array = NDArray[np.float64]
 QUIET = (False, False)
+FROZEN_STEPS = 3.0
+"""Steps of the sensor that the estimator must have predicted while the sensor repeated itself."""
 
 
 class Verdict(IntEnum):
@@ -76,7 +76,7 @@ class MonitorState:
         frozen: True while the sensor is held for frozen.
         seen: Samples taken, up to the window's.
         whole: Samples since something was missing, up to the window's.
-        dark: Samples in a row that were not judged.
+        invalid: Samples in a row without a reading.
     """
 
     memory: Array
@@ -88,23 +88,22 @@ class MonitorState:
     frozen: bool = False
     seen: int = 0
     whole: int = 0
-    dark: int = 0
+    invalid: int = 0
 
 
 @dataclass(frozen=True)
 class MonitorReading:
-    """One reading. It speaks of the window's centre, ``EnergyMonitor.delay`` before this sample.
+    """One reading, of the window's centre: ``EnergyMonitor.delay`` before this sample.
 
     Args:
         dE_model_w: Energy balance [W] with the model's acceleration.
         dE_measured_w: Energy balance [W] with the measured acceleration, at the same state.
         violation_w: ``|dE_model_w - dE_measured_w|`` [W].
         level_w: Mean violation [W] over the last ``average`` samples.
-        residual: Force that the model does not explain ``(n_q,)`` [N m for an angle, N for a length]; what
-            sticking friction may hold is taken off near rest.
+        residual: Force that the model does not explain ``(n_q,)`` [unit of force]; what sticking friction may hold is
+            taken off near rest.
         residual_level: Length of the mean residual over the last ``average`` samples.
-        alarm: True while any alarm is on, or the monitor is blind; without calibration, detector and freeze test
-            there is no other.
+        alarm: True while any alarm is on, or the monitor is blind.
         energy_j: Energy [J] by which the model's own free run departs from the measurement, accumulated over
             ``energy_s``; NaN without free runs, and after a missing measurement until the next run.
         energy_s: Time [s] over which it was accumulated.
@@ -114,8 +113,7 @@ class MonitorReading:
         numbers: What a detector is learned from: both balances, violation, residual, travel, speed and input at the
             centre; with free runs energy, squared speed and squared input times time, and the time. Default: none.
         verdict: Whether this sample was judged, and if not, why.
-        blind: True while the monitor has judged nothing for longer than its windows, that of the derivative and that of
-            the averages together: it cannot vouch for the model.
+        blind: True while the monitor has judged nothing for longer than its two windows together.
     """
 
     dE_model_w: float
@@ -134,67 +132,53 @@ class MonitorReading:
     blind: bool = False
 
 
-FROZEN_STEPS = 3.0
-"""Steps of the sensor that the estimator must have predicted while the sensor repeated itself."""
-
-
 class EnergyMonitor:
     """Compares the model's power balance with the measured one, causally.
 
-    Measured side: a cubic through the last ``window`` samples of ``y`` (least squares) gives position,
-    velocity and acceleration at the window's centre. That acceleration is a weighted mean of the true
-    one, ``sum_i w_i y_i = int K(s) a(s) ds``, where the Peano kernel ``K(s) = sum_{t_i > s} w_i (t_i - s)``
-    has unit area and is linear between samples. The model's acceleration is averaged with the same ``K``:
-    one step from every estimate ``(x_hat_i, h_i)`` under the input applied there gives
-    ``dv = int a ds`` and ``dp = int (t_{i+1} - s) a ds``, hence exactly
-    ``int K a ds = K_{i+1} dv - K' dp`` in every period. So steps of the input, however large, raise no
-    violation; the estimated disturbance ``d`` is left out, since it would hide the fault.
+    **Violation** [W]: a least-squares cubic through the last ``window`` samples of ``y`` gives position, velocity and
+    acceleration at the window's centre. This acceleration is a weighted mean of the true one,
+    ``sum_i w_i y_i = int K(s) a(s) ds`` with the Peano kernel ``K(s) = sum_{t_i > s} w_i (t_i - s)``. The model's
+    acceleration is averaged with the same ``K``: one step from every estimate ``(x_hat_i, h_i)`` gives
+    ``dv = int a ds`` and ``dp = int (t_{i+1} - s) a ds``, hence exactly ``int K a ds = K_{i+1} dv - K' dp`` in every
+    period. So steps of the input raise no violation. The estimated disturbance ``d`` is left out, since it would hide
+    the fault. Both balances take the state ``[q, v]`` of the cubic and the input averaged with ``K``; with one degree
+    of freedom their difference is ``J |v| |a_model - a_measured|``.
 
-    Both balances take the state ``[q, v]`` of the cubic and the input averaged with ``K``. At equal state
-    the other terms cancel: the violation is ``J |v| |a_model - a_measured|`` (one degree of freedom), where
-    ``a_model`` is a mean over each period's own step, so a model error acts as it would in a prediction.
-    The other terms of each single balance are taken at the centre, not averaged.
+    **Residual force**: at rest the violation is zero, whatever the forces do; ``M (a_measured - a_model)`` with the
+    inertia ``M`` of the energy balance is not. Near rest dry friction may be anything up to half the jump of the
+    model's force at zero speed. Only what exceeds this dead band counts there; it closes linearly up to twice
+    ``rest_speed``. So a hand that holds the machine still shows, and sticking friction does not.
 
-    At rest the violation is zero, whatever the forces do. Beside it stands the residual force ``M (a_measured -
-    a_model)`` with the inertia ``M`` that the energy balance holds. Near rest dry friction may be anything up to
-    ``F``, half the jump of the model's acceleration at zero speed times ``M``, told from what damps at ``rest_speed``
-    and twice that: only what exceeds this dead band counts there; it closes linearly up to twice the speed. So a hand
-    that holds the machine still shows, and sticking friction does not.
+    **Energy of the free run** [J]: the one step starts from an estimate that has followed the measurements, and so has
+    half forgotten what went wrong. With ``free_run`` the model also runs on its own under the applied inputs. What its
+    balance departs from the measured one adds up to an energy: noise averages out in it, a steady loss does not. Two
+    runs, begun half a length apart, take turns; the reading is of the older one.
 
-    The one step starts from an estimate that has followed the measurements, and so has half forgotten what went
-    wrong. With ``free_run`` the model also runs on its own, from ``(x_hat, h)`` of up to so long ago under the
-    applied inputs; its positions go through the same cubic, and what its balance, at its own state, departs from
-    the measured one adds up to an energy. Two such runs, begun half a length apart, take turns: the reading is of
-    the older one. Noise averages out in it, what takes power steadily does not.
+    **Frozen sensor**, with ``resolution``: the sensor repeats itself while the one-step predictions add up to more than
+    three of its steps. Predictions slower than ``rest_speed`` do not count, since an estimate creeps on where friction
+    sticks. Near rest the estimator takes a frozen sensor for a standing machine and the controller pulls harder: so
+    what the input's change since the sensor's last step would have moved counts as well, once it is more than a quarter
+    of the input's range. A machine that is blocked looks the same.
 
-    With ``resolution`` a sensor that repeats itself while the one-step predictions add up to more than three of its
-    steps is held for frozen, until it moves. Predictions slower than ``rest_speed`` do not count: where friction sticks
-    an estimate creeps on, and the sensor rightly stands still. A sensor that freezes near rest is taken for a standing
-    machine by the estimator, and by a controller for one that needs a stronger pull: so what the change of the
-    input since the last step of the sensors would have moved counts as well, once it is more than a quarter of the
-    input's range and the model says that it moves. A machine that is blocked looks the same.
-
-    A missing (NaN) measurement gives NaN readings until it has left the window. The level is the mean of the finite
-    ones of the last ``average`` violations, NaN (and no alarm) while fewer than half are finite. Each reading says
-    whether it judged and if not, why (``verdict``). A monitor that has judged nothing for longer than ``window`` and
-    ``average`` together is ``blind``, and that is an alarm: nobody knows how the machine is. Positions must count on
-    through full turns. Not for several threads at once (it reuses its buffers).
+    A missing (NaN) measurement gives NaN readings until it has left the window. A level is the mean of the finite ones
+    of the last ``average`` values, NaN (and no alarm) while fewer than half are finite. ``verdict`` says whether a
+    reading is one. A monitor that has judged nothing for longer than ``window`` and ``average`` together is ``blind``,
+    and that is an alarm. Positions must count on through full turns. Not for several threads at once (it reuses its
+    buffers).
 
     Args:
         model: Model whose outputs are its positions ``q`` (state ``[q, v]``).
         window: Samples in the local polynomial, odd, at least 5.
         average: Samples in the moving average of the level.
         calibration: Thresholds of the alarm. Default: none, then there is no alarm from the levels.
-        rest_speed: Speeds ``(n_q,)`` [unit of v] below which friction may stick, or one for all: what
-            :func:`~hybrid_mpc.monitor.lengths.rest_speeds` finds in recordings. Default: the detector's, else the
-            calibration's, else 0.2, which suits angles in rad/s and was every machine's before rest speeds were
-            learned.
+        rest_speed: Speeds ``(n_q,)`` [unit of v] below which friction may stick, or one for all; see
+            :func:`~hybrid_mpc.monitor.lengths.rest_speeds`. Default: the detector's, else the calibration's, else 0.2,
+            which suits angles in rad/s.
         free_run: Length [s] of the model's free runs. Default 0: none.
         resolution: Step of each sensor ``(n_y,)``. Default: unknown, then there is no test for freezing.
         detector: Detector of scaled residuals. Default: none.
         input_range: Range ``(n_u,)`` of each input, largest less smallest, for the test for freezing near rest.
-            Default: that of the model's signals; there is no such test for an input without bounds,
-            and hardly one with wide ones.
+            Default: that of the model's signals; without bounds there is no such test.
         history: Time [s] over which :func:`~hybrid_mpc.monitor.diagnose.diagnose` looks back. Default 0: not at all.
 
     Raises:
@@ -242,8 +226,8 @@ class EnergyMonitor:
         self.model, self.window, self.average = model, window, average
         self.calibration, self.detector = calibration, detector
         if rest_speed is None:
-            held = (part.rest_speed for part in (detector, calibration) if part is not None)
-            rest_speed = next((rest for rest in held if rest is not None), REST_SPEED)
+            stored = (part.rest_speed for part in (detector, calibration) if part is not None)
+            rest_speed = next((rest for rest in stored if rest is not None), REST_SPEED)
         self.rest_speed = checked_rest(rest_speed, model.n_x // 2, "energy monitor")
         self._resolution = _positive(resolution, model.n_y)
         if detector is not None:
@@ -299,37 +283,52 @@ class EnergyMonitor:
         ins[0][:], ins[1][:], ins[2][:], ins[3][:], ins[4][:] = state.memory, state.x, state.h, u_prev, y
         left = state.left and self._free_runs(state)
         self._evaluate()
-        memory, place, n_q = self._outs[0].copy(), self.layout.averaged, self.model.n_y
-        middle, end = place + self.average, self.layout.runs
-        level = _mean_of_finite(memory[place:middle])
-        if n_q == 1:
-            residual_level = abs(_mean_of_finite(memory[middle:end]))
-        else:
-            residual_level = _length_of_mean(memory[middle:end].reshape(self.average, n_q))
+        memory, numbers, n_q = self._outs[0].copy(), self._outs[1].tolist(), self.model.n_y
+        level, residual_level = self._levels(memory)
         alarms = self.alarms(level, residual_level, state.alarms)
-        numbers = self._outs[1].tolist()
-        frozen = False
-        for travel, step in zip(numbers[3 + n_q : 3 + 2 * n_q], self._resolution, strict=False):
-            frozen = frozen or abs(travel) > FROZEN_STEPS * step
+        travels = zip(numbers[3 + n_q : 3 + 2 * n_q], self._resolution, strict=False)
+        frozen = any(abs(travel) > FROZEN_STEPS * step for travel, step in travels)
         energy, seconds = self._older(numbers, left) if left else (math.nan, 0.0)
-        scores: tuple[float, ...]
-        found, scores, detected = state.detector, (), False
+        detector, detected = state.detector, False
+        scores: tuple[float, ...] = ()
         if self.detector is not None:
-            found, scores, detected = self.detector.update(found, numbers)
+            detector, scores, detected = self.detector.update(detector, numbers)
         seen = min(state.seen + 1, self.window)
         missing = not math.isfinite(sum(y.tolist()) + (sum(u_prev.tolist()) if state.seen else 0.0))
         whole = 0 if missing else min(state.whole + 1, self.window)
         verdict = self._verdict(numbers[2 : 3 + n_q], seen, whole)
-        dark = state.dark + 1 if verdict else 0
-        blind = dark > self.window + self.average
-        alarm = alarms[0] or alarms[1] or frozen or detected or blind
-        return MonitorState(memory, x, h, alarms, left, found, frozen, seen, whole, dark), MonitorReading(
-            numbers[0], numbers[1], numbers[2], level, self._outs[1][3 : 3 + n_q].copy(), residual_level, alarm,
-            energy, seconds, frozen, scores, tuple(numbers), verdict, blind,
-        )  # fmt: skip
+        invalid = state.invalid + 1 if verdict else 0
+        blind = invalid > self.window + self.average
+        following = MonitorState(memory, x, h, alarms, left, detector, frozen, seen, whole, invalid)
+        reading = MonitorReading(
+            dE_model_w=numbers[0],
+            dE_measured_w=numbers[1],
+            violation_w=numbers[2],
+            level_w=level,
+            residual=self._outs[1][3 : 3 + n_q].copy(),
+            residual_level=residual_level,
+            alarm=alarms[0] or alarms[1] or frozen or detected or blind,
+            energy_j=energy,
+            energy_s=seconds,
+            frozen=frozen,
+            scores=scores,
+            numbers=tuple(numbers),
+            verdict=verdict,
+            blind=blind,
+        )
+        return following, reading
+
+    def _levels(self, memory: Array) -> tuple[float, float]:
+        """Means of the latest violations and residual forces."""
+        first, n_q = self.layout.averaged, self.model.n_y
+        middle, end = first + self.average, self.layout.runs
+        level = _mean_of_finite(memory[first:middle])
+        if n_q == 1:
+            return level, abs(_mean_of_finite(memory[middle:end]))
+        return level, _length_of_mean(memory[middle:end].reshape(self.average, n_q))
 
     def _verdict(self, readings: Sequence[float], seen: int, whole: int) -> Verdict:
-        """Whether violation and residual force are numbers; and if not, what hinders."""
+        """Whether violation and residual force are numbers, and if not, why."""
         if math.isfinite(sum(readings)):
             return Verdict.JUDGED
         if seen < self.window:
@@ -337,7 +336,7 @@ class EnergyMonitor:
         return Verdict.MISSING if whole < self.window else Verdict.NOT_FINITE
 
     def alarms(self, level: float, residual_level: float, were_on: tuple[bool, bool]) -> tuple[bool, bool]:
-        """Whether power and residual alarm at these levels [W], [N m], after having been on or not."""
+        """Whether power and residual alarm at these levels, after having been on or not."""
         c = self.calibration
         if c is None or c.threshold_w is None or c.release_w is None:
             return QUIET
@@ -353,8 +352,8 @@ class EnergyMonitor:
             left = self.layout.begin_runs(self._ins[0], left, state.x, state.h)
         else:
             left = left[0] - 1, left[1] - 1
-        youngest, judged = self.layout.length - self.window + 2, self._ins[5]
-        judged[0], judged[1] = left[0] <= youngest, left[1] <= youngest
+        youngest, full = self.layout.length - self.window + 2, self._ins[5]
+        full[0], full[1] = left[0] <= youngest, left[1] <= youngest
         return left
 
     def _older(self, numbers: list[float], left: tuple[int, ...]) -> tuple[float, float]:

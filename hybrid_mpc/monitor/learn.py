@@ -33,16 +33,104 @@ from hybrid_mpc.monitor.lengths import (
 from hybrid_mpc.monitor.replay import EstimatorLike, TrajectoryLike, along, replay
 
 Array = NDArray[np.float64]
-
-
+DRIFT = 2.0
+"""Departure [deviations] that the detector's sums count as nothing. What that finds how soon: docs/energy-guard.md."""
 ROUNDS = 5
+"""Fits of a variance, each weighted by the one before."""
 FLOOR = 1e-3
 """Smallest constant of a variance, as a share of its mean: a scale must not vanish where the data were quiet."""
 BOOTSTRAPS = 200
+"""Resamplings of the thresholds."""
 NEIGHBOURS = 6
 """Blocks that are drawn together: half a minute of blocks of 5 s, longer than what one motion does to the next."""
 ODD = 1e-4
 """A largest block less probable than this under the rest of its own kind is no nominal one."""
+
+
+def guard_monitor(
+    model: HybridModel,
+    calibration: Calibration | Detector | None = None,
+    *,
+    resolution: ArrayLike | None = None,
+    input_range: ArrayLike | None = None,
+    rest_speed: ArrayLike | None = None,
+    diagnose: bool = False,
+) -> EnergyMonitor:
+    """The energy monitor with everything: short window, free runs, freeze test, detector, history.
+
+    Its lengths count in the machine's second (``model.time_unit``): a window of 0.2, averages of 0.1, free runs of 0.6,
+    a history of 2. Of a calibration only the detector is used: thresholds belong to the window they were found with.
+
+    Args:
+        model: Model whose outputs are its positions.
+        calibration: With a detector, or the detector itself. Default: none, e.g. to learn one.
+        resolution: Step of each sensor ``(n_y,)``. Default: unknown, no test for freezing.
+        input_range: As in :class:`~hybrid_mpc.monitor.energy.EnergyMonitor`.
+        rest_speed: As there; to learn a detector give what :func:`~hybrid_mpc.monitor.lengths.rest_speeds` finds.
+        diagnose: Whether to keep a history for :class:`~hybrid_mpc.monitor.diagnose.Diagnoser`. Default: no.
+
+    Raises:
+        InputError: If the calibration has no detector, or one learned otherwise.
+
+    Example: ``guard_monitor(artifact.models["hybrid"], detector, resolution=[2 * np.pi / 4096])``
+    """
+    detector = calibration.detector if isinstance(calibration, Calibration) else calibration
+    if calibration is not None and detector is None:
+        raise InputError(
+            "guard monitor: the calibration holds no detector; learn one from nominal recordings: "
+            "hybrid-mpc monitor MODEL NOMINAL.csv --learn 1"
+        )
+    half = half_window(WINDOW_S, model)
+    length = max(seconds(FREE_RUN_S, model), 2 * (2 * half + 1) * model.dt)
+    return EnergyMonitor(
+        model,
+        window=2 * half + 1,
+        average=samples(AVERAGE_S, model),
+        rest_speed=rest_speed,
+        free_run=length,
+        resolution=resolution,
+        input_range=input_range,
+        detector=detector,
+        history=seconds(HISTORY_S, model) if diagnose else 0.0,
+    )
+
+
+def learn_from(
+    model: HybridModel,
+    estimator: EstimatorLike,
+    recordings: Iterable[TrajectoryLike],
+    *,
+    false_alarms_per_hour: float = 1.0,
+    rest_speed: ArrayLike | None = None,
+    data_hash: str = "",
+    report: Callable[[str, int, int, str], None] = lambda key, done, total, text: None,
+) -> Detector:
+    """The detector of :func:`guard_monitor` from nominal recordings.
+
+    Args:
+        model: The model.
+        estimator: The one that the loop will use.
+        recordings: On the model's grid, in which nothing is wrong; the first of the machine's seconds is left out.
+        false_alarms_per_hour: Wanted rate [1/h]; default 1.
+        rest_speed: Speeds ``(n_q,)`` below which friction may stick. Default: found in the recordings.
+        data_hash: Hash of the recordings, kept in the result.
+        report: Called with ``(key, done, total, text)`` as the replay goes on, in samples. Default: not at all.
+
+    Raises:
+        InputError: If a recording is on another grid, they are too short, nothing moves in them, or they hold an alarm.
+
+    Example: ``learn_from(model, estimator, dataset.whole, data_hash=dataset.hash)``
+    """
+    given = list(recordings)
+    monitor = guard_monitor(model, rest_speed=rest_speeds(given, model) if rest_speed is None else rest_speed)
+    skipped = samples(SETTLING_S, model)
+    runs: list[Array] = []
+    for r, say in along(given, report):
+        runs.append(replay(monitor, estimator, r, on_progress=say).numbers[skipped:])
+    return learn_detector(
+        runs, model.dt, model.n_y, drift=DRIFT, false_alarms_per_hour=false_alarms_per_hour,
+        rest_speed=monitor.rest_speed, data_hash=data_hash, time_unit=model.time_unit,
+    )  # fmt: skip
 
 
 def learn_detector(
@@ -62,10 +150,9 @@ def learn_detector(
 ) -> Detector:
     """A detector from nominal readings.
 
-    Scales come from weighted least squares of the squared residuals with coefficients that are not negative, and
-    thresholds from a Gumbel tail of the block maxima (:func:`~hybrid_mpc.monitor.calibrate.calibrate`), half of the
-    wanted rate for either alarm. Beside them stands what a block bootstrap makes of the same maxima: six blocks, half a
-    minute, are drawn at a time, so that neighbours stay together.
+    Scales come from weighted least squares of the squared residuals with coefficients that are not negative. Thresholds
+    come from a Gumbel tail of the block maxima (:func:`~hybrid_mpc.monitor.calibrate.calibrate`), half of the wanted
+    rate for either alarm. A block bootstrap of the same maxima, six neighbours at a time, gives their interval.
 
     Args:
         runs: ``MonitorReading.numbers`` of nominal runs, each ``(n, columns)``.
@@ -74,12 +161,11 @@ def learn_detector(
         free_runs: Whether the numbers hold free runs. Default: yes.
         drift: See :class:`~hybrid_mpc.monitor.detector.Detector`. Default 1.
         false_alarms_per_hour: Wanted rate [1/h]; default 1.
-        rest_speed: Speeds ``(n_q,)`` [unit of v] below which friction may stick, or one for all: those of the monitor
-            that made the numbers (``monitor.rest_speed``). Default 0.2, that of a monitor which was given none.
+        rest_speed: That of the monitor which made the numbers. Default 0.2, as the monitor's.
         data_hash: Hash of the data, kept in the result.
         seed: Of the bootstrap.
-        trusted: Whether the data are known to be nominal, as simulated ones are: then a block that stands out is one
-            of theirs. Default: no; they are refused.
+        trusted: Whether the data are known to be nominal, as simulated ones are. Default: no; then a block that stands
+            out is refused.
         time_unit: The machine's second [s], the model's. Default 1.
         block_s: Length of a block [s]. Default: 5 of the machine's seconds, 50 periods at least; shorter where there
             is little data, and a higher rate is enough.
@@ -116,7 +202,7 @@ def learn_detector(
         time = np.where(long, seconds, np.inf)
         features = np.column_stack([np.ones(len(rows)), v2 / time, u2 / time, 1.0 / time])
         energy = _scale(features[long], (energy_j / time)[long], "power of the free runs")
-    raw = Detector(
+    unlimited = Detector(
         dt,
         force,
         energy,
@@ -126,7 +212,7 @@ def learn_detector(
         rest_speed=rest,
         time_unit=time_unit,
     )
-    levels = [detector_levels(raw, run) for run in runs]
+    levels = [detector_levels(unlimited, run) for run in runs]
     rate = false_alarms_per_hour / (2 if free_runs else 1)
     rng = np.random.default_rng(seed)
     checked = "" if trusted else "forces", "" if trusted else "power"
@@ -135,7 +221,7 @@ def learn_detector(
     if free_runs:
         power = _threshold([b for _, b in levels], dt, rate, rng, checked[1], block_s)
     return replace(
-        raw,
+        unlimited,
         force_threshold=sums[0],
         energy_threshold=power[0],
         false_alarms_per_hour=false_alarms_per_hour,
@@ -238,98 +324,3 @@ def check_nominal(maxima: Array, what: str, block_s: float = BLOCK_S) -> None:
             f"calibration data of the {what} hold an alarm: blocks of {block_s:g} s from {places} s stand out "
             f"(up to {maxima.max():.3g}, nominal blocks stay below {limit:.3g}); cut them out, or find what was wrong"
         )
-
-
-DRIFT = 2.0
-"""Departure [deviations] that the detector's sums count as nothing. What that finds how soon: docs/energy-guard.md."""
-
-
-def guard_monitor(
-    model: HybridModel,
-    calibration: Calibration | Detector | None = None,
-    *,
-    resolution: ArrayLike | None = None,
-    input_range: ArrayLike | None = None,
-    rest_speed: ArrayLike | None = None,
-    diagnose: bool = False,
-) -> EnergyMonitor:
-    """The energy monitor with everything: short window, free runs, freeze test, detector, history.
-
-    Its lengths count in the machine's second (``model.time_unit``): a window of 0.2, averages of 0.1, free runs of
-    0.6, a history of 2. Thresholds of a calibration belong to the window that they were found with, so only its
-    detector is used.
-
-    Args:
-        model: Model whose outputs are its positions.
-        calibration: With a detector, or the detector itself. Default: none, e.g. to learn one.
-        resolution: Step of each sensor ``(n_y,)``. Default: unknown, no test for freezing.
-        input_range: Range ``(n_u,)`` of each input that the controller has, for the same test. Default: that of the
-            model's signals.
-        rest_speed: Speeds ``(n_q,)`` below which friction may stick. Default: the detector's, else 0.2, see
-            :class:`~hybrid_mpc.monitor.energy.EnergyMonitor`; to learn a detector give what :func:`rest_speeds` finds.
-        diagnose: Whether to keep a history for :class:`~hybrid_mpc.monitor.diagnose.Diagnoser`. Default: no.
-
-    Raises:
-        InputError: If the calibration has no detector, or one learned otherwise.
-
-    Example: ``guard_monitor(artifact.models["hybrid"], detector, resolution=[2 * np.pi / 4096])``
-    """
-    detector = calibration.detector if isinstance(calibration, Calibration) else calibration
-    if calibration is not None and detector is None:
-        raise InputError(
-            "guard monitor: the calibration holds no detector; learn one from nominal recordings: "
-            "hybrid-mpc monitor MODEL NOMINAL.csv --learn 1"
-        )
-    half = half_window(WINDOW_S, model)
-    length = max(seconds(FREE_RUN_S, model), 2 * (2 * half + 1) * model.dt)
-    return EnergyMonitor(
-        model,
-        window=2 * half + 1,
-        average=samples(AVERAGE_S, model),
-        rest_speed=rest_speed,
-        free_run=length,
-        resolution=resolution,
-        input_range=input_range,
-        detector=detector,
-        history=seconds(HISTORY_S, model) if diagnose else 0.0,
-    )
-
-
-def learn_from(
-    model: HybridModel,
-    estimator: EstimatorLike,
-    recordings: Iterable[TrajectoryLike],
-    *,
-    false_alarms_per_hour: float = 1.0,
-    rest_speed: ArrayLike | None = None,
-    data_hash: str = "",
-    report: Callable[[str, int, int, str], None] = lambda key, done, total, text: None,
-) -> Detector:
-    """The detector of :func:`guard_monitor` from nominal recordings.
-
-    Args:
-        model: The model.
-        estimator: The one that the loop will use.
-        recordings: On the model's grid, in which nothing is wrong; the first of the machine's seconds of each is left
-            out.
-        false_alarms_per_hour: Wanted rate [1/h]; default 1.
-        rest_speed: Speeds ``(n_q,)`` below which friction may stick, e.g. the artifact's. Default: those that
-            :func:`rest_speeds` finds in the recordings.
-        data_hash: Hash of the recordings, kept in the result.
-        report: Called with ``(key, done, total, text)`` as the replay goes on, in samples. Default: not at all.
-
-    Raises:
-        InputError: If a recording is on another grid, they are too short, nothing moves in them, or they hold an alarm.
-
-    Example: ``learn_from(model, estimator, dataset.whole, data_hash=dataset.hash)``
-    """
-    given = list(recordings)
-    monitor = guard_monitor(model, rest_speed=rest_speeds(given, model) if rest_speed is None else rest_speed)
-    skipped = samples(SETTLING_S, model)
-    runs: list[Array] = []
-    for r, say in along(given, report):
-        runs.append(replay(monitor, estimator, r, on_progress=say).numbers[skipped:])
-    return learn_detector(
-        runs, model.dt, model.n_y, drift=DRIFT, false_alarms_per_hour=false_alarms_per_hour,
-        rest_speed=monitor.rest_speed, data_hash=data_hash, time_unit=model.time_unit,
-    )  # fmt: skip

@@ -1,4 +1,4 @@
-"""The speed below which a machine counts as at rest, from its own recordings."""
+"""The lengths of monitor, detector and guard in the machine's own seconds, and the speed below which it is at rest."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ from hybrid_mpc.data.scales import COARSEST, Outputs, noise_of, periods, speed_g
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.model import HybridModel
 
-# The lengths of monitor, detector and guard, all in the machine's own seconds
-# (:func:`hybrid_mpc.data.scales.time_unit`).
-
+Array = NDArray[np.float64]
 WINDOW_S = 0.2
 """Window of the guard's derivative: half of it is how late a reading is, and its noise grows with length^-2.5."""
 AVERAGE_S = 0.1
+"""Average of the guard's levels: half a window."""
 FREE_RUN_S = 0.6
+"""Length of the model's free runs: three windows."""
 HISTORY_S = 2.0
+"""How far back a diagnosis looks."""
 LEVEL_S = 0.3
 """Window of the main job's monitor, for its derivative and for the average that makes its level."""
 SETTLING_S = 1.0
@@ -27,15 +28,19 @@ BLOCK_S = 5.0
 """Blocks whose largest levels tell the rate of false alarms: much longer than what one sample does to the next."""
 SHORTEST_S = 0.08
 """Accumulated times of a free run below this say little."""
+REST_SPEED = 0.2
+"""Rest speed [unit of v] where no recording gave one; it suits angles in rad/s."""
+SHARE = 0.05
+"""Share of the speed at work below which friction may stick: on the recorded machines the smoothed step of the priors'
+dry friction (0.002 m/s to 0.1 rad/s) has risen to 99 % there."""
+QUANTILE = 0.99
+"""Quantile of the speeds in motion that counts as speed at work: an outlier or a blow by hand moves it little."""
+DEVIATIONS = 3.0
+"""Speeds within so many deviations of the sensor's noise count as no motion."""
 
 
 def seconds(length: float, model: HybridModel) -> float:
-    """A length of this module in seconds on the machine of a model.
-
-    Args:
-        length: In the machine's seconds.
-        model: The model, which holds its ``time_unit``.
-    """
+    """A length of this module [the machine's seconds] in seconds."""
     return length * model.time_unit
 
 
@@ -63,25 +68,11 @@ def block_seconds(dt: float, time_unit: float = 1.0) -> float:
     return BLOCK_S * max(time_unit, COARSEST * dt)
 
 
-Array = NDArray[np.float64]
-REST_SPEED = 0.2
-"""What every machine had before rest speeds were learned [rad/s]: that of artifacts and detectors that hold none."""
-SHARE = 0.05
-"""Share of the speed at work. Below it a drive's friction is told by whether it sticks rather than by how fast it
-moves: on the recorded machines the smoothed step of the priors' dry friction (0.002 m/s to 0.1 rad/s) has risen to 99
-% there."""
-QUANTILE = 0.99
-"""Quantile of the speeds in motion that counts as speed at work: an outlier or a blow by hand moves it little."""
-DEVIATIONS = 3.0
-"""So many deviations of what the sensor's noise makes of a speed count as no motion."""
-
-
 def rest_speeds(recordings: Sequence[Outputs], model: HybridModel) -> tuple[float, ...]:
     """Speeds, one for each degree of freedom, below which friction may stick [unit of v].
 
-    The rule: a twentieth of the speed at work, which is the 99 % quantile of the speeds in motion; but no less than
-    three deviations of what the sensor's noise and steps make of a speed over the guard's window. Speeds are those that
-    the monitor sees: slopes of cubics over that window.
+    A twentieth of the speed at work (the 99 % quantile of the speeds in motion), but no less than three deviations of
+    what the sensor's noise and steps make of a speed. Speeds are slopes of cubics over the guard's window.
 
     Args:
         recordings: Positions ``y`` ``(n, n_q)`` on the model's grid, in which nothing is wrong: the training ones.

@@ -16,10 +16,11 @@ from hybrid_mpc.monitor.energy import SECONDS, EnergyMonitor, MonitorReading, Mo
 Array = NDArray[np.float64]
 REPORTED = 500
 """Samples from one report of the progress to the next."""
-NUMBERS = "dE_model_w", "dE_measured_w", "violation_w", "level_w", "residual_level", "energy_j", "energy_s"
-FLAGS = "alarm", "frozen", "blind", "verdict"
-WIDE = "scores", "numbers"
-"""Fields of a reading that a trace holds: a number, a flag, or several numbers a sample."""
+COLUMNS = (
+    "dE_model_w", "dE_measured_w", "violation_w", "level_w", "residual_level", "energy_j", "energy_s",
+    "alarm", "frozen", "blind", "verdict", "scores", "numbers",
+)  # fmt: skip
+"""Fields of a reading that a trace holds."""
 
 
 class EstimatorLike(Protocol):
@@ -121,7 +122,7 @@ def replay(
     t, y, u = (np.asarray(a, dtype=np.float64) for a in (trajectory.t, trajectory.y, trajectory.u))
     _check(t, y, u, monitor.model.dt)
     state, estimate = monitor.initial(), estimator.start(y[0], float(t[0]))
-    rows = _Rows(t.size)
+    columns: dict[str, Any] = {}
     for k in range(t.size):
         if k % REPORTED == 0:
             on_progress(k, t.size)
@@ -129,46 +130,21 @@ def replay(
         if k:
             estimate = estimator.update(estimate, y[k], u_prev)
         state, reading = monitor.update(state, y[k], u_prev, estimate)
-        rows.add(k, reading)
+        for name in COLUMNS:
+            value = np.asarray(getattr(reading, name))
+            if not k:
+                columns[name] = np.zeros((t.size, *value.shape), dtype=value.dtype)
+            columns[name][k] = value
         if on_reading is not None:
             on_reading(k, state, reading)
     on_progress(t.size, t.size)
-    return rows.trace(t, state)
-
-
-class _Rows:
-    """The columns of a trace while they are filled; made with the first reading, whose width they take.
-
-    Args:
-        n: Samples.
-    """
-
-    def __init__(self, n: int) -> None:
-        self._n, self._columns = n, {name: np.zeros(n) for name in NUMBERS}
-        self._flags = {name: np.zeros(n, dtype=int if name == "verdict" else bool) for name in FLAGS}
-        self._wide: dict[str, Array] = {}
-
-    def add(self, k: int, reading: MonitorReading) -> None:
-        """Take the reading of sample ``k``."""
-        for columns in (self._columns, self._flags):
-            for name, column in columns.items():
-                column[k] = getattr(reading, name)
-        for name in WIDE:
-            values = getattr(reading, name)
-            if not k:
-                self._wide[name] = np.zeros((self._n, len(values)))
-            self._wide[name][k] = values
-
-    def trace(self, t: Array, state: MonitorState) -> MonitorTrace:
-        """All of it."""
-        columns: dict[str, Any] = {**self._columns, **self._flags, **self._wide}
-        return MonitorTrace(t, **columns, state=state)
+    return MonitorTrace(t, **columns, state=state)
 
 
 def along(
     recordings: Sequence[Recording], report: Callable[[str, int, int, str], None]
 ) -> Iterator[tuple[Recording, Callable[[int, int], None]]]:
-    """Recordings one after the other, each with what a replay tells its progress.
+    """Recordings one after the other, each with the function that a replay reports its progress to.
 
     Args:
         recordings: The recordings.
@@ -192,17 +168,17 @@ def along(
         before += len(r.t)
 
 
-def judge(monitor: EnergyMonitor, trace: MonitorTrace) -> MonitorTrace:
+def with_alarms(monitor: EnergyMonitor, trace: MonitorTrace) -> MonitorTrace:
     """The trace with the alarms of another calibration: those of ``monitor``.
 
     Estimates and levels do not depend on the calibration, so nothing is replayed.
 
     Args:
-        monitor: The monitor that judges; model and windows as in the replay.
+        monitor: Whose calibration counts; model and windows as in the replay.
         trace: What :func:`replay` returned.
 
     Example:
-        ``judge(EnergyMonitor(model, window=15, average=15, calibration=calibration), trace).intervals()``
+        ``with_alarms(EnergyMonitor(model, window=15, average=15, calibration=calibration), trace).intervals()``
     """
     on, alarm = (False, False), []
     for level, residual in zip(trace.level_w, trace.residual_level, strict=True):

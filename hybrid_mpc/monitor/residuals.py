@@ -1,4 +1,4 @@
-"""The monitor's arithmetic as one CasADi function: one-step violation, residual force, free runs, regressors."""
+"""The energy monitor's arithmetic as one CasADi function: violation, residual force, free runs, frozen sensor."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.model.model import Balance, HybridModel
 
 Array = NDArray[np.float64]
 RUNS = 2
@@ -19,8 +19,10 @@ RUN_SUMS = 3
 """Sums of a free run: energy departure, squared speed, squared input."""
 ENERGY = "energy"
 """Name of the balance that is watched."""
+FORCES = {("W", "rad/s"): "N m", ("W", "m/s"): "N"}
+"""Short names of a power over a speed."""
 HELD_SHARE = 0.25
-"""Change of an input, as a share of its plausible range, that no sticking friction is believed to hold."""
+"""Change of an input, as a share of its range, that sticking friction does not hold."""
 
 
 @dataclass(frozen=True)
@@ -125,14 +127,28 @@ def energy_balance(model: HybridModel, x: ca.MX, xdot: ca.MX, u: ca.MX) -> ca.MX
     Raises:
         InputError: If the model has no energy balance.
     """
+    return _energy_of(model).residual(x, xdot, u, model.w, model.p)
+
+
+def _energy_of(model: HybridModel) -> Balance:
     for balance in model.balances:
         if balance.name == ENERGY:
-            return balance.residual(x, xdot, u, model.w, model.p)
+            return balance
     known = ", ".join(b.name for b in model.balances) or "none"
     raise InputError(
         f"energy monitor: model {model.name} has no balance {ENERGY!r} (it has: {known}), so its energy cannot be "
         "watched; give its prior inertia(x), or energy_balance(x, xdot, u), and export it again, or take no monitor"
     )
+
+
+def force_units(model: HybridModel) -> tuple[str, ...]:
+    """Unit of each residual force: that of the balance's rate over that of the speed.
+
+    Raises:
+        InputError: If the model has no energy balance.
+    """
+    rate = _energy_of(model).rate_unit
+    return tuple(FORCES.get((rate, v.unit), f"{rate}/({v.unit})") for v in model.states[model.n_x // 2 :])
 
 
 def inertia_of(model: HybridModel, x: ca.MX, u: ca.MX) -> ca.MX:
@@ -194,9 +210,9 @@ def _residual(
 
 
 def _free_run(
-    layout: Layout, memory: ca.MX, u: ca.MX, measured_w: ca.MX, u_mean: ca.MX, v: ca.MX, judged: ca.MX
+    layout: Layout, memory: ca.MX, u: ca.MX, measured_w: ca.MX, u_mean: ca.MX, v: ca.MX, full: ca.MX
 ) -> tuple[ca.MX, ca.MX]:
-    """A free run one period on: its memory, and its sums over the periods that are judged.
+    """A free run one period on: its memory, and its sums over the periods whose windows are full.
 
     Its own positions go through the same polynomial as the measured ones.
     """
@@ -209,7 +225,7 @@ def _free_run(
     q_m, v_m, a_m = (ca.reshape(ring, n_q, window) @ ca.DM(w) for w in (position, velocity, acceleration))
     power = energy_balance(model, ca.vertcat(q_m, v_m), ca.vertcat(v_m, a_m), u_mean)
     added = model.dt * ca.vertcat(power - measured_w, ca.dot(v, v), ca.dot(u_mean, u_mean))
-    sums = memory[n_z + window * n_q :] + ca.if_else(judged, added, 0)
+    sums = memory[n_z + window * n_q :] + ca.if_else(full, added, 0)
     return ca.vertcat(x, h, ring, sums), sums
 
 
@@ -254,11 +270,11 @@ def _known(values: ca.MX) -> ca.MX:
 
 
 def reading_function(layout: Layout, rest_speed: Sequence[float], spans: Array) -> ca.Function:
-    """``(memory, x_prev, h_prev, u_prev, y, judged) -> (memory_next, numbers)``.
+    """``(memory, x_prev, h_prev, u_prev, y, full) -> (memory_next, numbers)``.
 
     The numbers: balances of model and measurement, violation, residual ``(n_q)``, travel ``(n_q)``, speed ``(n_q)``
-    and input ``(n_u)`` at the centre; with free runs the sums of each. ``judged`` says of each run whether its window
-    is full. ``rest_speed`` ``(n_q,)`` are the speeds below which friction may stick, ``spans`` ``(n_u,)`` the ranges of
+    and input ``(n_u)`` at the centre; with free runs the sums of each. ``full`` says of each run whether its window is
+    full. ``rest_speed`` ``(n_q,)`` are the speeds below which friction may stick, ``spans`` ``(n_u,)`` the ranges of
     the inputs.
     """
     model, window, n_q, rest = layout.model, layout.window, layout.n_q, ca.DM(list(rest_speed))
@@ -266,7 +282,7 @@ def reading_function(layout: Layout, rest_speed: Sequence[float], spans: Array) 
     position, velocity, acceleration, kernel, slope = weights(window, dt)
     memory = ca.MX.sym("memory", layout.size)
     x, h, u = ca.MX.sym("x", model.n_x), ca.MX.sym("h", model.n_h), ca.MX.sym("u", n_u)
-    y, judged = ca.MX.sym("y", n_q), ca.MX.sym("judged", RUNS)
+    y, full = ca.MX.sym("y", n_q), ca.MX.sym("full", RUNS)
     x_next = model.step(x, h, u, model.w, model.p)[0]
     dv = x_next[n_q:] - x[n_q:]
     dp = x_next[:n_q] - x[:n_q] - dt * x[n_q:]
@@ -305,13 +321,13 @@ def reading_function(layout: Layout, rest_speed: Sequence[float], spans: Array) 
     if layout.length:
         for i in range(RUNS):
             part = memory[layout.runs + i * layout.run : layout.runs + (i + 1) * layout.run]
-            run, sums = _free_run(layout, part, u, balances[1], u_mean, v, judged[i])
+            run, sums = _free_run(layout, part, u, balances[1], u_mean, v, full[i])
             outs.append(run)
             numbers.append(sums)
     if layout.history:
         outs += [memory[layout.rows + layout.history_row :], state, u_mean, residual]
     vectors = [ca.densify(ca.vertcat(*parts)) for parts in (outs, numbers)]
-    return ca.Function("monitor", [memory, x, h, u, y, judged], vectors)
+    return ca.Function("monitor", [memory, x, h, u, y, full], vectors)
 
 
 def check_model(model: HybridModel) -> None:

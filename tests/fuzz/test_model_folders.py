@@ -9,7 +9,7 @@ import shutil
 import numpy as np
 import pytest
 
-from hybrid_mpc import Calibration, Detector, Plausibility, set_calibration, set_process_noise
+from hybrid_mpc import Calibration, Detector, set_calibration, set_process_noise
 from hybrid_mpc.files import HASH, digest
 from tests.fuzz.forked import cheap, command, refused
 
@@ -112,8 +112,7 @@ def test_fields_that_do_not_fit(folder, whole, tmp_path, seed):
 
 def detector_and_thresholds():
     detector = Detector(0.02, ((1e-4, 1e-4, 0.0, 1e-4),), (), 0.5, 4.0, rest_speed=(0.2,))
-    ordinary = Plausibility(0.99, (1.0,) * 5, (0.1, 0.1), (0.0,) * 3, np.eye(3).tolist(), 4.0, 1.0)
-    return Calibration(0.2, 0.1, 1.0, 1000, 0.1, "by hand", "", 0.2, 0.1, detector, ordinary, (0.2,))
+    return Calibration(0.2, 0.1, 1.0, 1000, 0.1, "by hand", "", 0.2, 0.1, detector, (0.2,))
 
 
 @pytest.fixture

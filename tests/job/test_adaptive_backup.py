@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from closed_loop_parts import Told, run
+from closed_loop_parts import ScriptedMonitor, run
 from monitor_parts import MGL, J, pendulum
 from online_models import pendulum_model
 
@@ -63,7 +63,13 @@ def test_it_switches_once_the_alarm_has_lasted_and_pays():
     safe, estimator = make_controller(model, model, CONTROL), make_estimator(model, SCENARIO, SIGMA_X)
     plain, guarded = (
         run(
-            model, safe, plant=Heavy(), estimator=estimator, monitor=Told([(5, 10**9)]), guard=g, duration=3.0
+            model,
+            safe,
+            plant=Heavy(),
+            estimator=estimator,
+            monitor=ScriptedMonitor([(5, 10**9)]),
+            guard=g,
+            duration=3.0,
         )
         for g in (None, guard)
     )

@@ -19,7 +19,7 @@ from hybrid_mpc.job.benchmark import refitted
 from hybrid_mpc.job.benchmark_runs import pieces, read_test, run_error, run_freely
 from hybrid_mpc.kit.artifact import build_model
 from hybrid_mpc.monitor.calibrate import calibrate, with_residual
-from hybrid_mpc.monitor.replay import judge
+from hybrid_mpc.monitor.replay import with_alarms
 from scenarios.torque_pendulum import scenario
 
 OLD = {"J": 0.15, "mgl": 2.98, "d": 0.01, "F_c": 0.15, "phi_0": 0.0, "k_u": 0.83}
@@ -93,7 +93,7 @@ def test_the_monitor_alarms_at_once_with_the_old_model(machines):
     )
     levels = (clean.level_w, clean.residual_level)
     calibration = with_residual(*(calibrate([v], 0.02, false_alarms_per_hour=30.0) for v in levels))
-    trace = judge(make_monitor(model, calibration), changed)
+    trace = with_alarms(make_monitor(model, calibration), changed)
     first = trace.t[np.argmax(trace.alarm)]
     assert trace.alarm.any()
     assert first < 1.5  # s from standing still; the monitor averages over two windows of 0.3 s

@@ -17,7 +17,7 @@ from online_models import pendulum_model
 
 from hybrid_mpc import SafeEnd
 from hybrid_mpc.files import write_text
-from hybrid_mpc.loop import realtime as safe_end
+from hybrid_mpc.loop import realtime
 from hybrid_mpc.loop.realtime import RealClock
 
 SAFE = 0.25
@@ -25,7 +25,7 @@ LONG = 60.0
 """Seconds for which what blocks would block."""
 
 
-class Machine(Rig):
+class LoggedRig(Rig):
     """The rig with a log; blocks where a case wants it to."""
 
     def __init__(self, folder):
@@ -156,7 +156,7 @@ def broken_actuator(machine):
         ordinary(u)
 
     machine.actuate = actuate
-    safe_end.PAUSES_S = (0.0,)
+    realtime.PAUSES_S = (0.0,)
     machine.run(on_step=machine.here)
 
 
@@ -219,7 +219,7 @@ def daemon_thread(machine):
 
 def any_instant(machine):
     """A signal at every microsecond of short blocks: each hands over once."""
-    safe_end.ENDING = (signal.SIGALRM,)
+    realtime.ENDING = (signal.SIGALRM,)
     came, handed = [], []
     signal.signal(signal.SIGALRM, lambda *_: came.append(1))
     for i in range(6000):
@@ -245,7 +245,7 @@ def main():
             for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP):
                 signal.signal(number, signal.SIG_DFL)
             signal.signal(signal.SIGINT, signal.default_int_handler)
-            return globals()[case](Machine(folder))
+            return globals()[case](LoggedRig(folder))
 
 
 MODEL = pendulum_model(z=2)

@@ -1,3 +1,5 @@
+"""Faults: what each does, when it acts, and what a loop makes of it."""
+
 import numpy as np
 import pytest
 from closed_loop_parts import Recorder, make_ekf, run
@@ -104,24 +106,24 @@ def test_a_ramp_grows_from_nothing_in_proportion(target, value, want):
     np.testing.assert_allclose(seen, want, atol=1e-15)
 
 
-class Machine:
+class BreakablePlant:
     def __init__(self, faults=()):
         self.faults = faults
 
     def with_faults(self, faults):
         check_plant_faults(faults, ["plant_load"])
-        return Machine(tuple(faults))
+        return BreakablePlant(tuple(faults))
 
 
 def test_install_builds_the_plant_s_faults_in_and_leaves_the_rest():
     load, gain = Fault(0.0, 1.0, "plant_load", 2.0), Fault(0.0, 1.0, "input_gain", 0.5)
-    plant, rest = install(Machine(), [gain, load])
+    plant, rest = install(BreakablePlant(), [gain, load])
     assert plant.faults == (load,)
     assert rest == (gain,)
-    same = Machine()
+    same = BreakablePlant()
     assert install(same, [gain]) == (same, (gain,))
     with pytest.raises(InputError, match="plant_load"):
-        install(Machine(), [Fault(0.0, 1.0, "plant_lode", 2.0)])
+        install(BreakablePlant(), [Fault(0.0, 1.0, "plant_lode", 2.0)])
     with pytest.raises(InputError, match="with_faults"):
         install(PendulumPlant(), [load])
 

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from closed_loop_parts import DT, Told, make_ekf, make_safe, run, sine
+from closed_loop_parts import DT, Rig, ScriptedMonitor, make_ekf, make_runner, make_safe, run
 from online_models import PendulumPlant, pendulum_model
 
-from hybrid_mpc import EnergyMonitor, Fault, Guard, InputError, Limits, Mode, Runner
+from hybrid_mpc import EnergyMonitor, Fault, Guard, InputError, Limits, Mode
 
 DU = 0.4
 
@@ -23,7 +23,10 @@ def backup(**times):
 
 
 def test_without_an_alarm_the_loop_is_bit_equal():
-    plain, same = guarded(None, Told()), guarded(backup(limits=Limits([-0.5], [0.5])), Told())
+    plain, same = (
+        guarded(None, ScriptedMonitor()),
+        guarded(backup(limits=Limits([-0.5], [0.5])), ScriptedMonitor()),
+    )
     for name in ("x", "u", "x_hat", "h", "stage_cost"):
         assert np.array_equal(getattr(plain, name), getattr(same, name)), name
     assert same.switches == ()
@@ -37,7 +40,7 @@ def test_there_and_back_without_a_bump(mode):
         mode, limits=limits, backup=make_safe(prior, du_max=DU), backup_estimator=make_ekf(prior),
         dwell=0.1, quiet=0.1,
     )  # fmt: skip
-    result = guarded(guard, Told([(20, 25)]))
+    result = guarded(guard, ScriptedMonitor([(20, 25)]))
     assert [(s.before.name, s.after.name) for s in result.switches] == [
         ("NORMAL", mode.name),
         (mode.name, "NORMAL"),
@@ -64,7 +67,9 @@ def test_the_backup_continues_the_plan():
     guard = Guard(backup=make_safe(model, du_max=DU), backup_estimator=make_ekf(model), dwell=0.1, quiet=0.1)
     arguments = {"duration": 1.2, "sensor_delay": 0}
     plain = run(model, make_safe(model, du_max=DU), **arguments)
-    switched = run(model, make_safe(model, du_max=DU), guard=guard, monitor=Told([(30, 32)]), **arguments)
+    switched = run(
+        model, make_safe(model, du_max=DU), guard=guard, monitor=ScriptedMonitor([(30, 32)]), **arguments
+    )
     assert len(switched.switches) == 2
     # same estimate, same plan but for its last period, one iteration: 1e-3 of inputs of order 1
     np.testing.assert_allclose(switched.u, plain.u, atol=5e-3)
@@ -72,7 +77,7 @@ def test_the_backup_continues_the_plan():
 
 def test_a_frozen_sensor_takes_precedence_and_the_dwell_is_kept():
     guard = backup(dwell=0.3, quiet=0.04)
-    result = guarded(guard, Told(alarms=[(10, 40)], frozen=[(15, 17)]))
+    result = guarded(guard, ScriptedMonitor(alarms=[(10, 40)], frozen=[(15, 17)]))
     names = [(round(s.t / DT), s.after.name) for s in result.switches]
     assert names[0] == (11, "BACKUP")
     assert names[1] == (16, "REST")  # to a more careful mode at once
@@ -80,21 +85,27 @@ def test_a_frozen_sensor_takes_precedence_and_the_dwell_is_kept():
     assert names[3][1] == "NORMAL"
 
 
+def test_a_frozen_sensor_is_trusted_again_after_the_quiet_time():
+    result = guarded(backup(dwell=0.1, quiet=0.2), ScriptedMonitor(frozen=[(10, 12)]))
+    # the last reading is that of period 11; ten periods of quiet, and the period after
+    assert [(round(s.t / DT), s.after) for s in result.switches] == [(11, Mode.REST), (22, Mode.NORMAL)]
+
+
 def test_a_flickering_alarm_does_not_flicker_through():
-    result = guarded(backup(dwell=0.1, quiet=0.2), Told([(k, k + 1) for k in range(10, 40, 4)]))
+    result = guarded(backup(dwell=0.1, quiet=0.2), ScriptedMonitor([(k, k + 1) for k in range(10, 40, 4)]))
     assert len(result.switches) == 2
 
 
 def test_a_patient_guard_waits_for_what_lasts():
     patient = backup(dwell=0.1, quiet=0.2, patience=0.3)
-    passing = guarded(patient, Told([(10, 15), (20, 24)]))  # an alarm of 0.26 s, with a gap in it
+    passing = guarded(patient, ScriptedMonitor([(10, 15), (20, 24)]))  # an alarm of 0.26 s, with a gap in it
     assert passing.switches == ()
-    apart = guarded(patient, Told([(10, 20), (32, 42)]))  # two of 0.18 s, more than quiet apart
+    apart = guarded(patient, ScriptedMonitor([(10, 20), (32, 42)]))  # two of 0.18 s, more than quiet apart
     assert apart.switches == ()
-    lasting = guarded(patient, Told([(10, 15), (20, 40)]))
+    lasting = guarded(patient, ScriptedMonitor([(10, 15), (20, 40)]))
     assert round(lasting.switches[0].t / DT) == 26  # the reading 15 periods after the first, plus one
     assert lasting.switches[0].after is Mode.BACKUP
-    frozen = guarded(patient, Told(frozen=[(10, 12)]))
+    frozen = guarded(patient, ScriptedMonitor(frozen=[(10, 12)]))
     assert round(frozen.switches[0].t / DT) == 11  # a sensor is not waited for
 
 
@@ -106,7 +117,7 @@ def test_no_estimate_and_no_solve_are_survived_in_every_mode():
             dwell=0.1, quiet=0.1,
         )  # fmt: skip
         result = guarded(
-            guard, Told([(10, 20)]), late=lambda t: round(t / DT) % 3 == 0,
+            guard, ScriptedMonitor([(10, 20)]), late=lambda t: round(t / DT) % 3 == 0,
             faults=[Fault(0.2, 0.5, "measurement_dropout")],
         )  # fmt: skip
         assert np.all(np.isfinite(result.u))
@@ -143,60 +154,34 @@ def test_a_frozen_encoder_brings_the_machine_to_rest():
     assert np.sum(free.stage_cost) > np.sum(held.stage_cost)
 
 
-class FakeClock:
-    """Time passes only in sleep."""
-
-    def __init__(self):
-        self.t = 0.0
-
-    def now(self):
-        return self.t
-
-    def sleep_until(self, t):
-        self.t = max(self.t, t)
-
-
 def test_the_runner_does_the_same():
-    plant, inputs = PendulumPlant(noise=0.0), []
-    state = [plant.reset(np.array([0.1, 0.0]), 0)]
-    rng = np.random.default_rng(0)
-
-    def actuate(u):
-        inputs.append(u.copy())
-        state[0] = plant.step(state[0], u, DT)
-
-    model = pendulum_model(3)
-    runner = Runner(
-        lambda: plant.measure(state[0], rng), actuate, make_ekf(model), make_safe(model, du_max=DU), sine,
-        monitor=Told([(20, 25)]), guard=backup(dwell=0.1, quiet=0.1), clock=FakeClock(),
+    rig, model = Rig(PendulumPlant(noise=0.0)), pendulum_model(3)
+    runner = make_runner(
+        model, make_safe(model, du_max=DU), rig, monitor=ScriptedMonitor([(20, 25)]), guard=backup(dwell=0.1, quiet=0.1)
     )  # fmt: skip
     report = runner.run(duration=1.0)
-    assert [s.after.name for s in report.switches] == ["BACKUP", "NORMAL"]
-    assert [round(s.t / DT) for s in report.switches] == [21, 30]
+    assert [(round(s.t / DT), s.after) for s in report.switches] == [(21, Mode.BACKUP), (30, Mode.NORMAL)]
     assert np.max(np.abs(np.diff(report.u, axis=0))) <= DU + 1e-12
-    again = runner.run(duration=0.2)  # a run remembers nothing of another
-    assert again.switches == ()
+    assert runner.run(duration=0.2).switches == ()  # a run remembers nothing of another
 
 
-def test_bad_input_speaks():
-    with pytest.raises(InputError, match="belong together"):
-        Guard(backup=make_safe(pendulum_model()))
-    with pytest.raises(InputError, match="needs a controller"):
-        Guard(Mode.BACKUP)
-    with pytest.raises(InputError, match="needs limits"):
-        Guard(Mode.LIMITED)
-    with pytest.raises(InputError, match="0 s or more"):
-        Guard(dwell=-1.0)
-    with pytest.raises(InputError, match="patience must be 0 s or more"):
-        Guard(patience=-1.0)
-    with pytest.raises(InputError, match="needs a quiet above 0 s"):
-        Guard(quiet=0.0, patience=0.5)
+def test_bad_input_is_refused():
+    for words, arguments, times in (
+        ("belong together", (), {"backup": make_safe(pendulum_model())}),
+        ("needs a controller", (Mode.BACKUP,), {}),
+        ("needs limits", (Mode.LIMITED,), {}),
+        ("0 s or more", (), {"dwell": -1.0}),
+        ("patience must be 0 s or more", (), {"patience": -1.0}),
+        ("needs a quiet above 0 s", (), {"quiet": 0.0, "patience": 0.5}),
+    ):
+        with pytest.raises(InputError, match=words):
+            Guard(*arguments, **times)
     with pytest.raises(InputError, match="give monitor="):
         guarded(Guard(), None)
     model, prior = pendulum_model(3), pendulum_model()
     shorter = Guard(backup=make_safe(prior, horizon=10), backup_estimator=make_ekf(prior))
     with pytest.raises(InputError, match="give both one problem"):
-        run(model, make_safe(model), guard=shorter, monitor=Told())
+        run(model, make_safe(model), guard=shorter, monitor=ScriptedMonitor())
     mixed = Guard(backup=make_safe(prior), backup_estimator=make_ekf(model))
     with pytest.raises(InputError, match="that of its estimator"):
-        run(model, make_safe(model), guard=mixed, monitor=Told())
+        run(model, make_safe(model), guard=mixed, monitor=ScriptedMonitor())

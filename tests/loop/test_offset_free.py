@@ -43,6 +43,8 @@ def test_a_constant_load_leaves_no_offset_with_viscous_friction(load, other):
     assert np.max(np.abs(result.x[50:100, 0] - 0.4)) > 1e-3  # the load is felt ...
     # ... and taken off: to 1e-6 rad, as is wanted; the loop settles to 1e-9 within 3 s of the load.
     assert np.max(np.abs(result.x[-100:, 0] - 0.4)) < 1e-6
+    # at rest u + load = gravity sin(phi) on the plant and u + d = 2.4 sin(phi) in the model
+    assert abs(result.d[-1, 0] - (load + (2.4 - plant.gravity) * np.sin(0.4))) < 1e-4
 
 
 @pytest.mark.parametrize(("sensor", "inputs"), DELAYS)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from closed_loop_parts import DT, Rig, Told, hold, make_ekf, make_safe, run, sine
+from closed_loop_parts import DT, LateRig, Rig, ScriptedMonitor, hold, make_ekf, make_safe, run, sine
 from online_models import PendulumPlant, pendulum_model
 
 from hybrid_mpc import (
@@ -63,10 +63,10 @@ def test_ten_lines_are_simulate(model, safe):
 
 def test_what_is_left_undone_the_next_step_does(model, safe):
     guard = Guard(limits=None, dwell=0.1, quiet=0.1)
-    every, some = (make_loop(model, safe, monitor=Told([(8, 10)]), guard=guard) for _ in range(2))
+    every, some = (make_loop(model, safe, monitor=ScriptedMonitor([(8, 10)]), guard=guard) for _ in range(2))
     np.testing.assert_array_equal(drive(every), drive(some, finish=lambda k: k % 3 == 0))
     some.finish()
-    for name in ("k", "guard", "monitor", "held", "finished"):
+    for name in ("k", "guard", "monitor", "inputs", "finished"):
         assert getattr(every.state, name) == getattr(some.state, name), name
     assert [s.after for s in every.switches] == [Mode.FALLBACK, Mode.NORMAL]
 
@@ -107,7 +107,7 @@ def test_loops_that_share_their_parts_do_not_notice(ocp, z):
 
 def test_it_goes_on_from_a_state(model, safe):
     guard = Guard(backup=make_safe(pendulum_model(), horizon=10), backup_estimator=make_ekf(pendulum_model()))
-    options = {"monitor": Told([(8, 40)]), "guard": guard}
+    options = {"monitor": ScriptedMonitor([(8, 40)]), "guard": guard}
     loop, rig = make_loop(model, safe, **options), Rig()
     drive(loop, rig, 12)
     state, at = loop.state, rig.state
@@ -127,26 +127,26 @@ def test_a_state_is_frozen(model, safe):
     loop = make_loop(model, safe, monitor=monitored(model))
     drive(loop, n=5)
     state = loop.state
-    kept = state.estimate.x.copy(), state.decision.u.copy(), state.monitor.memory.copy()
+    copies = state.estimate.x.copy(), state.decision.u.copy(), state.monitor.memory.copy()
     rig = Rig()
     drive(loop, rig, 8, begun=True)
-    for now, before in zip((state.estimate.x, state.decision.u, state.monitor.memory), kept, strict=True):
+    for now, before in zip((state.estimate.x, state.decision.u, state.monitor.memory), copies, strict=True):
         np.testing.assert_array_equal(now, before)
     with pytest.raises(AttributeError):
         state.k = 3
 
 
 def test_the_input_that_acted_is_believed(model):
-    """An actuator that saturates at 1: told so, the observer takes nothing of it for a load."""
+    """An actuator that saturates at 1: if it says so, the observer takes nothing of it for a load."""
     safe, goal = make_safe(model, horizon=10, bound=6.0), [0.6, 0.0]
 
-    def estimate_load(told):
+    def estimate_load(reported):
         loop, rig = make_loop(model, safe, reference=goal), Rig()
         u = loop.start(rig.measure())
         for _ in range(40):
             acting = np.clip(u, -1.0, 1.0)
             rig.actuate(acting)
-            u = loop.step(rig.measure(), applied=acting if told else None)
+            u = loop.step(rig.measure(), applied=acting if reported else None)
         return loop.estimate.d[0]
 
     # the plant is heavier by 0.5 sin(0.6) and rubs 0.04 more than the model: 0.32 at most
@@ -154,6 +154,26 @@ def test_the_input_that_acted_is_believed(model):
     assert (
         abs(estimate_load(False)) > 4.0
     )  # of the 5 that the limits of 6 promise and the actuator does not give
+
+
+def test_the_monitor_gets_the_input_that_acted(model, safe):
+    seen = []
+
+    class Noting(ScriptedMonitor):
+        def update(self, state, y, u_prev, estimate):
+            seen.append(u_prev.copy())
+            return super().update(state, y, u_prev, estimate)
+
+    loop, rig = make_loop(model, safe, monitor=Noting()), Rig()
+    u, wanted, acted = loop.start(rig.measure()), [], []
+    for _ in range(5):
+        wanted.append(u)
+        acted.append(np.clip(u, -0.1, 0.1))
+        rig.actuate(acted[-1])
+        u = loop.step(rig.measure(), applied=acted[-1])
+    loop.finish()
+    assert not np.array_equal(acted, wanted)
+    np.testing.assert_array_equal(seen[1:], acted)  # the first is what acts before any sample
 
 
 def test_manual_and_back_without_bump_or_wind_up(model):
@@ -234,8 +254,8 @@ def test_a_reference_for_one_step(model, safe):
 def test_no_number_raises(model, safe, bad):
     loop, rig = make_loop(model, safe, monitor=monitored(model)), Rig()
     drive(loop, rig, 5)
-    for told in ({"applied": [bad]}, {"reference": [bad, bad]}, {}):
-        u = loop.step([bad] if not told else rig.measure(), **told)
+    for given in ({"applied": [bad]}, {"reference": [bad, bad]}, {}):
+        u = loop.step(rig.measure() if given else [bad], **given)
         assert np.isfinite(u).all()
         assert abs(u).max() <= 6.0
         loop.finish()
@@ -263,23 +283,17 @@ def test_what_cannot_be_is_refused(model, safe):
         loop.step([0.0, 1.0])
     with pytest.raises(InputError, match="applied has shape"):
         loop.step([0.0], applied=[1.0, 2.0])
-    told = make_loop(model, safe, estimator=TrueState(model))
+    oracle = make_loop(model, safe, estimator=TrueState(model))
     with pytest.raises(InputError, match="give truth="):
-        told.start([0.0])
+        oracle.start([0.0])
 
 
 def test_delays(model, safe):
     ekf = DelayCompensation(make_ekf(model), input_delay=1)
     want = run(model, safe, estimator=ekf, input_delay=1, monitor=monitored(model))
 
-    class Delayed(Rig):
-        def measure(self):
-            if self.u:
-                self.state = self.plant.step(self.state, self.u[-2] if len(self.u) > 1 else np.zeros(1), DT)
-            return self.plant.measure(self.state, self.rng)
-
     loop = make_loop(model, safe, estimator=ekf, input_delay=1, monitor=monitored(model))
-    np.testing.assert_array_equal(drive(loop, Delayed()), want.u)
+    np.testing.assert_array_equal(drive(loop, LateRig()), want.u)
     assert loop.reading.level_w == want.level[-1]
 
 

@@ -4,11 +4,11 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from closed_loop_parts import DT, FakeClock, Rig, Said, make_ekf, make_runner, sine
+from closed_loop_parts import DT, FakeClock, Rig, ScriptedReading, make_ekf, make_runner, sine
 from online_models import pendulum_model
 
 from hybrid_mpc import InputError, Runner, SafeInputError, TrueState
-from hybrid_mpc.loop import realtime as safe_end
+from hybrid_mpc.loop import realtime
 
 N = 30
 
@@ -36,13 +36,13 @@ class Watching:
         return 0
 
     def update(self, state, y, u_prev, estimate):
-        return state, Said(False)
+        return state, ScriptedReading(False)
 
 
 @pytest.mark.parametrize(
     "where", ["measure", "actuate", "reference", "weight", "stop", "on_step", "now", "sleep_until", "update"]
 )
-@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit, GeneratorExit])
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
 @pytest.mark.parametrize("call", [1, 9])
 def test_a_failing_callback_leaves_the_safe_input(model, safe, where, error, call):
     rig, clock, monitor, calls = Rig(), FakeClock(), Watching(), Counter()
@@ -86,8 +86,10 @@ def test_an_actuator_that_fails_for_a_while_gets_the_safe_input(model, safe):
 
 
 @pytest.mark.parametrize(("ends", "why"), [("duration", "None"), ("measure", "cable"), ("actuate", "no bus")])
-def test_an_actuator_that_stays_broken_is_told_with_what_ended_the_run(model, safe, ends, why, monkeypatch):
-    monkeypatch.setattr(safe_end, "PAUSES_S", (0.0, 0.0))
+def test_an_actuator_that_stays_broken_is_reported_with_what_ended_the_run(
+    model, safe, ends, why, monkeypatch
+):
+    monkeypatch.setattr(realtime, "PAUSES_S", (0.0, 0.0))
     rig = Rig()
 
     def measure():
@@ -102,9 +104,9 @@ def test_an_actuator_that_stays_broken_is_told_with_what_ended_the_run(model, sa
 
     runner = Runner(measure, actuate, make_ekf(model), safe, sine, clock=FakeClock(), safe_input=[0.25])
     words = r"failed 3 times, at last with OSError\('no bus for 0.25'\)"
-    with pytest.raises(SafeInputError, match=words) as told:
+    with pytest.raises(SafeInputError, match=words) as raised:
         runner.run(0.2)
-    first = told.value.__cause__
+    first = raised.value.__cause__
     assert (type(first), str(first)) == (OSError, "no bus for 0.25")
     assert why in str(first.__context__)
 

@@ -19,7 +19,7 @@ from hybrid_mpc import (
     TrueState,
     simulate,
 )
-from hybrid_mpc.loop.plant import Machine
+from hybrid_mpc.loop.plant import SimulatedMachine
 
 
 def test_two_runs_differ_in_nothing_but_durations(model, safe):
@@ -289,7 +289,7 @@ def test_several_inputs_and_outputs():
 
 
 def test_a_machine_remembers_its_delays_and_no_more():
-    machine = Machine(PendulumPlant(), np.zeros(2), 0, 1, (), DT, 2, 3)
+    machine = SimulatedMachine(PendulumPlant(), np.zeros(2), 0, 1, (), DT, 2, 3)
     machine.rest(np.zeros(1))
     held, lengths = [], []
     for k in range(20):

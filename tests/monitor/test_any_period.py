@@ -4,36 +4,10 @@ import numpy as np
 import pytest
 from linear_axes import Axis, kalman
 
-from hybrid_mpc import Diagnoser, guard_monitor, make_monitor, make_resting_guard, replay, rest_speeds
+from hybrid_mpc import Diagnoser, guard_monitor, make_monitor, replay, rest_speeds
 from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.monitor.learn import learn_detector
-from hybrid_mpc.monitor.lengths import SETTLING_S, block_seconds, samples, seconds
-
-TODAY = {
-    "golf_robot": 0.02,
-    "torque_pendulum": 0.02,
-    "unbalanced_disk": 0.025,
-    "pendulum": 0.01,
-    "emps": 0.01,
-}
-
-
-@pytest.mark.parametrize(("name", "dt"), TODAY.items())
-def test_today_s_lengths_are_what_they_were(name, dt):
-    """Written out as before there was a machine's second."""
-    model = Axis(dt).model()
-    half = max(2, round(0.5 * 0.2 / dt))
-    guard, main = guard_monitor(model, diagnose=True), make_monitor(model, None)
-    assert guard.window == 2 * half + 1
-    assert guard.average == max(1, round(0.1 / dt))
-    assert guard.layout.length == round(max(0.6, 2 * (2 * half + 1) * dt) / dt)
-    assert guard.layout.history == round(2.0 / dt)
-    assert main.window == 2 * max(2, round(0.5 * 0.3 / dt)) + 1
-    assert main.average == max(1, round(0.3 / dt))
-    assert samples(SETTLING_S, model) == round(1.0 / dt)
-    assert block_seconds(dt) == 5.0
-    resting = make_resting_guard(model)
-    assert (resting.dwell, resting.quiet) == (0.5, 1.0)
+from hybrid_mpc.monitor.lengths import SETTLING_S, samples, seconds
 
 
 def axis(dt, swing, unit=1.0, speed=0.1, push=0.0, viscous=1.0):

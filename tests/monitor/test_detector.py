@@ -7,29 +7,20 @@ import numpy as np
 import pytest
 from monitor_parts import DT, GAMMA, NOISE, Observer, pendulum, simulate
 
-from hybrid_mpc import Calibration, Detector, EnergyMonitor, InputError, Plausibility, replay
+from hybrid_mpc import Calibration, Detector, EnergyMonitor, InputError, replay
 from hybrid_mpc.monitor.learn import detector_levels, learn_detector
 from hybrid_mpc.records import plain, record
 
 WINDOW = {"window": 11, "average": 5, "free_run": 0.6}
 
 
-def numbers(run, monitor):
-    observer, state = Observer(monitor.model), monitor.initial()
-    estimate, rows = observer.start(run.y[0], 0.0), []
-    for k in range(len(run.t)):
-        u_prev = run.u[k - 1] if k else np.zeros(1)
-        if k:
-            estimate = observer.update(estimate, run.y[k], u_prev)
-        state, reading = monitor.update(state, run.y[k], u_prev, estimate)
-        rows.append(reading.numbers)
-    return np.array(rows)[60:]
-
-
 @pytest.fixture(scope="module")
 def learned():
     monitor = EnergyMonitor(pendulum(), **WINDOW)
-    runs = [numbers(simulate(5000, s, noise=NOISE), monitor) for s in range(4)]
+    runs = [
+        replay(monitor, Observer(monitor.model), simulate(5000, s, noise=NOISE)).numbers[60:]
+        for s in range(4)
+    ]
     return runs, learn_detector(runs, DT, 1, drift=1.0, false_alarms_per_hour=30, data_hash="abc")
 
 
@@ -123,14 +114,13 @@ def test_levels_are_those_of_the_update(learned):
 
 def test_it_survives_json(learned):
     _, detector = learned
-    ordinary = Plausibility(0.99, (1.0,) * 5, (0.1, 0.1), (0.0, 0.0), ((1.0, 0.0), (0.0, 1.0)), 4.0, 1.0)
-    calibration = Calibration(0.2, 0.1, 1.0, 1000, 0.1, "by hand", detector=detector, plausibility=ordinary)
+    calibration = Calibration(0.2, 0.1, 1.0, 1000, 0.1, "by hand", detector=detector)
     only_forces = replace(detector, energy=(), energy_threshold=np.inf)
     for part in (calibration, replace(calibration, detector=None), only_forces):
         assert record(type(part), json.loads(json.dumps(plain(part))), "") == part
 
 
-def test_bad_input_speaks(learned):
+def test_bad_input_is_refused(learned):
     runs, detector = learned
     with pytest.raises(InputError, match=r"need \d+\.\d min"):
         learn_detector([runs[0][:2000]], DT, 1, false_alarms_per_hour=1)

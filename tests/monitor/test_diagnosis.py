@@ -17,6 +17,7 @@ from hybrid_mpc import (
     Signal,
     load,
     model_info,
+    replay,
     save_artifact,
     trace_model,
 )
@@ -30,12 +31,7 @@ def seen(fault, causes=CAUSES, n=500, kind="sine", seed=7):
     model = pendulum()
     monitor = EnergyMonitor(model, window=11, average=5, detector=DETECTOR, history=4.0)
     run = simulate(n, seed=seed, fault=fault, at=0, noise=NOISE, kind=kind)
-    observer, state = Observer(model), monitor.initial()
-    estimate = observer.start(run.y[0], 0.0)
-    for k in range(1, n):
-        estimate = observer.update(estimate, run.y[k], run.u[k - 1])
-        state, _ = monitor.update(state, run.y[k], run.u[k - 1], estimate)
-    return Diagnoser(monitor, causes).diagnose(state)
+    return Diagnoser(monitor, causes).diagnose(replay(monitor, Observer(model), run).state)
 
 
 @pytest.mark.parametrize(
@@ -56,7 +52,7 @@ def test_a_known_cause_is_named_with_its_size(fault, name, value):
     assert found.text.startswith(f"{name} +")
 
 
-def test_several_at_once_are_told_apart():
+def test_several_at_once_are_distinguished():
     fault = pendulum(friction=3 * GAMMA, inertia=1.3 * INERTIA, mgl=1.3 * MGL)
     found = seen(fault, {name: CAUSES[name] for name in ("friction", "load")})
     sizes = {c.name: c.value for c in found.causes}
@@ -85,7 +81,7 @@ def test_little_motion_says_so():
     assert "too little motion" in Diagnoser(monitor).diagnose(monitor.initial()).text  # not one sample
 
 
-def test_what_the_motion_does_not_tell_apart_is_named():
+def test_what_the_motion_does_not_distinguish_is_named():
     # scaled alike, J, m g l and gamma do what one over the motor's gain does
     found = seen(pendulum(friction=2 * GAMMA), {**CAUSES, "everything": ("J", "mgl", "gamma")})
     assert any("everything" in words for words in found.blind)
@@ -130,7 +126,7 @@ class Bare(Prior):
         return 2.0
 
 
-def test_an_artifact_without_parameters_or_balances_loads_and_its_monitors_say_what_is_missing(tmp_path):
+def test_an_artifact_without_parameters_or_balances_loads_and_what_is_missing_is_said(tmp_path):
     programs, info = trace_model(PriorStep(Bare(), DT)), model_info(Bare(), DT)
     save_artifact(tmp_path, {"prior": programs}, info)
     model = load(tmp_path).models["prior"]
@@ -144,7 +140,7 @@ def test_an_artifact_without_parameters_or_balances_loads_and_its_monitors_say_w
         EnergyMonitor(silent, window=11, average=5)
 
 
-def test_bad_input_speaks():
+def test_bad_input_is_refused():
     monitor = EnergyMonitor(pendulum(), window=11, average=5, detector=DETECTOR)
     with pytest.raises(InputError, match=r"history=2\.0"):
         Diagnoser(monitor)

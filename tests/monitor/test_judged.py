@@ -17,7 +17,7 @@ from hybrid_mpc import Calibration, EnergyMonitor, Fault, Guard, InputError, Mod
 from hybrid_mpc.cli.main import app
 from hybrid_mpc.model.model import step_symbols
 from hybrid_mpc.monitor.energy import Verdict
-from hybrid_mpc.monitor.replay import judge
+from hybrid_mpc.monitor.replay import with_alarms
 
 WINDOW, AVERAGE = 5, 10
 NEVER = Calibration(1e9, 1e9, 1.0, 1, 1.0, "by hand")
@@ -58,7 +58,7 @@ def test_an_estimator_that_gives_no_number_is_an_alarm_and_not_quiet():
     # longer than both windows: from the 16th sample that is not judged on
     first = 101 + WINDOW + AVERAGE
     assert trace.intervals() == [(pytest.approx(first * DT), pytest.approx(199 * DT))]
-    assert np.array_equal(judge(monitor(calibration=NEVER), trace).alarm, trace.alarm)
+    assert np.array_equal(with_alarms(monitor(calibration=NEVER), trace).alarm, trace.alarm)
 
 
 @pytest.mark.parametrize("broken", ["step", "xdot", "balances"])

@@ -10,7 +10,7 @@ from monitor_parts import DT, GAMMA, NOISE, Estimate, Exact, Observer, Run, pend
 from hybrid_mpc import Calibration, EnergyMonitor, InputError, count_alarms, replay
 from hybrid_mpc.model.model import step_symbols
 from hybrid_mpc.monitor.calibrate import calibrate, with_residual
-from hybrid_mpc.monitor.replay import judge
+from hybrid_mpc.monitor.replay import with_alarms
 
 
 @pytest.mark.parametrize("kind", ["sine", "steps"])
@@ -51,7 +51,7 @@ def test_alarm_rate_on_fresh_nominal_data_is_near_the_wanted_rate(levels):
     armed = EnergyMonitor(model, window=11, average=10, calibration=calibration)
     runs = [replay(armed, Observer(model), simulate(5000, s, noise=NOISE)) for s in range(10, 16)]
     unarmed = replay(monitor, Observer(model), simulate(5000, 10, noise=NOISE))
-    np.testing.assert_array_equal(judge(armed, unarmed).alarm, runs[0].alarm)
+    np.testing.assert_array_equal(with_alarms(armed, unarmed).alarm, runs[0].alarm)
     assert not unarmed.alarm.any()
     n = sum(count_alarms(r.alarm[100:], DT)[0] for r in runs)
     # 10 min at 60/h: 10 expected. Factor 3 for the threshold's own error (80 blocks, |scale| error 10 %

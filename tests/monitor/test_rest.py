@@ -24,6 +24,7 @@ from hybrid_mpc import (
     rest_speeds,
 )
 from hybrid_mpc.data.scales import noise_of, time_unit
+from hybrid_mpc.monitor.residuals import force_units
 from hybrid_mpc.records import plain, record
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
@@ -201,6 +202,7 @@ def test_each_of_two_coupled_joints_has_a_rest_speed_and_a_dead_band_of_its_own(
     run = Run(0.02 * np.arange(n), np.zeros((n, 2)), np.tile(pull, (n, 1)), np.zeros((n, 4)))
     monitor = EnergyMonitor(two_joints(), window=11, average=5, rest_speed=[0.1, 1e-3])
     assert monitor.rest_speed == (0.1, 1e-3)
+    assert force_units(monitor.model) == ("N m", "N")
     trace = replay(monitor, Resting(run), run)
     # the machine stands, so that what nobody holds is unexplained, with its sign
     np.testing.assert_allclose(trace.numbers[-1, 3:5], -np.array(excess), atol=1e-9)

@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from hybrid_mpc.identify.settings import KINDS
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.loops import summaries, tasks_of
-from hybrid_mpc.job.monitor import force_unit
 from hybrid_mpc.job.stage import Absent
 from hybrid_mpc.job.stages.analyze import ANALYSIS
 from hybrid_mpc.job.stages.compare import CONTROL
@@ -21,6 +20,7 @@ from hybrid_mpc.job.stages.guard import GUARD, read_trace
 from hybrid_mpc.job.stages.identify import EVALUATION, MODELS, trained_models
 from hybrid_mpc.job.stages.monitor import MONITOR, clean_windows
 from hybrid_mpc.job.stages.results import REPORTED, step_times
+from hybrid_mpc.monitor.residuals import force_units
 from hybrid_mpc.plots import analysis, animation, data, estimation, fit, loops, monitor
 from hybrid_mpc.plots.style import save
 
@@ -250,7 +250,7 @@ def _monitor(context: Context) -> Any:
             own["y"],
             output=output,
             windows=clean_windows(context, recording, ("train", "valid", "test", "nominal")),
-            residual=(own["residual_level"], force, force_unit(context.kit.models["prior"])),
+            residual=(own["residual_level"], force, force_units(context.kit.models["prior"])[0]),
             title=recording.name,
         )
         name = recording.name.replace("#", "-")
@@ -322,7 +322,7 @@ def guard_figures(context: Context) -> Iterator[tuple[str, str, Figure, str]]:
     if isinstance(found, Absent) or not (found.faults or found.shown):
         return
     arrays, output = found.arrays, context.scenario.prior().outputs[0]
-    unit = force_unit(context.kit.models["prior"])
+    unit = force_units(context.kit.models["prior"])[0]
     for row in found.faults or ():
         marks = [
             (row.start_s, row.title),

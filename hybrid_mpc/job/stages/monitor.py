@@ -24,7 +24,7 @@ from hybrid_mpc.loop.simulate import ClosedLoopResult
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.monitor.calibrate import Calibration, alarm_intervals, calibrate, with_residual
 from hybrid_mpc.monitor.lengths import block_seconds, rest_speeds
-from hybrid_mpc.monitor.replay import along, judge, replay
+from hybrid_mpc.monitor.replay import along, replay, with_alarms
 
 if TYPE_CHECKING:
     from hybrid_mpc.data.trajectories import Trajectory
@@ -169,7 +169,7 @@ def monitor_stage(context: Context) -> MonitorResult | Absent:
         return result
     alarms, arrays, clean = [], {}, CleanAlarms()
     for recording, levels in zip(whole, traces, strict=True):
-        trace = judge(make_monitor(model, calibration), levels)
+        trace = with_alarms(make_monitor(model, calibration), levels)
         alarms += [RecordedAlarm(recording.name, a, b) for a, b in trace.intervals()]
         for key in ("t", "violation_w", "level_w", "residual_level", "alarm"):
             arrays[f"{recording.name}/{key}"] = getattr(trace, key)

@@ -14,7 +14,6 @@ from hybrid_mpc.files import write_json
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.controllers import CONTENDERS
 from hybrid_mpc.job.loops import Summary
-from hybrid_mpc.job.monitor import force_unit
 from hybrid_mpc.job.stage import Stage, source_of
 from hybrid_mpc.job.stages.analyze import ANALYSIS
 from hybrid_mpc.job.stages.compare import CONTROL
@@ -44,6 +43,7 @@ from hybrid_mpc.job.stages.results import (
     Timing,
     collect,
 )
+from hybrid_mpc.monitor.residuals import force_units
 from hybrid_mpc.plots.style import name_of
 from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, write_report
 
@@ -706,7 +706,7 @@ def _alarm_table(context: Context, monitor: Monitor) -> Table | None:
     if monitor.alarms is None or calibration is None:
         return None
     rows = [(a.file, a.start_s, a.end_s) for a in monitor.alarms]
-    unit = force_unit(context.kit.models["prior"])
+    unit = force_units(context.kit.models["prior"])[0]
     caption = (
         f"Alarms over the whole recordings; thresholds {calibration.threshold_w:.3g} W and "
         f"{calibration.residual_threshold:.3g} {unit}."

@@ -1,4 +1,4 @@
-"""The guard's detector, baselines on the filter's innovations, and a combination, all learned and judged alike."""
+"""The guard's detector, baselines on the filter's innovations, and a combination, all learned and evaluated alike."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -39,24 +38,23 @@ at half the rate.
 """
 
 
-class TraceLike(Protocol):
-    """What is judged of a loop of n periods."""
+@dataclass(frozen=True)
+class Trace:
+    """What detectors see of a loop of n periods.
 
-    @property
-    def numbers(self) -> Array:
-        """``MonitorReading.numbers`` ``(n, columns)`` of a :func:`~hybrid_mpc.monitor.learn.guard_monitor`."""
+    Args:
+        numbers: ``MonitorReading.numbers`` ``(n, columns)``.
+        level_w: Averaged one-step violation ``(n,)`` [W].
+        innovation: Innovations of the filter ``(n, n_y)`` [output units]; NaN in the first row.
+        nis: Normalised innovations squared ``(n,)``; NaN in the first.
+        speed: Largest true speed ``(n,)`` of the degrees of freedom [rad/s or m/s].
+    """
 
-    @property
-    def level_w(self) -> Array:
-        """Averaged one-step violation ``(n,)`` [W]."""
-
-    @property
-    def innovation(self) -> Array:
-        """Innovations ``(n, n_y)`` of the loop's filter."""
-
-    @property
-    def nis(self) -> Array:
-        """Their normalised squares ``(n,)``."""
+    numbers: Array
+    level_w: Array
+    innovation: Array
+    nis: Array
+    speed: Array
 
 
 @dataclass(frozen=True)
@@ -95,7 +93,7 @@ class Judges:
 
     @property
     def settling(self) -> int:
-        """Samples at the beginning of a loop that are not judged."""
+        """Samples at the beginning of a loop that do not count."""
         return round(SETTLING_S * self.detector.time_unit / self.detector.dt)
 
     def threshold(self, part: str, rate: float) -> float:
@@ -113,7 +111,7 @@ class Judges:
             method=f"Gumbel tail of maxima in blocks of {self.block_s:g} s",
         )  # fmt: skip
 
-    def levels(self, trace: TraceLike) -> dict[str, Array]:
+    def levels(self, trace: Trace) -> dict[str, Array]:
         """Level ``(n,)`` of each part along a loop; zero where it says nothing, and while the estimator settles."""
         n_q, window = len(self.resolution), WINDOW_S * self.detector.time_unit / self.detector.dt
         forces, power = detector_levels(self.detector, trace.numbers)
@@ -140,9 +138,7 @@ class Judges:
             )
         )
 
-    def alarm(
-        self, levels: Mapping[str, Array], trace: TraceLike, method: str, rate: float
-    ) -> NDArray[np.bool_]:
+    def alarm(self, levels: Mapping[str, Array], trace: Trace, method: str, rate: float) -> NDArray[np.bool_]:
         """Alarm ``(n,)`` of a method: each part's with its hysteresis, sums capped as online."""
         parts, on = METHODS[method], np.zeros(len(trace.level_w), dtype=bool)
         for part, share in parts.items():
@@ -151,7 +147,7 @@ class Judges:
             elif part == "freeze":
                 on |= levels[part] > 1.0
             elif part != "power":
-                on |= held(levels[part], self.threshold(part, share * rate))
+                on |= with_hysteresis(levels[part], self.threshold(part, share * rate))
         on[: self.settling] = False
         return on
 
@@ -165,7 +161,7 @@ class Judges:
 
 
 def learn_judges(
-    traces: Sequence[TraceLike],
+    traces: Sequence[Trace],
     dt: float,
     resolution: Sequence[float],
     *,
@@ -177,8 +173,7 @@ def learn_judges(
     """All methods from nominal loops, for wanted rates of false alarms down to ``rate``.
 
     Thresholds are Gumbel tails of block maxima, as :func:`~hybrid_mpc.monitor.calibrate.calibrate` makes them. The
-    loops are
-    known to be nominal, so a block that stands out is no reason to refuse them.
+    loops are known to be nominal, so a block that stands out is no reason to refuse them.
 
     Args:
         traces: Nominal loops; the first of the machine's seconds of each is left out.
@@ -218,11 +213,11 @@ def learn_judges(
     return replace(judges, tails=tails)
 
 
-def held(level: Array, threshold: float, release: float = RELEASE) -> NDArray[np.bool_]:
+def with_hysteresis(level: Array, threshold: float, release: float = RELEASE) -> NDArray[np.bool_]:
     """Alarm ``(n,)`` that begins above a threshold and ends below a share of it.
 
     Example:
-        >>> held(np.array([0.6, 1.1, 0.6, 0.4]), 1.0).tolist()
+        >>> with_hysteresis(np.array([0.6, 1.1, 0.6, 0.4]), 1.0).tolist()
         [False, True, True, False]
     """
     state = np.where(level > threshold, 1, np.where(level > release * threshold, 0, -1))

@@ -24,7 +24,7 @@ from hybrid_mpc.monitor.learn import guard_monitor
 from hybrid_mpc.monitor.lengths import REST_SPEED
 from hybrid_mpc.records import record
 from hybrid_mpc.scenario import Task, load_scenario
-from scenarios.golf_robot.monitor_study.detection import METHODS, Judges, learn_judges
+from scenarios.golf_robot.monitor_study.detection import METHODS, Judges, Trace, learn_judges
 from scenarios.golf_robot.monitor_study.plan import FAULT, GUARD, LEARN, LoopPlan, MonitorJob, MonitorStudy
 
 Array = NDArray[np.float64]
@@ -138,25 +138,6 @@ class _Loops:
             "switches": len(row.switches),
             "early_switches": early,
         }
-
-
-@dataclass(frozen=True)
-class Trace:
-    """What detectors see of a loop of n periods.
-
-    Args:
-        numbers: ``MonitorReading.numbers`` ``(n, columns)``.
-        level_w: Averaged one-step violation ``(n,)`` [W].
-        innovation: Innovations of the filter ``(n, n_y)`` [output units]; NaN in the first row.
-        nis: Normalised innovations squared ``(n,)``; NaN in the first.
-        speed: Largest true speed ``(n,)`` of the degrees of freedom [rad/s or m/s].
-    """
-
-    numbers: Array
-    level_w: Array
-    innovation: Array
-    nis: Array
-    speed: Array
 
 
 def trace_of(result: ClosedLoopResult) -> Trace:

@@ -76,9 +76,9 @@ def run_monitor_study(
     out, say = Path(out), progress or Silent()
     check_folder(out, "study", NOTE, resume=resume)
     say.start("reading the model, and the filters' noise")
-    held = read_note(out).models if (out / NOTE).is_file() else None
+    stored = read_note(out).models if (out / NOTE).is_file() else None
     loops, models = load_inputs(
-        Study(study.scenario, study.model, tasks=(study.task,), controllers=(PRIOR, CONTROLLER)), held
+        Study(study.scenario, study.model, tasks=(study.task,), controllers=(PRIOR, CONTROLLER)), stored
     )
     (model,) = loops.models
     note = make_note(study.identity(), models, study.size, KIND)
@@ -110,7 +110,7 @@ def finish(out: Path) -> dict[str, Any]:
         out: Its folder.
 
     Raises:
-        InputError: If nothing has been judged yet.
+        InputError: If nothing has been learned yet.
     """
     note = read_note(out)
     done = {row["id"]: row for row in rows(out / RUNS)}
@@ -119,11 +119,6 @@ def finish(out: Path) -> dict[str, Any]:
     write_json(out / RESULTS, results)
     write_monitor_report(out, results, note)
     return results
-
-
-def is_monitor_study(folder: Path) -> bool:
-    """Whether a folder holds this study."""
-    return read_note(folder).kind == KIND
 
 
 class _Todo:

@@ -9,7 +9,7 @@ import pytest
 
 from hybrid_mpc import InputError
 from hybrid_mpc.records import plain, record
-from scenarios.golf_robot.monitor_study.detection import METHODS, Judges, held, learn_judges
+from scenarios.golf_robot.monitor_study.detection import METHODS, Judges, learn_judges, with_hysteresis
 
 DT, STEP, RATE = 0.02, 1.5e-3, 2.5
 PERIODS = 9_000  # 180 s: 35 blocks of 5 s after the first second
@@ -89,4 +89,4 @@ def test_hysteresis_is_that_of_a_loop():
     for value in level:
         on = value > (0.5 if on else 1.0)
         wanted.append(on)
-    assert held(level, 1.0).tolist() == wanted
+    assert with_hysteresis(level, 1.0).tolist() == wanted
