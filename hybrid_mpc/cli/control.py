@@ -34,7 +34,7 @@ def control(
     controller: Annotated[
         list[str] | None,
         typer.Option(
-            help="A contender; may be repeated. Default: prior_observer (not with --guard) and hybrid_observer."
+            help="A controller; may be repeated. Default: prior_observer (not with --guard) and hybrid_observer."
         ),
     ] = None,
     solver: Annotated[str, typer.Option(help="rti, sqp or ipopt.")] = "rti",

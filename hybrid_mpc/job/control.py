@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import check_folder, write_json
-from hybrid_mpc.job.controllers import CONTENDERS, ORACLES, find_noise
+from hybrid_mpc.job.controllers import CONTROLLERS, ORACLES, find_noise
 from hybrid_mpc.job.loops import (
     MODEL,
     Bench,
@@ -55,7 +55,7 @@ class ControlSettings:
 
     Args:
         tasks: Names, or beginnings of names, of tasks. Default: all.
-        controllers: Names of contenders.
+        controllers: Names of controllers.
         solver: ``"rti"``, ``"sqp"`` or ``"ipopt"``; oracles have their own.
         seeds: Loops of each task and controller.
         seed: Seed of the first loop, times 1000, as in the main job.
@@ -82,10 +82,10 @@ class ControlSettings:
     guard: str = ""
 
     def __post_init__(self) -> None:
-        unknown = [name for name in self.controllers if name not in CONTENDERS]
+        unknown = [name for name in self.controllers if name not in CONTROLLERS]
         if unknown or not self.controllers:
             given = f"no controller {', '.join(unknown)}" if unknown else "no controller is given"
-            raise InputError(f"{given}; there are: {', '.join(CONTENDERS)}")
+            raise InputError(f"{given}; there are: {', '.join(CONTROLLERS)}")
         if self.solver not in SOLVERS:
             raise InputError(f"no solver {self.solver!r}; there are: {', '.join(SOLVERS)}")
         if self.guard not in ("", *REACTIONS):
@@ -95,7 +95,7 @@ class ControlSettings:
             raise InputError(
                 f"controller {oracles[0]} has a solver of its own (several starts); leave --solver out or it"
             )
-        others = [name for name in self.controllers if CONTENDERS[name].model != "hybrid"]
+        others = [name for name in self.controllers if CONTROLLERS[name].model != "hybrid"]
         if self.guard and others:
             raise InputError(
                 f"the guard watches with the hybrid, controller {others[0]} has another model; with --guard or --adapt "
@@ -215,7 +215,7 @@ def prepared(
         scenario: The machine.
         model: Artifact folder, or the folder of the run that holds it as ``model``.
         settings: What to run.
-        noise: Process noise by contender. Default: the artifact's; where it holds none, it is estimated on recordings
+        noise: Process noise by controller. Default: the artifact's; where it holds none, it is estimated on recordings
             that the scenario makes (budget quick, the settings' seed).
         named: Registered name of the scenario, or path of its file. Default: its own name.
 
@@ -332,7 +332,7 @@ def collected(job: Job, rows: Sequence[LoopRow], times: Mapping[str, Array]) -> 
         "model": {"provenance": kit.provenance},
         "noise": {
             "source": job.noise_source,
-            "sigma_x": {n: kit.noise(n).tolist() for n in settings.controllers if not CONTENDERS[n].truth},
+            "sigma_x": {n: kit.noise(n).tolist() for n in settings.controllers if not CONTROLLERS[n].truth},
         },
         "versions": versions(),
         "period_ms": 1e3 * kit.models["prior"].dt,

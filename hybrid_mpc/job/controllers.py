@@ -35,7 +35,7 @@ period it starts from its last plan and from the rival's that is cheaper by its 
 
 
 @dataclass(frozen=True)
-class Contender:
+class NamedController:
     """One of the compared controllers.
 
     Args:
@@ -49,37 +49,37 @@ class Contender:
     truth: bool = False
 
 
-CONTENDERS: Mapping[str, Contender] = {
-    "prior": Contender("prior"),
-    "prior_observer": Contender("prior", observer=True),
-    "hybrid": Contender("hybrid"),
-    "hybrid_observer": Contender("hybrid", observer=True),
-    "oracle": Contender("oracle", observer=True),
-    "oracle_state": Contender("oracle", truth=True),
+CONTROLLERS: Mapping[str, NamedController] = {
+    "prior": NamedController("prior"),
+    "prior_observer": NamedController("prior", observer=True),
+    "hybrid": NamedController("hybrid"),
+    "hybrid_observer": NamedController("hybrid", observer=True),
+    "oracle": NamedController("oracle", observer=True),
+    "oracle_state": NamedController("oracle", truth=True),
 }
 """Baselines: the fitted prior without and with disturbance observer; the hybrid likewise; two oracles on the
 plant's own equations, one with the same measurements through the same kind of estimator, one with the truth."""
 ORACLES = ("oracle", "oracle_state")
 LEAST_NOISE: Mapping[str, str] = {"hybrid": "prior", "hybrid_observer": "prior_observer"}
-"""Whose process noise is the least that a contender has, where tasks go beyond the recordings."""
+"""Whose process noise is the least that a controller has, where tasks go beyond the recordings."""
 
 
 def build(
     name: str, scenario: Scenario, kit: Kit, control: OCP, *, solver: str = "rti"
 ) -> tuple[Estimator, SafeController]:
-    """Estimator and controller of a contender.
+    """Estimator and controller by name.
 
     Args:
-        name: Name in :data:`CONTENDERS`.
+        name: Name in :data:`CONTROLLERS`.
         scenario: The machine, with its oracle if that is asked for.
-        kit: Prior and hybrid, and the process noise of the contender's filter.
+        kit: Prior and hybrid, and the process noise of the controller's filter.
         control: The task's control problem.
         solver: Name in :data:`~hybrid_mpc.kit.assembly.SOLVERS`; oracles have their own.
 
     Raises:
-        InputError: If there is no such contender, the scenario has no oracle, or the kit no noise.
+        InputError: If there is no such controller, the scenario has no oracle, or the kit no noise.
     """
-    c, prior = CONTENDERS[known(name, CONTENDERS, "controller")], kit.models["prior"]
+    c, prior = CONTROLLERS[known(name, CONTROLLERS, "controller")], kit.models["prior"]
     if c.model != "oracle":
         model = kit.models[c.model]
         estimator = make_estimator(model, kit, kit.noise(name), control, observer=c.observer)
@@ -98,7 +98,7 @@ def build(
 
 
 def noise_of(scenario: Scenario, artifact: Kit, recordings: Sequence[Trajectory]) -> dict[str, Array]:
-    """Process noise of every contender that estimates, each by maximum likelihood on the same recordings.
+    """Process noise of every controller that estimates, each by maximum likelihood on the same recordings.
 
     Args:
         scenario: The machine, its sensors' noise and input range; where its tasks go beyond the recordings a hybrid has
@@ -114,14 +114,14 @@ def noise_of(scenario: Scenario, artifact: Kit, recordings: Sequence[Trajectory]
     errors["oracle"] = errors["hybrid"]
     found = {
         name: tuned_noise(models[c.model], scenario, errors[c.model], recordings, observer=c.observer)
-        for name, c in CONTENDERS.items()
+        for name, c in CONTROLLERS.items()
         if c.model in models and not c.truth
     }
     return no_surer_than_prior(scenario, found)
 
 
 def no_surer_than_prior(scenario: Scenario, noise: Mapping[str, Array]) -> dict[str, Array]:
-    """Process noise by contender; where tasks go beyond the recordings a hybrid has no less than its prior.
+    """Process noise by controller; where tasks go beyond the recordings a hybrid has no less than its prior.
 
     Args:
         scenario: The machine.
@@ -147,12 +147,12 @@ def find_noise(
     controllers: Sequence[str],
     seed: int,
 ) -> tuple[Mapping[str, Array], str]:
-    """Process noise of the filters of contenders, and in words where it came from.
+    """Process noise of the filters of controllers, and in words where it came from.
 
     Args:
         scenario: The machine.
         artifact: Prior and hybrid.
-        controllers: Names of contenders.
+        controllers: Names of controllers.
         seed: Seed of the recordings that the machine makes where the artifact holds no noise.
 
     Raises:
@@ -161,7 +161,7 @@ def find_noise(
     Example:
         ``noise, source = find_noise(scenario, hm.load("runs/golf"), ("hybrid_observer",), 0)``
     """
-    needed = [name for name in controllers if not CONTENDERS[name].truth]
+    needed = [name for name in controllers if not CONTROLLERS[name].truth]
     held = {name: artifact.noise(name) for name in artifact.loop.process_noise}
     lacking = [name for name in needed if name not in held]
     if not lacking:

@@ -17,7 +17,7 @@ from hybrid_mpc.control.safeguard import SafeController, Source
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimator
 from hybrid_mpc.files import digest
-from hybrid_mpc.job.controllers import CONTENDERS, build
+from hybrid_mpc.job.controllers import CONTROLLERS, build
 from hybrid_mpc.kit.artifact import WATCHES, Kit
 from hybrid_mpc.kit.assembly import SOLVERS, make_adaptive_guard, make_backup_guard, make_resting_guard
 from hybrid_mpc.loop.faults import Fault, check_channels, install
@@ -139,7 +139,7 @@ class LoopSpec:
         scenario: Registered name or path of a user's file.
         model: Label of the model on the bench.
         task: Name of the task.
-        controller: Name of the contender, with its estimator.
+        controller: Name of the controller, with its estimator.
         solver: ``"rti"``, ``"sqp"`` or ``"ipopt"``.
         horizon: Periods; None for the task's own.
         monitor: Name in :data:`MONITORS`; without a hybrid there is none. Default: ``"own"``, or ``"guard"`` with a
@@ -188,13 +188,13 @@ class LoopSpec:
     number: int = field(default=0, compare=False)
 
     def __post_init__(self) -> None:
-        known(self.controller, CONTENDERS, "controller")
+        known(self.controller, CONTROLLERS, "controller")
         known(self.solver, SOLVERS, "solver")
         object.__setattr__(self, "monitor", self.monitor or ("guard" if self.guard else "own"))
         known(self.monitor, MONITORS, "monitor")
         if self.guard:
             known(self.guard, GUARDS[1:], "guard")
-        if self.guard and (self.monitor not in ALARMING or CONTENDERS[self.controller].model != "hybrid"):
+        if self.guard and (self.monitor not in ALARMING or CONTROLLERS[self.controller].model != "hybrid"):
             raise InputError(
                 f"a guard acts on alarms: give a controller with the hybrid and monitor {' or '.join(ALARMING)}, got "
                 f"controller {self.controller} and monitor {self.monitor}"
@@ -293,7 +293,7 @@ class LoopRow:
 
     Args:
         task: Name of the task.
-        controller: Name of the contender.
+        controller: Name of the controller.
         seed: Number of the loop.
         seconds: Length [s].
         cost: Closed-loop cost on the plant's true state.
@@ -437,7 +437,7 @@ class Bench:
         Raises:
             InputError: If the model lacks what the monitor needs.
         """
-        if spec.monitor == "none" or CONTENDERS[spec.controller].model != "hybrid":
+        if spec.monitor == "none" or CONTROLLERS[spec.controller].model != "hybrid":
             return None
         return self.kit(spec).monitor(kind=spec.monitor, task=spec.task)
 
@@ -607,7 +607,7 @@ def row_of(spec: LoopSpec, task: Task, problem: OCP, model: HybridModel, result:
     r, labels = result, [signal.label for signal in model.states]
     inputs = [signal.label for signal in model.inputs]
     level = r.level[np.isfinite(r.level)]
-    watched = spec.monitor != "none" and CONTENDERS[spec.controller].model == "hybrid"
+    watched = spec.monitor != "none" and CONTROLLERS[spec.controller].model == "hybrid"
     can_alarm = watched and spec.monitor in ALARMING
     return LoopRow(
         task=task.name,

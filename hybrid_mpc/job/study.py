@@ -1,4 +1,4 @@
-"""Studies that are ready: they need models only."""
+"""Built-in studies: they need models only."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import numpy as np
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_bytes
 from hybrid_mpc.job.control import DEFAULT_CONTROLLERS, parsed_fault, selected_tasks
-from hybrid_mpc.job.controllers import CONTENDERS, ORACLES
+from hybrid_mpc.job.controllers import CONTROLLERS, ORACLES
 from hybrid_mpc.job.loops import Intervals, LoopSpec
 from hybrid_mpc.kit.assembly import SOLVERS
 from hybrid_mpc.loop.faults import SIGNAL_TARGETS, Fault
@@ -183,13 +183,6 @@ def _span(
 
 # What a study consists of, and the runs that it expands to.
 
-ESTIMATORS: Mapping[str, tuple[bool, bool] | None] = {
-    "own": None,
-    "plain": (False, False),
-    "observer": (True, False),
-    "truth": (False, True),
-}
-"""By name: whether it follows an unknown load, and whether it is handed the truth; None for the controller's own."""
 MONITORS = ("own", "none", "energy")
 """``own``: what ``hybrid-mpc control`` runs, the uncalibrated energy monitor beside a hybrid; ``energy``: the same with
 the artifact's calibration, so that it alarms."""
@@ -197,7 +190,7 @@ MOST_DRAWS = 1_000_000
 """Most seeds, and most draws, of a study: all of them are in memory."""
 MOST_HORIZON = 10_000
 """Longest horizon [periods] of a study: a plan is in memory with its derivatives."""
-AXES = ("models", "tasks", "controllers", "estimators", "solvers", "horizons", "monitors", "faults", "seeds")
+AXES = ("models", "tasks", "controllers", "solvers", "horizons", "monitors", "faults", "seeds")
 
 
 @dataclass(frozen=True)
@@ -210,8 +203,7 @@ class Study:
         scenario: Registered name or path of a user's file.
         models: Artifact folders (or folders of runs) by label; a single folder gets the label ``"model"``.
         tasks: Names of tasks, or their beginnings. Default: all.
-        controllers: Names of contenders. Default: prior and hybrid, with observer.
-        estimators: Names in :data:`ESTIMATORS`: another estimator for each of the controllers. Default: its own.
+        controllers: Names in :data:`~hybrid_mpc.job.controllers.CONTROLLERS`. Default: prior and hybrid, with observer.
         solvers: ``"rti"``, ``"sqp"``, ``"ipopt"``. Default: the first.
         horizons: Periods; None for the task's own, which is the default.
         monitors: Names in :data:`MONITORS`. Default: ``"own"``.
@@ -243,7 +235,6 @@ hybrid, hybrid_observer, oracle, oracle_state
     models: str | Path | Mapping[str, str | Path] | Sequence[tuple[str, str]]
     tasks: Sequence[str] = ()
     controllers: Sequence[str] = DEFAULT_CONTROLLERS
-    estimators: Sequence[str] = ("own",)
     solvers: Sequence[str] = ("rti",)
     horizons: Sequence[int | None] = (None,)
     monitors: Sequence[str] = ("own",)
@@ -265,7 +256,7 @@ hybrid, hybrid_observer, oracle, oracle_state
                 raise InputError(f"study: {name} is empty; leave it out for the default")
             if len(set(values)) != len(values):
                 raise InputError(f"study: {name} lists something twice: {values}")
-        for what, table in (("controllers", CONTENDERS), ("estimators", ESTIMATORS), ("solvers", SOLVERS)):
+        for what, table in (("controllers", CONTROLLERS), ("solvers", SOLVERS)):
             for word in getattr(self, what):
                 known(word, table, what[:-1])
         for word in self.monitors:
@@ -297,19 +288,11 @@ hybrid, hybrid_observer, oracle, oracle_state
         return cast("tuple[tuple[Fault, ...], ...]", self.faults)
 
     @property
-    def contenders(self) -> tuple[str, ...]:
-        """Controllers with their estimators, each once."""
-        pairs = product(self.controllers, self.estimators)
-        return tuple(dict.fromkeys(_contender(c, e) for c, e in pairs))
-
-    @property
     def axes(self) -> dict[str, int]:
         """How many of each thing there are; the product is the number of runs."""
-        lengths = {
-            name: len(getattr(self, name)) for name in AXES if name not in ("controllers", "estimators")
-        }
+        lengths = {name: len(getattr(self, name)) for name in AXES}
         tasks = len(selected_tasks(load_scenario(self.scenario), self.tasks))
-        return {**lengths, "tasks": tasks, "controllers": len(self.contenders), "draws": self.draws}
+        return {**lengths, "tasks": tasks, "draws": self.draws}
 
     @property
     def size(self) -> int:
@@ -321,14 +304,14 @@ hybrid, hybrid_observer, oracle, oracle_state
         tasks = [t.name for t in selected_tasks(load_scenario(self.scenario), self.tasks)]
         drawn = [self._drawn(i) for i in range(self.draws)]
         outer = product(
-            self.folders, tasks, self.contenders, self.solvers, self.horizons, self.monitors, self.fault_sets
+            self.folders, tasks, self.controllers, self.solvers, self.horizons, self.monitors, self.fault_sets
         )
         number = count()
-        for model, task, contender, solver, horizon, monitor, faults in outer:
+        for model, task, controller, solver, horizon, monitor, faults in outer:
             for draw, (parameters, some, late) in enumerate(drawn):
                 for seed in self.loop_seeds:
                     yield LoopSpec(
-                        self.scenario, model, task, contender, solver, horizon, monitor,
+                        self.scenario, model, task, controller, solver, horizon, monitor,
                         faults, some, late, parameters, draw, seed, self.duration, number=next(number),
                     )  # fmt: skip
 
@@ -370,7 +353,7 @@ hybrid, hybrid_observer, oracle, oracle_state
             raise InputError(f"study: duration must be a positive number of seconds, got {self.duration!r}")
 
     def _check_combinations(self) -> None:
-        oracles = [name for name in self.contenders if name in ORACLES]
+        oracles = [name for name in self.controllers if name in ORACLES]
         if oracles and set(self.solvers) != {"rti"}:
             raise InputError(
                 f"study: {oracles[0]} has a solver of its own (several starts); leave it or solvers out"
@@ -383,7 +366,7 @@ hybrid, hybrid_observer, oracle, oracle_state
             raise InputError(
                 f"study: {self.draws} draws, and nothing that is drawn: give vary or random_faults, or use seeds"
             )
-        watched = [name for name in self.contenders if CONTENDERS[name].model != "hybrid"]
+        watched = [name for name in self.controllers if CONTROLLERS[name].model != "hybrid"]
         if "energy" in self.monitors and watched:
             raise InputError(
                 f"study: monitor energy is calibrated for the hybrid, {watched[0]} has none; take monitor own, or "
@@ -404,7 +387,7 @@ def _normal(s: Study) -> dict[str, Any]:
         drawn = record(RandomFaults, drawn, "random_faults")
     lists: dict[str, Any] = {
         name: _listed(getattr(s, name), name)
-        for name in ("tasks", "controllers", "estimators", "solvers", "horizons", "monitors")
+        for name in ("tasks", "controllers", "solvers", "horizons", "monitors")
     }
     if isinstance(s.seeds, int) and not isinstance(s.seeds, bool):
         if not 1 <= s.seeds <= MOST_DRAWS:
@@ -437,23 +420,6 @@ def _fault_set(entry: Any) -> tuple[Fault, ...]:
     if not isinstance(entry, Sequence):
         raise InputError(f"study: faults are texts, lists of texts, or Fault; got {entry!r}")
     return tuple(fault for part in entry for fault in _fault_set(part))
-
-
-def _contender(controller: str, estimator: str) -> str:
-    """The contender of a controller's model with that estimator.
-
-    Raises:
-        InputError: If there is none.
-    """
-    wanted, model = ESTIMATORS[estimator], CONTENDERS[controller].model
-    if wanted is None:
-        return controller
-    for name, c in CONTENDERS.items():
-        if c.model == model and (c.observer, c.truth) == wanted:
-            return name
-    raise InputError(
-        f"study: controller {controller} with estimator {estimator} is impossible: there is no such contender"
-    )
 
 
 # Studies in YAML files.
@@ -534,7 +500,7 @@ def _loader() -> Any:
                 raise yaml.composer.ComposerError(
                     None,
                     None,
-                    "prior_replay (&) and aliases (*) are not read; write the value out",
+                    "anchors (&) and aliases (*) are not read; write the value out",
                     event.start_mark,
                 )
             return super().compose_node(parent, index)
@@ -564,13 +530,13 @@ _PLAIN = (
 
 Models = str | Path | Mapping[str, str | Path]
 DEPLOYABLE = ("prior", "prior_observer", "hybrid", "hybrid_observer")
-"""The contenders without oracles, which know the machine as it is built, not as it is drawn."""
+"""The controllers without oracles, which know the machine as it is built, not as it is drawn."""
 SPAN = 0.2
 
 
 @dataclass(frozen=True)
-class Ready:
-    """A ready study.
+class BuiltIn:
+    """A built-in study.
 
     Args:
         title: One line.
@@ -581,21 +547,21 @@ class Ready:
     make: Callable[[Models], Study]
 
 
-def ready_study(name: str, models: Models) -> Study:
-    """The ready study of that name with these models.
+def built_in_study(name: str, models: Models) -> Study:
+    """The built-in study of that name with these models.
 
     Args:
-        name: Name in :data:`READY`.
+        name: Name in :data:`BUILT_IN`.
         models: Artifact folders by label, or one.
 
     Raises:
         InputError: If there is none of that name.
 
     Example:
-        >>> ready_study("faults_1000", "runs/golf").size
+        >>> built_in_study("faults_1000", "runs/golf").size
         1000
     """
-    return READY[known(name, READY, "ready study")].make(models)
+    return BUILT_IN[known(name, BUILT_IN, "built-in study")].make(models)
 
 
 def _plant_variation(models: Models) -> Study:
@@ -656,17 +622,19 @@ def _faults_1000(models: Models) -> Study:
     )  # fmt: skip
 
 
-READY: Mapping[str, Ready] = {
-    "plant_variation": Ready(
+BUILT_IN: Mapping[str, BuiltIn] = {
+    "plant_variation": BuiltIn(
         "every controller on every task of the golf robot, 20 copies of the rig that differ by up to 20 %",
         _plant_variation,
     ),
-    "horizon_size": Ready(
+    "horizon_size": BuiltIn(
         "horizon x hidden units (one --model each) x solver: what a longer look or a larger network pays",
         _horizon_size,
     ),
-    "data_amount": Ready(
+    "data_amount": BuiltIn(
         "models of runs with more and less data (one --model each): what data pay", _data_amount
     ),
-    "faults_1000": Ready("1,000 loops of the golf robot with one to three random faults each", _faults_1000),
+    "faults_1000": BuiltIn(
+        "1,000 loops of the golf robot with one to three random faults each", _faults_1000
+    ),
 }

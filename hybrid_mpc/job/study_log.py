@@ -34,7 +34,7 @@ class NoiseNote:
 
     Args:
         source: Where it is from, in words.
-        sigma_x: Standard deviations per period by contender.
+        sigma_x: Standard deviations per period by controller.
     """
 
     source: str

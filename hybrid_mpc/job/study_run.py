@@ -23,7 +23,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import MOST_CONTENT, read_bytes, sha256
 from hybrid_mpc.job.context import Progress, Silent
 from hybrid_mpc.job.control import ControlSettings, prepared
-from hybrid_mpc.job.controllers import CONTENDERS
+from hybrid_mpc.job.controllers import CONTROLLERS
 from hybrid_mpc.job.engine import Engine, Lost, make_engine
 from hybrid_mpc.job.folder import JobNote, check_folder, open_folder
 from hybrid_mpc.job.loops import Bench, LoopSpec, check_faults, varied
@@ -61,7 +61,7 @@ class ModelInput:
         label: Its name in the study.
         folder: Artifact folder.
         digest: SHA-256 of the folder's files.
-        noise: Process noise by contender.
+        noise: Process noise by controller.
         files: Names and contents of the folder's files, for workers that do not see the folder. Default: none.
     """
 
@@ -161,7 +161,7 @@ def load_inputs(
     scenario = load_scenario(study.scenario)
     _check_plant(scenario, study)
     models, notes = [], {}
-    settings = ControlSettings(tuple(study.tasks), study.contenders)
+    settings = ControlSettings(tuple(study.tasks), tuple(study.controllers))
     for label, folder in study.folders.items():
         before = held[label].noise if held and label in held else None
         known = None if before is None else {name: np.array(v) for name, v in before.sigma_x.items()}
@@ -170,7 +170,7 @@ def load_inputs(
         if "energy" in study.monitors and job.kit.calibration is None:
             raise InputError(f"study: monitor energy: {inner} holds no calibration; take monitor own")
         source = job.noise_source if before is None else before.source
-        sigma = {c: tuple(job.kit.noise(c).tolist()) for c in study.contenders if not CONTENDERS[c].truth}
+        sigma = {c: tuple(job.kit.noise(c).tolist()) for c in study.controllers if not CONTROLLERS[c].truth}
         digest = _digest(_files(inner))
         models.append(ModelInput(label, str(inner.resolve()), digest, tuple(sigma.items())))
         notes[label] = ModelNote(digest, plain(job.kit.provenance), NoiseNote(source, sigma))

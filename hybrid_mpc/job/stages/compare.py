@@ -1,4 +1,4 @@
-"""The closed loops of a run: every task under every contender, several seeds each."""
+"""The closed loops of a run: every task under every controller, several seeds each."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.files import digest
 from hybrid_mpc.job.context import Context
-from hybrid_mpc.job.controllers import CONTENDERS, ORACLES
+from hybrid_mpc.job.controllers import CONTROLLERS, ORACLES
 from hybrid_mpc.job.engine import WORKERS, run_jobs
 from hybrid_mpc.job.loops import MODEL, Bench, LoopRow, LoopSpec, tasks_of
 from hybrid_mpc.kit.artifact import load, loop_settings, read_description
@@ -23,18 +23,18 @@ from hybrid_mpc.scenario import Budget, Scenario, Task, load_scenario
 
 Array = NDArray[np.float64]
 TIMED = ("prior_observer", "hybrid_observer")
-"""Contenders whose first seed runs alone on the machine, so that the durations of its steps count."""
+"""Controllers whose first seed runs alone on the machine, so that the durations of its steps count."""
 SHOWN = ("t", "x", "u", "reference")
 """What is kept of the first seed, to be drawn."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """Loops that run and are kept together: one task under one contender.
+    """Loops that run and are kept together: one task under one controller.
 
     Args:
         task: The task.
-        controller: The contender.
+        controller: The controller.
         seeds: Numbers of the loops.
         timed: Whether it runs alone on the machine, so that the durations of its steps count.
     """
@@ -66,7 +66,7 @@ def parts_of(scenario: Scenario, budget: Budget) -> list[Part]:
     tasks, parts = tasks_of(scenario, budget.tasks), []
     for task in tasks:
         parts += [Part(task, name, (0,), timed=True) for name in TIMED]
-    for name in reversed(list(CONTENDERS)):
+    for name in reversed(list(CONTROLLERS)):
         seeds = range(1 if name in TIMED else 0, _seeds(name, scenario, budget.seeds, budget.oracle_seeds))
         together = 1 if name in ORACLES else max(1, len(seeds))
         for task in tasks:
@@ -76,7 +76,7 @@ def parts_of(scenario: Scenario, budget: Budget) -> list[Part]:
     return parts
 
 
-def contest(context: Context) -> list[LoopRow]:
+def compare(context: Context) -> list[LoopRow]:
     """Run all loops on the run's model; the timed ones alone, the others side by side in processes.
 
     Every part is kept as it ends; what a run that was killed has kept is not run again.

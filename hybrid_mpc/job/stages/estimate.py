@@ -10,7 +10,7 @@ import numpy as np
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.consistency import Consistency, consistency
 from hybrid_mpc.job.context import Context
-from hybrid_mpc.job.controllers import CONTENDERS
+from hybrid_mpc.job.controllers import CONTROLLERS
 from hybrid_mpc.job.stages.results import OBSERVERS
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def estimation_stage(context: Context) -> None:
     arrays: dict[str, Any] = {}
     for i, name in enumerate(OBSERVERS):
         context.progress.update("observers", i, len(OBSERVERS), name)
-        estimator = kit.observer(CONTENDERS[name].model, load=CONTENDERS[name].observer)
+        estimator = kit.observer(CONTROLLERS[name].model, load=CONTROLLERS[name].observer)
         try:
             found = consistency(estimator, parts)
         except InputError as too_short:

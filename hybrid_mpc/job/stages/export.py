@@ -16,7 +16,7 @@ from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
 from hybrid_mpc.estimate.switching import SwitchingFilter
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.controllers import noise_of
-from hybrid_mpc.job.stages.compare import contest, keep
+from hybrid_mpc.job.stages.compare import compare, keep
 from hybrid_mpc.kit.artifact import Kit, Provenance, loop_settings, save_artifact, set_process_noise
 from hybrid_mpc.loop.loop import Loop
 from hybrid_mpc.monitor.energy import EnergyMonitor
@@ -93,7 +93,7 @@ def control_stage(context: Context) -> None:
     if scenario.plant is None:
         _only_timing(context, context.kit)
     else:
-        keep(context, "control", contest(context))
+        keep(context, "control", compare(context))
 
 
 def _only_timing(context: Context, kit: Kit) -> None:

@@ -141,7 +141,7 @@ def _loops(context: Context) -> Any:
 
 
 def _overview(context: Context) -> Any:
-    """Costs of all contenders, errors of the strokes."""
+    """Costs of all controllers, errors of the strokes."""
     if "reason" in context.result("control"):
         return
     rows = kept(context, "control")

@@ -10,11 +10,11 @@ from markupsafe import Markup
 
 from hybrid_mpc.files import write_json
 from hybrid_mpc.job.context import Context
-from hybrid_mpc.job.controllers import CONTENDERS
+from hybrid_mpc.job.controllers import CONTROLLERS
 from hybrid_mpc.job.stages.figures import OBSERVER_TITLES, Figures, draw_all
 from hybrid_mpc.job.stages.identify import training_settings
 from hybrid_mpc.job.stages.monitor import RATES
-from hybrid_mpc.job.stages.results import CONTROLLERS, MODELS, OBSERVERS, collect
+from hybrid_mpc.job.stages.results import MODELS, OBSERVERS, REPORTED, collect
 from hybrid_mpc.plots.style import name_of
 from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, write_report
 
@@ -428,7 +428,7 @@ def _summary(context: Context, results: dict[str, Any]) -> list[KeyFigure]:
     ]  # fmt: skip
     control = results["control"]
     if control["gap_closed"] is not None:
-        costs = ", ".join(f"{n} {_text(control[n]['cost'])}" for n in CONTROLLERS)
+        costs = ", ".join(f"{n} {_text(control[n]['cost'])}" for n in REPORTED)
         gap = control["gap_closed"]
         summary.append(
             KeyFigure(
@@ -608,7 +608,7 @@ def _control_table(results: dict[str, Any]) -> Table | None:
     if results["control"]["hybrid"]["cost"] is None:
         return None
     details = results["control"]["details"]
-    names = [n for n in CONTENDERS if any(n in cells for cells in details["tasks"].values())]
+    names = [n for n in CONTROLLERS if any(n in cells for cells in details["tasks"].values())]
     rows = [
         (task, *(_cost(cells.get(name)) for name in names), _gap(details["gap_closed_by_task"][task]))
         for task, cells in details["tasks"].items()

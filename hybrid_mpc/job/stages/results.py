@@ -20,7 +20,8 @@ from hybrid_mpc.records import plain
 
 SCHEMA_VERSION = 4
 MODELS = ("phy_nominal", "phy", "rnn", "pgrnn", "mopgrnn")
-CONTROLLERS = ("prior", "hybrid", "oracle")
+REPORTED = {"prior": "prior_observer", "hybrid": "hybrid_observer", "oracle": "oracle"}
+"""Controllers behind the three names of the schema: all with the same kind of estimator."""
 OBSERVERS = ("prior_observer", "hybrid_observer")
 
 
@@ -152,7 +153,7 @@ SCHEMA = Group(
         "export": Group({"parity_max_abs_error": _SIZE, "jacobian_max_abs_error": _SIZE}),
         "control": Group(
             {
-                **{name: Group({"cost": _number(), "tracking_rmse": _SIZES}) for name in CONTROLLERS},
+                **{name: Group({"cost": _number(), "tracking_rmse": _SIZES}) for name in REPORTED},
                 "gap_closed": _number(),
             }
         ),
@@ -266,8 +267,6 @@ LOOP_FIGURES = ("cost", "tracking_rmse")
 ENERGY = "energy [W]"
 """Name of the only balance that there is so far, with the unit of its rate."""
 BASELINES = ("prior", "prior_observer")
-REPORTED = {"prior": "prior_observer", "hybrid": "hybrid_observer", "oracle": "oracle"}
-"""Contenders behind the three names of the schema: all with the same kind of estimator."""
 
 
 def collect(context: Context) -> dict[str, Any]:
@@ -357,15 +356,15 @@ def _control(context: Context) -> dict[str, Any]:
     control = context.result("control")
     if "reason" in control:
         groups: dict[str, Any] = {
-            name: dict.fromkeys(LOOP_FIGURES) | {"reason": control["reason"]} for name in CONTROLLERS
+            name: dict.fromkeys(LOOP_FIGURES) | {"reason": control["reason"]} for name in REPORTED
         }
         return {**groups, "gap_closed": None, "gap_closed_reason": control["reason"]}
     rows = kept(context, "control")
     table, found = by_task(rows), summaries(rows)
     out: dict[str, Any] = {}
-    for name, contender in REPORTED.items():
-        own = [cells[contender] for cells in found.values() if contender in cells]
-        loops = [row for row in rows if row.controller == contender]
+    for name, controller in REPORTED.items():
+        own = [cells[controller] for cells in found.values() if controller in cells]
+        loops = [row for row in rows if row.controller == controller]
         if own:
             costs = [cell.cost.mean for cell in own]
             out[name] = {
@@ -404,7 +403,7 @@ def gap_closed(cells: Mapping[str, Sequence[LoopRow]]) -> tuple[float | None, st
     with a reason, where the distance is below twice its standard error; one seed has no standard error.
 
     Args:
-        cells: Loops by contender.
+        cells: Loops by controller.
     """
     if "oracle" not in cells:
         return None, "the scenario has no oracle"

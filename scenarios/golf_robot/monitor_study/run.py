@@ -1,4 +1,4 @@
-"""Run the ready study ``monitor``: learn, then judge; resumable, with a report."""
+"""Run the study ``monitor``: learn, then judge; resumable, with a report."""
 
 from __future__ import annotations
 

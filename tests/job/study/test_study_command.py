@@ -6,7 +6,7 @@ import pytest
 import trivial_runs
 
 from hybrid_mpc.job import study_run as runner
-from hybrid_mpc.job.study import READY
+from hybrid_mpc.job.study import BUILT_IN
 
 YAML = "scenario: golf_robot\nmodels: nowhere\ntasks: [track_sine]\ncontrollers: [prior, hybrid]\nseeds: 6\n"
 
@@ -76,7 +76,7 @@ def test_ctrl_c_says_how_to_go_on(call, config, here, monkeypatch, tmp_path):
 def test_list(call):
     code, told, _ = call("list")
     assert code == 0
-    for name in READY:
+    for name in BUILT_IN:
         assert name in told
     assert "1000 runs" in told
 
