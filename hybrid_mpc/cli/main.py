@@ -36,8 +36,7 @@ KEPT = {
     "run": "finished stages are kept: the same command with --resume goes on",
     "reproduce": "what is done is kept: the same command with --resume goes on",
     "benchmark": "what is fitted and trained is kept: the same command goes on",
-    "control": "loops are kept at the end only, there is nothing to resume: the same command starts them anew (with "
-    "another --out if something lies in it already)",
+    "control": "finished loops are kept: the same command with --resume goes on",
     "search": "finished trials are kept: the same command with --resume goes on",
     "study": "finished runs are kept: the same command with --resume goes on",
     "analyze": "figures and tables are not complete: the same command with another --out makes them anew",

@@ -152,9 +152,9 @@ def _plan(plan: Plan, workers: int) -> list[str]:
 
     axes = " x ".join(f"{n} {name}" for name, n in plan.axes.items() if n > 1) or "a single one"
     lines = [f"{plan.runs} runs: {axes}"]
-    for (model, controller, solver, horizon), seconds in plan.kinds.items():
-        own = "" if horizon is None else f", horizon {horizon}"
-        lines.append(f"  {model}, {controller}, {solver}{own}: {seconds:.2f} s a run")
+    for kind, seconds in plan.kinds.items():
+        own = "" if kind.horizon is None else f", horizon {kind.horizon}"
+        lines.append(f"  {kind.model}, {kind.controller}, {kind.solver}{own}: {seconds:.2f} s a run")
     return [*lines, f"expected: {duration_text(plan.seconds)} in {workers} processes"]
 
 

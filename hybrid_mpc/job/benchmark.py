@@ -32,7 +32,7 @@ from hybrid_mpc.job.benchmark_runs import (
 from hybrid_mpc.job.check import check_scenario
 from hybrid_mpc.job.context import Progress, Silent
 from hybrid_mpc.job.engine import run_jobs
-from hybrid_mpc.job.folder import JobNote, check_same_job
+from hybrid_mpc.job.folder import JobNote, write_note
 from hybrid_mpc.job.stages.export import versions
 from hybrid_mpc.job.stages.identify import is_trained, load_trained, save_trained
 from hybrid_mpc.machine.specification import BenchmarkBudget
@@ -345,10 +345,6 @@ def refitted(
     return replace(physics, fit=fit.result(theta, slope, stages)), rest
 
 
-NOTE = "benchmark.json"
-"""What says which benchmark a folder holds."""
-
-
 @dataclass(frozen=True)
 class BenchmarkSettings:
     """What one benchmark computes.
@@ -608,14 +604,7 @@ def _claim(out: Path, settings: BenchmarkSettings, data: Recordings) -> None:
             [[p.role, p.name, p.t[0], p.t[-1]] for p in (*data.train, *data.valid, *data.held_back)]
         ),
     }
-    claim = JobNote(
-        "benchmark", NOTE, own, lambda folder: write_document(folder / NOTE, own),
-        lambda folder: read_document(folder / NOTE),
-    )  # fmt: skip
-    there = (out / NOTE).is_file()
-    check_same_job(out, claim, resume=there)
-    if not there:
-        claim.write(out)
+    write_note(out, JobNote("benchmark", own), resume=None)
 
 
 def table(results: dict[str, Any]) -> list[str]:

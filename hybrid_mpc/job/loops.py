@@ -1,12 +1,13 @@
-"""Rows of closed loops summed up: means with intervals, by task and controller."""
+"""Closed loops: from a loop's specification to its row, on a bench that holds the machine and its models."""
 
 from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import cached_property, partial
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -16,7 +17,7 @@ from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.safeguard import SafeController, Source
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimator
-from hybrid_mpc.files import digest
+from hybrid_mpc.files import digest, read_document, read_document_arrays, write_document
 from hybrid_mpc.job.controllers import CONTROLLERS, build
 from hybrid_mpc.kit.artifact import WATCHES, Kit
 from hybrid_mpc.kit.assembly import SOLVERS, make_adaptive_guard, make_backup_guard, make_resting_guard
@@ -29,106 +30,30 @@ from hybrid_mpc.model.limits import share_used
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.monitor.calibrate import alarm_intervals
 from hybrid_mpc.monitor.energy import EnergyMonitor
-from hybrid_mpc.records import known, plain
+from hybrid_mpc.records import known, plain, record
 from hybrid_mpc.scenario import Scenario, Task, load_scenario, registered_scenarios
 
-# A task over and over: what a long loop follows.
-
 Array = NDArray[np.float64]
-RETURN_S = 1.0
-"""Shortest way back to the reference's beginning [the machine's seconds]."""
-
-
-def repeated(task: Task, dt: float, shares: Array, time_unit: float = 1.0) -> Task:
-    """The task over and over: to its end, back to its beginning along a quintic, and again.
-
-    Args:
-        task: A task; its reference is asked for within its duration alone.
-        dt: Period [s]; a round takes whole periods, since weights may be of single instants.
-        shares: Factor ``(m,)`` on the distance from the reference's beginning, a round each.
-        time_unit: The machine's second [s]: the way back takes one at least. Default 1.
-
-    Returns:
-        The task of ``m`` rounds.
-
-    Example:
-        >>> ramp = Task("ramp", "", 1.0, (0.0, 0.0), lambda t: np.column_stack([t, np.ones(len(t))]))
-        >>> twice = repeated(ramp, 0.02, np.array([1.0, 0.5]))
-        >>> twice.duration, twice.reference(np.array([0.5, 3.5])).round(6).tolist()
-        (6.0, [[0.5, 1.0], [0.25, 0.5]])
-    """
-    n_q, length = len(task.x0) // 2, round(task.duration / dt)
-    rows = task.reference(np.arange(length + 1, dtype=np.float64) * dt)
-    first, last = rows[0], rows[-1]
-    fastest = np.abs(rows[:, n_q : 2 * n_q]).max(axis=0)
-    far = np.abs(last - first)[:n_q] / np.maximum(fastest, 1e-9)  # a quintic's top speed is 15/8 of its mean
-    back = max(RETURN_S * time_unit, 2.0 * float(far.max(initial=0.0)) if np.all(fastest > 0) else 0.0)
-    period = (length + math.ceil(back / dt - 1e-9)) * dt
-    curve = [
-        _quintic(first[i], last[i], first[n_q + i], last[n_q + i], period - length * dt) for i in range(n_q)
-    ]
-
-    def place(t: Array) -> tuple[NDArray[np.int_], Array, NDArray[np.bool_]]:
-        number = np.clip(np.floor(t / period + 1e-9).astype(int), 0, None)
-        inside = np.maximum(t - number * period, 0.0)
-        return np.minimum(number, len(shares) - 1), inside, inside < length * dt - 1e-9
-
-    def reference(t: Array) -> Array:
-        number, inside, during = place(np.asarray(t, dtype=float))
-        rows = np.tile(last, (len(inside), 1))
-        if during.any():
-            rows[during] = task.reference(inside[during])
-        left = inside[~during] - length * dt
-        for i, polynomial in enumerate(curve):
-            rows[~during, i], rows[~during, n_q + i] = polynomial(left), polynomial.deriv()(left)
-        start = np.concatenate([first[:n_q], np.zeros(len(first) - n_q)])
-        rows[:, : 2 * n_q] = (start + shares[number, None] * (rows - start))[:, : 2 * n_q]
-        return rows
-
-    def weight(t: Array) -> Array:
-        assert task.weight is not None
-        _, inside, during = place(np.asarray(t, dtype=float))
-        rows = np.ones((len(inside), len(task.x0)))
-        if during.any():
-            rows[during] = task.weight(inside[during])
-        return rows
-
-    return replace(
-        task,
-        duration=round(period * len(shares), 9),
-        reference=reference,
-        weight=None if task.weight is None else weight,
-        figures=None,
-    )
-
-
-def _quintic(p1: float, p0: float, v1: float, v0: float, time: float) -> np.polynomial.Polynomial:
-    """From position ``p0`` and speed ``v0`` to ``p1`` and ``v1`` within ``time``, without acceleration at the ends."""
-    d = p1 - p0
-    a3 = (10 * d - time * (6 * v0 + 4 * v1)) / time**3
-    a4 = (-15 * d + time * (8 * v0 + 7 * v1)) / time**4
-    a5 = (6 * d - time * 3 * (v0 + v1)) / time**5
-    return np.polynomial.Polynomial([p0, v0, 0.0, a3, a4, a5])
-
-
-# One closed-loop run: from its specification to its row, on a bench that holds the machine and its models.
-
+Intervals: TypeAlias = tuple[tuple[float, float], ...]
 MODEL = "model"
 """Label of the model on the bench where there is one."""
-Intervals: TypeAlias = tuple[tuple[float, float], ...]
 MONITORS = (*WATCHES, "none")
 """What watches a hybrid, see :meth:`~hybrid_mpc.kit.artifact.Kit.monitor`; or nothing does."""
 ALARMING = ("energy", "guard")
-"""Those that alarm."""
+"""Monitors that alarm."""
 GUARDS = ("", "rest", "adapt", "prior")
 """What an alarm does: nothing; a frozen sensor takes the input away; and a backup takes over, which estimates the
 prior's parameters, or which plans with the fitted prior."""
-NOT_KEPT = ("dt", "timing_ms", "switches")
-KEEPABLE = ("step_ms", "plans", *(f.name for f in fields(ClosedLoopResult) if f.name not in NOT_KEPT))
+ARRAYS = (
+    "step_ms", "plans",
+    *(f.name for f in fields(ClosedLoopResult) if f.name not in ("dt", "timing_ms", "switches")),
+)  # fmt: skip
 """What a row may hold of its loop."""
 TIMES = ("total", "solve", "estimate")
-KEPT_PARTS = 64
-"""Controllers that a bench keeps built; runs come ordered by controller, so few are asked for again."""
+MOST_BUILT = 64
+"""Controllers that a bench holds; loops come ordered by controller, so few are asked for again."""
+REPORT_PERIODS = 25
+"""Periods between two reports of :func:`run_loops`."""
 
 
 @dataclass(frozen=True)
@@ -139,27 +64,28 @@ class LoopSpec:
         scenario: Registered name or path of a user's file.
         model: Label of the model on the bench.
         task: Name of the task.
-        controller: Name of the controller, with its estimator.
+        controller: Name in :data:`~hybrid_mpc.job.controllers.CONTROLLERS`.
         solver: ``"rti"``, ``"sqp"`` or ``"ipopt"``.
-        horizon: Periods; None for the task's own.
+        horizon: Periods. Default: the task's own.
         monitor: Name in :data:`MONITORS`; without a hybrid there is none. Default: ``"own"``, or ``"guard"`` with a
             guard.
         faults: Beside what the task itself brings.
         drawn_faults: Those that a draw takes at random.
         late: Intervals [s] in which solves miss their deadline.
         parameters: Parameters of the plant and their factors.
-        draw: Number of the draw that ``parameters`` and random faults are from.
-        seed: Number of the loop; the same number, the same sensor noise for all that share draw and ``run_seed``.
-        duration: Longest duration [s]; None for the task's own.
-        guard: Name in :data:`GUARDS`. It acts on the alarms of the monitor, so it needs one that alarms.
+        draw: Number of the draw that ``parameters`` and ``drawn_faults`` are from.
+        seed: Number of the loop: the same sensor noise for all that share it, ``draw`` and ``run_seed``.
+        duration: Longest duration [s]. Default: the task's own.
+        guard: Name in :data:`GUARDS`; it needs a monitor that alarms.
         run_seed: Seed of the run that the loop belongs to.
-        rounds: The task is run over and over, with its reference scaled by these factors, one a round. Default: once.
-        keep: Arrays that its row holds: fields of :class:`~hybrid_mpc.loop.simulate.ClosedLoopResult`, ``"step_ms"``
-            ``(n,)`` and ``"plans"`` ``(n, N + 1, n_x)``. No part of the run's identity.
-        number: Place in a study, no part of the run's identity.
+        rounds: The task is run over and over, its reference scaled by these factors, one a round. Default: once.
+        keep: Arrays of its row, names in :data:`ARRAYS`: fields of
+            :class:`~hybrid_mpc.loop.simulate.ClosedLoopResult`, ``"step_ms"`` ``(n,)``, ``"plans"``
+            ``(n, N + 1, n_x)``. No part of the identity.
+        number: Place in a study, no part of the identity.
 
     Raises:
-        InputError: If there is no controller, solver, monitor or guard of a name.
+        InputError: If a name is unknown, a value is of the wrong kind, or a guard has nothing that alarms.
 
     Example:
         >>> spec = LoopSpec("golf_robot", "model", "track_sine", "prior", seed=3)
@@ -199,18 +125,22 @@ class LoopSpec:
                 f"a guard acts on alarms: give a controller with the hybrid and monitor {' or '.join(ALARMING)}, got "
                 f"controller {self.controller} and monitor {self.monitor}"
             )
-        if not (
-            isinstance(self.seed, int)
-            and isinstance(self.run_seed, int)
-            and min(self.seed, self.run_seed) >= 0
-        ):
+        for name in ("faults", "drawn_faults"):
+            given = getattr(self, name)
+            if not isinstance(given, tuple) or not all(isinstance(f, Fault) for f in given):
+                raise InputError(
+                    f"LoopSpec: {name} is a tuple of Fault, got {given!r}; write (Fault(start, end, target, value),), "
+                    'or parsed_fault("TARGET=VALUE@START:END") for a text'
+                )
+        seeds = (self.seed, self.run_seed)
+        if not all(isinstance(seed, int) and seed >= 0 for seed in seeds):
             raise InputError(
                 f"seed and run_seed are whole numbers from 0 on, got {self.seed!r} and {self.run_seed!r}"
             )
         if self.duration is not None and not self.duration > 0:
             raise InputError(f"duration: a positive number of seconds needed, got {self.duration}")
         for name in self.keep:
-            known(name, KEEPABLE, "array to keep")
+            known(name, ARRAYS, "array to keep")
 
     @cached_property
     def id(self) -> str:
@@ -225,14 +155,10 @@ class LoopSpec:
 
     def columns(self) -> dict[str, Any]:
         """The specification as the columns of a table."""
+        names = ("model", "task", "controller", "solver", "horizon", "monitor")
         return {
             "run": self.number,
-            "model": self.model,
-            "task": self.task,
-            "controller": self.controller,
-            "solver": self.solver,
-            "horizon": self.horizon,
-            "monitor": self.monitor,
+            **{name: getattr(self, name) for name in names},
             "faults": fault_text(self.faults),
             "drawn_faults": fault_text(self.drawn_faults, self.late),
             "draw": self.draw,
@@ -255,6 +181,38 @@ def fault_text(faults: Sequence[Fault], late: Intervals = ()) -> str:
         parts.append(f"{f.target}={f.value:g}@{f.start:g}{end}{more}")
     parts += [f"late@{a:g}" + ("" if np.isinf(b) else f":{b:g}") for a, b in late]
     return " + ".join(parts) or "none"
+
+
+def parsed_fault(text: str) -> Fault:
+    """A fault from ``TARGET[=VALUE][@START[:END]]``, times in seconds.
+
+    Args:
+        text: e.g. ``"input_gain=0.8@1.0"``; start 0 by default, end never. A sensor that freezes or drops out has no
+            value, every other fault needs one.
+
+    Raises:
+        InputError: If it has another form, or there is no such fault.
+
+    Example:
+        >>> fault = parsed_fault("plant_friction=2@1:2.5")
+        >>> fault.target, fault.value, fault.start, fault.end
+        ('plant_friction', 2.0, 1.0, 2.5)
+    """
+    head, _, when = text.partition("@")
+    target, _, value = head.partition("=")
+    start, _, end = when.partition(":")
+    try:
+        numbers = [float(v) if v else d for v, d in ((start, 0.0), (end, math.inf), (value, 0.0))]
+    except ValueError as error:
+        raise InputError(
+            f"fault {text!r}: {error}; the form is TARGET=VALUE@START:END, e.g. input_gain=0.8@1.0:2.5"
+        ) from error
+    if math.isnan(numbers[0]) or math.isnan(numbers[1]):
+        raise InputError(f"fault {text!r}: times must be numbers of seconds")
+    fault = Fault(numbers[0], numbers[1], target, numbers[2])
+    if not value and target not in ("measurement_freeze", "measurement_dropout"):
+        raise InputError(f"fault {text!r} has no value; write how large it is, e.g. {target}=1.5@1.0")
+    return fault
 
 
 @dataclass(frozen=True)
@@ -289,7 +247,7 @@ class ModeChange:
 
 @dataclass(frozen=True)
 class LoopRow:
-    """What is told of a closed loop. Signals are named with their unit, e.g. ``"phi [rad]"``.
+    """The figures of a closed loop. Signals are named with their unit, e.g. ``"phi [rad]"``.
 
     Args:
         task: Name of the task.
@@ -300,17 +258,14 @@ class LoopRow:
         tracking_rmse: Root mean square deviation of the true states from their reference, by signal.
         largest_x: Largest magnitude of the true states, by signal.
         largest_u: Largest magnitude of the inputs, by signal.
-        limits: Largest share of the way from rest to each limit that was used, by signal: 1 is the limit, more a
-            violation.
-        excess: By how much limits were left at most, by signal with its unit; ``change of`` an input where that is
-            limited.
+        limits: Largest share of the way from rest to each limit that was used: 1 is the limit, more a violation.
+        excess: By how much limits were left at most; ``change of`` an input where that is limited.
         sources: Share of periods by what gave the input.
         figures: The task's own figures.
-        alarms: Alarms of the monitor; one that is still on at the end ends there. None where nothing could alarm: there
-            is no monitor, or one without thresholds.
+        alarms: Alarms of the monitor; one that is on at the end ends there. None where nothing could alarm.
         alarm_share: Share of periods with an alarm; None where nothing could alarm.
         largest_level: Largest level of the monitor [W]; None without one.
-        not_judged_s: Time in which the monitor could not judge [s]; None without one.
+        not_judged_s: Time in which the monitor had no valid level [s]; None without one.
         switches: Changes of the guard's mode.
         timing_ms: ``median, p95, p99, max`` of the durations of ``total``, ``solve`` and ``estimate`` [ms].
         arrays: What the specification asked to keep. Default: nothing.
@@ -338,54 +293,57 @@ class LoopRow:
 
     def plain(self) -> dict[str, Any]:
         """The row in JSON's own types, without its arrays."""
-        told: dict[str, Any] = plain(replace(self, arrays={}))
-        del told["arrays"]
-        return told
+        found: dict[str, Any] = plain(replace(self, arrays={}))
+        del found["arrays"]
+        return found
 
     def columns(self) -> dict[str, Any]:
         """The row as flat columns of a table, without its arrays; durations begin with ``timing_``."""
-        groups = {
-            "tracking_rmse": self.tracking_rmse, "largest_x": self.largest_x, "largest_u": self.largest_u,
-        }  # fmt: skip
+        groups = ("tracking_rmse", "largest_x", "largest_u")
+        times = (("step", "total"), ("solve", "solve"))
+        nan = float("nan")
         return {
             "cost": self.cost,
-            **{f"{name} {signal}": v for name, by in groups.items() for signal, v in by.items()},
+            **{f"{name} {signal}": v for name in groups for signal, v in getattr(self, name).items()},
             **{f"share_{source}": share for source, share in self.sources.items()},
             **{f"task_{name}": float(value) for name, value in self.figures.items()},
-            "alarm_share": float("nan") if self.alarm_share is None else self.alarm_share,
-            "first_alarm_s": self.alarms[0].start_s if self.alarms else float("nan"),
-            "largest_level_w": float("nan") if self.largest_level is None else self.largest_level,
-            **{
-                f"timing_{kind}_{k}_ms": v
-                for kind, name in (("step", "total"), ("solve", "solve"))
-                for k, v in self.timing_ms[name].items()
-            },
+            "alarm_share": nan if self.alarm_share is None else self.alarm_share,
+            "first_alarm_s": self.alarms[0].start_s if self.alarms else nan,
+            "largest_level_w": nan if self.largest_level is None else self.largest_level,
+            **{f"timing_{kind}_{k}_ms": v for kind, name in times for k, v in self.timing_ms[name].items()},
         }
 
 
 class Bench:
     """What loops run on: a machine, its models, and the controllers that were built for them so far.
 
-    What the scenario says of the control problem and the sensors holds for all models; what was learned is the models'.
+    Control problem and sensors are the scenario's, for all models; what was learned is the models' own.
 
     Args:
         scenario: The machine, with plant, tasks and control problem.
         kits: Loaded artifacts by label; their process noise is that of the filters.
 
     Raises:
-        InputError: If the scenario has nothing to run, or a model is another machine's.
+        InputError: If the scenario has nothing to run, or a model is another machine's; or for a name in place of a
+            scenario or of a kit.
 
     Example:
         ``row, result = Bench(scenario, {"model": hm.load("runs/golf")}).run(spec)``
     """
 
     def __init__(self, scenario: Scenario, kits: Mapping[str, Kit]) -> None:
+        if not isinstance(scenario, Scenario):
+            raise InputError(f"Bench: a Scenario is needed, got {scenario!r}; give load_scenario(NAME)")
         check_complete(scenario)
+        if not isinstance(kits, Mapping) or not all(isinstance(kit, Kit) for kit in kits.values()):
+            raise InputError(
+                f'Bench: kits by label are needed, got {kits!r}; give {{"model": hm.load(FOLDER)}}'
+            )
         for label, kit in kits.items():
             check_kit(scenario, kit, f"model {label}")
         self.scenario = scenario
         self.kits = {label: kit.on(scenario) for label, kit in kits.items()}
-        self._parts: OrderedDict[tuple[object, ...], tuple[Estimator, SafeController]] = OrderedDict()
+        self._built: OrderedDict[tuple[object, ...], tuple[Estimator, SafeController]] = OrderedDict()
         self._guards: dict[tuple[object, ...], Guard] = {}
 
     def kit(self, spec: LoopSpec) -> Kit:
@@ -422,14 +380,14 @@ class Bench:
         """Estimator and controller of a specification; they remember nothing, so one serves many loops."""
         kit = self.kit(spec)
         key = (spec.model, spec.controller, spec.solver, spec.horizon, self._stated(spec))
-        if key not in self._parts:
-            self._parts[key] = build(
+        if key not in self._built:
+            self._built[key] = build(
                 spec.controller, self.scenario, kit, self.problem(spec), solver=spec.solver
             )
-            if len(self._parts) > KEPT_PARTS:
-                self._parts.popitem(last=False)
-        self._parts.move_to_end(key)
-        return self._parts[key]
+            if len(self._built) > MOST_BUILT:
+                self._built.popitem(last=False)
+        self._built.move_to_end(key)
+        return self._built[key]
 
     def monitor(self, spec: LoopSpec) -> EnergyMonitor | None:
         """What watches the loop of a specification.
@@ -497,7 +455,7 @@ class Bench:
         """
         plans: list[Array] = []
         run = self._simulation(spec, task, monitor, _noting(spec, plans, on_step), None)
-        return self._told(spec, task, run.run(), plans)
+        return self._row(spec, task, run.run(), plans)
 
     def run_together(
         self,
@@ -533,13 +491,13 @@ class Bench:
             )
         plans: list[list[Array]] = [[] for _ in specs]
         made = [
-            partial(self._simulation, spec, task, monitor, _noting(spec, kept, None))
-            for spec, task, kept in zip(specs, given, plans, strict=True)
+            partial(self._simulation, spec, task, monitor, _noting(spec, own, None))
+            for spec, task, own in zip(specs, given, plans, strict=True)
         ]
         results = simulate_together(parts[0], made)
         return [
-            self._told(spec, task, result, kept)
-            for spec, task, result, kept in zip(specs, given, results, plans, strict=True)
+            self._row(spec, task, result, own)
+            for spec, task, result, own in zip(specs, given, results, plans, strict=True)
         ]
 
     def _simulation(
@@ -561,14 +519,14 @@ class Bench:
             late=(lambda t: any(a - 1e-9 <= t < b - 1e-9 for a, b in late)) if late else None,
         )  # fmt: skip
 
-    def _told(
+    def _row(
         self, spec: LoopSpec, task: Task | None, result: ClosedLoopResult, plans: list[Array]
     ) -> tuple[LoopRow, ClosedLoopResult]:
         task = self.task(spec) if task is None else task
         row = row_of(spec, task, self.problem(spec), self.kit(spec).models["prior"], result)
         derived = {"step_ms": result.timing_ms["total"], "plans": np.array(plans)}
-        kept = {name: derived[name] if name in derived else getattr(result, name) for name in spec.keep}
-        return replace(row, arrays=kept), result
+        arrays = {name: derived[name] if name in derived else getattr(result, name) for name in spec.keep}
+        return replace(row, arrays=arrays), result
 
 
 def _noting(
@@ -592,6 +550,71 @@ def _parts_text(spec: LoopSpec) -> str:
         f"controller {spec.controller} of model {spec.model} for task {spec.task}, solver {spec.solver}, "
         f"horizon {horizon}"
     )
+
+
+def run_loops(
+    bench: Bench,
+    specs: Sequence[LoopSpec],
+    report: Callable[[int, int, str], None] = lambda done, total, text: None,
+) -> Iterator[LoopRow]:
+    """Run loops one after the other, alone in this process, so that the durations of their steps count.
+
+    Args:
+        bench: What they run on.
+        specs: The loops.
+        report: Called with ``(done, total, text)``, in periods of all loops, as they go on. Default: nothing.
+
+    Yields:
+        The row of each as it ends.
+
+    Example: ``costs = [row.cost for row in run_loops(bench, specs)]``
+    """
+    lengths = [round(bench.task(s).duration / bench.kit(s).models["prior"].dt) for s in specs]
+    for i, spec in enumerate(specs):
+        before, text = sum(lengths[:i]), f"{spec.controller}, seed {spec.seed}"
+
+        def on_step(step: Step, before: int = before, text: str = text) -> None:
+            if step.k % REPORT_PERIODS == 0:
+                report(before + step.k, sum(lengths), text)
+
+        yield bench.run(spec, on_step=on_step)[0]
+    report(sum(lengths), sum(lengths), "")
+
+
+def write_rows(path: Path, rows: Sequence[LoopRow], of: str) -> None:
+    """Write rows with their arrays, whole or not at all.
+
+    Args:
+        path: The file, ``.json``; arrays lie beside it as ``.npz``.
+        rows: The loops.
+        of: Digest of all that decides what they are.
+
+    Raises:
+        StorageError: If they cannot be written.
+    """
+    arrays = {f"{i}/{name}": values for i, row in enumerate(rows) for name, values in row.arrays.items()}
+    write_document(path, {"of": of, "rows": [row.plain() for row in rows]}, arrays)
+
+
+def read_rows(path: Path, of: str) -> list[LoopRow] | None:
+    """Rows that :func:`write_rows` wrote; None if there are none of that digest.
+
+    Raises:
+        InputError: If the file is damaged.
+    """
+    if not path.is_file():
+        return None
+    remedy = "delete it, and its loops run again"
+    document = read_document(path, remedy)
+    if document.get("of") != of:
+        return None
+    arrays = read_document_arrays(path, remedy)
+    rows = [record(LoopRow, row, str(path)) for row in document["rows"]]
+    own: list[dict[str, Array]] = [{} for _ in rows]
+    for key, values in arrays.items():
+        i, _, name = key.partition("/")
+        own[int(i)][name] = values
+    return [replace(row, arrays=found) for row, found in zip(rows, own, strict=True)]
 
 
 def row_of(spec: LoopSpec, task: Task, problem: OCP, model: HybridModel, result: ClosedLoopResult) -> LoopRow:
@@ -678,7 +701,7 @@ def excess(control: OCP, r: ClosedLoopResult, model: HybridModel) -> dict[str, f
 
 
 def tasks_of(scenario: Scenario, names: Sequence[str] | None) -> tuple[Task, ...]:
-    """The scenario's tasks of these names, all for None.
+    """The scenario's tasks of exactly these names, all for None.
 
     Raises:
         InputError: If there is no task of a name.
@@ -692,6 +715,30 @@ def tasks_of(scenario: Scenario, names: Sequence[str] | None) -> tuple[Task, ...
             f"scenario {scenario.name}: no task {', '.join(missing)}; there are: {', '.join(there)}"
         )
     return tuple(there[name] for name in names)
+
+
+def selected_tasks(scenario: Scenario, names: Sequence[str]) -> tuple[Task, ...]:
+    """The tasks of these names or, where there is none of a name, those whose names begin so; all for no names.
+
+    Raises:
+        InputError: If nothing fits a name.
+
+    Example:
+        >>> [task.name for task in selected_tasks(load_scenario("golf_robot"), ["track", "stroke_4"])]
+        ['track_sine', 'track_step', 'stroke_4']
+    """
+    if not names:
+        return scenario.tasks
+    there = [task.name for task in scenario.tasks]
+    chosen: set[str] = set()
+    for name in names:
+        fitting = [name] if name in there else [t for t in there if name and t.startswith(name)]
+        if not fitting:
+            raise InputError(
+                f"scenario {scenario.name}: no task {name!r}, none begins so; there are: {', '.join(there) or 'none'}"
+            )
+        chosen.update(fitting)
+    return tuple(task for task in scenario.tasks if task.name in chosen)
 
 
 def varied(plant: Any, factors: Sequence[tuple[str, float]]) -> Any:
@@ -815,7 +862,7 @@ def interval(values: Sequence[float]) -> Mean:
 
 @dataclass(frozen=True)
 class Summary:
-    """What the loops of one task and controller come to.
+    """The loops of one task and controller summed up.
 
     Args:
         cost: Closed-loop cost.
@@ -835,11 +882,7 @@ class Summary:
 
 
 def by_task(rows: Sequence[LoopRow]) -> dict[str, dict[str, list[LoopRow]]]:
-    """Rows by task and controller, in the order in which they come.
-
-    Args:
-        rows: The loops.
-    """
+    """Rows by task and controller, in the order in which they come."""
     table: dict[str, dict[str, list[LoopRow]]] = {}
     for row in rows:
         table.setdefault(row.task, {}).setdefault(row.controller, []).append(row)
@@ -847,23 +890,15 @@ def by_task(rows: Sequence[LoopRow]) -> dict[str, dict[str, list[LoopRow]]]:
 
 
 def summaries(rows: Sequence[LoopRow]) -> dict[str, dict[str, Summary]]:
-    """What loops come to, by task and controller.
+    """Summaries of loops by task and controller.
 
-    Args:
-        rows: The loops.
-
-    Example:
-        ``summaries(rows)["track_sine"]["hybrid"].cost.mean``
+    Example: ``summaries(rows)["track_sine"]["hybrid"].cost.mean``
     """
     return {task: {name: summary(r) for name, r in cell.items()} for task, cell in by_task(rows).items()}
 
 
 def summary(rows: Sequence[LoopRow]) -> Summary:
-    """What loops of one task and controller come to.
-
-    Args:
-        rows: At least one.
-    """
+    """The summary of loops of one task and controller, at least one."""
 
     def of(
         pick: Callable[[LoopRow], Mapping[str, float]], change: Callable[[float], float] = float
@@ -882,3 +917,79 @@ def summary(rows: Sequence[LoopRow]) -> Summary:
         sources={s.name: float(np.mean([row.sources[s.name] for row in rows])) for s in Source},
         limits=limits,
     )
+
+
+RETURN_S = 1.0
+"""Shortest way back to the reference's beginning [the machine's seconds]."""
+
+
+def repeated(task: Task, dt: float, shares: Array, time_unit: float = 1.0) -> Task:
+    """The task over and over: to its end, back to its beginning along a quintic, and again.
+
+    Args:
+        task: A task; its reference is asked for within its duration alone.
+        dt: Period [s]; a round takes whole periods, since weights may be of single instants.
+        shares: Factor ``(m,)`` on the distance from the reference's beginning, a round each.
+        time_unit: The machine's second [s]: the way back takes one at least. Default 1.
+
+    Returns:
+        The task of ``m`` rounds.
+
+    Example:
+        >>> ramp = Task("ramp", "", 1.0, (0.0, 0.0), lambda t: np.column_stack([t, np.ones(len(t))]))
+        >>> twice = repeated(ramp, 0.02, np.array([1.0, 0.5]))
+        >>> twice.duration, twice.reference(np.array([0.5, 3.5])).round(6).tolist()
+        (6.0, [[0.5, 1.0], [0.25, 0.5]])
+    """
+    n_q, length = len(task.x0) // 2, round(task.duration / dt)
+    rows = task.reference(np.arange(length + 1, dtype=np.float64) * dt)
+    first, last = rows[0], rows[-1]
+    fastest = np.abs(rows[:, n_q : 2 * n_q]).max(axis=0)
+    far = np.abs(last - first)[:n_q] / np.maximum(fastest, 1e-9)  # a quintic's top speed is 15/8 of its mean
+    back = max(RETURN_S * time_unit, 2.0 * float(far.max(initial=0.0)) if np.all(fastest > 0) else 0.0)
+    period = (length + math.ceil(back / dt - 1e-9)) * dt
+    curve = [
+        _quintic(first[i], last[i], first[n_q + i], last[n_q + i], period - length * dt) for i in range(n_q)
+    ]
+
+    def place(t: Array) -> tuple[NDArray[np.int_], Array, NDArray[np.bool_]]:
+        number = np.clip(np.floor(t / period + 1e-9).astype(int), 0, None)
+        inside = np.maximum(t - number * period, 0.0)
+        return np.minimum(number, len(shares) - 1), inside, inside < length * dt - 1e-9
+
+    def reference(t: Array) -> Array:
+        number, inside, during = place(np.asarray(t, dtype=float))
+        rows = np.tile(last, (len(inside), 1))
+        if during.any():
+            rows[during] = task.reference(inside[during])
+        left = inside[~during] - length * dt
+        for i, polynomial in enumerate(curve):
+            rows[~during, i], rows[~during, n_q + i] = polynomial(left), polynomial.deriv()(left)
+        start = np.concatenate([first[:n_q], np.zeros(len(first) - n_q)])
+        rows[:, : 2 * n_q] = (start + shares[number, None] * (rows - start))[:, : 2 * n_q]
+        return rows
+
+    def weight(t: Array) -> Array:
+        assert task.weight is not None
+        _, inside, during = place(np.asarray(t, dtype=float))
+        rows = np.ones((len(inside), len(task.x0)))
+        if during.any():
+            rows[during] = task.weight(inside[during])
+        return rows
+
+    return replace(
+        task,
+        duration=round(period * len(shares), 9),
+        reference=reference,
+        weight=None if task.weight is None else weight,
+        figures=None,
+    )
+
+
+def _quintic(p1: float, p0: float, v1: float, v0: float, time: float) -> np.polynomial.Polynomial:
+    """From position ``p0`` and speed ``v0`` to ``p1`` and ``v1`` within ``time``, without acceleration at the ends."""
+    d = p1 - p0
+    a3 = (10 * d - time * (6 * v0 + 4 * v1)) / time**3
+    a4 = (-15 * d + time * (8 * v0 + 7 * v1)) / time**4
+    a5 = (6 * d - time * 3 * (v0 + v1)) / time**5
+    return np.polynomial.Polynomial([p0, v0, 0.0, a3, a4, a5])

@@ -1,19 +1,15 @@
-"""Where networks can be trained."""
+"""Settings of a run: of the whole, of its networks from a file, and where they are trained."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import read_json, read_object, sha256, write_json
+from hybrid_mpc.files import read_json, sha256
 from hybrid_mpc.job.folder import JobNote
 
-# Settings of a run, those of its networks from a file, and the folder that holds it.
-
-FILE = "run.json"
 WHOLE = ("hidden", "networks", "teacher_steps", "free_run_steps", "horizon", "validation_horizon", "batch")
 MOST = {
     "hidden": 4096, "networks": 1024, "teacher_steps": 10**8, "free_run_steps": 10**8, "horizon": 10**5,
@@ -118,16 +114,7 @@ def claim(settings: Identified) -> JobNote:
     Args:
         settings: What the run computes.
     """
-    identity = settings.identity()
-    return JobNote("run", FILE, identity, lambda out: write_json(out / FILE, {"settings": identity}), _held)
-
-
-def _held(out: Path) -> Mapping[str, Any]:
-    """The settings that a folder's note states."""
-    before = read_object(out / FILE).get("settings")
-    if not isinstance(before, dict):
-        raise InputError(f"{out / FILE} is damaged: no settings in it; choose another --out")
-    return before
+    return JobNote("run", settings.identity())
 
 
 def check_device(device: str) -> None:

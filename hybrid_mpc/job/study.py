@@ -1,4 +1,4 @@
-"""Built-in studies: they need models only."""
+"""What a study is: the loops that it expands to, the things it draws, its YAML file, and the built-in studies."""
 
 from __future__ import annotations
 
@@ -16,18 +16,21 @@ import numpy as np
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_bytes
-from hybrid_mpc.job.control import DEFAULT_CONTROLLERS, parsed_fault, selected_tasks
 from hybrid_mpc.job.controllers import CONTROLLERS, ORACLES
-from hybrid_mpc.job.loops import Intervals, LoopSpec
+from hybrid_mpc.job.loops import ALARMING, GUARDS, MONITORS, Intervals, LoopSpec, parsed_fault, selected_tasks
 from hybrid_mpc.kit.assembly import SOLVERS
 from hybrid_mpc.loop.faults import SIGNAL_TARGETS, Fault
 from hybrid_mpc.records import MOST_SEED, known, plain, record
 from hybrid_mpc.scenario import load_scenario, scenario_of
 
-# What differs from draw to draw of a study: parameters of the plant, and faults of random kind, size and instant.
-
 LATE = "late"
 """A target beside those of :class:`~hybrid_mpc.loop.faults.Fault`: solves miss their deadline."""
+DEFAULT_CONTROLLERS = ("prior_observer", "hybrid_observer")
+MOST_DRAWS = 1_000_000
+"""Most seeds, and most draws, of a study: all of them are in memory."""
+MOST_HORIZON = 10_000
+"""Longest horizon [periods] of a study: a plan is in memory with its derivatives."""
+AXES = ("models", "tasks", "controllers", "solvers", "horizons", "monitors", "faults", "seeds")
 
 
 @dataclass(frozen=True)
@@ -181,18 +184,6 @@ def _span(
     return low, high
 
 
-# What a study consists of, and the runs that it expands to.
-
-MONITORS = ("own", "none", "energy")
-"""``own``: what ``hybrid-mpc control`` runs, the uncalibrated energy monitor beside a hybrid; ``energy``: the same with
-the artifact's calibration, so that it alarms."""
-MOST_DRAWS = 1_000_000
-"""Most seeds, and most draws, of a study: all of them are in memory."""
-MOST_HORIZON = 10_000
-"""Longest horizon [periods] of a study: a plan is in memory with its derivatives."""
-AXES = ("models", "tasks", "controllers", "solvers", "horizons", "monitors", "faults", "seeds")
-
-
 @dataclass(frozen=True)
 class Study:
     """Closed loops of every combination of what is listed.
@@ -206,16 +197,18 @@ class Study:
         controllers: Names in :data:`~hybrid_mpc.job.controllers.CONTROLLERS`. Default: prior and hybrid, with observer.
         solvers: ``"rti"``, ``"sqp"``, ``"ipopt"``. Default: the first.
         horizons: Periods; None for the task's own, which is the default.
-        monitors: Names in :data:`MONITORS`. Default: ``"own"``.
+        monitors: Names in :data:`~hybrid_mpc.job.loops.MONITORS`. Default: ``"own"``, without thresholds.
         faults: Sets of faults, each one text (``"plant_friction=2@1.5 + input_gain=0.8"``; ``"none"``), a
             :class:`~hybrid_mpc.loop.faults.Fault` or a sequence of either. Default: one empty set.
         vary: Parameters of the plant, and by what share each is varied at most in either direction. Default: none.
-        random_faults: Faults that a draw takes at random, see :class:`~hybrid_mpc.job.study.RandomFaults`. Default:
-            none.
+        random_faults: Faults that a draw takes at random. Default: none.
         draws: How many times the random things are drawn; all controllers meet the same draws. Default: 1.
         seeds: Numbers of the loops, or how many. Default: 10.
         seed: Seed of the draws.
         duration: Longest duration of a loop [s]. Default: the task's own.
+        guard: What an alarm does, in :data:`~hybrid_mpc.job.loops.GUARDS`; it needs monitors that alarm, and hybrids.
+            Default: nothing.
+        run_seed: Times 1000 it is added to the numbers of the loops, as in the main job. Default: 0.
         name: For tables and the report.
 
     Raises:
@@ -245,6 +238,8 @@ hybrid, hybrid_observer, oracle, oracle_state
     seeds: int | Sequence[int] = 10
     seed: int = 0
     duration: float | None = None
+    guard: str = ""
+    run_seed: int = 0
     name: str = "study"
 
     def __post_init__(self) -> None:
@@ -256,11 +251,11 @@ hybrid, hybrid_observer, oracle, oracle_state
                 raise InputError(f"study: {name} is empty; leave it out for the default")
             if len(set(values)) != len(values):
                 raise InputError(f"study: {name} lists something twice: {values}")
-        for what, table in (("controllers", CONTROLLERS), ("solvers", SOLVERS)):
+        for what, table in (("controllers", CONTROLLERS), ("solvers", SOLVERS), ("monitors", MONITORS)):
             for word in getattr(self, what):
                 known(word, table, what[:-1])
-        for word in self.monitors:
-            known(word, MONITORS, "monitor")
+        if self.guard:
+            known(self.guard, GUARDS[1:], "guard")
         for label in self.folders:
             if not re.fullmatch(r"[A-Za-z0-9_.-]*[A-Za-z0-9_-]", label):
                 raise InputError(f"study: a model's label is made of letters, digits, _ . -; got {label!r}")
@@ -300,7 +295,7 @@ hybrid, hybrid_observer, oracle, oracle_state
         return math.prod(self.axes.values())
 
     def runs(self) -> Iterator[LoopSpec]:
-        """The runs, those with the same controller next to each other; none is kept, so there may be millions."""
+        """The runs, those of a controller next to each other; they are made one by one, so there may be millions."""
         tasks = [t.name for t in selected_tasks(load_scenario(self.scenario), self.tasks)]
         drawn = [self._drawn(i) for i in range(self.draws)]
         outer = product(
@@ -312,7 +307,8 @@ hybrid, hybrid_observer, oracle, oracle_state
                 for seed in self.loop_seeds:
                     yield LoopSpec(
                         self.scenario, model, task, controller, solver, horizon, monitor,
-                        faults, some, late, parameters, draw, seed, self.duration, number=next(number),
+                        faults, some, late, parameters, draw, seed, self.duration, self.guard, self.run_seed,
+                        number=next(number),
                     )  # fmt: skip
 
     def identity(self) -> dict[str, Any]:
@@ -334,6 +330,7 @@ hybrid, hybrid_observer, oracle, oracle_state
         lists: tuple[tuple[str, Sequence[int | None], int, int], ...] = (
             ("draws", [self.draws], 1, MOST_DRAWS),
             ("seed", [self.seed], 0, MOST_SEED),
+            ("run_seed", [self.run_seed], 0, MOST_SEED),
             ("seeds", self.loop_seeds, 0, MOST_SEED),
             ("horizons", [h for h in self.horizons if h is not None], 1, MOST_HORIZON),
         )
@@ -366,11 +363,19 @@ hybrid, hybrid_observer, oracle, oracle_state
             raise InputError(
                 f"study: {self.draws} draws, and nothing that is drawn: give vary or random_faults, or use seeds"
             )
-        watched = [name for name in self.controllers if CONTROLLERS[name].model != "hybrid"]
-        if "energy" in self.monitors and watched:
+        others = [name for name in self.controllers if CONTROLLERS[name].model != "hybrid"]
+        alarming = [name for name in self.monitors if name in ALARMING]
+        if self.guard and others:
             raise InputError(
-                f"study: monitor energy is calibrated for the hybrid, {watched[0]} has none; take monitor own, or "
-                "controllers with a hybrid"
+                f"the guard watches with the hybrid, controller {others[0]} has another model; with a guard give the "
+                "controllers hybrid_observer or hybrid alone"
+            )
+        if self.guard and len(alarming) < len(self.monitors):
+            raise InputError(f"study: a guard acts on alarms; give monitors {' or '.join(ALARMING)}")
+        if alarming and others:
+            raise InputError(
+                f"study: monitor {alarming[0]} is calibrated for the hybrid, {others[0]} has none; take monitor own, "
+                "or controllers with a hybrid"
             )
 
 
@@ -421,8 +426,6 @@ def _fault_set(entry: Any) -> tuple[Fault, ...]:
         raise InputError(f"study: faults are texts, lists of texts, or Fault; got {entry!r}")
     return tuple(fault for part in entry for fault in _fault_set(part))
 
-
-# Studies in YAML files.
 
 MOST_YAML = 2**16
 """Largest study [bytes] that is read."""

@@ -15,9 +15,8 @@ from hybrid_mpc.files import digest
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.controllers import CONTROLLERS, ORACLES
 from hybrid_mpc.job.engine import WORKERS, run_jobs
-from hybrid_mpc.job.loops import MODEL, Bench, LoopRow, LoopSpec, tasks_of
+from hybrid_mpc.job.loops import MODEL, Bench, LoopRow, LoopSpec, run_loops, tasks_of
 from hybrid_mpc.kit.artifact import load, loop_settings, read_description
-from hybrid_mpc.loop.simulate import Step
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import Budget, Scenario, Task, load_scenario
 
@@ -123,18 +122,8 @@ def run_specs(
         specs: The loops.
         report: Called with ``(done, total, text)`` as the loops go on.
     """
-    bench, rows = _bench(scenario, folder, (folder / "model.json").stat().st_mtime_ns), []
-    dt = bench.kits[MODEL].models["prior"].dt
-    lengths = [round(bench.task(spec).duration / dt) for spec in specs]
-    for i, spec in enumerate(specs):
-        before = sum(lengths[:i])
-
-        def on_step(step: Step, before: int = before) -> None:
-            if step.k % 50 == 0:
-                report(before + step.k, sum(lengths), "periods")
-
-        rows.append(bench.run(spec, on_step=on_step)[0])
-    return rows
+    bench = _bench(scenario, folder, (folder / "model.json").stat().st_mtime_ns)
+    return list(run_loops(bench, specs, report))
 
 
 @lru_cache(maxsize=1)

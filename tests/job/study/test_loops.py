@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import (
+    Bench,
     Calibration,
     FaultKind,
     InputError,
@@ -20,8 +21,8 @@ from hybrid_mpc import (
     set_process_noise,
 )
 from hybrid_mpc.job.context import Silent
-from hybrid_mpc.job.control import ControlSettings, prepared, run_loops
-from hybrid_mpc.job.study_run import TIMING, load_inputs
+from hybrid_mpc.job.loops import run_loops
+from hybrid_mpc.job.study_run import TIMING, load_inputs, load_models
 from hybrid_mpc.kit.artifact import read_description, write_description
 
 GOLF = load_scenario("golf_robot")
@@ -64,19 +65,16 @@ def untimed(row):
     return {key: value for key, value in row.items() if not key.startswith(TIMING)}
 
 
-def test_a_run_is_what_control_runs(run_folder):
-    settings = ControlSettings(("stroke_4",), ("prior", "hybrid_observer"), "sqp", seeds=2, faults=())
-    short = replace(GOLF, tasks=tuple(replace(t, duration=SHORT, figures=None) for t in GOLF.tasks))
-    job = prepared(short, run_folder, settings)
-    costs = {(row.controller, row.seed): r.cost for row, r in run_loops(job, lambda *told: None)}
+def test_a_run_is_a_loop_on_a_bench(run_folder):
     study = Study(
         "golf_robot", run_folder, tasks=["stroke_4"], controllers=["prior", "hybrid_observer"], solvers=["sqp"],
         seeds=2, duration=SHORT,
     )  # fmt: skip
     run, _ = load_inputs(study)
-    for config in study.runs():
-        assert run(config)["cost"] == costs[config.controller, config.seed]  # bit by bit
-    assert len(costs) == 4
+    specs = list(study.runs())
+    alone = run_loops(Bench(GOLF, {"model": load_models(study)["model"].kit}), specs)
+    assert [run(spec)["cost"] for spec in specs] == [row.cost for row in alone]  # bit by bit
+    assert len(specs) == 4
 
 
 def test_what_a_study_adds_acts(run_folder):
