@@ -109,16 +109,18 @@ def compare(
 @app.command("list")
 def list_studies() -> None:
     """List the built-in studies."""
-    from hybrid_mpc.job.study import BUILT_IN, built_in_study
+    from hybrid_mpc.job.study import built_in_studies, built_in_study
 
-    for name, study in BUILT_IN.items():
-        print(f"{name:16} {built_in_study(name, 'model').size:6} runs with one model: {study.title}")
+    for name, path in built_in_studies().items():
+        title = path.read_text().partition("\n")[0].removeprefix("# ")
+        print(f"{name:16} {built_in_study(name, 'model').size:6} runs with one model: {title}")
 
 
 def _study(name: str, models: dict[str, str], scenario: str) -> Study:
-    from hybrid_mpc.job.study import BUILT_IN, built_in_study, read_study
+    from hybrid_mpc.job.study import built_in_studies, built_in_study, read_study
 
-    if name in BUILT_IN:
+    there = built_in_studies()
+    if name in there:
         if scenario:
             raise InputError(f"study {name} has a scenario of its own; leave --scenario out")
         if not models:
@@ -126,7 +128,7 @@ def _study(name: str, models: dict[str, str], scenario: str) -> Study:
         return built_in_study(name, models)
     if not Path(name).is_file() and Path(name).suffix not in (".yaml", ".yml"):
         raise InputError(
-            f"no study {name!r}; built-in studies are: {', '.join(BUILT_IN)}. Or give the path of a .yaml file."
+            f"no study {name!r}; built-in studies are: {', '.join(there)}. Or give the path of a .yaml file."
         )
     return read_study(
         name, **({"models": models} if models else {}), **({"scenario": scenario} if scenario else {})

@@ -1,4 +1,4 @@
-"""The controllers that a scenario's closed loops compare: same problem, period, horizon and safeguards."""
+"""The controllers that closed loops compare, by name: same problem, period, horizon and safeguards."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.rti import CondensedController
 from hybrid_mpc.control.safeguard import SafeController
 from hybrid_mpc.control.sqp import SQPController
+from hybrid_mpc.data.trajectories import Trajectory, load_trajectories
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimator, TrueState
 from hybrid_mpc.estimate.tuning import process_noise
@@ -23,9 +23,6 @@ from hybrid_mpc.kit.artifact import Kit
 from hybrid_mpc.kit.assembly import make_controller, make_estimator, make_ocp, tuned_noise
 from hybrid_mpc.records import known
 from hybrid_mpc.scenario import Scenario
-
-if TYPE_CHECKING:
-    from hybrid_mpc.data.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 ORACLE_ITERATIONS = 1
@@ -36,7 +33,7 @@ period it starts from its last plan and from the rival's that is cheaper by its 
 
 @dataclass(frozen=True)
 class NamedController:
-    """One of the compared controllers.
+    """A controller with its estimator.
 
     Args:
         model: ``"prior"``, ``"hybrid"`` or ``"oracle"``.
@@ -101,8 +98,7 @@ def noise_of(scenario: Scenario, artifact: Kit, recordings: Sequence[Trajectory]
     """Process noise of every controller that estimates, each by maximum likelihood on the same recordings.
 
     Args:
-        scenario: The machine, its sensors' noise and input range; where its tasks go beyond the recordings a hybrid has
-            no less than its prior.
+        scenario: The machine, with its sensors' noise and input range.
         artifact: Prior and hybrid.
         recordings: Training recordings with smoothed states.
     """
@@ -122,10 +118,6 @@ def noise_of(scenario: Scenario, artifact: Kit, recordings: Sequence[Trajectory]
 
 def no_surer_than_prior(scenario: Scenario, noise: Mapping[str, Array]) -> dict[str, Array]:
     """Process noise by controller; where tasks go beyond the recordings a hybrid has no less than its prior.
-
-    Args:
-        scenario: The machine.
-        noise: What suits the recordings.
 
     Example:
         >>> from scenarios.unbalanced_disk import scenario
@@ -170,8 +162,8 @@ def find_noise(
     if not any(name in ORACLES for name in lacking):
         machine = replace(scenario, oracle=None)  # whose noise takes the longest
     source = f"recordings of the simulated machine (quick, seed {seed}), smoothed by the prior"
-    if kept := [name for name in needed if name in held]:
-        source = f"{', '.join(lacking)}: {source}; {', '.join(kept)}: the model's own"
+    if own := [name for name in needed if name in held]:
+        source = f"{', '.join(lacking)}: {source}; {', '.join(own)}: the model's own"
     return no_surer_than_prior(
         scenario, {**_estimated_noise(machine, artifact, lacking, seed), **held}
     ), source
@@ -180,7 +172,6 @@ def find_noise(
 def _estimated_noise(
     scenario: Scenario, artifact: Kit, lacking: Sequence[str], seed: int
 ) -> Mapping[str, Array]:
-    from hybrid_mpc.data.trajectories import load_trajectories
     from hybrid_mpc.identify.delay import shifted, with_states
     from hybrid_mpc.identify.smooth import fit_smoother
 

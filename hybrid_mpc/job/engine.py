@@ -58,10 +58,7 @@ class Lost(Exception):
 
 
 class Engine(Protocol[B, R_co]):
-    """Computes batches, each in some worker, by a function of the batch; results do not depend on where.
-
-    Example: :class:`LocalEngine` and :class:`DaskEngine`.
-    """
+    """Computes batches, each in some worker, by a function of the batch: :class:`LocalEngine`, :class:`DaskEngine`."""
 
     @property
     def workers(self) -> int:
@@ -340,8 +337,7 @@ def run_jobs(
         jobs: Functions and their arguments by name; both must pickle, and so must the results.
         on_progress: ``(name, done, total, text)`` for each report, before the job's result.
         workers: Jobs side by side.
-        on_result: ``(name, result)`` as each job ends, so that what is done can be kept, also beside one that fails.
-            Default: nothing.
+        on_result: ``(name, result)`` as each job ends, also beside one that fails. Default: nothing.
 
     Raises:
         InputError: If a job raises one: bad input that shows only then. Or if ``workers`` is less than 1.
@@ -351,23 +347,23 @@ def run_jobs(
         >>> def double(x, report):
         ...     report(1, 1, "doubled")
         ...     return 2 * x
-        >>> run_jobs({"a": (double, (1,)), "b": (double, (2,))}, lambda *told: None, workers=1)
+        >>> run_jobs({"a": (double, (1,)), "b": (double, (2,))}, lambda *report: None, workers=1)
         {'a': 2, 'b': 4}
     """
     _check(workers)
-    waiting, results = list(jobs), {}
+    queue, results = list(jobs), {}
     running: dict[str, _Job] = {}
     try:
-        while waiting or running:
-            while waiting and len(running) < workers:
-                name = waiting.pop(0)
+        while queue or running:
+            while queue and len(running) < workers:
+                name = queue.pop(0)
                 running[name] = _Job(*jobs[name])
             wait([job.reports for job in running.values()], REPORT_S)
             failed: dict[str, _Ended] = {}
             for name, job in list(running.items()):
                 ended = job.ended()
-                for told in job.told(rest=ended is not None):
-                    on_progress(name, *told)
+                for report in job.new_reports(rest=ended is not None):
+                    on_progress(name, *report)
                 if ended is None:
                     continue
                 running.pop(name).close()
@@ -376,7 +372,7 @@ def run_jobs(
                     on_result(name, ended.value)
                 else:
                     failed[name] = ended
-            if failed:  # raised only now: others that had ended by then are kept
+            if failed:  # raised only now, after the results of others that had ended by then
                 name, first = next(iter(failed.items()))
                 raise first.error(name)
     finally:
@@ -428,7 +424,7 @@ class _Job:
         ended = found[1]
         return _Ended(failed=f"its process ended ({ended})") if isinstance(ended, Lost) else ended
 
-    def told(self, *, rest: bool) -> Iterator[tuple[int, int, str]]:
+    def new_reports(self, *, rest: bool) -> Iterator[tuple[int, int, str]]:
         """The next report, if there is one; the ``rest`` of them once the job has ended."""
         if rest:
             self._theirs.close()
@@ -479,13 +475,7 @@ def _began(parent: int, begin: Callable[[], None] | None) -> None:
 
 
 def follow(parent: int) -> None:
-    """Tie a worker to its parent: it leaves Ctrl-C to it, and ends with it, even if the parent was killed.
-
-    Args:
-        parent: The parent's process id.
-
-    Example: ``ProcessPoolExecutor(2, initializer=follow, initargs=(os.getpid(),))``
-    """
+    """Tie a worker to the process of its parent: it leaves Ctrl-C to it, and ends with it, even if it was killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def watch() -> None:

@@ -347,11 +347,7 @@ class Bench:
         self._guards: dict[tuple[object, ...], Guard] = {}
 
     def kit(self, spec: LoopSpec) -> Kit:
-        """The model of a specification.
-
-        Raises:
-            InputError: If there is none of that label, or the loop is another scenario's.
-        """
+        """The model of a specification; refused if there is none, or the loop is another scenario's."""
         own = self.scenario.name
         others = () if spec.scenario == own else registered_scenarios()
         if spec.scenario in others and load_scenario(spec.scenario).name != own:
@@ -359,11 +355,7 @@ class Bench:
         return self.kits[known(spec.model, self.kits, "model on the bench")]
 
     def task(self, spec: LoopSpec) -> Task:
-        """The task of a specification: its rounds and its duration.
-
-        Raises:
-            InputError: If there is none of that name.
-        """
+        """The task of a specification, with its rounds and its duration; refused if there is none of that name."""
         (task,) = tasks_of(self.scenario, (spec.task,))
         kit = self.kit(spec)
         if spec.rounds:
@@ -390,21 +382,13 @@ class Bench:
         return self._built[key]
 
     def monitor(self, spec: LoopSpec) -> EnergyMonitor | None:
-        """What watches the loop of a specification.
-
-        Raises:
-            InputError: If the model lacks what the monitor needs.
-        """
+        """What watches the loop of a specification; refused if the model lacks what it needs."""
         if spec.monitor == "none" or CONTROLLERS[spec.controller].model != "hybrid":
             return None
         return self.kit(spec).monitor(kind=spec.monitor, task=spec.task)
 
     def guard(self, spec: LoopSpec) -> Guard | None:
-        """What an alarm does in the loop of a specification; None: nothing.
-
-        Raises:
-            InputError: If the model lacks what the guard needs.
-        """
+        """What an alarm does in the loop of a specification; None: nothing. Refused if the model lacks its parts."""
         if not spec.guard:
             return None
         kit = self.kit(spec)
@@ -618,15 +602,7 @@ def read_rows(path: Path, of: str) -> list[LoopRow] | None:
 
 
 def row_of(spec: LoopSpec, task: Task, problem: OCP, model: HybridModel, result: ClosedLoopResult) -> LoopRow:
-    """The row of a loop.
-
-    Args:
-        spec: Which loop.
-        task: Its task.
-        problem: Its control problem, with the limits.
-        model: A model of the machine, whose signals name the columns.
-        result: Its record.
-    """
+    """The row of a loop, from its task, its control problem, a model that names the signals, and its record."""
     r, labels = result, [signal.label for signal in model.states]
     inputs = [signal.label for signal in model.inputs]
     level = r.level[np.isfinite(r.level)]
@@ -659,15 +635,9 @@ def _by(labels: Sequence[str], values: Array) -> dict[str, float]:
 
 
 def limits_used(control: OCP, r: ClosedLoopResult, model: HybridModel) -> dict[str, float]:
-    """Largest share of the way from rest to each limit that a loop used: 1 is the limit, more a violation.
+    """Largest share of the way from rest to each limit that a loop used [-]: 1 is the limit, more a violation.
 
-    Args:
-        control: The problem with the limits.
-        r: The loop; states are the plant's true ones.
-        model: Whose signals name them.
-
-    Returns:
-        Inputs, and ``change of`` an input and states where there are such limits [-].
+    By signal of the model: inputs and, where limited, ``change of`` an input and the plant's true states.
     """
     changes = np.abs(np.diff(r.u, axis=0, prepend=control.rest_input[None]))
     used: dict[str, float] = {}
@@ -682,13 +652,7 @@ def limits_used(control: OCP, r: ClosedLoopResult, model: HybridModel) -> dict[s
 
 
 def excess(control: OCP, r: ClosedLoopResult, model: HybridModel) -> dict[str, float]:
-    """By how much a loop left its limits at most [the signals' units]: inputs and, where limited, changes and states.
-
-    Args:
-        control: The problem with the limits.
-        r: The loop; states are the plant's true ones.
-        model: Whose signals name them.
-    """
+    """By how much a loop left its limits at most, in the signals' units: inputs and, where limited, changes, states."""
     beyond = np.maximum(r.u - control.u_max, control.u_min - r.u)
     over = {s.label: v for s, v in zip(model.inputs, beyond.T, strict=True)}
     if np.any(np.isfinite([control.x_min, control.x_max])):
@@ -701,11 +665,7 @@ def excess(control: OCP, r: ClosedLoopResult, model: HybridModel) -> dict[str, f
 
 
 def tasks_of(scenario: Scenario, names: Sequence[str] | None) -> tuple[Task, ...]:
-    """The scenario's tasks of exactly these names, all for None.
-
-    Raises:
-        InputError: If there is no task of a name.
-    """
+    """The scenario's tasks of exactly these names, all for None; an unknown name is refused."""
     if names is None:
         return scenario.tasks
     there = {task.name: task for task in scenario.tasks}
@@ -775,11 +735,7 @@ def varied(plant: Any, factors: Sequence[tuple[str, float]]) -> Any:
 
 
 def check_complete(scenario: Scenario) -> None:
-    """Refuse a scenario without plant, control problem or task.
-
-    Raises:
-        InputError: With what lacks.
-    """
+    """Refuse a scenario without plant, control problem or task."""
     parts = {"plant": scenario.plant, "control problem": scenario.control, "task": scenario.tasks or None}
     if lacks := [name for name, part in parts.items() if part is None]:
         raise InputError(
@@ -788,16 +744,7 @@ def check_complete(scenario: Scenario) -> None:
 
 
 def check_kit(scenario: Scenario, kit: Kit, where: str) -> None:
-    """Refuse the models of another machine.
-
-    Args:
-        scenario: The machine, with its control problem.
-        kit: The loaded artifact.
-        where: What it is, for the message.
-
-    Raises:
-        InputError: If prior or hybrid are missing, the artifact was made for another scenario, or sizes do not fit.
-    """
+    """Refuse an artifact without prior or hybrid, of another scenario, or of other sizes; ``where`` names it."""
     assert scenario.control is not None
     if missing := [name for name in ("prior", "hybrid") if name not in kit.models]:
         raise InputError(f"{where} holds {', '.join(kit.models)}; needed is a model {missing[0]} too")
@@ -812,11 +759,7 @@ def check_kit(scenario: Scenario, kit: Kit, where: str) -> None:
 
 
 def check_faults(scenario: Scenario, faults: Sequence[Fault]) -> None:
-    """Refuse faults that the machine cannot show.
-
-    Raises:
-        InputError: With the fault, and what there is.
-    """
+    """Refuse faults that the machine cannot show."""
     assert scenario.plant is not None
     assert scenario.control is not None
     outside = install(scenario.plant(), faults)[1]

@@ -5,9 +5,10 @@ from __future__ import annotations
 import hashlib
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
+from importlib.util import find_spec
 from itertools import count, product
 from pathlib import Path
 from typing import Any, cast
@@ -21,7 +22,7 @@ from hybrid_mpc.job.loops import ALARMING, GUARDS, MONITORS, Intervals, LoopSpec
 from hybrid_mpc.kit.assembly import SOLVERS
 from hybrid_mpc.loop.faults import SIGNAL_TARGETS, Fault
 from hybrid_mpc.records import MOST_SEED, known, plain, record
-from hybrid_mpc.scenario import load_scenario, scenario_of
+from hybrid_mpc.scenario import load_scenario, registered_scenarios, scenario_of
 
 LATE = "late"
 """A target beside those of :class:`~hybrid_mpc.loop.faults.Fault`: solves miss their deadline."""
@@ -316,10 +317,6 @@ hybrid, hybrid_observer, oracle, oracle_state
         whole: dict[str, Any] = plain(asdict(self))
         return {**whole, "models": list(self.folders)}
 
-    def with_models(self, models: Mapping[str, str | Path]) -> Study:
-        """The same study of other models."""
-        return replace(self, models=models)
-
     def _drawn(self, i: int) -> tuple[tuple[tuple[str, float], ...], tuple[Fault, ...], Intervals]:
         faults: tuple[tuple[Fault, ...], Intervals] = ((), ())
         if isinstance(self.random_faults, RandomFaults):
@@ -531,30 +528,25 @@ _PLAIN = (
 )  # fmt: skip
 """Kinds of plain words of YAML 1.2's core schema, with the letters that they begin with."""
 
-Models = str | Path | Mapping[str, str | Path]
-DEPLOYABLE = ("prior", "prior_observer", "hybrid", "hybrid_observer")
-"""The controllers without oracles, which know the machine as it is built, not as it is drawn."""
-SPAN = 0.2
 
+def built_in_studies() -> dict[str, Path]:
+    """Files of the studies that registered scenarios bring, by name: ``studies/*.yaml`` beside the scenario.
 
-@dataclass(frozen=True)
-class BuiltIn:
-    """A built-in study.
-
-    Args:
-        title: One line.
-        make: From models by label to the study.
+    The first line of each is a comment that says what the study is about.
     """
+    found: dict[str, Path] = {}
+    for place in registered_scenarios().values():
+        module = find_spec(place.partition(":")[0])
+        for folder in (module.submodule_search_locations if module else None) or ():
+            found |= {path.stem: path for path in sorted((Path(folder) / "studies").glob("*.yaml"))}
+    return found
 
-    title: str
-    make: Callable[[Models], Study]
 
-
-def built_in_study(name: str, models: Models) -> Study:
+def built_in_study(name: str, models: str | Path | Mapping[str, str | Path]) -> Study:
     """The built-in study of that name with these models.
 
     Args:
-        name: Name in :data:`BUILT_IN`.
+        name: Name in :func:`built_in_studies`.
         models: Artifact folders by label, or one.
 
     Raises:
@@ -564,80 +556,5 @@ def built_in_study(name: str, models: Models) -> Study:
         >>> built_in_study("faults_1000", "runs/golf").size
         1000
     """
-    return BUILT_IN[known(name, BUILT_IN, "built-in study")].make(models)
-
-
-def _plant_variation(models: Models) -> Study:
-    """The parts of the rig that a copy of it would differ in: masses, drive, friction, belt."""
-    varied = (
-        "m",
-        "a",
-        "J",
-        "d",
-        "mu_c",
-        "mu_s",
-        "motor_gain",
-        "drag",
-        "belt_stiffness",
-        "gap",
-        "motor_friction",
-    )
-    return Study(
-        "golf_robot", models, controllers=DEPLOYABLE, vary=dict.fromkeys(varied, SPAN), draws=20, seeds=1,
-        name="plant_variation",
-    )  # fmt: skip
-
-
-def _horizon_size(models: Models) -> Study:
-    """Tasks that can be done with any horizon: a stroke needs one that reaches the impact."""
-    return Study(
-        "golf_robot", models, tasks=("track_sine", "track_step", "reject_load"), controllers=("hybrid_observer",),
-        horizons=(10, 20, 35, 50, 80), solvers=("rti", "sqp"), seeds=5, name="horizon_size",
-    )  # fmt: skip
-
-
-def _data_amount(models: Models) -> Study:
-    return Study(
-        "golf_robot", models, tasks=("track_sine", "stroke_1.4", "stroke_3", "reject_push"), seeds=10,
-        controllers=("prior_observer", "hybrid_observer"), name="data_amount",
-    )  # fmt: skip
-
-
-def _faults_1000(models: Models) -> Study:
-    """The golf robot's catalogue of faults at 70 to 130 % of its sizes, one to three at once, and late solves."""
-    kinds = (
-        FaultKind("plant_friction", 1.35, 4.9),
-        FaultKind("plant_mass", 1.07, 1.65),
-        FaultKind("input_gain", 0.74, 0.86),
-        FaultKind("measurement_offset", 0.014, 0.026, signed=True),
-        FaultKind("measurement_scale", 1.035, 1.065),
-        FaultKind("measurement_freeze"),
-        FaultKind("measurement_dropout", length=(0.02, 0.1)),
-        FaultKind("plant_push", 0.7, 1.3, signed=True, length=(0.1, 0.3)),
-        FaultKind("plant_belt", 0.56, 1.04),
-        FaultKind("plant_delay", 0.042, 0.078, ramp=5.0),
-        FaultKind("late", length=(0.02, 0.24)),
-    )
-    return Study(
-        "golf_robot", models, tasks=("track_sine", "track_step", "stroke_1.4", "stroke_3", "reject_heavy"),
-        controllers=("prior_observer", "hybrid_observer"), random_faults=RandomFaults(kinds), draws=100, seeds=1,
-        duration=4.0, name="faults_1000",
-    )  # fmt: skip
-
-
-BUILT_IN: Mapping[str, BuiltIn] = {
-    "plant_variation": BuiltIn(
-        "every controller on every task of the golf robot, 20 copies of the rig that differ by up to 20 %",
-        _plant_variation,
-    ),
-    "horizon_size": BuiltIn(
-        "horizon x hidden units (one --model each) x solver: what a longer look or a larger network pays",
-        _horizon_size,
-    ),
-    "data_amount": BuiltIn(
-        "models of runs with more and less data (one --model each): what data pay", _data_amount
-    ),
-    "faults_1000": BuiltIn(
-        "1,000 loops of the golf robot with one to three random faults each", _faults_1000
-    ),
-}
+    files = built_in_studies()
+    return read_study(files[known(name, files, "built-in study")], models=models)

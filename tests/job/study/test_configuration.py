@@ -8,7 +8,7 @@ import pytest
 
 from hybrid_mpc import Fault, FaultKind, InputError, LoopSpec, RandomFaults, Study, varied
 from hybrid_mpc.job.controllers import CONTROLLERS
-from hybrid_mpc.job.study import BUILT_IN, built_in_study, generator, read_study
+from hybrid_mpc.job.study import built_in_studies, built_in_study, generator, read_study
 from scenarios.golf_robot.rig import Rig
 from scenarios.pendulum.plant import DampedPendulum
 
@@ -190,8 +190,8 @@ def test_bad_files(tmp_path, text, told):
         read_study(tmp_path / "none.yaml")
 
 
-@pytest.mark.parametrize("name", BUILT_IN)
-def test_ready_studies_expand(name):
+@pytest.mark.parametrize("name", built_in_studies())
+def test_built_in_studies_expand(name):
     study = built_in_study(name, {"z16": "runs/a", "z32": "runs/b"})
     runs = list(study.runs())
     assert len(runs) == study.size

@@ -132,26 +132,6 @@ def test_a_full_disk_stops_the_study_and_it_goes_on_later(here, tmp_path, monkey
     assert len(list(rows(tmp_path / "s" / "runs"))) == 40
 
 
-def test_ctrl_c_keeps_what_is_finished(here, tmp_path, monkeypatch):
-    here(trivial_runs.trivial)
-    real, calls = trivial_runs.Here.next, []
-
-    def stopped(self, timeout):
-        calls.append(1)
-        if len(calls) == 4:
-            raise KeyboardInterrupt
-        return real(self, timeout)
-
-    monkeypatch.setattr(trivial_runs.Here, "next", stopped)
-    with pytest.raises(KeyboardInterrupt):
-        run_study(trivial_runs.study(40), tmp_path / "s")
-    before = values(tmp_path / "s")
-    assert 0 < len(before) < 40
-    results = run_study(trivial_runs.study(40), tmp_path / "s", resume=True)
-    assert len(results.table) == 40
-    assert len(list(rows(tmp_path / "s" / "runs"))) == 40
-
-
 def begun(folder, run="noted", runs=RUNS, **environment):
     """A study in a process group of its own."""
     words = [sys.executable, str(TESTS / "trivial_runs.py"), str(folder), run, str(runs)]
@@ -229,8 +209,12 @@ def test_ctrl_c_ends_the_workers_and_resumes(tmp_path):
     _, error = process.communicate(timeout=60)
     assert "KeyboardInterrupt" in error
     assert not any(alive(pid) for pid in pids)
-    kept = len(list(rows(tmp_path / "s" / "runs")))
-    assert 4 < kept < 60
+    kept = values(tmp_path / "s")
+    assert 4 < len(kept) < 60
+    process = begun(tmp_path / "s", "slow", 60)
+    assert "finished" in process.communicate(timeout=300)[0]
+    assert count(tmp_path / "s") == 60  # none ran twice
+    assert kept.items() <= values(tmp_path / "s").items()
 
 
 @pytest.mark.full
