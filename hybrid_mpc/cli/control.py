@@ -103,13 +103,13 @@ def summary(results: dict[str, Any]) -> list[str]:
 
 def _guarded(row: dict[str, Any]) -> list[str]:
     """What the guard of one loop saw and did."""
-    blind = row["not_judged_s"] or 0.0
-    dark = f"; not judged: {blind:.2f} s" if blind else ""
+    invalid = row["not_judged_s"] or 0.0
+    rest = f"; without a valid level: {invalid:.2f} s" if invalid else ""
     if not row["alarms"]:
-        return [f"guard, {row['task']}, seed {row['seed']}: no alarm{dark}"]
+        return [f"guard, {row['task']}, seed {row['seed']}: no alarm{rest}"]
     when = ", ".join(f"{a['start_s']:.2f} to {a['end_s']:.2f} s" for a in row["alarms"])
     modes = "".join(f"; {s['after'].lower()} from {s['t_s']:.2f} s on" for s in row["switches"])
-    return [f"guard, {row['task']}, seed {row['seed']}: alarm {when}{modes}{dark}"]
+    return [f"guard, {row['task']}, seed {row['seed']}: alarm {when}{modes}{rest}"]
 
 
 def _number(value: float | None, sign: str = "") -> str:

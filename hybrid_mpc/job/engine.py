@@ -8,14 +8,16 @@ import signal
 import threading
 import time
 import traceback
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import BrokenExecutor, CancelledError
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
 from queue import Empty, Queue
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 from hybrid_mpc.errors import InputError
 
@@ -37,7 +39,6 @@ ALONE_S = 60.0
 """How long a cluster may be without any."""
 B = TypeVar("B")
 R = TypeVar("R")
-R_co = TypeVar("R_co", covariant=True)
 
 
 class Lost(Exception):
@@ -57,21 +58,22 @@ class Lost(Exception):
         self.final = final
 
 
-class Engine(Protocol[B, R_co]):
-    """Computes batches, each in some worker, by a function of the batch: :class:`LocalEngine`, :class:`DaskEngine`."""
+class Engine(ABC, Generic[B, R]):
+    """Computes batches side by side, each in some worker, by a function of the batch; results depend on no worker.
 
-    @property
-    def workers(self) -> int:
-        """Batches that are computed side by side."""
+    ``workers`` is the number of batches side by side, ``name`` is for the record, ``died`` counts workers that died.
+    """
 
-    @property
-    def name(self) -> str:
-        """What it is, for the record."""
+    workers: int
+    name: str
+    died: int
 
-    @property
-    def died(self) -> int:
-        """Workers that have died so far; what they were at is lost, and may be begun again."""
+    def __init__(self) -> None:
+        self.died = 0
+        self._ended: Queue[Any] = Queue()
+        self._batches: dict[Any, B] = {}
 
+    @abstractmethod
     def submit(self, batch: B) -> None:
         """Begin a batch.
 
@@ -79,29 +81,11 @@ class Engine(Protocol[B, R_co]):
             RuntimeError: If no worker can be started for it.
         """
 
-    def next(self, timeout: float) -> tuple[B, R_co | Lost] | None:
+    def next(self, timeout: float) -> tuple[B, R | Lost] | None:
         """A batch that has ended, with its result or how it was lost; None if none ends within ``timeout`` [s].
 
         What the work itself raises is raised here.
         """
-
-    def close(self) -> None:
-        """End what still runs."""
-
-
-class _Futures(Generic[B, R]):
-    """Batches as futures that tell a queue when they are done."""
-
-    def __init__(self) -> None:
-        self._ended: Queue[Any] = Queue()
-        self._batches: dict[Any, B] = {}
-
-    def _watch(self, future: Any, batch: B) -> None:
-        self._batches[future] = batch
-        future.add_done_callback(self._ended.put)
-
-    def next(self, timeout: float) -> tuple[B, R | Lost] | None:
-        """See :class:`Engine`."""
         try:
             future = self._ended.get(timeout=timeout)
         except Empty:
@@ -110,11 +94,19 @@ class _Futures(Generic[B, R]):
             return None
         return self._batches.pop(future), self._result(future)
 
-    def _result(self, future: Any) -> R | Lost:
-        raise NotImplementedError
+    @abstractmethod
+    def close(self) -> None:
+        """End what still runs."""
+
+    def _watch(self, future: Any, batch: B) -> None:
+        self._batches[future] = batch
+        future.add_done_callback(self._ended.put)
+
+    @abstractmethod
+    def _result(self, future: Any) -> R | Lost: ...
 
 
-class LocalEngine(_Futures[B, R]):
+class LocalEngine(Engine[B, R]):
     """Processes of this machine; each computes one batch after the other.
 
     Args:
@@ -147,15 +139,12 @@ class LocalEngine(_Futures[B, R]):
         self._work, self.workers, self.name = work, workers, f"joblib, {workers} processes"
         self._environment = {} if threads is None else dict.fromkeys(THREADS, str(threads))
         self._begin = begin
-        self.died = 0
         self._pool: Any = None
         self._pools: dict[Any, Any] = {}
         self._broken: list[Any] = []
 
     def submit(self, batch: B) -> None:
         """See :class:`Engine`."""
-        from concurrent.futures import BrokenExecutor
-
         for _ in range(2):
             self._pool = self._pool or self._started()
             try:
@@ -178,8 +167,6 @@ class LocalEngine(_Futures[B, R]):
         )
 
     def _result(self, future: Any) -> R | Lost:
-        from concurrent.futures import BrokenExecutor, CancelledError
-
         pool = self._pools.pop(future)
         try:
             result: R = future.result()
@@ -200,7 +187,7 @@ class LocalEngine(_Futures[B, R]):
             self._pool = None
 
 
-class DaskEngine(_Futures[B, R]):
+class DaskEngine(Engine[B, R]):
     """Workers of a dask cluster; ``work`` is sent to each of them once, with all that it holds.
 
     A worker that dies is the scheduler's affair: it gives the batch to another, and gives it up when several workers
@@ -233,7 +220,6 @@ class DaskEngine(_Futures[B, R]):
             self.close()
             raise
         self.workers, self.name = len(self._seen), f"dask, {len(self._seen)} workers"
-        self.died = 0
         self._looked = self._manned = time.monotonic()
 
     @property
@@ -271,8 +257,6 @@ class DaskEngine(_Futures[B, R]):
         )
 
     def _result(self, future: Any) -> R | Lost:
-        from concurrent.futures import CancelledError
-
         from distributed.scheduler import KilledWorker
 
         try:

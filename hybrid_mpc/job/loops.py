@@ -335,11 +335,13 @@ class Bench:
         if not isinstance(scenario, Scenario):
             raise InputError(f"Bench: a Scenario is needed, got {scenario!r}; give load_scenario(NAME)")
         check_complete(scenario)
-        if not isinstance(kits, Mapping) or not all(isinstance(kit, Kit) for kit in kits.values()):
+        if not isinstance(kits, Mapping):
             raise InputError(
-                f'Bench: kits by label are needed, got {kits!r}; give {{"model": hm.load(FOLDER)}}'
+                f'Bench: kits by label are needed, got a {type(kits).__name__}; give {{"model": hm.load(FOLDER)}}'
             )
         for label, kit in kits.items():
+            if not isinstance(kit, Kit):
+                raise InputError(f"Bench: kit {label!r} is a {type(kit).__name__}; load it: hm.load(FOLDER)")
             check_kit(scenario, kit, f"model {label}")
         self.scenario = scenario
         self.kits = {label: kit.on(scenario) for label, kit in kits.items()}

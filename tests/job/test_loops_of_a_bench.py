@@ -75,9 +75,10 @@ def test_another_machine_s_model_is_refused(kit):
         Bench(replace(GOLF, plant=None), {})
     with pytest.raises(InputError, match="a Scenario is needed, got 'golf_robot'; give load_scenario"):
         Bench("golf_robot", {"mine": kit})
-    for kits in (kit, {"mine": "runs/mine"}):
-        with pytest.raises(InputError, match=r"kits by label are needed, got .*hm\.load"):
-            Bench(GOLF, kits)
+    with pytest.raises(InputError, match=r"kits by label are needed, got a Kit; give .*hm\.load"):
+        Bench(GOLF, kit)
+    with pytest.raises(InputError, match=r"kit 'mine' is a str; load it: hm\.load"):
+        Bench(GOLF, {"mine": "runs/mine"})
 
 
 def test_rows_come_back_from_a_file_with_their_arrays(bench, tmp_path):

@@ -8,7 +8,6 @@ import pytest
 
 from hybrid_mpc import (
     Bench,
-    Calibration,
     FaultKind,
     InputError,
     Provenance,
@@ -17,7 +16,6 @@ from hybrid_mpc import (
     dry_run,
     load_scenario,
     run_study,
-    set_calibration,
     set_process_noise,
 )
 from hybrid_mpc.job.context import Silent
@@ -26,30 +24,8 @@ from hybrid_mpc.job.study_run import TIMING, load_inputs, load_models
 from hybrid_mpc.kit.artifact import read_description, write_description
 
 GOLF = load_scenario("golf_robot")
-SIGMA = {name: [1e-4, 2e-2] for name in ("prior", "prior_observer", "hybrid", "hybrid_observer", "oracle")}
+SIGMA = dict.fromkeys(("prior", "hybrid"), (1e-3, 1e-1))
 SHORT = 0.3  # s: 15 periods
-
-
-@pytest.fixture(scope="module")
-def run_folder(golf_artifact, tmp_path_factory):
-    """A run's folder as far as studies look at it, with a calibration."""
-    folder = tmp_path_factory.mktemp("run")
-    shutil.copytree(golf_artifact, folder / "model")
-    set_process_noise(folder / "model", SIGMA)
-    set_calibration(
-        folder / "model",
-        Calibration(
-            1e-9,
-            1e-10,
-            1.0,
-            10,
-            1.0,
-            "for tests: alarms at once",
-            residual_threshold=1e9,
-            residual_release=1e8,
-        ),
-    )
-    return folder
 
 
 def row_of(folder, **fields):
@@ -156,7 +132,7 @@ def test_a_resumed_study_keeps_its_noise(run_folder, tmp_path):
     again = run_study(study, tmp_path / "s", workers=1, resume=True)
     assert again.note.models["model"].noise == first.note.models["model"].noise
     assert again.table.equals(first.table)
-    set_process_noise(moved / "model", {name: [1e-3, 1e-1] for name in SIGMA})  # another one is another model
+    set_process_noise(moved / "model", SIGMA)  # another one is another model
     with pytest.raises(InputError, match="content of model model differ"):
         run_study(study, tmp_path / "s", workers=1, resume=True)
 
