@@ -181,7 +181,16 @@ def _span(
     except (TypeError, ValueError) as error:
         raise InputError(f"{what}: two numbers are needed, got {values!r}") from error
     if not (math.isfinite(low) and math.isfinite(high) and low <= high and low >= least and low > above):
-        raise InputError(f"{what}: [{low}, {high}] is no range of numbers that is allowed here")
+        bounds = (
+            f" of {least:g} or more"
+            if math.isfinite(least)
+            else f" above {above:g}"
+            if math.isfinite(above)
+            else ""
+        )
+        raise InputError(
+            f"{what}: [{low:g}, {high:g}] is no range; needed are two finite numbers{bounds}, the smaller one first"
+        )
     return low, high
 
 

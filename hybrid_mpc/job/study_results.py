@@ -346,7 +346,7 @@ def _head(results: StudyResults) -> list[KeyFigure]:
 
 def _what(results: StudyResults) -> Section:
     study = results.note.study
-    defaults: tuple[Any, ...] = (None, [], [None], ["own"], [[]], {})
+    defaults: tuple[Any, ...] = (None, "", [], [None], ["own"], [[]], {})
     rows = [(key, _short(value)) for key, value in study.items() if value not in defaults]
     rows += [(f"model {k}: noise", m.noise.source) for k, m in results.note.models.items()]
     return Section("Configuration", (), (), [Table(("setting", "value"), rows)])
