@@ -243,7 +243,7 @@ def test_workers_end_with_their_parent_and_say_nothing(tmp_path, end):
     """Killed they end within seconds; at Ctrl-C, which reaches all of them, only the parent speaks."""
     path = tmp_path / "pids"
     code = (
-        "import sys; from test_engine import *\n"
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); from test_engine import *\n"
         "if __name__ == '__main__': run_jobs({n: (lasts, (sys.argv[1],)) for n in 'ab'}, quiet, 2)"
     )
     (tmp_path / "main.py").write_text(code)
