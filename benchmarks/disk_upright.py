@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_mpc import load_scenario
-from hybrid_mpc.job.control import ControlSettings, prepared, run_loops
+from hybrid_mpc import Bench, Study, load_scenario
+from hybrid_mpc.job.study_run import load_models
 
 AHEAD = (1, 4, 10, 20)
 FOLLOWED = 20
@@ -44,13 +44,21 @@ def main() -> None:
     """Print the errors."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("run", type=Path, help="folder of hybrid-mpc run unbalanced_disk")
-    settings = ControlSettings(tasks=("track_up",), controllers=("prior",), seeds=3, seed=5)
-    job = prepared(load_scenario("unbalanced_disk"), parser.parse_args().run, settings)
-    loops = [loop for *_, loop, _ in run_loops(job, lambda *told: None)]
+    study = Study(
+        "unbalanced_disk",
+        parser.parse_args().run,
+        tasks=("track_up",),
+        controllers=("prior",),
+        seeds=3,
+        run_seed=5,
+    )
+    kit = load_models(study)["model"].kit
+    bench = Bench(load_scenario("unbalanced_disk"), {"model": kit})
+    loops = [bench.run(spec)[1] for spec in study.runs()]
     print("| periods ahead | model | mean [mrad] | RMS [mrad] |\n| ---: | --- | ---: | ---: |")
     for ahead in AHEAD:
         for name in ("prior", "hybrid"):
-            e = 1e3 * np.concatenate([errors(job.artifact.models[name], loop, ahead) for loop in loops])
+            e = 1e3 * np.concatenate([errors(kit.models[name], loop, ahead) for loop in loops])
             print(f"| {ahead} | {name} | {e.mean():.2f} | {np.sqrt(np.mean(e**2)):.2f} |")
 
 

@@ -77,13 +77,13 @@ def overhead(runs: int) -> dict:
         engine.close()
         found = list(rows(Path(folder)))[4:]
     tenth = max(1, runs // 10)
-    of_workers = [row[f"{TIMING}rss_mb"] for row in found]
+    of_workers = [row.columns[f"{TIMING}rss_mb"] for row in found]
     of_parent = [mb for done, mb in memory.at if done >= tenth]
     return {
         "runs": runs,
         "wall_ms_a_run": 1e3 * wall / runs,
         "parent_cpu_ms_a_run": 1e3 * parent / runs,
-        "in_runs_cpu_ms_a_run": 1e3 * sum(row[f"{TIMING}cpu_s"] for row in found) / runs,
+        "in_runs_cpu_ms_a_run": 1e3 * sum(row.columns[f"{TIMING}cpu_s"] for row in found) / runs,
         "worker_mb_at_tenth": float(np.median(of_workers[tenth : 2 * tenth])),
         "worker_mb_at_end": float(np.median(of_workers[-tenth:])),
         "parent_mb_at_tenth": of_parent[0],

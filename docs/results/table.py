@@ -30,7 +30,7 @@ def first(value: Any) -> float:
     return float(next(iter(value.values())) if isinstance(value, dict) else value)
 
 
-CONTENDERS = ("prior", "prior_observer", "hybrid", "hybrid_observer", "oracle", "oracle_state")
+CONTROLLERS = ("prior", "prior_observer", "hybrid", "hybrid_observer", "oracle", "oracle_state")
 
 
 def control(results: dict[str, Any]) -> list[str]:
@@ -38,10 +38,10 @@ def control(results: dict[str, Any]) -> list[str]:
     details = results["control"].get("details")
     if details is None:
         return []
-    lines = ["| task | " + " | ".join(CONTENDERS) + " | gap closed |", "|" + " --- |" * 8]
+    lines = ["| task | " + " | ".join(CONTROLLERS) + " | gap closed |", "|" + " --- |" * 8]
     for task, cells in details["tasks"].items():
         row = []
-        for cell in (cells.get(name) for name in CONTENDERS):
+        for cell in (cells.get(name) for name in CONTROLLERS):
             half = None if cell is None else cell["cost"]["ci95"]
             row.append(
                 "–"
@@ -61,10 +61,10 @@ def strokes(results: dict[str, Any]) -> list[str]:
         for task, cells in tasks.items()
     }
     figures = {task: row for task, row in figures.items() if any(row.values())}
-    lines = ["| stroke | " + " | ".join(CONTENDERS) + " |", "|" + " --- |" * 7] if figures else []
+    lines = ["| stroke | " + " | ".join(CONTROLLERS) + " |", "|" + " --- |" * 7] if figures else []
     for task, row in figures.items():
         cells = []
-        for name in CONTENDERS:
+        for name in CONTROLLERS:
             f = row.get(name)
             speed, time = (
                 (None, None) if not f else (f[k]["mean"] for k in ("speed_error_rel", "timing_error_s"))

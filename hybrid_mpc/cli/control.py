@@ -7,9 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from hybrid_mpc.cli.options import EmptyFolder, ScenarioName
+from hybrid_mpc.cli.options import ScenarioName
 from hybrid_mpc.records import MOST_SEED
-from hybrid_mpc.scenario import load_scenario
 
 EXAMPLES = (
     "Examples:\n\n"
@@ -26,7 +25,7 @@ EXAMPLES = (
 def control(
     scenario: ScenarioName,
     model: Annotated[Path, typer.Option(help="Artifact folder: model/ of a finished run.")],
-    out: EmptyFolder,
+    out: Annotated[Path, typer.Option(help="Folder to make.")],
     task: Annotated[
         list[str] | None,
         typer.Option(help="A task, or the beginning of tasks' names; may be repeated. Default: all."),
@@ -34,7 +33,7 @@ def control(
     controller: Annotated[
         list[str] | None,
         typer.Option(
-            help="A contender; may be repeated. Default: prior_observer (not with --guard) and hybrid_observer."
+            help="A controller; may be repeated. Default: prior_observer (not with --guard) and hybrid_observer."
         ),
     ] = None,
     solver: Annotated[str, typer.Option(help="rti, sqp or ipopt.")] = "rti",
@@ -54,35 +53,23 @@ def control(
             help="--guard, and a backup that learns what has become of mass and friction (scenario's causes).",
         ),
     ] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Finish the loops that the folder holds.")] = False,
     gif: Annotated[bool, typer.Option("--gif/--no-gif", help="Draw moving pictures.")] = True,
 ) -> None:
     """Close the loop around the simulated machine with a trained model, without training anything."""
     from hybrid_mpc.cli.progress import make_progress
-    from hybrid_mpc.files import check_folder
-    from hybrid_mpc.job.control import (
-        DEFAULT_CONTROLLERS,
-        GUARDED_CONTROLLERS,
-        ControlSettings,
-        parsed_fault,
-        prepared,
-        run_control,
-    )
+    from hybrid_mpc.job.control import run_control
+    from hybrid_mpc.job.study import DEFAULT_CONTROLLERS, Study
 
-    check_folder(out)
-    settings = ControlSettings(
-        tuple(task or ()),
-        tuple(dict.fromkeys(controller or (GUARDED_CONTROLLERS if guard or adapt else DEFAULT_CONTROLLERS))),
-        solver,
-        seeds,
-        seed,
-        tuple(parsed_fault(text) for text in fault or ()),
-        "adapt" if adapt else "rest" if guard else "",
-    )
+    guarded = guard or adapt
+    controllers = controller or (("hybrid_observer",) if guarded else DEFAULT_CONTROLLERS)
+    study = Study(
+        scenario, model, tuple(task or ()), tuple(dict.fromkeys(controllers)), (solver,),
+        monitors=("guard" if guarded else "own",), faults=(" + ".join(fault or ()),), seeds=seeds, run_seed=seed,
+        guard="adapt" if adapt else "rest" if guard else "",
+    )  # fmt: skip
     with make_progress() as progress:
-        progress.start("reading the model, and the filters' noise")
-        job = prepared(load_scenario(scenario), model, settings, named=scenario)
-        progress.finish(job.noise_source)
-        results = run_control(job, out, progress, gif=gif)
+        results = run_control(study, out, progress, gif=gif, resume=resume)
     for line in summary(results):
         print(line)
     print(f"results: {(out / 'results.json').resolve()}")
@@ -116,13 +103,13 @@ def summary(results: dict[str, Any]) -> list[str]:
 
 def _guarded(row: dict[str, Any]) -> list[str]:
     """What the guard of one loop saw and did."""
-    blind = row["not_judged_s"] or 0.0
-    dark = f"; not judged: {blind:.2f} s" if blind else ""
+    invalid = row["not_judged_s"] or 0.0
+    rest = f"; without a valid level: {invalid:.2f} s" if invalid else ""
     if not row["alarms"]:
-        return [f"guard, {row['task']}, seed {row['seed']}: no alarm{dark}"]
+        return [f"guard, {row['task']}, seed {row['seed']}: no alarm{rest}"]
     when = ", ".join(f"{a['start_s']:.2f} to {a['end_s']:.2f} s" for a in row["alarms"])
     modes = "".join(f"; {s['after'].lower()} from {s['t_s']:.2f} s on" for s in row["switches"])
-    return [f"guard, {row['task']}, seed {row['seed']}: alarm {when}{modes}{dark}"]
+    return [f"guard, {row['task']}, seed {row['seed']}: alarm {when}{modes}{rest}"]
 
 
 def _number(value: float | None, sign: str = "") -> str:

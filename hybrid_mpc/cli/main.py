@@ -36,8 +36,7 @@ SAVED = {
     "run": "finished stages are saved: the same command with --resume goes on",
     "reproduce": "what is done is saved: the same command with --resume goes on",
     "benchmark": "what is fitted and trained is saved: the same command goes on",
-    "control": "loops are saved at the end only, there is nothing to resume: the same command starts them anew (with "
-    "another --out if something lies in it already)",
+    "control": "finished loops are saved: the same command with --resume goes on",
     "tune": "finished trials are saved: the same command with --resume goes on",
     "study": "finished runs are saved: the same command with --resume goes on",
     "analyze": "figures and tables are not complete: the same command with another --out makes them anew",

@@ -36,7 +36,7 @@ app = typer.Typer(
 
 @app.command("run", epilog=EXAMPLES)
 def run(
-    study: Annotated[str, typer.Argument(metavar="CONFIG", help="A YAML file, or a ready study's name.")],
+    study: Annotated[str, typer.Argument(metavar="CONFIG", help="A YAML file, or a built-in study's name.")],
     out: Annotated[Path, typer.Option(help="Folder to make.")],
     model: Annotated[
         list[str] | None,
@@ -107,26 +107,28 @@ def compare(
 
 
 @app.command("list")
-def list_ready() -> None:
-    """List the studies that are ready."""
-    from hybrid_mpc.job.study import READY, ready_study
+def list_studies() -> None:
+    """List the built-in studies."""
+    from hybrid_mpc.job.study import built_in_studies, built_in_study
 
-    for name, ready in READY.items():
-        print(f"{name:16} {ready_study(name, 'model').size:6} runs with one model: {ready.title}")
+    for name, path in built_in_studies().items():
+        title = path.read_text().partition("\n")[0].removeprefix("# ")
+        print(f"{name:16} {built_in_study(name, 'model').size:6} runs with one model: {title}")
 
 
 def _study(name: str, models: dict[str, str], scenario: str) -> Study:
-    from hybrid_mpc.job.study import READY, read_study, ready_study
+    from hybrid_mpc.job.study import built_in_studies, built_in_study, read_study
 
-    if name in READY:
+    there = built_in_studies()
+    if name in there:
         if scenario:
             raise InputError(f"study {name} has a scenario of its own; leave --scenario out")
         if not models:
             raise InputError(f"study {name} needs a model: --model FOLDER, e.g. model/ of a finished run")
-        return ready_study(name, models)
+        return built_in_study(name, models)
     if not Path(name).is_file() and Path(name).suffix not in (".yaml", ".yml"):
         raise InputError(
-            f"no study {name!r}; ready are: {', '.join(READY)}. Or give the path of a .yaml file."
+            f"no study {name!r}; built-in studies are: {', '.join(there)}. Or give the path of a .yaml file."
         )
     return read_study(
         name, **({"models": models} if models else {}), **({"scenario": scenario} if scenario else {})
@@ -152,9 +154,9 @@ def _plan(plan: Plan, workers: int) -> list[str]:
 
     axes = " x ".join(f"{n} {name}" for name, n in plan.axes.items() if n > 1) or "a single one"
     lines = [f"{plan.runs} runs: {axes}"]
-    for (model, controller, solver, horizon), seconds in plan.kinds.items():
-        own = "" if horizon is None else f", horizon {horizon}"
-        lines.append(f"  {model}, {controller}, {solver}{own}: {seconds:.2f} s a run")
+    for kind, seconds in plan.kinds.items():
+        own = "" if kind.horizon is None else f", horizon {kind.horizon}"
+        lines.append(f"  {kind.model}, {kind.controller}, {kind.solver}{own}: {seconds:.2f} s a run")
     return [*lines, f"expected: {duration_text(plan.seconds)} in {workers} processes"]
 
 

@@ -37,7 +37,7 @@ from hybrid_mpc.job.benchmark_runs import (
 )
 from hybrid_mpc.job.check import check_scenario
 from hybrid_mpc.job.context import Progress, Silent, versions
-from hybrid_mpc.job.folder import JobNote, check_same_job
+from hybrid_mpc.job.folder import JobNote, write_note
 from hybrid_mpc.job.stages.identify import load_trained, save_trained, train_kinds
 from hybrid_mpc.machine.specification import BenchmarkBudget
 from hybrid_mpc.records import plain, record
@@ -49,8 +49,6 @@ if TYPE_CHECKING:
     from hybrid_mpc.machine.torch_prior import Prior
 
 SCHEMA = 1
-NOTE = "benchmark.json"
-"""Says which benchmark a folder holds."""
 MODEL_NOTE = "benchmark_model.json"
 CANDIDATES = ("phy", "pgrnn", "mopgrnn", "pgrnn mean", "mopgrnn mean")
 """What may be recommended."""
@@ -289,14 +287,7 @@ def _claim(out: Path, settings: BenchmarkSettings, data: Recordings) -> None:
             [[p.role, p.name, p.t[0], p.t[-1]] for p in (*data.train, *data.valid, *data.held_back)]
         ),
     }
-    note = JobNote(
-        "benchmark", NOTE, own, lambda folder: write_document(folder / NOTE, own),
-        lambda folder: read_document(folder / NOTE),
-    )  # fmt: skip
-    there = (out / NOTE).is_file()
-    check_same_job(out, note, resume=there)
-    if not there:
-        note.write(out)
+    write_note(out, JobNote("benchmark", own), resume=None)
 
 
 def _physics(scenario: Scenario, data: Recordings, out: Path, progress: Progress) -> Physics:

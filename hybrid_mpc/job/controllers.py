@@ -1,4 +1,4 @@
-"""The controllers that a scenario's closed loops compare: same problem, period, horizon and safeguards."""
+"""The controllers that closed loops compare, by name: same problem, period, horizon and safeguards."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.rti import CondensedController
 from hybrid_mpc.control.safeguard import SafeController
 from hybrid_mpc.control.sqp import SQPController
+from hybrid_mpc.data.trajectories import Trajectory, load_trajectories
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimator, TrueState
 from hybrid_mpc.estimate.tuning import process_noise
@@ -23,9 +23,6 @@ from hybrid_mpc.kit.artifact import Kit
 from hybrid_mpc.kit.assembly import make_controller, make_estimator, make_ocp, tuned_noise
 from hybrid_mpc.records import known
 from hybrid_mpc.scenario import Scenario
-
-if TYPE_CHECKING:
-    from hybrid_mpc.data.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 ORACLE_ITERATIONS = 1
@@ -35,8 +32,8 @@ period it starts from its last plan and from the rival's that is cheaper by its 
 
 
 @dataclass(frozen=True)
-class Contender:
-    """One of the compared controllers.
+class NamedController:
+    """A controller with its estimator.
 
     Args:
         model: ``"prior"``, ``"hybrid"`` or ``"oracle"``.
@@ -49,37 +46,37 @@ class Contender:
     truth: bool = False
 
 
-CONTENDERS: Mapping[str, Contender] = {
-    "prior": Contender("prior"),
-    "prior_observer": Contender("prior", observer=True),
-    "hybrid": Contender("hybrid"),
-    "hybrid_observer": Contender("hybrid", observer=True),
-    "oracle": Contender("oracle", observer=True),
-    "oracle_state": Contender("oracle", truth=True),
+CONTROLLERS: Mapping[str, NamedController] = {
+    "prior": NamedController("prior"),
+    "prior_observer": NamedController("prior", observer=True),
+    "hybrid": NamedController("hybrid"),
+    "hybrid_observer": NamedController("hybrid", observer=True),
+    "oracle": NamedController("oracle", observer=True),
+    "oracle_state": NamedController("oracle", truth=True),
 }
 """Baselines: the fitted prior without and with disturbance observer; the hybrid likewise; two oracles on the
 plant's own equations, one with the same measurements through the same kind of estimator, one with the truth."""
 ORACLES = ("oracle", "oracle_state")
 LEAST_NOISE: Mapping[str, str] = {"hybrid": "prior", "hybrid_observer": "prior_observer"}
-"""Whose process noise is the least that a contender has, where tasks go beyond the recordings."""
+"""Whose process noise is the least that a controller has, where tasks go beyond the recordings."""
 
 
 def build(
     name: str, scenario: Scenario, kit: Kit, control: OCP, *, solver: str = "rti"
 ) -> tuple[Estimator, SafeController]:
-    """Estimator and controller of a contender.
+    """Estimator and controller by name.
 
     Args:
-        name: Name in :data:`CONTENDERS`.
+        name: Name in :data:`CONTROLLERS`.
         scenario: The machine, with its oracle if that is asked for.
-        kit: Prior and hybrid, and the process noise of the contender's filter.
+        kit: Prior and hybrid, and the process noise of the controller's filter.
         control: The task's control problem.
         solver: Name in :data:`~hybrid_mpc.kit.assembly.SOLVERS`; oracles have their own.
 
     Raises:
-        InputError: If there is no such contender, the scenario has no oracle, or the kit no noise.
+        InputError: If there is no such controller, the scenario has no oracle, or the kit no noise.
     """
-    c, prior = CONTENDERS[known(name, CONTENDERS, "controller")], kit.models["prior"]
+    c, prior = CONTROLLERS[known(name, CONTROLLERS, "controller")], kit.models["prior"]
     if c.model != "oracle":
         model = kit.models[c.model]
         estimator = make_estimator(model, kit, kit.noise(name), control, observer=c.observer)
@@ -98,11 +95,10 @@ def build(
 
 
 def noise_of(scenario: Scenario, artifact: Kit, recordings: Sequence[Trajectory]) -> dict[str, Array]:
-    """Process noise of every contender that estimates, each by maximum likelihood on the same recordings.
+    """Process noise of every controller that estimates, each by maximum likelihood on the same recordings.
 
     Args:
-        scenario: The machine, its sensors' noise and input range; where its tasks go beyond the recordings a hybrid has
-            no less than its prior.
+        scenario: The machine, with its sensors' noise and input range.
         artifact: Prior and hybrid.
         recordings: Training recordings with smoothed states.
     """
@@ -114,18 +110,14 @@ def noise_of(scenario: Scenario, artifact: Kit, recordings: Sequence[Trajectory]
     errors["oracle"] = errors["hybrid"]
     found = {
         name: tuned_noise(models[c.model], scenario, errors[c.model], recordings, observer=c.observer)
-        for name, c in CONTENDERS.items()
+        for name, c in CONTROLLERS.items()
         if c.model in models and not c.truth
     }
     return no_surer_than_prior(scenario, found)
 
 
 def no_surer_than_prior(scenario: Scenario, noise: Mapping[str, Array]) -> dict[str, Array]:
-    """Process noise by contender; where tasks go beyond the recordings a hybrid has no less than its prior.
-
-    Args:
-        scenario: The machine.
-        noise: What suits the recordings.
+    """Process noise by controller; where tasks go beyond the recordings a hybrid has no less than its prior.
 
     Example:
         >>> from scenarios.unbalanced_disk import scenario
@@ -147,12 +139,12 @@ def find_noise(
     controllers: Sequence[str],
     seed: int,
 ) -> tuple[Mapping[str, Array], str]:
-    """Process noise of the filters of contenders, and in words where it came from.
+    """Process noise of the filters of controllers, and in words where it came from.
 
     Args:
         scenario: The machine.
         artifact: Prior and hybrid.
-        controllers: Names of contenders.
+        controllers: Names of controllers.
         seed: Seed of the recordings that the machine makes where the artifact holds no noise.
 
     Raises:
@@ -161,7 +153,7 @@ def find_noise(
     Example:
         ``noise, source = find_noise(scenario, hm.load("runs/golf"), ("hybrid_observer",), 0)``
     """
-    needed = [name for name in controllers if not CONTENDERS[name].truth]
+    needed = [name for name in controllers if not CONTROLLERS[name].truth]
     held = {name: artifact.noise(name) for name in artifact.loop.process_noise}
     lacking = [name for name in needed if name not in held]
     if not lacking:
@@ -170,8 +162,8 @@ def find_noise(
     if not any(name in ORACLES for name in lacking):
         machine = replace(scenario, oracle=None)  # whose noise takes the longest
     source = f"recordings of the simulated machine (quick, seed {seed}), smoothed by the prior"
-    if kept := [name for name in needed if name in held]:
-        source = f"{', '.join(lacking)}: {source}; {', '.join(kept)}: the model's own"
+    if own := [name for name in needed if name in held]:
+        source = f"{', '.join(lacking)}: {source}; {', '.join(own)}: the model's own"
     return no_surer_than_prior(
         scenario, {**_estimated_noise(machine, artifact, lacking, seed), **held}
     ), source
@@ -180,7 +172,6 @@ def find_noise(
 def _estimated_noise(
     scenario: Scenario, artifact: Kit, lacking: Sequence[str], seed: int
 ) -> Mapping[str, Array]:
-    from hybrid_mpc.data.trajectories import load_trajectories
     from hybrid_mpc.identify.delay import shifted, with_states
     from hybrid_mpc.identify.smooth import fit_smoother
 

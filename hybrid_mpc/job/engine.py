@@ -8,14 +8,16 @@ import signal
 import threading
 import time
 import traceback
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import BrokenExecutor, CancelledError
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
 from queue import Empty, Queue
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 from hybrid_mpc.errors import InputError
 
@@ -37,7 +39,6 @@ ALONE_S = 60.0
 """How long a cluster may be without any."""
 B = TypeVar("B")
 R = TypeVar("R")
-R_co = TypeVar("R_co", covariant=True)
 
 
 class Lost(Exception):
@@ -57,24 +58,22 @@ class Lost(Exception):
         self.final = final
 
 
-class Engine(Protocol[B, R_co]):
-    """Computes batches, each in some worker, by a function of the batch; results do not depend on where.
+class Engine(ABC, Generic[B, R]):
+    """Computes batches side by side, each in some worker, by a function of the batch; results depend on no worker.
 
-    Example: :class:`LocalEngine` and :class:`DaskEngine`.
+    ``workers`` is the number of batches side by side, ``name`` is for the record, ``died`` counts workers that died.
     """
 
-    @property
-    def workers(self) -> int:
-        """Batches that are computed side by side."""
+    workers: int
+    name: str
+    died: int
 
-    @property
-    def name(self) -> str:
-        """What it is, for the record."""
+    def __init__(self) -> None:
+        self.died = 0
+        self._ended: Queue[Any] = Queue()
+        self._batches: dict[Any, B] = {}
 
-    @property
-    def died(self) -> int:
-        """Workers that have died so far; what they were at is lost, and may be begun again."""
-
+    @abstractmethod
     def submit(self, batch: B) -> None:
         """Begin a batch.
 
@@ -82,29 +81,11 @@ class Engine(Protocol[B, R_co]):
             RuntimeError: If no worker can be started for it.
         """
 
-    def next(self, timeout: float) -> tuple[B, R_co | Lost] | None:
+    def next(self, timeout: float) -> tuple[B, R | Lost] | None:
         """A batch that has ended, with its result or how it was lost; None if none ends within ``timeout`` [s].
 
         What the work itself raises is raised here.
         """
-
-    def close(self) -> None:
-        """End what still runs."""
-
-
-class _Futures(Generic[B, R]):
-    """Batches as futures that tell a queue when they are done."""
-
-    def __init__(self) -> None:
-        self._ended: Queue[Any] = Queue()
-        self._batches: dict[Any, B] = {}
-
-    def _watch(self, future: Any, batch: B) -> None:
-        self._batches[future] = batch
-        future.add_done_callback(self._ended.put)
-
-    def next(self, timeout: float) -> tuple[B, R | Lost] | None:
-        """See :class:`Engine`."""
         try:
             future = self._ended.get(timeout=timeout)
         except Empty:
@@ -113,11 +94,19 @@ class _Futures(Generic[B, R]):
             return None
         return self._batches.pop(future), self._result(future)
 
-    def _result(self, future: Any) -> R | Lost:
-        raise NotImplementedError
+    @abstractmethod
+    def close(self) -> None:
+        """End what still runs."""
+
+    def _watch(self, future: Any, batch: B) -> None:
+        self._batches[future] = batch
+        future.add_done_callback(self._ended.put)
+
+    @abstractmethod
+    def _result(self, future: Any) -> R | Lost: ...
 
 
-class LocalEngine(_Futures[B, R]):
+class LocalEngine(Engine[B, R]):
     """Processes of this machine; each computes one batch after the other.
 
     Args:
@@ -150,15 +139,12 @@ class LocalEngine(_Futures[B, R]):
         self._work, self.workers, self.name = work, workers, f"joblib, {workers} processes"
         self._environment = {} if threads is None else dict.fromkeys(THREADS, str(threads))
         self._begin = begin
-        self.died = 0
         self._pool: Any = None
         self._pools: dict[Any, Any] = {}
         self._broken: list[Any] = []
 
     def submit(self, batch: B) -> None:
         """See :class:`Engine`."""
-        from concurrent.futures import BrokenExecutor
-
         for _ in range(2):
             self._pool = self._pool or self._started()
             try:
@@ -181,8 +167,6 @@ class LocalEngine(_Futures[B, R]):
         )
 
     def _result(self, future: Any) -> R | Lost:
-        from concurrent.futures import BrokenExecutor, CancelledError
-
         pool = self._pools.pop(future)
         try:
             result: R = future.result()
@@ -203,7 +187,7 @@ class LocalEngine(_Futures[B, R]):
             self._pool = None
 
 
-class DaskEngine(_Futures[B, R]):
+class DaskEngine(Engine[B, R]):
     """Workers of a dask cluster; ``work`` is sent to each of them once, with all that it holds.
 
     A worker that dies is the scheduler's affair: it gives the batch to another, and gives it up when several workers
@@ -236,7 +220,6 @@ class DaskEngine(_Futures[B, R]):
             self.close()
             raise
         self.workers, self.name = len(self._seen), f"dask, {len(self._seen)} workers"
-        self.died = 0
         self._looked = self._manned = time.monotonic()
 
     @property
@@ -274,8 +257,6 @@ class DaskEngine(_Futures[B, R]):
         )
 
     def _result(self, future: Any) -> R | Lost:
-        from concurrent.futures import CancelledError
-
         from distributed.scheduler import KilledWorker
 
         try:
@@ -340,8 +321,7 @@ def run_jobs(
         jobs: Functions and their arguments by name; both must pickle, and so must the results.
         on_progress: ``(name, done, total, text)`` for each report, before the job's result.
         workers: Jobs side by side.
-        on_result: ``(name, result)`` as each job ends, so that what is done can be kept, also beside one that fails.
-            Default: nothing.
+        on_result: ``(name, result)`` as each job ends, also beside one that fails. Default: nothing.
 
     Raises:
         InputError: If a job raises one: bad input that shows only then. Or if ``workers`` is less than 1.
@@ -351,23 +331,23 @@ def run_jobs(
         >>> def double(x, report):
         ...     report(1, 1, "doubled")
         ...     return 2 * x
-        >>> run_jobs({"a": (double, (1,)), "b": (double, (2,))}, lambda *told: None, workers=1)
+        >>> run_jobs({"a": (double, (1,)), "b": (double, (2,))}, lambda *report: None, workers=1)
         {'a': 2, 'b': 4}
     """
     _check(workers)
-    waiting, results = list(jobs), {}
+    queue, results = list(jobs), {}
     running: dict[str, _Job] = {}
     try:
-        while waiting or running:
-            while waiting and len(running) < workers:
-                name = waiting.pop(0)
+        while queue or running:
+            while queue and len(running) < workers:
+                name = queue.pop(0)
                 running[name] = _Job(*jobs[name])
             wait([job.reports for job in running.values()], REPORT_S)
             failed: dict[str, _Ended] = {}
             for name, job in list(running.items()):
                 ended = job.ended()
-                for told in job.told(rest=ended is not None):
-                    on_progress(name, *told)
+                for report in job.new_reports(rest=ended is not None):
+                    on_progress(name, *report)
                 if ended is None:
                     continue
                 running.pop(name).close()
@@ -376,7 +356,7 @@ def run_jobs(
                     on_result(name, ended.value)
                 else:
                     failed[name] = ended
-            if failed:  # raised only now: others that had ended by then are kept
+            if failed:  # raised only now, after the results of others that had ended by then
                 name, first = next(iter(failed.items()))
                 raise first.error(name)
     finally:
@@ -428,7 +408,7 @@ class _Job:
         ended = found[1]
         return _Ended(failed=f"its process ended ({ended})") if isinstance(ended, Lost) else ended
 
-    def told(self, *, rest: bool) -> Iterator[tuple[int, int, str]]:
+    def new_reports(self, *, rest: bool) -> Iterator[tuple[int, int, str]]:
         """The next report, if there is one; the ``rest`` of them once the job has ended."""
         if rest:
             self._theirs.close()
@@ -479,13 +459,7 @@ def _began(parent: int, begin: Callable[[], None] | None) -> None:
 
 
 def follow(parent: int) -> None:
-    """Tie a worker to its parent: it leaves Ctrl-C to it, and ends with it, even if the parent was killed.
-
-    Args:
-        parent: The parent's process id.
-
-    Example: ``ProcessPoolExecutor(2, initializer=follow, initargs=(os.getpid(),))``
-    """
+    """Tie a worker to the process of its parent: it leaves Ctrl-C to it, and ends with it, even if it was killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def watch() -> None:

@@ -2,107 +2,125 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import LOCK, check_writable, digest, is_empty, locked
+from hybrid_mpc.files import (
+    LOCK,
+    check_writable,
+    digest,
+    is_empty,
+    locked,
+    read_document,
+    write_document,
+)
+from hybrid_mpc.records import plain
+
+DAMAGED = "choose another --out"
 
 
 @dataclass(frozen=True)
 class JobNote:
-    """What a job says of itself in its folder.
+    """What a job says of itself in its folder, in ``<noun>.json``.
 
     Args:
-        noun: What the folder holds then, e.g. ``"run"``.
-        file: Name of its note.
-        identity: What decides what the job computes, as plain data by name.
-        write: Writes the note into a folder.
-        held: Reads the identity that a folder's note states.
+        noun: What the folder holds, e.g. ``"run"``.
+        settings: What decides what the job computes, by name.
+        more: What else the note says; it decides nothing. Default: nothing.
     """
 
     noun: str
-    file: str
-    identity: Mapping[str, Any]
-    write: Callable[[Path], None]
-    held: Callable[[Path], Mapping[str, Any]]
+    settings: Mapping[str, Any]
+    more: Mapping[str, Any] = field(default_factory=dict)
 
 
-def check_folder(out: Path, noun: str, file: str, *, resume: bool) -> None:
-    """Refuse a folder that holds something else, or (without ``resume``) a job; before anything is computed.
+def read_note(out: Path, noun: str) -> dict[str, Any]:
+    """The note of a job's folder: ``settings``, and what else it says.
+
+    Raises:
+        InputError: If there is none, or it is damaged.
+    """
+    note = read_document(out / f"{noun}.json", DAMAGED)
+    if not isinstance(note.get("settings"), dict):
+        raise InputError(f"{out / noun}.json is damaged: no settings in it; {DAMAGED}")
+    return note
+
+
+def check_out(out: Path, noun: str, *, resume: bool | None) -> None:
+    """Refuse a folder that a job cannot work in, before anything is computed.
 
     Args:
         out: The folder.
         noun: What the job is, e.g. ``"run"``.
-        file: Name of its note.
-        resume: Whether a job goes on there.
+        resume: Whether a job goes on there; None: either way.
 
     Raises:
-        InputError: If it does, or nothing can be written.
+        InputError: If the folder holds something else, a job where none is to go on, no job where one is; or if nothing
+            can be written there.
 
     Example:
-        >>> check_folder(Path("nowhere"), "run", "run.json", resume=True)
+        >>> check_out(Path("nowhere"), "run", resume=True)
         Traceback (most recent call last):
         hybrid_mpc.errors.InputError: nowhere holds no run to resume; leave --resume out
     """
-    _check_note(out, noun, file, resume)
+    _check_place(out, noun, resume)
     check_writable(out)
 
 
-def _check_note(out: Path, noun: str, file: str, resume: bool) -> None:
-    if not (out / file).is_file():
+def _check_place(out: Path, noun: str, resume: bool | None) -> None:
+    if not (out / f"{noun}.json").is_file():
         if not is_empty(out):
             raise InputError(f"{out} exists and holds something else than a {noun}; choose another --out")
-        if resume and not (out / LOCK).is_file():  # a job that ended before its first note leaves the lock
+        if resume and not (out / LOCK).is_file():  # a job that ended before its note leaves the lock
             raise InputError(f"{out} holds no {noun} to resume; leave --resume out")
-    elif not resume:
+    elif resume is False:
         raise InputError(f"{out} already holds a {noun}; add --resume to finish it, or choose another --out")
 
 
-def check_same_job(out: Path, claim: JobNote, *, resume: bool) -> None:
-    """Refuse a folder that holds something else, or another job than the one that claims it.
-
-    Args:
-        out: The folder.
-        claim: The job.
-        resume: Whether the same job goes on there.
-
-    Raises:
-        InputError: If it does, with what differs.
-    """
-    _check_note(out, claim.noun, claim.file, resume)
-    if not (out / claim.file).is_file():
-        return
-    held, own = claim.held(out), claim.identity
-    if differ := sorted(k for k in {**own, **held} if digest(held.get(k)) != digest(own.get(k))):
-        raise InputError(
-            f"{out} holds a {claim.noun} with other settings ({', '.join(differ)} differ); give the same ones to go on "
-            "with it, or choose another --out"
-        )
-
-
 @contextmanager
-def open_folder(out: Path, claim: JobNote, *, resume: bool) -> Iterator[None]:
+def open_folder(out: Path, note: JobNote, *, resume: bool | None) -> Iterator[None]:
     """A job's folder while it works: made, held against other processes, the job noted in it.
 
     Args:
         out: The folder.
-        claim: The job.
-        resume: Whether the same job goes on there.
+        note: The job.
+        resume: Whether the same job goes on there; None: either way.
 
     Raises:
-        InputError: If the folder holds something else, another job, or (without ``resume``) a job; if another process
-            works in it, or nothing can be written.
+        InputError: As :func:`check_out`; or if it holds a job of other settings, or another process works in it.
 
-    Example: ``with open_folder(Path("runs/mine"), claim, resume=False): ...``
+    Example: ``with open_folder(Path("runs/mine"), JobNote("run", {"seed": 0}), resume=False): ...``
     """
-    check_same_job(out, claim, resume=resume)
-    check_writable(out)
+    check_out(out, note.noun, resume=resume)
+    _check_settings(out, note)
     with locked(out):
-        check_same_job(out, claim, resume=resume)  # another process may have been quicker
-        if not (out / claim.file).is_file():
-            claim.write(out)
+        write_note(out, note, resume=resume)  # another process may have been quicker: checked again
         yield
+
+
+def write_note(out: Path, note: JobNote, *, resume: bool | None) -> None:
+    """Note a job in its folder, which the caller holds; the part of :func:`open_folder` after the lock.
+
+    Raises:
+        InputError: As :func:`open_folder`.
+    """
+    _check_place(out, note.noun, resume)
+    _check_settings(out, note)
+    path, own = out / f"{note.noun}.json", {**plain(note.more), "settings": plain(note.settings)}
+    if not path.is_file() or read_document(path, DAMAGED) != own:
+        write_document(path, own)
+
+
+def _check_settings(out: Path, note: JobNote) -> None:
+    if not (out / f"{note.noun}.json").is_file():
+        return
+    held, own = read_note(out, note.noun)["settings"], note.settings
+    if differ := sorted(k for k in {**own, **held} if digest(held.get(k)) != digest(own.get(k))):
+        raise InputError(
+            f"{out} holds a {note.noun} with other settings ({', '.join(differ)} differ); give the same ones to go on "
+            "with it, or choose another --out"
+        )

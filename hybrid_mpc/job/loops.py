@@ -1,12 +1,13 @@
-"""Rows of closed loops summed up: means with intervals, by task and controller."""
+"""Closed loops: from a loop's specification to its row, on a bench that holds the machine and its models."""
 
 from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -16,8 +17,8 @@ from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.safeguard import SafeController, Source
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimator
-from hybrid_mpc.files import digest
-from hybrid_mpc.job.controllers import CONTENDERS, build
+from hybrid_mpc.files import digest, read_document, read_document_arrays, write_document
+from hybrid_mpc.job.controllers import CONTROLLERS, build
 from hybrid_mpc.kit.artifact import WATCHES, Kit
 from hybrid_mpc.kit.assembly import SOLVERS, make_adaptive_guard, make_backup_guard, make_resting_guard
 from hybrid_mpc.loop.faults import Fault, check_channels, install
@@ -29,12 +30,773 @@ from hybrid_mpc.model.limits import share_used
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.monitor.calibrate import alarm_intervals
 from hybrid_mpc.monitor.energy import EnergyMonitor
-from hybrid_mpc.records import known, plain
+from hybrid_mpc.records import known, plain, record
 from hybrid_mpc.scenario import Scenario, Task, load_scenario, registered_scenarios
 
-# A task over and over: what a long loop follows.
-
 Array = NDArray[np.float64]
+Intervals: TypeAlias = tuple[tuple[float, float], ...]
+MODEL = "model"
+"""Label of the model on the bench where there is one."""
+MONITORS = (*WATCHES, "none")
+"""What watches a hybrid, see :meth:`~hybrid_mpc.kit.artifact.Kit.monitor`; or nothing does."""
+ALARMING = ("energy", "guard")
+"""Monitors that alarm."""
+GUARDS = ("", "rest", "adapt", "prior")
+"""What an alarm does: nothing; a frozen sensor takes the input away; and a backup takes over, which estimates the
+prior's parameters, or which plans with the fitted prior."""
+ARRAYS = (
+    "step_ms", "plans",
+    *(f.name for f in fields(ClosedLoopResult) if f.name not in ("dt", "timing_ms", "switches")),
+)  # fmt: skip
+"""What a row may hold of its loop."""
+TIMES = ("total", "solve", "estimate")
+MOST_BUILT = 64
+"""Controllers that a bench holds; loops come ordered by controller, so few are asked for again."""
+REPORT_PERIODS = 25
+"""Periods between two reports of :func:`run_loops`."""
+
+
+@dataclass(frozen=True)
+class LoopSpec:
+    """One closed loop: all that decides what it computes, but for the content of its model.
+
+    Args:
+        scenario: Registered name or path of a user's file.
+        model: Label of the model on the bench.
+        task: Name of the task.
+        controller: Name in :data:`~hybrid_mpc.job.controllers.CONTROLLERS`.
+        solver: ``"rti"``, ``"sqp"`` or ``"ipopt"``.
+        horizon: Periods. Default: the task's own.
+        monitor: Name in :data:`MONITORS`; without a hybrid there is none. Default: ``"own"``, or ``"guard"`` with a
+            guard.
+        faults: Beside what the task itself brings.
+        drawn_faults: Those that a draw takes at random.
+        late: Intervals [s] in which solves miss their deadline.
+        parameters: Parameters of the plant and their factors.
+        draw: Number of the draw that ``parameters`` and ``drawn_faults`` are from.
+        seed: Number of the loop: the same sensor noise for all that share it, ``draw`` and ``run_seed``.
+        duration: Longest duration [s]. Default: the task's own.
+        guard: Name in :data:`GUARDS`; it needs a monitor that alarms.
+        run_seed: Seed of the run that the loop belongs to.
+        rounds: The task is run over and over, its reference scaled by these factors, one a round. Default: once.
+        keep: Arrays of its row, names in :data:`ARRAYS`: fields of
+            :class:`~hybrid_mpc.loop.simulate.ClosedLoopResult`, ``"step_ms"`` ``(n,)``, ``"plans"``
+            ``(n, N + 1, n_x)``. No part of the identity.
+        number: Place in a study, no part of the identity.
+
+    Raises:
+        InputError: If a name is unknown, a value is of the wrong kind, or a guard has nothing that alarms.
+
+    Example:
+        >>> spec = LoopSpec("golf_robot", "model", "track_sine", "prior", seed=3)
+        >>> spec.noise_seed, replace(spec, run_seed=2).noise_seed, replace(spec, number=7).id == spec.id
+        (3, 2003, True)
+    """
+
+    scenario: str
+    model: str
+    task: str
+    controller: str
+    solver: str = "rti"
+    horizon: int | None = None
+    monitor: str = ""
+    faults: tuple[Fault, ...] = ()
+    drawn_faults: tuple[Fault, ...] = ()
+    late: Intervals = ()
+    parameters: tuple[tuple[str, float], ...] = ()
+    draw: int = 0
+    seed: int = 0
+    duration: float | None = None
+    guard: str = ""
+    run_seed: int = 0
+    rounds: tuple[float, ...] = ()
+    keep: tuple[str, ...] = field(default=(), compare=False)
+    number: int = field(default=0, compare=False)
+
+    def __post_init__(self) -> None:
+        known(self.controller, CONTROLLERS, "controller")
+        known(self.solver, SOLVERS, "solver")
+        object.__setattr__(self, "monitor", self.monitor or ("guard" if self.guard else "own"))
+        known(self.monitor, MONITORS, "monitor")
+        if self.guard:
+            known(self.guard, GUARDS[1:], "guard")
+        if self.guard and (self.monitor not in ALARMING or CONTROLLERS[self.controller].model != "hybrid"):
+            raise InputError(
+                f"a guard acts on alarms: give a controller with the hybrid and monitor {' or '.join(ALARMING)}, got "
+                f"controller {self.controller} and monitor {self.monitor}"
+            )
+        for name in ("faults", "drawn_faults"):
+            given = getattr(self, name)
+            if not isinstance(given, tuple) or not all(isinstance(f, Fault) for f in given):
+                raise InputError(
+                    f"LoopSpec: {name} is a tuple of Fault, got {given!r}; write (Fault(start, end, target, value),), "
+                    'or parsed_fault("TARGET=VALUE@START:END") for a text'
+                )
+        seeds = (self.seed, self.run_seed)
+        if not all(isinstance(seed, int) and seed >= 0 for seed in seeds):
+            raise InputError(
+                f"seed and run_seed are whole numbers from 0 on, got {self.seed!r} and {self.run_seed!r}"
+            )
+        if self.duration is not None and not self.duration > 0:
+            raise InputError(f"duration: a positive number of seconds needed, got {self.duration}")
+        for name in self.keep:
+            known(name, ARRAYS, "array to keep")
+
+    @cached_property
+    def id(self) -> str:
+        """The first 20 hexadecimal digits of the SHA-256 of the specification's JSON form."""
+        return digest({k: v for k, v in asdict(self).items() if k not in ("number", "keep")})[:20]
+
+    @property
+    def noise_seed(self) -> int:
+        """Seed of plant and sensor noise."""
+        seed = 1000 * self.run_seed + self.seed
+        return seed if self.draw == 0 else int(np.random.SeedSequence([seed, self.draw]).generate_state(1)[0])
+
+    def columns(self) -> dict[str, Any]:
+        """The specification as the columns of a table."""
+        names = ("model", "task", "controller", "solver", "horizon", "monitor")
+        return {
+            "run": self.number,
+            **{name: getattr(self, name) for name in names},
+            "faults": fault_text(self.faults),
+            "drawn_faults": fault_text(self.drawn_faults, self.late),
+            "draw": self.draw,
+            "seed": self.seed,
+            **{f"factor_{name}": value for name, value in self.parameters},
+        }
+
+
+def fault_text(faults: Sequence[Fault], late: Intervals = ()) -> str:
+    """Faults in the form in which the command line takes them; ``"none"`` for none.
+
+    Example:
+        >>> fault_text([Fault(1.5, np.inf, "plant_friction", 2.0)], late=((1.0, 1.2),))
+        'plant_friction=2@1.5 + late@1:1.2'
+    """
+    parts = []
+    for f in faults:
+        end = "" if np.isinf(f.end) else f":{f.end:g}"
+        more = (f" channel {f.channel}" if f.channel else "") + (f" ramp {f.ramp:g}" if f.ramp else "")
+        parts.append(f"{f.target}={f.value:g}@{f.start:g}{end}{more}")
+    parts += [f"late@{a:g}" + ("" if np.isinf(b) else f":{b:g}") for a, b in late]
+    return " + ".join(parts) or "none"
+
+
+def parsed_fault(text: str) -> Fault:
+    """A fault from ``TARGET[=VALUE][@START[:END]]``, times in seconds.
+
+    Args:
+        text: e.g. ``"input_gain=0.8@1.0"``; start 0 by default, end never. A sensor that freezes or drops out has no
+            value, every other fault needs one.
+
+    Raises:
+        InputError: If it has another form, or there is no such fault.
+
+    Example:
+        >>> fault = parsed_fault("plant_friction=2@1:2.5")
+        >>> fault.target, fault.value, fault.start, fault.end
+        ('plant_friction', 2.0, 1.0, 2.5)
+    """
+    head, _, when = text.partition("@")
+    target, _, value = head.partition("=")
+    start, _, end = when.partition(":")
+    try:
+        numbers = [float(v) if v else d for v, d in ((start, 0.0), (end, math.inf), (value, 0.0))]
+    except ValueError as error:
+        raise InputError(
+            f"fault {text!r}: {error}; the form is TARGET=VALUE@START:END, e.g. input_gain=0.8@1.0:2.5"
+        ) from error
+    if math.isnan(numbers[0]) or math.isnan(numbers[1]):
+        raise InputError(f"fault {text!r}: times must be numbers of seconds")
+    fault = Fault(numbers[0], numbers[1], target, numbers[2])
+    if not value and target not in ("measurement_freeze", "measurement_dropout"):
+        raise InputError(f"fault {text!r} has no value; write how large it is, e.g. {target}=1.5@1.0")
+    return fault
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A stretch of time.
+
+    Args:
+        start_s: First instant [s].
+        end_s: Last one [s].
+    """
+
+    start_s: float
+    end_s: float
+
+
+@dataclass(frozen=True)
+class ModeChange:
+    """A change of the guard's mode.
+
+    Args:
+        t_s: When [s].
+        before: Name of the mode before.
+        after: Name of the mode from then on.
+        why: What led to it.
+    """
+
+    t_s: float
+    before: str
+    after: str
+    why: str
+
+
+@dataclass(frozen=True)
+class LoopRow:
+    """The figures of a closed loop. Signals are named with their unit, e.g. ``"phi [rad]"``.
+
+    Args:
+        task: Name of the task.
+        controller: Name of the controller.
+        seed: Number of the loop.
+        seconds: Length [s].
+        cost: Closed-loop cost on the plant's true state.
+        tracking_rmse: Root mean square deviation of the true states from their reference, by signal.
+        largest_x: Largest magnitude of the true states, by signal.
+        largest_u: Largest magnitude of the inputs, by signal.
+        limits: Largest share of the way from rest to each limit that was used: 1 is the limit, more a violation.
+        excess: By how much limits were left at most; ``change of`` an input where that is limited.
+        sources: Share of periods by what gave the input.
+        figures: The task's own figures.
+        alarms: Alarms of the monitor; one that is on at the end ends there. None where nothing could alarm.
+        alarm_share: Share of periods with an alarm; None where nothing could alarm.
+        largest_level: Largest level of the monitor [W]; None without one.
+        not_judged_s: Time in which the monitor had no valid level [s]; None without one.
+        switches: Changes of the guard's mode.
+        timing_ms: ``median, p95, p99, max`` of the durations of ``total``, ``solve`` and ``estimate`` [ms].
+        arrays: What the specification asked to keep. Default: nothing.
+    """
+
+    task: str
+    controller: str
+    seed: int
+    seconds: float
+    cost: float
+    tracking_rmse: Mapping[str, float]
+    largest_x: Mapping[str, float]
+    largest_u: Mapping[str, float]
+    limits: Mapping[str, float]
+    excess: Mapping[str, float]
+    sources: Mapping[str, float]
+    figures: Mapping[str, float]
+    alarms: tuple[Interval, ...] | None
+    alarm_share: float | None
+    largest_level: float | None
+    not_judged_s: float | None
+    switches: tuple[ModeChange, ...]
+    timing_ms: Mapping[str, Mapping[str, float]]
+    arrays: Mapping[str, Array] = field(default_factory=dict, compare=False)
+
+    def plain(self) -> dict[str, Any]:
+        """The row in JSON's own types, without its arrays."""
+        found: dict[str, Any] = plain(replace(self, arrays={}))
+        del found["arrays"]
+        return found
+
+    def columns(self) -> dict[str, Any]:
+        """The row as flat columns of a table, without its arrays; durations begin with ``timing_``."""
+        groups = ("tracking_rmse", "largest_x", "largest_u")
+        times = (("step", "total"), ("solve", "solve"))
+        nan = float("nan")
+        return {
+            "cost": self.cost,
+            **{f"{name} {signal}": v for name in groups for signal, v in getattr(self, name).items()},
+            **{f"share_{source}": share for source, share in self.sources.items()},
+            **{f"task_{name}": float(value) for name, value in self.figures.items()},
+            "alarm_share": nan if self.alarm_share is None else self.alarm_share,
+            "first_alarm_s": self.alarms[0].start_s if self.alarms else nan,
+            "largest_level_w": nan if self.largest_level is None else self.largest_level,
+            **{f"timing_{kind}_{k}_ms": v for kind, name in times for k, v in self.timing_ms[name].items()},
+        }
+
+
+class Bench:
+    """What loops run on: a machine, its models, and the controllers that were built for them so far.
+
+    Control problem and sensors are the scenario's, for all models; what was learned is the models' own.
+
+    Args:
+        scenario: The machine, with plant, tasks and control problem.
+        kits: Loaded artifacts by label; their process noise is that of the filters.
+
+    Raises:
+        InputError: If the scenario has nothing to run, or a model is another machine's; or for a name in place of a
+            scenario or of a kit.
+
+    Example:
+        ``row, result = Bench(scenario, {"model": hm.load("runs/golf")}).run(spec)``
+    """
+
+    def __init__(self, scenario: Scenario, kits: Mapping[str, Kit]) -> None:
+        if not isinstance(scenario, Scenario):
+            raise InputError(f"Bench: a Scenario is needed, got {scenario!r}; give load_scenario(NAME)")
+        check_complete(scenario)
+        if not isinstance(kits, Mapping):
+            raise InputError(
+                f'Bench: kits by label are needed, got a {type(kits).__name__}; give {{"model": hm.load(FOLDER)}}'
+            )
+        for label, kit in kits.items():
+            if not isinstance(kit, Kit):
+                raise InputError(f"Bench: kit {label!r} is a {type(kit).__name__}; load it: hm.load(FOLDER)")
+            check_kit(scenario, kit, f"model {label}")
+        self.scenario = scenario
+        self.kits = {label: kit.on(scenario) for label, kit in kits.items()}
+        self._built: OrderedDict[tuple[object, ...], tuple[Estimator, SafeController]] = OrderedDict()
+        self._guards: dict[tuple[object, ...], Guard] = {}
+
+    def kit(self, spec: LoopSpec) -> Kit:
+        """The model of a specification; refused if there is none, or the loop is another scenario's."""
+        own = self.scenario.name
+        others = () if spec.scenario == own else registered_scenarios()
+        if spec.scenario in others and load_scenario(spec.scenario).name != own:
+            raise InputError(f"a loop of scenario {spec.scenario} given, the bench has {own}")
+        return self.kits[known(spec.model, self.kits, "model on the bench")]
+
+    def task(self, spec: LoopSpec) -> Task:
+        """The task of a specification, with its rounds and its duration; refused if there is none of that name."""
+        (task,) = tasks_of(self.scenario, (spec.task,))
+        kit = self.kit(spec)
+        if spec.rounds:
+            model = kit.models["prior"]
+            task = repeated(task, model.dt, np.array(spec.rounds), model.time_unit)
+        return task if spec.duration is None else replace(task, duration=min(task.duration, spec.duration))
+
+    def problem(self, spec: LoopSpec) -> OCP:
+        """The control problem of a specification."""
+        problem = self.kit(spec).problem(spec.task)
+        return problem if spec.horizon is None else problem.changed(horizon=spec.horizon)
+
+    def parts(self, spec: LoopSpec) -> tuple[Estimator, SafeController]:
+        """Estimator and controller of a specification; they remember nothing, so one serves many loops."""
+        kit = self.kit(spec)
+        key = (spec.model, spec.controller, spec.solver, spec.horizon, self._stated(spec))
+        if key not in self._built:
+            self._built[key] = build(
+                spec.controller, self.scenario, kit, self.problem(spec), solver=spec.solver
+            )
+            if len(self._built) > MOST_BUILT:
+                self._built.popitem(last=False)
+        self._built.move_to_end(key)
+        return self._built[key]
+
+    def monitor(self, spec: LoopSpec) -> EnergyMonitor | None:
+        """What watches the loop of a specification; refused if the model lacks what it needs."""
+        if spec.monitor == "none" or CONTROLLERS[spec.controller].model != "hybrid":
+            return None
+        return self.kit(spec).monitor(kind=spec.monitor, task=spec.task)
+
+    def guard(self, spec: LoopSpec) -> Guard | None:
+        """What an alarm does in the loop of a specification; None: nothing. Refused if the model lacks its parts."""
+        if not spec.guard:
+            return None
+        kit = self.kit(spec)
+        hybrid = kit.models["hybrid"]
+        if spec.guard == "rest":
+            return make_resting_guard(hybrid)
+        key = (spec.model, spec.guard, spec.solver, spec.horizon, self._stated(spec))
+        if key not in self._guards:
+            if spec.guard == "prior":
+                estimator, controller = self.parts(
+                    replace(spec, controller="prior_observer", guard="", monitor="none")
+                )
+                self._guards[key] = make_backup_guard(controller, estimator)
+            else:
+                noise = kit.noise("hybrid_observer")
+                self._guards[key] = make_adaptive_guard(
+                    hybrid, kit.models["prior"], kit, noise, self.problem(spec)
+                )
+        return self._guards[key]
+
+    def _stated(self, spec: LoopSpec) -> str:
+        """Whose control problem it is: the task's own, or that of all tasks."""
+        return spec.task if spec.task in self.kit(spec).loop.control else ""
+
+    def plant(self, spec: LoopSpec) -> Plant:
+        """The plant of a specification, with its parameters changed."""
+        assert self.scenario.plant is not None
+        return varied(self.scenario.plant(), spec.parameters)
+
+    def run(
+        self,
+        spec: LoopSpec,
+        *,
+        task: Task | None = None,
+        monitor: EnergyMonitor | None = None,
+        on_step: Callable[[Step], None] | None = None,
+    ) -> tuple[LoopRow, ClosedLoopResult]:
+        """Run one loop.
+
+        Args:
+            spec: The loop.
+            task: In place of the task that it names, e.g. with another reference.
+            monitor: In place of the one that it names.
+            on_step: Called after every period, e.g. to show progress.
+
+        Returns:
+            Its row, and its whole record.
+        """
+        plans: list[Array] = []
+        task = self.task(spec) if task is None else task
+        estimator, controller = self.parts(spec)
+        late = spec.late
+        result = simulate(
+            self.plant(spec), estimator, controller, task.reference, weight=task.weight,
+            dt=self.kit(spec).models["prior"].dt, duration=task.duration, x0=np.array(task.x0),
+            seed=spec.noise_seed, monitor=monitor or self.monitor(spec), guard=self.guard(spec),
+            faults=(*task.faults, *spec.faults, *spec.drawn_faults), on_step=_noting(spec, plans, on_step),
+            late=(lambda t: any(a - 1e-9 <= t < b - 1e-9 for a, b in late)) if late else None,
+        )  # fmt: skip
+        row = row_of(spec, task, self.problem(spec), self.kit(spec).models["prior"], result)
+        derived = {"step_ms": result.timing_ms["total"], "plans": np.array(plans)}
+        arrays = {name: derived[name] if name in derived else getattr(result, name) for name in spec.keep}
+        return replace(row, arrays=arrays), result
+
+
+def _noting(
+    spec: LoopSpec, plans: list[Array], on_step: Callable[[Step], None] | None
+) -> Callable[[Step], None] | None:
+    """What is called after every period: it notes the plan where the row is to hold plans."""
+    if "plans" not in spec.keep:
+        return on_step
+
+    def note(step: Step) -> None:
+        plans.append(step.decision.solution.x)
+        if on_step is not None:
+            on_step(step)
+
+    return note
+
+
+def run_loops(
+    bench: Bench,
+    specs: Sequence[LoopSpec],
+    report: Callable[[int, int, str], None] = lambda done, total, text: None,
+) -> Iterator[LoopRow]:
+    """Run loops one after the other, alone in this process, so that the durations of their steps count.
+
+    Args:
+        bench: What they run on.
+        specs: The loops.
+        report: Called with ``(done, total, text)``, in periods of all loops, as they go on. Default: nothing.
+
+    Yields:
+        The row of each as it ends.
+
+    Example: ``costs = [row.cost for row in run_loops(bench, specs)]``
+    """
+    lengths = [round(bench.task(s).duration / bench.kit(s).models["prior"].dt) for s in specs]
+    for i, spec in enumerate(specs):
+        before, text = sum(lengths[:i]), f"{spec.controller}, seed {spec.seed}"
+
+        def on_step(step: Step, before: int = before, text: str = text) -> None:
+            if step.k % REPORT_PERIODS == 0:
+                report(before + step.k, sum(lengths), text)
+
+        yield bench.run(spec, on_step=on_step)[0]
+    report(sum(lengths), sum(lengths), "")
+
+
+def write_rows(path: Path, rows: Sequence[LoopRow], of: str) -> None:
+    """Write rows with their arrays, whole or not at all.
+
+    Args:
+        path: The file, ``.json``; arrays lie beside it as ``.npz``.
+        rows: The loops.
+        of: Digest of all that decides what they are.
+
+    Raises:
+        StorageError: If they cannot be written.
+    """
+    arrays = {f"{i}/{name}": values for i, row in enumerate(rows) for name, values in row.arrays.items()}
+    write_document(path, {"of": of, "rows": [row.plain() for row in rows]}, arrays)
+
+
+def read_rows(path: Path, of: str) -> list[LoopRow] | None:
+    """Rows that :func:`write_rows` wrote; None if there are none of that digest.
+
+    Raises:
+        InputError: If the file is damaged.
+    """
+    if not path.is_file():
+        return None
+    remedy = "delete it, and its loops run again"
+    document = read_document(path, remedy)
+    if document.get("of") != of:
+        return None
+    arrays = read_document_arrays(path, remedy)
+    rows = [record(LoopRow, row, str(path)) for row in document["rows"]]
+    own: list[dict[str, Array]] = [{} for _ in rows]
+    for key, values in arrays.items():
+        i, _, name = key.partition("/")
+        own[int(i)][name] = values
+    return [replace(row, arrays=found) for row, found in zip(rows, own, strict=True)]
+
+
+def row_of(spec: LoopSpec, task: Task, problem: OCP, model: HybridModel, result: ClosedLoopResult) -> LoopRow:
+    """The row of a loop, from its task, its control problem, a model that names the signals, and its record."""
+    r, labels = result, [signal.label for signal in model.states]
+    inputs = [signal.label for signal in model.inputs]
+    level = r.level[np.isfinite(r.level)]
+    watched = spec.monitor != "none" and CONTROLLERS[spec.controller].model == "hybrid"
+    can_alarm = watched and spec.monitor in ALARMING
+    return LoopRow(
+        task=task.name,
+        controller=spec.controller,
+        seed=spec.seed,
+        seconds=len(r.t) * r.dt,
+        cost=r.cost,
+        tracking_rmse=_by(labels, np.sqrt(np.mean((r.x - r.reference) ** 2, axis=0))),
+        largest_x=_by(labels, np.abs(r.x).max(axis=0)),
+        largest_u=_by(inputs, np.abs(r.u).max(axis=0)),
+        limits=limits_used(problem, r, model),
+        excess=excess(problem, r, model),
+        sources={source.name: r.source.count(source.name) / len(r.source) for source in Source},
+        figures=dict(task.figures(r)) if task.figures is not None else {},
+        alarms=tuple(Interval(a, b) for a, b in alarm_intervals(r.alarm, r.dt)) if can_alarm else None,
+        alarm_share=float(np.mean(r.alarm)) if can_alarm else None,
+        largest_level=float(level.max()) if level.size else None,
+        not_judged_s=float(np.sum(~r.judged)) * r.dt if watched else None,
+        switches=tuple(ModeChange(s.t, s.before.name, s.after.name, s.why) for s in r.switches),
+        timing_ms={key: percentiles(r.timing_ms[key]) for key in TIMES},
+    )
+
+
+def _by(labels: Sequence[str], values: Array) -> dict[str, float]:
+    return dict(zip(labels, values.tolist(), strict=True))
+
+
+def limits_used(control: OCP, r: ClosedLoopResult, model: HybridModel) -> dict[str, float]:
+    """Largest share of the way from rest to each limit that a loop used [-]: 1 is the limit, more a violation.
+
+    By signal of the model: inputs and, where limited, ``change of`` an input and the plant's true states.
+    """
+    changes = np.abs(np.diff(r.u, axis=0, prepend=control.rest_input[None]))
+    used: dict[str, float] = {}
+    for i, signal in enumerate(model.inputs):
+        used[signal.name] = share_used(r.u[:, i], control.u_min[i], control.u_max[i])
+        if control.du_max is not None:
+            used[f"change of {signal.name}"] = float(np.max(changes[:, i] / control.du_max[i]))
+    for i, signal in enumerate(model.states):
+        if np.isfinite(control.x_min[i]) or np.isfinite(control.x_max[i]):
+            used[signal.name] = share_used(r.x[:, i], control.x_min[i], control.x_max[i])
+    return used
+
+
+def excess(control: OCP, r: ClosedLoopResult, model: HybridModel) -> dict[str, float]:
+    """By how much a loop left its limits at most, in the signals' units: inputs and, where limited, changes, states."""
+    beyond = np.maximum(r.u - control.u_max, control.u_min - r.u)
+    over = {s.label: v for s, v in zip(model.inputs, beyond.T, strict=True)}
+    if np.any(np.isfinite([control.x_min, control.x_max])):
+        beyond = np.maximum(r.x - control.x_max, control.x_min - r.x)
+        over |= {s.label: v for s, v in zip(model.states, beyond.T, strict=True)}
+    if control.du_max is not None:
+        changes = np.abs(np.diff(r.u, axis=0, prepend=control.rest_input[None])) - control.du_max
+        over |= {f"change of {s.label}": v for s, v in zip(model.inputs, changes.T, strict=True)}
+    return {name: max(0.0, float(values.max())) for name, values in over.items()}
+
+
+def tasks_of(scenario: Scenario, names: Sequence[str] | None) -> tuple[Task, ...]:
+    """The scenario's tasks of exactly these names, all for None; an unknown name is refused."""
+    if names is None:
+        return scenario.tasks
+    there = {task.name: task for task in scenario.tasks}
+    missing = [name for name in names if name not in there]
+    if missing:
+        raise InputError(
+            f"scenario {scenario.name}: no task {', '.join(missing)}; there are: {', '.join(there)}"
+        )
+    return tuple(there[name] for name in names)
+
+
+def selected_tasks(scenario: Scenario, names: Sequence[str]) -> tuple[Task, ...]:
+    """The tasks of these names or, where there is none of a name, those whose names begin so; all for no names.
+
+    Raises:
+        InputError: If nothing fits a name.
+
+    Example:
+        >>> [task.name for task in selected_tasks(load_scenario("golf_robot"), ["track", "stroke_4"])]
+        ['track_sine', 'track_step', 'stroke_4']
+    """
+    if not names:
+        return scenario.tasks
+    there = [task.name for task in scenario.tasks]
+    chosen: set[str] = set()
+    for name in names:
+        fitting = [name] if name in there else [t for t in there if name and t.startswith(name)]
+        if not fitting:
+            raise InputError(
+                f"scenario {scenario.name}: no task {name!r}, none begins so; there are: {', '.join(there) or 'none'}"
+            )
+        chosen.update(fitting)
+    return tuple(task for task in scenario.tasks if task.name in chosen)
+
+
+def varied(plant: Any, factors: Sequence[tuple[str, float]]) -> Any:
+    """The plant with some of its parameters multiplied.
+
+    Args:
+        plant: A dataclass with a dataclass ``parameters``, or with parameters of its own.
+        factors: Parameters and factors; may be empty.
+
+    Raises:
+        InputError: If the plant is no dataclass, or has no number of that name.
+
+    Example:
+        >>> from scenarios.golf_robot.rig import Rig
+        >>> round(varied(Rig(), [("m", 1.1)]).parameters.m, 5)
+        0.58806
+    """
+    if not factors:
+        return plant
+    inner = getattr(plant, "parameters", None)
+    holder = inner if is_dataclass(inner) else plant
+    if not is_dataclass(holder) or isinstance(holder, type):
+        raise InputError(
+            f"the plant {type(plant).__name__} has no parameters to vary: it must be a dataclass, or have one "
+            "named 'parameters'"
+        )
+    numbers = [f.name for f in fields(holder) if f.init and isinstance(getattr(holder, f.name), float)]
+    changed = {
+        known(name, numbers, f"parameter of {type(holder).__name__}"): getattr(holder, name) * factor
+        for name, factor in factors
+    }
+    other = replace(holder, **changed)
+    return replace(plant, parameters=other) if holder is inner else other
+
+
+def check_complete(scenario: Scenario) -> None:
+    """Refuse a scenario without plant, control problem or task."""
+    parts = {"plant": scenario.plant, "control problem": scenario.control, "task": scenario.tasks or None}
+    if lacks := [name for name, part in parts.items() if part is None]:
+        raise InputError(
+            f"scenario {scenario.name} has no {lacks[0]}: there is no loop to close in simulation"
+        )
+
+
+def check_kit(scenario: Scenario, kit: Kit, where: str) -> None:
+    """Refuse an artifact without prior or hybrid, of another scenario, or of other sizes; ``where`` names it."""
+    assert scenario.control is not None
+    if missing := [name for name in ("prior", "hybrid") if name not in kit.models]:
+        raise InputError(f"{where} holds {', '.join(kit.models)}; needed is a model {missing[0]} too")
+    if kit.name and kit.name != scenario.name:
+        raise InputError(f"{where} was made for scenario {kit.name}, not for {scenario.name}")
+    needed = scenario.control.n_x, scenario.control.n_u, len(scenario.sensor_sigma)
+    for name, model in kit.models.items():
+        if (sizes := (model.n_x, model.n_u, model.n_y)) != needed:
+            raise InputError(
+                f"{where}: model {name} has (states, inputs, outputs) = {sizes}, scenario {scenario.name} {needed}"
+            )
+
+
+def check_faults(scenario: Scenario, faults: Sequence[Fault]) -> None:
+    """Refuse faults that the machine cannot show."""
+    assert scenario.plant is not None
+    assert scenario.control is not None
+    outside = install(scenario.plant(), faults)[1]
+    check_channels(outside, len(scenario.sensor_sigma), scenario.control.n_u)
+
+
+@dataclass(frozen=True)
+class Mean:
+    """A mean with its 95 % interval (Student's t).
+
+    Args:
+        mean: The mean; None where a value is not finite, or there is none.
+        ci95: Half width of the interval; None of a single value.
+        n: Number of values.
+    """
+
+    mean: float | None
+    ci95: float | None
+    n: int
+
+
+def interval(values: Sequence[float]) -> Mean:
+    """Mean of values and half width of its 95 % interval.
+
+    Args:
+        values: ``(n,)``.
+
+    Example:
+        >>> interval([1.0])
+        Mean(mean=1.0, ci95=None, n=1)
+        >>> found = interval([1.0, 2.0])  # t(0.975, 1) = 12.706, standard error 0.5
+        >>> found.mean, round(found.ci95, 3)
+        (1.5, 6.353)
+    """
+    from scipy.stats import t as student
+
+    x, n = np.asarray(values, dtype=float), len(values)
+    if not (n and np.all(np.isfinite(x))):
+        return Mean(None, None, n)
+    half = float(student.ppf(0.975, n - 1) * x.std(ddof=1) / math.sqrt(n)) if n > 1 else None
+    return Mean(float(x.mean()), half, n)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The loops of one task and controller summed up.
+
+    Args:
+        cost: Closed-loop cost.
+        tracking_rmse: Tracking errors by signal.
+        figures: The task's own figures.
+        mean_abs_figures: Their magnitudes.
+        sources: Share of periods by what gave the input.
+        limits: Largest share of each limit that any loop used.
+    """
+
+    cost: Mean
+    tracking_rmse: Mapping[str, Mean]
+    figures: Mapping[str, Mean]
+    mean_abs_figures: Mapping[str, Mean]
+    sources: Mapping[str, float]
+    limits: Mapping[str, float]
+
+
+def by_task(rows: Sequence[LoopRow]) -> dict[str, dict[str, list[LoopRow]]]:
+    """Rows by task and controller, in the order in which they come."""
+    table: dict[str, dict[str, list[LoopRow]]] = {}
+    for row in rows:
+        table.setdefault(row.task, {}).setdefault(row.controller, []).append(row)
+    return table
+
+
+def summaries(rows: Sequence[LoopRow]) -> dict[str, dict[str, Summary]]:
+    """Summaries of loops by task and controller.
+
+    Example: ``summaries(rows)["track_sine"]["hybrid"].cost.mean``
+    """
+    return {task: {name: summary(r) for name, r in cell.items()} for task, cell in by_task(rows).items()}
+
+
+def summary(rows: Sequence[LoopRow]) -> Summary:
+    """The summary of loops of one task and controller, at least one."""
+
+    def of(
+        pick: Callable[[LoopRow], Mapping[str, float]], change: Callable[[float], float] = float
+    ) -> dict[str, Mean]:
+        return {key: interval([change(pick(row)[key]) for row in rows]) for key in pick(rows[0])}
+
+    limits: dict[str, float] = {}
+    for row in rows:
+        for key, share in row.limits.items():
+            limits[key] = max(share, limits.get(key, 0.0))
+    return Summary(
+        cost=interval([row.cost for row in rows]),
+        tracking_rmse=of(lambda row: row.tracking_rmse),
+        figures=of(lambda row: row.figures),
+        mean_abs_figures=of(lambda row: row.figures, abs),
+        sources={s.name: float(np.mean([row.sources[s.name] for row in rows])) for s in Source},
+        limits=limits,
+    )
+
+
 RETURN_S = 1.0
 """Shortest way back to the reference's beginning [the machine's seconds]."""
 
@@ -109,709 +871,3 @@ def _quintic(p1: float, p0: float, v1: float, v0: float, time: float) -> np.poly
     a4 = (-15 * d + time * (8 * v0 + 7 * v1)) / time**4
     a5 = (6 * d - time * 3 * (v0 + v1)) / time**5
     return np.polynomial.Polynomial([p0, v0, 0.0, a3, a4, a5])
-
-
-# One closed-loop run: from its specification to its row, on a bench that holds the machine and its models.
-
-MODEL = "model"
-"""Label of the model on the bench where there is one."""
-Intervals: TypeAlias = tuple[tuple[float, float], ...]
-MONITORS = (*WATCHES, "none")
-"""What watches a hybrid, see :meth:`~hybrid_mpc.kit.artifact.Kit.monitor`; or nothing does."""
-ALARMING = ("energy", "guard")
-"""Those that alarm."""
-GUARDS = ("", "rest", "adapt", "prior")
-"""What an alarm does: nothing; a frozen sensor takes the input away; and a backup takes over, which estimates the
-prior's parameters, or which plans with the fitted prior."""
-NOT_KEPT = ("dt", "timing_ms", "switches")
-KEEPABLE = ("step_ms", "plans", *(f.name for f in fields(ClosedLoopResult) if f.name not in NOT_KEPT))
-"""What a row may hold of its loop."""
-TIMES = ("total", "solve", "estimate")
-KEPT_PARTS = 64
-"""Controllers that a bench keeps built; runs come ordered by controller, so few are asked for again."""
-
-
-@dataclass(frozen=True)
-class LoopSpec:
-    """One closed loop: all that decides what it computes, but for the content of its model.
-
-    Args:
-        scenario: Registered name or path of a user's file.
-        model: Label of the model on the bench.
-        task: Name of the task.
-        controller: Name of the contender, with its estimator.
-        solver: ``"rti"``, ``"sqp"`` or ``"ipopt"``.
-        horizon: Periods; None for the task's own.
-        monitor: Name in :data:`MONITORS`; without a hybrid there is none. Default: ``"own"``, or ``"guard"`` with a
-            guard.
-        faults: Beside what the task itself brings.
-        drawn_faults: Those that a draw takes at random.
-        late: Intervals [s] in which solves miss their deadline.
-        parameters: Parameters of the plant and their factors.
-        draw: Number of the draw that ``parameters`` and random faults are from.
-        seed: Number of the loop; the same number, the same sensor noise for all that share draw and ``run_seed``.
-        duration: Longest duration [s]; None for the task's own.
-        guard: Name in :data:`GUARDS`. It acts on the alarms of the monitor, so it needs one that alarms.
-        run_seed: Seed of the run that the loop belongs to.
-        rounds: The task is run over and over, with its reference scaled by these factors, one a round. Default: once.
-        keep: Arrays that its row holds: fields of :class:`~hybrid_mpc.loop.simulate.ClosedLoopResult`, ``"step_ms"``
-            ``(n,)`` and ``"plans"`` ``(n, N + 1, n_x)``. No part of the run's identity.
-        number: Place in a study, no part of the run's identity.
-
-    Raises:
-        InputError: If there is no controller, solver, monitor or guard of a name.
-
-    Example:
-        >>> spec = LoopSpec("golf_robot", "model", "track_sine", "prior", seed=3)
-        >>> spec.noise_seed, replace(spec, run_seed=2).noise_seed, replace(spec, number=7).id == spec.id
-        (3, 2003, True)
-    """
-
-    scenario: str
-    model: str
-    task: str
-    controller: str
-    solver: str = "rti"
-    horizon: int | None = None
-    monitor: str = ""
-    faults: tuple[Fault, ...] = ()
-    drawn_faults: tuple[Fault, ...] = ()
-    late: Intervals = ()
-    parameters: tuple[tuple[str, float], ...] = ()
-    draw: int = 0
-    seed: int = 0
-    duration: float | None = None
-    guard: str = ""
-    run_seed: int = 0
-    rounds: tuple[float, ...] = ()
-    keep: tuple[str, ...] = field(default=(), compare=False)
-    number: int = field(default=0, compare=False)
-
-    def __post_init__(self) -> None:
-        known(self.controller, CONTENDERS, "controller")
-        known(self.solver, SOLVERS, "solver")
-        object.__setattr__(self, "monitor", self.monitor or ("guard" if self.guard else "own"))
-        known(self.monitor, MONITORS, "monitor")
-        if self.guard:
-            known(self.guard, GUARDS[1:], "guard")
-        if self.guard and (self.monitor not in ALARMING or CONTENDERS[self.controller].model != "hybrid"):
-            raise InputError(
-                f"a guard acts on alarms: give a controller with the hybrid and monitor {' or '.join(ALARMING)}, got "
-                f"controller {self.controller} and monitor {self.monitor}"
-            )
-        if not (
-            isinstance(self.seed, int)
-            and isinstance(self.run_seed, int)
-            and min(self.seed, self.run_seed) >= 0
-        ):
-            raise InputError(
-                f"seed and run_seed are whole numbers from 0 on, got {self.seed!r} and {self.run_seed!r}"
-            )
-        if self.duration is not None and not self.duration > 0:
-            raise InputError(f"duration: a positive number of seconds needed, got {self.duration}")
-        for name in self.keep:
-            known(name, KEEPABLE, "array to keep")
-
-    @cached_property
-    def id(self) -> str:
-        """The first 20 hexadecimal digits of the SHA-256 of the specification's JSON form."""
-        return digest({k: v for k, v in asdict(self).items() if k not in ("number", "keep")})[:20]
-
-    @property
-    def noise_seed(self) -> int:
-        """Seed of plant and sensor noise."""
-        seed = 1000 * self.run_seed + self.seed
-        return seed if self.draw == 0 else int(np.random.SeedSequence([seed, self.draw]).generate_state(1)[0])
-
-    def columns(self) -> dict[str, Any]:
-        """The specification as the columns of a table."""
-        return {
-            "run": self.number,
-            "model": self.model,
-            "task": self.task,
-            "controller": self.controller,
-            "solver": self.solver,
-            "horizon": self.horizon,
-            "monitor": self.monitor,
-            "faults": fault_text(self.faults),
-            "drawn_faults": fault_text(self.drawn_faults, self.late),
-            "draw": self.draw,
-            "seed": self.seed,
-            **{f"factor_{name}": value for name, value in self.parameters},
-        }
-
-
-def fault_text(faults: Sequence[Fault], late: Intervals = ()) -> str:
-    """Faults in the form in which the command line takes them; ``"none"`` for none.
-
-    Example:
-        >>> fault_text([Fault(1.5, np.inf, "plant_friction", 2.0)], late=((1.0, 1.2),))
-        'plant_friction=2@1.5 + late@1:1.2'
-    """
-    parts = []
-    for f in faults:
-        end = "" if np.isinf(f.end) else f":{f.end:g}"
-        more = (f" channel {f.channel}" if f.channel else "") + (f" ramp {f.ramp:g}" if f.ramp else "")
-        parts.append(f"{f.target}={f.value:g}@{f.start:g}{end}{more}")
-    parts += [f"late@{a:g}" + ("" if np.isinf(b) else f":{b:g}") for a, b in late]
-    return " + ".join(parts) or "none"
-
-
-@dataclass(frozen=True)
-class Interval:
-    """A stretch of time.
-
-    Args:
-        start_s: First instant [s].
-        end_s: Last one [s].
-    """
-
-    start_s: float
-    end_s: float
-
-
-@dataclass(frozen=True)
-class ModeChange:
-    """A change of the guard's mode.
-
-    Args:
-        t_s: When [s].
-        before: Name of the mode before.
-        after: Name of the mode from then on.
-        why: What led to it.
-    """
-
-    t_s: float
-    before: str
-    after: str
-    why: str
-
-
-@dataclass(frozen=True)
-class LoopRow:
-    """What is told of a closed loop. Signals are named with their unit, e.g. ``"phi [rad]"``.
-
-    Args:
-        task: Name of the task.
-        controller: Name of the contender.
-        seed: Number of the loop.
-        seconds: Length [s].
-        cost: Closed-loop cost on the plant's true state.
-        tracking_rmse: Root mean square deviation of the true states from their reference, by signal.
-        largest_x: Largest magnitude of the true states, by signal.
-        largest_u: Largest magnitude of the inputs, by signal.
-        limits: Largest share of the way from rest to each limit that was used, by signal: 1 is the limit, more a
-            violation.
-        excess: By how much limits were left at most, by signal with its unit; ``change of`` an input where that is
-            limited.
-        sources: Share of periods by what gave the input.
-        figures: The task's own figures.
-        alarms: Alarms of the monitor; one that is still on at the end ends there. None where nothing could alarm: there
-            is no monitor, or one without thresholds.
-        alarm_share: Share of periods with an alarm; None where nothing could alarm.
-        largest_level: Largest level of the monitor [W]; None without one.
-        not_judged_s: Time in which the monitor could not judge [s]; None without one.
-        switches: Changes of the guard's mode.
-        timing_ms: ``median, p95, p99, max`` of the durations of ``total``, ``solve`` and ``estimate`` [ms].
-        arrays: What the specification asked to keep. Default: nothing.
-    """
-
-    task: str
-    controller: str
-    seed: int
-    seconds: float
-    cost: float
-    tracking_rmse: Mapping[str, float]
-    largest_x: Mapping[str, float]
-    largest_u: Mapping[str, float]
-    limits: Mapping[str, float]
-    excess: Mapping[str, float]
-    sources: Mapping[str, float]
-    figures: Mapping[str, float]
-    alarms: tuple[Interval, ...] | None
-    alarm_share: float | None
-    largest_level: float | None
-    not_judged_s: float | None
-    switches: tuple[ModeChange, ...]
-    timing_ms: Mapping[str, Mapping[str, float]]
-    arrays: Mapping[str, Array] = field(default_factory=dict, compare=False)
-
-    def plain(self) -> dict[str, Any]:
-        """The row in JSON's own types, without its arrays."""
-        told: dict[str, Any] = plain(replace(self, arrays={}))
-        del told["arrays"]
-        return told
-
-    def columns(self) -> dict[str, Any]:
-        """The row as flat columns of a table, without its arrays; durations begin with ``timing_``."""
-        groups = {
-            "tracking_rmse": self.tracking_rmse, "largest_x": self.largest_x, "largest_u": self.largest_u,
-        }  # fmt: skip
-        return {
-            "cost": self.cost,
-            **{f"{name} {signal}": v for name, by in groups.items() for signal, v in by.items()},
-            **{f"share_{source}": share for source, share in self.sources.items()},
-            **{f"task_{name}": float(value) for name, value in self.figures.items()},
-            "alarm_share": float("nan") if self.alarm_share is None else self.alarm_share,
-            "first_alarm_s": self.alarms[0].start_s if self.alarms else float("nan"),
-            "largest_level_w": float("nan") if self.largest_level is None else self.largest_level,
-            **{
-                f"timing_{kind}_{k}_ms": v
-                for kind, name in (("step", "total"), ("solve", "solve"))
-                for k, v in self.timing_ms[name].items()
-            },
-        }
-
-
-class Bench:
-    """What loops run on: a machine, its models, and the controllers that were built for them so far.
-
-    What the scenario says of the control problem and the sensors holds for all models; what was learned is the models'.
-
-    Args:
-        scenario: The machine, with plant, tasks and control problem.
-        kits: Loaded artifacts by label; their process noise is that of the filters.
-
-    Raises:
-        InputError: If the scenario has nothing to run, or a model is another machine's.
-
-    Example:
-        ``row, result = Bench(scenario, {"model": hm.load("runs/golf")}).run(spec)``
-    """
-
-    def __init__(self, scenario: Scenario, kits: Mapping[str, Kit]) -> None:
-        check_complete(scenario)
-        for label, kit in kits.items():
-            check_kit(scenario, kit, f"model {label}")
-        self.scenario = scenario
-        self.kits = {label: kit.on(scenario) for label, kit in kits.items()}
-        self._parts: OrderedDict[tuple[object, ...], tuple[Estimator, SafeController]] = OrderedDict()
-        self._guards: dict[tuple[object, ...], Guard] = {}
-
-    def kit(self, spec: LoopSpec) -> Kit:
-        """The model of a specification.
-
-        Raises:
-            InputError: If there is none of that label, or the loop is another scenario's.
-        """
-        own = self.scenario.name
-        others = () if spec.scenario == own else registered_scenarios()
-        if spec.scenario in others and load_scenario(spec.scenario).name != own:
-            raise InputError(f"a loop of scenario {spec.scenario} given, the bench has {own}")
-        return self.kits[known(spec.model, self.kits, "model on the bench")]
-
-    def task(self, spec: LoopSpec) -> Task:
-        """The task of a specification: its rounds and its duration.
-
-        Raises:
-            InputError: If there is none of that name.
-        """
-        (task,) = tasks_of(self.scenario, (spec.task,))
-        kit = self.kit(spec)
-        if spec.rounds:
-            model = kit.models["prior"]
-            task = repeated(task, model.dt, np.array(spec.rounds), model.time_unit)
-        return task if spec.duration is None else replace(task, duration=min(task.duration, spec.duration))
-
-    def problem(self, spec: LoopSpec) -> OCP:
-        """The control problem of a specification."""
-        problem = self.kit(spec).problem(spec.task)
-        return problem if spec.horizon is None else problem.changed(horizon=spec.horizon)
-
-    def parts(self, spec: LoopSpec) -> tuple[Estimator, SafeController]:
-        """Estimator and controller of a specification; they remember nothing, so one serves many loops."""
-        kit = self.kit(spec)
-        key = (spec.model, spec.controller, spec.solver, spec.horizon, self._stated(spec))
-        if key not in self._parts:
-            self._parts[key] = build(
-                spec.controller, self.scenario, kit, self.problem(spec), solver=spec.solver
-            )
-            if len(self._parts) > KEPT_PARTS:
-                self._parts.popitem(last=False)
-        self._parts.move_to_end(key)
-        return self._parts[key]
-
-    def monitor(self, spec: LoopSpec) -> EnergyMonitor | None:
-        """What watches the loop of a specification.
-
-        Raises:
-            InputError: If the model lacks what the monitor needs.
-        """
-        if spec.monitor == "none" or CONTENDERS[spec.controller].model != "hybrid":
-            return None
-        return self.kit(spec).monitor(kind=spec.monitor, task=spec.task)
-
-    def guard(self, spec: LoopSpec) -> Guard | None:
-        """What an alarm does in the loop of a specification; None: nothing.
-
-        Raises:
-            InputError: If the model lacks what the guard needs.
-        """
-        if not spec.guard:
-            return None
-        kit = self.kit(spec)
-        hybrid = kit.models["hybrid"]
-        if spec.guard == "rest":
-            return make_resting_guard(hybrid)
-        key = (spec.model, spec.guard, spec.solver, spec.horizon, self._stated(spec))
-        if key not in self._guards:
-            if spec.guard == "prior":
-                estimator, controller = self.parts(
-                    replace(spec, controller="prior_observer", guard="", monitor="none")
-                )
-                self._guards[key] = make_backup_guard(controller, estimator)
-            else:
-                noise = kit.noise("hybrid_observer")
-                self._guards[key] = make_adaptive_guard(
-                    hybrid, kit.models["prior"], kit, noise, self.problem(spec)
-                )
-        return self._guards[key]
-
-    def _stated(self, spec: LoopSpec) -> str:
-        """Whose control problem it is: the task's own, or that of all tasks."""
-        return spec.task if spec.task in self.kit(spec).loop.control else ""
-
-    def plant(self, spec: LoopSpec) -> Plant:
-        """The plant of a specification, with its parameters changed."""
-        assert self.scenario.plant is not None
-        return varied(self.scenario.plant(), spec.parameters)
-
-    def run(
-        self,
-        spec: LoopSpec,
-        *,
-        task: Task | None = None,
-        monitor: EnergyMonitor | None = None,
-        on_step: Callable[[Step], None] | None = None,
-    ) -> tuple[LoopRow, ClosedLoopResult]:
-        """Run one loop.
-
-        Args:
-            spec: The loop.
-            task: In place of the task that it names, e.g. with another reference.
-            monitor: In place of the one that it names.
-            on_step: Called after every period, e.g. to show progress.
-
-        Returns:
-            Its row, and its whole record.
-        """
-        plans: list[Array] = []
-        task = self.task(spec) if task is None else task
-        estimator, controller = self.parts(spec)
-        late = spec.late
-        result = simulate(
-            self.plant(spec), estimator, controller, task.reference, weight=task.weight,
-            dt=self.kit(spec).models["prior"].dt, duration=task.duration, x0=np.array(task.x0),
-            seed=spec.noise_seed, monitor=monitor or self.monitor(spec), guard=self.guard(spec),
-            faults=(*task.faults, *spec.faults, *spec.drawn_faults), on_step=_noting(spec, plans, on_step),
-            late=(lambda t: any(a - 1e-9 <= t < b - 1e-9 for a, b in late)) if late else None,
-        )  # fmt: skip
-        row = row_of(spec, task, self.problem(spec), self.kit(spec).models["prior"], result)
-        derived = {"step_ms": result.timing_ms["total"], "plans": np.array(plans)}
-        kept = {name: derived[name] if name in derived else getattr(result, name) for name in spec.keep}
-        return replace(row, arrays=kept), result
-
-
-def _noting(
-    spec: LoopSpec, plans: list[Array], on_step: Callable[[Step], None] | None
-) -> Callable[[Step], None] | None:
-    """What is called after every period: it notes the plan where the row is to hold plans."""
-    if "plans" not in spec.keep:
-        return on_step
-
-    def note(step: Step) -> None:
-        plans.append(step.decision.solution.x)
-        if on_step is not None:
-            on_step(step)
-
-    return note
-
-
-def row_of(spec: LoopSpec, task: Task, problem: OCP, model: HybridModel, result: ClosedLoopResult) -> LoopRow:
-    """The row of a loop.
-
-    Args:
-        spec: Which loop.
-        task: Its task.
-        problem: Its control problem, with the limits.
-        model: A model of the machine, whose signals name the columns.
-        result: Its record.
-    """
-    r, labels = result, [signal.label for signal in model.states]
-    inputs = [signal.label for signal in model.inputs]
-    level = r.level[np.isfinite(r.level)]
-    watched = spec.monitor != "none" and CONTENDERS[spec.controller].model == "hybrid"
-    can_alarm = watched and spec.monitor in ALARMING
-    return LoopRow(
-        task=task.name,
-        controller=spec.controller,
-        seed=spec.seed,
-        seconds=len(r.t) * r.dt,
-        cost=r.cost,
-        tracking_rmse=_by(labels, np.sqrt(np.mean((r.x - r.reference) ** 2, axis=0))),
-        largest_x=_by(labels, np.abs(r.x).max(axis=0)),
-        largest_u=_by(inputs, np.abs(r.u).max(axis=0)),
-        limits=limits_used(problem, r, model),
-        excess=excess(problem, r, model),
-        sources={source.name: r.source.count(source.name) / len(r.source) for source in Source},
-        figures=dict(task.figures(r)) if task.figures is not None else {},
-        alarms=tuple(Interval(a, b) for a, b in alarm_intervals(r.alarm, r.dt)) if can_alarm else None,
-        alarm_share=float(np.mean(r.alarm)) if can_alarm else None,
-        largest_level=float(level.max()) if level.size else None,
-        not_judged_s=float(np.sum(~r.judged)) * r.dt if watched else None,
-        switches=tuple(ModeChange(s.t, s.before.name, s.after.name, s.why) for s in r.switches),
-        timing_ms={key: percentiles(r.timing_ms[key]) for key in TIMES},
-    )
-
-
-def _by(labels: Sequence[str], values: Array) -> dict[str, float]:
-    return dict(zip(labels, values.tolist(), strict=True))
-
-
-def limits_used(control: OCP, r: ClosedLoopResult, model: HybridModel) -> dict[str, float]:
-    """Largest share of the way from rest to each limit that a loop used: 1 is the limit, more a violation.
-
-    Args:
-        control: The problem with the limits.
-        r: The loop; states are the plant's true ones.
-        model: Whose signals name them.
-
-    Returns:
-        Inputs, and ``change of`` an input and states where there are such limits [-].
-    """
-    changes = np.abs(np.diff(r.u, axis=0, prepend=control.rest_input[None]))
-    used: dict[str, float] = {}
-    for i, signal in enumerate(model.inputs):
-        used[signal.name] = share_used(r.u[:, i], control.u_min[i], control.u_max[i])
-        if control.du_max is not None:
-            used[f"change of {signal.name}"] = float(np.max(changes[:, i] / control.du_max[i]))
-    for i, signal in enumerate(model.states):
-        if np.isfinite(control.x_min[i]) or np.isfinite(control.x_max[i]):
-            used[signal.name] = share_used(r.x[:, i], control.x_min[i], control.x_max[i])
-    return used
-
-
-def excess(control: OCP, r: ClosedLoopResult, model: HybridModel) -> dict[str, float]:
-    """By how much a loop left its limits at most [the signals' units]: inputs and, where limited, changes and states.
-
-    Args:
-        control: The problem with the limits.
-        r: The loop; states are the plant's true ones.
-        model: Whose signals name them.
-    """
-    beyond = np.maximum(r.u - control.u_max, control.u_min - r.u)
-    over = {s.label: v for s, v in zip(model.inputs, beyond.T, strict=True)}
-    if np.any(np.isfinite([control.x_min, control.x_max])):
-        beyond = np.maximum(r.x - control.x_max, control.x_min - r.x)
-        over |= {s.label: v for s, v in zip(model.states, beyond.T, strict=True)}
-    if control.du_max is not None:
-        changes = np.abs(np.diff(r.u, axis=0, prepend=control.rest_input[None])) - control.du_max
-        over |= {f"change of {s.label}": v for s, v in zip(model.inputs, changes.T, strict=True)}
-    return {name: max(0.0, float(values.max())) for name, values in over.items()}
-
-
-def tasks_of(scenario: Scenario, names: Sequence[str] | None) -> tuple[Task, ...]:
-    """The scenario's tasks of these names, all for None.
-
-    Raises:
-        InputError: If there is no task of a name.
-    """
-    if names is None:
-        return scenario.tasks
-    there = {task.name: task for task in scenario.tasks}
-    missing = [name for name in names if name not in there]
-    if missing:
-        raise InputError(
-            f"scenario {scenario.name}: no task {', '.join(missing)}; there are: {', '.join(there)}"
-        )
-    return tuple(there[name] for name in names)
-
-
-def varied(plant: Any, factors: Sequence[tuple[str, float]]) -> Any:
-    """The plant with some of its parameters multiplied.
-
-    Args:
-        plant: A dataclass with a dataclass ``parameters``, or with parameters of its own.
-        factors: Parameters and factors; may be empty.
-
-    Raises:
-        InputError: If the plant is no dataclass, or has no number of that name.
-
-    Example:
-        >>> from scenarios.golf_robot.rig import Rig
-        >>> round(varied(Rig(), [("m", 1.1)]).parameters.m, 5)
-        0.58806
-    """
-    if not factors:
-        return plant
-    inner = getattr(plant, "parameters", None)
-    holder = inner if is_dataclass(inner) else plant
-    if not is_dataclass(holder) or isinstance(holder, type):
-        raise InputError(
-            f"the plant {type(plant).__name__} has no parameters to vary: it must be a dataclass, or have one "
-            "named 'parameters'"
-        )
-    numbers = [f.name for f in fields(holder) if f.init and isinstance(getattr(holder, f.name), float)]
-    changed = {
-        known(name, numbers, f"parameter of {type(holder).__name__}"): getattr(holder, name) * factor
-        for name, factor in factors
-    }
-    other = replace(holder, **changed)
-    return replace(plant, parameters=other) if holder is inner else other
-
-
-def check_complete(scenario: Scenario) -> None:
-    """Refuse a scenario without plant, control problem or task.
-
-    Raises:
-        InputError: With what lacks.
-    """
-    parts = {"plant": scenario.plant, "control problem": scenario.control, "task": scenario.tasks or None}
-    if lacks := [name for name, part in parts.items() if part is None]:
-        raise InputError(
-            f"scenario {scenario.name} has no {lacks[0]}: there is no loop to close in simulation"
-        )
-
-
-def check_kit(scenario: Scenario, kit: Kit, where: str) -> None:
-    """Refuse the models of another machine.
-
-    Args:
-        scenario: The machine, with its control problem.
-        kit: The loaded artifact.
-        where: What it is, for the message.
-
-    Raises:
-        InputError: If prior or hybrid are missing, the artifact was made for another scenario, or sizes do not fit.
-    """
-    assert scenario.control is not None
-    if missing := [name for name in ("prior", "hybrid") if name not in kit.models]:
-        raise InputError(f"{where} holds {', '.join(kit.models)}; needed is a model {missing[0]} too")
-    if kit.name and kit.name != scenario.name:
-        raise InputError(f"{where} was made for scenario {kit.name}, not for {scenario.name}")
-    needed = scenario.control.n_x, scenario.control.n_u, len(scenario.sensor_sigma)
-    for name, model in kit.models.items():
-        if (sizes := (model.n_x, model.n_u, model.n_y)) != needed:
-            raise InputError(
-                f"{where}: model {name} has (states, inputs, outputs) = {sizes}, scenario {scenario.name} {needed}"
-            )
-
-
-def check_faults(scenario: Scenario, faults: Sequence[Fault]) -> None:
-    """Refuse faults that the machine cannot show.
-
-    Raises:
-        InputError: With the fault, and what there is.
-    """
-    assert scenario.plant is not None
-    assert scenario.control is not None
-    outside = install(scenario.plant(), faults)[1]
-    check_channels(outside, len(scenario.sensor_sigma), scenario.control.n_u)
-
-
-@dataclass(frozen=True)
-class Mean:
-    """A mean with its 95 % interval (Student's t).
-
-    Args:
-        mean: The mean; None where a value is not finite, or there is none.
-        ci95: Half width of the interval; None of a single value.
-        n: Number of values.
-    """
-
-    mean: float | None
-    ci95: float | None
-    n: int
-
-
-def interval(values: Sequence[float]) -> Mean:
-    """Mean of values and half width of its 95 % interval.
-
-    Args:
-        values: ``(n,)``.
-
-    Example:
-        >>> interval([1.0])
-        Mean(mean=1.0, ci95=None, n=1)
-        >>> found = interval([1.0, 2.0])  # t(0.975, 1) = 12.706, standard error 0.5
-        >>> found.mean, round(found.ci95, 3)
-        (1.5, 6.353)
-    """
-    from scipy.stats import t as student
-
-    x, n = np.asarray(values, dtype=float), len(values)
-    if not (n and np.all(np.isfinite(x))):
-        return Mean(None, None, n)
-    half = float(student.ppf(0.975, n - 1) * x.std(ddof=1) / math.sqrt(n)) if n > 1 else None
-    return Mean(float(x.mean()), half, n)
-
-
-@dataclass(frozen=True)
-class Summary:
-    """What the loops of one task and controller come to.
-
-    Args:
-        cost: Closed-loop cost.
-        tracking_rmse: Tracking errors by signal.
-        figures: The task's own figures.
-        mean_abs_figures: Their magnitudes.
-        sources: Share of periods by what gave the input.
-        limits: Largest share of each limit that any loop used.
-    """
-
-    cost: Mean
-    tracking_rmse: Mapping[str, Mean]
-    figures: Mapping[str, Mean]
-    mean_abs_figures: Mapping[str, Mean]
-    sources: Mapping[str, float]
-    limits: Mapping[str, float]
-
-
-def by_task(rows: Sequence[LoopRow]) -> dict[str, dict[str, list[LoopRow]]]:
-    """Rows by task and controller, in the order in which they come.
-
-    Args:
-        rows: The loops.
-    """
-    table: dict[str, dict[str, list[LoopRow]]] = {}
-    for row in rows:
-        table.setdefault(row.task, {}).setdefault(row.controller, []).append(row)
-    return table
-
-
-def summaries(rows: Sequence[LoopRow]) -> dict[str, dict[str, Summary]]:
-    """What loops come to, by task and controller.
-
-    Args:
-        rows: The loops.
-
-    Example:
-        ``summaries(rows)["track_sine"]["hybrid"].cost.mean``
-    """
-    return {task: {name: summary(r) for name, r in cell.items()} for task, cell in by_task(rows).items()}
-
-
-def summary(rows: Sequence[LoopRow]) -> Summary:
-    """What loops of one task and controller come to.
-
-    Args:
-        rows: At least one.
-    """
-
-    def of(
-        pick: Callable[[LoopRow], Mapping[str, float]], change: Callable[[float], float] = float
-    ) -> dict[str, Mean]:
-        return {key: interval([change(pick(row)[key]) for row in rows]) for key in pick(rows[0])}
-
-    limits: dict[str, float] = {}
-    for row in rows:
-        for key, share in row.limits.items():
-            limits[key] = max(share, limits.get(key, 0.0))
-    return Summary(
-        cost=interval([row.cost for row in rows]),
-        tracking_rmse=of(lambda row: row.tracking_rmse),
-        figures=of(lambda row: row.figures),
-        mean_abs_figures=of(lambda row: row.figures, abs),
-        sources={s.name: float(np.mean([row.sources[s.name] for row in rows])) for s in Source},
-        limits=limits,
-    )

@@ -69,9 +69,7 @@ def run(
     check_scenario(scenario, context.budget)
     check_data(context)
     check_device(settings.device)
-    note = run_note(settings)
-    with open_folder(out, note, resume=resume):
-        note.write(out)
+    with open_folder(out, run_note(settings), resume=resume):
         for stage in STAGES:
             context.progress.start(stage.title)
             if only and stage.name not in (*only, REPORT.name):

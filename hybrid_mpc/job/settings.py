@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import read_json, read_object, sha256, write_json
+from hybrid_mpc.files import read_json, sha256
 from hybrid_mpc.job.folder import JobNote
 
-FILE = "run.json"
 WHOLE = ("hidden", "networks", "teacher_steps", "free_run_steps", "horizon", "validation_horizon", "batch")
 MOST = {
     "hidden": 4096, "networks": 1024, "teacher_steps": 10**8, "free_run_steps": 10**8, "horizon": 10**5,
@@ -103,42 +101,13 @@ def read_network(path: Path) -> dict[str, Any]:
     return {name: tuple(v) if isinstance(v, list) else v for name, v in held.items()}
 
 
-class Identified(Protocol):
-    """Settings that tell whether two jobs are the same."""
-
-    def identity(self) -> dict[str, Any]:
-        """Settings as plain data."""
-
-
-def claim(settings: Identified) -> JobNote:
-    """What a job's folder says of it: its settings, in ``run.json``.
-
-    Args:
-        settings: What the job computes.
-    """
-    identity = settings.identity()
-    return JobNote("run", FILE, identity, lambda out: write_json(out / FILE, {"settings": identity}), _held)
-
-
 def run_note(settings: RunSettings) -> JobNote:
-    """What the folder of the main job says of it: its settings. Only the machine must stay; stages see the rest.
+    """What the folder of the main job says of it. Only the machine must stay the same; stages see all the rest.
 
     Args:
         settings: What the run computes.
     """
-    return replace(claim(settings), identity={"scenario": Path(settings.scenario).name}, held=_held_machine)
-
-
-def _held(out: Path) -> Mapping[str, Any]:
-    """The settings that a folder's note states."""
-    before = read_object(out / FILE).get("settings")
-    if not isinstance(before, dict):
-        raise InputError(f"{out / FILE} is damaged: no settings in it; choose another --out")
-    return before
-
-
-def _held_machine(out: Path) -> Mapping[str, Any]:
-    return {"scenario": str(_held(out).get("scenario")).split(" ")[0]}
+    return JobNote("run", {"scenario": Path(settings.scenario).name}, {"run": settings.identity()})
 
 
 def check_device(device: str) -> None:

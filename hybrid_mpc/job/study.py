@@ -1,13 +1,14 @@
-"""Studies that are ready: they need models only."""
+"""What a study is: the loops that it expands to, the things it draws, its YAML file, and the built-in studies."""
 
 from __future__ import annotations
 
 import hashlib
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
+from importlib.util import find_spec
 from itertools import count, product
 from pathlib import Path
 from typing import Any, cast
@@ -16,18 +17,21 @@ import numpy as np
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_bytes
-from hybrid_mpc.job.control import DEFAULT_CONTROLLERS, parsed_fault, selected_tasks
-from hybrid_mpc.job.controllers import CONTENDERS, ORACLES
-from hybrid_mpc.job.loops import Intervals, LoopSpec
+from hybrid_mpc.job.controllers import CONTROLLERS, ORACLES
+from hybrid_mpc.job.loops import ALARMING, GUARDS, MONITORS, Intervals, LoopSpec, parsed_fault, selected_tasks
 from hybrid_mpc.kit.assembly import SOLVERS
 from hybrid_mpc.loop.faults import SIGNAL_TARGETS, Fault
 from hybrid_mpc.records import MOST_SEED, known, plain, record
-from hybrid_mpc.scenario import load_scenario, scenario_of
-
-# What differs from draw to draw of a study: parameters of the plant, and faults of random kind, size and instant.
+from hybrid_mpc.scenario import load_scenario, registered_scenarios, scenario_of
 
 LATE = "late"
 """A target beside those of :class:`~hybrid_mpc.loop.faults.Fault`: solves miss their deadline."""
+DEFAULT_CONTROLLERS = ("prior_observer", "hybrid_observer")
+MOST_DRAWS = 1_000_000
+"""Most seeds, and most draws, of a study: all of them are in memory."""
+MOST_HORIZON = 10_000
+"""Longest horizon [periods] of a study: a plan is in memory with its derivatives."""
+AXES = ("models", "tasks", "controllers", "solvers", "horizons", "monitors", "faults", "seeds")
 
 
 @dataclass(frozen=True)
@@ -177,27 +181,17 @@ def _span(
     except (TypeError, ValueError) as error:
         raise InputError(f"{what}: two numbers are needed, got {values!r}") from error
     if not (math.isfinite(low) and math.isfinite(high) and low <= high and low >= least and low > above):
-        raise InputError(f"{what}: [{low}, {high}] is no range of numbers that is allowed here")
+        bounds = (
+            f" of {least:g} or more"
+            if math.isfinite(least)
+            else f" above {above:g}"
+            if math.isfinite(above)
+            else ""
+        )
+        raise InputError(
+            f"{what}: [{low:g}, {high:g}] is no range; needed are two finite numbers{bounds}, the smaller one first"
+        )
     return low, high
-
-
-# What a study consists of, and the runs that it expands to.
-
-ESTIMATORS: Mapping[str, tuple[bool, bool] | None] = {
-    "own": None,
-    "plain": (False, False),
-    "observer": (True, False),
-    "truth": (False, True),
-}
-"""By name: whether it follows an unknown load, and whether it is handed the truth; None for the controller's own."""
-MONITORS = ("own", "none", "energy")
-"""``own``: what ``hybrid-mpc control`` runs, the uncalibrated energy monitor beside a hybrid; ``energy``: the same with
-the artifact's calibration, so that it alarms."""
-MOST_DRAWS = 1_000_000
-"""Most seeds, and most draws, of a study: all of them are in memory."""
-MOST_HORIZON = 10_000
-"""Longest horizon [periods] of a study: a plan is in memory with its derivatives."""
-AXES = ("models", "tasks", "controllers", "estimators", "solvers", "horizons", "monitors", "faults", "seeds")
 
 
 @dataclass(frozen=True)
@@ -210,20 +204,21 @@ class Study:
         scenario: Registered name or path of a user's file.
         models: Artifact folders (or folders of runs) by label; a single folder gets the label ``"model"``.
         tasks: Names of tasks, or their beginnings. Default: all.
-        controllers: Names of contenders. Default: prior and hybrid, with observer.
-        estimators: Names in :data:`ESTIMATORS`: another estimator for each of the controllers. Default: its own.
+        controllers: Names in :data:`~hybrid_mpc.job.controllers.CONTROLLERS`. Default: prior and hybrid, with observer.
         solvers: ``"rti"``, ``"sqp"``, ``"ipopt"``. Default: the first.
         horizons: Periods; None for the task's own, which is the default.
-        monitors: Names in :data:`MONITORS`. Default: ``"own"``.
+        monitors: Names in :data:`~hybrid_mpc.job.loops.MONITORS`. Default: ``"own"``, without thresholds.
         faults: Sets of faults, each one text (``"plant_friction=2@1.5 + input_gain=0.8"``; ``"none"``), a
             :class:`~hybrid_mpc.loop.faults.Fault` or a sequence of either. Default: one empty set.
         vary: Parameters of the plant, and by what share each is varied at most in either direction. Default: none.
-        random_faults: Faults that a draw takes at random, see :class:`~hybrid_mpc.job.study.RandomFaults`. Default:
-            none.
+        random_faults: Faults that a draw takes at random. Default: none.
         draws: How many times the random things are drawn; all controllers meet the same draws. Default: 1.
         seeds: Numbers of the loops, or how many. Default: 10.
         seed: Seed of the draws.
         duration: Longest duration of a loop [s]. Default: the task's own.
+        guard: What an alarm does, in :data:`~hybrid_mpc.job.loops.GUARDS`; it needs monitors that alarm, and hybrids.
+            Default: nothing.
+        run_seed: Times 1000 it is added to the numbers of the loops, as in the main job. Default: 0.
         name: For tables and the report.
 
     Raises:
@@ -243,7 +238,6 @@ hybrid, hybrid_observer, oracle, oracle_state
     models: str | Path | Mapping[str, str | Path] | Sequence[tuple[str, str]]
     tasks: Sequence[str] = ()
     controllers: Sequence[str] = DEFAULT_CONTROLLERS
-    estimators: Sequence[str] = ("own",)
     solvers: Sequence[str] = ("rti",)
     horizons: Sequence[int | None] = (None,)
     monitors: Sequence[str] = ("own",)
@@ -254,6 +248,8 @@ hybrid, hybrid_observer, oracle, oracle_state
     seeds: int | Sequence[int] = 10
     seed: int = 0
     duration: float | None = None
+    guard: str = ""
+    run_seed: int = 0
     name: str = "study"
 
     def __post_init__(self) -> None:
@@ -265,11 +261,11 @@ hybrid, hybrid_observer, oracle, oracle_state
                 raise InputError(f"study: {name} is empty; leave it out for the default")
             if len(set(values)) != len(values):
                 raise InputError(f"study: {name} lists something twice: {values}")
-        for what, table in (("controllers", CONTENDERS), ("estimators", ESTIMATORS), ("solvers", SOLVERS)):
+        for what, table in (("controllers", CONTROLLERS), ("solvers", SOLVERS), ("monitors", MONITORS)):
             for word in getattr(self, what):
                 known(word, table, what[:-1])
-        for word in self.monitors:
-            known(word, MONITORS, "monitor")
+        if self.guard:
+            known(self.guard, GUARDS[1:], "guard")
         for label in self.folders:
             if not re.fullmatch(r"[A-Za-z0-9_.-]*[A-Za-z0-9_-]", label):
                 raise InputError(f"study: a model's label is made of letters, digits, _ . -; got {label!r}")
@@ -297,19 +293,11 @@ hybrid, hybrid_observer, oracle, oracle_state
         return cast("tuple[tuple[Fault, ...], ...]", self.faults)
 
     @property
-    def contenders(self) -> tuple[str, ...]:
-        """Controllers with their estimators, each once."""
-        pairs = product(self.controllers, self.estimators)
-        return tuple(dict.fromkeys(_contender(c, e) for c, e in pairs))
-
-    @property
     def axes(self) -> dict[str, int]:
         """How many of each thing there are; the product is the number of runs."""
-        lengths = {
-            name: len(getattr(self, name)) for name in AXES if name not in ("controllers", "estimators")
-        }
+        lengths = {name: len(getattr(self, name)) for name in AXES}
         tasks = len(selected_tasks(load_scenario(self.scenario), self.tasks))
-        return {**lengths, "tasks": tasks, "controllers": len(self.contenders), "draws": self.draws}
+        return {**lengths, "tasks": tasks, "draws": self.draws}
 
     @property
     def size(self) -> int:
@@ -317,29 +305,26 @@ hybrid, hybrid_observer, oracle, oracle_state
         return math.prod(self.axes.values())
 
     def runs(self) -> Iterator[LoopSpec]:
-        """The runs, those with the same controller next to each other; none is kept, so there may be millions."""
+        """The runs, those of a controller next to each other; they are made one by one, so there may be millions."""
         tasks = [t.name for t in selected_tasks(load_scenario(self.scenario), self.tasks)]
         drawn = [self._drawn(i) for i in range(self.draws)]
         outer = product(
-            self.folders, tasks, self.contenders, self.solvers, self.horizons, self.monitors, self.fault_sets
+            self.folders, tasks, self.controllers, self.solvers, self.horizons, self.monitors, self.fault_sets
         )
         number = count()
-        for model, task, contender, solver, horizon, monitor, faults in outer:
+        for model, task, controller, solver, horizon, monitor, faults in outer:
             for draw, (parameters, some, late) in enumerate(drawn):
                 for seed in self.loop_seeds:
                     yield LoopSpec(
-                        self.scenario, model, task, contender, solver, horizon, monitor,
-                        faults, some, late, parameters, draw, seed, self.duration, number=next(number),
+                        self.scenario, model, task, controller, solver, horizon, monitor,
+                        faults, some, late, parameters, draw, seed, self.duration, self.guard, self.run_seed,
+                        number=next(number),
                     )  # fmt: skip
 
     def identity(self) -> dict[str, Any]:
         """The study as plain data, without where its models lie."""
         whole: dict[str, Any] = plain(asdict(self))
         return {**whole, "models": list(self.folders)}
-
-    def with_models(self, models: Mapping[str, str | Path]) -> Study:
-        """The same study of other models."""
-        return replace(self, models=models)
 
     def _drawn(self, i: int) -> tuple[tuple[tuple[str, float], ...], tuple[Fault, ...], Intervals]:
         faults: tuple[tuple[Fault, ...], Intervals] = ((), ())
@@ -351,6 +336,7 @@ hybrid, hybrid_observer, oracle, oracle_state
         lists: tuple[tuple[str, Sequence[int | None], int, int], ...] = (
             ("draws", [self.draws], 1, MOST_DRAWS),
             ("seed", [self.seed], 0, MOST_SEED),
+            ("run_seed", [self.run_seed], 0, MOST_SEED),
             ("seeds", self.loop_seeds, 0, MOST_SEED),
             ("horizons", [h for h in self.horizons if h is not None], 1, MOST_HORIZON),
         )
@@ -370,7 +356,7 @@ hybrid, hybrid_observer, oracle, oracle_state
             raise InputError(f"study: duration must be a positive number of seconds, got {self.duration!r}")
 
     def _check_combinations(self) -> None:
-        oracles = [name for name in self.contenders if name in ORACLES]
+        oracles = [name for name in self.controllers if name in ORACLES]
         if oracles and set(self.solvers) != {"rti"}:
             raise InputError(
                 f"study: {oracles[0]} has a solver of its own (several starts); leave it or solvers out"
@@ -383,11 +369,19 @@ hybrid, hybrid_observer, oracle, oracle_state
             raise InputError(
                 f"study: {self.draws} draws, and nothing that is drawn: give vary or random_faults, or use seeds"
             )
-        watched = [name for name in self.contenders if CONTENDERS[name].model != "hybrid"]
-        if "energy" in self.monitors and watched:
+        others = [name for name in self.controllers if CONTROLLERS[name].model != "hybrid"]
+        alarming = [name for name in self.monitors if name in ALARMING]
+        if self.guard and others:
             raise InputError(
-                f"study: monitor energy is calibrated for the hybrid, {watched[0]} has none; take monitor own, or "
-                "controllers with a hybrid"
+                f"the guard watches with the hybrid, controller {others[0]} has another model; with a guard give the "
+                "controllers hybrid_observer or hybrid alone"
+            )
+        if self.guard and len(alarming) < len(self.monitors):
+            raise InputError(f"study: a guard acts on alarms; give monitors {' or '.join(ALARMING)}")
+        if alarming and others:
+            raise InputError(
+                f"study: monitor {alarming[0]} is calibrated for the hybrid, {others[0]} has none; take monitor own, "
+                "or controllers with a hybrid"
             )
 
 
@@ -404,7 +398,7 @@ def _normal(s: Study) -> dict[str, Any]:
         drawn = record(RandomFaults, drawn, "random_faults")
     lists: dict[str, Any] = {
         name: _listed(getattr(s, name), name)
-        for name in ("tasks", "controllers", "estimators", "solvers", "horizons", "monitors")
+        for name in ("tasks", "controllers", "solvers", "horizons", "monitors")
     }
     if isinstance(s.seeds, int) and not isinstance(s.seeds, bool):
         if not 1 <= s.seeds <= MOST_DRAWS:
@@ -438,25 +432,6 @@ def _fault_set(entry: Any) -> tuple[Fault, ...]:
         raise InputError(f"study: faults are texts, lists of texts, or Fault; got {entry!r}")
     return tuple(fault for part in entry for fault in _fault_set(part))
 
-
-def _contender(controller: str, estimator: str) -> str:
-    """The contender of a controller's model with that estimator.
-
-    Raises:
-        InputError: If there is none.
-    """
-    wanted, model = ESTIMATORS[estimator], CONTENDERS[controller].model
-    if wanted is None:
-        return controller
-    for name, c in CONTENDERS.items():
-        if c.model == model and (c.observer, c.truth) == wanted:
-            return name
-    raise InputError(
-        f"study: controller {controller} with estimator {estimator} is impossible: there is no such contender"
-    )
-
-
-# Studies in YAML files.
 
 MOST_YAML = 2**16
 """Largest study [bytes] that is read."""
@@ -534,7 +509,7 @@ def _loader() -> Any:
                 raise yaml.composer.ComposerError(
                     None,
                     None,
-                    "prior_replay (&) and aliases (*) are not read; write the value out",
+                    "anchors (&) and aliases (*) are not read; write the value out",
                     event.start_mark,
                 )
             return super().compose_node(parent, index)
@@ -562,111 +537,33 @@ _PLAIN = (
 )  # fmt: skip
 """Kinds of plain words of YAML 1.2's core schema, with the letters that they begin with."""
 
-Models = str | Path | Mapping[str, str | Path]
-DEPLOYABLE = ("prior", "prior_observer", "hybrid", "hybrid_observer")
-"""The contenders without oracles, which know the machine as it is built, not as it is drawn."""
-SPAN = 0.2
 
+def built_in_studies() -> dict[str, Path]:
+    """Files of the studies that registered scenarios bring, by name: ``studies/*.yaml`` beside the scenario.
 
-@dataclass(frozen=True)
-class Ready:
-    """A ready study.
-
-    Args:
-        title: One line.
-        make: From models by label to the study.
+    The first line of each is a comment that says what the study is about.
     """
+    found: dict[str, Path] = {}
+    for place in registered_scenarios().values():
+        module = find_spec(place.partition(":")[0])
+        for folder in (module.submodule_search_locations if module else None) or ():
+            found |= {path.stem: path for path in sorted((Path(folder) / "studies").glob("*.yaml"))}
+    return found
 
-    title: str
-    make: Callable[[Models], Study]
 
-
-def ready_study(name: str, models: Models) -> Study:
-    """The ready study of that name with these models.
+def built_in_study(name: str, models: str | Path | Mapping[str, str | Path]) -> Study:
+    """The built-in study of that name with these models.
 
     Args:
-        name: Name in :data:`READY`.
+        name: Name in :func:`built_in_studies`.
         models: Artifact folders by label, or one.
 
     Raises:
         InputError: If there is none of that name.
 
     Example:
-        >>> ready_study("faults_1000", "runs/golf").size
+        >>> built_in_study("faults_1000", "runs/golf").size
         1000
     """
-    return READY[known(name, READY, "ready study")].make(models)
-
-
-def _plant_variation(models: Models) -> Study:
-    """The parts of the rig that a copy of it would differ in: masses, drive, friction, belt."""
-    varied = (
-        "m",
-        "a",
-        "J",
-        "d",
-        "mu_c",
-        "mu_s",
-        "motor_gain",
-        "drag",
-        "belt_stiffness",
-        "gap",
-        "motor_friction",
-    )
-    return Study(
-        "golf_robot", models, controllers=DEPLOYABLE, vary=dict.fromkeys(varied, SPAN), draws=20, seeds=1,
-        name="plant_variation",
-    )  # fmt: skip
-
-
-def _horizon_size(models: Models) -> Study:
-    """Tasks that can be done with any horizon: a stroke needs one that reaches the impact."""
-    return Study(
-        "golf_robot", models, tasks=("track_sine", "track_step", "reject_load"), controllers=("hybrid_observer",),
-        horizons=(10, 20, 35, 50, 80), solvers=("rti", "sqp"), seeds=5, name="horizon_size",
-    )  # fmt: skip
-
-
-def _data_amount(models: Models) -> Study:
-    return Study(
-        "golf_robot", models, tasks=("track_sine", "stroke_1.4", "stroke_3", "reject_push"), seeds=10,
-        controllers=("prior_observer", "hybrid_observer"), name="data_amount",
-    )  # fmt: skip
-
-
-def _faults_1000(models: Models) -> Study:
-    """The golf robot's catalogue of faults at 70 to 130 % of its sizes, one to three at once, and late solves."""
-    kinds = (
-        FaultKind("plant_friction", 1.35, 4.9),
-        FaultKind("plant_mass", 1.07, 1.65),
-        FaultKind("input_gain", 0.74, 0.86),
-        FaultKind("measurement_offset", 0.014, 0.026, signed=True),
-        FaultKind("measurement_scale", 1.035, 1.065),
-        FaultKind("measurement_freeze"),
-        FaultKind("measurement_dropout", length=(0.02, 0.1)),
-        FaultKind("plant_push", 0.7, 1.3, signed=True, length=(0.1, 0.3)),
-        FaultKind("plant_belt", 0.56, 1.04),
-        FaultKind("plant_delay", 0.042, 0.078, ramp=5.0),
-        FaultKind("late", length=(0.02, 0.24)),
-    )
-    return Study(
-        "golf_robot", models, tasks=("track_sine", "track_step", "stroke_1.4", "stroke_3", "reject_heavy"),
-        controllers=("prior_observer", "hybrid_observer"), random_faults=RandomFaults(kinds), draws=100, seeds=1,
-        duration=4.0, name="faults_1000",
-    )  # fmt: skip
-
-
-READY: Mapping[str, Ready] = {
-    "plant_variation": Ready(
-        "every controller on every task of the golf robot, 20 copies of the rig that differ by up to 20 %",
-        _plant_variation,
-    ),
-    "horizon_size": Ready(
-        "horizon x hidden units (one --model each) x solver: what a longer look or a larger network pays",
-        _horizon_size,
-    ),
-    "data_amount": Ready(
-        "models of runs with more and less data (one --model each): what data pay", _data_amount
-    ),
-    "faults_1000": Ready("1,000 loops of the golf robot with one to three random faults each", _faults_1000),
-}
+    files = built_in_studies()
+    return read_study(files[known(name, files, "built-in study")], models=models)

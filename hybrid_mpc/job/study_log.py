@@ -1,4 +1,7 @@
-"""Rows of a finished study as one Parquet file, with what it is made of in the file's metadata."""
+"""What a study's folder holds: a note of what it is made of, the rows of its runs, and the table of all of them.
+
+Rows are appended as runs end, and are whole after a kill at any moment; the table is one Parquet file.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,8 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import locked, read_document, replacing, write_document
+from hybrid_mpc.files import locked, replacing
+from hybrid_mpc.job.folder import read_note
 from hybrid_mpc.records import NUMBERS, plain, record
 from nn_export.files import parse_json
 
@@ -22,10 +26,19 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 
-# What a study's folder says of itself: ``study.json``, and the same in the table of its results.
-
-FILE = "study.json"
+NOUN = "study"
 SCHEMA_VERSION = 2
+RUNS = "runs"
+"""Folder of the log in that of its study."""
+RESULTS = "results.parquet"
+METADATA = b"hybrid_mpc.study"
+STATUS = ("done", "failed")
+MOST_LINE = 2**24
+"""Largest row [bytes]: a run's figures, or the traceback of one that failed."""
+SEGMENT_ROWS = 10_000
+"""Rows of one file: a study of a million runs has a hundred of them."""
+GROUP_ROWS = 20_000
+"""Rows that are in memory at a time."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +47,7 @@ class NoiseNote:
 
     Args:
         source: Where it is from, in words.
-        sigma_x: Standard deviations per period by contender.
+        sigma_x: Standard deviations per period by controller.
     """
 
     source: str
@@ -87,24 +100,17 @@ class StudyNote:
     schema_version: int = SCHEMA_VERSION
 
 
-def write_note(folder: Path, note: StudyNote) -> None:
-    """Write ``study.json``.
-
-    Raises:
-        StorageError: If it cannot be written.
-    """
-    write_document(folder / FILE, plain(note))
-
-
-def read_note(folder: Path) -> StudyNote:
+def study_note(folder: Path) -> StudyNote:
     """What a study's folder says of itself.
 
     Raises:
         InputError: If it is no folder of a study, damaged, or of another version.
     """
-    if not (folder / FILE).is_file():
+    if not (folder / f"{NOUN}.json").is_file():
         raise InputError(f"{folder} holds no study; give the folder that 'study run --out' made")
-    return note_of(read_document(folder / FILE), str(folder / FILE))
+    note = read_note(folder, NOUN)
+    del note["settings"]
+    return note_of(note, str(folder / f"{NOUN}.json"))
 
 
 def note_of(data: Mapping[str, Any], where: str) -> StudyNote:
@@ -121,13 +127,25 @@ def note_of(data: Mapping[str, Any], where: str) -> StudyNote:
     return record(StudyNote, data, where)
 
 
-# The rows of a study while it runs: appended durably, whole after a kill at any moment.
+@dataclass(frozen=True)
+class RunRow:
+    """The row of a run.
 
-STATUS = ("done", "failed")
-MOST_LINE = 2**24
-"""Largest row [bytes]: a run's figures, or the traceback of one that failed."""
-SEGMENT_ROWS = 10_000
-"""Rows of one file: a study of a million runs has a hundred of them."""
+    Args:
+        id: Name made of all that decides what the run computes.
+        status: ``"done"`` or ``"failed"``.
+        error: Traceback of one that failed.
+        columns: What the run was, and what it found.
+    """
+
+    id: str
+    status: str
+    error: str
+    columns: Mapping[str, Any]
+
+    def plain(self) -> dict[str, Any]:
+        """The row as one flat mapping: ``id``, its columns, ``status`` and ``error``."""
+        return {"id": self.id, **self.columns, "status": self.status, "error": self.error}
 
 
 class RunLog:
@@ -146,8 +164,8 @@ class RunLog:
         >>> import tempfile
         >>> folder = Path(tempfile.mkdtemp())
         >>> with RunLog(folder) as log:
-        ...     log.append([{"id": "a", "status": "done", "cost": cost} for cost in (0.1, float("inf"))])
-        >>> [row["cost"] for row in rows(folder)]
+        ...     log.append([RunRow("a", "done", "", {"cost": cost}) for cost in (0.1, float("inf"))])
+        >>> [row.columns["cost"] for row in rows(folder)]
         [0.1, inf]
     """
 
@@ -173,13 +191,13 @@ class RunLog:
         os.close(self._file)
         self._held.close()
 
-    def append(self, new: Iterable[Mapping[str, Any]]) -> None:
+    def append(self, new: Iterable[RunRow]) -> None:
         """Add rows; on return they are on the disk.
 
         Raises:
             InputError: If they cannot be written (a full disk); what was there before is unharmed.
         """
-        lines = [json.dumps(plain(row), separators=(",", ":")) + "\n" for row in new]
+        lines = [json.dumps(plain(row.plain()), separators=(",", ":")) + "\n" for row in new]
         if not lines:
             return
         if self._rows >= SEGMENT_ROWS:
@@ -211,7 +229,7 @@ def segments(folder: Path) -> list[Path]:
     return sorted(path for path in folder.glob("[0-9]*.jsonl") if path.is_file())
 
 
-def rows(folder: Path) -> Iterator[dict[str, Any]]:
+def rows(folder: Path) -> Iterator[RunRow]:
     """Rows of a log, in the order in which they were written; a torn last line is left out.
 
     Raises:
@@ -225,7 +243,7 @@ def rows(folder: Path) -> Iterator[dict[str, Any]]:
                 yield _parsed(line, path, number)
 
 
-def _parsed(line: bytes, path: Path, number: int) -> dict[str, Any]:
+def _parsed(line: bytes, path: Path, number: int) -> RunRow:
     try:
         if len(line) == MOST_LINE:
             raise ValueError(f"longer than {MOST_LINE} bytes")
@@ -236,10 +254,9 @@ def _parsed(line: bytes, path: Path, number: int) -> dict[str, Any]:
         raise InputError(
             f"{path}:{number} is damaged ({error}); delete this line, and --resume runs its run again"
         ) from error
-    return {
-        key: NUMBERS[value] if isinstance(value, str) and value in NUMBERS else value
-        for key, value in row.items()
-    }
+    name, status, why = (row.pop(key, "") for key in ("id", "status", "error"))
+    columns = {key: NUMBERS.get(v, v) if isinstance(v, str) else v for key, v in row.items()}
+    return RunRow(name, status, str(why), columns)
 
 
 def _repaired(path: Path) -> int:
@@ -252,12 +269,6 @@ def _repaired(path: Path) -> int:
     if whole < path.stat().st_size:
         os.truncate(path, whole)
     return count
-
-
-RESULTS = "results.parquet"
-METADATA = b"hybrid_mpc.study"
-GROUP_ROWS = 20_000
-"""Rows that are in memory at a time."""
 
 
 def compact(log: Path, path: Path, provenance: Mapping[str, Any]) -> None:
@@ -276,13 +287,13 @@ def compact(log: Path, path: Path, provenance: Mapping[str, Any]) -> None:
     last: dict[str, int] = {}
     kinds: dict[str, set[type]] = {}
     for i, row in enumerate(rows(log)):
-        last[row["id"]] = i
-        for key, value in row.items():
+        last[row.id] = i
+        for key, value in row.plain().items():
             kinds.setdefault(key, set()).add(type(value))
     schema = _schema(kinds).with_metadata({METADATA: json.dumps(plain(provenance)).encode()})
-    kept = (row for i, row in enumerate(rows(log)) if last[row["id"]] == i)
+    final = (row.plain() for i, row in enumerate(rows(log)) if last[row.id] == i)
     with replacing(path) as file, pq.ParquetWriter(file, schema, compression="zstd") as writer:
-        for group in _groups(kept, GROUP_ROWS):
+        while group := list(islice(final, GROUP_ROWS)):
             writer.write_table(_table(group, schema))
 
 
@@ -356,8 +367,3 @@ def _table(group: list[dict[str, Any]], schema: pa.Schema) -> pa.Table:
             values = [None if v is None else str(v) for v in values]
         columns.append(pa.array(values, type=column.type))
     return pa.Table.from_arrays(columns, schema=schema)
-
-
-def _groups(values: Iterator[dict[str, Any]], size: int) -> Iterator[list[dict[str, Any]]]:
-    while group := list(islice(values, size)):
-        yield group

@@ -1,4 +1,4 @@
-"""Report of a study: one HTML page in the look of the main job's."""
+"""Results of a study: a table with one row a run, means with intervals, paired differences, and the report."""
 
 from __future__ import annotations
 
@@ -15,28 +15,20 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.job.loops import interval
 from hybrid_mpc.job.study_log import (
     RESULTS,
+    RUNS,
     StudyNote,
     intact,
     note_of,
     provenance_of,
-    read_note,
     rows,
+    study_note,
 )
-from hybrid_mpc.records import known
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-from typing import TYPE_CHECKING
-
 from hybrid_mpc.plots.style import name_of, save
+from hybrid_mpc.records import known
 from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, write_report
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
-# Results of a study: a table with one row a run, means with intervals, paired differences.
 
 FACTORS = ("model", "task", "controller", "solver", "horizon", "monitor", "faults")
 PAIR = ("draw", "seed")
@@ -77,13 +69,13 @@ class StudyResults:
         import pyarrow.parquet as pq
 
         folder = Path(folder)
-        note = read_note(folder)
+        note = study_note(folder)
         if intact(folder / RESULTS):
             table = pq.read_table(folder / RESULTS).to_pandas()
             note = note_of(provenance_of(folder / RESULTS), str(folder / RESULTS))
         else:  # not written yet, or damaged: the log has every row
-            table = pd.DataFrame({row["id"]: row for row in rows(folder / "runs")}.values())
-        if "run" in table:  # they are kept in the order in which they ended
+            table = pd.DataFrame({row.id: row.plain() for row in rows(folder / RUNS)}.values())
+        if "run" in table:  # the order in which they ended
             table = table.sort_values("run", ignore_index=True)
         return cls(table, note, folder)
 
@@ -354,7 +346,7 @@ def _head(results: StudyResults) -> list[KeyFigure]:
 
 def _what(results: StudyResults) -> Section:
     study = results.note.study
-    defaults: tuple[Any, ...] = (None, [], [None], ["own"], [[]], {})
+    defaults: tuple[Any, ...] = (None, "", [], [None], ["own"], [[]], {})
     rows = [(key, _short(value)) for key, value in study.items() if value not in defaults]
     rows += [(f"model {k}: noise", m.noise.source) for k, m in results.note.models.items()]
     return Section("Configuration", (), (), [Table(("setting", "value"), rows)])

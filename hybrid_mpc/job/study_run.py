@@ -1,4 +1,4 @@
-"""Run a study: every run once, kept as it ends, whatever happens to the process or to its workers."""
+"""Run a study: every loop once, on the disk as it ends, whatever happens to the process or to its workers."""
 
 from __future__ import annotations
 
@@ -8,48 +8,139 @@ import socket
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import islice
 from pathlib import Path
 from threading import Lock
 from time import perf_counter, process_time
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import MOST_CONTENT, read_bytes, sha256
 from hybrid_mpc.job.context import Progress, Silent, versions
-from hybrid_mpc.job.control import ControlSettings, prepared
-from hybrid_mpc.job.controllers import CONTENDERS
+from hybrid_mpc.job.controllers import CONTROLLERS, ORACLES, find_noise
 from hybrid_mpc.job.engine import Engine, Lost, make_engine
-from hybrid_mpc.job.folder import JobNote, check_folder, open_folder
-from hybrid_mpc.job.loops import Bench, LoopSpec, check_faults, varied
+from hybrid_mpc.job.folder import JobNote, check_out, open_folder
+from hybrid_mpc.job.loops import (
+    Bench,
+    LoopSpec,
+    check_complete,
+    check_faults,
+    check_kit,
+    selected_tasks,
+    varied,
+)
 from hybrid_mpc.job.study import RandomFaults, Study
-from hybrid_mpc.job.study_log import FILE as NOTE
 from hybrid_mpc.job.study_log import (
+    NOUN,
     RESULTS,
+    RUNS,
     ModelNote,
     NoiseNote,
     RunLog,
+    RunRow,
     StudyNote,
     compact,
     intact,
-    read_note,
     rows,
-    write_note,
+    study_note,
 )
 from hybrid_mpc.job.study_results import StudyResults, duration_text
-from hybrid_mpc.kit.artifact import FILES, artifact_folder, load
+from hybrid_mpc.kit.artifact import FILES, Kit, artifact_folder, load
+from hybrid_mpc.kit.assembly import adaptable
 from hybrid_mpc.records import plain
 from hybrid_mpc.scenario import Scenario, load_scenario
 
-# What a study's runs need: the models and their noise, as workers get them.
-
 TIMING = "timing_"
 """Columns that begin so are durations and places: they differ between two runs, no other does."""
+BATCH_S = 0.5
+"""Runs shorter than this are handed to workers several at a time, so that handing over costs little."""
+BATCHES_A_SECOND = 50.0
+"""Batches of all workers together are this many at most: a dask scheduler and the log take a few ms for each."""
+BATCH_MOST = 500
+AHEAD = 2
+"""Batches a worker: one that it computes, and one that waits for it."""
+TRIES = 3
+"""How many workers may die of a run before it is given up."""
+THREADS = 1
+"""Of the numerical libraries in each process: runs are small, and as many processes as cores are side by side."""
+PROBE_PERIODS = 20
+"""Periods of each kind of run that a dry run times."""
+
+
+# The models of a study
+
+
+@dataclass(frozen=True)
+class StudyModel:
+    """A model that fits its study, with the noise of its filters.
+
+    Args:
+        folder: Artifact folder.
+        sha256: Hash of the folder's files.
+        kit: The loaded artifact.
+        noise_source: Where the process noise is from, in words.
+    """
+
+    folder: Path
+    sha256: str
+    kit: Kit
+    noise_source: str
+
+
+def load_models(study: Study, held: Mapping[str, NoiseNote] | None = None) -> dict[str, StudyModel]:
+    """Load and check everything that a study's loops need, before the first.
+
+    Args:
+        study: The study.
+        held: Process noise by label that is taken as it is. Default: the artifact's; where it holds none, it is
+            estimated on recordings that the scenario makes (budget quick, seed ``study.run_seed``).
+
+    Raises:
+        InputError: If the scenario has nothing to run, a folder holds no artifact or another machine's, or a task,
+            fault or parameter does not fit.
+    """
+    scenario = load_scenario(study.scenario)
+    check_complete(scenario)
+    selected_tasks(scenario, study.tasks)
+    _check_plant(scenario, study)
+    if scenario.oracle is None and (oracles := [c for c in study.controllers if c in ORACLES]):
+        raise InputError(f"scenario {scenario.name} has no oracle; leave controller {oracles[0]} out")
+    found = {}
+    for label, given in study.folders.items():
+        folder = artifact_folder(given)
+        kit = load(folder)
+        check_kit(scenario, kit, str(folder))
+        if "energy" in study.monitors and kit.calibration is None:
+            raise InputError(f"study: monitor energy: {folder} holds no calibration; take monitor own")
+        if "guard" in study.monitors:
+            kit.detector()
+        if study.guard == "adapt":
+            adaptable(kit.models["hybrid"], scenario.causes)
+        if held is None or label not in held:
+            noise, source = find_noise(scenario, kit, study.controllers, study.run_seed)
+        else:
+            noise, source = {k: np.array(v) for k, v in held[label].sigma_x.items()}, held[label].source
+        found[label] = StudyModel(folder, _digest(_files(folder)), kit.with_noise(noise), source)
+    return found
+
+
+def _check_plant(scenario: Scenario, study: Study) -> None:
+    """Refuse faults and parameters that the plant does not have."""
+    assert scenario.plant is not None
+    plant = varied(scenario.plant(), [(name, 1.0) for name, _ in study.spans])
+    sets = list(study.fault_sets)
+    if isinstance(study.random_faults, RandomFaults):
+        sets.append(study.random_faults.examples())
+    for faults in sets:
+        check_faults(replace(scenario, plant=lambda: plant), faults)
+
+
+# What workers get
 
 
 @dataclass(frozen=True)
@@ -60,7 +151,7 @@ class ModelInput:
         label: Its name in the study.
         folder: Artifact folder.
         digest: SHA-256 of the folder's files.
-        noise: Process noise by contender.
+        noise: Process noise by controller.
         files: Names and contents of the folder's files, for workers that do not see the folder. Default: none.
     """
 
@@ -71,6 +162,26 @@ class ModelInput:
     files: tuple[tuple[str, bytes], ...] = ()
 
 
+def load_inputs(
+    study: Study, held: Mapping[str, ModelNote] | None = None
+) -> tuple[LoopRunner, dict[str, ModelNote]]:
+    """What runs a study's loops, and notes of its models by label.
+
+    Args:
+        study: The study.
+        held: Notes of the models of a study that is resumed: their noise is taken. Default: none.
+
+    Raises:
+        InputError: As :func:`load_models`.
+    """
+    models, notes = [], {}
+    for label, m in load_models(study, {k: note.noise for k, note in (held or {}).items()}).items():
+        sigma = {c: tuple(m.kit.noise(c).tolist()) for c in study.controllers if not CONTROLLERS[c].truth}
+        models.append(ModelInput(label, str(m.folder.resolve()), m.sha256, tuple(sigma.items())))
+        notes[label] = ModelNote(m.sha256, plain(m.kit.provenance), NoiseNote(m.noise_source, sigma))
+    return LoopRunner(study.scenario, tuple(models)), notes
+
+
 @dataclass(frozen=True)
 class LoopRunner:
     """Runs a study's loops; it is sent to each worker once, which then keeps the models loaded.
@@ -79,17 +190,22 @@ class LoopRunner:
         scenario: Registered name or path of a user's file.
         models: The models.
 
-    Example: ``LoopRunner("golf_robot", models)(run)["cost"]``
+    Example: ``LoopRunner("golf_robot", models)(spec)["cost"]``
     """
 
     scenario: str
     models: tuple[ModelInput, ...]
 
     def __call__(self, spec: LoopSpec) -> dict[str, Any]:
-        """The loop's results: cost, errors, limits, figures of the task, alarms, and ``timing_...``."""
-        worker = _worker(self)
-        with worker.alone:
-            return worker.run(spec)
+        """The loop's columns: cost, errors, limits, figures of the task, alarms, and ``timing_...``."""
+        bench, alone = _bench(self)
+        with alone:
+            begin = perf_counter()
+            bench.parts(spec)
+            built = perf_counter()
+            row, _ = bench.run(spec)
+            times = {f"{TIMING}setup_s": built - begin, f"{TIMING}run_s": perf_counter() - built}
+            return row.columns() | {"hidden_units": bench.kits[spec.model].models["hybrid"].n_h} | times
 
     def with_files(self) -> LoopRunner:
         """The same with the models' files in it, for workers on other machines."""
@@ -98,105 +214,10 @@ class LoopRunner:
 
 
 @lru_cache(maxsize=1)
-def _worker(runner: LoopRunner) -> _Worker:
-    return _Worker(runner)
-
-
-class _Worker:
-    """The bench of a process; it serves one thread at a time."""
-
-    def __init__(self, runner: LoopRunner) -> None:
-        self.alone = Lock()
-        kits = {m.label: load(local_folder(m)).with_noise(dict(m.noise)) for m in runner.models}
-        self._bench = Bench(load_scenario(runner.scenario), kits)
-
-    def run(self, spec: LoopSpec) -> dict[str, Any]:
-        begin = perf_counter()
-        self._bench.parts(spec)
-        ready = perf_counter()
-        row, _ = self._bench.run(spec)
-        told = row.columns() | {"hidden_units": self._bench.kits[spec.model].models["hybrid"].n_h}
-        return told | {f"{TIMING}setup_s": ready - begin, f"{TIMING}run_s": perf_counter() - ready}
-
-
-def run_batch(run: Callable[[Any], Mapping[str, Any]], configs: Sequence[Any]) -> list[dict[str, Any]]:
-    """Rows of several runs; one that raises leaves its traceback in ``error``.
-
-    Args:
-        run: Makes the results of one configuration.
-        configs: Each with ``id`` and ``columns()``.
-    """
-    rows = []
-    for config in configs:
-        begin, cpu = perf_counter(), process_time()
-        try:
-            results: Mapping[str, Any] = {"status": "done", "error": "", **run(config)}
-        except Exception:  # the study goes on; the traceback is what there is to tell
-            results = {"status": "failed", "error": traceback.format_exc()}
-        total: dict[str, Any] = {
-            f"{TIMING}total_s": perf_counter() - begin,
-            f"{TIMING}cpu_s": process_time() - cpu,
-        }
-        total[f"{TIMING}process"] = f"{socket.gethostname()}:{os.getpid()}"
-        rows.append({"id": config.id, **config.columns(), **results, **total})
-    return rows
-
-
-def load_inputs(
-    study: Study, held: Mapping[str, ModelNote] | None = None
-) -> tuple[LoopRunner, dict[str, ModelNote]]:
-    """Load and check everything that the runs need, before the first.
-
-    Args:
-        study: The study.
-        held: Notes of the models of a study that is resumed: their noise is taken. Default: none.
-
-    Returns:
-        What runs the loops, and notes by label: the model's digest, its provenance, the noise and where it is from.
-
-    Raises:
-        InputError: If a model, task, fault or parameter does not fit the scenario.
-    """
-    scenario = load_scenario(study.scenario)
-    _check_plant(scenario, study)
-    models, notes = [], {}
-    settings = ControlSettings(tuple(study.tasks), study.contenders)
-    for label, folder in study.folders.items():
-        before = held[label].noise if held and label in held else None
-        known = None if before is None else {name: np.array(v) for name, v in before.sigma_x.items()}
-        job = prepared(scenario, folder, settings, known, named=study.scenario)
-        inner = artifact_folder(folder)
-        if "energy" in study.monitors and job.kit.calibration is None:
-            raise InputError(f"study: monitor energy: {inner} holds no calibration; take monitor own")
-        source = job.noise_source if before is None else before.source
-        sigma = {c: tuple(job.kit.noise(c).tolist()) for c in study.contenders if not CONTENDERS[c].truth}
-        digest = _digest(_files(inner))
-        models.append(ModelInput(label, str(inner.resolve()), digest, tuple(sigma.items())))
-        notes[label] = ModelNote(digest, plain(job.kit.provenance), NoiseNote(source, sigma))
-    return LoopRunner(study.scenario, tuple(models)), notes
-
-
-def _check_plant(scenario: Scenario, study: Study) -> None:
-    """Refuse faults and parameters that the plant does not have."""
-    if scenario.plant is None or scenario.control is None:
-        return  # prepared says what lacks
-    plant = varied(scenario.plant(), [(name, 1.0) for name, _ in study.spans])
-    sets: list[Any] = list(study.fault_sets)
-    if isinstance(study.random_faults, RandomFaults):
-        sets.append(study.random_faults.examples())
-    for faults in sets:
-        check_faults(replace(scenario, plant=lambda: plant), faults)
-
-
-def _files(folder: Path) -> tuple[tuple[str, bytes], ...]:
-    return tuple((name, read_bytes(folder / name, MOST_CONTENT)) for name in sorted(FILES))
-
-
-def _digest(files: Sequence[tuple[str, bytes]]) -> str:
-    whole = hashlib.sha256()
-    for name, content in files:
-        whole.update(f"{name}\0{len(content)}\0".encode() + content)
-    return whole.hexdigest()
+def _bench(runner: LoopRunner) -> tuple[Bench, Lock]:
+    """The bench of a process, and what lets one thread at a time to it."""
+    kits = {m.label: load(local_folder(m)).with_noise(dict(m.noise)) for m in runner.models}
+    return Bench(load_scenario(runner.scenario), kits), Lock()
 
 
 def local_folder(model: ModelInput) -> Path:
@@ -215,93 +236,18 @@ def local_folder(model: ModelInput) -> Path:
     return unpacked
 
 
-# What a study would take, found out by a few periods of each kind of run.
-
-PROBE_PERIODS = 20
-Kind = tuple[object, ...]
+def _files(folder: Path) -> tuple[tuple[str, bytes], ...]:
+    return tuple((name, read_bytes(folder / name, MOST_CONTENT)) for name in sorted(FILES))
 
 
-@dataclass(frozen=True)
-class Plan:
-    """What a study would take.
-
-    Args:
-        runs: Number of runs.
-        axes: How many of each thing.
-        seconds: Expected time of all runs on the given workers [s]; without starting processes.
-        kinds: By model, controller, solver and horizon: seconds a run, averaged over tasks.
-    """
-
-    runs: int
-    axes: dict[str, int]
-    seconds: float
-    kinds: dict[Kind, float]
+def _digest(files: Sequence[tuple[str, bytes]]) -> str:
+    whole = hashlib.sha256()
+    for name, content in files:
+        whole.update(f"{name}\0{len(content)}\0".encode() + content)
+    return whole.hexdigest()
 
 
-def dry_run(
-    study: Study,
-    *,
-    workers: int = 2,
-    say: Callable[[str], None] = lambda text: None,
-) -> Plan:
-    """Check a study as far as running it would, and expect its time from a few periods of each kind of run.
-
-    Args:
-        study: The study.
-        workers: Processes that it is to run in.
-        say: Told what is timed.
-
-    Raises:
-        InputError: As :func:`~hybrid_mpc.job.study_run.run_study`.
-
-    Example: ``dry_run(study, workers=2).seconds``
-    """
-    scenario = load_scenario(study.scenario)
-    run, _ = load_inputs(study)
-    dt, lengths = scenario.data.dt, {task.name: task.duration for task in scenario.tasks}
-    tasks = list(dict.fromkeys(r.task for r in _first_runs(study)))
-    period: dict[tuple[Kind, str], float] = {}
-    for first in _first_runs(study):
-        say(f"{first.controller}, {first.task}")
-        probe = replace(first, duration=PROBE_PERIODS * dt)
-        period[_kind(first), first.task] = run(probe)[f"{TIMING}run_s"] / PROBE_PERIODS
-    kinds: dict[Kind, float] = {}
-    for (kind, task), seconds in period.items():
-        periods = min(lengths[task], study.duration or lengths[task]) / dt
-        kinds[kind] = kinds.get(kind, 0.0) + seconds * periods / len(tasks)
-    each = study.size / len(kinds)
-    return Plan(study.size, study.axes, each * sum(kinds.values()) / workers, kinds)
-
-
-def _kind(run: LoopSpec) -> Kind:
-    return run.model, run.controller, run.solver, run.horizon
-
-
-def _first_runs(study: Study) -> list[LoopSpec]:
-    """One run of each kind and task."""
-    small = replace(study, draws=1, seeds=study.loop_seeds[:1], faults=study.fault_sets[:1])
-    kinds: dict[tuple[Kind, str], LoopSpec] = {}
-    for run in small.runs():
-        kinds.setdefault((_kind(run), run.task), run)
-    return list(kinds.values())
-
-
-RUNS = "runs"
-BATCH_S = 0.5
-"""Runs shorter than this are handed to workers several at a time, so that handing over costs little."""
-BATCHES_A_SECOND = 50.0
-"""Batches of all workers together are this many at most: a dask scheduler and the log take a few ms for each."""
-BATCH_MOST = 500
-AHEAD = 2
-"""Batches a worker: one that it computes, and one that waits for it."""
-TRIES = 3
-"""How many workers may die of a run before it is given up."""
-THREADS = 1
-"""Of the numerical libraries in each process: runs are small, and as many processes as cores are side by side."""
-Batch = tuple[Any, ...]
-"""Some configurations, run one after the other by one worker."""
-Rows = list[dict[str, Any]]
-"""Their results."""
+# The study
 
 
 def run_study(
@@ -318,7 +264,7 @@ def run_study(
 
     Finished runs are on the disk as they end; after a kill at any moment, Ctrl-C or a full disk ``resume=True`` runs
     what is missing. Results depend on nothing but the study: not on order, number of workers, or engine; only columns
-    that begin with ``timing_`` differ. A run that raises is kept with its traceback, and the others go on.
+    that begin with ``timing_`` differ. A run that raises leaves its traceback, and the others go on.
 
     Args:
         study: What to run.
@@ -339,29 +285,101 @@ def run_study(
         >>> results = run_study(Study("golf_robot", "runs/golf"), "studies/first")  # doctest: +SKIP
     """
     out, say = Path(out), progress or Silent()
-    check_folder(out, "study", NOTE, resume=resume)
+    check_out(out, NOUN, resume=resume)
     say.start("reading the models, and the filters' noise")
-    run, models = load_inputs(study, read_note(out).models if (out / NOTE).is_file() else None)
+    run, models = load_inputs(study, held_models(out))
     note = make_note(study.identity(), models, study.size)
     say.finish(f"{study.size} runs")
     if cluster is not None and isinstance(run, LoopRunner):  # its workers may not see the models' folders
         run = run.with_files()
     engine = make_engine(partial(run_batch, run), workers, cluster, threads=THREADS)
     try:
-        with open_folder(out, claim(note), resume=resume), RunLog(out / RUNS) as log:
+        with open_folder(out, job_note(note), resume=resume), RunLog(out / RUNS) as log:
             done = finished(out, retry_failed)
             say.start("running")
-            left = (config for config in study.runs() if config.id not in done)
+            left = (spec for spec in study.runs() if spec.id not in done)
             if study.size > len(done) or not intact(out / RESULTS):
                 (out / RESULTS).unlink(missing_ok=True)
-            told = execute(left, log, engine, say, study.size - len(done))
-            say.finish(told.text)
+            tally = execute(left, log, engine, say, study.size - len(done))
+            say.finish(tally.text)
             if not (out / RESULTS).is_file():
-                made = replace(read_note(out), engine=engine.name, workers_died=told.died)
+                made = replace(study_note(out), engine=engine.name, workers_died=tally.died)
                 compact(out / RUNS, out / RESULTS, plain(made))
     finally:
         engine.close()
     return StudyResults.load(out)
+
+
+def make_note(
+    study: Mapping[str, Any], models: Mapping[str, ModelNote], runs: int, kind: str = "loops"
+) -> StudyNote:
+    """What a study is made of.
+
+    Args:
+        study: Its settings as plain data, with its scenario.
+        models: Its models by label.
+        runs: Number of its runs.
+        kind: Kind of study. Default: closed loops of all combinations.
+    """
+    scenario, path = load_scenario(study["scenario"]), Path(study["scenario"])
+    content = sha256(path) if path.suffix == ".py" and path.is_file() else None
+    return StudyNote(
+        study, scenario.title, scenario.description, models, runs, versions(), kind, content
+    )  # fmt: skip
+
+
+def job_note(note: StudyNote) -> JobNote:
+    """What a study's folder says of it."""
+    models = {f"the content of model {label}": model.sha256 for label, model in note.models.items()}
+    settings = {key: value for key, value in note.study.items() if key != "name"}
+    settings |= models | {"the content of the scenario's file": note.scenario_sha256}
+    return JobNote(NOUN, settings, plain(note))
+
+
+def held_models(out: Path) -> Mapping[str, ModelNote] | None:
+    """Notes of the models of the study that a folder holds; None if it holds none yet."""
+    return study_note(out).models if (out / f"{NOUN}.json").is_file() else None
+
+
+def finished(out: Path, retry_failed: bool) -> set[str]:
+    """Ids of the runs that need not run."""
+    status = {row.id: row.status for row in rows(out / RUNS)}
+    return {id for id, how in status.items() if how == "done" or not retry_failed}
+
+
+# Batches of runs in an engine
+
+
+class Config(Protocol):
+    """What a run is made of, e.g. a :class:`~hybrid_mpc.job.loops.LoopSpec`."""
+
+    @property
+    def id(self) -> str:
+        """Name made of all that decides what it computes."""
+
+    def columns(self) -> dict[str, Any]:
+        """What says which run it is."""
+
+
+def run_batch(run: Callable[[Any], Mapping[str, Any]], configs: Sequence[Config]) -> list[RunRow]:
+    """Rows of several runs; one that raises leaves its traceback in ``error``.
+
+    Args:
+        run: Makes the columns of one configuration's results.
+        configs: The runs.
+    """
+    found = []
+    for config in configs:
+        begin, cpu = perf_counter(), process_time()
+        status, error, results = "done", "", {}
+        try:
+            results = dict(run(config))
+        except Exception:  # the study goes on; the traceback is what there is to report
+            status, error = "failed", traceback.format_exc()
+        times = {f"{TIMING}total_s": perf_counter() - begin, f"{TIMING}cpu_s": process_time() - cpu}
+        place = {f"{TIMING}process": f"{socket.gethostname()}:{os.getpid()}"}
+        found.append(RunRow(config.id, status, error, {**config.columns(), **results, **times, **place}))
+    return found
 
 
 @dataclass
@@ -385,8 +403,7 @@ class Tally:
     @property
     def text(self) -> str:
         """In words, with rate and remaining time."""
-        spent = max(time.monotonic() - self.begin, 1e-9)
-        rate = self.runs / spent
+        rate = self.runs / max(time.monotonic() - self.begin, 1e-9)
         words = [f"{rate:.3g} runs/s"]
         if 0 < self.runs < self.total:
             words.append(f"{duration_text((self.total - self.runs) / rate)} left")
@@ -398,25 +415,28 @@ class Tally:
 
 
 def execute(
-    configs: Iterable[Any], log: RunLog, engine: Engine[Batch, Rows], progress: Progress, total: int
+    configs: Iterable[Config],
+    log: RunLog,
+    engine: Engine[tuple[Config, ...], list[RunRow]],
+    progress: Progress,
+    total: int,
 ) -> Tally:
     """Run configurations in an engine and log their rows.
 
     At any time a few batches are under way; a row is logged before the next batch is asked for.
 
     Args:
-        configs: Each with ``id`` and ``columns()``; taken as they are needed.
+        configs: The runs; taken as they are needed.
         log: Where the rows go.
         engine: Where they are computed.
         progress: Where to report.
         total: How many there are, for the report.
     """
-    tally, waiting, pace = Tally(total, begin=time.monotonic()), iter(configs), _Pace(engine.workers)
-    suspects = _Suspects()
-    running = 0
+    tally, left, pace = Tally(total, begin=time.monotonic()), iter(configs), _Pace(engine.workers)
+    suspects, running = _Suspects(), 0
     while True:
         while batch := suspects.next(running) or (
-            _next_batch(waiting, pace) if running < AHEAD * engine.workers and not suspects.left else ()
+            tuple(islice(left, pace.size)) if running < AHEAD * engine.workers and not suspects.left else ()
         ):
             engine.submit(batch)
             running += 1
@@ -428,13 +448,13 @@ def execute(
         running -= 1
         batch, result = ended
         if isinstance(result, Lost):
-            result = suspects.judge(batch, result)
+            result = suspects.given_up(batch, result)
         suspects.alone = None
         log.append(result)
         pace.learn(result)
         tally.died = engine.died
         tally.runs += len(result)
-        tally.failed += sum(row["status"] == "failed" for row in result)
+        tally.failed += sum(row.status == "failed" for row in result)
         progress.update("runs", tally.runs, total, tally.text)
 
 
@@ -442,20 +462,20 @@ class _Suspects:
     """Runs whose worker died: they are begun again one at a time with nothing beside them, to find the culprit."""
 
     def __init__(self) -> None:
-        self.left: list[Any] = []
-        self.alone: Any = None
+        self.left: list[Config] = []
+        self.alone: Config | None = None
         self._tries: dict[str, int] = {}
 
-    def next(self, running: int) -> Batch:
+    def next(self, running: int) -> tuple[Config, ...]:
         """The next suspect once nothing else runs; empty if there is none, or something runs."""
         if running or not self.left:
             return ()
         self.alone = self.left.pop()
         return (self.alone,)
 
-    def judge(self, batch: Batch, lost: Lost) -> Rows:
+    def given_up(self, batch: Sequence[Config], lost: Lost) -> list[RunRow]:
         """Suspect the runs of a lost batch; rows of those that are given up."""
-        given_up = []
+        found = []
         for config in batch:
             alone = self.alone is not None and config.id == self.alone.id
             tries = self._tries[config.id] = self._tries.get(config.id, 0) + 1
@@ -463,8 +483,8 @@ class _Suspects:
                 self.left.append(config)
                 continue
             error = f"its worker died {tries} times ({lost}); out of memory, or a crash outside Python"
-            given_up.append({"id": config.id, **config.columns(), "status": "failed", "error": error})
-        return given_up
+            found.append(RunRow(config.id, "failed", error, config.columns()))
+        return found
 
 
 class _Pace:
@@ -473,70 +493,73 @@ class _Pace:
     def __init__(self, workers: int) -> None:
         self.size, self._aim = 1, max(BATCH_S, workers / BATCHES_A_SECOND)
 
-    def learn(self, done: Rows) -> None:
-        spent = sum(row.get(f"{TIMING}total_s", 0.0) for row in done)
+    def learn(self, done: Sequence[RunRow]) -> None:
+        spent = sum(row.columns.get(f"{TIMING}total_s", 0.0) for row in done)
         if done:
             wanted = int(self._aim * len(done) / max(spent, 1e-6))
             self.size = max(1, min(wanted, 2 * self.size, BATCH_MOST))
 
 
-def _next_batch(waiting: Iterator[Any], pace: _Pace) -> Batch:
-    """Some runs; empty where none is left."""
-    return tuple(islice(waiting, pace.size))
+# What a study would take
 
 
-def make_note(
-    study: Mapping[str, Any], models: Mapping[str, ModelNote], runs: int, kind: str = "loops"
-) -> StudyNote:
-    """What a study is made of.
+@dataclass(frozen=True)
+class RunKind:
+    """Runs that take about the same time a period.
 
     Args:
-        study: Its settings as plain data, with its scenario.
-        models: Its models by label.
-        runs: Number of its runs.
-        kind: Kind of study. Default: closed loops of all combinations.
+        model: Label of the model.
+        controller: Name of the controller.
+        solver: Its solver.
+        horizon: Periods; None for the task's own.
     """
-    scenario = load_scenario(study["scenario"])
-    return StudyNote(
-        study,
-        scenario.title,
-        scenario.description,
-        models,
-        runs,
-        versions(),
-        kind,
-        _content(study["scenario"]),
-    )
+
+    model: str
+    controller: str
+    solver: str
+    horizon: int | None
 
 
-def claim(note: StudyNote) -> JobNote:
-    """What a study's folder says of it.
+@dataclass(frozen=True)
+class Plan:
+    """What a study would take.
 
     Args:
-        note: What the study is made of.
+        runs: Number of runs.
+        axes: How many of each thing.
+        seconds: Expected time of all runs on the given workers [s]; without starting processes.
+        kinds: Seconds a run of each kind, averaged over tasks.
     """
-    return JobNote(
-        "study",
-        NOTE,
-        _identity(note),
-        lambda out: write_note(out, note),
-        lambda out: _identity(read_note(out)),
-    )
+
+    runs: int
+    axes: dict[str, int]
+    seconds: float
+    kinds: dict[RunKind, float]
 
 
-def _identity(note: StudyNote) -> dict[str, Any]:
-    models = {f"the content of model {label}": model.sha256 for label, model in note.models.items()}
-    settings = {key: value for key, value in note.study.items() if key != "name"}
-    return {**settings, **models, "the content of the scenario's file": note.scenario_sha256}
+def dry_run(study: Study, *, workers: int = 2, say: Callable[[str], None] = lambda text: None) -> Plan:
+    """Check a study as far as running it would, and expect its time from a few periods of each kind of run.
 
+    Args:
+        study: The study.
+        workers: Processes that it is to run in.
+        say: Called with what is timed.
 
-def _content(scenario: str) -> str | None:
-    """SHA-256 of a user's scenario file; None for a registered scenario."""
-    path = Path(scenario)
-    return sha256(path) if path.suffix == ".py" and path.is_file() else None
+    Raises:
+        InputError: As :func:`~hybrid_mpc.job.study_run.run_study`.
 
-
-def finished(out: Path, retry_failed: bool) -> set[str]:
-    """Ids of the runs that need not run."""
-    status = {row["id"]: row["status"] for row in rows(out / RUNS)}
-    return {id for id, how in status.items() if how == "done" or not retry_failed}
+    Example: ``dry_run(study, workers=2).seconds``
+    """
+    scenario = load_scenario(study.scenario)
+    run, _ = load_inputs(study)
+    dt, lengths = scenario.data.dt, {task.name: task.duration for task in scenario.tasks}
+    firsts: dict[tuple[RunKind, str], LoopSpec] = {}
+    for spec in replace(study, draws=1, seeds=study.loop_seeds[:1], faults=study.fault_sets[:1]).runs():
+        firsts.setdefault((RunKind(spec.model, spec.controller, spec.solver, spec.horizon), spec.task), spec)
+    tasks, kinds = {task for _, task in firsts}, dict[RunKind, float]()
+    for (kind, task), first in firsts.items():
+        say(f"{first.controller}, {task}")
+        period = run(replace(first, duration=PROBE_PERIODS * dt))[f"{TIMING}run_s"] / PROBE_PERIODS
+        periods = min(lengths[task], study.duration or lengths[task]) / dt
+        kinds[kind] = kinds.get(kind, 0.0) + period * periods / len(tasks)
+    return Plan(study.size, study.axes, study.size / len(kinds) * sum(kinds.values()) / workers, kinds)

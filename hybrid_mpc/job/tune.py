@@ -12,8 +12,8 @@ from hybrid_mpc.files import write_json, write_text
 from hybrid_mpc.identify.tune import SearchSpace
 from hybrid_mpc.job.check import check_scenario
 from hybrid_mpc.job.context import Context, Progress, Silent, versions
-from hybrid_mpc.job.folder import open_folder
-from hybrid_mpc.job.settings import RunSettings, claim
+from hybrid_mpc.job.folder import JobNote, open_folder
+from hybrid_mpc.job.settings import RunSettings
 from hybrid_mpc.job.stage import bring_up_to_date
 from hybrid_mpc.job.stages.identify import DATA, MODELS, PRIOR, check_data, training_settings
 from hybrid_mpc.report.page import Cell, Table
@@ -85,7 +85,7 @@ def run_tuning(
     context = Context(settings, load_scenario(settings.scenario), out, progress or Silent())
     check_scenario(context.scenario, context.budget)
     check_data(context)
-    with open_folder(out, claim(settings), resume=resume):
+    with open_folder(out, JobNote("run", settings.identity()), resume=resume):
         for stage in (DATA, PRIOR):
             context.progress.start(stage.title)
             context.progress.finish(bring_up_to_date(context, stage))

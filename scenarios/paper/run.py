@@ -20,8 +20,8 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_arrays, read_json, write_json, write_text
 from hybrid_mpc.job.context import Progress, Silent, versions
 from hybrid_mpc.job.engine import WORKERS, run_jobs
-from hybrid_mpc.job.folder import open_folder
-from hybrid_mpc.job.settings import check_device, claim
+from hybrid_mpc.job.folder import JobNote, open_folder
+from hybrid_mpc.job.settings import check_device
 from hybrid_mpc.scenario import Scenario, load_scenario
 from scenarios.paper.experiment import Effort, Experiment
 from scenarios.paper.jobs import RULE, Case, EvaluationSet, ensemble_job, fit_job, physics_job, sindy_job
@@ -77,7 +77,7 @@ def reproduce(
         settings, scenario, experiment, settings.effort(experiment), out, progress or Silent(), workers
     )
     check_device(settings.device)
-    with open_folder(out, claim(settings), resume=resume):
+    with open_folder(out, JobNote("run", settings.identity()), resume=resume):
         stages: tuple[tuple[str, Callable[[Work], None]], ...] = (
             ("recording the machine", record_stage),
             ("fitting the priors", fit_stage),

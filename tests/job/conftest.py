@@ -1,6 +1,7 @@
-"""A small machine of a user's own: the README's lines, and recordings of a pendulum that differs from them."""
+"""What jobs work on: a small machine of a user's own with its recordings, and the folder of a golf robot's run."""
 
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -71,3 +72,17 @@ def finished(arguments, tmp_path_factory) -> Path:
     assert "report.html" in done.stdout
     (out.parent / "told.txt").write_text(done.stdout)
     return out
+
+
+@pytest.fixture(scope="session")
+def run_folder(golf_artifact, tmp_path_factory) -> Path:
+    """A run's folder as far as loops look at it: an artifact with noise, and a calibration that alarms at once."""
+    from hybrid_mpc import Calibration, set_calibration, set_process_noise
+
+    folder = tmp_path_factory.mktemp("run")
+    model = shutil.copytree(golf_artifact, folder / "model")
+    names = ("prior", "prior_observer", "hybrid", "hybrid_observer", "oracle")
+    set_process_noise(model, dict.fromkeys(names, (1e-4, 2e-2)))
+    limits = {"residual_threshold": 1e9, "residual_release": 1e8}
+    set_calibration(model, Calibration(1e-9, 1e-10, 1.0, 10, 1.0, "for tests", **limits))
+    return folder

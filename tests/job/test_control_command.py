@@ -9,34 +9,25 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import (
+    Bench,
     Calibration,
     Detector,
     InputError,
-    Provenance,
+    Study,
     load_scenario,
     set_calibration,
     set_process_noise,
 )
-from hybrid_mpc.job.control import ControlSettings, parsed_fault, prepared, selected_tasks
-from hybrid_mpc.kit.artifact import read_description, write_description
+from hybrid_mpc.job.loops import parsed_fault, selected_tasks
+from hybrid_mpc.job.study_run import load_models
 from hybrid_mpc.records import record
 
 GOLF = load_scenario("golf_robot")
-SIGMA = {name: [1e-4, 2e-2] for name in ("prior", "prior_observer", "hybrid", "hybrid_observer", "oracle")}
 MINE = """
 import dataclasses
 from scenarios.golf_robot import scenario as golf
 scenario = dataclasses.replace(golf, {change})
 """
-
-
-@pytest.fixture(scope="module")
-def run_folder(golf_artifact, tmp_path_factory):
-    """A run's folder as far as the command looks at it."""
-    folder = tmp_path_factory.mktemp("run")
-    shutil.copytree(golf_artifact, folder / "model")
-    set_process_noise(folder / "model", SIGMA)
-    return folder
 
 
 @pytest.fixture
@@ -83,18 +74,39 @@ def test_loops_of_two_controllers(call, run_folder, tmp_path):
     assert repeated["summary"] == results["summary"]
 
 
-def test_ctrl_c_says_that_nothing_is_kept(call, run_folder, tmp_path, monkeypatch):
-    from hybrid_mpc.job import control as control_results
+def test_ctrl_c_loses_no_finished_loop(call, run_folder, tmp_path, monkeypatch):
+    out, real, begun = tmp_path / "loops", Bench.run, []
 
-    def stopped(*given):
-        raise KeyboardInterrupt
+    def stopped(self, spec, **more):
+        begun.append(spec.seed)
+        if len(begun) == 2:
+            raise KeyboardInterrupt
+        return real(self, spec, **more)
 
-    monkeypatch.setattr(control_results, "run_loops", stopped)
-    code, _, told = call("golf_robot", "--model", run_folder, "--out", tmp_path / "stopped")
-    assert code == 130
-    assert "nothing to resume" in told
-    assert "--resume" not in told  # which is an option of run alone
-    assert not (tmp_path / "stopped").exists()
+    words = [
+        "golf_robot",
+        "--model",
+        run_folder,
+        "--out",
+        out,
+        "--task",
+        "stroke_1.4",
+        "--controller",
+        "prior",
+    ]
+    words += ["--seeds", 2, "--no-gif"]
+    monkeypatch.setattr(Bench, "run", stopped)
+    code, _, error = call(*words)
+    assert (code, "--resume" in error) == (130, True)
+    code, _, error = call(*words)
+    assert (code, "already holds a control" in error) == (2, True)
+    code, _, error = call(*words[:-2], 3, "--no-gif", "--resume")
+    assert (code, "seeds differ" in error) == (2, True)
+    assert call(*words, "--resume")[0] == 0
+    assert begun == [0, 1, 1]
+    results = json.loads((out / "results.json").read_text())
+    assert [row["seed"] for row in results["loops"]] == [0, 1]
+    assert results["step_ms"]["prior"]["median"] > 0
 
 
 def test_a_fault_from_the_command_line_acts(call, run_folder, tmp_path):
@@ -143,9 +155,9 @@ def test_a_guarded_loop_lets_go_of_a_frozen_sensor(call, run_folder, tmp_path):
         (["--guard", "--controller", "prior"], ["controller prior has another model", "hybrid_observer"]),
         (["--adapt", "--controller", "prior"], ["controller prior has another model", "hybrid_observer"]),
         (["--task", "golf"], ["no task 'golf'", "track_sine", "stroke_1.4"]),
-        (["--controller", "pid"], ["no controller pid", "hybrid_observer"]),
+        (["--controller", "pid"], ["no controller 'pid'", "hybrid_observer"]),
         (["--solver", "newton"], ["no solver 'newton'", "rti, sqp, ipopt"]),
-        (["--controller", "oracle", "--solver", "sqp"], ["oracle", "--solver"]),
+        (["--controller", "oracle", "--solver", "sqp"], ["oracle", "solver of its own"]),
         (["--fault", "fire=1"], ["'fire'", "measurement_offset"]),
         (["--fault", "plant_fire=1@1"], ["plant_fire", "plant_friction"]),
         (["--fault", "input_gain=lots"], ["input_gain=lots", "TARGET=VALUE@START:END"]),
@@ -182,15 +194,6 @@ def test_bad_models(call, run_folder, tmp_path):
     assert not (tmp_path / "o").exists()
 
 
-def test_a_model_of_another_machine(call, run_folder, tmp_path):
-    folder = tmp_path / "model"
-    shutil.copytree(run_folder / "model", folder)
-    write_description(folder, replace(read_description(folder), provenance=Provenance("torque_pendulum")))
-    code, _, error = call("golf_robot", "--model", folder, "--out", tmp_path / "o")
-    assert code == 2
-    assert "made for scenario torque_pendulum, not for golf_robot" in error
-
-
 @pytest.mark.parametrize(
     ("change", "told"),
     [("plant=None", "has no plant"), ("control=None", "has no control problem"), ("tasks=()", "has no task"),
@@ -207,7 +210,7 @@ def test_scenarios_without_what_is_needed(call, golf_artifact, tmp_path, change,
 
 def test_noise_that_does_not_fit(call, run_folder, tmp_path):
     folder = shutil.copytree(run_folder / "model", tmp_path / "model")
-    set_process_noise(folder, {**SIGMA, "prior_observer": [1e-3]})
+    set_process_noise(folder, {"prior_observer": [1e-3], "hybrid_observer": [1e-4, 2e-2]})
     code, _, error = call("golf_robot", "--model", folder, "--out", tmp_path / "o")
     assert (code, "must be 2 numbers" in error) == (2, True)
 
@@ -216,7 +219,7 @@ def test_the_folder_must_be_empty(call, run_folder, tmp_path):
     (tmp_path / "mine.txt").write_text("keep")
     code, _, error = call("golf_robot", "--model", run_folder, "--out", tmp_path)
     assert code == 2
-    assert "no empty folder" in error
+    assert "something else than a control" in error
     assert (tmp_path / "mine.txt").read_text() == "keep"
 
 
@@ -236,16 +239,6 @@ def test_names_and_beginnings_of_tasks():
         names("")
 
 
-@pytest.mark.parametrize("solver", ["sqp", "ipopt"])
-def test_solver_is_the_one_asked_for(run_folder, solver):
-    settings = ControlSettings(("stroke_1.4",), ("hybrid",), solver, 1)
-    job = prepared(GOLF, run_folder, settings)
-    _, safe = job.bench.parts(job.spec(job.tasks[0], "hybrid", 0))
-    assert type(safe.controller).__name__.lower().startswith(solver)
-    assert safe.controller.ocp.horizon == 80  # the task's own problem
-    assert safe.controller.model.n_h == 8
-
-
 def test_faults_as_text():
     fault = parsed_fault("measurement_freeze@1")
     assert (fault.target, fault.value, fault.start, fault.end) == ("measurement_freeze", 0.0, 1.0, np.inf)
@@ -255,10 +248,11 @@ def test_faults_as_text():
 
 @pytest.mark.full
 def test_noise_is_estimated_where_there_is_no_run(golf_artifact):
-    settings = ControlSettings(("track_sine",), ("prior",), seeds=1)
-    job = prepared(GOLF, golf_artifact, settings)
-    assert "recordings of the simulated machine" in job.noise_source
-    angle, speed = job.kit.noise("prior")
+    model = load_models(Study("golf_robot", golf_artifact, tasks=["track_sine"], controllers=["prior"]))[
+        "model"
+    ]
+    assert "recordings of the simulated machine" in model.noise_source
+    angle, speed = model.kit.noise("prior")
     # The rig accelerates by some rad/s^2 otherwise than the nominal prior: some 1e-2 rad/s within 20 ms.
     assert 1e-6 < angle < 5e-3
     assert 1e-3 < speed < 0.2

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import Kit, LoopSettings, Provenance, find_noise, load_scenario
-from hybrid_mpc.job import controllers as contenders
+from hybrid_mpc.job import controllers
 from scenarios.golf_robot import scenario
 
 OWN = {"prior": np.array([1e-3, 2e-2]), "hybrid": np.array([4e-4, 3e-2])}
@@ -16,9 +16,9 @@ OWN = {"prior": np.array([1e-3, 2e-2]), "hybrid": np.array([4e-4, 3e-2])}
 @pytest.fixture
 def noise(monkeypatch):
     """``noise_of`` on models that are known by their one-period errors alone."""
-    monkeypatch.setattr(contenders, "process_noise", lambda model, recordings: OWN[model])
+    monkeypatch.setattr(controllers, "process_noise", lambda model, recordings: OWN[model])
     monkeypatch.setattr(
-        contenders,
+        controllers,
         "tuned_noise",
         lambda model, scenario, base, recordings, observer: (2 if observer else 1) * base,
     )
@@ -26,7 +26,7 @@ def noise(monkeypatch):
 
     def found(beyond):
         machine = replace(scenario, oracle=None, beyond_recordings=beyond)
-        return contenders.noise_of(machine, artifact, [])
+        return controllers.noise_of(machine, artifact, [])
 
     return found
 

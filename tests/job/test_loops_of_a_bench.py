@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybrid_mpc import Bench, InputError, LoopSpec, Provenance, load, load_scenario
+from hybrid_mpc import Bench, Fault, InputError, LoopSpec, Provenance, load, load_scenario
+from hybrid_mpc.job.loops import read_rows, run_loops, write_rows
 
 GOLF = load_scenario("golf_robot")
 SPEC = LoopSpec("golf_robot", "mine", "track_sine", "hybrid_observer", duration=0.1)
@@ -38,9 +39,18 @@ def test_what_is_built_serves_again(bench):
         ({"solver": "newton"}, "no solver 'newton'"),
         ({"monitor": "energi"}, "did you mean 'energy'"),
         ({"guard": "run"}, "no guard 'run'"),
+        ({"seed": -1}, "whole numbers from 0 on, got -1"),
+        ({"seed": 1.5}, "whole numbers"),
+        ({"duration": float("nan")}, "positive number of seconds needed, got nan"),
+        ({"keep": ("xx",)}, "no array to keep 'xx'"),
+        ({"faults": ("plant_friction=2@1",)}, "faults is a tuple of Fault, got .*parsed_fault"),
+        ({"drawn_faults": Fault(0.0, 1.0, "input_gain", 0.5)}, "drawn_faults is a tuple of Fault"),
+        ({"guard": "rest", "monitor": "own"}, "a guard acts on alarms"),
+        ({"guard": "rest", "monitor": "none"}, "a guard acts on alarms"),
+        ({"guard": "rest", "controller": "prior_observer"}, "a guard acts on alarms"),
     ],
 )
-def test_names_are_checked_where_they_are_given(change, told):
+def test_a_specification_is_checked_where_it_is_given(change, told):
     with pytest.raises(InputError, match=told):
         replace(SPEC, **change)
 
@@ -63,33 +73,36 @@ def test_another_machine_s_model_is_refused(kit):
         Bench(GOLF, {"mine": replace(kit, models={"hybrid": kit.models["hybrid"]})})
     with pytest.raises(InputError, match="has no plant"):
         Bench(replace(GOLF, plant=None), {})
+    with pytest.raises(InputError, match="a Scenario is needed, got 'golf_robot'; give load_scenario"):
+        Bench("golf_robot", {"mine": kit})
+    with pytest.raises(InputError, match=r"kits by label are needed, got a Kit; give .*hm\.load"):
+        Bench(GOLF, kit)
+    with pytest.raises(InputError, match=r"kit 'mine' is a str; load it: hm\.load"):
+        Bench(GOLF, {"mine": "runs/mine"})
+
+
+def test_rows_come_back_from_a_file_with_their_arrays(bench, tmp_path):
+    specs, reports = [replace(SPEC, seed=seed, keep=("plans", "u")) for seed in (0, 1)], []
+    rows = list(run_loops(bench, specs, lambda *given: reports.append(given)))
+    assert reports[0] == (0, 10, "hybrid_observer, seed 0")
+    assert reports[-1] == (10, 10, "")
+    path = tmp_path / "loops" / "a.json"
+    assert read_rows(path, "mine") is None
+    write_rows(path, rows, "mine")
+    found = read_rows(path, "mine")
+    assert found == rows
+    for one, other in zip(found, rows, strict=True):
+        assert one.arrays.keys() == other.arrays.keys() == {"plans", "u"}
+        assert all(np.array_equal(one.arrays[name], other.arrays[name]) for name in one.arrays)
+    assert read_rows(path, "another's") is None
+    path.write_text(path.read_text().replace('"seed": 1', '"seed": 2'))
+    with pytest.raises(InputError, match=r"damaged.*delete it, and its loops run again"):
+        read_rows(path, "mine")
 
 
 def test_a_guard_brings_its_monitor():
     assert LoopSpec("golf_robot", "mine", "track_sine", "hybrid_observer", guard="rest").monitor == "guard"
     assert LoopSpec("golf_robot", "mine", "track_sine", "hybrid_observer").monitor == "own"
-    for change in ({"monitor": "own"}, {"monitor": "none"}, {"controller": "prior_observer"}):
-        with pytest.raises(InputError, match="a guard acts on alarms"):
-            LoopSpec(
-                "golf_robot",
-                "mine",
-                "track_sine",
-                **{"controller": "hybrid_observer", "guard": "rest", **change},
-            )
-
-
-@pytest.mark.parametrize(
-    ("change", "told"),
-    [
-        ({"seed": -1}, "whole numbers from 0 on, got -1"),
-        ({"seed": 1.5}, "whole numbers"),
-        ({"duration": float("nan")}, "positive number of seconds needed, got nan"),
-        ({"keep": ("xx",)}, "no array to keep 'xx'"),
-    ],
-)
-def test_numbers_are_checked_where_they_are_given(change, told):
-    with pytest.raises(InputError, match=told):
-        replace(SPEC, **change)
 
 
 def test_a_loop_of_another_scenario_is_refused(bench):

@@ -1,4 +1,4 @@
-"""The ready study ``monitor``: its loops, its bookkeeping, what it makes of rows."""
+"""The study ``monitor``: its loops, its bookkeeping, what it makes of rows."""
 
 import json
 import sys

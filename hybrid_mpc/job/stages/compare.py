@@ -1,4 +1,4 @@
-"""The closed loops of a run: every task under every contender, several seeds each."""
+"""The closed loops of a run: every task under every controller, several seeds each."""
 
 from __future__ import annotations
 
@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import digest, read_document, read_document_arrays, write_document
 from hybrid_mpc.job.context import Context
-from hybrid_mpc.job.controllers import CONTENDERS, ORACLES
+from hybrid_mpc.job.controllers import CONTROLLERS, ORACLES
 from hybrid_mpc.job.engine import WORKERS, run_jobs
-from hybrid_mpc.job.loops import MODEL, Bench, LoopRow, LoopSpec, tasks_of
+from hybrid_mpc.job.loops import MODEL, Bench, LoopRow, LoopSpec, run_loops, tasks_of
 from hybrid_mpc.job.stage import UNKNOWN, Absent, Stage, source_of
 from hybrid_mpc.job.stages.export import EXPORT, NOISE, observed
 from hybrid_mpc.kit.artifact import LoopSettings, load, loop_settings, read_description, write_description
 from hybrid_mpc.loop.loop import Loop
-from hybrid_mpc.loop.simulate import Step
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import Budget, Scenario, Task, load_scenario
 
@@ -37,18 +36,18 @@ Array = NDArray[np.float64]
 TIMED_PERIODS = 1000
 """Periods timed on recordings, where there is no plant; enough for a 99th percentile."""
 TIMED = ("prior_observer", "hybrid_observer")
-"""Contenders whose first seed runs alone on the machine, so that the durations of its steps count."""
+"""Controllers whose first seed runs alone on the machine, so that the durations of its steps count."""
 SHOWN = ("t", "x", "u", "reference")
 """What is kept of the first seed, to be drawn."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """Loops that run and are kept together: one task under one contender.
+    """Loops that run and are kept together: one task under one controller.
 
     Args:
         task: The task.
-        controller: The contender.
+        controller: The controller.
         seeds: Numbers of the loops.
         timed: Whether it runs alone on the machine, so that the durations of its steps count.
     """
@@ -80,7 +79,7 @@ def parts_of(scenario: Scenario, budget: Budget) -> list[Part]:
     tasks, parts = tasks_of(scenario, budget.tasks), []
     for task in tasks:
         parts += [Part(task, name, (0,), timed=True) for name in TIMED]
-    for name in reversed(list(CONTENDERS)):
+    for name in reversed(list(CONTROLLERS)):
         seeds = range(1 if name in TIMED else 0, _seeds(name, scenario, budget.seeds, budget.oracle_seeds))
         together = 1 if name in ORACLES else max(1, len(seeds))
         for task in tasks:
@@ -208,18 +207,8 @@ def run_specs(
         specs: The loops.
         report: Called with ``(done, total, text)`` as the loops go on.
     """
-    bench, rows = _bench(scenario, folder, (folder / "model.json").stat().st_mtime_ns), []
-    dt = bench.kits[MODEL].models["prior"].dt
-    lengths = [round(bench.task(spec).duration / dt) for spec in specs]
-    for i, spec in enumerate(specs):
-        before = sum(lengths[:i])
-
-        def on_step(step: Step, before: int = before) -> None:
-            if step.k % 50 == 0:
-                report(before + step.k, sum(lengths), "periods")
-
-        rows.append(bench.run(spec, on_step=on_step)[0])
-    return rows
+    bench = _bench(scenario, folder, (folder / "model.json").stat().st_mtime_ns)
+    return list(run_loops(bench, specs, report))
 
 
 @lru_cache(maxsize=1)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.consistency import Consistency, consistency
 from hybrid_mpc.job.context import Context
-from hybrid_mpc.job.controllers import CONTENDERS
+from hybrid_mpc.job.controllers import CONTROLLERS
 from hybrid_mpc.job.stage import Absent, Stage
 from hybrid_mpc.job.stages.export import EXPORT, NOISE, observed
 from hybrid_mpc.job.stages.identify import DATA
@@ -85,7 +85,7 @@ def estimation_stage(context: Context) -> EstimationResult | Absent:
     arrays: dict[str, Array] = {}
     for i, name in enumerate(OBSERVERS):
         context.progress.update("observers", i, len(OBSERVERS), name)
-        estimator = kit.observer(CONTENDERS[name].model, load=CONTENDERS[name].observer)
+        estimator = kit.observer(CONTROLLERS[name].model, load=CONTROLLERS[name].observer)
         try:
             tested = consistency(estimator, parts)
         except InputError as too_short:

@@ -34,7 +34,7 @@ from hybrid_mpc.scenario import Budget, Scenario, Task
 
 # Nominal loops that the energy guard is learned from: the tasks, over and over, under the hybrid MPC.
 
-CONTENDER = "hybrid_observer"
+CONTROLLER = "hybrid_observer"
 """The controller that the guard is for."""
 BLOCKS = 9
 """Whole blocks (of five of the machine's seconds) in a loop. Four such loops carry two false alarms an hour, eight
@@ -100,7 +100,7 @@ def nominal_loops(
         )
         found.append(
             LoopSpec(
-                named or scenario.name, MODEL, task.name, CONTENDER, monitor="readings", seed=seed, duration=seconds,
+                named or scenario.name, MODEL, task.name, CONTROLLER, monitor="readings", seed=seed, duration=seconds,
                 faults=() if friction == 1.0 else (drift,), run_seed=run_seed, rounds=tuple(shares.tolist()),
                 keep=("numbers", "y", "u"),
             )
@@ -232,7 +232,7 @@ def faulted(
     for case in cases(scenario):
         fault = Fault(start, math.inf, case.target, case.value)
         spec = LoopSpec(
-            named, MODEL, task.name, CONTENDER, monitor="guard", guard="rest", seed=SEED, run_seed=run_seed,
+            named, MODEL, task.name, CONTROLLER, monitor="guard", guard="rest", seed=SEED, run_seed=run_seed,
             faults=(fault,),
         )  # fmt: skip
         row, result = bench.run(spec, monitor=monitor)

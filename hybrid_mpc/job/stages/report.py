@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from hybrid_mpc.files import write_json
 from hybrid_mpc.job.context import Context
-from hybrid_mpc.job.controllers import CONTENDERS
+from hybrid_mpc.job.controllers import CONTROLLERS
 from hybrid_mpc.job.loops import Summary
 from hybrid_mpc.job.stage import Stage, source_of
 from hybrid_mpc.job.stages.analyze import ANALYSIS
@@ -655,7 +655,7 @@ def _control_table(control: Control) -> Table | None:
     details = control.details
     if details is None:
         return None
-    names = [n for n in CONTENDERS if any(n in cells for cells in details.tasks.values())]
+    names = [n for n in CONTROLLERS if any(n in cells for cells in details.tasks.values())]
     rows = [
         (task, *(_cost(cells.get(name)) for name in names), _gap(details.gap_closed_by_task[task]))
         for task, cells in details.tasks.items()

@@ -32,7 +32,6 @@ from hybrid_mpc.records import plain, record
 
 Array = NDArray[np.float64]
 SCHEMA_VERSION = 4
-CONTROLLERS = ("prior", "hybrid", "oracle")
 ENERGY = "energy [W]"
 """Name of the only balance that there is so far, with the unit of its rate."""
 BASELINES = ("prior", "prior_observer")

@@ -1,4 +1,4 @@
-"""What the ready study ``monitor`` consists of: nominal loops to learn from and judge on, faulted, guarded."""
+"""What the study ``monitor`` consists of: nominal loops to learn from and judge on, faulted, guarded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Run the ready study ``monitor``: learn, then judge; resumable, with a report."""
+"""Run the study ``monitor``: learn, then judge; resumable, with a report."""
 
 from __future__ import annotations
 
@@ -12,18 +12,16 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_json, write_json
 from hybrid_mpc.job.context import Progress, Silent
 from hybrid_mpc.job.engine import Engine, make_engine
-from hybrid_mpc.job.folder import check_folder, open_folder
+from hybrid_mpc.job.folder import check_out, open_folder
 from hybrid_mpc.job.study import Study
-from hybrid_mpc.job.study_log import FILE as NOTE
-from hybrid_mpc.job.study_log import RunLog, read_note, rows
+from hybrid_mpc.job.study_log import NOUN, RUNS, RunLog, RunRow, rows, study_note
 from hybrid_mpc.job.study_run import (
-    RUNS,
     THREADS,
-    Batch,
-    Rows,
-    claim,
+    Config,
     execute,
     finished,
+    held_models,
+    job_note,
     load_inputs,
     make_note,
     run_batch,
@@ -74,11 +72,11 @@ def run_monitor_study(
         >>> results = run_monitor_study(monitor_study("runs/golf"), "studies/monitor")  # doctest: +SKIP
     """
     out, say = Path(out), progress or Silent()
-    check_folder(out, "study", NOTE, resume=resume)
+    check_out(out, NOUN, resume=resume)
     say.start("reading the model, and the filters' noise")
-    stored = read_note(out).models if (out / NOTE).is_file() else None
     loops, models = load_inputs(
-        Study(study.scenario, study.model, tasks=(study.task,), controllers=(PRIOR, CONTROLLER)), stored
+        Study(study.scenario, study.model, tasks=(study.task,), controllers=(PRIOR, CONTROLLER)),
+        held_models(out),
     )
     (model,) = loops.models
     note = make_note(study.identity(), models, study.size, KIND)
@@ -90,7 +88,7 @@ def run_monitor_study(
     engine = make_engine(partial(run_batch, run), workers, threads=THREADS)
     try:
         jobs = list(study.jobs())
-        with open_folder(out, claim(note), resume=resume), RunLog(out / RUNS) as log:
+        with open_folder(out, job_note(note), resume=resume), RunLog(out / RUNS) as log:
             todo = _Todo(out, log, engine, say, finished(out, retry_failed))
             first = [job for job in jobs if job.kind == LEARN]
             todo.run("nominal loops to learn from", first)
@@ -112,8 +110,8 @@ def finish(out: Path) -> dict[str, Any]:
     Raises:
         InputError: If nothing has been learned yet.
     """
-    note = read_note(out)
-    done = {row["id"]: row for row in rows(out / RUNS)}
+    note = study_note(out)
+    done = {row.id: row.plain() for row in rows(out / RUNS)}
     judges = record(Judges, read_json(out / JUDGES), str(out / JUDGES))
     results = monitor_results(note.study, judges, list(done.values()))
     write_json(out / RESULTS, results)
@@ -125,7 +123,12 @@ class _Todo:
     """What is left of a study, run in its engine."""
 
     def __init__(
-        self, out: Path, log: RunLog, engine: Engine[Batch, Rows], say: Progress, done: set[str]
+        self,
+        out: Path,
+        log: RunLog,
+        engine: Engine[tuple[Config, ...], list[RunRow]],
+        say: Progress,
+        done: set[str],
     ) -> None:
         self._out, self._log, self._engine, self._say, self._done = out, log, engine, say, done
 
@@ -138,11 +141,11 @@ class _Todo:
 
 
 def _learn(study: MonitorStudy, out: Path, jobs: list[MonitorJob], artifact: Kit) -> None:
-    failed = [row for row in rows(out / RUNS) if row["kind"] == LEARN and row["status"] == "failed"]
+    failed = [row for row in rows(out / RUNS) if row.columns["kind"] == LEARN and row.status == "failed"]
     paths = [out / LEARNING / f"{job.id}.npz" for job in jobs]
     if failed and not all(path.is_file() for path in paths):
         raise InputError(
-            f"{out}: a nominal loop to learn from has failed: {failed[-1]['error'].strip().splitlines()[-1]}; "
+            f"{out}: a nominal loop to learn from has failed: {failed[-1].error.strip().splitlines()[-1]}; "
             "--resume --retry-failed runs it again"
         )
     write_json(out / JUDGES, learn(study, paths, artifact))

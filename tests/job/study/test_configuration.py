@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import Fault, FaultKind, InputError, LoopSpec, RandomFaults, Study, varied
-from hybrid_mpc.job.controllers import CONTENDERS
-from hybrid_mpc.job.study import READY, generator, read_study, ready_study
+from hybrid_mpc.job.controllers import CONTROLLERS
+from hybrid_mpc.job.study import built_in_studies, built_in_study, generator, read_study
 from scenarios.golf_robot.rig import Rig
 from scenarios.pendulum.plant import DampedPendulum
 
@@ -94,15 +94,6 @@ def test_random_faults_stay_in_their_ranges():
     assert any(late for _, late in drawn)
 
 
-def test_estimators_choose_the_contender():
-    study = make(controllers=["prior", "hybrid"], estimators=["plain", "observer"])
-    assert study.contenders == ("prior", "prior_observer", "hybrid", "hybrid_observer")
-    assert make(controllers=["prior", "prior_observer"], estimators=["observer"]).contenders == (
-        "prior_observer",
-    )
-    assert make(controllers=["oracle"], estimators=["truth"]).contenders == ("oracle_state",)
-
-
 def test_plants_are_varied():
     rig = varied(Rig(), [("m", 1.1), ("mu_c", 0.9)])
     assert rig.parameters.m == Rig().parameters.m * 1.1
@@ -122,7 +113,6 @@ def test_plants_are_varied():
     [
         ({"controllers": ["hybird"]}, "did you mean 'hybrid'"),
         ({"solvers": ["ipop"]}, "did you mean 'ipopt'"),
-        ({"estimators": ["observe"]}, "did you mean 'observer'"),
         ({"monitors": ["energie"]}, "did you mean 'energy'"),
         ({"faults": ["input_gian=0.8"]}, "input_gain"),
         ({"faults": ["input_gain=much"]}, "TARGET=VALUE@START:END"),
@@ -142,7 +132,6 @@ def test_plants_are_varied():
         ({"duration": -1.0}, "positive"),
         ({"controllers": ["oracle"], "solvers": ["rti", "sqp"]}, "solver of its own"),
         ({"controllers": ["oracle"], "vary": {"m": 0.2}}, "as it is built"),
-        ({"controllers": ["hybrid"], "estimators": ["truth"]}, "impossible"),
         ({"controllers": ["prior"], "monitors": ["energy"]}, "calibrated for the hybrid"),
         ({"random_faults": {"kinds": [], "at_once": [1, 1]}}, "0 kinds"),
         ({"random_faults": {"kind": []}}, "did you mean 'kinds'"),
@@ -201,15 +190,15 @@ def test_bad_files(tmp_path, text, told):
         read_study(tmp_path / "none.yaml")
 
 
-@pytest.mark.parametrize("name", READY)
-def test_ready_studies_expand(name):
-    study = ready_study(name, {"z16": "runs/a", "z32": "runs/b"})
+@pytest.mark.parametrize("name", built_in_studies())
+def test_built_in_studies_expand(name):
+    study = built_in_study(name, {"z16": "runs/a", "z32": "runs/b"})
     runs = list(study.runs())
     assert len(runs) == study.size
     assert study.name == name
-    assert {run.controller for run in runs} <= set(CONTENDERS)
+    assert {run.controller for run in runs} <= set(CONTROLLERS)
     if name == "faults_1000":
-        assert ready_study(name, "runs/a").size == 1000
+        assert built_in_study(name, "runs/a").size == 1000
         assert all(run.drawn_faults or run.late for run in runs)
     with pytest.raises(InputError, match="did you mean 'faults_1000'"):
-        ready_study("fault_1000", "runs/a")
+        built_in_study("fault_1000", "runs/a")

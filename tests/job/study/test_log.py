@@ -8,11 +8,12 @@ import pytest
 
 from hybrid_mpc import InputError
 from hybrid_mpc.job import study_log as log_module
-from hybrid_mpc.job.study_log import RunLog, compact, provenance_of, rows, segments
+from hybrid_mpc.job.study_log import RunLog, RunRow, compact, provenance_of, rows, segments
 
 
 def row(i, **more):
-    return {"id": f"{i:04}", "cost": 0.1 * i, "status": "done", **more}
+    status, error = more.pop("status", "done"), more.pop("error", "")
+    return RunRow(f"{i:04}", status, error, {"cost": 0.1 * i, **more})
 
 
 def test_floats_come_back_bit_by_bit(tmp_path):
@@ -20,7 +21,7 @@ def test_floats_come_back_bit_by_bit(tmp_path):
     with RunLog(tmp_path) as log:
         log.append([row(i, value=v) for i, v in enumerate(values)])
         log.append([])
-    assert [r["value"] for r in rows(tmp_path)] == values
+    assert [r.columns["value"] for r in rows(tmp_path)] == values
 
 
 def test_segments_are_rolled(tmp_path, monkeypatch):
@@ -39,10 +40,10 @@ def test_a_torn_line_is_cut_off(tmp_path, cut):
         log.append([row(i) for i in range(3)])
     (path,) = segments(tmp_path)
     path.write_bytes(path.read_bytes()[:-cut])
-    assert [r["id"] for r in rows(tmp_path)] == ["0000", "0001"]
+    assert [r.id for r in rows(tmp_path)] == ["0000", "0001"]
     with RunLog(tmp_path) as log:
         log.append([row(9)])
-    assert [r["id"] for r in rows(tmp_path)] == ["0000", "0001", "0009"]
+    assert [r.id for r in rows(tmp_path)] == ["0000", "0001", "0009"]
 
 
 def test_damage_within_is_named(tmp_path):
@@ -76,10 +77,10 @@ def test_a_full_disk_leaves_whole_rows(tmp_path, monkeypatch, written):
     with pytest.raises(InputError, match=r"No space left on device.*--resume"):
         log.append([row(2), row(3)])
     monkeypatch.undo()
-    assert [r["id"] for r in rows(tmp_path)] == ["0001"]
+    assert [r.id for r in rows(tmp_path)] == ["0001"]
     log.append([row(4)])  # there is room again
     log.close()
-    assert [r["id"] for r in rows(tmp_path)] == ["0001", "0004"]
+    assert [r.id for r in rows(tmp_path)] == ["0001", "0004"]
 
 
 def test_parquet_has_the_last_row_of_a_run_and_the_provenance(tmp_path):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import (
-    Calibration,
+    Bench,
     FaultKind,
     InputError,
     Provenance,
@@ -16,39 +16,16 @@ from hybrid_mpc import (
     dry_run,
     load_scenario,
     run_study,
-    set_calibration,
     set_process_noise,
 )
 from hybrid_mpc.job.context import Silent
-from hybrid_mpc.job.control import ControlSettings, prepared, run_loops
-from hybrid_mpc.job.study_run import TIMING, load_inputs
+from hybrid_mpc.job.loops import run_loops
+from hybrid_mpc.job.study_run import TIMING, load_inputs, load_models
 from hybrid_mpc.kit.artifact import read_description, write_description
 
 GOLF = load_scenario("golf_robot")
-SIGMA = {name: [1e-4, 2e-2] for name in ("prior", "prior_observer", "hybrid", "hybrid_observer", "oracle")}
+SIGMA = dict.fromkeys(("prior", "hybrid"), (1e-3, 1e-1))
 SHORT = 0.3  # s: 15 periods
-
-
-@pytest.fixture(scope="module")
-def run_folder(golf_artifact, tmp_path_factory):
-    """A run's folder as far as studies look at it, with a calibration."""
-    folder = tmp_path_factory.mktemp("run")
-    shutil.copytree(golf_artifact, folder / "model")
-    set_process_noise(folder / "model", SIGMA)
-    set_calibration(
-        folder / "model",
-        Calibration(
-            1e-9,
-            1e-10,
-            1.0,
-            10,
-            1.0,
-            "for tests: alarms at once",
-            residual_threshold=1e9,
-            residual_release=1e8,
-        ),
-    )
-    return folder
 
 
 def row_of(folder, **fields):
@@ -64,19 +41,16 @@ def untimed(row):
     return {key: value for key, value in row.items() if not key.startswith(TIMING)}
 
 
-def test_a_run_is_what_control_runs(run_folder):
-    settings = ControlSettings(("stroke_4",), ("prior", "hybrid_observer"), "sqp", seeds=2, faults=())
-    short = replace(GOLF, tasks=tuple(replace(t, duration=SHORT, figures=None) for t in GOLF.tasks))
-    job = prepared(short, run_folder, settings)
-    costs = {(row.controller, row.seed): r.cost for row, r in run_loops(job, lambda *told: None)}
+def test_a_run_is_a_loop_on_a_bench(run_folder):
     study = Study(
         "golf_robot", run_folder, tasks=["stroke_4"], controllers=["prior", "hybrid_observer"], solvers=["sqp"],
         seeds=2, duration=SHORT,
     )  # fmt: skip
     run, _ = load_inputs(study)
-    for config in study.runs():
-        assert run(config)["cost"] == costs[config.controller, config.seed]  # bit by bit
-    assert len(costs) == 4
+    specs = list(study.runs())
+    alone = run_loops(Bench(GOLF, {"model": load_models(study)["model"].kit}), specs)
+    assert [run(spec)["cost"] for spec in specs] == [row.cost for row in alone]  # bit by bit
+    assert len(specs) == 4
 
 
 def test_what_a_study_adds_acts(run_folder):
@@ -158,7 +132,7 @@ def test_a_resumed_study_keeps_its_noise(run_folder, tmp_path):
     again = run_study(study, tmp_path / "s", workers=1, resume=True)
     assert again.note.models["model"].noise == first.note.models["model"].noise
     assert again.table.equals(first.table)
-    set_process_noise(moved / "model", {name: [1e-3, 1e-1] for name in SIGMA})  # another one is another model
+    set_process_noise(moved / "model", SIGMA)  # another one is another model
     with pytest.raises(InputError, match="content of model model differ"):
         run_study(study, tmp_path / "s", workers=1, resume=True)
 

@@ -5,8 +5,7 @@ from functools import partial
 import pytest
 import trivial_runs
 
-from hybrid_mpc.job import study_run as runner
-from hybrid_mpc.job.study import READY
+from hybrid_mpc.job.study import built_in_studies
 
 YAML = "scenario: golf_robot\nmodels: nowhere\ntasks: [track_sine]\ncontrollers: [prior, hybrid]\nseeds: 6\n"
 
@@ -61,22 +60,10 @@ def test_a_run_that_raises_makes_the_exit_code(call, config, here, tmp_path):
     assert "ZeroDivisionError" in told
 
 
-def test_ctrl_c_says_how_to_go_on(call, config, here, monkeypatch, tmp_path):
-    here(steps)
-
-    def stopped(*given):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(runner, "execute", stopped)
-    code, _, error = call("run", config, "--out", tmp_path / "s")
-    assert code == 130
-    assert "--resume" in error
-
-
 def test_list(call):
     code, told, _ = call("list")
     assert code == 0
-    for name in READY:
+    for name in built_in_studies():
         assert name in told
     assert "1000 runs" in told
 

@@ -15,15 +15,16 @@ import pytest
 import trivial_runs
 
 from hybrid_mpc import InputError, StudyResults, run_study
+from hybrid_mpc.files import read_document, write_document
 from hybrid_mpc.job import study_run as runner
-from hybrid_mpc.job.study_log import RunLog, read_note, rows, write_note
+from hybrid_mpc.job.study_log import RunLog, RunRow, rows
 
 ROOT, TESTS = (Path(__file__).parents[i] for i in (3, 2))  # the root first: tests/ has a folder nn_export
 RUNS = 150
 
 
 def values(folder):
-    return {row["id"]: row["cost"] for row in rows(folder / "runs")}
+    return {row.id: row.columns["cost"] for row in rows(folder / "runs")}
 
 
 def test_all_runs_and_their_table(here, tmp_path):
@@ -74,7 +75,7 @@ def test_short_runs_are_handed_over_together(here, tmp_path, monkeypatch):
 def test_batches_grow_with_the_workers(workers, size):
     pace = runner._Pace(workers)
     for _ in range(9):  # runs of 0.1 s: half a second a batch, or 2 s where 100 workers ask for 50 a second
-        pace.learn([{"timing_total_s": 0.1}] * pace.size)
+        pace.learn([RunRow("a", "done", "", {"timing_total_s": 0.1})] * pace.size)
     assert pace.size == pytest.approx(size, abs=1)  # whole runs
 
 
@@ -83,8 +84,9 @@ def test_the_folder_of_another_study(here, tmp_path):
     run_study(trivial_runs.study(3), tmp_path / "s")
     with pytest.raises(InputError, match=r"holds a study with other settings \(seeds differ\)"):
         run_study(trivial_runs.study(4), tmp_path / "s", resume=True)
-    note = read_note(tmp_path / "s")
-    write_note(tmp_path / "s", replace(note, models={"model": replace(note.models["model"], sha256="1")}))
+    path = tmp_path / "s" / "study.json"
+    note = read_document(path)
+    write_document(path, note | {"settings": note["settings"] | {"the content of model model": "1"}})
     with pytest.raises(InputError, match="content of model model"):
         run_study(trivial_runs.study(3), tmp_path / "s", resume=True)
     machine = tmp_path / "machine.py"
@@ -130,26 +132,6 @@ def test_a_full_disk_stops_the_study_and_it_goes_on_later(here, tmp_path, monkey
     assert len(list(rows(tmp_path / "s" / "runs"))) == 40
 
 
-def test_ctrl_c_keeps_what_is_finished(here, tmp_path, monkeypatch):
-    here(trivial_runs.trivial)
-    real, calls = trivial_runs.Here.next, []
-
-    def stopped(self, timeout):
-        calls.append(1)
-        if len(calls) == 4:
-            raise KeyboardInterrupt
-        return real(self, timeout)
-
-    monkeypatch.setattr(trivial_runs.Here, "next", stopped)
-    with pytest.raises(KeyboardInterrupt):
-        run_study(trivial_runs.study(40), tmp_path / "s")
-    before = values(tmp_path / "s")
-    assert 0 < len(before) < 40
-    results = run_study(trivial_runs.study(40), tmp_path / "s", resume=True)
-    assert len(results.table) == 40
-    assert len(list(rows(tmp_path / "s" / "runs"))) == 40
-
-
 def begun(folder, run="noted", runs=RUNS, **environment):
     """A study in a process group of its own."""
     words = [sys.executable, str(TESTS / "trivial_runs.py"), str(folder), run, str(runs)]
@@ -184,7 +166,7 @@ def killed_and_resumed(tmp_path, kills, seed):
     for _ in range(kills):
         kept = set()
         if (folder / "study.json").is_file():
-            kept = {row["id"] for row in rows(folder / "runs")}
+            kept = {row.id for row in rows(folder / "runs")}
             executed.write_text("")
         process = begun(folder, EXECUTED=str(executed))
         goal = rng.choice([None, 0, 1, RUNS // 10, RUNS // 4])
@@ -198,11 +180,11 @@ def killed_and_resumed(tmp_path, kills, seed):
         process.communicate()
         again = set(executed.read_text().split()) if executed.is_file() else set()
         assert not again & kept, "a finished run ran again"
-        assert kept <= {row["id"] for row in rows(folder / "runs")}, "a finished run was lost"
+        assert kept <= {row.id for row in rows(folder / "runs")}, "a finished run was lost"
     process = begun(folder, EXECUTED=str(executed))
     told, error = process.communicate(timeout=300)
     assert "finished" in told, error
-    ids = [row["id"] for row in rows(folder / "runs")]
+    ids = [row.id for row in rows(folder / "runs")]
     assert sorted(ids) == sorted(run.id for run in trivial_runs.study(RUNS).runs())
     expected = {run.id: trivial_runs.trivial(run)["cost"] for run in trivial_runs.study(RUNS).runs()}
     assert values(folder) == expected
@@ -222,20 +204,24 @@ def test_killed_many_times(tmp_path):
 def test_ctrl_c_ends_the_workers_and_resumes(tmp_path):
     process = begun(tmp_path / "s", "slow", 60)
     wait_for(lambda: count(tmp_path / "s") > 4, process)
-    pids = {int(row["timing_pid"]) for row in rows(tmp_path / "s" / "runs")}
+    pids = {int(row.columns["timing_pid"]) for row in rows(tmp_path / "s" / "runs")}
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: the workers get it too
     _, error = process.communicate(timeout=60)
     assert "KeyboardInterrupt" in error
     assert not any(alive(pid) for pid in pids)
-    kept = len(list(rows(tmp_path / "s" / "runs")))
-    assert 4 < kept < 60
+    kept = values(tmp_path / "s")
+    assert 4 < len(kept) < 60
+    process = begun(tmp_path / "s", "slow", 60)
+    assert "finished" in process.communicate(timeout=300)[0]
+    assert count(tmp_path / "s") == 60  # none ran twice
+    assert kept.items() <= values(tmp_path / "s").items()
 
 
 @pytest.mark.full
 def test_workers_end_with_a_parent_that_was_killed(tmp_path):
     process = begun(tmp_path / "s", "slow", 400)
     wait_for(lambda: count(tmp_path / "s") > 4, process)
-    pids = {int(row["timing_pid"]) for row in rows(tmp_path / "s" / "runs")}
+    pids = {int(row.columns["timing_pid"]) for row in rows(tmp_path / "s" / "runs")}
     process.kill()
     process.communicate()
     end = time.monotonic() + 60.0  # they look once a second

@@ -10,7 +10,7 @@ from closed_loop_parts import loop_row
 
 from hybrid_mpc import InputError, RunSettings, Signal, load_scenario, set_process_noise
 from hybrid_mpc.job.context import Context
-from hybrid_mpc.job.controllers import CONTENDERS, ORACLES
+from hybrid_mpc.job.controllers import CONTROLLERS, ORACLES
 from hybrid_mpc.job.loops import by_task, interval, limits_used, summaries, tasks_of
 from hybrid_mpc.job.stages.compare import TIMED, _seeds, compare, parts_of
 from hybrid_mpc.job.stages.results import gap_closed
@@ -131,18 +131,18 @@ def test_parts_are_every_loop_once_and_the_timed_ones_come_first():
     budget = GOLF.budgets["full"]
     parts = parts_of(GOLF, budget)
     loops = [(p.task.name, p.controller, seed) for p in parts for seed in p.seeds]
-    per_task = sum(_seeds(n, GOLF, budget.seeds, budget.oracle_seeds) for n in CONTENDERS)
+    per_task = sum(_seeds(n, GOLF, budget.seeds, budget.oracle_seeds) for n in CONTROLLERS)
     assert len(loops) == len(set(loops)) == per_task * len(GOLF.tasks)
     assert len({p.stage for p in parts}) == len(parts)
     assert [p.timed for p in parts] == sorted((p.timed for p in parts), reverse=True)
     assert all(len(p.seeds) == 1 for p in parts if p.controller in ORACLES)  # a kill loses one slow loop
 
 
-def test_every_contender_runs_and_oracles_less_often():
-    assert [_seeds(n, GOLF, 10, 2) for n in CONTENDERS] == [10, 10, 10, 10, 2, 1]
-    assert [_seeds(n, GOLF, 10, 10) for n in CONTENDERS] == [10, 10, 10, 10, 10, 1]
-    assert set(ORACLES) < set(CONTENDERS)
-    assert len({(c.model, c.observer, c.truth) for c in CONTENDERS.values()}) == len(CONTENDERS)
+def test_every_controller_runs_and_oracles_less_often():
+    assert [_seeds(n, GOLF, 10, 2) for n in CONTROLLERS] == [10, 10, 10, 10, 2, 1]
+    assert [_seeds(n, GOLF, 10, 10) for n in CONTROLLERS] == [10, 10, 10, 10, 10, 1]
+    assert set(ORACLES) < set(CONTROLLERS)
+    assert len({(c.model, c.observer, c.truth) for c in CONTROLLERS.values()}) == len(CONTROLLERS)
 
 
 SHORT = """
@@ -161,13 +161,13 @@ def test_a_comparison_that_was_killed_goes_on_from_what_it_kept(golf_artifact, t
     shutil.copytree(golf_artifact, out / "model")
     scenario = load_scenario(str(file))
     context = Context(RunSettings(str(file)), scenario, out)
-    set_process_noise(out / "model", {name: np.array([1e-4, 1e-2]) for name in CONTENDERS})
+    set_process_noise(out / "model", {name: np.array([1e-4, 1e-2]) for name in CONTROLLERS})
     rows = compare(context)
     assert [(r.controller, r.seed) for r in rows] == [
-        (name, seed) for name in sorted(set(CONTENDERS) - set(ORACLES)) for seed in (0, 1)
+        (name, seed) for name in sorted(set(CONTROLLERS) - set(ORACLES)) for seed in (0, 1)
     ]
     kept = sorted((out / "checkpoints" / "loops").glob("*.json"))
-    assert len(kept) == 6  # two timed loops, what is left of their contenders, and two contenders whole
+    assert len(kept) == 6  # two timed loops, what is left of their controllers, and two controllers whole
     for lost in kept[1::3]:  # as a kill in between leaves them: arrays perhaps, but no JSON
         lost.unlink()
     stamps = {path: path.stat().st_mtime_ns for path in kept if path.exists()}
@@ -182,7 +182,7 @@ def test_a_comparison_that_was_killed_goes_on_from_what_it_kept(golf_artifact, t
                 np.testing.assert_array_equal(one.arrays[key], other.arrays[key])
     assert all(path.is_file() for path in kept)
     assert stamps == {path: path.stat().st_mtime_ns for path in stamps}
-    set_process_noise(out / "model", {name: np.array([1e-4, 2e-2]) for name in CONTENDERS})
+    set_process_noise(out / "model", {name: np.array([1e-4, 2e-2]) for name in CONTROLLERS})
     other = compare(context)  # loops of another filter: none of those that are kept
     assert [r.controller for r in other] == [r.controller for r in rows]
     assert all(a.cost != b.cost for a, b in zip(other, rows, strict=True))
