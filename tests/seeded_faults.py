@@ -5,8 +5,8 @@ it before and after a change of the tests. What they caught before, they must ca
 
 It copies the repository into a temporary folder, puts one fault into the copy, and runs the tests of that fault there.
 A fault is *caught* where a test fails, *MISSED* where all pass. It is *broken* where the tool cannot say: the text to
-be replaced is not there exactly once, no test is selected, or the tests fail without any fault. A fault that is missed
-or broken makes the exit code 1.
+be replaced is not there exactly once, no test is selected, the tests fail without any fault, or a module with the fault
+cannot be imported. A fault that is missed or broken makes the exit code 1.
 
     python tests/seeded_faults.py                      all of them, about a quarter of an hour
     python tests/seeded_faults.py --room control       those of one room
@@ -346,7 +346,9 @@ class Copy:
             path.write_text(text)
         if code == PASSED:
             return "MISSED", f"all pass: pytest {' '.join(seeded.tests)}"
-        return ("caught", failed) if code == FAILED else ("broken", f"pytest ends with {code}")
+        if code != FAILED or "::" not in failed:  # a module that cannot be imported
+            return "broken", f"pytest ends with {code} before any test: {failed}"
+        return "caught", failed
 
     def _run(self, tests: Sequence[str]) -> tuple[int, str]:
         """Exit code of pytest, and the test that failed.
@@ -360,7 +362,7 @@ class Copy:
                 words, cwd=self.root, env=environment, capture_output=True, text=True, timeout=LONGEST_S
             )
         except subprocess.TimeoutExpired:
-            return FAILED, f"no end within {LONGEST_S:g} s"
+            return FAILED, f"no end within {LONGEST_S:g} s :: {' '.join(tests)}"
         lines = [line for line in done.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
         return done.returncode, lines[0].split(" ")[1] if lines else ""
 
