@@ -80,6 +80,12 @@ def test_a_frozen_sensor_takes_precedence_and_the_dwell_is_kept():
     assert names[3][1] == "NORMAL"
 
 
+def test_a_frozen_sensor_is_trusted_again_after_the_quiet_time():
+    result = guarded(backup(dwell=0.1, quiet=0.2), Told(frozen=[(10, 12)]))
+    # the last reading is that of period 11; ten periods of quiet, and the period after
+    assert [(round(s.t / DT), s.after) for s in result.switches] == [(11, Mode.REST), (22, Mode.NORMAL)]
+
+
 def test_a_flickering_alarm_does_not_flicker_through():
     result = guarded(backup(dwell=0.1, quiet=0.2), Told([(k, k + 1) for k in range(10, 40, 4)]))
     assert len(result.switches) == 2

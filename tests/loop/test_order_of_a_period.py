@@ -156,6 +156,26 @@ def test_the_input_that_acted_is_believed(model):
     )  # of the 5 that the limits of 6 promise and the actuator does not give
 
 
+def test_the_monitor_is_told_the_input_that_acted(model, safe):
+    told = []
+
+    class Noting(Told):
+        def update(self, state, y, u_prev, estimate):
+            told.append(u_prev.copy())
+            return super().update(state, y, u_prev, estimate)
+
+    loop, rig = make_loop(model, safe, monitor=Noting()), Rig()
+    u, wanted, acted = loop.start(rig.measure()), [], []
+    for _ in range(5):
+        wanted.append(u)
+        acted.append(np.clip(u, -0.1, 0.1))
+        rig.actuate(acted[-1])
+        u = loop.step(rig.measure(), applied=acted[-1])
+    loop.finish()
+    assert not np.array_equal(acted, wanted)
+    np.testing.assert_array_equal(told[1:], acted)  # the first is what acts before any sample
+
+
 def test_manual_and_back_without_bump_or_wind_up(model):
     """An operator holds the pendulum for long; automatic then goes on from his input, at rest."""
     safe, ocp_du = make_safe(model, horizon=10, du_max=0.5), 0.5
