@@ -72,18 +72,18 @@ class Verdict:
 
 
 FOLDERS = {
-    "machine": "tests/identification",
+    "machine": "tests/identify",
     "data": "tests/data",
-    "identify": "tests/identification",
+    "identify": "tests/identify",
     "model": "tests",
-    "estimate": "tests/estimation",
-    "control": "tests/mpc",
-    "loop": "tests/closed_loop",
+    "estimate": "tests/estimate",
+    "control": "tests/control",
+    "loop": "tests/loop",
     "monitor": "tests/monitor",
-    "analyze": "tests/analysis",
+    "analyze": "tests/analyze",
     "job": "tests/job",
-    "pipeline": "tests/pipeline",
-    "studies": "tests/studies",
+    "pipeline": "tests/job",
+    "studies": "tests/job/study",
     "fuzz": "tests/fuzz",
     "golden": "tests/golden",
 }
