@@ -16,7 +16,7 @@ from parts import arguments, report
 
 from hybrid_mpc import Trajectory
 from hybrid_mpc.identify.dataset import cut_windows
-from hybrid_mpc.identify.fit import STAGES, cut_segments, multiple_shooting
+from hybrid_mpc.identify.fit import cut_segments, multiple_shooting
 from hybrid_mpc.identify.residuals import ParameterFit
 from scenarios.pendulum.data import run
 from scenarios.pendulum.plant import DampedPendulum
@@ -43,16 +43,9 @@ def methods(fit: ParameterFit, runs: list[Trajectory]):
         cut = cut_windows(runs, 0, n, max(1, n // overlap))
         return cut.take(torch.linspace(0, len(cut) - 1, min(48, len(cut))).round().long())
 
-    def staged(start):
-        jacobian: object = None
-        for length, evaluations in STAGES:
-            start, jacobian = fit.output_error(start, windows(min(length, 4.9)), evaluations)
-        return start, jacobian
-
     return {
         "equation error": lambda s: fit.output_error(s, windows(DT, 1), 40),
         "free runs of 0.5 s": lambda s: fit.output_error(s, windows(0.5), 20),
-        "free runs of 0.5, 2, 4.9 s": staged,
         "multiple shooting 0.5 s": lambda s: multiple_shooting(fit, s, cut_segments(runs, 50)),
     }
 
