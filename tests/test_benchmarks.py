@@ -36,8 +36,9 @@ def test_solvers_find_the_same_plan(tmp_path):
     found = rows(tmp_path / "out.json", "rivals", "--z 4 --n 6 --rounds 1")
     assert len(found) >= 9
     assert all(row["solved"] == 1.0 for row in found)
+    converged = [row["cost"] for row in found if row["solver"] != "rti"]  # that takes one iteration
     # L-BFGS stops at 1e-6 of its scaled gradient; a cost of the order of 1 is flat there
-    assert max(row["cost"] for row in found) - min(row["cost"] for row in found) < 1e-5
+    assert max(converged) - min(converged) < 1e-5
 
 
 @pytest.mark.full
