@@ -1,56 +1,44 @@
-"""Processor time of one update of the energy monitor: ``python benchmarks/monitor_step.py --model DIR [--rounds 7]``.
+"""Processor time of an update of the energy monitor: ``python benchmarks/monitor_step.py [--model DIR] [--rounds 7]``.
 
-The hybrid of an artifact along 6 s of a sinusoid of 0.6 rad (a quarter of it near rest, where the residual's dead band
-asks for two accelerations more), for the main job's monitor and the guard's; both take turns. Median and largest of
-the rounds' means, and what the CasADi function alone takes of it [us]. With a network of 32 units.
+A hybrid along 6 s of a sinusoid of 0.6 rad (a quarter of it near rest, where the residual's dead band asks for more
+accelerations), for the main job's monitor and the guard's, by turns: median and largest of the rounds' means, and
+their ratio to the CasADi function alone [us]. Without ``--model`` a network of 32 random units.
 """
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
-import argparse
-import json
-from dataclasses import dataclass
 from pathlib import Path
 from time import process_time
 
 import numpy as np
+from parts import arguments, deployed, estimate, hybrid_step, report
 
 from hybrid_mpc import Detector, guard_monitor, load, make_monitor
 
 SAMPLES = 300
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """State and hidden state of a sample."""
-
-    x: np.ndarray
-    h: np.ndarray
-
-
 def samples(model):
     """Measurements, inputs and estimates of the sinusoid."""
-    t = model.dt * np.arange(SAMPLES)
-    phase = 2 * np.pi * 0.5 * t
+    phase = 2 * np.pi * 0.5 * model.dt * np.arange(SAMPLES)
     x = np.column_stack([0.6 * np.sin(phase), 0.6 * np.pi * np.cos(phase)])
     u = 0.3 * np.sin(phase + 0.5)[:, None]
-    return list(zip(x[:, :1].copy(), u, [Estimate(row, np.zeros(model.n_h)) for row in x], strict=True))
+    return [
+        (row[:1].copy(), held, estimate(model, row, np.zeros(model.n_h)))
+        for row, held in zip(x, u, strict=True)
+    ]
 
 
 def update_time(monitor, rows) -> float:
     """Mean processor time [us] of an update."""
     state = monitor.initial()
     begin = process_time()
-    for y, u, estimate in rows:
-        state, _ = monitor.update(state, y, u, estimate)
+    for y, u, e in rows:
+        state, _ = monitor.update(state, y, u, e)
     return 1e6 * (process_time() - begin) / len(rows)
 
 
-def evaluation_time(monitor) -> float:
+def casadi_time(monitor) -> float:
     """Mean processor time [us] of the CasADi function at its last arguments."""
     begin = process_time()
     for _ in range(SAMPLES):
@@ -58,8 +46,13 @@ def evaluation_time(monitor) -> float:
     return 1e6 * (process_time() - begin) / SAMPLES
 
 
-def measured(model, rounds: int) -> dict[str, dict[str, float]]:
-    """Times by monitor."""
+def main() -> None:
+    """Measure and print."""
+    parser = arguments(__doc__)
+    parser.add_argument("--model", type=Path, help="artifact folder")
+    parser.add_argument("--rounds", type=int, default=7)
+    given = parser.parse_args()
+    model = load(given.model).models["hybrid"] if given.model else deployed(hybrid_step(32))
     detector = Detector(model.dt, ((0.01, 0.0, 0.0, 0.0),), (0.01, 0.0, 0.0, 0.0), 2.0, 20.0, 4.0)
     monitors = {
         "main job": make_monitor(model, None),
@@ -67,32 +60,21 @@ def measured(model, rounds: int) -> dict[str, dict[str, float]]:
         "guard with history": guard_monitor(model, detector, resolution=[1.5e-3], diagnose=model.n_p > 0),
     }
     rows, found = samples(model), {name: [] for name in monitors}
-    for _ in range(rounds):
+    for _ in range(given.rounds):
         for name, monitor in monitors.items():
-            found[name].append((update_time(monitor, rows), evaluation_time(monitor)))
-    return {
-        name: {
-            "median_us": float(np.median([a for a, _ in times])),
-            "largest_us": float(np.max([a for a, _ in times])),
-            "casadi_us": float(np.median([b for _, b in times])),
+            found[name].append((update_time(monitor, rows), casadi_time(monitor)))
+    out = []
+    for name, times in found.items():
+        update, casadi = np.array(times).T
+        median, alone = float(np.median(update)), float(np.median(casadi))
+        row = {
+            "median": median,
+            "largest": float(update.max()),
+            "CasADi": alone,
+            "median / CasADi": median / alone,
         }
-        for name, times in found.items()
-    }
-
-
-def main() -> None:
-    """Print a table; write JSON where asked."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--model", type=Path, required=True, help="artifact folder")
-    parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--out", type=Path, help="JSON file to write")
-    given = parser.parse_args()
-    result = measured(load(given.model).models["hybrid"], given.rounds)
-    print("| monitor | median | largest | CasADi |\n| --- | ---: | ---: | ---: |")
-    for name, row in result.items():
-        print(f"| {name} | " + " | ".join(f"{v:.1f}" for v in row.values()) + " |")
-    if given.out is not None:
-        given.out.write_text(json.dumps(result, indent=1) + "\n")
+        out.append({"monitor": name, **row})
+    report(out, given.out)
 
 
 if __name__ == "__main__":

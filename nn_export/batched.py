@@ -29,7 +29,7 @@ from nn_export.expressions import Step, scalar_steps
 MAX_WALK = 3000
 """Scalar operations up to which a function is also kept as torch operators."""
 WALK_FROM = 200
-"""Samples from which torch operators are faster than CasADi's machine (`benchmarks/torch_prior.py`)."""
+"""Samples from which torch operators are faster than CasADi's machine (`benchmarks/export.py`)."""
 CHUNK = 1024  # samples of one call of CasADi's machine, at most: bounds the number of mapped functions
 
 

@@ -173,19 +173,6 @@ def costs(program: Program) -> Iterator[tuple[str | Node, Cost]]:
     yield "the outputs", walk.outputs([port.source for port in program.outputs])
 
 
-def total(program: Program) -> Cost:
-    """What a program costs: the largest array, and the sums of the rest.
-
-    Raises:
-        ProgramError: As :func:`costs`.
-    """
-    elements = memory = work = nodes = 0
-    for _, cost in costs(program):
-        elements = max(elements, cost.elements)
-        memory, work, nodes = memory + cost.memory, work + cost.work, nodes + cost.nodes
-    return Cost(elements, memory, work, nodes)
-
-
 def place(node: Node) -> str:
     """Where an operator stands, for messages."""
     return f"node {node.name:.80} ({node.op})" + (f" from {node.line:.200}" if node.line else "")

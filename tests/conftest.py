@@ -7,19 +7,20 @@ from pathlib import Path
 import pytest
 
 LONG = (
-    "pipeline/test_machines.py",
-    "pipeline/test_run.py",
+    "job/test_machines.py",
+    "job/test_run.py",
     "nn_export/test_random_modules.py",
-    "studies/test_study_runner.py",
+    "job/study/test_study_runner.py",
     "scenarios/test_pendulum.py",
     "notebooks/test_notebooks.py",
-    "reproduction/test_reproduce.py",
-    "pipeline/test_machine_benchmark.py",
-    "pipeline/test_search_command.py",
-    "identification/test_training_options.py",
-    "identification/test_training.py",
+    "scenarios/paper/test_reproduce.py",
+    "job/test_machine_benchmark.py",
+    "job/test_search_command.py",
+    "identify/test_training_options.py",
+    "identify/test_training.py",
     "job/test_engine.py",
-    "studies/test_loops.py",
+    "job/study/test_loops.py",
+    "loop/test_faulted_loops.py",
 )
 """Modules that take longest. Processes that share the tests by whole modules must not end with one of them."""
 

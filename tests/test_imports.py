@@ -44,7 +44,6 @@ A machine in ``scenarios`` imports the public names of ``hybrid_mpc`` alone; its
 TORCH = (
     "nn_export/tracing.py",
     "nn_export/convert.py",
-    "nn_export/checks.py",
     "nn_export/comparison.py",
     "nn_export/batched.py",
     "nn_export/torch_bridge.py",

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.identify.simulated_pendulum import DT, TRUTH, Pendulum, record
 
 from hybrid_mpc import fit_smoother
 from hybrid_mpc.data.differentiate import local_polynomial
 from hybrid_mpc.identify.smooth import Smoother
+from tests.simulated_pendulum import DT, TRUTH, Pendulum, record
 
 SIGMA = 1e-3
 

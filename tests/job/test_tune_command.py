@@ -14,8 +14,8 @@ from hybrid_mpc.cli.main import app
 from hybrid_mpc.files import LOCK
 from hybrid_mpc.identify.tune import parsed_space
 from hybrid_mpc.job.context import Context
-from hybrid_mpc.job.folder import open_folder
-from hybrid_mpc.job.settings import claim, read_network
+from hybrid_mpc.job.folder import JobNote, open_folder
+from hybrid_mpc.job.settings import read_network
 from hybrid_mpc.job.stages.identify import training_settings
 from hybrid_mpc.job.tune import TuneSettings, usage
 
@@ -160,16 +160,16 @@ def test_a_run_is_bound_to_the_content_of_its_file(tmp_path):
     path = tmp_path / "settings.json"
     path.write_text('{"hidden": 8}')
     settings = RunSettings("golf_robot", network_file=path)
-    with open_folder(tmp_path / "run", claim(settings), resume=False):
+    with open_folder(tmp_path / "run", JobNote("run", settings.identity()), resume=False):
         pass
     path.write_text('{ "hidden" : 8 }')
-    with open_folder(tmp_path / "run", claim(settings), resume=True):
+    with open_folder(tmp_path / "run", JobNote("run", settings.identity()), resume=True):
         pass
     path.write_text('{"hidden": 9}')
     for other in (settings, RunSettings("golf_robot")):
         with (
             pytest.raises(InputError, match="network differ"),
-            open_folder(tmp_path / "run", claim(other), resume=True),
+            open_folder(tmp_path / "run", JobNote("run", other.identity()), resume=True),
         ):
             pass
 

@@ -11,7 +11,8 @@ from typer.testing import CliRunner
 from hybrid_mpc import Calibration, Detector, InputError, load, load_scenario, set_calibration, write_csv
 from hybrid_mpc.cli.main import app
 from hybrid_mpc.files import write_json
-from hybrid_mpc.job.monitor import MonitorJob, force_unit, prepared, read_detector, watched
+from hybrid_mpc.job.monitor import MonitorJob, prepared, read_detector, watched
+from hybrid_mpc.monitor.residuals import force_units
 from hybrid_mpc.records import plain
 from scenarios.golf_robot.rig import Rig
 
@@ -67,7 +68,7 @@ def test_it_says_where_and_writes_what_it_saw(folder, noisy_artifact, tmp_path):
     assert len(rows) == 1 + round(second["seconds"] / DT)
     assert len(rows) > 480
     assert (tmp_path / "out" / "pushed_2.png").stat().st_size > 10_000
-    assert force_unit(load(noisy_artifact).models["hybrid"]) == "J/rad"
+    assert force_units(load(noisy_artifact).models["hybrid"]) == ("N m",)
 
 
 def test_the_artifact_s_own_detector_needs_no_option(folder, noisy_artifact, tmp_path):

@@ -67,6 +67,7 @@ def _twice(x):
         (lambda x: torch.view_as_real(torch.fft.fft(x)), DtypeError, "complex"),
         (lambda x: torch.complex(x, x), DtypeError, "complex"),
         (lambda x: x > 0, DtypeError, "bool"),
+        (lambda x: x.long(), DtypeError, "int64"),
         (lambda x: x.half().double(), DtypeError, "float16"),
         (lambda x: x + torch.arange(0, 0.4, 0.1)[:4].sin(), DtypeError, "float64"),
         (lambda x: (x > 0) * 0.1 * x, DtypeError, "float32"),

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import nn
 
-from nn_export import ExportError, from_casadi, parity, to_casadi
+from nn_export import ExportError, from_casadi, to_casadi
 from nn_export.batched import WALK_FROM, Batched
 from nn_export.errors import DerivativeError, DtypeError, SignatureError
 
@@ -104,14 +104,6 @@ def test_torch_func(transform):
     assert torch.allclose(grid[1, 2], reference(x[1], u[2], J), rtol=1e-14)
 
 
-def test_jvp_and_vjp():
-    module, args = from_casadi(pendulum()), tuple(samples((3,)))
-    for given, expected in zip(
-        torch.func.jvp(module, args, args), torch.func.jvp(reference, args, args), strict=True
-    ):
-        assert torch.allclose(given, expected, rtol=1e-14, atol=1e-14)
-
-
 def test_a_branch_not_taken_does_not_spoil_gradients():
     x = torch.tensor([[0.3, -4.0]], **f64, requires_grad=True)
     for n in (1, WALK_FROM):  # both ways of evaluation
@@ -132,58 +124,6 @@ def test_float32_in_gives_the_exact_result_rounded_once():
     exact[:, 1].sum().backward()
     assert torch.equal(narrow[0].grad, wide[0].grad.float())
     assert module(narrow[0], wide[1], narrow[2]).dtype is torch.float64  # the widest input
-
-
-def test_a_prior_in_casadi_learns_its_parameter():
-    """An inertia of 0.7 is found from accelerations, through a module that holds it as a parameter."""
-    x, u, J = samples((64,))
-    target = reference(x, u, J)
-
-    class Prior(nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.dynamics, self.J = from_casadi(pendulum()), nn.Parameter(torch.tensor(1.0, **f64))
-
-        def forward(self, x, u):
-            return self.dynamics(x, u, self.J)
-
-    prior = Prior()
-    assert [name for name, _ in prior.named_parameters()] == ["J"]
-    optimizer = torch.optim.LBFGS(
-        prior.parameters(), max_iter=50, tolerance_change=0.0, line_search_fn="strong_wolfe"
-    )
-
-    def closure():
-        optimizer.zero_grad()
-        loss = ((prior(x, u) - target) ** 2).mean()
-        loss.backward()
-        return loss
-
-    optimizer.step(closure)
-    assert (
-        abs(prior.J.item() - 0.7) < 1e-6
-    )  # the optimizer stops at a gradient of 1e-7, the curvature is about 10
-
-
-def test_a_hybrid_of_a_casadi_prior_and_a_network_is_exported_again():
-    class Hybrid(nn.Module):
-        def __init__(self):
-            super().__init__()
-            torch.manual_seed(0)
-            self.prior, self.cell, self.head = from_casadi(pendulum()), nn.GRUCell(3, 4), nn.Linear(4, 1)
-            self.J = nn.Parameter(torch.tensor(0.7, **f64))
-
-        def forward(self, x, h, u):
-            h_next = self.cell(torch.cat([x, u], -1), h)
-            return x + 0.05 * self.prior(x, u + self.head(h_next), self.J), h_next
-
-    examples = (torch.zeros(2), torch.zeros(4), torch.zeros(1))
-    function = to_casadi(Hybrid(), examples, output_names=["x_next", "h_next"])
-    report = parity(Hybrid(), function, examples, n=10)
-    # The package's promise.
-    assert report.value_rel < 1e-12
-    assert report.jacobian_rel < 1e-10
-    assert report.hvp_rel < 1e-10
 
 
 def test_what_has_no_scalar_form_is_trained_with_too():

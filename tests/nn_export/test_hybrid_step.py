@@ -1,6 +1,5 @@
 """The module this package is made for: a prior ODE with a recurrent correction, as one step."""
 
-import casadi as ca
 import numpy as np
 import pytest
 import torch
@@ -69,42 +68,6 @@ def test_parity_of_the_step(z, torch_cell):
     assert report.value_rel < 1e-12
     assert report.jacobian_rel < 1e-10
     assert report.hvp_rel < 1e-10
-
-
-def test_hessian_is_exact():
-    torch.manual_seed(1)
-    z = 4
-    module = Step(z, True).double()
-    function = to_casadi(module, examples(z))
-    symbols = [ca.MX.sym(name, n) for name, n in (("x", 2), ("h", z), ("u", 1))]
-    total = ca.sum1(ca.sin(ca.vertcat(*function(*symbols))))
-    stacked = ca.vertcat(*symbols)
-    whole = ca.MX.sym("whole", 7)
-    hessian = ca.Function("hessian", symbols, [total])
-    parts = ca.vertsplit(whole, [0, 2, 6, 7])
-    exact = ca.Function("exact", [whole], [ca.hessian(hessian(*parts), whole)[0]])
-    point = torch.tensor([0.3, -0.7, 0.1, -0.2, 0.4, 0.9, 0.2], dtype=torch.float64)
-
-    def scalar(p):
-        x, h = module(p[:2], p[2:6], p[6:])
-        return torch.sin(x).sum() + torch.sin(h).sum()
-
-    expected = torch.func.hessian(scalar)(point).detach().numpy()
-    assert stacked.shape == (7, 1)
-    # Second derivatives of about 40 chained operations in float64: 1e-10 of their scale.
-    assert np.abs(exact(point.numpy()).full() - expected).max() < 1e-10 * np.abs(expected).max()
-
-
-class Identity(nn.Module):
-    def forward(self, x, h, u):
-        return torch.cat([x[1:], u]), h
-
-
-def test_an_empty_hidden_state_passes_through():
-    inputs = (torch.zeros(2), torch.zeros(0), torch.zeros(1))
-    function = to_casadi(Identity(), inputs, output_names=["x_next", "h_next"])
-    assert function.size_in(1) == function.size_out(1) == (0, 1)
-    assert parity(Identity(), function, inputs, n=4).value_abs == 0.0
 
 
 def test_a_saved_step_is_the_same_function(tmp_path):

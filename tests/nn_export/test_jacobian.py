@@ -4,10 +4,11 @@ import casadi as ca
 import numpy as np
 import pytest
 import torch
+from export_parts import Call
 from test_hybrid_step import Step, examples
 from torch import nn
 
-from nn_export import Node, Port, Program, ProgramError, build, trace, with_jacobian
+from nn_export import Node, Port, Program, ProgramError, build, to_casadi, trace, with_jacobian
 
 torch.set_num_threads(1)
 
@@ -155,29 +156,6 @@ def test_an_unknown_input_is_named():
         with_jacobian(program, {"A": ("x", "v")})
 
 
-@pytest.mark.parametrize("route", ["composed", "called"])
-def test_second_derivatives_of_the_cell(route):
-    torch.manual_seed(3)
-    module, inputs = nn.GRUCell(2, 3).double(), (torch.zeros(2), torch.zeros(3))
-    program = trace(module, inputs)
-    z = ca.MX.sym("z", 5)
-    if route == "composed":
-        slope = with_jacobian(program)(*ca.vertsplit(z, [0, 2, 5]))[-1]
-    else:
-        slope = ca.jacobian(build(program)(*ca.vertsplit(z, [0, 2, 5])), z)
-    weights = np.array([0.7, -1.2, 0.4])
-    curvature = ca.Function("curvature", [z], [ca.jacobian(slope.T @ weights, z)])
-    point = torch.tensor([0.5, -0.8, 0.9, -0.3, 0.2], dtype=torch.float64)
-    expected = torch.func.hessian(lambda p: module(p[:2], p[2:]) @ torch.tensor(weights))(point)
-    expected = expected.detach().numpy()
-    # Some fifty roundings of numbers of order one.
-    np.testing.assert_allclose(curvature(point.numpy()).full(), expected, rtol=0, atol=1e-13)
-    gradient = ca.Function("gradient", [z], [slope.T @ weights])
-    differences = by_differences(gradient, 1, [point.numpy()])
-    # Central differences of a function of order one: eps^(2/3).
-    np.testing.assert_allclose(differences, expected, rtol=0, atol=1e-9)
-
-
 def test_an_exported_cell_still_expands_to_scalars():
     program = trace(nn.GRUCell(2, 3), (torch.zeros(2), torch.zeros(3)))
     point = [0.1, 0.2], [0.3, 0.4, 0.5]
@@ -241,3 +219,10 @@ def test_sweeps_through_a_cell(direction):
     given = ca.Function("swept", by, [swept])(x.numpy(), s.numpy()).full().ravel()
     # Some fifty roundings of numbers of order one.
     np.testing.assert_allclose(given, expected, rtol=0, atol=1e-14)
+
+
+def test_a_sum_added_to_its_vector_has_the_right_jacobian():
+    function = to_casadi(Call(lambda x: x + x.sum()), (torch.zeros(4),))
+    x = ca.MX.sym("x", 4)
+    jacobian = ca.Function("jacobian", [x], [ca.jacobian(function(x), x)])(np.ones(4)).full()
+    assert np.array_equal(jacobian, np.eye(4) + 1)

@@ -8,6 +8,7 @@ import torch
 from nn_export import Node, Port, Program, build
 from nn_export.operators import OPERATORS
 from nn_export.operators.elementwise import OPERATORS as ELEMENTWISE
+from nn_export.operators.table import GROUPS, document
 from nn_export.operators.value import constant, matrix_shape
 
 A = torch.ops.aten
@@ -228,3 +229,10 @@ def test_derivative_against_torch(name, plain):
             ours = values[k * len(held) + j].full()[rows][:, x.positions.reshape(-1)]
             # Derivatives round some more operations than values; slopes of this set are below 100.
             np.testing.assert_allclose(ours, exact[k][j].reshape(ours.shape), rtol=1e-12, atol=1e-13)
+
+
+def test_all_operators_are_in_a_group_and_in_the_document():
+    grouped = [name for group in GROUPS.values() for name in group]
+    assert sorted([*grouped, "getitem"]) == sorted(OPERATORS)
+    rows = [line for line in document().splitlines() if line.startswith("| `")]
+    assert len(rows) == len(grouped)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
-from nn_export import build, parity, trace, with_jacobian
+from nn_export import build, trace, with_jacobian
 
 torch.set_num_threads(1)
 # Hardsigmoid and CELU have own tests: torch rounds a factor of their slopes to float32.
@@ -93,6 +93,7 @@ def check(n, plans, seed):
     before = {k: v.clone() for k, v in module.state_dict().items()}
     program = trace(module, (torch.zeros(n),))
     assert module.training
+    assert all(p.requires_grad for p in module.parameters())
     for key, value in module.state_dict().items():
         assert value.dtype == before[key].dtype
         assert torch.equal(value, before[key])
@@ -131,14 +132,3 @@ def test_random_stack(plan):
 @given(stacks())
 def test_many_random_stacks(plan):
     check(*plan)
-
-
-def test_parity_of_a_float32_stack_with_itself():
-    module = Stack(3, [(5, nn.Tanh, ("cell", 1), (True, True, True))])
-    inputs = (torch.zeros(3),)
-    program = trace(module, inputs)
-    for name, array in program.weights.items():
-        assert np.array_equal(
-            array, module.state_dict()[name].double().numpy()
-        )  # float32 is exact in float64
-    assert parity(module, build(program), inputs, n=6).value_rel < 1e-12  # the package's promise

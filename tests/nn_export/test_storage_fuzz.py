@@ -114,16 +114,6 @@ def test_foreign_content_is_refused_by_name_or_builds(where, value):
         build(load({**files, "programs.json": signed(document)}))
 
 
-@pytest.mark.parametrize("depth", [100, 800, 100_000])
-def test_deep_nesting(depth):
-    files = saved()[1]
-    document = json.loads(files["programs.json"])
-    document["programs"]["program"]["program"]["nodes"][0]["args"] = ["DEEP"]
-    text = json.dumps(document).replace('"DEEP"', "[" * depth + "]" * depth)
-    with pytest.raises(ProgramError, match=r"programs\.json"):
-        load({**files, "programs.json": text.encode()})
-
-
 @pytest.mark.parametrize("name", FILES)
 def test_oversized_files_are_not_read(tmp_path, name):
     for file, data in saved()[1].items():
@@ -136,32 +126,6 @@ def test_oversized_files_are_not_read(tmp_path, name):
     limits = Limits(json_bytes=100)
     with pytest.raises(ProgramError, match=r"programs.json: has .* KiB, at most 100 bytes"):
         Program.load(tmp_path, limits)
-
-
-def _fifo(path):
-    os.mkfifo(path)  # nobody writes: a plain open would wait for ever
-
-
-@pytest.mark.skipif(os.name != "posix", reason="needs POSIX files")
-@pytest.mark.parametrize("name", FILES)
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (Path.mkdir, "is a directory"),
-        (_fifo, "is a named pipe"),
-        (lambda path: path.symlink_to("/dev/zero"), "is a device"),
-        (lambda path: path.symlink_to(path.name), "symbolic link"),
-        (lambda path: None, "no such file"),
-    ],
-    ids=["folder", "pipe", "zeros", "loop", "nothing"],
-)
-def test_what_is_no_file_is_named(tmp_path, name, make, words):
-    for file, data in saved()[1].items():
-        (tmp_path / file).write_bytes(data)
-    (tmp_path / name).unlink()
-    make(tmp_path / name)
-    with pytest.raises(ProgramError, match=f"{name}: .*{words}"):
-        Program.load(tmp_path)
 
 
 def test_another_schema_and_another_pair_are_named(tmp_path):
@@ -182,26 +146,18 @@ def test_a_number_changed_by_hand_is_noticed():
         load({**files, "programs.json": files["programs.json"].replace(b"-1.5", b"-2.5")})
 
 
-AUDIT = """
-import sys
-from nn_export import Program
-Program.load(sys.argv[1])  # now all modules are imported
-seen = []
-sys.addaudithook(lambda event, args: seen.append(event))
-Program.load(sys.argv[1])
-print(*sorted(set(seen)))
-"""
-
-
-def test_loading_executes_nothing_and_writes_nothing(tmp_path):
-    saved()[0].save(tmp_path)
-    root = str(Path(__file__).parents[2])
-    done = subprocess.run(
-        [sys.executable, "-c", AUDIT, str(tmp_path)], capture_output=True, text=True, cwd=root, check=True
+def test_load_and_build_without_torch(tmp_path):
+    program = saved()[0]
+    program.save(tmp_path)
+    code = (
+        "import sys; sys.modules['torch'] = None\n"
+        "import nn_export\n"
+        f"f = nn_export.build(nn_export.Program.load({str(tmp_path)!r}))\n"
+        "print(repr(f(range(6)).full().ravel().tolist()))"
     )
-    # Every other audited event (exec, compile, import, dlopen, subprocess, unpickling) would be listed too.
-    assert set(done.stdout.split()) <= {"open", "object.__getattr__"}
-    assert "open" in done.stdout.split()
+    root = str(Path(__file__).parents[2])
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=root, check=True)
+    assert run.stdout.strip() == repr(build(program)(range(6)).full().ravel().tolist())
 
 
 def judged(tmp_path, cases, *steps):
