@@ -62,11 +62,7 @@ class RunSettings:
         if scenario.endswith(".py") and Path(scenario).is_file():
             scenario = f"{Path(scenario).name} {sha256(Path(scenario))}"
         plain = {**asdict(replace(self, data=(), scenario=scenario)), "data": files}
-        network = self.network()  # a run without such a file has no word of it
-        del plain["network_file"]
-        if self.device == "cpu":
-            del plain["device"]  # as in runs from before there was a choice
-        return plain | ({"network": network} if network else {})
+        return plain | {"network_file": self.network()}
 
 
 def read_network(path: Path) -> dict[str, Any]:

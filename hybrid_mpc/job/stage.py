@@ -241,7 +241,7 @@ def source_of(made: object) -> object:
     Example:
         >>> from hybrid_mpc.scenario import load_scenario
         >>> sorted(source_of(load_scenario("golf_robot").plant))[:2]
-        ['scenarios.golf_robot.dynamics', 'scenarios.golf_robot.integration']
+        ['scenarios.common', 'scenarios.golf_robot.dynamics']
         >>> source_of(eval("lambda: 0")) is UNKNOWN
         True
     """

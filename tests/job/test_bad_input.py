@@ -152,7 +152,7 @@ def test_columns_by_option(call, machine, tmp_path):
 
 
 def test_ctrl_c_says_how_to_go_on(call, arguments, tmp_path, monkeypatch):
-    from hybrid_mpc.job.run import run as job
+    from hybrid_mpc.job import run as job
 
     def stopped(*given, **more):
         raise KeyboardInterrupt

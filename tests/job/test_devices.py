@@ -2,9 +2,8 @@
 
 import pytest
 
-from hybrid_mpc import InputError, RunSettings
+from hybrid_mpc import InputError
 from hybrid_mpc.job.settings import check_device
-from scenarios.paper.settings import ReproductionSettings
 
 
 def test_cpu_is_there():
@@ -23,9 +22,3 @@ def test_the_commands_refuse_it_before_they_make_a_folder(call, tmp_path, words)
     assert code == 2
     assert "--device toaster" in error
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("settings", [RunSettings, ReproductionSettings])
-def test_a_run_on_the_cpu_has_the_identity_it_always_had(settings):
-    assert "device" not in settings("pendulum").identity()
-    assert settings("pendulum", device="cuda").identity()["device"] == "cuda"

@@ -1,6 +1,7 @@
 """What is doubtful about a user's recordings, and about the fit of the prior, reaches the terminal and the files."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,9 +10,9 @@ from cart import written
 
 from hybrid_mpc import InputError, load_scenario
 from hybrid_mpc.cli.progress import Bars, Lines
+from hybrid_mpc.job import run as job
 from hybrid_mpc.job.benchmark import BenchmarkSettings, _read
 from hybrid_mpc.job.context import Silent
-from hybrid_mpc.job.run import run as job
 
 from .conftest import recording, write
 
@@ -57,7 +58,7 @@ def doubtful(machine, tmp_path):
 
 
 def test_the_terminal_hears_of_doubts_and_of_the_fit_s_warnings(call, doubtful, tmp_path, monkeypatch):
-    monkeypatch.setattr(job, "STAGES", (*job.STAGES[:2], ("training", "nothing more", stopped)))
+    monkeypatch.setattr(job, "STAGES", (*job.STAGES[:2], replace(job.STAGES[2], compute=stopped)))
     code, told, message = call("run", *doubtful)
     assert (code, "stopped here" in message) == (2, True)
     reading, fitting = told.index("reading the measurements"), told.index("fitting the prior")
@@ -68,11 +69,11 @@ def test_the_terminal_hears_of_doubts_and_of_the_fit_s_warnings(call, doubtful, 
     fit = told.index("warning: fit of the prior: mgl")
     assert reading < first < second < fitting < fit
     kept = {
-        name: json.loads((tmp_path / "out" / "checkpoints" / f"{name}.json").read_text())
+        name: json.loads((tmp_path / "out" / "checkpoints" / f"{name}.json").read_text())["result"]
         for name in ("data", "prior")
     }
     assert [text.split(":")[0] for text in kept["data"]["warnings"]][:2] == ["monday.csv", "sunday.csv"]
-    assert f"warning: fit of the prior: {kept['prior']['warnings'][0]}" in told
+    assert f"warning: fit of the prior: {kept['prior']['fit']['warnings'][0]}" in told
 
 
 def test_bars_and_lines_print_warnings_as_they_are(capsys):

@@ -12,9 +12,9 @@ from hybrid_mpc.files import read_document, write_document
 from hybrid_mpc.identify.dataset import cut_windows
 from hybrid_mpc.identify.delay import shifted
 from hybrid_mpc.identify.prior import fit_physics
-from hybrid_mpc.job import benchmark as benchmark_job
 from hybrid_mpc.job.benchmark import BenchmarkSettings, benchmark, load_model, training_settings
 from hybrid_mpc.job.benchmark_runs import BenchmarkRun, read_test, read_training, run_error, run_freely
+from hybrid_mpc.job.stages import identify as training_stage
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def trained_here():
             function(*arguments, lambda *told, name=name: on_progress(name, *told))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(benchmark_job, "run_jobs", one_by_one)
+        patch.setattr(training_stage, "run_jobs", one_by_one)
         yield
 
 
@@ -146,7 +146,7 @@ def test_the_delay_takes_samples_from_the_start_only(machine):
 def test_a_diverging_run_is_infinite_and_not_nan():
     y = np.array([[0.0], [1.0]])
     run = BenchmarkRun("run", np.arange(2.0), y, y, {"rnn": np.array([[0.0], [np.nan]])})
-    assert run_error([run], "rnn", BenchmarkSpec()).rmse == float("inf")
+    assert run_error([run], "rnn", BenchmarkSpec(unit="rad")).rmse == float("inf")
 
 
 @pytest.fixture
@@ -186,7 +186,9 @@ def test_what_the_command_refuses(call, machine, tmp_path, words, message):
 def test_a_folder_whose_pieces_had_other_roles_is_refused(machine, made):
     scenario, train, _ = machine
     note = read_document(made[0] / "benchmark.json")
-    write_document(made[0] / "benchmark.json", note | {"pieces": "of another version"})
+    write_document(
+        made[0] / "benchmark.json", note | {"settings": note["settings"] | {"pieces": "of another version"}}
+    )
     try:
         with pytest.raises(InputError, match="pieces differ"):
             benchmark(BenchmarkSettings(str(scenario), (train,)), made[0])
