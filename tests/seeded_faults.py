@@ -100,7 +100,7 @@ FAULTS = (
     fault(
         "machine", "the energy balance is a sum of forces, not of powers",
         "(v_dot - self.acceleration(x, u)) * v).sum(-1)", "(v_dot - self.acceleration(x, u))).sum(-1)",
-        "friction or lags",
+        "friction",
     ),
     fault(
         "machine", "friction decelerates by its torque, not by torque over inertia",
@@ -115,7 +115,7 @@ FAULTS = (
     fault(
         "machine", "the shares of the two inputs that act within one period are swapped",
         "u=(1 - share) * younger + share * older", "u=share * younger + (1 - share) * older",
-        "lags and recordings",
+        "delay",
     ),
     fault(
         "data", "the input of a period is the mean over the period before",
@@ -131,7 +131,7 @@ FAULTS = (
     fault(
         "data", "a time stamp that repeats is accepted",
         "if (steps <= 0).any():", "if (steps < 0).any():",
-        "tables",
+        "read",
     ),
     fault(
         "data", "a sensor's noise is estimated too large: the factor of first differences on third ones",
@@ -152,11 +152,11 @@ FAULTS = (
         "identify", "a bound on the objectives is lowered where one of them is met, not all",
         "keeps = (losses <= self.bounds).all(dim=-1, keepdim=True)",
         "keeps = (losses <= self.bounds).any(dim=-1, keepdim=True)",
-        "combination",
+        "objectives or bound",
     ),
     fault(
         "identify", "a free run starts a period before the end of its warm-up",
-        "x, states = x_all[..., warm, :], []", "x, states = x_all[..., warm - 1, :], []",
+        "x = x_all[..., warm, :]\n", "x = x_all[..., warm - 1, :]\n",
         "evaluation",
     ),
     fault(
@@ -171,7 +171,7 @@ FAULTS = (
     ),
     fault(
         "model", "programs that do not belong to the description are accepted",
-        'if sha256(folder / "programs.json") != d.programs_sha256:', 'if not (folder / "programs.json").is_file():',
+        "if sha256(folder / PROGRAMS) != found.programs_sha256:", "if not (folder / PROGRAMS).is_file():",
         "two_models", "fuzz",
     ),
     fault(
@@ -202,8 +202,8 @@ FAULTS = (
     ),
     fault(
         "control", "the gradient's price of the first change lacks the period",
-        "gradient[: u_prev.size] -= 2 * self._model.dt * self._ocp.r_delta * u_prev",
-        "gradient[: u_prev.size] -= 2 * self._ocp.r_delta * u_prev",
+        "gradient[: u_prev.size] -= 2 * self.model.dt * self.ocp.r_delta * u_prev",
+        "gradient[: u_prev.size] -= 2 * self.ocp.r_delta * u_prev",
         "lq",
     ),
     fault(
@@ -231,7 +231,7 @@ FAULTS = (
     ),
     fault(
         "loop", "the monitor is told the command, not the input that was applied",
-        "held = (*held[:-1], previous.u)", "held = (*held[:-1], state.decision.u)",
+        "inputs = (*inputs[:-1], previous.u)", "inputs = (*inputs[:-1], state.decision.u)",
         "order",
     ),
     fault(
@@ -258,7 +258,7 @@ FAULTS = (
     ),
     fault(
         "monitor", "a sensor that freezes while the machine moves backwards is not noticed",
-        "frozen = frozen or abs(travel) > FROZEN_STEPS * step", "frozen = frozen or travel > FROZEN_STEPS * step",
+        "any(abs(travel) > FROZEN_STEPS * step for", "any(travel > FROZEN_STEPS * step for",
         "frozen",
     ),
     fault(
@@ -293,7 +293,7 @@ FAULTS = (
     ),
     fault(
         "job", "a study goes on with models that were trained anew since",
-        "return {**settings, **models,", "return {**settings,",
+        "settings |= models | {", "settings |= {",
         "another or resumed", "studies",
     ),
     fault(

@@ -18,12 +18,15 @@ from hybrid_mpc.job.stage import (
     UNKNOWN,
     Absent,
     Stage,
+    Stored,
     bring_up_to_date,
     changed,
     read_stage,
     source_of,
     write_stage,
 )  # fmt: skip
+from hybrid_mpc.job.stages.compare import CONTROL
+from hybrid_mpc.job.stages.export import EXPORT, NOISE
 
 
 @dataclass(frozen=True)
@@ -224,6 +227,25 @@ def test_source_is_code_without_words(tmp_path):
     assert made(extra="G = 1") != same
     sys.modules.pop("falling")
     assert source_of(None) is None
+
+
+def test_loops_read_tasks_by_what_they_say(tmp_path):
+    def keys(**changed):
+        golf = load_scenario("golf_robot")
+        first, *others = golf.tasks
+        scenario = replace(golf, tasks=(replace(first, **changed), *others))
+        context = Context(RunSettings("golf_robot", budget="full"), scenario, tmp_path)
+        context._read.update(
+            {EXPORT.name: Stored({}, Absent("none"), "e"), NOISE.name: Stored({}, Absent("none"), "n")}
+        )
+        return CONTROL.keys(context)
+
+    same, name = keys(), load_scenario("golf_robot").tasks[0].name
+    assert all(same.values())  # nothing is unknown
+    assert keys(title="Another") == same
+    other = keys(reference=lambda t: np.zeros((len(t), 2)))
+    assert [key for key in same if same[key] != other[key]] == [f"task {name}"]
+    assert keys(figures=eval("lambda result: {}"))[f"task {name}"] == ""
 
 
 def test_changes_are_named():

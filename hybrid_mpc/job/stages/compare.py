@@ -364,7 +364,7 @@ def what_loops_read(context: Context) -> dict[str, object]:
     }
     for task in tasks_of(scenario, budget.tasks) if scenario.plant is not None else ():
         content = task_content(task, context.spec.dt, loop)
-        read[f"task {task.name}"] = UNKNOWN if UNKNOWN in content.values() else content
+        read[f"task {task.name}"] = UNKNOWN if any(v is UNKNOWN for v in content.values()) else content
     return read
 
 
