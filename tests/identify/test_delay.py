@@ -12,20 +12,20 @@ from hybrid_mpc.identify.step import rk4
 
 
 def late_recording(seed):
-    """A recording with the commanded torque, which acts 1.5 periods later."""
+    """A recording with the commanded torque, which acts 1.3 periods later: at 1.5 both inputs of a period have the same share."""
     run = record(seed, seconds=3.0)
     prior, x = Pendulum(TRUTH), [torch.tensor(run.x[0])]
     for k in range(len(run.u) - 1):
         older, younger = (torch.tensor(run.u[max(k - m, 0)]) for m in (2, 1))
-        half = rk4(lambda z, u=older: prior(z, u), x[-1], DT / 2, 2)
-        x.append(rk4(lambda z, u=younger: prior(z, u), half, DT / 2, 2))
+        between = rk4(lambda z, u=older: prior(z, u), x[-1], 0.3 * DT, 2)
+        x.append(rk4(lambda z, u=younger: prior(z, u), between, 0.7 * DT, 2))
     states = torch.stack(x).numpy()
     return replace(run, x=states, y=states[:, :1])
 
 
 def test_a_prior_is_fitted_to_delayed_recordings():
     commanded = [late_recording(seed) for seed in range(2)]
-    acting = [delayed(run, 1.5 * DT) for run in commanded]
+    acting = [delayed(run, 1.3 * DT) for run in commanded]
     right, wrong = (
         fit_prior(Pendulum, runs, runs, dt=DT, methods=("equation_error",)) for runs in (acting, commanded)
     )
