@@ -12,7 +12,7 @@ from hybrid_mpc.identify.step import rk4
 
 
 def late_recording(seed):
-    """A recording with the commanded torque, which acts 1.3 periods later: at 1.5 both inputs of a period have the same share."""
+    """A recording with the commanded torque, which acts 1.3 periods later; at 1.5 its two shares would be equal."""
     run = record(seed, seconds=3.0)
     prior, x = Pendulum(TRUTH), [torch.tensor(run.x[0])]
     for k in range(len(run.u) - 1):
