@@ -103,7 +103,7 @@ def summary(results: dict[str, Any]) -> list[str]:
 
 def _guarded(row: dict[str, Any]) -> list[str]:
     """What the guard of one loop saw and did."""
-    invalid = row["not_judged_s"] or 0.0
+    invalid = row["invalid_s"] or 0.0
     rest = f"; without a valid level: {invalid:.2f} s" if invalid else ""
     if not row["alarms"]:
         return [f"guard, {row['task']}, seed {row['seed']}: no alarm{rest}"]

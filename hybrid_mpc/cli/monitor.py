@@ -46,7 +46,7 @@ def monitor(
 ) -> None:
     """Say where in recordings the model does not describe the machine, and what would explain it.
 
-    Exit code 1 if nothing of a recording could be judged.
+    Exit code 1 if a recording gave no valid reading.
     """
     from hybrid_mpc.cli.progress import make_progress, print_summary
     from hybrid_mpc.files import check_folder
@@ -75,7 +75,7 @@ def monitor(
     with make_progress() as progress:
         result = watch(job, out, progress)
     print_summary(summary(result), out / "monitor.json")
-    if any(not row.judged_s for row in result.recordings):
+    if any(not row.valid_s for row in result.recordings):
         raise typer.Exit(1)
 
 
@@ -94,8 +94,8 @@ def watching(job: MonitorJob) -> str:
     if calibration is None or calibration.threshold_w is None:
         why = f" ({calibration.method.rstrip('.')})" if calibration is not None else ""
         return (
-            f"the artifact holds no detector and no thresholds{why}: nothing alarms but a monitor that cannot judge "
-            "(see --learn)"
+            f"the artifact holds no detector and no thresholds{why}: nothing alarms but a monitor without valid "
+            "readings (see --learn)"
         )
     return (
         "watched with the artifact's thresholds of violation and residual; it holds no detector (see --learn)"
@@ -111,9 +111,7 @@ def summary(result: MonitorResult) -> list[str]:
     lines = []
     for row in result.recordings:
         n = len(row.alarms)
-        lines.append(
-            f"{row.recording}: {row.seconds:.1f} s, {n} alarm{'' if n == 1 else 's'}{_not_judged(row)}"
-        )
+        lines.append(f"{row.recording}: {row.seconds:.1f} s, {n} alarm{'' if n == 1 else 's'}{_invalid(row)}")
         for alarm in row.alarms:
             why = f": {alarm.diagnosis}" if alarm.diagnosis else ""
             lines.append(f"  {alarm.start_s:.2f} to {alarm.end_s:.2f} s{why}")
@@ -122,14 +120,14 @@ def summary(result: MonitorResult) -> list[str]:
     return lines
 
 
-def _not_judged(row: RecordingResult) -> str:
-    """What of a recording was not judged, and why."""
+def _invalid(row: RecordingResult) -> str:
+    """What of a recording gave no valid reading, and why."""
     parts = (
         (row.warm_up_s, "warm-up"),
         (row.missing_s, "samples are missing"),
         (row.not_finite_s, "model or estimator gives no finite number"),
     )
     text = ", ".join(f"{seconds:.2f} s {why}" for seconds, why in parts if seconds)
-    if not row.judged_s:
-        return f"; NOTHING COULD BE JUDGED: {text}"
-    return f"; not judged: {text}" if text else ""
+    if not row.valid_s:
+        return f"; NO VALID READING: {text}"
+    return f"; no valid reading for {text}" if text else ""

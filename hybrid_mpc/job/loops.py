@@ -265,7 +265,7 @@ class LoopRow:
         alarms: Alarms of the monitor; one that is on at the end ends there. None where nothing could alarm.
         alarm_share: Share of periods with an alarm; None where nothing could alarm.
         largest_level: Largest level of the monitor [W]; None without one.
-        not_judged_s: Time in which the monitor had no valid level [s]; None without one.
+        invalid_s: Time in which the monitor had no valid level [s]; None without one.
         switches: Changes of the guard's mode.
         timing_ms: ``median, p95, p99, max`` of the durations of ``total``, ``solve`` and ``estimate`` [ms].
         arrays: What the specification asked to keep. Default: nothing.
@@ -286,7 +286,7 @@ class LoopRow:
     alarms: tuple[Interval, ...] | None
     alarm_share: float | None
     largest_level: float | None
-    not_judged_s: float | None
+    invalid_s: float | None
     switches: tuple[ModeChange, ...]
     timing_ms: Mapping[str, Mapping[str, float]]
     arrays: Mapping[str, Array] = field(default_factory=dict, compare=False)
@@ -511,8 +511,7 @@ def write_rows(path: Path, rows: Sequence[LoopRow], of: str) -> None:
     Raises:
         StorageError: If they cannot be written.
     """
-    arrays = {f"{i}/{name}": values for i, row in enumerate(rows) for name, values in row.arrays.items()}
-    write_document(path, {"of": of, "rows": [row.plain() for row in rows]}, arrays)
+    write_document(path, {"of": of, "rows": [row.plain() for row in rows]}, arrays_of(rows))
 
 
 def read_rows(path: Path, of: str) -> list[LoopRow] | None:
@@ -527,8 +526,17 @@ def read_rows(path: Path, of: str) -> list[LoopRow] | None:
     document = read_document(path, remedy)
     if document.get("of") != of:
         return None
-    arrays = read_document_arrays(path, remedy)
     rows = [record(LoopRow, row, str(path)) for row in document["rows"]]
+    return with_arrays(rows, read_document_arrays(path, remedy))
+
+
+def arrays_of(rows: Sequence[LoopRow]) -> dict[str, Array]:
+    """The arrays of rows by ``"NUMBER/NAME"``, the number being that of the row."""
+    return {f"{i}/{name}": values for i, row in enumerate(rows) for name, values in row.arrays.items()}
+
+
+def with_arrays(rows: Sequence[LoopRow], arrays: Mapping[str, Array]) -> list[LoopRow]:
+    """Rows with the arrays that :func:`arrays_of` took from them."""
     own: list[dict[str, Array]] = [{} for _ in rows]
     for key, values in arrays.items():
         i, _, name = key.partition("/")
@@ -559,7 +567,7 @@ def row_of(spec: LoopSpec, task: Task, problem: OCP, model: HybridModel, result:
         alarms=tuple(Interval(a, b) for a, b in alarm_intervals(r.alarm, r.dt)) if can_alarm else None,
         alarm_share=float(np.mean(r.alarm)) if can_alarm else None,
         largest_level=float(level.max()) if level.size else None,
-        not_judged_s=float(np.sum(~r.judged)) * r.dt if watched else None,
+        invalid_s=float(np.sum(~r.valid)) * r.dt if watched else None,
         switches=tuple(ModeChange(s.t, s.before.name, s.after.name, s.why) for s in r.switches),
         timing_ms={key: percentiles(r.timing_ms[key]) for key in TIMES},
     )

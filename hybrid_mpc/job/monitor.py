@@ -21,7 +21,7 @@ from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.diagnose import Diagnoser
-from hybrid_mpc.monitor.energy import EnergyMonitor, Verdict
+from hybrid_mpc.monitor.energy import EnergyMonitor, Validity
 from hybrid_mpc.monitor.learn import guard_monitor, learn_from
 from hybrid_mpc.monitor.lengths import HISTORY_S, samples
 from hybrid_mpc.monitor.replay import EstimatorLike, MonitorTrace, TrajectoryLike, along, replay
@@ -31,11 +31,11 @@ from hybrid_mpc.scenario import Scenario
 
 FROZEN = "the sensor repeats itself while motion is predicted"
 BLIND = {
-    Verdict.WARM_UP: "nothing can be judged: the monitor's window is not full",
-    Verdict.MISSING: "nothing can be judged: samples are missing",
-    Verdict.NOT_FINITE: "nothing can be judged: model or estimator gives no finite number",
+    Validity.WARM_UP: "no valid reading: the monitor's window is not full",
+    Validity.MISSING: "no valid reading: samples are missing",
+    Validity.NOT_FINITE: "no valid reading: model or estimator gives no finite number",
 }
-"""Diagnosis of an alarm that the monitor raises because it cannot judge."""
+"""Diagnosis of an alarm that the monitor raises because it has no valid reading."""
 COLUMNS = (
     "dE_model_w", "dE_measured_w", "violation_w", "level_w", "residual_level", "energy_j", "energy_s"
 )  # fmt: skip
@@ -59,12 +59,12 @@ class Alarm:
 
 @dataclass(frozen=True)
 class RecordingResult:
-    """What the monitor found in a recording, and how much of it was judged.
+    """What the monitor found in a recording, and for how long it had a valid reading.
 
     Args:
         recording: Its name.
         seconds: Its length [s].
-        judged_s: Length [s] that was judged.
+        valid_s: Length [s] with a valid reading.
         warm_up_s: Length [s] in which the window was not full.
         missing_s: Length [s] in which samples were missing.
         not_finite_s: Length [s] in which model or estimator gave no finite number.
@@ -73,7 +73,7 @@ class RecordingResult:
 
     recording: str
     seconds: float
-    judged_s: float
+    valid_s: float
     warm_up_s: float
     missing_s: float
     not_finite_s: float
@@ -301,7 +301,7 @@ def explained(
         if reading.frozen:
             texts[start] = FROZEN
         elif reading.blind:
-            texts.setdefault(start, BLIND[reading.verdict])
+            texts.setdefault(start, BLIND[reading.validity])
         due = not active or k == start + later or k == last
         if due and diagnoser is not None and start not in texts:
             texts[start] = diagnoser.diagnose(state, (k - start) * dt).text
@@ -320,7 +320,7 @@ def table(trace: MonitorTrace, recording: Trajectory, outputs: Sequence[Signal])
     columns |= {name: getattr(trace, name) for name in COLUMNS}
     if trace.scores.size:
         columns |= {"force_score": trace.scores[:, 0], "power_score": trace.scores[:, 1]}
-    columns |= {"judged": trace.verdict == Verdict.JUDGED, "frozen": trace.frozen, "alarm": trace.alarm}
+    columns |= {"valid": trace.validity == Validity.VALID, "frozen": trace.frozen, "alarm": trace.alarm}
     text = io.StringIO()
     rows = np.column_stack([*columns.values()])
     np.savetxt(text, rows, fmt="%.9g", delimiter=",", header=",".join(columns), comments="")

@@ -245,7 +245,7 @@ class GuardedController:
         elif on and alarm - doubt >= guard.patience - TINY:
             blind = getattr(reading, "blind", False)
             wanted = guard.on_model
-            why = "the monitor cannot judge" if blind else "the model does not describe the machine"
+            why = "the monitor has no valid reading" if blind else "the model does not describe the machine"
         else:
             wanted, why = Mode.NORMAL, f"no alarm for {guard.quiet:g} s"
         if wanted < state.mode and t - state.since < guard.dwell - TINY:

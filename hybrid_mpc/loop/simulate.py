@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -109,110 +110,64 @@ def simulate(
         result = simulate(plant, ekf, controller, task.reference, weight=task.weight, dt=0.02,
                           duration=task.duration, x0=task.x0, seed=0)
     """
-    return Simulation(
-        plant, estimator, controller, reference, dt=dt, duration=duration, x0=x0, seed=seed, weight=weight,
-        horizon=horizon, monitor=monitor, faults=faults, stage_cost=stage_cost, on_step=on_step,
-        sensor_delay=sensor_delay, input_delay=input_delay, late=late, guard=guard,
-    ).run()  # fmt: skip
-
-
-class Simulation:
-    """A plant in a loop, a period at a time: what :func:`simulate` drives.
-
-    Args: as :func:`simulate`.
-
-    Example: ``Simulation(plant, ekf, mpc, [0.0, 0.0], dt=0.02, duration=1.0, x0=[0.0, 0.0], seed=0).run()``
-    """
-
-    def __init__(
-        self,
-        plant: Plant,
-        estimator: Estimator,
-        controller: SafeController | Controller,
-        reference: Preview | ArrayLike,
-        *,
-        dt: float,
-        duration: float,
-        x0: ArrayLike,
-        seed: int,
-        weight: Preview | None = None,
-        horizon: int | None = None,
-        monitor: Monitor | None = None,
-        faults: Sequence[Fault] = (),
-        stage_cost: OCP | None = None,
-        on_step: Callable[[Step], None] | None = None,
-        sensor_delay: int = 0,
-        input_delay: int = 0,
-        late: Callable[[float], bool] | None = None,
-        guard: Guard | None = None,
-    ) -> None:
-        self.loop = loop = Loop(
-            estimator, controller, monitor=monitor, reference=reference, weight=weight, guard=guard, horizon=horizon,
-            end=_end(dt, duration, estimator.model.dt), input_delay=input_delay, sensor_delay=sensor_delay,
-        )  # fmt: skip
-        ocp, model = loop.ocp, loop.model
-        self.periods, self._dt, self._k = round(duration / dt), dt, 0
-        self._plant, faults = install(plant, faults)
-        check_channels(faults, model.n_y, ocp.n_u)
-        self._cost = _checked_cost(ocp, ocp if stage_cost is None else stage_cost)
-        end = self.periods * dt
-        self._acting = Previews(reference, weight, ocp, horizon, dt, end) if input_delay else None
-        rest = vector(x0, ocp.n_x, "x0")
-        self._machine = SimulatedMachine(
-            self._plant, rest, seed, model.n_y, faults, dt, sensor_delay, input_delay
-        )
-        self._late, self._on_step = late, on_step
-        self._rows: list[_Row] = []
-
-    def run(self) -> ClosedLoopResult:
-        """All periods; returns the record."""
-        while self._k < self.periods:
-            self._period()
-        return self._result()
-
-    def _period(self) -> None:
-        """Measure, decide, hold the input for a period, and note what happened."""
-        loop, machine, t = self.loop, self._machine, self._k * self._dt
-        x = fitting(self._plant.truth(machine.state), loop.ocp.n_x, "the plant's truth")
+    loop = Loop(
+        estimator, controller, monitor=monitor, reference=reference, weight=weight, guard=guard, horizon=horizon,
+        end=_end(dt, duration, estimator.model.dt), input_delay=input_delay, sensor_delay=sensor_delay,
+    )  # fmt: skip
+    ocp, model, periods = loop.ocp, loop.model, round(duration / dt)
+    plant, faults = install(plant, faults)
+    check_channels(faults, model.n_y, ocp.n_u)
+    cost = _checked_cost(ocp, ocp if stage_cost is None else stage_cost)
+    # what the loop previews is for the instant at which its input will act; the cost counts now
+    acting = Previews(reference, weight, ocp, horizon, dt, periods * dt) if input_delay else None
+    rest = vector(x0, ocp.n_x, "x0")
+    machine = SimulatedMachine(plant, rest, seed, model.n_y, faults, dt, sensor_delay, input_delay)
+    rows: list[_Row] = []
+    for k in range(periods):
+        t = k * dt
+        x = fitting(plant.truth(machine.state), ocp.n_x, "the plant's truth")
         y = machine.measure(t)
-        truth = np.concatenate([x, self._plant.hidden(machine.state)])
-        late = self._late
-        in_time = None if late is None else lambda: not late(t)
-        if self._k == 0:
+        truth = np.concatenate([x, plant.hidden(machine.state)])
+        in_time = None if late is None else partial(_in_time, late, t)
+        if k == 0:
             loop.start(y, truth=truth, in_time=in_time)
             machine.rest(loop.state.inputs[0])
         else:
             loop.step(y, truth=truth, in_time=in_time)
         u, u_prev = machine.command(loop.decision.u)
         loop.finish()
-        x_ref, factors = loop.previewed if self._acting is None else self._acting(t)
-        now_factors = 1.0 if factors is None else factors[0]
+        x_ref, factors = loop.previewed if acting is None else acting(t)
         with np.errstate(over="ignore", invalid="ignore"):  # an absurd reference costs infinitely much
-            stage = float(self._cost.stage_cost(x, u, x_ref[0, : x.size], u - u_prev, now_factors))
-        step = Step(self._k, t, x, y, loop.estimate, loop.decision, loop.reading)
-        self._rows.append(_row(step, x_ref[0, : x.size].copy(), stage, loop.spent))
-        if self._on_step is not None:
-            self._on_step(step)
+            now = 1.0 if factors is None else factors[0]
+            stage = float(cost.stage_cost(x, u, x_ref[0, : x.size], u - u_prev, now))
+        step = Step(k, t, x, y, loop.estimate, loop.decision, loop.reading)
+        rows.append(_row(step, x_ref[0, : x.size].copy(), stage, loop.spent))
+        if on_step is not None:
+            on_step(step)
         machine.advance(t)
-        self._k += 1
+    return _result(rows, dt, loop.switches)
 
-    def _result(self) -> ClosedLoopResult:
-        rows = self._rows
-        readings = [row.reading for row in rows]
-        timing = {name: 1e3 * np.array([row.spent[name] for row in rows]) for name in TIMED}
-        return ClosedLoopResult(
-            dt=self._dt,
-            **{name: np.array([getattr(row, name) for row in rows]) for name in COLUMNS},
-            source=tuple(row.source for row in rows),
-            status=tuple(row.status for row in rows),
-            timing_ms={**timing, "total": np.sum(list(timing.values()), axis=0)},
-            violation=np.array([np.nan if r is None else r.violation_w for r in readings]),
-            level=np.array([np.nan if r is None else r.level_w for r in readings]),
-            alarm=np.array([r is not None and bool(r.alarm) for r in readings]),
-            judged=np.array([r is not None and not getattr(r, "verdict", 0) for r in readings]),
-            switches=self.loop.switches,
-            numbers=np.array([getattr(r, "numbers", ()) for r in readings], dtype=np.float64),
-        )
+
+def _in_time(late: Callable[[float], bool], t: float) -> bool:
+    return not late(t)
+
+
+def _result(rows: Sequence[_Row], dt: float, switches: tuple[Switch, ...]) -> ClosedLoopResult:
+    readings = [row.reading for row in rows]
+    timing = {name: 1e3 * np.array([row.spent[name] for row in rows]) for name in TIMED}
+    return ClosedLoopResult(
+        dt=dt,
+        **{name: np.array([getattr(row, name) for row in rows]) for name in COLUMNS},
+        source=tuple(row.source for row in rows),
+        status=tuple(row.status for row in rows),
+        timing_ms={**timing, "total": np.sum(list(timing.values()), axis=0)},
+        violation=np.array([np.nan if r is None else r.violation_w for r in readings]),
+        level=np.array([np.nan if r is None else r.level_w for r in readings]),
+        alarm=np.array([r is not None and bool(r.alarm) for r in readings]),
+        valid=np.array([r is not None and not getattr(r, "validity", 0) for r in readings]),
+        switches=switches,
+        numbers=np.array([getattr(r, "numbers", ()) for r in readings], dtype=np.float64),
+    )
 
 
 class _Row(NamedTuple):
@@ -294,7 +249,7 @@ class ClosedLoopResult:
         level: Alarm level ``(n,)`` [W]; NaN without a monitor.
         alarm: ``(n,)``, True while the monitor alarms.
         switches: Changes of the guard's mode, in their order. Default: none.
-        judged: ``(n,)``, True where the monitor could judge the period. Default: unknown.
+        valid: ``(n,)``, True where the monitor's reading was valid. Default: unknown.
         innovation: Innovations of the estimator ``(n, n_y)`` [output units]; NaN where it had none. Default: unknown.
         nis: Normalised innovations squared ``(n,)`` [-]; NaN where there was none. Default: unknown.
         numbers: The monitor's readings as numbers ``(n, columns)``, from which detectors are learned. Default: none.
@@ -325,7 +280,7 @@ class ClosedLoopResult:
     level: Array
     alarm: NDArray[np.bool_]
     switches: tuple[Switch, ...] = ()
-    judged: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    valid: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
     innovation: Array = field(default_factory=lambda: np.zeros((0, 0)))
     nis: Array = field(default_factory=lambda: np.zeros(0))
     numbers: Array = field(default_factory=lambda: np.zeros((0, 0)))

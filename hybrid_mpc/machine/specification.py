@@ -1,4 +1,4 @@
-"""How a machine's recordings are read, and how ``hybrid-mpc benchmark`` judges models by them."""
+"""How a machine's recordings are read, and how ``hybrid-mpc benchmark`` evaluates models on them."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class DataSpec:
             it, and none of it is scored.
         windows: Known windows by file stem. A recording that is not named here is split by ``fractions``.
         fractions: Shares of training, validation and test samples, in this order of time.
-        free_run: Length [s] of the free runs that judge a model, started every fifth of it. Default: each test
+        free_run: Length [s] of the free runs that evaluate a model, started every fifth of it. Default: each test
             trajectory as a whole. Where an unstable point multiplies every error, many short runs say more.
         inputs_of: Input columns of single recordings, by file stem, where they differ from ``inputs``.
         units: Units of columns that are not in seconds or in their signal's unit, by column: ``"ms"``, ``"deg"``, or
@@ -134,7 +134,7 @@ def check_prior_replay(weight: float) -> None:
 
 @dataclass(frozen=True)
 class BenchmarkSpec:
-    """How a machine's models are judged by free runs over recordings that they have not seen.
+    """How a machine's models are evaluated by free runs over recordings that they have not seen.
 
     A run starts from the scenario's ``warm_up``; it is the whole recording after that, or its first ``length`` seconds.
 

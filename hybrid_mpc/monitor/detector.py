@@ -121,14 +121,12 @@ class Detector:
         """Refuse a monitor that this detector was not learned for.
 
         Raises:
-            InputError: If it has another number of forces, no free runs to judge, another period or unit of time.
+            InputError: If it has another number of forces, no free runs, another period or unit of time.
         """
         if len(self.force) != n_q:
             raise InputError(f"detector: learned for {len(self.force)} forces, the model has {n_q}")
         if self.energy and not free_runs:
-            raise InputError(
-                "detector: it judges free runs, the monitor has none; give free_run=0.8 [s], say"
-            )
+            raise InputError("detector: it reads free runs, the monitor has none; give free_run=0.8 [s], say")
         if dt is not None and abs(dt - self.dt) > 1e-9 * self.dt:
             raise InputError(
                 f"detector: learned at a period of {self.dt} s, the model's is {dt} s; learn it anew"

@@ -25,10 +25,10 @@ FROZEN_STEPS = 3.0
 """Steps of the sensor that the estimator must have predicted while the sensor repeated itself."""
 
 
-class Verdict(IntEnum):
-    """Whether a sample was judged, and if not, why."""
+class Validity(IntEnum):
+    """Whether a reading is valid, and if not, why."""
 
-    JUDGED = 0
+    VALID = 0
     """It was: violation and residual force are numbers."""
     WARM_UP = 1
     """The window was not full yet."""
@@ -38,12 +38,12 @@ class Verdict(IntEnum):
     """All was there, and still a reading is no number: the model or the estimator is at fault."""
 
 
-SECONDS: Mapping[Verdict, str] = MappingProxyType(
+SECONDS: Mapping[Validity, str] = MappingProxyType(
     {
-        Verdict.JUDGED: "judged_s",
-        Verdict.WARM_UP: "warm_up_s",
-        Verdict.MISSING: "missing_s",
-        Verdict.NOT_FINITE: "not_finite_s",
+        Validity.VALID: "valid_s",
+        Validity.WARM_UP: "warm_up_s",
+        Validity.MISSING: "missing_s",
+        Validity.NOT_FINITE: "not_finite_s",
     }
 )
 """Names under which results count the seconds of each."""
@@ -112,8 +112,8 @@ class MonitorReading:
             forces, the power of the free runs. Default: none.
         numbers: What a detector is learned from: both balances, violation, residual, travel, speed and input at the
             centre; with free runs energy, squared speed and squared input times time, and the time. Default: none.
-        verdict: Whether this sample was judged, and if not, why.
-        blind: True while the monitor has judged nothing for longer than its two windows together.
+        validity: Whether this reading is valid, and if not, why.
+        blind: True while no reading has been valid for longer than its two windows together.
     """
 
     dE_model_w: float
@@ -128,7 +128,7 @@ class MonitorReading:
     frozen: bool = False
     scores: tuple[float, ...] = ()
     numbers: tuple[float, ...] = ()
-    verdict: Verdict = Verdict.JUDGED
+    validity: Validity = Validity.VALID
     blind: bool = False
 
 
@@ -161,8 +161,8 @@ class EnergyMonitor:
     of the input's range. A machine that is blocked looks the same.
 
     A missing (NaN) measurement gives NaN readings until it has left the window. A level is the mean of the finite ones
-    of the last ``average`` values, NaN (and no alarm) while fewer than half are finite. ``verdict`` says whether a
-    reading is one. A monitor that has judged nothing for longer than ``window`` and ``average`` together is ``blind``,
+    of the last ``average`` values, NaN (and no alarm) while fewer than half are finite. ``validity`` says whether a
+    reading is one. A monitor without a valid reading for longer than ``window`` and ``average`` together is ``blind``,
     and that is an alarm. Positions must count on through full turns. Not for several threads at once (it reuses its
     buffers).
 
@@ -296,8 +296,8 @@ class EnergyMonitor:
         seen = min(state.seen + 1, self.window)
         missing = not math.isfinite(sum(y.tolist()) + (sum(u_prev.tolist()) if state.seen else 0.0))
         whole = 0 if missing else min(state.whole + 1, self.window)
-        verdict = self._verdict(numbers[2 : 3 + n_q], seen, whole)
-        invalid = state.invalid + 1 if verdict else 0
+        validity = self._validity(numbers[2 : 3 + n_q], seen, whole)
+        invalid = state.invalid + 1 if validity else 0
         blind = invalid > self.window + self.average
         following = MonitorState(memory, x, h, alarms, left, detector, frozen, seen, whole, invalid)
         reading = MonitorReading(
@@ -313,7 +313,7 @@ class EnergyMonitor:
             frozen=frozen,
             scores=scores,
             numbers=tuple(numbers),
-            verdict=verdict,
+            validity=validity,
             blind=blind,
         )
         return following, reading
@@ -327,13 +327,13 @@ class EnergyMonitor:
             return level, abs(_mean_of_finite(memory[middle:end]))
         return level, _length_of_mean(memory[middle:end].reshape(self.average, n_q))
 
-    def _verdict(self, readings: Sequence[float], seen: int, whole: int) -> Verdict:
+    def _validity(self, readings: Sequence[float], seen: int, whole: int) -> Validity:
         """Whether violation and residual force are numbers, and if not, why."""
         if math.isfinite(sum(readings)):
-            return Verdict.JUDGED
+            return Validity.VALID
         if seen < self.window:
-            return Verdict.WARM_UP
-        return Verdict.MISSING if whole < self.window else Verdict.NOT_FINITE
+            return Validity.WARM_UP
+        return Validity.MISSING if whole < self.window else Validity.NOT_FINITE
 
     def alarms(self, level: float, residual_level: float, were_on: tuple[bool, bool]) -> tuple[bool, bool]:
         """Whether power and residual alarm at these levels, after having been on or not."""

@@ -18,7 +18,7 @@ REPORTED = 500
 """Samples from one report of the progress to the next."""
 COLUMNS = (
     "dE_model_w", "dE_measured_w", "violation_w", "level_w", "residual_level", "energy_j", "energy_s",
-    "alarm", "frozen", "blind", "verdict", "scores", "numbers",
+    "alarm", "frozen", "blind", "validity", "scores", "numbers",
 )  # fmt: skip
 """Fields of a reading that a trace holds."""
 
@@ -56,15 +56,15 @@ Recording = TypeVar("Recording", bound=TrajectoryLike)
 class MonitorTrace:
     """Readings over time, all ``(n,)``; see :class:`~hybrid_mpc.monitor.energy.MonitorReading`.
 
-    ``scores`` are ``(n, 2)`` and ``numbers`` ``(n, columns)``; without a detector there are no scores. ``verdict`` are
-    the values of :class:`~hybrid_mpc.monitor.energy.Verdict`. ``state`` is the monitor's after the last sample.
+    ``scores`` are ``(n, 2)`` and ``numbers`` ``(n, columns)``; without a detector there are no scores. ``validity`` are
+    the values of :class:`~hybrid_mpc.monitor.energy.Validity`. ``state`` is the monitor's after the last sample.
 
     Example:
         >>> z = np.zeros(3)
         >>> on, why = np.array([False, True, True]), np.array([1, 0, 0])
-        >>> trace = MonitorTrace(np.arange(3.0), z, z, z, z, z, on, verdict=why)
+        >>> trace = MonitorTrace(np.arange(3.0), z, z, z, z, z, on, validity=why)
         >>> trace.intervals(), trace.coverage(0.5)
-        ([(1.0, 2.0)], {'judged_s': 1.0, 'warm_up_s': 0.5, 'missing_s': 0.0, 'not_finite_s': 0.0})
+        ([(1.0, 2.0)], {'valid_s': 1.0, 'warm_up_s': 0.5, 'missing_s': 0.0, 'not_finite_s': 0.0})
     """
 
     t: Array
@@ -80,7 +80,7 @@ class MonitorTrace:
     scores: Array = field(default_factory=lambda: np.zeros((0, 2)))
     numbers: Array = field(default_factory=lambda: np.zeros((0, 0)))
     state: MonitorState | None = None
-    verdict: NDArray[np.int_] = field(default_factory=lambda: np.zeros(0, dtype=int))
+    validity: NDArray[np.int_] = field(default_factory=lambda: np.zeros(0, dtype=int))
     blind: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     def intervals(self) -> list[tuple[float, float]]:
@@ -88,12 +88,12 @@ class MonitorTrace:
         return [(float(self.t[int(a)]), float(self.t[int(b)])) for a, b in alarm_intervals(self.alarm, 1.0)]
 
     def coverage(self, dt: float) -> dict[str, float]:
-        """Seconds that were judged, and those that were not, by reason.
+        """Seconds with a valid reading, and those without, by reason.
 
         Args:
             dt: Period [s].
         """
-        return {name: float(np.sum(self.verdict == why)) * dt for why, name in SECONDS.items()}
+        return {name: float(np.sum(self.validity == why)) * dt for why, name in SECONDS.items()}
 
 
 def replay(

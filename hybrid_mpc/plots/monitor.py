@@ -51,8 +51,8 @@ def trace(
     Args:
         t: Times ``(n,)`` [s].
         violation: Violation of the energy balance, ``(n,)`` [W].
-        level: What is compared with the threshold (the averaged violation), ``(n,)`` [W]; NaN where the monitor does
-            not judge yet.
+        level: What is compared with the threshold (the averaged violation), ``(n,)`` [W]; NaN where the monitor has
+            no valid reading.
         threshold: Alarm threshold [W].
         alarm: True where the monitor alarms, ``(n,)``.
         y: Measured position, ``(n,)``.

@@ -31,7 +31,7 @@ TRAIN = {
     "b": ("sine", "step", "chirp", "stair", "pulse", "fastsine", "fastchirp"),
 }
 """Kinds of torque, in turn, of the training runs: data set (a) without sinusoids, (b) with."""
-JUDGE = ("sine", "pulse", "chirp", "stair", "step", "fastsine", "fastchirp")
+TEST_KINDS = ("sine", "pulse", "chirp", "stair", "step", "fastsine", "fastchirp")
 """Kinds of torque, in turn, of the validation and test runs, which both data sets share."""
 
 
@@ -51,7 +51,7 @@ def stems(budget: str, data_set: str = "b") -> list[str]:
         raise InputError(f"golf_robot: no data set {data_set!r}; it has: {', '.join(TRAIN)}")
     names = []
     for role, n in SIZES[budget].items():
-        kinds = TRAIN[data_set] if role == "train" else JUDGE
+        kinds = TRAIN[data_set] if role == "train" else TEST_KINDS
         names += [f"{role}_{k + 1:02d}_{kinds[k % len(kinds)]}" for k in range(n)]
     return names
 

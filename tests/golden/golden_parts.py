@@ -329,7 +329,7 @@ def converged(m, name):
 
 
 READ = ("violation_w", "level_w", "residual_level", "energy_j", "energy_s")
-SAID = ("alarm", "frozen", "blind", "verdict")
+SAID = ("alarm", "frozen", "blind", "validity")
 
 
 def readings(m, kind):
@@ -401,7 +401,7 @@ def loop_values(result):
     """What is held of a closed loop: arrays, and the guard's switches in words."""
     names = ("x", "y", "u", "x_hat", "d", "stage_cost", "violation", "level")
     found = {name: getattr(result, name) for name in names}
-    found |= {name: getattr(result, name).astype(int) for name in ("alarm", "judged")}
+    found |= {name: getattr(result, name).astype(int) for name in ("alarm", "valid")}
     found |= {name: np.array(getattr(result, name)) for name in ("source", "status", "mode")}
     return found
 

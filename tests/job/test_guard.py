@@ -22,10 +22,10 @@ from hybrid_mpc import (
     write_csv,
 )
 from hybrid_mpc.job.context import Context
-from hybrid_mpc.job.loops import repeated
+from hybrid_mpc.job.loops import read_rows, repeated, write_rows
+from hybrid_mpc.job.stages import compare as compare_job
 from hybrid_mpc.job.stages import guard as guard_job
-from hybrid_mpc.job.stages import guard as nominal_loops
-from hybrid_mpc.job.stages.compare import keep, kept
+from hybrid_mpc.job.stages.compare import identity
 from hybrid_mpc.job.stages.export import NOISE, NoiseResult
 from hybrid_mpc.job.stages.figures import guard_figures
 from hybrid_mpc.job.stages.guard import GUARD, guard_stage, learned
@@ -82,25 +82,25 @@ def test_a_repeated_task_has_no_jump(name):
 
 
 def test_loops_are_nominal_and_age_where_the_plant_can():
-    quick = nominal_loops.nominal_loops(GOLF, GOLF.budgets["quick"], MODEL)
-    assert len(quick) * nominal_loops.BLOCKS >= guard_job.blocks_needed(2.0)
-    full = nominal_loops.nominal_loops(GOLF, GOLF.budgets["full"], MODEL)
-    assert len(full) * nominal_loops.BLOCKS >= guard_job.blocks_needed(1.0)
+    quick = guard_job.nominal_loops(GOLF, GOLF.budgets["quick"], MODEL)
+    assert len(quick) * guard_job.BLOCKS >= guard_job.blocks_needed(2.0)
+    full = guard_job.nominal_loops(GOLF, GOLF.budgets["full"], MODEL)
+    assert len(full) * guard_job.BLOCKS >= guard_job.blocks_needed(1.0)
     assert {fault.value for loop in quick for fault in loop.faults} == {0.9, 1.1}
     assert any(not loop.faults for loop in quick)
     pendulum = load_scenario("pendulum")  # whose plant has no faults
     assert not any(
-        loop.faults for loop in nominal_loops.nominal_loops(pendulum, pendulum.budgets["quick"], MODEL)
+        loop.faults for loop in guard_job.nominal_loops(pendulum, pendulum.budgets["quick"], MODEL)
     )
     broken = tuple(replace(t, faults=(Fault(0.0, 1.0, "input_gain", 0.5),)) for t in GOLF.tasks)
     with pytest.raises(InputError, match="every task brings a fault"):
-        nominal_loops.nominal_loops(replace(GOLF, tasks=broken), GOLF.budgets["quick"], MODEL)
+        guard_job.nominal_loops(replace(GOLF, tasks=broken), GOLF.budgets["quick"], MODEL)
 
 
 def test_a_nominal_loop_is_what_the_guard_would_read(golf_artifact, monkeypatch):
-    monkeypatch.setattr(nominal_loops, "BLOCKS", 1)
+    monkeypatch.setattr(guard_job, "BLOCKS", 1)
     bench = Bench(GOLF, {"model": load(golf_artifact).with_noise(SIGMA)})
-    spec = nominal_loops.nominal_loops(GOLF, GOLF.budgets["quick"], MODEL)[1]
+    spec = guard_job.nominal_loops(GOLF, GOLF.budgets["quick"], MODEL)[1]
     assert (spec.task, spec.faults[0].value) == ("track_step", 1.1)
     row, _ = bench.run(spec)
     assert row.arrays["numbers"].shape == (BLOCK + 50, 11)
@@ -139,11 +139,11 @@ def context(golf_artifact, tmp_path_factory):
     made.keep(NOISE, {}, NoiseResult({name: tuple(sigma) for name, sigma in SIGMA.items()}))
     made.keep(MONITOR, {}, MonitorResult(CALIBRATION, ()))
     set_calibration(out / "model", CALIBRATION)
-    for i, spec in enumerate(nominal_loops.nominal_loops(scenario, made.budget, MODEL)):
-        read = np.vstack([np.full((50, 11), np.nan), numbers(nominal_loops.BLOCKS, i)])  # a second settles
+    for i, spec in enumerate(guard_job.nominal_loops(scenario, made.budget, MODEL)):
+        read = np.vstack([np.full((50, 11), np.nan), numbers(guard_job.BLOCKS, i)])  # a second settles
         arrays = {"numbers": read, "y": np.full((9, 1), i), "u": np.zeros((9, 1))}
         row = loop_row(spec.task, spec.controller, spec.seed, seconds=46.0, arrays=arrays)
-        keep(made, nominal_loops.stage_of(spec), [row], [spec])
+        write_rows(made.path(guard_job.stage_of(spec)), [row], identity(made, [spec]))
     return made
 
 
@@ -151,8 +151,9 @@ def context(golf_artifact, tmp_path_factory):
 def resumed(context):
     """The stage after the kill: no loop that is kept runs again."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compare_job, "run_specs", lambda *args: pytest.fail(f"runs {args} again"))
         patch.setattr(
-            guard_job, "run_parts", lambda context, parts: parts and pytest.fail(f"runs {list(parts)} again")
+            compare_job, "run_jobs", lambda jobs, *args: jobs and pytest.fail(f"runs {list(jobs)} again")
         )
         context.keep(GUARD, {}, guard_stage(context))
     return context.read(GUARD)
@@ -164,12 +165,13 @@ def test_the_stage_learns_from_what_is_kept_and_fills_the_artifact(context, resu
     assert stored.detector.false_alarms_per_hour == 2.0
     assert re.fullmatch("[0-9a-f]{64}", stored.detector.data_hash)
     assert stored.threshold_w == CALIBRATION.threshold_w
-    spec = nominal_loops.nominal_loops(context.scenario, context.budget, MODEL)[0]
-    (row,) = kept(context, "guard/track_sine-500")
+    spec = guard_job.nominal_loops(context.scenario, context.budget, MODEL)[0]
+    path, of = context.path("guard/track_sine-500"), identity(context, [spec])
+    (row,) = read_rows(path, of)
     other = replace(row, arrays=row.arrays | {"y": row.arrays["y"] + 1})
-    keep(context, "guard/track_sine-500", [other], [spec])
+    write_rows(path, [other], of)
     changed = guard_job._from_loops(context, MODEL).data_hash
-    keep(context, "guard/track_sine-500", [row], [spec])
+    write_rows(path, [row], of)
     assert guard_job._from_loops(context, MODEL).data_hash == stored.detector.data_hash != changed
 
 

@@ -146,7 +146,7 @@ def test_an_axis_of_millimetres_a_second_is_calibrated(slow):
     model = load(slow.out / "model").models["hybrid"]
     assert model.time_unit == slow.time_unit > 5.0
     covered = found.recordings[0]
-    assert covered["judged_s"] > 500
+    assert covered["valid_s"] > 500
     assert covered["not_finite_s"] == covered["missing_s"] == 0.0
 
 
@@ -173,7 +173,7 @@ def test_recordings_shorter_than_the_windows_give_a_reason_and_the_run_goes_on(s
     assert found.calibration.threshold_w is None
     window = 2 * round(0.1 * short.time_unit / QUICK.dt) + 1
     assert f"no recording has the {window} samples ({window * QUICK.dt:g} s)" in found.reason
-    assert found.recordings[0]["judged_s"] == 0.0
+    assert found.recordings[0]["valid_s"] == 0.0
     said = monitor_results(short)
     assert said.alarms is None
     assert found.reason == said.reason
@@ -214,4 +214,4 @@ def test_the_command_watches_with_an_artifact_without_calibration(short, tmp_pat
     assert done.exit_code == 0, done.output
     assert "the artifact holds no detector and no thresholds" in done.output
     warm_up = 2 * round(0.15 * short.time_unit / QUICK.dt) * QUICK.dt
-    assert f"long: 0.9 s, 0 alarms; not judged: {warm_up:.2f} s warm-up" in done.output
+    assert f"long: 0.9 s, 0 alarms; no valid reading for {warm_up:.2f} s warm-up" in done.output

@@ -15,7 +15,7 @@ from hybrid_mpc.loop.faults import install
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.monitor_study import run as room
 from scenarios.golf_robot.monitor_study.__main__ import main
-from scenarios.golf_robot.monitor_study.detection import METHODS, Judges
+from scenarios.golf_robot.monitor_study.detection import METHODS, Detectors
 from scenarios.golf_robot.monitor_study.plan import CASES, LoopPlan, MonitorStudy, monitor_study
 from scenarios.golf_robot.monitor_study.results import roc
 
@@ -73,7 +73,7 @@ def stand_in(monkeypatch):
 
     model = SimpleNamespace(dt=0.02, n_p=1, delay_states=0)
     scales = (0.01, 0.0, 0.0, 0.0)
-    learned = Judges(
+    learned = Detectors(
         Detector(0.02, (scales,), scales, 2.0, 1.0, 1.0), {"forces": (3.0, 0.5)}, (1e-3,), 1.0, 700
     )
     monkeypatch.setattr(

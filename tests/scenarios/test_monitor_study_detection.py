@@ -9,7 +9,7 @@ import pytest
 
 from hybrid_mpc import InputError
 from hybrid_mpc.records import plain, record
-from scenarios.golf_robot.monitor_study.detection import METHODS, Judges, learn_judges, with_hysteresis
+from scenarios.golf_robot.monitor_study.detection import METHODS, Detectors, learn_detectors, with_hysteresis
 
 DT, STEP, RATE = 0.02, 1.5e-3, 2.5
 PERIODS = 9_000  # 180 s: 35 blocks of 5 s after the first second
@@ -35,53 +35,53 @@ def trace(seed, force=0.0, output=0.0):
 
 
 @pytest.fixture(scope="module")
-def judges():
-    return learn_judges([trace(seed) for seed in range(2)], DT, (STEP,), rate=RATE)
+def detectors():
+    return learn_detectors([trace(seed) for seed in range(2)], DT, (STEP,), rate=RATE)
 
 
-def found(judges, which, method):
-    return judges.alarm(judges.levels(which), which, method, RATE)
+def found(detectors, which, method):
+    return detectors.alarm(detectors.levels(which), which, method, RATE)
 
 
-def test_each_sees_what_it_is_for(judges):
+def test_each_sees_what_it_is_for(detectors):
     half = PERIODS // 2
     force, output = trace(20, force=0.1), trace(21, output=3e-3)
     for method, sees in {"guard": (1, 0), "innovation_rms": (0, 1), "guard_or_innovation": (1, 1)}.items():
         for which, seen in zip((force, output), sees, strict=True):
-            alarm = found(judges, which, method)
+            alarm = found(detectors, which, method)
             assert not alarm[:half].any()  # 90 s at 2.5 an hour: one in sixteen seeds alarms
             # ten deviations of either pass any threshold within half a second
             assert alarm[half : half + 25].any() == bool(seen)
 
 
-def test_a_frozen_sensor_is_one_whose_travel_passes_three_steps(judges):
+def test_a_frozen_sensor_is_one_whose_travel_passes_three_steps(detectors):
     frozen = trace(12)
     frozen.numbers[6000:6005, 4] = 3.1 * STEP
-    assert np.flatnonzero(found(judges, frozen, "guard")).tolist() == list(range(6000, 6005))
+    assert np.flatnonzero(found(detectors, frozen, "guard")).tolist() == list(range(6000, 6005))
 
 
-def test_rates_are_shared_and_thresholds_fall_with_them(judges):
-    assert judges.threshold("forces", 1.0) > judges.threshold("forces", 10.0)
-    assert judges.detector_at(2.0).force_threshold == judges.threshold("forces", 1.0)
+def test_rates_are_shared_and_thresholds_fall_with_them(detectors):
+    assert detectors.threshold("forces", 1.0) > detectors.threshold("forces", 10.0)
+    assert detectors.detector_at(2.0).force_threshold == detectors.threshold("forces", 1.0)
     for shares in METHODS.values():
         assert math.isclose(sum(shares.values()), 1.0)
 
 
-def test_score_passes_one_where_a_part_passes_its_threshold(judges):
-    levels = judges.levels(trace(13, output=3e-3))
-    score = judges.score(levels, "innovation_rms", RATE)
-    assert np.array_equal(score > 1.0, levels["innovation_rms"] > judges.threshold("innovation_rms", RATE))
+def test_score_passes_one_where_a_part_passes_its_threshold(detectors):
+    levels = detectors.levels(trace(13, output=3e-3))
+    score = detectors.score(levels, "innovation_rms", RATE)
+    assert np.array_equal(score > 1.0, levels["innovation_rms"] > detectors.threshold("innovation_rms", RATE))
 
 
-def test_round_trip(judges):
-    again = record(Judges, json.loads(json.dumps(plain(judges))), "")
-    assert again.threshold("power", 3.0) == judges.threshold("power", 3.0)
-    assert again.detector.force == judges.detector.force
+def test_round_trip(detectors):
+    again = record(Detectors, json.loads(json.dumps(plain(detectors))), "")
+    assert again.threshold("power", 3.0) == detectors.threshold("power", 3.0)
+    assert again.detector.force == detectors.detector.force
 
 
 def test_too_little_data_says_how_much_is_needed():
     with pytest.raises(InputError, match=r"2\.9 min of nominal loops.*needs 12\.0 min"):
-        learn_judges([trace(0)], DT, (STEP,), rate=1.0)
+        learn_detectors([trace(0)], DT, (STEP,), rate=1.0)
 
 
 def test_hysteresis_is_that_of_a_loop():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -12,17 +12,27 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import digest, read_document, read_document_arrays, write_document
+from hybrid_mpc.files import digest
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.controllers import CONTROLLERS, ORACLES
 from hybrid_mpc.job.engine import WORKERS, run_jobs
-from hybrid_mpc.job.loops import MODEL, Bench, LoopRow, LoopSpec, run_loops, tasks_of
+from hybrid_mpc.job.loops import (
+    MODEL,
+    Bench,
+    LoopRow,
+    LoopSpec,
+    arrays_of,
+    read_rows,
+    run_loops,
+    tasks_of,
+    with_arrays,
+    write_rows,
+)
 from hybrid_mpc.job.stage import UNKNOWN, Absent, Stage, source_of
 from hybrid_mpc.job.stages.export import EXPORT, NOISE, observed
 from hybrid_mpc.kit.artifact import LoopSettings, load, loop_settings, read_description, write_description
 from hybrid_mpc.loop.loop import Loop
-from hybrid_mpc.records import plain, record
+from hybrid_mpc.records import plain
 from hybrid_mpc.scenario import Budget, Scenario, Task, load_scenario
 
 if TYPE_CHECKING:
@@ -96,7 +106,7 @@ class ControlResult:
     Args:
         rows: The loops by task, controller and seed.
         reason: Why there are none, where only steps could be timed. Default: there are loops.
-        arrays: Signals that are drawn, ``"TASK/CONTROLLER/SEED/NAME"``; without loops ``step_ms``.
+        arrays: Signals that are drawn, ``"NUMBER/NAME"`` with the number of the row; without loops ``step_ms``.
     """
 
     rows: tuple[LoopRow, ...]
@@ -106,7 +116,7 @@ class ControlResult:
     @property
     def drawn(self) -> list[LoopRow]:
         """The loops with their signals."""
-        return [with_arrays(row, self.arrays) for row in self.rows]
+        return with_arrays(self.rows, self.arrays)
 
 
 def control_stage(context: Context) -> ControlResult | Absent:
@@ -138,15 +148,9 @@ def compare(context: Context) -> list[LoopRow]:
         ``plans``.
     """
     parts, settings = parts_of(context.scenario, context.budget), context.settings
-    common = settings.scenario, context.out / "model"
     specs = {part.stage: part.specs(settings.scenario, settings.seed) for part in parts}
-    missing = [part for part in parts if not is_kept(context, part.stage, specs[part.stage])]
-    timed = [part for part in missing if part.timed]
-    for i, part in enumerate(timed):
-        context.progress.update("timed loops", i, len(timed), f"{part.task.name}, {part.controller}")
-        keep(context, part.stage, run_specs(*common, specs[part.stage]), specs[part.stage])
-    run_parts(context, {part.stage: specs[part.stage] for part in missing if not part.timed})
-    rows = [row for part in parts for row in kept(context, part.stage)]
+    found = run_or_read(context, specs, alone=[part.stage for part in parts if part.timed])
+    rows = [row for part in parts for row in found[part.stage]]
     order = [task.name for task in tasks_of(context.scenario, context.budget.tasks)]
     return sorted(rows, key=lambda row: (order.index(row.task), row.controller, row.seed))
 
@@ -196,7 +200,7 @@ def _seeds(name: str, scenario: Scenario, seeds: int, oracle_seeds: int) -> int:
 def run_specs(
     scenario: str,
     folder: Path,
-    specs: list[LoopSpec],
+    specs: Sequence[LoopSpec],
     report: Callable[[int, int, str], None] = lambda done, total, text: None,
 ) -> list[LoopRow]:
     """Rows of loops on a run's own model.
@@ -217,45 +221,43 @@ def _bench(scenario: str, folder: Path, changed: int) -> Bench:
     return Bench(load_scenario(scenario), {MODEL: load(folder)})
 
 
-def run_parts(context: Context, parts: Mapping[str, list[LoopSpec]]) -> None:
-    """Run loops side by side in processes; each part is kept as it ends.
+def run_or_read(
+    context: Context, parts: Mapping[str, Sequence[LoopSpec]], *, alone: Collection[str] = ()
+) -> dict[str, list[LoopRow]]:
+    """Rows of loops on the run's model: those that ``checkpoints`` holds are read, the others run.
+
+    A part is what runs together. It is written as it ends, so a killed run goes on from there. It is read only if it
+    was run with the present model, noise, machine and control problem.
 
     Args:
         context: The run.
-        parts: Loops by the checkpoint that keeps them.
+        parts: Loops by the name of their file.
+        alone: Parts that run in this process with nothing beside them, so that the durations of their steps count. The
+            others run side by side in processes. Default: none.
+
+    Returns:
+        The rows by the name of their file.
     """
+    of = {part: identity(context, specs) for part, specs in parts.items()}
+    found = {part: read_rows(context.path(part), of[part]) for part in parts}
+    rows = {part: held for part, held in found.items() if held is not None}
+
+    def write(part: str, made: list[LoopRow]) -> None:
+        write_rows(context.path(part), made, of[part])
+        rows[part] = made
+
     common = context.settings.scenario, context.out / "model"
+    missing = [part for part in parts if part not in rows]
+    timed = [part for part in missing if part in alone]
+    for i, part in enumerate(timed):
+        spec = parts[part][0]
+        context.progress.update("timed loops", i, len(timed), f"{spec.task}, {spec.controller}")
+        write(part, run_specs(*common, parts[part]))
     jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
-        stage: (run_specs, (*common, specs)) for stage, specs in parts.items()
+        part: (run_specs, (*common, parts[part])) for part in missing if part not in alone
     }
-    run_jobs(
-        jobs, context.progress.update, WORKERS, lambda stage, rows: keep(context, stage, rows, parts[stage])
-    )
-
-
-def keep(context: Context, part: str, rows: list[LoopRow], specs: Sequence[LoopSpec] = ()) -> None:
-    """Write rows into ``checkpoints``, with what they are of.
-
-    Args:
-        context: The run.
-        part: Name of the file.
-        rows: The loops.
-        specs: Their specifications, to know them again. Default: unknown.
-    """
-    held = {"rows": [row.plain() for row in rows], "of": identity(context, specs)}
-    write_document(context.path(part), held, arrays_of(rows))
-
-
-def is_kept(context: Context, part: str, specs: Sequence[LoopSpec]) -> bool:
-    """Whether ``checkpoints`` holds these loops of the run's present model, noise, machine and control problem.
-
-    Args:
-        context: The run.
-        part: Name of the file.
-        specs: The loops.
-    """
-    path = context.path(part)
-    return path.is_file() and read_document(path, _remedy(path)).get("of") == identity(context, specs)
+    run_jobs(jobs, context.progress.update, WORKERS, write)
+    return rows
 
 
 def identity(context: Context, specs: Sequence[LoopSpec]) -> str:
@@ -311,43 +313,6 @@ def task_content(task: Task, dt: float, loop: LoopSettings) -> dict[str, object]
         "control problem": problem,
         "figures": source_of(task.figures),
     }
-
-
-def kept(context: Context, part: str) -> list[LoopRow]:
-    """Rows that :func:`keep` wrote.
-
-    Args:
-        context: The run.
-        part: Name of the file.
-
-    Raises:
-        InputError: If the file is damaged.
-    """
-    path = context.path(part)
-    held, arrays = read_document(path, _remedy(path)), read_document_arrays(path, _remedy(path))
-    if "rows" not in held:
-        raise InputError(f"{path} holds no loops; {_remedy(path)}")
-    return [with_arrays(record(LoopRow, row, str(path)), arrays) for row in held["rows"]]
-
-
-def _remedy(path: Path) -> str:
-    return f"delete {path.stem}.* in {path.parent}, and --resume runs these loops anew"
-
-
-def arrays_of(rows: Sequence[LoopRow]) -> dict[str, Array]:
-    """The arrays of rows by ``task/controller/seed/name``."""
-    return {f"{_place(row)}/{name}": values for row in rows for name, values in row.arrays.items()}
-
-
-def with_arrays(row: LoopRow, arrays: Mapping[str, Array]) -> LoopRow:
-    """A row with its own of the arrays of many."""
-    start = f"{_place(row)}/"
-    own = {key.removeprefix(start): values for key, values in arrays.items() if key.startswith(start)}
-    return replace(row, arrays=own)
-
-
-def _place(row: LoopRow) -> str:
-    return f"{row.task}/{row.controller}/{row.seed}"
 
 
 def what_loops_read(context: Context) -> dict[str, object]:

@@ -17,8 +17,7 @@ from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.loops import MODEL, Bench, LoopSpec, ModeChange
 from hybrid_mpc.job.monitor import explained
 from hybrid_mpc.job.stage import Absent, Stage
-from hybrid_mpc.job.stages.compare import is_kept, run_parts, what_loops_read
-from hybrid_mpc.job.stages.compare import kept as rows_of
+from hybrid_mpc.job.stages.compare import run_or_read, what_loops_read
 from hybrid_mpc.job.stages.export import EXPORT, NOISE
 from hybrid_mpc.job.stages.identify import DATA
 from hybrid_mpc.job.stages.monitor import MONITOR, RATES, clean_windows
@@ -250,24 +249,24 @@ def faulted(
                 tuple(row.switches),
             )
         )  # fmt: skip
-        arrays |= kept(case.name, trace, result.y)
+        arrays |= trace_arrays(case.name, trace, result.y)
     return tuple(loops), arrays
 
 
-def kept(name: str, trace: MonitorTrace, y: Array) -> dict[str, Array]:
+def trace_arrays(name: str, trace: MonitorTrace, y: Array) -> dict[str, Array]:
     """A trace's arrays and the first output of ``y`` ``(n, n_y)`` under a name, for the checkpoint.
 
     Example:
         >>> z = np.zeros(2)
         >>> trace = MonitorTrace(z, z, z, z, z, z, z > 0)
-        >>> read_trace(kept("a", trace, np.zeros((2, 1))), "a").alarm.tolist()
+        >>> read_trace(trace_arrays("a", trace, np.zeros((2, 1))), "a").alarm.tolist()
         [False, False]
     """
     return {f"{name}/{key}": np.asarray(getattr(trace, key)) for key in SHOWN} | {f"{name}/y": y[:, 0]}
 
 
 def read_trace(arrays: Mapping[str, Any], name: str) -> MonitorTrace:
-    """The trace that :func:`kept` kept; the balances, which the report does not show, are NaN."""
+    """The trace that :func:`trace_arrays` made; the balances, which the report does not show, are NaN."""
     own = {key: arrays[f"{name}/{key}"] for key in SHOWN}
     none = np.full(len(own["t"]), np.nan)
     return MonitorTrace(dE_model_w=none, dE_measured_w=none, **own)
@@ -511,12 +510,11 @@ def _from_loops(context: Context, model: HybridModel) -> NominalData:
     wanted = nominal_loops(
         context.scenario, context.budget, model, named=settings.scenario, run_seed=settings.seed
     )
-    parts = {stage_of(spec): [spec] for spec in wanted}
-    run_parts(context, {stage: part for stage, part in parts.items() if not is_kept(context, stage, part)})
+    found = run_or_read(context, {stage_of(spec): [spec] for spec in wanted})
     content, runs = hashlib.sha256(), []
     loops: list[NominalLoop] = []
     for spec in wanted:
-        (row,) = rows_of(context, stage_of(spec))
+        (row,) = found[stage_of(spec)]
         friction = spec.faults[0].value if spec.faults else 1.0
         loops.append(NominalLoop(row.task, row.seed, friction, row.seconds, row.cost))
         runs.append(row.arrays["numbers"][samples(SETTLING_S, model) :])
@@ -552,7 +550,7 @@ def _recorded(
             watched += float(inside.sum() * model.dt)
             starts += int((edges & inside).sum())
         if not arrays or (alarms and not arrays["recorded/alarm"].any()):  # one is shown, best with an alarm
-            arrays = kept("recorded", trace, recording.y)
+            arrays = trace_arrays("recorded", trace, recording.y)
             shown = recording.name
     most = 0.5 * float(chi2.ppf(0.95, 2 * starts + 2)) / (watched / 3600) if watched > 0 else None
     return GuardTest(watched, starts, tuple(found), most), shown, arrays

@@ -584,7 +584,7 @@ def coverage_words(recordings: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
         recordings: Of each the seconds that were monitored and that were not, by reason.
 
     Example:
-        >>> coverage_words([{"judged_s": 4.0, "warm_up_s": 0.3, "missing_s": 0.0, "not_finite_s": 2.0}])
+        >>> coverage_words([{"valid_s": 4.0, "warm_up_s": 0.3, "missing_s": 0.0, "not_finite_s": 2.0}])
         ('Not monitored: 2 s in which model or estimator gave no finite number.',)
     """
     why = {

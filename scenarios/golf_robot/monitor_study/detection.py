@@ -58,7 +58,7 @@ class Trace:
 
 
 @dataclass(frozen=True)
-class Judges:
+class Detectors:
     """All methods, learned from the same nominal loops.
 
     Args:
@@ -70,8 +70,8 @@ class Judges:
 
     Example:
         >>> tails = {"forces": (3.0, 0.5), "power": (2.0, 0.4)}
-        >>> judges = Judges(Detector(0.02, ((0.01, 0, 0, 0),), (0.01, 0, 0, 0), 2.0, 1.0, 1.0), tails, (1.5e-3,))
-        >>> round(judges.threshold("forces", 1.0), 2), judges.threshold("freeze", 1.0)
+        >>> detectors = Detectors(Detector(0.02, ((0.01, 0, 0, 0),), (0.01, 0, 0, 0), 2.0, 1.0, 1.0), tails, (1.5e-3,))
+        >>> round(detectors.threshold("forces", 1.0), 2), detectors.threshold("freeze", 1.0)
         (6.29, 1.0)
     """
 
@@ -84,7 +84,7 @@ class Judges:
     def __post_init__(self) -> None:
         known = {part for parts in METHODS.values() for part in parts} - {"freeze"}
         if not set(self.tails) <= known:
-            raise InputError(f"judges: tails of {sorted(self.tails)}, known are {sorted(known)}")
+            raise InputError(f"detectors: tails of {sorted(self.tails)}, known are {sorted(known)}")
 
     @property
     def block_s(self) -> float:
@@ -160,7 +160,7 @@ class Judges:
         return np.array(found, dtype=bool)
 
 
-def learn_judges(
+def learn_detectors(
     traces: Sequence[Trace],
     dt: float,
     resolution: Sequence[float],
@@ -169,7 +169,7 @@ def learn_judges(
     rest_speed: ArrayLike = REST_SPEED,
     time_unit: float = 1.0,
     data_hash: str = "",
-) -> Judges:
+) -> Detectors:
     """All methods from nominal loops, for wanted rates of false alarms down to ``rate``.
 
     Thresholds are Gumbel tails of block maxima, as :func:`~hybrid_mpc.monitor.calibrate.calibrate` makes them. The
@@ -195,7 +195,7 @@ def learn_judges(
     blocks = sum(len(run) // size for run in runs)
     if blocks < needed:
         raise InputError(
-            f"learn_judges: {blocks * block_s / 60:.1f} min of nominal loops in whole blocks of {block_s:g} s; a rate "
+            f"learning: {blocks * block_s / 60:.1f} min of nominal loops in whole blocks of {block_s:g} s; a rate "
             f"of {rate:g}/h, of which a part gets {share:g}, needs {needed * block_s / 60:.1f} min"
         )
     detector = learn_detector(
@@ -203,14 +203,14 @@ def learn_judges(
         data_hash=data_hash, trusted=True, time_unit=time_unit,
     )  # fmt: skip
     hours = sum(len(run) for run in runs) * dt / 3600.0
-    judges = Judges(detector, {}, tuple(resolution), hours, blocks)
-    levels = [judges.levels(trace) for trace in traces]
+    detectors = Detectors(detector, {}, tuple(resolution), hours, blocks)
+    levels = [detectors.levels(trace) for trace in traces]
     tails = {}
     for part in levels[0]:
         if part != "freeze":
             maxima, _ = block_maxima([level[part][skipped:] for level in levels], size)
             tails[part] = gumbel(maxima)
-    return replace(judges, tails=tails)
+    return replace(detectors, tails=tails)
 
 
 def with_hysteresis(level: Array, threshold: float, release: float = RELEASE) -> NDArray[np.bool_]:

@@ -23,11 +23,11 @@ from hybrid_mpc.monitor.learn import guard_monitor
 from hybrid_mpc.monitor.lengths import REST_SPEED
 from hybrid_mpc.records import record
 from hybrid_mpc.scenario import Task, load_scenario
-from scenarios.golf_robot.monitor_study.detection import METHODS, Judges, Trace, learn_judges
+from scenarios.golf_robot.monitor_study.detection import METHODS, Detectors, Trace, learn_detectors
 from scenarios.golf_robot.monitor_study.plan import FAULT, GUARD, LEARN, LoopPlan, MonitorJob, MonitorStudy
 
 Array = NDArray[np.float64]
-JUDGES, LEARNING = "judges.json", "learning"
+DETECTORS, LEARNING = "detectors.json", "learning"
 MOVING = 1.5
 """True speed, in rest speeds, above which time counts towards a delay."""
 WITHIN_S = 1.0
@@ -71,14 +71,16 @@ class _Loops:
         self._kit = self._bench.kits[MODEL]
         self._task = plain_task(selected_tasks(self._bench.scenario, (runner.study.task,))[0])
         self._dt = self._kit.models["hybrid"].dt
-        self._judges: Judges | None = None
+        self._detectors: Detectors | None = None
 
     @property
-    def judges(self) -> Judges:
+    def detectors(self) -> Detectors:
         """What was learned, read when first needed."""
-        if self._judges is None:
-            self._judges = record(Judges, read_json(self._folder / JUDGES), str(self._folder / JUDGES))
-        return self._judges
+        if self._detectors is None:
+            self._detectors = record(
+                Detectors, read_json(self._folder / DETECTORS), str(self._folder / DETECTORS)
+            )
+        return self._detectors
 
     def run(self, job: MonitorJob) -> dict[str, Any]:
         if job.kind == FAULT:
@@ -89,7 +91,7 @@ class _Loops:
         if job.kind == LEARN:
             write_learning(self._folder / LEARNING / f"{job.id}.npz", traces)
             return {"loops": [{"seconds": plan.duration} for plan in job.plans]}
-        shown = [nominal_figures(self._study, self.judges, t) for t in traces]
+        shown = [nominal_figures(self._study, self.detectors, t) for t in traces]
         return {"loops": [{"case": p.case, **f} for p, f in zip(job.plans, shown, strict=True)]}
 
     def _spec(self, plan: LoopPlan, arm: str = "", horizon: int | None = None) -> LoopSpec:
@@ -108,7 +110,7 @@ class _Loops:
 
     def _monitor(self, detector: Detector | None = None) -> EnergyMonitor:
         rest = self._kit.rest_speed if detector is None else None
-        steps = None if detector is None else self.judges.resolution
+        steps = None if detector is None else self.detectors.resolution
         ranges = self._kit.problem(self._task.name).input_range
         return guard_monitor(
             self._kit.models["hybrid"], detector, resolution=steps, input_range=ranges, rest_speed=rest
@@ -124,11 +126,11 @@ class _Loops:
     def _fault(self, plan: LoopPlan) -> dict[str, Any]:
         row, result = self._bench.run(self._spec(plan), task=self._follows(plan), monitor=self._monitor())
         onset = round(plan.onset(self._dt) / self._dt)
-        found = fault_figures(self._study, self.judges, trace_of(result), onset)
+        found = fault_figures(self._study, self.detectors, trace_of(result), onset)
         return {**found, "cost": row.cost, "excess": dict(row.excess)}
 
     def _guarded(self, plan: LoopPlan, arm: str) -> dict[str, Any]:
-        monitor = self._monitor(self.judges.detector_at(self._study.rates[0]))
+        monitor = self._monitor(self.detectors.detector_at(self._study.rates[0]))
         row, _ = self._bench.run(self._spec(plan, arm), task=self._follows(plan), monitor=monitor)
         early = sum(switch.t_s < plan.onset(self._dt) for switch in row.switches)
         return {
@@ -154,52 +156,52 @@ def plain_task(task: Task) -> Task:
     return replace(task, faults=())
 
 
-def nominal_figures(study: MonitorStudy, judges: Judges, trace: Trace) -> dict[str, Any]:
+def nominal_figures(study: MonitorStudy, detectors: Detectors, trace: Trace) -> dict[str, Any]:
     """Of a nominal loop: false alarms by rate and method, and the largest scores of its blocks.
 
     Args:
         study: The study.
-        judges: What was learned.
+        detectors: What was learned.
         trace: The loop.
     """
-    dt, levels = judges.detector.dt, judges.levels(trace)
-    size = round(judges.block_s / dt)
+    dt, levels = detectors.detector.dt, detectors.levels(trace)
+    size = round(detectors.block_s / dt)
     counts: dict[str, dict[str, int]] = {}
     for rate in study.rates:
-        alarms = {m: judges.alarm(levels, trace, m, rate) for m in METHODS}
+        alarms = {m: detectors.alarm(levels, trace, m, rate) for m in METHODS}
         counts[f"{rate:g}"] = {
             m: int(np.sum(np.diff(on.astype(int), prepend=0) == 1)) for m, on in alarms.items()
         }
     blocks = {}
     for method in METHODS:
-        score = judges.score(levels, method, study.rates[0])
+        score = detectors.score(levels, method, study.rates[0])
         whole = len(score) // size * size
         blocks[method] = score[:whole].reshape(-1, size).max(axis=1).round(4).tolist()
     return {"seconds": len(trace.nis) * dt, "alarms": counts, "blocks": blocks}
 
 
-def fault_figures(study: MonitorStudy, judges: Judges, trace: Trace, onset: int) -> dict[str, Any]:
+def fault_figures(study: MonitorStudy, detectors: Detectors, trace: Trace, onset: int) -> dict[str, Any]:
     """Of a faulted loop: delays by rate and method, alarms before the fault, and the largest scores soon after.
 
     Args:
         study: The study.
-        judges: What was learned.
+        detectors: What was learned.
         trace: The loop.
         onset: First sample of the fault.
     """
-    dt, levels = judges.detector.dt, judges.levels(trace)
-    moving = MOVING * max(judges.detector.rest_speed)
+    dt, levels = detectors.detector.dt, detectors.levels(trace)
+    moving = MOVING * max(detectors.detector.rest_speed)
     moved: Array = np.cumsum(trace.speed[onset:] > moving) * np.float64(dt)
     delays: dict[str, dict[str, float]] = {}
     early: dict[str, dict[str, bool]] = {}
     for rate in study.rates:
-        alarms = {m: judges.alarm(levels, trace, m, rate) for m in METHODS}
+        alarms = {m: detectors.alarm(levels, trace, m, rate) for m in METHODS}
         key = f"{rate:g}"
         early[key] = {m: bool(on[:onset].any()) for m, on in alarms.items()}
         delays[key] = {m: _delay(on[onset:], moved) for m, on in alarms.items()}
     soon = moved <= WITHIN_S + 1e-9
     scores = {
-        m: round(float(np.max(judges.score(levels, m, study.rates[0])[onset:][soon], initial=0.0)), 4)
+        m: round(float(np.max(detectors.score(levels, m, study.rates[0])[onset:][soon], initial=0.0)), 4)
         for m in METHODS
     }
     return {"delays": delays, "early": early, "scores": scores}
@@ -217,7 +219,7 @@ def write_learning(path: Path, traces: list[Trace]) -> None:
     write_arrays(path, arrays)
 
 
-def learn(study: MonitorStudy, paths: list[Path], artifact: Kit) -> Judges:
+def learn(study: MonitorStudy, paths: list[Path], artifact: Kit) -> Detectors:
     """Thresholds of all methods from the nominal loops in these files.
 
     Args:
@@ -236,7 +238,7 @@ def learn(study: MonitorStudy, paths: list[Path], artifact: Kit) -> Judges:
             traces.append(Trace(**fields))
             hashed.update(traces[-1].numbers.tobytes())
     model, rest = artifact.models["hybrid"], artifact.rest_speed
-    return learn_judges(
+    return learn_detectors(
         traces, model.dt, study.resolution, rate=min(study.rates), rest_speed=REST_SPEED if rest is None else rest,
         time_unit=model.time_unit, data_hash=hashed.hexdigest(),
     )  # fmt: skip

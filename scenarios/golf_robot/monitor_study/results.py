@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.monitor.lengths import BLOCK_S
-from scenarios.golf_robot.monitor_study.detection import METHODS, Judges
+from scenarios.golf_robot.monitor_study.detection import METHODS, Detectors
 from scenarios.golf_robot.monitor_study.plan import ARMS, CASES, FAULT, GUARD, NOMINAL
 
 Array = NDArray[np.float64]
@@ -21,15 +21,15 @@ TOLERANCE = 1e-6
 """Excess over a limit that is rounding."""
 
 
-def monitor_results(study: Mapping[str, Any], judges: Judges, rows: Rows) -> dict[str, Any]:
+def monitor_results(study: Mapping[str, Any], detectors: Detectors, rows: Rows) -> dict[str, Any]:
     """Everything that report and table show.
 
     Args:
         study: The study as plain data.
-        judges: What was learned.
+        detectors: What was learned.
         rows: Rows of the finished jobs.
 
-    Example: ``monitor_results(note["study"], judges, rows)["false_alarms"]["1"]["guard"]["upper_95"]``
+    Example: ``monitor_results(note["study"], detectors, rows)["false_alarms"]["1"]["guard"]["upper_95"]``
     """
     done = [row for row in rows if row["status"] == "done"]
     of = {kind: [row for row in done if row["kind"] == kind] for kind in (NOMINAL, FAULT, GUARD)}
@@ -38,12 +38,12 @@ def monitor_results(study: Mapping[str, Any], judges: Judges, rows: Rows) -> dic
     return {
         "study": dict(study),
         "jobs": {"done": len(done), "failed": len(rows) - len(done)},
-        "learned": {"hours": judges.hours, "blocks": judges.blocks, "tails": dict(judges.tails)},
+        "learned": {"hours": detectors.hours, "blocks": detectors.blocks, "tails": dict(detectors.tails)},
         "nominal_hours": sum(loop["seconds"] for loop in loops) / 3600,
         "false_alarms": {rate: {m: false_alarms(loops, rate, m) for m in METHODS} for rate in rates},
         "delays": {rate: {c.name: _delays(of[FAULT], rate, c.name) for c in CASES} for rate in rates},
         "roc": {
-            c.name: {m: roc(loops, _case(of[FAULT], c.name), m, judges.block_s) for m in METHODS}
+            c.name: {m: roc(loops, _case(of[FAULT], c.name), m, detectors.block_s) for m in METHODS}
             for c in CASES
         },
         "guard": {c.name: _guard(_case(of[FAULT], c.name), _case(of[GUARD], c.name)) for c in CASES},

@@ -30,8 +30,15 @@ from hybrid_mpc.kit.artifact import Kit, load
 from hybrid_mpc.kit.assembly import adaptable
 from hybrid_mpc.records import record
 from hybrid_mpc.scenario import load_scenario
-from scenarios.golf_robot.monitor_study.detection import Judges
-from scenarios.golf_robot.monitor_study.loops import CONTROLLER, JUDGES, LEARNING, PRIOR, MonitorRunner, learn
+from scenarios.golf_robot.monitor_study.detection import Detectors
+from scenarios.golf_robot.monitor_study.loops import (
+    CONTROLLER,
+    DETECTORS,
+    LEARNING,
+    PRIOR,
+    MonitorRunner,
+    learn,
+)
 from scenarios.golf_robot.monitor_study.plan import LEARN, MonitorJob, MonitorStudy
 from scenarios.golf_robot.monitor_study.report import write_monitor_report
 from scenarios.golf_robot.monitor_study.results import monitor_results
@@ -92,9 +99,9 @@ def run_monitor_study(
             todo = _Todo(out, log, engine, say, finished(out, retry_failed))
             first = [job for job in jobs if job.kind == LEARN]
             todo.run("nominal loops to learn from", first)
-            if not (out / JUDGES).is_file():
+            if not (out / DETECTORS).is_file():
                 _learn(study, out, first, load(Path(model.folder)))
-            shutil.rmtree(out / LEARNING, ignore_errors=True)  # judges.json has what was learned
+            shutil.rmtree(out / LEARNING, ignore_errors=True)  # detectors.json has what was learned
             todo.run("nominal, faulted and guarded loops", [job for job in jobs if job.kind != LEARN])
     finally:
         engine.close()
@@ -112,8 +119,8 @@ def finish(out: Path) -> dict[str, Any]:
     """
     note = study_note(out)
     done = {row.id: row.plain() for row in rows(out / RUNS)}
-    judges = record(Judges, read_json(out / JUDGES), str(out / JUDGES))
-    results = monitor_results(note.study, judges, list(done.values()))
+    detectors = record(Detectors, read_json(out / DETECTORS), str(out / DETECTORS))
+    results = monitor_results(note.study, detectors, list(done.values()))
     write_json(out / RESULTS, results)
     write_monitor_report(out, results, note)
     return results
@@ -148,4 +155,4 @@ def _learn(study: MonitorStudy, out: Path, jobs: list[MonitorJob], artifact: Kit
             f"{out}: a nominal loop to learn from has failed: {failed[-1].error.strip().splitlines()[-1]}; "
             "--resume --retry-failed runs it again"
         )
-    write_json(out / JUDGES, learn(study, paths, artifact))
+    write_json(out / DETECTORS, learn(study, paths, artifact))

@@ -1,4 +1,4 @@
-"""What was not judged is said: warm-up, missing samples, and readings that should be there and are no numbers."""
+"""Time without a valid reading is reported: warm-up, missing samples, and readings that are no numbers."""
 
 import json
 from dataclasses import replace
@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from hybrid_mpc import Calibration, EnergyMonitor, Fault, Guard, InputError, Mode, replay, write_csv
 from hybrid_mpc.cli.main import app
 from hybrid_mpc.model.model import step_symbols
-from hybrid_mpc.monitor.energy import Verdict
+from hybrid_mpc.monitor.energy import Validity
 from hybrid_mpc.monitor.replay import with_alarms
 
 WINDOW, AVERAGE = 5, 10
@@ -42,9 +42,9 @@ class Lost(Exact):
 def test_a_whole_recording_is_judged_but_for_the_warm_up():
     run = simulate(200)
     trace = replay(monitor(), Exact(run), run)
-    assert trace.verdict.tolist() == [Verdict.WARM_UP] * (WINDOW - 1) + [Verdict.JUDGED] * (201 - WINDOW)
+    assert trace.validity.tolist() == [Validity.WARM_UP] * (WINDOW - 1) + [Validity.VALID] * (201 - WINDOW)
     assert trace.coverage(DT) == pytest.approx(
-        {"judged_s": 196 * DT, "warm_up_s": 4 * DT, "missing_s": 0.0, "not_finite_s": 0.0}
+        {"valid_s": 196 * DT, "warm_up_s": 4 * DT, "missing_s": 0.0, "not_finite_s": 0.0}
     )
     assert not trace.blind.any()
 
@@ -53,9 +53,9 @@ def test_an_estimator_that_gives_no_number_is_an_alarm_and_not_quiet():
     run = simulate(200)
     trace = replay(monitor(calibration=NEVER), Lost(run, 100), run)
     # the estimate of sample 100 is that of the period after it
-    assert (trace.verdict[101:] == Verdict.NOT_FINITE).all()
-    assert (trace.verdict[WINDOW - 1 : 101] == Verdict.JUDGED).all()
-    # longer than both windows: from the 16th sample that is not judged on
+    assert (trace.validity[101:] == Validity.NOT_FINITE).all()
+    assert (trace.validity[WINDOW - 1 : 101] == Validity.VALID).all()
+    # longer than both windows: from the 16th sample without a valid reading on
     first = 101 + WINDOW + AVERAGE
     assert trace.intervals() == [(pytest.approx(first * DT), pytest.approx(199 * DT))]
     assert np.array_equal(with_alarms(monitor(calibration=NEVER), trace).alarm, trace.alarm)
@@ -73,8 +73,8 @@ def test_a_model_that_gives_no_number_is_an_alarm(broken):
     }
     run = simulate(100, kind="rest")
     trace = replay(monitor(replace(model, **{broken: functions[broken]})), Exact(run), run)
-    assert (trace.verdict[WINDOW - 1 :] == Verdict.NOT_FINITE).all()
-    assert trace.coverage(DT)["judged_s"] == 0.0
+    assert (trace.validity[WINDOW - 1 :] == Validity.NOT_FINITE).all()
+    assert trace.coverage(DT)["valid_s"] == 0.0
     assert trace.alarm[WINDOW + AVERAGE :].all()
 
 
@@ -83,7 +83,7 @@ def test_missing_samples_are_counted_and_alarm_where_they_last():
     y = run.y.copy()
     y[50], y[100:140] = np.nan, np.nan
     trace = replay(monitor(calibration=NEVER), Exact(run), replace(run, y=y))
-    missing = np.flatnonzero(trace.verdict == Verdict.MISSING)
+    missing = np.flatnonzero(trace.validity == Validity.MISSING)
     # a sample is gone until it has left the window
     assert missing.tolist() == [*range(50, 55), *range(100, 144)]
     assert np.flatnonzero(trace.blind).tolist() == list(range(100 + WINDOW + AVERAGE, 144))
@@ -98,7 +98,7 @@ def test_in_the_loop_a_blind_monitor_is_no_quiet_one():
     watching = EnergyMonitor(model, window=5, average=5)
     result = closed_loop(model, make_safe(model), guard=guard, monitor=watching, faults=(gone,), duration=1.6)
     assert [(s.before.name, s.after.name, s.why) for s in result.switches] == [
-        ("NORMAL", "BACKUP", "the monitor cannot judge"),
+        ("NORMAL", "BACKUP", "the monitor has no valid reading"),
         ("BACKUP", "NORMAL", "no alarm for 0.1 s"),
     ]
     first, last = result.switches[0].t, result.switches[1].t
@@ -106,10 +106,10 @@ def test_in_the_loop_a_blind_monitor_is_no_quiet_one():
         0.4 + (5 + 5 + 1) * LOOP_DT
     )  # longer than its windows, then the next period
     assert 1.0 < last < 1.3
-    dark = ~result.judged
+    dark = ~result.valid
     assert dark[:4].all()  # warm-up
     assert dark[round(0.4 / LOOP_DT) : round(1.0 / LOOP_DT)].all()
-    assert result.judged.sum() == len(result.t) - 4 - (round(0.6 / LOOP_DT) + 4)
+    assert result.valid.sum() == len(result.t) - 4 - (round(0.6 / LOOP_DT) + 4)
     # a guard that only records leaves the loop as it is, and the alarm stands in the record
     quiet = closed_loop(
         model, make_safe(model), guard=Guard(Mode.NORMAL, Mode.REST), monitor=watching, faults=(gone,), duration=1.6
@@ -121,7 +121,7 @@ def test_in_the_loop_a_blind_monitor_is_no_quiet_one():
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory):
     """Ten seconds and one of the golf robot's columns, and the filters' noise."""
-    out = tmp_path_factory.mktemp("judged")
+    out = tmp_path_factory.mktemp("validity")
     for name, n in (("long", 500), ("short", 50), ("tiny", 8)):
         t = 0.02 * np.arange(n)
         phi = 0.3 * np.sin(2 * np.pi * 0.6 * t)
@@ -164,14 +164,14 @@ def diverging(folder):
     return folder
 
 
-def test_the_command_fails_where_nothing_could_be_judged(recordings, tmp_path):
+def test_the_command_fails_where_no_reading_is_valid(recordings, tmp_path):
     model = diverging(tmp_path / "model")
     done = command(recordings, model, tmp_path / "out", "long")
     assert done.exit_code == 1, done.output
-    assert "long: 10.0 s, 1 alarm; NOTHING COULD BE JUDGED" in done.output
+    assert "long: 10.0 s, 1 alarm; NO VALID READING" in done.output
     assert "model or estimator gives no finite number" in done.output
     found = json.loads((tmp_path / "out" / "monitor.json").read_text())["recordings"][0]
-    assert found["judged_s"] == 0.0
+    assert found["valid_s"] == 0.0
     assert found["not_finite_s"] > 9.0
     assert "no finite number" in found["alarms"][0]["diagnosis"]
 
@@ -181,10 +181,12 @@ def test_a_recording_of_a_second_is_watched_and_the_replay_shows_how_far_it_is(
 ):
     done = command(recordings, noisy_artifact, tmp_path / "out", "short", "long")
     assert done.exit_code == 0, done.output
-    assert "short: 1.0 s, 0 alarms; not judged: 0.32 s warm-up" in done.output  # a window of 17 samples
+    assert (
+        "short: 1.0 s, 0 alarms; no valid reading for 0.32 s warm-up" in done.output
+    )  # a window of 17 samples
     assert "replaying the recordings ..." in done.output
     header, first, *_ = (tmp_path / "out" / "short.csv").read_text().splitlines()
-    assert header.endswith("judged,frozen,alarm")
+    assert header.endswith("valid,frozen,alarm")
     assert first.endswith(",0,0,0")
 
 
