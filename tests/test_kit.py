@@ -27,6 +27,7 @@ from hybrid_mpc import (
     simulate,
 )
 from hybrid_mpc.kit.artifact import loop_settings, read_description, write_description
+from hybrid_mpc.kit.assembly import first_deviations
 
 README = Path(__file__).parents[1] / "README.md"
 GOLF = load_scenario("golf_robot")
@@ -101,6 +102,22 @@ def test_the_safe_input_is_the_scenario_s(run):
     for wrong in ((9.0,), (0.0, 0.0), (np.nan,)):
         with pytest.raises(hm.InputError, match="outside the limits"):
             kit.on(replace(GOLF, safe_input=wrong))
+
+
+@pytest.mark.parametrize(
+    ("solver", "kind"),
+    [("rti", "CondensedController"), ("sqp", "SQPController"), ("ipopt", "IpoptController")],
+)
+def test_the_solver_is_the_one_asked_for(run, solver, kind):
+    assert type(hm.load(run).controller(solver=solver).controller).__name__ == kind
+
+
+def test_the_first_speed_is_as_uncertain_as_two_readings_a_period_apart(run):
+    kit = hm.load(run)
+    sigma, dt = GOLF.sensor_sigma[0], kit.models["prior"].dt
+    want = [sigma, np.sqrt(2) * sigma / dt]
+    found = first_deviations(kit.models["prior"], replace(GOLF, first_sigma=None))
+    np.testing.assert_allclose(found, want, rtol=1e-15)
 
 
 def test_a_scenario_s_problem_is_taken_as_it_now_is(run):

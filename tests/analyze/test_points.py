@@ -137,6 +137,15 @@ def test_a_continuum_of_points_of_rest_is_marginal():
     assert found.unseen > 0.5  # each start ends elsewhere: it says itself that these are not all
 
 
+@pytest.mark.parametrize(("size", "stability"), [(0.9, "stable"), (1.1, "unstable")])
+@pytest.mark.parametrize("angle", [0.3, 2.5])
+def test_a_spiral_is_stable_where_its_poles_lie_inside_the_unit_circle(size, stability, angle):
+    """Real parts say nothing: both signs of them occur inside the circle and outside."""
+    turn = size * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    found = equilibria(linear_model(turn, [[0.0], [1.0]], [[1.0, 0.0]]), [0.0], [(-1, 1), (-1, 1)])
+    assert [p.stability for p in found.points] == [stability]
+
+
 def test_friction_at_rest_is_the_tanh_s_slope(golf):
     speeds = np.array([0.01, 0.2, 1.0])
     found = friction_slopes(golf["prior"], [0.0], speeds)
