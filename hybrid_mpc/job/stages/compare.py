@@ -139,13 +139,6 @@ def compare(context: Context) -> list[LoopRow]:
     """Run all loops on the run's model; the timed ones alone, the others side by side in processes.
 
     Every part is kept as it ends; what a run that was killed has kept is not run again.
-
-    Args:
-        context: The run; its artifact holds the filters' process noise.
-
-    Returns:
-        The rows by task, controller and seed; of the first seed with ``SHOWN``, of a timed one with ``step_ms`` and
-        ``plans``.
     """
     parts, settings = parts_of(context.scenario, context.budget), context.settings
     specs = {part.stage: part.specs(settings.scenario, settings.seed) for part in parts}
@@ -203,14 +196,7 @@ def run_specs(
     specs: Sequence[LoopSpec],
     report: Callable[[int, int, str], None] = lambda done, total, text: None,
 ) -> list[LoopRow]:
-    """Rows of loops on a run's own model.
-
-    Args:
-        scenario: Name or path of the scenario.
-        folder: The artifact.
-        specs: The loops.
-        report: Called with ``(done, total, text)`` as the loops go on.
-    """
+    """Rows of loops on a run's own model."""
     bench = _bench(scenario, folder, (folder / "model.json").stat().st_mtime_ns)
     return list(run_loops(bench, specs, report))
 
@@ -227,16 +213,8 @@ def run_or_read(
     """Rows of loops on the run's model: those that ``checkpoints`` holds are read, the others run.
 
     A part is what runs together. It is written as it ends, so a killed run goes on from there. It is read only if it
-    was run with the present model, noise, machine and control problem.
-
-    Args:
-        context: The run.
-        parts: Loops by the name of their file.
-        alone: Parts that run in this process with nothing beside them, so that the durations of their steps count. The
-            others run side by side in processes. Default: none.
-
-    Returns:
-        The rows by the name of their file.
+    was run with the present model, noise, machine and control problem. Parts named in ``alone`` run in this process
+    with nothing beside them, so that the durations of their steps count; the others side by side in processes.
     """
     of = {part: identity(context, specs) for part, specs in parts.items()}
     found = {part: read_rows(context.path(part), of[part]) for part in parts}
@@ -261,12 +239,7 @@ def run_or_read(
 
 
 def identity(context: Context, specs: Sequence[LoopSpec]) -> str:
-    """Digest of all that decides what loops of a run compute: their specifications, machine, tasks and model.
-
-    Args:
-        context: The run.
-        specs: The loops.
-    """
+    """Digest of all that decides what loops of a run compute: their specifications, machine, tasks and model."""
     model = read_description(context.out / "model")
     rest = None if model.calibration is None else model.calibration.rest_speed
     of_monitor = rest if any(spec.monitor == "readings" for spec in specs) else None
@@ -293,13 +266,7 @@ def identity(context: Context, specs: Sequence[LoopSpec]) -> str:
 
 
 def task_content(task: Task, dt: float, loop: LoopSettings) -> dict[str, object]:
-    """All of a task that decides how its loops go: its references sampled on the grid, its control problem.
-
-    Args:
-        task: The task.
-        dt: Period of the model [s].
-        loop: The control problems by task.
-    """
+    """All of a task that decides how its loops go: its references sampled on the grid, its control problem."""
     problem = loop.control.get(task.name, loop.control.get(""))
     horizon = 0 if problem is None else problem.horizon
     t = np.arange(round(task.duration / dt) + horizon + 1, dtype=np.float64) * dt

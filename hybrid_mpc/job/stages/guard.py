@@ -69,13 +69,6 @@ def nominal_loops(
 ) -> list[LoopSpec]:
     """The loops of a budget: calm tasks in turn, each round of them scaled by its own share.
 
-    Args:
-        scenario: The machine.
-        budget: Whose seeds tell how many.
-        model: The model, whose period and unit of time count.
-        named: Registered name or path of the scenario. Default: its own name.
-        run_seed: Seed of the run. Default 0.
-
     Raises:
         InputError: If something goes wrong in every task.
 
@@ -108,11 +101,7 @@ def nominal_loops(
 
 
 def stage_of(spec: LoopSpec) -> str:
-    """Name of a nominal loop's file in ``checkpoints``.
-
-    Args:
-        spec: The loop.
-    """
+    """Name of a nominal loop's file in ``checkpoints``."""
     return f"guard/{spec.task}-{spec.seed}"
 
 
@@ -210,17 +199,7 @@ class FaultedLoop:
 def faulted(
     bench: Bench, named: str, run_seed: int, causes: Mapping[str, tuple[str, ...]]
 ) -> tuple[tuple[FaultedLoop, ...], dict[str, Array]]:
-    """A loop of each case on the first tracking task, in which something breaks from the middle on.
-
-    Args:
-        bench: The machine and its model, with the detector that the guard listens to.
-        named: Name or path of the scenario.
-        run_seed: Seed of the run.
-        causes: What may break, by name.
-
-    Returns:
-        The loops, and their traces for the report, see :func:`read_trace`.
-    """
+    """A loop of each case on the first tracking task, in which something breaks from the middle on."""
     scenario, kit = bench.scenario, bench.kits[MODEL]
     dt = kit.models["hybrid"].dt
     task = nominal_tasks(scenario)[0]
@@ -420,14 +399,6 @@ def learned(
     Of a machine with another second (:func:`~hybrid_mpc.data.scales.time_unit`) they are 1, 2, 5 and 10 in 3600 of
     these.
 
-    Args:
-        runs: Reading numbers of nominal runs, each ``(n, columns)``.
-        dt: Period [s].
-        n_q: Degrees of freedom.
-        data_hash: Hash of the data.
-        rest_speed: That of the monitor which made the numbers. Default 0.2, as the monitor's.
-        time_unit: The machine's second [s], the model's. Default 1.
-
     Raises:
         InputError: If they are too short for any of them (it says how much is needed), or hold an alarm.
 
@@ -454,9 +425,6 @@ def learned(
 
 def blocks_needed(rate: float) -> int:
     """Blocks that a rate of false alarms needs, half of it for either of the detector's two alarms.
-
-    Args:
-        rate: Wanted false alarms in 3600 of the machine's seconds, of which a block has five.
 
     Example:
         >>> [blocks_needed(rate) for rate in (1.0, 2.0, 10.0)]

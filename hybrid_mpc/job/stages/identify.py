@@ -293,19 +293,7 @@ def train_kinds(
     workers: int = WORKERS,
     on_progress: Callable[[str, int, int, str], None] = lambda key, done, total, text: None,
 ) -> dict[str, Trained]:
-    """Train the networks of every kind that ``folder`` does not hold yet; an interrupted training is resumed.
-
-    Args:
-        scenario: Registered name or path, which every process loads for itself.
-        values: Parameters of the fitted prior.
-        training: Smoothed training trajectories.
-        validation: Smoothed validation trajectories.
-        settings: Settings of each kind.
-        folder: Where checkpoints and finished networks lie.
-        device: Where the networks are trained. Default: cpu.
-        workers: Kinds trained at once.
-        on_progress: ``(kind, done, total, text)``.
-    """
+    """Train the networks of every kind that ``folder`` does not hold yet; an interrupted training is resumed."""
     jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
         kind: (_train_kind, (scenario, dict(values), training, validation, settings[kind], folder, device))
         for kind in reversed(list(settings))
