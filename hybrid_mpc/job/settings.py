@@ -17,7 +17,7 @@ MOST = {
 }  # fmt: skip
 """Largest values: a file of settings must not ask for more memory than a machine has."""
 NETWORK = (*WHOLE, "decay", "learning_rates", "prior_replay")
-"""What a file of network settings may hold: arguments of ``identification.TrainingSettings``."""
+"""What a file of network settings may hold: arguments of :class:`~hybrid_mpc.identify.settings.TrainingSettings`."""
 
 
 @dataclass(frozen=True)
