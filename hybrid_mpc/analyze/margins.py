@@ -414,7 +414,7 @@ class LinearLoop:
 
 
 def mpc_loop(gain: MpcGain, filter: SteadyFilter, plant: Any, *, delay: int = 0) -> LinearLoop:
-    """The loop of an MPC's gain, a steady filter and a plant, in the order of :func:`~hybrid_mpc.loop.simulate.simulate`.
+    """The loop of an MPC's gain, a steady filter and a plant, in the order of ``simulate``.
 
     At ``t_k``: measure ``y_k``, ``w_k = w- + L (y_k - C w-)`` with ``w- = F w_{k-1} + G u_{k-1}``, then ``u_k`` from
     ``w_k`` and ``u_{k-1}``, held until ``t_{k+1}``.

@@ -15,19 +15,11 @@ from hybrid_mpc.files import digest, write_json
 from hybrid_mpc.job.context import Progress, versions
 from hybrid_mpc.job.controllers import CONTROLLERS
 from hybrid_mpc.job.folder import JobNote, check_out, open_folder
-from hybrid_mpc.job.loops import (
-    Bench,
-    LoopRow,
-    LoopSpec,
-    by_task,
-    read_rows,
-    run_loops,
-    summaries,
-    tasks_of,
-    write_rows,
-)
+from hybrid_mpc.job.loops import Bench, LoopRow, LoopSpec, read_rows, run_loops, write_rows
 from hybrid_mpc.job.study import Study
 from hybrid_mpc.job.study_run import StudyModel, load_models
+from hybrid_mpc.job.summary import by_task, summaries
+from hybrid_mpc.job.tasks import tasks_of
 from hybrid_mpc.loop.realtime import percentiles
 from hybrid_mpc.records import plain
 from hybrid_mpc.scenario import load_scenario

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
@@ -19,9 +18,10 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimator
 from hybrid_mpc.files import digest, read_document, read_document_arrays, write_document
 from hybrid_mpc.job.controllers import CONTROLLERS, build
+from hybrid_mpc.job.tasks import repeated, tasks_of
 from hybrid_mpc.kit.artifact import WATCHES, Kit
 from hybrid_mpc.kit.assembly import SOLVERS, make_adaptive_guard, make_backup_guard, make_resting_guard
-from hybrid_mpc.loop.faults import Fault, check_channels, install
+from hybrid_mpc.loop.faults import Fault, check_channels, fault_text, install
 from hybrid_mpc.loop.guard import Guard
 from hybrid_mpc.loop.plant import Plant
 from hybrid_mpc.loop.realtime import percentiles
@@ -165,54 +165,6 @@ class LoopSpec:
             "seed": self.seed,
             **{f"factor_{name}": value for name, value in self.parameters},
         }
-
-
-def fault_text(faults: Sequence[Fault], late: Intervals = ()) -> str:
-    """Faults in the form in which the command line takes them; ``"none"`` for none.
-
-    Example:
-        >>> fault_text([Fault(1.5, np.inf, "plant_friction", 2.0)], late=((1.0, 1.2),))
-        'plant_friction=2@1.5 + late@1:1.2'
-    """
-    parts = []
-    for f in faults:
-        end = "" if np.isinf(f.end) else f":{f.end:g}"
-        more = (f" channel {f.channel}" if f.channel else "") + (f" ramp {f.ramp:g}" if f.ramp else "")
-        parts.append(f"{f.target}={f.value:g}@{f.start:g}{end}{more}")
-    parts += [f"late@{a:g}" + ("" if np.isinf(b) else f":{b:g}") for a, b in late]
-    return " + ".join(parts) or "none"
-
-
-def parsed_fault(text: str) -> Fault:
-    """A fault from ``TARGET[=VALUE][@START[:END]]``, times in seconds.
-
-    Args:
-        text: e.g. ``"input_gain=0.8@1.0"``; start 0 by default, end never. A sensor that freezes or drops out has no
-            value, every other fault needs one.
-
-    Raises:
-        InputError: If it has another form, or there is no such fault.
-
-    Example:
-        >>> fault = parsed_fault("plant_friction=2@1:2.5")
-        >>> fault.target, fault.value, fault.start, fault.end
-        ('plant_friction', 2.0, 1.0, 2.5)
-    """
-    head, _, when = text.partition("@")
-    target, _, value = head.partition("=")
-    start, _, end = when.partition(":")
-    try:
-        numbers = [float(v) if v else d for v, d in ((start, 0.0), (end, math.inf), (value, 0.0))]
-    except ValueError as error:
-        raise InputError(
-            f"fault {text!r}: {error}; the form is TARGET=VALUE@START:END, e.g. input_gain=0.8@1.0:2.5"
-        ) from error
-    if math.isnan(numbers[0]) or math.isnan(numbers[1]):
-        raise InputError(f"fault {text!r}: times must be numbers of seconds")
-    fault = Fault(numbers[0], numbers[1], target, numbers[2])
-    if not value and target not in ("measurement_freeze", "measurement_dropout"):
-        raise InputError(f"fault {text!r} has no value; write how large it is, e.g. {target}=1.5@1.0")
-    return fault
 
 
 @dataclass(frozen=True)
@@ -607,43 +559,6 @@ def excess(control: OCP, r: ClosedLoopResult, model: HybridModel) -> dict[str, f
     return {name: max(0.0, float(values.max())) for name, values in over.items()}
 
 
-def tasks_of(scenario: Scenario, names: Sequence[str] | None) -> tuple[Task, ...]:
-    """The scenario's tasks of exactly these names, all for None; an unknown name is refused."""
-    if names is None:
-        return scenario.tasks
-    there = {task.name: task for task in scenario.tasks}
-    missing = [name for name in names if name not in there]
-    if missing:
-        raise InputError(
-            f"scenario {scenario.name}: no task {', '.join(missing)}; there are: {', '.join(there)}"
-        )
-    return tuple(there[name] for name in names)
-
-
-def selected_tasks(scenario: Scenario, names: Sequence[str]) -> tuple[Task, ...]:
-    """The tasks of these names or, where there is none of a name, those whose names begin so; all for no names.
-
-    Raises:
-        InputError: If nothing fits a name.
-
-    Example:
-        >>> [task.name for task in selected_tasks(load_scenario("golf_robot"), ["track", "stroke_4"])]
-        ['track_sine', 'track_step', 'stroke_4']
-    """
-    if not names:
-        return scenario.tasks
-    there = [task.name for task in scenario.tasks]
-    chosen: set[str] = set()
-    for name in names:
-        fitting = [name] if name in there else [t for t in there if name and t.startswith(name)]
-        if not fitting:
-            raise InputError(
-                f"scenario {scenario.name}: no task {name!r}, none begins so; there are: {', '.join(there) or 'none'}"
-            )
-        chosen.update(fitting)
-    return tuple(task for task in scenario.tasks if task.name in chosen)
-
-
 def varied(plant: Any, factors: Sequence[tuple[str, float]]) -> Any:
     """The plant with some of its parameters multiplied.
 
@@ -707,175 +622,3 @@ def check_faults(scenario: Scenario, faults: Sequence[Fault]) -> None:
     assert scenario.control is not None
     outside = install(scenario.plant(), faults)[1]
     check_channels(outside, len(scenario.sensor_sigma), scenario.control.n_u)
-
-
-@dataclass(frozen=True)
-class Mean:
-    """A mean with its 95 % interval (Student's t).
-
-    Args:
-        mean: The mean; None where a value is not finite, or there is none.
-        ci95: Half width of the interval; None of a single value.
-        n: Number of values.
-    """
-
-    mean: float | None
-    ci95: float | None
-    n: int
-
-
-def interval(values: Sequence[float]) -> Mean:
-    """Mean of values and half width of its 95 % interval.
-
-    Args:
-        values: ``(n,)``.
-
-    Example:
-        >>> interval([1.0])
-        Mean(mean=1.0, ci95=None, n=1)
-        >>> found = interval([1.0, 2.0])  # t(0.975, 1) = 12.706, standard error 0.5
-        >>> found.mean, round(found.ci95, 3)
-        (1.5, 6.353)
-    """
-    from scipy.stats import t as student
-
-    x, n = np.asarray(values, dtype=float), len(values)
-    if not (n and np.all(np.isfinite(x))):
-        return Mean(None, None, n)
-    half = float(student.ppf(0.975, n - 1) * x.std(ddof=1) / math.sqrt(n)) if n > 1 else None
-    return Mean(float(x.mean()), half, n)
-
-
-@dataclass(frozen=True)
-class Summary:
-    """The loops of one task and controller summed up.
-
-    Args:
-        cost: Closed-loop cost.
-        tracking_rmse: Tracking errors by signal.
-        figures: The task's own figures.
-        mean_abs_figures: Their magnitudes.
-        sources: Share of periods by what gave the input.
-        limits: Largest share of each limit that any loop used.
-    """
-
-    cost: Mean
-    tracking_rmse: Mapping[str, Mean]
-    figures: Mapping[str, Mean]
-    mean_abs_figures: Mapping[str, Mean]
-    sources: Mapping[str, float]
-    limits: Mapping[str, float]
-
-
-def by_task(rows: Sequence[LoopRow]) -> dict[str, dict[str, list[LoopRow]]]:
-    """Rows by task and controller, in the order in which they come."""
-    table: dict[str, dict[str, list[LoopRow]]] = {}
-    for row in rows:
-        table.setdefault(row.task, {}).setdefault(row.controller, []).append(row)
-    return table
-
-
-def summaries(rows: Sequence[LoopRow]) -> dict[str, dict[str, Summary]]:
-    """Summaries of loops by task and controller.
-
-    Example: ``summaries(rows)["track_sine"]["hybrid"].cost.mean``
-    """
-    return {task: {name: summary(r) for name, r in cell.items()} for task, cell in by_task(rows).items()}
-
-
-def summary(rows: Sequence[LoopRow]) -> Summary:
-    """The summary of loops of one task and controller, at least one."""
-
-    def of(
-        pick: Callable[[LoopRow], Mapping[str, float]], change: Callable[[float], float] = float
-    ) -> dict[str, Mean]:
-        return {key: interval([change(pick(row)[key]) for row in rows]) for key in pick(rows[0])}
-
-    limits: dict[str, float] = {}
-    for row in rows:
-        for key, share in row.limits.items():
-            limits[key] = max(share, limits.get(key, 0.0))
-    return Summary(
-        cost=interval([row.cost for row in rows]),
-        tracking_rmse=of(lambda row: row.tracking_rmse),
-        figures=of(lambda row: row.figures),
-        mean_abs_figures=of(lambda row: row.figures, abs),
-        sources={s.name: float(np.mean([row.sources[s.name] for row in rows])) for s in Source},
-        limits=limits,
-    )
-
-
-RETURN_S = 1.0
-"""Shortest way back to the reference's beginning [the machine's seconds]."""
-
-
-def repeated(task: Task, dt: float, shares: Array, time_unit: float = 1.0) -> Task:
-    """The task over and over: to its end, back to its beginning along a quintic, and again.
-
-    Args:
-        task: A task; its reference is asked for within its duration alone.
-        dt: Period [s]; a round takes whole periods, since weights may be of single instants.
-        shares: Factor ``(m,)`` on the distance from the reference's beginning, a round each.
-        time_unit: The machine's second [s]: the way back takes one at least. Default 1.
-
-    Returns:
-        The task of ``m`` rounds.
-
-    Example:
-        >>> ramp = Task("ramp", "", 1.0, (0.0, 0.0), lambda t: np.column_stack([t, np.ones(len(t))]))
-        >>> twice = repeated(ramp, 0.02, np.array([1.0, 0.5]))
-        >>> twice.duration, twice.reference(np.array([0.5, 3.5])).round(6).tolist()
-        (6.0, [[0.5, 1.0], [0.25, 0.5]])
-    """
-    n_q, length = len(task.x0) // 2, round(task.duration / dt)
-    rows = task.reference(np.arange(length + 1, dtype=np.float64) * dt)
-    first, last = rows[0], rows[-1]
-    fastest = np.abs(rows[:, n_q : 2 * n_q]).max(axis=0)
-    far = np.abs(last - first)[:n_q] / np.maximum(fastest, 1e-9)  # a quintic's top speed is 15/8 of its mean
-    back = max(RETURN_S * time_unit, 2.0 * float(far.max(initial=0.0)) if np.all(fastest > 0) else 0.0)
-    period = (length + math.ceil(back / dt - 1e-9)) * dt
-    curve = [
-        _quintic(first[i], last[i], first[n_q + i], last[n_q + i], period - length * dt) for i in range(n_q)
-    ]
-
-    def place(t: Array) -> tuple[NDArray[np.int_], Array, NDArray[np.bool_]]:
-        number = np.clip(np.floor(t / period + 1e-9).astype(int), 0, None)
-        inside = np.maximum(t - number * period, 0.0)
-        return np.minimum(number, len(shares) - 1), inside, inside < length * dt - 1e-9
-
-    def reference(t: Array) -> Array:
-        number, inside, during = place(np.asarray(t, dtype=float))
-        rows = np.tile(last, (len(inside), 1))
-        if during.any():
-            rows[during] = task.reference(inside[during])
-        left = inside[~during] - length * dt
-        for i, polynomial in enumerate(curve):
-            rows[~during, i], rows[~during, n_q + i] = polynomial(left), polynomial.deriv()(left)
-        start = np.concatenate([first[:n_q], np.zeros(len(first) - n_q)])
-        rows[:, : 2 * n_q] = (start + shares[number, None] * (rows - start))[:, : 2 * n_q]
-        return rows
-
-    def weight(t: Array) -> Array:
-        assert task.weight is not None
-        _, inside, during = place(np.asarray(t, dtype=float))
-        rows = np.ones((len(inside), len(task.x0)))
-        if during.any():
-            rows[during] = task.weight(inside[during])
-        return rows
-
-    return replace(
-        task,
-        duration=round(period * len(shares), 9),
-        reference=reference,
-        weight=None if task.weight is None else weight,
-        figures=None,
-    )
-
-
-def _quintic(p1: float, p0: float, v1: float, v0: float, time: float) -> np.polynomial.Polynomial:
-    """From position ``p0`` and speed ``v0`` to ``p1`` and ``v1`` within ``time``, without acceleration at the ends."""
-    d = p1 - p0
-    a3 = (10 * d - time * (6 * v0 + 4 * v1)) / time**3
-    a4 = (-15 * d + time * (8 * v0 + 7 * v1)) / time**4
-    a5 = (6 * d - time * 3 * (v0 + v1)) / time**5
-    return np.polynomial.Polynomial([p0, v0, 0.0, a3, a4, a5])

@@ -18,9 +18,10 @@ import numpy as np
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_bytes
 from hybrid_mpc.job.controllers import CONTROLLERS, ORACLES
-from hybrid_mpc.job.loops import ALARMING, GUARDS, MONITORS, Intervals, LoopSpec, parsed_fault, selected_tasks
+from hybrid_mpc.job.loops import ALARMING, GUARDS, MONITORS, Intervals, LoopSpec
+from hybrid_mpc.job.tasks import selected_tasks
 from hybrid_mpc.kit.assembly import SOLVERS
-from hybrid_mpc.loop.faults import SIGNAL_TARGETS, Fault
+from hybrid_mpc.loop.faults import SIGNAL_TARGETS, Fault, parsed_fault
 from hybrid_mpc.records import MOST_SEED, known, plain, record
 from hybrid_mpc.scenario import load_scenario, registered_scenarios, scenario_of
 

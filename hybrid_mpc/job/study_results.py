@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.job.loops import interval
 from hybrid_mpc.job.study_log import (
     RESULTS,
     RUNS,
@@ -23,6 +22,7 @@ from hybrid_mpc.job.study_log import (
     rows,
     study_note,
 )
+from hybrid_mpc.job.summary import interval
 from hybrid_mpc.plots.style import name_of, save
 from hybrid_mpc.records import known
 from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, write_report

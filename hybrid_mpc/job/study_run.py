@@ -25,15 +25,7 @@ from hybrid_mpc.job.context import Progress, Silent, versions
 from hybrid_mpc.job.controllers import CONTROLLERS, ORACLES, find_noise
 from hybrid_mpc.job.engine import Engine, Lost, make_engine
 from hybrid_mpc.job.folder import JobNote, check_out, open_folder
-from hybrid_mpc.job.loops import (
-    Bench,
-    LoopSpec,
-    check_complete,
-    check_faults,
-    check_kit,
-    selected_tasks,
-    varied,
-)
+from hybrid_mpc.job.loops import Bench, LoopSpec, check_complete, check_faults, check_kit, varied
 from hybrid_mpc.job.study import RandomFaults, Study
 from hybrid_mpc.job.study_log import (
     NOUN,
@@ -50,6 +42,7 @@ from hybrid_mpc.job.study_log import (
     study_note,
 )
 from hybrid_mpc.job.study_results import StudyResults, duration_text
+from hybrid_mpc.job.tasks import selected_tasks
 from hybrid_mpc.kit.artifact import FILES, Kit, artifact_folder, load
 from hybrid_mpc.kit.assembly import adaptable
 from hybrid_mpc.records import plain

@@ -181,3 +181,51 @@ def corrupt_input(faults: Sequence[Fault], t: float, u: Array) -> Array:
         elif fault.active(t) and fault.target == "input_offset":
             u[fault.channel] += fault.value_at(t, 0.0)
     return u
+
+
+def fault_text(faults: Sequence[Fault], late: Sequence[tuple[float, float]] = ()) -> str:
+    """Faults in the form in which the command line takes them; ``"none"`` for none.
+
+    Example:
+        >>> fault_text([Fault(1.5, np.inf, "plant_friction", 2.0)], late=((1.0, 1.2),))
+        'plant_friction=2@1.5 + late@1:1.2'
+    """
+    parts = []
+    for f in faults:
+        end = "" if np.isinf(f.end) else f":{f.end:g}"
+        more = (f" channel {f.channel}" if f.channel else "") + (f" ramp {f.ramp:g}" if f.ramp else "")
+        parts.append(f"{f.target}={f.value:g}@{f.start:g}{end}{more}")
+    parts += [f"late@{a:g}" + ("" if np.isinf(b) else f":{b:g}") for a, b in late]
+    return " + ".join(parts) or "none"
+
+
+def parsed_fault(text: str) -> Fault:
+    """A fault from ``TARGET[=VALUE][@START[:END]]``, times in seconds.
+
+    Args:
+        text: e.g. ``"input_gain=0.8@1.0"``; start 0 by default, end never. A sensor that freezes or drops out has no
+            value, every other fault needs one.
+
+    Raises:
+        InputError: If it has another form, or there is no such fault.
+
+    Example:
+        >>> fault = parsed_fault("plant_friction=2@1:2.5")
+        >>> fault.target, fault.value, fault.start, fault.end
+        ('plant_friction', 2.0, 1.0, 2.5)
+    """
+    head, _, when = text.partition("@")
+    target, _, value = head.partition("=")
+    start, _, end = when.partition(":")
+    try:
+        numbers = [float(v) if v else d for v, d in ((start, 0.0), (end, math.inf), (value, 0.0))]
+    except ValueError as error:
+        raise InputError(
+            f"fault {text!r}: {error}; the form is TARGET=VALUE@START:END, e.g. input_gain=0.8@1.0:2.5"
+        ) from error
+    if math.isnan(numbers[0]) or math.isnan(numbers[1]):
+        raise InputError(f"fault {text!r}: times must be numbers of seconds")
+    fault = Fault(numbers[0], numbers[1], target, numbers[2])
+    if not value and target not in ("measurement_freeze", "measurement_dropout"):
+        raise InputError(f"fault {text!r} has no value; write how large it is, e.g. {target}=1.5@1.0")
+    return fault

@@ -11,9 +11,11 @@ from closed_loop_parts import loop_row
 from hybrid_mpc import InputError, RunSettings, Signal, load_scenario, set_process_noise
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.controllers import CONTROLLERS, ORACLES
-from hybrid_mpc.job.loops import by_task, interval, limits_used, summaries, tasks_of
+from hybrid_mpc.job.loops import limits_used
 from hybrid_mpc.job.stages.compare import TIMED, _seeds, compare, parts_of
 from hybrid_mpc.job.stages.results import gap_closed
+from hybrid_mpc.job.summary import by_task, interval, summaries
+from hybrid_mpc.job.tasks import tasks_of
 
 GOLF = load_scenario("golf_robot")
 SIGNALS = SimpleNamespace(

@@ -18,8 +18,9 @@ from hybrid_mpc import (
     set_calibration,
     set_process_noise,
 )
-from hybrid_mpc.job.loops import parsed_fault, selected_tasks
 from hybrid_mpc.job.study_run import load_models
+from hybrid_mpc.job.tasks import selected_tasks
+from hybrid_mpc.loop.faults import parsed_fault
 from hybrid_mpc.records import record
 
 GOLF = load_scenario("golf_robot")

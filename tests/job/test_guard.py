@@ -22,7 +22,7 @@ from hybrid_mpc import (
     write_csv,
 )
 from hybrid_mpc.job.context import Context
-from hybrid_mpc.job.loops import read_rows, repeated, write_rows
+from hybrid_mpc.job.loops import read_rows, write_rows
 from hybrid_mpc.job.stages import compare as compare_job
 from hybrid_mpc.job.stages import guard as guard_job
 from hybrid_mpc.job.stages.compare import identity
@@ -32,6 +32,7 @@ from hybrid_mpc.job.stages.guard import GUARD, guard_stage, learned
 from hybrid_mpc.job.stages.monitor import MONITOR, MonitorResult
 from hybrid_mpc.job.stages.report import guard_tables, guard_words
 from hybrid_mpc.job.stages.results import _guard as guard_results
+from hybrid_mpc.job.tasks import repeated
 from scenarios.golf_robot.rig import Rig
 
 GOLF = load_scenario("golf_robot")

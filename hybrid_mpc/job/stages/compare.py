@@ -24,12 +24,12 @@ from hybrid_mpc.job.loops import (
     arrays_of,
     read_rows,
     run_loops,
-    tasks_of,
     with_arrays,
     write_rows,
 )
 from hybrid_mpc.job.stage import UNKNOWN, Absent, Stage, source_of
 from hybrid_mpc.job.stages.export import EXPORT, NOISE, observed
+from hybrid_mpc.job.tasks import tasks_of
 from hybrid_mpc.kit.artifact import LoopSettings, load, loop_settings, read_description, write_description
 from hybrid_mpc.loop.loop import Loop
 from hybrid_mpc.records import plain

@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 
 from hybrid_mpc.identify.settings import KINDS
 from hybrid_mpc.job.context import Context
-from hybrid_mpc.job.loops import summaries, tasks_of
 from hybrid_mpc.job.stage import Absent
 from hybrid_mpc.job.stages.analyze import ANALYSIS
 from hybrid_mpc.job.stages.compare import CONTROL
@@ -20,6 +19,8 @@ from hybrid_mpc.job.stages.guard import GUARD, read_trace
 from hybrid_mpc.job.stages.identify import EVALUATION, MODELS, trained_models
 from hybrid_mpc.job.stages.monitor import MONITOR, clean_windows
 from hybrid_mpc.job.stages.results import REPORTED, step_times
+from hybrid_mpc.job.summary import summaries
+from hybrid_mpc.job.tasks import tasks_of
 from hybrid_mpc.monitor.residuals import force_units
 from hybrid_mpc.plots import analysis, animation, data, estimation, fit, loops, monitor
 from hybrid_mpc.plots.style import save

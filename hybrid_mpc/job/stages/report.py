@@ -13,7 +13,6 @@ from markupsafe import Markup
 from hybrid_mpc.files import write_json
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.controllers import CONTROLLERS
-from hybrid_mpc.job.loops import Summary
 from hybrid_mpc.job.stage import Stage, source_of
 from hybrid_mpc.job.stages.analyze import ANALYSIS
 from hybrid_mpc.job.stages.compare import CONTROL
@@ -43,6 +42,7 @@ from hybrid_mpc.job.stages.results import (
     Timing,
     collect,
 )
+from hybrid_mpc.job.summary import Summary
 from hybrid_mpc.monitor.residuals import force_units
 from hybrid_mpc.plots.style import name_of
 from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, write_report

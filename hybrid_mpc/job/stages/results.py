@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.evaluate import Scores
 from hybrid_mpc.job.context import Context
-from hybrid_mpc.job.loops import LoopRow, Summary, by_task, summaries
+from hybrid_mpc.job.loops import LoopRow
 from hybrid_mpc.job.stage import Absent
 from hybrid_mpc.job.stages.analyze import ANALYSIS, ModelAnalysis
 from hybrid_mpc.job.stages.compare import CONTROL
@@ -26,6 +26,7 @@ from hybrid_mpc.job.stages.export import EXPORT
 from hybrid_mpc.job.stages.guard import GUARD, FaultedLoop, GuardTest, NominalLoop
 from hybrid_mpc.job.stages.identify import DATA, EVALUATION, MODELS
 from hybrid_mpc.job.stages.monitor import MONITOR, CleanAlarms, RecordedAlarm
+from hybrid_mpc.job.summary import Summary, by_task, summaries
 from hybrid_mpc.monitor.calibrate import Calibration
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.records import plain, record

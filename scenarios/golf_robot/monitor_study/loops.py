@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.files import read_arrays, read_json, write_arrays
-from hybrid_mpc.job.loops import MODEL, Bench, LoopSpec, selected_tasks
+from hybrid_mpc.job.loops import MODEL, Bench, LoopSpec
 from hybrid_mpc.job.study_run import ModelInput, local_folder
+from hybrid_mpc.job.tasks import selected_tasks
 from hybrid_mpc.kit.artifact import Kit, load
 from hybrid_mpc.loop.simulate import ClosedLoopResult
 from hybrid_mpc.monitor.detector import Detector
