@@ -209,13 +209,16 @@ class Pieces:
 
 
 def operations(f: ca.Function) -> float:
-    """Scalar operations of a matrix graph, about; infinite if it calls other functions."""
+    """Scalar operations of a matrix graph, about; infinite if it calls functions that are no scalar code."""
     total = 0
     for k in range(f.n_instructions()):
         kind = f.instruction_id(k)
         if kind == ca.OP_CALL:
-            return math.inf
-        if kind not in (ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST):
+            called = f.instruction_MX(k).which_function()
+            if not called.is_a("SXFunction"):
+                return math.inf
+            total += called.n_instructions()
+        elif kind not in (ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST):
             node = f.instruction_MX(k)
             total += node.numel() * (2 * node.dep(1).size2() if kind == ca.OP_MTIMES else 1)
     return total

@@ -23,7 +23,8 @@ from nn_export.program import Port, Program
 # Kept whole: their decompositions lose structure, or derivatives at the far ends.
 _WHOLE = re.compile(
     r"aten\.(gru|lstm|rnn_tanh|rnn_relu|gru_cell|lstm_cell|rnn_tanh_cell|rnn_relu_cell|linear|layer_norm"
-    r"|softplus|silu|mish|celu|logsumexp|log_sigmoid|mv|dot|std|std_mean|xlogy)$"
+    r"|softplus|silu|mish|celu|logsumexp|log_sigmoid|mv|dot|std|std_mean|xlogy"
+    r"|linalg_solve|linalg_inv|linalg_det|linalg_cholesky)$"
 )
 
 

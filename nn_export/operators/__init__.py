@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from nn_export.operators import elementwise, linear, recurrent, reduce, shape
+from nn_export.operators import elementwise, linear, recurrent, reduce, shape, systems
 from nn_export.operators.value import Value
 
 
@@ -19,6 +19,7 @@ OPERATORS: dict[str, Callable[..., Any]] = {
     **elementwise.OPERATORS,
     **shape.OPERATORS,
     **linear.OPERATORS,
+    **systems.OPERATORS,
     **reduce.OPERATORS,
     **recurrent.OPERATORS,
 }

@@ -14,7 +14,7 @@ from itertools import chain
 from math import ceil
 from typing import Any, NamedTuple
 
-from nn_export.operators import elementwise
+from nn_export.operators import elementwise, systems
 from nn_export.operators.value import broadcast_shape
 
 HUGE = 2**62
@@ -410,6 +410,23 @@ def _trilinear(
     return _sum(moved, _reduced(12)(out, whole))
 
 
+# Systems of a few linear equations
+
+
+def _system(out: int, a: Tensor, b: Tensor | bool | None = None, *args: Any, **kwargs: Any) -> Cost:
+    """Elimination in scalars: ``n^2 (n + columns)`` of them, three times with the rows that may be swapped."""
+    b = b if type(b) is Tensor else None
+    n = max([1, *(t.shape[-1] for t in (a, b) if t is not None and t.shape)])
+    if n > systems.MOST:
+        raise ValueError(f"a matrix of {n} rows; at most {systems.MOST} can be exported")
+    given = a.size + (0 if b is None else b.size)
+    stacks, columns = product(a.shape[:-2]), given // n + n
+    scalars = 3 * n * n * (n + columns) + 16
+    whole = given + stacks * n * columns
+    moved = _moved(whole, whole, 24 * (1 + stacks), times=4)
+    return _sum(moved, Cost(whole, 4 * NUMBER * stacks * scalars, 4 * stacks * scalars, stacks * scalars))
+
+
 # Recurrent layers and cells
 
 
@@ -511,6 +528,7 @@ REDUCTIONS: dict[str, Rule] = {
     "aten.any.default": _reduced(12, 12), "aten.any.dim": _reduced(12, 12), "aten.any.dims": _reduced(12, 12),
     "aten.dist.default": _dist,
 }  # fmt: skip
+SYSTEMS: dict[str, Rule] = dict.fromkeys(systems.OPERATORS, _system)
 RECURRENT: dict[str, Rule] = {
     **{f"aten.{kind}.input": _layers for kind in ("gru", "lstm", "rnn_tanh", "rnn_relu")},
     **{f"aten.{kind}_cell.default": _cell for kind in ("gru", "lstm", "rnn_tanh", "rnn_relu")},
@@ -545,6 +563,7 @@ COSTS: dict[str, Rule] = {
     **MOVEMENTS,
     **REDUCTIONS,
     **PRODUCTS,
+    **SYSTEMS,
     **RECURRENT,
 }
 """The rule of each operator of :data:`nn_export.operators.OPERATORS`."""

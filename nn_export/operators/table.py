@@ -7,12 +7,13 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
-from nn_export.operators import OPERATORS, elementwise, linear, recurrent, reduce, shape
+from nn_export.operators import OPERATORS, elementwise, linear, recurrent, reduce, shape, systems
 
 GROUPS: dict[str, Mapping[str, Any]] = {
     "Element by element, with broadcasting": elementwise.OPERATORS,
     "Moving elements, constants": shape.OPERATORS,
     "Products, linear layers, normalisations": linear.OPERATORS,
+    "Systems of a few linear equations": systems.OPERATORS,
     "Reductions": reduce.OPERATORS,
     "Recurrent layers and cells": recurrent.OPERATORS,
 }

@@ -19,6 +19,10 @@ A34, B34 = (
 V4, V3, M43 = B34[0].clone(), A34[:, 0].clone(), B34.T.clone()
 I2 = torch.tensor([2.0, 0.0]).double()
 ROWS = torch.tensor([[0.0], [1.0], [3.0]]).double()
+G33 = torch.tensor(
+    [[0.1, 2.0, -0.3], [1.5, 0.4, 0.2], [0.3, -0.6, 1.1]]
+).double()  # the second row is the first pivot
+S33, L33 = G33 @ G33.T + torch.eye(3).double(), torch.tril(G33) + torch.eye(3).double()
 W244 = torch.linspace(-1, 1, 32).double().reshape(2, 4, 4)
 
 
@@ -80,6 +84,9 @@ CASES = {
     "cumprod.default": (A34, 0), "_trilinear.default": (A34, W244, B34, [1, 3], [0], [1, 2], [2, 3]),
     "native_group_norm.default": (A34[None], V3, V3 + 1, 1, 3, 4, 3, 1e-5),
     "lstm_cell.default": (A34, [A34[:, :2], A34[:, 1:3]], *_gates(4)),
+    "linalg_solve.default": (G33, V3), "linalg_inv.default": (G33,), "linalg_det.default": (G33,),
+    "linalg_cholesky.default": (S33,), "cholesky_solve.default": (A34, L33), "cholesky_inverse.default": (L33,),
+    "linalg_solve_triangular.default": ((L33, A34), {"upper": False}),
 }  # fmt: skip
 
 
@@ -119,6 +126,9 @@ OWN_SLOPES = {
     "aten.detach.default",
     "aten.native_group_norm.default",
     "aten.copy.default",
+    # torch's slopes by the elements above the diagonal, which neither reads, are not zero: see test_systems
+    "aten.cholesky_solve.default",
+    "aten.cholesky_inverse.default",
 }  # test_operator_slopes
 
 
