@@ -79,71 +79,10 @@ def _hautus(a: Array, b: Array, z: complex) -> float:
     return smallest / float(np.linalg.norm(np.hstack([a, scaled]), 2))
 
 
-def _stabilisable_detectable(found: tuple[Mode, ...]) -> tuple[bool, bool]:
+def stabilisable_detectable(found: tuple[Mode, ...]) -> tuple[bool, bool]:
     """Whether every mode on or outside the unit circle is reached, and whether every such mode is seen."""
     risky = [m for m in found if abs(m.pole) >= 1.0 - RANK_TOLERANCE]
     return all(m.reach > RANK_TOLERANCE for m in risky), all(m.see > RANK_TOLERANCE for m in risky)
-
-
-@dataclass(frozen=True)
-class LinearAnalysis:
-    """Poles and structural properties of a discrete linear model.
-
-    Args:
-        dt: Period [s].
-        poles: Eigenvalues of A ``(n,)``, largest magnitude first.
-        frequency: Natural frequencies ``(n,)`` [rad/s]; see :class:`Mode`.
-        damping: Damping ratios ``(n,)``.
-        slow: True where the natural frequency lies below ``split`` ``(n,)``.
-        split: Border [rad/s] between slow and fast poles: a tenth of the Nyquist frequency.
-        stable: All poles inside the unit circle.
-        stabilisable: The input reaches every mode on or outside the unit circle.
-        detectable: The output shows every such mode.
-    """
-
-    dt: float
-    poles: Complex
-    frequency: Array
-    damping: Array
-    slow: NDArray[np.bool_]
-    split: float
-    stable: bool
-    stabilisable: bool
-    detectable: bool
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain dictionary for JSON: complex as ``[re, im]``, an infinite frequency (z = 0) as None."""
-        return {
-            "dt": self.dt,
-            "poles": [[float(z.real), float(z.imag)] for z in self.poles],
-            "frequency_rad_s": [float(w) if np.isfinite(w) else None for w in self.frequency],
-            "damping": [float(d) for d in self.damping],
-            "slow": [bool(s) for s in self.slow],
-            "split_rad_s": self.split,
-            "stable": self.stable,
-            "stabilisable": self.stabilisable,
-            "detectable": self.detectable,
-        }
-
-
-def analyze(sys: Any) -> LinearAnalysis:
-    """Poles and properties of a discrete ``control.StateSpace``.
-
-    Raises:
-        InputError: If the system has no period.
-
-    Example:
-        >>> import control
-        >>> analyze(control.ss([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.1)).stable
-        True
-    """
-    found, dt = modes(sys), period(sys)
-    poles, frequency, damping, _, _ = (np.array(column) for column in zip(*found, strict=True))
-    split = 0.1 * np.pi / dt
-    return LinearAnalysis(
-        dt, poles, frequency, damping, frequency < split, split, bool(np.all(np.abs(poles) < 1.0)),
-        *_stabilisable_detectable(found),
-    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -164,18 +103,6 @@ class Structure:
     hankel: Array
     stabilisable: bool
     detectable: bool
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain dictionary for JSON; complex as ``[re, im]``."""
-        return {
-            "dt": self.dt,
-            "modes": [
-                {**m._asdict(), "pole": [float(np.real(m.pole)), float(np.imag(m.pole))]} for m in self.modes
-            ],
-            "hankel": self.hankel.tolist(),
-            "stabilisable": self.stabilisable,
-            "detectable": self.detectable,
-        }
 
 
 def system_structure(sys: Any) -> Structure:
@@ -199,7 +126,7 @@ def system_structure(sys: Any) -> Structure:
         ([0.0, 0.538], False, True)
     """
     found = modes(sys)
-    return Structure(period(sys), found, hankel_singular_values(sys), *_stabilisable_detectable(found))
+    return Structure(period(sys), found, hankel_singular_values(sys), *stabilisable_detectable(found))
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_mpc import Signal
-from hybrid_mpc.job.stages.report import TITLES, paragraphs
+from hybrid_mpc.job.stages.report import TITLES
 from hybrid_mpc.monitor.replay import MonitorTrace
 from hybrid_mpc.plots import analysis, data, estimation, fit, loops, monitor
 from hybrid_mpc.plots import fit as training
 from hybrid_mpc.plots.monitor import overview
 from hybrid_mpc.plots.style import name_of, save
-from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, write_report
+from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, words, write_report
 
 STATES = (Signal("phi", "rad"), Signal("phi_dot", "rad/s"))
 INPUTS = (Signal("tau", "N m"),)
@@ -233,7 +233,7 @@ def report(folder: Path) -> Report:
     sections = tuple(
         Section(
             TITLES[key],
-            paragraphs(key),
+            words("run_words.html")[key],
             tuple((paths[n], f"Figure of {n}: what it shows, in one sentence.") for n in names),
             tables.get(key, ()),
         )
