@@ -290,15 +290,7 @@ def _slope_of(model: HybridModel, i: int) -> Any:
 class AlongTrajectory:
     """``dz_{k+1} = A_k dz_k + B_k du_k``, ``dy_k = C_k dz_k + D_k du_k`` around a trajectory, ``z = (x, h)``.
 
-    Args:
-        model: The model.
-        x: States ``(n, n_x)``.
-        h: Hidden states ``(n, n_h)``.
-        u: Inputs ``(n, n_u)``.
-        A: ``(n, n_z, n_z)``.
-        B: ``(n, n_z, n_u)``.
-        C: ``(n, n_y, n_z)``.
-        D: ``(n, n_y, n_u)``.
+    States ``x``, hidden states ``h``, inputs ``u`` and the matrices have a row for each of the n periods.
     """
 
     model: HybridModel
@@ -333,11 +325,7 @@ class AlongTrajectory:
         return _state_space(self.model, *(m[skip:].mean(axis=0) for m in (self.A, self.B, self.C, self.D)))
 
     def transition(self, start: int, end: int) -> Array:
-        """``A_{end-1} ... A_start`` ``(n_z, n_z)``: what a deviation at ``start`` has become at ``end``.
-
-        Raises:
-            InputError: If the range does not lie within the trajectory.
-        """
+        """``A_{end-1} ... A_start`` ``(n_z, n_z)``: what a deviation at ``start`` has become at ``end``."""
         if not 0 <= start <= end <= len(self.A):
             raise InputError(f"transition: 0 <= start <= end <= {len(self.A)} needed, got {start} and {end}")
         product = np.eye(self.A.shape[1])

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import cholesky, schur, solve_discrete_lyapunov, solve_sylvester
 
+from hybrid_mpc.analyze.equilibria import poles_of
 from hybrid_mpc.analyze.linearize import control_toolbox, linearize, period
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.model import HybridModel
@@ -26,15 +27,12 @@ NOTHING = 1e-14
 
 
 class Mode(NamedTuple):
-    """One mode of a discrete system.
+    """One mode of a discrete system; frequency [rad/s] and damping ratio are those of the continuous equivalent.
 
-    Args:
-        pole: Eigenvalue of A.
-        frequency: Natural frequency ``|log(z) / dt|`` [rad/s] of the continuous equivalent; infinite for a pole at 0.
-        damping: Damping ratio of the continuous equivalent; 1 for a pole at 0 or 1.
-        reach: Distance from being uncontrollable: smallest singular value of the Popov-Belevitch-Hautus pencil
-            ``[A - z I, B]`` over the largest of ``[A, B]``, B's columns scaled to the norm of A (units must not count).
-        see: Distance from being unobservable, the dual.
+    A pole at 0 has an infinite frequency, and one at 0 or 1 the damping 1. ``reach`` is the distance from being
+    uncontrollable: the smallest singular value of the Popov-Belevitch-Hautus pencil ``[A - z I, B]`` over the largest
+    of ``[A, B]``, B's columns scaled to the norm of A (units must not count); ``see`` is the dual, from being
+    unobservable.
     """
 
     pole: complex
@@ -45,20 +43,10 @@ class Mode(NamedTuple):
 
 
 def modes(sys: Any) -> tuple[Mode, ...]:
-    """Modes of a discrete ``control.StateSpace``, largest pole first.
-
-    Raises:
-        InputError: If the system has no period.
-
-    Example:
-        >>> import control
-        >>> round(modes(control.ss([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.1))[0].frequency, 6)
-        6.931472
-    """
+    """Modes of a discrete ``control.StateSpace``, largest pole first."""
     dt = period(sys)
-    a, b, c, _ = _matrices(sys)
-    poles = np.linalg.eigvals(a).astype(np.complex128)
-    poles = poles[np.argsort(-np.abs(poles), kind="stable")]
+    a, b, c, _ = matrices(sys)
+    poles = poles_of(a)
     frequency, damping = np.full(poles.size, np.inf), np.ones(poles.size)
     moving = np.abs(poles) > 0
     s = np.log(poles[moving]) / dt
@@ -87,15 +75,10 @@ def stabilisable_detectable(found: tuple[Mode, ...]) -> tuple[bool, bool]:
 
 @dataclass(frozen=True)
 class Structure:
-    """Modes and input-output weight of a discrete system.
+    """Modes of a discrete system, largest pole first, and its Hankel singular values ``(n,)``, largest first.
 
-    Args:
-        dt: Period [s].
-        modes: Largest pole first.
-        hankel: Hankel singular values ``(n,)`` of the stable part, largest first, inputs and outputs as they are
-            given; infinite for each mode on or outside the unit circle.
-        stabilisable: Every mode on or outside the unit circle is reached.
-        detectable: Every such mode is seen.
+    The latter are those of the stable part, inputs and outputs as they are given; infinite for each mode on or outside
+    the unit circle. ``stabilisable`` and ``detectable``: every such mode is reached, is seen.
     """
 
     dt: float
@@ -131,13 +114,7 @@ def system_structure(sys: Any) -> Structure:
 
 @dataclass(frozen=True)
 class FrequencyResponse:
-    """Frequency response for Bode plots.
-
-    Args:
-        omega: Frequencies ``(n,)`` [rad/s].
-        magnitude: ``|G|`` ``(n_y, n_u, n)`` [output unit / input unit].
-        phase: Unwrapped phase ``(n_y, n_u, n)`` [rad].
-    """
+    """Magnitude [output unit / input unit] and unwrapped phase [rad], each ``(n_y, n_u, n)``; ``omega`` in rad/s."""
 
     omega: Array
     magnitude: Array
@@ -160,7 +137,7 @@ def frequency_response(sys: Any, omega: ArrayLike) -> FrequencyResponse:
     w = np.asarray(omega, dtype=np.float64).reshape(-1)
     if w.size == 0 or not (w.min() > 0 and w.max() <= np.pi / dt * (1 + 1e-9)):
         raise InputError(f"frequency response: give frequencies in (0, {np.pi / dt:.6g}] rad/s (Nyquist)")
-    a, b, c, d = (np.asarray(m, dtype=np.float64) for m in (sys.A, sys.B, sys.C, sys.D))
+    a, b, c, d = matrices(sys)
     z = np.exp(1j * w * dt)
     response = c @ np.linalg.solve(z[:, None, None] * np.eye(a.shape[0]) - a, b.astype(complex)) + d
     g = np.moveaxis(response, 0, -1)
@@ -169,14 +146,11 @@ def frequency_response(sys: Any, omega: ArrayLike) -> FrequencyResponse:
 
 @dataclass(frozen=True)
 class Reduced:
-    """A reduced system and what the reduction costs.
+    """A reduced ``control.StateSpace`` of ``order`` states and what the reduction costs.
 
-    Args:
-        system: ``control.StateSpace``.
-        hankel: Hankel singular values ``(n,)`` of the system before, infinite for poles on or outside the circle.
-        order: States kept.
-        bound: Largest difference of the two frequency responses, at any frequency, at most: twice the sum of the
-            singular values left out.
+    ``hankel`` are the singular values ``(n,)`` of the system before, infinite for poles on or outside the circle.
+    ``bound`` is the largest difference of the two frequency responses at most: twice the sum of the singular values
+    left out.
     """
 
     system: Any
@@ -186,18 +160,9 @@ class Reduced:
 
 
 def hankel_singular_values(sys: Any) -> Array:
-    """Hankel singular values ``(n,)`` of a discrete system, largest first; infinite for each unstable pole.
-
-    Raises:
-        InputError: If the system has no period.
-
-    Example:
-        >>> import control
-        >>> hankel_singular_values(control.ss([[0.6]], [[0.8]], [[0.8]], 0.0, 1.0)).round(12)
-        array([1.])
-    """
+    """Hankel singular values ``(n,)`` of a discrete system, largest first; infinite for each unstable pole."""
     period(sys)
-    _, stable = _split(_matrices(sys))
+    _, stable = _split(matrices(sys))
     values = _balance(*stable[:3])[0]
     return np.concatenate([np.full(len(sys.A) - values.size, np.inf), values])
 
@@ -227,7 +192,7 @@ def balanced_truncation(sys: Any, order: int) -> Reduced:
         (1, True)
     """
     dt = period(sys)
-    kept, stable = _split(_matrices(sys))
+    kept, stable = _split(matrices(sys))
     values, left, right = _balance(*stable[:3])
     fixed, n = len(kept[0]), len(sys.A)
     if not fixed <= order <= n:
@@ -281,7 +246,7 @@ def physical_states(
     n_x = model.n_x
     by_x = _scale(x_scale, n_x, "x_scale")
     by_u = _scale(u_scale, model.n_u, "u_scale")
-    a, b, c, d = _matrices(sys)
+    a, b, c, d = matrices(sys)
     states = np.hstack([np.diag(1.0 / by_x), np.zeros((n_x, len(a) - n_x))])
     control = control_toolbox()
     scaled = control.ss(a, b * by_u, states, 0.0, sys.dt, remove_useless_states=False)
@@ -307,14 +272,15 @@ def _scale(value: ArrayLike | None, n: int, name: str) -> Array:
     return scale
 
 
-def _matrices(sys: Any) -> Matrices:
+def matrices(sys: Any) -> Matrices:
+    """A, B, C and D of a ``control.StateSpace``."""
     a, b, c, d = (np.asarray(m, dtype=float) for m in (sys.A, sys.B, sys.C, sys.D))
     return a, b, c, d
 
 
-def _split(matrices: Matrices) -> tuple[Matrices, Matrices]:
+def _split(whole: Matrices) -> tuple[Matrices, Matrices]:
     """The part with poles not inside the circle, and the stable part with D: an ordered Schur form, decoupled."""
-    a, b, c, d = matrices
+    a, b, c, d = whole
     t, q, kept = schur(a, sort=lambda re, im: np.hypot(re, im) >= 1.0 - EDGE)
     if len(t) - kept == 0 or kept == 0:
         whole, none = (q.T @ a @ q, q.T @ b, c @ q, d), _empty(b, c, d)

@@ -286,7 +286,7 @@ def analysis_input(settings: AnalysisSettings) -> tuple[AnalysisInput, tuple[str
     plant = scenario.plant() if scenario is not None and scenario.plant is not None else None
     return AnalysisInput(
         kit.models, load_programs(folder), state_range(model, control), input_range(model, control), speed, ocp,
-        filters, plant, _recordings(settings.data, scenario, model), whole_range(model),
+        filters, plant, _recordings(settings.data, scenario, model), state_range(model),
     ), tuple(notes)  # fmt: skip
 
 
@@ -302,17 +302,12 @@ def _speed(model: HybridModel, control: OCP | None, given: float | None) -> Arra
     return 1.0 / np.sqrt(np.where(weights > 0, weights, 1.0))
 
 
-def state_range(model: HybridModel, control: OCP | None) -> Array:
-    """Working range of the states ``(n_x, 2)``: limits of the control problem, else the signals', else a unit."""
+def state_range(model: HybridModel, control: OCP | None = None) -> Array:
+    """Range of the states ``(n_x, 2)``: limits of the control problem, else the signals', else a unit (half a turn)."""
     none = np.full(model.n_x, np.inf)
     lower, upper = (-none, none) if control is None else (control.x_min, control.x_max)
     sides = zip(model.states, lower.tolist(), upper.tolist(), strict=True)
-    return np.array([_within(s, _unit(s), low, high) for s, low, high in sides])
-
-
-def whole_range(model: HybridModel) -> Array:
-    """Whole range of the states ``(n_x, 2)``: the signals', a turn for a periodic angle, else a unit either way."""
-    return np.array([_within(s, _unit(s)) for s in model.states])
+    return np.array([_within(s, np.pi if s.periodic else 1.0, low, high) for s, low, high in sides])
 
 
 def input_range(model: HybridModel, control: OCP | None) -> Array:
@@ -321,10 +316,6 @@ def input_range(model: HybridModel, control: OCP | None) -> Array:
         return np.array([_within(s, 1.0) for s in model.inputs])
     sides = zip(model.inputs, control.input_scale, control.u_min, control.u_max, strict=True)
     return np.array([_within(s, size, low, high) for s, size, low, high in sides])
-
-
-def _unit(signal: Signal) -> float:
-    return np.pi if signal.periodic else 1.0
 
 
 def _within(

@@ -239,30 +239,9 @@ def benchmark_run(
 ) -> Figure:
     """A free run over a recording: output, errors, inputs, and the errors' course over the whole run.
 
-    Args:
-        t: Times ``(n,)`` [s].
-        y: Measured output ``(n,)``.
-        predictions: Output of each model's free run ``(n,)``.
-        u: Inputs ``(n, n_u)``.
-        output: Signal of ``y``.
-        inputs: Signals of ``u``.
-        unit: Unit of the errors.
-        scale: Errors' units in an SI unit.
-        title: Title. Default: none.
-        names: How models are to be called in the legend, where not as everywhere. Default: none.
-
-    Returns:
-        The figure. The first 20 s of a longer run are drawn; the last row has all of it.
-
-    Raises:
-        InputError: If shapes do not fit.
-
-    Example:
-        >>> t, y = 0.1 * np.arange(50), np.zeros(50)
-        >>> figure = benchmark_run(t, y, {"phy": y + 0.1}, y, output=Signal("q", "m"), inputs=(Signal("F", "N"),),
-        ...                        unit="mm", scale=1e3)
-        >>> len(figure.axes)
-        4
+    ``y`` and each model's run are ``(n,)``; ``scale`` errors of ``unit`` are an SI unit. ``names`` says how models are
+    to be called in the legend, where not as everywhere. The first 20 s of a longer run are drawn; the last row has all
+    of it.
     """
     t = np.asarray(t, dtype=float)
     y, u = checked("y", y, len(t)), checked("u", u, len(t), len(inputs))

@@ -164,7 +164,7 @@ def new_figure(
     sharey: Share = False,
     heights: Sequence[float] | None = None,
 ) -> tuple[Figure, NDArray[np.object_]]:
-    """An empty figure in the project's look, and its axes.
+    """An empty figure in the project's look, and its axes ``(rows, cols)``.
 
     Args:
         rows: Rows of axes.
@@ -172,11 +172,11 @@ def new_figure(
         title: Title over all axes. Default: none.
         size: Width and height [inch]. Default: 10 wide, 2.2 a row and at least 3.6 high.
         sharex: As in ``matplotlib.figure.Figure.subplots``.
-        sharey: As in ``matplotlib.figure.Figure.subplots``.
+        sharey: Likewise.
         heights: Relative heights of the rows. Default: equal.
 
     Returns:
-        The figure, on its own Agg canvas (nothing global is touched), and the axes ``(rows, cols)``.
+        The figure, on its own Agg canvas (nothing global is touched), and the axes.
 
     Example:
         >>> figure, axes = new_figure(2, 1)
@@ -200,15 +200,7 @@ def new_column(
 ) -> tuple[Figure, list[Axes]]:
     """An empty figure of panels one above the other that share their horizontal axis.
 
-    Args:
-        heights: Relative heights of the panels.
-        height: Height [inch] of a panel of relative height 1.
-        title: Title over all panels. Default: none.
-
-    Example:
-        >>> figure, panels = new_column([2.0, 1.0])
-        >>> len(panels)
-        2
+    ``heights`` are relative; a panel of relative height 1 is ``height`` inches high.
     """
     size = (10.0, 0.8 + height * sum(heights))
     figure, axes = new_figure(len(heights), 1, sharex=True, heights=heights, title=title, size=size)
@@ -216,13 +208,7 @@ def new_column(
 
 
 def finish_column(figure: Figure, panels: Sequence[Axes], *, columns: int = 7) -> None:
-    """Complete a column of panels over time: no margins, time axis, aligned labels, one legend.
-
-    Args:
-        figure: The figure.
-        panels: Its panels.
-        columns: Most columns of the legend.
-    """
+    """Complete a column of panels over time: no margins, time axis, aligned labels, one legend."""
     for ax in panels:
         ax.margins(x=0)
     panels[-1].set_xlabel("time [s]")
@@ -303,21 +289,7 @@ def number(value: float) -> str:
 
 
 def checked(name: str, values: Any, length: int, columns: int | None = None) -> Array:
-    """An array of a figure with its length (and number of columns) checked.
-
-    Args:
-        name: What it is, for the message.
-        values: Numbers, ``(length,)``, or ``(length, columns)`` where ``columns`` is given.
-        length: Samples it must have.
-        columns: Columns it must have; a 1-D array counts as one column. Default: a 1-D array is needed.
-
-    Raises:
-        InputError: If the shape is another.
-
-    Example:
-        >>> checked("u", [1.0, 2.0], 2, 1).shape
-        (2, 1)
-    """
+    """An array of a figure, its shape checked: ``(length,)``, or ``(length, columns)`` where those are given."""
     array = np.asarray(values, dtype=float)
     if columns is not None and array.ndim == 1:
         array = array[:, None]
@@ -342,9 +314,8 @@ def save(figure: Figure, path: str | Path) -> Path:
 
     Example:
         >>> import tempfile
-        >>> figure, _ = new_figure(1, 1)
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     save(figure, Path(folder) / "a.png").name
+        ...     save(new_figure(1, 1)[0], Path(folder) / "a.png").name
         'a.png'
     """
     path = Path(path)
