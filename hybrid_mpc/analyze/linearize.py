@@ -144,9 +144,6 @@ def linearize_at_speed(model: HybridModel, q: ArrayLike, v_work: ArrayLike, u: A
 
     Raises:
         InputError: If a size is wrong or the hidden state finds no rest.
-
-    Example:
-        ``linearize_at_speed(model, [0.0], [2.0], [0.1])``
     """
     n_q = model.n_x // 2
     x = np.concatenate([vector(q, n_q, "q"), vector(v_work, n_q, "v_work")])
@@ -159,10 +156,10 @@ def linearize_secant(
 ) -> Any:  # fmt: skip
     """Linearization at rest whose damping is that of motions of a given size.
 
-    A smoothed Coulomb friction has a slope at rest that no motion feels. Here the columns of A by the velocities are
-    chords: of the step from ``v = +speed`` and ``-speed`` (``"secant"``), or the mean over a sinusoid of that
-    amplitude (``"harmonic"``, the describing function; 4/pi of the secant for Coulomb friction). All other columns
-    are the tangents. The point stays a point of rest, so poles, loops and margins of it mean something.
+    The columns of A by the velocities are chords: of the step from ``v = +speed`` and ``-speed`` (``"secant"``), or
+    the mean over a sinusoid of that amplitude (``"harmonic"``, the describing function; 4/pi of the secant for Coulomb
+    friction). All other columns are the tangents. The point stays a point of rest, so poles, loops and margins of it
+    mean something.
 
     Args:
         model: The model, state ``[q, v]``.
@@ -177,9 +174,6 @@ def linearize_secant(
 
     Raises:
         InputError: If a size is wrong, a speed is not positive, or the hidden state finds no rest.
-
-    Example:
-        ``linearize_secant(model, [0.0, 0.0], [0.0], [0.5])``
     """
     n_q, n_z = model.n_x // 2, model.n_x + model.n_h
     size = _positive(speed, n_q)
@@ -239,9 +233,6 @@ def friction_slopes(
 
     Source: the describing function: Gelb and Vander Velde, *Multiple-Input Describing Functions and Nonlinear System
     Design*, 1968, section 2.2.
-
-    Example:
-        ``friction_slopes(model, [0.0], [0.1, 1.0]).secant``
     """
     n_q = model.n_x // 2
     size = _positive(speeds, np.size(speeds))

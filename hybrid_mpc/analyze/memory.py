@@ -195,9 +195,6 @@ def feature_box(program: Program, x: ArrayLike, u: ArrayLike) -> tuple[Array, Ar
 
     Raises:
         InputError: If there is no such cell, its inputs depend on more, or an operation on the way to it is not known.
-
-    Example:
-        ``low, high = feature_box(program, [(-1, 1), (-4, 4)], [(-0.5, 0.5)])``
     """
     cell = _cell(program)
     source = cell.args[0]

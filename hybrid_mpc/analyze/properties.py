@@ -278,22 +278,19 @@ def matrices(sys: Any) -> Matrices:
     return a, b, c, d
 
 
-def _split(whole: Matrices) -> tuple[Matrices, Matrices]:
+def _split(given: Matrices) -> tuple[Matrices, Matrices]:
     """The part with poles not inside the circle, and the stable part with D: an ordered Schur form, decoupled."""
-    a, b, c, d = whole
+    a, b, c, d = given
     t, q, kept = schur(a, sort=lambda re, im: np.hypot(re, im) >= 1.0 - EDGE)
     if len(t) - kept == 0 or kept == 0:
-        whole, none = (q.T @ a @ q, q.T @ b, c @ q, d), _empty(b, c, d)
+        whole = q.T @ a @ q, q.T @ b, c @ q, d
+        none = np.zeros((0, 0)), np.zeros((0, b.shape[1])), np.zeros((c.shape[0], 0)), d
         return (none, whole) if kept == 0 else (whole, none)
     first, second, cross = t[:kept, :kept], t[kept:, kept:], t[:kept, kept:]
     x = solve_sylvester(first, -second, -cross)
     b, c = q.T @ b, c @ q
     upper = (first, b[:kept] - x @ b[kept:], c[:, :kept], np.zeros_like(d))
     return upper, (second, b[kept:], c[:, kept:] + c[:, :kept] @ x, d)
-
-
-def _empty(b: Array, c: Array, d: Array) -> Matrices:
-    return np.zeros((0, 0)), np.zeros((0, b.shape[1])), np.zeros((c.shape[0], 0)), d
 
 
 def _balance(a: Array, b: Array, c: Array) -> tuple[Array, Array, Array]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -360,7 +360,6 @@ def _recordings(
 # The parts.
 
 
-T = TypeVar("T")
 Report = Callable[[str, int, int, str], None]
 
 
@@ -370,24 +369,24 @@ def analyze_models(given: AnalysisInput, report: Report = lambda *text: None) ->
     ``report`` is called with ``("parts", done, total, part)``.
     """
     points = {name: resting_point(given, model) for name, model in given.models.items()}
-
-    def part(number: int, name: str, compute: Callable[[], T]) -> T | Missing:
-        report("parts", number, 8, name)
+    parts: dict[str, Callable[[], Any]] = {
+        "equilibria": lambda: equilibria_of(given),
+        "friction": lambda: friction_of(given, points),
+        "linear": lambda: linearizations_of(given, points),
+        "measured": lambda: responses_of(given),
+        "schedule": lambda: schedules_of(given),
+        "loops": lambda: loops_of(given, points),
+        "memory": lambda: memory_of(given),
+        "sensitivity": lambda: sensitivities_of(given),
+    }
+    found: dict[str, Any] = {}
+    for number, (name, compute) in enumerate(parts.items()):
+        report("parts", number, len(parts), name)
         try:
-            return compute()
+            found[name] = compute()
         except InputError as error:
-            return Missing(str(error))
-
-    return AnalysisResult(
-        part(0, "equilibria", lambda: equilibria_of(given)),
-        part(1, "friction", lambda: friction_of(given, points)),
-        part(2, "linear", lambda: linearizations_of(given, points)),
-        part(3, "measured", lambda: responses_of(given)),
-        part(4, "schedule", lambda: schedules_of(given)),
-        part(5, "loops", lambda: loops_of(given, points)),
-        part(6, "memory", lambda: memory_of(given)),
-        part(7, "sensitivity", lambda: sensitivities_of(given)),
-    )
+            found[name] = Missing(str(error))
+    return AnalysisResult(**found)
 
 
 def resting_point(given: AnalysisInput, model: HybridModel) -> Point:

@@ -74,9 +74,6 @@ def free_run(
         energy_model: Energy balance of the MOPGRNN, ``(n,)`` [W].
         title: Title. Default: none.
 
-    Returns:
-        The figure: a row for each state and input, the balances, and the violation.
-
     Raises:
         InputError: If shapes do not fit.
 
@@ -295,7 +292,7 @@ def curves(
     free_run_start: Mapping[str, float] | None = None,
     units: tuple[str, str, str] = ("-", "-", "-"),
 ) -> Figure:
-    """Training curves of each model: two objectives with their never-rising bounds, and the validation.
+    """Training curves, a column a model: two objectives with their never-rising bounds, and the validation.
 
     Args:
         training: By model, arrays of equal length: ``step``, ``loss_error`` and, where the model has
@@ -303,9 +300,6 @@ def curves(
             was not taken at a step.
         free_run_start: Step at which a model's training turns from teacher forcing to free runs.
         units: Units of the error objective, the energy objective and the validation metric.
-
-    Returns:
-        The figure: one column a model, logarithmic axes up.
 
     Raises:
         InputError: If there is no model, ``step`` is missing, or lengths differ.

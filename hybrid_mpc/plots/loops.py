@@ -60,7 +60,7 @@ def closed_loops(
     inputs: Sequence[Signal],
     limits: tuple[Sequence[float] | Array, Sequence[float] | Array] | None = None,
 ) -> Figure:
-    """The same task under each controller: states with their reference, tracking error, inputs.
+    """The same task under each controller: states with their reference, error of the positions, inputs.
 
     Args:
         title: The task in one line.
@@ -70,9 +70,6 @@ def closed_loops(
         states: Signals of ``x``.
         inputs: Signals of ``u``.
         limits: Lower and upper bounds of the inputs, drawn where finite. Default: none drawn.
-
-    Returns:
-        The figure; the error row shows the positions only.
 
     Raises:
         InputError: If there is no loop or shapes do not fit.
@@ -115,14 +112,11 @@ def closed_loops(
 
 
 def solve_times(times_ms: Mapping[str, Array], period_ms: float) -> Figure:
-    """How long a controller step takes, against the period that it must fit into.
+    """How long a controller step takes, against the period that it must fit into: distribution, share of longer steps.
 
     Args:
         times_ms: Durations of all steps by controller, ``(n,)`` [ms].
         period_ms: Control period [ms], the deadline.
-
-    Returns:
-        The figure: left the distribution, right the share of steps that took longer.
 
     Raises:
         InputError: If a controller has no positive durations, or the period is not positive.

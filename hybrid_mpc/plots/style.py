@@ -29,46 +29,27 @@ DPI = 110
 INK, FAINT, PALE = "#222222", "#8a8a8a", "#9a9a9a"
 ALARM, GOOD = "#CC79A7", "#009E73"
 
-COLOURS: Mapping[str, str] = MappingProxyType(
-    {
-        "measured": "#000000",
-        "reference": "#000000",
-        "phy_nominal": "#7f7f7f",
-        "phy": "#0072B2",
-        "prior": "#0072B2",
-        "prior_observer": "#56B4E9",
-        "rnn": "#E69F00",
-        "pgrnn": "#009E73",
-        "mopgrnn": "#D55E00",
-        "hybrid": "#D55E00",
-        "hybrid_observer": "#E69F00",
-        "oracle": "#CC79A7",
-        "oracle_state": "#009E73",
-        "train": "#56B4E9",
-        "valid": "#F0E442",
-        "test": "#555555",
-    }
-)
-NAMES: Mapping[str, str] = MappingProxyType(
-    {
-        "measured": "measured",
-        "reference": "reference",
-        "phy_nominal": "prior, nominal",
-        "phy": "prior, fitted",
-        "prior": "prior, fitted",
-        "prior_observer": "prior with observer",
-        "rnn": "RNN",
-        "pgrnn": "PGRNN",
-        "mopgrnn": "MOPGRNN (hybrid)",
-        "hybrid": "MOPGRNN (hybrid)",
-        "hybrid_observer": "MOPGRNN with observer",
-        "oracle": "oracle",
-        "oracle_state": "oracle, true state",
-        "train": "training",
-        "valid": "validation",
-        "test": "test",
-    }
-)
+_ROLES = {
+    "measured": ("#000000", "measured"),
+    "reference": ("#000000", "reference"),
+    "phy_nominal": ("#7f7f7f", "prior, nominal"),
+    "phy": ("#0072B2", "prior, fitted"),
+    "prior": ("#0072B2", "prior, fitted"),
+    "prior_observer": ("#56B4E9", "prior with observer"),
+    "rnn": ("#E69F00", "RNN"),
+    "pgrnn": ("#009E73", "PGRNN"),
+    "mopgrnn": ("#D55E00", "MOPGRNN (hybrid)"),
+    "hybrid": ("#D55E00", "MOPGRNN (hybrid)"),
+    "hybrid_observer": ("#E69F00", "MOPGRNN with observer"),
+    "oracle": ("#CC79A7", "oracle"),
+    "oracle_state": ("#009E73", "oracle, true state"),
+    "train": ("#56B4E9", "training"),
+    "valid": ("#F0E442", "validation"),
+    "test": ("#555555", "test"),
+}
+"""Colour and name of each role or model."""
+COLOURS: Mapping[str, str] = MappingProxyType({role: ink for role, (ink, _) in _ROLES.items()})
+NAMES: Mapping[str, str] = MappingProxyType({role: name for role, (_, name) in _ROLES.items()})
 _DASHED = frozenset({"phy_nominal", "reference"})
 _SYMBOLS = {
     "phi": r"$\varphi$",
@@ -305,9 +286,6 @@ def save(figure: Figure, path: str | Path) -> Path:
     Args:
         figure: The figure.
         path: Target file, ``.png``; its folder is made if missing.
-
-    Returns:
-        The path.
 
     Raises:
         InputError: If the name does not end in ``.png``, or the file cannot be written.

@@ -6,7 +6,6 @@ import base64
 import csv
 import io
 import re
-import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,14 +13,14 @@ from typing import Any, Literal
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
+from PIL import Image, UnidentifiedImageError
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import write_text
 from hybrid_mpc.plots.style import number
 
 Cell = str | float | int | bool | None
-_PNG = b"\x89PNG\r\n\x1a\n"
-_GIF = b"GIF8"
+Verdict = Literal["good", "bad", "plain"]
 
 
 @dataclass(frozen=True)
@@ -32,7 +31,7 @@ class KeyFigure:
     value: Cell
     unit: str = ""
     comment: str = ""
-    verdict: Literal["good", "bad", "plain"] = "plain"
+    verdict: Verdict = "plain"
 
 
 @dataclass(frozen=True)
@@ -175,12 +174,10 @@ def _figure(section: Section, path: str | Path, caption: str) -> dict[str, Any]:
         raise InputError(
             f"report, section {section.title!r}: no figure {path}; draw it first, or leave it out"
         )
-    content = path.read_bytes()
-    if content.startswith(_PNG) and len(content) >= 24:
-        kind, (width, height) = "png", struct.unpack(">II", content[16:24])
-    elif content.startswith(_GIF) and len(content) >= 10:
-        kind, (width, height) = "gif", struct.unpack("<HH", content[6:10])
-    else:
-        raise InputError(f"report, section {section.title!r}: figure {path} is no PNG or GIF file")
-    data = base64.b64encode(content).decode("ascii")
+    try:
+        with Image.open(path, formats=("PNG", "GIF")) as image:
+            kind, (width, height) = str(image.format).lower(), image.size
+    except UnidentifiedImageError:
+        raise InputError(f"report, section {section.title!r}: figure {path} is no PNG or GIF file") from None
+    data = base64.b64encode(path.read_bytes()).decode("ascii")
     return {"uri": f"data:image/{kind};base64,{data}", "caption": caption, "width": width, "height": height}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,6 @@ from hybrid_mpc.job.stages.results import (
     Control,
     Data,
     Export,
-    Gap,
     Guard,
     Monitor,
     Results,
@@ -43,7 +42,7 @@ from hybrid_mpc.job.stages.results import (
 )
 from hybrid_mpc.monitor.residuals import force_units
 from hybrid_mpc.plots.style import name_of
-from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, words, write_report
+from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, Verdict, words, write_report
 
 TITLES: Mapping[str, str] = {
     "data": "Data",
@@ -125,8 +124,9 @@ def guard_words(guard: Guard) -> tuple[str, ...]:
             "ones."
         )
     if test.seconds > 0:
+        times = {0: "never", 1: "once", 2: "twice"}.get(test.alarms, f"{test.alarms} times")
         words.append(
-            f"In {test.seconds:.0f} s of test recordings it alarmed {_times(test.alarms)}; that bounds its "
+            f"In {test.seconds:.0f} s of test recordings it alarmed {times}; that bounds its "
             f"rate there at {test.at_most_per_hour:.3g} an hour (95 %)."
         )
         if details.loops:
@@ -137,10 +137,6 @@ def guard_words(guard: Guard) -> tuple[str, ...]:
     else:
         words.append("No test recording is long enough to try it on.")
     return tuple(words)
-
-
-def _times(n: int) -> str:
-    return {0: "never", 1: "once", 2: "twice"}.get(n, f"{n} times")
 
 
 @dataclass(frozen=True)
@@ -221,57 +217,47 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         context.scenario.title,
         context.scenario.description,
         command(context),
-        _summary(context, results),
+        list(_summary(context, results)),
         sections,
         f"seed {results.seed}, budget {results.budget}; {versions}",
     )
 
 
-def _summary(context: Context, results: Results) -> list[KeyFigure]:
+def _summary(context: Context, results: Results) -> Iterator[KeyFigure]:
     found, timing, control = results.identification, results.timing, results.control
     unit = context.scenario.prior().outputs[0].unit
     rmse = {m: _first(found.rmse[m]) for m in MODELS}
     e_sim = {m: _first(found.e_sim_s[m]) for m in MODELS}
     ratio = found.details.hybrid_over_phy
-    summary = [
-        KeyFigure(
-            "Free-run error (RMSE) of the hybrid on unseen data", rmse["mopgrnn"], unit,
-            f"fitted prior: {_text(rmse['phy'])} {unit}", _verdict(ratio["rmse"], 1.0),
-        ),
-        KeyFigure(
-            "Simulation error E_sim of the hybrid", e_sim["mopgrnn"], "s",
-            f"fitted prior: {_text(e_sim['phy'])}, RNN: {_text(e_sim['rnn'])}", _verdict(ratio["e_sim_s"], 1.0),
-        ),
-    ]  # fmt: skip
+    yield KeyFigure(
+        "Free-run error (RMSE) of the hybrid on unseen data", rmse["mopgrnn"], unit,
+        f"fitted prior: {_text(rmse['phy'])} {unit}", _verdict(ratio["rmse"]),
+    )  # fmt: skip
+    yield KeyFigure(
+        "Simulation error E_sim of the hybrid", e_sim["mopgrnn"], "s",
+        f"fitted prior: {_text(e_sim['phy'])}, RNN: {_text(e_sim['rnn'])}", _verdict(ratio["e_sim_s"]),
+    )  # fmt: skip
     gap = control.gap_closed
     if gap is not None:
         named = {"prior": control.prior, "hybrid": control.hybrid, "oracle": control.oracle}
         costs = ", ".join(f"{name} {_text(of.cost)}" for name, of in named.items())
-        summary.append(
-            KeyFigure(
-                "Gap from prior to oracle closed by the hybrid", gap, "",
-                f"mean over the tasks that tell controllers apart; summed costs: {costs}",
-                "good" if gap > 0 else "bad",
-            )
+        yield KeyFigure(
+            "Gap from prior to oracle closed by the hybrid", gap, "",
+            f"mean over the tasks that tell controllers apart; summed costs: {costs}", "good" if gap > 0 else "bad",
         )  # fmt: skip
-    p99 = timing.controller_step_ms.p99
+    p99, period = timing.controller_step_ms.p99, timing.period_ms
     if p99 is not None:
-        summary.append(
-            KeyFigure("Controller step, 99th percentile", p99, "ms", f"period: {timing.period_ms:g} ms",
-                      _verdict(p99 / timing.period_ms, 1.0))
-        )  # fmt: skip
+        comment = f"period: {period:g} ms"
+        yield KeyFigure("Controller step, 99th percentile", p99, "ms", comment, _verdict(p99 / period))
     alarms, clean = results.monitor.alarms, results.monitor.details.clean
     if alarms is not None and clean is not None:
-        summary.append(
-            KeyFigure("Alarms of the energy monitor", len(alarms), "",
-                      f"{clean.alarms} of them in {clean.seconds:.0f} s known to be undisturbed",
-                      "good" if clean.alarms == 0 else "bad")
-        )  # fmt: skip
-    return summary
+        comment = f"{clean.alarms} of them in {clean.seconds:.0f} s known to be undisturbed"
+        verdict: Verdict = "good" if clean.alarms == 0 else "bad"
+        yield KeyFigure("Alarms of the energy monitor", len(alarms), "", comment, verdict)
 
 
-def _verdict(ratio: float | None, most: float) -> Any:
-    return "plain" if ratio is None else "good" if ratio < most else "bad"
+def _verdict(ratio: float | None) -> Verdict:
+    return "plain" if ratio is None else "good" if ratio < 1.0 else "bad"
 
 
 def _text(value: float | None) -> str:
@@ -289,11 +275,8 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
     if control.gap_closed is None:
         reason = control.gap_closed_reason.rstrip(".")
         if control.hybrid.cost is None:
-            timed = (
-                ""
-                if results.timing.misses is None
-                else " The controller was built and timed on recordings instead."
-            )
+            timed = " The controller was built and timed on recordings instead."
+            timed = "" if results.timing.misses is None else timed
             instead["control"] = (f"There is no closed loop here: {reason}.{timed}",)
         else:
             after["control"] = (f"The gap closed is not defined: {reason}.",)
@@ -418,10 +401,11 @@ def _control_table(control: Control) -> Table | None:
     if details is None:
         return None
     names = [n for n in CONTROLLERS if any(n in cells for cells in details.tasks.values())]
-    rows = [
-        (task, *(_cost(cells.get(name)) for name in names), _gap(details.gap_closed_by_task[task]))
-        for task, cells in details.tasks.items()
-    ]
+    rows = []
+    for task, cells in details.tasks.items():
+        gap = details.gap_closed_by_task[task].value
+        costs = (_cost(cells.get(name)) for name in names)
+        rows.append((task, *costs, "–" if gap is None else f"{gap:.2f}"))
     caption = (
         "Closed-loop cost J on the true state: mean over seeds with its 95 % interval (none for one seed). Gap: "
         "share of the distance from the better baseline to the measuring oracle that the hybrid with observer "
@@ -437,10 +421,6 @@ def _cost(cell: Summary | None) -> str:
     if mean is None:
         return "diverged"
     return f"{mean:.3g}" + (f" ± {half:.1g}" if half is not None else "")
-
-
-def _gap(gap: Gap) -> str:
-    return "–" if gap.value is None else f"{gap.value:.2f}"
 
 
 def _observer_table(results: Results) -> Table:

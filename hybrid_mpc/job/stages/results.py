@@ -387,18 +387,15 @@ def _identification(context: Context) -> Identification:
     found, prior = context.read(EVALUATION), context.prior
     output, network = context.scenario.prior().outputs[0].label, context.settings.network()
     best = {name: found.scores[name].best for name in MODELS}
-    e_sim = {name: _finite(scores.e_sim_s) for name, scores in best.items()}
-    rmse = {name: _finite(scores.rmse_rad) for name, scores in best.items()}
-    violation = {name: _finite(scores.energy_violation_w) for name, scores in best.items()}
+    e_sim = {name: finite(scores.e_sim_s) for name, scores in best.items()}
+    rmse = {name: finite(scores.rmse_rad) for name, scores in best.items()}
+    violation = {name: finite(scores.energy_violation_w) for name, scores in best.items()}
     details = IdentificationDetails(
         FittedPrior(
             prior.fit.values, prior.fit.standard_errors, prior.nominal, prior.fit.warnings, prior.fit.stages
         ),
         {name: found.scores[name].networks for name in MODELS},
-        {
-            stem: {m: _finite(found.by_file[m][stem].rmse_rad) for m in MODELS}
-            for stem in found.by_file["phy"]
-        },
+        {stem: {m: finite(found.by_file[m][stem].rmse_rad) for m in MODELS} for stem in found.by_file["phy"]},
         SmootherNoise(prior.sigma, prior.walk),
         {
             "e_sim_s": _ratio(e_sim["mopgrnn"], e_sim["phy"]),
@@ -421,7 +418,8 @@ def _with_reasons(values: Mapping[str, Any]) -> dict[str, Any]:
     return dict(values) | {f"{name}_reason": "a free run diverged" for name, v in values.items() if v is None}
 
 
-def _finite(value: float) -> float | None:
+def finite(value: float) -> float | None:
+    """The number, or None where it is none."""
     return float(value) if math.isfinite(float(value)) else None
 
 
@@ -456,7 +454,7 @@ def _costs(
     if not own:
         return ControllerCosts(None, None, reason="the scenario has no oracle")
     tracking = {
-        signal: _root_mean_square([row.tracking_rmse[signal] for row in loops])
+        signal: float(np.sqrt(np.mean(np.square([row.tracking_rmse[signal] for row in loops]))))
         for signal in loops[0].tracking_rmse
     }
     known = [cost for cost in own if cost is not None]
@@ -464,10 +462,6 @@ def _costs(
     return ControllerCosts(
         None if diverged else float(sum(known)), tracking, "a loop diverged" if diverged else ""
     )
-
-
-def _root_mean_square(values: Sequence[float]) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def gap_closed(cells: Mapping[str, Sequence[LoopRow]]) -> tuple[float | None, str]:
