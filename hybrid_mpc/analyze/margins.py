@@ -39,13 +39,9 @@ MOST_DELAY = 200
 class MpcGain:
     """An MPC to first order: ``du_0 = by_state dz + by_load dd + by_before du_before + by_reference dr``.
 
-    It is exact as long as no bound acts and the prediction's linearization stays the same.
-
-    Args:
-        by_state: By the estimate of ``z = (x, h)``, ``(n_u, n_z)``.
-        by_load: By the estimated input disturbance ``(n_u, n_u)``.
-        by_before: By the input held before ``(n_u, n_u)``; zero without ``r_delta``.
-        by_reference: By a reference that is constant over the horizon ``(n_u, n_x)``.
+    It is exact as long as no bound acts and the prediction's linearization stays the same. ``z = (x, h)`` and ``d``,
+    the disturbance at the inputs, are estimates; ``u_before`` is the input held before (its gain is zero without
+    ``r_delta``), and ``r`` a reference that is constant over the horizon.
     """
 
     by_state: Array
@@ -307,11 +303,7 @@ class LinearLoop:
         return bool(np.abs(self.poles[0]) < 1.0)
 
     def broken(self, input: int = 0) -> Any:
-        """The loop transfer function with one input cut open, the others closed, in negative-feedback sign.
-
-        Raises:
-            InputError: If there is no such input.
-        """
+        """The loop transfer function with one input cut open, the others closed, in negative-feedback sign."""
         n_u = self.plant.ninputs
         if not 0 <= input < n_u:
             raise InputError(f"loop: input {input} asked for, the plant has {n_u}")
@@ -331,8 +323,7 @@ class LinearLoop:
     def margins(self, input: int = 0) -> Margins:
         """Margins of the loop broken at one input, by python-control on a fine grid of frequencies.
 
-        Raises:
-            InputError: If there is no such input, or the closed loop is not stable: it has no margins then.
+        A closed loop that is not stable has none: an InputError.
         """
         if not self.stable:
             raise InputError(

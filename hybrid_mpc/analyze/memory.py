@@ -300,12 +300,10 @@ def _perron(matrix: Array) -> tuple[float, Array]:
 
 @dataclass(frozen=True)
 class LyapunovExponent:
-    """Mean rate at which the distance of neighbouring runs grows along a run.
+    """Mean rate [1/s] at which the distance of neighbouring runs grows along a run; negative: they come together.
 
-    Args:
-        value: Exponent [1/s]; negative: they come together.
-        deviation: Standard deviation of its mean over ten stretches of the run [1/s].
-        growth: Logarithm of the distance over the first one ``(n + 1,)``, for a plot.
+    ``deviation`` is the standard deviation of this mean over ten stretches of the run, ``growth`` the logarithm of the
+    distance over the first one ``(n + 1,)``, for a plot.
     """
 
     value: float

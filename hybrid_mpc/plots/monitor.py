@@ -144,10 +144,6 @@ def intervals(t: Array, active: Any) -> list[tuple[float, float]]:
     """Start and end [s] of the stretches in which ``active`` ``(n,)`` is true.
 
     An interval ends at the first sample that is false again, or at the last sample.
-
-    Example:
-        >>> intervals(np.array([0.0, 1.0, 2.0, 3.0]), [False, True, True, False])
-        [(1.0, 3.0)]
     """
     edges = np.diff(np.concatenate([[0], np.asarray(active, dtype=int), [0]]))
     starts = np.flatnonzero(edges == 1)

@@ -81,12 +81,7 @@ def name_of(role: str) -> str:
 
 
 def plain(text: str) -> str:
-    r"""Text of a user as matplotlib prints it literally (a dollar sign starts no formula).
-
-    Example:
-        >>> plain("run $1")
-        'run \\$1'
-    """
+    """Text of a user as matplotlib prints it literally (a dollar sign starts no formula)."""
     return text.replace("$", r"\$")
 
 
@@ -255,12 +250,7 @@ def plain_log(axis: Axis, lowest: float, highest: float) -> None:
 
 
 def number(value: float) -> str:
-    """A number as figures and tables print it: three significant digits.
-
-    Example:
-        >>> number(0.012345), number(1234.5), number(2.5e-13), number(0.0)
-        ('0.0123', '1234', '2.5e-13', '0')
-    """
+    """A number as figures and tables print it: three significant digits."""
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"
     size = abs(value)
