@@ -28,7 +28,7 @@ from hybrid_mpc import (
     make_resting_guard,
     simulate,
 )
-from hybrid_mpc.job.analyze import driving_input, input_range, responses_of, state_range, whole_range
+from hybrid_mpc.job.analyze import driving_input, input_range, responses_of, state_range
 from hybrid_mpc.job.check import check_scenario
 from hybrid_mpc.job.loops import excess, limits_used
 from hybrid_mpc.job.stages.monitor import unknown_load
@@ -252,7 +252,7 @@ def test_a_scenario_whose_limits_cross_ends_before_anything_is_computed(call, tm
 def test_ranges_that_are_analysed_never_cross(signal, inside):
     one = Signal("T", "K", *signal)
     model = SimpleNamespace(states=(one, one), inputs=(one,), n_x=2)
-    np.testing.assert_array_equal(whole_range(model), [inside, inside])
+    np.testing.assert_array_equal(state_range(model), [inside, inside])
     np.testing.assert_array_equal(input_range(model, None), [inside])
     np.testing.assert_array_equal(state_range(model, None), [inside, inside])
 

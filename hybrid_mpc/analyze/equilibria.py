@@ -16,6 +16,7 @@ from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.model.riccati import hidden_fixed_point, vector
 
 Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
 RESIDUAL = 1e-10
 ITERATIONS = 50
 STARTS = 64
@@ -27,18 +28,10 @@ MARGINAL = 1e-7
 
 
 def fixed_point(model: HybridModel, u: ArrayLike, x_guess: ArrayLike) -> tuple[Array, Array]:
-    """The equilibrium near a guess: ``x`` ``(n_x,)`` and ``h`` ``(n_h,)`` that one step leaves where they are.
-
-    Args:
-        model: The model.
-        u: Held input ``(n_u,)``.
-        x_guess: Where Newton's method starts ``(n_x,)``, with the hidden state that settles there.
+    """The equilibrium ``x`` ``(n_x,)``, ``h`` ``(n_h,)`` under a held input, by Newton's method from a guess of ``x``.
 
     Raises:
         InputError: If a size is wrong or none is found (largest residual above 1e-10 in the units of the state).
-
-    Example:
-        ``x, h = fixed_point(model, [0.0], [3.0, 0.0])``
     """
     x0, u0 = vector(x_guess, model.n_x, "x_guess"), vector(u, model.n_u, "u")
     start = np.concatenate([x0, _settled(model, x0, u0)])
@@ -52,14 +45,7 @@ def fixed_point(model: HybridModel, u: ArrayLike, x_guess: ArrayLike) -> tuple[A
 
 
 def hidden_equilibrium(model: HybridModel, x: ArrayLike, u: ArrayLike) -> Array:
-    """Hidden state ``(n_h,)`` at rest while ``x`` ``(n_x,)`` and ``u`` ``(n_u,)`` are held, by Newton's method.
-
-    Raises:
-        InputError: If a size is wrong or none is found (residual above 1e-10).
-
-    Example:
-        ``h = hidden_equilibrium(model, [0.0, 2.0], [0.1])``
-    """
+    """Hidden state ``(n_h,)`` at rest while ``x`` ``(n_x,)`` and ``u`` ``(n_u,)`` are held, by Newton's method."""
     x0, u0 = vector(x, model.n_x, "x"), vector(u, model.n_u, "u")
     if model.n_h == 0:
         return np.zeros(0)
@@ -77,38 +63,28 @@ def hidden_equilibrium(model: HybridModel, x: ArrayLike, u: ArrayLike) -> Array:
 
 @dataclass(frozen=True)
 class Equilibrium:
-    """A point of rest.
+    """A point of rest: its residual is the largest change in one step, its poles are those of the step, largest first.
 
-    Args:
-        x: ``(n_x,)``.
-        h: ``(n_h,)``.
-        u: ``(n_u,)``.
-        residual: Largest change in one step.
-        poles: Of the step there ``(n_z,)``, largest first.
-        stability: ``"stable"``, ``"unstable"`` or ``"marginal"`` (an eigenvalue on the unit circle: a continuum of
-            points of rest, or a stability that no linearization tells).
-        hits: Starts that ended here.
+    ``stability`` is ``"stable"``, ``"unstable"`` or ``"marginal"`` (an eigenvalue on the unit circle: a continuum of
+    points of rest, or a stability that no linearization tells). ``hits`` counts the starts that ended here.
     """
 
     x: Array
     h: Array
     u: Array
     residual: float
-    poles: NDArray[np.complex128]
+    poles: Complex
     stability: str
     hits: int
 
 
 @dataclass(frozen=True)
 class Equilibria:
-    """What Newton's method found from many starts.
+    """What Newton's method found from many starts: points in order of their states.
 
-    Args:
-        points: The points of rest, in order of their states.
-        starts: Number of starts.
-        converged: Of them, those that ended at a point of rest inside the region.
-        unseen: Estimated probability that a further converging start finds a new point: the share of points that
-            were hit only once (Good and Turing). 1 where nothing was found.
+    ``converged`` starts ended at a point of rest inside the region. ``unseen`` is the estimated probability that a
+    further one finds a new point: the share of points that were hit only once (Good and Turing); 1 where nothing was
+    found.
     """
 
     points: tuple[Equilibrium, ...]
@@ -182,11 +158,16 @@ def equilibria(
     return Equilibria(tuple(points), starts, converged, once / converged if converged else 1.0)
 
 
+def poles_of(a: Array) -> Complex:
+    """Eigenvalues of a one-step map, largest magnitude first."""
+    poles = np.linalg.eigvals(a).astype(np.complex128)
+    return poles[np.argsort(-np.abs(poles), kind="stable")]
+
+
 def _point(model: HybridModel, z: Array, error: float, hits: int, u: Array) -> Equilibrium:
     x, h = z[: model.n_x], z[model.n_x :]
     assert model.with_jacobian is not None
-    poles = np.linalg.eigvals(model.with_jacobian(x, h, u, model.w, model.p)[2].full()).astype(np.complex128)
-    poles = poles[np.argsort(-np.abs(poles), kind="stable")]
+    poles = poles_of(model.with_jacobian(x, h, u, model.w, model.p)[2].full())
     over = float(np.abs(poles[0])) - 1.0
     stability = "marginal" if abs(over) <= MARGINAL else "stable" if over < 0 else "unstable"
     return Equilibrium(x, h, u, error, poles, stability, hits)

@@ -144,9 +144,6 @@ def linearize_at_speed(model: HybridModel, q: ArrayLike, v_work: ArrayLike, u: A
 
     Raises:
         InputError: If a size is wrong or the hidden state finds no rest.
-
-    Example:
-        ``linearize_at_speed(model, [0.0], [2.0], [0.1])``
     """
     n_q = model.n_x // 2
     x = np.concatenate([vector(q, n_q, "q"), vector(v_work, n_q, "v_work")])
@@ -159,10 +156,10 @@ def linearize_secant(
 ) -> Any:  # fmt: skip
     """Linearization at rest whose damping is that of motions of a given size.
 
-    A smoothed Coulomb friction has a slope at rest that no motion feels. Here the columns of A by the velocities are
-    chords: of the step from ``v = +speed`` and ``-speed`` (``"secant"``), or the mean over a sinusoid of that
-    amplitude (``"harmonic"``, the describing function; 4/pi of the secant for Coulomb friction). All other columns
-    are the tangents. The point stays a point of rest, so poles, loops and margins of it mean something.
+    The columns of A by the velocities are chords: of the step from ``v = +speed`` and ``-speed`` (``"secant"``), or
+    the mean over a sinusoid of that amplitude (``"harmonic"``, the describing function; 4/pi of the secant for Coulomb
+    friction). All other columns are the tangents. The point stays a point of rest, so poles, loops and margins of it
+    mean something.
 
     Args:
         model: The model, state ``[q, v]``.
@@ -177,9 +174,6 @@ def linearize_secant(
 
     Raises:
         InputError: If a size is wrong, a speed is not positive, or the hidden state finds no rest.
-
-    Example:
-        ``linearize_secant(model, [0.0, 0.0], [0.0], [0.5])``
     """
     n_q, n_z = model.n_x // 2, model.n_x + model.n_h
     size = _positive(speed, n_q)
@@ -239,9 +233,6 @@ def friction_slopes(
 
     Source: the describing function: Gelb and Vander Velde, *Multiple-Input Describing Functions and Nonlinear System
     Design*, 1968, section 2.2.
-
-    Example:
-        ``friction_slopes(model, [0.0], [0.1, 1.0]).secant``
     """
     n_q = model.n_x // 2
     size = _positive(speeds, np.size(speeds))
@@ -290,15 +281,7 @@ def _slope_of(model: HybridModel, i: int) -> Any:
 class AlongTrajectory:
     """``dz_{k+1} = A_k dz_k + B_k du_k``, ``dy_k = C_k dz_k + D_k du_k`` around a trajectory, ``z = (x, h)``.
 
-    Args:
-        model: The model.
-        x: States ``(n, n_x)``.
-        h: Hidden states ``(n, n_h)``.
-        u: Inputs ``(n, n_u)``.
-        A: ``(n, n_z, n_z)``.
-        B: ``(n, n_z, n_u)``.
-        C: ``(n, n_y, n_z)``.
-        D: ``(n, n_y, n_u)``.
+    States ``x``, hidden states ``h``, inputs ``u`` and the matrices have a row for each of the n periods.
     """
 
     model: HybridModel
@@ -333,11 +316,7 @@ class AlongTrajectory:
         return _state_space(self.model, *(m[skip:].mean(axis=0) for m in (self.A, self.B, self.C, self.D)))
 
     def transition(self, start: int, end: int) -> Array:
-        """``A_{end-1} ... A_start`` ``(n_z, n_z)``: what a deviation at ``start`` has become at ``end``.
-
-        Raises:
-            InputError: If the range does not lie within the trajectory.
-        """
+        """``A_{end-1} ... A_start`` ``(n_z, n_z)``: what a deviation at ``start`` has become at ``end``."""
         if not 0 <= start <= end <= len(self.A):
             raise InputError(f"transition: 0 <= start <= end <= {len(self.A)} needed, got {start} and {end}")
         product = np.eye(self.A.shape[1])

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_discrete_are
 
+from hybrid_mpc.analyze.equilibria import poles_of
 from hybrid_mpc.analyze.linearize import (
     Kind,
     control_toolbox,
@@ -20,7 +21,7 @@ from hybrid_mpc.analyze.linearize import (
     operating_point,
     period,
 )
-from hybrid_mpc.analyze.properties import frequency_response
+from hybrid_mpc.analyze.properties import frequency_response, matrices
 from hybrid_mpc.control.rti import CondensedController, propagate
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate, ExtendedKalmanFilter
@@ -38,13 +39,9 @@ MOST_DELAY = 200
 class MpcGain:
     """An MPC to first order: ``du_0 = by_state dz + by_load dd + by_before du_before + by_reference dr``.
 
-    It is exact as long as no bound acts and the prediction's linearization stays the same.
-
-    Args:
-        by_state: By the estimate of ``z = (x, h)``, ``(n_u, n_z)``.
-        by_load: By the estimated input disturbance ``(n_u, n_u)``.
-        by_before: By the input held before ``(n_u, n_u)``; zero without ``r_delta``.
-        by_reference: By a reference that is constant over the horizon ``(n_u, n_x)``.
+    It is exact as long as no bound acts and the prediction's linearization stays the same. ``z = (x, h)`` and ``d``,
+    the disturbance at the inputs, are estimates; ``u_before`` is the input held before (its gain is zero without
+    ``r_delta``), and ``r`` a reference that is constant over the horizon.
     """
 
     by_state: Array
@@ -128,13 +125,9 @@ def mpc_gain(
 
 @dataclass(frozen=True)
 class GainSchedule:
-    """LQR gains by operating point: ``du = -gain[k] @ dz`` with ``z = (x, h)``.
+    """LQR gains ``(n, n_u, n_x + n_h)`` by operating point: ``du = -gain[k] @ dz`` with ``z = (x, h)``.
 
-    Args:
-        x: Operating points ``(n, n_x)``.
-        u: Inputs there ``(n, n_u)``.
-        gain: ``(n, n_u, n_x + n_h)`` [input unit / state unit].
-        radius: Spectral radius of each closed loop ``(n,)``.
+    ``radius`` is the spectral radius of each closed loop ``(n,)``.
     """
 
     x: Array
@@ -189,16 +182,9 @@ def gain_schedule(
 
 @dataclass(frozen=True)
 class SteadyFilter:
-    """A Kalman filter in its steady state over ``w = (x, h, d)``.
+    """A Kalman filter in its steady state over ``w = (x, h, d)``: ``w- = F w + G u``, ``w = w- + gain (y - C w-)``.
 
-    ``w- = F w + G u``, then ``w = w- + gain (y - C w-)``.
-
-    Args:
-        F: ``(n_w, n_w)``.
-        G: ``(n_w, n_u)``.
-        C: ``(n_y, n_w)``.
-        gain: ``(n_w, n_y)``.
-        P: Covariance after a measurement ``(n_w, n_w)``.
+    ``P`` is the covariance after a measurement.
     """
 
     F: Array
@@ -300,13 +286,10 @@ class Margins:
 
 @dataclass(frozen=True)
 class LinearLoop:
-    """A linearized loop of plant and output feedback, both discrete, with ``u = feedback y``.
+    """A linearized loop of plant and output feedback, both discrete ``control.StateSpace``, with ``u = feedback y``.
 
-    Args:
-        plant: ``control.StateSpace`` from inputs to outputs.
-        feedback: ``control.StateSpace`` from outputs to inputs, no sign in between.
-        closed: Closed loop from loads at the inputs and noise at the outputs to outputs and inputs.
-        poles: Its poles, largest first.
+    ``closed`` leads from loads at the inputs and noise at the outputs to outputs and inputs; ``poles`` are its, largest
+    first.
     """
 
     plant: Any
@@ -320,11 +303,7 @@ class LinearLoop:
         return bool(np.abs(self.poles[0]) < 1.0)
 
     def broken(self, input: int = 0) -> Any:
-        """The loop transfer function with one input cut open, the others closed, in negative-feedback sign.
-
-        Raises:
-            InputError: If there is no such input.
-        """
+        """The loop transfer function with one input cut open, the others closed, in negative-feedback sign."""
         n_u = self.plant.ninputs
         if not 0 <= input < n_u:
             raise InputError(f"loop: input {input} asked for, the plant has {n_u}")
@@ -344,8 +323,7 @@ class LinearLoop:
     def margins(self, input: int = 0) -> Margins:
         """Margins of the loop broken at one input, by python-control on a fine grid of frequencies.
 
-        Raises:
-            InputError: If there is no such input, or the closed loop is not stable: it has no margins then.
+        A closed loop that is not stable has none: an InputError.
         """
         if not self.stable:
             raise InputError(
@@ -382,7 +360,7 @@ class LinearLoop:
 
     def _delay_periods(self, input: int) -> int:
         loop = self.broken(input)
-        a, b, c, d = (np.asarray(m, dtype=float) for m in (loop.A, loop.B, loop.C, loop.D))
+        a, b, c, d = matrices(loop)
         for periods in range(1, MOST_DELAY + 1):
             n = len(a)
             whole = np.zeros((n + periods, n + periods))
@@ -466,13 +444,12 @@ def mpc_loop(gain: MpcGain, filter: SteadyFilter, plant: Any, *, delay: int = 0)
     for _ in range(delay):
         late = _delayed(late)
     closed = _closed(late, feedback)
-    poles = np.linalg.eigvals(closed.A).astype(np.complex128)
-    return LinearLoop(late, feedback, closed, poles[np.argsort(-np.abs(poles), kind="stable")])
+    return LinearLoop(late, feedback, closed, poles_of(closed.A))
 
 
 def _delayed(plant: Any) -> Any:
     """The plant with its inputs one period late."""
-    a, b, c = (np.asarray(m, dtype=float) for m in (plant.A, plant.B, plant.C))
+    a, b, c, _ = matrices(plant)
     n, n_u = b.shape
     whole = np.block([[a, b], [np.zeros((n_u, n + n_u))]])
     into = np.vstack([np.zeros((n, n_u)), np.eye(n_u)])
@@ -482,8 +459,8 @@ def _delayed(plant: Any) -> Any:
 
 def _open(plant: Any, feedback: Any) -> tuple[Array, Array, Array, Array]:
     """From the plant's inputs through plant and feedback."""
-    a, b, c = (np.asarray(m, dtype=float) for m in (plant.A, plant.B, plant.C))
-    f, g, h, k = (np.asarray(m, dtype=float) for m in (feedback.A, feedback.B, feedback.C, feedback.D))
+    a, b, c, _ = matrices(plant)
+    f, g, h, k = matrices(feedback)
     whole = np.block([[a, np.zeros((len(a), len(f)))], [g @ c, f]])
     into = np.vstack([b, np.zeros((len(f), b.shape[1]))])
     return whole, into, np.hstack([k @ c, h]), np.zeros((len(h), b.shape[1]))
@@ -493,7 +470,7 @@ def _closed(plant: Any, feedback: Any) -> Any:
     """From loads at the inputs and noise at the outputs to outputs and the controller's inputs."""
     a, b, c, _ = _open(plant, feedback)
     n, (n_y, n_u) = plant.nstates, (plant.noutputs, plant.ninputs)
-    g, k = np.asarray(feedback.B, dtype=float), np.asarray(feedback.D, dtype=float)
+    _, g, _, k = matrices(feedback)
     noise = np.vstack([b[:n] @ k, g])
     outputs = np.hstack([np.asarray(plant.C, dtype=float), np.zeros((n_y, feedback.nstates))])
     direct = np.block([[np.zeros((n_y, n_u + n_y))], [np.zeros((n_u, n_u)), k]])
@@ -511,7 +488,7 @@ def _response(sys: Any, omega: ArrayLike) -> Complex:
 
 def _at_rest(sys: Any) -> float:
     """Gain of a single loop at the frequency zero; 0 with an integrator, whose curve goes to infinity there."""
-    a, b, c, d = (np.asarray(m, dtype=float) for m in (sys.A, sys.B, sys.C, sys.D))
+    a, b, c, d = matrices(sys)
     if not len(a):
         return float(d.item())
     if np.abs(np.linalg.eigvals(a) - 1.0).min() < 1e-9:

@@ -28,26 +28,12 @@ BLOCKS = 10
 
 
 def interval_bounds(f: ca.Function, lower: ArrayLike, upper: ArrayLike) -> tuple[Array, Array]:
-    """Lower and upper bounds ``(m,)`` of a function's first output over a box of its first input.
+    """Lower and upper bounds ``(m,)`` of a function's first output over a box of its first input ``(n,)``.
 
-    Never too small but for rounding (about 1e-15 of the values), mostly too large: a variable that appears twice
-    counts as two.
-
-    Args:
-        f: One input ``(n,)``, one output ``(m,)``; arithmetic, powers of two, tanh, exp, roots, sine, cosine.
-        lower: Lower bounds of the input ``(n,)``.
-        upper: Upper bounds of the input ``(n,)``.
-
-    Raises:
-        InputError: If a bound is missing or not finite, or the function has an operation that is not known here.
+    Never too small but for rounding (about 1e-15 of the values), mostly too large: a variable that appears twice counts
+    as two. An operation that is not known here is an InputError.
 
     Source: Moore, Kearfott, Cloud, *Introduction to Interval Analysis*, 2009, chapter 2 and section 5.
-
-    Example:
-        >>> x = ca.SX.sym("x", 2)
-        >>> low, high = interval_bounds(ca.Function("f", [x], [x[0] * x[1] + ca.cos(x[0])]), [-1.0, 0.0], [1.0, 2.0])
-        >>> low.round(6), high.round(6)
-        (array([-1.459698]), array([3.]))
     """
     low, high = _box(lower, upper, f.numel_in(0))
     scalar = f if f.is_a("SXFunction") else f.expand()
@@ -139,16 +125,7 @@ class GruWeights:
     """Weights of a GRU cell in torch's form, gates in the order reset, update, new.
 
     ``r = sig(W_r s + b_ir + R_r h + b_hr)``, ``z`` likewise, ``n = tanh(W_n s + b_in + r (R_n h + b_hn))``,
-    ``h+ = (1 - z) n + z h``.
-
-    Args:
-        w: ``(3 n_h, n_s)``, by the inputs.
-        r: ``(3 n_h, n_h)``, by the hidden state.
-        b_w: ``(3 n_h,)``.
-        b_r: ``(3 n_h,)``.
-
-    Raises:
-        InputError: If the shapes do not fit.
+    ``h+ = (1 - z) n + z h``. By the inputs ``w`` ``(3 n_h, n_s)``, by the hidden state ``r`` ``(3 n_h, n_h)``.
     """
 
     w: Array
@@ -218,9 +195,6 @@ def feature_box(program: Program, x: ArrayLike, u: ArrayLike) -> tuple[Array, Ar
 
     Raises:
         InputError: If there is no such cell, its inputs depend on more, or an operation on the way to it is not known.
-
-    Example:
-        ``low, high = feature_box(program, [(-1, 1), (-4, 4)], [(-0.5, 0.5)])``
     """
     cell = _cell(program)
     source = cell.args[0]
@@ -326,12 +300,10 @@ def _perron(matrix: Array) -> tuple[float, Array]:
 
 @dataclass(frozen=True)
 class LyapunovExponent:
-    """Mean rate at which the distance of neighbouring runs grows along a run.
+    """Mean rate [1/s] at which the distance of neighbouring runs grows along a run; negative: they come together.
 
-    Args:
-        value: Exponent [1/s]; negative: they come together.
-        deviation: Standard deviation of its mean over ten stretches of the run [1/s].
-        growth: Logarithm of the distance over the first one ``(n + 1,)``, for a plot.
+    ``deviation`` is the standard deviation of this mean over ten stretches of the run, ``growth`` the logarithm of the
+    distance over the first one ``(n + 1,)``, for a plot.
     """
 
     value: float

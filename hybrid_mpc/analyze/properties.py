@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import cholesky, schur, solve_discrete_lyapunov, solve_sylvester
 
+from hybrid_mpc.analyze.equilibria import poles_of
 from hybrid_mpc.analyze.linearize import control_toolbox, linearize, period
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.model import HybridModel
@@ -26,15 +27,12 @@ NOTHING = 1e-14
 
 
 class Mode(NamedTuple):
-    """One mode of a discrete system.
+    """One mode of a discrete system; frequency [rad/s] and damping ratio are those of the continuous equivalent.
 
-    Args:
-        pole: Eigenvalue of A.
-        frequency: Natural frequency ``|log(z) / dt|`` [rad/s] of the continuous equivalent; infinite for a pole at 0.
-        damping: Damping ratio of the continuous equivalent; 1 for a pole at 0 or 1.
-        reach: Distance from being uncontrollable: smallest singular value of the Popov-Belevitch-Hautus pencil
-            ``[A - z I, B]`` over the largest of ``[A, B]``, B's columns scaled to the norm of A (units must not count).
-        see: Distance from being unobservable, the dual.
+    A pole at 0 has an infinite frequency, and one at 0 or 1 the damping 1. ``reach`` is the distance from being
+    uncontrollable: the smallest singular value of the Popov-Belevitch-Hautus pencil ``[A - z I, B]`` over the largest
+    of ``[A, B]``, B's columns scaled to the norm of A (units must not count); ``see`` is the dual, from being
+    unobservable.
     """
 
     pole: complex
@@ -45,20 +43,10 @@ class Mode(NamedTuple):
 
 
 def modes(sys: Any) -> tuple[Mode, ...]:
-    """Modes of a discrete ``control.StateSpace``, largest pole first.
-
-    Raises:
-        InputError: If the system has no period.
-
-    Example:
-        >>> import control
-        >>> round(modes(control.ss([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.1))[0].frequency, 6)
-        6.931472
-    """
+    """Modes of a discrete ``control.StateSpace``, largest pole first."""
     dt = period(sys)
-    a, b, c, _ = _matrices(sys)
-    poles = np.linalg.eigvals(a).astype(np.complex128)
-    poles = poles[np.argsort(-np.abs(poles), kind="stable")]
+    a, b, c, _ = matrices(sys)
+    poles = poles_of(a)
     frequency, damping = np.full(poles.size, np.inf), np.ones(poles.size)
     moving = np.abs(poles) > 0
     s = np.log(poles[moving]) / dt
@@ -79,84 +67,18 @@ def _hautus(a: Array, b: Array, z: complex) -> float:
     return smallest / float(np.linalg.norm(np.hstack([a, scaled]), 2))
 
 
-def _stabilisable_detectable(found: tuple[Mode, ...]) -> tuple[bool, bool]:
+def stabilisable_detectable(found: tuple[Mode, ...]) -> tuple[bool, bool]:
     """Whether every mode on or outside the unit circle is reached, and whether every such mode is seen."""
     risky = [m for m in found if abs(m.pole) >= 1.0 - RANK_TOLERANCE]
     return all(m.reach > RANK_TOLERANCE for m in risky), all(m.see > RANK_TOLERANCE for m in risky)
 
 
 @dataclass(frozen=True)
-class LinearAnalysis:
-    """Poles and structural properties of a discrete linear model.
-
-    Args:
-        dt: Period [s].
-        poles: Eigenvalues of A ``(n,)``, largest magnitude first.
-        frequency: Natural frequencies ``(n,)`` [rad/s]; see :class:`Mode`.
-        damping: Damping ratios ``(n,)``.
-        slow: True where the natural frequency lies below ``split`` ``(n,)``.
-        split: Border [rad/s] between slow and fast poles: a tenth of the Nyquist frequency.
-        stable: All poles inside the unit circle.
-        stabilisable: The input reaches every mode on or outside the unit circle.
-        detectable: The output shows every such mode.
-    """
-
-    dt: float
-    poles: Complex
-    frequency: Array
-    damping: Array
-    slow: NDArray[np.bool_]
-    split: float
-    stable: bool
-    stabilisable: bool
-    detectable: bool
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain dictionary for JSON: complex as ``[re, im]``, an infinite frequency (z = 0) as None."""
-        return {
-            "dt": self.dt,
-            "poles": [[float(z.real), float(z.imag)] for z in self.poles],
-            "frequency_rad_s": [float(w) if np.isfinite(w) else None for w in self.frequency],
-            "damping": [float(d) for d in self.damping],
-            "slow": [bool(s) for s in self.slow],
-            "split_rad_s": self.split,
-            "stable": self.stable,
-            "stabilisable": self.stabilisable,
-            "detectable": self.detectable,
-        }
-
-
-def analyze(sys: Any) -> LinearAnalysis:
-    """Poles and properties of a discrete ``control.StateSpace``.
-
-    Raises:
-        InputError: If the system has no period.
-
-    Example:
-        >>> import control
-        >>> analyze(control.ss([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.1)).stable
-        True
-    """
-    found, dt = modes(sys), period(sys)
-    poles, frequency, damping, _, _ = (np.array(column) for column in zip(*found, strict=True))
-    split = 0.1 * np.pi / dt
-    return LinearAnalysis(
-        dt, poles, frequency, damping, frequency < split, split, bool(np.all(np.abs(poles) < 1.0)),
-        *_stabilisable_detectable(found),
-    )  # fmt: skip
-
-
-@dataclass(frozen=True)
 class Structure:
-    """Modes and input-output weight of a discrete system.
+    """Modes of a discrete system, largest pole first, and its Hankel singular values ``(n,)``, largest first.
 
-    Args:
-        dt: Period [s].
-        modes: Largest pole first.
-        hankel: Hankel singular values ``(n,)`` of the stable part, largest first, inputs and outputs as they are
-            given; infinite for each mode on or outside the unit circle.
-        stabilisable: Every mode on or outside the unit circle is reached.
-        detectable: Every such mode is seen.
+    The latter are those of the stable part, inputs and outputs as they are given; infinite for each mode on or outside
+    the unit circle. ``stabilisable`` and ``detectable``: every such mode is reached, is seen.
     """
 
     dt: float
@@ -164,18 +86,6 @@ class Structure:
     hankel: Array
     stabilisable: bool
     detectable: bool
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain dictionary for JSON; complex as ``[re, im]``."""
-        return {
-            "dt": self.dt,
-            "modes": [
-                {**m._asdict(), "pole": [float(np.real(m.pole)), float(np.imag(m.pole))]} for m in self.modes
-            ],
-            "hankel": self.hankel.tolist(),
-            "stabilisable": self.stabilisable,
-            "detectable": self.detectable,
-        }
 
 
 def system_structure(sys: Any) -> Structure:
@@ -199,18 +109,12 @@ def system_structure(sys: Any) -> Structure:
         ([0.0, 0.538], False, True)
     """
     found = modes(sys)
-    return Structure(period(sys), found, hankel_singular_values(sys), *_stabilisable_detectable(found))
+    return Structure(period(sys), found, hankel_singular_values(sys), *stabilisable_detectable(found))
 
 
 @dataclass(frozen=True)
 class FrequencyResponse:
-    """Frequency response for Bode plots.
-
-    Args:
-        omega: Frequencies ``(n,)`` [rad/s].
-        magnitude: ``|G|`` ``(n_y, n_u, n)`` [output unit / input unit].
-        phase: Unwrapped phase ``(n_y, n_u, n)`` [rad].
-    """
+    """Magnitude [output unit / input unit] and unwrapped phase [rad], each ``(n_y, n_u, n)``; ``omega`` in rad/s."""
 
     omega: Array
     magnitude: Array
@@ -233,7 +137,7 @@ def frequency_response(sys: Any, omega: ArrayLike) -> FrequencyResponse:
     w = np.asarray(omega, dtype=np.float64).reshape(-1)
     if w.size == 0 or not (w.min() > 0 and w.max() <= np.pi / dt * (1 + 1e-9)):
         raise InputError(f"frequency response: give frequencies in (0, {np.pi / dt:.6g}] rad/s (Nyquist)")
-    a, b, c, d = (np.asarray(m, dtype=np.float64) for m in (sys.A, sys.B, sys.C, sys.D))
+    a, b, c, d = matrices(sys)
     z = np.exp(1j * w * dt)
     response = c @ np.linalg.solve(z[:, None, None] * np.eye(a.shape[0]) - a, b.astype(complex)) + d
     g = np.moveaxis(response, 0, -1)
@@ -242,14 +146,11 @@ def frequency_response(sys: Any, omega: ArrayLike) -> FrequencyResponse:
 
 @dataclass(frozen=True)
 class Reduced:
-    """A reduced system and what the reduction costs.
+    """A reduced ``control.StateSpace`` of ``order`` states and what the reduction costs.
 
-    Args:
-        system: ``control.StateSpace``.
-        hankel: Hankel singular values ``(n,)`` of the system before, infinite for poles on or outside the circle.
-        order: States kept.
-        bound: Largest difference of the two frequency responses, at any frequency, at most: twice the sum of the
-            singular values left out.
+    ``hankel`` are the singular values ``(n,)`` of the system before, infinite for poles on or outside the circle.
+    ``bound`` is the largest difference of the two frequency responses at most: twice the sum of the singular values
+    left out.
     """
 
     system: Any
@@ -259,18 +160,9 @@ class Reduced:
 
 
 def hankel_singular_values(sys: Any) -> Array:
-    """Hankel singular values ``(n,)`` of a discrete system, largest first; infinite for each unstable pole.
-
-    Raises:
-        InputError: If the system has no period.
-
-    Example:
-        >>> import control
-        >>> hankel_singular_values(control.ss([[0.6]], [[0.8]], [[0.8]], 0.0, 1.0)).round(12)
-        array([1.])
-    """
+    """Hankel singular values ``(n,)`` of a discrete system, largest first; infinite for each unstable pole."""
     period(sys)
-    _, stable = _split(_matrices(sys))
+    _, stable = _split(matrices(sys))
     values = _balance(*stable[:3])[0]
     return np.concatenate([np.full(len(sys.A) - values.size, np.inf), values])
 
@@ -300,7 +192,7 @@ def balanced_truncation(sys: Any, order: int) -> Reduced:
         (1, True)
     """
     dt = period(sys)
-    kept, stable = _split(_matrices(sys))
+    kept, stable = _split(matrices(sys))
     values, left, right = _balance(*stable[:3])
     fixed, n = len(kept[0]), len(sys.A)
     if not fixed <= order <= n:
@@ -354,7 +246,7 @@ def physical_states(
     n_x = model.n_x
     by_x = _scale(x_scale, n_x, "x_scale")
     by_u = _scale(u_scale, model.n_u, "u_scale")
-    a, b, c, d = _matrices(sys)
+    a, b, c, d = matrices(sys)
     states = np.hstack([np.diag(1.0 / by_x), np.zeros((n_x, len(a) - n_x))])
     control = control_toolbox()
     scaled = control.ss(a, b * by_u, states, 0.0, sys.dt, remove_useless_states=False)
@@ -380,27 +272,25 @@ def _scale(value: ArrayLike | None, n: int, name: str) -> Array:
     return scale
 
 
-def _matrices(sys: Any) -> Matrices:
+def matrices(sys: Any) -> Matrices:
+    """A, B, C and D of a ``control.StateSpace``."""
     a, b, c, d = (np.asarray(m, dtype=float) for m in (sys.A, sys.B, sys.C, sys.D))
     return a, b, c, d
 
 
-def _split(matrices: Matrices) -> tuple[Matrices, Matrices]:
+def _split(given: Matrices) -> tuple[Matrices, Matrices]:
     """The part with poles not inside the circle, and the stable part with D: an ordered Schur form, decoupled."""
-    a, b, c, d = matrices
+    a, b, c, d = given
     t, q, kept = schur(a, sort=lambda re, im: np.hypot(re, im) >= 1.0 - EDGE)
     if len(t) - kept == 0 or kept == 0:
-        whole, none = (q.T @ a @ q, q.T @ b, c @ q, d), _empty(b, c, d)
+        whole = q.T @ a @ q, q.T @ b, c @ q, d
+        none = np.zeros((0, 0)), np.zeros((0, b.shape[1])), np.zeros((c.shape[0], 0)), d
         return (none, whole) if kept == 0 else (whole, none)
     first, second, cross = t[:kept, :kept], t[kept:, kept:], t[:kept, kept:]
     x = solve_sylvester(first, -second, -cross)
     b, c = q.T @ b, c @ q
     upper = (first, b[:kept] - x @ b[kept:], c[:, :kept], np.zeros_like(d))
     return upper, (second, b[kept:], c[:, kept:] + c[:, :kept] @ x, d)
-
-
-def _empty(b: Array, c: Array, d: Array) -> Matrices:
-    return np.zeros((0, 0)), np.zeros((0, b.shape[1])), np.zeros((c.shape[0], 0)), d
 
 
 def _balance(a: Array, b: Array, c: Array) -> tuple[Array, Array, Array]:

@@ -18,14 +18,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sensitivities:
-    """Derivatives of a free run by parameters.
-
-    Args:
-        names: Parameters ``(n_p,)``.
-        values: Their values ``(n_p,)``.
-        x: The run ``(n + 1, n_x)``.
-        by: ``(n + 1, n_x, n_p)``: derivative of the states by the parameters.
-    """
+    """A free run ``x`` ``(n + 1, n_x)`` and its derivatives ``by`` ``(n + 1, n_x, n_p)`` by parameters ``(n_p,)``."""
 
     names: tuple[str, ...]
     values: Array

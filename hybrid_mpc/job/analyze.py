@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,13 +94,9 @@ POSITIONS = 21
 class AnalysisSettings:
     """What ``hybrid-mpc analyze`` is asked for.
 
-    Args:
-        folder: Artifact folder, or the folder of the run that holds it as ``model``.
-        scenario: Name or file. Default: the one that the artifact names; without any, the artifact's own control
-            problem and noise make the loops, where it holds them.
-        data: Recordings.
-        speed: Working speed [unit of v]. Default: that of the scenario's weights, else 1.
-        seed: Of the recordings that the scenario makes to estimate the filters' noise on, if the artifact holds none.
+    ``folder`` is that of the artifact, or of the run that holds it as ``model``. ``scenario`` is a name or file;
+    without one the artifact names it. The working ``speed`` [unit of v] is by default that of the scenario's weights,
+    else 1.
     """
 
     folder: Path
@@ -112,19 +108,11 @@ class AnalysisSettings:
 
 @dataclass(frozen=True)
 class AnalysisInput:
-    """What is analyzed.
+    """What is analyzed: models by name (``"prior"`` and ``"hybrid"`` are compared), and their surroundings.
 
-    Args:
-        models: By name; ``"prior"`` and ``"hybrid"`` are compared.
-        programs: Exported programs of the artifact, ``"prior/step"`` and so on.
-        x_range: Working range of the states ``(n_x, 2)``.
-        u_range: That of the inputs ``(n_u, 2)``.
-        speed: Working speeds ``(n_x / 2,)``.
-        ocp: The control problem; default: none, then there are no loops.
-        filters: Estimators by model and mode, ``("hybrid", "quiet")``; default: none.
-        plant: The simulated machine; default: none.
-        recordings: Inputs ``(n,)``, outputs ``(n,)`` and first states of recordings; default: none.
-        region: Region in which points of rest are looked for ``(n_x, 2)``. Default: ``x_range``.
+    ``programs`` are by ``"prior/step"``, ``filters`` by model and mode, ``("hybrid", "quiet")``. ``x_range`` and
+    ``u_range`` are working ranges ``(n, 2)``, ``speed`` is ``(n_x / 2,)``. Recordings are inputs ``(n,)``, outputs
+    ``(n,)`` and first states. Points of rest are looked for in ``region`` ``(n_x, 2)``, by default ``x_range``.
     """
 
     models: Mapping[str, HybridModel]
@@ -156,15 +144,7 @@ class FrictionAnalysis:
 
 @dataclass(frozen=True)
 class Reduction:
-    """A linearization reduced to its physical states.
-
-    Args:
-        a: System matrix ``(n_x, n_x)``.
-        b: Input matrix ``(n_x, n_u)``.
-        bound: Largest difference of the two frequency responses, at most.
-        hankel: Hankel singular values before ``(n,)``.
-        response: Frequency response of the reduced system.
-    """
+    """A linearization reduced to its physical states; ``bound`` is the largest difference of the responses."""
 
     a: Array
     b: Array
@@ -175,16 +155,10 @@ class Reduction:
 
 @dataclass(frozen=True)
 class Linearization:
-    """One linearization of a model.
+    """One linearization of a model: modes, poles (largest first), zeros of a square system, responses.
 
-    Args:
-        structure: Modes and Hankel singular values.
-        poles: ``(n,)``, largest first.
-        zeros: Of a square system ``(m,)``; otherwise empty.
-        response: Frequency response.
-        t: Times of the step response ``(k,)`` [s].
-        step: Unit step responses ``(n_y, n_u, k)``.
-        reduced: Reduced to the physical states; None for a model without hidden states.
+    The unit step responses ``step`` are ``(n_y, n_u, k)`` at the times ``t`` [s]. ``reduced`` is None without hidden
+    states.
     """
 
     structure: Structure
@@ -206,14 +180,7 @@ class ResponseError:
 
 @dataclass(frozen=True)
 class ResponseAnalysis:
-    """Responses of machine and models to the same inputs.
-
-    Args:
-        source: How they were measured.
-        machine: Response of the machine.
-        models: Of the models, by name.
-        errors: Distance of each model from the machine.
-    """
+    """Responses of machine and models to the same inputs, and each model's distance from the machine."""
 
     source: str
     machine: MeasuredResponse
@@ -234,16 +201,9 @@ class ScheduleAnalysis:
 class LoopAnalysis:
     """A controller and a filter around a linearized machine.
 
-    Args:
-        stable: All poles of the closed loop are inside the unit circle.
-        radius: Their largest magnitude.
-        gain: Gain of the controller by the physical states ``(n_u, n_x)``.
-        omega: Angular frequencies ``(n,)`` [rad/s].
-        open_loop: Loop gain at the first input ``(n,)``, negative feedback.
-        margins: None where the loop is not stable.
-        sensitivity: ``"S"``, ``"T"``, ``"KS"``, ``"GS"`` of the first input and output ``(n,)``; empty where the loop
-            is not stable.
-        peaks: Largest magnitude of ``"S"`` and ``"T"``; empty likewise.
+    ``gain`` is the controller's by the physical states ``(n_u, n_x)``, ``open_loop`` the loop gain at the first input
+    ``(n,)`` in negative feedback at ``omega`` [rad/s]. A loop that is not stable has no margins, no sensitivities
+    (``"S"``, ``"T"``, ``"KS"``, ``"GS"``) and no peaks (of ``"S"`` and ``"T"``).
     """
 
     stable: bool
@@ -258,13 +218,7 @@ class LoopAnalysis:
 
 @dataclass(frozen=True)
 class MemoryAnalysis:
-    """Whether a model forgets where it began.
-
-    Args:
-        whole: Lyapunov exponent of the whole state.
-        hidden: Of the hidden state alone; None for a model without.
-        certificate: Contraction over the working range; None for a model without a network.
-    """
+    """Whether a model forgets where it began: exponents of the whole state and of the hidden one, certificate."""
 
     whole: LyapunovExponent
     hidden: LyapunovExponent | None
@@ -275,13 +229,8 @@ class MemoryAnalysis:
 class SensitivityAnalysis:
     """A driven run's derivatives by the prior's parameters.
 
-    Args:
-        parameters: Names ``(n_p,)``.
-        t: Times ``(n,)`` [s].
-        relative: Change of the states per 100 % of each parameter ``(n, n_x, n_p)``.
-        rms: Its root mean square over the run ``(n_x, n_p)``.
-        identifiable: Parameters that the run tells apart.
-        correlation: Correlation of their errors in a fit of this run.
+    ``relative`` is the change of the states per 100 % of each parameter ``(n, n_x, n_p)``, ``rms`` its root mean square
+    over the run. ``identifiable`` are the parameters that the run tells apart, ``correlation`` is that of their errors.
     """
 
     parameters: tuple[str, ...]
@@ -294,17 +243,9 @@ class SensitivityAnalysis:
 
 @dataclass(frozen=True)
 class AnalysisResult:
-    """The parts of an analysis, each by model.
+    """The parts of an analysis, each by model; linearizations also by point of :data:`POINTS`.
 
-    Args:
-        equilibria: Points of rest without input.
-        friction: Damping at rest, of motions of a size, in motion.
-        linear: By model and point of :data:`POINTS`.
-        measured: Machine and models under the same inputs.
-        schedule: LQR gains over the positions.
-        loops: By loop (``"prior on hybrid"``: controller on machine), point and mode of the filter.
-        memory: Lyapunov exponents and the contraction certificate.
-        sensitivity: Derivatives of a run by the parameters.
+    Loops are by ``"prior on hybrid"`` (controller on machine), point, and mode of the filter.
     """
 
     equilibria: Mapping[str, Equilibria] | Missing
@@ -321,14 +262,7 @@ class AnalysisResult:
 
 
 def analysis_input(settings: AnalysisSettings) -> tuple[AnalysisInput, tuple[str, ...]]:
-    """Read what is analyzed, with notes on where it came from.
-
-    Args:
-        settings: What is asked for.
-
-    Raises:
-        InputError: If there is no artifact, the scenario does not fit it, or a recording is bad.
-    """
+    """Read what is analyzed, with notes on where it came from."""
     folder = artifact_folder(settings.folder)
     kit = load(folder)
     scenario = scenario_of(kit.provenance.scenario, folder / FILE, settings.scenario)
@@ -352,7 +286,7 @@ def analysis_input(settings: AnalysisSettings) -> tuple[AnalysisInput, tuple[str
     plant = scenario.plant() if scenario is not None and scenario.plant is not None else None
     return AnalysisInput(
         kit.models, load_programs(folder), state_range(model, control), input_range(model, control), speed, ocp,
-        filters, plant, _recordings(settings.data, scenario, model), whole_range(model),
+        filters, plant, _recordings(settings.data, scenario, model), state_range(model),
     ), tuple(notes)  # fmt: skip
 
 
@@ -368,17 +302,12 @@ def _speed(model: HybridModel, control: OCP | None, given: float | None) -> Arra
     return 1.0 / np.sqrt(np.where(weights > 0, weights, 1.0))
 
 
-def state_range(model: HybridModel, control: OCP | None) -> Array:
-    """Working range of the states ``(n_x, 2)``: limits of the control problem, else the signals', else a unit."""
+def state_range(model: HybridModel, control: OCP | None = None) -> Array:
+    """Range of the states ``(n_x, 2)``: limits of the control problem, else the signals', else a unit (half a turn)."""
     none = np.full(model.n_x, np.inf)
     lower, upper = (-none, none) if control is None else (control.x_min, control.x_max)
     sides = zip(model.states, lower.tolist(), upper.tolist(), strict=True)
-    return np.array([_within(s, _unit(s), low, high) for s, low, high in sides])
-
-
-def whole_range(model: HybridModel) -> Array:
-    """Whole range of the states ``(n_x, 2)``: the signals', a turn for a periodic angle, else a unit either way."""
-    return np.array([_within(s, _unit(s)) for s in model.states])
+    return np.array([_within(s, np.pi if s.periodic else 1.0, low, high) for s, low, high in sides])
 
 
 def input_range(model: HybridModel, control: OCP | None) -> Array:
@@ -387,10 +316,6 @@ def input_range(model: HybridModel, control: OCP | None) -> Array:
         return np.array([_within(s, 1.0) for s in model.inputs])
     sides = zip(model.inputs, control.input_scale, control.u_min, control.u_max, strict=True)
     return np.array([_within(s, size, low, high) for s, size, low, high in sides])
-
-
-def _unit(signal: Signal) -> float:
-    return np.pi if signal.periodic else 1.0
 
 
 def _within(
@@ -435,36 +360,33 @@ def _recordings(
 # The parts.
 
 
-T = TypeVar("T")
 Report = Callable[[str, int, int, str], None]
 
 
 def analyze_models(given: AnalysisInput, report: Report = lambda *text: None) -> AnalysisResult:
     """Analyze the models, part after part; a part that cannot be computed says why.
 
-    Args:
-        given: What is analyzed.
-        report: Called with ``("parts", done, total, part)``. Default: nobody is told.
+    ``report`` is called with ``("parts", done, total, part)``.
     """
     points = {name: resting_point(given, model) for name, model in given.models.items()}
-
-    def part(number: int, name: str, compute: Callable[[], T]) -> T | Missing:
-        report("parts", number, 8, name)
+    parts: dict[str, Callable[[], Any]] = {
+        "equilibria": lambda: equilibria_of(given),
+        "friction": lambda: friction_of(given, points),
+        "linear": lambda: linearizations_of(given, points),
+        "measured": lambda: responses_of(given),
+        "schedule": lambda: schedules_of(given),
+        "loops": lambda: loops_of(given, points),
+        "memory": lambda: memory_of(given),
+        "sensitivity": lambda: sensitivities_of(given),
+    }
+    found: dict[str, Any] = {}
+    for number, (name, compute) in enumerate(parts.items()):
+        report("parts", number, len(parts), name)
         try:
-            return compute()
+            found[name] = compute()
         except InputError as error:
-            return Missing(str(error))
-
-    return AnalysisResult(
-        part(0, "equilibria", lambda: equilibria_of(given)),
-        part(1, "friction", lambda: friction_of(given, points)),
-        part(2, "linear", lambda: linearizations_of(given, points)),
-        part(3, "measured", lambda: responses_of(given)),
-        part(4, "schedule", lambda: schedules_of(given)),
-        part(5, "loops", lambda: loops_of(given, points)),
-        part(6, "memory", lambda: memory_of(given)),
-        part(7, "sensitivity", lambda: sensitivities_of(given)),
-    )
+            found[name] = Missing(str(error))
+    return AnalysisResult(**found)
 
 
 def resting_point(given: AnalysisInput, model: HybridModel) -> Point:

@@ -31,7 +31,7 @@ from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.plots import analysis as plots
 from hybrid_mpc.plots.style import ratio_unit, save
 from hybrid_mpc.records import plain
-from hybrid_mpc.report.page import Cell, KeyFigure, Report, Section, Table, write_report
+from hybrid_mpc.report.page import Cell, KeyFigure, Report, Section, Table, words, write_report
 
 MODES = 6
 """Modes of each linearization in the page's table; the CSV has all."""
@@ -41,18 +41,7 @@ Drawn = Mapping[str, tuple[Path, str]]
 def write_analysis(
     out: Path, given: AnalysisInput, result: AnalysisResult, notes: Sequence[str], command: str
 ) -> list[Path]:
-    """Write everything of an analysis into a folder.
-
-    Args:
-        out: Folder; made if missing.
-        given: What was analyzed.
-        result: What was found.
-        notes: Where the numbers came from.
-        command: The command line that repeats it.
-
-    Returns:
-        The files.
-    """
+    """Write everything of an analysis into a folder; the files. ``notes`` say where the numbers came from."""
     numbers, curves = flattened(result)
     region = given.x_range if given.region is None else given.region
     head = {"schema_version": 1, "notes": list(notes), "region": region, "working_speed": given.speed}
@@ -77,10 +66,6 @@ def write_analysis(
 
 def flattened(value: Any, path: str = "") -> tuple[Any, dict[str, Any]]:
     """A result as numbers for JSON, and its arrays by their path; a complex number becomes ``[re, im]``.
-
-    Args:
-        value: Dataclasses, mappings and sequences of numbers, texts and arrays.
-        path: Where it lies.
 
     Example:
         >>> numbers, arrays = flattened({"a": {"gain": np.ones(2), "pole": 0.5 + 0.1j}})
@@ -117,12 +102,7 @@ def flattened(value: Any, path: str = "") -> tuple[Any, dict[str, Any]]:
 
 
 def tables_of(given: AnalysisInput, result: AnalysisResult) -> dict[str, Table]:
-    """Tables by file name; a missing part has none.
-
-    Args:
-        given: What was analyzed.
-        result: What was found.
-    """
+    """Tables by file name; a missing part has none."""
     parts: dict[str, tuple[Any, Callable[[HybridModel, Any], Table]]] = {
         "equilibria": (result.equilibria, _equilibria),
         "friction": (result.friction, _friction),
@@ -252,12 +232,7 @@ TITLES = {
 
 
 def figures_of(given: AnalysisInput, result: AnalysisResult) -> Named:
-    """Name, figure and caption of what was found; a missing part has no figure.
-
-    Args:
-        given: What was analyzed.
-        result: What was found.
-    """
+    """Name, figure and caption of what was found; a missing part has no figure."""
     parts: tuple[tuple[Any, Callable[[AnalysisInput, Any], Named]], ...] = (
         (result.friction, _draw_friction),
         (result.linear, _draw_linear),
@@ -360,88 +335,33 @@ def _some(given: AnalysisInput) -> HybridModel:
     return next(iter(given.models.values()))
 
 
-# The page: title, part of the result, tables, figures, text.
+# The page.
 
-SECTIONS: Sequence[tuple[str, str, tuple[str, ...], tuple[str, ...], str]] = (
-    (
-        "Points of rest",
-        "equilibria",
-        ("equilibria",),
-        (),
-        "Newton's method from many starts finds states and hidden states that one step does not change, to 1e-10. "
-        "Where a point was hit only once, others may have been missed.",
-    ),
-    (
-        "Friction in a linearization",
-        "friction",
-        ("friction",),
-        ("friction",),
-        "A smoothed dry friction tanh(v / v_s) is steepest at rest, where the tangent takes its slope. No motion "
-        "larger than v_s feels that slope. The secant from -v to v, or the describing function of a sinusoid of that "
-        "size, gives the damping of such a motion. The tangent in motion gives that of small deviations from it.",
-    ),
-    (
+SECTIONS: Mapping[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
+    "equilibria": ("Points of rest", ("equilibria",), ()),
+    "friction": ("Friction in a linearization", ("friction",), ("friction",)),
+    "linear": (
         "Linearized models",
-        "linear",
         ("modes",),
         ("poles", "bode_rest", "bode_working", "bode_moving", "bode_driven", "steps"),
-        "Each model is linearized four times: the tangent at rest; at rest with friction of working size; the "
-        "tangent in motion; the mean of the tangents along a run driven by a multisine (statistical linearization). "
-        "The tangent in motion holds for deviations that are short against the motion. With friction of working "
-        "size only the columns by the speeds are describing functions. What a network makes of the other signals "
-        "stays its tangent at rest, which is stiction where the machine sticks.",
     ),
-    (
-        "Against the machine",
-        "measured",
-        (),
-        ("measured",),
-        "Machine and models get the same inputs, and their responses are estimated in the same way. This is the best "
-        "linear approximation for inputs of this size. For a machine with friction it is the Jacobian of nothing, "
-        "but the only fair comparison.",
-    ),
-    (
-        "Control loops",
-        "loops",
-        ("margins",),
-        ("sensitivity", "nyquist"),
-        "The gain of the MPC is the exact derivative of its QP's solution where no bound is active. The filter is "
-        "the extended Kalman filter in its steady state: quiet, and as in the few periods after a load came or went. "
-        "'prior on hybrid' is the prior's controller and filter around the hybrid as the machine. A loop that is "
-        "unstable here has no margins. The real loop is nonlinear, and limited by what a linearization leaves out.",
-    ),
-    (
-        "Gain schedule",
-        "schedule",
-        ("gain_schedule",),
-        ("schedule",),
-        "LQR of the linearizations over the positions, with the weights of the control problem.",
-    ),
-    (
-        "Memory of the recurrent part",
-        "memory",
-        ("memory",),
-        (),
-        "The certificate is sufficient for the network to forget, for all inputs in the working range. Trained "
-        "networks mostly fail it and still forget: the exponents show that for one driven run.",
-    ),
-    (
-        "Parameters",
-        "sensitivity",
-        ("sensitivity",),
-        ("sensitivity_parameters",),
-        "Exact derivatives of a free run by the prior's parameters, in the prior and within the hybrid.",
-    ),
-)
+    "measured": ("Against the machine", (), ("measured",)),
+    "loops": ("Control loops", ("margins",), ("sensitivity", "nyquist")),
+    "schedule": ("Gain schedule", ("gain_schedule",), ("schedule",)),
+    "memory": ("Memory of the recurrent part", ("memory",), ()),
+    "sensitivity": ("Parameters", ("sensitivity",), ("sensitivity_parameters",)),
+}
+"""Title, tables and figures by part of the result."""
 
 
 def _sections(result: AnalysisResult, tables: Mapping[str, Table], drawn: Drawn) -> list[Section]:
     sections = []
-    for title, part, names, figures, text in SECTIONS:
+    texts = words("analysis_words.html")
+    for part, (title, names, figures) in SECTIONS.items():
         found = getattr(result, part)
         notes = [f"Left out: {found.reason}."] if isinstance(found, Missing) else []
         shown = [tables[n] if n != "modes" else _leading(tables[n]) for n in names if n in tables]
-        sections.append(Section(title, (text,), [drawn[f] for f in figures if f in drawn], shown, notes))
+        sections.append(Section(title, texts[part], [drawn[f] for f in figures if f in drawn], shown, notes))
     return sections
 
 

@@ -52,9 +52,6 @@ def pole_map(poles: Mapping[str, Any], dt: float, *, zeros: Mapping[str, Any] | 
         zeros: Zeros ``(n,)``, complex, by model: then poles are crosses and zeros circles, and the title counts zeros
             that lie outside of the frame. Default: none, and the markers tell the models apart.
 
-    Returns:
-        The figure: unit circle (stable inside), lines of constant damping and natural frequency.
-
     Raises:
         InputError: If there is no pole or ``dt`` is not positive.
 
@@ -155,7 +152,7 @@ def bode(
     output_signal: Signal,
     nyquist: float | None = None,
 ) -> Figure:
-    """Frequency responses of the linearized models from one input to one output.
+    """Frequency responses of the linearized models from one input to one output: magnitude and phase.
 
     Args:
         responses: By model: angular frequencies ``(n,)`` [rad/s], magnitude ``(n,)`` [output unit / input
@@ -163,9 +160,6 @@ def bode(
         input_signal: The input.
         output_signal: The output.
         nyquist: Highest meaningful frequency ``pi / dt`` [rad/s]; drawn as a line. Default: none.
-
-    Returns:
-        The figure: magnitude and phase over frequency.
 
     Raises:
         InputError: If there is no model or lengths differ.

@@ -250,9 +250,6 @@ def animate(
         limits: Lower and upper bounds of the inputs, drawn as lines where finite. Default: none.
         reference: Reference of ``x[0]``, ``(n,)``. Default: none.
 
-    Returns:
-        The path.
-
     Raises:
         InputError: If the name does not end in ``.gif``, shapes do not fit, times do not increase, a true state
             is not finite, or ``dt`` or ``fps`` is not positive.

@@ -60,16 +60,13 @@ def recordings(
     *,
     limit: int = 4,
 ) -> Figure:
-    """A few recordings over time, each part shaded by what it is used for.
+    """A few recordings over time, a row a file, each part shaded by what it is used for.
 
     Args:
         trajectories: Pieces of recordings; pieces of one file (same stem) share a row.
         outputs: Signals of ``y``.
         inputs: Signals of ``u``.
         limit: Most files drawn; files are chosen so that every role is seen. Default: 4.
-
-    Returns:
-        The figure: one row a file, one column a signal.
 
     Raises:
         InputError: If there is no trajectory, or its shapes do not fit the signals.
@@ -111,9 +108,6 @@ def coverage(trajectories: Sequence[Recording], states: Sequence[Signal]) -> Fig
     Args:
         trajectories: Pieces of recordings.
         states: Signals of ``x = [q, v]``.
-
-    Returns:
-        The figure: one panel a degree of freedom, position across, velocity up.
 
     Raises:
         InputError: If there is no trajectory, or its shapes do not fit the signals.

@@ -51,9 +51,6 @@ def innovations(
         correlation_band: Half width of the band of one autocorrelation.
         title: Default: none.
 
-    Returns:
-        The figure: single NIS and their mean over windows of 50 samples above, autocorrelation beneath.
-
     Raises:
         InputError: If there are no recordings, or shapes do not fit.
 

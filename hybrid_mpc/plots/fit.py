@@ -74,9 +74,6 @@ def free_run(
         energy_model: Energy balance of the MOPGRNN, ``(n,)`` [W].
         title: Title. Default: none.
 
-    Returns:
-        The figure: a row for each state and input, the balances, and the violation.
-
     Raises:
         InputError: If shapes do not fit.
 
@@ -239,30 +236,9 @@ def benchmark_run(
 ) -> Figure:
     """A free run over a recording: output, errors, inputs, and the errors' course over the whole run.
 
-    Args:
-        t: Times ``(n,)`` [s].
-        y: Measured output ``(n,)``.
-        predictions: Output of each model's free run ``(n,)``.
-        u: Inputs ``(n, n_u)``.
-        output: Signal of ``y``.
-        inputs: Signals of ``u``.
-        unit: Unit of the errors.
-        scale: Errors' units in an SI unit.
-        title: Title. Default: none.
-        names: How models are to be called in the legend, where not as everywhere. Default: none.
-
-    Returns:
-        The figure. The first 20 s of a longer run are drawn; the last row has all of it.
-
-    Raises:
-        InputError: If shapes do not fit.
-
-    Example:
-        >>> t, y = 0.1 * np.arange(50), np.zeros(50)
-        >>> figure = benchmark_run(t, y, {"phy": y + 0.1}, y, output=Signal("q", "m"), inputs=(Signal("F", "N"),),
-        ...                        unit="mm", scale=1e3)
-        >>> len(figure.axes)
-        4
+    ``y`` and each model's run are ``(n,)``; ``scale`` errors of ``unit`` are an SI unit. ``names`` says how models are
+    to be called in the legend, where not as everywhere. The first 20 s of a longer run are drawn; the last row has all
+    of it.
     """
     t = np.asarray(t, dtype=float)
     y, u = checked("y", y, len(t)), checked("u", u, len(t), len(inputs))
@@ -316,7 +292,7 @@ def curves(
     free_run_start: Mapping[str, float] | None = None,
     units: tuple[str, str, str] = ("-", "-", "-"),
 ) -> Figure:
-    """Training curves of each model: two objectives with their never-rising bounds, and the validation.
+    """Training curves, a column a model: two objectives with their never-rising bounds, and the validation.
 
     Args:
         training: By model, arrays of equal length: ``step``, ``loss_error`` and, where the model has
@@ -324,9 +300,6 @@ def curves(
             was not taken at a step.
         free_run_start: Step at which a model's training turns from teacher forcing to free runs.
         units: Units of the error objective, the energy objective and the validation metric.
-
-    Returns:
-        The figure: one column a model, logarithmic axes up.
 
     Raises:
         InputError: If there is no model, ``step`` is missing, or lengths differ.

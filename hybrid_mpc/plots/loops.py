@@ -43,10 +43,6 @@ class Motion:
         t: Times ``(n,)`` [s].
         x: True states ``(n, n_x)``.
         u: Inputs ``(n, n_u)``, held between samples.
-
-    Example:
-        >>> Motion(np.zeros(1), np.zeros((1, 2)), np.zeros((1, 1))).x.shape
-        (1, 2)
     """
 
     t: Array
@@ -64,7 +60,7 @@ def closed_loops(
     inputs: Sequence[Signal],
     limits: tuple[Sequence[float] | Array, Sequence[float] | Array] | None = None,
 ) -> Figure:
-    """The same task under each controller: states with their reference, tracking error, inputs.
+    """The same task under each controller: states with their reference, error of the positions, inputs.
 
     Args:
         title: The task in one line.
@@ -74,9 +70,6 @@ def closed_loops(
         states: Signals of ``x``.
         inputs: Signals of ``u``.
         limits: Lower and upper bounds of the inputs, drawn where finite. Default: none drawn.
-
-    Returns:
-        The figure; the error row shows the positions only.
 
     Raises:
         InputError: If there is no loop or shapes do not fit.
@@ -119,14 +112,11 @@ def closed_loops(
 
 
 def solve_times(times_ms: Mapping[str, Array], period_ms: float) -> Figure:
-    """How long a controller step takes, against the period that it must fit into.
+    """How long a controller step takes, against the period that it must fit into: distribution, share of longer steps.
 
     Args:
         times_ms: Durations of all steps by controller, ``(n,)`` [ms].
         period_ms: Control period [ms], the deadline.
-
-    Returns:
-        The figure: left the distribution, right the share of steps that took longer.
 
     Raises:
         InputError: If a controller has no positive durations, or the period is not positive.
@@ -188,24 +178,11 @@ Costs = Mapping[str, Mapping[str, tuple[float, float]]]
 def costs(table: Costs) -> Figure:
     """Closed-loop cost of every controller in every task, relative to the oracle that measures.
 
-    The interval is the controller's own, divided by the oracle's mean; the oracle's own interval shows how
-    well that is known. A missing controller or a mean that is not finite leaves a gap; an interval that is not
-    finite (a single seed) is not drawn. A task without the oracle's cost keeps its row, with a note.
-
-    Args:
-        table: By task and controller: mean cost and half width of its 95 % interval. Controllers:
-            ``prior``, ``prior_observer``, ``hybrid``, ``hybrid_observer``, ``oracle``, ``oracle_state``.
-
-    Returns:
-        The figure: one row a task; logarithmic where the costs span more than a factor of 5.
-
-    Raises:
-        InputError: If no task has a positive cost of ``oracle``.
-
-    Example:
-        >>> figure = costs({"track_sine": {"prior": (2.0, 0.1), "hybrid": (1.1, 0.1), "oracle": (1.0, 0.05)}})
-        >>> [text.get_text() for text in figure.legends[0].get_texts()][:2]
-        ['prior, fitted', 'MOPGRNN (hybrid)']
+    The table holds by task and controller the mean cost and the half width of its 95 % interval. The interval is the
+    controller's own, divided by the oracle's mean; the oracle's own interval shows how well that is known. A missing
+    controller or a mean that is not finite leaves a gap; an interval that is not finite (a single seed) is not drawn. A
+    task without the oracle's cost keeps its row, with a note. The axis is logarithmic where the costs span more than a
+    factor of 5.
     """
     relative = {task: _relative(row) for task, row in table.items()}
     points = [mean for row in relative.values() for mean, _ in row.values()]

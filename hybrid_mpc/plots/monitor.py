@@ -48,27 +48,9 @@ def trace(
 ) -> Figure:
     """The monitor over a whole recording: violation, residual force, alarms, and the position beneath.
 
-    Args:
-        t: Times ``(n,)`` [s].
-        violation: Violation of the energy balance, ``(n,)`` [W].
-        level: What is compared with the threshold (the averaged violation), ``(n,)`` [W]; NaN where the monitor has
-            no valid reading.
-        threshold: Alarm threshold [W].
-        alarm: True where the monitor alarms, ``(n,)``.
-        y: Measured position, ``(n,)``.
-        output: Signal of ``y``.
-        windows: Start and end [s] of the stretches known to be clean. Default: none.
-        residual: Level of the residual force ``(n,)``, its threshold and its unit. Default: no such row.
-        title: Title. Default: none.
-
-    Raises:
-        InputError: If lengths differ.
-
-    Example:
-        >>> t, zero = np.array([0.0, 0.1]), np.zeros(2)
-        >>> figure = trace(t, zero, zero, 0.1, [False, False], zero, output=Signal("phi", "rad"))
-        >>> len(figure.axes)
-        2
+    All arrays are ``(n,)``. ``level`` is what is compared with the threshold, the averaged violation [W]; NaN where the
+    monitor has no valid reading. ``windows`` are stretches [s] known to be clean, ``residual`` is the level of the
+    residual force, its threshold and its unit.
     """
     t = np.asarray(t, dtype=float)
     raw, averaged = checked("violation", violation, len(t)), checked("level", level, len(t))
@@ -162,10 +144,6 @@ def intervals(t: Array, active: Any) -> list[tuple[float, float]]:
     """Start and end [s] of the stretches in which ``active`` ``(n,)`` is true.
 
     An interval ends at the first sample that is false again, or at the last sample.
-
-    Example:
-        >>> intervals(np.array([0.0, 1.0, 2.0, 3.0]), [False, True, True, False])
-        [(1.0, 3.0)]
     """
     edges = np.diff(np.concatenate([[0], np.asarray(active, dtype=int), [0]]))
     starts = np.flatnonzero(edges == 1)

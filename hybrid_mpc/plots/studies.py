@@ -75,9 +75,6 @@ def differences(rows: Mapping[str, Mapping[str, tuple[float, float, float]]], la
         rows: By group and level: difference, lower and upper end of its interval (NaN: not drawn).
         label: Name and unit of the axis.
 
-    Returns:
-        The figure.
-
     Raises:
         InputError: If there is no finite difference.
 
@@ -107,9 +104,6 @@ def pareto(points: Mapping[str, Mapping[str, tuple[float, float]]], cost: str) -
     Args:
         points: By group and level: median duration of a step [ms], mean cost.
         cost: Name and unit of the cost.
-
-    Returns:
-        The figure; durations on a logarithmic axis where they span much.
 
     Raises:
         InputError: If there is no finite point.

@@ -29,46 +29,27 @@ DPI = 110
 INK, FAINT, PALE = "#222222", "#8a8a8a", "#9a9a9a"
 ALARM, GOOD = "#CC79A7", "#009E73"
 
-COLOURS: Mapping[str, str] = MappingProxyType(
-    {
-        "measured": "#000000",
-        "reference": "#000000",
-        "phy_nominal": "#7f7f7f",
-        "phy": "#0072B2",
-        "prior": "#0072B2",
-        "prior_observer": "#56B4E9",
-        "rnn": "#E69F00",
-        "pgrnn": "#009E73",
-        "mopgrnn": "#D55E00",
-        "hybrid": "#D55E00",
-        "hybrid_observer": "#E69F00",
-        "oracle": "#CC79A7",
-        "oracle_state": "#009E73",
-        "train": "#56B4E9",
-        "valid": "#F0E442",
-        "test": "#555555",
-    }
-)
-NAMES: Mapping[str, str] = MappingProxyType(
-    {
-        "measured": "measured",
-        "reference": "reference",
-        "phy_nominal": "prior, nominal",
-        "phy": "prior, fitted",
-        "prior": "prior, fitted",
-        "prior_observer": "prior with observer",
-        "rnn": "RNN",
-        "pgrnn": "PGRNN",
-        "mopgrnn": "MOPGRNN (hybrid)",
-        "hybrid": "MOPGRNN (hybrid)",
-        "hybrid_observer": "MOPGRNN with observer",
-        "oracle": "oracle",
-        "oracle_state": "oracle, true state",
-        "train": "training",
-        "valid": "validation",
-        "test": "test",
-    }
-)
+_ROLES = {
+    "measured": ("#000000", "measured"),
+    "reference": ("#000000", "reference"),
+    "phy_nominal": ("#7f7f7f", "prior, nominal"),
+    "phy": ("#0072B2", "prior, fitted"),
+    "prior": ("#0072B2", "prior, fitted"),
+    "prior_observer": ("#56B4E9", "prior with observer"),
+    "rnn": ("#E69F00", "RNN"),
+    "pgrnn": ("#009E73", "PGRNN"),
+    "mopgrnn": ("#D55E00", "MOPGRNN (hybrid)"),
+    "hybrid": ("#D55E00", "MOPGRNN (hybrid)"),
+    "hybrid_observer": ("#E69F00", "MOPGRNN with observer"),
+    "oracle": ("#CC79A7", "oracle"),
+    "oracle_state": ("#009E73", "oracle, true state"),
+    "train": ("#56B4E9", "training"),
+    "valid": ("#F0E442", "validation"),
+    "test": ("#555555", "test"),
+}
+"""Colour and name of each role or model."""
+COLOURS: Mapping[str, str] = MappingProxyType({role: ink for role, (ink, _) in _ROLES.items()})
+NAMES: Mapping[str, str] = MappingProxyType({role: name for role, (_, name) in _ROLES.items()})
 _DASHED = frozenset({"phy_nominal", "reference"})
 _SYMBOLS = {
     "phi": r"$\varphi$",
@@ -100,12 +81,7 @@ def name_of(role: str) -> str:
 
 
 def plain(text: str) -> str:
-    r"""Text of a user as matplotlib prints it literally (a dollar sign starts no formula).
-
-    Example:
-        >>> plain("run $1")
-        'run \\$1'
-    """
+    """Text of a user as matplotlib prints it literally (a dollar sign starts no formula)."""
     return text.replace("$", r"\$")
 
 
@@ -164,7 +140,7 @@ def new_figure(
     sharey: Share = False,
     heights: Sequence[float] | None = None,
 ) -> tuple[Figure, NDArray[np.object_]]:
-    """An empty figure in the project's look, and its axes.
+    """An empty figure in the project's look, and its axes ``(rows, cols)``.
 
     Args:
         rows: Rows of axes.
@@ -172,11 +148,11 @@ def new_figure(
         title: Title over all axes. Default: none.
         size: Width and height [inch]. Default: 10 wide, 2.2 a row and at least 3.6 high.
         sharex: As in ``matplotlib.figure.Figure.subplots``.
-        sharey: As in ``matplotlib.figure.Figure.subplots``.
+        sharey: Likewise.
         heights: Relative heights of the rows. Default: equal.
 
     Returns:
-        The figure, on its own Agg canvas (nothing global is touched), and the axes ``(rows, cols)``.
+        The figure, on its own Agg canvas (nothing global is touched), and the axes.
 
     Example:
         >>> figure, axes = new_figure(2, 1)
@@ -200,15 +176,7 @@ def new_column(
 ) -> tuple[Figure, list[Axes]]:
     """An empty figure of panels one above the other that share their horizontal axis.
 
-    Args:
-        heights: Relative heights of the panels.
-        height: Height [inch] of a panel of relative height 1.
-        title: Title over all panels. Default: none.
-
-    Example:
-        >>> figure, panels = new_column([2.0, 1.0])
-        >>> len(panels)
-        2
+    ``heights`` are relative; a panel of relative height 1 is ``height`` inches high.
     """
     size = (10.0, 0.8 + height * sum(heights))
     figure, axes = new_figure(len(heights), 1, sharex=True, heights=heights, title=title, size=size)
@@ -216,13 +184,7 @@ def new_column(
 
 
 def finish_column(figure: Figure, panels: Sequence[Axes], *, columns: int = 7) -> None:
-    """Complete a column of panels over time: no margins, time axis, aligned labels, one legend.
-
-    Args:
-        figure: The figure.
-        panels: Its panels.
-        columns: Most columns of the legend.
-    """
+    """Complete a column of panels over time: no margins, time axis, aligned labels, one legend."""
     for ax in panels:
         ax.margins(x=0)
     panels[-1].set_xlabel("time [s]")
@@ -288,12 +250,7 @@ def plain_log(axis: Axis, lowest: float, highest: float) -> None:
 
 
 def number(value: float) -> str:
-    """A number as figures and tables print it: three significant digits.
-
-    Example:
-        >>> number(0.012345), number(1234.5), number(2.5e-13), number(0.0)
-        ('0.0123', '1234', '2.5e-13', '0')
-    """
+    """A number as figures and tables print it: three significant digits."""
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"
     size = abs(value)
@@ -303,21 +260,7 @@ def number(value: float) -> str:
 
 
 def checked(name: str, values: Any, length: int, columns: int | None = None) -> Array:
-    """An array of a figure with its length (and number of columns) checked.
-
-    Args:
-        name: What it is, for the message.
-        values: Numbers, ``(length,)``, or ``(length, columns)`` where ``columns`` is given.
-        length: Samples it must have.
-        columns: Columns it must have; a 1-D array counts as one column. Default: a 1-D array is needed.
-
-    Raises:
-        InputError: If the shape is another.
-
-    Example:
-        >>> checked("u", [1.0, 2.0], 2, 1).shape
-        (2, 1)
-    """
+    """An array of a figure, its shape checked: ``(length,)``, or ``(length, columns)`` where those are given."""
     array = np.asarray(values, dtype=float)
     if columns is not None and array.ndim == 1:
         array = array[:, None]
@@ -334,17 +277,13 @@ def save(figure: Figure, path: str | Path) -> Path:
         figure: The figure.
         path: Target file, ``.png``; its folder is made if missing.
 
-    Returns:
-        The path.
-
     Raises:
         InputError: If the name does not end in ``.png``, or the file cannot be written.
 
     Example:
         >>> import tempfile
-        >>> figure, _ = new_figure(1, 1)
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     save(figure, Path(folder) / "a.png").name
+        ...     save(new_figure(1, 1)[0], Path(folder) / "a.png").name
         'a.png'
     """
     path = Path(path)

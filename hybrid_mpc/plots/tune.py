@@ -45,17 +45,7 @@ class Trial(Protocol):
 def history(trials: Sequence[Trial], *, base: float | None = None) -> Figure:
     """Validation error over the number of the trial, with the best so far.
 
-    Args:
-        trials: The trials.
-        base: Validation error of the settings that the search started from. Default: not drawn.
-
-    Raises:
-        InputError: If there is no trial with a finite value.
-
-    Example:
-        >>> from types import SimpleNamespace as Row
-        >>> len(history([Row(number=0, state="complete", value=0.2, values={"hidden": 8})]).axes)
-        1
+    ``base`` is the validation error of the settings that the search started from; by default it is not drawn.
     """
     figure, axes = new_figure(1, 1)
     ax = axes[0, 0]
@@ -73,20 +63,7 @@ def history(trials: Sequence[Trial], *, base: float | None = None) -> Figure:
 
 
 def settings(trials: Sequence[Trial], names: Sequence[str]) -> Figure:
-    """Validation error over each searched setting, one panel a setting.
-
-    Args:
-        trials: The trials.
-        names: Searched settings.
-
-    Raises:
-        InputError: If there is no trial with a finite value, or no setting.
-
-    Example:
-        >>> from types import SimpleNamespace as Row
-        >>> len(settings([Row(number=0, state="complete", value=0.2, values={"hidden": 8})], ["hidden"]).axes)
-        1
-    """
+    """Validation error over each searched setting, one panel a setting."""
     if not names:
         raise InputError("plot of a search: no setting to draw; give the searched ones")
     figure, axes = new_figure(1, len(names), sharey=True)

@@ -6,68 +6,37 @@ import base64
 import csv
 import io
 import re
-import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
+from PIL import Image, UnidentifiedImageError
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import write_text
 from hybrid_mpc.plots.style import number
 
 Cell = str | float | int | bool | None
-_PNG = b"\x89PNG\r\n\x1a\n"
-_GIF = b"GIF8"
+Verdict = Literal["good", "bad", "plain"]
 
 
 @dataclass(frozen=True)
 class KeyFigure:
-    """A number at the head of the report.
-
-    Args:
-        label: What it is, e.g. ``"Free-run error, hybrid against fitted prior"``.
-        value: The number (or a word); None shows a dash, say why in ``comment``.
-        unit: Its unit. Default: none.
-        comment: A few words, e.g. ``"target: at most 0.8"``.
-        verdict: ``"good"``, ``"bad"`` or ``"plain"`` (neither).
-
-    Example:
-        >>> KeyFigure("Period", 20.0, "ms").text
-        '20.0'
-    """
+    """A number (or a word) at the head of the report; None shows a dash, ``comment`` says why."""
 
     label: str
     value: Cell
     unit: str = ""
     comment: str = ""
-    verdict: Literal["good", "bad", "plain"] = "plain"
-
-    @property
-    def text(self) -> str:
-        """The value as printed."""
-        return cell(self.value)
+    verdict: Verdict = "plain"
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table.
-
-    Args:
-        columns: Heads, with units.
-        rows: Cells; numbers get three significant digits, None a dash.
-        caption: One sentence.
-
-    Raises:
-        InputError: If a row has another length than ``columns``.
-
-    Example:
-        >>> Table(("model", "RMSE [rad]"), (("prior", 0.0255),)).rows[0]
-        ('prior', 0.0255)
-    """
+    """A table: heads with units, cells (numbers get three significant digits, None a dash), a sentence about it."""
 
     columns: Sequence[str]
     rows: Sequence[Sequence[Cell]]
@@ -95,18 +64,9 @@ class Table:
 
 @dataclass(frozen=True)
 class Section:
-    """A section of the report.
+    """A section: text, tables, figures with captions, and notes after them.
 
-    Args:
-        title: Its title.
-        paragraphs: Text. A plain ``str`` is escaped; ``markupsafe.Markup`` is taken as HTML.
-        figures: PNG files with their captions.
-        tables: Tables.
-        notes: Text after figures and tables.
-
-    Example:
-        >>> Section("Data", ("Two recordings.",)).anchor
-        'data'
+    Of the text a plain ``str`` is escaped; ``markupsafe.Markup`` is taken as HTML.
     """
 
     title: str
@@ -123,20 +83,9 @@ class Section:
 
 @dataclass(frozen=True)
 class Report:
-    """Everything the report shows.
+    """A page: titles, a paragraph about the machine, the command that made it, key figures, sections.
 
-    Args:
-        title: Title of the page.
-        scenario: Title of the scenario.
-        description: A paragraph about the machine.
-        command: The command that made it.
-        summary: Key figures.
-        sections: Sections, in order.
-        remark: A line under the title, e.g. seed, budget, versions.
-
-    Example:
-        >>> Report("Report", "A pendulum", "It swings.", "hybrid-mpc run pendulum").sections
-        ()
+    ``remark`` is a line under the title: seed, budget, versions.
     """
 
     title: str
@@ -149,41 +98,45 @@ class Report:
 
 
 def write_report(path: str | Path, report: Report) -> Path:
-    """Write a report as one self-contained HTML file: all of it or nothing.
-
-    Args:
-        path: Target file; its folder is made if missing.
-        report: What it shows.
-
-    Returns:
-        The path.
+    """Write a report as one self-contained HTML file, all of it or nothing; the path.
 
     Raises:
-        InputError: If a figure is missing or is no PNG, or the page cannot be written.
-
-    Example:
-        >>> page = Report("Report", "A pendulum", "It swings.", "hybrid-mpc run pendulum")
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     write_report(Path(folder) / "report.html", page).name
-        'report.html'
+        InputError: If a figure is missing or is no PNG or GIF, or the page cannot be written.
     """
     path = Path(path)
-    text = render(report)
-    write_text(path, text)
+    write_text(path, render(report))
     return path
 
 
 def render(report: Report) -> str:
     """The report as HTML text.
 
-    Raises:
-        InputError: If a figure is missing or is no PNG.
-
     Example:
         >>> "<title>Report &amp; more</title>" in render(Report("Report & more", "", "", ""))
         True
     """
+    sections = [
+        {"section": s, "id": f"s{i}-{s.anchor}", "figures": [_figure(s, *f) for f in s.figures]}
+        for i, s in enumerate(report.sections, 1)
+    ]
+    return _template("report.html").render(report=report, sections=sections)
+
+
+def words(file: str) -> dict[str, tuple[Markup, ...]]:
+    """General texts of the sections of a page, from a template with a block for each section.
+
+    Example:
+        >>> len(words("run_words.html")["training"])
+        2
+    """
+    template, texts = _template(file), {}
+    for name, block in template.blocks.items():  # type: ignore[attr-defined]
+        paragraphs = "".join(block(template.new_context())).split("\n\n")
+        texts[name] = tuple(Markup(" ".join(paragraph.split())) for paragraph in paragraphs)
+    return texts
+
+
+def _template(file: str) -> Template:
     environment = Environment(
         loader=PackageLoader("hybrid_mpc.report"),
         autoescape=True,
@@ -191,14 +144,8 @@ def render(report: Report) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["cell"] = cell
-    environment.filters["is_number"] = is_number
-    sections = [
-        {"section": s, "id": f"s{i}-{s.anchor}", "figures": [_figure(s, *f) for f in s.figures]}
-        for i, s in enumerate(report.sections, 1)
-    ]
-    style = Markup((Path(__file__).parent / "templates" / "report.css").read_text(encoding="utf-8"))
-    return environment.get_template("report.html").render(report=report, sections=sections, style=style)
+    environment.filters |= {"cell": cell, "is_number": is_number}
+    return environment.get_template(file)
 
 
 def cell(value: Cell) -> str:
@@ -227,12 +174,10 @@ def _figure(section: Section, path: str | Path, caption: str) -> dict[str, Any]:
         raise InputError(
             f"report, section {section.title!r}: no figure {path}; draw it first, or leave it out"
         )
-    content = path.read_bytes()
-    if content.startswith(_PNG) and len(content) >= 24:
-        kind, (width, height) = "png", struct.unpack(">II", content[16:24])
-    elif content.startswith(_GIF) and len(content) >= 10:
-        kind, (width, height) = "gif", struct.unpack("<HH", content[6:10])
-    else:
-        raise InputError(f"report, section {section.title!r}: figure {path} is no PNG or GIF file")
-    data = base64.b64encode(content).decode("ascii")
+    try:
+        with Image.open(path, formats=("PNG", "GIF")) as image:
+            kind, (width, height) = str(image.format).lower(), image.size
+    except UnidentifiedImageError:
+        raise InputError(f"report, section {section.title!r}: figure {path} is no PNG or GIF file") from None
+    data = base64.b64encode(path.read_bytes()).decode("ascii")
     return {"uri": f"data:image/{kind};base64,{data}", "caption": caption, "width": width, "height": height}

@@ -84,15 +84,9 @@ def test_a_model_that_runs_away_does_not_flatten_the_others():
     t = np.linspace(0.0, 10.0, 101)
     x = example.swing(t)
     figure = fit.free_run(
-        t,
-        x,
-        {"rnn": 1e6 * x, "mopgrnn": x},
-        np.zeros((101, 1)),
-        states=example.STATES,
-        inputs=example.INPUTS,
-        energy_measured=np.zeros(101),
-        energy_model=np.zeros(101),
-    )
+        t, x, {"rnn": 1e6 * x, "mopgrnn": x}, np.zeros((101, 1)), states=example.STATES, inputs=example.INPUTS,
+        energy_measured=np.zeros(101), energy_model=np.zeros(101),
+    )  # fmt: skip
     low, high = figure.axes[0].get_ylim()
     span = np.ptp(x[:, 0])
     assert high - low <= 2.2 * span + 1e-9  # the range of the measurement and 0.6 of it to either side
@@ -131,14 +125,13 @@ def test_alarm_intervals():
     assert monitor.intervals(t, [False] * 5) == []
 
 
-def test_numbers_have_three_digits():
-    assert [number(v) for v in (0.01234, 12.34, 123.4, 1e-12, float("nan"))] == [
-        "0.0123",
-        "12.3",
-        "123",
-        "1e-12",
-        "nan",
-    ]
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.01234, "0.0123"), (12.34, "12.3"), (123.4, "123"), (1234.5, "1234"), (2.5e-13, "2.5e-13"), (0.0, "0"),
+     (float("nan"), "nan")],
+)  # fmt: skip
+def test_numbers_have_three_digits(value, text):
+    assert number(value) == text
 
 
 @pytest.mark.parametrize(

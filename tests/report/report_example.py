@@ -9,13 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_mpc import Signal
-from hybrid_mpc.job.stages.report import TITLES, paragraphs
+from hybrid_mpc.job.stages.report import TITLES
 from hybrid_mpc.monitor.replay import MonitorTrace
 from hybrid_mpc.plots import analysis, data, estimation, fit, loops, monitor
-from hybrid_mpc.plots import fit as training
-from hybrid_mpc.plots.monitor import overview
 from hybrid_mpc.plots.style import name_of, save
-from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, write_report
+from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, words, write_report
 
 STATES = (Signal("phi", "rad"), Signal("phi_dot", "rad/s"))
 INPUTS = (Signal("tau", "N m"),)
@@ -89,7 +87,7 @@ def training_figure():
     bound = 1.1 * np.minimum.accumulate(out["mopgrnn"]["loss_error"])
     out["mopgrnn"] |= {"loss_energy": energy, "bound_error": bound, "bound_energy": 1.15 * energy}
     starts = dict.fromkeys(out, 300.0)
-    return training.curves(out, free_run_start=starts, units=("rad/s²", "W", "s"))
+    return fit.curves(out, free_run_start=starts, units=("rad/s²", "W", "s"))
 
 
 def loop_figure():
@@ -175,13 +173,9 @@ def guard_figure():
         t, t, t, 0.02 * late, 0.01 * late, 0.1 * late, scores[:, 0] > 1, 0.2 * late, late, late < 0, scores
     )
     marks = ((3.0, "friction doubles"), (3.1, "guard: rest"))
-    return overview(
-        seen,
-        np.sin(2 * t),
-        output=OUTPUTS[0],
-        force_unit="J/rad",
-        marks=marks,
-        title="something breaks at 3 s",
+    title = "something breaks at 3 s"
+    return monitor.overview(
+        seen, np.sin(2 * t), output=OUTPUTS[0], force_unit="J/rad", marks=marks, title=title
     )
 
 
@@ -233,7 +227,7 @@ def report(folder: Path) -> Report:
     sections = tuple(
         Section(
             TITLES[key],
-            paragraphs(key),
+            words("run_words.html")[key],
             tuple((paths[n], f"Figure of {n}: what it shows, in one sentence.") for n in names),
             tables.get(key, ()),
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,25 +15,16 @@ from hybrid_mpc.job.stage import Stage
 from hybrid_mpc.job.stages.export import EXPORT
 from hybrid_mpc.kit.assembly import working_point
 from hybrid_mpc.model.riccati import hidden_fixed_point
-from hybrid_mpc.records import record
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class LinearPoint:
-    """A model linearized at a point; see :class:`~hybrid_mpc.analyze.properties.LinearAnalysis`.
+    """A model linearized at a point: poles as (real part, imaginary part), the largest first.
 
-    Args:
-        dt: Period [s].
-        poles: Poles as (real part, imaginary part), the largest magnitude first.
-        frequency_rad_s: Their natural frequencies [rad/s]; None for a pole at zero.
-        damping: Their damping ratios.
-        slow: Whether each lies below ``split_rad_s``.
-        split_rad_s: Border between slow and fast poles [rad/s].
-        stable: All poles inside the unit circle.
-        stabilisable: By the test of Popov, Belevitch and Hautus.
-        detectable: Alike.
+    ``slow`` poles have a natural frequency below ``split_rad_s``, a tenth of the Nyquist frequency; that of a pole at
+    zero is None.
     """
 
     dt: float
@@ -48,13 +40,9 @@ class LinearPoint:
 
 @dataclass(frozen=True)
 class ModelAnalysis:
-    """A model at its points.
+    """A model at rest and, with a control problem, at working speed.
 
-    Args:
-        rest: At rest.
-        moving: At working speed; None without a control problem.
-        fixed_point: The state at rest ``(n_x,)``; None where there is none near zero.
-        fixed_point_reason: Why not. Default: there is one.
+    ``fixed_point`` is the state at rest ``(n_x,)``; None where there is none near zero, and the reason why.
     """
 
     rest: LinearPoint
@@ -70,13 +58,7 @@ class ModelAnalysis:
 
 @dataclass(frozen=True)
 class AnalysisResult:
-    """The linear analysis of a run.
-
-    Args:
-        models: By model.
-        working_speed: Speeds at working speed; None without a control problem.
-        arrays: Frequency responses, ``"MODEL/POINT/omega"``, ``magnitude`` and ``phase``.
-    """
+    """The models by name, their working speeds, and frequency responses as ``"MODEL/POINT/omega"`` and so on."""
 
     models: Mapping[str, ModelAnalysis]
     working_speed: tuple[float, ...] | None = None
@@ -87,7 +69,7 @@ def analysis_stage(context: Context) -> AnalysisResult:
     """Linearize prior and hybrid at rest and at working speed; poles, PBH tests, frequency responses."""
     from hybrid_mpc.analyze.equilibria import fixed_point
     from hybrid_mpc.analyze.linearize import linearize
-    from hybrid_mpc.analyze.properties import analyze, frequency_response
+    from hybrid_mpc.analyze.properties import frequency_response
 
     models, speed = context.kit.models, None
     control = context.scenario.control
@@ -115,9 +97,26 @@ def analysis_stage(context: Context) -> AnalysisResult:
             arrays[f"{name}/{point}/omega"] = omega
             arrays[f"{name}/{point}/magnitude"] = response.magnitude[0, 0]
             arrays[f"{name}/{point}/phase"] = response.phase[0, 0]
-            points[point] = record(LinearPoint, analyze(system).to_dict(), point)
+            points[point] = linear_point(system)
         found[name] = ModelAnalysis(points["rest"], points.get("moving"), rest, reason)
     return AnalysisResult(found, speed, arrays)
+
+
+def linear_point(system: Any) -> LinearPoint:
+    """Poles of a discrete ``control.StateSpace``, and whether it can be stabilised and observed."""
+    from hybrid_mpc.analyze.properties import modes, stabilisable_detectable
+
+    found, split = modes(system), 0.1 * np.pi / system.dt
+    return LinearPoint(
+        float(system.dt),
+        tuple((m.pole.real, m.pole.imag) for m in found),
+        tuple(m.frequency if np.isfinite(m.frequency) else None for m in found),
+        tuple(m.damping for m in found),
+        tuple(m.frequency < split for m in found),
+        float(split),
+        all(abs(m.pole) < 1.0 for m in found),
+        *stabilisable_detectable(found),
+    )
 
 
 ANALYSIS = Stage(

@@ -18,7 +18,7 @@ from hybrid_mpc.job.stages.estimate import ESTIMATION, OBSERVERS
 from hybrid_mpc.job.stages.guard import GUARD, read_trace
 from hybrid_mpc.job.stages.identify import EVALUATION, MODELS, trained_models
 from hybrid_mpc.job.stages.monitor import MONITOR, clean_windows
-from hybrid_mpc.job.stages.results import REPORTED, step_times
+from hybrid_mpc.job.stages.results import REPORTED, finite, step_times
 from hybrid_mpc.job.summary import summaries
 from hybrid_mpc.job.tasks import tasks_of
 from hybrid_mpc.monitor.residuals import force_units
@@ -53,10 +53,8 @@ def draw_all(context: Context) -> Figures:
 def _data(context: Context) -> Any:
     prior = context.scenario.prior()
     pieces = [t for t in context.dataset.trajectories if t.role != "nominal"]
-    yield (
-        "data", "recordings", data.recordings(pieces, prior.outputs, prior.inputs),
-        "Recordings with what each part is used for.",
-    )  # fmt: skip
+    figure = data.recordings(pieces, prior.outputs, prior.inputs)
+    yield "data", "recordings", figure, "Recordings with what each part is used for."
     yield "data", "coverage", data.coverage(pieces, prior.states), "Where training and test data lie."
 
 
@@ -68,9 +66,7 @@ def _training(context: Context) -> Any:
         names = ["loss_error", "validation"]
         if kind == "mopgrnn":
             names += ["loss_energy", "bound_error", "bound_energy"]
-        best = trained.best
-        curves[kind] = {"step": trained.curve["step"][:, best]}
-        curves[kind] |= {name: trained.curve[name][:, best] for name in names}
+        curves[kind] = {name: trained.curve[name][:, trained.best] for name in ["step", *names]}
         starts[kind] = float(trained.settings.teacher_steps)
     figure = fit.curves(curves, free_run_start=starts, units=("mixed SI", "W", "mixed SI"))
     caption = (
@@ -87,40 +83,23 @@ def _free_runs(context: Context) -> Any:
         shared = {k: arrays[f"mopgrnn/{run}/{k}"] for k in ("t", "x", "u", "energy_measured_w")}
         shown = ("phy_nominal", "phy", "rnn", "mopgrnn")
         figure = fit.free_run(
-            shared["t"],
-            shared["x"],
-            {m: own[m]["x_hat"] for m in shown},
-            shared["u"],
-            states=prior.states,
-            inputs=prior.inputs,
-            energy_measured=shared["energy_measured_w"],
-            energy_model=own["mopgrnn"]["energy_model_w"],
-            title=f"Free run on {run}",
-        )
-        name = run.replace("#", "-")
-        yield (
-            "free_run",
-            f"free_run_{name}",
-            figure,
-            f"Free run over the unseen piece {run}; the warm-up before it is left out.",
-        )
+            shared["t"], shared["x"], {m: own[m]["x_hat"] for m in shown}, shared["u"],
+            states=prior.states, inputs=prior.inputs, energy_measured=shared["energy_measured_w"],
+            energy_model=own["mopgrnn"]["energy_model_w"], title=f"Free run on {run}",
+        )  # fmt: skip
+        caption = f"Free run over the unseen piece {run}; the warm-up before it is left out."
+        yield "free_run", f"free_run_{run.replace('#', '-')}", figure, caption
     keys = ("e_sim_s", "rmse_rad", "energy_violation_w")
-    finite = {m: {k: _finite(getattr(found.scores[m].best, k)) for k in keys} for m in MODELS}
-    values = {m: {k: [getattr(n, k) for n in found.scores[m].networks] for k in keys} for m in KINDS}
+    values = {m: {k: finite(getattr(found.scores[m].best, k)) for k in keys} for m in MODELS}
+    every = {m: {k: [getattr(n, k) for n in found.scores[m].networks] for k in keys} for m in KINDS}
     spread: dict[str, dict[str, float]] = {
         m: {k: float(np.std(v)) for k, v in by.items()}
-        for m, by in values.items()
+        for m, by in every.items()
         if all(np.isfinite(v).all() for v in by.values())
     }
-    metrics = {**fit.METRICS, "rmse_rad": f"free-run RMSE [{context.scenario.prior().outputs[0].unit}]"}
-    yield (
-        "free_run", "errors", fit.errors_bar(finite, spread=spread, metrics=metrics),
-        "Errors over all unseen pieces; whiskers: standard deviation over the networks of a kind.",
-    )  # fmt: skip
-
-
-def _finite(value: Any) -> float | None:
-    return float(value) if np.isfinite(float(value)) else None
+    metrics = {**fit.METRICS, "rmse_rad": f"free-run RMSE [{prior.outputs[0].unit}]"}
+    caption = "Errors over all unseen pieces; whiskers: standard deviation over the networks of a kind."
+    yield "free_run", "errors", fit.errors_bar(values, spread=spread, metrics=metrics), caption
 
 
 def _loops(context: Context) -> Any:
@@ -134,44 +113,31 @@ def _loops(context: Context) -> Any:
         own = {row.controller: row.arrays for row in drawn if row.task == task.name}
         names = {short: n for short, n in REPORTED.items() if n in own}
         control = task.control or scenario.control
+        hybrid = own[names["hybrid"]]
+        motions = {
+            short: loops.Motion(*(own[n][key] for key in ("t", "x", "u"))) for short, n in names.items()
+        }
         figure = loops.closed_loops(
-            task.title,
-            own[names["hybrid"]]["t"],
-            own[names["hybrid"]]["reference"],
-            {short: loops.Motion(*(own[n][key] for key in ("t", "x", "u"))) for short, n in names.items()},
-            states=prior.states,
-            inputs=prior.inputs,
-            limits=(control.u_min, control.u_max),
-        )
+            task.title, hybrid["t"], hybrid["reference"], motions,
+            states=prior.states, inputs=prior.inputs, limits=(control.u_min, control.u_max),
+        )  # fmt: skip
         yield "control", f"loop_{task.name}", figure, f"{task.title}, first seed."
 
 
 def _overview(context: Context) -> Any:
     """Costs of all controllers, and the scenario's own figures."""
-    scenario = context.scenario
-    found = context.find(CONTROL)
+    scenario, found = context.scenario, context.find(CONTROL)
     if isinstance(found, Absent) or not found.rows:
         return
-    rows = found.rows
     table = {
-        task: {name: (cell.cost.mean, cell.cost.ci95) for name, cell in cells.items()}
-        for task, cells in summaries(list(rows)).items()
+        task: {name: (_number(cell.cost.mean), _number(cell.cost.ci95)) for name, cell in cells.items()}
+        for task, cells in summaries(list(found.rows)).items()
     }
     if any("oracle" in row for row in table.values()):
-        finite = {
-            task: {n: (_number(mean), _number(half)) for n, (mean, half) in row.items()}
-            for task, row in table.items()
-        }
-        yield (
-            "control",
-            "costs",
-            loops.costs(finite),
-            (
-                "Closed-loop cost of every controller over the measuring oracle's, with 95 % intervals over the seeds."
-            ),
-        )
+        text = "Closed-loop cost of every controller over the measuring oracle's, with 95 % intervals over the seeds."
+        yield "control", "costs", loops.costs(table), text
     if scenario.figures is not None:
-        for name, (figure, caption) in scenario.figures(rows).items():
+        for name, (figure, caption) in scenario.figures(found.rows).items():
             yield "control", name, figure, caption
 
 
@@ -210,14 +176,10 @@ def _estimation(context: Context) -> Any:
         if isinstance(own, Absent):
             continue
         figure = estimation.innovations(
-            [arrays[f"{name}/nis/{i}"] for i in range(len(found.recordings))],
-            arrays[f"{name}/autocorrelation"],
-            dt=context.spec.dt,
-            outputs=context.scenario.prior().outputs,
-            mean_band=(own.nis_low, own.nis_high),
-            correlation_band=own.correlation_band,
-            title=OBSERVER_TITLES[name],
-        )
+            [arrays[f"{name}/nis/{i}"] for i in range(len(found.recordings))], arrays[f"{name}/autocorrelation"],
+            dt=context.spec.dt, outputs=context.scenario.prior().outputs, mean_band=(own.nis_low, own.nis_high),
+            correlation_band=own.correlation_band, title=OBSERVER_TITLES[name],
+        )  # fmt: skip
         caption = f"{OBSERVER_TITLES[name]}: how surprised it was by test recordings."
         yield "estimation", f"innovations_{name}", figure, caption
 
@@ -243,33 +205,21 @@ def _monitor(context: Context) -> Any:
         keys = ("t", "violation_w", "level_w", "residual_level", "alarm", "y")
         own = {k: arrays[f"{recording.name}/{k}"] for k in keys}
         figure = monitor.trace(
-            own["t"],
-            own["violation_w"],
-            own["level_w"],
-            power,
-            own["alarm"],
-            own["y"],
-            output=output,
+            own["t"], own["violation_w"], own["level_w"], power, own["alarm"], own["y"], output=output,
             windows=clean_windows(context, recording, ("train", "valid", "test", "nominal")),
             residual=(own["residual_level"], force, force_units(context.kit.models["prior"])[0]),
             title=recording.name,
-        )
+        )  # fmt: skip
         name = recording.name.replace("#", "-")
         yield "monitor", f"monitor_{name}", figure, f"The monitor over the whole recording {recording.name}."
     if found.load is not None:
         load = found.load
         own = {k: arrays[f"load/{k}"] for k in ("t", "violation", "level", "alarm", "x")}
         figure = monitor.trace(
-            own["t"],
-            own["violation"],
-            own["level"],
-            power,
-            own["alarm"],
-            own["x"][:, 0],
-            output=output,
+            own["t"], own["violation"], own["level"], power, own["alarm"], own["x"][:, 0], output=output,
             windows=((0.0, load.start_s),),
             title=f"closed loop, {load.task}: an unknown load from {load.start_s:g} s on",
-        )
+        )  # fmt: skip
         unit = context.scenario.prior().inputs[0].unit
         caption = (
             f"The monitor inside the loop: a constant load of {load.load:g} {unit} at the input sets in."
@@ -309,11 +259,8 @@ def _analysis(context: Context) -> Any:
             for n, c in colours.items()
         }
         figure = analysis.bode(
-            responses,
-            input_signal=prior.inputs[0],
-            output_signal=prior.outputs[0],
-            nyquist=np.pi / context.spec.dt,
-        )
+            responses, input_signal=prior.inputs[0], output_signal=prior.outputs[0], nyquist=np.pi / context.spec.dt
+        )  # fmt: skip
         yield "analysis", f"bode_{point}", figure, f"Bode plot of prior and hybrid {titles[point]}."
 
 
@@ -325,10 +272,7 @@ def guard_figures(context: Context) -> Iterator[tuple[str, str, Figure, str]]:
     arrays, output = found.arrays, context.scenario.prior().outputs[0]
     unit = force_units(context.kit.models["prior"])[0]
     for row in found.faults or ():
-        marks = [
-            (row.start_s, row.title),
-            *((s.t_s, f"guard: {s.after.lower()}") for s in row.switches),
-        ]
+        marks = [(row.start_s, row.title), *((s.t_s, f"guard: {s.after.lower()}") for s in row.switches)]
         figure = monitor.overview(
             read_trace(arrays, row.fault), arrays[f"{row.fault}/y"], output=output, force_unit=unit, marks=marks,
             title=f"{row.task}: {row.title} at {row.start_s:g} s",

@@ -91,15 +91,8 @@ class SmootherNoise:
 
 @dataclass(frozen=True)
 class IdentificationDetails:
-    """Behind the errors.
-
-    Args:
-        prior_parameters: The fitted prior.
-        scores_of_all_networks: Errors of every network of a kind, by model.
-        by_file: Root mean square error of the first output by recording and model; None where a run diverged.
-        smoother: What the smoother assumes.
-        hybrid_over_phy: Error of the hybrid over that of the fitted prior.
-        network_settings: What replaced the budget's settings of the networks. Default: nothing.
+    """Behind the errors. ``by_file`` is the RMSE of the first output by recording, None where a run diverged;
+    ``hybrid_over_phy`` the hybrid's error over the fitted prior's; ``network_settings`` what replaced the budget's.
     """
 
     prior_parameters: FittedPrior
@@ -112,14 +105,7 @@ class IdentificationDetails:
 
 @dataclass(frozen=True)
 class Identification:
-    """Errors of free runs on unseen data.
-
-    Args:
-        e_sim_s: Simulation error [s] by model.
-        rmse: Root mean square error of the first output.
-        balance_violation: Mean absolute violation of each balance.
-        details: Behind the errors.
-    """
+    """Errors of free runs on unseen data: simulation error, RMSE of the first output, mean absolute violation."""
 
     e_sim_s: Mapping[str, float | str | None]
     rmse: Errors
@@ -270,15 +256,8 @@ class GuardDetails:
 class Guard:
     """The energy guard's detector, alarms on test recordings, and loops in which something breaks.
 
-    Args:
-        false_alarms_per_hour: Wanted rate on nominal data [1/h].
-        hours: Length of the nominal data [h].
-        force_threshold: Sum of scaled residual forces above which an alarm starts.
-        energy_threshold: Scaled violation above which one starts.
-        data_hash: Hash of the nominal data.
-        test_seconds: Test recordings that were monitored [s].
-        test_alarms: Alarms that began in them.
-        faults: Loops in which something breaks.
+    Wanted false alarms [1/h] and length of the nominal data [h]; an alarm starts above the sum of scaled residual
+    forces or the scaled violation of the two thresholds.
     """
 
     false_alarms_per_hour: float | None = None
@@ -315,24 +294,7 @@ class Analysis:
 
 @dataclass(frozen=True)
 class Results:
-    """The content of ``results.json``.
-
-    Args:
-        schema_version: Number of this form.
-        scenario: Name of the machine.
-        seed: Seed of data, training and loops.
-        budget: Name of the budget.
-        versions: Versions of the packages.
-        data: The recordings.
-        identification: Errors of free runs on unseen data.
-        export: Parity with PyTorch.
-        control: Closed loops.
-        estimation: Tests of the observers.
-        timing: Durations of the controller's steps.
-        monitor: The energy monitor.
-        guard: The energy guard.
-        analysis: The linear analysis.
-    """
+    """The content of ``results.json``."""
 
     schema_version: int
     scenario: str
@@ -369,20 +331,10 @@ def _without_empty(value: Any) -> Any:
 
 
 def read_results(values: Mapping[str, Any], where: str = "results") -> Results:
-    """Results from the content of ``results.json``, checked.
-
-    Args:
-        values: The content.
-        where: The file, for messages.
+    """Results from the content of ``results.json``, checked; ``where`` is the file, for messages.
 
     Raises:
         InputError: Naming what is missing, unknown or of the wrong kind, or null without a reason.
-
-    Example:
-        >>> read_results({"schema_version": 4, "seed": 0})
-        Traceback (most recent call last):
-        ...
-        hybrid_mpc.errors.InputError: results: scenario is missing; budget is missing; versions is missing; ...
     """
     results = record(Results, values, where)
     if results.schema_version != SCHEMA_VERSION:
@@ -436,18 +388,15 @@ def _identification(context: Context) -> Identification:
     found, prior = context.read(EVALUATION), context.prior
     output, network = context.scenario.prior().outputs[0].label, context.settings.network()
     best = {name: found.scores[name].best for name in MODELS}
-    e_sim = {name: _finite(scores.e_sim_s) for name, scores in best.items()}
-    rmse = {name: _finite(scores.rmse_rad) for name, scores in best.items()}
-    violation = {name: _finite(scores.energy_violation_w) for name, scores in best.items()}
+    e_sim = {name: finite(scores.e_sim_s) for name, scores in best.items()}
+    rmse = {name: finite(scores.rmse_rad) for name, scores in best.items()}
+    violation = {name: finite(scores.energy_violation_w) for name, scores in best.items()}
     details = IdentificationDetails(
         FittedPrior(
             prior.fit.values, prior.fit.standard_errors, prior.nominal, prior.fit.warnings, prior.fit.stages
         ),
         {name: found.scores[name].networks for name in MODELS},
-        {
-            stem: {m: _finite(found.by_file[m][stem].rmse_rad) for m in MODELS}
-            for stem in found.by_file["phy"]
-        },
+        {stem: {m: finite(found.by_file[m][stem].rmse_rad) for m in MODELS} for stem in found.by_file["phy"]},
         SmootherNoise(prior.sigma, prior.walk),
         {
             "e_sim_s": _ratio(e_sim["mopgrnn"], e_sim["phy"]),
@@ -470,7 +419,8 @@ def _with_reasons(values: Mapping[str, Any]) -> dict[str, Any]:
     return dict(values) | {f"{name}_reason": "a free run diverged" for name, v in values.items() if v is None}
 
 
-def _finite(value: float) -> float | None:
+def finite(value: float) -> float | None:
+    """The number, or None where it is none."""
     return float(value) if math.isfinite(float(value)) else None
 
 
@@ -505,7 +455,7 @@ def _costs(
     if not own:
         return ControllerCosts(None, None, reason="the scenario has no oracle")
     tracking = {
-        signal: _root_mean_square([row.tracking_rmse[signal] for row in loops])
+        signal: float(np.sqrt(np.mean(np.square([row.tracking_rmse[signal] for row in loops]))))
         for signal in loops[0].tracking_rmse
     }
     known = [cost for cost in own if cost is not None]
@@ -515,18 +465,11 @@ def _costs(
     )
 
 
-def _root_mean_square(values: Sequence[float]) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
 def gap_closed(cells: Mapping[str, Sequence[LoopRow]]) -> tuple[float | None, str]:
     """Share of the distance from the better baseline to the measuring oracle that the hybrid covers in a task.
 
-    The baselines are the fitted prior with and without disturbance observer; the hybrid is the one with it. None,
-    with a reason, where the distance is below twice its standard error; one seed has no standard error.
-
-    Args:
-        cells: Loops by controller.
+    The baselines are the fitted prior with and without disturbance observer; the hybrid is the one with it. None, with
+    a reason, where the distance is below twice its standard error; one seed has no standard error.
     """
     if "oracle" not in cells:
         return None, "the scenario has no oracle"
