@@ -22,11 +22,7 @@ Known = TypeVar("Known")
 
 
 class Chain(ABC, Generic[Known]):
-    """The cuts of a graph: cells in order, each with its arguments; then what is known of their outputs.
-
-    Args:
-        budget: What all that is made here is taken off.
-    """
+    """The cuts of a graph: cells in order, each with its arguments; then what is known of their outputs."""
 
     def __init__(self, budget: Budget) -> None:
         self.budget = budget
@@ -73,11 +69,7 @@ class Chain(ABC, Generic[Known]):
         return [known[k] for k in range(len(targets))]
 
     def spend(self, symbols: list[ca.MX], slopes: Iterable[Mapping[str, Any]]) -> None:
-        """Take off what the Jacobians of a cell's results cost, by all that its arguments depend on.
-
-        Raises:
-            ProgramError: If there is not as much left.
-        """
+        """Take off what the Jacobians of a cell's results cost, by all that its arguments depend on."""
         widths = {name: slope.shape[1] for by_name in slopes for name, slope in by_name.items()}
         size = sum(symbol.numel() for symbol in symbols)
         self.budget.spend(
@@ -120,11 +112,7 @@ class Piece:
 
 
 def differentiated(symbols: list[ca.MX], targets: list[ca.MX], wanted: list[bool], budget: Budget) -> Piece:
-    """Expressions with their Jacobians by the symbols that are wanted, as scalar code where they are small.
-
-    Raises:
-        ProgramError: If the budget does not hold them.
-    """
+    """Expressions with their Jacobians by the symbols that are wanted, as scalar code where they are small."""
     piece = ca.Function("piece", symbols, targets)
     rows, columns = _edges(targets), _edges(list(compress(symbols, wanted)))
     sweeps = min(rows[-1], columns[-1])

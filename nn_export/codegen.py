@@ -245,10 +245,7 @@ def _process_folder() -> Path:
 def _distrust(path: Path, kind: Callable[[int], bool], rights: int) -> str:
     """Why others could have put code into a file or folder; empty if they could not.
 
-    Args:
-        path: The file or folder.
-        kind: What it must be, e.g. ``stat.S_ISDIR``.
-        rights: Rights of group and others that are too many.
+    ``rights`` are those of group and others that are too many.
     """
     if os.name != "posix":
         return ""
@@ -348,12 +345,7 @@ int main(void) {{
 
 
 def main_program(f: ca.Function, points: Sequence[Sequence[np.ndarray | float]]) -> str:
-    """C text of a main program that evaluates ``f`` at the points and compares with CasADi.
-
-    Args:
-        f: The function, written as C beside it.
-        points: Samples: for each one value for each input.
-    """
+    """C text of a main program that evaluates ``f`` at the points and compares with CasADi."""
     inputs, expected = [], []
     for point in points:
         held = [ca.DM(ca.project(ca.DM(v), f.sparsity_in(i))) for i, v in enumerate(point)]

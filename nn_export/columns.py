@@ -46,15 +46,7 @@ Slope: TypeAlias = Array | Slot
 
 
 class Sum:
-    """A sum of products of two Jacobians each.
-
-    Example:
-        >>> terms = Sum()
-        >>> terms.add(np.eye(2), np.ones((2, 1)))
-        >>> terms.add(np.eye(2), np.ones((2, 1)))
-        >>> terms.known().tolist()
-        [[2.0], [2.0]]
-    """
+    """A sum of products of two Jacobians each."""
 
     def __init__(self) -> None:
         self.columns = 0
@@ -177,14 +169,7 @@ class _Jacobian:
 
 
 class CellColumns:
-    """A cell at ``n`` points, values and Jacobians.
-
-    Args:
-        kind: The cell.
-        x: Its input ``(F, n)``, an array that stays.
-        state: Its states ``(H, n)``, so too.
-        weights: Weights and biases, as :func:`matrices` gives them.
-    """
+    """A cell at ``n`` points, values and Jacobians; its input ``(F, n)`` and states ``(H, n)`` are arrays that stay."""
 
     values: list[Array]
     """New states ``(H, n)``, filled by a call."""
@@ -211,11 +196,8 @@ class CellColumns:
     ) -> Slot:
         """Have the Jacobian of new state ``k`` by one input of the program taken by every call.
 
-        Args:
-            k: The new state.
-            slot: Gives the place for a number of columns.
-            x: The Jacobian of the cell's input; None if it does not depend on the program's.
-            state: The Jacobians of its states.
+        ``slot`` gives the place for a number of columns; ``x`` and ``state`` are the Jacobians of the cell's input
+        (None if it does not depend on the program's) and of its states.
         """
         pattern, constant = self._patterns[k], None
         products: list[tuple[Slope, Slope | None]] = []

@@ -47,11 +47,6 @@ class Step:
         code: CasADi's number of the operation, e.g. ``ca.OP_MUL``.
         taken: Registers of its arguments; for an input ``(input, nonzero)``, for a constant its value alone.
         given: Register of its result; for an output ``(output, nonzero)``.
-
-    Example:
-        >>> x = ca.SX.sym("x")
-        >>> [step.code == ca.OP_SQ for step in scalar_steps(ca.Function("f", [x], [x**2]), 100)]
-        [False, True, False]
     """
 
     code: int
@@ -61,14 +56,6 @@ class Step:
 
 def scalar_steps(function: ca.Function, most: int) -> list[Step]:
     """The function as scalar operations, one after the other.
-
-    Args:
-        function: Any CasADi function.
-        most: So many operations at most.
-
-    Raises:
-        ProgramError: If there are more.
-        UnsupportedOperatorError: If it calls what has no scalar form, a solver, a table, external code; by its name.
 
     Example:
         >>> x = ca.MX.sym("x", 2)

@@ -71,11 +71,7 @@ def build(
 
 @contextmanager
 def named(name: str) -> Iterator[None]:
-    """CasADi's errors, and a lack of memory, as errors of the program.
-
-    Raises:
-        ProgramError: Instead of what CasADi raises.
-    """
+    """CasADi's errors, and a lack of memory, as errors of the program."""
     try:
         yield
     except (RuntimeError, MemoryError) as error:
@@ -88,9 +84,6 @@ def graph(
     """Symbols of the inputs and values of the outputs, with the operators of a table.
 
     The program must be within the budget. The pieces, if given, are told the inputs before the first operator.
-
-    Raises:
-        ProgramError: As :func:`build`.
     """
     budget.add(program)
     values: dict[tuple[str, str], Any] = {}
@@ -121,11 +114,7 @@ def graph(
 def function(
     name: str, symbols: list[ca.MX], results: list[ca.MX], program: Program, outputs: list[str]
 ) -> ca.Function:
-    """A function of the program's inputs.
-
-    Raises:
-        ProgramError: If CasADi refuses a name or the function.
-    """
+    """A function of the program's inputs."""
     for text in (name, *outputs):
         if not valid_name(text):
             raise ProgramError(_BAD_NAME.format(text))

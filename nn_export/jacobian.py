@@ -82,11 +82,7 @@ def with_jacobian(
 def spend_results(
     budget: Budget, outputs: Sequence[Value], blocks: Mapping[str, Sequence[str]], sizes: Mapping[str, int]
 ) -> None:
-    """Take off what the dense Jacobians of all outputs cost.
-
-    Raises:
-        ProgramError: If there is not as much left.
-    """
+    """Take off what the dense Jacobians of all outputs cost."""
     rows = sum(v.mx.numel() for v in outputs)
     for block, names in blocks.items():
         count = rows * sum(sizes[name] for name in names)

@@ -98,14 +98,7 @@ class SideBySide:
 
     @np.errstate(all="ignore")  # what overflows is the caller's to look at, as in CasADi
     def __call__(self, *points: Array) -> tuple[Array, ...]:
-        """Outputs ``(n, size)`` and Jacobians ``(n, rows, columns)``, new arrays.
-
-        Args:
-            points: For each input ``(n, size)``; matrices column by column.
-
-        Raises:
-            ShapeError: If an input has another shape.
-        """
+        """Outputs ``(n, size)`` and Jacobians ``(n, rows, columns)``, new arrays."""
         if [p.shape for p in points] != [b.T.shape for b in self._inputs]:
             needed = ", ".join(str(b.T.shape) for b in self._inputs)
             raise ShapeError(f"arrays of {[p.shape for p in points]} given, {needed} needed")

@@ -46,10 +46,6 @@ class LazyPrior:
 def whole_windows(stems: Iterable[str], seconds: float) -> dict[str, tuple[Window, ...]]:
     """Windows of recordings each of which has one role, with which its stem begins.
 
-    Args:
-        stems: File stems, e.g. ``train_01``.
-        seconds: Their length [s].
-
     Example:
         >>> whole_windows(["test_01_sine"], 20.0)
         {'test_01_sine': (Window(start=0.0, end=20.0, role='test'),)}
@@ -59,14 +55,6 @@ def whole_windows(stems: Iterable[str], seconds: float) -> dict[str, tuple[Windo
 
 def faded_sines(t: Array, waves: tuple[tuple[float, float], ...], fade_s: float = 1.0) -> Array:
     """Sum of sinusoids that is faded in, from rest and without a jump in the acceleration.
-
-    Args:
-        t: Times ``(n,)`` [s].
-        waves: Amplitude [rad or m] and frequency [Hz] of each.
-        fade_s: Time [s] over which they are faded in. Default 1.
-
-    Returns:
-        ``(n, 2)``: position and its exact derivative.
 
     Example:
         >>> faded_sines(np.array([0.0, 1.25]), ((0.5, 1.0),)).round(6).tolist()
@@ -93,16 +81,8 @@ def quintic(s: Array) -> tuple[Array, Array]:
 def moves(t: Array, levels: tuple[float, ...], hold_s: float, move_s: float) -> Array:
     """From level to level, each for ``hold_s``, along a quintic of ``move_s``.
 
-    A bare jump cannot be followed by anyone, and what it costs hides all differences.
-
-    Args:
-        t: Times ``(n,)`` [s].
-        levels: Levels [rad or m], the last one held.
-        hold_s: Time from the begin of a move to that of the next [s].
-        move_s: Time of a move [s], at most ``hold_s``.
-
-    Returns:
-        ``(n, 2)``: position and its exact derivative.
+    A bare jump cannot be followed by anyone, and what it costs hides all differences. Gives position and exact
+    derivative ``(n, 2)``; ``hold_s`` [s] is the time from the begin of a move to that of the next.
 
     Example:
         >>> moves(np.array([0.0, 1.3, 1.7, 2.2]), (0.0, 0.4), 1.3, 0.8).round(2).tolist()
@@ -116,14 +96,7 @@ def moves(t: Array, levels: tuple[float, ...], hold_s: float, move_s: float) -> 
 
 
 def rk4(f: ca.Function, s: ca.SX, u: ca.SX, h: ca.SX | float) -> ca.SX:
-    """One classical Runge-Kutta step of ``s_dot = f(s, u)`` over ``h`` [s]; order 4.
-
-    Example:
-        >>> s, u = ca.SX.sym("s"), ca.SX.sym("u")
-        >>> decay = ca.Function("f", [s, u], [-s])
-        >>> round(float(rk4(decay, ca.DM(1.0), ca.DM(0.0), ca.DM(0.1))), 6)
-        0.904837
-    """
+    """One classical Runge-Kutta step of ``s_dot = f(s, u)`` over ``h`` [s]; order 4."""
     k1 = f(s, u)
     k2 = f(s + h / 2 * k1, u)
     k3 = f(s + h / 2 * k2, u)

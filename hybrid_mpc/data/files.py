@@ -97,12 +97,7 @@ class Source:
     note: str = ""
 
     def find(self, name: str) -> str:
-        """Full name of a column: its own, or ``struct.field`` where just one struct has such a field.
-
-        Raises:
-            MissingColumn: If there is none.
-            InputError: If there are several.
-        """
+        """Full name of a column: its own, or ``struct.field`` where just one struct has it; else an error."""
         count = self.header.count(name)
         if count == 1:
             return name
@@ -137,10 +132,6 @@ def opened(path: Path) -> Source:
                 ``struct.field``
     any other   CSV: a comma between cells, decimals with a point, the first line the header, UTF-8
     ==========  ========================================================================================
-
-    Raises:
-        InputError: If it is missing, no regular file, too large, empty, damaged or not of the format that its ending
-            says.
     """
     return {".npz": _npz, ".mat": _mat}.get(path.suffix.lower(), _csv)(path)
 

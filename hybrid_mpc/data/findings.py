@@ -59,19 +59,10 @@ def findings_of(
     outputs: Sequence[Signal],
     states: Sequence[Signal] = (),
 ) -> tuple[Finding, ...]:
-    """All that is doubtful about the recordings of one run, file by file.
+    """All that is doubtful about the recordings of one run, file by file, with their own findings.
 
-    Args:
-        recordings: The recordings as they were read; their own findings are among the result.
-        motions: Times ``(n,)`` [s] and states ``(n, n_x)``, smoothed and differentiated, of each recording; ``n = 0``
-            where it could not be smoothed.
-        spec: Columns, ``max_gap`` and ``smoothing`` [s].
-        outputs: Signals of the outputs.
-        states: Signals of the prior's states, for the plausible ranges of the outputs' rates among them. Default:
-            speeds are not checked.
-
-    Returns:
-        The findings.
+    ``motions`` are times ``(n,)`` [s] and states ``(n, n_x)`` of each recording, smoothed; ``n = 0`` where that could
+    not be. Speeds are checked if ``states``, the prior's signals, are given.
     """
     spreads = (
         np.std(np.concatenate([recording.u for recording in recordings]), axis=0)
@@ -142,14 +133,6 @@ def still_stretches(
     this one is ``ABRUPT`` times as sharp. Steps of the sensor count as changes. ``"noise"``: a sensor whose noise is
     larger than its steps flickers at rest, and here it does not; exact zeros, which speeds made from counts have at
     rest, do not count. ``"driven"``: the inputs go on for longer than ``patience``.
-
-    Args:
-        t: Time stamps ``(m,)`` [s].
-        y: One output ``(m,)``.
-        u: Inputs ``(m, n_u)``.
-        max_gap: Distance [s] beyond which two samples are no neighbours.
-        patience: Time [s] that a driven machine may rest, for all that is known of it.
-        spreads: Standard deviation ``(n_u,)`` of the inputs over all recordings of the machine.
 
     Example:
         >>> t = 0.01 * np.arange(400)

@@ -48,11 +48,7 @@ class Windows:
 
 
 def cut_windows(trajectories: Sequence[Trajectory], warm: int, horizon: int, stride: int) -> Windows:
-    """Windows of ``warm + horizon`` periods, every ``stride`` samples, from every trajectory long enough.
-
-    Raises:
-        InputError: If no trajectory is long enough, or one holds a value that is not finite.
-    """
+    """Windows of ``warm + horizon`` periods, every ``stride`` samples, from every trajectory long enough."""
     x, u, xdot, length = [], [], [], warm + horizon
     for trajectory in trajectories:
         _check_finite(trajectory)
@@ -77,29 +73,13 @@ def fitting_horizon(trajectories: Sequence[Trajectory], warm: int, most: int) ->
     That is two thirds of what the warm-up leaves of it, at most ``most``. Where that is less than half of
     ``most``, the longest trajectory decides up to that half: one too short then gives no window, which is
     better than short windows for all.
-
-    Args:
-        trajectories: The trajectories to cut.
-        warm: Samples of the warm-up.
-        most: Most scored periods.
-
-    Example:
-        >>> import numpy as np
-        >>> z = np.zeros((65, 1))
-        >>> short = Trajectory("run", "train", 0.02, 0.02 * np.arange(65), z, z, z, z)
-        >>> fitting_horizon([short], warm=10, most=50)
-        36
     """
     lengths = [2 * (len(t.t) - warm - 1) // 3 for t in trajectories]
     return max(1, min(most, max(min(lengths), min(most // 2, max(lengths)))))
 
 
 def check_rates(trajectories: Sequence[Trajectory]) -> None:
-    """Refuse trajectories whose derivative is not known: the paper form is trained on it.
-
-    Raises:
-        InputError: If xdot holds a value that is not finite.
-    """
+    """Refuse trajectories whose derivative is not known: the paper form is trained on it."""
     for trajectory in trajectories:
         _check_finite(trajectory, ("xdot",))
 

@@ -19,7 +19,7 @@ from torch.func import functional_call
 
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.identify.fit import ParameterFit
+from hybrid_mpc.identify.fit import ParameterFit, correlations, covariance_of
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.step import required_substeps, rk4
 from hybrid_mpc.machine.torch_prior import Prior
@@ -53,9 +53,6 @@ class Runs:
 def cut_runs(trajectories: Sequence[Trajectory], periods: int, lead: int, most: int) -> Runs:
     """At most ``most`` free runs of ``periods``, one after the other, evenly chosen.
 
-    Raises:
-        InputError: If no trajectory is long enough.
-
     Example:
         >>> z = np.zeros((50, 1))
         >>> run = Trajectory("run", "train", 0.1, 0.1 * np.arange(50), z, z, np.zeros((50, 2)), np.zeros((50, 2)))
@@ -82,13 +79,7 @@ def cut_runs(trajectories: Sequence[Trajectory], periods: int, lead: int, most: 
 
 
 class OutputErrorFit:
-    """A prior's free parameters and its input's delay, over their nominal sizes, and their fit.
-
-    Args:
-        make: Prior class or factory ``(values=None) -> Prior``.
-        dt: Model period [s].
-        largest_delay: Longest delay [s]; zero: there is none.
-    """
+    """A prior's free parameters and its input's delay, over their nominal sizes, and their fit."""
 
     def __init__(self, make: Callable[..., Prior], dt: float, largest_delay: float = 0.0) -> None:
         self.make, self.dt, self.largest = make, dt, largest_delay
@@ -134,16 +125,9 @@ class OutputErrorFit:
         return float(np.sqrt(np.mean(np.square(self.errors(theta[None], runs)))))
 
     def fit(self, start: Array, runs: Runs, evaluations: int, *, robust: bool) -> tuple[Array, Array]:
-        """Fit from ``start``.
+        """``theta`` fitted from ``start``, and the Jacobian of the residuals over their standard deviation.
 
-        Args:
-            start: First ``theta``.
-            runs: What is fitted.
-            evaluations: Most simulations.
-            robust: Soft absolute values instead of squares, for runs from starts that are far off.
-
-        Returns:
-            ``theta`` and the Jacobian of the residuals over their standard deviation.
+        ``robust`` takes soft absolute values instead of squares, for runs from starts that are far off.
         """
         spread = runs.y.reshape(-1, runs.y.shape[-1]).std(0).clamp_min(1e-12).numpy()
 
@@ -171,18 +155,13 @@ class OutputErrorFit:
     def result(self, theta: Array, slope: Array, stages: Sequence[dict[str, Any]]) -> PriorFit:
         """Values with standard errors; the delay counts among what is fitted, it is no parameter of the prior."""
         _, singular, rows = np.linalg.svd(slope, full_matrices=False)
-        covariance = (rows.T / np.maximum(singular, 1e-12 * singular[0]) ** 2) @ rows
+        covariance = covariance_of(singular, rows)
         sizes = np.sqrt(np.diag(covariance))
         names = [p.name for p in self.free]
         near = np.minimum(theta - self.lower, self.upper - theta) < AT_BOUND * (self.upper - self.lower)
         warnings = tuple(f"{p.label} ends at a bound" for p, hit in zip(self.free, near, strict=False) if hit)
-        correlations = {
-            f"{names[i]}, {names[j]}": float(covariance[i, j] / (sizes[i] * sizes[j]))
-            for i in range(len(names))
-            for j in range(i + 1, len(names))
-        }
         errors = {name: float(sizes[i] * self.unit[i]) for i, name in enumerate(names)}
-        return PriorFit(self.values(theta), errors, warnings, tuple(stages), correlations)
+        return PriorFit(self.values(theta), errors, warnings, tuple(stages), correlations(names, covariance))
 
     def _acting(self, delays: Tensor, runs: Runs) -> Tensor:
         """Inputs ``(m, n, periods, n_u)`` that act under each delay, means over each period."""

@@ -70,19 +70,10 @@ def fit_and_smooth(
     start: Mapping[str, float] | None = None,
     on_progress: Callable[[str, int, int, str], None] = lambda key, done, total, text: None,
 ) -> Physics:
-    """Fit a prior to polynomially smoothed states, smooth by it, fit it to these states.
+    """Fit a prior to polynomially smoothed states, smooth by it, fit it to these states; there is no delay.
 
-    Args:
-        make: Prior class or factory ``(values=None) -> Prior``.
-        train: Training trajectories.
-        valid: Validation trajectories.
-        dt: Model period [s].
-        methods: See :func:`~hybrid_mpc.identify.fit.fit_prior`.
-        start: See :func:`~hybrid_mpc.identify.fit.fit_prior`.
-        on_progress: ``(round, done, total, text)`` with a title of ``ROUNDS``.
-
-    Returns:
-        The last fit, and the smoother around it; there is no delay.
+    ``methods`` and ``start`` are those of :func:`~hybrid_mpc.identify.fit.fit_prior`; ``on_progress`` takes
+    ``(round, done, total, text)`` with a title of ``ROUNDS``.
     """
     physics: Physics | None = None
     unit = time_unit(train, dt)
@@ -113,16 +104,8 @@ def fit_physics(
     """Fit parameters and delay to longer and longer free runs; the last ones start from states smoothed by the prior.
 
     The stage with the least error over training and validation runs of the longest length wins: a handful of
-    parameters follows no noise, and where friction drifts a short validation part alone misleads.
-
-    Args:
-        make: Prior class or factory ``(values=None) -> Prior``.
-        train: Training pieces.
-        valid: Validation pieces: nothing is fitted to them.
-        dt: Model period [s].
-        length: Length [s] of the longest free runs.
-        largest_delay: Longest delay searched for [s]. Default: zero, none is searched.
-        on_progress: ``(done, total, text)``.
+    parameters follows no noise, and where friction drifts a short validation part alone misleads. ``length`` [s] is
+    that of the longest runs; no delay is searched for where ``largest_delay`` [s] is zero.
     """
     fit = OutputErrorFit(make, dt, largest_delay)
     theta, total, unit = fit.nominal, len(STAGES) + 1, time_unit(train, dt)

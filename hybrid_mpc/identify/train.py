@@ -417,11 +417,7 @@ def save_checkpoint(path: Path, key: str, tensors: dict[str, Tensor], numbers: d
 
 
 def load_checkpoint(path: Path, key: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors and numbers of a checkpoint.
-
-    Raises:
-        InputError: If the file is damaged or belongs to a training with other settings or data.
-    """
+    """Tensors and numbers of a checkpoint."""
     read_bytes(path, MOST_ARRAYS)  # a regular file of a size that can be
     try:
         with safe_open(path, framework="pt") as file:

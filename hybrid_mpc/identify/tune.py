@@ -136,18 +136,9 @@ class SearchSpace:
 
 
 def parsed_space(texts: Sequence[str]) -> SearchSpace:
-    """A space from ``NAME`` or ``NAME=LOW:HIGH`` for each setting; all that are not named stay as they are.
+    """A space from ``NAME`` or ``NAME=LOW:HIGH`` for each setting, e.g. ``["hidden=8:32", "batch"]``.
 
-    Args:
-        texts: e.g. ``["hidden=8:32", "batch"]``; a name alone has its usual bounds. None at all is the default
-            space.
-
-    Raises:
-        InputError: If a name is not known or given twice, or bounds are no numbers.
-
-    Example:
-        >>> parsed_space(["hidden=8:32", "batch"]).batch
-        (8, 128)
+    A name alone has its usual bounds; settings that are not named stay as they are. No text gives the default space.
     """
     if not texts:
         return SearchSpace()
@@ -287,11 +278,7 @@ def tune(
 
 
 def check_numbers(trials: int, seed: int, timeout: float | None) -> None:
-    """Refuse numbers that no search can be made with.
-
-    Raises:
-        InputError: If one is too small.
-    """
+    """Refuse numbers that no search can be made with."""
     if trials < 1 or seed < 0 or (timeout is not None and not timeout > 0):
         raise InputError(
             f"a search needs trials of 1 or more, a seed of 0 or more and a timeout above 0 s, got "
@@ -403,13 +390,6 @@ def _row(number: int, trial: FrozenTrial) -> TrialRow:
 
 def open_study(storage: Path, identity: Mapping[str, str]) -> optuna.Study:
     """The study of a journal, whose trials are all finished or given up.
-
-    Args:
-        storage: The journal; made if missing.
-        identity: Hashes by name of everything that decides what the trials are.
-
-    Raises:
-        InputError: If the journal is damaged or another search's.
 
     Example:
         >>> import tempfile

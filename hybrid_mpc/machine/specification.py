@@ -122,9 +122,6 @@ class BenchmarkBudget:
 def check_prior_replay(weight: float) -> None:
     """Refuse a weight of prior_replay that is none.
 
-    Raises:
-        InputError: If it is negative or not finite.
-
     Example:
         >>> check_prior_replay(10.0)
     """

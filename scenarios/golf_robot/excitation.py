@@ -30,18 +30,6 @@ def excitation(kind: str, rng: np.random.Generator, t: Array) -> Array:
     ``fastsine``   0.3 to 0.5 N m, 1 to 2 Hz
     ``fastchirp``  0.3 to 0.5 N m, 1 to 2 Hz, up or down
     =============  ==========================================================================
-
-    Args:
-        kind: One of these.
-        rng: Source of amplitudes, frequencies and levels.
-        t: Times ``(n,)`` [s], evenly spaced.
-
-    Raises:
-        InputError: If there is no such kind.
-
-    Example:
-        >>> excitation("sine", np.random.default_rng(0), np.arange(0.0, 1.0, 0.02)).shape
-        (50,)
     """
     if kind not in KINDS:
         raise InputError(f"golf_robot: no excitation {kind!r}; there are: {', '.join(KINDS)}")

@@ -18,11 +18,6 @@ Array = NDArray[np.float64]
 def one_step(p: RigParameters, *, faulty: bool = False) -> ca.Function:
     """Function ``(s, q, h) -> s`` of one RK4 step of length ``h`` [s] of the rig's equations.
 
-    Args:
-        p: Parameters.
-        faulty: True: ``q`` is the commanded torque [N m] and the four :class:`Conditions`, in their order;
-            else the torque alone.
-
     Example:
         >>> one_step(RigParameters(), faulty=True).size1_in(1)
         5
@@ -46,10 +41,6 @@ def steps_with_jacobian(p: RigParameters, n: int) -> ca.Function:
 
     The sensitivities are integrated beside the state, whose equations' Jacobian is sparse. By RK4 they are the
     derivative of RK4's own map, not an approximation, and they cost a third of CasADi's forward mode.
-
-    Args:
-        p: Parameters of a healthy rig.
-        n: Number of steps.
 
     Example:
         >>> _, a, b = steps_with_jacobian(RigParameters(), 10)(ca.DM.zeros(6), 0.1, 1e-4)
@@ -76,9 +67,6 @@ class Stepper:
     """A compiled ``(s, q, h) -> s`` called on arrays without conversion: 20 us less than CasADi's own call.
 
     The arrays it works in are its own, so one object serves one thread.
-
-    Args:
-        f: Function of three dense columns with one dense column as result.
 
     Example:
         >>> Stepper(steps(RigParameters(), 10))(np.zeros(6), np.zeros(1), 1e-4).shape

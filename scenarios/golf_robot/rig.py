@@ -63,15 +63,6 @@ class Rig:
             0.05 rad/s hits it, and the club loses the momentum that the ball takes.
         faults: Faults of the machine itself, see :func:`scenarios.golf_robot.faults.catalogue`.
         sub_step: Largest integration step [s]. Default 0.5 ms.
-
-    Raises:
-        InputError: If ``sub_step`` is not positive, ``delay`` is negative, or a fault is not one of a rig's.
-
-    Example:
-        >>> rig = Rig()
-        >>> state = rig.reset(np.array([0.05, 0.0]), seed=0)
-        >>> rig.truth(rig.step(state, np.zeros(1), 0.02)).shape
-        (2,)
     """
 
     parameters: RigParameters = field(default_factory=RigParameters)
@@ -104,14 +95,9 @@ class Rig:
     def with_faults(self, faults: Sequence[Fault]) -> Rig:
         """The same rig with ``faults`` beside those it has.
 
-        Args:
-            faults: With targets ``"plant_friction"`` and ``"plant_mass"`` (factors on the bearing's friction and
-                on the club's mass and inertia), ``"plant_push"`` (torque on the club [N m]), ``"plant_belt"``
-                (largest torque that the belt transmits, at the club [N m]), ``"plant_delay"`` (of the sensor,
-                beside the rig's own [s]).
-
-        Raises:
-            InputError: If a fault is not one of a rig's.
+        Targets are ``"plant_friction"`` and ``"plant_mass"`` (factors on the bearing's friction and on the club's mass
+        and inertia), ``"plant_push"`` (torque on the club [N m]), ``"plant_belt"`` (largest torque that the belt
+        transmits, at the club [N m]) and ``"plant_delay"`` (of the sensor, beside the rig's own [s]).
         """
         return replace(self, faults=(*self.faults, *faults))
 

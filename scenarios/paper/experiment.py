@@ -28,10 +28,6 @@ class Effort:
         decay: Weight decay of AdamW times the number of training samples; 0 is the paper's Adam. Default 0.
         fit: Methods that the prior is fitted by, where it is fitted: those of ``fit_prior``, and ``"particle_swarm"``.
             Default: those of the main job.
-
-    Example:
-        >>> Effort(networks=2, sequences=(3, 6), steps=100, free_run_steps=20, valid=1, test=1).hidden
-        16
     """
 
     networks: int

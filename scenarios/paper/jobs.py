@@ -38,11 +38,7 @@ SHOWN = ("t", "u", "x", "x_hat", "energy_measured_w", "energy_model_w")
 
 
 def divergence(runs: Sequence[FreeRun]) -> Divergence | None:
-    """Where the free runs of one network left all bounds (``RULE``); None if they did not.
-
-    Args:
-        runs: Free runs over all test runs.
-    """
+    """Where the free runs of one network left all bounds (``RULE``); None if they did not."""
     largest = np.max([np.abs(run.y).max(0) for run in runs], axis=0)
     found: list[tuple[FreeRun, int]] = []
     for run in runs:
@@ -59,13 +55,7 @@ def divergence(runs: Sequence[FreeRun]) -> Divergence | None:
 def network_figures(
     runs: Sequence[FreeRun], validation: float | None = None, converged: int | None = None
 ) -> Network:
-    """Figures of one network, or where it diverged.
-
-    Args:
-        runs: Its free runs over all test runs.
-        validation: Its best validation error. Default: there was none.
-        converged: Optimiser steps until it had converged. Default: not known.
-    """
+    """Figures of one network, or where it diverged."""
     where = divergence(runs)
     figures = {} if where is not None else figures_of(runs)
     known = validation if validation is not None and np.isfinite(validation) else None
@@ -200,13 +190,7 @@ def smoothed_arrays(trajectories: Sequence[Trajectory]) -> dict[str, Any]:
 
 
 def physics_job(cases: Sequence[tuple[Case, int]], path: Path, report: Progress) -> None:
-    """Evaluate the nominal and the fitted prior of all amounts of training data.
-
-    Args:
-        cases: Each amount of training data, and its number of sequences.
-        path: File to write, without ending.
-        report: Takes progress.
-    """
+    """Evaluate the nominal and the fitted prior of all amounts of training data."""
     from hybrid_mpc.identify.evaluate import free_runs
     from hybrid_mpc.identify.step import PriorStep
 
@@ -230,16 +214,7 @@ def physics_job(cases: Sequence[tuple[Case, int]], path: Path, report: Progress)
 def ensemble_job(
     case: Case, count: int, model: str, settings: TrainingSettings, key: str, report: Progress
 ) -> None:
-    """Train the networks of one model on one amount of data and evaluate all of them.
-
-    Args:
-        case: Data and prior.
-        count: Number of sequences.
-        model: Name of the row.
-        settings: Of the training.
-        key: Name of the files.
-        report: Takes progress.
-    """
+    """Train the networks of one model on one amount of data and evaluate all of them."""
     from hybrid_mpc.identify.evaluate import stacked_free_runs
     from hybrid_mpc.identify.train import train
 

@@ -53,23 +53,7 @@ def reproduce(
 
     Every fit and every ensemble is a job in a process of its own that leaves its files in ``out/checkpoints``; a
     training also leaves its state as it goes. A reproduction that was interrupted, at any point, is finished by
-    ``resume=True`` and then equals one that was not.
-
-    Args:
-        settings: What to compute.
-        out: Folder to make; it must be new or empty unless ``resume``.
-        resume: Finish the reproduction that ``out`` holds.
-        progress: Where to report. Default: nowhere.
-        workers: Processes at once; 0 runs the jobs in this one. Default: two.
-
-    Returns:
-        The results (docs/reproduction.md).
-
-    Raises:
-        InputError: If the scenario has no experiment, a setting is bad, or the folder holds something else.
-
-    Example:
-        >>> results = reproduce(ReproductionSettings("pendulum"), Path("out"))  # doctest: +SKIP
+    ``resume=True`` and then equals one that was not. ``workers=0`` runs the jobs in this process.
     """
     scenario = load_scenario(settings.scenario)
     experiment = experiment_of(scenario)
@@ -317,9 +301,6 @@ def _with_states(trajectories: Sequence[Trajectory], arrays: Mapping[str, Any]) 
 class Slots:
     """Gives every running job a place, so that the terminal has a bar a process and not one a job.
 
-    Args:
-        count: Processes at once.
-
     Example:
         >>> slots = Slots(2)
         >>> slots.name("one"), slots.name("two"), slots.name("one")
@@ -347,14 +328,7 @@ class Slots:
 
 
 def write_outputs(work: Work) -> dict[str, Any]:
-    """Collect what the jobs left, check the claims, write tables and figures.
-
-    Args:
-        work: A reproduction whose jobs are all done.
-
-    Returns:
-        What ``results.json`` holds.
-    """
+    """Collect what the jobs left, check the claims, write tables and figures."""
     rows = work.rows()
     table = Table(rows)
     results = collected(work, rows, table)
@@ -395,11 +369,7 @@ def collected(work: Work, rows: Sequence[Row], table: Table) -> dict[str, Any]:
 
 
 def read_results(path: Path) -> dict[str, Any]:
-    """Results of a reproduction.
-
-    Raises:
-        InputError: If the file is missing, damaged, something else, or of another version of the schema.
-    """
+    """Results of a reproduction."""
     results = read_json(path)
     if not isinstance(results, dict) or results.get("schema") != SCHEMA:
         raise InputError(f"{path} holds no results of 'hybrid-mpc reproduce'")

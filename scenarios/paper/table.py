@@ -85,13 +85,7 @@ class Row:
 
     @staticmethod
     def of(value: Mapping[str, Any]) -> Row:
-        """From what :meth:`plain` gave.
-
-        Example:
-            >>> row = Row("exact", 3, "rnn", (Network({}, diverged=Divergence("test_01", 7, 0.07, 1)),))
-            >>> Row.of(row.plain()) == row
-            True
-        """
+        """From what :meth:`plain` gave."""
         networks = tuple(
             Network(
                 dict(n["figures"]),
@@ -124,19 +118,7 @@ class Cell:
 
 
 class Table:
-    """Rows with their statistics.
-
-    Args:
-        rows: In any order.
-
-    Example:
-        >>> good, bad = Network({"e_sim_s": 2.0}), Network({}, diverged=Divergence("test_01", 7, 0.07, 1))
-        >>> table = Table([Row("exact", 3, "rnn", (good, good, bad))])
-        >>> table.cell("exact", 3, "rnn")
-        Cell(mean=2.0, std=0.0, median=2.0, networks=3, diverged=1)
-        >>> print(table.cell("exact", 6, "rnn"))
-        None
-    """
+    """Rows with their statistics."""
 
     def __init__(self, rows: Sequence[Row]) -> None:
         self._rows = {(row.data_set, row.sequences, row.model): row for row in rows}
@@ -158,14 +140,7 @@ class Table:
         return [model for model in MODELS if model in there]
 
     def cell(self, data_set: str, sequences: int, model: str, metric: str = "e_sim_s") -> Cell | None:
-        """One figure of one row, or None if there is no such row or it has no such figure.
-
-        Args:
-            data_set: Name of the data set.
-            sequences: Number of training runs.
-            model: One of ``MODELS``.
-            metric: One of ``METRICS``, or ``"converged_step"``.
-        """
+        """One figure of one row, or None if there is no such row or it has no such figure."""
         row = self._rows.get((data_set, sequences, model))
         if row is None:
             return None
@@ -240,13 +215,6 @@ class Claim:
         text: In words, with its numbers.
         source: Where it stands, e.g. ``"paper, Fig. 3"``.
         check: Checks it; made by :meth:`below`, :meth:`above`, :meth:`level`, ... or by a function of one's own.
-
-    Example:
-        >>> from scenarios.paper.table import Network, Row
-        >>> rows = [Row("exact", 3, m, (Network({"e_sim_s": e}),)) for m, e in (("rnn", 1.0), ("pgrnn", 0.5))]
-        >>> claim = Claim("halved", "PGRNN 40 % below RNN", "paper", Claim.below("pgrnn", "rnn", 0.4, "exact"))
-        >>> claim.line(Table(rows))
-        'reproduced: PGRNN 40 % below RNN (paper). Found: pgrnn to rnn −50 % (with 3 sequences).'
     """
 
     name: str
@@ -264,13 +232,7 @@ class Claim:
     ) -> Check:
         """``model`` lies at least ``share`` below ``reference``; a negative share allows it to lie above.
 
-        Args:
-            model: Which is better.
-            reference: Than which.
-            share: Of the reference's figure.
-            data_set: Where.
-            at: With every amount of data, the least, the most, or any of them (``"some"``).
-            metric: Figure. Default E_sim.
+        That holds with every amount of data, the least, the most, or any of them (``at="some"``).
         """
 
         def check(table: Table) -> Verdict:

@@ -54,15 +54,7 @@ the disk's own 1.9 Hz, which swing far, and steps."""
 
 
 def stems(budget: str) -> list[str]:
-    """Names of the recordings of a budget, e.g. ``train_01_multisine``; the kinds take turns.
-
-    Raises:
-        InputError: If there is no such budget.
-
-    Example:
-        >>> stems("quick")[:2], len(stems("full"))
-        (['train_01_multisine', 'train_02_swing'], 34)
-    """
+    """Names of the recordings of a budget, e.g. ``train_01_multisine``; the kinds take turns."""
     if budget not in SIZES:
         raise InputError(f"unbalanced_disk: no budget {budget!r}; it has: {', '.join(SIZES)}")
     kinds = list(KINDS)
@@ -75,16 +67,6 @@ def record(plant: DiskPlant, kind: str, seed: tuple[int, ...]) -> tuple[Array, A
     """One recording: voltages commanded ``(n,)`` [V] and encoder angles at the same instants ``(n,)`` [rad].
 
     If the disk goes beyond 2.8 rad, the recording is repeated with nine tenths of the voltage.
-
-    Args:
-        plant: The disk.
-        kind: Of the voltage, one of ``KINDS``.
-        seed: Of everything random in it.
-
-    Example:
-        >>> u, th = record(DiskPlant(), "multisine", (0, 0, 1))
-        >>> u.shape, th.shape, bool(abs(th).max() < 2.81)
-        ((1000,), (1000,), True)
     """
     rng = np.random.default_rng(seed)
     u = KINDS[kind](rng, DT * np.arange(SAMPLES, dtype=np.float64))
@@ -102,25 +84,7 @@ def record(plant: DiskPlant, kind: str, seed: tuple[int, ...]) -> tuple[Array, A
 
 
 def make_data(folder: Path, seed: int, budget: str) -> list[Path]:
-    """Write the recordings of a budget as ``.npz`` files with ``u`` [V], ``th`` [rad] and ``dt`` [s], as the real ones.
-
-    Args:
-        folder: Where to; made if missing. Files of the same name are replaced whole.
-        seed: Same seed, same files.
-        budget: ``"quick"`` (8 training, 3 validation, 4 test recordings of 25 s) or ``"full"`` (20, 6, 8).
-
-    Returns:
-        The files.
-
-    Raises:
-        InputError: If there is no such budget.
-
-    Example:
-        >>> make_data(Path("out"), 0, "none")
-        Traceback (most recent call last):
-        ...
-        hybrid_mpc.errors.InputError: unbalanced_disk: no budget 'none'; it has: quick, full
-    """
+    """Write the recordings of a budget as ``.npz`` files with ``u`` [V], ``th`` [rad], ``dt`` [s], as the real ones."""
     names, plant = stems(budget), DiskPlant()
     paths = []
     for stem in names:

@@ -67,12 +67,6 @@ class Judges:
         resolution: Step of each sensor ``(n_y,)``.
         hours: Nominal data learned from [h].
         blocks: Blocks among them.
-
-    Example:
-        >>> tails = {"forces": (3.0, 0.5), "power": (2.0, 0.4)}
-        >>> judges = Judges(Detector(0.02, ((0.01, 0, 0, 0),), (0.01, 0, 0, 0), 2.0, 1.0, 1.0), tails, (1.5e-3,))
-        >>> round(judges.threshold("forces", 1.0), 2), judges.threshold("freeze", 1.0)
-        (6.29, 1.0)
     """
 
     detector: Detector
@@ -174,18 +168,6 @@ def learn_judges(
 
     Thresholds are Gumbel tails of block maxima, as :func:`~hybrid_mpc.monitor.calibrate.calibrate` makes them. The
     loops are known to be nominal, so a block that stands out is no reason to refuse them.
-
-    Args:
-        traces: Nominal loops; the first of the machine's seconds of each is left out.
-        dt: Period [s].
-        resolution: Step of each sensor ``(n_y,)``.
-        rate: Smallest wanted rate [1/h]; default 1.
-        rest_speed: That of the monitor which watched them (``monitor.rest_speed``). Default 0.2, as the monitor's.
-        time_unit: The machine's second [s], the model's. Default 1.
-        data_hash: Hash of the data, kept in the detector.
-
-    Raises:
-        InputError: If there is too little data for the rate, or no motion.
     """
     skipped, block_s = round(SETTLING_S * time_unit / dt), block_seconds(dt, time_unit)
     runs = [trace.numbers[skipped:] for trace in traces]
@@ -214,12 +196,7 @@ def learn_judges(
 
 
 def with_hysteresis(level: Array, threshold: float, release: float = RELEASE) -> NDArray[np.bool_]:
-    """Alarm ``(n,)`` that begins above a threshold and ends below a share of it.
-
-    Example:
-        >>> with_hysteresis(np.array([0.6, 1.1, 0.6, 0.4]), 1.0).tolist()
-        [False, True, True, False]
-    """
+    """Alarm ``(n,)`` that begins above a threshold and ends below a share of it."""
     state = np.where(level > threshold, 1, np.where(level > release * threshold, 0, -1))
     places = np.maximum.accumulate(np.where(state != 0, np.arange(len(state)), -1))
     return np.asarray((places >= 0) & (state[np.maximum(places, 0)] == 1))

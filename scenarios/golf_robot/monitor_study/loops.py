@@ -140,11 +140,7 @@ class _Loops:
 
 
 def trace_of(result: ClosedLoopResult) -> Trace:
-    """What detectors see of a loop.
-
-    Args:
-        result: Its record.
-    """
+    """What detectors see of a loop."""
     speed = np.abs(result.x[:, result.x.shape[1] // 2 :]).max(axis=1)
     return Trace(result.numbers, result.level, result.innovation, result.nis, speed)
 
@@ -155,13 +151,7 @@ def plain_task(task: Task) -> Task:
 
 
 def nominal_figures(study: MonitorStudy, judges: Judges, trace: Trace) -> dict[str, Any]:
-    """Of a nominal loop: false alarms by rate and method, and the largest scores of its blocks.
-
-    Args:
-        study: The study.
-        judges: What was learned.
-        trace: The loop.
-    """
+    """Of a nominal loop: false alarms by rate and method, and the largest scores of its blocks."""
     dt, levels = judges.detector.dt, judges.levels(trace)
     size = round(judges.block_s / dt)
     counts: dict[str, dict[str, int]] = {}
@@ -179,14 +169,7 @@ def nominal_figures(study: MonitorStudy, judges: Judges, trace: Trace) -> dict[s
 
 
 def fault_figures(study: MonitorStudy, judges: Judges, trace: Trace, onset: int) -> dict[str, Any]:
-    """Of a faulted loop: delays by rate and method, alarms before the fault, and the largest scores soon after.
-
-    Args:
-        study: The study.
-        judges: What was learned.
-        trace: The loop.
-        onset: First sample of the fault.
-    """
+    """Of a faulted loop: delays by rate and method, alarms before the fault, and the largest scores soon after."""
     dt, levels = judges.detector.dt, judges.levels(trace)
     moving = MOVING * max(judges.detector.rest_speed)
     moved: Array = np.cumsum(trace.speed[onset:] > moving) * np.float64(dt)
@@ -218,16 +201,7 @@ def write_learning(path: Path, traces: list[Trace]) -> None:
 
 
 def learn(study: MonitorStudy, paths: list[Path], artifact: Kit) -> Judges:
-    """Thresholds of all methods from the nominal loops in these files.
-
-    Args:
-        study: The study.
-        paths: Files of :func:`write_learning`.
-        artifact: The models that ran in them.
-
-    Raises:
-        InputError: If a file is missing, or there is too little data.
-    """
+    """Thresholds of all methods from the nominal loops in these files."""
     traces, hashed = [], hashlib.sha256()
     for path in paths:
         arrays = read_arrays(path)

@@ -157,14 +157,6 @@ class MonitorStudy:
         resolution: Step of each sensor ``(n_y,)``.
         fault_s: Length of a faulted loop [s].
         name: For the report.
-
-    Raises:
-        InputError: If a number is not positive.
-
-    Example:
-        >>> study = MonitorStudy("golf_robot", "runs/golf", seeds=2, guard_seeds=1, nominal_hours=1.0)
-        >>> study.size, sum(job.kind == "nominal" for job in study.jobs())
-        (34, 2)
     """
 
     scenario: str
@@ -240,19 +232,7 @@ BUDGETS = {
 
 
 def monitor_study(model: str, budget: str = "full") -> MonitorStudy:
-    """The golf robot's study.
-
-    Args:
-        model: Artifact folder.
-        budget: ``"full"``, or ``"quick"``: one nominal hour, six loops a fault.
-
-    Raises:
-        InputError: If there is no such budget.
-
-    Example:
-        >>> monitor_study("runs/golf", "quick").nominal_hours
-        1.0
-    """
+    """The golf robot's study."""
     if budget not in BUDGETS:
         raise InputError(f"study monitor: no budget {budget!r}; there are: {', '.join(BUDGETS)}")
     chosen: dict[str, Any] = dict(BUDGETS[budget])
@@ -260,12 +240,7 @@ def monitor_study(model: str, budget: str = "full") -> MonitorStudy:
 
 
 def moves(levels: Array) -> Callable[[Array], Array]:
-    """Reference ``t (n,) -> (n, 2)`` from level to level along quintics, and its derivative.
-
-    Example:
-        >>> moves(np.array([0.0, 0.4]))(np.array([0.0, 1.7, 2.2])).round(2).tolist()
-        [[0.0, 0.0], [0.2, 0.94], [0.4, 0.0]]
-    """
+    """Reference ``t (n,) -> (n, 2)`` from level to level along quintics, and its derivative."""
 
     def reference(t: Array) -> Array:
         index = np.clip(np.floor(t / HOLD_S + 1e-9).astype(int), 0, len(levels) - 1)

@@ -35,22 +35,7 @@ def method_name(method: str) -> str:
 
 
 def delays(cases: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
-    """Share of faults found up to a delay, one panel a fault; what is missed never comes.
-
-    Args:
-        cases: By fault and method: delays [s], infinite for a miss.
-
-    Returns:
-        The figure; delays on a logarithmic axis.
-
-    Raises:
-        InputError: If there is no delay.
-
-    Example:
-        >>> figure = delays({"push": {"guard": [0.1, 0.12, math.inf]}})
-        >>> len(figure.axes)
-        1
-    """
+    """Share of faults found up to a delay, one panel a fault; what is missed never comes."""
     if not any(len(values) for row in cases.values() for values in row.values()):
         raise InputError("plot of delays: there is none")
     figure, panels = _panels(len(cases))
@@ -78,16 +63,6 @@ def operating_curves(
     cases: Mapping[str, Mapping[str, tuple[Sequence[float], Sequence[float]]]], wanted: float
 ) -> Figure:
     """Share of faults found within a second against false alarms an hour, one panel a fault.
-
-    Args:
-        cases: By fault and method: false alarms [1/h], and the share found.
-        wanted: Wanted rate [1/h], marked.
-
-    Returns:
-        The figure; a rate of nothing is drawn at the left edge.
-
-    Raises:
-        InputError: If there is no curve.
 
     Example:
         >>> figure = operating_curves({"push": {"guard": ([60.0, 0.0], [1.0, 0.5])}}, 1.0)

@@ -38,16 +38,7 @@ GUARD_TEXT = (
 
 
 def write_monitor_report(out: Path, results: Mapping[str, Any], note: StudyNote) -> Path:
-    """Write ``report.html``, ``table.md``, ``delays.png`` and ``roc.png``.
-
-    Args:
-        out: Folder of the study.
-        results: What :func:`~scenarios.golf_robot.monitor_study.results.monitor_results` found.
-        note: What the study is made of.
-
-    Returns:
-        The report's path.
-    """
+    """Write ``report.html``, ``table.md``, ``delays.png`` and ``roc.png``."""
     sections = [
         Section("False alarms", NOMINAL_TEXT, (), [alarm_table(results)]),
         Section("Delays", DELAY_TEXT, _figure(_delays, results, out), _delay_tables(results)),
