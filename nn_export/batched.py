@@ -71,11 +71,7 @@ OPERATORS: dict[int, Callable[..., Tensor]] = {
 
 @dataclass(frozen=True)
 class Batched:
-    """A CasADi function over batches, with its derivatives as further ones.
-
-    Args:
-        function: Any CasADi function.
-    """
+    """A CasADi function over batches, with its derivatives as further ones."""
 
     function: ca.Function
 

@@ -276,9 +276,8 @@ def _said(value: Any) -> str:
     return f"a list of {len(value)}" if isinstance(value, list) else f"{value!r:.100}"
 
 
-_BOUND = {
-    op: _bound(op) for op in OPERATORS
-}  # here, as Python evaluates annotations: loading is to evaluate nothing
+# here, as Python evaluates annotations: loading is to evaluate nothing
+_BOUND = {op: _bound(op) for op in OPERATORS}
 
 
 def resolve(data: Any, values: Mapping[tuple[str, str], Any]) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -11,7 +12,6 @@ from typing import Any, Generic, TypeVar
 import casadi as ca
 
 from nn_export.budget import Budget
-from nn_export.graph import operations
 from nn_export.operators import cells
 from nn_export.operators.costs import HUGE, NUMBER
 
@@ -96,13 +96,9 @@ class Chain(ABC, Generic[Known]):
 
 @dataclass(frozen=True)
 class Piece:
-    """Expressions and their Jacobians.
+    """Expressions ``values`` of the symbols ``inner``, scalar code (SX) or a graph of MX, and their Jacobians.
 
-    Args:
-        scalar: True for an SX graph, False for one of MX.
-        inner: Its symbols.
-        values: The expressions.
-        blocks: The Jacobian of each expression, a row, by each symbol; empty by those that nobody asks for.
+    ``blocks`` has a row an expression, with its Jacobian by each symbol; empty by those that nobody asks for.
     """
 
     scalar: bool
@@ -144,3 +140,16 @@ def differentiated(symbols: list[ca.MX], targets: list[ca.MX], wanted: list[bool
 
 def _edges(parts: list[ca.MX]) -> list[int]:
     return list(accumulate((p.numel() for p in parts), initial=0))
+
+
+def operations(f: ca.Function) -> float:
+    """Scalar operations of a matrix graph, about; infinite if it calls other functions."""
+    total = 0
+    for k in range(f.n_instructions()):
+        kind = f.instruction_id(k)
+        if kind == ca.OP_CALL:
+            return math.inf
+        if kind not in (ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST):
+            node = f.instruction_MX(k)
+            total += node.numel() * (2 * node.dep(1).size2() if kind == ca.OP_MTIMES else 1)
+    return total

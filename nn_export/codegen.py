@@ -121,7 +121,7 @@ def generate_c(
     points: Sequence[Sequence[np.ndarray | float]] | None = None,
     seed: int = 0,
 ) -> CFiles:
-    """Write a function as self-contained C with a header and a test program.
+    """Write a function as self-contained C with a header and a test program, and return their paths.
 
     ``cc <name>.c <name>_test.c -lm && ./a.out`` prints one line a sample (all outputs, column by column) and
     ends with status 0 if all agree with CasADi to 1e-9 relative to the largest output (``-DTOLERANCE=...``
@@ -133,9 +133,6 @@ def generate_c(
         points: Samples for the test program: for each one value for each input. Default: three samples of
             normal random numbers.
         seed: Seed of the random samples.
-
-    Returns:
-        The paths.
 
     Raises:
         CompileError: If CasADi cannot write the function as C.

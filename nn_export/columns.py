@@ -20,14 +20,8 @@ Results: TypeAlias = Mapping[str, Array]
 
 @dataclass(frozen=True, eq=False)
 class Slot:
-    """Where a Jacobian of ``n`` points is kept.
-
-    Args:
-        shape: Its rows and columns.
-        own: An array ``(n, *shape)`` of its own; None if it is part of a result.
-        block: The result's name.
-        rows: Rows there.
-        columns: Columns there.
+    """Where a Jacobian of ``n`` points is kept: in an array ``own`` ``(n, *shape)``, or as rows and columns of the
+    result ``block``.
     """
 
     shape: tuple[int, int]
@@ -122,11 +116,9 @@ def matrices(weights: cells.Weights) -> list[Array | None]:
 class _Pattern:
     """Which of the row factors of a new state's Jacobian are the same: gates that share one are added.
 
-    Args:
-        first: Positions of the different factors among all, the input's gates first.
-        by_input: For every gate of the input its factor's number, or None.
-        by_hidden: The same of the hidden state.
-        diagonal: Old states that the new one depends on entry by entry.
+    ``first`` are the positions of the different factors among all, the input's gates first; ``by_input`` and
+    ``by_hidden`` have each gate's factor by number, or None; ``diagonal`` the old states that the new one depends on
+    entry by entry.
     """
 
     first: list[int]
@@ -153,12 +145,8 @@ class _Pattern:
 class _Jacobian:
     """Jacobian of new state ``k`` by one input of the program: the sum of its parts.
 
-    Args:
-        k: The new state.
-        slot: Where it goes.
-        weights: Rows of the constant part ``(H, factors, columns)``, to be scaled; None if there is none.
-        products: The cell's own Jacobian, times that of its argument.
-        diagonal: Old states with their Jacobians; None is the identity.
+    ``weights`` ``(H, factors, columns)`` are rows of the constant part, to be scaled; ``products`` the cell's own
+    Jacobian times that of its argument; ``diagonal`` old states with their Jacobians, None for the identity.
     """
 
     k: int

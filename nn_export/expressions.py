@@ -41,12 +41,10 @@ PASSES = 4
 
 @dataclass(frozen=True)
 class Step:
-    """One scalar operation of a function: values are numbered registers, which are used again.
+    """One scalar operation (CasADi's ``code``) of a function: values are numbered registers, which are used again.
 
-    Args:
-        code: CasADi's number of the operation, e.g. ``ca.OP_MUL``.
-        taken: Registers of its arguments; for an input ``(input, nonzero)``, for a constant its value alone.
-        given: Register of its result; for an output ``(output, nonzero)``.
+    ``taken`` are registers; for an input ``(input, nonzero)``, for a constant its value alone. ``given`` is a
+    register; for an output ``(output, nonzero)``.
     """
 
     code: int
@@ -55,13 +53,7 @@ class Step:
 
 
 def scalar_steps(function: ca.Function, most: int) -> list[Step]:
-    """The function as scalar operations, one after the other.
-
-    Example:
-        >>> x = ca.MX.sym("x", 2)
-        >>> len(scalar_steps(ca.Function("f", [x], [ca.sin(x)]), 100))  # two inputs, sines and outputs
-        6
-    """
+    """The function as scalar operations, one after the other."""
     # An estimate first: a dense network is not written out in scalars to be counted.
     if scalar_size(function) <= 4 * most:
         calls = ", ".join(dict.fromkeys(_without_form(function)))

@@ -58,14 +58,6 @@ def opened(path: Path, limit: int) -> Iterator[tuple[BinaryIO, int]]:
     """A regular file of at most ``limit`` bytes, opened for reading without waiting, and its length [byte].
 
     Only a regular file says how long it is; a pipe or a device may never end.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     write_bytes(Path(folder) / "a.txt", b"content")
-        ...     with opened(Path(folder) / "a.txt", 1024) as (file, length):
-        ...         print(length, file.read(3))
-        7 b'con'
     """
     try:
         _refuse_kind(os.stat(path), path)  # before it is opened: to open a device may already do something
@@ -178,9 +170,8 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     folder under a hidden name of its own until then; :func:`sweep` removes those that killed writers leave.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(
-        f".{path.name[:50]}.{secrets.token_hex(8)}.part"
-    )  # 50: a name has at most 255 bytes
+    # 50: a name has at most 255 bytes
+    part = path.with_name(f".{path.name[:50]}.{secrets.token_hex(8)}.part")
     # The mode is given to open, which takes the umask off: to ask for the umask is to change it, for all threads.
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
     handle = os.open(part, flags, 0o644)

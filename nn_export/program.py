@@ -175,17 +175,7 @@ def to_json(program: Program) -> dict[str, Any]:
     return {
         "inputs": [{"name": p.name, "shape": list(p.shape)} for p in program.inputs],
         "outputs": [{"name": p.name, "shape": list(p.shape), "source": p.source} for p in program.outputs],
-        "nodes": [
-            {
-                "name": n.name,
-                "op": n.op,
-                "args": n.args,
-                "kwargs": n.kwargs,
-                "shapes": [list(s) for s in n.shapes],
-                "line": n.line,
-            }
-            for n in program.nodes
-        ],
+        "nodes": [{**vars(n), "shapes": [list(s) for s in n.shapes]} for n in program.nodes],
         "metadata": program.metadata,
     }
 

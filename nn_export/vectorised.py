@@ -59,14 +59,7 @@ def _walk(f: ca.Function, n: int, inputs: list[ca.MX]) -> list[ca.MX] | None:
 
 
 class OnArrays:
-    """A dense CasADi function between numpy arrays that stay where they are.
-
-    Example:
-        >>> x, given, result = ca.MX.sym("x", 2), np.array([1.0, 2.0]), np.zeros(2)
-        >>> OnArrays(ca.Function("double", [x], [2 * x]), [given], [result])()
-        >>> result
-        array([2., 4.])
-    """
+    """A dense CasADi function between numpy arrays that stay where they are."""
 
     def __init__(self, function: ca.Function, inputs: list[Array], outputs: list[Array]) -> None:
         buffer: Any

@@ -513,19 +513,9 @@ RECURRENT: dict[str, Rule] = {
 
 
 _LONG = {
-    "elu",
-    "celu",
-    "softplus",
-    "round",
-    "hardtanh",
-    "gelu",
-    "mish",
-    "clamp",
-    "clamp_min",
-    "silu",
-    "sigmoid",
-}
-_LONG |= {"log_sigmoid", "xlogy", "fmin", "fmax"}
+    "elu", "celu", "softplus", "round", "hardtanh", "gelu", "mish", "clamp", "clamp_min", "silu", "sigmoid",
+    "log_sigmoid", "xlogy", "fmin", "fmax",
+}  # fmt: skip
 """Operators element by element that are made of some ten operations and more."""
 
 

@@ -41,12 +41,7 @@ def layout(shape: Shape) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Value:
-    """A tensor: its torch shape and the dense matrix that holds it.
-
-    Args:
-        shape: Shape in torch.
-        mx: Matrix of ``layout(shape)``.
-    """
+    """A tensor: its torch shape and the dense matrix that holds it, of ``layout(shape)``."""
 
     shape: Shape
     mx: ca.MX
