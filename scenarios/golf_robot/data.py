@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc import InputError, Role, Window, write_csv
-from scenarios.common import ROLES, whole_windows
+from hybrid_mpc import InputError, Role, Window
+from scenarios.common import ROLES, sizes_of, whole_windows, write_tables
 from scenarios.golf_robot.excitation import excitation
 from scenarios.golf_robot.rig import Rig, RigState
 
@@ -37,12 +37,11 @@ JUDGE = ("sine", "pulse", "chirp", "stair", "step", "fastsine", "fastchirp")
 
 def stems(budget: str, data_set: str = "b") -> list[str]:
     """Names of the recordings of a budget, e.g. ``train_01_sine``."""
-    if budget not in SIZES:
-        raise InputError(f"golf_robot: no budget {budget!r}; it has: {', '.join(SIZES)}")
+    sizes = sizes_of("golf_robot", budget, SIZES)
     if data_set not in TRAIN:
         raise InputError(f"golf_robot: no data set {data_set!r}; it has: {', '.join(TRAIN)}")
     names = []
-    for role, n in SIZES[budget].items():
+    for role, n in sizes.items():
         kinds = TRAIN[data_set] if role == "train" else JUDGE
         names += [f"{role}_{k + 1:02d}_{kinds[k % len(kinds)]}" for k in range(n)]
     return names
@@ -93,10 +92,10 @@ def recordings(seed: int, budget: str, data_set: str = "b") -> Iterator[tuple[st
 
     The same seed gives the same recordings; validation and test runs do not depend on the data set.
     """
-    rig, roles = Rig(), [str(role) for role in ROLES]
+    rig = Rig()
     for stem in stems(budget, data_set):
         role, number, kind = stem.split("_")
-        table, states = record(rig, kind, (seed, roles.index(role), int(number)))
+        table, states = record(rig, kind, (seed, ROLES.index(role), int(number)))
         yield stem, table, states
 
 
@@ -105,9 +104,5 @@ def make_data(folder: Path, seed: int, budget: str, *, data_set: str = "b") -> l
 
     Training data are without sinusoidal torques in ``data_set`` ``"a"``, with them in ``"b"``.
     """
-    stems(budget, data_set)
-    paths = []
-    for stem, table, _ in recordings(seed, budget, data_set):
-        columns = dict(zip(COLUMNS, table.T, strict=True))
-        paths.append(write_csv(folder / f"{stem}.csv", columns, decimals=6))
-    return paths
+    tables = ((stem, table) for stem, table, _ in recordings(seed, budget, data_set))
+    return write_tables(folder, tables, COLUMNS)

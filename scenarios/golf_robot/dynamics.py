@@ -118,10 +118,6 @@ class Conditions:
         mass: Factor on the club's mass, inertia included [-].
         push: Torque on the club from outside [N m].
         limit: Twist at which the belt slips [rad]; infinite: it never does.
-
-    Example:
-        >>> Conditions(friction=2.0).mass
-        1.0
     """
 
     friction: ca.SX | float = 1.0

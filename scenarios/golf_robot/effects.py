@@ -32,11 +32,7 @@ FREE = [p for p in PARAMETERS if not p.fixed]
 class Motion:
     """What one recording did, free of noise, on a grid of 10 ms; ``(n,)`` each.
 
-    Args:
-        phi: Angle [rad].
-        v: Speed [rad/s].
-        a: Acceleration [rad/s^2]: second difference of the angle, a mean over 20 ms around each sample.
-        u: Torque command [N m], a mean over the same 20 ms.
+    The acceleration is the second difference of the angle, a mean over 20 ms around each sample; so is the torque.
     """
 
     phi: Array
@@ -72,10 +68,10 @@ class Effects:
     largest_speed: float
 
 
-def noise_floor(p: RigParameters, window: float = SMOOTHING) -> float:
+def noise_floor(p: RigParameters) -> float:
     """Torque noise [N m]: J x the noise of a quartic Savitzky-Golay second derivative at 100 Hz."""
     sigma = np.hypot(p.noise, p.count / np.sqrt(12))
-    return float(p.J * sigma * LocalPolynomial(window).noise_gain(RECORD, 2))
+    return float(p.J * sigma * LocalPolynomial(SMOOTHING).noise_gain(RECORD, 2))
 
 
 def measure_effects(seed: int = 0, budget: str = "quick", data_set: str = "b") -> Effects:

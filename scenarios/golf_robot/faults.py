@@ -15,14 +15,7 @@ CAUSES = {"friction": ("d", "mu"), "mass": ("m", "J"), "motor": ("gain of u",)}
 
 @dataclass(frozen=True)
 class FaultCase:
-    """One thing that goes wrong.
-
-    Args:
-        name: Short name, e.g. ``"friction_x2"``.
-        title: One line for plots and the report.
-        faults: What acts; see :func:`hybrid_mpc.loop.faults.install`.
-        nominal: True for ageing that a monitor must not take for a fault.
-    """
+    """One thing that goes wrong; ``nominal`` for ageing that a monitor must not take for a fault."""
 
     name: str
     title: str

@@ -61,10 +61,6 @@ def sine_reference(t: Array) -> Array:
 
     The friction reverses about four times in a second, and the faster part is above the pendulum's own
     0.6 Hz: neither gravity nor a slow observer carries the club along.
-
-    Example:
-        >>> sine_reference(np.zeros(1)).tolist()
-        [[0.0, 0.0]]
     """
     return faded_sines(t, ((0.5, 0.35), (0.2, 0.9)))
 
@@ -73,10 +69,6 @@ def swing_reference(t: Array) -> Array:
     """``(n, 2)``: 0.3 rad at 0.35 Hz, faded in over 1 s: what disturbances are rejected on.
 
     A club that is merely held sticks, and what holding it costs is the same for all models.
-
-    Example:
-        >>> swing_reference(np.zeros(1)).tolist()
-        [[0.0, 0.0]]
     """
     return faded_sines(t, ((0.3, 0.35),))
 

@@ -123,9 +123,8 @@ def shown_free_run(
             tint, dashes, _, words = LOOKS.get(name, (colour(name), "-", "", name))
             x_hat = checked(f"free run of {name}", run["x_hat"], len(t), len(states))[:, i]
             ax.plot(t, x_hat, color=tint, linestyle=dashes, linewidth=1.3, label=words)
-        reach = 1.6 * max(
-            float(np.abs(measured[:, i]).max()), 1e-9
-        )  # one that runs away must not flatten the rest
+        # one that runs away must not flatten the rest
+        reach = 1.6 * max(float(np.abs(measured[:, i]).max()), 1e-9)
         bottom, top = ax.get_ylim()
         ax.set_ylim(max(bottom, -reach), min(top, reach))
         ax.set_ylabel(axis_label(signal))

@@ -22,6 +22,7 @@ from hybrid_mpc.job.context import Progress, Silent, versions
 from hybrid_mpc.job.engine import WORKERS, run_jobs
 from hybrid_mpc.job.folder import JobNote, open_folder
 from hybrid_mpc.job.settings import check_device
+from hybrid_mpc.records import record
 from hybrid_mpc.scenario import Scenario, load_scenario
 from scenarios.paper.experiment import Effort, Experiment
 from scenarios.paper.jobs import RULE, Case, EvaluationSet, ensemble_job, fit_job, physics_job, sindy_job
@@ -80,17 +81,7 @@ def reproduce(
 
 @dataclass(frozen=True)
 class Work:
-    """A reproduction in its folder.
-
-    Args:
-        settings: What it computes.
-        scenario: The machine.
-        experiment: Its experiment.
-        effort: How much of it.
-        out: The folder.
-        progress: Where to report.
-        workers: Processes at once; 0 for none.
-    """
+    """A reproduction in its folder; ``workers`` processes at once, 0 for none."""
 
     settings: ReproductionSettings
     scenario: Scenario
@@ -205,8 +196,8 @@ class Work:
 
     def rows(self) -> list[Row]:
         """Rows of all jobs that are done."""
-        found = [read_json(path) for path in sorted(self.folder.glob("*.json"))]
-        return [Row.of(row) for job in found for row in job.get("rows", ())]
+        found = {path: read_json(path) for path in sorted(self.folder.glob("*.json"))}
+        return [record(Row, row, str(path)) for path, job in found.items() for row in job.get("rows", ())]
 
     def notes(self) -> list[str]:
         """What is doubtful about the recordings, and what was left out, and why."""
@@ -362,7 +353,7 @@ def collected(work: Work, rows: Sequence[Row], table: Table) -> dict[str, Any]:
         "priors": priors,
         "summary": table.summary(),
         "claims": claims,
-        "rows": [row.plain() for row in rows],
+        "rows": [asdict(row) for row in rows],
         "details": {key: job["details"] for key, job in jobs.items() if job.get("details")},
         "timing": {"seconds_of_jobs": {key: job["seconds"] for key, job in jobs.items()}},
     }
@@ -383,7 +374,7 @@ def read_results(path: Path) -> dict[str, Any]:
 
 def table_of(results: Mapping[str, Any]) -> Table:
     """The table of results that were read."""
-    return Table([Row.of(row) for row in results["rows"]])
+    return Table([record(Row, row, "results of a reproduction") for row in results["rows"]])
 
 
 def claim_lines(results: Mapping[str, Any]) -> list[str]:

@@ -73,12 +73,7 @@ class ReproductionSettings:
 
 
 def parsed_sequences(text: str) -> tuple[int, ...]:
-    """Amounts of training data as the command line has them.
-
-    Example:
-        >>> parsed_sequences("3, 6")
-        (3, 6)
-    """
+    """Amounts of training data as the command line has them."""
     try:
         return tuple(int(word) for word in text.split(","))
     except ValueError:
@@ -98,10 +93,5 @@ def experiment_of(scenario: Scenario) -> Experiment:
 
 
 def case_key(data_set: str, sequences: int, model: str = "") -> str:
-    """Name of a job and its files.
-
-    Example:
-        >>> case_key("a", 3, "rnn"), case_key("b", 15)
-        ('a_03_rnn', 'b_15')
-    """
+    """Name of a job and its files."""
     return "_".join([data_set, f"{sequences:02d}", *([model] if model else [])])

@@ -39,13 +39,9 @@ _FUNCTIONS: dict[str, tuple[Callable[[Tensor], Tensor], str]] = {
 
 @dataclass(frozen=True)
 class Factor:
-    """``function(scale * signal) ** power``, a factor of a candidate term.
+    """``function(scale * signal) ** power``, a factor of a candidate term; the signal is a state or an input.
 
-    Args:
-        signal: Name of a state or an input.
-        function: ``"value"``, ``"sin"``, ``"cos"``, ``"tanh"``, ``"abs"`` or ``"abs_cos"``. Default: the value.
-        scale: Default 1.
-        power: 1, 2, ... Default 1.
+    Functions: ``"value"``, ``"sin"``, ``"cos"``, ``"tanh"``, ``"abs"``, ``"abs_cos"``.
     """
 
     signal: str
@@ -80,12 +76,7 @@ Term = tuple[Factor, ...]
 
 @dataclass(frozen=True)
 class Library:
-    """Candidate terms of an acceleration, as plain data.
-
-    Args:
-        name: Names it in tables.
-        terms: The terms.
-    """
+    """Candidate terms of an acceleration, as plain data."""
 
     name: str
     terms: tuple[Term, ...]
@@ -161,15 +152,11 @@ class SindyStep(Step):
 
 @dataclass(frozen=True)
 class SindyCandidate:
-    """One fit of a library with a threshold.
+    """One fit of a library with a threshold, a share of the acceleration's root mean square, and the terms that it
+    keeps.
 
-    Args:
-        library: Name of its library.
-        threshold: Its threshold, a share of the acceleration's root mean square.
-        terms: Number of terms that it keeps.
-        training: Mean absolute error of the training accelerations [rad/s²].
-        validation: E_sim on the validation free runs (duration form, λ = 0); infinite if one of them diverges or the
-            model is too stiff for the period.
+    ``training`` is the mean absolute error of the training accelerations [rad/s²], ``validation`` E_sim on the
+    validation free runs (duration form, λ = 0), infinite if one diverges or the model is too stiff for the period.
     """
 
     library: str

@@ -33,13 +33,7 @@ WINDOWS = 24
 
 @dataclass(frozen=True)
 class SwarmSettings:
-    """Effort of a particle swarm.
-
-    Args:
-        particles: Sets of parameters in the swarm. Default 24.
-        generations: How often all of them move. Default 40.
-        seed: Same seed, same fit. Default 0.
-    """
+    """Effort of a particle swarm: sets of parameters, and how often all of them move."""
 
     particles: int = 24
     generations: int = 40

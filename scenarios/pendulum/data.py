@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc import InputError, Role, Trajectory, sinusoid, write_csv
-from scenarios.common import ROLES
+from hybrid_mpc import InputError, Role, Trajectory, sinusoid
+from scenarios.common import ROLES, sizes_of, write_tables
 from scenarios.pendulum.plant import DampedPendulum
 
 Array = NDArray[np.float64]
@@ -29,9 +29,9 @@ SIZES: Mapping[str, Mapping[Role, int]] = {
 
 def stems(budget: str) -> list[str]:
     """Names of the recordings of a budget, e.g. ``train_01``."""
-    if budget not in SIZES:
-        raise InputError(f"pendulum: no budget {budget!r}; it has: {', '.join(SIZES)}")
-    return [f"{role}_{k + 1:02d}" for role, n in SIZES[budget].items() for k in range(n)]
+    return [
+        f"{role}_{k + 1:02d}" for role, n in sizes_of("pendulum", budget, SIZES).items() for k in range(n)
+    ]
 
 
 def simulate(plant: DampedPendulum, x0: Array, u: Array) -> Array:
@@ -85,7 +85,7 @@ def recordings(seed: int, budget: str) -> Iterator[tuple[str, Array]]:
     plant = DampedPendulum()
     for stem in stems(budget):
         name, number = stem.split("_")
-        role = ROLES[[str(r) for r in ROLES].index(name)]
+        role = ROLES[ROLES.index(name)]
         t, u, x = run(plant, role, int(number), seed)
         noise = np.random.default_rng((seed, ROLES.index(role), int(number), 1)).standard_normal(len(t))
         yield stem, np.column_stack([t, x[:, 0] + plant.noise * noise, x[:, 1], u])
@@ -93,9 +93,4 @@ def recordings(seed: int, budget: str) -> Iterator[tuple[str, Array]]:
 
 def make_data(folder: Path, seed: int, budget: str) -> list[Path]:
     """Write the recordings of a budget as CSV files with columns time_s, phi_rad, phi_dot_rad_s, u_nm."""
-    stems(budget)
-    paths = []
-    for stem, table in recordings(seed, budget):
-        columns = dict(zip(COLUMNS, table.T, strict=True))
-        paths.append(write_csv(folder / f"{stem}.csv", columns, decimals=6))
-    return paths
+    return write_tables(folder, recordings(seed, budget), COLUMNS)

@@ -56,14 +56,8 @@ class PendulumParameters:
 
 @dataclass(frozen=True)
 class PendulumState:
-    """State of the plant.
-
-    Args:
-        z: phi [rad], phi_dot [rad/s], work of the torque since the reset [J], heat of the damping since then [J].
-
-    Example:
-        >>> DampedPendulum().reset(np.array([0.1, 0.0]), seed=0).z
-        (0.1, 0.0, 0.0, 0.0)
+    """State of the plant ``z``: phi [rad], phi_dot [rad/s]; work of the torque and heat of the damping since the
+    reset [J].
     """
 
     z: Values

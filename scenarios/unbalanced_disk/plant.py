@@ -18,16 +18,10 @@ CHUNK = 10
 
 @dataclass(frozen=True)
 class DiskState:
-    """State of the plant.
+    """State of the plant: ``z`` ``(4,)`` is phi [rad], phi_dot [rad/s], motor current [A], bristle [rad].
 
-    Args:
-        z: ``(4,)``: phi [rad], phi_dot [rad/s], motor current [A], bristle [rad].
-        acting: Voltage that acts [V].
-        waiting: Commands on their way: time until each acts [s] and its voltage [V], the oldest first.
-
-    Example:
-        >>> DiskPlant().reset(np.array([0.1, 0.0]), seed=0).waiting
-        ()
+    ``acting`` is the voltage that acts [V]; ``waiting`` are commands on their way, time until each acts [s] and its
+    voltage [V], the oldest first.
     """
 
     z: Array

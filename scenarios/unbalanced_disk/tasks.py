@@ -40,10 +40,6 @@ def pumps(horizon: int) -> tuple[tuple[tuple[float, ...], ...], ...]:
 
     Which way first, for how long, and for how long back is what tells the ways up apart; a plan that begins with none
     of them sees only the slope from where the disk hangs.
-
-    Example:
-        >>> len(pumps(60)), pumps(60)[0][0], pumps(60)[0][-1]
-        (12, (3.0,), (0.0,))
     """
     t = DT * np.arange(horizon)
     plans = []

@@ -42,12 +42,9 @@ at half the rate.
 class Trace:
     """What detectors see of a loop of n periods.
 
-    Args:
-        numbers: ``MonitorReading.numbers`` ``(n, columns)``.
-        level_w: Averaged one-step violation ``(n,)`` [W].
-        innovation: Innovations of the filter ``(n, n_y)`` [output units]; NaN in the first row.
-        nis: Normalised innovations squared ``(n,)``; NaN in the first.
-        speed: Largest true speed ``(n,)`` of the degrees of freedom [rad/s or m/s].
+    ``numbers`` are ``MonitorReading.numbers``, ``level_w`` the averaged one-step violation [W], ``speed`` the largest
+    true speed of the degrees of freedom. Innovations ``(n, n_y)`` and their normalised squares ``nis`` ``(n,)`` are
+    NaN in the first row.
     """
 
     numbers: Array
@@ -59,14 +56,11 @@ class Trace:
 
 @dataclass(frozen=True)
 class Judges:
-    """All methods, learned from the same nominal loops.
+    """All methods, learned from the same ``hours`` of nominal loops.
 
-    Args:
-        detector: Scales of residual forces and power; its thresholds are set by the wanted rate.
-        tails: By part location and scale of the Gumbel tail of its maxima in blocks (:attr:`block_s`).
-        resolution: Step of each sensor ``(n_y,)``.
-        hours: Nominal data learned from [h].
-        blocks: Blocks among them.
+    ``detector`` has the scales of residual forces and power; its thresholds are set by the wanted rate. ``tails`` has
+    by part location and scale of the Gumbel tail of its maxima in blocks (:attr:`block_s`); ``resolution`` the step
+    of each sensor.
     """
 
     detector: Detector
@@ -195,9 +189,9 @@ def learn_judges(
     return replace(judges, tails=tails)
 
 
-def with_hysteresis(level: Array, threshold: float, release: float = RELEASE) -> NDArray[np.bool_]:
+def with_hysteresis(level: Array, threshold: float) -> NDArray[np.bool_]:
     """Alarm ``(n,)`` that begins above a threshold and ends below a share of it."""
-    state = np.where(level > threshold, 1, np.where(level > release * threshold, 0, -1))
+    state = np.where(level > threshold, 1, np.where(level > RELEASE * threshold, 0, -1))
     places = np.maximum.accumulate(np.where(state != 0, np.arange(len(state)), -1))
     return np.asarray((places >= 0) & (state[np.maximum(places, 0)] == 1))
 

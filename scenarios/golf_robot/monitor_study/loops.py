@@ -37,14 +37,8 @@ CONTROLLER, PRIOR = "hybrid_observer", "prior_observer"
 
 @dataclass(frozen=True)
 class MonitorRunner:
-    """Runs the study's jobs; sent to each worker once.
-
-    Args:
-        study: The study.
-        model: Its model.
-        folder: Folder of the study: learning data go there, what was learned is read there.
-
-    Example: ``MonitorRunner(study, model, "studies/monitor")(job)["loops"]``
+    """Runs the study's jobs; sent to each worker once. Learning data go to ``folder``, what was learned is read
+    there.
     """
 
     study: MonitorStudy
@@ -69,7 +63,7 @@ class _Loops:
         kit = load(local_folder(runner.model)).with_noise(dict(runner.model.noise))
         self._bench = Bench(load_scenario(runner.study.scenario), {MODEL: kit})
         self._kit = self._bench.kits[MODEL]
-        self._task = plain_task(selected_tasks(self._bench.scenario, (runner.study.task,))[0])
+        self._task = replace(selected_tasks(self._bench.scenario, (runner.study.task,))[0], faults=())
         self._dt = self._kit.models["hybrid"].dt
         self._judges: Judges | None = None
 
@@ -87,7 +81,8 @@ class _Loops:
             return self._guarded(job.plans[0], job.arm)
         traces = self._nominal(job.plans)
         if job.kind == LEARN:
-            write_learning(self._folder / LEARNING / f"{job.id}.npz", traces)
+            arrays = {f"{name}_{i}": value for i, t in enumerate(traces) for name, value in vars(t).items()}
+            write_arrays(self._folder / LEARNING / f"{job.id}.npz", arrays)
             return {"loops": [{"seconds": plan.duration} for plan in job.plans]}
         shown = [nominal_figures(self._study, self.judges, t) for t in traces]
         return {"loops": [{"case": p.case, **f} for p, f in zip(job.plans, shown, strict=True)]}
@@ -145,11 +140,6 @@ def trace_of(result: ClosedLoopResult) -> Trace:
     return Trace(result.numbers, result.level, result.innovation, result.nis, speed)
 
 
-def plain_task(task: Task) -> Task:
-    """The task without disturbances of its own."""
-    return replace(task, faults=())
-
-
 def nominal_figures(study: MonitorStudy, judges: Judges, trace: Trace) -> dict[str, Any]:
     """Of a nominal loop: false alarms by rate and method, and the largest scores of its blocks."""
     dt, levels = judges.detector.dt, judges.levels(trace)
@@ -192,12 +182,6 @@ def _delay(alarm: NDArray[np.bool_], moved: Array) -> float:
     """Time in motion [s] to the first alarm; infinite without one."""
     places = np.flatnonzero(alarm)
     return float(moved[places[0]]) if places.size else float("inf")
-
-
-def write_learning(path: Path, traces: list[Trace]) -> None:
-    """Keep what is learned from."""
-    arrays = {f"{name}_{i}": value for i, t in enumerate(traces) for name, value in vars(t).items()}
-    write_arrays(path, arrays)
 
 
 def learn(study: MonitorStudy, paths: list[Path], artifact: Kit) -> Judges:

@@ -25,12 +25,7 @@ LINES: Mapping[str, tuple[str, str, str]] = {
 
 
 def method_name(method: str) -> str:
-    """Human name of a method of detection; an unknown one stays as it is.
-
-    Example:
-        >>> method_name("guard")
-        'guard (energy)'
-    """
+    """Human name of a method of detection; an unknown one stays as it is."""
     return LINES[method][0] if method in LINES else plain(method)
 
 
@@ -62,13 +57,7 @@ def delays(cases: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
 def operating_curves(
     cases: Mapping[str, Mapping[str, tuple[Sequence[float], Sequence[float]]]], wanted: float
 ) -> Figure:
-    """Share of faults found within a second against false alarms an hour, one panel a fault.
-
-    Example:
-        >>> figure = operating_curves({"push": {"guard": ([60.0, 0.0], [1.0, 0.5])}}, 1.0)
-        >>> len(figure.axes)
-        1
-    """
+    """Share of faults found within a second against false alarms an hour, one panel a fault."""
     rates = [r for row in cases.values() for per_hour, _ in row.values() for r in per_hour if r > 0]
     if not rates:
         raise InputError("plot of operating curves: there is none")
