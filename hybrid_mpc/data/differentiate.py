@@ -31,13 +31,7 @@ SLOWEST = 2e-4
 
 @dataclass(frozen=True)
 class Derivatives:
-    """A smoothed signal with its first two derivatives, each of the signal's shape.
-
-    Args:
-        value: Smoothed signal.
-        first: First derivative [1/s].
-        second: Second derivative [1/s^2].
-    """
+    """A smoothed signal with its first two derivatives [1/s], [1/s^2], each of the signal's shape."""
 
     value: Array
     first: Array

@@ -108,14 +108,11 @@ def _patience(recordings: Sequence[Recording], j: int, spec: DataSpec) -> float:
 
 @dataclass(frozen=True)
 class Still:
-    """Equal samples in a row that are no rest.
+    """Equal samples in a row, from index ``first`` to ``last``, that are no rest.
 
-    Args:
-        first: Index of the first of them.
-        last: Index of the last.
-        why: ``"abrupt"``: it begins or ends in full motion; ``"noise"``: the sensor's noise stops, too; ``"driven"``:
-            the inputs go on.
-        amount: Speed right before or after [unit/s]; standard deviation of the noise [unit]; length [s].
+    ``"abrupt"``: it begins or ends in full motion; ``"noise"``: the sensor's noise stops, too; ``"driven"``: the
+    inputs go on. ``amount`` is the speed right before or after [unit/s], the standard deviation of the noise [unit],
+    the length [s].
     """
 
     first: int
@@ -133,16 +130,6 @@ def still_stretches(
     this one is ``ABRUPT`` times as sharp. Steps of the sensor count as changes. ``"noise"``: a sensor whose noise is
     larger than its steps flickers at rest, and here it does not; exact zeros, which speeds made from counts have at
     rest, do not count. ``"driven"``: the inputs go on for longer than ``patience``.
-
-    Example:
-        >>> t = 0.01 * np.arange(400)
-        >>> y = np.sin(3 * t).round(2)  # a coarse sensor: rests at every turn of the motion are no fault
-        >>> still_stretches(t, y, y[:, None], max_gap=0.05, patience=9.0, spreads=np.ones(1))
-        ()
-        >>> y[150:210] = y[150]
-        >>> [(s.first, s.last, s.why) for s in still_stretches(
-        ...     t, y, y[:, None], max_gap=0.05, patience=9.0, spreads=np.ones(1))]
-        [(150, 209, 'abrupt')]
     """
     flat = np.r_[False, (np.diff(y) == 0) & ~gaps(t, max_gap), False]
     edges = np.flatnonzero(np.diff(flat.astype(np.int8)))

@@ -54,20 +54,11 @@ ABSURD = 1e100
 
 @dataclass(frozen=True)
 class Finding:
-    """What is doubtful about one channel of one recording.
+    """What is doubtful about one channel of one recording; ``refused`` where nothing can be identified from it as it
+    is.
 
-    Args:
-        kind: ``"wrapped"``, ``"frozen"``, ``"clipped"`` or ``"speed"``.
-        file: Name of the file.
-        channel: Column.
-        start: Time of the first sample concerned [s], in the recording's own time.
-        count: Samples concerned; of a wrapped angle, its jumps.
-        message: What was found, what is the likely cause, and what to do.
-        refused: Whether nothing can be identified from the recording as it is. Default: no.
-
-    Example:
-        >>> print(Finding("frozen", "monday.csv", "phi", 3.0, 200, "column 'phi' repeats itself"))
-        monday.csv: column 'phi' repeats itself
+    ``start`` is the time [s] of the first sample concerned, in the recording's own time; ``count`` the samples
+    concerned, of a wrapped angle its jumps. ``message`` says what was found, the likely cause, and what to do.
     """
 
     kind: Literal["wrapped", "frozen", "clipped", "speed"]
@@ -84,16 +75,10 @@ class Finding:
 
 @dataclass(frozen=True)
 class Recording:
-    """One recording as it was written, checked.
+    """One recording as it was written, checked: ``m`` samples; its ``name`` is the file's stem.
 
-    Args:
-        name: File stem; windows are looked up by it.
-        path: The file.
-        sha256: SHA-256 of the file's bytes, in hexadecimal.
-        t: Time stamps ``(m,)`` [s], strictly increasing.
-        u: Inputs ``(m, n_u)``, held from each time stamp to the next.
-        y: Measured outputs ``(m, n_y)``; those of periodic signals count on.
-        findings: Angles that were wrapped. Default: none.
+    ``t`` ``(m,)`` [s] increases strictly; inputs ``u`` ``(m, n_u)`` are held from each time stamp to the next;
+    outputs ``y`` ``(m, n_y)`` of periodic signals count on. ``findings`` are the angles that were wrapped.
     """
 
     name: str
@@ -131,11 +116,6 @@ def read_recordings(
     """Read the recordings of one run: :func:`read_recording` for each, with ``spec.inputs_of`` for those it names.
 
     They may differ in format, length and sampling, and in columns that ``spec`` does not name.
-
-    Example:
-        >>> spec = DataSpec("t", ("u",), ("y",), dt=0.1, max_gap=0.2, smoothing=0.5, warm_up=0.5)
-        >>> read_recordings([], spec, outputs=[Signal("y", "rad")], inputs=[Signal("u", "N m")])
-        ([], [])
     """
     if len(spec.outputs) != len(outputs) or len(spec.inputs) != len(inputs):
         raise InputError(
@@ -333,15 +313,9 @@ def _turn(signal: Signal) -> float | None:
 
 
 def unwrapped(t: Array, angle: Array, turn: float, max_gap: float) -> tuple[Array, NDArray[np.intp]]:
-    """An angle that counts on, and the places where it jumped by about a full turn.
+    """An angle that counts on, and the indices of the samples where it jumped by about a full turn.
 
     An angle is wrapped if it keeps within one turn and jumps by about one between neighbouring samples.
-
-    Example:
-        >>> angle = np.array([2.0, 2.6, 3.1, -2.7, -2.2, -2.8, 3.0])
-        >>> angle, jumps = unwrapped(np.arange(7.0), angle, 2 * np.pi, 1.5)
-        >>> angle.round(2).tolist(), jumps.tolist()
-        ([2.0, 2.6, 3.1, 3.58, 4.08, 3.48, 3.0], [3, 6])
     """
     step = np.diff(angle)
     jumps = ~gaps(t, max_gap) & (np.abs(np.abs(step) - turn) <= NEARLY * turn)

@@ -134,9 +134,6 @@ def load_trajectories(
             are not checked.
         needed: Roles that must not be empty. Default: all three.
 
-    Returns:
-        The data set; it has at least one trajectory of each role that is needed.
-
     Raises:
         InputError: If recordings are bad (see :func:`~hybrid_mpc.data.recording.read_recording`), columns differ
             between them, windows overlap, a role gets no trajectory, the sampling is too coarse or too uneven for

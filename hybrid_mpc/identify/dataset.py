@@ -15,13 +15,10 @@ from hybrid_mpc.errors import InputError
 
 @dataclass(frozen=True)
 class Windows:
-    """Equal windows cut from trajectories: a warm-up on measurements, then a scored part.
+    """Equal windows cut from trajectories [SI]: a warm-up of ``warm`` samples on measurements, then a scored part.
 
-    Args:
-        x: States ``(n, warm + horizon + 1, n_x)`` [SI].
-        u: Inputs ``(n, warm + horizon, n_u)`` [SI].
-        warm: Samples of the warm-up.
-        xdot: Derivatives of the states at the periods' starts ``(n, warm + horizon, n_x)`` [SI].
+    States ``x`` are ``(n, warm + horizon + 1, n_x)``; inputs ``u`` and the states' derivatives ``xdot`` at the
+    periods' starts ``(n, warm + horizon, ...)``.
     """
 
     x: Tensor

@@ -25,18 +25,9 @@ STARTS = 5
 class FreeRun:
     """A free run over one trajectory after its warm-up, and the measurement; n scored periods.
 
-    Args:
-        name: The trajectory's name.
-        t: Times [s] ``(n,)``.
-        u: Inputs ``(n, n_u)``.
-        x: Measured (smoothed) states ``(n, n_x)``.
-        x_hat: States of the model ``(n, n_x)``.
-        y: Measured outputs ``(n, n_y)``, not smoothed.
-        y_hat: Outputs of the model ``(n, n_y)``.
-        xdot: Measured mean rates over each period ``(n, n_x)``.
-        xdot_hat: Mean rates of the model ``(n, n_x)``.
-        energy_measured_w: ΔE_S [W] ``(n,)``, the prior's balance on the measurement.
-        energy_model_w: ΔE_M [W] ``(n,)`` on the model's own run.
+    ``x`` are the measured, smoothed states, ``y`` the measured outputs, not smoothed; ``xdot`` and ``xdot_hat`` are
+    mean rates over each period. ``energy_measured_w`` is ΔE_S, the prior's balance on the measurement,
+    ``energy_model_w`` ΔE_M on the model's own run.
     """
 
     name: str

@@ -24,12 +24,7 @@ ENERGY = BalanceInfo("energy", "J", "W")
 
 @dataclass(frozen=True)
 class Parity:
-    """Largest differences between the exported step and torch in float64, relative to the outputs' scale.
-
-    Args:
-        max_abs_error: Of the values.
-        jacobian_max_abs_error: Of the Jacobians.
-    """
+    """Largest differences between the exported step and torch in float64, relative to the outputs' scale."""
 
     max_abs_error: float
     jacobian_max_abs_error: float

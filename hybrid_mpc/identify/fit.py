@@ -167,12 +167,7 @@ EVALUATIONS = 15
 
 @dataclass(frozen=True)
 class Segments:
-    """Adjacent segments of trajectories.
-
-    Args:
-        windows: The segments, ``n`` of them.
-        joined: True ``(n,)`` where a segment's end is the next one's start.
-    """
+    """Adjacent segments of trajectories; ``joined`` ``(n,)`` is true where a segment's end is the next one's start."""
 
     windows: Windows
     joined: NDArray[np.bool_]

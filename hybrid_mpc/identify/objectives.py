@@ -43,14 +43,11 @@ class VectorPerformanceIndex:
 
 @dataclass(frozen=True)
 class Prediction:
-    """A model's prediction along windows and the measurement, at the periods' starts.
+    """A model's prediction along windows and the measurement, at the periods' starts; ``(..., n_x)`` and ``(...,
+    n_u)``.
 
-    Args:
-        x: Measured states ``(..., n_x)``.
-        x_hat: States of the model (the measured ones under teacher forcing).
-        u: Inputs ``(..., n_u)``.
-        xdot: Measured rates ``(..., n_x)``, as the model's form has them (hybrid: means over the period).
-        xdot_hat: Rates of the model.
+    ``x_hat`` are the measured states under teacher forcing; rates ``xdot`` are as the model's form has them (hybrid:
+    means over the period).
     """
 
     x: Tensor

@@ -35,13 +35,10 @@ AT_BOUND = 1e-3
 
 @dataclass(frozen=True)
 class Runs:
-    """Free runs to be fitted.
+    """Free runs to be fitted: first states ``x`` ``(n, n_x)``, measured outputs ``y`` ``(n, periods, n_y)`` after
+    each period.
 
-    Args:
-        x: First states ``(n, n_x)``.
-        u: Commanded inputs ``(n, lead + periods, n_u)``, from ``lead`` samples before the first state on.
-        y: Measured outputs after each period ``(n, periods, n_y)``.
-        lead: Samples before the first state.
+    The commanded inputs ``u`` ``(n, lead + periods, n_u)`` begin ``lead`` samples before the first state.
     """
 
     x: Tensor
@@ -51,17 +48,9 @@ class Runs:
 
 
 def cut_runs(trajectories: Sequence[Trajectory], periods: int, lead: int, most: int) -> Runs:
-    """At most ``most`` free runs of ``periods``, one after the other, evenly chosen.
-
-    Example:
-        >>> z = np.zeros((50, 1))
-        >>> run = Trajectory("run", "train", 0.1, 0.1 * np.arange(50), z, z, np.zeros((50, 2)), np.zeros((50, 2)))
-        >>> cut_runs([run], 20, lead=3, most=10).u.shape
-        torch.Size([2, 23, 1])
-    """
-    starts = [
-        (t, k) for t in trajectories for k in range(lead, len(t.t) - periods, periods)
-    ]  # a run needs the sample after its last period
+    """At most ``most`` free runs of ``periods``, one after the other, evenly chosen."""
+    # a run needs the sample after its last period
+    starts = [(t, k) for t in trajectories for k in range(lead, len(t.t) - periods, periods)]
     if not starts:
         longest = max((len(t.t) for t in trajectories), default=0)
         raise InputError(

@@ -42,13 +42,10 @@ recordings, an angle by sine and cosine."""
 
 @dataclass(frozen=True)
 class PriorReplay:
-    """Runs of the prior, and how much each of their states counts.
+    """Runs of the prior ``(FOLLOWED + COUNTED, n, ...)`` [SI], and how much each of their states counts.
 
-    Args:
-        x: States ``(FOLLOWED + COUNTED, n, n_x)`` [SI].
-        u: Inputs ``(FOLLOWED + COUNTED, n, n_u)`` [SI].
-        weight: ``(FOLLOWED + COUNTED, n)``: 0 at a recorded sample, 1 far from all of them; 0 beyond the measured
-            range of a state that is no angle.
+    The weight is 0 at a recorded sample, 1 far from all of them, 0 beyond the measured range of a state that is no
+    angle.
     """
 
     x: Tensor

@@ -9,8 +9,7 @@ import hashlib
 import math
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
@@ -270,8 +269,8 @@ def tune(
     while (number := len(_finished(study))) < trials:
         trial = _ask(study, number, base, space, seed)
         settings = space.apply(base, trial.params)
-        with _recorded(study, trial, partial(on_progress, number)) as report:
-            report.trained = train(prior, training, validation, settings, on_progress=report)
+        own = partial(train, prior, training, validation, settings)
+        _tried(study, trial, own, partial(on_progress, number))
         if timeout is not None and time.monotonic() - start >= timeout:
             break
     return _result(study, base, space)
@@ -286,34 +285,27 @@ def check_numbers(trials: int, seed: int, timeout: float | None) -> None:
         )
 
 
-class _Report:
-    """Hands the validation errors of a training on, to the user and to the pruner."""
+def _tried(
+    study: optuna.Study,
+    trial: Trial,
+    training: Callable[..., Trained],
+    on_progress: Callable[[int, int, float], None],
+) -> None:
+    """Make a trial's training and store how it ended; one that is interrupted stays open and is drawn again."""
 
-    def __init__(self, trial: Trial, on_progress: Callable[[int, int, float], None]) -> None:
-        self.trial, self.on_progress = trial, on_progress
-        self.trained: Trained | None = None
-
-    def __call__(self, done: int, total: int, error: float) -> None:
-        self.trial.report(error, done)
-        self.on_progress(done, total, error)
-        if done < total and self.trial.should_prune():
+    def report(done: int, total: int, error: float) -> None:
+        trial.report(error, done)
+        on_progress(done, total, error)
+        if done < total and trial.should_prune():
             raise optuna.TrialPruned
 
-
-@contextmanager
-def _recorded(
-    study: optuna.Study, trial: Trial, on_progress: Callable[[int, int, float], None]
-) -> Iterator[_Report]:
-    """Store how a trial ended; one that is interrupted stays open and is drawn again."""
-    report = _Report(trial, on_progress)
     try:
-        yield report
+        trained = training(on_progress=report)
     except optuna.TrialPruned:
         study.tell(trial, state=TrialState.PRUNED)
-        return
-    assert report.trained is not None
-    trial.set_user_attr("mean", str(float(report.trained.validation.mean())))
-    study.tell(trial, float(report.trained.validation.min()))
+    else:
+        trial.set_user_attr("mean", str(float(trained.validation.mean())))
+        study.tell(trial, float(trained.validation.min()))
 
 
 def _ask(study: optuna.Study, number: int, base: TrainingSettings, space: SearchSpace, seed: int) -> Trial:
@@ -389,14 +381,7 @@ def _row(number: int, trial: FrozenTrial) -> TrialRow:
 
 
 def open_study(storage: Path, identity: Mapping[str, str]) -> optuna.Study:
-    """The study of a journal, whose trials are all finished or given up.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     open_study(Path(folder) / "tune.jsonl", {"seed": "0"}).user_attrs
-        {'identity': {'seed': '0'}}
-    """
+    """The study of a journal, whose trials are all finished or given up."""
     storage.parent.mkdir(parents=True, exist_ok=True)
     _mend(storage)
     verbosity = optuna.logging.get_verbosity()

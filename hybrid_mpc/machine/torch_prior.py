@@ -256,9 +256,6 @@ def with_friction(base: type[Prior], *terms: FrictionTerm) -> type[Prior]:
         base: Prior class with ``inertia(x)``.
         terms: Blocks, any number on any axis.
 
-    Returns:
-        A class like ``base``: ``cls(values)``.
-
     Raises:
         InputError: If there is no term, ``base`` has no ``inertia``, a parameter's name is there already, or there
             is no such axis.
@@ -287,7 +284,10 @@ def with_friction(base: type[Prior], *terms: FrictionTerm) -> type[Prior]:
 
     class Rubbing(base):  # type: ignore[valid-type,misc]
         parameters_spec = (*base.parameters_spec, *added)
-        balance_follows_acceleration = follows_acceleration(base)
+        # whether the balance is made of ``acceleration``, not written out term by term
+        balance_follows_acceleration = base.energy_balance is Prior.energy_balance or bool(
+            getattr(base, "balance_follows_acceleration", False)
+        )
 
         def acceleration(self, x: Tensor, u: Tensor) -> Tensor:
             free: Tensor = super().acceleration(x, u)
@@ -299,18 +299,8 @@ def with_friction(base: type[Prior], *terms: FrictionTerm) -> type[Prior]:
                 return balance  # it is made of this class's acceleration
             return balance + (torques(self, x) * x[..., self.n_q :]).sum(-1)
 
-    return _named(Rubbing, base, f"{base.__name__}With{''.join(type(t).__name__ for t in terms)}")
-
-
-def follows_acceleration(base: type[Prior]) -> bool:
-    """Whether a class's energy balance is made of its ``acceleration``, not written out term by term."""
-    own = base.energy_balance is Prior.energy_balance
-    return own or bool(getattr(base, "balance_follows_acceleration", False))
-
-
-def _named(made: Any, base: type[Prior], name: str) -> type[Prior]:
-    """The class under a name and with a docstring that tell what it is."""
-    made.__name__ = made.__qualname__ = name
+    made: Any = Rubbing  # under a name and with a docstring that tell what it is
+    made.__name__ = made.__qualname__ = f"{base.__name__}With{''.join(type(t).__name__ for t in terms)}"
     made.__module__, made.__doc__ = base.__module__, base.__doc__
     result: type[Prior] = made
     return result
