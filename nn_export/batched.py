@@ -71,17 +71,7 @@ OPERATORS: dict[int, Callable[..., Tensor]] = {
 
 @dataclass(frozen=True)
 class Batched:
-    """A CasADi function over batches, with its derivatives as further ones.
-
-    Args:
-        function: Any CasADi function.
-
-    Example:
-        >>> x = ca.SX.sym("x", 2)
-        >>> square = Batched(ca.Function("f", [x], [x * x]))
-        >>> square.evaluate([torch.tensor([[1.0, 2.0], [3.0, 4.0]], dtype=torch.float64)])[0].tolist()
-        [[1.0, 4.0], [9.0, 16.0]]
-    """
+    """A CasADi function over batches, with its derivatives as further ones."""
 
     function: ca.Function
 
@@ -102,11 +92,7 @@ class Batched:
         return steps if all(step.code in known for step in steps) else None
 
     def walk(self, args: list[Tensor]) -> list[Tensor]:
-        """The same, by torch operators.
-
-        Raises:
-            ExportError: If the function has no such form.
-        """
+        """The same, by torch operators."""
         if self.steps is None:
             raise ExportError(
                 f"{self.function.name()} has no form in torch operators (a solver, a table, external code, or more "

@@ -63,42 +63,20 @@ LOOK = 4
 
 
 class Budget:
-    """What is left of limits.
-
-    Args:
-        limits: The limits. Default: :class:`Limits`.
-
-    Example:
-        >>> budget = Budget(Limits(nodes=100))
-        >>> budget.spend("this one", nodes=70)
-        >>> try:
-        ...     budget.spend("that one", nodes=70)
-        ... except ProgramError as error:
-        ...     print(str(error).split(";")[0])
-        that one: it would come to 70 operations of CasADi's graph with 70 before it, the limit is 100
-    """
+    """What is left of limits."""
 
     def __init__(self, limits: Limits | None = None) -> None:
         self.limits = Limits() if limits is None else limits
         self._spent = Cost(0, 0, 0, 0)
 
     def spend(self, what: str, *, elements: int = 0, memory: int = 0, work: int = 0, nodes: int = 0) -> None:
-        """Take off what something costs.
-
-        Raises:
-            ProgramError: If that is more than is left; it names ``what``.
-        """
+        """Take off what something costs."""
         cost = Cost(elements, memory, work, nodes)
         if not self._take(cost):
             raise self._refusal(what, cost)
 
     def add(self, program: Program, where: str = "") -> None:
-        """Take off what a program costs as a function.
-
-        Raises:
-            ProgramError: If that is more than is left, naming the node; if an operator gets arguments that it does not
-                know.
-        """
+        """Take off what a program costs as a function."""
         if program.known_cost is not None and self._take(program.known_cost):
             return
         self.check_count(len(program.nodes), where)
@@ -115,11 +93,7 @@ class Budget:
         object.__setattr__(program, "known_cost", Cost(largest, memory, work, nodes))
 
     def check_count(self, operators: int, where: str = "") -> None:
-        """Refuse a number of operators that is too large whatever they are.
-
-        Raises:
-            ProgramError: If it is.
-        """
+        """Refuse a number of operators that is too large whatever they are."""
         if EACH_OPERATOR * operators > self.limits.nodes:
             raise self._refusal(f"{where}{operators} operators", Cost(0, 0, 0, EACH_OPERATOR * operators))
 
@@ -157,11 +131,7 @@ def _count(n: int) -> str:
 
 
 def costs(program: Program) -> Iterator[tuple[str | Node, Cost]]:
-    """What each part of a program costs, in order: its inputs and weights, its nodes, and all outputs together.
-
-    Raises:
-        ProgramError: If an operator gets arguments that it does not know.
-    """
+    """What each part of a program costs, in order: its inputs and weights, its nodes, and all outputs together."""
     walk = _Walk()
     yield "the program", Cost(0, 0, 0, EACH_PROGRAM)
     for port in program.inputs:
@@ -306,18 +276,12 @@ def _said(value: Any) -> str:
     return f"a list of {len(value)}" if isinstance(value, list) else f"{value!r:.100}"
 
 
-_BOUND = {
-    op: _bound(op) for op in OPERATORS
-}  # here, as Python evaluates annotations: loading is to evaluate nothing
+# here, as Python evaluates annotations: loading is to evaluate nothing
+_BOUND = {op: _bound(op) for op in OPERATORS}
 
 
 def resolve(data: Any, values: Mapping[tuple[str, str], Any]) -> Any:
-    """Arguments of a node with values in the place of references, and numbers in that of ``{"float": "inf"}``.
-
-    Example:
-        >>> resolve([{"input": "x"}, {"float": "inf"}, [1, None]], {("input", "x"): "the value"})
-        ['the value', inf, [1, None]]
-    """
+    """Arguments of a node with values in the place of references, and numbers in that of ``{"float": "inf"}``."""
     if type(data) is list:
         return [resolve(item, values) if type(item) in (dict, list) else item for item in data]
     if type(data) is dict:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -11,7 +12,6 @@ from typing import Any, Generic, TypeVar
 import casadi as ca
 
 from nn_export.budget import Budget
-from nn_export.graph import operations
 from nn_export.operators import cells
 from nn_export.operators.costs import HUGE, NUMBER
 
@@ -22,11 +22,7 @@ Known = TypeVar("Known")
 
 
 class Chain(ABC, Generic[Known]):
-    """The cuts of a graph: cells in order, each with its arguments; then what is known of their outputs.
-
-    Args:
-        budget: What all that is made here is taken off.
-    """
+    """The cuts of a graph: cells in order, each with its arguments; then what is known of their outputs."""
 
     def __init__(self, budget: Budget) -> None:
         self.budget = budget
@@ -73,11 +69,7 @@ class Chain(ABC, Generic[Known]):
         return [known[k] for k in range(len(targets))]
 
     def spend(self, symbols: list[ca.MX], slopes: Iterable[Mapping[str, Any]]) -> None:
-        """Take off what the Jacobians of a cell's results cost, by all that its arguments depend on.
-
-        Raises:
-            ProgramError: If there is not as much left.
-        """
+        """Take off what the Jacobians of a cell's results cost, by all that its arguments depend on."""
         widths = {name: slope.shape[1] for by_name in slopes for name, slope in by_name.items()}
         size = sum(symbol.numel() for symbol in symbols)
         self.budget.spend(
@@ -104,13 +96,9 @@ class Chain(ABC, Generic[Known]):
 
 @dataclass(frozen=True)
 class Piece:
-    """Expressions and their Jacobians.
+    """Expressions ``values`` of the symbols ``inner``, scalar code (SX) or a graph of MX, and their Jacobians.
 
-    Args:
-        scalar: True for an SX graph, False for one of MX.
-        inner: Its symbols.
-        values: The expressions.
-        blocks: The Jacobian of each expression, a row, by each symbol; empty by those that nobody asks for.
+    ``blocks`` has a row an expression, with its Jacobian by each symbol; empty by those that nobody asks for.
     """
 
     scalar: bool
@@ -120,11 +108,7 @@ class Piece:
 
 
 def differentiated(symbols: list[ca.MX], targets: list[ca.MX], wanted: list[bool], budget: Budget) -> Piece:
-    """Expressions with their Jacobians by the symbols that are wanted, as scalar code where they are small.
-
-    Raises:
-        ProgramError: If the budget does not hold them.
-    """
+    """Expressions with their Jacobians by the symbols that are wanted, as scalar code where they are small."""
     piece = ca.Function("piece", symbols, targets)
     rows, columns = _edges(targets), _edges(list(compress(symbols, wanted)))
     sweeps = min(rows[-1], columns[-1])
@@ -156,3 +140,19 @@ def differentiated(symbols: list[ca.MX], targets: list[ca.MX], wanted: list[bool
 
 def _edges(parts: list[ca.MX]) -> list[int]:
     return list(accumulate((p.numel() for p in parts), initial=0))
+
+
+def operations(f: ca.Function) -> float:
+    """Scalar operations of a matrix graph, about; infinite if it calls functions that are no scalar code."""
+    total = 0
+    for k in range(f.n_instructions()):
+        kind = f.instruction_id(k)
+        if kind == ca.OP_CALL:
+            called = f.instruction_MX(k).which_function()
+            if not called.is_a("SXFunction"):
+                return math.inf
+            total += called.n_instructions()
+        elif kind not in (ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST):
+            node = f.instruction_MX(k)
+            total += node.numel() * (2 * node.dep(1).size2() if kind == ca.OP_MTIMES else 1)
+    return total

@@ -121,7 +121,7 @@ def generate_c(
     points: Sequence[Sequence[np.ndarray | float]] | None = None,
     seed: int = 0,
 ) -> CFiles:
-    """Write a function as self-contained C with a header and a test program.
+    """Write a function as self-contained C with a header and a test program, and return their paths.
 
     ``cc <name>.c <name>_test.c -lm && ./a.out`` prints one line a sample (all outputs, column by column) and
     ends with status 0 if all agree with CasADi to 1e-9 relative to the largest output (``-DTOLERANCE=...``
@@ -133,9 +133,6 @@ def generate_c(
         points: Samples for the test program: for each one value for each input. Default: three samples of
             normal random numbers.
         seed: Seed of the random samples.
-
-    Returns:
-        The paths.
 
     Raises:
         CompileError: If CasADi cannot write the function as C.
@@ -245,10 +242,7 @@ def _process_folder() -> Path:
 def _distrust(path: Path, kind: Callable[[int], bool], rights: int) -> str:
     """Why others could have put code into a file or folder; empty if they could not.
 
-    Args:
-        path: The file or folder.
-        kind: What it must be, e.g. ``stat.S_ISDIR``.
-        rights: Rights of group and others that are too many.
+    ``rights`` are those of group and others that are too many.
     """
     if os.name != "posix":
         return ""
@@ -348,12 +342,7 @@ int main(void) {{
 
 
 def main_program(f: ca.Function, points: Sequence[Sequence[np.ndarray | float]]) -> str:
-    """C text of a main program that evaluates ``f`` at the points and compares with CasADi.
-
-    Args:
-        f: The function, written as C beside it.
-        points: Samples: for each one value for each input.
-    """
+    """C text of a main program that evaluates ``f`` at the points and compares with CasADi."""
     inputs, expected = [], []
     for point in points:
         held = [ca.DM(ca.project(ca.DM(v), f.sparsity_in(i))) for i, v in enumerate(point)]

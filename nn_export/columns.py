@@ -20,14 +20,8 @@ Results: TypeAlias = Mapping[str, Array]
 
 @dataclass(frozen=True, eq=False)
 class Slot:
-    """Where a Jacobian of ``n`` points is kept.
-
-    Args:
-        shape: Its rows and columns.
-        own: An array ``(n, *shape)`` of its own; None if it is part of a result.
-        block: The result's name.
-        rows: Rows there.
-        columns: Columns there.
+    """Where a Jacobian of ``n`` points is kept: in an array ``own`` ``(n, *shape)``, or as rows and columns of the
+    result ``block``.
     """
 
     shape: tuple[int, int]
@@ -46,15 +40,7 @@ Slope: TypeAlias = Array | Slot
 
 
 class Sum:
-    """A sum of products of two Jacobians each.
-
-    Example:
-        >>> terms = Sum()
-        >>> terms.add(np.eye(2), np.ones((2, 1)))
-        >>> terms.add(np.eye(2), np.ones((2, 1)))
-        >>> terms.known().tolist()
-        [[2.0], [2.0]]
-    """
+    """A sum of products of two Jacobians each."""
 
     def __init__(self) -> None:
         self.columns = 0
@@ -130,11 +116,9 @@ def matrices(weights: cells.Weights) -> list[Array | None]:
 class _Pattern:
     """Which of the row factors of a new state's Jacobian are the same: gates that share one are added.
 
-    Args:
-        first: Positions of the different factors among all, the input's gates first.
-        by_input: For every gate of the input its factor's number, or None.
-        by_hidden: The same of the hidden state.
-        diagonal: Old states that the new one depends on entry by entry.
+    ``first`` are the positions of the different factors among all, the input's gates first; ``by_input`` and
+    ``by_hidden`` have each gate's factor by number, or None; ``diagonal`` the old states that the new one depends on
+    entry by entry.
     """
 
     first: list[int]
@@ -161,12 +145,8 @@ class _Pattern:
 class _Jacobian:
     """Jacobian of new state ``k`` by one input of the program: the sum of its parts.
 
-    Args:
-        k: The new state.
-        slot: Where it goes.
-        weights: Rows of the constant part ``(H, factors, columns)``, to be scaled; None if there is none.
-        products: The cell's own Jacobian, times that of its argument.
-        diagonal: Old states with their Jacobians; None is the identity.
+    ``weights`` ``(H, factors, columns)`` are rows of the constant part, to be scaled; ``products`` the cell's own
+    Jacobian times that of its argument; ``diagonal`` old states with their Jacobians, None for the identity.
     """
 
     k: int
@@ -177,14 +157,7 @@ class _Jacobian:
 
 
 class CellColumns:
-    """A cell at ``n`` points, values and Jacobians.
-
-    Args:
-        kind: The cell.
-        x: Its input ``(F, n)``, an array that stays.
-        state: Its states ``(H, n)``, so too.
-        weights: Weights and biases, as :func:`matrices` gives them.
-    """
+    """A cell at ``n`` points, values and Jacobians; its input ``(F, n)`` and states ``(H, n)`` are arrays that stay."""
 
     values: list[Array]
     """New states ``(H, n)``, filled by a call."""
@@ -211,11 +184,8 @@ class CellColumns:
     ) -> Slot:
         """Have the Jacobian of new state ``k`` by one input of the program taken by every call.
 
-        Args:
-            k: The new state.
-            slot: Gives the place for a number of columns.
-            x: The Jacobian of the cell's input; None if it does not depend on the program's.
-            state: The Jacobians of its states.
+        ``slot`` gives the place for a number of columns; ``x`` and ``state`` are the Jacobians of the cell's input
+        (None if it does not depend on the program's) and of its states.
         """
         pattern, constant = self._patterns[k], None
         products: list[tuple[Slope, Slope | None]] = []

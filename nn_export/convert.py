@@ -32,11 +32,7 @@ Graph = tuple[
 
 
 def convert(exported: torch.export.ExportedProgram, input_names: list[str], n_outputs: int) -> Graph:
-    """Nodes, output references with shapes, weights and inputs of an exported program.
-
-    Raises:
-        ExportError: One of the named errors that :func:`nn_export.trace` lists.
-    """
+    """Nodes, output references with shapes, weights and inputs of an exported program."""
     _check_mutations(exported)
     calls = [n for n in exported.graph.nodes if n.op not in ("placeholder", "output")]
     calls = [n for n in calls if str(n.target) not in _SKIPPED]
@@ -145,17 +141,7 @@ _TORCH = str(Path(torch.__file__).parent)
 
 
 def check_operators(calls: list[torch.fx.Node]) -> None:
-    """Refuse a graph that cannot be repeated exactly; all operators of a kind are listed at once.
-
-    Args:
-        calls: Calls of the graph in order.
-
-    Raises:
-        DynamicShapeError: If a size depends on values.
-        DtypeError: If a result is complex, or computed in less than float64.
-        TrainingModeError: If a call draws random numbers or uses batch statistics.
-        UnsupportedOperatorError: If an operator or one of its arguments is not known.
-    """
+    """Refuse a graph that cannot be repeated exactly; all operators of a kind are listed at once."""
     _raise(DynamicShapeError, _DYNAMIC, [n for n in calls if _dynamic(n)])
     _raise(DtypeError, _COMPLEX, [n for n in calls if any(v.is_complex() for v in results(n))])
     unknown = [n for n in calls if op_name(n) not in OPERATORS]

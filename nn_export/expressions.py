@@ -41,17 +41,10 @@ PASSES = 4
 
 @dataclass(frozen=True)
 class Step:
-    """One scalar operation of a function: values are numbered registers, which are used again.
+    """One scalar operation (CasADi's ``code``) of a function: values are numbered registers, which are used again.
 
-    Args:
-        code: CasADi's number of the operation, e.g. ``ca.OP_MUL``.
-        taken: Registers of its arguments; for an input ``(input, nonzero)``, for a constant its value alone.
-        given: Register of its result; for an output ``(output, nonzero)``.
-
-    Example:
-        >>> x = ca.SX.sym("x")
-        >>> [step.code == ca.OP_SQ for step in scalar_steps(ca.Function("f", [x], [x**2]), 100)]
-        [False, True, False]
+    ``taken`` are registers; for an input ``(input, nonzero)``, for a constant its value alone. ``given`` is a
+    register; for an output ``(output, nonzero)``.
     """
 
     code: int
@@ -60,21 +53,7 @@ class Step:
 
 
 def scalar_steps(function: ca.Function, most: int) -> list[Step]:
-    """The function as scalar operations, one after the other.
-
-    Args:
-        function: Any CasADi function.
-        most: So many operations at most.
-
-    Raises:
-        ProgramError: If there are more.
-        UnsupportedOperatorError: If it calls what has no scalar form, a solver, a table, external code; by its name.
-
-    Example:
-        >>> x = ca.MX.sym("x", 2)
-        >>> len(scalar_steps(ca.Function("f", [x], [ca.sin(x)]), 100))  # two inputs, sines and outputs
-        6
-    """
+    """The function as scalar operations, one after the other."""
     # An estimate first: a dense network is not written out in scalars to be counted.
     if scalar_size(function) <= 4 * most:
         calls = ", ".join(dict.fromkeys(_without_form(function)))

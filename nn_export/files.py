@@ -41,24 +41,7 @@ _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 def read_bytes(path: Path, limit: int) -> bytes:
     """Content of a regular file of at most ``limit`` bytes. It never waits and never reads more than that.
 
-    Args:
-        path: The file; links are followed.
-        limit: Most bytes, also of a file that grows while it is read.
-
-    Raises:
-        OSError: If there is no such file, it is none (a folder, a pipe, a device), is longer, or may not be read.
-            ``strerror`` reads well behind ``cannot read PATH: ``.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     write_bytes(Path(folder) / "a.txt", b"content")
-        ...     print(read_bytes(Path(folder) / "a.txt", 1024))
-        b'content'
-        >>> read_bytes(Path("/"), 1024)
-        Traceback (most recent call last):
-        ...
-        IsADirectoryError: [Errno 21] is a directory: '/'
+    The ``strerror`` of its OSError reads well behind ``cannot read PATH: ``.
     """
     with opened(path, limit) as (file, length):
         blocks, size = [], 0
@@ -75,21 +58,6 @@ def opened(path: Path, limit: int) -> Iterator[tuple[BinaryIO, int]]:
     """A regular file of at most ``limit`` bytes, opened for reading without waiting, and its length [byte].
 
     Only a regular file says how long it is; a pipe or a device may never end.
-
-    Args:
-        path: The file; links are followed.
-        limit: Most bytes.
-
-    Raises:
-        OSError: As :func:`read_bytes`.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     write_bytes(Path(folder) / "a.txt", b"content")
-        ...     with opened(Path(folder) / "a.txt", 1024) as (file, length):
-        ...         print(length, file.read(3))
-        7 b'con'
     """
     try:
         _refuse_kind(os.stat(path), path)  # before it is opened: to open a device may already do something
@@ -130,21 +98,9 @@ def _size(count: int) -> str:
 def parse_json(content: bytes) -> Any:
     """A JSON text as Python's own types, with all refused that readers disagree on, or that costs without limit.
 
-    Args:
-        content: The text in UTF-8.
-
-    Raises:
-        ValueError: With a short reason, if it is no JSON or no UTF-8, or holds ``NaN`` or ``Infinity``, a number that
-            overflows, a whole number of more than 20 digits, a name twice in one object, half a surrogate pair, more
-            than 40 nested levels, or more than two million values.
-
-    Example:
-        >>> parse_json(b'{"x": [1, 2.5, null]}')
-        {'x': [1, 2.5, None]}
-        >>> parse_json(b'{"x": 1, "x": 2}')
-        Traceback (most recent call last):
-        ...
-        ValueError: 'x' stands twice in one object
+    A ValueError gives the reason: no JSON or UTF-8, ``NaN`` or ``Infinity``, a number that overflows, a whole number of
+    more than 20 digits, a name twice in one object, half a surrogate pair, more than 40 nested levels or two million
+    values.
     """
     if sum(map(content.count, (b",", b":", b"[", b"{"))) > MAX_VALUES:
         raise ValueError(f"more than {MAX_VALUES} values")
@@ -212,25 +168,10 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     A reader sees the old file or the new one, whole, also after a kill or a loss of power at any moment, and however
     many processes write to the same path. An exception within the block leaves the old file. The file lies in the same
     folder under a hidden name of its own until then; :func:`sweep` removes those that killed writers leave.
-
-    Args:
-        path: The file; its folder is made if missing. A new one may be read by all whom the umask lets.
-
-    Raises:
-        OSError: If the folder cannot be made or written in, or the disk is full.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     with replacing(Path(folder) / "new" / "a.txt") as file:
-        ...         _ = file.write(b"content")
-        ...     print([p.name for p in (Path(folder) / "new").iterdir()])
-        ['a.txt']
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(
-        f".{path.name[:50]}.{secrets.token_hex(8)}.part"
-    )  # 50: a name has at most 255 bytes
+    # 50: a name has at most 255 bytes
+    part = path.with_name(f".{path.name[:50]}.{secrets.token_hex(8)}.part")
     # The mode is given to open, which takes the umask off: to ask for the umask is to change it, for all threads.
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
     handle = os.open(part, flags, 0o644)
@@ -261,42 +202,13 @@ def _sync_folder(folder: Path) -> None:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all, as :func:`replacing` does.
-
-    Args:
-        path: The file; its folder is made if missing.
-        content: What it is to hold.
-
-    Raises:
-        OSError: As :func:`replacing`.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     write_bytes(Path(folder) / "a.txt", b"content")
-        ...     print((Path(folder) / "a.txt").read_text())
-        content
-    """
+    """Write a file whole or not at all, as :func:`replacing` does."""
     with replacing(path) as file:
         file.write(content)
 
 
 def sweep(folder: Path, age: float = LEFTOVER_AGE) -> None:
-    """Remove the temporary files (``.*.part``) that killed writers left in a folder.
-
-    Args:
-        folder: The folder, without those in it. One that is missing has none.
-        age: Time [s] since they were written to last. Younger ones stay: somebody may be writing. Default: an hour.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     _ = (Path(folder) / ".a.txt.0123.part").write_text("half")
-        ...     sweep(Path(folder))  # too young
-        ...     sweep(Path(folder), age=-1.0)
-        ...     print(list(Path(folder).iterdir()))
-        []
-    """
+    """Remove the temporary files (``.*.part``) older than ``age`` [s] that killed writers left in a folder."""
     now = time.time()
     for part in folder.glob(".*.part"):
         with suppress(FileNotFoundError, PermissionError):  # another sweep was faster; another user's stays

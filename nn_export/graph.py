@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -11,6 +10,7 @@ from typing import Any
 import casadi as ca
 
 from nn_export.budget import Budget, Limits, place, resolve
+from nn_export.chain import Chain, operations
 from nn_export.errors import ProgramError, ShapeError, last_line
 from nn_export.operators import OPERATORS, PLAIN, cells, recurrent
 from nn_export.operators.value import Value, constant, matrix_shape
@@ -33,7 +33,7 @@ def valid_name(name: str) -> bool:
 def build(
     program: Program, name: str | None = None, *, plain: bool = False, limits: Limits | None = None
 ) -> ca.Function:
-    """The program as a CasADi function of MX with the program's names.
+    """The program as a CasADi function of MX with the program's names and dense inputs and outputs.
 
     A tensor of shape (n,) becomes n x 1, (r, c) becomes r x c; axes of size 1 are dropped.
 
@@ -44,9 +44,6 @@ def build(
             function that brings its exact Jacobian, and small parts between are scalar code: both values
             and derivatives are faster.
         limits: What it may cost; more is refused before anything is built. Default: :class:`nn_export.Limits`.
-
-    Returns:
-        Function with dense inputs and outputs.
 
     Raises:
         ProgramError: If it would cost more than the limits, an operator gets arguments it does not know, or a result
@@ -64,18 +61,17 @@ def build(
         if plain:
             symbols, values = graph(program, PLAIN, budget)
             return function(name, symbols, [v.mx for v in values], program, outputs)
-        pieces = Pieces()
-        symbols, values = graph(program, {**OPERATORS, **recurrent.table(pieces.cell)}, budget, pieces)
-        return function(name, symbols, pieces.evaluate([v.mx for v in values]), program, outputs)
+        chain = _Calls(budget)
+        symbols, values = graph(program, {**OPERATORS, **recurrent.table(chain.cell)}, budget)
+        for symbol in (s for s in symbols if s.numel()):  # CasADi has no empty symbols
+            chain.add(symbol, symbol)
+        chain.settle()
+        return function(name, symbols, chain.derive([v.mx for v in values]), program, outputs)
 
 
 @contextmanager
 def named(name: str) -> Iterator[None]:
-    """CasADi's errors, and a lack of memory, as errors of the program.
-
-    Raises:
-        ProgramError: Instead of what CasADi raises.
-    """
+    """CasADi's errors, and a lack of memory, as errors of the program."""
     try:
         yield
     except (RuntimeError, MemoryError) as error:
@@ -83,14 +79,11 @@ def named(name: str) -> Iterator[None]:
 
 
 def graph(
-    program: Program, table: Mapping[str, Callable[..., Any]], budget: Budget, pieces: Pieces | None = None
+    program: Program, table: Mapping[str, Callable[..., Any]], budget: Budget
 ) -> tuple[list[ca.MX], list[Value]]:
     """Symbols of the inputs and values of the outputs, with the operators of a table.
 
-    The program must be within the budget. The pieces, if given, are told the inputs before the first operator.
-
-    Raises:
-        ProgramError: As :func:`build`.
+    The program must be within the budget.
     """
     budget.add(program)
     values: dict[tuple[str, str], Any] = {}
@@ -100,8 +93,6 @@ def graph(
             raise ProgramError(_BAD_NAME.format(port.name))
         symbols.append(ca.MX.sym(port.name, *_size(f"input {port.name}", port.shape)))
         values["input", port.name] = Value(port.shape, symbols[-1])
-        if pieces is not None and symbols[-1].numel():
-            pieces.add(symbols[-1], symbols[-1])
     for weight, array in program.weights.items():
         values["weight", weight] = constant(array)
     for node in program.nodes:
@@ -121,11 +112,7 @@ def graph(
 def function(
     name: str, symbols: list[ca.MX], results: list[ca.MX], program: Program, outputs: list[str]
 ) -> ca.Function:
-    """A function of the program's inputs.
-
-    Raises:
-        ProgramError: If CasADi refuses a name or the function.
-    """
+    """A function of the program's inputs."""
     for text in (name, *outputs):
         if not valid_name(text):
             raise ProgramError(_BAD_NAME.format(text))
@@ -165,60 +152,19 @@ PIECE_LIMIT = 3000
 """Scalar operations up to which a piece becomes scalar code: dense layers are faster as matrices."""
 
 
-class Pieces:
-    """Evaluates expressions of cut symbols: what lies between recurrent cells becomes scalar code where small.
+class _Calls(Chain[ca.MX]):
+    """Values alone: cells are calls, what lies between them becomes scalar code where small."""
 
-    Example:
-        >>> pieces, x = Pieces(), ca.MX.sym("x", 2)
-        >>> pieces.add(x, x)
-        >>> pieces.evaluate([ca.sin(x)])[0].shape
-        (2, 1)
-    """
+    def _constant(self, target: ca.MX) -> ca.MX:
+        return target
 
-    def __init__(self) -> None:
-        self._values: dict[str, ca.MX] = {}
+    def _piece(self, symbols: list[ca.MX], targets: list[ca.MX], arguments: list[ca.MX]) -> list[ca.MX]:
+        piece = ca.Function("piece", symbols, targets)
+        scalar = operations(piece) <= PIECE_LIMIT
+        results: list[ca.MX] = (piece.expand() if scalar else piece).call(arguments, not scalar, False)
+        return results
 
-    def add(self, symbol: ca.MX, value: ca.MX) -> None:
-        """What a symbol stands for."""
-        self._values[symbol.name()] = value
-
-    def cell(self, kind: cells.Kind, x: ca.MX, state: cells.State, w: cells.Weights) -> cells.State:
-        """The form of a cell: symbols that stand for the results of its call."""
-        if not cells.simple(x, w):
-            return cells.call(kind, x, state, w)
-        at_x, *at_state = self.evaluate([x, *state])
-        symbols = []
-        for value in cells.call(kind, at_x, tuple(at_state), w):
-            symbols.append(ca.MX.sym(f"cell {len(self._values)}", value.shape[0]))
-            self.add(symbols[-1], value)
-        return tuple(symbols)
-
-    def evaluate(self, targets: list[ca.MX]) -> list[ca.MX]:
-        """Expressions of the symbols at what these stand for."""
-        moved = [k for k, t in enumerate(targets) if ca.symvar(t) and not t.is_symbolic()]
-        values = [self._values[t.name()] if t.is_symbolic() else t for t in targets]
-        if moved:
-            symbols = ca.symvar(ca.veccat(*(targets[k] for k in moved)))
-            piece = ca.Function("piece", symbols, [targets[k] for k in moved])
-            scalar = operations(piece) <= PIECE_LIMIT
-            arguments = [self._values[s.name()] for s in symbols]
-            results = (piece.expand() if scalar else piece).call(arguments, not scalar, False)
-            for k, value in zip(moved, results, strict=True):
-                values[k] = value
-        return values
-
-
-def operations(f: ca.Function) -> float:
-    """Scalar operations of a matrix graph, about; infinite if it calls functions that are no scalar code."""
-    total = 0
-    for k in range(f.n_instructions()):
-        kind = f.instruction_id(k)
-        if kind == ca.OP_CALL:
-            called = f.instruction_MX(k).which_function()
-            if not called.is_a("SXFunction"):
-                return math.inf
-            total += called.n_instructions()
-        elif kind not in (ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST):
-            node = f.instruction_MX(k)
-            total += node.numel() * (2 * node.dep(1).size2() if kind == ca.OP_MTIMES else 1)
-    return total
+    def _after(
+        self, symbols: list[ca.MX], kind: cells.Kind, x: ca.MX, state: list[ca.MX], w: cells.Weights
+    ) -> list[ca.MX]:
+        return list(cells.call(kind, x, tuple(state), w))

@@ -56,18 +56,14 @@ def with_jacobian(
         >>> slope.full().round(3).tolist()
         [[1.0, 0.0], [0.0, 0.42]]
     """
-    inputs = [port.name for port in program.inputs]
-    blocks = {"jacobian": inputs} if blocks is None else blocks
-    if unknown := sorted({i for names in blocks.values() for i in names} - set(inputs)):
-        raise ProgramError(f"no inputs {', '.join(unknown)}; the program has {', '.join(inputs)}")
-    name = name or "with_jacobian"
+    blocks, name = checked_blocks(program, blocks), name or "with_jacobian"
+    inputs, wanted = [port.name for port in program.inputs], {i for names in blocks.values() for i in names}
     with named(name):
         chain = _Chain(budget := Budget(limits))
         symbols, outputs = graph(program, {**OPERATORS, **recurrent.table(chain.cell)}, budget)
         sizes = {name: symbol.numel() for name, symbol in zip(inputs, symbols, strict=True)}
         spend_results(budget, outputs, blocks, sizes)
         budget.spend("the slopes of the inputs", memory=4 * NUMBER * sum(sizes.values()))  # sparse identities
-        wanted = {i for names in blocks.values() for i in names}
         for symbol in (s for s in symbols if s.numel()):  # CasADi has no empty symbols
             slopes = {symbol.name(): ca.MX.eye(symbol.numel())} if symbol.name() in wanted else {}
             chain.add(symbol, _Known(symbol, slopes))
@@ -79,14 +75,21 @@ def with_jacobian(
         return function(name, symbols, [*values, *stacked], program, names)
 
 
+def checked_blocks(
+    program: Program, blocks: Mapping[str, Sequence[str]] | None
+) -> Mapping[str, Sequence[str]]:
+    """The Jacobians asked for, by default one by all inputs; ProgramError if one is by an input that there is not."""
+    inputs = [port.name for port in program.inputs]
+    blocks = {"jacobian": inputs} if blocks is None else blocks
+    if unknown := sorted({i for names in blocks.values() for i in names} - set(inputs)):
+        raise ProgramError(f"no inputs {', '.join(unknown)}; the program has {', '.join(inputs)}")
+    return blocks
+
+
 def spend_results(
     budget: Budget, outputs: Sequence[Value], blocks: Mapping[str, Sequence[str]], sizes: Mapping[str, int]
 ) -> None:
-    """Take off what the dense Jacobians of all outputs cost.
-
-    Raises:
-        ProgramError: If there is not as much left.
-    """
+    """Take off what the dense Jacobians of all outputs cost."""
     rows = sum(v.mx.numel() for v in outputs)
     for block, names in blocks.items():
         count = rows * sum(sizes[name] for name in names)

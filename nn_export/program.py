@@ -175,27 +175,13 @@ def to_json(program: Program) -> dict[str, Any]:
     return {
         "inputs": [{"name": p.name, "shape": list(p.shape)} for p in program.inputs],
         "outputs": [{"name": p.name, "shape": list(p.shape), "source": p.source} for p in program.outputs],
-        "nodes": [
-            {
-                "name": n.name,
-                "op": n.op,
-                "args": n.args,
-                "kwargs": n.kwargs,
-                "shapes": [list(s) for s in n.shapes],
-                "line": n.line,
-            }
-            for n in program.nodes
-        ],
+        "nodes": [{**vars(n), "shapes": [list(s) for s in n.shapes]} for n in program.nodes],
         "metadata": program.metadata,
     }
 
 
 def from_json(data: Any, weights: dict[str, np.ndarray], where: str) -> Program:
-    """Inverse of :func:`to_json`; every field is checked.
-
-    Raises:
-        ProgramError: Naming the field that is wrong.
-    """
+    """Inverse of :func:`to_json`; every field is checked."""
     top = _fields(data, {"inputs": list, "outputs": list, "nodes": list, "metadata": dict}, where)
     inputs = [_port(p, f"{where}.inputs[{i}]", False) for i, p in enumerate(top["inputs"])]
     outputs = [_port(p, f"{where}.outputs[{i}]", True) for i, p in enumerate(top["outputs"])]
@@ -221,11 +207,7 @@ def _fields(data: Any, types: Mapping[str, type], where: str) -> dict[str, Any]:
 
 
 def shape_of(data: Any, where: str) -> Shape:
-    """A shape from JSON data.
-
-    Raises:
-        ProgramError: If it is none.
-    """
+    """A shape from JSON data."""
     if isinstance(data, list) and len(data) <= 16:
         for n in data:
             if type(n) is not int or not 0 <= n < 2**31:

@@ -21,7 +21,7 @@ from nn_export.chain import Chain, differentiated
 from nn_export.columns import CellColumns, Results, Slope, Slot, Sum, matrices
 from nn_export.errors import ProgramError, ShapeError
 from nn_export.graph import graph, named
-from nn_export.jacobian import spend_results
+from nn_export.jacobian import checked_blocks, spend_results
 from nn_export.operators import OPERATORS, cells, recurrent
 from nn_export.operators.costs import NUMBER
 from nn_export.program import Program
@@ -61,11 +61,11 @@ class SideBySide:
     ) -> None:
         if n < 1:
             raise ProgramError(f"n = {n} points given; at least 1 needed")
-        inputs = [port.name for port in program.inputs]
-        blocks = {"jacobian": inputs} if blocks is None else blocks
-        wanted = {name for names in blocks.values() for name in names}
-        if unknown := sorted(wanted - set(inputs)):
-            raise ProgramError(f"no inputs {', '.join(unknown)}; the program has {', '.join(inputs)}")
+        blocks = checked_blocks(program, blocks)
+        inputs, wanted = (
+            [port.name for port in program.inputs],
+            {i for names in blocks.values() for i in names},
+        )
         with named(f"{n} points"):
             chain = _Chain(n, budget := Budget(limits))
             symbols, outputs = graph(program, {**OPERATORS, **recurrent.table(chain.cell)}, budget)
@@ -98,14 +98,7 @@ class SideBySide:
 
     @np.errstate(all="ignore")  # what overflows is the caller's to look at, as in CasADi
     def __call__(self, *points: Array) -> tuple[Array, ...]:
-        """Outputs ``(n, size)`` and Jacobians ``(n, rows, columns)``, new arrays.
-
-        Args:
-            points: For each input ``(n, size)``; matrices column by column.
-
-        Raises:
-            ShapeError: If an input has another shape.
-        """
+        """Outputs ``(n, size)`` and Jacobians ``(n, rows, columns)``, new arrays."""
         if [p.shape for p in points] != [b.T.shape for b in self._inputs]:
             needed = ", ".join(str(b.T.shape) for b in self._inputs)
             raise ShapeError(f"arrays of {[p.shape for p in points]} given, {needed} needed")

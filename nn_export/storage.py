@@ -19,10 +19,8 @@ from nn_export.program import Program, Shape, dumps, from_json, shape_of, to_jso
 FORMAT = "nn_export programs"
 SCHEMA = 2
 PROGRAMS, WEIGHTS = "programs.json", "weights.safetensors"
-HEADER, HEADER_EACH = (
-    4096,
-    400,
-)  # bytes of a weights file beside the numbers, and beside the name of each array
+# bytes of a weights file beside the numbers, and beside the name of each array
+HEADER, HEADER_EACH = 4096, 400
 
 
 def save_programs(folder: str | Path, programs: Mapping[str, Program]) -> None:
@@ -79,7 +77,7 @@ def save_programs(folder: str | Path, programs: Mapping[str, Program]) -> None:
 
 
 def load_programs(folder: str | Path, limits: Limits | None = None) -> dict[str, Program]:
-    """Read what :func:`save_programs` wrote. Nothing in the files is executed.
+    """Read what :func:`save_programs` wrote, programs by name. Nothing in the files is executed.
 
     What the programs would cost is settled from the JSON alone: a small file may ask for any amount of memory and time.
 
@@ -87,9 +85,6 @@ def load_programs(folder: str | Path, limits: Limits | None = None) -> dict[str,
         folder: Folder with ``programs.json`` and ``weights.safetensors``.
         limits: What all programs together may cost; the same are to be given to :func:`nn_export.build`. Default:
             :class:`nn_export.Limits`.
-
-    Returns:
-        Programs by name.
 
     Raises:
         ProgramError: If a file is missing, damaged, foreign, of another schema version, or changed since it was saved;
@@ -188,9 +183,8 @@ def _tensors(path: Path, sha256: str, shapes: Mapping[str, Shape]) -> dict[str, 
     from safetensors import SafetensorError
     from safetensors.numpy import load
 
-    names = HEADER + sum(
-        HEADER_EACH + 6 * len(key) for key in shapes
-    )  # at most six bytes a character: "\u1234"
+    # at most six bytes a character: "\u1234"
+    names = HEADER + sum(HEADER_EACH + 6 * len(key) for key in shapes)
     blob = _content(path, sum(NUMBER * product(shape) for shape in shapes.values()) + names)
     if hashlib.sha256(blob).hexdigest() != sha256:
         raise ProgramError(

@@ -35,7 +35,7 @@ def trace(
     input_names: Sequence[str] | None = None,
     output_names: Sequence[str] | None = None,
 ) -> Program:
-    """Record what a module computes.
+    """Record what a module computes, as plain data.
 
     The module is copied, cast to float64 and put in evaluation mode; it is itself not changed.
 
@@ -48,9 +48,6 @@ def trace(
             followed by its keys or positions: ``state_h``, ``hx_0``.
         output_names: Names of the outputs. Default: dictionary keys, else ``output_0``, ``output_1`` ...
             (``output`` if there is one).
-
-    Returns:
-        The program, as plain data.
 
     Raises:
         UnsupportedOperatorError: Listing all operators that are not supported, with their source lines.

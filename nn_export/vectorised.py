@@ -19,19 +19,8 @@ def vectorised(f: ca.Function, n: int) -> ca.Function:
 
     Scalar code (an ``SXFunction``) becomes a graph whose every operation runs over all points: the work of CasADi's
     machine is done once and not ``n`` times, and the same operations give the same numbers. Any other function is
-    mapped: called point by point.
-
-    Args:
-        f: The function.
-        n: Number of points.
-
-    Returns:
-        Function of dense matrices ``n x size``: a row has an argument's elements, column by column, or a result's.
-
-    Example:
-        >>> x = ca.SX.sym("x", 2)
-        >>> vectorised(ca.Function("f", [x], [x[0] * x[1]]), 3)(ca.DM([[1, 2], [3, 4], [5, 6]]))
-        DM([2, 12, 30])
+    mapped: called point by point. In and out go dense matrices ``n x size``: a row has an argument's elements, column
+    by column, or a result's.
     """
     kind: Any = ca.SX if f.is_a("SXFunction") else ca.MX
     symbols = [kind.sym("v", *f.size_in(i)) for i in range(f.n_in())]
@@ -70,19 +59,7 @@ def _walk(f: ca.Function, n: int, inputs: list[ca.MX]) -> list[ca.MX] | None:
 
 
 class OnArrays:
-    """A dense CasADi function between numpy arrays that stay where they are.
-
-    Args:
-        function: The function.
-        inputs: One contiguous array per argument, its elements column by column.
-        outputs: One for each result.
-
-    Example:
-        >>> x, given, result = ca.MX.sym("x", 2), np.array([1.0, 2.0]), np.zeros(2)
-        >>> OnArrays(ca.Function("double", [x], [2 * x]), [given], [result])()
-        >>> result
-        array([2., 4.])
-    """
+    """A dense CasADi function between numpy arrays that stay where they are."""
 
     def __init__(self, function: ca.Function, inputs: list[Array], outputs: list[Array]) -> None:
         buffer: Any

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc import Role, Window
+from hybrid_mpc import InputError, Role, Window, write_csv
 
 if TYPE_CHECKING:
     from hybrid_mpc import Prior
@@ -23,16 +24,7 @@ ROLES: tuple[Role, ...] = ("train", "valid", "test")
 
 @dataclass(frozen=True)
 class LazyPrior:
-    """A scenario's prior that is imported, and torch with it, when it is made.
-
-    Args:
-        module: Module of the class.
-        name: Its name.
-
-    Example:
-        >>> LazyPrior("scenarios.pendulum.prior", "PendulumPrior")({"d": 1.5}).values["d"]
-        1.5
-    """
+    """A scenario's prior that is imported, and torch with it, when it is made."""
 
     module: str
     name: str
@@ -44,29 +36,27 @@ class LazyPrior:
 
 
 def whole_windows(stems: Iterable[str], seconds: float) -> dict[str, tuple[Window, ...]]:
-    """Windows of recordings each of which has one role, with which its stem begins.
-
-    Args:
-        stems: File stems, e.g. ``train_01``.
-        seconds: Their length [s].
-
-    Example:
-        >>> whole_windows(["test_01_sine"], 20.0)
-        {'test_01_sine': (Window(start=0.0, end=20.0, role='test'),)}
-    """
+    """Windows of recordings each of which has one role, with which its stem begins."""
     return {stem: (Window(0.0, seconds, role),) for role in ROLES for stem in stems if stem.startswith(role)}
+
+
+def sizes_of(machine: str, budget: str, sizes: Mapping[str, Mapping[Role, int]]) -> Mapping[Role, int]:
+    """Recordings of each role in a budget."""
+    if budget not in sizes:
+        raise InputError(f"{machine}: no budget {budget!r}; it has: {', '.join(sizes)}")
+    return sizes[budget]
+
+
+def write_tables(folder: Path, tables: Iterable[tuple[str, Array]], columns: Sequence[str]) -> list[Path]:
+    """Tables ``(n, columns)`` by stem as CSV files with six decimals; the files."""
+    return [
+        write_csv(folder / f"{stem}.csv", dict(zip(columns, table.T, strict=True)), decimals=6)
+        for stem, table in tables
+    ]
 
 
 def faded_sines(t: Array, waves: tuple[tuple[float, float], ...], fade_s: float = 1.0) -> Array:
     """Sum of sinusoids that is faded in, from rest and without a jump in the acceleration.
-
-    Args:
-        t: Times ``(n,)`` [s].
-        waves: Amplitude [rad or m] and frequency [Hz] of each.
-        fade_s: Time [s] over which they are faded in. Default 1.
-
-    Returns:
-        ``(n, 2)``: position and its exact derivative.
 
     Example:
         >>> faded_sines(np.array([0.0, 1.25]), ((0.5, 1.0),)).round(6).tolist()
@@ -80,29 +70,16 @@ def faded_sines(t: Array, waves: tuple[tuple[float, float], ...], fade_s: float 
 
 
 def quintic(s: Array) -> tuple[Array, Array]:
-    """From 0 to 1 while ``s`` does, with slope and curvature zero at both ends; and its slope.
-
-    Example:
-        >>> quintic(np.array([0.5, 2.0]))
-        (array([0.5, 1. ]), array([1.875, 0.   ]))
-    """
+    """From 0 to 1 while ``s`` does, with slope and curvature zero at both ends; and its slope."""
     s = np.clip(s, 0.0, 1.0)
     return s**3 * (10 - 15 * s + 6 * s**2), 30 * s**2 * (1 - s) ** 2
 
 
-def moves(t: Array, levels: tuple[float, ...], hold_s: float, move_s: float) -> Array:
+def moves(t: Array, levels: Sequence[float], hold_s: float, move_s: float) -> Array:
     """From level to level, each for ``hold_s``, along a quintic of ``move_s``.
 
-    A bare jump cannot be followed by anyone, and what it costs hides all differences.
-
-    Args:
-        t: Times ``(n,)`` [s].
-        levels: Levels [rad or m], the last one held.
-        hold_s: Time from the begin of a move to that of the next [s].
-        move_s: Time of a move [s], at most ``hold_s``.
-
-    Returns:
-        ``(n, 2)``: position and its exact derivative.
+    A bare jump cannot be followed by anyone, and what it costs hides all differences. Gives position and exact
+    derivative ``(n, 2)``; ``hold_s`` [s] is the time from the begin of a move to that of the next.
 
     Example:
         >>> moves(np.array([0.0, 1.3, 1.7, 2.2]), (0.0, 0.4), 1.3, 0.8).round(2).tolist()
@@ -116,14 +93,7 @@ def moves(t: Array, levels: tuple[float, ...], hold_s: float, move_s: float) -> 
 
 
 def rk4(f: ca.Function, s: ca.SX, u: ca.SX, h: ca.SX | float) -> ca.SX:
-    """One classical Runge-Kutta step of ``s_dot = f(s, u)`` over ``h`` [s]; order 4.
-
-    Example:
-        >>> s, u = ca.SX.sym("s"), ca.SX.sym("u")
-        >>> decay = ca.Function("f", [s, u], [-s])
-        >>> round(float(rk4(decay, ca.DM(1.0), ca.DM(0.0), ca.DM(0.1))), 6)
-        0.904837
-    """
+    """One classical Runge-Kutta step of ``s_dot = f(s, u)`` over ``h`` [s]; order 4."""
     k1 = f(s, u)
     k2 = f(s + h / 2 * k1, u)
     k3 = f(s + h / 2 * k2, u)

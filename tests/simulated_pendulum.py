@@ -3,9 +3,10 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from scipy.integrate import solve_ivp
 
-from hybrid_mpc import Parameter, Prior, Signal, Trajectory
+from hybrid_mpc import Parameter, Prior, Signal, Trajectory, train
 
 DT = 0.02
 TRUTH = {"J": 0.1, "mgl": 1.2, "d": 0.05}
@@ -62,6 +63,22 @@ def dragged():
 
 class Killed(Exception):
     """What a test raises in the middle of a training."""
+
+
+def killed_and_resumed(at, file, *data, **options):
+    """A training that is killed after ``at`` steps and goes on from its checkpoint; the steps seen after that."""
+
+    def kill(done, total, error):
+        if done == at:
+            raise Killed
+
+    seen = []
+    with pytest.raises(Killed):
+        train(*data, checkpoint=file, on_progress=kill, **options)
+    resumed = train(
+        *data, checkpoint=file, on_progress=lambda done, total, error: seen.append(done), **options
+    )
+    return resumed, seen
 
 
 def same_training(one, two):

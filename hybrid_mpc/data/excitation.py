@@ -41,9 +41,6 @@ def sinusoid(
         phase: Phase [rad].
         offset: Mean [input unit].
 
-    Returns:
-        Inputs ``(n,)``.
-
     Example:
         >>> sinusoid(np.array([0.0, 0.25]), 2.0, 1.0).tolist()
         [0.0, 2.0]
@@ -70,9 +67,6 @@ def chirp(
         start_frequency: Frequency [Hz] at ``t[0]``.
         end_frequency: Frequency [Hz] at ``t[-1]``.
         offset: Mean [input unit].
-
-    Returns:
-        Inputs ``(n,)``.
 
     Raises:
         InputError: If ``t`` spans no time.
@@ -102,9 +96,6 @@ def random_steps(
         upper: Largest level [input unit].
         hold: Shortest and longest hold [s], uniform between them.
         rng: Source of the randomness; the same state gives the same signal.
-
-    Returns:
-        Inputs ``(n,)``.
 
     Raises:
         InputError: If a range is empty or the shortest hold is not positive.
@@ -151,9 +142,6 @@ def multisine(
         period: Period [s]; the lines are ``1 / period`` apart. Default: the length of ``t``.
         odd: Odd multiples only: what appears at the even ones is nonlinear distortion of even order.
         offset: Mean [input unit].
-
-    Returns:
-        Inputs ``(n,)``.
 
     Raises:
         InputError: If no line lies in the band, or the band is not below half the sampling rate.
@@ -207,9 +195,6 @@ def prbs(
         bits: Length of the shift register, 2 to 32. Default: the shortest that does not repeat within ``t``.
         shift: Ticks by which the sequence is advanced, to give several inputs ones of their own.
 
-    Returns:
-        Inputs ``(n,)``, each ``lower`` or ``upper``.
-
     Raises:
         InputError: If the levels are not in order, the clock is shorter than the sampling time, or ``bits`` is out of
             range.
@@ -250,13 +235,9 @@ def _period_of(what: str, t: Array) -> float:
 
 @dataclass(frozen=True)
 class Excitation:
-    """What one input does over a set of trajectories.
+    """What one input does over a set of trajectories: its standard deviation [input unit] and its spectral lines.
 
-    Args:
-        name: The input.
-        spread: Standard deviation over all samples [input unit].
-        lines: Frequencies [Hz] of sines that the recordings tell apart, increasing; the mean is none of them.
-
+    ``lines`` are the frequencies [Hz] of sines that the recordings tell apart, increasing; the mean is none of them.
     Each sine gives two numbers of a linear machine's response, its gain and its phase.
     """
 
@@ -306,7 +287,7 @@ def check_excitation(
     outputs: Sequence[Signal] = (),
     parameters: int = 0,
 ) -> tuple[str, ...]:
-    """Refuse inputs that excite nothing; warn of ones that excite too little for a number of parameters.
+    """Refuse inputs that excite nothing; return warnings of ones that excite too little for a number of parameters.
 
     Args:
         trajectories: All that a model is fitted to; one input at rest in some of them is no fault.
@@ -314,9 +295,6 @@ def check_excitation(
         outputs: Signals of the outputs, likewise.
         parameters: Number of parameters to be fitted. A linear model needs a sine for every two of them; a nonlinear
             one may get by with fewer, so this is a warning. Default: not checked.
-
-    Returns:
-        Warnings; none if all is well.
 
     Raises:
         InputError: If there is no trajectory, an input is constant over all of them, or an output is.

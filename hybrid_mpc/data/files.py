@@ -60,12 +60,9 @@ class MissingColumn(InputError):
 class Columns:
     """Numbers of some columns.
 
-    Args:
-        values: ``(m, n)``, a column for each name asked for; NaN where there is no finite number.
-        row: What the file's own tools call a row: ``"row"`` or ``"index"``.
-        numbers: Number of each row, ``m`` of them, as those tools count.
-        problems: What is wrong with single columns, each with place and remedy, without the file's name. Default: all
-            numbers are finite.
+    ``values`` ``(m, n)`` has a column for each name asked for, NaN where there is no finite number. ``row`` is what
+    the file's own tools call a row, ``"row"`` or ``"index"``, and ``numbers`` are the rows' numbers as they count.
+    ``problems`` of single columns have place and remedy, without the file's name.
     """
 
     values: Array
@@ -80,14 +77,9 @@ class Columns:
 
 @dataclass(frozen=True)
 class Source:
-    """A recording's file, opened.
+    """A recording's file, opened: ``read(full names)``, the first one being the time, gives the columns.
 
-    Args:
-        path: The file.
-        sha256: SHA-256 of its bytes, in hexadecimal.
-        header: Names of its columns, in its order.
-        read: ``(full names) -> Columns``, the first one being the time.
-        note: What else a user should know who misses a column. Default: nothing.
+    ``sha256`` is that of its bytes; ``note`` is what else a user should know who misses a column.
     """
 
     path: Path
@@ -97,12 +89,7 @@ class Source:
     note: str = ""
 
     def find(self, name: str) -> str:
-        """Full name of a column: its own, or ``struct.field`` where just one struct has such a field.
-
-        Raises:
-            MissingColumn: If there is none.
-            InputError: If there are several.
-        """
+        """Full name of a column: its own, or ``struct.field`` where just one struct has it; else an error."""
         count = self.header.count(name)
         if count == 1:
             return name
@@ -137,10 +124,6 @@ def opened(path: Path) -> Source:
                 ``struct.field``
     any other   CSV: a comma between cells, decimals with a point, the first line the header, UTF-8
     ==========  ========================================================================================
-
-    Raises:
-        InputError: If it is missing, no regular file, too large, empty, damaged or not of the format that its ending
-            says.
     """
     return {".npz": _npz, ".mat": _mat}.get(path.suffix.lower(), _csv)(path)
 
@@ -303,15 +286,12 @@ def _number(cell: str) -> float:
 
 
 def write_csv(path: Path | str, columns: Mapping[str, Array], *, decimals: int | None = None) -> Path:
-    r"""Write columns of equal length as CSV: all of it or nothing, the same data as the same bytes.
+    r"""Write columns of equal length as CSV: all of it or nothing, the same data as the same bytes; the path.
 
     Args:
         path: File to write; its folder is made if need be, an old file of that name is replaced.
         columns: Values ``(m,)`` by column name.
         decimals: Digits after the point. Default: ten significant digits.
-
-    Returns:
-        The path.
 
     Raises:
         InputError: If the columns differ in length or are not one-dimensional.

@@ -59,19 +59,10 @@ def findings_of(
     outputs: Sequence[Signal],
     states: Sequence[Signal] = (),
 ) -> tuple[Finding, ...]:
-    """All that is doubtful about the recordings of one run, file by file.
+    """All that is doubtful about the recordings of one run, file by file, with their own findings.
 
-    Args:
-        recordings: The recordings as they were read; their own findings are among the result.
-        motions: Times ``(n,)`` [s] and states ``(n, n_x)``, smoothed and differentiated, of each recording; ``n = 0``
-            where it could not be smoothed.
-        spec: Columns, ``max_gap`` and ``smoothing`` [s].
-        outputs: Signals of the outputs.
-        states: Signals of the prior's states, for the plausible ranges of the outputs' rates among them. Default:
-            speeds are not checked.
-
-    Returns:
-        The findings.
+    ``motions`` are times ``(n,)`` [s] and states ``(n, n_x)`` of each recording, smoothed; ``n = 0`` where that could
+    not be. Speeds are checked if ``states``, the prior's signals, are given.
     """
     spreads = (
         np.std(np.concatenate([recording.u for recording in recordings]), axis=0)
@@ -117,14 +108,11 @@ def _patience(recordings: Sequence[Recording], j: int, spec: DataSpec) -> float:
 
 @dataclass(frozen=True)
 class Still:
-    """Equal samples in a row that are no rest.
+    """Equal samples in a row, from index ``first`` to ``last``, that are no rest.
 
-    Args:
-        first: Index of the first of them.
-        last: Index of the last.
-        why: ``"abrupt"``: it begins or ends in full motion; ``"noise"``: the sensor's noise stops, too; ``"driven"``:
-            the inputs go on.
-        amount: Speed right before or after [unit/s]; standard deviation of the noise [unit]; length [s].
+    ``"abrupt"``: it begins or ends in full motion; ``"noise"``: the sensor's noise stops, too; ``"driven"``: the
+    inputs go on. ``amount`` is the speed right before or after [unit/s], the standard deviation of the noise [unit],
+    the length [s].
     """
 
     first: int
@@ -142,24 +130,6 @@ def still_stretches(
     this one is ``ABRUPT`` times as sharp. Steps of the sensor count as changes. ``"noise"``: a sensor whose noise is
     larger than its steps flickers at rest, and here it does not; exact zeros, which speeds made from counts have at
     rest, do not count. ``"driven"``: the inputs go on for longer than ``patience``.
-
-    Args:
-        t: Time stamps ``(m,)`` [s].
-        y: One output ``(m,)``.
-        u: Inputs ``(m, n_u)``.
-        max_gap: Distance [s] beyond which two samples are no neighbours.
-        patience: Time [s] that a driven machine may rest, for all that is known of it.
-        spreads: Standard deviation ``(n_u,)`` of the inputs over all recordings of the machine.
-
-    Example:
-        >>> t = 0.01 * np.arange(400)
-        >>> y = np.sin(3 * t).round(2)  # a coarse sensor: rests at every turn of the motion are no fault
-        >>> still_stretches(t, y, y[:, None], max_gap=0.05, patience=9.0, spreads=np.ones(1))
-        ()
-        >>> y[150:210] = y[150]
-        >>> [(s.first, s.last, s.why) for s in still_stretches(
-        ...     t, y, y[:, None], max_gap=0.05, patience=9.0, spreads=np.ones(1))]
-        [(150, 209, 'abrupt')]
     """
     flat = np.r_[False, (np.diff(y) == 0) & ~gaps(t, max_gap), False]
     edges = np.flatnonzero(np.diff(flat.astype(np.int8)))

@@ -37,11 +37,7 @@ class Left:
         self._most = size
 
     def take(self, size: int = 0, count: int = 0) -> None:
-        """Use some of it up.
-
-        Raises:
-            ValueError: If so much is not left.
-        """
+        """Use some of it up."""
         self.size, self.count = self.size - size, self.count - count
         if self.count < 0:
             raise ValueError(f"it has more than {ELEMENTS} elements")
@@ -58,12 +54,7 @@ class Element(NamedTuple):
 
 
 def version(content: bytes) -> str:
-    """``"7.3"`` (HDF5), ``"5"`` (what -v6 and -v7 write) or ``"4"`` (anything else).
-
-    Example:
-        >>> version(b"MATLAB 7.3 MAT-file".ljust(124) + bytes([0, 2]) + b"IM")
-        '7.3'
-    """
+    """``"7.3"`` (HDF5), ``"5"`` (what -v6 and -v7 write) or ``"4"`` (anything else)."""
     if content[:8] == b"\x89HDF\r\n\x1a\n" or content[512:520] == b"\x89HDF\r\n\x1a\n":
         return "7.3"
     mark = content[126:128]
@@ -73,21 +64,10 @@ def version(content: bytes) -> str:
 
 
 def check_structure(content: bytes, budget: int) -> None:
-    """Follow all elements of a file; a compressed variable is decompressed as far as the budget allows.
+    """Follow all elements of a file of level 4 or 5; a compressed variable is decompressed as far as the budget allows.
 
-    Args:
-        content: The file, of level 4 or 5.
-        budget: Most bytes of numbers that it may hold, each counted as 8 of them [byte].
-
-    Raises:
-        ValueError: If an element leaves its surroundings or is of a type that cannot stand there, or the file declares
-            more than the budget.
-
-    Example:
-        >>> check_structure(b"MATLAB 5.0 MAT-file".ljust(124) + bytes([0, 1]) + b"IM" + bytes([99] + 7 * [0]), 10**6)
-        Traceback (most recent call last):
-        ...
-        ValueError: an element of type 99 where a variable is due
+    ``budget`` is the most bytes of numbers that the file may hold, each counted as 8 of them; ValueError if there are
+    more, or an element is damaged.
     """
     left = Left(budget)
     if version(content) == "4":

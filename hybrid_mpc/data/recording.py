@@ -54,20 +54,11 @@ ABSURD = 1e100
 
 @dataclass(frozen=True)
 class Finding:
-    """What is doubtful about one channel of one recording.
+    """What is doubtful about one channel of one recording; ``refused`` where nothing can be identified from it as it
+    is.
 
-    Args:
-        kind: ``"wrapped"``, ``"frozen"``, ``"clipped"`` or ``"speed"``.
-        file: Name of the file.
-        channel: Column.
-        start: Time of the first sample concerned [s], in the recording's own time.
-        count: Samples concerned; of a wrapped angle, its jumps.
-        message: What was found, what is the likely cause, and what to do.
-        refused: Whether nothing can be identified from the recording as it is. Default: no.
-
-    Example:
-        >>> print(Finding("frozen", "monday.csv", "phi", 3.0, 200, "column 'phi' repeats itself"))
-        monday.csv: column 'phi' repeats itself
+    ``start`` is the time [s] of the first sample concerned, in the recording's own time; ``count`` the samples
+    concerned, of a wrapped angle its jumps. ``message`` says what was found, the likely cause, and what to do.
     """
 
     kind: Literal["wrapped", "frozen", "clipped", "speed"]
@@ -84,16 +75,10 @@ class Finding:
 
 @dataclass(frozen=True)
 class Recording:
-    """One recording as it was written, checked.
+    """One recording as it was written, checked: ``m`` samples; its ``name`` is the file's stem.
 
-    Args:
-        name: File stem; windows are looked up by it.
-        path: The file.
-        sha256: SHA-256 of the file's bytes, in hexadecimal.
-        t: Time stamps ``(m,)`` [s], strictly increasing.
-        u: Inputs ``(m, n_u)``, held from each time stamp to the next.
-        y: Measured outputs ``(m, n_y)``; those of periodic signals count on.
-        findings: Angles that were wrapped. Default: none.
+    ``t`` ``(m,)`` [s] increases strictly; inputs ``u`` ``(m, n_u)`` are held from each time stamp to the next;
+    outputs ``y`` ``(m, n_y)`` of periodic signals count on. ``findings`` are the angles that were wrapped.
     """
 
     name: str
@@ -119,32 +104,6 @@ def read_recording(
     made to count on if its signal is ``periodic``. A single number as the time, in ``.npz`` or ``.mat``, is the
     sampling time; time then begins at 0. Rows are counted from 1, as an editor or MATLAB shows them (in CSV the header
     is row 1), the indices of ``.npz`` from 0.
-
-    Args:
-        path: The file.
-        spec: Names of the columns, their units, ``max_gap`` and ``warm_up`` [s], windows by file stem.
-        outputs: Signals of ``spec.outputs``, with their plausible ranges.
-        inputs: Signals of ``spec.inputs``, with their plausible ranges.
-
-    Returns:
-        The recording, ``m`` samples.
-
-    Raises:
-        InputError: If the file or a column is missing, a cell is no finite number, columns differ in length,
-            time stamps repeat or decrease, values are implausible, an angle is wrapped and its signal is
-            not ``periodic``, the sampling is coarser than ``max_gap`` throughout, or there are fewer samples than
-            a window or the warm-up needs.
-
-    Example:
-        >>> import tempfile
-        >>> spec = DataSpec("Ts", ("tau",), ("phi",), dt=0.1, max_gap=0.2, smoothing=0.5, warm_up=0.5,
-        ...                 units={"phi": "deg"})
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     file = Path(folder) / "run.npz"
-        ...     np.savez(file, Ts=0.1, tau=np.zeros(40), phi=np.full(40, 90.0))
-        ...     run = read_recording(file, spec, outputs=[Signal("phi", "rad")], inputs=[Signal("tau", "N m")])
-        >>> run.name, round(float(run.t[-1]), 6), round(float(run.y[0, 0]), 6)
-        ('run', 3.9, 1.570796)
     """
     recordings, problems = read_recordings([path], spec, outputs=outputs, inputs=inputs)
     refuse(problems)
@@ -157,17 +116,6 @@ def read_recordings(
     """Read the recordings of one run: :func:`read_recording` for each, with ``spec.inputs_of`` for those it names.
 
     They may differ in format, length and sampling, and in columns that ``spec`` does not name.
-
-    Returns:
-        The recordings that can be read, and all problems of the others.
-
-    Raises:
-        InputError: If ``spec`` does not name a column for each signal.
-
-    Example:
-        >>> spec = DataSpec("t", ("u",), ("y",), dt=0.1, max_gap=0.2, smoothing=0.5, warm_up=0.5)
-        >>> read_recordings([], spec, outputs=[Signal("y", "rad")], inputs=[Signal("u", "N m")])
-        ([], [])
     """
     if len(spec.outputs) != len(outputs) or len(spec.inputs) != len(inputs):
         raise InputError(
@@ -365,24 +313,9 @@ def _turn(signal: Signal) -> float | None:
 
 
 def unwrapped(t: Array, angle: Array, turn: float, max_gap: float) -> tuple[Array, NDArray[np.intp]]:
-    """An angle that counts on, and the places where it jumped by about a full turn.
+    """An angle that counts on, and the indices of the samples where it jumped by about a full turn.
 
     An angle is wrapped if it keeps within one turn and jumps by about one between neighbouring samples.
-
-    Args:
-        t: Time stamps ``(m,)`` [s].
-        angle: The angle ``(m,)``.
-        turn: A full turn in its unit.
-        max_gap: Distance [s] beyond which two samples are no neighbours.
-
-    Returns:
-        The angle ``(m,)``, equal to the given one but for whole turns, and the indices of the samples after a jump.
-
-    Example:
-        >>> angle = np.array([2.0, 2.6, 3.1, -2.7, -2.2, -2.8, 3.0])
-        >>> angle, jumps = unwrapped(np.arange(7.0), angle, 2 * np.pi, 1.5)
-        >>> angle.round(2).tolist(), jumps.tolist()
-        ([2.0, 2.6, 3.1, 3.58, 4.08, 3.48, 3.0], [3, 6])
     """
     step = np.diff(angle)
     jumps = ~gaps(t, max_gap) & (np.abs(np.abs(step) - turn) <= NEARLY * turn)

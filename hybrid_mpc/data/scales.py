@@ -36,15 +36,6 @@ def noise_of(recordings: Sequence[Outputs]) -> Array:
 
     White noise of 1 gives third differences of sqrt(20). What the machine itself does in three periods counts as noise
     too, so the number is at most too large.
-
-    Args:
-        recordings: At least one; shorter ones than four samples say nothing, and neither do samples that are missing.
-
-    Example:
-        >>> from types import SimpleNamespace
-        >>> y = np.sin(0.01 * np.arange(5000)) + np.random.default_rng(0).normal(scale=1e-3, size=5000)
-        >>> noise_of([SimpleNamespace(y=y[:, None])]).round(4)
-        array([0.001])
     """
     third = np.concatenate([np.diff(r.y, 3, axis=0) for r in recordings])
     third = third[np.isfinite(third).all(axis=1)]
@@ -55,11 +46,6 @@ def noise_of(recordings: Sequence[Outputs]) -> Array:
 
 def speeds_of(recording: Outputs, dt: float, half: int) -> Array:
     """Speeds ``(m, n_y)`` at the centres of cubics through ``2 half + 1`` samples each.
-
-    Args:
-        recording: Positions.
-        dt: Period [s].
-        half: Samples to either side of a centre.
 
     Example:
         >>> from types import SimpleNamespace
@@ -99,23 +85,8 @@ def time_scale(recordings: Sequence[Outputs], dt: float) -> float:
     follows from third differences, and the window is doubled until the acceleration stands out of it. Of several
     outputs the fastest decides.
 
-    Args:
-        recordings: Recordings of positions in motion.
-        dt: Their period [s].
-
-    Returns:
-        The time; NaN where nothing stands out of the noise.
-
     Source: the mean rate at which a Gaussian process crosses its mean; Rice, *Mathematical analysis of random noise*,
     Bell System Technical Journal 24 (1945).
-
-    Example:
-        >>> from types import SimpleNamespace
-        >>> t = 0.02 * np.arange(5000)
-        >>> noise = np.random.default_rng(0).normal(scale=1e-6, size=5000)
-        >>> slow = SimpleNamespace(y=(1e-3 * np.sin(2 * np.pi * t / 30.0) + noise)[:, None])
-        >>> 27.0 < time_scale([slow], 0.02) < 33.0
-        True
     """
     if not recordings:
         return math.nan
@@ -146,17 +117,6 @@ def time_unit(recordings: Sequence[Outputs], dt: float) -> float:
 
     1 s for a machine whose :func:`time_scale` lies between 0.25 and 4 s. A slower one has so much longer a second, a
     faster one so much shorter, to two digits; at least 10 periods, so that no length holds too few samples.
-
-    Args:
-        recordings: Recordings of positions in motion, e.g. the training ones.
-        dt: Their period [s].
-
-    Example:
-        >>> from types import SimpleNamespace
-        >>> phase = np.linspace(0.0, 60.0, 3000)
-        >>> swings = SimpleNamespace(y=np.sin(phase)[:, None])  # 314 samples a swing
-        >>> [time_unit([swings], dt) for dt in (1e-4, 0.01, 2.0)]  # swings of 0.03, 3 and 628 s
-        [0.13, 1.0, 160.0]
     """
     scale = time_scale(recordings, dt)
     unit = scale / min(max(scale, FASTEST), SLOWEST) if math.isfinite(scale) else 1.0
@@ -164,15 +124,5 @@ def time_unit(recordings: Sequence[Outputs], dt: float) -> float:
 
 
 def periods(seconds: float, dt: float, fewest: int = 1) -> int:
-    """Whole periods of a length, at least ``fewest``.
-
-    Args:
-        seconds: Length [s].
-        dt: Period [s].
-        fewest: Least number. Default 1.
-
-    Example:
-        >>> periods(0.5, 0.02), periods(0.5, 2.0)
-        (25, 1)
-    """
+    """Whole periods of a length, at least ``fewest``."""
     return max(fewest, round(seconds / dt))

@@ -59,10 +59,19 @@ class Trajectory:
         """Stem of the file that it comes from."""
         return self.name.split("#")[0]
 
-    def part(self, keep: NDArray[np.bool_], name: str, role: str) -> Trajectory:
-        """The samples where ``keep`` ``(n,)`` holds (one contiguous run), under a new name and role."""
+    def part(
+        self, keep: NDArray[np.bool_] | slice, name: str | None = None, role: str | None = None
+    ) -> Trajectory:
+        """The samples of ``keep``, a slice or a mask ``(n,)`` of one contiguous run.
+
+        Args:
+            keep: Which samples.
+            name: New name. Default: as before.
+            role: New role. Default: as before.
+        """
         arrays = {key: getattr(self, key)[keep] for key in ("t", "u", "y", "x", "xdot")}
-        return replace(self, name=name, role=role, **arrays)
+        own = (self.name if name is None else name), (self.role if role is None else role)
+        return replace(self, name=own[0], role=own[1], **arrays)
 
 
 class Cut(NamedTuple):
@@ -124,9 +133,6 @@ def load_trajectories(
         states: Signals of the prior's states ``[q, v, ...]``, for the plausible ranges of the speeds. Default: speeds
             are not checked.
         needed: Roles that must not be empty. Default: all three.
-
-    Returns:
-        The data set; it has at least one trajectory of each role that is needed.
 
     Raises:
         InputError: If recordings are bad (see :func:`~hybrid_mpc.data.recording.read_recording`), columns differ
@@ -236,20 +242,9 @@ def _resample(recording: Recording, rows: NDArray[np.intp], spec: DataSpec, name
 
 
 def hold_mean(t: Array, u: Array, grid: Array, dt: float) -> Array:
-    """Mean over ``[T_k, T_k + dt)`` of an input recorded as a zero-order hold: exact, whatever the stamps.
+    """Mean over ``[T_k, T_k + dt)`` of an input ``(m, n_u)`` recorded as a zero-order hold: exact, whatever the stamps.
 
-    Args:
-        t: Recorded time stamps ``(m,)`` [s].
-        u: Recorded inputs ``(m, n_u)``, each held until the next time stamp; zero outside the recording.
-        grid: Times ``T_k`` ``(n,)`` [s].
-        dt: Period [s].
-
-    Returns:
-        Means ``(n, n_u)``.
-
-    Example:
-        >>> hold_mean(np.array([0.0, 0.1, 0.2]), np.array([[1.0], [3.0], [9.0]]), np.array([0.0]), 0.2)
-        array([[2.]])
+    Each input is held until the next time stamp; it is zero outside the recording.
     """
     integral = np.vstack([np.zeros((1, u.shape[1])), np.cumsum(u[:-1] * np.diff(t)[:, None], axis=0)])
     return (_interpolate(t, integral, grid + dt) - _interpolate(t, integral, grid)) / dt

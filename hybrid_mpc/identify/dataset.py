@@ -15,13 +15,10 @@ from hybrid_mpc.errors import InputError
 
 @dataclass(frozen=True)
 class Windows:
-    """Equal windows cut from trajectories: a warm-up on measurements, then a scored part.
+    """Equal windows cut from trajectories [SI]: a warm-up of ``warm`` samples on measurements, then a scored part.
 
-    Args:
-        x: States ``(n, warm + horizon + 1, n_x)`` [SI].
-        u: Inputs ``(n, warm + horizon, n_u)`` [SI].
-        warm: Samples of the warm-up.
-        xdot: Derivatives of the states at the periods' starts ``(n, warm + horizon, n_x)`` [SI].
+    States ``x`` are ``(n, warm + horizon + 1, n_x)``; inputs ``u`` and the states' derivatives ``xdot`` at the
+    periods' starts ``(n, warm + horizon, ...)``.
     """
 
     x: Tensor
@@ -48,11 +45,7 @@ class Windows:
 
 
 def cut_windows(trajectories: Sequence[Trajectory], warm: int, horizon: int, stride: int) -> Windows:
-    """Windows of ``warm + horizon`` periods, every ``stride`` samples, from every trajectory long enough.
-
-    Raises:
-        InputError: If no trajectory is long enough, or one holds a value that is not finite.
-    """
+    """Windows of ``warm + horizon`` periods, every ``stride`` samples, from every trajectory long enough."""
     x, u, xdot, length = [], [], [], warm + horizon
     for trajectory in trajectories:
         _check_finite(trajectory)
@@ -77,29 +70,13 @@ def fitting_horizon(trajectories: Sequence[Trajectory], warm: int, most: int) ->
     That is two thirds of what the warm-up leaves of it, at most ``most``. Where that is less than half of
     ``most``, the longest trajectory decides up to that half: one too short then gives no window, which is
     better than short windows for all.
-
-    Args:
-        trajectories: The trajectories to cut.
-        warm: Samples of the warm-up.
-        most: Most scored periods.
-
-    Example:
-        >>> import numpy as np
-        >>> z = np.zeros((65, 1))
-        >>> short = Trajectory("run", "train", 0.02, 0.02 * np.arange(65), z, z, z, z)
-        >>> fitting_horizon([short], warm=10, most=50)
-        36
     """
     lengths = [2 * (len(t.t) - warm - 1) // 3 for t in trajectories]
     return max(1, min(most, max(min(lengths), min(most // 2, max(lengths)))))
 
 
 def check_rates(trajectories: Sequence[Trajectory]) -> None:
-    """Refuse trajectories whose derivative is not known: the paper form is trained on it.
-
-    Raises:
-        InputError: If xdot holds a value that is not finite.
-    """
+    """Refuse trajectories whose derivative is not known: the paper form is trained on it."""
     for trajectory in trajectories:
         _check_finite(trajectory, ("xdot",))
 

@@ -6,8 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.smooth import Smoother
@@ -20,20 +18,8 @@ def delayed(trajectory: Trajectory, delay: float) -> Trajectory:
     """The trajectory with the inputs that act under a delay: identification then runs as without one.
 
     A delay of ``m`` periods and a share ``f`` gives ``(1 - f) u_{k-m} + f u_{k-m-1}``, the mean of what acts over the
-    period. What acts before the first recorded input has arrived is not known: these samples are left out.
-
-    Args:
-        trajectory: Recording with the commanded inputs.
-        delay: Of the input [s], positive.
-
-    Raises:
-        InputError: If the delay is not positive, or the recording is not longer.
-
-    Example:
-        >>> t, z = 0.1 * np.arange(6), np.zeros((6, 1))
-        >>> run = Trajectory("run", "train", 0.1, t, np.arange(6.0)[:, None], z, np.zeros((6, 2)), np.zeros((6, 2)))
-        >>> delayed(run, 0.15).u.ravel().round(6).tolist(), delayed(run, 0.15).t.round(1).tolist()
-        ([0.5, 1.5, 2.5, 3.5], [0.2, 0.3, 0.4, 0.5])
+    period. What acts before the first recorded input has arrived is not known: these samples are left out. ``delay``
+    [s] is positive.
     """
     whole, rest = _split(delay, trajectory.dt)
     share = rest / trajectory.dt
@@ -43,7 +29,7 @@ def delayed(trajectory: Trajectory, delay: float) -> Trajectory:
         raise InputError(f"{trajectory.name}: a delay of {delay:g} s leaves nothing of {n} samples")
     younger = trajectory.u[first - whole : n - whole]
     older = trajectory.u[first - whole - 1 : n - whole - 1] if share > 0 else younger
-    rest_of = trajectory.part(np.arange(n) >= first, trajectory.name, trajectory.role)
+    rest_of = trajectory.part(slice(first, None))
     return replace(rest_of, u=(1 - share) * younger + share * older)
 
 
@@ -53,12 +39,7 @@ def shifted(trajectories: Sequence[Trajectory], delay: float) -> list[Trajectory
 
 
 def lost_samples(delay: float, dt: float) -> int:
-    """Samples at the start of a trajectory whose acting input is not known.
-
-    Example:
-        >>> lost_samples(0.0, 0.025), lost_samples(0.025, 0.025), lost_samples(0.03, 0.025)
-        (0, 1, 2)
-    """
+    """Samples at the start of a trajectory whose acting input is not known."""
     return math.ceil(delay / dt - 1e-6)
 
 
@@ -66,9 +47,7 @@ def with_states(trajectories: Sequence[Trajectory], smoother: Smoother, delay: f
     """Trajectories with smoothed states but the inputs as they were commanded, without the samples a delay costs."""
     made = []
     for t, s in zip(trajectories, smoother.smooth(shifted(trajectories, delay)), strict=True):
-        lost = len(t.t) - len(s.t)
-        rest = t.part(np.arange(len(t.t)) >= lost, t.name, t.role)
-        made.append(replace(rest, x=s.x, xdot=s.xdot))
+        made.append(replace(t.part(slice(len(t.t) - len(s.t), None)), x=s.x, xdot=s.xdot))
     return made
 
 

@@ -25,18 +25,9 @@ STARTS = 5
 class FreeRun:
     """A free run over one trajectory after its warm-up, and the measurement; n scored periods.
 
-    Args:
-        name: The trajectory's name.
-        t: Times [s] ``(n,)``.
-        u: Inputs ``(n, n_u)``.
-        x: Measured (smoothed) states ``(n, n_x)``.
-        x_hat: States of the model ``(n, n_x)``.
-        y: Measured outputs ``(n, n_y)``, not smoothed.
-        y_hat: Outputs of the model ``(n, n_y)``.
-        xdot: Measured mean rates over each period ``(n, n_x)``.
-        xdot_hat: Mean rates of the model ``(n, n_x)``.
-        energy_measured_w: ΔE_S [W] ``(n,)``, the prior's balance on the measurement.
-        energy_model_w: ΔE_M [W] ``(n,)`` on the model's own run.
+    ``x`` are the measured, smoothed states, ``y`` the measured outputs, not smoothed; ``xdot`` and ``xdot_hat`` are
+    mean rates over each period. ``energy_measured_w`` is ΔE_S, the prior's balance on the measurement,
+    ``energy_model_w`` ΔE_M on the model's own run.
     """
 
     name: str
@@ -86,8 +77,8 @@ def evaluation_trajectories(
     for t in trajectories:
         n = len(t.t) if length is None else min(len(t.t), warm + round(length / t.dt) + 1)
         stride = len(t.t) if length is None else max(1, round(length / t.dt / STARTS))
-        pieces += [_samples(t, slice(a, a + n)) for a in range(0, len(t.t) - n + 1, stride)]
-    starts = smoother.smooth([_samples(t, slice(0, warm + 1)) for t in pieces])
+        pieces += [t.part(slice(a, a + n)) for a in range(0, len(t.t) - n + 1, stride)]
+    starts = smoother.smooth([t.part(slice(0, warm + 1)) for t in pieces])
     return [
         replace(t, x=np.vstack([s.x, t.x[warm + 1 :]]), xdot=np.vstack([s.xdot, t.xdot[warm + 1 :]]))
         for t, s in zip(pieces, starts, strict=True)
@@ -122,16 +113,7 @@ def free_runs(
 def stacked_free_runs(
     trained: Trained, prior: Prior, dt: float, balance: Prior, trajectories: Sequence[Trajectory], warm: int
 ) -> list[list[FreeRun]]:
-    """:func:`free_runs` of all networks of a training at once: those of the first network, the second, ...
-
-    Args:
-        trained: The training.
-        prior: The prior that the networks correct.
-        dt: Model period [s].
-        balance: The prior whose energy balance and output count.
-        trajectories: The trajectories; they may differ in length.
-        warm: Samples of the warm-up.
-    """
+    """:func:`free_runs` of all networks of a training at once: those of the first network, the second, ..."""
     step = trained.stacked_step(prior, dt)
     x_hat = model_states(step, trajectories, warm)
     return [[_free_run(balance, t, x[i], warm) for i, t in enumerate(trajectories)] for x in x_hat]
@@ -142,11 +124,8 @@ def model_states(
 ) -> Array:
     """States of a model that runs freely from sample ``warm`` on, ``(..., runs, samples - warm + 1, n_x)``.
 
-    Args:
-        step: The model, or a stack of networks (:meth:`~hybrid_mpc.identify.train.Trained.stacked_step`).
-        trajectories: The trajectories. Those that are shorter go on under their last input.
-        warm: Samples of the warm-up, in which h follows the measured states.
-        h0: Hidden state before the warm-up ``(n_h,)``, or ``(networks, 1, n_h)`` of a stack. Default: zero.
+    Shorter trajectories go on under their last input. ``h0`` ``(n_h,)``, of a stack ``(networks, 1, n_h)``, is the
+    hidden state before the warm-up; default zero.
     """
     h0 = step.h0 if h0 is None else h0
     longest = max(len(t.t) for t in trajectories)
@@ -193,11 +172,6 @@ def _free_run(prior: Prior, trajectory: Trajectory, x_hat: Array, warm: int) -> 
         trajectory.name, trajectory.t[part], u, x, x_hat[:n], trajectory.y[part], y_hat, xdot, xdot_hat,
         measured, model,
     )  # fmt: skip
-
-
-def _samples(trajectory: Trajectory, keep: slice) -> Trajectory:
-    arrays = {key: getattr(trajectory, key)[keep] for key in ("t", "u", "y", "x", "xdot")}
-    return replace(trajectory, **arrays)
 
 
 def _padded(values: Array, length: int) -> Array:

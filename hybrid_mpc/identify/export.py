@@ -24,12 +24,7 @@ ENERGY = BalanceInfo("energy", "J", "W")
 
 @dataclass(frozen=True)
 class Parity:
-    """Largest differences between the exported step and torch in float64, relative to the outputs' scale.
-
-    Args:
-        max_abs_error: Of the values.
-        jacobian_max_abs_error: Of the Jacobians.
-    """
+    """Largest differences between the exported step and torch in float64, relative to the outputs' scale."""
 
     max_abs_error: float
     jacobian_max_abs_error: float
@@ -93,28 +88,17 @@ class _Xdot(_OfStep):
         return super().forward(x, h, u, w, p)[0]
 
 
-class _Output(_WithParameters):
-    """``output`` of a prior."""
+class _OfPrior(_WithParameters):
+    """``output`` or ``energy_balance`` of a prior; its last two inputs are ``w`` and ``p``."""
 
-    def __init__(self, prior: Prior) -> None:
+    def __init__(self, prior: Prior, method: str) -> None:
         super().__init__(prior)
-        self.part = _Method(prior, "output")
+        self.part = _Method(prior, method)
 
-    def forward(self, x: Tensor, u: Tensor, w: Tensor, p: Tensor) -> Tensor:
-        y: Tensor = self.at(self.part, "owner.", p, x, u)
-        return y
-
-
-class _Energy(_WithParameters):
-    """Residual of the energy balance."""
-
-    def __init__(self, prior: Prior) -> None:
-        super().__init__(prior)
-        self.part = _Method(prior, "energy_balance")
-
-    def forward(self, x: Tensor, xdot: Tensor, u: Tensor, w: Tensor, p: Tensor) -> Tensor:
-        balance: Tensor = self.at(self.part, "owner.", p, x, xdot, u)
-        return balance
+    def forward(self, *args: Tensor) -> Tensor:
+        *signals, _, p = args
+        found: Tensor = self.at(self.part, "owner.", p, *signals)
+        return found
 
 
 def trace_model(step: Step) -> dict[str, nn_export.Program]:
@@ -126,8 +110,8 @@ def trace_model(step: Step) -> dict[str, nn_export.Program]:
     modules: dict[str, nn.Module] = {
         "step": _OfStep(step, "forward", "integrate"),
         "xdot": _Xdot(step, "xdot", "derivative"),
-        "output": _Output(step.prior),
-        ENERGY.program: _Energy(step.prior),
+        "output": _OfPrior(step.prior, "output"),
+        ENERGY.program: _OfPrior(step.prior, "energy_balance"),
     }
     examples = _examples(step)
     programs = {}

@@ -30,12 +30,7 @@ LARGEST = 1e3
 
 
 class ParameterFit:
-    """A prior's free parameters ``theta``, each over its nominal size, and the residuals that are fitted.
-
-    Args:
-        make: Prior class or factory ``(values=None) -> Prior``.
-        dt: Model period [s].
-    """
+    """A prior's free parameters ``theta``, each over its nominal size, and the residuals that are fitted."""
 
     def __init__(self, make: Callable[..., Prior], dt: float) -> None:
         self.make, self.prior, self.dt = make, make(), dt
@@ -65,8 +60,7 @@ class ParameterFit:
     def output_error(self, start: Array, windows: Windows, evaluations: int) -> tuple[Array, Any]:
         """Fit from ``start`` to free runs over the windows, each from its first measured state.
 
-        Returns:
-            ``theta`` and the Jacobian of the residuals over their standard deviation.
+        Gives ``theta`` and the Jacobian of the residuals over their standard deviation.
         """
         run = self.residual_function(windows, start)
         derivative = torch.func.jacfwd(run)
@@ -108,7 +102,7 @@ class ParameterFit:
         if singular[-1] < 1e-6 * singular[0]:
             names = [p.name for p, w in zip(self.free, np.abs(rows[-1]), strict=True) if w > 0.2]
             warnings.append(f"the data cannot tell apart: {', '.join(names)}")
-        errors = np.sqrt(np.diag(_covariance(singular, rows))) * self.unit
+        errors = np.sqrt(np.diag(covariance_of(singular, rows))) * self.unit
         for p, value, low, high in zip(self.free, theta, self.lower, self.upper, strict=True):
             if min(value - low, high - value) < 1e-3 * (high - low):
                 warnings.append(f"{p.label} ends at a bound ({value * abs(p.value or 1):.4g})")
@@ -119,22 +113,12 @@ class ParameterFit:
         if jacobian is None:
             return {}
         _, singular, rows = np.linalg.svd(jacobian, full_matrices=False)
-        covariance = _covariance(singular, rows)
-        sigma = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-        names = [p.name for p in self.free]
-        return {
-            f"{names[i]}, {names[j]}": float(covariance[i, j] / (sigma[i] * sigma[j]))
-            for i in range(len(names))
-            for j in range(i + 1, len(names))
-        }
+        return correlations([p.name for p in self.free], covariance_of(singular, rows))
 
     def residual_function(self, windows: Windows, near: Array, most: int = 0) -> Callable[[Tensor], Tensor]:
         """``theta -> `` errors of all states of all free runs over the states' spread, as one vector.
 
-        Args:
-            windows: Free runs from their first states.
-            near: Parameters whose stiffness decides the sub-steps.
-            most: Sub-steps instead, if not zero.
+        The stiffness at ``near`` decides the sub-steps, unless ``most`` says how many.
         """
         spread = spread_of(windows)
         unit, names = torch.tensor(self.unit), [p.name for p in self.free]
@@ -158,8 +142,19 @@ def spread_of(windows: Windows) -> Tensor:
     return windows.x.reshape(-1, windows.x.shape[-1]).std(0).clamp_min(1e-9)
 
 
-def _covariance(singular: Array, rows: Array) -> Array:
+def covariance_of(singular: Array, rows: Array) -> Array:
+    """Covariance of the parameters, from singular values and right vectors of a Jacobian over its noise."""
     return np.asarray((rows.T / np.maximum(singular, 1e-12 * singular[0]) ** 2) @ rows)
+
+
+def correlations(names: Sequence[str], covariance: Array) -> dict[str, float]:
+    """Correlation of the errors of every two parameters, by ``"a, b"``."""
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    return {
+        f"{names[i]}, {names[j]}": float(covariance[i, j] / (sigma[i] * sigma[j]))
+        for i in range(len(names))
+        for j in range(i + 1, len(names))
+    }
 
 
 MOST_SEGMENTS = 60
@@ -172,34 +167,14 @@ EVALUATIONS = 15
 
 @dataclass(frozen=True)
 class Segments:
-    """Adjacent segments of trajectories.
-
-    Args:
-        windows: The segments, ``n`` of them.
-        joined: True ``(n,)`` where a segment's end is the next one's start.
-    """
+    """Adjacent segments of trajectories; ``joined`` ``(n,)`` is true where a segment's end is the next one's start."""
 
     windows: Windows
     joined: NDArray[np.bool_]
 
 
 def cut_segments(trajectories: Sequence[Trajectory], periods: int, most: int = MOST_SEGMENTS) -> Segments:
-    """Adjacent segments of ``periods``, of evenly chosen trajectories if there are more than ``most``.
-
-    Args:
-        trajectories: Recordings; what is left at the end of one is not used.
-        periods: Length of a segment.
-        most: Most segments.
-
-    Raises:
-        InputError: If no trajectory holds a segment.
-
-    Example:
-        >>> t, z = 0.02 * np.arange(65), np.zeros((65, 1))
-        >>> run = Trajectory("run", "train", 0.02, t, z, z, np.hstack([z, z]), np.hstack([z, z]))
-        >>> cut_segments([run, run], 30).joined.tolist()
-        [True, False, True, False]
-    """
+    """Adjacent segments of ``periods``, of evenly chosen trajectories if there are more than ``most``."""
     counts = [(len(t.t) - 1) // periods for t in trajectories]
     fitting = [i for i, count in enumerate(counts) if count]
     if not fitting:
@@ -227,14 +202,8 @@ def multiple_shooting(fit: ParameterFit, start: Array, segments: Segments) -> tu
     run from an unknown state: no measured state is taken for exact, while free runs from measured ones carry their
     noise along. Derivatives are exact (forward mode through the integrator).
 
-    Args:
-        fit: The parameters.
-        start: First ``theta``; the states start as they are measured.
-        segments: What is fitted.
-
-    Returns:
-        ``theta`` and the Jacobian by it with the states projected out, over the residuals' standard deviation: the
-        standard errors made of it know that the states are unknown.
+    Gives ``theta`` and the Jacobian by it with the states projected out, over the residuals' standard deviation: the
+    standard errors made of it know that the states are unknown.
 
     Source: Bock, *Recent advances in parameter identification techniques for O.D.E.* (1983).
     """

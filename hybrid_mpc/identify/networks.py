@@ -45,24 +45,9 @@ class StackedGRU(nn.Module):
     """``networks`` independent :class:`GRUNetwork` with stacked weights, trained at once.
 
     Tensors carry the network as first axis, ``(networks, batch, features)``. Small networks are bound by the cost of
-    launching operations, so several cost little more than one.
-
-    Args:
-        networks: Number of networks.
-        n_in: Number of input features.
-        hidden: Number of hidden units z.
-        n_out: Number of outputs.
-        seed: Seed of the initial weights; network i of one seed is the same whatever ``networks`` is.
-        zero_head: Start with zero output, so that a hybrid starts as its prior.
-        fused: :meth:`sequence` with few operations a time step (:func:`fused_states`): faster, other rounding.
-
-    Example:
-        >>> net = StackedGRU(2, 3, 4, 1, seed=0)
-        >>> s = torch.rand(2, 5, 3, dtype=torch.float64)
-        >>> out, h = net(s, net.initial(5))
-        >>> one, _ = net.member(1)(s[1], h.new_zeros(5, 4))
-        >>> torch.allclose(out[1], one, atol=1e-14)
-        True
+    launching operations, so several cost little more than one. Network i of one ``seed`` is the same whatever
+    ``networks`` is; ``zero_head`` starts with zero output; ``fused`` makes :meth:`sequence` faster, with other
+    rounding.
     """
 
     def __init__(
@@ -104,9 +89,7 @@ class StackedGRU(nn.Module):
     def sequence(self, s: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
         """Outputs ``(T, networks, batch, n_out)`` and last h along a sequence.
 
-        Args:
-            s: Features ``(T, networks, batch, n_in)``, or ``(T, 1, batch, n_in)`` if all networks have the same.
-            h: Hidden states at the start ``(networks, batch, z)``.
+        Features ``s`` are ``(T, networks, batch, n_in)``, or ``(T, 1, batch, n_in)`` if all networks have the same.
         """
         if self.fused:
             states = fused_states(s, h, self.w_ih, self.w_hh, self.b_ih, self.b_hh)
@@ -143,20 +126,8 @@ def fused_states(s: Tensor, h: Tensor, w_ih: Tensor, w_hh: Tensor, b_ih: Tensor,
     The equations of :class:`StackedGRU` with a derivative written by hand. A time step is one matrix product (hidden
     state, features and bias in one row) and four operations on the gates, in memory that is allocated once. Automatic
     differentiation would record a dozen operations a step. Sums run in another order, so results differ by rounding.
-
-    Args:
-        s: Features ``(T, networks or 1, batch, n_in)``.
-        h: Hidden states at the start ``(networks, batch, z)``.
-        w_ih: Weights of the features ``(networks, n_in, 3 z)``, gates r, z and candidate.
-        w_hh: Weights of the hidden state ``(networks, z, 3 z)``.
-        b_ih: Bias next to the features ``(networks, 1, 3 z)``.
-        b_hh: Bias inside the reset product ``(networks, 1, 3 z)``.
-
-    Example:
-        >>> def w(*shape):
-        ...     return torch.rand(2, *shape, dtype=torch.float64)
-        >>> tuple(fused_states(w(1, 5, 3), w(5, 4), w(3, 12), w(4, 12), w(1, 12), w(1, 12)).shape)
-        (2, 2, 5, 4)
+    ``s`` is ``(T, networks or 1, batch, n_in)``, h ``(networks, batch, z)``; the columns of the weights are the gates
+    r, z and the candidate.
     """
     z = w_hh.shape[1]
     rows = torch.cat([s, s.new_ones(*s.shape[:3], 1)], dim=3).transpose(0, 1)

@@ -21,20 +21,10 @@ from hybrid_mpc.identify.step import RecurrentStep
 class VectorPerformanceIndex:
     """Several objectives L_j as one number, with bounds c_j that only fall (Kreisselmeier & Steinhauser 1979).
 
-    :meth:`value`, a smooth maximum of L_j / c_j, is minimised on mini-batches. :meth:`lower` takes the objectives on a
-    *fixed* set of windows, a statistic that means the same from step to step. So no step that improves one objective at
-    another's cost ever moves a bound.
-
-    Args:
-        bounds: Start values ``(networks, objectives)``, e.g. the fitted prior's objectives.
-        rho: Sharpness of the maximum; 10 keeps the value within log(2)/10 of the hard maximum of two.
-
-    Example:
-        >>> index = VectorPerformanceIndex(torch.tensor([[1.0, 1.0]]))
-        >>> index.lower(torch.tensor([[0.5, 0.8]])).bounds.tolist()
-        [[0.5, 0.800000011920929]]
-        >>> index.lower(torch.tensor([[0.5, 1.1]])).bounds.tolist()
-        [[1.0, 1.0]]
+    :meth:`value`, a smooth maximum of L_j / c_j, is minimised on mini-batches. :meth:`lower` takes the objectives on
+    a *fixed* set of windows, a statistic that means the same from step to step. So no step that improves one
+    objective at another's cost ever moves a bound. ``bounds`` are ``(networks, objectives)``; ``rho`` is the
+    sharpness of the maximum: 10 keeps the value within log(2)/10 of the hard maximum of two.
     """
 
     def __init__(self, bounds: Tensor, rho: float = 10.0) -> None:
@@ -53,14 +43,11 @@ class VectorPerformanceIndex:
 
 @dataclass(frozen=True)
 class Prediction:
-    """A model's prediction along windows and the measurement, at the periods' starts.
+    """A model's prediction along windows and the measurement, at the periods' starts; ``(..., n_x)`` and ``(...,
+    n_u)``.
 
-    Args:
-        x: Measured states ``(..., n_x)``.
-        x_hat: States of the model (the measured ones under teacher forcing).
-        u: Inputs ``(..., n_u)``.
-        xdot: Measured rates ``(..., n_x)``, as the model's form has them (hybrid: means over the period).
-        xdot_hat: Rates of the model.
+    ``x_hat`` are the measured states under teacher forcing; rates ``xdot`` are as the model's form has them (hybrid:
+    means over the period).
     """
 
     x: Tensor

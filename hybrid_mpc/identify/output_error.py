@@ -19,7 +19,7 @@ from torch.func import functional_call
 
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.identify.fit import ParameterFit
+from hybrid_mpc.identify.fit import ParameterFit, correlations, covariance_of
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.step import required_substeps, rk4
 from hybrid_mpc.machine.torch_prior import Prior
@@ -35,13 +35,10 @@ AT_BOUND = 1e-3
 
 @dataclass(frozen=True)
 class Runs:
-    """Free runs to be fitted.
+    """Free runs to be fitted: first states ``x`` ``(n, n_x)``, measured outputs ``y`` ``(n, periods, n_y)`` after
+    each period.
 
-    Args:
-        x: First states ``(n, n_x)``.
-        u: Commanded inputs ``(n, lead + periods, n_u)``, from ``lead`` samples before the first state on.
-        y: Measured outputs after each period ``(n, periods, n_y)``.
-        lead: Samples before the first state.
+    The commanded inputs ``u`` ``(n, lead + periods, n_u)`` begin ``lead`` samples before the first state.
     """
 
     x: Tensor
@@ -51,20 +48,9 @@ class Runs:
 
 
 def cut_runs(trajectories: Sequence[Trajectory], periods: int, lead: int, most: int) -> Runs:
-    """At most ``most`` free runs of ``periods``, one after the other, evenly chosen.
-
-    Raises:
-        InputError: If no trajectory is long enough.
-
-    Example:
-        >>> z = np.zeros((50, 1))
-        >>> run = Trajectory("run", "train", 0.1, 0.1 * np.arange(50), z, z, np.zeros((50, 2)), np.zeros((50, 2)))
-        >>> cut_runs([run], 20, lead=3, most=10).u.shape
-        torch.Size([2, 23, 1])
-    """
-    starts = [
-        (t, k) for t in trajectories for k in range(lead, len(t.t) - periods, periods)
-    ]  # a run needs the sample after its last period
+    """At most ``most`` free runs of ``periods``, one after the other, evenly chosen."""
+    # a run needs the sample after its last period
+    starts = [(t, k) for t in trajectories for k in range(lead, len(t.t) - periods, periods)]
     if not starts:
         longest = max((len(t.t) for t in trajectories), default=0)
         raise InputError(
@@ -82,13 +68,7 @@ def cut_runs(trajectories: Sequence[Trajectory], periods: int, lead: int, most: 
 
 
 class OutputErrorFit:
-    """A prior's free parameters and its input's delay, over their nominal sizes, and their fit.
-
-    Args:
-        make: Prior class or factory ``(values=None) -> Prior``.
-        dt: Model period [s].
-        largest_delay: Longest delay [s]; zero: there is none.
-    """
+    """A prior's free parameters and its input's delay, over their nominal sizes, and their fit."""
 
     def __init__(self, make: Callable[..., Prior], dt: float, largest_delay: float = 0.0) -> None:
         self.make, self.dt, self.largest = make, dt, largest_delay
@@ -134,16 +114,9 @@ class OutputErrorFit:
         return float(np.sqrt(np.mean(np.square(self.errors(theta[None], runs)))))
 
     def fit(self, start: Array, runs: Runs, evaluations: int, *, robust: bool) -> tuple[Array, Array]:
-        """Fit from ``start``.
+        """``theta`` fitted from ``start``, and the Jacobian of the residuals over their standard deviation.
 
-        Args:
-            start: First ``theta``.
-            runs: What is fitted.
-            evaluations: Most simulations.
-            robust: Soft absolute values instead of squares, for runs from starts that are far off.
-
-        Returns:
-            ``theta`` and the Jacobian of the residuals over their standard deviation.
+        ``robust`` takes soft absolute values instead of squares, for runs from starts that are far off.
         """
         spread = runs.y.reshape(-1, runs.y.shape[-1]).std(0).clamp_min(1e-12).numpy()
 
@@ -171,18 +144,13 @@ class OutputErrorFit:
     def result(self, theta: Array, slope: Array, stages: Sequence[dict[str, Any]]) -> PriorFit:
         """Values with standard errors; the delay counts among what is fitted, it is no parameter of the prior."""
         _, singular, rows = np.linalg.svd(slope, full_matrices=False)
-        covariance = (rows.T / np.maximum(singular, 1e-12 * singular[0]) ** 2) @ rows
+        covariance = covariance_of(singular, rows)
         sizes = np.sqrt(np.diag(covariance))
         names = [p.name for p in self.free]
         near = np.minimum(theta - self.lower, self.upper - theta) < AT_BOUND * (self.upper - self.lower)
         warnings = tuple(f"{p.label} ends at a bound" for p, hit in zip(self.free, near, strict=False) if hit)
-        correlations = {
-            f"{names[i]}, {names[j]}": float(covariance[i, j] / (sizes[i] * sizes[j]))
-            for i in range(len(names))
-            for j in range(i + 1, len(names))
-        }
         errors = {name: float(sizes[i] * self.unit[i]) for i, name in enumerate(names)}
-        return PriorFit(self.values(theta), errors, warnings, tuple(stages), correlations)
+        return PriorFit(self.values(theta), errors, warnings, tuple(stages), correlations(names, covariance))
 
     def _acting(self, delays: Tensor, runs: Runs) -> Tensor:
         """Inputs ``(m, n, periods, n_u)`` that act under each delay, means over each period."""

@@ -34,13 +34,10 @@ Progress = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class Physics:
-    """The fitted prior.
+    """The fitted prior: the fit, the input's delay [s] (zero for none), and what its smoother assumes.
 
-    Args:
-        fit: Parameters and what is known of their confidence.
-        delay: Delay of the input [s], zero for none.
-        sigma: Standard deviation of the measurement that the smoother assumes [output unit].
-        walk: Standard deviation of the unexplained acceleration's change per period.
+    ``sigma`` is the standard deviation of the measurement [output unit], ``walk`` that of the unexplained
+    acceleration's change per period.
     """
 
     fit: PriorFit
@@ -70,19 +67,10 @@ def fit_and_smooth(
     start: Mapping[str, float] | None = None,
     on_progress: Callable[[str, int, int, str], None] = lambda key, done, total, text: None,
 ) -> Physics:
-    """Fit a prior to polynomially smoothed states, smooth by it, fit it to these states.
+    """Fit a prior to polynomially smoothed states, smooth by it, fit it to these states; there is no delay.
 
-    Args:
-        make: Prior class or factory ``(values=None) -> Prior``.
-        train: Training trajectories.
-        valid: Validation trajectories.
-        dt: Model period [s].
-        methods: See :func:`~hybrid_mpc.identify.fit.fit_prior`.
-        start: See :func:`~hybrid_mpc.identify.fit.fit_prior`.
-        on_progress: ``(round, done, total, text)`` with a title of ``ROUNDS``.
-
-    Returns:
-        The last fit, and the smoother around it; there is no delay.
+    ``methods`` and ``start`` are those of :func:`~hybrid_mpc.identify.fit.fit_prior`; ``on_progress`` takes
+    ``(round, done, total, text)`` with a title of ``ROUNDS``.
     """
     physics: Physics | None = None
     unit = time_unit(train, dt)
@@ -113,16 +101,8 @@ def fit_physics(
     """Fit parameters and delay to longer and longer free runs; the last ones start from states smoothed by the prior.
 
     The stage with the least error over training and validation runs of the longest length wins: a handful of
-    parameters follows no noise, and where friction drifts a short validation part alone misleads.
-
-    Args:
-        make: Prior class or factory ``(values=None) -> Prior``.
-        train: Training pieces.
-        valid: Validation pieces: nothing is fitted to them.
-        dt: Model period [s].
-        length: Length [s] of the longest free runs.
-        largest_delay: Longest delay searched for [s]. Default: zero, none is searched.
-        on_progress: ``(done, total, text)``.
+    parameters follows no noise, and where friction drifts a short validation part alone misleads. ``length`` [s] is
+    that of the longest runs; no delay is searched for where ``largest_delay`` [s] is zero.
     """
     fit = OutputErrorFit(make, dt, largest_delay)
     theta, total, unit = fit.nominal, len(STAGES) + 1, time_unit(train, dt)
@@ -135,8 +115,14 @@ def fit_physics(
         runs = cut_runs(train, _periods(train, min(seconds, length), dt, fit.lead), fit.lead, most)
         theta, slope = fit.fit(theta, runs, evaluations, robust=True)
         found.append((f"free runs of {seconds:g} s", theta, slope))
-    delay = _delay(fit.delay(theta), dt)
-    smoother = fit_smoother(make(fit.values(theta)), [*shifted(train, delay), *shifted(valid, delay)], dt)
+
+    def smoothing(theta: Any) -> tuple[float, Smoother]:
+        """The delay, none where it is too short to count, and the smoother of the recordings under it."""
+        delay = fit.delay(theta) if fit.delay(theta) >= NONE * dt else 0.0
+        recordings = [*shifted(train, delay), *shifted(valid, delay)]
+        return delay, fit_smoother(make(fit.values(theta)), recordings, dt)
+
+    delay, smoother = smoothing(theta)
     starts, others = (with_states(part, smoother, delay) for part in (train, valid))
     on_progress(total - 1, total, "the longest free runs")
     runs = cut_runs(starts, _periods(starts, length, dt, fit.lead), fit.lead, LAST[1])
@@ -147,8 +133,7 @@ def fit_physics(
     best = int(np.argmin(scores))
     stages = [{"stage": f[0], "validation_error": s} for f, s in zip(found, scores, strict=True)]
     _, theta, slope = found[best]
-    delay = _delay(fit.delay(theta), dt)
-    smoother = fit_smoother(make(fit.values(theta)), [*shifted(train, delay), *shifted(valid, delay)], dt)
+    delay, smoother = smoothing(theta)
     return Physics(fit.result(theta, slope, stages), delay, smoother.sigma, smoother.walk)
 
 
@@ -156,10 +141,6 @@ def _together(errors: Sequence[float], parts: Sequence[Runs]) -> float:
     """Root mean square over several parts."""
     sizes = [part.y.numel() for part in parts]
     return float(np.sqrt(np.average(np.square(errors), weights=sizes)))
-
-
-def _delay(delay: float, dt: float) -> float:
-    return delay if delay >= NONE * dt else 0.0
 
 
 def _periods(trajectories: Sequence[Trajectory], length: float, dt: float, lead: int) -> int:

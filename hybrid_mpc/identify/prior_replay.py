@@ -42,13 +42,10 @@ recordings, an angle by sine and cosine."""
 
 @dataclass(frozen=True)
 class PriorReplay:
-    """Runs of the prior, and how much each of their states counts.
+    """Runs of the prior ``(FOLLOWED + COUNTED, n, ...)`` [SI], and how much each of their states counts.
 
-    Args:
-        x: States ``(FOLLOWED + COUNTED, n, n_x)`` [SI].
-        u: Inputs ``(FOLLOWED + COUNTED, n, n_u)`` [SI].
-        weight: ``(FOLLOWED + COUNTED, n)``: 0 at a recorded sample, 1 far from all of them; 0 beyond the measured
-            range of a state that is no angle.
+    The weight is 0 at a recorded sample, 1 far from all of them, 0 beyond the measured range of a state that is no
+    angle.
     """
 
     x: Tensor
@@ -66,25 +63,7 @@ class PriorReplay:
 
 
 def make_prior_replay(prior: Prior, training: Sequence[Trajectory], seed: int) -> PriorReplay:
-    """Prior replay around training trajectories.
-
-    Args:
-        prior: The fitted prior.
-        training: Training trajectories.
-        seed: Of starts and inputs; the same seed and data give the same runs.
-
-    Example:
-        >>> from scenarios.unbalanced_disk import scenario
-        >>> prior, t = scenario.prior(), 0.025 * np.arange(500.0)
-        >>> x = 0.3 * np.column_stack([np.sin(3 * t), 3 * np.cos(3 * t)])  # hangs and swings a little
-        >>> u, y = np.zeros((500, 1)), x[:, :1]
-        >>> prior_replay = make_prior_replay(prior, [Trajectory("run", "train", 0.025, t, u, y, x, 0 * x)], seed=0)
-        >>> prior_replay.x.shape
-        torch.Size([30, 2000, 2])
-        >>> up = (prior_replay.x[..., 0].cos() < -0.9) & (prior_replay.x[..., 1].abs() < 0.9)  # as fast as was measured
-        >>> bool(prior_replay.weight[up].min() > 0.99)
-        True
-    """
+    """Prior replay around training trajectories."""
     rng = np.random.default_rng([seed, 1])
     x, u = (np.concatenate([getattr(t, key) for t in training]) for key in ("x", "u"))
     low, high = x.min(0), x.max(0)

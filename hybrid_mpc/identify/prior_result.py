@@ -30,14 +30,6 @@ class PriorFit:
         warnings: Parameters at a bound, or ones that the data do not identify.
         stages: One row per stage: its name and the validation error that chose the winner.
         correlations: Correlation of the errors of every two fitted parameters, by ``"a, b"``. Default: none known.
-
-    Example:
-        >>> fit = PriorFit({"J": 0.11, "d": 0.01}, {"J": 0.01, "d": 0.02}, (), (), {"J, d": 0.995})
-        >>> fit.t_ratios
-        {'J': 11.0, 'd': 0.5}
-        >>> for line in fit.identifiability: print(line)
-        J and d can hardly be told apart: their errors are correlated by 0.995
-        d may be zero: 0.5 standard errors
     """
 
     values: dict[str, float]
@@ -75,20 +67,7 @@ class PriorFit:
         return (*self.warnings, *close, *small)
 
     def covariance(self, parameters: Sequence[Parameter]) -> tuple[tuple[float, ...], ...]:
-        """Rows of the covariance of the fitted values, as an artifact stores it; fixed parameters have none.
-
-        Args:
-            parameters: The prior's ``parameters_spec``.
-
-        Returns:
-            ``(n_p, n_p)``; empty where an error of a free one is unknown.
-
-        Example:
-            >>> fit = PriorFit({"J": 0.11, "d": 0.01}, {"J": 0.01, "d": 0.02}, (), (), {"J, d": 0.5})
-            >>> spec = [Parameter(n, v, "-", 0.0, 1.0) for n, v in fit.values.items()]
-            >>> [[round(v, 6) for v in row] for row in fit.covariance(spec)]
-            [[0.0001, 0.0001], [0.0001, 0.0004]]
-        """
+        """Rows of the covariance of the fitted values, as an artifact stores it; fixed parameters have none."""
         errors = [0.0 if p.fixed else self.standard_errors.get(p.name, math.nan) for p in parameters]
         rows = tuple(
             tuple(a * b * self._correlation(p.name, q.name) for q, b in zip(parameters, errors, strict=True))
@@ -97,16 +76,7 @@ class PriorFit:
         return rows if all(math.isfinite(value) for row in rows for value in row) else ()
 
     def rows(self, parameters: Sequence[Parameter]) -> list[dict[str, Any]]:
-        """One row a parameter: name, unit, nominal, fitted, standard error, t-ratio, largest correlation.
-
-        Args:
-            parameters: The prior's ``parameters_spec``. What is unknown of a fixed one is None.
-
-        Example:
-            >>> fit = PriorFit({"J": 0.11}, {"J": 0.01}, (), ())
-            >>> fit.rows([Parameter("J", 0.1, "kg m^2", 0.01, 1.0)])[0]["t_ratio"]
-            11.0
-        """
+        """One row a parameter: name, unit, nominal, fitted, standard error, t-ratio, largest correlation."""
         ratios = self.t_ratios
         return [
             {
@@ -122,16 +92,7 @@ class PriorFit:
         ]
 
     def table(self, parameters: Sequence[Parameter]) -> pd.DataFrame:
-        """:meth:`rows` as a data frame, by parameter; ``fit.table(prior.parameters_spec).to_csv(path)`` writes it.
-
-        Raises:
-            InputError: If pandas is not installed.
-
-        Example:
-            >>> fit = PriorFit({"J": 0.11}, {"J": 0.01}, (), ())
-            >>> fit.table([Parameter("J", 0.1, "kg m^2", 0.01, 1.0)]).loc["J", "fitted"].item()
-            0.11
-        """
+        """:meth:`rows` as a data frame, by parameter; ``fit.table(prior.parameters_spec).to_csv(path)`` writes it."""
         try:
             import pandas as pd
         except ImportError as missing:

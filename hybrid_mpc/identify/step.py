@@ -29,13 +29,7 @@ SPAN = 10
 
 
 def rk4(f: Callable[[Tensor], Tensor], x: Tensor, dt: float, substeps: int) -> Tensor:
-    """Classical Runge-Kutta of order 4 for ``xdot = f(x)`` over ``dt`` in equal sub-steps.
-
-    Example:
-        >>> x = rk4(lambda x: -x, torch.ones(1, dtype=torch.float64), 0.1, 2)
-        >>> abs(x.item() - math.exp(-0.1)) < 1e-8
-        True
-    """
+    """Classical Runge-Kutta of order 4 for ``xdot = f(x)`` over ``dt`` in equal sub-steps."""
     s = dt / substeps
     for _ in range(substeps):
         k1 = f(x)
@@ -51,19 +45,12 @@ def required_substeps(prior: Prior, dt: float) -> int:
 
     Friction is steepest at rest; Runge-Kutta of order 4 is stable up to 2.8 and accurate to per cents
     of the fast mode at 1.
-
-    Raises:
-        InputError: If more than ``MAX_SUBSTEPS`` would be needed.
     """
     return substeps_for(prior, len(prior.states), len(prior.inputs), dt, f"{type(prior).__name__}: the prior")
 
 
 def substeps_for(f: Callable[[Tensor, Tensor], Tensor], n_x: int, n_u: int, dt: float, name: str) -> int:
-    """:func:`required_substeps` of any ``xdot = f(x, u)``; ``name`` says in the error what is too stiff.
-
-    Raises:
-        InputError: If more than ``MAX_SUBSTEPS`` would be needed.
-    """
+    """:func:`required_substeps` of any ``xdot = f(x, u)``; ``name`` says in the error what is too stiff."""
     zeros = torch.zeros(n_x, dtype=torch.float64)
     u = torch.zeros(n_u, dtype=torch.float64)
     slope = torch.func.jacrev(lambda x: f(x, u))(zeros)
@@ -79,12 +66,7 @@ def substeps_for(f: Callable[[Tensor, Tensor], Tensor], n_x: int, n_u: int, dt: 
 
 
 class Step(nn.Module):
-    """What every model is: a step over one period, its derivative, and the prior that names its signals.
-
-    Args:
-        prior: The ODE prior; names, output and energy balance are its own.
-        dt: Model period [s].
-    """
+    """What every model is: a step over one period, its derivative, and the prior that names its signals."""
 
     def __init__(self, prior: Prior, dt: float) -> None:
         super().__init__()
@@ -154,16 +136,9 @@ class RecurrentStep(Step):
     """A step with a network in it. A subclass is a form of model that :func:`~hybrid_mpc.identify.train.train` takes.
 
     A subclass says what the network sees and gives (``sizes``, ``scaling_of``, ``features``) and what becomes of it
-    (``integrate``, ``derivative``, ``rate``, ``measured_rate``).
-
-    Args:
-        prior: The ODE prior; it also names the states.
-        network: ``(s, h) -> (output, h_next)``, one network or a stack.
-        scaling: Magnitudes of features and outputs.
-        dt: Model period [s].
-        use_prior: False makes the plain recurrent network (RNN) of the paper's comparison, which sees no prior.
-        dynamics: The prior's equation with parameters that were, or are, trained along; names, output and energy
-            balance stay those of ``prior``. Default: ``prior``.
+    (``integrate``, ``derivative``, ``rate``, ``measured_rate``). ``use_prior=False`` makes the plain recurrent network
+    (RNN) of the paper's comparison. ``dynamics`` is the prior's equation with parameters trained along (default:
+    ``prior``); names, output and energy balance stay those of ``prior``.
     """
 
     corrects_prior: ClassVar[bool]
@@ -187,6 +162,7 @@ class RecurrentStep(Step):
     ) -> None:
         super().__init__(prior, dt)
         self.network, self.use_prior, self.dynamics = network, use_prior, dynamics
+        self.substeps = required_substeps(prior, dt) if use_prior and self.corrects_prior else 1
         for name in ("x", "u", "acceleration", "correction"):
             self.register_buffer(f"scale_{name}", torch.tensor(getattr(scaling, name), dtype=torch.float64))
 
@@ -271,26 +247,13 @@ class HybridStep(RecurrentStep):
         scaling: Magnitudes of features and outputs.
         dt: Model period [s].
         use_prior: False for the plain recurrent network (RNN) of the paper's comparison.
-        dynamics: See :class:`RecurrentStep`.
+        dynamics: The prior's equation with parameters that were trained along. Default: ``prior``.
 
     Raises:
         InputError: If the prior is too stiff for the period.
     """
 
     corrects_prior = True
-
-    def __init__(
-        self,
-        prior: Prior,
-        network: nn.Module,
-        scaling: Scaling,
-        dt: float,
-        *,
-        use_prior: bool = True,
-        dynamics: Prior | StackedPrior | None = None,
-    ) -> None:
-        super().__init__(prior, network, scaling, dt, use_prior=use_prior, dynamics=dynamics)
-        self.substeps = required_substeps(prior, dt) if use_prior else 1
 
     @classmethod
     def sizes(cls, prior: Prior, use_prior: bool) -> tuple[int, int]:
@@ -367,19 +330,6 @@ class StackedPrior(nn.Module):
     What is trained is the way from the prior's value in units of the parameter's range, ``(networks, 1)``, zero at
     first: weight decay then pulls towards the prior, as it pulls a network's weights towards no correction.
     :meth:`project` keeps the values within their bounds.
-
-    Args:
-        prior: The fitted prior, where all of them start; it is not changed.
-        networks: Number of networks.
-
-    Raises:
-        InputError: If the prior has no parameter that is free.
-
-    Example:
-        >>> from scenarios.pendulum.prior import PendulumPrior
-        >>> stack = StackedPrior(PendulumPrior(), 2)
-        >>> {name: value.tolist() for name, value in stack.values().items()}
-        {'l': [0.05, 0.05], 'd': [2.0, 2.0]}
     """
 
     def __init__(self, prior: Prior, networks: int) -> None:
@@ -417,7 +367,7 @@ class StackedPrior(nn.Module):
     def acceleration(self, x: Tensor, u: Tensor) -> Tensor:
         """Accelerations ``(..., networks, batch, n_q)``."""
         n_q = self._prior[0].n_q
-        return self.forward(x, u)[..., n_q : 2 * n_q]
+        return self.forward(x, u)[..., n_q:]
 
     def project(self) -> None:
         """Put values that have left their bounds back onto them."""
@@ -440,16 +390,7 @@ class StackedPrior(nn.Module):
 
 
 def with_values(prior: Prior, values: Mapping[str, float]) -> Prior:
-    """A copy of a prior with other parameter values [SI].
-
-    Raises:
-        InputError: If the prior has no such parameter.
-
-    Example:
-        >>> from scenarios.pendulum.prior import PendulumPrior
-        >>> with_values(PendulumPrior(), {"d": 2.1}).values["d"]
-        2.1
-    """
+    """A copy of a prior with other parameter values [SI]."""
     unknown = set(values) - set(prior.values)
     if unknown:
         raise InputError(

@@ -96,13 +96,10 @@ def train(
 
 @dataclass(frozen=True)
 class TrainingFailure:
-    """Updates of one network that were skipped because a number was not finite.
+    """Updates of network ``network`` that were skipped because a number was not finite; ``step`` is the last of them.
 
-    Args:
-        network: Its index.
-        objective: The objective whose loss was not finite; ``"gradient"`` where all losses were finite.
-        step: The last such update.
-        stopped: Whether the network was stopped there, with its best weights by validation.
+    ``objective`` is the one whose loss was not finite, ``"gradient"`` where all losses were. ``stopped``: it rests at
+    its best weights from there on.
     """
 
     network: int
@@ -125,7 +122,7 @@ class Trained:
             an evaluation, a column a network.
         skipped: Updates skipped because a number was not finite, per network.
         failures: The objectives they were skipped for, one entry a network that has any.
-        form: The form of the model. Default: prior plus correction of its acceleration.
+        form: The form of the model.
     """
 
     settings: TrainingSettings
@@ -417,11 +414,7 @@ def save_checkpoint(path: Path, key: str, tensors: dict[str, Tensor], numbers: d
 
 
 def load_checkpoint(path: Path, key: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors and numbers of a checkpoint.
-
-    Raises:
-        InputError: If the file is damaged or belongs to a training with other settings or data.
-    """
+    """Tensors and numbers of a checkpoint."""
     read_bytes(path, MOST_ARRAYS)  # a regular file of a size that can be
     try:
         with safe_open(path, framework="pt") as file:

@@ -9,8 +9,7 @@ import hashlib
 import math
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
@@ -136,18 +135,9 @@ class SearchSpace:
 
 
 def parsed_space(texts: Sequence[str]) -> SearchSpace:
-    """A space from ``NAME`` or ``NAME=LOW:HIGH`` for each setting; all that are not named stay as they are.
+    """A space from ``NAME`` or ``NAME=LOW:HIGH`` for each setting, e.g. ``["hidden=8:32", "batch"]``.
 
-    Args:
-        texts: e.g. ``["hidden=8:32", "batch"]``; a name alone has its usual bounds. None at all is the default
-            space.
-
-    Raises:
-        InputError: If a name is not known or given twice, or bounds are no numbers.
-
-    Example:
-        >>> parsed_space(["hidden=8:32", "batch"]).batch
-        (8, 128)
+    A name alone has its usual bounds; settings that are not named stay as they are. No text gives the default space.
     """
     if not texts:
         return SearchSpace()
@@ -279,19 +269,15 @@ def tune(
     while (number := len(_finished(study))) < trials:
         trial = _ask(study, number, base, space, seed)
         settings = space.apply(base, trial.params)
-        with _recorded(study, trial, partial(on_progress, number)) as report:
-            report.trained = train(prior, training, validation, settings, on_progress=report)
+        own = partial(train, prior, training, validation, settings)
+        _tried(study, trial, own, partial(on_progress, number))
         if timeout is not None and time.monotonic() - start >= timeout:
             break
     return _result(study, base, space)
 
 
 def check_numbers(trials: int, seed: int, timeout: float | None) -> None:
-    """Refuse numbers that no search can be made with.
-
-    Raises:
-        InputError: If one is too small.
-    """
+    """Refuse numbers that no search can be made with."""
     if trials < 1 or seed < 0 or (timeout is not None and not timeout > 0):
         raise InputError(
             f"a search needs trials of 1 or more, a seed of 0 or more and a timeout above 0 s, got "
@@ -299,34 +285,27 @@ def check_numbers(trials: int, seed: int, timeout: float | None) -> None:
         )
 
 
-class _Report:
-    """Hands the validation errors of a training on, to the user and to the pruner."""
+def _tried(
+    study: optuna.Study,
+    trial: Trial,
+    training: Callable[..., Trained],
+    on_progress: Callable[[int, int, float], None],
+) -> None:
+    """Make a trial's training and store how it ended; one that is interrupted stays open and is drawn again."""
 
-    def __init__(self, trial: Trial, on_progress: Callable[[int, int, float], None]) -> None:
-        self.trial, self.on_progress = trial, on_progress
-        self.trained: Trained | None = None
-
-    def __call__(self, done: int, total: int, error: float) -> None:
-        self.trial.report(error, done)
-        self.on_progress(done, total, error)
-        if done < total and self.trial.should_prune():
+    def report(done: int, total: int, error: float) -> None:
+        trial.report(error, done)
+        on_progress(done, total, error)
+        if done < total and trial.should_prune():
             raise optuna.TrialPruned
 
-
-@contextmanager
-def _recorded(
-    study: optuna.Study, trial: Trial, on_progress: Callable[[int, int, float], None]
-) -> Iterator[_Report]:
-    """Store how a trial ended; one that is interrupted stays open and is drawn again."""
-    report = _Report(trial, on_progress)
     try:
-        yield report
+        trained = training(on_progress=report)
     except optuna.TrialPruned:
         study.tell(trial, state=TrialState.PRUNED)
-        return
-    assert report.trained is not None
-    trial.set_user_attr("mean", str(float(report.trained.validation.mean())))
-    study.tell(trial, float(report.trained.validation.min()))
+    else:
+        trial.set_user_attr("mean", str(float(trained.validation.mean())))
+        study.tell(trial, float(trained.validation.min()))
 
 
 def _ask(study: optuna.Study, number: int, base: TrainingSettings, space: SearchSpace, seed: int) -> Trial:
@@ -402,21 +381,7 @@ def _row(number: int, trial: FrozenTrial) -> TrialRow:
 
 
 def open_study(storage: Path, identity: Mapping[str, str]) -> optuna.Study:
-    """The study of a journal, whose trials are all finished or given up.
-
-    Args:
-        storage: The journal; made if missing.
-        identity: Hashes by name of everything that decides what the trials are.
-
-    Raises:
-        InputError: If the journal is damaged or another search's.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     open_study(Path(folder) / "tune.jsonl", {"seed": "0"}).user_attrs
-        {'identity': {'seed': '0'}}
-    """
+    """The study of a journal, whose trials are all finished or given up."""
     storage.parent.mkdir(parents=True, exist_ok=True)
     _mend(storage)
     verbosity = optuna.logging.get_verbosity()

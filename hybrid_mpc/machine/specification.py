@@ -120,14 +120,7 @@ class BenchmarkBudget:
 
 
 def check_prior_replay(weight: float) -> None:
-    """Refuse a weight of prior_replay that is none.
-
-    Raises:
-        InputError: If it is negative or not finite.
-
-    Example:
-        >>> check_prior_replay(10.0)
-    """
+    """Refuse a weight of prior_replay that is none."""
     if not 0 <= weight < math.inf:
         raise InputError(f"prior_replay must be a weight of 0 or more, got {weight}")
 

@@ -18,10 +18,10 @@ from hybrid_mpc.machine.signals import Parameter, Signal
 class Prior(nn.Module):
     """A mechanical ODE prior with its output equation and its energy balance.
 
-    The state is ``x = [q, v]``: positions first, then their velocities, so that ``q_dot = v`` is exact. ``n_extra``
-    states of another kind (a lagging input, say) may follow, whose rates :meth:`extra_rates` gives. A subclass names
-    its signals and parameters as class attributes and writes ``acceleration`` and ``inertia``; both index the last axis
-    of their arguments. Every parameter becomes a float64 ``nn.Parameter`` of shape ``()`` under its name.
+    The state is ``x = [q, v]``: positions first, then their velocities, so that ``q_dot = v`` is exact. A
+    subclass names its signals and parameters as class attributes and writes ``acceleration`` and ``inertia``; both
+    index the last axis of their arguments. Every parameter becomes a float64 ``nn.Parameter`` of shape ``()`` under its
+    name.
 
     Args:
         values: Parameter values [SI] by name that replace the nominal ones, e.g. fitted ones.
@@ -47,12 +47,11 @@ class Prior(nn.Module):
     inputs: ClassVar[tuple[Signal, ...]]
     outputs: ClassVar[tuple[Signal, ...]]
     parameters_spec: ClassVar[tuple[Parameter, ...]]
-    n_extra: ClassVar[int] = 0
 
     def __init__(self, values: Mapping[str, float] | None = None) -> None:
         super().__init__()
-        if (found := len(self.states) - self.n_extra) % 2:
-            raise InputError(f"{type(self).__name__}: states must be [q, v] in pairs, got {found}")
+        if len(self.states) % 2:
+            raise InputError(f"{type(self).__name__}: states must be [q, v] in pairs, got {len(self.states)}")
         values = dict(values or {})
         for spec in self.parameters_spec:
             value = torch.tensor(values.pop(spec.name, spec.value), dtype=torch.float64)
@@ -64,7 +63,7 @@ class Prior(nn.Module):
     @property
     def n_q(self) -> int:
         """Number of degrees of freedom."""
-        return (len(self.states) - self.n_extra) // 2
+        return len(self.states) // 2
 
     @property
     def values(self) -> dict[str, float]:
@@ -77,15 +76,7 @@ class Prior(nn.Module):
 
     def forward(self, x: Tensor, u: Tensor) -> Tensor:
         """Derivative ``xdot`` ``(..., n_x)`` of the state: exact kinematics and :meth:`acceleration`."""
-        if self.n_extra:
-            return torch.cat([self._velocity(x), self.acceleration(x, u), self.extra_rates(x, u)], dim=-1)
         return torch.cat([x[..., self.n_q :], self.acceleration(x, u)], dim=-1)
-
-    def extra_rates(self, x: Tensor, u: Tensor) -> Tensor:
-        """Rates ``(..., n_extra)`` of the states after ``[q, v]``; only a prior that has such states needs it."""
-        raise NotImplementedError(
-            f"{type(self).__name__} has n_extra states and must define extra_rates(x, u)"
-        )
 
     def output(self, x: Tensor, u: Tensor) -> Tensor:
         """Measured outputs ``(..., n_y)``. Default: the positions."""
@@ -103,12 +94,8 @@ class Prior(nn.Module):
         By default the equation of motion times the velocity, ``inertia * (v_dot - acceleration(x, u)) * v``: what the
         balance written out term by term comes to. ``v`` is taken from ``x``, ``v_dot`` from ``xdot``.
         """
-        v, v_dot = self._velocity(x), self._velocity(xdot)
+        v, v_dot = x[..., self.n_q :], xdot[..., self.n_q :]
         return (self.inertia(x) * (v_dot - self.acceleration(x, u)) * v).sum(-1)
-
-    def _velocity(self, x: Tensor) -> Tensor:
-        """The second ``n_q`` of a state or of its derivative."""
-        return x[..., self.n_q : 2 * self.n_q] if self.n_extra else x[..., self.n_q :]
 
 
 class FrictionTerm(ABC):
@@ -244,12 +231,7 @@ class PendulumLoad:
 
 
 def coulomb(v: Tensor, level: Tensor, steepness: Tensor) -> Tensor:
-    """``level tanh(steepness v)``, any shape.
-
-    Example:
-        >>> round(coulomb(torch.tensor(0.1), torch.tensor(2.0), torch.tensor(10.0)).item(), 4)
-        1.5232
-    """
+    """``level tanh(steepness v)``, any shape."""
     return level * torch.tanh(steepness * v)
 
 
@@ -274,9 +256,6 @@ def with_friction(base: type[Prior], *terms: FrictionTerm) -> type[Prior]:
         base: Prior class with ``inertia(x)``.
         terms: Blocks, any number on any axis.
 
-    Returns:
-        A class like ``base``: ``cls(values)``.
-
     Raises:
         InputError: If there is no term, ``base`` has no ``inertia``, a parameter's name is there already, or there
             is no such axis.
@@ -298,14 +277,17 @@ def with_friction(base: type[Prior], *terms: FrictionTerm) -> type[Prior]:
 
     def torques(prior: Prior, x: Tensor) -> Tensor:
         n_q = prior.n_q
-        v = x[..., n_q : 2 * n_q]
+        v = x[..., n_q:]
         none = torch.zeros_like(v[..., 0])
         on = [[t.torque(prior, x, v[..., i]) for t in terms if t.axis == i] for i in range(n_q)]
         return torch.stack([sum(parts, none) for parts in on], dim=-1)
 
     class Rubbing(base):  # type: ignore[valid-type,misc]
         parameters_spec = (*base.parameters_spec, *added)
-        balance_follows_acceleration = follows_acceleration(base)
+        # whether the balance is made of ``acceleration``, not written out term by term
+        balance_follows_acceleration = base.energy_balance is Prior.energy_balance or bool(
+            getattr(base, "balance_follows_acceleration", False)
+        )
 
         def acceleration(self, x: Tensor, u: Tensor) -> Tensor:
             free: Tensor = super().acceleration(x, u)
@@ -315,20 +297,10 @@ def with_friction(base: type[Prior], *terms: FrictionTerm) -> type[Prior]:
             balance: Tensor = super().energy_balance(x, xdot, u)
             if self.balance_follows_acceleration:
                 return balance  # it is made of this class's acceleration
-            return balance + (torques(self, x) * self._velocity(x)).sum(-1)
+            return balance + (torques(self, x) * x[..., self.n_q :]).sum(-1)
 
-    return _named(Rubbing, base, f"{base.__name__}With{''.join(type(t).__name__ for t in terms)}")
-
-
-def follows_acceleration(base: type[Prior]) -> bool:
-    """Whether a class's energy balance is made of its ``acceleration``, not written out term by term."""
-    own = base.energy_balance is Prior.energy_balance
-    return own or bool(getattr(base, "balance_follows_acceleration", False))
-
-
-def _named(made: Any, base: type[Prior], name: str) -> type[Prior]:
-    """The class under a name and with a docstring that tell what it is."""
-    made.__name__ = made.__qualname__ = name
+    made: Any = Rubbing  # under a name and with a docstring that tell what it is
+    made.__name__ = made.__qualname__ = f"{base.__name__}With{''.join(type(t).__name__ for t in terms)}"
     made.__module__, made.__doc__ = base.__module__, base.__doc__
     result: type[Prior] = made
     return result
@@ -349,7 +321,7 @@ def _check(base: type[Prior], terms: Sequence[FrictionTerm]) -> None:
         raise InputError(
             f"friction for {base.__name__}: parameter {', '.join(twice)} is there twice; rename one"
         )
-    n_q = (len(base.states) - base.n_extra) // 2
+    n_q = len(base.states) // 2
     for term in terms:
         if not 0 <= term.axis < n_q:
             raise InputError(

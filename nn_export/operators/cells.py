@@ -35,12 +35,9 @@ Factors = tuple[Columns | None, ...]
 
 @dataclass(frozen=True)
 class Slope:
-    """Jacobian of one new state.
+    """Jacobian of one new state: row factors of the gates' blocks of ``W`` and of ``R``, and diagonals by old states.
 
-    Args:
-        by_input: Row factors of the gates' blocks of ``W``; None for a gate that does not act.
-        by_hidden: Row factors of the gates' blocks of ``R``.
-        diagonal: Diagonals by old states, by their position.
+    A factor is None for a gate that does not act.
     """
 
     by_input: Factors
@@ -50,12 +47,7 @@ class Slope:
 
 @dataclass(frozen=True)
 class Step:
-    """One evaluation of a cell.
-
-    Args:
-        state: New states, the hidden state first, each (H, batch).
-        slopes: Jacobian of each.
-    """
+    """One evaluation of a cell: new states (H, batch), the hidden state first, and the Jacobian of each."""
 
     state: tuple[Columns, ...]
     slopes: tuple[Slope, ...]
@@ -63,14 +55,10 @@ class Step:
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of cell.
+    """A kind of cell: names of its states, the hidden state first, and its number of gates, blocks of rows in its
+    weights.
 
-    Args:
-        name: Name of its CasADi function.
-        states: Names of its states, the hidden state first.
-        gates: Number of gates: blocks of rows in its weights.
-        equations: The cell on columns, of the gates' sums: ``equations(W x + b, R h + c, state)``, all of MX or
-            all of numpy.
+    ``equations(W x + b, R h + c, state)`` is the cell on columns, all of MX or all of numpy.
     """
 
     name: str

@@ -155,6 +155,12 @@ def _places(self: Value) -> np.ndarray:
     return np.arange(math.prod(self.shape)).reshape(self.shape)
 
 
+def _each_once(where: np.ndarray) -> np.ndarray:
+    if np.unique(where).size < where.size:
+        raise ValueError("a position is written twice; the result would depend on the order")
+    return where
+
+
 def slice_scatter(
     self: Value, src: Value, dim: int = 0, start: int | None = None, end: int | None = None, step: int = 1
 ) -> Value:
@@ -172,10 +178,7 @@ def select_scatter(self: Value, src: Value, dim: int, index: int) -> Value:
 def index_put(self: Value, indices: Sequence[Value | None], values: Value) -> Value:
     """A copy with elements at constant positions replaced, each at most once."""
     key = tuple(slice(None) if i is None else numbers(i).astype(int) for i in indices)
-    where = _places(self)[key]
-    if np.unique(where).size < where.size:
-        raise ValueError("a position is written twice; the result would depend on the order")
-    return _written(self, where, values)
+    return _written(self, _each_once(_places(self)[key]), values)
 
 
 def scatter(self: Value, dim: int, index: Value, src: Value) -> Value:
@@ -183,9 +186,7 @@ def scatter(self: Value, dim: int, index: Value, src: Value) -> Value:
     chosen = numbers(index).astype(int)
     at: list[np.ndarray] = list(np.indices(chosen.shape))
     at[dim] = chosen
-    where = _places(self)[tuple(at)]
-    if np.unique(where).size < where.size:
-        raise ValueError("a position is written twice; the result would depend on the order")
+    where = _each_once(_places(self)[tuple(at)])
     cut = tuple(slice(n) for n in chosen.shape)
     return _written(self, where, move(src, src.positions[cut]))
 

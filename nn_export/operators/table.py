@@ -25,12 +25,7 @@ reduces it to these. What is not here is refused by name, and so is any argument
 
 
 def document() -> str:
-    """The table as Markdown.
-
-    Example:
-        >>> document().splitlines()[0]
-        '# Operators'
-    """
+    """The table as Markdown."""
     parts = [HEAD]
     for title, group in GROUPS.items():
         parts.append(f"## {title}\n\n| operator | does | arguments |\n| --- | --- | --- |")

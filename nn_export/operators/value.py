@@ -22,15 +22,7 @@ Shape = tuple[int, ...]
 
 
 def matrix_shape(shape: Shape) -> tuple[int, int]:
-    """Rows and columns of the matrix that holds a tensor of this shape.
-
-    Raises:
-        ShapeError: If more than two axes are longer than one.
-
-    Example:
-        >>> matrix_shape((1, 3)), matrix_shape((4, 1, 2)), matrix_shape(()), matrix_shape((0,))
-        ((3, 1), (4, 2), (1, 1), (0, 1))
-    """
+    """Rows and columns of the matrix that holds a tensor of this shape."""
     if sum(n != 1 for n in shape) > 2:
         raise ShapeError(
             f"shape {shape} has more than two axes longer than 1; export one sample, not a batch"
@@ -39,12 +31,7 @@ def matrix_shape(shape: Shape) -> tuple[int, int]:
 
 
 def layout(shape: Shape) -> tuple[int, int]:
-    """As :func:`matrix_shape`, for tensors inside a graph, which may have more axes.
-
-    Example:
-        >>> layout((4, 1, 2)), layout((4, 3, 2))
-        ((4, 2), (12, 2))
-    """
+    """As :func:`matrix_shape`, for tensors inside a graph, which may have more axes."""
     kept = [n for n in shape if n != 1]
     if len(kept) > 2:
         return math.prod(kept[:-1]), kept[-1]
@@ -54,19 +41,7 @@ def layout(shape: Shape) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Value:
-    """A tensor: its torch shape and the dense matrix that holds it.
-
-    Args:
-        shape: Shape in torch.
-        mx: Matrix of ``layout(shape)``.
-
-    Raises:
-        ShapeError: If the two do not fit.
-
-    Example:
-        >>> Value((1, 3), ca.MX.sym("x", 3)).mx.shape
-        (3, 1)
-    """
+    """A tensor: its torch shape and the dense matrix that holds it, of ``layout(shape)``."""
 
     shape: Shape
     mx: ca.MX
@@ -132,15 +107,7 @@ def from_matrix(mx: ca.MX, shape: Shape) -> Value:
 
 
 def broadcast_shape(shapes: Sequence[Sequence[int]]) -> Shape:
-    """The shape to which tensors are repeated together, by the rules of torch.
-
-    Raises:
-        ValueError: If they cannot be.
-
-    Example:
-        >>> broadcast_shape([(3, 1), (4,)])
-        (3, 4)
-    """
+    """The shape to which tensors are repeated together, by the rules of torch."""
     if all(shape == shapes[0] for shape in shapes[1:]):
         return tuple(shapes[0]) if shapes else ()
     result = [1] * max(map(len, shapes))
@@ -172,11 +139,7 @@ def concatenate(values: list[Value], axis: int) -> Value:
 
 
 def numbers(value: Value) -> np.ndarray:
-    """The numbers of a constant value, in its shape.
-
-    Raises:
-        ValueError: If it depends on an input.
-    """
+    """The numbers of a constant value, in its shape."""
     if ca.symvar(value.mx):
         raise ValueError("an index or size depends on an input; only constant ones can be exported")
     return np.array(ca.evalf(value.mx)).flatten(order="F")[value.positions]

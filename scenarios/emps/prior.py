@@ -20,11 +20,6 @@ class EmpsPrior(Prior):
     the recording's first half are fitted to 0.5 mm, without it to 1.7 mm, and the offset then nearly vanishes.
 
     Source: A. Janot, M. Gautier, M. Brunot, *Data Set and Reference Models of EMPS* (2019), with the nominal values.
-
-    Example:
-        >>> prior = EmpsPrior({"M": 100.0, "offset": 0.0})
-        >>> prior(torch.zeros(2, dtype=torch.float64), torch.tensor([50.0], dtype=torch.float64)).tolist()
-        [0.0, 0.5]
     """
 
     states: ClassVar[tuple[Signal, ...]] = (Signal("q", "m", -1.0, 1.0), Signal("q_dot", "m/s", -5.0, 5.0))

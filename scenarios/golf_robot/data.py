@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc import InputError, Role, Window, write_csv
-from scenarios.common import ROLES, whole_windows
+from hybrid_mpc import InputError, Role, Window
+from scenarios.common import ROLES, sizes_of, whole_windows, write_tables
 from scenarios.golf_robot.excitation import excitation
 from scenarios.golf_robot.rig import Rig, RigState
 
@@ -36,21 +36,12 @@ TEST_KINDS = ("sine", "pulse", "chirp", "stair", "step", "fastsine", "fastchirp"
 
 
 def stems(budget: str, data_set: str = "b") -> list[str]:
-    """Names of the recordings of a budget, e.g. ``train_01_sine``.
-
-    Raises:
-        InputError: If there is no such budget or data set.
-
-    Example:
-        >>> stems("quick")[:2], len(stems("full"))
-        (['train_01_sine', 'train_02_step'], 36)
-    """
-    if budget not in SIZES:
-        raise InputError(f"golf_robot: no budget {budget!r}; it has: {', '.join(SIZES)}")
+    """Names of the recordings of a budget, e.g. ``train_01_sine``."""
+    sizes = sizes_of("golf_robot", budget, SIZES)
     if data_set not in TRAIN:
         raise InputError(f"golf_robot: no data set {data_set!r}; it has: {', '.join(TRAIN)}")
     names = []
-    for role, n in SIZES[budget].items():
+    for role, n in sizes.items():
         kinds = TRAIN[data_set] if role == "train" else TEST_KINDS
         names += [f"{role}_{k + 1:02d}_{kinds[k % len(kinds)]}" for k in range(n)]
     return names
@@ -62,19 +53,7 @@ def windows() -> dict[str, tuple[Window, ...]]:
 
 
 def simulate(rig: Rig, x0: Array, u: Array, times: Array) -> list[RigState]:
-    """Rig states at ``times`` ``(n,)`` [s], from ``x0`` at rest within itself at time 0.
-
-    Args:
-        rig: The rig.
-        x0: Initial ``(phi, phi_dot)``.
-        u: Torque ``(n_u,)`` [N m] held over periods of 20 ms from time 0.
-        times: Increasing times [s], none negative, within the torque's length.
-
-    Example:
-        >>> states = simulate(Rig(), np.zeros(2), np.full(5, 0.3), np.array([0.0, 0.05, 0.1]))
-        >>> [round(state.t, 6) for state in states]
-        [0.0, 0.05, 0.1]
-    """
+    """Rig states at ``times`` ``(n,)`` [s], from ``x0`` at rest within itself at time 0."""
     state, states = rig.reset(x0, 0), []
     edges = GRID * np.arange(1, len(u))
     for time in times:
@@ -92,14 +71,7 @@ def record(rig: Rig, kind: str, seed: tuple[int, ...]) -> tuple[Array, Array]:
 
     The angle is sampled at the jittered times that are recorded; the torque is the one held after them. If
     the club goes beyond 1.5 rad, the recording is repeated with four fifths of the torque.
-
-    Args:
-        rig: The rig.
-        kind: Of the torque, see :func:`scenarios.golf_robot.excitation.excitation`.
-        seed: Of everything random in it.
-
-    Returns:
-        Table ``(n, 3)`` of time [s], measured angle [rad], torque [N m]; states ``(n, 6)`` at these times.
+    Gives a table ``(n, 3)`` of time [s], measured angle [rad], torque [N m], and the states ``(n, 6)``.
     """
     rng = np.random.default_rng(seed)
     n = round(DURATION / RECORD) + 1
@@ -119,46 +91,18 @@ def recordings(seed: int, budget: str, data_set: str = "b") -> Iterator[tuple[st
     """Stem, table and true states of each recording, as :func:`record` gives them.
 
     The same seed gives the same recordings; validation and test runs do not depend on the data set.
-
-    Raises:
-        InputError: If there is no such budget or data set.
-
-    Example:
-        >>> stem, table, states = next(recordings(0, "quick"))
-        >>> stem, table.shape, states.shape
-        ('train_01_sine', (2001, 3), (2001, 6))
     """
-    rig, roles = Rig(), [str(role) for role in ROLES]
+    rig = Rig()
     for stem in stems(budget, data_set):
         role, number, kind = stem.split("_")
-        table, states = record(rig, kind, (seed, roles.index(role), int(number)))
+        table, states = record(rig, kind, (seed, ROLES.index(role), int(number)))
         yield stem, table, states
 
 
 def make_data(folder: Path, seed: int, budget: str, *, data_set: str = "b") -> list[Path]:
-    """Write the recordings of a budget as CSV files with columns time_s, phi_rad, u_nm.
+    """Write the recordings of a budget as CSV files with columns time_s, phi_rad, u_nm; same seed, same files.
 
-    Args:
-        folder: Where to; made if missing. Files of the same name are replaced whole.
-        seed: Same seed, same files.
-        budget: ``"quick"`` (8 training, 3 validation, 4 test runs of 20 s) or ``"full"`` (15, 6, 15).
-        data_set: ``"a"`` without sinusoidal torques in the training data, ``"b"`` with (the default).
-
-    Returns:
-        The files.
-
-    Raises:
-        InputError: If there is no such budget or data set.
-
-    Example:
-        >>> make_data(Path("out"), 0, "none")
-        Traceback (most recent call last):
-        ...
-        hybrid_mpc.errors.InputError: golf_robot: no budget 'none'; it has: quick, full
+    Training data are without sinusoidal torques in ``data_set`` ``"a"``, with them in ``"b"``.
     """
-    stems(budget, data_set)
-    paths = []
-    for stem, table, _ in recordings(seed, budget, data_set):
-        columns = dict(zip(COLUMNS, table.T, strict=True))
-        paths.append(write_csv(folder / f"{stem}.csv", columns, decimals=6))
-    return paths
+    tables = ((stem, table) for stem, table, _ in recordings(seed, budget, data_set))
+    return write_tables(folder, tables, COLUMNS)

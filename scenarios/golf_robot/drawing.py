@@ -24,21 +24,7 @@ def draw(x: Array) -> list[Array]:
     ``phi = 0`` hangs straight down, positive ``phi`` swings to the right. The ball waits on a tee where the
     face meets its centre at ``phi = 0``, 0.6 m beneath the axis as in
     :class:`~scenarios.golf_robot.dynamics.RigParameters`; it is drawn where it waits, also after the impact.
-
-    Args:
-        x: State ``(phi, ...)`` [rad]; only the angle is used.
-
-    Returns:
-        Polylines ``(m, 2)`` of horizontal and vertical position [m], always the same ones in the same order:
-        shaft, head, pivot, ball, tee, floor. Head, pivot and ball are closed: they end where they begin.
-
-    Raises:
-        InputError: If there is no finite angle.
-
-    Example:
-        >>> shaft = draw(np.array([np.pi / 2, 0.0]))[0]
-        >>> shaft[-1].round(6).tolist()
-        [0.7, -0.0]
+    Polylines ``(m, 2)`` [m], always in this order: shaft, head, pivot, ball, tee, floor.
     """
     x = np.ravel(np.asarray(x, dtype=float))
     if x.size == 0 or not np.isfinite(x[0]):

@@ -118,10 +118,6 @@ class Conditions:
         mass: Factor on the club's mass, inertia included [-].
         push: Torque on the club from outside [N m].
         limit: Twist at which the belt slips [rad]; infinite: it never does.
-
-    Example:
-        >>> Conditions(friction=2.0).mass
-        1.0
     """
 
     friction: ca.SX | float = 1.0
@@ -141,22 +137,10 @@ def rhs(s: ca.SX, u: ca.SX, p: RigParameters, c: Conditions = HEALTHY) -> tuple[
     deflection, so it is of order one. A slipping belt keeps its twist (and loses count of the motor's angle,
     on which only the phase of the cogging hangs).
 
-    Args:
-        s: State ``(6,)``: phi [rad], phi_dot [rad/s], bristle [-], motor torque at the motor [N m], twist of
-            the belt (motor angle / 4 minus phi) [rad], motor speed / 4 [rad/s].
-        u: Commanded motor torque ``(1,)`` [N m].
-        p: Parameters.
-        c: Conditions.
-
-    Returns:
-        The derivative ``(6,)`` and the torques [N m, at the club] by name, each with the sign with which it
-        drives its own inertia: motor, motor friction, motor viscous and cogging the motor's, the others the
-        club's. The belt drives the club, and the motor backwards.
-
-    Example:
-        >>> ds, torques = rhs(ca.SX.sym("s", 6), ca.SX.sym("u"), RigParameters())
-        >>> ds.shape, sorted(torques)[:4]
-        ((6, 1), ['belt', 'belt damping', 'cogging', 'drag'])
+    The state ``(6,)`` is phi [rad], phi_dot [rad/s], bristle [-], motor torque at the motor [N m], twist of the belt
+    (motor angle / 4 minus phi) [rad], motor speed / 4 [rad/s]. Gives its derivative and the torques [N m, at the
+    club] by name, each with the sign with which it drives its own inertia: motor, motor friction, motor viscous and
+    cogging the motor's, the others the club's. The belt drives the club, and the motor backwards.
     """
     phi, v, b, motor, twist, w = (s[i] for i in range(N_STATES))
     side = 1 + p.asymmetry * ca.tanh(v / p.v_d)
@@ -197,10 +181,6 @@ def elastic(twist: ca.SX, p: RigParameters) -> tuple[ca.SX, ca.SX]:
     """Belt torque [N m] at a twist [rad], and the share [-] of the full stiffness that acts there.
 
     Zero within the gap, ``belt_stiffness`` beyond it; the flanks come into contact over ``flank``.
-
-    Example:
-        >>> [round(float(ca.evalf(value)), 2) for value in elastic(ca.SX(4e-3), RigParameters())]
-        [1.0, 1.0]
     """
     above, below = twist - p.gap, twist + p.gap
     near, far = ca.sqrt(above**2 + p.flank**2), ca.sqrt(below**2 + p.flank**2)
@@ -208,14 +188,7 @@ def elastic(twist: ca.SX, p: RigParameters) -> tuple[ca.SX, ca.SX]:
 
 
 def stored_energy(s: ca.SX, p: RigParameters) -> ca.SX:
-    """Energy [J] of motion, height, belt and cogging; the bristles' counts as dissipated.
-
-    Example:
-        >>> s = ca.SX.sym("s", 6)
-        >>> energy = ca.Function("energy", [s], [stored_energy(s, RigParameters())])
-        >>> 0.01 < float(energy([0.1, 0, 0, 0, 0, 0]) - energy([0, 0, 0, 0, 0, 0])) < 0.02
-        True
-    """
+    """Energy [J] of motion, height, belt and cogging; the bristles' counts as dissipated."""
     phi, v, twist, w = s[0], s[1], s[4], s[5]
 
     def area(x: ca.SX) -> ca.SX:
@@ -229,17 +202,7 @@ def stored_energy(s: ca.SX, p: RigParameters) -> ca.SX:
 
 
 def powers(s: ca.SX, torques: dict[str, ca.SX]) -> dict[str, ca.SX]:
-    """Power [W] that each of ``LOSSES`` dissipates, and that of the ``motor`` and the ``push``, both put in.
-
-    Args:
-        s: State ``(6,)``.
-        torques: As :func:`rhs` returns them.
-
-    Example:
-        >>> s = ca.SX.sym("s", 6)
-        >>> sorted(set(powers(s, rhs(s, ca.SX.sym("u"), RigParameters())[1])) - set(LOSSES))
-        ['motor', 'push']
-    """
+    """Power [W] that each of ``LOSSES`` dissipates, and that of the ``motor`` and the ``push``, both put in."""
     v, w = s[1], s[5]
     speed = {"belt damping": v - w, "motor friction": w, "motor viscous": w}
     lost = {name: -torques[name] * speed.get(name, v) for name in LOSSES}

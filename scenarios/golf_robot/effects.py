@@ -32,11 +32,7 @@ FREE = [p for p in PARAMETERS if not p.fixed]
 class Motion:
     """What one recording did, free of noise, on a grid of 10 ms; ``(n,)`` each.
 
-    Args:
-        phi: Angle [rad].
-        v: Speed [rad/s].
-        a: Acceleration [rad/s^2]: second difference of the angle, a mean over 20 ms around each sample.
-        u: Torque command [N m], a mean over the same 20 ms.
+    The acceleration is the second difference of the angle, a mean over 20 ms around each sample; so is the torque.
     """
 
     phi: Array
@@ -72,28 +68,14 @@ class Effects:
     largest_speed: float
 
 
-def noise_floor(p: RigParameters, window: float = SMOOTHING) -> float:
-    """Torque noise [N m]: J x the noise of a quartic Savitzky-Golay second derivative at 100 Hz.
-
-    Args:
-        p: The rig's parameters: quantisation (count / sqrt 12) and noise add in squares.
-        window: Its length [s].
-
-    Example:
-        >>> noise_floor(RigParameters()) > noise_floor(RigParameters(), window=0.3)
-        True
-    """
+def noise_floor(p: RigParameters) -> float:
+    """Torque noise [N m]: J x the noise of a quartic Savitzky-Golay second derivative at 100 Hz."""
     sigma = np.hypot(p.noise, p.count / np.sqrt(12))
-    return float(p.J * sigma * LocalPolynomial(window).noise_gain(RECORD, 2))
+    return float(p.J * sigma * LocalPolynomial(SMOOTHING).noise_gain(RECORD, 2))
 
 
 def measure_effects(seed: int = 0, budget: str = "quick", data_set: str = "b") -> Effects:
-    """Effects over the training runs of ``make_data(seed, budget, data_set=...)``, from noise-free truth.
-
-    Example:
-        >>> measure_effects(budget="quick").noise_floor == noise_floor(RigParameters())
-        True
-    """
+    """Effects over the training runs of ``make_data(seed, budget, data_set=...)``, from noise-free truth."""
     p, runs = RigParameters(), []
     for stem, table, states in recordings(seed, budget, data_set):
         if stem.startswith("train"):
@@ -136,12 +118,7 @@ def residual_torque(p: dict[str, float], m: Motion) -> Array:
 
 
 def fit(motions: list[Motion], kernel: Array | None = None) -> tuple[dict[str, float], list[Array]]:
-    """Prior parameters that leave the least torque, and what they leave of each motion.
-
-    Args:
-        motions: True motions.
-        kernel: Smooths the residual before it counts; default: none.
-    """
+    """Prior parameters that leave the least torque, and what they leave of each motion."""
 
     def residuals(values: Array) -> list[Array]:
         p = PUBLISHED | dict(zip([spec.name for spec in FREE], values.tolist(), strict=True))
@@ -161,10 +138,6 @@ def smoothing(window: float = SMOOTHING) -> Array:
     """Weights with which the differentiated angle averages the true acceleration (their sum is 1).
 
     Twice the running sum of the second derivative's coefficients: what acts on second differences.
-
-    Example:
-        >>> round(float(smoothing().sum()), 9)
-        1.0
     """
     n = 2 * LocalPolynomial(window).reach(RECORD) + 1
     taps = savgol_coeffs(n, 4, deriv=2, delta=RECORD, use="dot")

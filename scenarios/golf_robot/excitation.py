@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from hybrid_mpc import InputError, chirp, random_steps, sinusoid
 
 Array = NDArray[np.float64]
+Range = tuple[float, float]
+Torque = Callable[[np.random.Generator, Array], Array]
 
 PEAK = 0.5  # [N m] the motor's
 ROUNDED = 0.2  # [s]
@@ -30,37 +32,31 @@ def excitation(kind: str, rng: np.random.Generator, t: Array) -> Array:
     ``fastsine``   0.3 to 0.5 N m, 1 to 2 Hz
     ``fastchirp``  0.3 to 0.5 N m, 1 to 2 Hz, up or down
     =============  ==========================================================================
-
-    Args:
-        kind: One of these.
-        rng: Source of amplitudes, frequencies and levels.
-        t: Times ``(n,)`` [s], evenly spaced.
-
-    Raises:
-        InputError: If there is no such kind.
-
-    Example:
-        >>> excitation("sine", np.random.default_rng(0), np.arange(0.0, 1.0, 0.02)).shape
-        (50,)
     """
     if kind not in KINDS:
         raise InputError(f"golf_robot: no excitation {kind!r}; there are: {', '.join(KINDS)}")
     return KINDS[kind](rng, t)
 
 
-def _sine(rng: np.random.Generator, t: Array) -> Array:
-    amplitude, phase = rng.uniform(0.08, 0.16), rng.uniform(0.0, 2 * np.pi)
-    return sinusoid(t, amplitude, rng.uniform(0.15, 0.9), phase=phase)
+def _sines(sizes: Range, frequencies: Range) -> Torque:
+    def torque(rng: np.random.Generator, t: Array) -> Array:
+        amplitude, phase = rng.uniform(*sizes), rng.uniform(0.0, 2 * np.pi)
+        return sinusoid(t, amplitude, rng.uniform(*frequencies), phase=phase)
+
+    return torque
+
+
+def _chirps(sizes: Range, low: Range, high: Range) -> Torque:
+    def torque(rng: np.random.Generator, t: Array) -> Array:
+        amplitude = rng.uniform(*sizes)
+        f0, f1 = rng.permutation([rng.uniform(*low), rng.uniform(*high)])
+        return chirp(t, amplitude, f0, f1)
+
+    return torque
 
 
 def _step(rng: np.random.Generator, t: Array) -> Array:
     return random_steps(t, -0.25, 0.25, hold=(1.0, 3.0), rng=rng)
-
-
-def _chirp(rng: np.random.Generator, t: Array) -> Array:
-    amplitude = rng.uniform(0.08, 0.16)
-    f0, f1 = rng.permutation([rng.uniform(0.1, 0.3), rng.uniform(0.8, 1.2)])
-    return chirp(t, amplitude, f0, f1)
 
 
 def _stair(rng: np.random.Generator, t: Array) -> Array:
@@ -83,18 +79,12 @@ def _rounded(levels: Array, t: Array) -> Array:
     return np.convolve(levels, taps / taps.sum())[: len(levels)]
 
 
-def _fastsine(rng: np.random.Generator, t: Array) -> Array:
-    amplitude, phase = rng.uniform(0.3, PEAK), rng.uniform(0.0, 2 * np.pi)
-    return sinusoid(t, amplitude, rng.uniform(1.0, 2.0), phase=phase)
-
-
-def _fastchirp(rng: np.random.Generator, t: Array) -> Array:
-    amplitude = rng.uniform(0.3, PEAK)
-    f0, f1 = rng.permutation([rng.uniform(1.0, 1.3), rng.uniform(1.6, 2.0)])
-    return chirp(t, amplitude, f0, f1)
-
-
-KINDS: Mapping[str, Callable[[np.random.Generator, Array], Array]] = {
-    "sine": _sine, "step": _step, "chirp": _chirp, "stair": _stair, "pulse": _pulse,
-    "fastsine": _fastsine, "fastchirp": _fastchirp,
-}  # fmt: skip
+KINDS: Mapping[str, Torque] = {
+    "sine": _sines((0.08, 0.16), (0.15, 0.9)),
+    "step": _step,
+    "chirp": _chirps((0.08, 0.16), (0.1, 0.3), (0.8, 1.2)),
+    "stair": _stair,
+    "pulse": _pulse,
+    "fastsine": _sines((0.3, PEAK), (1.0, 2.0)),
+    "fastchirp": _chirps((0.3, PEAK), (1.0, 1.3), (1.6, 2.0)),
+}

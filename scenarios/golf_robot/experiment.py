@@ -32,13 +32,9 @@ def runs(data_set: str, seed: int, folder: Path) -> Dataset:
 
 
 def claims(data_set: str, rnn: float, pgrnn: float, mopgrnn: float) -> tuple[Claim, ...]:
-    """The claims on one data set.
+    """The claims on one data set, as shares of the physics' error.
 
-    Args:
-        data_set: ``"a"`` or ``"b"``.
-        rnn: How much the RNN is above the physics.
-        pgrnn: How much the PGRNN is below it at best.
-        mopgrnn: How much the MOPGRNN is below it.
+    The RNN is ``rnn`` above it, the PGRNN at best ``pgrnn`` and the MOPGRNN ``mopgrnn`` below it.
     """
     paper, goal, s = FIGURE.format(data_set), GOAL.format(data_set), data_set
     return (

@@ -15,14 +15,7 @@ CAUSES = {"friction": ("d", "mu"), "mass": ("m", "J"), "motor": ("gain of u",)}
 
 @dataclass(frozen=True)
 class FaultCase:
-    """One thing that goes wrong.
-
-    Args:
-        name: Short name, e.g. ``"friction_x2"``.
-        title: One line for plots and the report.
-        faults: What acts; see :func:`hybrid_mpc.loop.faults.install`.
-        nominal: True for ageing that a monitor must not take for a fault.
-    """
+    """One thing that goes wrong; ``nominal`` for ageing that a monitor must not take for a fault."""
 
     name: str
     title: str
@@ -35,19 +28,8 @@ def catalogue(start: float = 2.0, end: float = inf, drift_time: float = 60.0) ->
 
     Sizes: a push of a finger (1.7 N at the head for 0.2 s, 1.3 rad/s); an encoder that slipped on its shaft by
     13 counts, or is read with 5 % too many counts; a worn belt that jumps at 0.8 N m of the 2 N m the motor
-    makes; a delay that grows to three periods.
-
-    Args:
-        start: First instant [s].
-        end: Last instant [s]; default: never. Push and dropouts end by themselves, before it.
-        drift_time: Time [s] over which ageing friction changes by 10 %. Days on a rig; a minute here.
-
-    Raises:
-        InputError: If ``end`` is not later than ``start``.
-
-    Example:
-        >>> [case.name for case in catalogue()][:3], [case.name for case in catalogue() if case.nominal]
-        (['friction_x1.5', 'friction_x2', 'friction_x4'], ['friction_ageing_up', 'friction_ageing_down'])
+    makes; a delay that grows to three periods. Push and dropouts end by
+    themselves; ``drift_time`` [s] is that in which ageing friction changes by 10 %: days on a rig.
     """
     if not start < end:
         raise InputError(f"fault catalogue: end must be later than start, got {start} s and {end} s")
@@ -79,15 +61,7 @@ def catalogue(start: float = 2.0, end: float = inf, drift_time: float = 60.0) ->
 
 
 def fault_case(name: str, start: float = 2.0, end: float = inf) -> FaultCase:
-    """The case of that name.
-
-    Raises:
-        InputError: If there is none; it lists those that there are.
-
-    Example:
-        >>> fault_case("push").faults[0].value
-        1.0
-    """
+    """The case of that name."""
     cases = {case.name: case for case in catalogue(start, end)}
     if name not in cases:
         raise InputError(f"golf_robot: no fault {name!r}; there are: {', '.join(cases)}")

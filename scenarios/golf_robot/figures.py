@@ -27,17 +27,7 @@ RED, BLUE, GREY = colour("hybrid"), colour("prior"), colour("")
 
 
 def draw(folder: Path, seed: int = 0, budget: str = "quick", data_set: str = "b") -> list[Path]:
-    """Draw friction over speed, the residual torque, the coverage and the faults as PNG files.
-
-    Args:
-        folder: Where to; made if missing.
-        seed: Of the data.
-        budget: Of the data.
-        data_set: Of the data.
-
-    Returns:
-        The files.
-    """
+    """Draw friction over speed, the residual torque, the coverage and the faults as PNG files."""
     runs = [run for run in recordings(seed, budget, data_set) if run[0].startswith("train")]
     figures = {
         "golf_friction": friction(RigParameters()),

@@ -2,31 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from scenarios.common import repeated, rk4
 from scenarios.golf_robot.dynamics import HEALTHY, N_STATES, Conditions, RigParameters, rhs
 
-Array = NDArray[np.float64]
-
 
 def one_step(p: RigParameters, *, faulty: bool = False) -> ca.Function:
-    """Function ``(s, q, h) -> s`` of one RK4 step of length ``h`` [s] of the rig's equations.
-
-    Args:
-        p: Parameters.
-        faulty: True: ``q`` is the commanded torque [N m] and the four :class:`Conditions`, in their order;
-            else the torque alone.
-
-    Example:
-        >>> one_step(RigParameters(), faulty=True).size1_in(1)
-        5
-    """
+    """Function ``(s, q, h) -> s`` of one RK4 step of length ``h`` [s] of the rig's equations."""
     s, q, h = ca.SX.sym("s", N_STATES), ca.SX.sym("q", 5 if faulty else 1), ca.SX.sym("h")
     conditions = Conditions(*(q[i] for i in range(1, 5))) if faulty else HEALTHY
     f = ca.Function("f", [s, q], [rhs(s, q[0], p, conditions)[0]])
@@ -46,15 +30,6 @@ def steps_with_jacobian(p: RigParameters, n: int) -> ca.Function:
 
     The sensitivities are integrated beside the state, whose equations' Jacobian is sparse. By RK4 they are the
     derivative of RK4's own map, not an approximation, and they cost a third of CasADi's forward mode.
-
-    Args:
-        p: Parameters of a healthy rig.
-        n: Number of steps.
-
-    Example:
-        >>> _, a, b = steps_with_jacobian(RigParameters(), 10)(ca.DM.zeros(6), 0.1, 1e-4)
-        >>> a.shape, b.shape
-        ((6, 6), (6, 1))
     """
     s, u, h = ca.SX.sym("s", N_STATES), ca.SX.sym("u"), ca.SX.sym("h")
     w = ca.SX.sym("w", N_STATES, N_STATES + 1)  # derivatives of the state by (its start, u)
@@ -70,33 +45,3 @@ def steps_with_jacobian(p: RigParameters, n: int) -> ca.Function:
     slopes = ca.reshape(end[N_STATES:], N_STATES, N_STATES + 1)
     results = [end[:N_STATES], slopes[:, :N_STATES], slopes[:, N_STATES]]
     return ca.Function("steps_with_jacobian", [z, q, step], results)
-
-
-class Stepper:
-    """A compiled ``(s, q, h) -> s`` called on arrays without conversion: 20 us less than CasADi's own call.
-
-    The arrays it works in are its own, so one object serves one thread.
-
-    Args:
-        f: Function of three dense columns with one dense column as result.
-
-    Example:
-        >>> Stepper(steps(RigParameters(), 10))(np.zeros(6), np.zeros(1), 1e-4).shape
-        (6,)
-    """
-
-    def __init__(self, f: ca.Function) -> None:
-        self._ins = [np.zeros(f.size1_in(i)) for i in range(3)]
-        self._out = np.zeros(f.size1_out(0))
-        self._evaluate: Callable[[], None]
-        self._buffer: Any
-        self._buffer, self._evaluate = f.buffer()
-        for i, values in enumerate(self._ins):
-            self._buffer.set_arg(i, values.data)
-        self._buffer.set_res(0, self._out.data)
-
-    def __call__(self, s: Array, q: Array, h: float) -> Array:
-        """The state ``(6,)`` after the steps."""
-        self._ins[0][:], self._ins[1][:], self._ins[2][0] = s, q, h
-        self._evaluate()
-        return self._out.copy()

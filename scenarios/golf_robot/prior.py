@@ -19,15 +19,6 @@ class GolfRobotPrior(Prior):
     are identifiable, but not m, g, a one by one and not r and mu. Hence m, g, r are fixed and a, J, d,
     mu, gamma are free. The paper gives no gamma; 50 s/rad takes friction to 96 % at 0.04 rad/s.
     Bounds: ``r mu gamma m g / J`` stays below 192 1/s, so RK4 sub-steps of 10 ms are stable (1.92 < 2).
-
-    Args:
-        values: Parameter values that replace the published ones.
-
-    Example:
-        >>> prior = GolfRobotPrior()
-        >>> xdot = prior(torch.zeros(2, dtype=torch.float64), torch.ones(1, dtype=torch.float64) * 0.1)
-        >>> round(float(xdot[1]), 3)
-        2.768
     """
 
     states = STATES

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 from scipy.optimize import brentq
 
-from hybrid_mpc import Fault, InputError, check_plant_faults
+from hybrid_mpc import BufferedFunction, Fault, InputError, check_plant_faults
 from scenarios.golf_robot.dynamics import N_STATES, RigParameters
-from scenarios.golf_robot.integration import Stepper, steps
+from scenarios.golf_robot.integration import steps
 
 Array = NDArray[np.float64]
 
@@ -28,19 +28,11 @@ SLOWEST_HIT = 0.05  # [rad/s]; slower, the club pushes the ball along and feels 
 
 @dataclass(frozen=True)
 class RigState:
-    """State of the rig.
+    """State of the rig, ``t`` [s] after the reset; ``ball`` while a ball lies at the angle zero.
 
-    Args:
-        z: ``(6,)``: phi [rad], phi_dot [rad/s], bristle [-], motor torque [N m], belt twist [rad], motor
-            speed / 4 [rad/s].
-        t: Time since the reset [s].
-        past: ``(n, 3)``: time, angle, speed at the ends of the last steps, oldest first, as far back as the
-            sensor's delay can reach; the present is the last row.
-        ball: True while a ball lies at the angle zero.
-
-    Example:
-        >>> Rig(ball=True).reset(np.array([-0.3, 0.0]), seed=0).ball
-        True
+    ``z`` ``(6,)``: phi [rad], phi_dot [rad/s], bristle [-], motor torque [N m], belt twist [rad], motor speed / 4
+    [rad/s]. ``past`` ``(n, 3)``: time, angle, speed at the ends of the last steps, oldest first, as far back as the
+    sensor's delay can reach; the present is the last row.
     """
 
     z: Array
@@ -63,15 +55,6 @@ class Rig:
             0.05 rad/s hits it, and the club loses the momentum that the ball takes.
         faults: Faults of the machine itself, see :func:`scenarios.golf_robot.faults.catalogue`.
         sub_step: Largest integration step [s]. Default 0.5 ms.
-
-    Raises:
-        InputError: If ``sub_step`` is not positive, ``delay`` is negative, or a fault is not one of a rig's.
-
-    Example:
-        >>> rig = Rig()
-        >>> state = rig.reset(np.array([0.05, 0.0]), seed=0)
-        >>> rig.truth(rig.step(state, np.zeros(1), 0.02)).shape
-        (2,)
     """
 
     parameters: RigParameters = field(default_factory=RigParameters)
@@ -79,7 +62,7 @@ class Rig:
     ball: bool = False
     faults: tuple[Fault, ...] = ()
     sub_step: float = 0.5e-3
-    _chunk: Stepper = field(init=False, repr=False, compare=False)
+    _chunk: BufferedFunction = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not self.sub_step > 0:
@@ -91,7 +74,8 @@ class Rig:
             signed, zero = fault.target == "plant_push", fault.target != "plant_mass"
             if not (signed or fault.value > 0 or (zero and fault.value == 0)):
                 raise InputError(f"fault {fault.target}: value must be positive, got {fault.value}")
-        object.__setattr__(self, "_chunk", Stepper(steps(self.parameters, CHUNK, faulty=self._faulty)))
+        chunk = BufferedFunction(steps(self.parameters, CHUNK, faulty=self._faulty))
+        object.__setattr__(self, "_chunk", chunk)
 
     def __reduce__(self) -> tuple[type[Rig], tuple[object, ...]]:
         """Copies and other processes build their own compiled steps."""
@@ -104,14 +88,9 @@ class Rig:
     def with_faults(self, faults: Sequence[Fault]) -> Rig:
         """The same rig with ``faults`` beside those it has.
 
-        Args:
-            faults: With targets ``"plant_friction"`` and ``"plant_mass"`` (factors on the bearing's friction and
-                on the club's mass and inertia), ``"plant_push"`` (torque on the club [N m]), ``"plant_belt"``
-                (largest torque that the belt transmits, at the club [N m]), ``"plant_delay"`` (of the sensor,
-                beside the rig's own [s]).
-
-        Raises:
-            InputError: If a fault is not one of a rig's.
+        Targets are ``"plant_friction"`` and ``"plant_mass"`` (factors on the bearing's friction and on the club's mass
+        and inertia), ``"plant_push"`` (torque on the club [N m]), ``"plant_belt"`` (largest torque that the belt
+        transmits, at the club [N m]) and ``"plant_delay"`` (of the sensor, beside the rig's own [s]).
         """
         return replace(self, faults=(*self.faults, *faults))
 
@@ -160,7 +139,10 @@ class Rig:
         return min(self.sub_step, STIFF / rate)
 
     def _advance(self, z: Array, q: Array, length: float) -> Array:
-        return self._chunk(z, q, length / CHUNK)
+        chunk = self._chunk
+        chunk.inputs[0][:], chunk.inputs[1][:], chunk.inputs[2][:] = z, q, length / CHUNK
+        chunk()
+        return chunk.outputs[0].copy()
 
     def _held(self, t: float, u: Array) -> Array:
         """What is held over a step: torque and, if there are faults, the conditions."""

@@ -25,13 +25,6 @@ def figures(rows: Sequence[LoopRow]) -> dict[str, tuple[Figure, str]]:
 
     Above the speed error [%], below the timing error [ms], over the target speed: every stroke small, the mean of a
     target speed large. The legend gives mean absolute errors, and how many strokes never came past the ball.
-
-    Args:
-        rows: Closed loops of all tasks; a stroke's ``figures`` are those of :func:`~scenarios.golf_robot.tasks.impact`.
-
-    Example:
-        >>> figures([])
-        {}
     """
     from hybrid_mpc.plots import colour, name_of, new_figure, shared_legend, title_axes
 

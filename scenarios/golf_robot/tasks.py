@@ -61,10 +61,6 @@ def sine_reference(t: Array) -> Array:
 
     The friction reverses about four times in a second, and the faster part is above the pendulum's own
     0.6 Hz: neither gravity nor a slow observer carries the club along.
-
-    Example:
-        >>> sine_reference(np.zeros(1)).tolist()
-        [[0.0, 0.0]]
     """
     return faded_sines(t, ((0.5, 0.35), (0.2, 0.9)))
 
@@ -73,10 +69,6 @@ def swing_reference(t: Array) -> Array:
     """``(n, 2)``: 0.3 rad at 0.35 Hz, faded in over 1 s: what disturbances are rejected on.
 
     A club that is merely held sticks, and what holding it costs is the same for all models.
-
-    Example:
-        >>> swing_reference(np.zeros(1)).tolist()
-        [[0.0, 0.0]]
     """
     return faded_sines(t, ((0.3, 0.35),))
 
@@ -88,11 +80,6 @@ def stroke(
 
     No swing is planned beforehand: up to the impact only effort counts, at it a miss by 5 mrad or by 10 mrad/s
     costs 1, then nothing for ``follow_through`` [s], then rest at 0 counts as in every task.
-
-    Example:
-        >>> reference, weight = stroke(1.4)
-        >>> reference(np.array([1.6])).tolist(), weight(np.array([0.5, 1.6, 1.8, 2.4])).round().tolist()
-        ([[0.0, 1.4]], [[0.0, 0.0], [200.0, 31250.0], [0.0, 0.0], [1.0, 1.0]])
     """
     dt, half = 0.02, 0.01
     met = 1.0 / (np.array(CONTROL.q) * dt * np.array([5e-3, 1e-2]) ** 2)
@@ -110,13 +97,8 @@ def stroke(
 def impact(result: ClosedLoopResult, speed: float) -> dict[str, float]:
     """What a stroke reached, at the true crossing of ``phi = 0`` next to ``IMPACT`` (cubic between samples).
 
-    Args:
-        result: The loop.
-        speed: Wanted speed [rad/s].
-
-    Returns:
-        ``speed_rad_s`` wanted, ``speed_error_rel``, ``timing_error_s``, ``effort_nm2s`` (integral of u^2 up to
-        the impact). Errors are infinite where the club never crosses forwards.
+    ``speed_rad_s`` wanted, ``speed_error_rel``, ``timing_error_s``, ``effort_nm2s`` (integral of u^2 up to the impact).
+    Errors are infinite where the club never crosses forwards.
     """
     t, x, u = result.t, result.x, result.u
     effort = float(np.sum(u[t < IMPACT] ** 2) * (t[1] - t[0]))

@@ -28,10 +28,6 @@ class Effort:
         decay: Weight decay of AdamW times the number of training samples; 0 is the paper's Adam. Default 0.
         fit: Methods that the prior is fitted by, where it is fitted: those of ``fit_prior``, and ``"particle_swarm"``.
             Default: those of the main job.
-
-    Example:
-        >>> Effort(networks=2, sequences=(3, 6), steps=100, free_run_steps=20, valid=1, test=1).hidden
-        16
     """
 
     networks: int
@@ -62,11 +58,6 @@ class Experiment:
         shown: Name of the test run that is drawn (the paper's Fig. 6).
         efforts: Effort by the name of the budget.
         claims: What the paper, and this project, expect.
-
-    Example:
-        >>> from hybrid_mpc.scenario import load_scenario
-        >>> load_scenario("pendulum").experiment.most
-        15
     """
 
     figure: str
@@ -86,15 +77,6 @@ class Experiment:
 
 @dataclass(frozen=True)
 class PaperScenario(Scenario):
-    """A scenario with the paper's experiment on its machine, for ``hybrid-mpc reproduce``.
-
-    Args:
-        experiment: What is trained, on which runs, and which claims are checked.
-
-    Example:
-        >>> from hybrid_mpc import load_scenario
-        >>> load_scenario("golf_robot").experiment.figure
-        'Fig. 5'
-    """
+    """A scenario with the paper's experiment on its machine, for ``hybrid-mpc reproduce``."""
 
     experiment: Experiment = field(kw_only=True)

@@ -38,11 +38,7 @@ SHOWN = ("t", "u", "x", "x_hat", "energy_measured_w", "energy_model_w")
 
 
 def divergence(runs: Sequence[FreeRun]) -> Divergence | None:
-    """Where the free runs of one network left all bounds (``RULE``); None if they did not.
-
-    Args:
-        runs: Free runs over all test runs.
-    """
+    """Where the free runs of one network left all bounds (``RULE``); None if they did not."""
     largest = np.max([np.abs(run.y).max(0) for run in runs], axis=0)
     found: list[tuple[FreeRun, int]] = []
     for run in runs:
@@ -59,13 +55,7 @@ def divergence(runs: Sequence[FreeRun]) -> Divergence | None:
 def network_figures(
     runs: Sequence[FreeRun], validation: float | None = None, converged: int | None = None
 ) -> Network:
-    """Figures of one network, or where it diverged.
-
-    Args:
-        runs: Its free runs over all test runs.
-        validation: Its best validation error. Default: there was none.
-        converged: Optimiser steps until it had converged. Default: not known.
-    """
+    """Figures of one network, or where it diverged."""
     where = divergence(runs)
     figures = {} if where is not None else figures_of(runs)
     known = validation if validation is not None and np.isfinite(validation) else None
@@ -105,13 +95,10 @@ def shown_run(runs: Sequence[FreeRun], name: str) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class EvaluationSet:
-    """What all models of a reproduction are evaluated on.
+    """What all models of a reproduction are evaluated on: test runs whose starts are smoothed from their warm-ups
+    alone.
 
-    Args:
-        test: Test runs; their starts are smoothed from their warm-ups alone.
-        values: Parameters of the prior whose energy balance counts.
-        warm: Samples of the warm-up.
-        shown: Name of the run that is drawn.
+    The prior with the parameters ``values`` gives the energy balance; ``shown`` is the run that is drawn.
     """
 
     test: Sequence[Trajectory]
@@ -122,19 +109,11 @@ class EvaluationSet:
 
 @dataclass(frozen=True)
 class Case:
-    """One amount of training data of one data set, as a process gets it.
+    """One amount of training data of one data set, as a process gets it, with the prior and the smoother fitted to
+    it.
 
-    Args:
-        scenario: Registered name or path.
-        data_set: Name of the data set.
-        training: Its first trajectories, smoothed.
-        validation: Validation trajectories, smoothed by the same.
-        values: Parameters of the prior fitted to them.
-        smoother: ``sigma`` and ``walk`` of the smoother; None where states are exact.
-        evaluation: What all models are evaluated on.
-        folder: Where the files go.
-        device: Where the networks are trained. Default: cpu.
-        form: Form of the networks' models, ``"hybrid"`` or ``"paper"``. Default: hybrid.
+    The smoother is ``sigma`` and ``walk``, None where states are exact. ``form`` of the models is ``"hybrid"`` or
+    ``"paper"``.
     """
 
     scenario: str
@@ -188,25 +167,15 @@ def fit_job(
         make, train, valid, dt, methods=others, start=start,
         on_progress=lambda key, done, total, text: report(ROUNDS.index(key), len(ROUNDS), text),
     )  # fmt: skip
-    parts = [smoothed(make, physics, part, dt) for part in (train, valid)]
-    write_arrays(path.with_suffix(".npz"), smoothed_arrays([t for part in parts for t in part]))
+    parts = [t for part in (train, valid) for t in smoothed(make, physics, part, dt)]
+    arrays = {f"{t.name}/{key}": getattr(t, key) for t in parts for key in ("x", "xdot")}
+    write_arrays(path.with_suffix(".npz"), arrays)
     note = {**asdict(physics.fit), "smoother": {"sigma": physics.sigma, "walk": physics.walk}}
     write_json(path.with_suffix(".json"), {**note, "seconds": time.monotonic() - started})
 
 
-def smoothed_arrays(trajectories: Sequence[Trajectory]) -> dict[str, Any]:
-    """States and derivatives of trajectories by name, as files hold them."""
-    return {f"{t.name}/{key}": getattr(t, key) for t in trajectories for key in ("x", "xdot")}
-
-
 def physics_job(cases: Sequence[tuple[Case, int]], path: Path, report: Progress) -> None:
-    """Evaluate the nominal and the fitted prior of all amounts of training data.
-
-    Args:
-        cases: Each amount of training data, and its number of sequences.
-        path: File to write, without ending.
-        report: Takes progress.
-    """
+    """Evaluate the nominal and the fitted prior of all amounts of training data."""
     from hybrid_mpc.identify.evaluate import free_runs
     from hybrid_mpc.identify.step import PriorStep
 
@@ -230,16 +199,7 @@ def physics_job(cases: Sequence[tuple[Case, int]], path: Path, report: Progress)
 def ensemble_job(
     case: Case, count: int, model: str, settings: TrainingSettings, key: str, report: Progress
 ) -> None:
-    """Train the networks of one model on one amount of data and evaluate all of them.
-
-    Args:
-        case: Data and prior.
-        count: Number of sequences.
-        model: Name of the row.
-        settings: Of the training.
-        key: Name of the files.
-        report: Takes progress.
-    """
+    """Train the networks of one model on one amount of data and evaluate all of them."""
     from hybrid_mpc.identify.evaluate import stacked_free_runs
     from hybrid_mpc.identify.train import train
 
@@ -297,5 +257,5 @@ def sindy_job(case: Case, count: int, key: str, report: Progress) -> None:
 
 def _finish(path: Path, rows: Sequence[Row], details: dict[str, Any], start: float) -> None:
     """Write what means that the job is done."""
-    value = {"rows": [row.plain() for row in rows], "details": details, "seconds": time.monotonic() - start}
+    value = {"rows": [asdict(row) for row in rows], "details": details, "seconds": time.monotonic() - start}
     write_json(path.with_suffix(".json"), value)

@@ -39,23 +39,8 @@ DODGE = 0.16
 def errors_over_sequences(panels: Mapping[str, Mapping[str, Mapping[str, Any]]], label: str) -> Figure:
     """An error over the number of training sequences, linear as in the paper and logarithmic, a column a data set.
 
-    Args:
-        panels: By title and model: ``sequences``, ``mean`` (NaN if all networks diverged), ``std``, ``diverged``
-            and ``networks``, one entry an amount of data.
-        label: The error with its unit.
-
-    Returns:
-        The figure. Models without marker are the priors. The linear axis ends where all but the nominal prior
-        do; diverged networks are written at their mean.
-
-    Raises:
-        InputError: If there is no panel or curve.
-
-    Example:
-        >>> curve = {"sequences": [3, 6], "mean": [0.2, 0.1], "std": [0.02, 0.01], "diverged": [0, 1],
-        ...          "networks": [16, 16]}
-        >>> len(errors_over_sequences({"(a)": {"phy": curve, "pgrnn": curve}}, "E_sim [s]").axes)
-        2
+    By title and model: ``sequences``, ``mean`` (NaN if all networks diverged), ``std``, ``diverged`` and
+    ``networks``, one entry an amount of data. The linear axis ends where all but the nominal prior do.
     """
     if not panels or not all(panels.values()):
         raise InputError("plot of errors: there is no data set, or one without a model")
@@ -124,25 +109,7 @@ def shown_free_run(
     model: str = "mopgrnn",
     title: str = "",
 ) -> Figure:
-    """A test free run with input, energy balances and violation (the paper's Fig. 6, whose joules are watts).
-
-    Args:
-        runs: By model: ``t`` [s], ``u``, measured ``x``, ``x_hat``, ``energy_measured_w``, ``energy_model_w``.
-        states: Signals of ``x``.
-        inputs: Signals of ``u``.
-        model: Whose balance is drawn.
-        title: Title. Default: none.
-
-    Raises:
-        InputError: If ``model`` has no run, or shapes do not fit.
-
-    Example:
-        >>> z = np.zeros((3, 1))
-        >>> run = {"t": np.arange(3.0), "u": z, "x": z, "x_hat": z, "energy_measured_w": z[:, 0],
-        ...        "energy_model_w": z[:, 0]}
-        >>> len(shown_free_run({"mopgrnn": run}, [Signal("q", "m")], [Signal("F", "N")]).axes)
-        3
-    """
+    """A test free run with input, energy balances and violation (the paper's Fig. 6, whose joules are watts)."""
     if model not in runs:
         raise InputError(f"plot of a free run: there is none of {model}; there are: {', '.join(runs)}")
     own = runs[model]
@@ -156,9 +123,8 @@ def shown_free_run(
             tint, dashes, _, words = LOOKS.get(name, (colour(name), "-", "", name))
             x_hat = checked(f"free run of {name}", run["x_hat"], len(t), len(states))[:, i]
             ax.plot(t, x_hat, color=tint, linestyle=dashes, linewidth=1.3, label=words)
-        reach = 1.6 * max(
-            float(np.abs(measured[:, i]).max()), 1e-9
-        )  # one that runs away must not flatten the rest
+        # one that runs away must not flatten the rest
+        reach = 1.6 * max(float(np.abs(measured[:, i]).max()), 1e-9)
         bottom, top = ax.get_ylim()
         ax.set_ylim(max(bottom, -reach), min(top, reach))
         ax.set_ylabel(axis_label(signal))

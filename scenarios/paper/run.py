@@ -22,6 +22,7 @@ from hybrid_mpc.job.context import Progress, Silent, versions
 from hybrid_mpc.job.engine import WORKERS, run_jobs
 from hybrid_mpc.job.folder import JobNote, open_folder
 from hybrid_mpc.job.settings import check_device
+from hybrid_mpc.records import record
 from hybrid_mpc.scenario import Scenario, load_scenario
 from scenarios.paper.experiment import Effort, Experiment
 from scenarios.paper.jobs import RULE, Case, EvaluationSet, ensemble_job, fit_job, physics_job, sindy_job
@@ -53,23 +54,7 @@ def reproduce(
 
     Every fit and every ensemble is a job in a process of its own that leaves its files in ``out/checkpoints``; a
     training also leaves its state as it goes. A reproduction that was interrupted, at any point, is finished by
-    ``resume=True`` and then equals one that was not.
-
-    Args:
-        settings: What to compute.
-        out: Folder to make; it must be new or empty unless ``resume``.
-        resume: Finish the reproduction that ``out`` holds.
-        progress: Where to report. Default: nowhere.
-        workers: Processes at once; 0 runs the jobs in this one. Default: two.
-
-    Returns:
-        The results (docs/reproduction.md).
-
-    Raises:
-        InputError: If the scenario has no experiment, a setting is bad, or the folder holds something else.
-
-    Example:
-        >>> results = reproduce(ReproductionSettings("pendulum"), Path("out"))  # doctest: +SKIP
+    ``resume=True`` and then equals one that was not. ``workers=0`` runs the jobs in this process.
     """
     scenario = load_scenario(settings.scenario)
     experiment = experiment_of(scenario)
@@ -96,17 +81,7 @@ def reproduce(
 
 @dataclass(frozen=True)
 class Work:
-    """A reproduction in its folder.
-
-    Args:
-        settings: What it computes.
-        scenario: The machine.
-        experiment: Its experiment.
-        effort: How much of it.
-        out: The folder.
-        progress: Where to report.
-        workers: Processes at once; 0 for none.
-    """
+    """A reproduction in its folder; ``workers`` processes at once, 0 for none."""
 
     settings: ReproductionSettings
     scenario: Scenario
@@ -221,8 +196,8 @@ class Work:
 
     def rows(self) -> list[Row]:
         """Rows of all jobs that are done."""
-        found = [read_json(path) for path in sorted(self.folder.glob("*.json"))]
-        return [Row.of(row) for job in found for row in job.get("rows", ())]
+        found = {path: read_json(path) for path in sorted(self.folder.glob("*.json"))}
+        return [record(Row, row, str(path)) for path, job in found.items() for row in job.get("rows", ())]
 
     def notes(self) -> list[str]:
         """What is doubtful about the recordings, and what was left out, and why."""
@@ -317,9 +292,6 @@ def _with_states(trajectories: Sequence[Trajectory], arrays: Mapping[str, Any]) 
 class Slots:
     """Gives every running job a place, so that the terminal has a bar a process and not one a job.
 
-    Args:
-        count: Processes at once.
-
     Example:
         >>> slots = Slots(2)
         >>> slots.name("one"), slots.name("two"), slots.name("one")
@@ -347,14 +319,7 @@ class Slots:
 
 
 def write_outputs(work: Work) -> dict[str, Any]:
-    """Collect what the jobs left, check the claims, write tables and figures.
-
-    Args:
-        work: A reproduction whose jobs are all done.
-
-    Returns:
-        What ``results.json`` holds.
-    """
+    """Collect what the jobs left, check the claims, write tables and figures."""
     rows = work.rows()
     table = Table(rows)
     results = collected(work, rows, table)
@@ -388,18 +353,14 @@ def collected(work: Work, rows: Sequence[Row], table: Table) -> dict[str, Any]:
         "priors": priors,
         "summary": table.summary(),
         "claims": claims,
-        "rows": [row.plain() for row in rows],
+        "rows": [asdict(row) for row in rows],
         "details": {key: job["details"] for key, job in jobs.items() if job.get("details")},
         "timing": {"seconds_of_jobs": {key: job["seconds"] for key, job in jobs.items()}},
     }
 
 
 def read_results(path: Path) -> dict[str, Any]:
-    """Results of a reproduction.
-
-    Raises:
-        InputError: If the file is missing, damaged, something else, or of another version of the schema.
-    """
+    """Results of a reproduction."""
     results = read_json(path)
     if not isinstance(results, dict) or results.get("schema") != SCHEMA:
         raise InputError(f"{path} holds no results of 'hybrid-mpc reproduce'")
@@ -413,7 +374,7 @@ def read_results(path: Path) -> dict[str, Any]:
 
 def table_of(results: Mapping[str, Any]) -> Table:
     """The table of results that were read."""
-    return Table([Row.of(row) for row in results["rows"]])
+    return Table([record(Row, row, "results of a reproduction") for row in results["rows"]])
 
 
 def claim_lines(results: Mapping[str, Any]) -> list[str]:

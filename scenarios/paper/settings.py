@@ -27,10 +27,6 @@ class ReproductionSettings:
         form: ``"hybrid"`` (exact kinematics, the network corrects the prior's acceleration) or ``"paper"``
             (the paper's: it gives the whole derivative, explicit Euler integrates).
         device: Where the networks are trained, ``"cpu"`` or e.g. ``"cuda"``. Default: cpu.
-
-    Example:
-        >>> ReproductionSettings("pendulum", sequences=(3, 15)).effort(load_scenario("pendulum").experiment).networks
-        16
     """
 
     scenario: str
@@ -42,11 +38,7 @@ class ReproductionSettings:
     device: str = "cpu"
 
     def effort(self, experiment: Experiment) -> Effort:
-        """The budget's effort with these networks and sequences.
-
-        Raises:
-            InputError: If there is no such budget or form, no network, or other sequences than there are runs.
-        """
+        """The budget's effort with these networks and sequences."""
         if self.budget not in experiment.efforts:
             raise InputError(
                 f"no budget {self.budget!r} to reproduce with; there are: {', '.join(experiment.efforts)}"
@@ -81,15 +73,7 @@ class ReproductionSettings:
 
 
 def parsed_sequences(text: str) -> tuple[int, ...]:
-    """Amounts of training data as the command line has them.
-
-    Raises:
-        InputError: If one is no whole number.
-
-    Example:
-        >>> parsed_sequences("3, 6")
-        (3, 6)
-    """
+    """Amounts of training data as the command line has them."""
     try:
         return tuple(int(word) for word in text.split(","))
     except ValueError:
@@ -99,15 +83,7 @@ def parsed_sequences(text: str) -> tuple[int, ...]:
 
 
 def experiment_of(scenario: Scenario) -> Experiment:
-    """The scenario's experiment.
-
-    Raises:
-        InputError: If it has none; the message names the scenarios that have one.
-
-    Example:
-        >>> experiment_of(load_scenario("golf_robot")).figure
-        'Fig. 5'
-    """
+    """The scenario's experiment."""
     if not isinstance(scenario, PaperScenario):
         names = [name for name in registered_scenarios() if isinstance(load_scenario(name), PaperScenario)]
         raise InputError(
@@ -117,10 +93,5 @@ def experiment_of(scenario: Scenario) -> Experiment:
 
 
 def case_key(data_set: str, sequences: int, model: str = "") -> str:
-    """Name of a job and its files.
-
-    Example:
-        >>> case_key("a", 3, "rnn"), case_key("b", 15)
-        ('a_03_rnn', 'b_15')
-    """
+    """Name of a job and its files."""
     return "_".join([data_set, f"{sequences:02d}", *([model] if model else [])])

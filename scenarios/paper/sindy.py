@@ -39,20 +39,9 @@ _FUNCTIONS: dict[str, tuple[Callable[[Tensor], Tensor], str]] = {
 
 @dataclass(frozen=True)
 class Factor:
-    """``function(scale * signal) ** power``, a factor of a candidate term.
+    """``function(scale * signal) ** power``, a factor of a candidate term; the signal is a state or an input.
 
-    Args:
-        signal: Name of a state or an input.
-        function: ``"value"``, ``"sin"``, ``"cos"``, ``"tanh"``, ``"abs"`` or ``"abs_cos"``. Default: the value.
-        scale: Default 1.
-        power: 1, 2, ... Default 1.
-
-    Raises:
-        InputError: If there is no such function, or the power is none.
-
-    Example:
-        >>> Factor("phi_dot", "tanh", 20.0).label
-        'tanh(20 phi_dot)'
+    Functions: ``"value"``, ``"sin"``, ``"cos"``, ``"tanh"``, ``"abs"``, ``"abs_cos"``.
     """
 
     signal: str
@@ -87,16 +76,7 @@ Term = tuple[Factor, ...]
 
 @dataclass(frozen=True)
 class Library:
-    """Candidate terms of an acceleration, as plain data.
-
-    Args:
-        name: Names it in tables.
-        terms: The terms.
-
-    Example:
-        >>> Library("mine", ((), (Factor("v"), Factor("v", "abs")))).labels
-        ('1', 'v |v|')
-    """
+    """Candidate terms of an acceleration, as plain data."""
 
     name: str
     terms: tuple[Term, ...]
@@ -112,27 +92,7 @@ class SindyStep(Step):
 
     Kinematics are exact, the acceleration is the sum of terms times coefficients, Runge-Kutta of order 4 integrates
     with the input held: as :class:`~hybrid_mpc.identify.step.PriorStep` does.
-
-    Args:
-        prior: Names the states and gives output and energy balance; its equation of motion is not used.
-        library: The terms.
-        coefficients: ``(n_terms, n_q)`` [SI]. Leading axes are those of a batch, a model for each of its rows.
-        dt: Model period [s].
-        substeps: Runge-Kutta steps a period; default: what the stiffness at rest asks for.
-        candidates: What it was chosen from; default: nothing.
-
-    Raises:
-        InputError: If a term names no signal of the prior, shapes do not fit, or the model is too stiff for ``dt``.
-
-    Example:
-        >>> from scenarios.pendulum.prior import PendulumPrior
-        >>> library = Library("pendulum", ((Factor("u"),), (Factor("phi_dot"),), (Factor("phi", "sin"),)))
-        >>> step = SindyStep(PendulumPrior(), library, torch.tensor([[8.0], [-16.0], [-196.2]]).double(), 0.01)
-        >>> step.equations()
-        ("phi_dot' = 8 u - 16 phi_dot - 196.2 sin(phi)",)
-        >>> x, h, u = torch.zeros(2).double(), torch.zeros(0).double(), torch.ones(1).double()
-        >>> step.xdot(x, h, u).tolist()
-        [0.0, 8.0]
+    ``coefficients`` are ``(n_terms, n_q)`` [SI]; leading axes are those of a batch, a model for each of its rows.
     """
 
     coefficients: Tensor
@@ -172,11 +132,7 @@ class SindyStep(Step):
         return evaluate(self.library, self._names, x, u)
 
     def equations(self, digits: int = 4) -> tuple[str, ...]:
-        """The identified equations, one an acceleration; terms whose coefficient is zero are left out.
-
-        Args:
-            digits: Significant digits of a coefficient. Default 4.
-        """
+        """The identified equations, one an acceleration; terms whose coefficient is zero are left out."""
         n_q, made = self.prior.n_q, []
         for i, signal in enumerate(self.prior.states[n_q : 2 * n_q]):
             pairs = zip(self.coefficients[:, i].tolist(), self.library.labels, strict=True)
@@ -196,15 +152,11 @@ class SindyStep(Step):
 
 @dataclass(frozen=True)
 class SindyCandidate:
-    """One fit of a library with a threshold.
+    """One fit of a library with a threshold, a share of the acceleration's root mean square, and the terms that it
+    keeps.
 
-    Args:
-        library: Name of its library.
-        threshold: Its threshold, a share of the acceleration's root mean square.
-        terms: Number of terms that it keeps.
-        training: Mean absolute error of the training accelerations [rad/s²].
-        validation: E_sim on the validation free runs (duration form, λ = 0); infinite if one of them diverges or the
-            model is too stiff for the period.
+    ``training`` is the mean absolute error of the training accelerations [rad/s²], ``validation`` E_sim on the
+    validation free runs (duration form, λ = 0), infinite if one diverges or the model is too stiff for the period.
     """
 
     library: str
@@ -231,11 +183,7 @@ def evaluate(library: Library, names: dict[str, int], x: Tensor, u: Tensor) -> T
 
 
 def signal_names(prior: Prior, library: Library) -> dict[str, int]:
-    """Column of each state and input in ``[x, u]``.
-
-    Raises:
-        InputError: If a term of the library names none of them, or the library has no term.
-    """
+    """Column of each state and input in ``[x, u]``."""
     names = {signal.name: i for i, signal in enumerate((*prior.states, *prior.inputs))}
     unknown = {factor.signal for term in library.terms for factor in term} - set(names)
     if unknown or not library.terms:
@@ -251,17 +199,6 @@ def machine_libraries(prior: Prior) -> tuple[Library, ...]:
     out) and u; ``trigonometric`` has 1, sin q, cos q, v, v², v abs(v), u, u cos q; ``friction_20`` has those and
     ``tanh(20 v)`` alone and times cos q, abs(cos q) and v², which is the golf robot's friction where its load keeps
     its sign. Axes meet in the polynomials only: coupled ones need a library of their own.
-
-    Args:
-        prior: Names the signals.
-
-    Example:
-        >>> from scenarios.pendulum.prior import PendulumPrior
-        >>> libraries = machine_libraries(PendulumPrior())
-        >>> [library.name for library in libraries][:3]
-        ['polynomial', 'trigonometric', 'friction_5']
-        >>> libraries[1].labels
-        ('1', 'sin(phi)', 'cos(phi)', 'phi_dot', 'phi_dot^2', 'phi_dot |phi_dot|', 'u', 'u cos(phi)')
     """
     n_q = prior.n_q
     q, v = prior.states[:n_q], [s.name for s in prior.states[n_q : 2 * n_q]]
@@ -320,40 +257,15 @@ def fit_sindy(
     fewest terms. A candidate that diverges or is too stiff has an infinite error and stays in ``step.candidates``.
     If all of them are, the one that fits the training data best is returned with its infinite error.
 
-    Args:
-        training: Training trajectories.
-        prior: Names the signals; its energy balance and output are those of the free runs. Its equation of motion is
-            not used.
-        dt: Model period [s], that of the trajectories.
-        validation: Validation trajectories, which alone choose library and threshold. Use
-            :func:`~hybrid_mpc.identify.evaluate.evaluation_trajectories` on noisy ones.
-        libraries: Default: :func:`machine_libraries`.
-        thresholds: Default: ``THRESHOLDS``.
-        target: What is regressed: ``"mean_rate"``, the acceleration's mean over each period, against the terms' mean
-            over it with the input held (Simpson's rule, the state between two samples from the cubic through both),
-            or ``"derivative"``, the recorded derivative at the samples.
-        warm: Samples of the validation trajectories before the free run starts. Default 0.
-        ridge: Ridge while terms are dropped, a share of the columns' squares: it keeps two terms that are nearly
-            one from growing against each other. The terms that stay are fitted without it. Default 1e-5.
-
-    Returns:
-        The model with its equations and candidates.
-
-    Raises:
-        InputError: If pysindy is not installed, trajectories do not fit the prior or ``dt``, are not finite or too
-            short, or an input never changes.
+    ``validation`` alone chooses library and threshold; take
+    :func:`~hybrid_mpc.identify.evaluate.evaluation_trajectories` of noisy ones. ``target`` is what is regressed:
+    ``"mean_rate"``, the acceleration's mean over each period against the terms' mean over it with the input held
+    (Simpson's rule, the state between two samples from the cubic through both), or ``"derivative"``, the recorded
+    derivative at the samples. ``ridge`` is a share of the columns' squares while terms are dropped: it keeps two terms
+    that are nearly one from growing against each other. The terms that stay are fitted without it.
 
     Source: Brunton, Proctor, Kutz, *Sparse identification of nonlinear dynamics with control (SINDYc)*, IFAC
     NOLCOS (2016); de Silva et al., *PySINDy*, Journal of Open Source Software 5 (2020).
-
-    Example:
-        >>> from scenarios.pendulum.data import exact_runs
-        >>> from scenarios.pendulum.prior import PendulumPrior
-        >>> step = fit_sindy(
-        ...     exact_runs("train", 2), PendulumPrior(), 0.01, validation=exact_runs("valid", 1)
-        ... )  # doctest: +SKIP
-        >>> step.equations()  # doctest: +SKIP
-        ("phi_dot' = -218 sin(phi) - 20.74 phi_dot + 9.877 u",)
     """
     pysindy = _pysindy()
     _check(training, validation, prior, dt)

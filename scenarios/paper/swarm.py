@@ -33,20 +33,7 @@ WINDOWS = 24
 
 @dataclass(frozen=True)
 class SwarmSettings:
-    """Effort of a particle swarm.
-
-    Args:
-        particles: Sets of parameters in the swarm. Default 24.
-        generations: How often all of them move. Default 40.
-        seed: Same seed, same fit. Default 0.
-
-    Raises:
-        InputError: If there are fewer than two particles or no generation.
-
-    Example:
-        >>> SwarmSettings().particles
-        24
-    """
+    """Effort of a particle swarm: sets of parameters, and how often all of them move."""
 
     particles: int = 24
     generations: int = 40
@@ -67,22 +54,7 @@ def swarm_values(
     settings: SwarmSettings | None = None,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, float]:
-    """Values [SI] of a prior's parameters that free runs of up to 2 s follow best, searched between the bounds.
-
-    Args:
-        make: Prior class or factory ``(values=None) -> Prior``.
-        train: Training trajectories.
-        dt: Model period [s].
-        settings: Effort. Default: 24 particles, 40 generations.
-        on_progress: ``(done, total)`` generations.
-
-    Raises:
-        InputError: If pymoo is not installed, or no particle's free runs stay finite.
-
-    Example:
-        >>> start = swarm_values(PendulumPrior, train, 0.01)  # doctest: +SKIP
-        >>> fit_prior(PendulumPrior, train, valid, dt=0.01, methods=("output_error",), start=start)  # doctest: +SKIP
-    """
+    """Values [SI] of a prior's parameters that free runs of up to 2 s follow best, searched between the bounds."""
     fit, longest = ParameterFit(make, dt), max(len(t.t) for t in train) - 1
     n = max(1, min(scales.periods(scales.time_unit(train, dt) * SECONDS, dt), longest // 2))
     windows = cut_windows(train, 0, n, max(1, n // 4))
@@ -100,15 +72,6 @@ def particle_swarm(
 
     The swarm starts from the nominal parameters and a Latin hypercube. All particles run at once. It needs no
     derivative and no good start, and many more simulations than a fit with derivatives.
-
-    Args:
-        fit: The parameters with their bounds.
-        windows: Free runs from their first states.
-        settings: Effort.
-        on_progress: ``(done, total)`` generations.
-
-    Raises:
-        InputError: If pymoo is not installed, or no particle's free runs stay finite.
 
     Source: Kennedy, Eberhart, *Particle swarm optimization* (1995), adaptive as pymoo has it: Blank, Deb, *pymoo:
     multi-objective optimization in Python*, IEEE Access 8 (2020).

@@ -12,7 +12,7 @@ import csv
 import io
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -31,13 +31,9 @@ METRICS: Mapping[str, str] = {
 
 @dataclass(frozen=True)
 class Divergence:
-    """Where a network's free run left all bounds.
+    """Where a network's free run left all bounds, and in how many test ``runs``.
 
-    Args:
-        run: Name of the first test run in which it did.
-        step: Sample of that run, counted from the end of the warm-up.
-        time_s: The same [s].
-        runs: Number of test runs in which it did.
+    ``run`` is the first of them; ``step`` and ``time_s`` [s] count from the end of the warm-up.
     """
 
     run: str
@@ -48,13 +44,10 @@ class Divergence:
 
 @dataclass(frozen=True)
 class Network:
-    """One network on the test runs.
+    """One network on the test runs: figures by name (``METRICS``), none if it diverged.
 
-    Args:
-        figures: Figures by name (``METRICS``); empty if it diverged.
-        validation: Its best validation error, or None (infinite, or there was none).
-        converged_step: Optimiser steps until its validation error was within 10 % of its best. Default: none.
-        diverged: Where it diverged. Default: nowhere.
+    ``validation`` is its best validation error, None if infinite or unknown; ``converged_step`` the optimiser steps
+    until that error was within 10 % of its best.
     """
 
     figures: Mapping[str, float]
@@ -65,55 +58,19 @@ class Network:
 
 @dataclass(frozen=True)
 class Row:
-    """All networks of one model, trained on one amount of data.
-
-    Args:
-        data_set: Name of the data set.
-        sequences: Number of training runs.
-        model: One of ``MODELS``.
-        networks: Its networks.
-    """
+    """All networks of one model, trained on ``sequences`` runs of a data set."""
 
     data_set: str
     sequences: int
     model: str
     networks: tuple[Network, ...]
 
-    def plain(self) -> dict[str, Any]:
-        """As JSON holds it."""
-        return asdict(self)
-
-    @staticmethod
-    def of(value: Mapping[str, Any]) -> Row:
-        """From what :meth:`plain` gave.
-
-        Example:
-            >>> row = Row("exact", 3, "rnn", (Network({}, diverged=Divergence("test_01", 7, 0.07, 1)),))
-            >>> Row.of(row.plain()) == row
-            True
-        """
-        networks = tuple(
-            Network(
-                dict(n["figures"]),
-                n["validation"],
-                n["converged_step"],
-                None if n["diverged"] is None else Divergence(**n["diverged"]),
-            )
-            for n in value["networks"]
-        )
-        return Row(value["data_set"], value["sequences"], value["model"], networks)
-
 
 @dataclass(frozen=True)
 class Cell:
-    """One figure over the networks of a row.
+    """One figure over the networks of a row; the mean and its deviation (n - 1) are over those that did not diverge.
 
-    Args:
-        mean: Mean over the networks that did not diverge; None if all did.
-        std: Standard deviation over these (n - 1); None if there are fewer than two.
-        median: Median over all networks, a diverged one counting as infinite; None if infinite.
-        networks: Number of networks, diverged ones included.
-        diverged: Number of diverged ones.
+    In the median a diverged one counts as infinite. What is infinite, or needs more networks, is None.
     """
 
     mean: float | None
@@ -124,19 +81,7 @@ class Cell:
 
 
 class Table:
-    """Rows with their statistics.
-
-    Args:
-        rows: In any order.
-
-    Example:
-        >>> good, bad = Network({"e_sim_s": 2.0}), Network({}, diverged=Divergence("test_01", 7, 0.07, 1))
-        >>> table = Table([Row("exact", 3, "rnn", (good, good, bad))])
-        >>> table.cell("exact", 3, "rnn")
-        Cell(mean=2.0, std=0.0, median=2.0, networks=3, diverged=1)
-        >>> print(table.cell("exact", 6, "rnn"))
-        None
-    """
+    """Rows with their statistics."""
 
     def __init__(self, rows: Sequence[Row]) -> None:
         self._rows = {(row.data_set, row.sequences, row.model): row for row in rows}
@@ -158,14 +103,7 @@ class Table:
         return [model for model in MODELS if model in there]
 
     def cell(self, data_set: str, sequences: int, model: str, metric: str = "e_sim_s") -> Cell | None:
-        """One figure of one row, or None if there is no such row or it has no such figure.
-
-        Args:
-            data_set: Name of the data set.
-            sequences: Number of training runs.
-            model: One of ``MODELS``.
-            metric: One of ``METRICS``, or ``"converged_step"``.
-        """
+        """One figure of one row, or None if there is no such row or it has no such figure."""
         row = self._rows.get((data_set, sequences, model))
         if row is None:
             return None
@@ -217,12 +155,7 @@ At = Literal["every", "least", "most", "some"]
 
 @dataclass(frozen=True)
 class Verdict:
-    """What was found of a claim.
-
-    Args:
-        holds: Whether it was reproduced; None if the results do not tell.
-        found: The numbers.
-    """
+    """What was found of a claim; ``holds`` is None if the results do not tell."""
 
     holds: bool | None
     found: str
@@ -233,20 +166,9 @@ Check = Callable[[Table], Verdict]
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim and how it is checked.
+    """A claim, where it stands (``"paper, Fig. 3"``), and how it is checked.
 
-    Args:
-        name: Short and unique within an experiment.
-        text: In words, with its numbers.
-        source: Where it stands, e.g. ``"paper, Fig. 3"``.
-        check: Checks it; made by :meth:`below`, :meth:`above`, :meth:`level`, ... or by a function of one's own.
-
-    Example:
-        >>> from scenarios.paper.table import Network, Row
-        >>> rows = [Row("exact", 3, m, (Network({"e_sim_s": e}),)) for m, e in (("rnn", 1.0), ("pgrnn", 0.5))]
-        >>> claim = Claim("halved", "PGRNN 40 % below RNN", "paper", Claim.below("pgrnn", "rnn", 0.4, "exact"))
-        >>> claim.line(Table(rows))
-        'reproduced: PGRNN 40 % below RNN (paper). Found: pgrnn to rnn −50 % (with 3 sequences).'
+    Checks are made by :meth:`below`, :meth:`above`, :meth:`level`, ... or by a function of one's own.
     """
 
     name: str
@@ -254,65 +176,25 @@ class Claim:
     source: str
     check: Check
 
-    def line(self, table: Table) -> str:
-        """One line: verdict, claim, numbers."""
-        return verdict_line(self.text, self.source, self.check(table))
-
     @staticmethod
     def below(
         model: str, reference: str, share: float, data_set: str, *, at: At = "every", metric: str = "e_sim_s"
     ) -> Check:
         """``model`` lies at least ``share`` below ``reference``; a negative share allows it to lie above.
 
-        Args:
-            model: Which is better.
-            reference: Than which.
-            share: Of the reference's figure.
-            data_set: Where.
-            at: With every amount of data, the least, the most, or any of them (``"some"``).
-            metric: Figure. Default E_sim.
+        That holds with every amount of data, the least, the most, or any of them (``at="some"``).
         """
-
-        def check(table: Table) -> Verdict:
-            changes, note = _changes(table, data_set, model, reference, metric, at)
-            if not changes:
-                return Verdict(None, note)
-            fine = [change <= -share for change in changes.values()]
-            clean = not any(_cell(table, data_set, n, model, metric).diverged for n in changes)
-            return Verdict(
-                (any(fine) if at == "some" else all(fine)) and clean,
-                _numbers(model, reference, changes, note),
-            )
-
-        return check
+        return _compared(model, reference, data_set, at, metric, lambda change: change <= -share, better=True)
 
     @staticmethod
-    def above(model: str, reference: str, share: float, data_set: str, *, at: At = "every") -> Check:
+    def above(model: str, reference: str, share: float, data_set: str) -> Check:
         """``model`` lies at least ``share`` above ``reference`` in E_sim; one that diverged does too."""
-
-        def check(table: Table) -> Verdict:
-            changes, note = _changes(table, data_set, model, reference, "e_sim_s", at)
-            if not changes:
-                return Verdict(None, note)
-            return Verdict(
-                all(c >= share for c in changes.values()), _numbers(model, reference, changes, note)
-            )
-
-        return check
+        return _compared(model, reference, data_set, "every", "e_sim_s", lambda change: change >= share)
 
     @staticmethod
     def level(model: str, reference: str, share: float, data_set: str, *, at: At = "every") -> Check:
         """``model`` and ``reference`` differ by at most ``share`` of the reference's E_sim."""
-
-        def check(table: Table) -> Verdict:
-            changes, note = _changes(table, data_set, model, reference, "e_sim_s", at)
-            if not changes:
-                return Verdict(None, note)
-            return Verdict(
-                all(abs(c) <= share for c in changes.values()), _numbers(model, reference, changes, note)
-            )
-
-        return check
+        return _compared(model, reference, data_set, at, "e_sim_s", lambda change: abs(change) <= share)
 
     @staticmethod
     def steady(model: str, share: float, data_set: str) -> Check:
@@ -393,6 +275,31 @@ def verdict_line(text: str, source: str, verdict: Verdict) -> str:
     """A claim with its verdict as one line."""
     word = {True: "reproduced", False: "not reproduced", None: "not tested"}[verdict.holds]
     return f"{word}: {text} ({source}). Found: {verdict.found}."
+
+
+def _compared(
+    model: str,
+    reference: str,
+    data_set: str,
+    at: At,
+    metric: str,
+    fine: Callable[[float], bool],
+    *,
+    better: bool = False,
+) -> Check:
+    """Whether the relative changes from reference to model are fine; no diverged network if it is to be better."""
+
+    def check(table: Table) -> Verdict:
+        changes, note = _changes(table, data_set, model, reference, metric, at)
+        if not changes:
+            return Verdict(None, note)
+        found = [fine(change) for change in changes.values()]
+        holds = any(found) if at == "some" else all(found)
+        if better and any(_cell(table, data_set, n, model, metric).diverged for n in changes):
+            holds = False
+        return Verdict(holds, _numbers(model, reference, changes, note))
+
+    return check
 
 
 def _changes(

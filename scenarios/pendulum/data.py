@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc import InputError, Role, Trajectory, sinusoid, write_csv
-from scenarios.common import ROLES
+from hybrid_mpc import InputError, Role, Trajectory, sinusoid
+from scenarios.common import ROLES, sizes_of, write_tables
 from scenarios.pendulum.plant import DampedPendulum
 
 Array = NDArray[np.float64]
@@ -28,32 +28,14 @@ SIZES: Mapping[str, Mapping[Role, int]] = {
 
 
 def stems(budget: str) -> list[str]:
-    """Names of the recordings of a budget, e.g. ``train_01``.
-
-    Raises:
-        InputError: If there is no such budget.
-
-    Example:
-        >>> stems("quick")[:2], len(stems("full"))
-        (['train_01', 'train_02'], 30)
-    """
-    if budget not in SIZES:
-        raise InputError(f"pendulum: no budget {budget!r}; it has: {', '.join(SIZES)}")
-    return [f"{role}_{k + 1:02d}" for role, n in SIZES[budget].items() for k in range(n)]
+    """Names of the recordings of a budget, e.g. ``train_01``."""
+    return [
+        f"{role}_{k + 1:02d}" for role, n in sizes_of("pendulum", budget, SIZES).items() for k in range(n)
+    ]
 
 
 def simulate(plant: DampedPendulum, x0: Array, u: Array) -> Array:
-    """States ``(n, 2)`` every millisecond from ``x0`` ``(2,)`` under torques ``u`` ``(n,)`` [N m].
-
-    Args:
-        plant: The pendulum.
-        x0: Initial angle and speed.
-        u: Torque from each sample to the next.
-
-    Example:
-        >>> simulate(DampedPendulum(), np.array([0.3, 0.0]), np.zeros(11))[-1].round(4).tolist()
-        [0.297, -0.5798]
-    """
+    """States ``(n, 2)`` every millisecond from ``x0`` ``(2,)`` under torques ``u`` ``(n,)`` [N m]."""
     state, states = plant.reset(x0, 0), []
     for torque in u:
         states.append(plant.truth(state))
@@ -64,21 +46,8 @@ def simulate(plant: DampedPendulum, x0: Array, u: Array) -> Array:
 def run(plant: DampedPendulum, role: Role, number: int, seed: int) -> tuple[Array, Array, Array]:
     """One run of 5 s: a sinusoidal torque of random size, frequency and phase from a random x0.
 
-    The torque is held for a model period of 10 ms: a discrete-time model can then be exact.
-
-    Args:
-        plant: The pendulum.
-        role: Of the run; each role has its own.
-        number: Counts from 1. The runs of fewer are the first of more.
-        seed: Same seed, same run.
-
-    Returns:
-        Times ``(n,)`` [s], torque ``(n,)`` [N m], true states ``(n, 2)``, every millisecond.
-
-    Example:
-        >>> t, u, x = run(DampedPendulum(), "train", 1, 0)
-        >>> t.shape, u.shape, x.shape
-        ((5001,), (5001,), (5001, 2))
+    The torque is held for a model period of 10 ms: a discrete-time model can then be exact. The runs of fewer
+    are the first of more. Gives times, torque ``(n,)`` [N m] and true states ``(n, 2)``, every millisecond.
     """
     rng = np.random.default_rng((seed, ROLES.index(role), number))
     t = RECORD * np.arange(round(DURATION / RECORD) + 1, dtype=np.float64)
@@ -92,21 +61,8 @@ def run(plant: DampedPendulum, role: Role, number: int, seed: int) -> tuple[Arra
 def exact_runs(role: Role, count: int, *, seed: int = 0, dt: float = HELD * RECORD) -> list[Trajectory]:
     """The paper's data: runs with the full state measured and without noise, for its experiment.
 
-    Args:
-        role: ``"train"``, ``"valid"`` or ``"test"``; the first 3 of 15 training runs are those of 3.
-        count: Number of runs.
-        seed: Same seed, same runs.
-        dt: Period [s], 1, 2, 5 or 10 ms. Default 10 ms; the paper has 1 ms.
-
-    Returns:
-        Trajectories whose ``x`` is the state and ``xdot`` its derivative at the samples, both exact.
-
-    Raises:
-        InputError: If ``dt`` is none of these periods, or the role is another.
-
-    Example:
-        >>> [(r.name, r.x.shape) for r in exact_runs("train", 2)]
-        [('train_01', (501, 2)), ('train_02', (501, 2))]
+    The first 3 of 15 training runs are those of 3. ``dt`` [s] is 1, 2, 5 or 10 ms; the paper has 1 ms. ``xdot`` is the
+    exact derivative at the samples.
     """
     every = round(dt / RECORD)
     if abs(every * RECORD - dt) > 1e-9 or every < 1 or HELD % every:
@@ -125,47 +81,16 @@ def recordings(seed: int, budget: str) -> Iterator[tuple[str, Array]]:
     """Stem and table ``(n, 4)`` of each recording: time [s], angle [rad], speed [rad/s], torque [N m].
 
     The angle has the plant's noise; the speed is true: the main job reads the angle alone.
-
-    Raises:
-        InputError: If there is no such budget.
-
-    Example:
-        >>> stem, table = next(recordings(0, "quick"))
-        >>> stem, table.shape
-        ('train_01', (5001, 4))
     """
     plant = DampedPendulum()
     for stem in stems(budget):
         name, number = stem.split("_")
-        role = ROLES[[str(r) for r in ROLES].index(name)]
+        role = ROLES[ROLES.index(name)]
         t, u, x = run(plant, role, int(number), seed)
         noise = np.random.default_rng((seed, ROLES.index(role), int(number), 1)).standard_normal(len(t))
         yield stem, np.column_stack([t, x[:, 0] + plant.noise * noise, x[:, 1], u])
 
 
 def make_data(folder: Path, seed: int, budget: str) -> list[Path]:
-    """Write the recordings of a budget as CSV files with columns time_s, phi_rad, phi_dot_rad_s, u_nm.
-
-    Args:
-        folder: Where to; made if missing. Files of the same name are replaced whole.
-        seed: Same seed, same files.
-        budget: ``"quick"`` (6 training, 3 validation, 4 test runs of 5 s) or ``"full"`` (15, 5, 10).
-
-    Returns:
-        The files.
-
-    Raises:
-        InputError: If there is no such budget.
-
-    Example:
-        >>> make_data(Path("out"), 0, "none")
-        Traceback (most recent call last):
-        ...
-        hybrid_mpc.errors.InputError: pendulum: no budget 'none'; it has: quick, full
-    """
-    stems(budget)
-    paths = []
-    for stem, table in recordings(seed, budget):
-        columns = dict(zip(COLUMNS, table.T, strict=True))
-        paths.append(write_csv(folder / f"{stem}.csv", columns, decimals=6))
-    return paths
+    """Write the recordings of a budget as CSV files with columns time_s, phi_rad, phi_dot_rad_s, u_nm."""
+    return write_tables(folder, recordings(seed, budget), COLUMNS)

@@ -15,12 +15,7 @@ GOAL = "goal of this project"
 
 
 def runs(data_set: str, seed: int, folder: Path) -> list[Trajectory]:
-    """The exact runs of all roles; nothing is written.
-
-    Example:
-        >>> [sum(t.role == role for t in runs("exact", 0, Path("unused"))) for role in ROLES]
-        [15, 5, 10]
-    """
+    """The exact runs of all roles; nothing is written."""
     return [t for role in ROLES for t in exact_runs(role, SIZES["full"][role], seed=seed)]
 
 

@@ -11,20 +11,7 @@ from scenarios.pendulum.plant import PendulumParameters
 
 
 def oracle(dt: float, parameters: PendulumParameters | None = None, sub_steps: int = 10) -> HybridModel:
-    """The plant as a :class:`HybridModel` with an empty hidden state.
-
-    Args:
-        dt: Model period [s].
-        parameters: The plant's parameters. Default: the paper's.
-        sub_steps: RK4 steps per period. Default 10 (1 ms at 10 ms).
-
-    Returns:
-        The model; its energy balance is the prior's, with the published parameters.
-
-    Example:
-        >>> oracle(0.01).n_h
-        0
-    """
+    """The plant as a :class:`HybridModel` with an empty hidden state."""
     p = parameters or PendulumParameters()
     x, u, rate = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("rate", 2)
     xdot = ca.vertcat(x[1], (u - p.gravity * ca.sin(x[0]) - p.d * x[1]) / p.inertia)

@@ -26,13 +26,6 @@ class PendulumParameters:
         l: Distance of the mass from the axis [m]; the prior has 0.05.
         d: Viscous damping [N m s/rad]; the prior has 2.
         g: Gravity [m/s^2].
-
-    Example:
-        >>> p = PendulumParameters()
-        >>> round(p.inertia, 5), round(p.frequency, 1), round(p.damping, 2)
-        (0.10125, 14.8, 0.7)
-        >>> round(PendulumParameters(l=0.045e-2).damping)
-        702
     """
 
     m: float = 50.0
@@ -63,14 +56,8 @@ class PendulumParameters:
 
 @dataclass(frozen=True)
 class PendulumState:
-    """State of the plant.
-
-    Args:
-        z: phi [rad], phi_dot [rad/s], work of the torque since the reset [J], heat of the damping since then [J].
-
-    Example:
-        >>> DampedPendulum().reset(np.array([0.1, 0.0]), seed=0).z
-        (0.1, 0.0, 0.0, 0.0)
+    """State of the plant ``z``: phi [rad], phi_dot [rad/s]; work of the torque and heat of the damping since the
+    reset [J].
     """
 
     z: Values
@@ -87,15 +74,6 @@ class DampedPendulum:
         parameters: What it is made of.
         noise: Standard deviation of the measured angle [rad]. Default 0.1 mrad; the paper measures without noise.
         sub_step: Largest integration step [s]. Default 0.5 ms.
-
-    Raises:
-        InputError: If ``sub_step`` is not positive or ``noise`` negative.
-
-    Example:
-        >>> plant = DampedPendulum()
-        >>> state = plant.step(plant.reset(np.array([0.3, 0.0]), seed=0), np.zeros(1), 0.01)
-        >>> plant.truth(state).round(4).tolist()
-        [0.297, -0.5798]
     """
 
     parameters: PendulumParameters = field(default_factory=PendulumParameters)

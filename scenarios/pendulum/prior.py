@@ -16,14 +16,6 @@ class PendulumPrior(Prior):
 
     ``phi = 0`` hangs down, ``u`` is the torque on the axis [N m]. The known torque sets the scale: ``m l^2``,
     ``m g l`` and ``d`` show in the motion, and with m and g fixed a fit frees l and d.
-
-    Args:
-        values: Parameter values that replace the published ones.
-
-    Example:
-        >>> prior = PendulumPrior()
-        >>> prior(torch.zeros(2, dtype=torch.float64), torch.ones(1, dtype=torch.float64)).tolist()
-        [0.0, 8.0]
     """
 
     states: ClassVar[tuple[Signal, ...]] = STATES
@@ -57,10 +49,6 @@ class PublishedPendulumPrior(PendulumPrior):
     """The same with every parameter fixed at its published value: a fit leaves it alone, as the paper does.
 
     With l and d free a fit finds the plant itself, since nothing else is wrong: no network could add to that.
-
-    Example:
-        >>> all(p.fixed for p in PublishedPendulumPrior.parameters_spec)
-        True
     """
 
     parameters_spec: ClassVar[tuple[Parameter, ...]] = PUBLISHED

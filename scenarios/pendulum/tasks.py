@@ -32,22 +32,12 @@ LOAD = -3.0
 
 
 def sine_reference(t: Array) -> Array:
-    """``(n, 2)``: 0.4 rad at 0.5 Hz and 0.15 rad at 1.2 Hz, faded in over 0.5 s, and its exact derivative.
-
-    Example:
-        >>> sine_reference(np.zeros(1)).tolist()
-        [[0.0, 0.0]]
-    """
+    """``(n, 2)``: 0.4 rad at 0.5 Hz and 0.15 rad at 1.2 Hz, faded in over 0.5 s, and its exact derivative."""
     return faded_sines(t, ((0.4, 0.5), (0.15, 1.2)), fade_s=0.5)
 
 
 def swing_reference(t: Array) -> Array:
-    """``(n, 2)``: 0.3 rad at 0.5 Hz, faded in over 0.5 s: what the load is rejected on.
-
-    Example:
-        >>> swing_reference(np.zeros(1)).tolist()
-        [[0.0, 0.0]]
-    """
+    """``(n, 2)``: 0.3 rad at 0.5 Hz, faded in over 0.5 s: what the load is rejected on."""
     return faded_sines(t, ((0.3, 0.5),), fade_s=0.5)
 
 

@@ -20,11 +20,6 @@ class TorquePendulumPrior(Prior):
     the others are fitted relative to it. A fitted ``k_u`` below 1 holds the drive's losses and torque
     constant and the error of ``J``. Energy shaping commands ``u`` with the sign of the speed, which makes
     ``k_u`` and ``F_c`` hard to tell apart in one recording; fit runs of different torque together.
-
-    Example:
-        >>> prior = TorquePendulumPrior()
-        >>> prior(torch.zeros(2), torch.tensor([0.15])).tolist()
-        [0.0, 1.0]
     """
 
     states: ClassVar[tuple[Signal, ...]] = (

@@ -31,12 +31,7 @@ with the least validation error of the MOPGRNN (docs/disk.md)."""
 
 
 def draw(x: NDArray[np.float64]) -> Sequence[NDArray[np.float64]]:
-    """The disk's rim, and its mass as a small ring; phi = 0 hangs down.
-
-    Example:
-        >>> [line.shape for line in draw(np.zeros(2))]
-        [(61, 2), (21, 2)]
-    """
+    """The disk's rim, and its mass as a small ring; phi = 0 hangs down."""
     turn = np.linspace(0.0, 2 * np.pi, 61)
     ring = np.column_stack([np.cos(turn), np.sin(turn)])
     centre = 0.045 * np.array([sin(x[0]), -cos(x[0])])

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc import InputError, Role, chirp, multisine, random_steps, write_arrays
-from scenarios.common import ROLES
+from hybrid_mpc import Role, chirp, multisine, random_steps, write_arrays
+from scenarios.common import ROLES, sizes_of
 from scenarios.unbalanced_disk.nominal import DT
 from scenarios.unbalanced_disk.plant import DiskPlant
 
@@ -27,13 +28,10 @@ SIZES: Mapping[str, Mapping[Role, int]] = {
 }
 
 
-def _multisine(rng: np.random.Generator, t: Array) -> Array:
-    u = multisine(t, rng.uniform(0.6, 1.0) * PEAK, 0.56, 2.6)
-    return np.roll(u, int(rng.integers(len(t))))
-
-
-def _wide(rng: np.random.Generator, t: Array) -> Array:
-    u = multisine(t, rng.uniform(0.8, 1.0) * PEAK, 0.5, 10.6)
+def _multisine(
+    rng: np.random.Generator, t: Array, least: float = 0.6, low: float = 0.56, high: float = 2.6
+) -> Array:
+    u = multisine(t, rng.uniform(least, 1.0) * PEAK, low, high)
     return np.roll(u, int(rng.integers(len(t))))
 
 
@@ -47,44 +45,23 @@ def _step(rng: np.random.Generator, t: Array) -> Array:
 
 
 KINDS: Mapping[str, Callable[[np.random.Generator, Array], Array]] = {
-    "multisine": _multisine, "swing": _swing, "step": _step, "wide": _wide,
+    "multisine": _multisine, "swing": _swing, "step": _step,
+    "wide": partial(_multisine, least=0.8, low=0.5, high=10.6),
 }  # fmt: skip
 """Voltages: multisines of the band of the recording of 2024 (0.56 to 2.6 Hz) and of 2022 (to 10.6 Hz), chirps through
 the disk's own 1.9 Hz, which swing far, and steps."""
 
 
 def stems(budget: str) -> list[str]:
-    """Names of the recordings of a budget, e.g. ``train_01_multisine``; the kinds take turns.
-
-    Raises:
-        InputError: If there is no such budget.
-
-    Example:
-        >>> stems("quick")[:2], len(stems("full"))
-        (['train_01_multisine', 'train_02_swing'], 34)
-    """
-    if budget not in SIZES:
-        raise InputError(f"unbalanced_disk: no budget {budget!r}; it has: {', '.join(SIZES)}")
-    kinds = list(KINDS)
-    return [
-        f"{role}_{k + 1:02d}_{kinds[k % len(kinds)]}" for role, n in SIZES[budget].items() for k in range(n)
-    ]
+    """Names of the recordings of a budget, e.g. ``train_01_multisine``; the kinds take turns."""
+    kinds, sizes = list(KINDS), sizes_of("unbalanced_disk", budget, SIZES)
+    return [f"{role}_{k + 1:02d}_{kinds[k % len(kinds)]}" for role, n in sizes.items() for k in range(n)]
 
 
 def record(plant: DiskPlant, kind: str, seed: tuple[int, ...]) -> tuple[Array, Array]:
     """One recording: voltages commanded ``(n,)`` [V] and encoder angles at the same instants ``(n,)`` [rad].
 
     If the disk goes beyond 2.8 rad, the recording is repeated with nine tenths of the voltage.
-
-    Args:
-        plant: The disk.
-        kind: Of the voltage, one of ``KINDS``.
-        seed: Of everything random in it.
-
-    Example:
-        >>> u, th = record(DiskPlant(), "multisine", (0, 0, 1))
-        >>> u.shape, th.shape, bool(abs(th).max() < 2.81)
-        ((1000,), (1000,), True)
     """
     rng = np.random.default_rng(seed)
     u = KINDS[kind](rng, DT * np.arange(SAMPLES, dtype=np.float64))
@@ -102,30 +79,11 @@ def record(plant: DiskPlant, kind: str, seed: tuple[int, ...]) -> tuple[Array, A
 
 
 def make_data(folder: Path, seed: int, budget: str) -> list[Path]:
-    """Write the recordings of a budget as ``.npz`` files with ``u`` [V], ``th`` [rad] and ``dt`` [s], as the real ones.
-
-    Args:
-        folder: Where to; made if missing. Files of the same name are replaced whole.
-        seed: Same seed, same files.
-        budget: ``"quick"`` (8 training, 3 validation, 4 test recordings of 25 s) or ``"full"`` (20, 6, 8).
-
-    Returns:
-        The files.
-
-    Raises:
-        InputError: If there is no such budget.
-
-    Example:
-        >>> make_data(Path("out"), 0, "none")
-        Traceback (most recent call last):
-        ...
-        hybrid_mpc.errors.InputError: unbalanced_disk: no budget 'none'; it has: quick, full
-    """
-    names, plant = stems(budget), DiskPlant()
-    paths = []
-    for stem in names:
+    """Write the recordings of a budget as ``.npz`` files with ``u`` [V], ``th`` [rad], ``dt`` [s], as the real ones."""
+    plant, paths = DiskPlant(), []
+    for stem in stems(budget):
         role, number, kind = stem.split("_")
-        u, th = record(plant, kind, (seed, [str(r) for r in ROLES].index(role), int(number)))
+        u, th = record(plant, kind, (seed, ROLES.index(role), int(number)))
         path = folder / f"{stem}.npz"
         write_arrays(path, {"u": u, "th": th, "dt": np.array(DT)})
         paths.append(path)

@@ -40,14 +40,6 @@ class DiskParameters:
         delay: Time from a command to the voltage [s], less than a period.
         count: Encoder step [rad].
         noise: Deviation of the angle before it is rounded [rad]: a tenth of a step.
-
-    Raises:
-        InputError: If a parameter is not finite, or one that must be positive is not.
-
-    Example:
-        >>> p = DiskParameters()
-        >>> round((p.weight / p.J) ** 0.5, 2), round(p.k / p.R / p.J, 2), round(p.L / p.R * 1e3, 2)
-        (11.67, 28.55, 1.16)
     """
 
     J: float = 2.44e-4
@@ -90,10 +82,6 @@ def rhs(s: ca.SX, u: ca.SX, p: DiskParameters) -> ca.SX:
     The motor's winding with back-EMF, LuGre's friction whose level falls with speed (Stribeck) and changes over a
     turn, cogging. Source of the friction: Canudas de Wit, Olsson, Aastroem, Lischinsky, IEEE TAC 40 (1995), with
     neither damping of the bristle nor of its rate.
-
-    Example:
-        >>> rhs(ca.DM.zeros(4), ca.DM(1.0), DiskParameters()).full().ravel().round(3).tolist()
-        [0.0, 4.63, 200.0, 0.0]
     """
     phi, v, i, z = s[0], s[1], s[2], s[3]
     level = 1 + (p.stiction - 1) * ca.exp(-((v / p.stribeck) ** 2))
@@ -107,12 +95,7 @@ def rhs(s: ca.SX, u: ca.SX, p: DiskParameters) -> ca.SX:
 
 
 def steps(p: DiskParameters, n: int) -> ca.Function:
-    """Function ``(s, u, h) -> s`` of ``n`` Runge-Kutta steps of ``h`` [s] each.
-
-    Example:
-        >>> steps(DiskParameters(), 10)(ca.DM.zeros(4), 1.0, 1e-4).shape
-        (4, 1)
-    """
+    """Function ``(s, u, h) -> s`` of ``n`` Runge-Kutta steps of ``h`` [s] each."""
     s, u, h = ca.SX.sym("s", N_STATES), ca.SX.sym("u"), ca.SX.sym("h")
     f = ca.Function("f", [s, u], [rhs(s, u, p)])
     return repeated(ca.Function("one", [s, u, h], [rk4(f, s, u, h)]), n)

@@ -18,16 +18,10 @@ CHUNK = 10
 
 @dataclass(frozen=True)
 class DiskState:
-    """State of the plant.
+    """State of the plant: ``z`` ``(4,)`` is phi [rad], phi_dot [rad/s], motor current [A], bristle [rad].
 
-    Args:
-        z: ``(4,)``: phi [rad], phi_dot [rad/s], motor current [A], bristle [rad].
-        acting: Voltage that acts [V].
-        waiting: Commands on their way: time until each acts [s] and its voltage [V], the oldest first.
-
-    Example:
-        >>> DiskPlant().reset(np.array([0.1, 0.0]), seed=0).waiting
-        ()
+    ``acting`` is the voltage that acts [V]; ``waiting`` are commands on their way, time until each acts [s] and its
+    voltage [V], the oldest first.
     """
 
     z: Array
@@ -55,15 +49,6 @@ class DiskPlant:
         parameters: What it is made of.
         sub_step: Largest integration step [s]. Default 0.4 ms: the bristle relaxes at 4200 1/s at 25 rad/s, faster than
             any swing over the top, and order 4 is stable up to 2.78 over that.
-
-    Raises:
-        InputError: If ``sub_step`` is not positive.
-
-    Example:
-        >>> plant = DiskPlant()
-        >>> state = plant.step(plant.reset(np.zeros(2), seed=0), np.array([3.0]), 0.025)
-        >>> state.acting, state.waiting, bool(state.z[2] > 0)  # the voltage has acted for 1.5 ms
-        (3.0, (), True)
     """
 
     parameters: DiskParameters = field(default_factory=DiskParameters)

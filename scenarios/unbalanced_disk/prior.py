@@ -22,11 +22,6 @@ class UnbalancedDiskPrior(Prior):
     only; ``J`` is fixed and turns them into torques, so that the energy balance is in watts.
 
     Source: structure and nominal values, GerbenBeintema/gym-unbalanced-disk; J from the first version of its simulator.
-
-    Example:
-        >>> prior = UnbalancedDiskPrior({"K_u": 20.0})
-        >>> prior(torch.zeros(2, dtype=torch.float64), torch.tensor([0.5], dtype=torch.float64)).tolist()
-        [0.0, 10.0]
     """
 
     states: ClassVar[tuple[Signal, ...]] = STATES

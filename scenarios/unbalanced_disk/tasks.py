@@ -40,10 +40,6 @@ def pumps(horizon: int) -> tuple[tuple[tuple[float, ...], ...], ...]:
 
     Which way first, for how long, and for how long back is what tells the ways up apart; a plan that begins with none
     of them sees only the slope from where the disk hangs.
-
-    Example:
-        >>> len(pumps(60)), pumps(60)[0][0], pumps(60)[0][-1]
-        (12, (3.0,), (0.0,))
     """
     t = DT * np.arange(horizon)
     plans = []
@@ -60,54 +56,30 @@ SWING = UPRIGHT.changed(horizon=round(UP_AT / DT), r=(0.11,), starts=pumps(round
 
 
 def upright(t: Array) -> Array:
-    """``(n, 2)``: at rest at the top.
-
-    Example:
-        >>> upright(np.zeros(1)).round(3).tolist()
-        [[3.142, 0.0]]
-    """
+    """``(n, 2)``: at rest at the top."""
     return np.tile([pi, 0.0], (len(t), 1))
 
 
 def standing(t: Array) -> Array:
-    """Weight factors ``(n, 2)`` of the swing-up: nothing counts before ``UP_AT``, everything from then on.
-
-    Example:
-        >>> standing(np.array([1.4, 1.5])).tolist()
-        [[0.0, 0.0], [1.0, 1.0]]
-    """
+    """Weight factors ``(n, 2)`` of the swing-up: nothing counts before ``UP_AT``, everything from then on."""
     return np.where(t[:, None] > UP_AT - DT / 2, 1.0, 0.0) * np.ones(2)
 
 
 def sway(t: Array) -> Array:
-    """``(n, 2)``: 0.25 rad at 0.5 Hz and 0.1 rad at 1.1 Hz about the top, faded in over 1 s, and its derivative.
-
-    Example:
-        >>> sway(np.zeros(1)).round(3).tolist()
-        [[3.142, 0.0]]
-    """
+    """``(n, 2)``: 0.25 rad at 0.5 Hz and 0.1 rad at 1.1 Hz about the top, faded in over 1 s, and its derivative."""
     return faded_sines(t, ((0.25, 0.5), (0.1, 1.1))) + np.array([pi, 0.0])
 
 
 def swing(t: Array) -> Array:
-    """``(n, 2)``: 0.5 rad at 0.6 Hz and 0.3 rad at 1.5 Hz about hanging down, faded in over 1 s, and its derivative.
-
-    Example:
-        >>> swing(np.zeros(1)).tolist()
-        [[0.0, 0.0]]
-    """
+    """``(n, 2)``: 0.5 rad at 0.6 Hz and 0.3 rad at 1.5 Hz about hanging down, faded in over 1 s, and its derivative."""
     return faded_sines(t, ((0.5, 0.6), (0.3, 1.5)))
 
 
 def stood(result: ClosedLoopResult) -> dict[str, float]:
     """What a swing-up reached.
 
-    Args:
-        result: The loop.
-
-    Returns:
-        ``up_at_s``: from when on the disk stays within 0.2 rad of the top (infinite: never); ``hold_rmse_rad``: root
-        mean square of its angle from the top over the last second.
+    ``up_at_s``: from when on the disk stays within 0.2 rad of the top (infinite: never); ``hold_rmse_rad``: root mean
+    square of its angle from the top over the last second.
     """
     off = np.abs(result.x[:, 0] - pi)
     away = np.flatnonzero(off > 0.2)

@@ -21,12 +21,6 @@ class Xl330PendulumPrior(Prior):
 
     Source: Duclusaud, Passault, Padois, Ly, *Extended friction models for the physics simulation of servo actuators*
     (ICRA 2025), whose fit gives the nominal values.
-
-    Example:
-        >>> prior = Xl330PendulumPrior({"k_t": 0.4, "R": 4.0, "J": 0.005})
-        >>> on = torch.tensor([0.5, 6.0, 1.0], dtype=torch.float64)  # half of 6 V, switched on
-        >>> [round(v, 9) for v in prior(torch.zeros(2, dtype=torch.float64), on).tolist()]
-        [0.0, 60.0]
     """
 
     states: ClassVar[tuple[Signal, ...]] = (

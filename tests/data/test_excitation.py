@@ -95,9 +95,8 @@ def test_prbs_has_the_levels_mean_and_lines_of_theory(bits):
     np.testing.assert_allclose(amplitude[k], 2 * 0.4 * np.sqrt(n + 1) / n * hold, atol=1e-12)
     assert f[1] == pytest.approx(1 / (n * per * dt))
     half = np.interp(0.44 / (per * dt), f[k], hold)
-    assert half == pytest.approx(
-        np.sqrt(0.5), abs=0.02
-    )  # between two lines; n of them to the clock's frequency
+    # between two lines; n of them to the clock's frequency
+    assert half == pytest.approx(np.sqrt(0.5), abs=0.02)
     assert crest_factor(u) < 1 + 1.5 / n  # two levels, the mean a little off their middle
 
 
@@ -126,9 +125,8 @@ def test_chirp_is_flat_between_its_frequencies():
     assert (amplitude[(f < 0.3) | (f > 5.0)] < 0.2 * flat).all()
     assert crest_factor(u) == pytest.approx(np.sqrt(2), abs=0.02)
     crossings = t[1:][np.diff(np.sign(u)) != 0]
-    assert crossings[-1] - crossings[-2] == pytest.approx(
-        1 / (2 * 4.5), abs=0.005
-    )  # half a period, one sample
+    # half a period, one sample
+    assert crossings[-1] - crossings[-2] == pytest.approx(1 / (2 * 4.5), abs=0.005)
 
 
 def test_what_cannot_be_made_is_refused():
@@ -164,9 +162,8 @@ def sine(f, seconds=20.0, amplitude=0.1):
 def test_a_sine_is_one_line_wherever_it_lies_between_bins(f):
     (found,) = excitation_of([run(0.3 + sine(f))], INPUT)
     assert found.name == "torque"
-    assert found.spread == pytest.approx(
-        0.1 / np.sqrt(2), rel=0.02
-    )  # of whole periods; others differ a little
+    # of whole periods; others differ a little
+    assert found.spread == pytest.approx(0.1 / np.sqrt(2), rel=0.02)
     assert len(found.lines) == 1
     assert found.lines[0] == pytest.approx(f, abs=0.025 + 1e-9)  # half a bin of 20 s
 

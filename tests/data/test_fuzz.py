@@ -15,22 +15,8 @@ from scipy.io import savemat
 from hybrid_mpc import DataSpec, InputError, Signal, load_trajectories
 
 STRANGE = (
-    0.0,
-    -0.0,
-    5e-324,
-    -1e-300,
-    1e-9,
-    1.0,
-    6.283,
-    1e9,
-    -1e99,
-    1e101,
-    1e200,
-    1.7e308,
-    np.inf,
-    -np.inf,
-    np.nan,
-)
+    0.0, -0.0, 5e-324, -1e-300, 1e-9, 1.0, 6.283, 1e9, -1e99, 1e101, 1e200, 1.7e308, np.inf, -np.inf, np.nan,
+)  # fmt: skip
 PHI = Signal("phi", "rad", periodic=True)
 ANY = {
     "outputs": (PHI,),

@@ -78,8 +78,7 @@ def test_folders_of_studies_that_are_damaged(monkeypatch, tmp_path):
             for words in (["report", folder], ["compare", folder, made]):
                 ended = command("study", *words)
                 assert "Traceback" not in ended.told, f"{name}, {i}:\n{ended.told}"
-                assert ended.code in (0, 2), (
-                    f"{name}, {i}:\n{ended.told}"
-                )  # a log that ends with a torn line is whole
+                # a log that ends with a torn line is whole
+                assert ended.code in (0, 2), f"{name}, {i}:\n{ended.told}"
                 tried += 1
     assert tried > 60

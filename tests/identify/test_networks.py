@@ -87,14 +87,8 @@ def test_the_fused_sequence_is_the_plain_one(shared):
 
 def test_the_fused_derivative_is_that_of_its_values():
     rng = np.random.default_rng(2)
-    shapes = (
-        (4, 2, 3, 2),
-        (2, 3, 3),
-        (2, 2, 9),
-        (2, 3, 9),
-        (2, 1, 9),
-        (2, 1, 9),
-    )  # s, h, w_ih, w_hh, b_ih, b_hh
+    # s, h, w_ih, w_hh, b_ih, b_hh
+    shapes = ((4, 2, 3, 2), (2, 3, 3), (2, 2, 9), (2, 3, 9), (2, 1, 9), (2, 1, 9))
     arguments = [torch.tensor(rng.uniform(-1, 1, shape)).requires_grad_() for shape in shapes]
     # central differences with steps of 1e-6: rounding of 1e-16 / 1e-6 and more through the steps
     assert torch.autograd.gradcheck(fused_states, arguments, eps=1e-6, atol=1e-8)

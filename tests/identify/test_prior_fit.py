@@ -61,9 +61,8 @@ def test_a_fit_goes_on_from_another_with_the_length_that_won(fit):
     again = fit_prior(Pendulum, train, valid, dt=DT, before=fit)
     assert [stage["stage"] for stage in again.stages] == ["the fit before", fit.best]
     for name, truth in TRUTH.items():
-        assert (
-            abs(again.values[name] - truth) < 0.1 * abs(fit.values[name] - truth) + 1e-6
-        )  # no noise, no error
+        # no noise, no error
+        assert abs(again.values[name] - truth) < 0.1 * abs(fit.values[name] - truth) + 1e-6
 
 
 def test_methods_are_those_asked_for_and_the_best_wins():

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from simulated_pendulum import TRUTH, Killed, Pendulum, dragged, same_training
+from simulated_pendulum import TRUTH, Pendulum, killed_and_resumed, same_training
 
 from hybrid_mpc import DEFAULT_BUDGETS, BenchmarkBudget, InputError, TrainingSettings, train
 from hybrid_mpc.identify.prior_replay import COUNTED, FOLLOWED, RUNS, make_prior_replay, prior_replay_penalty
@@ -15,11 +15,6 @@ SMALL = TrainingSettings(
     "pgrnn", 4, 2, 20, 20, seed=3, warm=10, horizon=20, batch=8, every=10, prior_replay=10.0
 )
 PRIOR = Pendulum(TRUTH)
-
-
-@pytest.fixture(scope="module")
-def data():
-    return dragged()
 
 
 @pytest.fixture(scope="module")
@@ -88,14 +83,8 @@ def test_it_goes_with_other_options(data, changed):
 
 
 def test_a_training_with_prior_replay_resumes_to_the_same_bits(data, tmp_path):
-    def kill(done, total, error):
-        if done == 30:
-            raise Killed
-
     whole, file = train(PRIOR, *data, SMALL), tmp_path / "training.safetensors"
-    with pytest.raises(Killed):
-        train(PRIOR, *data, SMALL, checkpoint=file, on_progress=kill)
-    same_training(train(PRIOR, *data, SMALL, checkpoint=file), whole)
+    same_training(killed_and_resumed(30, file, PRIOR, *data, SMALL)[0], whole)
     with pytest.raises(InputError, match="other settings or data"):
         train(PRIOR, *data, replace(SMALL, prior_replay=5.0), checkpoint=file)
 

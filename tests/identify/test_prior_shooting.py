@@ -46,9 +46,8 @@ def test_without_noise_the_parameters_are_exact_and_the_gaps_closed(fit):
     segments = cut_segments(runs(0.0), 25)
     theta, _ = multiple_shooting(fit, fit.nominal, segments)
     for name, truth in TRUTH.items():
-        assert fit.values(theta)[name] == pytest.approx(
-            truth, rel=1e-5
-        )  # the integrators' difference at 20 ms
+        # the integrators' difference at 20 ms
+        assert fit.values(theta)[name] == pytest.approx(truth, rel=1e-5)
 
 
 def test_standard_errors_are_those_of_the_noise(fit):

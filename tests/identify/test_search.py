@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from simulated_pendulum import TRUTH, Pendulum, dragged
+from simulated_pendulum import TRUTH, Pendulum
 
 from hybrid_mpc import InputError, SearchSpace, TrainingSettings, train, tune
 from hybrid_mpc.identify import tune as module
@@ -19,11 +19,6 @@ SPACE = SearchSpace(batch=(8, 128))
 TOTAL = BASE.teacher_steps + BASE.free_run_steps
 PRIOR = Pendulum(TRUTH)
 TRIALS = 25
-
-
-@pytest.fixture(scope="module")
-def data():
-    return dragged()
 
 
 def fake(prior, training, validation, settings, *, on_progress):

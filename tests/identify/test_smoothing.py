@@ -51,9 +51,8 @@ def test_without_noise_and_with_the_true_prior_the_states_are_exact():
     truth = record(2)
     run = replace(truth, x=np.full_like(truth.x, np.nan))
     smoothed = Smoother(Pendulum(TRUTH), DT, (1e-6,), (1e-3,)).smooth([run])[0]
-    np.testing.assert_allclose(
-        smoothed.x, truth.x, atol=1e-4
-    )  # a wandering d of 1e-3 over a period, and more
+    # a wandering d of 1e-3 over a period, and more
+    np.testing.assert_allclose(smoothed.x, truth.x, atol=1e-4)
 
 
 def test_equals_the_least_squares_solution_of_a_linear_system():

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from simulated_pendulum import DT, TRUTH, Killed, Pendulum, dragged, same_training
+from simulated_pendulum import DT, TRUTH, Pendulum, killed_and_resumed, same_training
 
 from hybrid_mpc import InputError, TrainingSettings, train
 from hybrid_mpc.identify.dataset import cut_windows, fitting_horizon
@@ -12,11 +12,6 @@ from hybrid_mpc.identify.settings import KINDS
 from hybrid_mpc.identify.train import REPEATS, TrainingRun, load_checkpoint, save_checkpoint
 
 SMALL = TrainingSettings("mopgrnn", 4, 2, 20, 20, seed=3, warm=10, horizon=20, batch=8, every=10)
-
-
-@pytest.fixture(scope="module")
-def data():
-    return dragged()
 
 
 PRIOR = Pendulum(TRUTH)
@@ -54,15 +49,7 @@ def test_a_training_gives_the_recorded_numbers(data, kind):
 
 @pytest.mark.parametrize("at", [10, 20, 30])  # within a stage, between the stages, within the second
 def test_a_killed_training_resumes_to_the_same_bits(data, whole, tmp_path, at):
-    def kill(done, total, error):
-        if done == at:
-            raise Killed
-
-    file = tmp_path / "training.safetensors"
-    with pytest.raises(Killed):
-        train(PRIOR, *data, SMALL, checkpoint=file, on_progress=kill)
-    seen = []
-    resumed = train(PRIOR, *data, SMALL, checkpoint=file, on_progress=lambda d, t, e: seen.append(d))
+    resumed, seen = killed_and_resumed(at, tmp_path / "training.safetensors", PRIOR, *data, SMALL)
     assert seen[0] == at + 10  # it went on, it did not start anew
     same_training(resumed, whole)
 

@@ -5,18 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from simulated_pendulum import DT, TRUTH, Killed, Pendulum, dragged, same_training
+from simulated_pendulum import DT, TRUTH, Pendulum, killed_and_resumed, same_training
 
 from hybrid_mpc import InputError, TrainingSettings, train
 from hybrid_mpc.identify.objectives import OBJECTIVES
 
 SHORT = TrainingSettings("mopgrnn", 4, 2, 15, 10, seed=3, warm=10, horizon=20, batch=8, every=5)
 PRIOR = Pendulum(TRUTH)
-
-
-@pytest.fixture(scope="module")
-def data():
-    return dragged()
 
 
 OPTIONS = (
@@ -35,17 +30,11 @@ def usual(data):
 
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
 def test_every_option_trains_resumes_and_makes_a_model(data, usual, options, tmp_path):
-    def kill(done, total, error):
-        if done == 10:
-            raise Killed
-
     settings, file = replace(SHORT, **options), tmp_path / "training.safetensors"
     whole = train(PRIOR, *data, settings)
     assert (whole.validation < whole.curve["validation"][0]).all()
     assert not whole.failures
-    with pytest.raises(Killed):
-        train(PRIOR, *data, settings, checkpoint=file, on_progress=kill)
-    same_training(whole, train(PRIOR, *data, settings, checkpoint=file))
+    same_training(whole, killed_and_resumed(10, file, PRIOR, *data, settings)[0])
     if options != {"fused": True}:
         assert not np.array_equal(whole.validation, usual.validation)
     step = whole.step(PRIOR, DT)

@@ -18,26 +18,8 @@ from nn_export import storage
 MEMORY = 3 * 2**29
 """Bytes of address space that the process has: 1.5 GiB."""
 LARGE = [
-    10**4,
-    10**6,
-    10**9,
-    2**31 - 1,
-    2**40,
-    10**18,
-    -1,
-    -(10**9),
-    0,
-    1,
-    2,
-    3,
-    7,
-    True,
-    None,
-    0.5,
-    1e300,
-    "3.0",
-    [],
-]
+    10**4, 10**6, 10**9, 2**31 - 1, 2**40, 10**18, -1, -(10**9), 0, 1, 2, 3, 7, True, None, 0.5, 1e300, "3.0", [],
+]  # fmt: skip
 """What numbers are replaced by."""
 X, H = {"input": "x"}, {"input": "h"}
 GRU = [{"weight": name} for name in "abcd"]

@@ -27,7 +27,7 @@ from nn_export import (
     with_jacobian,
 )
 from nn_export.budget import _BOUND, EACH_PROGRAM, Budget, costs
-from nn_export.graph import operations
+from nn_export.chain import operations
 from nn_export.operators import OPERATORS, PLAIN, elementwise, recurrent
 from nn_export.operators.costs import COSTS, Cost, Tensor, product
 from nn_export.operators.value import Value, broadcast_shape, constant, layout

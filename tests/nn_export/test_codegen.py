@@ -12,33 +12,18 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
-import torch
-from torch import nn
+from export_parts import traced_cell
 
-from nn_export import build, codegen, compile_function, generate_c, trace, unroll, with_jacobian
+from nn_export import build, codegen, compile_function, generate_c, unroll, with_jacobian
 from nn_export.errors import CompileError
 
 needs_compiler = pytest.mark.skipif(not shutil.which("cc"), reason="no C compiler on this machine")
 POINT = [np.array([0.3, -0.5]), np.linspace(-1, 1, 4), np.array([0.2])]
 
 
-class Cell(nn.Module):
-    """Linear layers, a GRU cell with its own Jacobian and scalar code between: all that an export holds."""
-
-    def __init__(self):
-        super().__init__()
-        torch.manual_seed(1)
-        self.cell, self.head = nn.GRUCell(3, 4), nn.Linear(4, 2)
-
-    def forward(self, x, h, u):
-        h_next = self.cell(torch.cat([torch.sin(x), u]), h)
-        return 0.9 * x + 0.1 * self.head(h_next), h_next
-
-
 @pytest.fixture(scope="module")
 def program():
-    examples = torch.zeros(2), torch.zeros(4), torch.zeros(1)
-    return trace(Cell(), examples, output_names=["x_next", "h_next"])
+    return traced_cell(4)
 
 
 def flat(values):

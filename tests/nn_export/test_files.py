@@ -127,9 +127,8 @@ def test_json_that_is_in_order_is_read():
     deep = b"[" * MAX_DEPTH + b"]" * MAX_DEPTH
     for content in (deep, b"{}", b"-0", b"[-0.0, 1e308, 1e-400, 18446744073709551615, -9223372036854775808]"):
         assert parse_json(content) == json.loads(content)
-    assert (
-        parse_json(rb'"\ud83d\ude00 \\ud800"') == "\U0001f600 \\ud800"
-    )  # a pair; and a backslash before text
+    # a pair; and a backslash before text
+    assert parse_json(rb'"\ud83d\ude00 \\ud800"') == "\U0001f600 \\ud800"
 
 
 def _stop_within(path, error):

@@ -4,28 +4,16 @@ import casadi as ca
 import numpy as np
 import pytest
 import torch
+from export_parts import Cell, traced_cell
 from torch import nn
 
-from nn_export import build, fold, to_casadi, trace, unroll, with_jacobian
+from nn_export import build, fold, to_casadi, unroll, with_jacobian
 from nn_export.errors import SignatureError
-
-
-class Cell(nn.Module):
-    """(x, h, u) -> (x_next, h_next)"""
-
-    def __init__(self, z=5):
-        super().__init__()
-        torch.manual_seed(1)
-        self.cell, self.head = nn.GRUCell(3, z), nn.Linear(z, 2)
-
-    def forward(self, x, h, u):
-        h_next = self.cell(torch.cat([x, u]), h)
-        return 0.9 * x + 0.1 * self.head(h_next), h_next
 
 
 @pytest.fixture(scope="module")
 def program():
-    return trace(Cell(), (torch.zeros(2), torch.zeros(5), torch.zeros(1)), output_names=["x_next", "h_next"])
+    return traced_cell(5)
 
 
 def stacked(values):
@@ -52,7 +40,7 @@ def test_the_numbers_are_those_of_the_steps_in_a_row(program, n):
 
 def test_gradient_and_hessian_agree_between_unroll_fold_and_torch(program):
     step, n = build(program), 19
-    module = Cell().double()
+    module = Cell(5).double()
     rng = np.random.default_rng(0)
     x, h, u = rng.standard_normal(2), rng.standard_normal(5), rng.standard_normal((1, n))
 

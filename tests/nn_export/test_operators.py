@@ -99,7 +99,7 @@ def _case(name):
         return (A34, 0.4), {}
     if short == "pow.Scalar":
         return (0.4, A34), {}
-    many = (
+    many = [
         "Tensor",
         "atan2",
         "fmax",
@@ -110,17 +110,17 @@ def _case(name):
         "logical_or",
         "logical_xor",
         "pow",
-    )
+    ]
     if name in ELEMENTWISE and any(m in short for m in many):
         return (A34, V4), {}
     return (A34,), {}  # operators of one tensor
 
 
-NAMES = [
-    name for name in OPERATORS if name not in ("getitem", "aten.empty.memory_format")
-]  # test_operator_slopes
+# test_operator_slopes
+NAMES = [name for name in OPERATORS if name not in ("getitem", "aten.empty.memory_format")]
 RECURRENT = ("gru", "lstm", "rnn")
 INDEXED = ("index", "gather", "scatter", "embedding")
+# test_operator_slopes
 OWN_SLOPES = {
     "aten.celu.default",
     "aten.detach.default",
@@ -129,7 +129,7 @@ OWN_SLOPES = {
     # torch's slopes by the elements above the diagonal, which neither reads, are not zero: see test_systems
     "aten.cholesky_solve.default",
     "aten.cholesky_inverse.default",
-}  # test_operator_slopes
+}
 
 
 class Setup:
@@ -162,9 +162,8 @@ class Setup:
             or (self.base.startswith(INDEXED) and k > 0)
             or (self.base == "_trilinear" and k == 1)  # three axes
             or (self.base.startswith(RECURRENT) and k > 1)  # weights are constant
-            or (
-                self.base == "_native_batch_norm_legit_no_training" and k > 2
-            )  # statistics: no slope in torch
+            # statistics: no slope in torch
+            or (self.base == "_native_batch_norm_legit_no_training" and k > 2)
         )
 
     def torch_side(self, a, k):

@@ -123,9 +123,8 @@ def test_friction_never_feeds_energy_into_a_free_swing():
 def test_motor_torque_follows_with_its_lag():
     rig = Rig()
     state = rig.step(rig.reset(np.zeros(2), 0), np.array([0.1]), P.lag)
-    assert state.z[3] == pytest.approx(
-        0.1 * P.motor_gain * (1 - np.exp(-1)), rel=1e-4
-    )  # exact; RK4 at 0.1 lag
+    # exact; RK4 at 0.1 lag
+    assert state.z[3] == pytest.approx(0.1 * P.motor_gain * (1 - np.exp(-1)), rel=1e-4)
 
 
 def test_without_losses_and_gap_it_is_the_pendulum_of_both_inertias():

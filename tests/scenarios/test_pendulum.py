@@ -127,9 +127,8 @@ def test_oracle_s_step_is_the_plant_s():
     for torque in (20.0, -20.0, 5.0):
         x = model.step(QUIET.truth(state), [], torque, model.w, model.p)[0].full().ravel()
         state = QUIET.step(state, np.array([torque]), DT)
-        np.testing.assert_allclose(
-            x, QUIET.truth(state), rtol=0, atol=1e-8
-        )  # 1 ms against 0.5 ms: 16 times its error
+        # 1 ms against 0.5 ms: 16 times its error
+        np.testing.assert_allclose(x, QUIET.truth(state), rtol=0, atol=1e-8)
 
 
 def test_measurement_has_the_stated_noise():

@@ -42,12 +42,9 @@ at half the rate.
 class Trace:
     """What detectors see of a loop of n periods.
 
-    Args:
-        numbers: ``MonitorReading.numbers`` ``(n, columns)``.
-        level_w: Averaged one-step violation ``(n,)`` [W].
-        innovation: Innovations of the filter ``(n, n_y)`` [output units]; NaN in the first row.
-        nis: Normalised innovations squared ``(n,)``; NaN in the first.
-        speed: Largest true speed ``(n,)`` of the degrees of freedom [rad/s or m/s].
+    ``numbers`` are ``MonitorReading.numbers``, ``level_w`` the averaged one-step violation [W], ``speed`` the largest
+    true speed of the degrees of freedom. Innovations ``(n, n_y)`` and their normalised squares ``nis`` ``(n,)`` are
+    NaN in the first row.
     """
 
     numbers: Array
@@ -59,20 +56,11 @@ class Trace:
 
 @dataclass(frozen=True)
 class Detectors:
-    """All methods, learned from the same nominal loops.
+    """All methods, learned from the same ``hours`` of nominal loops.
 
-    Args:
-        detector: Scales of residual forces and power; its thresholds are set by the wanted rate.
-        tails: By part location and scale of the Gumbel tail of its maxima in blocks (:attr:`block_s`).
-        resolution: Step of each sensor ``(n_y,)``.
-        hours: Nominal data learned from [h].
-        blocks: Blocks among them.
-
-    Example:
-        >>> tails = {"forces": (3.0, 0.5), "power": (2.0, 0.4)}
-        >>> detectors = Detectors(Detector(0.02, ((0.01, 0, 0, 0),), (0.01, 0, 0, 0), 2.0, 1.0, 1.0), tails, (1.5e-3,))
-        >>> round(detectors.threshold("forces", 1.0), 2), detectors.threshold("freeze", 1.0)
-        (6.29, 1.0)
+    ``detector`` has the scales of residual forces and power; its thresholds are set by the wanted rate. ``tails`` has
+    by part location and scale of the Gumbel tail of its maxima in blocks (:attr:`block_s`); ``resolution`` the step
+    of each sensor.
     """
 
     detector: Detector
@@ -174,18 +162,6 @@ def learn_detectors(
 
     Thresholds are Gumbel tails of block maxima, as :func:`~hybrid_mpc.monitor.calibrate.calibrate` makes them. The
     loops are known to be nominal, so a block that stands out is no reason to refuse them.
-
-    Args:
-        traces: Nominal loops; the first of the machine's seconds of each is left out.
-        dt: Period [s].
-        resolution: Step of each sensor ``(n_y,)``.
-        rate: Smallest wanted rate [1/h]; default 1.
-        rest_speed: That of the monitor which watched them (``monitor.rest_speed``). Default 0.2, as the monitor's.
-        time_unit: The machine's second [s], the model's. Default 1.
-        data_hash: Hash of the data, kept in the detector.
-
-    Raises:
-        InputError: If there is too little data for the rate, or no motion.
     """
     skipped, block_s = round(SETTLING_S * time_unit / dt), block_seconds(dt, time_unit)
     runs = [trace.numbers[skipped:] for trace in traces]
@@ -213,14 +189,9 @@ def learn_detectors(
     return replace(detectors, tails=tails)
 
 
-def with_hysteresis(level: Array, threshold: float, release: float = RELEASE) -> NDArray[np.bool_]:
-    """Alarm ``(n,)`` that begins above a threshold and ends below a share of it.
-
-    Example:
-        >>> with_hysteresis(np.array([0.6, 1.1, 0.6, 0.4]), 1.0).tolist()
-        [False, True, True, False]
-    """
-    state = np.where(level > threshold, 1, np.where(level > release * threshold, 0, -1))
+def with_hysteresis(level: Array, threshold: float) -> NDArray[np.bool_]:
+    """Alarm ``(n,)`` that begins above a threshold and ends below a share of it."""
+    state = np.where(level > threshold, 1, np.where(level > RELEASE * threshold, 0, -1))
     places = np.maximum.accumulate(np.where(state != 0, np.arange(len(state)), -1))
     return np.asarray((places >= 0) & (state[np.maximum(places, 0)] == 1))
 

@@ -38,14 +38,8 @@ CONTROLLER, PRIOR = "hybrid_observer", "prior_observer"
 
 @dataclass(frozen=True)
 class MonitorRunner:
-    """Runs the study's jobs; sent to each worker once.
-
-    Args:
-        study: The study.
-        model: Its model.
-        folder: Folder of the study: learning data go there, what was learned is read there.
-
-    Example: ``MonitorRunner(study, model, "studies/monitor")(job)["loops"]``
+    """Runs the study's jobs; sent to each worker once. Learning data go to ``folder``, what was learned is read
+    there.
     """
 
     study: MonitorStudy
@@ -70,7 +64,7 @@ class _Loops:
         kit = load(local_folder(runner.model)).with_noise(dict(runner.model.noise))
         self._bench = Bench(load_scenario(runner.study.scenario), {MODEL: kit})
         self._kit = self._bench.kits[MODEL]
-        self._task = plain_task(selected_tasks(self._bench.scenario, (runner.study.task,))[0])
+        self._task = replace(selected_tasks(self._bench.scenario, (runner.study.task,))[0], faults=())
         self._dt = self._kit.models["hybrid"].dt
         self._detectors: Detectors | None = None
 
@@ -90,7 +84,8 @@ class _Loops:
             return self._guarded(job.plans[0], job.arm)
         traces = self._nominal(job.plans)
         if job.kind == LEARN:
-            write_learning(self._folder / LEARNING / f"{job.id}.npz", traces)
+            arrays = {f"{name}_{i}": value for i, t in enumerate(traces) for name, value in vars(t).items()}
+            write_arrays(self._folder / LEARNING / f"{job.id}.npz", arrays)
             return {"loops": [{"seconds": plan.duration} for plan in job.plans]}
         shown = [nominal_figures(self._study, self.detectors, t) for t in traces]
         return {"loops": [{"case": p.case, **f} for p, f in zip(job.plans, shown, strict=True)]}
@@ -143,28 +138,13 @@ class _Loops:
 
 
 def trace_of(result: ClosedLoopResult) -> Trace:
-    """What detectors see of a loop.
-
-    Args:
-        result: Its record.
-    """
+    """What detectors see of a loop."""
     speed = np.abs(result.x[:, result.x.shape[1] // 2 :]).max(axis=1)
     return Trace(result.numbers, result.level, result.innovation, result.nis, speed)
 
 
-def plain_task(task: Task) -> Task:
-    """The task without disturbances of its own."""
-    return replace(task, faults=())
-
-
 def nominal_figures(study: MonitorStudy, detectors: Detectors, trace: Trace) -> dict[str, Any]:
-    """Of a nominal loop: false alarms by rate and method, and the largest scores of its blocks.
-
-    Args:
-        study: The study.
-        detectors: What was learned.
-        trace: The loop.
-    """
+    """Of a nominal loop: false alarms by rate and method, and the largest scores of its blocks."""
     dt, levels = detectors.detector.dt, detectors.levels(trace)
     size = round(detectors.block_s / dt)
     counts: dict[str, dict[str, int]] = {}
@@ -182,14 +162,7 @@ def nominal_figures(study: MonitorStudy, detectors: Detectors, trace: Trace) -> 
 
 
 def fault_figures(study: MonitorStudy, detectors: Detectors, trace: Trace, onset: int) -> dict[str, Any]:
-    """Of a faulted loop: delays by rate and method, alarms before the fault, and the largest scores soon after.
-
-    Args:
-        study: The study.
-        detectors: What was learned.
-        trace: The loop.
-        onset: First sample of the fault.
-    """
+    """Of a faulted loop: delays by rate and method, alarms before the fault, and the largest scores soon after."""
     dt, levels = detectors.detector.dt, detectors.levels(trace)
     moving = MOVING * max(detectors.detector.rest_speed)
     moved: Array = np.cumsum(trace.speed[onset:] > moving) * np.float64(dt)
@@ -214,23 +187,8 @@ def _delay(alarm: NDArray[np.bool_], moved: Array) -> float:
     return float(moved[places[0]]) if places.size else float("inf")
 
 
-def write_learning(path: Path, traces: list[Trace]) -> None:
-    """Keep what is learned from."""
-    arrays = {f"{name}_{i}": value for i, t in enumerate(traces) for name, value in vars(t).items()}
-    write_arrays(path, arrays)
-
-
 def learn(study: MonitorStudy, paths: list[Path], artifact: Kit) -> Detectors:
-    """Thresholds of all methods from the nominal loops in these files.
-
-    Args:
-        study: The study.
-        paths: Files of :func:`write_learning`.
-        artifact: The models that ran in them.
-
-    Raises:
-        InputError: If a file is missing, or there is too little data.
-    """
+    """Thresholds of all methods from the nominal loops in these files."""
     traces, hashed = [], hashlib.sha256()
     for path in paths:
         arrays = read_arrays(path)

@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 MOVE_S, HOLD_S = 0.8, 1.3
 """Length [s] of a move between random levels, and the time from one move to the next."""
 AMPLITUDE = 0.5
+DRIFT = 0.1
+"""Share by which friction drifts in nominal loops."""
 LEARN, NOMINAL, FAULT, GUARD = "learn", "nominal", "fault", "guard"
 SEEDS = {LEARN: 1_000_000, NOMINAL: 2_000_000, FAULT: 3_000_000}
 """First seed of each kind of loop, so that none meets the noise of another; guarded loops share the faulted ones'."""
@@ -27,15 +29,7 @@ SEEDS = {LEARN: 1_000_000, NOMINAL: 2_000_000, FAULT: 3_000_000}
 
 @dataclass(frozen=True)
 class Case:
-    """A fault of the study.
-
-    Args:
-        name: Short name.
-        title: For tables.
-        target: Target of a :class:`~hybrid_mpc.loop.faults.Fault`.
-        value: Its size.
-        length: How long [s] it lasts. Default: to the end.
-    """
+    """A fault of the study: target and value of a :class:`~hybrid_mpc.loop.faults.Fault`, and how long [s] it lasts."""
 
     name: str
     title: str
@@ -57,13 +51,10 @@ CASES = (
 
 @dataclass(frozen=True)
 class LoopPlan:
-    """One loop.
+    """One loop of ``duration`` [s]; its seed is that of sensor, onset and levels.
 
-    Args:
-        case: ``"none"``, ``"drift_up"``, ``"drift_down"``, or the name of a :class:`Case`.
-        motion: ``"task"``: the task's reference; ``"moves"``: moves between random levels.
-        seed: Of sensor, onset and levels.
-        duration: Length [s].
+    ``case`` is ``"none"``, ``"drift_up"``, ``"drift_down"``, or the name of a :class:`Case`; ``motion`` ``"task"``,
+    the task's reference, or ``"moves"`` between random levels.
     """
 
     case: str
@@ -72,21 +63,16 @@ class LoopPlan:
     duration: float
 
     def onset(self, dt: float) -> float:
-        """First instant of the fault [s]: a sample from 1.5 to 3.5 s.
-
-        Example:
-            >>> 1.5 <= LoopPlan("push", "task", 3, 7.5).onset(0.02) <= 3.5
-            True
-        """
+        """First instant of the fault [s]: a sample from 1.5 to 3.5 s."""
         first, last = round(1.5 / dt), round(3.5 / dt)
         return dt * int(np.random.default_rng([self.seed, 1]).integers(first, last + 1))
 
-    def faults(self, dt: float, drift: float = 0.1) -> tuple[Fault, ...]:
+    def faults(self, dt: float) -> tuple[Fault, ...]:
         """What acts; friction that drifts goes one way in a third of the loop, and in half of it back and beyond."""
         if self.case == "none":
             return ()
         if self.case.startswith("drift"):
-            first = 1 + drift if self.case == "drift_up" else 1 - drift
+            first = 1 + DRIFT if self.case == "drift_up" else 1 - DRIFT
             third, half = self.duration / 3, self.duration / 2
             return (
                 Fault(0.0, math.inf, "plant_friction", first, ramp=third),
@@ -106,13 +92,10 @@ class LoopPlan:
 
 @dataclass(frozen=True)
 class MonitorJob:
-    """Loops that a worker runs in one go.
+    """Loops that a worker runs in one go: ``"learn"``, ``"nominal"``, ``"fault"``, or ``"guard"`` with the reaction
+    ``arm``.
 
-    Args:
-        kind: ``"learn"``, ``"nominal"``, ``"fault"`` or ``"guard"``.
-        plans: Its loops.
-        arm: The guard's reaction, of a guarded loop. Default: none.
-        number: Place in the study, no part of the identity.
+    ``number`` is its place in the study, no part of the identity.
     """
 
     kind: str
@@ -157,14 +140,6 @@ class MonitorStudy:
         resolution: Step of each sensor ``(n_y,)``.
         fault_s: Length of a faulted loop [s].
         name: For the report.
-
-    Raises:
-        InputError: If a number is not positive.
-
-    Example:
-        >>> study = MonitorStudy("golf_robot", "runs/golf", seeds=2, guard_seeds=1, nominal_hours=1.0)
-        >>> study.size, sum(job.kind == "nominal" for job in study.jobs())
-        (34, 2)
     """
 
     scenario: str
@@ -240,19 +215,7 @@ BUDGETS = {
 
 
 def monitor_study(model: str, budget: str = "full") -> MonitorStudy:
-    """The golf robot's study.
-
-    Args:
-        model: Artifact folder.
-        budget: ``"full"``, or ``"quick"``: one nominal hour, six loops a fault.
-
-    Raises:
-        InputError: If there is no such budget.
-
-    Example:
-        >>> monitor_study("runs/golf", "quick").nominal_hours
-        1.0
-    """
+    """The golf robot's study."""
     if budget not in BUDGETS:
         raise InputError(f"study monitor: no budget {budget!r}; there are: {', '.join(BUDGETS)}")
     chosen: dict[str, Any] = dict(BUDGETS[budget])
@@ -260,12 +223,7 @@ def monitor_study(model: str, budget: str = "full") -> MonitorStudy:
 
 
 def moves(levels: Array) -> Callable[[Array], Array]:
-    """Reference ``t (n,) -> (n, 2)`` from level to level along quintics, and its derivative.
-
-    Example:
-        >>> moves(np.array([0.0, 0.4]))(np.array([0.0, 1.7, 2.2])).round(2).tolist()
-        [[0.0, 0.0], [0.2, 0.94], [0.4, 0.0]]
-    """
+    """Reference ``t (n,) -> (n, 2)`` from level to level along quintics, and its derivative."""
 
     def reference(t: Array) -> Array:
         index = np.clip(np.floor(t / HOLD_S + 1e-9).astype(int), 0, len(levels) - 1)

@@ -25,32 +25,12 @@ LINES: Mapping[str, tuple[str, str, str]] = {
 
 
 def method_name(method: str) -> str:
-    """Human name of a method of detection; an unknown one stays as it is.
-
-    Example:
-        >>> method_name("guard")
-        'guard (energy)'
-    """
+    """Human name of a method of detection; an unknown one stays as it is."""
     return LINES[method][0] if method in LINES else plain(method)
 
 
 def delays(cases: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
-    """Share of faults found up to a delay, one panel a fault; what is missed never comes.
-
-    Args:
-        cases: By fault and method: delays [s], infinite for a miss.
-
-    Returns:
-        The figure; delays on a logarithmic axis.
-
-    Raises:
-        InputError: If there is no delay.
-
-    Example:
-        >>> figure = delays({"push": {"guard": [0.1, 0.12, math.inf]}})
-        >>> len(figure.axes)
-        1
-    """
+    """Share of faults found up to a delay, one panel a fault; what is missed never comes."""
     if not any(len(values) for row in cases.values() for values in row.values()):
         raise InputError("plot of delays: there is none")
     figure, panels = _panels(len(cases))
@@ -77,23 +57,7 @@ def delays(cases: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
 def operating_curves(
     cases: Mapping[str, Mapping[str, tuple[Sequence[float], Sequence[float]]]], wanted: float
 ) -> Figure:
-    """Share of faults found within a second against false alarms an hour, one panel a fault.
-
-    Args:
-        cases: By fault and method: false alarms [1/h], and the share found.
-        wanted: Wanted rate [1/h], marked.
-
-    Returns:
-        The figure; a rate of nothing is drawn at the left edge.
-
-    Raises:
-        InputError: If there is no curve.
-
-    Example:
-        >>> figure = operating_curves({"push": {"guard": ([60.0, 0.0], [1.0, 0.5])}}, 1.0)
-        >>> len(figure.axes)
-        1
-    """
+    """Share of faults found within a second against false alarms an hour, one panel a fault."""
     rates = [r for row in cases.values() for per_hour, _ in row.values() for r in per_hour if r > 0]
     if not rates:
         raise InputError("plot of operating curves: there is none")

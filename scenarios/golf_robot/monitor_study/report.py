@@ -38,19 +38,11 @@ GUARD_TEXT = (
 
 
 def write_monitor_report(out: Path, results: Mapping[str, Any], note: StudyNote) -> Path:
-    """Write ``report.html``, ``table.md``, ``delays.png`` and ``roc.png``.
-
-    Args:
-        out: Folder of the study.
-        results: What :func:`~scenarios.golf_robot.monitor_study.results.monitor_results` found.
-        note: What the study is made of.
-
-    Returns:
-        The report's path.
-    """
+    """Write ``report.html``, ``table.md``, ``delays.png`` and ``roc.png``."""
+    delay_tables = [*(delay_table(results, rate) for rate in results["delays"]), _miss_table(results)]
     sections = [
         Section("False alarms", NOMINAL_TEXT, (), [alarm_table(results)]),
-        Section("Delays", DELAY_TEXT, _figure(_delays, results, out), _delay_tables(results)),
+        Section("Delays", DELAY_TEXT, _figure(_delays, results, out), delay_tables),
         Section("Found against false alarms", ROC_TEXT, _figure(_roc, results, out)),
         Section("Reaction", GUARD_TEXT, (), [guard_table(results), limit_table(results)]),
         _setup(results, note),
@@ -161,10 +153,6 @@ def _delay(f: Mapping[str, Any]) -> str:
         return "-"
     early = f", {f['early']} early" if f["early"] else ""
     return f"{f['median']:.2f} [{f['low']:.2f}, {f['high']:.2f}], {100 * f['miss_rate']:.0f} %{early}"
-
-
-def _delay_tables(results: Mapping[str, Any]) -> list[Table]:
-    return [*(delay_table(results, rate) for rate in results["delays"]), _miss_table(results)]
 
 
 def _miss_table(results: Mapping[str, Any]) -> Table:

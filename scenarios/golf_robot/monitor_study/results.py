@@ -22,15 +22,7 @@ TOLERANCE = 1e-6
 
 
 def monitor_results(study: Mapping[str, Any], detectors: Detectors, rows: Rows) -> dict[str, Any]:
-    """Everything that report and table show.
-
-    Args:
-        study: The study as plain data.
-        detectors: What was learned.
-        rows: Rows of the finished jobs.
-
-    Example: ``monitor_results(note["study"], detectors, rows)["false_alarms"]["1"]["guard"]["upper_95"]``
-    """
+    """Everything that report and table show."""
     done = [row for row in rows if row["status"] == "done"]
     of = {kind: [row for row in done if row["kind"] == kind] for kind in (NOMINAL, FAULT, GUARD)}
     loops = [loop for row in of[NOMINAL] for loop in row["loops"]]
@@ -56,11 +48,6 @@ def _case(rows: Rows, case: str) -> list[Mapping[str, Any]]:
 
 def false_alarms(loops: Rows, rate: str, method: str) -> dict[str, Any]:
     """False alarms of a method: number, rate [1/h] and its upper 95 % Poisson bound; also where friction drifts.
-
-    Args:
-        loops: Nominal loops.
-        rate: Wanted rate, as the rows' key.
-        method: Name in :data:`~scenarios.golf_robot.monitor_study.detection.METHODS`.
 
     Example:
         >>> loops = [{"case": "none", "seconds": 3600.0, "alarms": {"1": {"guard": 1}}}]
@@ -107,9 +94,6 @@ def delay_figures(delays: Sequence[float]) -> dict[str, float]:
     """Median of delays [s], infinite for a miss, with its 95 % interval, and the share of misses with its own.
 
     Order statistics for the median (exact, whatever the distribution), Wilson's interval for the share.
-
-    Args:
-        delays: In ascending order.
 
     Source: Wilson, *Probable inference, the law of succession, and statistical inference*, JASA 22 (1927).
 
@@ -158,21 +142,6 @@ def roc(loops: Rows, faulted: Rows, method: str, block_s: float = BLOCK_S) -> di
     """Share of faults found within a second against false alarms an hour, as all thresholds grow together.
 
     A false alarm is a block whose largest score passes.
-
-    Args:
-        loops: Nominal loops with the largest scores of their ``blocks``.
-        faulted: Faulted loops with their largest ``scores`` soon after the onset.
-        method: Name of the method.
-        block_s: Length of a block [s]. Default 5.
-
-    Returns:
-        ``factor`` of the thresholds, ``per_hour`` and ``found``, in descending order of false alarms.
-
-    Example:
-        >>> loops = [{"blocks": {"guard": [0.5, 1.2]}}]
-        >>> curve = roc(loops, [{"scores": {"guard": 0.9}}], "guard")
-        >>> curve["per_hour"][0], curve["found"][0], curve["found"][-1]
-        (720.0, 1.0, 0.0)
     """
     blocks = np.array([b for loop in loops for b in loop["blocks"][method]])
     scores = np.array([row["scores"][method] for row in faulted])

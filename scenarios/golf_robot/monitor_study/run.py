@@ -59,24 +59,6 @@ def run_monitor_study(
     """Run the study into a folder and return its results.
 
     What is finished is on the disk; after a kill at any moment ``resume=True`` goes on.
-
-    Args:
-        study: What to run.
-        out: Folder to make; new or empty unless ``resume``.
-        workers: Processes.
-        resume: Finish the study that ``out`` holds.
-        retry_failed: Run those jobs again that have failed.
-        progress: Where to report; default: nowhere.
-
-    Returns:
-        What ``out/results.json`` holds; beside it are ``report.html``, ``table.md`` and the figures.
-
-    Raises:
-        InputError: For bad input, a model without parameters or a scenario without causes to adapt to, too little
-            nominal data for the rates, or if every job has failed.
-
-    Example:
-        >>> results = run_monitor_study(monitor_study("runs/golf"), "studies/monitor")  # doctest: +SKIP
     """
     out, say = Path(out), progress or Silent()
     check_out(out, NOUN, resume=resume)
@@ -109,14 +91,7 @@ def run_monitor_study(
 
 
 def finish(out: Path) -> dict[str, Any]:
-    """Results and report of a study's folder, of one that still runs too.
-
-    Args:
-        out: Its folder.
-
-    Raises:
-        InputError: If nothing has been learned yet.
-    """
+    """Results and report of a study's folder, of one that still runs too."""
     note = study_note(out)
     done = {row.id: row.plain() for row in rows(out / RUNS)}
     detectors = record(Detectors, read_json(out / DETECTORS), str(out / DETECTORS))

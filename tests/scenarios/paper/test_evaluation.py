@@ -82,8 +82,7 @@ def test_two_figures_that_only_the_paper_needs(dt):
     made = FreeRun("r", dt * np.arange(n), z[:, :1], z, z, z, z, z, z + off, z[:, 0], z[:, 0])
     figures = figures_of([made])
     assert figures["e_sim_s"] == pytest.approx(3.0, rel=1e-12)
-    assert figures["e_sim_paper_s"] == pytest.approx(
-        3.0 * 2.0 / n, rel=1e-12
-    )  # integral over 2 s / n samples
+    # integral over 2 s / n samples
+    assert figures["e_sim_paper_s"] == pytest.approx(3.0 * 2.0 / n, rel=1e-12)
     # 1/T integral of 3 / (1 + t) over T = 2 s; the sum over left ends errs by dt / 2 (f(0) - f(T)) / T
     assert figures["e_sim_lambda1_s"] == pytest.approx(1.5 * np.log(3.0), abs=dt / 2 * 1.05)

@@ -98,9 +98,8 @@ def test_validation_alone_chooses_and_the_fewest_terms_win(runs):
     assert names == {library.name for library in machine_libraries(Pendulum())}
     # what a candidate is said to score is what its step scores
     alone = score(free_runs(step, Pendulum(), runs[1], WARM, EMPTY)).e_sim_s
-    assert alone == pytest.approx(
-        chosen.validation, rel=1e-9
-    )  # without the terms of coefficient 0: another rounding
+    # without the terms of coefficient 0: another rounding
+    assert alone == pytest.approx(chosen.validation, rel=1e-9)
 
 
 GOOD = Library("good", (SINE, V, U))

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from simulated_pendulum import DT, TRUTH, Killed, Pendulum, dragged, record, same_training
+from simulated_pendulum import DT, TRUTH, Pendulum, dragged, killed_and_resumed, record, same_training
 
 from hybrid_mpc import (
     InputError,
@@ -98,19 +98,13 @@ SHORT = TrainingSettings("mopgrnn", 4, 2, 15, 10, seed=3, warm=10, horizon=20, b
     "options", [{}, {"kind": "rnn"}, {"fused": True}, {"prior_parameters": "trained"}], ids=str
 )
 def test_it_trains_resumes_and_leaves_torch_at_rounding(options, tmp_path):
-    def kill(done, total, error):
-        if done == 10:
-            raise Killed
-
     data, prior, file = dragged(), Pendulum(TRUTH), tmp_path / "training.safetensors"
     settings = replace(SHORT, **options)
     whole = train(prior, *data, settings, form=PaperStep)
     assert (whole.validation < whole.curve["validation"][0]).all()
-    with pytest.raises(Killed):
-        train(prior, *data, settings, form=PaperStep, checkpoint=file, on_progress=kill)
+    same_training(whole, killed_and_resumed(10, file, prior, *data, settings, form=PaperStep)[0])
     with pytest.raises(InputError, match="other settings or data"):
         train(prior, *data, settings, checkpoint=file)  # the hybrid form is another training
-    same_training(whole, train(prior, *data, settings, form=PaperStep, checkpoint=file))
     step = whole.step(prior, DT)
     assert isinstance(step, PaperStep)
     parity = check_parity(step, trace_model(step), model_info(prior, DT), [record(0, seconds=2.0)], seed=0)
