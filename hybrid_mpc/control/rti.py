@@ -70,19 +70,7 @@ class Condenser:
     """Derivative of the states by the inputs, on scratch memory of its own: not for several threads at once.
 
     The products run transposed, on contiguous memory: a period's array is written by one product from the one before.
-    They cost ``N^2 n_u n_z^2`` operations.
-
-    Args:
-        n: Periods N.
-        n_z: Number of states and hidden states.
-        n_u: Number of inputs.
-        n_x: Number of states; they come first in z.
-
-    Example:
-        >>> Condenser(2, 1, 1, 1)(np.ones((2, 1, 1)), np.ones((2, 1, 1)))
-        array([[0., 0.],
-               [1., 0.],
-               [1., 1.]])
+    They cost ``N^2 n_u n_z^2`` operations. The states are the first ``n_x`` of z.
     """
 
     by_inputs: Array
@@ -108,14 +96,7 @@ class Condenser:
 def propagate(a: Sequence[Array], drift: Array, dz0: Array) -> Array:
     """``dz_{k+1} = A_k dz_k + drift_k`` from ``dz0``: ``(N + 1, n_z)``.
 
-    Args:
-        a: ``A_k`` ``(n_z, n_z)``; column by column in memory is fastest.
-        drift: ``(N, n_z)``.
-        dz0: ``(n_z,)``.
-
-    Example:
-        >>> propagate([np.array([[0.5]])] * 2, np.ones((2, 1)), np.zeros(1)).ravel()
-        array([0. , 1. , 1.5])
+    ``A_k`` column by column in memory is fastest.
     """
     dz = np.concatenate([dz0[None], drift])
     rows = list(dz)
@@ -127,14 +108,7 @@ def propagate(a: Sequence[Array], drift: Array, dz0: Array) -> Array:
 def adjoint(a_t: Array, last: Array, stages: Array) -> Array:
     """Multipliers ``(N, n_z)`` of the stages' results: derivative of the cost by ``z_1 .. z_N``.
 
-    Args:
-        a_t: Transposed ``A_k`` ``(N, n_z, n_z)``.
-        last: Derivative of the terminal cost by ``x_N`` ``(n_x,)``.
-        stages: Derivatives of the stage costs by ``x_0 .. x_{N-1}`` ``(N, n_x)``.
-
-    Example:
-        >>> adjoint(np.full((2, 1, 1), 0.5), np.ones(1), np.full((2, 1), 3.0)).ravel()
-        array([3.5, 1. ])
+    ``last`` ``(n_x,)`` is the derivative of the terminal cost, ``stages`` ``(N, n_x)`` are those of the stage costs.
     """
     n_x = last.size
     multipliers = np.zeros((len(a_t), a_t.shape[1]))
@@ -147,12 +121,7 @@ def adjoint(a_t: Array, last: Array, stages: Array) -> Array:
 
 
 def condense_hessians(stages: Array, from_u: Array, n_x: int) -> Array:
-    """Second derivatives by the stages' ``(x, u)`` ``(N, n_x + n_u, n_x + n_u)`` as those by the inputs.
-
-    Example:
-        >>> condense_hessians(np.full((1, 2, 2), 3.0), np.array([[0.0], [5.0]]), 1)
-        array([[3.]])
-    """
+    """Second derivatives by the stages' ``(x, u)`` ``(N, n_x + n_u, n_x + n_u)`` as those by the inputs."""
     n, size, _ = stages.shape
     n_u = size - n_x
     states = from_u[: n * n_x].reshape(n, n_x, n * n_u)
@@ -167,15 +136,7 @@ def condense_hessians(stages: Array, from_u: Array, n_x: int) -> Array:
 def condense_all(stages: Array, by_inputs: Array, n_x: int, n_u: int) -> Array:
     """Second derivatives by the stages' ``(x, u, h)`` ``(N, n, n)`` as those by the inputs ``(N n_u, N n_u)``.
 
-    Args:
-        stages: Second derivatives.
-        by_inputs: Derivatives ``(N + 1, N n_u, n_z)`` of states and hidden states by the inputs.
-        n_x: Number of states.
-        n_u: Number of inputs.
-
-    Example:
-        >>> condense_all(np.full((1, 3, 3), 3.0), np.zeros((2, 1, 2)), 1, 1)
-        array([[3.]])
+    ``by_inputs`` ``(N + 1, N n_u, n_z)`` are the derivatives of states and hidden states by the inputs.
     """
     n, few = len(stages), n_x + n_u
     z = np.r_[:n_x, few : stages.shape[1]]
@@ -245,15 +206,9 @@ class CondensedController(Controller):
 
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def prepare(self, previous: Solution, weight: Array | None = None) -> Prepared:
-        """Linearize and condense along the previous plan, shifted by one period.
+        """Linearize and condense along the previous plan, shifted by one period; its last input is repeated.
 
-        Args:
-            previous: The last plan. ``previous.u[0]`` is the input that is being held; the shifted plan
-                repeats its last input.
-            weight: Factors on ``q`` as :meth:`Controller.solve` takes them. Default: 1.
-
-        Raises:
-            InputError: If the weight has another shape.
+        ``previous.u[0]`` is the input that is being held; ``weight`` as :meth:`Controller.solve` takes it.
         """
         start = perf_counter()
         u = self.ocp.held(np.vstack([previous.u[1:], previous.u[-1:]]))
@@ -263,29 +218,14 @@ class CondensedController(Controller):
         weight = self.problem.weights(weight)
         return self.condense(u, z, previous.d, previous.u[0], weight, derivatives, start)
 
-    @np.errstate(over="ignore", invalid="ignore")
-    def linearize(self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array) -> Prepared:
-        """Linearize and condense along a trajectory as it is: ``u`` ``(N, n_u)``, ``z`` ``(N + 1, n_z)``."""
-        start = perf_counter()
-        return self.condense(u, z, d, u_prev, weight, self.stages.at(z[:-1], u + d), start)
-
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def feedback(
         self, prepared: Prepared, estimate: Estimate, reference: Array, limits: Limits | None = None
     ) -> Solution:
         """Embed the estimate and the reference, solve the QP and check its answer.
 
-        Args:
-            prepared: What :meth:`prepare` returned.
-            estimate: The state now.
-            reference: As :meth:`Controller.solve` takes it.
-            limits: Bounds of the inputs for this solve. Default: the problem's own.
-
-        Returns:
-            The plan. If its status is not ``ok`` the inputs are the shifted previous plan.
-
-        Raises:
-            InputError: If the reference or the limits have another shape.
+        Arguments as :meth:`Controller.solve` takes them. If the plan's status is not ``ok`` its inputs are the shifted
+        previous plan.
         """
         start = perf_counter()
         target = replace(self.problem.target(reference), weight=prepared.weight)
@@ -333,6 +273,7 @@ class CondensedController(Controller):
         """:meth:`prepare` and :meth:`finish`."""
         return self.finish(self.prepare(previous, weight), estimate, reference, limits)
 
+    @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def finish(
         self, prepared: Prepared, estimate: Estimate, reference: Array, limits: Limits | None = None
     ) -> Solution:
@@ -341,9 +282,10 @@ class CondensedController(Controller):
         for i in range(1, self._iterations):
             if not solution.status.ok:
                 break
-            spent = solution.timing
+            spent, start, u, d = solution.timing, perf_counter(), solution.u, solution.d
             z = np.hstack([solution.x, solution.h])
-            again = self.linearize(solution.u, z, solution.d, prepared.u_prev, prepared.weight)
+            along = self.stages.at(z[:-1], u + d)
+            again = self.condense(u, z, d, prepared.u_prev, prepared.weight, along, start)
             solution = self.feedback(again, estimate, reference, limits)
             total = {name: spent[name] + solution.timing[name] for name in spent}
             solution = replace(solution, timing=total, iterations=i + 1)

@@ -153,10 +153,10 @@ class SafeController:
         self, previous: Decision, estimate: Estimate, reference: Array, weight: Array | None = None,
         *, limits: Limits | None = None, prepared: Prepared | None = None,
     ) -> Decision:  # fmt: skip
-        """The input to hold from now on.
+        """The input to hold from now on; ``previous.u`` is being held.
 
         Args:
-            previous: The last decision; its ``u`` is being held.
+            previous: The last decision.
             estimate: The state now.
             reference: ``(m, n_x)`` from now on in steps of ``dt``.
             weight: Factors on ``q`` ``(m, n_x)``, as the reference. Default: 1.
@@ -174,14 +174,9 @@ class SafeController:
         return self._without(previous, estimate, reference, solution, limits)
 
     def prepare(self, previous: Decision, weight: Array | None = None) -> Prepared | None:
-        """The part of the next :meth:`decide` that needs no measurement, to be done while the input acts.
+        """The linearization, condensed: the part of the next :meth:`decide` that needs no measurement.
 
-        Args:
-            previous: The decision that the next one goes on from.
-            weight: Factors on ``q`` ``(m, n_x)`` of the next period. Default: 1.
-
-        Returns:
-            The linearization, condensed; None for a solver without such a part.
+        ``weight`` is that of the next period. None for a solver without such a part.
         """
         return None if self._rti is None else self._rti.prepare(previous.solution, weight)
 
@@ -229,15 +224,7 @@ class SafeController:
 
 
 def checked_safe_input(given: ArrayLike | None, ocp: OCP) -> Array:
-    """The safe input ``(n_u,)`` of a problem; default: zero, or the limit next to it.
-
-    Raises:
-        InputError: If it has another size, is not finite, or is outside the limits.
-
-    Example:
-        >>> checked_safe_input(None, OCP(5, [1.0], [1.0], [0.0], [2.0], [9.0])).tolist()
-        [2.0]
-    """
+    """The safe input ``(n_u,)`` of a problem, within its limits; default: zero, or the limit next to it."""
     u = vector(ocp.rest_input if given is None else given, ocp.n_u, "safe_input")
     if np.any(u < ocp.u_min) or np.any(u > ocp.u_max):
         raise InputError(f"safe_input {u} is outside the limits {ocp.u_min} to {ocp.u_max}")

@@ -33,13 +33,9 @@ class Case:
 
 @dataclass(frozen=True)
 class Rollout:
-    """A run of the model on inputs.
+    """A run of the model on inputs ``(N, n_u)``; its cost includes the penalties of soft bounds.
 
-    Args:
-        u: Inputs ``(N, n_u)``.
-        z: Trajectory ``(N + 1, n_z)``.
-        soft: Values of the soft bounds ``(M,)``, their derivatives by their state ``(M, n_x)`` and input.
-        cost: Penalties of soft bounds included.
+    ``soft`` are the soft bounds' values ``(M,)`` and their derivatives by their state ``(M, n_x)`` and input.
     """
 
     u: Array
@@ -50,14 +46,7 @@ class Rollout:
 
 @dataclass(frozen=True)
 class Point:
-    """A run with its first derivatives.
-
-    Args:
-        run: The run.
-        derivatives: Successors, transposed ``A`` and ``B`` of the stages.
-        multipliers: Derivative of the cost by ``z_1 .. z_N``, soft bounds left out ``(N, n_z)``.
-        gradient: Of the cost by the inputs, soft bounds left out ``(N n_u,)``.
-    """
+    """A run with its first derivatives, soft bounds left out of multipliers ``(N, n_z)`` and gradient ``(N n_u,)``."""
 
     run: Rollout
     derivatives: Derivatives
@@ -124,22 +113,15 @@ class ReducedCost:
             case.target.p,
         )  # fmt: skip
 
-    def without_what_is_small(self, prepared: Prepared, curvature: Array) -> Array:
-        """See :meth:`StageCurvature.without_what_is_small`; nothing was condensed since ``prepared``."""
-        by_inputs = self.inner.condenser.by_inputs
-        return self.stages.without_what_is_small(curvature, prepared.hessian, prepared.from_u, by_inputs)
-
     def penalty(self, values: Array) -> float:
         """What values of the soft bounds cost."""
         soft = self.problem.soft
         return self.problem.model.dt * soft.penalty(soft.excess(values))
 
     def gap(self, values: Array, multipliers: Array) -> float:
-        """By how much the penalties of values may exceed those after the best change (Fenchel's inequality).
+        """By how much the penalties of values ``(M,)`` may exceed those after the best change (Fenchel's inequality).
 
-        Args:
-            values: Of the soft bounds ``(M,)``.
-            multipliers: Under which everything else is stationary ``(M,)``.
+        Under the multipliers ``(M,)`` everything else is stationary.
         """
         soft, dt, acting = self.problem.soft, self.problem.model.dt, np.flatnonzero(multipliers)
         mu = multipliers[acting]
@@ -195,15 +177,7 @@ class _Step:
 
 
 class Descent:
-    """The steps of one solve, from a first point on.
-
-    Args:
-        cost: Cost and derivatives.
-        case: What the solve is given.
-        at: The first run; its cost is finite.
-        curvature: Second derivatives from the last solve, shifted. Default: taken at the first run.
-        tolerance: See :class:`SQPController`.
-    """
+    """The steps of one solve, from a first point on, whose cost is finite."""
 
     def __init__(
         self, cost: ReducedCost, case: Case, at: Point, curvature: Array | None, tolerance: float
@@ -350,8 +324,10 @@ class Descent:
         if old is not None and (self._taken in AGAIN if small else self._taken > 0):
             old = None
         curvature = cost.curvature(self.at, self._case, multipliers, self._soft, old)
-        if old is None:
-            curvature = cost.without_what_is_small(prepared, curvature)
+        if old is None:  # nothing was condensed since ``prepared``
+            curvature = cost.stages.without_what_is_small(
+                curvature, prepared.hessian, prepared.from_u, cost.inner.condenser.by_inputs
+            )
         self._stale, self._fresh, self._taken = False, True, self._taken + 1
         return curvature
 

@@ -88,20 +88,10 @@ def consistency(
     consistent switching filter has the same mean NIS, but its single NIS scatter more than band and ``nis_inside``
     assume: its innovations are a mixture of Gaussians.
 
-    Args:
-        estimator: The filter.
-        recordings: Inputs ``u (n, n_u)`` and measurements ``y (n, n_y)`` on the model's grid; NaN where missing.
-        skip: Samples left out at the start of each, while the filter settles. Default 25.
-        lags: Largest lag [samples]. Default 20.
-
-    Raises:
-        InputError: If ``skip`` or ``lags`` is not positive, or too few samples are left (five times ``lags``).
+    The first ``skip`` samples of each recording are left out, while the filter settles; ``lags`` is the largest lag.
 
     Source: Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to Tracking and Navigation*, 2001, section
     5.4; Ljung, Box, *On a measure of lack of fit in time series models*, Biometrika 65 (1978).
-
-    Example:
-        ``consistency(ekf, test_recordings).nis_passes``
     """
     from scipy.stats import chi2, norm
 
@@ -135,16 +125,7 @@ def consistency(
 
 
 def innovations(estimator: Filter, recording: Recording, skip: int = 25) -> Innovations:
-    """Innovations of a filter along a recording.
-
-    Args:
-        estimator: The filter.
-        recording: Inputs and measurements on the model's grid.
-        skip: Samples left out at the start. Default 25.
-
-    Raises:
-        InputError: If the shapes do not fit.
-    """
+    """Innovations of a filter along a recording on the model's grid, the first ``skip`` samples left out."""
     n_y, n = estimator.model.n_y, len(recording.y)
     if recording.y.shape != (n, n_y) or recording.u.shape != (n, estimator.model.n_u) or n == 0:
         raise InputError(

@@ -29,10 +29,8 @@ class Predictor(Estimator, Protocol):
 class DelayedEstimate(Estimate):
     """An estimate of the instant at which the next input acts, and what it was predicted from.
 
-    Args:
-        filtered: Estimate of the instant of the last measurement that has arrived.
-        inputs: Inputs held since then, the oldest first, each for a period.
-        missing: Measurements still to come that were taken before the start.
+    ``filtered`` is the estimate of the last measurement's instant, ``inputs`` are those held since, the oldest first.
+    ``missing`` measurements that were taken before the start are still to come.
     """
 
     filtered: Estimate
@@ -92,11 +90,7 @@ class DelayCompensation:
         return self._ahead(first, resting, self._sensor)
 
     def update(self, estimate: Estimate, y: ArrayLike, u_prev: ArrayLike) -> DelayedEstimate:
-        """Estimate one period later, from what arrives and the input decided since.
-
-        Raises:
-            InputError: If the estimate is not one of this class.
-        """
+        """Estimate one period later, from what arrives and the input decided since."""
         if not isinstance(estimate, DelayedEstimate):
             raise InputError("DelayCompensation goes on from its own estimates only; begin with start()")
         base, y = estimate.filtered, np.asarray(y, dtype=float)

@@ -181,14 +181,9 @@ class ExtendedKalmanFilter:
         return Estimate(estimate.t + self._model.dt, x.copy(), h.copy(), estimate.d, p, empty, float("nan"))
 
     def correct(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> Estimate:
-        """Estimate after the measurement ``y`` ``(n_y,)``, in Joseph form.
+        """Estimate after the measurement ``y`` ``(n_y,)``, in Joseph form; ``u`` is the input of the output equation.
 
         Elements of ``y`` that are not finite are left out; if all are, the estimate comes back as it is.
-
-        Args:
-            estimate: The predicted estimate.
-            y: Measurement ``(n_y,)``.
-            u: Input ``(n_u,)`` of the output equation. Default: zero.
         """
         return self.assess(estimate, y, u)[0]
 
@@ -221,12 +216,7 @@ class ExtendedKalmanFilter:
         return after, -0.5 * (nis + size)
 
     def innovation_covariance(self, estimate: Estimate, u: ArrayLike | None = None) -> Array:
-        """Covariance ``(n_y, n_y)`` that a predicted estimate gives its innovation: ``C P C' + R``.
-
-        Args:
-            estimate: The predicted estimate.
-            u: Input ``(n_u,)`` of the output equation. Default: zero.
-        """
+        """Covariance ``(n_y, n_y)`` that a predicted estimate gives its innovation: ``C P C' + R``."""
         held = estimate.d if u is None else np.asarray(u, dtype=float).ravel() + estimate.d
         _, c_x, c_u = self._measured(estimate.x, held)
         c = np.hstack([c_x, np.zeros((self._model.n_y, self._model.n_h)), c_u])
@@ -286,13 +276,7 @@ def _variance(sigma: ArrayLike, size: int, name: str) -> Array:
 
 
 def output_with_jacobian(model: HybridModel) -> ca.Function:
-    """Output ``(n_y,)`` of a model at ``(x, u)`` and its dense Jacobians by ``x`` and by ``u``.
-
-    Args:
-        model: The model.
-
-    Example: ``y, c_x, c_u = output_with_jacobian(model)(x, u)``
-    """
+    """Output ``(n_y,)`` of a model at ``(x, u)`` and its dense Jacobians by ``x`` and by ``u``."""
     x, u = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
     y = model.output(x, u, model.w, model.p)
     return ca.Function(
@@ -323,11 +307,7 @@ class TrueState:
         return self._model
 
     def start(self, y: ArrayLike, t: float = 0.0) -> Estimate:
-        """Estimate that is the truth ``y = (x, hidden)``, ``(n_x + n_h,)`` or longer; ``d`` zero.
-
-        Raises:
-            InputError: If the plant has fewer hidden states than the model.
-        """
+        """Estimate that is the truth ``y = (x, hidden)``, ``(n_x + n_h,)`` or longer; ``d`` zero."""
         m, z = self._model, np.asarray(y, dtype=float).ravel()
         n_z = m.n_x + m.n_h
         if z.size < n_z:

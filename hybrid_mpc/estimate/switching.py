@@ -26,12 +26,7 @@ load that comes or goes or a part that breaks every 40 s; each lasts a period or
 
 @dataclass(frozen=True)
 class SwitchingEstimate(Estimate):
-    """Estimate of several filters: its own fields are their means, weighted by probability.
-
-    Args:
-        modes: Estimate of each filter.
-        probability: Of each mode ``(m,)``; they sum to one.
-    """
+    """Estimates of several filters and the probability ``(m,)`` of each; its own fields are their weighted means."""
 
     modes: tuple[Estimate, ...]
     probability: Array
@@ -102,11 +97,7 @@ class SwitchingFilter:
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
     def predict(self, estimate: Estimate, u: ArrayLike) -> SwitchingEstimate:
-        """Estimate one period later with the input ``u`` ``(n_u,)`` held.
-
-        Raises:
-            InputError: If the estimate is not one of this class.
-        """
+        """Estimate one period later with the input ``u`` ``(n_u,)`` held."""
         modes, probability = self._predicted(self._own(estimate), u)
         return _together(modes, probability, np.full(self.model.n_y, np.nan), float("nan"))
 
@@ -125,11 +116,7 @@ class SwitchingFilter:
         return modes, after
 
     def correct(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> SwitchingEstimate:
-        """Estimate after the measurement ``y`` ``(n_y,)``; see :meth:`ExtendedKalmanFilter.correct`.
-
-        Raises:
-            InputError: If the estimate is not one of this class.
-        """
+        """Estimate after the measurement ``y`` ``(n_y,)``; see :meth:`ExtendedKalmanFilter.correct`."""
         return self.assess(estimate, y, u)[0]
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update

@@ -41,14 +41,7 @@ class Mode(IntEnum):
 
 @dataclass(frozen=True)
 class Switch:
-    """A change of mode.
-
-    Args:
-        t: First instant [s] at which the new mode decides.
-        before: Mode until then.
-        after: Mode from then on.
-        why: In words.
-    """
+    """A change of mode, in words why; ``t`` [s] is the first instant at which the new mode decides."""
 
     t: float
     before: Mode
@@ -166,15 +159,7 @@ class GuardState:
 
 
 class GuardedController:
-    """A controller that changes with the guard's mode. Pure: what it remembers is a :class:`GuardState`.
-
-    Args:
-        safe: The loop's own controller.
-        guard: What to do on alarms. Default: nothing; the mode stays normal.
-
-    Raises:
-        InputError: If the backup has another problem or period.
-    """
+    """A controller that changes with the guard's mode. Pure: what it remembers is a :class:`GuardState`."""
 
     def __init__(self, safe: SafeController, guard: Guard | None = None) -> None:
         self.safe, self.guard = safe, guard

@@ -338,12 +338,6 @@ class Loop:
         """Periods that passed without a step, e.g. since one before them took too long; the input was held.
 
         The estimator is led through them without a sample; after 250 it starts anew at the next one.
-
-        Args:
-            n: Their number.
-
-        Raises:
-            InputError: If it is negative.
         """
         if n < 0:
             raise InputError(f"skip: a number of periods needed, got {n}")
@@ -374,13 +368,7 @@ class Loop:
         self._state, self._basis, self._ahead, self._reading, self._spent = before
 
     def restore(self, state: LoopState) -> Array:
-        """Go on from a state, which a loop of the same parts had.
-
-        Args:
-            state: What :attr:`state` was.
-
-        Returns:
-            The input that is held ``(n_u,)``.
+        """Go on from ``state``, what :attr:`state` of a loop of the same parts was; returns the input that is held.
 
         Raises:
             InputError: If it is no state, or that of a loop of another model or horizon.
@@ -407,11 +395,7 @@ class Loop:
 
     @property
     def state(self) -> LoopState:
-        """All that the loop remembers.
-
-        Raises:
-            InputError: Before :meth:`start`.
-        """
+        """All that the loop remembers, from :meth:`start` on."""
         if self._state is None:
             raise InputError("the loop has not begun; call start() with the first sample")
         return self._state

@@ -26,15 +26,6 @@ class Previews:
         horizon: Periods of preview, or None for the problem's.
         dt: Period [s].
         end: End of the run [s]; where values beyond it are not finite, the last before them is held.
-
-    Raises:
-        InputError: If the horizon is negative, or a shape does not fit.
-
-    Example:
-        >>> ocp = OCP(2, [1.0], [1.0], [0.0], [-1.0], [1.0])
-        >>> ends = Previews(lambda t: np.where(t < 1.05, t, np.nan)[:, None], None, ocp, None, 0.1, 1.0)
-        >>> ends(0.9)[0].ravel().round(6)
-        array([0.9, 1. , 1. ])
     """
 
     def __init__(

@@ -385,12 +385,7 @@ class RunReport:
 
 
 def percentiles(values: Array) -> dict[str, float]:
-    """Median, 95th and 99th percentile and maximum of ``values`` ``(n,)``; NaN where there are none.
-
-    Example:
-        >>> percentiles(np.arange(101.0))
-        {'median': 50.0, 'p95': 95.0, 'p99': 99.0, 'max': 100.0}
-    """
+    """Median, 95th and 99th percentile and maximum of ``values`` ``(n,)``; NaN where there are none."""
     if len(values) == 0:
         return dict.fromkeys(QUANTILES, float("nan"))
     return {name: float(np.quantile(values, q)) for name, q in QUANTILES.items()}
@@ -446,10 +441,9 @@ class SafeEnd:
         return "exit" if self._exiting else ""
 
     def check(self) -> None:
-        """End the block if that has been asked for. Call it often: a callback may have swallowed what a signal raised.
+        """End the block if that has been asked for.
 
-        Raises:
-            Ended: If so.
+        Call it often: a callback may have swallowed what a signal raised.
         """
         if self.cause:
             raise Ended(self.cause)
@@ -539,15 +533,7 @@ class Clock(Protocol):
 
 
 class RealClock:
-    """The computer's monotonic clock.
-
-    Example:
-        >>> clock = RealClock()
-        >>> until = clock.now() + 0.002
-        >>> clock.sleep_until(until)
-        >>> clock.now() >= until
-        True
-    """
+    """The computer's monotonic clock."""
 
     def now(self) -> float:
         """Time [s] since some fixed instant."""
@@ -562,31 +548,14 @@ class RealClock:
 class CheckedClock:
     """A clock that is checked: a loop on one that stands still would spin for ever.
 
-    Args:
-        clock: The clock.
-        dt: Period [s] of the loop, of which a wait may end a small share early.
-
-    Example:
-        >>> class Dead:
-        ...     def now(self):
-        ...         return 7.0
-        ...     def sleep_until(self, t):
-        ...         pass
-        >>> CheckedClock(Dead(), 0.02).sleep_until(7.5)
-        Traceback (most recent call last):
-        ...
-        hybrid_mpc.errors.InputError: clock: sleep_until(7.5) has come back 10 times, at last at 7.0; it must wait
+    A wait may end early by a small share of the loop's period ``dt`` [s].
     """
 
     def __init__(self, clock: Clock, dt: float) -> None:
         self._clock, self._early, self._last = clock, EARLY * dt, -math.inf
 
     def now(self) -> float:
-        """Time [s].
-
-        Raises:
-            InputError: If it is not finite, or before the last one.
-        """
+        """Time [s], finite and never before the last one."""
         t = float(self._clock.now())
         if not math.isfinite(t):
             raise InputError(f"clock: now() gives {t}; a finite time [s] needed")
@@ -596,11 +565,7 @@ class CheckedClock:
         return t
 
     def sleep_until(self, t: float) -> None:
-        """Wait until ``t`` [s].
-
-        Raises:
-            InputError: If the clock does not wait, or as :meth:`now`.
-        """
+        """Wait until ``t`` [s]."""
         for _ in range(WAKES):
             self._clock.sleep_until(t)
             if self.now() >= t - self._early:

@@ -35,13 +35,6 @@ class Balance:
         rate_unit: Of its rate, e.g. ``"W"``.
         residual: ``(x, xdot, u, w, p) -> residual`` [rate_unit]: the violation of the balance if the state changes at
             ``xdot``; zero along the prior's own flow.
-
-    Example:
-        >>> x, xdot, u, w, p = (ca.SX.sym(name, n) for name, n in (("x", 2), ("xdot", 2), ("u", 1), ("w", 0), ("p", 1)))
-        >>> power = ca.Function("residual", [x, xdot, u, w, p], [(p * xdot[1] - u) * x[1]])
-        >>> cart = Balance("energy", "J", "W", power)
-        >>> float(cart.residual([0.0, 2.0], [2.0, 1.5], 1.0, [], 0.5))
-        -0.5
     """
 
     name: str
@@ -310,15 +303,7 @@ def longer_period(model: HybridModel, periods: int) -> HybridModel:
 def prior_acceleration(model: HybridModel, prior: HybridModel | None = None) -> ca.Function:
     """Acceleration ``(x, u, w, p) -> a`` ``(n_q,)`` of the prior behind a model, without what a network adds.
 
-    Args:
-        model: The model, state ``[q, v]``.
-        prior: Model of its prior alone. Default: the model itself, where it has no network.
-
-    Raises:
-        InputError: If the model has a network and no prior is given, the two have other parameters, or there are none.
-
-    Example:
-        ``prior_acceleration(kit.models["hybrid"], kit.models["prior"])``
+    ``prior`` is the model of its prior alone. Default: the model itself, where it has no network.
     """
     if prior is None:
         if model.n_h > model.delay_states:

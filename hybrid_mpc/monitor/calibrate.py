@@ -78,16 +78,7 @@ class Calibration:
 
     @classmethod
     def without(cls, reason: str, rest_speed: Sequence[float] | None = None) -> Calibration:
-        """A calibration without thresholds.
-
-        Args:
-            reason: Why not.
-            rest_speed: Speeds below which friction may stick. Default: not known either.
-
-        Example:
-            >>> Calibration.without("2 s of data").threshold_w is None
-            True
-        """
+        """A calibration without thresholds; ``reason`` says why. The rest speeds may still be known."""
         rest = None if rest_speed is None else tuple(rest_speed)
         return cls(None, None, 0.0, 0, 0.0, reason, rest_speed=rest)
 
@@ -164,17 +155,7 @@ def calibrate(
 
 
 def with_residual(power: Calibration, residual: Calibration) -> Calibration:
-    """One calibration of both alarms; either may raise a false one, so their wanted rates add up.
-
-    Args:
-        power: Calibration on the levels of the violation.
-        residual: Calibration on the levels of the residual force.
-
-    Example:
-        >>> c = with_residual(Calibration(0.2, 0.1, 0.5, 9, 0.1, ""), Calibration(3.0, 2.0, 0.5, 9, 0.1, ""))
-        >>> c.threshold_w, c.residual_threshold, c.false_alarms_per_hour
-        (0.2, 3.0, 1.0)
-    """
+    """One calibration of both alarms; either may raise a false one, so their wanted rates add up."""
     return replace(
         power,
         false_alarms_per_hour=power.false_alarms_per_hour + residual.false_alarms_per_hour,
@@ -198,12 +179,7 @@ def count_alarms(alarm: Array | NDArray[np.bool_], dt: float) -> tuple[int, floa
 def alarm_intervals(
     alarm: Array | NDArray[np.bool_], dt: float, start: float = 0.0
 ) -> list[tuple[float, float]]:
-    """Intervals ``(first, last)`` [s] in which the alarm is on; sample k lies at ``start + k dt``.
-
-    Example:
-        >>> alarm_intervals(np.array([False, True, True, False]), 0.5)
-        [(0.5, 1.0)]
-    """
+    """Intervals ``(first, last)`` [s] in which the alarm is on; sample k lies at ``start + k dt``."""
     on = np.concatenate([[False], np.asarray(alarm, dtype=bool), [False]]).astype(int)
     edges = np.diff(on)
     firsts, lasts = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1

@@ -35,13 +35,7 @@ RANGE = (-0.9, 20.0)
 
 @dataclass(frozen=True)
 class Change:
-    """A change of one cause.
-
-    Args:
-        name: The cause.
-        value: Change as a share of the nominal value [-]: 0.5 is half as much more.
-        sigma: Its standard deviation [-].
-    """
+    """A change of one cause, as a share of the nominal value (0.5: half as much more), with its standard deviation."""
 
     name: str
     value: float
@@ -116,12 +110,7 @@ class Diagnoser:
         self._force = _force_function(model, acceleration, _incidence(known, chosen))
 
     def diagnose(self, state: MonitorState, since: float = math.inf) -> Diagnosis:
-        """What explains the residual force.
-
-        Args:
-            state: The monitor's.
-            since: Looks back no further than this [s], e.g. since the alarm began. Default: the whole history.
-        """
+        """What explains the residual force of the last ``since`` [s], e.g. since the alarm. Default: all history."""
         layout, detector = self._monitor.layout, self._detector
         rows = state.memory[layout.rows :].reshape(layout.history, layout.history_row)
         rows = rows[-min(layout.history, max(round(min(since, 1e6) / layout.model.dt), 1)) :]

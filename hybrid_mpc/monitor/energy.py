@@ -269,9 +269,6 @@ class EnergyMonitor:
 
         Returns:
             The next state and the reading.
-
-        Raises:
-            InputError: If a shape does not fit the model.
         """
         x, h = _copied(estimate.x), _copied(estimate.h)
         y, u_prev = np.asarray(y, dtype=np.float64), np.asarray(u_prev, dtype=np.float64)

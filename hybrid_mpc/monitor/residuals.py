@@ -29,12 +29,8 @@ HELD_SHARE = 0.25
 class Layout:
     """Where things lie in the monitor's memory and in its outputs.
 
-    Args:
-        model: The model.
-        window: Samples in the local polynomial.
-        average: Samples in the averages of the levels.
-        length: Periods of a free run; 0 for none.
-        history: Rows kept for the question what broke; 0 for none.
+    ``window`` and ``average`` are samples, ``length`` the periods of a free run, ``history`` the rows kept for a
+    diagnosis; 0 for none.
     """
 
     model: HybridModel
@@ -122,11 +118,7 @@ def weights(window: int, dt: float) -> tuple[Array, Array, Array, Array, Array]:
 
 
 def energy_balance(model: HybridModel, x: ca.MX, xdot: ca.MX, u: ca.MX) -> ca.MX:
-    """Residual [W] of the model's energy balance if its state changes at ``xdot``.
-
-    Raises:
-        InputError: If the model has no energy balance.
-    """
+    """Residual [W] of the model's energy balance if its state changes at ``xdot``."""
     return _energy_of(model).residual(x, xdot, u, model.w, model.p)
 
 
@@ -142,11 +134,7 @@ def _energy_of(model: HybridModel) -> Balance:
 
 
 def force_units(model: HybridModel) -> tuple[str, ...]:
-    """Unit of each residual force: that of the balance's rate over that of the speed.
-
-    Raises:
-        InputError: If the model has no energy balance.
-    """
+    """Unit of each residual force: that of the balance's rate over that of the speed."""
     rate = _energy_of(model).rate_unit
     return tuple(FORCES.get((rate, v.unit), f"{rate}/({v.unit})") for v in model.states[model.n_x // 2 :])
 
@@ -170,10 +158,7 @@ def _near_rest(
 
     Half the difference of the accelerations back and forth is ``D(s) = jump + damping s``: dry friction, which is fully
     there at the rest speed, and what grows with the speed. So ``2 D(s) - D(2 s)`` is what dry friction can hold at
-    rest, and what damps is no part of it.
-
-    Returns:
-        The mean ``(n_q,)`` of back and forth at the rest speed, ``D`` there, and ``2 D(s) - D(2 s)``.
+    rest, and what damps is no part of it. Returned are the mean, ``D(s)`` and ``2 D(s) - D(2 s)``.
     """
     n_q = model.n_x // 2
     (back, forth), (faster_back, faster_forth) = (
@@ -331,12 +316,7 @@ def reading_function(layout: Layout, rest_speed: Sequence[float], spans: Array) 
 
 
 def check_model(model: HybridModel) -> None:
-    """Refuse a model that the monitor cannot read.
-
-    Raises:
-        InputError: If its outputs are not its positions, it has no energy balance, or one that says nothing of its
-            motion.
-    """
+    """Refuse a model that the monitor cannot read: its outputs are not its positions, or it has no energy balance."""
     n_q = model.n_x // 2
     x, u = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
     jacobian = ca.Function("C", [x, u], [ca.jacobian(model.output(x, u, model.w, model.p), ca.vertcat(x, u))])
