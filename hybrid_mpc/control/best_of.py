@@ -90,7 +90,6 @@ class BestOf(Controller):
         Its cost is that on a run of the model. If no solve ends well, the one from the previous plan is returned.
         """
         begin = perf_counter()
-        known = np.all(np.isfinite(np.concatenate([estimate.x, estimate.h, estimate.d])))
         target, u_prev = self.problem.target(reference, weight), previous.u[0]
         z0 = np.concatenate([estimate.x, estimate.h])
 
@@ -101,7 +100,7 @@ class BestOf(Controller):
         given = estimate, reference, weight
         first = self._controller.solve(previous, *given, limits=limits)
         solutions = [first]
-        guesses = self._guesses(previous, *given, limits) if known else []
+        guesses = self._guesses(previous, *given, limits) if estimate.finite else []
         for guess in sorted(guesses, key=cost_of)[: self._most]:
             start = self._controller.initial(estimate, guess).delayed(previous.u[0])  # its shift is the guess
             solutions.append(self._controller.solve(start, *given, limits=limits))

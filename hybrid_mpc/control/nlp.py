@@ -51,7 +51,7 @@ class IpoptController(Controller):
     Source: Wächter and Biegler, *On the implementation of an interior-point filter line-search algorithm
     for large-scale nonlinear programming*, Math. Program. 106 (2006).
 
-    Example: as :class:`~hybrid_mpc.control.sqp.SQPController`, whose interface it shares.
+    Example: as :class:`~hybrid_mpc.control.rti.CondensedController`, whose interface it shares.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class IpoptController(Controller):
         start = perf_counter()
         problem, u_prev = self.problem, previous.u[0]
         target = problem.target(reference, weight)
-        u = np.vstack([previous.u[1:], previous.u[-1:]])
+        u = previous.following
         z = np.hstack([previous.x, previous.h])
         z = np.vstack([np.concatenate([estimate.x, estimate.h]), z[2:], z[-1:]])
         given = np.concatenate(

@@ -73,6 +73,15 @@ class Solution:
     iterations: int = 1
     curvature: Array | None = None
 
+    @property
+    def following(self) -> Array:
+        """Inputs ``(N, n_u)`` of the plan one period later, the last one repeated."""
+        return np.vstack([self.u[1:], self.u[-1:]])
+
+    def beginning_with(self, u: Array) -> Solution:
+        """The plan with ``u`` ``(n_u,)`` as its first input."""
+        return replace(self, u=np.vstack([u[None], self.u[1:]]))
+
     def delayed(self, u_held: Array) -> Solution:
         """The plan one period earlier, with ``u_held`` ``(n_u,)`` held in it: a solve that shifts it has this plan.
 

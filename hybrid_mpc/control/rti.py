@@ -43,8 +43,7 @@ class Prepared:
         weighted: State weights times ``from_u``.
         hessian: Hessian of the cost by ``du`` ``(N n_u, N n_u)``.
         weight: Weight factors ``(N + 1, n_x)``.
-        soft: Soft bounds' values ``(M,)``, their derivatives by their state ``(M, n_x)`` and by the inputs
-            ``(M, N n_u)``.
+        soft: What :meth:`SoftRows.condensed` gives.
         economic: First derivatives ``(N, n_x + n_u)`` of the economic stage costs and their convex second ones;
             None where there are none.
         milliseconds: Time the preparation took.
@@ -211,7 +210,7 @@ class CondensedController(Controller):
         ``previous.u[0]`` is the input that is being held; ``weight`` as :meth:`Controller.solve` takes it.
         """
         start = perf_counter()
-        u = self.ocp.held(np.vstack([previous.u[1:], previous.u[-1:]]))
+        u = self.ocp.held(previous.following)
         z = np.hstack([previous.x[1:], previous.h[1:]])
         derivatives = self.stages.at(z, u + previous.d)
         z = np.vstack([z, derivatives[0][-1:]])  # the appended period starts without a defect

@@ -32,14 +32,10 @@ class Source(Enum):
 
 @dataclass(frozen=True)
 class Decision:
-    """The input of one period.
+    """The input ``(n_u,)`` of one period, always within the bounds and the limit of its change.
 
-    Args:
-        u: Input ``(n_u,)``, always within the bounds and the limit of its change.
-        source: Where it came from.
-        solution: The plan to go on from; its ``u[0]`` is ``u``.
-        status: How this period's solve ended.
-        age: Periods since the last successful solve.
+    ``solution`` is the plan to go on from; its ``u[0]`` is ``u``. ``status`` says how this period's solve ended,
+    ``age`` counts the periods since the last successful one.
     """
 
     u: Array
@@ -137,9 +133,6 @@ class SafeController:
             reference: ``(m, n_x)``, from the first period on in steps of ``dt``: the plan is optimised for it.
                 Default: none; the plan holds ``u``.
             weight: Factors on ``q`` ``(m, n_x)``, as the reference. Default: 1.
-
-        Raises:
-            InputError: If ``u`` has another size or is not finite, or another shape does not fit.
         """
         ocp = self.controller.ocp
         held = self.safe_input if u is None else np.clip(vector(u, ocp.n_u, "u"), ocp.u_min, ocp.u_max)
@@ -169,8 +162,7 @@ class SafeController:
             solution = self.controller.solve(previous.solution, estimate, reference, weight, limits=limits)
         if solution.status.ok:
             u = self.controller.ocp.saturate(solution.u[0], previous.u, limits)
-            plan = replace(solution, u=np.vstack([u[None], solution.u[1:]]))
-            return Decision(u, Source.MPC, plan, solution.status, 0)
+            return Decision(u, Source.MPC, solution.beginning_with(u), solution.status, 0)
         return self._without(previous, estimate, reference, solution, limits)
 
     def prepare(self, previous: Decision, weight: Array | None = None) -> Prepared | None:
@@ -184,9 +176,7 @@ class SafeController:
         self, previous: Decision, estimate: Estimate, reference: Array, *, limits: Limits | None = None
     ) -> Decision:
         """The input to hold where the solve has not come in time: as after a failed solve, status LATE."""
-        plan = previous.solution
-        shifted = np.vstack([plan.u[1:], plan.u[-1:]])
-        failed = replace(plan, u=shifted, status=Status.LATE)
+        failed = replace(previous.solution, u=previous.solution.following, status=Status.LATE)
         return self._without(previous, estimate, reference, failed, limits)
 
     def _without(
@@ -197,10 +187,9 @@ class SafeController:
         ocp, held = self.controller.ocp, previous.u
         u, source = self._instead(solution, estimate, np.asarray(reference, dtype=float), previous.age + 1)
         u = ocp.saturate(u, held, limits)
-        inputs = np.vstack([u[None], solution.u[1:]])
+        inputs = solution.beginning_with(u).u
         inputs = np.where(np.isfinite(inputs), inputs, u)
-        known = bool(np.all(np.isfinite(np.concatenate([estimate.x, estimate.h, estimate.d]))))
-        plan = self.controller.initial(estimate, inputs) if known else replace(solution, u=inputs)
+        plan = self.controller.initial(estimate, inputs) if estimate.finite else replace(solution, u=inputs)
         return Decision(u, source, plan, solution.status, previous.age + 1)
 
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused

@@ -363,15 +363,13 @@ class SQPController(Controller):
     every QP, soft bounds are penalties within the cost. So the cost is the merit function: a step is made when it
     lowers the cost by a share (1e-4) of what the QP's convex model promises. One that does not is first corrected by
     what states and soft bounds were found to bend along it (Fletcher's second-order correction), then the QP is solved
-    again with more curvature in all directions (Levenberg and Marquardt's damping). The damping carries over to the
-    next iteration and falls where steps keep their promise.
+    again with more damping (Levenberg and Marquardt), which carries over and falls where steps keep their promise.
 
     The QP's Hessian is Gauss-Newton's and the second derivatives of dynamics and soft bounds, weighted with their
     multipliers: under a steep friction law or a trained network Gauss-Newton alone converges slowly. They are
-    differences of the exact Jacobians (``n_x + n_u + n_h`` evaluations) and come along with a plan, shifted by a
-    period. They are taken anew where the Hessian got more than a tenth of the residual wrong. Where the sum is not
-    convex it is made so, if possible in the inputs alone that lie on a bound. The plan is independent of the first
-    guess but for the basin it lies in.
+    differences of the exact Jacobians, come along with a plan, shifted by a period, and are taken anew where the
+    Hessian got more than a tenth of the residual wrong. Where the sum is not convex it is made so, if possible in the
+    inputs alone that lie on a bound. The plan is independent of the first guess but for the basin it lies in.
 
     Args:
         model: The deployed model; ``n_h`` may be 0. It must not be so unstable that a run over the horizon
@@ -389,18 +387,7 @@ class SQPController(Controller):
     33 (1985); Fletcher, *Second order corrections for non-differentiable optimization*, Numerical Analysis,
     Lecture Notes in Mathematics 912 (1982).
 
-    Example:
-        >>> import casadi as ca
-        >>> from hybrid_mpc.estimate.kalman import TrueState
-        >>> from hybrid_mpc.machine.signals import Signal
-        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
-        >>> model = HybridModel.of("sine", 1.0, level, (Signal("u", "-"),), level,
-        ...     x=x, u=u, x_next=x + ca.sin(u), xdot=u, y=x)
-        >>> controller = SQPController(model, OCP(5, [1.0], [1.0], [0.0], [-1.5], [1.5]))
-        >>> estimate = TrueState(model).start([2.0])
-        >>> solution = controller.solve(controller.initial(estimate), estimate, np.zeros((6, 1)))
-        >>> solution.status.name, solution.defect
-        ('SOLVED', 0.0)
+    Example: as :class:`~hybrid_mpc.control.rti.CondensedController`.
     """
 
     def __init__(
@@ -431,7 +418,7 @@ class SQPController(Controller):
         """
         start = perf_counter()
         case = Case(estimate.d, previous.u[0], self.problem.target(reference, weight), limits)
-        u = self._admissible(np.vstack([previous.u[1:], previous.u[-1:]]), case)
+        u = self._admissible(previous.following, case)
         run = self._cost.run(np.concatenate([estimate.x, estimate.h]), u, case)
         at = self._cost.at(run, case)
         descent = Descent(self._cost, case, at, self._shifted(previous), self._tolerance)

@@ -19,10 +19,9 @@ LEVEL = 0.95
 
 @dataclass(frozen=True)
 class Innovations:
-    """Innovations of a filter along one recording, the first ``skip`` samples left out.
+    """Innovations of a filter along one recording, the first samples left out; ``t`` [s] since the recording's begin.
 
     Args:
-        t: Times ``(n,)`` [s] since the recording's begin.
         normalised: ``L^-1 (y - y_predicted)`` with ``L L' = C P C' + R``, ``(n, n_y)`` [-]; white with unit
             variance if the filter's assumptions hold; NaN in rows with a missing output.
         nis: Normalised innovations squared ``(n,)`` [-]; NaN without a measurement. Of a switching filter they are

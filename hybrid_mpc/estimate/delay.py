@@ -68,10 +68,9 @@ class DelayCompensation:
     """
 
     def __init__(self, estimator: Predictor, *, sensor_delay: int = 0, input_delay: int = 0) -> None:
-        for name, delay in (("sensor_delay", sensor_delay), ("input_delay", input_delay)):
-            if int(delay) != delay or delay < 0:
-                raise InputError(f"{name}: a whole number of periods needed, not negative; got {delay}")
-        self._estimator, self._sensor, self._input = estimator, int(sensor_delay), int(input_delay)
+        self._estimator = estimator
+        self._sensor = whole_periods(sensor_delay, "sensor_delay")
+        self._input = whole_periods(input_delay, "input_delay")
 
     @property
     def model(self) -> HybridModel:
@@ -109,6 +108,13 @@ class DelayCompensation:
         return DelayedEstimate(
             now.t, now.x, now.h, now.d, now.P, base.innovation, base.nis, base, inputs, missing
         )
+
+
+def whole_periods(delay: float, name: str) -> int:
+    """A delay in periods, whole and not negative."""
+    if int(delay) != delay or delay < 0:
+        raise InputError(f"{name}: a whole number of periods needed, not negative; got {delay}")
+    return int(delay)
 
 
 def filtered(estimate: Estimate) -> Estimate:

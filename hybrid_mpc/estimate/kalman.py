@@ -45,6 +45,11 @@ class Estimate:
     innovation: Array
     nis: float
 
+    @property
+    def finite(self) -> bool:
+        """Whether all estimated values are finite."""
+        return bool(np.all(np.isfinite(np.concatenate([self.x, self.h, self.d]))))
+
 
 class Estimator(Protocol):
     """What a closed loop needs of an estimator. Both methods are pure."""
@@ -142,9 +147,7 @@ class ExtendedKalmanFilter:
 
     def lost(self, estimate: Estimate) -> bool:
         """Whether an estimate is not finite, or so uncertain that nothing is known any more."""
-        mean = np.concatenate([estimate.x, estimate.h, estimate.d])
-        known = np.all(np.isfinite(mean)) and np.max(np.diag(estimate.P)) <= self._lost
-        return not known
+        return not (estimate.finite and np.max(np.diag(estimate.P)) <= self._lost)
 
     def start(self, y: ArrayLike, t: float = 0.0) -> Estimate:
         """Estimate at rest: the smallest state with the output ``y`` ``(n_y,)``, ``d`` zero.

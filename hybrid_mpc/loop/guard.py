@@ -135,8 +135,7 @@ class GuardState:
 
     Args:
         mode: The mode that decides now.
-        wanted: The mode of the next period.
-        why: Why it is wanted, in words.
+        wanted: The mode of the next period, and ``why``, in words.
         since: Time [s] from which the mode decides.
         alarm: Time [s] of the last alarm.
         doubt: Time [s] at which the present row of alarms began.
@@ -260,11 +259,10 @@ class GuardedController:
         planner = self._planner(safe)
         if planner == state.planner:
             return previous, state
-        u = np.vstack([previous.solution.u[1:], previous.solution.u[-1:]])
         finite = replace(
             estimate, **{name: np.nan_to_num(getattr(estimate, name)) for name in ("x", "h", "d")}
         )
-        following = safe.controller.initial(finite, u).delayed(previous.u)
+        following = safe.controller.initial(finite, previous.solution.following).delayed(previous.u)
         decision = Decision(previous.u, previous.source, following, Status.INITIAL, 0)
         return decision, replace(state, planner=planner)
 

@@ -27,7 +27,7 @@ from hybrid_mpc.control.problem import Controller, Status
 from hybrid_mpc.control.rti import Prepared
 from hybrid_mpc.control.safeguard import Decision, SafeController, Source
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimate.delay import filtered, sees_truth
+from hybrid_mpc.estimate.delay import filtered, sees_truth, whole_periods
 from hybrid_mpc.estimate.kalman import Estimate, Estimator
 from hybrid_mpc.loop.guard import Guard, GuardedController, GuardState, Switch
 from hybrid_mpc.loop.plant import fitting
@@ -190,8 +190,8 @@ class Loop:
             raise InputError("a guard acts on a monitor's alarms; give monitor= as well")
         self._estimator, self._safe, self._monitor = estimator, safe, monitor
         self._control = GuardedController(safe, guard)
-        self._delay = _whole_delay(input_delay, "input_delay")
-        self._n_inputs = self._delay + _whole_delay(sensor_delay, "sensor_delay") + 1
+        self._delay = whole_periods(input_delay, "input_delay")
+        self._n_inputs = self._delay + whole_periods(sensor_delay, "sensor_delay") + 1
         self._previews = Previews(reference, weight, self.ocp, horizon, self.model.dt, end)
         self._truth, self._now = sees_truth(estimator), now
         self._state: LoopState | None = None
@@ -211,14 +211,7 @@ class Loop:
     ) -> Array:
         """Begin, while the machine rests: the first estimate, the first plan, which may take its time, the first input.
 
-        Args:
-            y: First sample ``(n_y,)``; None or NaN: missing.
-            truth: The true ``(x, h)``, for an estimator that needs it.
-            reference: As in :meth:`step`.
-            in_time: As in :meth:`step`.
-
-        Returns:
-            The input ``(n_u,)`` to hold from now on.
+        Arguments are those of :meth:`step`. Returned is the input ``(n_u,)`` to hold from now on.
         """
         sample = self._sample(y)
         x_ref, factors = self._preview(0, reference)
@@ -479,9 +472,9 @@ class Loop:
     def _operated(self, previous: Decision, estimate: Estimate) -> Decision:
         """The operator's input goes on, and so does the plan that automatic would begin from."""
         u, plan = previous.u, previous.solution
-        if np.all(np.isfinite(np.concatenate([estimate.x, estimate.h, estimate.d, u]))):
+        if estimate.finite and np.all(np.isfinite(u)):
             plan = self._safe.controller.initial(estimate, np.tile(u, (self.ocp.horizon, 1)))
-            plan = _beginning_with(u, plan)
+            plan = plan.beginning_with(u)
         return Decision(u, Source.MANUAL, plan, Status.INITIAL, 0)
 
 
@@ -490,18 +483,7 @@ def _with_input(decision: Decision, u: Array) -> Decision:
     u = np.where(np.isfinite(u), u, decision.u)
     if np.array_equal(u, decision.u):
         return decision
-    return replace(decision, u=u, solution=_beginning_with(u, decision.solution))
-
-
-def _beginning_with(u: Array, plan: Any) -> Any:
-    """The plan with ``u`` as its first input."""
-    return replace(plan, u=np.vstack([u[None], plan.u[1:]]))
-
-
-def _whole_delay(delay: int, name: str) -> int:
-    if int(delay) != delay or delay < 0:
-        raise InputError(f"{name}: a whole number of periods needed, not negative; got {delay}")
-    return int(delay)
+    return replace(decision, u=u, solution=decision.solution.beginning_with(u))
 
 
 def _check_models(estimated: HybridModel, controlled: HybridModel) -> None:

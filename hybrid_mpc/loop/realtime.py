@@ -1,9 +1,4 @@
-"""The loop in real time: against a machine's callbacks, in step with a clock, and with a safe end.
-
-:class:`Runner` is what a user makes; each of its runs is a :class:`_Run`, which gives a :class:`RunReport`. Whatever
-ends a run, :class:`SafeEnd` hands over the safe input first. So does a clock that does not keep time
-(:class:`CheckedClock`).
-"""
+"""The loop in real time: against a machine's callbacks, in step with a clock, and with a safe end."""
 
 from __future__ import annotations
 
@@ -305,18 +300,18 @@ class _Run:
 
 @dataclass(frozen=True)
 class RunnerStep:
-    """One period as ``on_step`` sees it.
+    """One period as ``on_step`` sees it; times are in seconds.
 
     Args:
         k: Its number on the grid; skipped periods have none.
-        t: Its time [s] on the grid, since the start.
+        t: Its time on the grid, since the start.
         y: Measurement ``(n_y,)``; NaN where there was none.
         estimate: The estimate.
         decision: The input and where it came from.
         reading: What the monitor says, or None.
-        lateness: Begin of the period after its instant on the grid [s].
-        applied: Instant after the grid's at which the input had been handed over [s].
-        spent: Durations [s] by the names of ``TIMED``.
+        lateness: Begin of the period after its instant on the grid.
+        applied: Instant after the grid's at which the input had been handed over.
+        spent: Durations by the names of ``TIMED``.
     """
 
     k: int
@@ -402,8 +397,8 @@ class SafeEnd:
     thread also when a signal ends it (``ENDING``): the signal breaks off what the block is doing, the safe input is
     handed over, and only then the signal has the effect that it would have had without this block: the process ends by
     it, or ``KeyboardInterrupt`` is raised, or the program's own handler is called. If the program lives on, it goes on
-    behind the block. Handlers are installed for the time of the block alone. Signals that are ignored, as under
-    ``nohup``, stay so. While the safe input is handed over no signal interrupts; it waits.
+    behind the block. Signals that are ignored, as under ``nohup``, stay so. While the safe input is handed over no
+    signal interrupts; it waits.
 
     Another thread gets no signals. There the block ends when the interpreter does, which waits for it.
 

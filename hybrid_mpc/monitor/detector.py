@@ -110,9 +110,7 @@ class Detector:
         """Accumulated time [s] of a free run from which on it counts."""
         return SHORTEST_S * self.time_unit
 
-    def check(
-        self, n_q: int, free_runs: bool, dt: float | None = None, time_unit: float | None = None
-    ) -> None:
+    def check(self, n_q: int, free_runs: bool, dt: float, time_unit: float) -> None:
         """Refuse a monitor of other forces, without the free runs to judge, or of another period or unit of time."""
         if len(self.force) != n_q:
             raise InputError(f"detector: learned for {len(self.force)} forces, the model has {n_q}")
@@ -120,11 +118,11 @@ class Detector:
             raise InputError(
                 "detector: it judges free runs, the monitor has none; give free_run=0.8 [s], say"
             )
-        if dt is not None and abs(dt - self.dt) > 1e-9 * self.dt:
+        if abs(dt - self.dt) > 1e-9 * self.dt:
             raise InputError(
                 f"detector: learned at a period of {self.dt} s, the model's is {dt} s; learn it anew"
             )
-        if time_unit is not None and abs(time_unit - self.time_unit) > 1e-9 * self.time_unit:
+        if abs(time_unit - self.time_unit) > 1e-9 * self.time_unit:
             raise InputError(
                 f"detector: its lengths count in a machine's second of {self.time_unit:g} s, the model's in "
                 f"{time_unit:g} s; learn it anew"

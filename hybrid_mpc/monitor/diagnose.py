@@ -53,8 +53,8 @@ class Diagnosis:
         text: In words: ``"friction +95 ± 20 %"``, ``"none of the known causes"``, ``"nothing to explain"``.
         samples: Independent samples: those at speed over the length of the monitor's window.
         causes: One cause that explains all, or several that together do. Default: none does.
-        alternatives: Other single causes that explain it as well. Default: none.
-        blind: Directions that the motion does not show, in words. Default: none.
+        alternatives: Other single causes that explain it as well.
+        blind: Directions that the motion does not show, in words.
         p_value: Probability of what the causes leave over, if they are all there is. Default: not known.
     """
 

@@ -7,12 +7,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.model.buffered import BufferedFunction
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.monitor.calibrate import Calibration
 from hybrid_mpc.monitor.detector import Detector
@@ -49,25 +50,12 @@ SECONDS: Mapping[Verdict, str] = MappingProxyType(
 """Names under which results count the seconds of each."""
 
 
-class EstimateLike(Protocol):
-    """What the monitor reads of an estimate: ``x`` (n_x,) and ``h`` (n_h,). It ignores ``d``."""
-
-    @property
-    def x(self) -> Any:
-        """Estimated state ``(n_x,)``."""
-
-    @property
-    def h(self) -> Any:
-        """Hidden state ``(n_h,)`` before this sample's input."""
-
-
 @dataclass(frozen=True)
 class MonitorState:
     """All that the monitor remembers. Never changed in place.
 
     Args:
-        memory: Past measurements, model increments and inputs of the window, the averaged readings, the model's free
-            runs and the rows for :func:`~hybrid_mpc.monitor.diagnose.diagnose`, in one vector; NaN until filled.
+        memory: One vector, laid out as :class:`~hybrid_mpc.monitor.residuals.Layout` says; NaN until filled.
         x: Estimated state ``(n_x,)`` at the latest sample.
         h: Hidden state ``(n_h,)`` at the latest sample.
         alarms: True while the alarm on the violation, and the one on the residual force, is on.
@@ -232,17 +220,9 @@ class EnergyMonitor:
         self._resolution = _positive(resolution, model.n_y)
         if detector is not None:
             detector.check(model.n_y, bool(self.layout.length), model.dt, model.time_unit)
-        self._function = reading_function(self.layout, self.rest_speed, _spans(model, input_range))
-        self._ins = [np.zeros(self._function.size1_in(i)) for i in range(6)]
-        self._outs = [np.zeros(self._function.size1_out(i)) for i in range(2)]
-        self._sizes = tuple(values.size for values in self._ins[1:5])
-        buffer: Any
-        buffer, self._evaluate = self._function.buffer()
-        for i, array in enumerate(self._ins):
-            buffer.set_arg(i, memoryview(array.data))
-        for i, array in enumerate(self._outs):
-            buffer.set_res(i, memoryview(array.data))
-        self._buffer = buffer
+        spans = _spans(model, input_range)
+        self._function = BufferedFunction(reading_function(self.layout, self.rest_speed, spans))
+        self._sizes = tuple(values.size for values in self._function.inputs[1:5])
 
     @property
     def delay(self) -> float:
@@ -257,7 +237,7 @@ class EnergyMonitor:
         return MonitorState(memory, *empty, QUIET, left, first)
 
     def update(
-        self, state: MonitorState, y: Array, u_prev: Array, estimate: EstimateLike
+        self, state: MonitorState, y: Array, u_prev: Array, estimate: Any
     ) -> tuple[MonitorState, MonitorReading]:
         """Take one sample; pure: the same arguments give the same result.
 
@@ -265,7 +245,7 @@ class EnergyMonitor:
             state: State after the previous sample, or :meth:`initial`.
             y: Measurement ``(n_y,)`` now; NaN where missing.
             u_prev: Input ``(n_u,)`` applied over the period that just ended.
-            estimate: Estimate at this sample, with ``x`` ``(n_x,)`` and ``h`` ``(n_h,)``.
+            estimate: Estimate at this sample, of which ``x`` ``(n_x,)`` and ``h`` ``(n_h,)`` are read.
 
         Returns:
             The next state and the reading.
@@ -276,11 +256,11 @@ class EnergyMonitor:
             raise self._unfit(y, u_prev, x, h)
         if y.ndim != 1 or u_prev.ndim != 1:
             y, u_prev = y.reshape(-1), u_prev.reshape(-1)
-        ins = self._ins
+        ins, outs = self._function.inputs, self._function.outputs
         ins[0][:], ins[1][:], ins[2][:], ins[3][:], ins[4][:] = state.memory, state.x, state.h, u_prev, y
         left = state.left and self._free_runs(state)
-        self._evaluate()
-        memory, numbers, n_q = self._outs[0].copy(), self._outs[1].tolist(), self.model.n_y
+        self._function()
+        memory, numbers, n_q = outs[0].copy(), outs[1].tolist(), self.model.n_y
         level, residual_level = self._levels(memory)
         alarms = self.alarms(level, residual_level, state.alarms)
         travels = zip(numbers[3 + n_q : 3 + 2 * n_q], self._resolution, strict=False)
@@ -302,7 +282,7 @@ class EnergyMonitor:
             dE_measured_w=numbers[1],
             violation_w=numbers[2],
             level_w=level,
-            residual=self._outs[1][3 : 3 + n_q].copy(),
+            residual=outs[1][3 : 3 + n_q].copy(),
             residual_level=residual_level,
             alarm=alarms[0] or alarms[1] or frozen or detected or blind,
             energy_j=energy,
@@ -346,10 +326,10 @@ class EnergyMonitor:
         """Periods left of each free run, after beginning those anew that have ended; whose windows are full."""
         left = state.left
         if min(left) <= 1:
-            left = self.layout.begin_runs(self._ins[0], left, state.x, state.h)
+            left = self.layout.begin_runs(self._function.inputs[0], left, state.x, state.h)
         else:
             left = left[0] - 1, left[1] - 1
-        youngest, full = self.layout.length - self.window + 2, self._ins[5]
+        youngest, full = self.layout.length - self.window + 2, self._function.inputs[5]
         full[0], full[1] = left[0] <= youngest, left[1] <= youngest
         return left
 
