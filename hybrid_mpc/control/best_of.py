@@ -37,22 +37,7 @@ class BestOf(Controller):
     Raises:
         InputError: If a rival or a plan does not fit, ``most < 1``, or there is neither start nor rival.
 
-    Example:
-        >>> import casadi as ca
-        >>> from hybrid_mpc.estimate.kalman import TrueState
-        >>> from hybrid_mpc.control.ocp import OCP; from hybrid_mpc.control.sqp import SQPController
-        >>> from hybrid_mpc.machine.signals import Signal
-        >>> from hybrid_mpc.model.model import HybridModel
-        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
-        >>> model = HybridModel.of("even", 1.0, level, (Signal("u", "-"),), level,
-        ...     x=x, u=u, x_next=x - u**2, xdot=u, y=x)
-        >>> ocp = OCP(2, [1.0], [0.1], [0.0], [-1.0], [1.0], terminal=[[1.0]])
-        >>> single = SQPController(model, ocp)  # u = 0 is stationary: it sees no way down
-        >>> best = BestOf(single, starts=[np.full((2, 1), 0.5)])
-        >>> estimate = TrueState(model).start([1.0])
-        >>> plans = [c.solve(c.initial(estimate), estimate, np.zeros((1, 1))) for c in (single, best)]
-        >>> [round(plan.cost, 2) for plan in plans]
-        [3.0, 1.1]
+    Example: ``BestOf(SQPController(model, ocp), starts=[np.full((ocp.horizon, 1), 0.5)])``
     """
 
     def __init__(

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from dataclasses import fields as dataclass_fields
-from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
 import casadi as ca
@@ -272,9 +271,9 @@ class OCP:
         Raises:
             InputError: If the limits have another size.
         """
-        if limits is None:
-            return self._own_bounds
         shape = (self.horizon, self.n_u)
+        if limits is None:
+            return np.broadcast_to(self.u_min, shape), np.broadcast_to(self.u_max, shape)
         if limits.u_min.size != self.n_u:
             raise InputError(f"limits of {limits.u_min.size} inputs given, the problem has {self.n_u}")
         lower, upper = (np.clip(v, self.u_min, self.u_max) for v in (limits.u_min, limits.u_max))
@@ -284,12 +283,6 @@ class OCP:
         rows = np.minimum(lower, u_prev + change), np.maximum(upper, u_prev - change)
         own = (np.clip(row, self.u_min, self.u_max) for row in rows)
         lower, upper = (row if self.blocks is None else np.repeat(row, self.blocks, axis=0) for row in own)
-        return lower, upper
-
-    @cached_property
-    def _own_bounds(self) -> tuple[Array, Array]:
-        lower, upper = np.tile(self.u_min, (self.horizon, 1)), np.tile(self.u_max, (self.horizon, 1))
-        lower.flags.writeable = upper.flags.writeable = False
         return lower, upper
 
     def saturate(self, u: Array, u_prev: Array, limits: Limits | None = None) -> Array:

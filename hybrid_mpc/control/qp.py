@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -125,36 +125,30 @@ class InputQP:
         The Hessian is symmetric positive definite. ``soft`` are the values of the soft bounds without a step ``(M,)``,
         and their derivatives by it ``(M, N n_u)``.
         """
-        if self._ocp.blocks is None:
-            return self._solve(hessian, gradient, u, u_prev, soft, limits)
-        if soft is not None:
-            soft = soft[0], self.by_blocks(soft[1])
-        given = self.blocked_hessian(hessian), self.by_blocks(gradient), u[self._starts]
-        answer = self._solve(*given, u_prev, soft, limits)
-        step = np.repeat(answer.step.reshape(-1, u.shape[1]), self._ocp.blocks, axis=0)
-        return replace(answer, step=step.ravel())
-
-    def _solve(
-        self, hessian: Array, gradient: Array, u: Array, u_prev: Array, soft: Soft, limits: Limits | None
-    ) -> Answer:
-        scale = self.scale
+        scale, u = self.scale, u[self._starts]
         bounds = (bound[self._starts] for bound in self._ocp.bounds(u_prev, limits))
         lower, upper = ((bound - u).ravel() / scale for bound in bounds)
         row_lower, row_upper = self._row_bounds(u, u_prev)
-        h, g = hessian * scale * scale[:, None], gradient * scale
-        size = float(np.max(np.diag(h)))
+        h = self.blocked_hessian(hessian) * scale * scale[:, None]
+        g, size = self.by_blocks(gradient) * scale, float(np.max(np.diag(h)))
         hard = _Scaled(h / size, g / size, self._rows, lower, upper, row_lower, row_upper)
         s, status, kkt = _check(hard, *_solve(self._solver, hard), self._n)
-        if soft is None or not status.ok:
-            return Answer(s * scale, status, kkt, np.zeros(0 if soft is None else soft[0].size))
-        return self._softly(hard, size, s, kkt, *soft)
+        multipliers = np.zeros(0 if soft is None else soft[0].size)
+        if soft is not None and status.ok:
+            s, status, kkt, multipliers = self._softly(hard, size, s, kkt, *soft)
+        step = (s[: self._n] * scale).reshape(u.shape)
+        if self._ocp.blocks is not None:
+            step = np.repeat(step, self._ocp.blocks, axis=0)
+        return Answer(step.ravel(), status, kkt, multipliers)
 
-    def _softly(self, hard: _Scaled, size: float, s: Array, kkt: float, value: Array, slope: Array) -> Answer:
-        """The answer with soft bounds, from the answer ``s`` without."""
+    def _softly(
+        self, hard: _Scaled, size: float, s: Array, kkt: float, value: Array, slope: Array
+    ) -> tuple[Array, Status, float, Array]:
+        """Answer, what it is worth, and multipliers with soft bounds, from the answer ``s`` without."""
         sides, n, rows = self._sides, self._n, value.size
         assert sides is not None
         multipliers = np.zeros(rows)
-        value, slope = sides.of(value), sides.of(slope) * self.scale
+        value, slope = sides.of(value), sides.of(self.by_blocks(slope)) * self.scale
         wanted = np.zeros(value.size, dtype=bool)
         for room, solver in self._soft_solvers.items():
             beyond = value + slope @ s[:n]
@@ -173,9 +167,9 @@ class InputQP:
             others = np.ones(value.size, dtype=bool)
             others[nearest] = False
             if not status.ok or not np.any((value + slope @ s[:n])[others] > 0):
-                return Answer(s[:n] * self.scale, status, kkt, multipliers)
+                return s, status, kkt, multipliers
             wanted[nearest] = True
-        return Answer(s[:n] * self.scale, Status.SOLVED, kkt, multipliers)
+        return s, Status.SOLVED, kkt, multipliers
 
     def _with_slacks(
         self, hard: _Scaled, size: float, value: Array, slope: Array, chosen: NDArray[np.int64]

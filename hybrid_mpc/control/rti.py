@@ -26,27 +26,13 @@ GROUP = 10
 
 @dataclass(frozen=True)
 class Prepared:
-    """Everything of an iteration that needs neither the estimate nor the reference.
+    """Everything of an iteration that needs neither the estimate nor the reference, linearized at ``u``, ``z``, ``d``.
 
     With ``dz = (x, h) - (x_bar, h_bar)`` the linearized prediction is ``dz_{k+1} = A_k dz_k + B_k (du_k + dd) +
-    defect_k``; of it, ``x`` depends on the inputs by ``from_u``.
-
-    Args:
-        u: Linearization inputs ``(N, n_u)``.
-        z: Linearization trajectory ``(N + 1, n_x + n_h)``.
-        d: Linearization disturbance ``(n_u,)``.
-        u_prev: Input ``(n_u,)`` held before the plan.
-        a_t: Transposed ``A_k`` ``(N, n_z, n_z)``.
-        b: ``B_k`` ``(N, n_z, n_u)``.
-        defects: ``(N, n_z)``.
-        from_u: Derivative of the states by the inputs ``((N + 1) n_x, N n_u)``.
-        weighted: State weights times ``from_u``.
-        hessian: Hessian of the cost by ``du`` ``(N n_u, N n_u)``.
-        weight: Weight factors ``(N + 1, n_x)``.
-        soft: What :meth:`SoftRows.condensed` gives.
-        economic: First derivatives ``(N, n_x + n_u)`` of the economic stage costs and their convex second ones;
-            None where there are none.
-        milliseconds: Time the preparation took.
+    defect_k``; ``a_t`` holds the transposed ``A_k``. By the inputs' change, ``x`` has the derivative ``from_u``
+    ``((N + 1) n_x, N n_u)``, and the cost the ``hessian``; ``weighted`` is ``from_u`` times the state weights.
+    ``soft`` is what :meth:`SoftRows.condensed` gives, ``economic`` the first derivatives ``(N, n_x + n_u)`` of the
+    economic stage costs and their convex second ones; None where there are none.
     """
 
     u: Array

@@ -161,12 +161,9 @@ AGAIN = (1, 4, 16, 64)
 class _Step:
     """What a search has found.
 
-    Args:
-        run: The model on the step; None if no step lowers the cost.
-        answer: The QP's.
-        hessian: The damped Hessian that the answer belongs to.
-        promised: What the model without damping promises of the step before its correction.
-        own: That model's curvature along the step, in the damping's metric.
+    ``run`` is None if no step lowers the cost; ``hessian`` is the damped one that the QP's answer belongs to.
+    ``promised`` is what the model without damping promises of the step before its correction, ``own`` that model's
+    curvature along it, in the damping's metric.
     """
 
     run: Rollout | None
@@ -250,9 +247,11 @@ class Descent:
         self, prepared: Prepared, damped: Array, answer: Answer, promised: float
     ) -> tuple[Rollout | None, Answer]:
         """The run on a step if it lowers the cost enough, or on the step corrected by what it was found to bend."""
-        least, before = self.at.run.cost - ARMIJO * promised, np.inf
+        start, bounds = self.at.run, self._cost.inner.ocp.bounds(self._case.u_prev, self._case.limits)
+        least, before = start.cost - ARMIJO * promised, np.inf
         for i in range(1 + CORRECTIONS):
-            run = self._trial(answer.step)
+            u = np.clip(start.u + answer.step.reshape(start.u.shape), *bounds)
+            run = self._cost.run(start.z[0], u, self._case)
             if run.cost <= least:
                 return run, answer
             if i == CORRECTIONS or not run.cost < before:
@@ -274,11 +273,6 @@ class Descent:
         soft = (value, slope) if value.size else None
         case = self._case
         return self._cost.inner.qp.solve(hessian, gradient, self.at.run.u, case.u_prev, soft, case.limits)
-
-    def _trial(self, step: Array) -> Rollout:
-        run, bounds = self.at.run, self._cost.inner.ocp.bounds(self._case.u_prev, self._case.limits)
-        u = np.clip(run.u + step.reshape(run.u.shape), *bounds)
-        return self._cost.run(run.z[0], u, self._case)
 
     def _promised(self, prepared: Prepared, hessian: Array, step: Array) -> float:
         """By how much the convex model falls along a step."""

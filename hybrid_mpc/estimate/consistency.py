@@ -39,17 +39,10 @@ class Innovations:
 class Consistency:
     """Two tests of a filter's innovations, each passed by 95 % of the consistent filters.
 
-    Args:
-        runs: Innovations of each recording.
-        samples: Samples with a measurement.
-        mean_nis: Mean NIS [-].
-        nis_band: 95 % band of the mean NIS of a consistent filter. Above it the filter assumes too little noise (or its
-            model is wrong), below it too much.
-        nis_inside: Share of single NIS below the 95 % point of their own distribution.
-        autocorrelation: Of the normalised innovations at lags 1, 2, ..., ``(lags, n_y)`` [-].
-        correlation_band: Half width of the 95 % band of one autocorrelation of white innovations.
-        ljung_box: Ljung-Box statistic, summed over the outputs.
-        ljung_box_limit: Its 95 % point for white innovations.
+    Above its band the mean NIS says that the filter assumes too little noise (or its model is wrong), below it too
+    much. ``nis_inside`` is the share of single NIS below the 95 % point of their own distribution. Of the normalised
+    innovations there are the autocorrelations ``(lags, n_y)`` at lags 1, 2, ..., with half the width of the 95 % band
+    of one, and the Ljung-Box statistic, summed over the outputs, with its 95 % point; both for white innovations.
     """
 
     runs: tuple[Innovations, ...]

@@ -122,7 +122,7 @@ class ExtendedKalmanFilter:
         variance_y = _variance(sigma_y, n_y, "sigma_y")
         if not np.all(variance_y > 0):
             raise InputError(f"sigma_y must be positive, got {np.asarray(sigma_y)}")
-        self._model, self._sizes = model, (n_x, n_h, n_u, n_y)
+        self.model, self._sizes = model, (n_x, n_h, n_u, n_y)
         self._noise_y = variance_y
         self._noise = np.concatenate(
             [_variance(sigma_x, n_x, "sigma_x"), hidden, _variance(sigma_d, n_u, "sigma_d")]
@@ -134,11 +134,6 @@ class ExtendedKalmanFilter:
         assert model.with_jacobian is not None
         self._step, self._output = map(BufferedFunction, (model.with_jacobian, output_with_jacobian(model)))
         self._step.inputs[3][:], self._step.inputs[4][:] = model.w, model.p
-
-    @property
-    def model(self) -> HybridModel:
-        """The model of this filter."""
-        return self._model
 
     @property
     def noise(self) -> tuple[Array, Array]:
@@ -154,7 +149,7 @@ class ExtendedKalmanFilter:
 
         Elements of ``y`` that are not finite count as the output at the state zero.
         """
-        model = self._model
+        model = self.model
         x, u = np.zeros(model.n_x), np.zeros(model.n_u)
         target = np.asarray(y, dtype=float).ravel()
         for _ in range(20):  # Newton; one step if the outputs are linear in the state
@@ -181,7 +176,7 @@ class ExtendedKalmanFilter:
         p = f @ estimate.P @ f.T
         p.flat[:: p.shape[0] + 1] += self._noise
         empty = np.full(n_y, np.nan)
-        return Estimate(estimate.t + self._model.dt, x.copy(), h.copy(), estimate.d, p, empty, float("nan"))
+        return Estimate(estimate.t + self.model.dt, x.copy(), h.copy(), estimate.d, p, empty, float("nan"))
 
     def correct(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> Estimate:
         """Estimate after the measurement ``y`` ``(n_y,)``, in Joseph form; ``u`` is the input of the output equation.
@@ -222,7 +217,7 @@ class ExtendedKalmanFilter:
         """Covariance ``(n_y, n_y)`` that a predicted estimate gives its innovation: ``C P C' + R``."""
         held = estimate.d if u is None else np.asarray(u, dtype=float).ravel() + estimate.d
         _, c_x, c_u = self._measured(estimate.x, held)
-        c = np.hstack([c_x, np.zeros((self._model.n_y, self._model.n_h)), c_u])
+        c = np.hstack([c_x, np.zeros((self.model.n_y, self.model.n_h)), c_u])
         s: Array = c @ estimate.P @ c.T + np.diag(self._noise_y)
         return 0.5 * (s + s.T)
 
@@ -260,10 +255,10 @@ class ExtendedKalmanFilter:
         """
         ys, us = np.asarray(y, dtype=float), np.asarray(u, dtype=float)
         n = len(ys)
-        if n == 0 or ys.shape != (n, self._model.n_y) or us.shape != (n, self._model.n_u):
+        if n == 0 or ys.shape != (n, self.model.n_y) or us.shape != (n, self.model.n_u):
             raise InputError(
                 f"y {ys.shape} and u {us.shape} given; "
-                f"needed: (n, {self._model.n_y}) and (n, {self._model.n_u}) with n > 0"
+                f"needed: (n, {self.model.n_y}) and (n, {self.model.n_u}) with n > 0"
             )
         estimates = [self.start(ys[0], t)]
         for y_k, u_k in zip(ys[1:], us[:-1], strict=True):
@@ -302,16 +297,11 @@ class TrueState:
     """
 
     def __init__(self, model: HybridModel) -> None:
-        self._model = model
-
-    @property
-    def model(self) -> HybridModel:
-        """The oracle model."""
-        return self._model
+        self.model = model
 
     def start(self, y: ArrayLike, t: float = 0.0) -> Estimate:
         """Estimate that is the truth ``y = (x, hidden)``, ``(n_x + n_h,)`` or longer; ``d`` zero."""
-        m, z = self._model, np.asarray(y, dtype=float).ravel()
+        m, z = self.model, np.asarray(y, dtype=float).ravel()
         n_z = m.n_x + m.n_h
         if z.size < n_z:
             raise InputError(f"true state: the plant gives {z.size} states, the oracle model needs {n_z}")
@@ -320,7 +310,7 @@ class TrueState:
 
     def predict(self, estimate: Estimate, u: ArrayLike) -> Estimate:
         """The model's own step with ``u`` ``(n_u,)`` held."""
-        m = self._model
+        m = self.model
         x, h = (
             v.full().ravel() for v in m.step(estimate.x, estimate.h, np.asarray(u, dtype=float), m.w, m.p)
         )
@@ -332,4 +322,4 @@ class TrueState:
 
     def update(self, estimate: Estimate, y: ArrayLike, u_prev: ArrayLike) -> Estimate:
         """The truth one period later; ``u_prev`` is not used."""
-        return self.start(y, estimate.t + self._model.dt)
+        return self.start(y, estimate.t + self.model.dt)

@@ -14,7 +14,8 @@ A period of :class:`Loop` is::
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any, Literal, Protocol
@@ -74,7 +75,7 @@ class LoopState:
     Args:
         k: Number of the period that the last step began.
         y: Its measurement ``(n_y,)``; NaN where there was none.
-        estimate: The estimate; None after a long break, until the next sample.
+        estimate: None after a long break, until the next sample.
         decision: The input that is held, and the plan to go on from.
         guard: Modes and the backup's estimate.
         monitor: The monitor's memory; None without one.
@@ -197,9 +198,12 @@ class Loop:
         self._state: LoopState | None = None
         self._basis: _Basis | None = None
         self._ahead: _Ahead | None = None
-        self._reading: Reading | None = None
-        self._previewed: tuple[Array, Array | None] = np.zeros((0, self.ocp.n_x)), None
-        self._spent = dict.fromkeys(TIMED, 0.0)
+        self.reading: Reading | None = None
+        """What the monitor said last; None without one."""
+        self.previewed: tuple[Array, Array | None] = np.zeros((0, self.ocp.n_x)), None
+        """Reference ``(m, n_x)`` and factors on ``q`` (None for 1) of this period's decision."""
+        self.spent = dict.fromkeys(TIMED, 0.0)
+        """Durations [s] of this period, by the names of ``TIMED``."""
 
     def start(
         self,
@@ -218,7 +222,7 @@ class Loop:
         estimate = self._estimator.start(self._seen(sample, truth), 0.0)
         first = self._safe.initial(estimate, None, x_ref, factors)
         self._state = self._first_state(sample, estimate, first)
-        self._ahead, self._reading, self._spent = None, None, dict.fromkeys(TIMED, 0.0)
+        self._ahead, self.reading, self.spent = None, None, dict.fromkeys(TIMED, 0.0)
         return self._decide(first, x_ref, factors, in_time)
 
     def step(
@@ -267,7 +271,7 @@ class Loop:
         else:
             estimate = self._estimator.update(state.estimate, seen, previous.u)
         self._state = replace(state, k=k, y=sample, estimate=estimate, inputs=inputs, finished=False)
-        self._spent = {**dict.fromkeys(TIMED, 0.0), "estimate": self._now() - begin}
+        self.spent = {**dict.fromkeys(TIMED, 0.0), "estimate": self._now() - begin}
         return self._decide(previous, x_ref, factors, in_time)
 
     def _decide(
@@ -275,20 +279,19 @@ class Loop:
     ) -> Array:
         """The input of this period, by the controller of the guard's mode or by the operator."""
         state, estimate = self.state, self.estimate
-        self._previewed = x_ref, factors
+        self.previewed = x_ref, factors
         guard = self._control.measured(state.guard, self.t, state.y, previous.u)
         self._basis = _Basis(previous, guard, estimate, x_ref)
         may_solve = in_time is None or in_time()
         begin = self._now()
         if state.mode == "manual":
             decision = self._operated(previous, estimate)
-        elif may_solve:
-            decision, guard = self._control.decide(
-                guard, previous, estimate, x_ref, factors, prepared=self._prepared(previous, factors)
-            )
         else:
-            decision, guard = self._control.late(guard, previous, estimate, x_ref)
-        self._spent["solve"] = self._now() - begin
+            prepared = self._prepared(previous, factors)
+            decision, guard = self._control.decide(
+                guard, previous, estimate, x_ref, factors, prepared=prepared, late=not may_solve
+            )
+        self.spent["solve"] = self._now() - begin
         self._state = replace(state, decision=decision, guard=guard)
         return decision.u
 
@@ -299,7 +302,9 @@ class Loop:
         """
         basis = self._basis
         if basis is not None and self.state.mode == "automatic":
-            decision, guard = self._control.late(basis.guard, basis.previous, basis.estimate, basis.reference)
+            decision, guard = self._control.decide(
+                basis.guard, basis.previous, basis.estimate, basis.reference, late=True
+            )
             self._state = replace(self.state, decision=decision, guard=guard)
         return self.state.decision.u
 
@@ -314,10 +319,10 @@ class Loop:
         self._basis = None
         begin, guard, memory = self._now(), state.guard, state.monitor
         if self._monitor is not None:
-            memory, self._reading = self._monitor.update(
+            memory, self.reading = self._monitor.update(
                 memory, state.y, state.inputs[0], filtered(self.estimate)
             )
-            guard = self._control.watched(guard, self.t, self._reading)
+            guard = self._control.watched(guard, self.t, self.reading)
         inputs = (*state.inputs[1:], state.decision.u)
         self._state = state = replace(state, guard=guard, monitor=memory, inputs=inputs, finished=True)
         middle = self._now()
@@ -325,7 +330,7 @@ class Loop:
             previews = self._previews((state.k + 1 + self._delay) * self.model.dt)
             prepared = self._control.prepare(guard, state.decision, previews[1])
             self._ahead = _Ahead(state.k + 1, state.decision, previews, prepared)
-        self._spent |= {"monitor": middle - begin, "prepare": self._now() - middle}
+        self.spent |= {"monitor": middle - begin, "prepare": self._now() - middle}
 
     def skip(self, n: int = 1) -> None:
         """Periods that passed without a step, e.g. since one before them took too long; the input was held.
@@ -348,17 +353,16 @@ class Loop:
 
     def warm_up(self) -> None:
         """Call every part once, at rest, and forget it: first calls are slow."""
-        before = self._state, self._basis, self._ahead, self._reading, self._spent
-        y, truth = np.zeros(self.model.n_y), np.zeros(self.model.n_x + self.model.n_h)
+        trial, y, truth = copy(self), np.zeros(self.model.n_y), np.zeros(self.model.n_x + self.model.n_h)
         x_ref, factors = self._preview(0, None)
         estimate = self._estimator.start(truth if self._truth else y, 0.0)
         first = self._safe.initial(estimate)
-        self._state, self._ahead = self._first_state(y, estimate, first), None
-        self._decide(first, x_ref, factors, None)
-        self.step(y, truth=truth)
-        self.late()
-        self.finish()
-        self._state, self._basis, self._ahead, self._reading, self._spent = before
+        trial._state, trial._ahead = self._first_state(y, estimate, first), None
+        trial.spent = dict.fromkeys(TIMED, 0.0)
+        trial._decide(first, x_ref, factors, None)
+        trial.step(y, truth=truth)
+        trial.late()
+        trial.finish()
 
     def restore(self, state: LoopState) -> Array:
         """Go on from ``state``, what :attr:`state` of a loop of the same parts was; returns the input that is held.
@@ -367,7 +371,7 @@ class Loop:
             InputError: If it is no state, or that of a loop of another model or horizon.
         """
         _check_state(state, self.model, self.ocp, self._monitor)
-        self._state, self._basis, self._ahead, self._reading = state, None, None, None
+        self._state, self._basis, self._ahead, self.reading = state, None, None, None
         return state.decision.u
 
     @property
@@ -411,24 +415,9 @@ class Loop:
         return self.state.decision
 
     @property
-    def reading(self) -> Reading | None:
-        """What the monitor said last; None without one."""
-        return self._reading
-
-    @property
     def switches(self) -> tuple[Switch, ...]:
         """Changes of the guard's mode until now."""
         return self.state.guard.switches
-
-    @property
-    def previewed(self) -> tuple[Array, Array | None]:
-        """Reference ``(m, n_x)`` and factors on ``q`` (None for 1) of this period's decision."""
-        return self._previewed
-
-    @property
-    def spent(self) -> Mapping[str, float]:
-        """Durations [s] of this period, by the names of ``TIMED``."""
-        return self._spent
 
     @property
     def safe_input(self) -> Array:

@@ -16,16 +16,9 @@ Preview = Callable[[Array], Array]
 
 
 class Previews:
-    """Reference and weight factors over the horizon, in their shapes.
+    """Reference and weight factors over the horizon, in their shapes; arguments are those of a ``Loop``.
 
-    Args:
-        reference: ``t (n,) -> (n, n_x)``, with ``n_p`` more columns where the economic stage cost has parameters; or a
-            set-point with so many numbers; or None for zero.
-        weight: ``t (n,) -> (n, n_x)`` for the factors on ``q``, or None for 1.
-        ocp: The problem.
-        horizon: Periods of preview, or None for the problem's.
-        dt: Period [s].
-        end: End of the run [s]; where values beyond it are not finite, the last before them is held.
+    Where values beyond the ``end`` of the run [s] are not finite, the last before them is held.
     """
 
     def __init__(

@@ -55,11 +55,10 @@ class Runner:
 
     It drives a :class:`~hybrid_mpc.loop.loop.Loop`. Before the clock starts, while the machine rests: the first sample,
     and plan and input from it. Each period: wait for its instant, measure, estimate, decide, actuate, then what the
-    loop leaves until after the input (monitor, preparation of the next solve). A missing sample leaves the prediction.
-    A solve is never interrupted: one that comes back after the deadline is dropped, one that cannot be in time any more
-    is not begun, and the shifted plan is applied (:meth:`~hybrid_mpc.control.safeguard.SafeController.late`). After a
-    long delay the run goes on at the grid's nearest instant; the estimator is led through the periods in between
-    without a measurement.
+    loop leaves until after the input. A missing sample leaves the prediction. A solve is never interrupted: one that
+    comes back after the deadline is dropped, one that cannot be in time any more is not begun, and the shifted plan is
+    applied (:meth:`~hybrid_mpc.control.safeguard.SafeController.late`). After a long delay the run goes on at the
+    grid's nearest instant; the estimator is led through the periods in between without a measurement.
 
     Numbers never raise. Whatever ends the run, exceptions in callbacks and signals (Ctrl-C, SIGTERM, SIGHUP, ...)
     included, the safe input is handed to the actuator before anything else (:class:`SafeEnd`); then the exception is
@@ -82,8 +81,8 @@ class Runner:
         monitor: Default: none.
         deadline: Time [s] after a period's instant by which its input must be decided. Default: one period.
         safe_input: Input ``(n_u,)`` within the limits for the end of the run. Default: the controller's.
-        input_delay: Periods after which an input acts, as the estimator knows it; shifts the preview.
-        sensor_delay: Periods after which a measurement arrives; pairs it with its input for the monitor.
+        input_delay: As in :class:`~hybrid_mpc.loop.loop.Loop`.
+        sensor_delay: As there.
         clock: Default: the computer's. One that does not wait, stands still, goes back or gives NaN ends the run.
         on_step: Called at the end of every period with a :class:`RunnerStep`; must be short.
         guard: What to do on alarms of the monitor, which it needs. Default: nothing.
@@ -126,8 +125,8 @@ class Runner:
             raise InputError(f"Runner: deadline must lie within the period of {dt} s, got {deadline} s")
         if keep < 1:
             raise InputError(f"Runner: keep must be 1 or more periods, got {keep}")
-        self._clock, self._dt, self._actuate = clock or RealClock(), dt, actuate
-        self._run = partial(_Run, measure=measure, actuate=actuate, deadline=due, on_step=on_step, keep=keep)
+        self._clock, self._dt, self._deadline, self._keep = clock or RealClock(), dt, due, keep
+        self._measure, self._actuate, self._on_step = measure, actuate, on_step
         self._loop = partial(
             Loop, estimator, controller, monitor=monitor, reference=reference, weight=weight, guard=guard,
             horizon=horizon, input_delay=input_delay, sensor_delay=sensor_delay,
@@ -147,9 +146,6 @@ class Runner:
             duration: Length [s], rounded to whole periods. Default: none.
             stop: Asked before every period. Default: never.
 
-        Returns:
-            The statistics and the rows of the last ``keep`` periods.
-
         Raises:
             InputError: If neither end is given, the duration is not positive and finite, a callback returns
                 another shape, or the clock is none. What a callback raises is raised on, after the safe input.
@@ -158,7 +154,7 @@ class Runner:
         n = self._periods(duration, stop)
         clock = CheckedClock(self._clock, self._dt)
         loop = self._loop(end=math.inf if n is None else n * self._dt, now=clock.now)
-        run = self._run(loop, clock)
+        run = _Run(self, loop, clock)
         ended = "duration"
         with SafeEnd(lambda: self._actuate(self.safe_input)) as end:
             end.check()
@@ -189,21 +185,12 @@ class Runner:
 class _Run:
     """One run: its clock, its counts and its last rows; all that the loop remembers is in the loop."""
 
-    def __init__(
-        self,
-        loop: Loop,
-        clock: CheckedClock,
-        measure: Callable[[], ArrayLike | None],
-        actuate: Callable[[Array], object],
-        deadline: float,
-        on_step: Callable[[RunnerStep], None] | None,
-        keep: int,
-    ) -> None:
-        self._loop, self._clock, self._dt = loop, clock, loop.model.dt
-        self._measure, self._actuate, self._deadline, self._on_step = measure, actuate, deadline, on_step
+    def __init__(self, runner: Runner, loop: Loop, clock: CheckedClock) -> None:
+        self._runner, self._loop, self._clock = runner, loop, clock
+        self._dt, self._deadline = runner._dt, runner._deadline
         self.k = self._periods = self._skipped = self._missing = self._late = self._overruns = 0
         self._sources: Counter[str] = Counter()
-        self._rows: deque[RunnerStep] = deque(maxlen=keep)
+        self._rows: deque[RunnerStep] = deque(maxlen=runner._keep)
         self._solves: deque[float] = deque(maxlen=RECENT)
         self._start = 0.0
 
@@ -227,7 +214,7 @@ class _Run:
             measured = clock.now()
             self._decide(y, due + self._deadline)
         decided = clock.now()
-        self._actuate(loop.decision.u.copy())
+        self._runner._actuate(loop.decision.u.copy())
         acted = clock.now()
         loop.finish()
         spent = {"measure": measured - begin, "actuate": acted - decided, **loop.spent}
@@ -236,8 +223,8 @@ class _Run:
             acted - due, spent,
         )  # fmt: skip
         self._count(step)
-        if self._on_step is not None:
-            self._on_step(step)
+        if self._runner._on_step is not None:
+            self._runner._on_step(step)
         self._go_on()
 
     def report(self, stopped: str) -> RunReport:
@@ -260,7 +247,7 @@ class _Run:
         )  # fmt: skip
 
     def _sample(self) -> Array | None:
-        y = self._measure()
+        y = self._runner._measure()
         return None if y is None else fitting(y, self._loop.model.n_y, "what measure() returns")
 
     def _decide(self, y: Array | None, deadline: float) -> None:

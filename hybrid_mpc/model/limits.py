@@ -39,14 +39,6 @@ def share_used(values: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> float:
     """Largest share of the way from rest to a limit ``(n,)`` that values ``(m, n)`` use: 1 at the limit, more beyond.
 
     Beyond a limit that is at rest itself the share is 1 plus that of the whole range; infinite without a range.
-
-    Example:
-        >>> share_used([[0.1], [-0.4]], [-0.5], [0.5]), share_used([[0.0], [1.0]], [0.0], [4.0])
-        (0.8, 0.25)
-        >>> share_used([[2.0], [2.5]], [2.0], [4.0]), share_used([[-1.0]], [0.0], [4.0])
-        (0.25, 1.25)
-        >>> share_used([[-3.0]], [-np.inf], [np.inf]), share_used([[-3.0]], [0.0], [np.inf])
-        (0.0, inf)
     """
     value, low, high = (np.asarray(v, dtype=float) for v in (values, lower, upper))
     rest, span = at_rest(low, high), high - low

@@ -29,12 +29,8 @@ STEP_OUTPUTS = ("x_next", "h_next")
 class Balance:
     """A balance of what a machine stores, e.g. of its energy, as the prior has it.
 
-    Args:
-        name: E.g. ``"energy"``.
-        unit: Of the storage, e.g. ``"J"``.
-        rate_unit: Of its rate, e.g. ``"W"``.
-        residual: ``(x, xdot, u, w, p) -> residual`` [rate_unit]: the violation of the balance if the state changes at
-            ``xdot``; zero along the prior's own flow.
+    ``residual`` ``(x, xdot, u, w, p)`` [rate_unit] is the violation of the balance if the state changes at ``xdot``;
+    zero along the prior's own flow. ``unit`` is that of the storage, e.g. ``"J"``.
     """
 
     name: str
@@ -322,6 +318,23 @@ def prior_acceleration(model: HybridModel, prior: HybridModel | None = None) -> 
     x, _, u, w, p = point
     a = prior.xdot(x, ca.DM.zeros(prior.n_h), u, w, p)[n_q : 2 * n_q]
     return ca.Function("acceleration", [x, u, w, p], [ca.densify(a)])
+
+
+def changeable(model: HybridModel) -> tuple[str, ...]:
+    """What of a prior may change: its parameters, and the gain of each input."""
+    return (*(p.name for p in model.parameters), *(f"gain of {s.name}" for s in model.inputs))
+
+
+def incidence(model: HybridModel, groups: Mapping[str, Sequence[str]], what: str) -> Array:
+    """Which of the :func:`changeable` names each group changes ``(n_p + n_u, groups)``."""
+    known = changeable(model)
+    matrix = np.zeros((len(known), len(groups)))
+    for j, names in enumerate(groups.values()):
+        for name in names:
+            if name not in known:
+                raise InputError(f"{what}: no parameter {name!r}; there are: {', '.join(known)}")
+            matrix[known.index(name), j] = 1.0
+    return matrix
 
 
 def step_symbols(model: HybridModel) -> list[ca.MX]:

@@ -154,21 +154,9 @@ def learn_detector(
     come from a Gumbel tail of the block maxima (:func:`~hybrid_mpc.monitor.calibrate.calibrate`), half of the wanted
     rate for either alarm. A block bootstrap of the same maxima, six neighbours at a time, gives their interval.
 
-    Args:
-        runs: The readings.
-        dt: Period [s].
-        n_q: Degrees of freedom.
-        free_runs: Whether the numbers hold free runs. Default: yes.
-        drift: See :class:`~hybrid_mpc.monitor.detector.Detector`. Default 1.
-        false_alarms_per_hour: Wanted rate [1/h]; default 1.
-        rest_speed: That of the monitor which made the numbers. Default 0.2, as the monitor's.
-        data_hash: Hash of the data, kept in the result.
-        seed: Of the bootstrap.
-        trusted: Whether the data are known to be nominal, as simulated ones are. Default: no; then a block that stands
-            out is refused.
-        time_unit: The machine's second [s], the model's. Default 1.
-        block_s: Length of a block [s]. Default: 5 of the machine's seconds, 50 periods at least; shorter where there
-            is little data, and a higher rate is enough.
+    ``rest_speed`` and ``time_unit`` are those of the monitor that made the numbers. Unless the data are ``trusted``,
+    as simulated ones are, a block that stands out is refused. A block lasts ``block_s`` [s], by default 5 of the
+    machine's seconds and 50 periods at least; shorter where there is little data, and a higher rate is enough.
 
     Raises:
         InputError: If there is too little data for the rate, no motion, or an alarm in what should be nominal.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -25,7 +24,6 @@ HELD_SHARE = 0.25
 """Change of an input, as a share of its range, that sticking friction does not hold."""
 
 
-@dataclass(frozen=True)
 class Layout:
     """Where things lie in the monitor's memory and in its outputs.
 
@@ -33,56 +31,32 @@ class Layout:
     diagnosis; 0 for none.
     """
 
-    model: HybridModel
-    window: int
-    average: int
-    length: int = 0
-    history: int = 0
-
-    @property
-    def n_q(self) -> int:
-        """Degrees of freedom."""
-        return self.model.n_x // 2
-
-    @property
-    def row(self) -> int:
+    def __init__(
+        self, model: HybridModel, window: int, average: int, length: int = 0, history: int = 0
+    ) -> None:
+        self.model, self.window, self.average, self.length, self.history = (
+            model,
+            window,
+            average,
+            length,
+            history,
+        )
+        n_q = self.n_q = model.n_x // 2
+        self.row = 2 * n_q + model.n_u
         """Model increments and input of a period."""
-        return 2 * self.n_q + self.model.n_u
-
-    @property
-    def one_step(self) -> int:
+        self.one_step = window * n_q + (window - 1) * self.row
         """Size of the window's part of the memory."""
-        return self.window * self.n_q + (self.window - 1) * self.row
-
-    @property
-    def run(self) -> int:
-        """Size of a free run: state, hidden state, positions, sums."""
-        return self.model.n_x + self.model.n_h + self.window * self.n_q + RUN_SUMS
-
-    @property
-    def averaged(self) -> int:
+        self.averaged = self.one_step + 3 * n_q + model.n_u
         """Where the latest violations begin; the residuals follow them."""
-        return self.one_step + 3 * self.n_q + self.model.n_u
-
-    @property
-    def runs(self) -> int:
+        self.runs = self.averaged + average * (1 + n_q)
         """Where the free runs begin."""
-        return self.averaged + self.average * (1 + self.n_q)
-
-    @property
-    def history_row(self) -> int:
-        """Numbers of a row: state and input at the centre, residual."""
-        return 3 * self.n_q + self.model.n_u
-
-    @property
-    def rows(self) -> int:
+        self.run = model.n_x + model.n_h + window * n_q + RUN_SUMS
+        """Size of a free run: state, hidden state, positions, sums."""
+        self.rows = self.runs + (RUNS * self.run if length else 0)
         """Where the history begins."""
-        return self.runs + (RUNS * self.run if self.length else 0)
-
-    @property
-    def size(self) -> int:
-        """Size of the memory."""
-        return self.rows + self.history * self.history_row
+        self.history_row = 3 * n_q + model.n_u
+        """Numbers of a row: state and input at the centre, residual."""
+        self.size = self.rows + history * self.history_row
 
     def initial(self) -> tuple[Array, tuple[int, ...]]:
         """Memory before the first sample, and the periods until each free run begins anew."""
