@@ -203,6 +203,12 @@ class CondensedController(Controller):
         weight = self.problem.weights(weight)
         return self.condense(u, z, previous.d, previous.u[0], weight, derivatives, start)
 
+    @np.errstate(over="ignore", invalid="ignore")
+    def linearize(self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array) -> Prepared:
+        """Linearize and condense along a trajectory as it is: ``u`` ``(N, n_u)``, ``z`` ``(N + 1, n_z)``."""
+        start = perf_counter()
+        return self.condense(u, z, d, u_prev, weight, self.stages.at(z[:-1], u + d), start)
+
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def feedback(
         self, prepared: Prepared, estimate: Estimate, reference: Array, limits: Limits | None = None
@@ -258,7 +264,6 @@ class CondensedController(Controller):
         """:meth:`prepare` and :meth:`finish`."""
         return self.finish(self.prepare(previous, weight), estimate, reference, limits)
 
-    @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def finish(
         self, prepared: Prepared, estimate: Estimate, reference: Array, limits: Limits | None = None
     ) -> Solution:
@@ -267,10 +272,9 @@ class CondensedController(Controller):
         for i in range(1, self._iterations):
             if not solution.status.ok:
                 break
-            spent, start, u, d = solution.timing, perf_counter(), solution.u, solution.d
+            spent = solution.timing
             z = np.hstack([solution.x, solution.h])
-            along = self.stages.at(z[:-1], u + d)
-            again = self.condense(u, z, d, prepared.u_prev, prepared.weight, along, start)
+            again = self.linearize(solution.u, z, solution.d, prepared.u_prev, prepared.weight)
             solution = self.feedback(again, estimate, reference, limits)
             total = {name: spent[name] + solution.timing[name] for name in spent}
             solution = replace(solution, timing=total, iterations=i + 1)

@@ -17,6 +17,7 @@ import math
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import partial
 from time import perf_counter
 from typing import Any, Literal, Protocol
 
@@ -93,16 +94,6 @@ class LoopState:
     inputs: tuple[Array, ...]
     mode: Literal["automatic", "manual"] = "automatic"
     finished: bool = False
-
-
-@dataclass(frozen=True)
-class _Basis:
-    """What the decision of this period was made from; :meth:`Loop.late` makes another one from it."""
-
-    previous: Decision
-    guard: GuardState
-    estimate: Estimate
-    reference: Array
 
 
 @dataclass(frozen=True)
@@ -196,7 +187,7 @@ class Loop:
         self._previews = Previews(reference, weight, self.ocp, horizon, self.model.dt, end)
         self._truth, self._now = sees_truth(estimator), now
         self._state: LoopState | None = None
-        self._basis: _Basis | None = None
+        self._decide_late: Callable[[], tuple[Decision, GuardState]] | None = None
         self._ahead: _Ahead | None = None
         self.reading: Reading | None = None
         """What the monitor said last; None without one."""
@@ -281,7 +272,7 @@ class Loop:
         state, estimate = self.state, self.estimate
         self.previewed = x_ref, factors
         guard = self._control.measured(state.guard, self.t, state.y, previous.u)
-        self._basis = _Basis(previous, guard, estimate, x_ref)
+        self._decide_late = partial(self._control.decide, guard, previous, estimate, x_ref, late=True)
         may_solve = in_time is None or in_time()
         begin = self._now()
         if state.mode == "manual":
@@ -300,11 +291,8 @@ class Loop:
 
         To be called after :meth:`step`, in place of the input that it returned.
         """
-        basis = self._basis
-        if basis is not None and self.state.mode == "automatic":
-            decision, guard = self._control.decide(
-                basis.guard, basis.previous, basis.estimate, basis.reference, late=True
-            )
+        if self._decide_late is not None and self.state.mode == "automatic":
+            decision, guard = self._decide_late()
             self._state = replace(self.state, decision=decision, guard=guard)
         return self.state.decision.u
 
@@ -316,7 +304,7 @@ class Loop:
         state = self.state
         if state.finished:
             return
-        self._basis = None
+        self._decide_late = None
         begin, guard, memory = self._now(), state.guard, state.monitor
         if self._monitor is not None:
             memory, self.reading = self._monitor.update(
@@ -371,7 +359,7 @@ class Loop:
             InputError: If it is no state, or that of a loop of another model or horizon.
         """
         _check_state(state, self.model, self.ocp, self._monitor)
-        self._state, self._basis, self._ahead, self.reading = state, None, None, None
+        self._state, self._decide_late, self._ahead, self.reading = state, None, None, None
         return state.decision.u
 
     @property
