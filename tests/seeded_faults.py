@@ -186,13 +186,13 @@ FAULTS = (
     ),
     fault(
         "estimate", "a late measurement is matched with the newest input, not the one of its time",
-        "self._estimator.update(base, y, inputs[0])", "self._estimator.update(base, y, inputs[-1])",
+        "self.estimator.update(base, y, inputs[0])", "self.estimator.update(base, y, inputs[-1])",
         "delays",
     ),
     fault(
         "estimate", "probabilities of the modes are carried on by the transposed transition",
-        "joint = before.probability[:, None] * self._transition",
-        "joint = before.probability[:, None] * self._transition.T",
+        "joint = before.probability[:, None] * self.transition",
+        "joint = before.probability[:, None] * self.transition.T",
         "switching",
     ),
     fault(

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import cart
 import numpy as np
 import pytest
-from closed_loop_parts import ScriptedMonitor
+from closed_loop_parts import ModelPlant, ScriptedMonitor
 from online_models import PendulumPlant, linear_model, pendulum_model
 
 from hybrid_mpc import (
@@ -93,29 +93,6 @@ def test_a_whole_loop_with_its_figures(limits):
     assert unknown_load(control) == pytest.approx(0.1 * span)
 
 
-class Track:
-    """The cart of ``cart.py`` as its prior has it, with a sensor of 0.1 mm."""
-
-    def __init__(self, model):
-        self._model = model
-
-    def reset(self, x0, seed):
-        return np.asarray(x0, dtype=float)
-
-    def step(self, state, u, dt):
-        m = self._model
-        return m.step(state, [], u, m.w, m.p)[0].full().ravel()
-
-    def measure(self, state, rng):
-        return state[:1] + 1e-4 * rng.normal(size=1)
-
-    def truth(self, state):
-        return state
-
-    def hidden(self, state):
-        return np.zeros(0)
-
-
 @pytest.fixture(scope="module")
 def carts(tmp_path_factory):
     """The scenario of the cart, and its prior as a deployed model."""
@@ -146,7 +123,7 @@ def test_a_cart_is_brought_to_what_its_limits_allow(carts, limits):
     # At rest the spring of 1 N/m holds what pushes: a place of so many metres takes so many newtons.
     for place in (0.7, -0.7):
         result = simulate(
-            Track(model), make_estimator(model, machine, np.array([1e-5, 1e-4])),
+            ModelPlant(model), make_estimator(model, machine, np.array([1e-5, 1e-4])),
             make_controller(model, model, control), lambda t, place=place: np.tile([place, 0.0], (len(t), 1)),
             dt=model.dt, duration=14.0, x0=[0.0, 0.0], seed=0,
         )  # fmt: skip

@@ -37,22 +37,7 @@ class BestOf(Controller):
     Raises:
         InputError: If a rival or a plan does not fit, ``most < 1``, or there is neither start nor rival.
 
-    Example:
-        >>> import casadi as ca
-        >>> from hybrid_mpc.estimate.kalman import TrueState
-        >>> from hybrid_mpc.control.ocp import OCP; from hybrid_mpc.control.sqp import SQPController
-        >>> from hybrid_mpc.machine.signals import Signal
-        >>> from hybrid_mpc.model.model import HybridModel
-        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
-        >>> model = HybridModel.of("even", 1.0, level, (Signal("u", "-"),), level,
-        ...     x=x, u=u, x_next=x - u**2, xdot=u, y=x)
-        >>> ocp = OCP(2, [1.0], [0.1], [0.0], [-1.0], [1.0], terminal=[[1.0]])
-        >>> single = SQPController(model, ocp)  # u = 0 is stationary: it sees no way down
-        >>> best = BestOf(single, starts=[np.full((2, 1), 0.5)])
-        >>> estimate = TrueState(model).start([1.0])
-        >>> plans = [c.solve(c.initial(estimate), estimate, np.zeros((1, 1))) for c in (single, best)]
-        >>> [round(plan.cost, 2) for plan in plans]
-        [3.0, 1.1]
+    Example: ``BestOf(SQPController(model, ocp), starts=[np.full((ocp.horizon, 1), 0.5)])``
     """
 
     def __init__(
@@ -90,7 +75,6 @@ class BestOf(Controller):
         Its cost is that on a run of the model. If no solve ends well, the one from the previous plan is returned.
         """
         begin = perf_counter()
-        known = np.all(np.isfinite(np.concatenate([estimate.x, estimate.h, estimate.d])))
         target, u_prev = self.problem.target(reference, weight), previous.u[0]
         z0 = np.concatenate([estimate.x, estimate.h])
 
@@ -101,7 +85,7 @@ class BestOf(Controller):
         given = estimate, reference, weight
         first = self._controller.solve(previous, *given, limits=limits)
         solutions = [first]
-        guesses = self._guesses(previous, *given, limits) if known else []
+        guesses = self._guesses(previous, *given, limits) if estimate.finite else []
         for guess in sorted(guesses, key=cost_of)[: self._most]:
             start = self._controller.initial(estimate, guess).delayed(previous.u[0])  # its shift is the guess
             solutions.append(self._controller.solve(start, *given, limits=limits))

@@ -29,13 +29,7 @@ class StageCurvature:
 
     They are differences of the model's exact Jacobians: ``n_x + n_u`` evaluations for the block by states and inputs,
     in which friction curves sharply, and ``n_h`` for the blocks by the hidden state. Those of soft bounds, weighted
-    with their multipliers, are added.
-
-    Args:
-        stages: The model's stages.
-        ocp: The problem; its weights and limits give the length of the differences.
-        n_h: Number of hidden states.
-        soft: The problem's soft bounds. Default: none has an expression that curves.
+    with their multipliers, are added. The problem's weights and limits give the length of the differences.
     """
 
     def __init__(self, stages: Linearization, ocp: OCP, n_h: int = 0, soft: SoftRows | None = None) -> None:
@@ -61,14 +55,9 @@ class StageCurvature:
     ) -> Array:
         """Curvature ``(N, n, n)`` of every stage by ``(x, u, h)``, or by ``(x, u)`` alone where ``old`` has no more.
 
-        Args:
-            z: ``(N + 1, n_z)``, where the Jacobians were taken.
-            u: Inputs ``(N, n_u)`` and what the model runs on ``(N, n_u)``, stacked ``(2, N, n_u)``.
-            a_t: Transposed ``A_k`` ``(N, n_z, n_z)``.
-            b: ``B_k`` ``(N, n_z, n_u)``.
-            adjoint: Multipliers ``(N, n_z)`` of the stages' results.
-            soft: Multipliers ``(M,)`` of the soft bounds.
-            old: Curvature whose hidden part is kept. Default: all is taken.
+        ``u`` ``(2, N, n_u)`` are the inputs, and what the model runs on; the Jacobians ``a_t`` (transposed) and ``b``
+        were taken at ``z``. ``adjoint`` and ``soft`` are the multipliers of the stages' results and of the soft bounds.
+        The hidden part of ``old`` is kept.
         """
         few = self._shift.size
         size = self.size if old is None else old.shape[1]
@@ -135,13 +124,7 @@ class StageCurvature:
         return np.asarray(0.5 * (curvature + curvature.transpose(0, 2, 1)))
 
     def condensed(self, curvature: Array, from_u: Array, by_inputs: Array) -> Array:
-        """The stages' curvature as that of the inputs ``(N n_u, N n_u)``.
-
-        Args:
-            curvature: As :meth:`of` returns it.
-            from_u: As in ``Prepared``.
-            by_inputs: As the ``Condenser`` that made it has it.
-        """
+        """The stages' curvature as that of the inputs ``(N n_u, N n_u)``; ``by_inputs`` as the ``Condenser`` has it."""
         if curvature.shape[1] > self._shift.size:
             return condense_all(curvature, by_inputs, self._n_x, self._n_u)
         return condense_hessians(curvature, from_u, self._n_x)
@@ -163,11 +146,6 @@ def convex(gauss_newton: Array, rest: Array, held: NDArray[np.bool_] | None = No
 
     Along every direction the result has at least the share 0.001 of Gauss-Newton's curvature; directions are the joint
     eigenvectors of the two. Where the sum curves up as long as the ``held`` unknowns stay, only their block is changed.
-
-    Example:
-        >>> convex(np.eye(2), np.diag([1.0, -3.0]))
-        array([[2., 0.],
-               [0., 2.]])
     """
     whole = gauss_newton + rest
     try:

@@ -51,7 +51,7 @@ class IpoptController(Controller):
     Source: Wächter and Biegler, *On the implementation of an interior-point filter line-search algorithm
     for large-scale nonlinear programming*, Math. Program. 106 (2006).
 
-    Example: as :class:`~hybrid_mpc.control.sqp.SQPController`, whose interface it shares.
+    Example: as :class:`~hybrid_mpc.control.rti.CondensedController`, whose interface it shares.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class IpoptController(Controller):
         start = perf_counter()
         problem, u_prev = self.problem, previous.u[0]
         target = problem.target(reference, weight)
-        u = np.vstack([previous.u[1:], previous.u[-1:]])
+        u = previous.following
         z = np.hstack([previous.x, previous.h])
         z = np.vstack([np.concatenate([estimate.x, estimate.h]), z[2:], z[-1:]])
         given = np.concatenate(
@@ -146,15 +146,11 @@ class IpoptController(Controller):
     ) -> Solution:
         n_x, soft = self.ocp.n_x, self.problem.soft
         excess = soft.excess(soft.values(z[:, :n_x], u)) if len(soft) else np.zeros(0)
-        defect = self._defect(z, u + d)
+        x, h = self._step(z[:-1, :n_x].T, z[:-1, n_x:].T, (u + d).T)
+        defect = float(np.max(np.abs(np.vstack([x.full(), h.full()]).T - z[1:])))
         spent = {"solve": (perf_counter() - start) * 1e3}
         largest = float(np.max(excess, initial=0.0))
         return Solution(u, z[:, :n_x], z[:, n_x:], d, cost, status, kkt, defect, spent, largest, i)
-
-    def _defect(self, z: Array, u: Array) -> float:
-        n_x = self.ocp.n_x
-        x, h = self._step(z[:-1, :n_x].T, z[:-1, n_x:].T, u.T)
-        return float(np.max(np.abs(np.vstack([x.full(), h.full()]).T - z[1:])))
 
     def _formulate(self) -> dict[str, ca.MX]:
         """Problem of ``nlpsol`` over ``(u, z, slacks)``; keeps the bounds of its unknowns and rows."""
@@ -209,23 +205,18 @@ class IpoptController(Controller):
         return self.model.dt * ca.sum2(stages)
 
     def _soft_rows(self, u: ca.MX, z: ca.MX, s: ca.MX) -> list[Rows]:
-        soft, rows = self.problem.soft, []
-        value = ca.vertcat(*self._soft_values(u, z))
+        """Constraints of the bounded values, in the order of the problem's rows."""
+        ocp, soft, rows = self.ocp, self.problem.soft, []
+        states = [int(i) for i in np.flatnonzero(np.isfinite(ocp.x_min) | np.isfinite(ocp.x_max))]
+        values = [ca.vec(z[states, 1:])] if states else []
+        values += [ca.vec(b.expression.map(ocp.horizon)(z[: ocp.n_x, :-1], u)) for b in ocp.soft]
+        value = ca.vertcat(*values)
         for bound, sign in ((soft.upper, 1.0), (soft.lower, -1.0)):
-            chosen = np.flatnonzero(np.isfinite(bound))
-            pick = [int(i) for i in chosen]
+            pick = np.flatnonzero(np.isfinite(bound)).tolist()
             if pick:
-                gap = sign * (value[pick] - bound[chosen]) - s[pick]
-                rows.append(Rows(gap, -np.inf, 0.0, soft.scale[chosen]))
+                gap = sign * (value[pick] - bound[pick]) - s[pick]
+                rows.append(Rows(gap, -np.inf, 0.0, soft.scale[pick]))
         return rows
-
-    def _soft_values(self, u: ca.MX, z: ca.MX) -> list[ca.MX]:
-        """Bounded values in the order of the problem's rows."""
-        ocp = self.ocp
-        chosen = [int(i) for i in np.flatnonzero(np.isfinite(ocp.x_min) | np.isfinite(ocp.x_max))]
-        values = [ca.vec(z[chosen, 1:])] if chosen else []
-        x = z[: ocp.n_x, :-1]
-        return values + [ca.vec(bound.expression.map(ocp.horizon)(x, u)) for bound in ocp.soft]
 
 
 def _filled(rows: list[Rows], field: int) -> Array:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from dataclasses import fields as dataclass_fields
-from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
 import casadi as ca
@@ -193,10 +192,6 @@ class OCP:
 
         Raises:
             InputError: If there is no such field, or the problem would be wrong.
-
-        Example:
-            >>> OCP(20, [1.0], [0.1], [0.0], [-1.0], [1.0]).changed(horizon=30, u_max=[2.0]).u_max
-            array([2.])
         """
         names = [field.name for field in dataclass_fields(self)]
         for name in fields:
@@ -230,12 +225,7 @@ class OCP:
 
     @property
     def rest_input(self) -> Array:
-        """Zero, or the limit next to it ``(n_u,)``: what is held where nothing else is known.
-
-        Example:
-            >>> OCP(5, [1.0], [1.0], [0.0], [2.0], [9.0]).rest_input
-            array([2.])
-        """
+        """Zero, or the limit next to it ``(n_u,)``: what is held where nothing else is known."""
         return at_rest(self.u_min, self.u_max)
 
     @property
@@ -250,12 +240,7 @@ class OCP:
 
     @property
     def input_scale(self) -> Array:
-        """By what solvers scale the inputs ``(n_u,)``: half the range, or, without one, what their weights tolerate.
-
-        Example:
-            >>> OCP(5, [1.0], [0.3, 3.0], [0.1, 1.0], [0.0, 0.0], [8.0, np.inf]).input_scale
-            array([4. , 0.5])
-        """
+        """By what solvers scale the inputs ``(n_u,)``: half the range, or, without one, what their weights tolerate."""
         half = 0.5 * (self.u_max - self.u_min)
         return np.where(np.isfinite(half), half, 1.0 / np.sqrt(self.r + self.r_delta))
 
@@ -266,13 +251,7 @@ class OCP:
         return np.cumsum((0, *lengths[:-1]))
 
     def held(self, u: Array) -> Array:
-        """Inputs ``(N, n_u)`` held over the move blocks, each at its first value.
-
-        Example:
-            >>> ocp = OCP(4, [1.0], [1.0], [0.0], [-9.0], [9.0], blocks=(1, 3))
-            >>> ocp.held(np.arange(4.0)[:, None]).ravel()
-            array([0., 1., 1., 1.])
-        """
+        """Inputs ``(N, n_u)`` held over the move blocks, each at its first value."""
         return u if self.blocks is None else np.repeat(u[self.block_starts], self.blocks, axis=0)
 
     def stage_cost(self, x: Array, u: Array, x_ref: Array, du: Array, weight: Array | float = 1.0) -> Array:
@@ -291,15 +270,10 @@ class OCP:
 
         Raises:
             InputError: If the limits have another size.
-
-        Example:
-            >>> ocp = OCP(3, [1.0], [1.0], [0.0], [-1.0], [1.0], du_max=[0.2])
-            >>> ocp.bounds(np.array([0.9]), Limits([-0.5], [0.5]))[1].ravel().round(6)
-            array([0.7, 0.5, 0.5])
         """
-        if limits is None:
-            return self._own_bounds
         shape = (self.horizon, self.n_u)
+        if limits is None:
+            return np.broadcast_to(self.u_min, shape), np.broadcast_to(self.u_max, shape)
         if limits.u_min.size != self.n_u:
             raise InputError(f"limits of {limits.u_min.size} inputs given, the problem has {self.n_u}")
         lower, upper = (np.clip(v, self.u_min, self.u_max) for v in (limits.u_min, limits.u_max))
@@ -311,19 +285,8 @@ class OCP:
         lower, upper = (row if self.blocks is None else np.repeat(row, self.blocks, axis=0) for row in own)
         return lower, upper
 
-    @cached_property
-    def _own_bounds(self) -> tuple[Array, Array]:
-        lower, upper = np.tile(self.u_min, (self.horizon, 1)), np.tile(self.u_max, (self.horizon, 1))
-        lower.flags.writeable = upper.flags.writeable = False
-        return lower, upper
-
     def saturate(self, u: Array, u_prev: Array, limits: Limits | None = None) -> Array:
-        """``u`` ``(n_u,)`` moved within ``du_max`` of ``u_prev`` and into :meth:`bounds`.
-
-        Example:
-            >>> OCP(5, [1.0], [1.0], [0.0], [-1.0], [1.0], du_max=[0.2]).saturate([3.0], [0.5])
-            array([0.7])
-        """
+        """``u`` ``(n_u,)`` moved within ``du_max`` of ``u_prev`` and into :meth:`bounds`."""
         u = np.asarray(u, dtype=float)
         if self.du_max is not None:
             u = np.clip(u, u_prev - self.du_max, u_prev + self.du_max)

@@ -17,17 +17,13 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
 from hybrid_mpc.model.buffered import BufferedFunction
 from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.model.stages import free_run
 
 Array = NDArray[np.float64]
 
 
 class Status(Enum):
-    """How a solve ended; the value is the message.
-
-    Example:
-        >>> Status.INFEASIBLE.ok, Status.SOLVED.ok
-        (False, True)
-    """
+    """How a solve ended; the value is the message."""
 
     INITIAL = "a first plan, not optimised"
     SOLVED = "the QP was solved and its solution checked"
@@ -77,6 +73,15 @@ class Solution:
     iterations: int = 1
     curvature: Array | None = None
 
+    @property
+    def following(self) -> Array:
+        """Inputs ``(N, n_u)`` of the plan one period later, the last one repeated."""
+        return np.vstack([self.u[1:], self.u[-1:]])
+
+    def beginning_with(self, u: Array) -> Solution:
+        """The plan with ``u`` ``(n_u,)`` as its first input."""
+        return replace(self, u=np.vstack([u[None], self.u[1:]]))
+
     def delayed(self, u_held: Array) -> Solution:
         """The plan one period earlier, with ``u_held`` ``(n_u,)`` held in it: a solve that shifts it has this plan.
 
@@ -92,17 +97,6 @@ class SoftRows:
     """The M soft bounds of a problem along a trajectory, one row a bound and period.
 
     Bounds on states hold for ``x_1 .. x_N`` (``x_0`` is given), expressions for ``(x_0, u_0) .. (x_{N-1}, u_{N-1})``.
-
-    Args:
-        ocp: The problem.
-
-    Raises:
-        InputError: If an expression does not take the problem's ``(x, u)``.
-
-    Example:
-        >>> rows = SoftRows(OCP(2, [1.0], [1.0], [0.0], [-9.0], [9.0], x_max=[0.5]))
-        >>> rows.excess(rows.values(np.array([[7.0], [0.6], [0.2]]), np.zeros((2, 1)))).round(6)
-        array([0.1, 0. ])
     """
 
     stage: NDArray[np.int64]
@@ -156,10 +150,7 @@ class SoftRows:
     def condensed(self, x: Array, u: Array, from_u: Array) -> tuple[Array, Array, Array]:
         """Values ``(M,)`` and their derivatives by the row's state ``(M, n_x)`` and by all inputs ``(M, N n_u)``.
 
-        Args:
-            x: States ``(N + 1, n_x)``.
-            u: Inputs ``(N, n_u)``.
-            from_u: Derivatives of the states by the inputs ``((N + 1) n_x, N n_u)``.
+        ``from_u`` ``((N + 1) n_x, N n_u)`` are the derivatives of the states by the inputs.
         """
         if not len(self):
             return np.zeros(0), np.zeros((0, self._n_x)), np.zeros((0, u.size))
@@ -195,22 +186,7 @@ def _with_slopes(bound: SoftBound, n_x: int, n_u: int) -> ca.Function:
 
 
 class EconomicCost:
-    """The economic stage cost along a trajectory, with first and second derivatives; zero where there is none.
-
-    Args:
-        ocp: The problem.
-        dt: Model period [s].
-
-    Raises:
-        InputError: If the expression does not take the problem's ``(x, u)`` or ``(x, u, p)``.
-
-    Example:
-        >>> x, u = ca.MX.sym("x"), ca.MX.sym("u")
-        >>> power = ca.Function("power", [x, u], [x * u])
-        >>> cost = EconomicCost(OCP(2, [1.0], [1.0], [0.0], [-1.0], [1.0], economic=power), 0.1)
-        >>> round(cost.value(np.array([[1.0], [2.0], [9.0]]), np.ones((2, 1))), 6)
-        0.3
-    """
+    """The economic stage cost along a trajectory, with first and second derivatives; zero where there is none."""
 
     def __init__(self, ocp: OCP, dt: float) -> None:
         self.function, self._dt, self._n = ocp.economic, dt, ocp.horizon
@@ -292,12 +268,9 @@ def output_cost(output: ca.Function, q_y: ArrayLike) -> ca.Function:
 
 @dataclass(frozen=True)
 class Target:
-    """Reference and weight factors over the horizon, the last values held where the preview ends.
+    """Reference ``(N + 1, n_x)``, weight factors on ``q``, and parameters ``(N + 1, n_p)`` of the economic stage cost.
 
-    Args:
-        x: Reference ``(N + 1, n_x)``.
-        weight: Factors ``(N + 1, n_x)`` on ``q``.
-        p: Parameters of the economic stage cost ``(N + 1, n_p)``.
+    The last values hold where the preview ends.
     """
 
     x: Array
@@ -318,23 +291,8 @@ def weights_ok(weight: Array) -> bool:
 class Problem:
     """A model with an :class:`~hybrid_mpc.control.ocp.OCP`, and what every solver needs of the two.
 
-    Args:
-        model: The deployed model; ``n_h`` may be 0.
-        ocp: The problem.
-
     Raises:
         InputError: If problem and model do not fit, or the terminal weight cannot be found.
-
-    Example:
-        >>> from hybrid_mpc.machine.signals import Signal
-        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
-        >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
-        >>> problem = Problem(model, OCP(3, [1.0], [1.0], [0.0], [-9.0], [9.0], terminal=[[1.0]]))
-        >>> z = problem.run(np.zeros(1), np.ones((3, 1)))
-        >>> z[:, 0].tolist()
-        [0.0, 1.0, 2.0, 3.0]
-        >>> problem.cost(z, np.ones((3, 1)), np.zeros(1), problem.target(np.zeros((1, 1))))
-        17.0
     """
 
     def __init__(self, model: HybridModel, ocp: OCP) -> None:
@@ -347,22 +305,14 @@ class Problem:
         self.terminal = ocp.terminal_weight(model)
         self.soft = SoftRows(ocp)
         self.economic = EconomicCost(ocp, model.dt)
-        self._rollout = _rollout(model, ocp.horizon)
+        self.run = free_run(model, ocp.horizon)
         self._rows = np.arange(ocp.horizon + 1)
 
     def initial(self, estimate: Estimate, u: Array | None = None) -> Solution:
-        """A first plan: the model run freely from the estimate.
+        """A first plan, of status INITIAL: the model run freely from the estimate on ``u`` ``(N, n_u)``.
 
-        Args:
-            estimate: Where the plan starts.
-            u: Inputs ``(N, n_u)``; ``u[0]`` counts as the input held before the next solve. Default: zero, or the
-                bound next to it.
-
-        Returns:
-            A plan of status INITIAL. Where the free run diverges, the state is held at the estimate.
-
-        Raises:
-            InputError: If ``u`` has another shape or is not finite.
+        ``u[0]`` counts as the input held before the next solve; without ``u`` it is zero, or the bound next to it.
+        Where the free run diverges, the state is held at the estimate.
         """
         n, ocp = self.ocp.horizon, self.ocp
         start = np.tile(ocp.rest_input, (n, 1)) if u is None else input_plan(u, n, ocp.n_u, "u")
@@ -373,18 +323,8 @@ class Problem:
         x, h = z[:, : ocp.n_x], z[:, ocp.n_x :]
         return Solution(plan, x, h, estimate.d, float("nan"), Status.INITIAL, float("nan"), float("nan"), {})
 
-    def run(self, z0: Array, u: Array) -> Array:
-        """States and hidden states ``(N + 1, n_z)`` of the model from ``z0`` on inputs ``(N, n_u)``."""
-        self._rollout.inputs[0][:], self._rollout.inputs[1][:] = z0, u.ravel()
-        self._rollout()
-        return np.vstack([z0, self._rollout.outputs[0].reshape(len(u), -1)])
-
     def target(self, reference: ArrayLike, weight: ArrayLike | None = None) -> Target:
-        """Reference and factors over the horizon; the last value holds where the preview is shorter.
-
-        Raises:
-            InputError: If a shape is not ``(m, n_x)``, or of the reference ``(m, n_x + n_p)``, with m > 0.
-        """
+        """Reference and factors over the horizon; the last value holds where the preview is shorter."""
         rows = self._preview(reference, "reference", self.ocp.n_x + self.ocp.n_p)
         return Target(rows[:, : self.ocp.n_x], self.weights(weight), rows[:, self.ocp.n_x :])
 
@@ -407,14 +347,9 @@ class Problem:
 
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def cost(self, z: Array, u: Array, u_prev: Array, target: Target, excess: Array | None = None) -> float:
-        """Cost of a plan, penalties of soft bounds included.
+        """Cost of a plan with the trajectory ``z`` ``(N + 1, n_x)`` or longer rows, penalties of soft bounds included.
 
-        Args:
-            z: Trajectory ``(N + 1, n_x)`` or longer rows.
-            u: Inputs ``(N, n_u)``.
-            u_prev: Input held before ``(n_u,)``.
-            target: Reference and factors.
-            excess: Violations of the soft bounds ``(M,)``. Default: those of the trajectory.
+        ``excess`` ``(M,)`` are the violations of the soft bounds. Default: those of the trajectory.
         """
         x = z[:, : self.ocp.n_x]
         du = u - np.vstack([u_prev, u[:-1]])
@@ -427,12 +362,6 @@ class Problem:
             excess = self.soft.excess(self.soft.values(x, u)) if excess is None else excess
             total += self.model.dt * self.soft.penalty(excess)
         return total
-
-
-def _rollout(model: HybridModel, n: int) -> BufferedFunction:
-    z, u = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("u", model.n_u)
-    z_next = ca.vertcat(*model.step(z[: model.n_x], z[model.n_x :], u, model.w, model.p))
-    return BufferedFunction(ca.Function("z_step", [z, u], [z_next]).mapaccum("rollout", n))
 
 
 class Controller(Protocol):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -29,14 +29,7 @@ BOUND_TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class Answer:
-    """A QP's answer and what it is worth.
-
-    Args:
-        step: Of the inputs ``(N n_u,)``.
-        status: How the solve ended.
-        kkt: Relative KKT residual.
-        multipliers: Of the soft bounds' values ``(M,)``: what they cost per unit; none where none were given.
-    """
+    """A QP's answer: the step of the inputs ``(N n_u,)``, and what it is worth."""
 
     step: Array
     status: Status
@@ -94,19 +87,8 @@ class InputQP:
     the answer with them. Else it is solved with a slack for each of the few bounds that are violated most, and those
     that this answer violates are added, up to all.
 
-    Args:
-        ocp: The problem whose bounds hold.
-        soft: Its soft bounds. Default: none.
-        dt: Model period [s], by which penalties count. Default: 1.
-
     Source: Arnström, Bemporad, Axehill, *A dual active-set solver for embedded quadratic programming
     using recursive LDL' updates*, IEEE TAC 67 (2022).
-
-    Example:
-        >>> qp = InputQP(OCP(1, [1.0], [1.0], [0.0], [-1.0], [1.0]))
-        >>> answer = qp.solve(np.eye(1), np.array([-3.0]), np.zeros((1, 1)), np.zeros(1))
-        >>> answer.step, answer.status.name
-        (array([1.]), 'SOLVED')
     """
 
     def __init__(self, ocp: OCP, soft: SoftRows | None = None, dt: float = 1.0) -> None:
@@ -124,13 +106,7 @@ class InputQP:
         self._soft_solvers = {size: _daqp(n + size, len(rows) + size) for size in sizes}
 
     def by_blocks(self, slopes: Array) -> Array:
-        """Derivatives by the inputs, the last axis ``N n_u``, as those by the blocks' inputs ``M n_u``.
-
-        Example:
-            >>> qp = InputQP(OCP(3, [1.0], [1.0], [0.0], [-1.0], [1.0], blocks=(1, 2)))
-            >>> qp.by_blocks(np.array([1.0, 2.0, 3.0]))
-            array([1., 5.])
-        """
+        """Derivatives by the inputs, the last axis ``N n_u``, as those by the blocks' inputs ``M n_u``."""
         if self._ocp.blocks is None:
             return slopes
         each = slopes.reshape(*slopes.shape[:-1], self._ocp.horizon, self._ocp.n_u)
@@ -144,47 +120,35 @@ class InputQP:
         self, hessian: Array, gradient: Array, u: Array, u_prev: Array, soft: Soft = None,
         limits: Limits | None = None,
     ) -> Answer:  # fmt: skip
-        """Solve from a plan, and check the answer.
+        """Solve from a plan ``u`` ``(N, n_u)``, with ``u_prev`` held before, and check the answer.
 
-        Args:
-            hessian: ``(N n_u, N n_u)``, symmetric positive definite.
-            gradient: ``(N n_u,)``.
-            u: Plan ``(N, n_u)`` the step starts from.
-            u_prev: Input ``(n_u,)`` held before.
-            soft: Values of the soft bounds ``(M,)`` without a step, and their derivatives by the step
-                ``(M, N n_u)``. Default: none.
-            limits: As :meth:`OCP.bounds` has them. Default: the problem's own.
+        The Hessian is symmetric positive definite. ``soft`` are the values of the soft bounds without a step ``(M,)``,
+        and their derivatives by it ``(M, N n_u)``.
         """
-        if self._ocp.blocks is None:
-            return self._solve(hessian, gradient, u, u_prev, soft, limits)
-        if soft is not None:
-            soft = soft[0], self.by_blocks(soft[1])
-        given = self.blocked_hessian(hessian), self.by_blocks(gradient), u[self._starts]
-        answer = self._solve(*given, u_prev, soft, limits)
-        step = np.repeat(answer.step.reshape(-1, u.shape[1]), self._ocp.blocks, axis=0)
-        return replace(answer, step=step.ravel())
-
-    def _solve(
-        self, hessian: Array, gradient: Array, u: Array, u_prev: Array, soft: Soft, limits: Limits | None
-    ) -> Answer:
-        scale = self.scale
+        scale, u = self.scale, u[self._starts]
         bounds = (bound[self._starts] for bound in self._ocp.bounds(u_prev, limits))
         lower, upper = ((bound - u).ravel() / scale for bound in bounds)
         row_lower, row_upper = self._row_bounds(u, u_prev)
-        h, g = hessian * scale * scale[:, None], gradient * scale
-        size = float(np.max(np.diag(h)))
+        h = self.blocked_hessian(hessian) * scale * scale[:, None]
+        g, size = self.by_blocks(gradient) * scale, float(np.max(np.diag(h)))
         hard = _Scaled(h / size, g / size, self._rows, lower, upper, row_lower, row_upper)
         s, status, kkt = _check(hard, *_solve(self._solver, hard), self._n)
-        if soft is None or not status.ok:
-            return Answer(s * scale, status, kkt, np.zeros(0 if soft is None else soft[0].size))
-        return self._softly(hard, size, s, kkt, *soft)
+        multipliers = np.zeros(0 if soft is None else soft[0].size)
+        if soft is not None and status.ok:
+            s, status, kkt, multipliers = self._softly(hard, size, s, kkt, *soft)
+        step = (s[: self._n] * scale).reshape(u.shape)
+        if self._ocp.blocks is not None:
+            step = np.repeat(step, self._ocp.blocks, axis=0)
+        return Answer(step.ravel(), status, kkt, multipliers)
 
-    def _softly(self, hard: _Scaled, size: float, s: Array, kkt: float, value: Array, slope: Array) -> Answer:
-        """The answer with soft bounds, from the answer ``s`` without."""
+    def _softly(
+        self, hard: _Scaled, size: float, s: Array, kkt: float, value: Array, slope: Array
+    ) -> tuple[Array, Status, float, Array]:
+        """Answer, what it is worth, and multipliers with soft bounds, from the answer ``s`` without."""
         sides, n, rows = self._sides, self._n, value.size
         assert sides is not None
         multipliers = np.zeros(rows)
-        value, slope = sides.of(value), sides.of(slope) * self.scale
+        value, slope = sides.of(value), sides.of(self.by_blocks(slope)) * self.scale
         wanted = np.zeros(value.size, dtype=bool)
         for room, solver in self._soft_solvers.items():
             beyond = value + slope @ s[:n]
@@ -203,9 +167,9 @@ class InputQP:
             others = np.ones(value.size, dtype=bool)
             others[nearest] = False
             if not status.ok or not np.any((value + slope @ s[:n])[others] > 0):
-                return Answer(s[:n] * self.scale, status, kkt, multipliers)
+                return s, status, kkt, multipliers
             wanted[nearest] = True
-        return Answer(s[:n] * self.scale, Status.SOLVED, kkt, multipliers)
+        return s, Status.SOLVED, kkt, multipliers
 
     def _with_slacks(
         self, hard: _Scaled, size: float, value: Array, slope: Array, chosen: NDArray[np.int64]

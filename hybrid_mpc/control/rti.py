@@ -26,28 +26,13 @@ GROUP = 10
 
 @dataclass(frozen=True)
 class Prepared:
-    """Everything of an iteration that needs neither the estimate nor the reference.
+    """Everything of an iteration that needs neither the estimate nor the reference, linearized at ``u``, ``z``, ``d``.
 
     With ``dz = (x, h) - (x_bar, h_bar)`` the linearized prediction is ``dz_{k+1} = A_k dz_k + B_k (du_k + dd) +
-    defect_k``; of it, ``x`` depends on the inputs by ``from_u``.
-
-    Args:
-        u: Linearization inputs ``(N, n_u)``.
-        z: Linearization trajectory ``(N + 1, n_x + n_h)``.
-        d: Linearization disturbance ``(n_u,)``.
-        u_prev: Input ``(n_u,)`` held before the plan.
-        a_t: Transposed ``A_k`` ``(N, n_z, n_z)``.
-        b: ``B_k`` ``(N, n_z, n_u)``.
-        defects: ``(N, n_z)``.
-        from_u: Derivative of the states by the inputs ``((N + 1) n_x, N n_u)``.
-        weighted: State weights times ``from_u``.
-        hessian: Hessian of the cost by ``du`` ``(N n_u, N n_u)``.
-        weight: Weight factors ``(N + 1, n_x)``.
-        soft: Soft bounds' values ``(M,)``, their derivatives by their state ``(M, n_x)`` and by the inputs
-            ``(M, N n_u)``.
-        economic: First derivatives ``(N, n_x + n_u)`` of the economic stage costs and their convex second ones;
-            None where there are none.
-        milliseconds: Time the preparation took.
+    defect_k``; ``a_t`` holds the transposed ``A_k``. By the inputs' change, ``x`` has the derivative ``from_u``
+    ``((N + 1) n_x, N n_u)``, and the cost the ``hessian``; ``weighted`` is ``from_u`` times the state weights.
+    ``soft`` is what :meth:`SoftRows.condensed` gives, ``economic`` the first derivatives ``(N, n_x + n_u)`` of the
+    economic stage costs and their convex second ones; None where there are none.
     """
 
     u: Array
@@ -70,19 +55,7 @@ class Condenser:
     """Derivative of the states by the inputs, on scratch memory of its own: not for several threads at once.
 
     The products run transposed, on contiguous memory: a period's array is written by one product from the one before.
-    They cost ``N^2 n_u n_z^2`` operations.
-
-    Args:
-        n: Periods N.
-        n_z: Number of states and hidden states.
-        n_u: Number of inputs.
-        n_x: Number of states; they come first in z.
-
-    Example:
-        >>> Condenser(2, 1, 1, 1)(np.ones((2, 1, 1)), np.ones((2, 1, 1)))
-        array([[0., 0.],
-               [1., 0.],
-               [1., 1.]])
+    They cost ``N^2 n_u n_z^2`` operations. The states are the first ``n_x`` of z.
     """
 
     by_inputs: Array
@@ -108,14 +81,7 @@ class Condenser:
 def propagate(a: Sequence[Array], drift: Array, dz0: Array) -> Array:
     """``dz_{k+1} = A_k dz_k + drift_k`` from ``dz0``: ``(N + 1, n_z)``.
 
-    Args:
-        a: ``A_k`` ``(n_z, n_z)``; column by column in memory is fastest.
-        drift: ``(N, n_z)``.
-        dz0: ``(n_z,)``.
-
-    Example:
-        >>> propagate([np.array([[0.5]])] * 2, np.ones((2, 1)), np.zeros(1)).ravel()
-        array([0. , 1. , 1.5])
+    ``A_k`` column by column in memory is fastest.
     """
     dz = np.concatenate([dz0[None], drift])
     rows = list(dz)
@@ -127,14 +93,7 @@ def propagate(a: Sequence[Array], drift: Array, dz0: Array) -> Array:
 def adjoint(a_t: Array, last: Array, stages: Array) -> Array:
     """Multipliers ``(N, n_z)`` of the stages' results: derivative of the cost by ``z_1 .. z_N``.
 
-    Args:
-        a_t: Transposed ``A_k`` ``(N, n_z, n_z)``.
-        last: Derivative of the terminal cost by ``x_N`` ``(n_x,)``.
-        stages: Derivatives of the stage costs by ``x_0 .. x_{N-1}`` ``(N, n_x)``.
-
-    Example:
-        >>> adjoint(np.full((2, 1, 1), 0.5), np.ones(1), np.full((2, 1), 3.0)).ravel()
-        array([3.5, 1. ])
+    ``last`` ``(n_x,)`` is the derivative of the terminal cost, ``stages`` ``(N, n_x)`` are those of the stage costs.
     """
     n_x = last.size
     multipliers = np.zeros((len(a_t), a_t.shape[1]))
@@ -147,12 +106,7 @@ def adjoint(a_t: Array, last: Array, stages: Array) -> Array:
 
 
 def condense_hessians(stages: Array, from_u: Array, n_x: int) -> Array:
-    """Second derivatives by the stages' ``(x, u)`` ``(N, n_x + n_u, n_x + n_u)`` as those by the inputs.
-
-    Example:
-        >>> condense_hessians(np.full((1, 2, 2), 3.0), np.array([[0.0], [5.0]]), 1)
-        array([[3.]])
-    """
+    """Second derivatives by the stages' ``(x, u)`` ``(N, n_x + n_u, n_x + n_u)`` as those by the inputs."""
     n, size, _ = stages.shape
     n_u = size - n_x
     states = from_u[: n * n_x].reshape(n, n_x, n * n_u)
@@ -167,15 +121,7 @@ def condense_hessians(stages: Array, from_u: Array, n_x: int) -> Array:
 def condense_all(stages: Array, by_inputs: Array, n_x: int, n_u: int) -> Array:
     """Second derivatives by the stages' ``(x, u, h)`` ``(N, n, n)`` as those by the inputs ``(N n_u, N n_u)``.
 
-    Args:
-        stages: Second derivatives.
-        by_inputs: Derivatives ``(N + 1, N n_u, n_z)`` of states and hidden states by the inputs.
-        n_x: Number of states.
-        n_u: Number of inputs.
-
-    Example:
-        >>> condense_all(np.full((1, 3, 3), 3.0), np.zeros((2, 1, 2)), 1, 1)
-        array([[3.]])
+    ``by_inputs`` ``(N + 1, N n_u, n_z)`` are the derivatives of states and hidden states by the inputs.
     """
     n, few = len(stages), n_x + n_u
     z = np.r_[:n_x, few : stages.shape[1]]
@@ -245,18 +191,12 @@ class CondensedController(Controller):
 
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def prepare(self, previous: Solution, weight: Array | None = None) -> Prepared:
-        """Linearize and condense along the previous plan, shifted by one period.
+        """Linearize and condense along the previous plan, shifted by one period; its last input is repeated.
 
-        Args:
-            previous: The last plan. ``previous.u[0]`` is the input that is being held; the shifted plan
-                repeats its last input.
-            weight: Factors on ``q`` as :meth:`Controller.solve` takes them. Default: 1.
-
-        Raises:
-            InputError: If the weight has another shape.
+        ``previous.u[0]`` is the input that is being held; ``weight`` as :meth:`Controller.solve` takes it.
         """
         start = perf_counter()
-        u = self.ocp.held(np.vstack([previous.u[1:], previous.u[-1:]]))
+        u = self.ocp.held(previous.following)
         z = np.hstack([previous.x[1:], previous.h[1:]])
         derivatives = self.stages.at(z, u + previous.d)
         z = np.vstack([z, derivatives[0][-1:]])  # the appended period starts without a defect
@@ -275,17 +215,8 @@ class CondensedController(Controller):
     ) -> Solution:
         """Embed the estimate and the reference, solve the QP and check its answer.
 
-        Args:
-            prepared: What :meth:`prepare` returned.
-            estimate: The state now.
-            reference: As :meth:`Controller.solve` takes it.
-            limits: Bounds of the inputs for this solve. Default: the problem's own.
-
-        Returns:
-            The plan. If its status is not ``ok`` the inputs are the shifted previous plan.
-
-        Raises:
-            InputError: If the reference or the limits have another shape.
+        Arguments as :meth:`Controller.solve` takes them. If the plan's status is not ``ok`` its inputs are the shifted
+        previous plan.
         """
         start = perf_counter()
         target = replace(self.problem.target(reference), weight=prepared.weight)

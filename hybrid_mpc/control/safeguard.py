@@ -32,14 +32,10 @@ class Source(Enum):
 
 @dataclass(frozen=True)
 class Decision:
-    """The input of one period.
+    """The input ``(n_u,)`` of one period, always within the bounds and the limit of its change.
 
-    Args:
-        u: Input ``(n_u,)``, always within the bounds and the limit of its change.
-        source: Where it came from.
-        solution: The plan to go on from; its ``u[0]`` is ``u``.
-        status: How this period's solve ended.
-        age: Periods since the last successful solve.
+    ``solution`` is the plan to go on from; its ``u[0]`` is ``u``. ``status`` says how this period's solve ended,
+    ``age`` counts the periods since the last successful one.
     """
 
     u: Array
@@ -137,9 +133,6 @@ class SafeController:
             reference: ``(m, n_x)``, from the first period on in steps of ``dt``: the plan is optimised for it.
                 Default: none; the plan holds ``u``.
             weight: Factors on ``q`` ``(m, n_x)``, as the reference. Default: 1.
-
-        Raises:
-            InputError: If ``u`` has another size or is not finite, or another shape does not fit.
         """
         ocp = self.controller.ocp
         held = self.safe_input if u is None else np.clip(vector(u, ocp.n_u, "u"), ocp.u_min, ocp.u_max)
@@ -153,10 +146,10 @@ class SafeController:
         self, previous: Decision, estimate: Estimate, reference: Array, weight: Array | None = None,
         *, limits: Limits | None = None, prepared: Prepared | None = None,
     ) -> Decision:  # fmt: skip
-        """The input to hold from now on.
+        """The input to hold from now on; ``previous.u`` is being held.
 
         Args:
-            previous: The last decision; its ``u`` is being held.
+            previous: The last decision.
             estimate: The state now.
             reference: ``(m, n_x)`` from now on in steps of ``dt``.
             weight: Factors on ``q`` ``(m, n_x)``, as the reference. Default: 1.
@@ -169,19 +162,13 @@ class SafeController:
             solution = self.controller.solve(previous.solution, estimate, reference, weight, limits=limits)
         if solution.status.ok:
             u = self.controller.ocp.saturate(solution.u[0], previous.u, limits)
-            plan = replace(solution, u=np.vstack([u[None], solution.u[1:]]))
-            return Decision(u, Source.MPC, plan, solution.status, 0)
+            return Decision(u, Source.MPC, solution.beginning_with(u), solution.status, 0)
         return self._without(previous, estimate, reference, solution, limits)
 
     def prepare(self, previous: Decision, weight: Array | None = None) -> Prepared | None:
-        """The part of the next :meth:`decide` that needs no measurement, to be done while the input acts.
+        """The linearization, condensed: the part of the next :meth:`decide` that needs no measurement.
 
-        Args:
-            previous: The decision that the next one goes on from.
-            weight: Factors on ``q`` ``(m, n_x)`` of the next period. Default: 1.
-
-        Returns:
-            The linearization, condensed; None for a solver without such a part.
+        ``weight`` is that of the next period. None for a solver without such a part.
         """
         return None if self._rti is None else self._rti.prepare(previous.solution, weight)
 
@@ -189,9 +176,7 @@ class SafeController:
         self, previous: Decision, estimate: Estimate, reference: Array, *, limits: Limits | None = None
     ) -> Decision:
         """The input to hold where the solve has not come in time: as after a failed solve, status LATE."""
-        plan = previous.solution
-        shifted = np.vstack([plan.u[1:], plan.u[-1:]])
-        failed = replace(plan, u=shifted, status=Status.LATE)
+        failed = replace(previous.solution, u=previous.solution.following, status=Status.LATE)
         return self._without(previous, estimate, reference, failed, limits)
 
     def _without(
@@ -202,10 +187,9 @@ class SafeController:
         ocp, held = self.controller.ocp, previous.u
         u, source = self._instead(solution, estimate, np.asarray(reference, dtype=float), previous.age + 1)
         u = ocp.saturate(u, held, limits)
-        inputs = np.vstack([u[None], solution.u[1:]])
+        inputs = solution.beginning_with(u).u
         inputs = np.where(np.isfinite(inputs), inputs, u)
-        known = bool(np.all(np.isfinite(np.concatenate([estimate.x, estimate.h, estimate.d]))))
-        plan = self.controller.initial(estimate, inputs) if known else replace(solution, u=inputs)
+        plan = self.controller.initial(estimate, inputs) if estimate.finite else replace(solution, u=inputs)
         return Decision(u, source, plan, solution.status, previous.age + 1)
 
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
@@ -229,15 +213,7 @@ class SafeController:
 
 
 def checked_safe_input(given: ArrayLike | None, ocp: OCP) -> Array:
-    """The safe input ``(n_u,)`` of a problem; default: zero, or the limit next to it.
-
-    Raises:
-        InputError: If it has another size, is not finite, or is outside the limits.
-
-    Example:
-        >>> checked_safe_input(None, OCP(5, [1.0], [1.0], [0.0], [2.0], [9.0])).tolist()
-        [2.0]
-    """
+    """The safe input ``(n_u,)`` of a problem, within its limits; default: zero, or the limit next to it."""
     u = vector(ocp.rest_input if given is None else given, ocp.n_u, "safe_input")
     if np.any(u < ocp.u_min) or np.any(u > ocp.u_max):
         raise InputError(f"safe_input {u} is outside the limits {ocp.u_min} to {ocp.u_max}")

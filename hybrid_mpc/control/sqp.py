@@ -33,13 +33,9 @@ class Case:
 
 @dataclass(frozen=True)
 class Rollout:
-    """A run of the model on inputs.
+    """A run of the model on inputs ``(N, n_u)``; its cost includes the penalties of soft bounds.
 
-    Args:
-        u: Inputs ``(N, n_u)``.
-        z: Trajectory ``(N + 1, n_z)``.
-        soft: Values of the soft bounds ``(M,)``, their derivatives by their state ``(M, n_x)`` and input.
-        cost: Penalties of soft bounds included.
+    ``soft`` are the soft bounds' values ``(M,)`` and their derivatives by their state ``(M, n_x)`` and input.
     """
 
     u: Array
@@ -50,14 +46,7 @@ class Rollout:
 
 @dataclass(frozen=True)
 class Point:
-    """A run with its first derivatives.
-
-    Args:
-        run: The run.
-        derivatives: Successors, transposed ``A`` and ``B`` of the stages.
-        multipliers: Derivative of the cost by ``z_1 .. z_N``, soft bounds left out ``(N, n_z)``.
-        gradient: Of the cost by the inputs, soft bounds left out ``(N n_u,)``.
-    """
+    """A run with its first derivatives, soft bounds left out of multipliers ``(N, n_z)`` and gradient ``(N n_u,)``."""
 
     run: Rollout
     derivatives: Derivatives
@@ -124,22 +113,15 @@ class ReducedCost:
             case.target.p,
         )  # fmt: skip
 
-    def without_what_is_small(self, prepared: Prepared, curvature: Array) -> Array:
-        """See :meth:`StageCurvature.without_what_is_small`; nothing was condensed since ``prepared``."""
-        by_inputs = self.inner.condenser.by_inputs
-        return self.stages.without_what_is_small(curvature, prepared.hessian, prepared.from_u, by_inputs)
-
     def penalty(self, values: Array) -> float:
         """What values of the soft bounds cost."""
         soft = self.problem.soft
         return self.problem.model.dt * soft.penalty(soft.excess(values))
 
     def gap(self, values: Array, multipliers: Array) -> float:
-        """By how much the penalties of values may exceed those after the best change (Fenchel's inequality).
+        """By how much the penalties of values ``(M,)`` may exceed those after the best change (Fenchel's inequality).
 
-        Args:
-            values: Of the soft bounds ``(M,)``.
-            multipliers: Under which everything else is stationary ``(M,)``.
+        Under the multipliers ``(M,)`` everything else is stationary.
         """
         soft, dt, acting = self.problem.soft, self.problem.model.dt, np.flatnonzero(multipliers)
         mu = multipliers[acting]
@@ -179,12 +161,9 @@ AGAIN = (1, 4, 16, 64)
 class _Step:
     """What a search has found.
 
-    Args:
-        run: The model on the step; None if no step lowers the cost.
-        answer: The QP's.
-        hessian: The damped Hessian that the answer belongs to.
-        promised: What the model without damping promises of the step before its correction.
-        own: That model's curvature along the step, in the damping's metric.
+    ``run`` is None if no step lowers the cost; ``hessian`` is the damped one that the QP's answer belongs to.
+    ``promised`` is what the model without damping promises of the step before its correction, ``own`` that model's
+    curvature along it, in the damping's metric.
     """
 
     run: Rollout | None
@@ -195,15 +174,7 @@ class _Step:
 
 
 class Descent:
-    """The steps of one solve, from a first point on.
-
-    Args:
-        cost: Cost and derivatives.
-        case: What the solve is given.
-        at: The first run; its cost is finite.
-        curvature: Second derivatives from the last solve, shifted. Default: taken at the first run.
-        tolerance: See :class:`SQPController`.
-    """
+    """The steps of one solve, from a first point on, whose cost is finite."""
 
     def __init__(
         self, cost: ReducedCost, case: Case, at: Point, curvature: Array | None, tolerance: float
@@ -276,9 +247,11 @@ class Descent:
         self, prepared: Prepared, damped: Array, answer: Answer, promised: float
     ) -> tuple[Rollout | None, Answer]:
         """The run on a step if it lowers the cost enough, or on the step corrected by what it was found to bend."""
-        least, before = self.at.run.cost - ARMIJO * promised, np.inf
+        start, bounds = self.at.run, self._cost.inner.ocp.bounds(self._case.u_prev, self._case.limits)
+        least, before = start.cost - ARMIJO * promised, np.inf
         for i in range(1 + CORRECTIONS):
-            run = self._trial(answer.step)
+            u = np.clip(start.u + answer.step.reshape(start.u.shape), *bounds)
+            run = self._cost.run(start.z[0], u, self._case)
             if run.cost <= least:
                 return run, answer
             if i == CORRECTIONS or not run.cost < before:
@@ -300,11 +273,6 @@ class Descent:
         soft = (value, slope) if value.size else None
         case = self._case
         return self._cost.inner.qp.solve(hessian, gradient, self.at.run.u, case.u_prev, soft, case.limits)
-
-    def _trial(self, step: Array) -> Rollout:
-        run, bounds = self.at.run, self._cost.inner.ocp.bounds(self._case.u_prev, self._case.limits)
-        u = np.clip(run.u + step.reshape(run.u.shape), *bounds)
-        return self._cost.run(run.z[0], u, self._case)
 
     def _promised(self, prepared: Prepared, hessian: Array, step: Array) -> float:
         """By how much the convex model falls along a step."""
@@ -350,8 +318,10 @@ class Descent:
         if old is not None and (self._taken in AGAIN if small else self._taken > 0):
             old = None
         curvature = cost.curvature(self.at, self._case, multipliers, self._soft, old)
-        if old is None:
-            curvature = cost.without_what_is_small(prepared, curvature)
+        if old is None:  # nothing was condensed since ``prepared``
+            curvature = cost.stages.without_what_is_small(
+                curvature, prepared.hessian, prepared.from_u, cost.inner.condenser.by_inputs
+            )
         self._stale, self._fresh, self._taken = False, True, self._taken + 1
         return curvature
 
@@ -387,15 +357,13 @@ class SQPController(Controller):
     every QP, soft bounds are penalties within the cost. So the cost is the merit function: a step is made when it
     lowers the cost by a share (1e-4) of what the QP's convex model promises. One that does not is first corrected by
     what states and soft bounds were found to bend along it (Fletcher's second-order correction), then the QP is solved
-    again with more curvature in all directions (Levenberg and Marquardt's damping). The damping carries over to the
-    next iteration and falls where steps keep their promise.
+    again with more damping (Levenberg and Marquardt), which carries over and falls where steps keep their promise.
 
     The QP's Hessian is Gauss-Newton's and the second derivatives of dynamics and soft bounds, weighted with their
     multipliers: under a steep friction law or a trained network Gauss-Newton alone converges slowly. They are
-    differences of the exact Jacobians (``n_x + n_u + n_h`` evaluations) and come along with a plan, shifted by a
-    period. They are taken anew where the Hessian got more than a tenth of the residual wrong. Where the sum is not
-    convex it is made so, if possible in the inputs alone that lie on a bound. The plan is independent of the first
-    guess but for the basin it lies in.
+    differences of the exact Jacobians, come along with a plan, shifted by a period, and are taken anew where the
+    Hessian got more than a tenth of the residual wrong. Where the sum is not convex it is made so, if possible in the
+    inputs alone that lie on a bound. The plan is independent of the first guess but for the basin it lies in.
 
     Args:
         model: The deployed model; ``n_h`` may be 0. It must not be so unstable that a run over the horizon
@@ -413,18 +381,7 @@ class SQPController(Controller):
     33 (1985); Fletcher, *Second order corrections for non-differentiable optimization*, Numerical Analysis,
     Lecture Notes in Mathematics 912 (1982).
 
-    Example:
-        >>> import casadi as ca
-        >>> from hybrid_mpc.estimate.kalman import TrueState
-        >>> from hybrid_mpc.machine.signals import Signal
-        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
-        >>> model = HybridModel.of("sine", 1.0, level, (Signal("u", "-"),), level,
-        ...     x=x, u=u, x_next=x + ca.sin(u), xdot=u, y=x)
-        >>> controller = SQPController(model, OCP(5, [1.0], [1.0], [0.0], [-1.5], [1.5]))
-        >>> estimate = TrueState(model).start([2.0])
-        >>> solution = controller.solve(controller.initial(estimate), estimate, np.zeros((6, 1)))
-        >>> solution.status.name, solution.defect
-        ('SOLVED', 0.0)
+    Example: as :class:`~hybrid_mpc.control.rti.CondensedController`.
     """
 
     def __init__(
@@ -455,7 +412,7 @@ class SQPController(Controller):
         """
         start = perf_counter()
         case = Case(estimate.d, previous.u[0], self.problem.target(reference, weight), limits)
-        u = self._admissible(np.vstack([previous.u[1:], previous.u[-1:]]), case)
+        u = self._admissible(previous.following, case)
         run = self._cost.run(np.concatenate([estimate.x, estimate.h]), u, case)
         at = self._cost.at(run, case)
         descent = Descent(self._cost, case, at, self._shifted(previous), self._tolerance)

@@ -19,10 +19,9 @@ LEVEL = 0.95
 
 @dataclass(frozen=True)
 class Innovations:
-    """Innovations of a filter along one recording, the first ``skip`` samples left out.
+    """Innovations of a filter along one recording, the first samples left out; ``t`` [s] since the recording's begin.
 
     Args:
-        t: Times ``(n,)`` [s] since the recording's begin.
         normalised: ``L^-1 (y - y_predicted)`` with ``L L' = C P C' + R``, ``(n, n_y)`` [-]; white with unit
             variance if the filter's assumptions hold; NaN in rows with a missing output.
         nis: Normalised innovations squared ``(n,)`` [-]; NaN without a measurement. Of a switching filter they are
@@ -40,17 +39,10 @@ class Innovations:
 class Consistency:
     """Two tests of a filter's innovations, each passed by 95 % of the consistent filters.
 
-    Args:
-        runs: Innovations of each recording.
-        samples: Samples with a measurement.
-        mean_nis: Mean NIS [-].
-        nis_band: 95 % band of the mean NIS of a consistent filter. Above it the filter assumes too little noise (or its
-            model is wrong), below it too much.
-        nis_inside: Share of single NIS below the 95 % point of their own distribution.
-        autocorrelation: Of the normalised innovations at lags 1, 2, ..., ``(lags, n_y)`` [-].
-        correlation_band: Half width of the 95 % band of one autocorrelation of white innovations.
-        ljung_box: Ljung-Box statistic, summed over the outputs.
-        ljung_box_limit: Its 95 % point for white innovations.
+    Above its band the mean NIS says that the filter assumes too little noise (or its model is wrong), below it too
+    much. ``nis_inside`` is the share of single NIS below the 95 % point of their own distribution. Of the normalised
+    innovations there are the autocorrelations ``(lags, n_y)`` at lags 1, 2, ..., with half the width of the 95 % band
+    of one, and the Ljung-Box statistic, summed over the outputs, with its 95 % point; both for white innovations.
     """
 
     runs: tuple[Innovations, ...]
@@ -88,20 +80,10 @@ def consistency(
     consistent switching filter has the same mean NIS, but its single NIS scatter more than band and ``nis_inside``
     assume: its innovations are a mixture of Gaussians.
 
-    Args:
-        estimator: The filter.
-        recordings: Inputs ``u (n, n_u)`` and measurements ``y (n, n_y)`` on the model's grid; NaN where missing.
-        skip: Samples left out at the start of each, while the filter settles. Default 25.
-        lags: Largest lag [samples]. Default 20.
-
-    Raises:
-        InputError: If ``skip`` or ``lags`` is not positive, or too few samples are left (five times ``lags``).
+    The first ``skip`` samples of each recording are left out, while the filter settles; ``lags`` is the largest lag.
 
     Source: Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to Tracking and Navigation*, 2001, section
     5.4; Ljung, Box, *On a measure of lack of fit in time series models*, Biometrika 65 (1978).
-
-    Example:
-        ``consistency(ekf, test_recordings).nis_passes``
     """
     from scipy.stats import chi2, norm
 
@@ -135,16 +117,7 @@ def consistency(
 
 
 def innovations(estimator: Filter, recording: Recording, skip: int = 25) -> Innovations:
-    """Innovations of a filter along a recording.
-
-    Args:
-        estimator: The filter.
-        recording: Inputs and measurements on the model's grid.
-        skip: Samples left out at the start. Default 25.
-
-    Raises:
-        InputError: If the shapes do not fit.
-    """
+    """Innovations of a filter along a recording on the model's grid, the first ``skip`` samples left out."""
     n_y, n = estimator.model.n_y, len(recording.y)
     if recording.y.shape != (n, n_y) or recording.u.shape != (n, estimator.model.n_u) or n == 0:
         raise InputError(

@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate, Estimator, TrueState
-from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
 
@@ -29,10 +28,8 @@ class Predictor(Estimator, Protocol):
 class DelayedEstimate(Estimate):
     """An estimate of the instant at which the next input acts, and what it was predicted from.
 
-    Args:
-        filtered: Estimate of the instant of the last measurement that has arrived.
-        inputs: Inputs held since then, the oldest first, each for a period.
-        missing: Measurements still to come that were taken before the start.
+    ``filtered`` is the estimate of the last measurement's instant, ``inputs`` are those held since, the oldest first.
+    ``missing`` measurements that were taken before the start are still to come.
     """
 
     filtered: Estimate
@@ -60,7 +57,7 @@ class DelayCompensation:
 
     Example:
         >>> import casadi as ca
-        >>> from hybrid_mpc.machine.signals import Signal
+        >>> from hybrid_mpc.machine.signals import Signal; from hybrid_mpc.model.model import HybridModel
         >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
         >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
         >>> ahead = DelayCompensation(TrueState(model), input_delay=1)
@@ -70,33 +67,18 @@ class DelayCompensation:
     """
 
     def __init__(self, estimator: Predictor, *, sensor_delay: int = 0, input_delay: int = 0) -> None:
-        for name, delay in (("sensor_delay", sensor_delay), ("input_delay", input_delay)):
-            if int(delay) != delay or delay < 0:
-                raise InputError(f"{name}: a whole number of periods needed, not negative; got {delay}")
-        self._estimator, self._sensor, self._input = estimator, int(sensor_delay), int(input_delay)
-
-    @property
-    def model(self) -> HybridModel:
-        """The model of the wrapped estimator."""
-        return self._estimator.model
-
-    @property
-    def estimator(self) -> Predictor:
-        """The wrapped estimator."""
-        return self._estimator
+        self.estimator, self.model = estimator, estimator.model
+        self._sensor = whole_periods(sensor_delay, "sensor_delay")
+        self._input = whole_periods(input_delay, "input_delay")
 
     def start(self, y: ArrayLike, t: float = 0.0) -> DelayedEstimate:
         """First estimate, of the instant ``t`` plus the input delay, from the first measurement."""
         resting = (np.zeros(self.model.n_u),) * self._input
-        first = self._estimator.start(np.asarray(y, dtype=float), t)
+        first = self.estimator.start(np.asarray(y, dtype=float), t)
         return self._ahead(first, resting, self._sensor)
 
     def update(self, estimate: Estimate, y: ArrayLike, u_prev: ArrayLike) -> DelayedEstimate:
-        """Estimate one period later, from what arrives and the input decided since.
-
-        Raises:
-            InputError: If the estimate is not one of this class.
-        """
+        """Estimate one period later, from what arrives and the input decided since."""
         if not isinstance(estimate, DelayedEstimate):
             raise InputError("DelayCompensation goes on from its own estimates only; begin with start()")
         base, y = estimate.filtered, np.asarray(y, dtype=float)
@@ -104,17 +86,24 @@ class DelayCompensation:
         if estimate.missing:
             missing = estimate.missing - 1
             if not missing:  # this one was taken at the start itself
-                base = self._estimator.correct(base, y)
+                base = self.estimator.correct(base, y)
             return self._ahead(base, inputs, missing)
-        return self._ahead(self._estimator.update(base, y, inputs[0]), inputs[1:], 0)
+        return self._ahead(self.estimator.update(base, y, inputs[0]), inputs[1:], 0)
 
     def _ahead(self, base: Estimate, inputs: tuple[Array, ...], missing: int) -> DelayedEstimate:
         now = base
         for u in inputs:
-            now = self._estimator.predict(now, u)
+            now = self.estimator.predict(now, u)
         return DelayedEstimate(
             now.t, now.x, now.h, now.d, now.P, base.innovation, base.nis, base, inputs, missing
         )
+
+
+def whole_periods(delay: float, name: str) -> int:
+    """A delay in periods, whole and not negative."""
+    if int(delay) != delay or delay < 0:
+        raise InputError(f"{name}: a whole number of periods needed, not negative; got {delay}")
+    return int(delay)
 
 
 def filtered(estimate: Estimate) -> Estimate:

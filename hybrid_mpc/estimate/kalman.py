@@ -45,6 +45,11 @@ class Estimate:
     innovation: Array
     nis: float
 
+    @property
+    def finite(self) -> bool:
+        """Whether all estimated values are finite."""
+        return bool(np.all(np.isfinite(np.concatenate([self.x, self.h, self.d]))))
+
 
 class Estimator(Protocol):
     """What a closed loop needs of an estimator. Both methods are pure."""
@@ -117,7 +122,7 @@ class ExtendedKalmanFilter:
         variance_y = _variance(sigma_y, n_y, "sigma_y")
         if not np.all(variance_y > 0):
             raise InputError(f"sigma_y must be positive, got {np.asarray(sigma_y)}")
-        self._model, self._sizes = model, (n_x, n_h, n_u, n_y)
+        self.model, self._sizes = model, (n_x, n_h, n_u, n_y)
         self._noise_y = variance_y
         self._noise = np.concatenate(
             [_variance(sigma_x, n_x, "sigma_x"), hidden, _variance(sigma_d, n_u, "sigma_d")]
@@ -131,27 +136,20 @@ class ExtendedKalmanFilter:
         self._step.inputs[3][:], self._step.inputs[4][:] = model.w, model.p
 
     @property
-    def model(self) -> HybridModel:
-        """The model of this filter."""
-        return self._model
-
-    @property
     def noise(self) -> tuple[Array, Array]:
         """Variances of the process noise of ``(x, h, d)`` a period ``(n,)``, and of the measurement ``(n_y,)``."""
         return self._noise.copy(), self._noise_y.copy()
 
     def lost(self, estimate: Estimate) -> bool:
         """Whether an estimate is not finite, or so uncertain that nothing is known any more."""
-        mean = np.concatenate([estimate.x, estimate.h, estimate.d])
-        known = np.all(np.isfinite(mean)) and np.max(np.diag(estimate.P)) <= self._lost
-        return not known
+        return not (estimate.finite and np.max(np.diag(estimate.P)) <= self._lost)
 
     def start(self, y: ArrayLike, t: float = 0.0) -> Estimate:
         """Estimate at rest: the smallest state with the output ``y`` ``(n_y,)``, ``d`` zero.
 
         Elements of ``y`` that are not finite count as the output at the state zero.
         """
-        model = self._model
+        model = self.model
         x, u = np.zeros(model.n_x), np.zeros(model.n_u)
         target = np.asarray(y, dtype=float).ravel()
         for _ in range(20):  # Newton; one step if the outputs are linear in the state
@@ -178,17 +176,12 @@ class ExtendedKalmanFilter:
         p = f @ estimate.P @ f.T
         p.flat[:: p.shape[0] + 1] += self._noise
         empty = np.full(n_y, np.nan)
-        return Estimate(estimate.t + self._model.dt, x.copy(), h.copy(), estimate.d, p, empty, float("nan"))
+        return Estimate(estimate.t + self.model.dt, x.copy(), h.copy(), estimate.d, p, empty, float("nan"))
 
     def correct(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> Estimate:
-        """Estimate after the measurement ``y`` ``(n_y,)``, in Joseph form.
+        """Estimate after the measurement ``y`` ``(n_y,)``, in Joseph form; ``u`` is the input of the output equation.
 
         Elements of ``y`` that are not finite are left out; if all are, the estimate comes back as it is.
-
-        Args:
-            estimate: The predicted estimate.
-            y: Measurement ``(n_y,)``.
-            u: Input ``(n_u,)`` of the output equation. Default: zero.
         """
         return self.assess(estimate, y, u)[0]
 
@@ -221,15 +214,10 @@ class ExtendedKalmanFilter:
         return after, -0.5 * (nis + size)
 
     def innovation_covariance(self, estimate: Estimate, u: ArrayLike | None = None) -> Array:
-        """Covariance ``(n_y, n_y)`` that a predicted estimate gives its innovation: ``C P C' + R``.
-
-        Args:
-            estimate: The predicted estimate.
-            u: Input ``(n_u,)`` of the output equation. Default: zero.
-        """
+        """Covariance ``(n_y, n_y)`` that a predicted estimate gives its innovation: ``C P C' + R``."""
         held = estimate.d if u is None else np.asarray(u, dtype=float).ravel() + estimate.d
         _, c_x, c_u = self._measured(estimate.x, held)
-        c = np.hstack([c_x, np.zeros((self._model.n_y, self._model.n_h)), c_u])
+        c = np.hstack([c_x, np.zeros((self.model.n_y, self.model.n_h)), c_u])
         s: Array = c @ estimate.P @ c.T + np.diag(self._noise_y)
         return 0.5 * (s + s.T)
 
@@ -267,10 +255,10 @@ class ExtendedKalmanFilter:
         """
         ys, us = np.asarray(y, dtype=float), np.asarray(u, dtype=float)
         n = len(ys)
-        if n == 0 or ys.shape != (n, self._model.n_y) or us.shape != (n, self._model.n_u):
+        if n == 0 or ys.shape != (n, self.model.n_y) or us.shape != (n, self.model.n_u):
             raise InputError(
                 f"y {ys.shape} and u {us.shape} given; "
-                f"needed: (n, {self._model.n_y}) and (n, {self._model.n_u}) with n > 0"
+                f"needed: (n, {self.model.n_y}) and (n, {self.model.n_u}) with n > 0"
             )
         estimates = [self.start(ys[0], t)]
         for y_k, u_k in zip(ys[1:], us[:-1], strict=True):
@@ -286,13 +274,7 @@ def _variance(sigma: ArrayLike, size: int, name: str) -> Array:
 
 
 def output_with_jacobian(model: HybridModel) -> ca.Function:
-    """Output ``(n_y,)`` of a model at ``(x, u)`` and its dense Jacobians by ``x`` and by ``u``.
-
-    Args:
-        model: The model.
-
-    Example: ``y, c_x, c_u = output_with_jacobian(model)(x, u)``
-    """
+    """Output ``(n_y,)`` of a model at ``(x, u)`` and its dense Jacobians by ``x`` and by ``u``."""
     x, u = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
     y = model.output(x, u, model.w, model.p)
     return ca.Function(
@@ -315,20 +297,11 @@ class TrueState:
     """
 
     def __init__(self, model: HybridModel) -> None:
-        self._model = model
-
-    @property
-    def model(self) -> HybridModel:
-        """The oracle model."""
-        return self._model
+        self.model = model
 
     def start(self, y: ArrayLike, t: float = 0.0) -> Estimate:
-        """Estimate that is the truth ``y = (x, hidden)``, ``(n_x + n_h,)`` or longer; ``d`` zero.
-
-        Raises:
-            InputError: If the plant has fewer hidden states than the model.
-        """
-        m, z = self._model, np.asarray(y, dtype=float).ravel()
+        """Estimate that is the truth ``y = (x, hidden)``, ``(n_x + n_h,)`` or longer; ``d`` zero."""
+        m, z = self.model, np.asarray(y, dtype=float).ravel()
         n_z = m.n_x + m.n_h
         if z.size < n_z:
             raise InputError(f"true state: the plant gives {z.size} states, the oracle model needs {n_z}")
@@ -337,7 +310,7 @@ class TrueState:
 
     def predict(self, estimate: Estimate, u: ArrayLike) -> Estimate:
         """The model's own step with ``u`` ``(n_u,)`` held."""
-        m = self._model
+        m = self.model
         x, h = (
             v.full().ravel() for v in m.step(estimate.x, estimate.h, np.asarray(u, dtype=float), m.w, m.p)
         )
@@ -349,4 +322,4 @@ class TrueState:
 
     def update(self, estimate: Estimate, y: ArrayLike, u_prev: ArrayLike) -> Estimate:
         """The truth one period later; ``u_prev`` is not used."""
-        return self.start(y, estimate.t + self._model.dt)
+        return self.start(y, estimate.t + self.model.dt)

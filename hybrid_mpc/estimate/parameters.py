@@ -17,6 +17,7 @@ from hybrid_mpc.model.model import (
     HybridModel,
     ManyPoints,
     SideBySide,
+    incidence,
     inlined,
     prior_acceleration,
     step_function,
@@ -204,18 +205,12 @@ def _acceleration(
     model: HybridModel, given: ca.Function, groups: Mapping[str, Sequence[str]], most: float
 ) -> ca.Function:
     """``(x, u, theta, w, p) -> a`` of the prior; one function, so that it is exactly itself at equal arguments."""
-    known = (*(p.name for p in model.parameters), *(f"gain of {s.name}" for s in model.inputs))
-    incidence = np.zeros((len(known), len(groups)))
-    for j, (group, names) in enumerate(groups.items()):
-        if not names:
-            raise InputError(f"parameter states: group {group!r} is empty")
-        for name in names:
-            if name not in known:
-                raise InputError(f"parameter states: no parameter {name!r}; there are: {', '.join(known)}")
-            incidence[known.index(name), j] = 1.0
+    if empty := [group for group, names in groups.items() if not names]:
+        raise InputError(f"parameter states: group {empty[0]!r} is empty")
+    changed = ca.DM(incidence(model, groups, "parameter states"))
     x, _, u, w, p = step_symbols(model)
     theta, bound = ca.MX.sym("theta", len(groups)), math.log(most)
-    factors = ca.exp(ca.DM(incidence) @ (bound * ca.tanh(theta / bound)))
+    factors = ca.exp(changed @ (bound * ca.tanh(theta / bound)))
     a = given(x, factors[model.n_p :] * u, w, factors[: model.n_p] * p)
     return _expanded(ca.Function("acceleration", [x, u, theta, w, p], [a]))
 

@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate, ExtendedKalmanFilter
-from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
 NEGLIGIBLE = 0.01
@@ -26,12 +25,7 @@ load that comes or goes or a part that breaks every 40 s; each lasts a period or
 
 @dataclass(frozen=True)
 class SwitchingEstimate(Estimate):
-    """Estimate of several filters: its own fields are their means, weighted by probability.
-
-    Args:
-        modes: Estimate of each filter.
-        probability: Of each mode ``(m,)``; they sum to one.
-    """
+    """Estimates of several filters and the probability ``(m,)`` of each; its own fields are their weighted means."""
 
     modes: tuple[Estimate, ...]
     probability: Array
@@ -56,7 +50,7 @@ class SwitchingFilter:
 
     Example:
         >>> import casadi as ca
-        >>> from hybrid_mpc.machine.signals import Signal
+        >>> from hybrid_mpc.machine.signals import Signal; from hybrid_mpc.model.model import HybridModel
         >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
         >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
         >>> quiet, quick = (ExtendedKalmanFilter(model, sigma_y=[0.1], sigma_x=[0.01], sigma_x0=[0.1],
@@ -70,66 +64,43 @@ class SwitchingFilter:
     """
 
     def __init__(self, filters: Sequence[ExtendedKalmanFilter], transition: ArrayLike) -> None:
-        m, p = len(filters), np.asarray(transition, dtype=float)
+        m, p = len(filters), np.array(transition, dtype=float)
         if not m or any(f.model is not filters[0].model for f in filters):
             raise InputError("a switching filter needs at least one filter, all on the same model")
         if p.shape != (m, m) or np.any(p < 0) or not np.allclose(p.sum(axis=1), 1.0, atol=1e-9):
             raise InputError(
                 f"transition: probabilities of shape {(m, m)} whose rows sum to 1 needed, got {p.tolist()}"
             )
-        self._filters, self._transition = tuple(filters), p
+        self.model, self.filters, self.transition = filters[0].model, tuple(filters), p
         self._first = _stationary(p)
-
-    @property
-    def model(self) -> HybridModel:
-        """The model of all its filters."""
-        return self._filters[0].model
-
-    @property
-    def filters(self) -> tuple[ExtendedKalmanFilter, ...]:
-        """The modes."""
-        return self._filters
-
-    @property
-    def transition(self) -> Array:
-        """Probability per period ``(m, m)`` to go from mode i to mode j."""
-        return self._transition.copy()
 
     def start(self, y: ArrayLike, t: float = 0.0) -> SwitchingEstimate:
         """Estimate at rest at ``y`` ``(n_y,)``; see :meth:`ExtendedKalmanFilter.start`."""
         empty = np.full(self.model.n_y, np.nan)
-        return _together([f.start(y, t) for f in self._filters], self._first, empty, float("nan"))
+        return _together([f.start(y, t) for f in self.filters], self._first, empty, float("nan"))
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
     def predict(self, estimate: Estimate, u: ArrayLike) -> SwitchingEstimate:
-        """Estimate one period later with the input ``u`` ``(n_u,)`` held.
-
-        Raises:
-            InputError: If the estimate is not one of this class.
-        """
+        """Estimate one period later with the input ``u`` ``(n_u,)`` held."""
         modes, probability = self._predicted(self._own(estimate), u)
         return _together(modes, probability, np.full(self.model.n_y, np.nan), float("nan"))
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
     def _predicted(self, before: SwitchingEstimate, u: ArrayLike) -> tuple[list[Estimate], Array]:
         """Estimate of each filter one period later, and the filters' probabilities ``(m,)``."""
-        joint = before.probability[:, None] * self._transition
+        joint = before.probability[:, None] * self.transition
         after = joint.sum(axis=0)
         share = joint / np.where(after > 0, after, 1.0)
         share = np.where(share < NEGLIGIBLE, 0.0, share)
         share = share / share.sum(axis=0)
         modes = [
             f.predict(_mixed(before.modes, share[:, j]), u) if after[j] > 0 else f.predict(before.modes[j], u)
-            for j, f in enumerate(self._filters)
+            for j, f in enumerate(self.filters)
         ]
         return modes, after
 
     def correct(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> SwitchingEstimate:
-        """Estimate after the measurement ``y`` ``(n_y,)``; see :meth:`ExtendedKalmanFilter.correct`.
-
-        Raises:
-            InputError: If the estimate is not one of this class.
-        """
+        """Estimate after the measurement ``y`` ``(n_y,)``; see :meth:`ExtendedKalmanFilter.correct`."""
         return self.assess(estimate, y, u)[0]
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
@@ -147,7 +118,7 @@ class SwitchingFilter:
         self, predicted: Sequence[Estimate], probability: Array, y: ArrayLike, u: ArrayLike | None
     ) -> tuple[SwitchingEstimate, float]:
         """Estimate after a measurement of which something is there, and its log-likelihood."""
-        found = [f.assess(e, y, u) for f, e in zip(self._filters, predicted, strict=True)]
+        found = [f.assess(e, y, u) for f, e in zip(self.filters, predicted, strict=True)]
         likelihood = np.array([value for _, value in found])
         largest = float(np.max(np.where(np.isfinite(likelihood), likelihood, -np.inf)))
         weight = probability * np.exp(np.where(np.isfinite(likelihood), likelihood, -np.inf) - largest)
@@ -160,7 +131,7 @@ class SwitchingFilter:
 
     def innovation_covariance(self, estimate: Estimate, u: ArrayLike | None = None) -> Array:
         """Covariance ``(n_y, n_y)`` that a predicted estimate gives its innovation; that of the mixture."""
-        return self._filters[0].innovation_covariance(estimate, u)
+        return self.filters[0].innovation_covariance(estimate, u)
 
     def update(self, estimate: Estimate, y: ArrayLike, u_prev: ArrayLike) -> SwitchingEstimate:
         """:meth:`predict` with the input ``u_prev`` held since, then :meth:`correct` with ``y``.
@@ -170,12 +141,12 @@ class SwitchingFilter:
         modes, probability = self._predicted(self._own(estimate), u_prev)
         if not np.any(np.isfinite(np.asarray(y, dtype=float))):
             return _together(modes, probability, np.full(self.model.n_y, np.nan), float("nan"))
-        if any(f.lost(e) for f, e in zip(self._filters, modes, strict=True)):
+        if any(f.lost(e) for f, e in zip(self.filters, modes, strict=True)):
             return self.start(y, modes[0].t)
         return self._assessed(modes, probability, y, u_prev)[0]
 
     def _own(self, estimate: Estimate) -> SwitchingEstimate:
-        if not isinstance(estimate, SwitchingEstimate) or len(estimate.modes) != len(self._filters):
+        if not isinstance(estimate, SwitchingEstimate) or len(estimate.modes) != len(self.filters):
             raise InputError("SwitchingFilter goes on from its own estimates only; begin with start()")
         return estimate
 

@@ -77,13 +77,7 @@ def process_noise(model: HybridModel, recordings: Sequence[Known], most: int = 4
 def log_likelihood(estimator: Filter, recording: Recording, skip: int = 25) -> float:
     """Log-likelihood of the measured outputs under a filter's own innovations and their variances.
 
-    Args:
-        estimator: The filter; an extended Kalman filter or several that switch.
-        recording: Inputs and measurements.
-        skip: Samples left out at the start, while the filter settles. Default 25.
-
-    Returns:
-        The sum over samples, without the constant; minus infinity where the filter is lost.
+    The sum over samples, the first ``skip`` left out, without the constant; minus infinity where the filter is lost.
 
     Source: Schweppe, *Evaluation of likelihood functions for Gaussian signals*, IEEE T-IT 11 (1965).
     """
@@ -101,15 +95,6 @@ def log_likelihood(estimator: Filter, recording: Recording, skip: int = 25) -> f
 def most_likely(
     make: Callable[[float], Filter], recordings: Sequence[Recording], scales: Sequence[float]
 ) -> float:
-    """The one of ``scales`` whose filter ``make(scale)`` makes the recordings most likely.
-
-    Args:
-        make: Builds the filter for a scale of its process noise.
-        recordings: Undisturbed recordings, e.g. the training ones.
-        scales: Scales to try.
-
-    Example:
-        ``scale = most_likely(lambda s: ExtendedKalmanFilter(model, sigma_x=s * base, ...), runs, (0.1, 1.0))``
-    """
+    """The one of ``scales`` whose filter ``make(scale)`` makes the recordings, undisturbed ones, most likely."""
     values = [sum(log_likelihood(make(s), r) for r in recordings) for s in scales]
     return float(scales[int(np.argmax(values))])

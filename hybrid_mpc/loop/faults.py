@@ -86,10 +86,6 @@ class Fault:
         """Size at ``t`` [s]: on its ramp from ``neutral`` (1 for a factor, 0 for a sum) to ``value``.
 
         Where ``neutral`` is infinite (a limit that is not there) the ramp is at its end from the start.
-
-        Example:
-            >>> Fault(0.0, math.inf, "input_gain", 0.5, ramp=10.0).value_at(5.0, 1.0)
-            0.75
         """
         if self.ramp == 0 or not math.isfinite(neutral):
             return self.value
@@ -98,11 +94,7 @@ class Fault:
 
 
 def check_channels(faults: Sequence[Fault], n_y: int, n_u: int) -> None:
-    """Refuse faults of channels that do not exist, and faults that only a plant can show.
-
-    Raises:
-        InputError: With the fault and the number of channels there are, or how to build the fault in.
-    """
+    """Refuse faults of channels that do not exist, and faults that only a plant can show."""
     for fault in faults:
         if fault.on_plant:
             raise InputError(
@@ -128,20 +120,13 @@ def check_plant_faults(faults: Sequence[Fault], known: Sequence[str]) -> None:
 def install(plant: Any, faults: Sequence[Fault]) -> tuple[Any, tuple[Fault, ...]]:
     """Build the faults of the machine into a plant; what is left are those of sensors and actuators.
 
-    Args:
-        plant: A plant; if any fault is its own, it has a method ``with_faults(faults) -> plant``.
-        faults: Faults of any target.
+    If any fault is the plant's own, it has a method ``with_faults(faults) -> plant``.
 
     Returns:
         The plant to simulate, and the faults to hand to ``simulate``.
 
     Raises:
         InputError: If the plant takes no faults, or not one of these.
-
-    Example:
-        >>> plant, faults = install("a plant", [Fault(0.0, 1.0, "input_gain", 0.8)])
-        >>> plant, len(faults)
-        ('a plant', 1)
     """
     inside = tuple(fault for fault in faults if fault.on_plant)
     outside = tuple(fault for fault in faults if not fault.on_plant)

@@ -41,14 +41,7 @@ class Mode(IntEnum):
 
 @dataclass(frozen=True)
 class Switch:
-    """A change of mode.
-
-    Args:
-        t: First instant [s] at which the new mode decides.
-        before: Mode until then.
-        after: Mode from then on.
-        why: In words.
-    """
+    """A change of mode, in words why; ``t`` [s] is the first instant at which the new mode decides."""
 
     t: float
     before: Mode
@@ -138,16 +131,13 @@ class Guard:
 
 @dataclass(frozen=True)
 class GuardState:
-    """What a guard remembers from one period to the next.
+    """What a guard remembers from one period to the next; times are in seconds.
 
     Args:
-        mode: The mode that decides now.
-        wanted: The mode of the next period.
-        why: Why it is wanted, in words.
-        since: Time [s] from which the mode decides.
-        alarm: Time [s] of the last alarm.
-        doubt: Time [s] at which the present row of alarms began.
-        frozen: Time [s] at which the sensor was last seen frozen.
+        mode: The mode that decides now, ``since`` when.
+        wanted: The mode of the next period, and ``why``, in words.
+        alarm: Time of the last alarm; ``doubt``: of the first of the present row.
+        frozen: Time at which the sensor was last seen frozen.
         backup: Estimate of the backup's estimator; None without one, and before the first sample.
         planner: Whose plan the last one is: ``"controller"``, ``"backup"`` or nobody's (at rest).
         switches: Changes of the mode until now.
@@ -166,18 +156,11 @@ class GuardState:
 
 
 class GuardedController:
-    """A controller that changes with the guard's mode. Pure: what it remembers is a :class:`GuardState`.
-
-    Args:
-        safe: The loop's own controller.
-        guard: What to do on alarms. Default: nothing; the mode stays normal.
-
-    Raises:
-        InputError: If the backup has another problem or period.
-    """
+    """A controller that changes with the guard's mode. Pure: what it remembers is a :class:`GuardState`."""
 
     def __init__(self, safe: SafeController, guard: Guard | None = None) -> None:
         self.safe, self.guard = safe, guard
+        self._backup = safe if guard is None or guard.backup is None else guard.backup
         if guard is not None and guard.backup is not None and guard.backup_estimator is not None:
             _check_alike(safe.controller, guard.backup.controller, guard.backup_estimator)
 
@@ -196,29 +179,25 @@ class GuardedController:
 
     def decide(
         self, state: GuardState, previous: Decision, estimate: Estimate, reference: Array,
-        weight: Array | None = None, *, prepared: Prepared | None = None,
+        weight: Array | None = None, *, prepared: Prepared | None = None, late: bool = False,
     ) -> tuple[Decision, GuardState]:  # fmt: skip
-        """The input to hold from now on, by the mode's controller; see :meth:`SafeController.decide`."""
-        mode, bounds = state.mode, self._bounds(state)
-        if mode is Mode.REST:
+        """The input to hold from now on, by the mode's controller; see :meth:`SafeController.decide`.
+
+        ``late``: the solve has not come in time; see :meth:`SafeController.late`.
+        """
+        bounds = None if state.mode is Mode.NORMAL or self.guard is None else self.guard.limits
+        if state.mode is Mode.REST:
             return self._rest(previous, bounds), replace(state, planner="nobody")
-        safe, known = self._active(state, estimate)
+        safe, known = self.safe, estimate
+        if state.mode is Mode.BACKUP and state.backup is not None:
+            safe, known = self._backup, state.backup
         before, state = self._handed(state, previous, safe, known)
-        if mode is Mode.FALLBACK:
+        if late:
+            return safe.late(before, known, reference, limits=bounds), state
+        if state.mode is Mode.FALLBACK:
             decision = safe.late(replace(before, age=USED_UP), known, reference, limits=bounds)
             return replace(decision, status=Status.INITIAL, age=0), state
         return safe.decide(before, known, reference, weight, limits=bounds, prepared=prepared), state
-
-    def late(
-        self, state: GuardState, previous: Decision, estimate: Estimate, reference: Array
-    ) -> tuple[Decision, GuardState]:
-        """The input where a solve has not come in time; see :meth:`SafeController.late`."""
-        bounds = self._bounds(state)
-        if state.mode is Mode.REST:
-            return self._rest(previous, bounds), replace(state, planner="nobody")
-        safe, known = self._active(state, estimate)
-        before, state = self._handed(state, previous, safe, known)
-        return safe.late(before, known, reference, limits=bounds), state
 
     def prepare(self, state: GuardState, decision: Decision, weight: Array | None) -> Prepared | None:
         """What of the next solve can be done now; None where there is no such part, or another's plan is taken over."""
@@ -252,21 +231,8 @@ class GuardedController:
             wanted = state.mode
         return replace(state, wanted=wanted, why=why, alarm=alarm, doubt=doubt, frozen=frozen)
 
-    @property
-    def _backup(self) -> SafeController:
-        own = None if self.guard is None else self.guard.backup
-        return self.safe if own is None else own
-
     def _planner(self, safe: SafeController) -> Literal["controller", "backup"]:
         return "controller" if safe is self.safe else "backup"
-
-    def _active(self, state: GuardState, estimate: Estimate) -> tuple[SafeController, Estimate]:
-        if state.mode is Mode.BACKUP and state.backup is not None:
-            return self._backup, state.backup
-        return self.safe, estimate
-
-    def _bounds(self, state: GuardState) -> Limits | None:
-        return None if state.mode is Mode.NORMAL or self.guard is None else self.guard.limits
 
     def _handed(
         self, state: GuardState, previous: Decision, safe: SafeController, estimate: Estimate
@@ -275,11 +241,10 @@ class GuardedController:
         planner = self._planner(safe)
         if planner == state.planner:
             return previous, state
-        u = np.vstack([previous.solution.u[1:], previous.solution.u[-1:]])
         finite = replace(
             estimate, **{name: np.nan_to_num(getattr(estimate, name)) for name in ("x", "h", "d")}
         )
-        following = safe.controller.initial(finite, u).delayed(previous.u)
+        following = safe.controller.initial(finite, previous.solution.following).delayed(previous.u)
         decision = Decision(previous.u, previous.source, following, Status.INITIAL, 0)
         return decision, replace(state, planner=planner)
 

@@ -14,8 +14,10 @@ A period of :class:`Loop` is::
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
+from functools import partial
 from time import perf_counter
 from typing import Any, Literal, Protocol
 
@@ -27,7 +29,7 @@ from hybrid_mpc.control.problem import Controller, Status
 from hybrid_mpc.control.rti import Prepared
 from hybrid_mpc.control.safeguard import Decision, SafeController, Source
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimate.delay import filtered, sees_truth
+from hybrid_mpc.estimate.delay import filtered, sees_truth, whole_periods
 from hybrid_mpc.estimate.kalman import Estimate, Estimator
 from hybrid_mpc.loop.guard import Guard, GuardedController, GuardState, Switch
 from hybrid_mpc.loop.plant import fitting
@@ -74,7 +76,7 @@ class LoopState:
     Args:
         k: Number of the period that the last step began.
         y: Its measurement ``(n_y,)``; NaN where there was none.
-        estimate: The estimate; None after a long break, until the next sample.
+        estimate: None after a long break, until the next sample.
         decision: The input that is held, and the plan to go on from.
         guard: Modes and the backup's estimate.
         monitor: The monitor's memory; None without one.
@@ -92,16 +94,6 @@ class LoopState:
     inputs: tuple[Array, ...]
     mode: Literal["automatic", "manual"] = "automatic"
     finished: bool = False
-
-
-@dataclass(frozen=True)
-class _Basis:
-    """What the decision of this period was made from; :meth:`Loop.late` makes another one from it."""
-
-    previous: Decision
-    guard: GuardState
-    estimate: Estimate
-    reference: Array
 
 
 @dataclass(frozen=True)
@@ -190,16 +182,19 @@ class Loop:
             raise InputError("a guard acts on a monitor's alarms; give monitor= as well")
         self._estimator, self._safe, self._monitor = estimator, safe, monitor
         self._control = GuardedController(safe, guard)
-        self._delay = _whole_delay(input_delay, "input_delay")
-        self._n_inputs = self._delay + _whole_delay(sensor_delay, "sensor_delay") + 1
+        self._delay = whole_periods(input_delay, "input_delay")
+        self._n_inputs = self._delay + whole_periods(sensor_delay, "sensor_delay") + 1
         self._previews = Previews(reference, weight, self.ocp, horizon, self.model.dt, end)
         self._truth, self._now = sees_truth(estimator), now
         self._state: LoopState | None = None
-        self._basis: _Basis | None = None
+        self._decide_late: Callable[[], tuple[Decision, GuardState]] | None = None
         self._ahead: _Ahead | None = None
-        self._reading: Reading | None = None
-        self._previewed: tuple[Array, Array | None] = np.zeros((0, self.ocp.n_x)), None
-        self._spent = dict.fromkeys(TIMED, 0.0)
+        self.reading: Reading | None = None
+        """What the monitor said last; None without one."""
+        self.previewed: tuple[Array, Array | None] = np.zeros((0, self.ocp.n_x)), None
+        """Reference ``(m, n_x)`` and factors on ``q`` (None for 1) of this period's decision."""
+        self.spent = dict.fromkeys(TIMED, 0.0)
+        """Durations [s] of this period, by the names of ``TIMED``."""
 
     def start(
         self,
@@ -211,21 +206,14 @@ class Loop:
     ) -> Array:
         """Begin, while the machine rests: the first estimate, the first plan, which may take its time, the first input.
 
-        Args:
-            y: First sample ``(n_y,)``; None or NaN: missing.
-            truth: The true ``(x, h)``, for an estimator that needs it.
-            reference: As in :meth:`step`.
-            in_time: As in :meth:`step`.
-
-        Returns:
-            The input ``(n_u,)`` to hold from now on.
+        Arguments are those of :meth:`step`. Returned is the input ``(n_u,)`` to hold from now on.
         """
         sample = self._sample(y)
         x_ref, factors = self._preview(0, reference)
         estimate = self._estimator.start(self._seen(sample, truth), 0.0)
         first = self._safe.initial(estimate, None, x_ref, factors)
         self._state = self._first_state(sample, estimate, first)
-        self._ahead, self._reading, self._spent = None, None, dict.fromkeys(TIMED, 0.0)
+        self._ahead, self.reading, self.spent = None, None, dict.fromkeys(TIMED, 0.0)
         return self._decide(first, x_ref, factors, in_time)
 
     def step(
@@ -274,7 +262,7 @@ class Loop:
         else:
             estimate = self._estimator.update(state.estimate, seen, previous.u)
         self._state = replace(state, k=k, y=sample, estimate=estimate, inputs=inputs, finished=False)
-        self._spent = {**dict.fromkeys(TIMED, 0.0), "estimate": self._now() - begin}
+        self.spent = {**dict.fromkeys(TIMED, 0.0), "estimate": self._now() - begin}
         return self._decide(previous, x_ref, factors, in_time)
 
     def _decide(
@@ -282,20 +270,19 @@ class Loop:
     ) -> Array:
         """The input of this period, by the controller of the guard's mode or by the operator."""
         state, estimate = self.state, self.estimate
-        self._previewed = x_ref, factors
+        self.previewed = x_ref, factors
         guard = self._control.measured(state.guard, self.t, state.y, previous.u)
-        self._basis = _Basis(previous, guard, estimate, x_ref)
+        self._decide_late = partial(self._control.decide, guard, previous, estimate, x_ref, late=True)
         may_solve = in_time is None or in_time()
         begin = self._now()
         if state.mode == "manual":
             decision = self._operated(previous, estimate)
-        elif may_solve:
-            decision, guard = self._control.decide(
-                guard, previous, estimate, x_ref, factors, prepared=self._prepared(previous, factors)
-            )
         else:
-            decision, guard = self._control.late(guard, previous, estimate, x_ref)
-        self._spent["solve"] = self._now() - begin
+            prepared = self._prepared(previous, factors)
+            decision, guard = self._control.decide(
+                guard, previous, estimate, x_ref, factors, prepared=prepared, late=not may_solve
+            )
+        self.spent["solve"] = self._now() - begin
         self._state = replace(state, decision=decision, guard=guard)
         return decision.u
 
@@ -304,9 +291,8 @@ class Loop:
 
         To be called after :meth:`step`, in place of the input that it returned.
         """
-        basis = self._basis
-        if basis is not None and self.state.mode == "automatic":
-            decision, guard = self._control.late(basis.guard, basis.previous, basis.estimate, basis.reference)
+        if self._decide_late is not None and self.state.mode == "automatic":
+            decision, guard = self._decide_late()
             self._state = replace(self.state, decision=decision, guard=guard)
         return self.state.decision.u
 
@@ -318,13 +304,13 @@ class Loop:
         state = self.state
         if state.finished:
             return
-        self._basis = None
+        self._decide_late = None
         begin, guard, memory = self._now(), state.guard, state.monitor
         if self._monitor is not None:
-            memory, self._reading = self._monitor.update(
+            memory, self.reading = self._monitor.update(
                 memory, state.y, state.inputs[0], filtered(self.estimate)
             )
-            guard = self._control.watched(guard, self.t, self._reading)
+            guard = self._control.watched(guard, self.t, self.reading)
         inputs = (*state.inputs[1:], state.decision.u)
         self._state = state = replace(state, guard=guard, monitor=memory, inputs=inputs, finished=True)
         middle = self._now()
@@ -332,18 +318,12 @@ class Loop:
             previews = self._previews((state.k + 1 + self._delay) * self.model.dt)
             prepared = self._control.prepare(guard, state.decision, previews[1])
             self._ahead = _Ahead(state.k + 1, state.decision, previews, prepared)
-        self._spent |= {"monitor": middle - begin, "prepare": self._now() - middle}
+        self.spent |= {"monitor": middle - begin, "prepare": self._now() - middle}
 
     def skip(self, n: int = 1) -> None:
         """Periods that passed without a step, e.g. since one before them took too long; the input was held.
 
         The estimator is led through them without a sample; after 250 it starts anew at the next one.
-
-        Args:
-            n: Their number.
-
-        Raises:
-            InputError: If it is negative.
         """
         if n < 0:
             raise InputError(f"skip: a number of periods needed, got {n}")
@@ -361,32 +341,25 @@ class Loop:
 
     def warm_up(self) -> None:
         """Call every part once, at rest, and forget it: first calls are slow."""
-        before = self._state, self._basis, self._ahead, self._reading, self._spent
-        y, truth = np.zeros(self.model.n_y), np.zeros(self.model.n_x + self.model.n_h)
+        trial, y, truth = copy(self), np.zeros(self.model.n_y), np.zeros(self.model.n_x + self.model.n_h)
         x_ref, factors = self._preview(0, None)
         estimate = self._estimator.start(truth if self._truth else y, 0.0)
         first = self._safe.initial(estimate)
-        self._state, self._ahead = self._first_state(y, estimate, first), None
-        self._decide(first, x_ref, factors, None)
-        self.step(y, truth=truth)
-        self.late()
-        self.finish()
-        self._state, self._basis, self._ahead, self._reading, self._spent = before
+        trial._state, trial._ahead = self._first_state(y, estimate, first), None
+        trial.spent = dict.fromkeys(TIMED, 0.0)
+        trial._decide(first, x_ref, factors, None)
+        trial.step(y, truth=truth)
+        trial.late()
+        trial.finish()
 
     def restore(self, state: LoopState) -> Array:
-        """Go on from a state, which a loop of the same parts had.
-
-        Args:
-            state: What :attr:`state` was.
-
-        Returns:
-            The input that is held ``(n_u,)``.
+        """Go on from ``state``, what :attr:`state` of a loop of the same parts was; returns the input that is held.
 
         Raises:
             InputError: If it is no state, or that of a loop of another model or horizon.
         """
         _check_state(state, self.model, self.ocp, self._monitor)
-        self._state, self._basis, self._ahead, self._reading = state, None, None, None
+        self._state, self._decide_late, self._ahead, self.reading = state, None, None, None
         return state.decision.u
 
     @property
@@ -407,11 +380,7 @@ class Loop:
 
     @property
     def state(self) -> LoopState:
-        """All that the loop remembers.
-
-        Raises:
-            InputError: Before :meth:`start`.
-        """
+        """All that the loop remembers, from :meth:`start` on."""
         if self._state is None:
             raise InputError("the loop has not begun; call start() with the first sample")
         return self._state
@@ -434,24 +403,9 @@ class Loop:
         return self.state.decision
 
     @property
-    def reading(self) -> Reading | None:
-        """What the monitor said last; None without one."""
-        return self._reading
-
-    @property
     def switches(self) -> tuple[Switch, ...]:
         """Changes of the guard's mode until now."""
         return self.state.guard.switches
-
-    @property
-    def previewed(self) -> tuple[Array, Array | None]:
-        """Reference ``(m, n_x)`` and factors on ``q`` (None for 1) of this period's decision."""
-        return self._previewed
-
-    @property
-    def spent(self) -> Mapping[str, float]:
-        """Durations [s] of this period, by the names of ``TIMED``."""
-        return self._spent
 
     @property
     def safe_input(self) -> Array:
@@ -495,9 +449,9 @@ class Loop:
     def _operated(self, previous: Decision, estimate: Estimate) -> Decision:
         """The operator's input goes on, and so does the plan that automatic would begin from."""
         u, plan = previous.u, previous.solution
-        if np.all(np.isfinite(np.concatenate([estimate.x, estimate.h, estimate.d, u]))):
+        if estimate.finite and np.all(np.isfinite(u)):
             plan = self._safe.controller.initial(estimate, np.tile(u, (self.ocp.horizon, 1)))
-            plan = _beginning_with(u, plan)
+            plan = plan.beginning_with(u)
         return Decision(u, Source.MANUAL, plan, Status.INITIAL, 0)
 
 
@@ -506,18 +460,7 @@ def _with_input(decision: Decision, u: Array) -> Decision:
     u = np.where(np.isfinite(u), u, decision.u)
     if np.array_equal(u, decision.u):
         return decision
-    return replace(decision, u=u, solution=_beginning_with(u, decision.solution))
-
-
-def _beginning_with(u: Array, plan: Any) -> Any:
-    """The plan with ``u`` as its first input."""
-    return replace(plan, u=np.vstack([u[None], plan.u[1:]]))
-
-
-def _whole_delay(delay: int, name: str) -> int:
-    if int(delay) != delay or delay < 0:
-        raise InputError(f"{name}: a whole number of periods needed, not negative; got {delay}")
-    return int(delay)
+    return replace(decision, u=u, solution=decision.solution.beginning_with(u))
 
 
 def _check_models(estimated: HybridModel, controlled: HybridModel) -> None:

@@ -37,21 +37,7 @@ class Plant(Protocol):
 
 
 class SimulatedMachine:
-    """A plant behind the delays and faults of its sensors and actuators. Unlike the rest it changes in place.
-
-    Args:
-        plant: The plant.
-        x0: Initial state ``(n_x,)``.
-        seed: Seed of the plant and of the measurement noise.
-        n_y: Number of outputs.
-        faults: Of sensors and actuators; may be empty.
-        dt: Period [s].
-        sensor_delay: Periods.
-        input_delay: Periods.
-
-    Raises:
-        InputError: If a measurement's shape does not fit.
-    """
+    """A plant behind the delays [periods] and faults of its sensors and actuators. It changes in place."""
 
     def __init__(
         self, plant: Plant, x0: Array, seed: int, n_y: int, faults: Sequence[Fault], dt: float,
@@ -92,11 +78,7 @@ class SimulatedMachine:
 
 
 def fitting(values: ArrayLike, size: int, name: str) -> Array:
-    """``values`` as a vector ``(size,)``; NaN is allowed.
-
-    Raises:
-        InputError: If the shape is another; ``name`` says whose.
-    """
+    """``values`` as a vector ``(size,)``; NaN is allowed. ``name`` says whose they are."""
     array: Array = np.array(values, dtype=np.float64)
     if array.shape != (size,):
         raise InputError(f"{name} has shape {array.shape}, the model needs {(size,)}")

@@ -16,25 +16,9 @@ Preview = Callable[[Array], Array]
 
 
 class Previews:
-    """Reference and weight factors over the horizon, in their shapes.
+    """Reference and weight factors over the horizon, in their shapes; arguments are those of a ``Loop``.
 
-    Args:
-        reference: ``t (n,) -> (n, n_x)``, with ``n_p`` more columns where the economic stage cost has parameters; or a
-            set-point with so many numbers; or None for zero.
-        weight: ``t (n,) -> (n, n_x)`` for the factors on ``q``, or None for 1.
-        ocp: The problem.
-        horizon: Periods of preview, or None for the problem's.
-        dt: Period [s].
-        end: End of the run [s]; where values beyond it are not finite, the last before them is held.
-
-    Raises:
-        InputError: If the horizon is negative, or a shape does not fit.
-
-    Example:
-        >>> ocp = OCP(2, [1.0], [1.0], [0.0], [-1.0], [1.0])
-        >>> ends = Previews(lambda t: np.where(t < 1.05, t, np.nan)[:, None], None, ocp, None, 0.1, 1.0)
-        >>> ends(0.9)[0].ravel().round(6)
-        array([0.9, 1. , 1. ])
+    Where values beyond the ``end`` of the run [s] are not finite, the last before them is held.
     """
 
     def __init__(

@@ -1,9 +1,4 @@
-"""The loop in real time: against a machine's callbacks, in step with a clock, and with a safe end.
-
-:class:`Runner` is what a user makes; each of its runs is a :class:`_Run`, which gives a :class:`RunReport`. Whatever
-ends a run, :class:`SafeEnd` hands over the safe input first. So does a clock that does not keep time
-(:class:`CheckedClock`).
-"""
+"""The loop in real time: against a machine's callbacks, in step with a clock, and with a safe end."""
 
 from __future__ import annotations
 
@@ -60,11 +55,10 @@ class Runner:
 
     It drives a :class:`~hybrid_mpc.loop.loop.Loop`. Before the clock starts, while the machine rests: the first sample,
     and plan and input from it. Each period: wait for its instant, measure, estimate, decide, actuate, then what the
-    loop leaves until after the input (monitor, preparation of the next solve). A missing sample leaves the prediction.
-    A solve is never interrupted: one that comes back after the deadline is dropped, one that cannot be in time any more
-    is not begun, and the shifted plan is applied (:meth:`~hybrid_mpc.control.safeguard.SafeController.late`). After a
-    long delay the run goes on at the grid's nearest instant; the estimator is led through the periods in between
-    without a measurement.
+    loop leaves until after the input. A missing sample leaves the prediction. A solve is never interrupted: one that
+    comes back after the deadline is dropped, one that cannot be in time any more is not begun, and the shifted plan is
+    applied (:meth:`~hybrid_mpc.control.safeguard.SafeController.late`). After a long delay the run goes on at the
+    grid's nearest instant; the estimator is led through the periods in between without a measurement.
 
     Numbers never raise. Whatever ends the run, exceptions in callbacks and signals (Ctrl-C, SIGTERM, SIGHUP, ...)
     included, the safe input is handed to the actuator before anything else (:class:`SafeEnd`); then the exception is
@@ -87,8 +81,8 @@ class Runner:
         monitor: Default: none.
         deadline: Time [s] after a period's instant by which its input must be decided. Default: one period.
         safe_input: Input ``(n_u,)`` within the limits for the end of the run. Default: the controller's.
-        input_delay: Periods after which an input acts, as the estimator knows it; shifts the preview.
-        sensor_delay: Periods after which a measurement arrives; pairs it with its input for the monitor.
+        input_delay: As in :class:`~hybrid_mpc.loop.loop.Loop`.
+        sensor_delay: As there.
         clock: Default: the computer's. One that does not wait, stands still, goes back or gives NaN ends the run.
         on_step: Called at the end of every period with a :class:`RunnerStep`; must be short.
         guard: What to do on alarms of the monitor, which it needs. Default: nothing.
@@ -131,8 +125,8 @@ class Runner:
             raise InputError(f"Runner: deadline must lie within the period of {dt} s, got {deadline} s")
         if keep < 1:
             raise InputError(f"Runner: keep must be 1 or more periods, got {keep}")
-        self._clock, self._dt, self._actuate = clock or RealClock(), dt, actuate
-        self._run = partial(_Run, measure=measure, actuate=actuate, deadline=due, on_step=on_step, keep=keep)
+        self._clock, self._dt, self._deadline, self._keep = clock or RealClock(), dt, due, keep
+        self._measure, self._actuate, self._on_step = measure, actuate, on_step
         self._loop = partial(
             Loop, estimator, controller, monitor=monitor, reference=reference, weight=weight, guard=guard,
             horizon=horizon, input_delay=input_delay, sensor_delay=sensor_delay,
@@ -152,9 +146,6 @@ class Runner:
             duration: Length [s], rounded to whole periods. Default: none.
             stop: Asked before every period. Default: never.
 
-        Returns:
-            The statistics and the rows of the last ``keep`` periods.
-
         Raises:
             InputError: If neither end is given, the duration is not positive and finite, a callback returns
                 another shape, or the clock is none. What a callback raises is raised on, after the safe input.
@@ -163,7 +154,7 @@ class Runner:
         n = self._periods(duration, stop)
         clock = CheckedClock(self._clock, self._dt)
         loop = self._loop(end=math.inf if n is None else n * self._dt, now=clock.now)
-        run = self._run(loop, clock)
+        run = _Run(self, loop, clock)
         ended = "duration"
         with SafeEnd(lambda: self._actuate(self.safe_input)) as end:
             end.check()
@@ -194,21 +185,12 @@ class Runner:
 class _Run:
     """One run: its clock, its counts and its last rows; all that the loop remembers is in the loop."""
 
-    def __init__(
-        self,
-        loop: Loop,
-        clock: CheckedClock,
-        measure: Callable[[], ArrayLike | None],
-        actuate: Callable[[Array], object],
-        deadline: float,
-        on_step: Callable[[RunnerStep], None] | None,
-        keep: int,
-    ) -> None:
-        self._loop, self._clock, self._dt = loop, clock, loop.model.dt
-        self._measure, self._actuate, self._deadline, self._on_step = measure, actuate, deadline, on_step
+    def __init__(self, runner: Runner, loop: Loop, clock: CheckedClock) -> None:
+        self._runner, self._loop, self._clock = runner, loop, clock
+        self._dt, self._deadline = runner._dt, runner._deadline
         self.k = self._periods = self._skipped = self._missing = self._late = self._overruns = 0
         self._sources: Counter[str] = Counter()
-        self._rows: deque[RunnerStep] = deque(maxlen=keep)
+        self._rows: deque[RunnerStep] = deque(maxlen=runner._keep)
         self._solves: deque[float] = deque(maxlen=RECENT)
         self._start = 0.0
 
@@ -232,7 +214,7 @@ class _Run:
             measured = clock.now()
             self._decide(y, due + self._deadline)
         decided = clock.now()
-        self._actuate(loop.decision.u.copy())
+        self._runner._actuate(loop.decision.u.copy())
         acted = clock.now()
         loop.finish()
         spent = {"measure": measured - begin, "actuate": acted - decided, **loop.spent}
@@ -241,8 +223,8 @@ class _Run:
             acted - due, spent,
         )  # fmt: skip
         self._count(step)
-        if self._on_step is not None:
-            self._on_step(step)
+        if self._runner._on_step is not None:
+            self._runner._on_step(step)
         self._go_on()
 
     def report(self, stopped: str) -> RunReport:
@@ -265,7 +247,7 @@ class _Run:
         )  # fmt: skip
 
     def _sample(self) -> Array | None:
-        y = self._measure()
+        y = self._runner._measure()
         return None if y is None else fitting(y, self._loop.model.n_y, "what measure() returns")
 
     def _decide(self, y: Array | None, deadline: float) -> None:
@@ -305,18 +287,18 @@ class _Run:
 
 @dataclass(frozen=True)
 class RunnerStep:
-    """One period as ``on_step`` sees it.
+    """One period as ``on_step`` sees it; times are in seconds.
 
     Args:
         k: Its number on the grid; skipped periods have none.
-        t: Its time [s] on the grid, since the start.
+        t: Its time on the grid, since the start.
         y: Measurement ``(n_y,)``; NaN where there was none.
         estimate: The estimate.
         decision: The input and where it came from.
         reading: What the monitor says, or None.
-        lateness: Begin of the period after its instant on the grid [s].
-        applied: Instant after the grid's at which the input had been handed over [s].
-        spent: Durations [s] by the names of ``TIMED``.
+        lateness: Begin of the period after its instant on the grid.
+        applied: Instant after the grid's at which the input had been handed over.
+        spent: Durations by the names of ``TIMED``.
     """
 
     k: int
@@ -385,12 +367,7 @@ class RunReport:
 
 
 def percentiles(values: Array) -> dict[str, float]:
-    """Median, 95th and 99th percentile and maximum of ``values`` ``(n,)``; NaN where there are none.
-
-    Example:
-        >>> percentiles(np.arange(101.0))
-        {'median': 50.0, 'p95': 95.0, 'p99': 99.0, 'max': 100.0}
-    """
+    """Median, 95th and 99th percentile and maximum of ``values`` ``(n,)``; NaN where there are none."""
     if len(values) == 0:
         return dict.fromkeys(QUANTILES, float("nan"))
     return {name: float(np.quantile(values, q)) for name, q in QUANTILES.items()}
@@ -407,8 +384,8 @@ class SafeEnd:
     thread also when a signal ends it (``ENDING``): the signal breaks off what the block is doing, the safe input is
     handed over, and only then the signal has the effect that it would have had without this block: the process ends by
     it, or ``KeyboardInterrupt`` is raised, or the program's own handler is called. If the program lives on, it goes on
-    behind the block. Handlers are installed for the time of the block alone. Signals that are ignored, as under
-    ``nohup``, stay so. While the safe input is handed over no signal interrupts; it waits.
+    behind the block. Signals that are ignored, as under ``nohup``, stay so. While the safe input is handed over no
+    signal interrupts; it waits.
 
     Another thread gets no signals. There the block ends when the interpreter does, which waits for it.
 
@@ -446,10 +423,9 @@ class SafeEnd:
         return "exit" if self._exiting else ""
 
     def check(self) -> None:
-        """End the block if that has been asked for. Call it often: a callback may have swallowed what a signal raised.
+        """End the block if that has been asked for.
 
-        Raises:
-            Ended: If so.
+        Call it often: a callback may have swallowed what a signal raised.
         """
         if self.cause:
             raise Ended(self.cause)
@@ -539,15 +515,7 @@ class Clock(Protocol):
 
 
 class RealClock:
-    """The computer's monotonic clock.
-
-    Example:
-        >>> clock = RealClock()
-        >>> until = clock.now() + 0.002
-        >>> clock.sleep_until(until)
-        >>> clock.now() >= until
-        True
-    """
+    """The computer's monotonic clock."""
 
     def now(self) -> float:
         """Time [s] since some fixed instant."""
@@ -562,31 +530,14 @@ class RealClock:
 class CheckedClock:
     """A clock that is checked: a loop on one that stands still would spin for ever.
 
-    Args:
-        clock: The clock.
-        dt: Period [s] of the loop, of which a wait may end a small share early.
-
-    Example:
-        >>> class Dead:
-        ...     def now(self):
-        ...         return 7.0
-        ...     def sleep_until(self, t):
-        ...         pass
-        >>> CheckedClock(Dead(), 0.02).sleep_until(7.5)
-        Traceback (most recent call last):
-        ...
-        hybrid_mpc.errors.InputError: clock: sleep_until(7.5) has come back 10 times, at last at 7.0; it must wait
+    A wait may end early by a small share of the loop's period ``dt`` [s].
     """
 
     def __init__(self, clock: Clock, dt: float) -> None:
         self._clock, self._early, self._last = clock, EARLY * dt, -math.inf
 
     def now(self) -> float:
-        """Time [s].
-
-        Raises:
-            InputError: If it is not finite, or before the last one.
-        """
+        """Time [s], finite and never before the last one."""
         t = float(self._clock.now())
         if not math.isfinite(t):
             raise InputError(f"clock: now() gives {t}; a finite time [s] needed")
@@ -596,11 +547,7 @@ class CheckedClock:
         return t
 
     def sleep_until(self, t: float) -> None:
-        """Wait until ``t`` [s].
-
-        Raises:
-            InputError: If the clock does not wait, or as :meth:`now`.
-        """
+        """Wait until ``t`` [s]."""
         for _ in range(WAKES):
             self._clock.sleep_until(t)
             if self.now() >= t - self._early:

@@ -86,12 +86,7 @@ def with_input_delay(model: HybridModel, delay: float) -> HybridModel:
 
 
 class _Queue:
-    """Delay states: how many, and the share of each (and of the new input) that acts.
-
-    Args:
-        periods: Delay in periods.
-        n_u: Inputs.
-    """
+    """Delay states: how many, and the share of each (and of the new input) that acts."""
 
     def __init__(self, periods: float, n_u: int) -> None:
         whole = math.floor(periods + TINY)

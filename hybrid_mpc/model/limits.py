@@ -11,15 +11,7 @@ Array = NDArray[np.float64]
 
 
 def input_limits(u_min: ArrayLike, u_max: ArrayLike, n_u: int) -> tuple[Array, Array]:
-    """Checked limits ``(n_u,)`` of the inputs; ``-inf`` and ``inf`` for none.
-
-    Raises:
-        InputError: If they are not ``n_u`` numbers, one is NaN, or a lower limit is not below its upper one.
-
-    Example:
-        >>> input_limits((0.0,), (5.0,), 1)
-        (array([0.]), array([5.]))
-    """
+    """Checked limits ``(n_u,)`` of the inputs; ``-inf`` and ``inf`` for none."""
     lower, upper = numbers(u_min, "u_min"), numbers(u_max, "u_max")
     if lower.shape != (n_u,) or upper.shape != (n_u,):
         raise InputError(f"u_min has {lower.size} and u_max {upper.size} values, {n_u} needed")
@@ -31,15 +23,7 @@ def input_limits(u_min: ArrayLike, u_max: ArrayLike, n_u: int) -> tuple[Array, A
 
 
 def numbers(values: ArrayLike, name: str) -> Array:
-    """``values`` as a vector ``(n,)``, a copy; infinite ones and NaN too.
-
-    Raises:
-        InputError: If they are no numbers.
-
-    Example:
-        >>> numbers((1, 2), "q")
-        array([1., 2.])
-    """
+    """``values`` as a vector ``(n,)``, a copy; infinite ones and NaN too."""
     try:
         return np.array(values, dtype=float).ravel()
     except (TypeError, ValueError) as error:
@@ -47,12 +31,7 @@ def numbers(values: ArrayLike, name: str) -> Array:
 
 
 def at_rest(lower: ArrayLike, upper: ArrayLike) -> Array:
-    """Zero, or where limits ``(n,)`` exclude it the limit next to it: the input where nothing is known.
-
-    Example:
-        >>> at_rest([-1.0, 2.0, -5.0], [1.0, 3.0, -4.0])
-        array([ 0.,  2., -4.])
-    """
+    """Zero, or where limits ``(n,)`` exclude it the limit next to it: the input where nothing is known."""
     return np.asarray(np.clip(0.0, lower, upper))
 
 
@@ -60,14 +39,6 @@ def share_used(values: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> float:
     """Largest share of the way from rest to a limit ``(n,)`` that values ``(m, n)`` use: 1 at the limit, more beyond.
 
     Beyond a limit that is at rest itself the share is 1 plus that of the whole range; infinite without a range.
-
-    Example:
-        >>> share_used([[0.1], [-0.4]], [-0.5], [0.5]), share_used([[0.0], [1.0]], [0.0], [4.0])
-        (0.8, 0.25)
-        >>> share_used([[2.0], [2.5]], [2.0], [4.0]), share_used([[-1.0]], [0.0], [4.0])
-        (0.25, 1.25)
-        >>> share_used([[-3.0]], [-np.inf], [np.inf]), share_used([[-3.0]], [0.0], [np.inf])
-        (0.0, inf)
     """
     value, low, high = (np.asarray(v, dtype=float) for v in (values, lower, upper))
     rest, span = at_rest(low, high), high - low

@@ -29,19 +29,8 @@ STEP_OUTPUTS = ("x_next", "h_next")
 class Balance:
     """A balance of what a machine stores, e.g. of its energy, as the prior has it.
 
-    Args:
-        name: E.g. ``"energy"``.
-        unit: Of the storage, e.g. ``"J"``.
-        rate_unit: Of its rate, e.g. ``"W"``.
-        residual: ``(x, xdot, u, w, p) -> residual`` [rate_unit]: the violation of the balance if the state changes at
-            ``xdot``; zero along the prior's own flow.
-
-    Example:
-        >>> x, xdot, u, w, p = (ca.SX.sym(name, n) for name, n in (("x", 2), ("xdot", 2), ("u", 1), ("w", 0), ("p", 1)))
-        >>> power = ca.Function("residual", [x, xdot, u, w, p], [(p * xdot[1] - u) * x[1]])
-        >>> cart = Balance("energy", "J", "W", power)
-        >>> float(cart.residual([0.0, 2.0], [2.0, 1.5], 1.0, [], 0.5))
-        -0.5
+    ``residual`` ``(x, xdot, u, w, p)`` [rate_unit] is the violation of the balance if the state changes at ``xdot``;
+    zero along the prior's own flow. ``unit`` is that of the storage, e.g. ``"J"``.
     """
 
     name: str
@@ -310,15 +299,7 @@ def longer_period(model: HybridModel, periods: int) -> HybridModel:
 def prior_acceleration(model: HybridModel, prior: HybridModel | None = None) -> ca.Function:
     """Acceleration ``(x, u, w, p) -> a`` ``(n_q,)`` of the prior behind a model, without what a network adds.
 
-    Args:
-        model: The model, state ``[q, v]``.
-        prior: Model of its prior alone. Default: the model itself, where it has no network.
-
-    Raises:
-        InputError: If the model has a network and no prior is given, the two have other parameters, or there are none.
-
-    Example:
-        ``prior_acceleration(kit.models["hybrid"], kit.models["prior"])``
+    ``prior`` is the model of its prior alone. Default: the model itself, where it has no network.
     """
     if prior is None:
         if model.n_h > model.delay_states:
@@ -337,6 +318,23 @@ def prior_acceleration(model: HybridModel, prior: HybridModel | None = None) -> 
     x, _, u, w, p = point
     a = prior.xdot(x, ca.DM.zeros(prior.n_h), u, w, p)[n_q : 2 * n_q]
     return ca.Function("acceleration", [x, u, w, p], [ca.densify(a)])
+
+
+def changeable(model: HybridModel) -> tuple[str, ...]:
+    """What of a prior may change: its parameters, and the gain of each input."""
+    return (*(p.name for p in model.parameters), *(f"gain of {s.name}" for s in model.inputs))
+
+
+def incidence(model: HybridModel, groups: Mapping[str, Sequence[str]], what: str) -> Array:
+    """Which of the :func:`changeable` names each group changes ``(n_p + n_u, groups)``."""
+    known = changeable(model)
+    matrix = np.zeros((len(known), len(groups)))
+    for j, names in enumerate(groups.values()):
+        for name in names:
+            if name not in known:
+                raise InputError(f"{what}: no parameter {name!r}; there are: {', '.join(known)}")
+            matrix[known.index(name), j] = 1.0
+    return matrix
 
 
 def step_symbols(model: HybridModel) -> list[ca.MX]:

@@ -59,15 +59,6 @@ def hidden_fixed_point(model: HybridModel, x: Array, u: Array, *, limit: int = 2
 
     The iteration starts at zero. It ends when no element moves by more than 1e-10, or after ``limit`` steps with the
     last value.
-
-    Example:
-        >>> import casadi as ca
-        >>> from hybrid_mpc.machine.signals import Signal
-        >>> (x, h, u), level = (ca.MX.sym(n) for n in "xhu"), (Signal("x", "-"),)
-        >>> model = HybridModel.of("lag", 0.1, level, (Signal("u", "-"),), level,
-        ...     x=x, h=h, u=u, x_next=x + u, h_next=0.5 * h + x, xdot=u, y=x)
-        >>> hidden_fixed_point(model, np.ones(1), np.zeros(1)).round(6)
-        array([2.])
     """
     h = np.zeros(model.n_h)
     for _ in range(limit if model.n_h else 0):
@@ -129,15 +120,7 @@ def lqr(
 
 
 def vector(value: ArrayLike, size: int, name: str) -> Array:
-    """``value`` as a finite float vector ``(size,)``.
-
-    Raises:
-        InputError: If it has another size or holds a NaN, an infinite value or what is no number.
-
-    Example:
-        >>> vector([1, 2], 2, "q")
-        array([1., 2.])
-    """
+    """``value`` as a finite float vector ``(size,)``."""
     array = numbers(value, name)
     if array.shape != (size,):
         raise InputError(f"{name}: {array.size} values given, {size} needed")

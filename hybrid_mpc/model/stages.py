@@ -19,6 +19,8 @@ from nn_export.errors import CompileError
 Array = NDArray[np.float64]
 Derivatives = tuple[Array, Array, Array]
 """Successors ``(N, n_z)``, transposed ``A_k`` ``(N, n_z, n_z)`` and ``B_k`` ``(N, n_z, n_u)``."""
+Run = Callable[[Array, Array], Array]
+"""Trajectory ``(N + 1, n_z)`` of a model from ``z0`` ``(n_z,)`` on inputs ``(N, n_u)``."""
 Slopes = Callable[[Array, Array], Array]
 """Jacobians of the successors ``(m, n_z, n_x + n_u)`` by ``(x, u)``, of ``z`` ``(m, n_z)`` and ``u``; with
 ``hidden`` by ``(x, u, h)``."""
@@ -30,8 +32,8 @@ class Linearization(Protocol):
     def at(self, z: Array, u: Array) -> Derivatives:
         """Every period from its own ``z`` ``(N, n_z)`` on ``u`` ``(N, n_u)``."""
 
-    def run(self, z0: Array, u: Array) -> Array:
-        """Trajectory ``(N + 1, n_z)`` of the model from ``z0`` ``(n_z,)`` on ``u`` ``(N, n_u)``."""
+    run: Run
+    """The model from one ``z`` on."""
 
     def slopes(self, times: int, *, hidden: bool = False) -> Slopes:
         """A function for ``m = times N`` periods; made once, it is called often."""
@@ -40,10 +42,7 @@ class Linearization(Protocol):
 def stages(model: HybridModel, n: int, *, compiled: bool = False) -> Linearization:
     """The fastest way that a model has: all periods at once with ``side_by_side``, else one after the other.
 
-    Args:
-        model: The model.
-        n: Periods N.
-        compiled: Whether what is evaluated period by period is compiled as C. Default: no.
+    ``compiled``: what is evaluated period by period is compiled as C.
 
     Raises:
         InputError: If it is to be compiled and there is no compiler, or it fails.
@@ -53,38 +52,18 @@ def stages(model: HybridModel, n: int, *, compiled: bool = False) -> Linearizati
 
 
 class Stages:
-    """One period after the other, interpreted by CasADi or compiled.
-
-    Args:
-        model: The model.
-        n: Periods N.
-        compiled: Whether one period is compiled as C.
-
-    Raises:
-        InputError: If it is to be compiled and there is no compiler, or it fails.
-
-    Example:
-        >>> from hybrid_mpc.machine.signals import Signal
-        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
-        >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
-        >>> Stages(model, 3).run(np.zeros(1), np.ones((3, 1))).ravel().tolist()
-        [0.0, 1.0, 2.0, 3.0]
-    """
+    """One period after the other, interpreted by CasADi or compiled."""
 
     def __init__(self, model: HybridModel, n: int, *, compiled: bool = False) -> None:
         stage = _compiled(_stage(model)) if compiled else _stage(model)
         self._side_by_side = BufferedFunction(stage.map(n))
-        self._along = _run(model, n, compiled)
+        self.run = free_run(model, n, compiled=compiled)
         self._shape, self._n_x = (n, model.n_x + model.n_h), model.n_x
 
     def at(self, z: Array, u: Array) -> Derivatives:
         """See :class:`Linearization`."""
         z_next, a_t, b = self._call(z, u)
         return z_next.copy(), a_t.copy(), b.copy()  # the next call overwrites them
-
-    def run(self, z0: Array, u: Array) -> Array:
-        """See :class:`Linearization`."""
-        return _trajectory(self._along, z0, u)
 
     def slopes(self, times: int, *, hidden: bool = False) -> Slopes:
         """See :class:`Linearization`."""
@@ -110,32 +89,19 @@ class Stages:
 
 
 class VectorisedStages:
-    """All periods at once, of a model with ``side_by_side``; a run is one of ``step``.
-
-    Args:
-        model: The model.
-        n: Periods N.
-        compiled: Whether the run's ``step`` is compiled as C.
-
-    Raises:
-        InputError: If it is to be compiled and there is no compiler, or it fails.
-    """
+    """All periods at once, of a model with ``side_by_side``; a run is one of ``step``."""
 
     def __init__(self, model: HybridModel, n: int, *, compiled: bool = False) -> None:
         assert model.side_by_side is not None
         self._many, self._n, self._n_x = model.side_by_side, n, model.n_x
         self._given = model.w, model.p
         self._at, self._held = self._many(n, {"A": ("x", "h"), "B": ("u",)}), self._tiled(n)
-        self._along = _run(model, n, compiled)
+        self.run = free_run(model, n, compiled=compiled)
 
     def at(self, z: Array, u: Array) -> Derivatives:
         """See :class:`Linearization`."""
         x_next, h_next, a, b = self._at(z[:, : self._n_x], z[:, self._n_x :], u, *self._held)
         return np.hstack([x_next, h_next]), np.ascontiguousarray(a.transpose(0, 2, 1)), b
-
-    def run(self, z0: Array, u: Array) -> Array:
-        """See :class:`Linearization`."""
-        return _trajectory(self._along, z0, u)
 
     def slopes(self, times: int, *, hidden: bool = False) -> Slopes:
         """See :class:`Linearization`."""
@@ -149,16 +115,18 @@ class VectorisedStages:
         return [np.tile(values, (n, 1)) for values in self._given]
 
 
-def _run(model: HybridModel, n: int, compiled: bool) -> BufferedFunction:
+def free_run(model: HybridModel, n: int, *, compiled: bool = False) -> Run:
+    """The model run freely over ``n`` periods."""
     z, u = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("u", model.n_u)
     step = ca.Function("z_step", [z, u], [ca.vertcat(*inlined(model.step, _point(model, z, u)))])
-    return BufferedFunction((_compiled(step) if compiled else step).mapaccum("run", n))
+    f = BufferedFunction((_compiled(step) if compiled else step).mapaccum("run", n))
 
+    def run(z0: Array, u: Array) -> Array:
+        f.inputs[0][:], f.inputs[1][:] = z0, u.ravel()
+        f()
+        return np.concatenate([z0[None], f.outputs[0].reshape(n, -1)])
 
-def _trajectory(f: BufferedFunction, z0: Array, u: Array) -> Array:
-    f.inputs[0][:], f.inputs[1][:] = z0, u.ravel()
-    f()
-    return np.concatenate([z0[None], f.outputs[0].reshape(len(u), -1)])
+    return run
 
 
 def _stage(model: HybridModel) -> ca.Function:

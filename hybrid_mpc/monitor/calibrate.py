@@ -78,16 +78,7 @@ class Calibration:
 
     @classmethod
     def without(cls, reason: str, rest_speed: Sequence[float] | None = None) -> Calibration:
-        """A calibration without thresholds.
-
-        Args:
-            reason: Why not.
-            rest_speed: Speeds below which friction may stick. Default: not known either.
-
-        Example:
-            >>> Calibration.without("2 s of data").threshold_w is None
-            True
-        """
+        """A calibration without thresholds; ``reason`` says why. The rest speeds may still be known."""
         rest = None if rest_speed is None else tuple(rest_speed)
         return cls(None, None, 0.0, 0, 0.0, reason, rest_speed=rest)
 
@@ -101,20 +92,12 @@ def calibrate(
     block_s: float = BLOCK_S,
     rest_speed: ArrayLike = REST_SPEED,
 ) -> Calibration:
-    """Threshold that nominal levels pass upwards at the wanted rate.
+    """Threshold that nominal levels, ``(n,)`` [W] of each run, pass upwards at the wanted rate; NaN are left out.
 
     The largest level in a block follows a Gumbel distribution with location and scale from its first two L-moments. The
     threshold ``location - scale * log(rate * block)`` is passed at the wanted rate. The alarm is released at half of
-    it, but not below the nominal 95 % quantile (or it would hang), nor above the threshold.
-
-    Args:
-        levels: ``level_w`` of nominal runs, each ``(n,)`` [W]; NaN are left out.
-        dt: Sample period [s].
-        false_alarms_per_hour: Wanted rate [1/h]; default 1.
-        data_hash: Hash of the data, kept in the result.
-        block_s: Length of a block [s], much longer than levels are correlated; see
-            :func:`~hybrid_mpc.monitor.lengths.block_seconds`. Default 5.
-        rest_speed: That of the monitor which made the levels. Default 0.2, as the monitor's.
+    it, but not below the nominal 95 % quantile (or it would hang), nor above the threshold. A block of ``block_s``
+    seconds must be much longer than levels are correlated (:func:`~hybrid_mpc.monitor.lengths.block_seconds`).
 
     Raises:
         InputError: If ``dt``, the block or the rate is not positive, more alarms are wanted than one in two blocks,
@@ -122,12 +105,6 @@ def calibrate(
 
     Source: Coles (2001), An Introduction to Statistical Modeling of Extreme Values, ch. 3;
     Hosking (1990) for the L-moments.
-
-    Example:
-        >>> noise = np.abs(np.random.default_rng(0).normal(size=40_000))
-        >>> c = calibrate([noise], 0.01, false_alarms_per_hour=10)
-        >>> bool(c.threshold_w > np.quantile(noise, 0.999))
-        True
     """
     if not dt > 0 or not false_alarms_per_hour > 0 or not block_s > 0:
         raise InputError(
@@ -164,17 +141,7 @@ def calibrate(
 
 
 def with_residual(power: Calibration, residual: Calibration) -> Calibration:
-    """One calibration of both alarms; either may raise a false one, so their wanted rates add up.
-
-    Args:
-        power: Calibration on the levels of the violation.
-        residual: Calibration on the levels of the residual force.
-
-    Example:
-        >>> c = with_residual(Calibration(0.2, 0.1, 0.5, 9, 0.1, ""), Calibration(3.0, 2.0, 0.5, 9, 0.1, ""))
-        >>> c.threshold_w, c.residual_threshold, c.false_alarms_per_hour
-        (0.2, 3.0, 1.0)
-    """
+    """One calibration of both alarms; either may raise a false one, so their wanted rates add up."""
     return replace(
         power,
         false_alarms_per_hour=power.false_alarms_per_hour + residual.false_alarms_per_hour,
@@ -195,19 +162,12 @@ def count_alarms(alarm: Array | NDArray[np.bool_], dt: float) -> tuple[int, floa
     return n, n / hours if hours > 0 else 0.0
 
 
-def alarm_intervals(
-    alarm: Array | NDArray[np.bool_], dt: float, start: float = 0.0
-) -> list[tuple[float, float]]:
-    """Intervals ``(first, last)`` [s] in which the alarm is on; sample k lies at ``start + k dt``.
-
-    Example:
-        >>> alarm_intervals(np.array([False, True, True, False]), 0.5)
-        [(0.5, 1.0)]
-    """
+def alarm_intervals(alarm: Array | NDArray[np.bool_], dt: float) -> list[tuple[float, float]]:
+    """Intervals ``(first, last)`` [s] in which the alarm is on; sample k lies at ``k dt``."""
     on = np.concatenate([[False], np.asarray(alarm, dtype=bool), [False]]).astype(int)
     edges = np.diff(on)
     firsts, lasts = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
-    return [(float(start + a * dt), float(start + b * dt)) for a, b in zip(firsts, lasts, strict=True)]
+    return [(float(a * dt), float(b * dt)) for a, b in zip(firsts, lasts, strict=True)]
 
 
 def _ordered(release: float | None, threshold: float | None) -> bool:
@@ -219,15 +179,13 @@ def _ordered(release: float | None, threshold: float | None) -> bool:
 
 def block_maxima(levels: Sequence[Array], size: int) -> tuple[Array, Array]:
     """Largest finite level of each whole block of ``size`` samples, and all finite levels."""
-    maxima, finite = [], []
+    maxima, finite = [np.zeros(0)], [np.zeros(0)]
     for level in levels:
         values = np.asarray(level, dtype=np.float64).reshape(-1)
         values = values[np.isfinite(values)]
         finite.append(values)
         n = values.size // size
         maxima.append(values[: n * size].reshape(n, size).max(axis=1) if n else np.zeros(0))
-    if not finite:
-        return np.zeros(0), np.zeros(0)
     return np.concatenate(maxima), np.concatenate(finite)
 
 

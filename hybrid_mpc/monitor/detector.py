@@ -21,12 +21,7 @@ TERMS = 4
 
 @dataclass(frozen=True)
 class DetectorState:
-    """What the detector remembers.
-
-    Args:
-        sums: Sums of each force upwards, then downwards.
-        on: True while the alarm on a force, on the energy, is on.
-    """
+    """Sums of each force upwards, then downwards; whether the alarm on a force, and that on the energy, is on."""
 
     sums: tuple[float, ...]
     on: tuple[bool, bool]
@@ -115,46 +110,31 @@ class Detector:
         """Accumulated time [s] of a free run from which on it counts."""
         return SHORTEST_S * self.time_unit
 
-    def check(
-        self, n_q: int, free_runs: bool, dt: float | None = None, time_unit: float | None = None
-    ) -> None:
-        """Refuse a monitor that this detector was not learned for.
-
-        Raises:
-            InputError: If it has another number of forces, no free runs, another period or unit of time.
-        """
+    def check(self, n_q: int, free_runs: bool, dt: float, time_unit: float) -> None:
+        """Refuse a monitor of other forces, without the free runs that it reads, or of another period or unit of time."""
         if len(self.force) != n_q:
             raise InputError(f"detector: learned for {len(self.force)} forces, the model has {n_q}")
         if self.energy and not free_runs:
             raise InputError("detector: it reads free runs, the monitor has none; give free_run=0.8 [s], say")
-        if dt is not None and abs(dt - self.dt) > 1e-9 * self.dt:
+        if abs(dt - self.dt) > 1e-9 * self.dt:
             raise InputError(
                 f"detector: learned at a period of {self.dt} s, the model's is {dt} s; learn it anew"
             )
-        if time_unit is not None and abs(time_unit - self.time_unit) > 1e-9 * self.time_unit:
+        if abs(time_unit - self.time_unit) > 1e-9 * self.time_unit:
             raise InputError(
                 f"detector: its lengths count in a machine's second of {self.time_unit:g} s, the model's in "
                 f"{time_unit:g} s; learn it anew"
             )
 
     def deviations(self, v2: Array, u2: Array) -> Array:
-        """Standard deviations ``(n, n_q)`` of nominal residual forces.
-
-        Args:
-            v2: Squared speed of each degree of freedom ``(n, n_q)``; ``(n,)`` where there is one.
-            u2: Squared length of the inputs ``(n,)``.
-        """
+        """Standard deviations ``(n, n_q)`` of nominal residual forces; arguments as :func:`force_terms` has them."""
         squares = np.asarray(v2, dtype=np.float64).reshape(len(u2), len(self.force))
         return np.asarray(np.sqrt(force_terms(squares, u2, self.rest_speed) @ np.array(self.force).T))
 
     def update(
         self, state: DetectorState, numbers: Sequence[float]
     ) -> tuple[DetectorState, tuple[float, float], bool]:
-        """One sample.
-
-        Args:
-            state: State after the sample before.
-            numbers: What :attr:`MonitorReading.numbers` holds; a departure that is not finite changes nothing.
+        """One sample of :attr:`MonitorReading.numbers`; a departure that is not finite changes nothing.
 
         Returns:
             The next state; the largest sum and the scaled power as shares of their thresholds; whether an alarm is on.
@@ -196,10 +176,7 @@ class Detector:
 def force_terms(v2: Array, u2: Array, rest_speed: Sequence[float]) -> Array:
     """What the variance of a nominal residual force is linear in, ``(n, 4)``.
 
-    Args:
-        v2: Squared speed of each degree of freedom ``(n, n_q)``.
-        u2: Squared length of the inputs ``(n,)``.
-        rest_speed: Speeds ``(n_q,)`` below which friction may stick.
+    ``v2`` ``(n, n_q)`` are squared speeds, ``u2`` ``(n,)`` squared lengths of the inputs.
     """
     slow = (v2 / np.array(rest_speed) ** 2).sum(axis=1)
     return np.column_stack([np.ones(len(v2)), v2.sum(axis=1), u2, 1.0 / (1.0 + slow)])

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.model.model import HybridModel, prior_acceleration
+from hybrid_mpc.model.model import HybridModel, changeable, incidence, prior_acceleration
 from hybrid_mpc.monitor.energy import EnergyMonitor, MonitorState
 from hybrid_mpc.monitor.residuals import inertia_of
 
@@ -35,13 +35,7 @@ RANGE = (-0.9, 20.0)
 
 @dataclass(frozen=True)
 class Change:
-    """A change of one cause.
-
-    Args:
-        name: The cause.
-        value: Change as a share of the nominal value [-]: 0.5 is half as much more.
-        sigma: Its standard deviation [-].
-    """
+    """A change of one cause, as a share of the nominal value (0.5: half as much more), with its standard deviation."""
 
     name: str
     value: float
@@ -59,8 +53,8 @@ class Diagnosis:
         text: In words: ``"friction +95 ± 20 %"``, ``"none of the known causes"``, ``"nothing to explain"``.
         samples: Independent samples: those at speed over the length of the monitor's window.
         causes: One cause that explains all, or several that together do. Default: none does.
-        alternatives: Other single causes that explain it as well. Default: none.
-        blind: Directions that the motion does not show, in words. Default: none.
+        alternatives: Other single causes that explain it as well.
+        blind: Directions that the motion does not show, in words.
         p_value: Probability of what the causes leave over, if they are all there is. Default: not known.
     """
 
@@ -110,18 +104,12 @@ class Diagnoser:
             raise InputError(
                 "diagnosis: the monitor has no detector, so the residuals' own scatter is unknown"
             )
-        known = (*(p.name for p in model.parameters), *(f"gain of {s.name}" for s in model.inputs))
-        chosen = {name: (name,) for name in known} if causes is None else causes
+        chosen = {name: (name,) for name in changeable(model)} if causes is None else causes
         self._monitor, self._detector, self._names = monitor, detector, list(chosen)
-        self._force = _force_function(model, acceleration, _incidence(known, chosen))
+        self._force = _force_function(model, acceleration, incidence(model, chosen, "diagnosis"))
 
     def diagnose(self, state: MonitorState, since: float = math.inf) -> Diagnosis:
-        """What explains the residual force.
-
-        Args:
-            state: The monitor's.
-            since: Looks back no further than this [s], e.g. since the alarm began. Default: the whole history.
-        """
+        """What explains the residual force of the last ``since`` [s], e.g. since the alarm. Default: all history."""
         layout, detector = self._monitor.layout, self._detector
         rows = state.memory[layout.rows :].reshape(layout.history, layout.history_row)
         rows = rows[-min(layout.history, max(round(min(since, 1e6) / layout.model.dt), 1)) :]
@@ -144,23 +132,12 @@ class Diagnoser:
         return _explained(force, (residual / sigma).ravel(), self._names, float(layout.window))
 
 
-def _incidence(known: Sequence[str], causes: Mapping[str, Sequence[str]]) -> Array:
-    """Which parameters (and gains) ``(known, causes)`` a cause changes."""
-    matrix = np.zeros((len(known), len(causes)))
-    for j, names in enumerate(causes.values()):
-        for name in names:
-            if name not in known:
-                raise InputError(f"diagnosis: no parameter {name!r}; there are: {', '.join(known)}")
-            matrix[known.index(name), j] = 1.0
-    return matrix
-
-
-def _force_function(model: HybridModel, acceleration: ca.Function, incidence: Array) -> ca.Function:
+def _force_function(model: HybridModel, acceleration: ca.Function, changed_by: Array) -> ca.Function:
     """``(x, u, shares) -> (force (n_q,), its slopes (n_q, causes))``."""
     values, n_p = ca.DM(model.p), model.n_p
     x, u = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
-    shares = ca.MX.sym("shares", incidence.shape[1])
-    factors = 1 + ca.DM(incidence) @ shares
+    shares = ca.MX.sym("shares", changed_by.shape[1])
+    factors = 1 + ca.DM(changed_by) @ shares
     changed = acceleration(x, factors[n_p:] * u, model.w, factors[:n_p] * values)
     force = inertia_of(model, x, u) @ (changed - acceleration(x, u, model.w, values))
     return ca.Function("force", [x, u, shares], [ca.densify(force), ca.densify(ca.jacobian(force, shares))])

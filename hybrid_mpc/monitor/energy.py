@@ -7,12 +7,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.model.buffered import BufferedFunction
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.monitor.calibrate import Calibration
 from hybrid_mpc.monitor.detector import Detector
@@ -49,33 +50,16 @@ SECONDS: Mapping[Validity, str] = MappingProxyType(
 """Names under which results count the seconds of each."""
 
 
-class EstimateLike(Protocol):
-    """What the monitor reads of an estimate: ``x`` (n_x,) and ``h`` (n_h,). It ignores ``d``."""
-
-    @property
-    def x(self) -> Any:
-        """Estimated state ``(n_x,)``."""
-
-    @property
-    def h(self) -> Any:
-        """Hidden state ``(n_h,)`` before this sample's input."""
-
-
 @dataclass(frozen=True)
 class MonitorState:
-    """All that the monitor remembers. Never changed in place.
+    """All that the monitor remembers, never changed in place; ``x`` and ``h`` are the latest estimate's.
 
     Args:
-        memory: Past measurements, model increments and inputs of the window, the averaged readings, the model's free
-            runs and the rows for :func:`~hybrid_mpc.monitor.diagnose.diagnose`, in one vector; NaN until filled.
-        x: Estimated state ``(n_x,)`` at the latest sample.
-        h: Hidden state ``(n_h,)`` at the latest sample.
+        memory: One vector, laid out as :class:`~hybrid_mpc.monitor.residuals.Layout` says; NaN until filled.
         alarms: True while the alarm on the violation, and the one on the residual force, is on.
-        left: Periods left of each free run. Default: there are none.
-        detector: What the detector of scaled residuals remembers. Default: nothing.
+        left: Periods left of each free run.
         frozen: True while the sensor is held for frozen.
-        seen: Samples taken, up to the window's.
-        whole: Samples since something was missing, up to the window's.
+        seen: Samples taken; ``whole``: since something was missing; both up to the window's.
         invalid: Samples in a row without a reading.
     """
 
@@ -150,21 +134,19 @@ class EnergyMonitor:
     ``rest_speed``. So a hand that holds the machine still shows, and sticking friction does not.
 
     **Energy of the free run** [J]: the one step starts from an estimate that has followed the measurements, and so has
-    half forgotten what went wrong. With ``free_run`` the model also runs on its own under the applied inputs. What its
-    balance departs from the measured one adds up to an energy: noise averages out in it, a steady loss does not. Two
-    runs, begun half a length apart, take turns; the reading is of the older one.
+    half forgotten what went wrong. With ``free_run`` the model also runs on its own under the applied inputs, and what
+    its balance departs from the measured one adds up: noise averages out in it, a steady loss does not. Two runs, begun
+    half a length apart, take turns; the reading is of the older one.
 
     **Frozen sensor**, with ``resolution``: the sensor repeats itself while the one-step predictions add up to more than
-    three of its steps. Predictions slower than ``rest_speed`` do not count, since an estimate creeps on where friction
-    sticks. Near rest the estimator takes a frozen sensor for a standing machine and the controller pulls harder: so
-    what the input's change since the sensor's last step would have moved counts as well, once it is more than a quarter
-    of the input's range. A machine that is blocked looks the same.
+    three of its steps, those slower than ``rest_speed`` left out. Near rest the estimator takes a frozen sensor for a
+    standing machine and the controller pulls harder: so what the input's change since the sensor's last step would have
+    moved counts as well, once it is more than a quarter of the input's range. A blocked machine looks the same.
 
     A missing (NaN) measurement gives NaN readings until it has left the window. A level is the mean of the finite ones
-    of the last ``average`` values, NaN (and no alarm) while fewer than half are finite. ``validity`` says whether a
-    reading is one. A monitor without a valid reading for longer than ``window`` and ``average`` together is ``blind``,
-    and that is an alarm. Positions must count on through full turns. Not for several threads at once (it reuses its
-    buffers).
+    of the last ``average`` values, NaN (and no alarm) while fewer than half are finite. A monitor without
+    a valid reading for longer than ``window`` and ``average`` together is ``blind``, and that is an alarm. Positions must count
+    on through full turns. Not for several threads at once (it reuses its buffers).
 
     Args:
         model: Model whose outputs are its positions ``q`` (state ``[q, v]``).
@@ -179,12 +161,11 @@ class EnergyMonitor:
         detector: Detector of scaled residuals. Default: none.
         input_range: Range ``(n_u,)`` of each input, largest less smallest, for the test for freezing near rest.
             Default: that of the model's signals; without bounds there is no such test.
-        history: Time [s] over which :func:`~hybrid_mpc.monitor.diagnose.diagnose` looks back. Default 0: not at all.
+        history: Time [s] over which a :class:`~hybrid_mpc.monitor.diagnose.Diagnoser` looks back. Default 0.
 
     Raises:
         InputError: If the window, the average or a rest speed is unfit, a free run is no longer than two windows, the
-            outputs are not the positions, the energy balance says nothing, or the model cannot say what a history
-            needs.
+            outputs are not the positions, or the energy balance says nothing.
 
     Source: energy balance and violation of the paper (energy objective, powers in W); Savitzky and Golay
     (1964) for the polynomial; Peano kernel theorem for the weighting.
@@ -216,7 +197,12 @@ class EnergyMonitor:
         history: float = 0.0,
         input_range: ArrayLike | None = None,
     ) -> None:
-        _check(window, average)
+        if window < 5 or window % 2 == 0:
+            raise InputError(
+                f"energy monitor: window must be an odd number of at least 5 samples, got {window}"
+            )
+        if average < 1:
+            raise InputError(f"energy monitor: average must be at least 1 sample, got {average}")
         check_model(model)
         self.layout = Layout(model, window, average, round(free_run / model.dt), round(history / model.dt))
         if free_run and self.layout.length < 2 * window:
@@ -232,17 +218,9 @@ class EnergyMonitor:
         self._resolution = _positive(resolution, model.n_y)
         if detector is not None:
             detector.check(model.n_y, bool(self.layout.length), model.dt, model.time_unit)
-        self._function = reading_function(self.layout, self.rest_speed, _spans(model, input_range))
-        self._ins = [np.zeros(self._function.size1_in(i)) for i in range(6)]
-        self._outs = [np.zeros(self._function.size1_out(i)) for i in range(2)]
-        self._sizes = tuple(values.size for values in self._ins[1:5])
-        buffer: Any
-        buffer, self._evaluate = self._function.buffer()
-        for i, array in enumerate(self._ins):
-            buffer.set_arg(i, memoryview(array.data))
-        for i, array in enumerate(self._outs):
-            buffer.set_res(i, memoryview(array.data))
-        self._buffer = buffer
+        spans = _spans(model, input_range)
+        self._function = BufferedFunction(reading_function(self.layout, self.rest_speed, spans))
+        self._sizes = tuple(values.size for values in self._function.inputs[1:5])
 
     @property
     def delay(self) -> float:
@@ -257,7 +235,7 @@ class EnergyMonitor:
         return MonitorState(memory, *empty, QUIET, left, first)
 
     def update(
-        self, state: MonitorState, y: Array, u_prev: Array, estimate: EstimateLike
+        self, state: MonitorState, y: Array, u_prev: Array, estimate: Any
     ) -> tuple[MonitorState, MonitorReading]:
         """Take one sample; pure: the same arguments give the same result.
 
@@ -265,25 +243,23 @@ class EnergyMonitor:
             state: State after the previous sample, or :meth:`initial`.
             y: Measurement ``(n_y,)`` now; NaN where missing.
             u_prev: Input ``(n_u,)`` applied over the period that just ended.
-            estimate: Estimate at this sample, with ``x`` ``(n_x,)`` and ``h`` ``(n_h,)``.
+            estimate: Estimate at this sample, of which ``x`` ``(n_x,)`` and ``h`` ``(n_h,)`` are read.
 
         Returns:
             The next state and the reading.
-
-        Raises:
-            InputError: If a shape does not fit the model.
         """
-        x, h = _copied(estimate.x), _copied(estimate.h)
-        y, u_prev = np.asarray(y, dtype=np.float64), np.asarray(u_prev, dtype=np.float64)
+        x, h = (np.array(values, dtype=np.float64).ravel() for values in (estimate.x, estimate.h))
+        y, u_prev = (np.asarray(values, dtype=np.float64).ravel() for values in (y, u_prev))
         if (x.size, h.size, u_prev.size, y.size) != self._sizes:
-            raise self._unfit(y, u_prev, x, h)
-        if y.ndim != 1 or u_prev.ndim != 1:
-            y, u_prev = y.reshape(-1), u_prev.reshape(-1)
-        ins = self._ins
+            raise InputError(
+                f"monitor of model {self.model.name}: x, h, u_prev, y have {(x.size, h.size, u_prev.size, y.size)} "
+                f"entries, the model needs {self._sizes}"
+            )
+        ins, outs = self._function.inputs, self._function.outputs
         ins[0][:], ins[1][:], ins[2][:], ins[3][:], ins[4][:] = state.memory, state.x, state.h, u_prev, y
         left = state.left and self._free_runs(state)
-        self._evaluate()
-        memory, numbers, n_q = self._outs[0].copy(), self._outs[1].tolist(), self.model.n_y
+        self._function()
+        memory, numbers, n_q = outs[0].copy(), outs[1].tolist(), self.model.n_y
         level, residual_level = self._levels(memory)
         alarms = self.alarms(level, residual_level, state.alarms)
         travels = zip(numbers[3 + n_q : 3 + 2 * n_q], self._resolution, strict=False)
@@ -305,7 +281,7 @@ class EnergyMonitor:
             dE_measured_w=numbers[1],
             violation_w=numbers[2],
             level_w=level,
-            residual=self._outs[1][3 : 3 + n_q].copy(),
+            residual=outs[1][3 : 3 + n_q].copy(),
             residual_level=residual_level,
             alarm=alarms[0] or alarms[1] or frozen or detected or blind,
             energy_j=energy,
@@ -349,10 +325,10 @@ class EnergyMonitor:
         """Periods left of each free run, after beginning those anew that have ended; whose windows are full."""
         left = state.left
         if min(left) <= 1:
-            left = self.layout.begin_runs(self._ins[0], left, state.x, state.h)
+            left = self.layout.begin_runs(self._function.inputs[0], left, state.x, state.h)
         else:
             left = left[0] - 1, left[1] - 1
-        youngest, full = self.layout.length - self.window + 2, self._ins[5]
+        youngest, full = self.layout.length - self.window + 2, self._function.inputs[5]
         full[0], full[1] = left[0] <= youngest, left[1] <= youngest
         return left
 
@@ -365,18 +341,6 @@ class EnergyMonitor:
         seconds = max(self.layout.length - self.window + 3 - periods, 0) * self.model.dt
         numbers[-6:] = *older, seconds
         return numbers[-4], seconds
-
-    def _unfit(self, y: Array, u_prev: Array, x: Array, h: Array) -> InputError:
-        model = self.model
-        return InputError(
-            f"monitor of model {model.name}: y, u_prev, x, h have {(y.size, u_prev.size, x.size, h.size)} entries, "
-            f"the model needs {(model.n_y, model.n_u, model.n_x, model.n_h)}"
-        )
-
-
-def _copied(values: Any) -> Array:
-    array = np.array(values, dtype=np.float64)
-    return array if array.ndim == 1 else array.reshape(-1)
 
 
 def _mean_of_finite(values: Array) -> float:
@@ -413,10 +377,3 @@ def _spans(model: HybridModel, given: ArrayLike | None) -> Array:
     if spans.shape != (model.n_u,) or not np.all(spans > 0):
         raise InputError(f"energy monitor: input_range needs {model.n_u} positive ranges, got {spans}")
     return spans
-
-
-def _check(window: int, average: int) -> None:
-    if window < 5 or window % 2 == 0:
-        raise InputError(f"energy monitor: window must be an odd number of at least 5 samples, got {window}")
-    if average < 1:
-        raise InputError(f"energy monitor: average must be at least 1 sample, got {average}")

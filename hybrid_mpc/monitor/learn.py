@@ -148,42 +148,21 @@ def learn_detector(
     time_unit: float = 1.0,
     block_s: float | None = None,
 ) -> Detector:
-    """A detector from nominal readings.
+    """A detector from nominal readings, ``MonitorReading.numbers`` ``(n, columns)`` of each run.
 
     Scales come from weighted least squares of the squared residuals with coefficients that are not negative. Thresholds
     come from a Gumbel tail of the block maxima (:func:`~hybrid_mpc.monitor.calibrate.calibrate`), half of the wanted
     rate for either alarm. A block bootstrap of the same maxima, six neighbours at a time, gives their interval.
 
-    Args:
-        runs: ``MonitorReading.numbers`` of nominal runs, each ``(n, columns)``.
-        dt: Period [s].
-        n_q: Degrees of freedom.
-        free_runs: Whether the numbers hold free runs. Default: yes.
-        drift: See :class:`~hybrid_mpc.monitor.detector.Detector`. Default 1.
-        false_alarms_per_hour: Wanted rate [1/h]; default 1.
-        rest_speed: That of the monitor which made the numbers. Default 0.2, as the monitor's.
-        data_hash: Hash of the data, kept in the result.
-        seed: Of the bootstrap.
-        trusted: Whether the data are known to be nominal, as simulated ones are. Default: no; then a block that stands
-            out is refused.
-        time_unit: The machine's second [s], the model's. Default 1.
-        block_s: Length of a block [s]. Default: 5 of the machine's seconds, 50 periods at least; shorter where there
-            is little data, and a higher rate is enough.
+    ``rest_speed`` and ``time_unit`` are those of the monitor that made the numbers. Unless the data are ``trusted``,
+    as simulated ones are, a block that stands out is refused. A block lasts ``block_s`` [s], by default 5 of the
+    machine's seconds and 50 periods at least; shorter where there is little data, and a higher rate is enough.
 
     Raises:
         InputError: If there is too little data for the rate, no motion, or an alarm in what should be nominal.
 
     Source: Lawson and Hanson (1974) for the least squares; Künsch, *The jackknife and the bootstrap for general
     stationary observations*, Annals of Statistics 17 (1989).
-
-    Example:
-        >>> rng = np.random.default_rng(0)
-        >>> numbers = np.zeros((40_000, 7))
-        >>> numbers[:, 5] = np.sin(0.01 * np.arange(40_000))
-        >>> numbers[:, 3] = rng.normal(size=40_000) * (0.1 + 0.2 * np.abs(numbers[:, 5]))
-        >>> detector = learn_detector([numbers], 0.02, 1, free_runs=False, false_alarms_per_hour=10)
-        >>> bool(detector.force[0][1] > 0.01)  # its variance grows with speed
-        True
     """
     if not runs or any(run.ndim != 2 for run in runs):
         raise InputError(
@@ -236,12 +215,6 @@ def detector_levels(detector: Detector, run: Array) -> tuple[Array, Array]:
     """Largest sum of the forces and scaled power ``(n,)`` along a run's numbers ``(n, columns)``.
 
     They are not shares of the thresholds, and no alarm limits the sums.
-
-    Example:
-        >>> detector = Detector(0.02, ((0.01, 0.0, 0.0, 0.0),), (), 0.5, 4.0)
-        >>> run = np.array([[0.0, 0.0, 0.0, 0.3, 0.0, 1.0, 0.0]] * 3)
-        >>> detector_levels(detector, run)[0].round(6)
-        array([2.5, 5. , 7.5])
     """
     free = replace(detector, force_threshold=1e300, energy_threshold=1e300 if detector.energy else math.inf)
     state, scores = free.initial(), []
@@ -296,22 +269,9 @@ def _threshold(
 
 
 def check_nominal(maxima: Array, what: str, block_s: float = BLOCK_S) -> None:
-    """Refuse data in which a block stands out so far that it can be no nominal one.
+    """Refuse largest levels of blocks, in their order, of which one stands out so far that it can be no nominal one.
 
-    Location and scale come from the quartiles, which a few odd blocks hardly move.
-
-    Args:
-        maxima: Largest level of each block, in their order.
-        what: Whose, for the message.
-        block_s: Length of a block [s]. Default 5.
-
-    Raises:
-        InputError: With the places of the odd blocks.
-
-    Example:
-        >>> check_nominal(np.append(np.random.default_rng(0).gumbel(size=60), 30.0), "forces")
-        Traceback (most recent call last):
-        hybrid_mpc.errors.InputError: calibration data of the forces hold an alarm: ... s stand out ...
+    Location and scale come from the quartiles, which a few odd blocks hardly move. The message names the places.
     """
     low, high = np.quantile(maxima, [0.25, 0.75])
     scale = max((high - low) / (-math.log(-math.log(0.75)) + math.log(-math.log(0.25))), 1e-12)

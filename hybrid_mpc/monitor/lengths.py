@@ -55,16 +55,7 @@ def half_window(length: float, model: HybridModel) -> int:
 
 
 def block_seconds(dt: float, time_unit: float = 1.0) -> float:
-    """Length [s] of a block: of ``BLOCK_S`` of the machine's seconds, which are no fewer than 10 periods.
-
-    Args:
-        dt: Period [s].
-        time_unit: The machine's second [s]. Default 1.
-
-    Example:
-        >>> block_seconds(0.02), block_seconds(0.02, 10.0), block_seconds(2.0)
-        (5.0, 50.0, 100.0)
-    """
+    """Length [s] of a block: of ``BLOCK_S`` of the machine's seconds, which are no fewer than 10 periods."""
     return BLOCK_S * max(time_unit, COARSEST * dt)
 
 
@@ -106,15 +97,7 @@ def rest_speeds(recordings: Sequence[Outputs], model: HybridModel) -> tuple[floa
 
 
 def checked_rest(rest_speed: ArrayLike, n_q: int, what: str) -> tuple[float, ...]:
-    """Rest speeds of ``n_q`` degrees of freedom, from as many or from one for all.
-
-    Raises:
-        InputError: If there are not so many, or one is not positive.
-
-    Example:
-        >>> checked_rest(0.2, 2, "monitor")
-        (0.2, 0.2)
-    """
+    """Rest speeds of ``n_q`` degrees of freedom, from as many or from one for all; positive."""
     values = np.asarray(rest_speed, dtype=float).ravel()
     if values.size not in (1, n_q) or not (np.all(np.isfinite(values)) and np.all(values > 0)):
         raise InputError(

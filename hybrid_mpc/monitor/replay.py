@@ -58,13 +58,6 @@ class MonitorTrace:
 
     ``scores`` are ``(n, 2)`` and ``numbers`` ``(n, columns)``; without a detector there are no scores. ``validity`` are
     the values of :class:`~hybrid_mpc.monitor.energy.Validity`. ``state`` is the monitor's after the last sample.
-
-    Example:
-        >>> z = np.zeros(3)
-        >>> on, why = np.array([False, True, True]), np.array([1, 0, 0])
-        >>> trace = MonitorTrace(np.arange(3.0), z, z, z, z, z, on, validity=why)
-        >>> trace.intervals(), trace.coverage(0.5)
-        ([(1.0, 2.0)], {'valid_s': 1.0, 'warm_up_s': 0.5, 'missing_s': 0.0, 'not_finite_s': 0.0})
     """
 
     t: Array
@@ -88,11 +81,7 @@ class MonitorTrace:
         return [(float(self.t[int(a)]), float(self.t[int(b)])) for a, b in alarm_intervals(self.alarm, 1.0)]
 
     def coverage(self, dt: float) -> dict[str, float]:
-        """Seconds with a valid reading, and those without, by reason.
-
-        Args:
-            dt: Period [s].
-        """
+        """Seconds with a valid reading, and those without, by reason."""
         return {name: float(np.sum(self.validity == why)) * dt for why, name in SECONDS.items()}
 
 
@@ -146,16 +135,7 @@ def along(
 ) -> Iterator[tuple[Recording, Callable[[int, int], None]]]:
     """Recordings one after the other, each with the function that a replay reports its progress to.
 
-    Args:
-        recordings: The recordings.
-        report: ``(key, done, total, text)`` with the samples of all of them.
-
-    Example:
-        >>> from types import SimpleNamespace
-        >>> runs = [SimpleNamespace(t=np.zeros(n), name=name) for n, name in ((30, "a"), (10, "b"))]
-        >>> for run, say in along(runs, print): say(5, len(run.t))
-        recordings 5 40 samples, a
-        recordings 35 40 samples, b
+    ``report`` takes ``(key, done, total, text)`` with the samples of all of them.
     """
     total, before = sum(len(r.t) for r in recordings), 0
     for r in recordings:
@@ -169,16 +149,9 @@ def along(
 
 
 def with_alarms(monitor: EnergyMonitor, trace: MonitorTrace) -> MonitorTrace:
-    """The trace with the alarms of another calibration: those of ``monitor``.
+    """The trace with the alarms of another calibration: those of ``monitor``, of the replay's model and windows.
 
     Estimates and levels do not depend on the calibration, so nothing is replayed.
-
-    Args:
-        monitor: Whose calibration counts; model and windows as in the replay.
-        trace: What :func:`replay` returned.
-
-    Example:
-        ``with_alarms(EnergyMonitor(model, window=15, average=15, calibration=calibration), trace).intervals()``
     """
     on, alarm = (False, False), []
     for level, residual in zip(trace.level_w, trace.residual_level, strict=True):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -25,68 +24,39 @@ HELD_SHARE = 0.25
 """Change of an input, as a share of its range, that sticking friction does not hold."""
 
 
-@dataclass(frozen=True)
 class Layout:
     """Where things lie in the monitor's memory and in its outputs.
 
-    Args:
-        model: The model.
-        window: Samples in the local polynomial.
-        average: Samples in the averages of the levels.
-        length: Periods of a free run; 0 for none.
-        history: Rows kept for the question what broke; 0 for none.
+    ``window`` and ``average`` are samples, ``length`` the periods of a free run, ``history`` the rows kept for a
+    diagnosis; 0 for none.
     """
 
-    model: HybridModel
-    window: int
-    average: int
-    length: int = 0
-    history: int = 0
-
-    @property
-    def n_q(self) -> int:
-        """Degrees of freedom."""
-        return self.model.n_x // 2
-
-    @property
-    def row(self) -> int:
+    def __init__(
+        self, model: HybridModel, window: int, average: int, length: int = 0, history: int = 0
+    ) -> None:
+        self.model, self.window, self.average, self.length, self.history = (
+            model,
+            window,
+            average,
+            length,
+            history,
+        )
+        n_q = self.n_q = model.n_x // 2
+        self.row = 2 * n_q + model.n_u
         """Model increments and input of a period."""
-        return 2 * self.n_q + self.model.n_u
-
-    @property
-    def one_step(self) -> int:
+        self.one_step = window * n_q + (window - 1) * self.row
         """Size of the window's part of the memory."""
-        return self.window * self.n_q + (self.window - 1) * self.row
-
-    @property
-    def run(self) -> int:
-        """Size of a free run: state, hidden state, positions, sums."""
-        return self.model.n_x + self.model.n_h + self.window * self.n_q + RUN_SUMS
-
-    @property
-    def averaged(self) -> int:
+        self.averaged = self.one_step + 3 * n_q + model.n_u
         """Where the latest violations begin; the residuals follow them."""
-        return self.one_step + 3 * self.n_q + self.model.n_u
-
-    @property
-    def runs(self) -> int:
+        self.runs = self.averaged + average * (1 + n_q)
         """Where the free runs begin."""
-        return self.averaged + self.average * (1 + self.n_q)
-
-    @property
-    def history_row(self) -> int:
-        """Numbers of a row: state and input at the centre, residual."""
-        return 3 * self.n_q + self.model.n_u
-
-    @property
-    def rows(self) -> int:
+        self.run = model.n_x + model.n_h + window * n_q + RUN_SUMS
+        """Size of a free run: state, hidden state, positions, sums."""
+        self.rows = self.runs + (RUNS * self.run if length else 0)
         """Where the history begins."""
-        return self.runs + (RUNS * self.run if self.length else 0)
-
-    @property
-    def size(self) -> int:
-        """Size of the memory."""
-        return self.rows + self.history * self.history_row
+        self.history_row = 3 * n_q + model.n_u
+        """Numbers of a row: state and input at the centre, residual."""
+        self.size = self.rows + history * self.history_row
 
     def initial(self) -> tuple[Array, tuple[int, ...]]:
         """Memory before the first sample, and the periods until each free run begins anew."""
@@ -122,11 +92,7 @@ def weights(window: int, dt: float) -> tuple[Array, Array, Array, Array, Array]:
 
 
 def energy_balance(model: HybridModel, x: ca.MX, xdot: ca.MX, u: ca.MX) -> ca.MX:
-    """Residual [W] of the model's energy balance if its state changes at ``xdot``.
-
-    Raises:
-        InputError: If the model has no energy balance.
-    """
+    """Residual [W] of the model's energy balance if its state changes at ``xdot``."""
     return _energy_of(model).residual(x, xdot, u, model.w, model.p)
 
 
@@ -142,11 +108,7 @@ def _energy_of(model: HybridModel) -> Balance:
 
 
 def force_units(model: HybridModel) -> tuple[str, ...]:
-    """Unit of each residual force: that of the balance's rate over that of the speed.
-
-    Raises:
-        InputError: If the model has no energy balance.
-    """
+    """Unit of each residual force: that of the balance's rate over that of the speed."""
     rate = _energy_of(model).rate_unit
     return tuple(FORCES.get((rate, v.unit), f"{rate}/({v.unit})") for v in model.states[model.n_x // 2 :])
 
@@ -170,10 +132,7 @@ def _near_rest(
 
     Half the difference of the accelerations back and forth is ``D(s) = jump + damping s``: dry friction, which is fully
     there at the rest speed, and what grows with the speed. So ``2 D(s) - D(2 s)`` is what dry friction can hold at
-    rest, and what damps is no part of it.
-
-    Returns:
-        The mean ``(n_q,)`` of back and forth at the rest speed, ``D`` there, and ``2 D(s) - D(2 s)``.
+    rest, and what damps is no part of it. Returned are the mean, ``D(s)`` and ``2 D(s) - D(2 s)``.
     """
     n_q = model.n_x // 2
     (back, forth), (faster_back, faster_forth) = (
@@ -331,12 +290,7 @@ def reading_function(layout: Layout, rest_speed: Sequence[float], spans: Array) 
 
 
 def check_model(model: HybridModel) -> None:
-    """Refuse a model that the monitor cannot read.
-
-    Raises:
-        InputError: If its outputs are not its positions, it has no energy balance, or one that says nothing of its
-            motion.
-    """
+    """Refuse a model that the monitor cannot read: its outputs are not its positions, or it has no energy balance."""
     n_q = model.n_x // 2
     x, u = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
     jacobian = ca.Function("C", [x, u], [ca.jacobian(model.output(x, u, model.w, model.p), ca.vertcat(x, u))])

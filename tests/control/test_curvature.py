@@ -78,7 +78,10 @@ def test_the_hidden_states_part_can_be_kept_or_left_out():
     for size, shape in ((1e-9 * share, 3), (1e3 * share, 5)):  # far below and above what matters
         given = whole * size
         given[:, :3, :3] = whole[:, :3, :3]
-        assert cost.without_what_is_small(prepared, given).shape == (12, shape, shape)
+        kept = cost.stages.without_what_is_small(
+            given, prepared.hessian, prepared.from_u, cost.inner.condenser.by_inputs
+        )
+        assert kept.shape == (12, shape, shape)
 
 
 def test_soft_bounds_are_in_the_lagrangian_and_its_hessian():

@@ -82,9 +82,8 @@ def test_an_ill_conditioned_problem_keeps_its_bounds():
         gradient = -far.T @ (np.array([1e5, 1e6]) * rng.normal(size=2)) + rng.normal(size=n)
         answer = qp.solve(hessian, gradient, np.zeros((n, 1)), HELD)
         assert answer.status is Status.SOLVED
-        assert (
-            np.max(np.abs(answer.step)) <= 1 + 1e-7
-        )  # 1e-9 in DAQP's scaling, by which the Hessian's condition counts
+        # 1e-9 in DAQP's scaling, by which the Hessian's condition counts
+        assert np.max(np.abs(answer.step)) <= 1 + 1e-7
 
 
 def test_messages_and_ok():

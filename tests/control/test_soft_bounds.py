@@ -63,9 +63,8 @@ def test_a_bound_that_can_be_kept_is_kept_exactly():
         x_min=[-np.inf, -0.5], x_max=[0.8, 0.5], slack_linear=[1e5, 1e5], slack_quadratic=[1e5, 1e5]
     )
     again = solve(model, higher, np.zeros(2), np.tile([1.0, 0.0], (31, 1)))
-    np.testing.assert_allclose(
-        again.u, got.u, atol=2e-5
-    )  # the QP's tolerance of half the range of 6, times ten
+    # the QP's tolerance of half the range of 6, times ten
+    np.testing.assert_allclose(again.u, got.u, atol=2e-5)
 
 
 def test_a_bound_that_cannot_be_kept_is_approached_as_fast_as_possible():

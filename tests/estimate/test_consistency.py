@@ -88,9 +88,8 @@ def test_several_outputs_missing_samples_and_recordings():
     assert first.t[0] == pytest.approx(25 * model.dt)
     # The squares of the normalised innovations are the NIS, which the filter takes output by output.
     whole = np.isfinite(first.normalised).all(axis=1)
-    np.testing.assert_allclose(
-        np.sum(first.normalised[whole] ** 2, axis=1), first.nis[whole], rtol=1e-9
-    )  # rounding of two orders of the same arithmetic
+    # rounding of two orders of the same arithmetic
+    np.testing.assert_allclose(np.sum(first.normalised[whole] ** 2, axis=1), first.nis[whole], rtol=1e-9)
 
 
 def test_the_statistics_by_hand():

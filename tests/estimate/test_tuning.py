@@ -72,8 +72,7 @@ def test_process_noise_is_the_error_of_one_period():
     # A standard deviation of 4,000 samples is off by 1 / sqrt(8000) = 1.1 %; four of these.
     assert np.abs(found / [0.001, 0.05] - 1).max() < 0.045
     half = SimpleNamespace(u=u[:100], y=x[:100, :1], x=x[:100])
-    assert np.array_equal(
-        process_noise(model, [half, half], most=50), process_noise(model, [half])
-    )  # the second one is not looked at
+    # the second one is not looked at
+    assert np.array_equal(process_noise(model, [half, half], most=50), process_noise(model, [half]))
     with pytest.raises(InputError, match="two samples"):
         process_noise(model, [])

@@ -74,9 +74,8 @@ def test_unstable_upright_position_is_held_and_the_angle_counts_on():
     plant = PendulumPlant()
     up = lambda t: hold(t, np.pi)  # noqa: E731
     result = loop(pendulum_model(), plant, up, duration=5.0, x0=[np.pi - 0.2, 0.0])
-    assert (
-        np.max(np.abs(result.x[-50:, 0] - np.pi)) < 0.03
-    )  # 0.09 N m of dry friction over a gain of several N m/rad
+    # 0.09 N m of dry friction over a gain of several N m/rad
+    assert np.max(np.abs(result.x[-50:, 0] - np.pi)) < 0.03
 
 
 def test_missing_measurements_are_bridged_by_the_model():
@@ -87,9 +86,8 @@ def test_missing_measurements_are_bridged_by_the_model():
     assert np.mean(np.isnan(gappy.y[100:])) > 0.4
     late = whole.t > 2.0
     worse = np.max(np.abs(gappy.x[late, 0] - gappy.reference[late, 0]))
-    assert (
-        worse < np.max(np.abs(whole.x[late, 0] - whole.reference[late, 0])) + 1e-3
-    )  # half of them are missing
+    # half of them are missing
+    assert worse < np.max(np.abs(whole.x[late, 0] - whole.reference[late, 0])) + 1e-3
 
 
 @pytest.mark.parametrize("kind", ["rti", "sqp"])

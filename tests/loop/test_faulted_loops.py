@@ -86,9 +86,8 @@ def test_inputs_are_finite_and_within_their_limits(loops):
     for kinds, _, _, result, ocp in loops:
         assert len(result.u) == PERIODS, kinds
         assert np.isfinite(result.u).all(), kinds
-        assert excess(result.u, ocp) <= 1e-12, (
-            kinds
-        )  # rounding of the slew, a difference of inputs below 1 N m
+        # rounding of the slew, a difference of inputs below 1 N m
+        assert excess(result.u, ocp) <= 1e-12, kinds
 
 
 def test_nearly_all_periods_are_solved_but_those_whose_solve_is_late(loops):

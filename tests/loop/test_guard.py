@@ -75,38 +75,31 @@ def test_the_backup_continues_the_plan():
     np.testing.assert_allclose(switched.u, plain.u, atol=5e-3)
 
 
-def test_a_frozen_sensor_takes_precedence_and_the_dwell_is_kept():
-    guard = backup(dwell=0.3, quiet=0.04)
-    result = guarded(guard, ScriptedMonitor(alarms=[(10, 40)], frozen=[(15, 17)]))
-    names = [(round(s.t / DT), s.after.name) for s in result.switches]
-    assert names[0] == (11, "BACKUP")
-    assert names[1] == (16, "REST")  # to a more careful mode at once
-    assert names[2] == (32, "BACKUP")  # back not before 0.3 s in it, and one period after the reading
-    assert names[3][1] == "NORMAL"
+PATIENT = {"dwell": 0.1, "quiet": 0.2, "patience": 0.3}
 
 
-def test_a_frozen_sensor_is_trusted_again_after_the_quiet_time():
-    result = guarded(backup(dwell=0.1, quiet=0.2), ScriptedMonitor(frozen=[(10, 12)]))
-    # the last reading is that of period 11; ten periods of quiet, and the period after
-    assert [(round(s.t / DT), s.after) for s in result.switches] == [(11, Mode.REST), (22, Mode.NORMAL)]
-
-
-def test_a_flickering_alarm_does_not_flicker_through():
-    result = guarded(backup(dwell=0.1, quiet=0.2), ScriptedMonitor([(k, k + 1) for k in range(10, 40, 4)]))
-    assert len(result.switches) == 2
-
-
-def test_a_patient_guard_waits_for_what_lasts():
-    patient = backup(dwell=0.1, quiet=0.2, patience=0.3)
-    passing = guarded(patient, ScriptedMonitor([(10, 15), (20, 24)]))  # an alarm of 0.26 s, with a gap in it
-    assert passing.switches == ()
-    apart = guarded(patient, ScriptedMonitor([(10, 20), (32, 42)]))  # two of 0.18 s, more than quiet apart
-    assert apart.switches == ()
-    lasting = guarded(patient, ScriptedMonitor([(10, 15), (20, 40)]))
-    assert round(lasting.switches[0].t / DT) == 26  # the reading 15 periods after the first, plus one
-    assert lasting.switches[0].after is Mode.BACKUP
-    frozen = guarded(patient, ScriptedMonitor(frozen=[(10, 12)]))
-    assert round(frozen.switches[0].t / DT) == 11  # a sensor is not waited for
+@pytest.mark.parametrize(
+    ("times", "alarms", "frozen", "switches"),
+    [
+        # to a more careful mode at once, back not before 0.3 s in each, and one period after the reading
+        ({"dwell": 0.3, "quiet": 0.04}, [(10, 40)], [(15, 17)],
+         [(11, Mode.BACKUP), (16, Mode.REST), (32, Mode.BACKUP), (48, Mode.NORMAL)]),
+        # the last reading is that of period 11; ten periods of quiet, and the period after
+        ({"dwell": 0.1, "quiet": 0.2}, [], [(10, 12)], [(11, Mode.REST), (22, Mode.NORMAL)]),
+        # a flickering alarm does not flicker through
+        ({"dwell": 0.1, "quiet": 0.2}, [(k, k + 1) for k in range(10, 40, 4)], [],
+         [(11, Mode.BACKUP), (49, Mode.NORMAL)]),
+        # a patient guard waits for what lasts: an alarm of 0.26 s with a gap in it, two of 0.18 s more than quiet
+        # apart, one that lasts (the reading 15 periods after the first, plus one), and not for a sensor
+        (PATIENT, [(10, 15), (20, 24)], [], []),
+        (PATIENT, [(10, 20), (32, 42)], [], []),
+        (PATIENT, [(10, 15), (20, 40)], [], [(26, Mode.BACKUP), (50, Mode.NORMAL)]),
+        (PATIENT, [], [(10, 12)], [(11, Mode.REST), (22, Mode.NORMAL)]),
+    ],
+)  # fmt: skip
+def test_when_the_guard_goes_over_and_back(times, alarms, frozen, switches):
+    result = guarded(backup(**times), ScriptedMonitor(alarms, frozen))
+    assert [(round(s.t / DT), s.after) for s in result.switches] == switches
 
 
 def test_no_estimate_and_no_solve_are_survived_in_every_mode():

@@ -151,9 +151,8 @@ def test_the_input_that_acted_is_believed(model):
 
     # the plant is heavier by 0.5 sin(0.6) and rubs 0.04 more than the model: 0.32 at most
     assert abs(estimate_load(True)) < 0.32
-    assert (
-        abs(estimate_load(False)) > 4.0
-    )  # of the 5 that the limits of 6 promise and the actuator does not give
+    # of the 5 that the limits of 6 promise and the actuator does not give
+    assert abs(estimate_load(False)) > 4.0
 
 
 def test_the_monitor_gets_the_input_that_acted(model, safe):

@@ -4,7 +4,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from closed_loop_parts import DT, FakeClock, Rig, ScriptedReading, make_ekf, make_runner, sine
+from closed_loop_parts import DT, FakeClock, Rig, ScriptedMonitor, make_ekf, make_runner, sine
 from online_models import pendulum_model
 
 from hybrid_mpc import InputError, Runner, SafeInputError, TrueState
@@ -29,23 +29,13 @@ def test_no_number_raises(model, safe, absurd):
     assert Counter(report.source) == report.sources
 
 
-class Watching:
-    """A monitor that says nothing."""
-
-    def initial(self):
-        return 0
-
-    def update(self, state, y, u_prev, estimate):
-        return state, ScriptedReading(False)
-
-
 @pytest.mark.parametrize(
     "where", ["measure", "actuate", "reference", "weight", "stop", "on_step", "now", "sleep_until", "update"]
 )
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
 @pytest.mark.parametrize("call", [1, 9])
 def test_a_failing_callback_leaves_the_safe_input(model, safe, where, error, call):
-    rig, clock, monitor, calls = Rig(), FakeClock(), Watching(), Counter()
+    rig, clock, monitor, calls = Rig(), FakeClock(), ScriptedMonitor(), Counter()
 
     def guard(name, function):
         def call_it(*arguments):

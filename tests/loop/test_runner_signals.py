@@ -114,33 +114,31 @@ def test_a_signal_ends_the_process_after_the_safe_input(start, name, case):
     assert ("KeyboardInterrupt" in child.errors()) == (name == "SIGINT")
 
 
-@pytest.mark.parametrize("second", ["SIGTERM", "SIGINT", "SIGHUP"])
-def test_a_second_signal_does_not_break_off_the_hand_over(start, second):
-    child = start("slow_hand_over")
+TERM = -signal.SIGTERM
+
+
+@pytest.mark.parametrize(
+    ("case", "first", "then", "others", "status", "log"),
+    [
+        ("slow_hand_over", "SIGTERM", "handing over", ["SIGTERM", "SIGTERM"], TERM, [SAFE]),
+        ("slow_hand_over", "SIGTERM", "handing over", ["SIGINT", "SIGINT"], TERM, [SAFE]),
+        ("slow_hand_over", "SIGTERM", "handing over", ["SIGHUP", "SIGHUP"], TERM, [SAFE]),
+        ("slow_hand_over", "SIGINT", "handing over", ["SIGTERM"], TERM, [SAFE]),  # it still has its effect
+        ("after_an_error", "SIGTERM", "here", [], TERM, [SAFE]),
+        ("ignored", "SIGHUP", "here", [], 0, [SAFE, "duration"]),
+        ("own_handler", "SIGTERM", "here", [], 0, [SAFE, "handler", "SIGTERM"]),
+        ("suspended", "SIGTSTP", SAFE, ["SIGCONT"], 0, [SAFE, "SIGTSTP"]),  # safe before it stands still
+        ("stopped_thread", "SIGTERM", "here", [], 0, [SAFE, "stop"]),
+    ],
+)
+def test_the_safe_input_comes_before_the_effect_of_signals(start, case, first, then, others, status, log):
+    child = start(case)
     child.until("here")
-    child.send("SIGTERM")
-    child.until("handing over")
-    child.send(second, second)
-    assert child.end() == -signal.SIGTERM
-    assert child.log()[-1] == SAFE
-
-
-def test_after_ctrl_c_the_other_signal_still_has_its_effect(start):
-    child = start("slow_hand_over")
-    child.until("here")
-    child.send("SIGINT")
-    child.until("handing over")
-    child.send("SIGTERM")
-    assert child.end() == -signal.SIGTERM
-    assert child.log()[-1] == SAFE
-
-
-def test_a_signal_during_the_hand_over_after_an_error(start):
-    child = start("after_an_error")
-    child.until("here")
-    child.send("SIGTERM")
-    assert child.end() == -signal.SIGTERM
-    assert child.log()[-1] == SAFE
+    child.send(first)
+    child.until(then)
+    child.send(*others)
+    assert child.end() == status, child.errors()
+    assert child.log()[-len(log) :] == log
 
 
 def test_where_the_actuator_stays_broken_the_error_is_printed_before_the_signal(start):
@@ -150,40 +148,6 @@ def test_where_the_actuator_stays_broken_the_error_is_printed_before_the_signal(
     assert child.end() == -signal.SIGTERM
     assert "the safe input could not be handed over: the actuator failed 2 times" in child.errors()
     assert "the bus is gone" in child.errors()
-
-
-def test_ignored_signals_stay_ignored(start):
-    child = start("ignored")
-    child.until("here")
-    child.send("SIGHUP")
-    assert child.end() == 0
-    assert child.log()[-2:] == [SAFE, "duration"]
-
-
-def test_the_programs_own_handler_follows_the_safe_input(start):
-    child = start("own_handler")
-    child.until("here")
-    child.send("SIGTERM")
-    assert child.end() == 0, child.errors()
-    assert child.log()[-3:] == [SAFE, "handler", "SIGTERM"]
-
-
-def test_suspending_ends_the_run_before_the_process_stands_still(start):
-    child = start("suspended")
-    child.until("here")
-    child.send("SIGTSTP")
-    child.until(SAFE)
-    child.send("SIGCONT")
-    assert child.end() == 0, child.errors()
-    assert child.log()[-2:] == [SAFE, "SIGTSTP"]
-
-
-def test_a_run_in_another_thread_is_ended_by_stop(start):
-    child = start("stopped_thread")
-    child.until("here")
-    child.send("SIGTERM")
-    assert child.end() == 0, child.errors()
-    assert child.log()[-2:] == [SAFE, "stop"]
 
 
 def test_ctrl_c_leaves_a_run_in_another_thread_alone_until_the_interpreter_ends(start):

@@ -1,10 +1,10 @@
 """The simulation itself: what is called when, what is recorded, what is refused."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from closed_loop_parts import DT, Recorder, hold, make_ekf, make_safe, run, sine
+from closed_loop_parts import DT, ModelPlant, Recorder, ScriptedReading, hold, make_ekf, make_safe, run, sine
 from online_models import PendulumPlant, linear_model, pendulum_model
 
 from hybrid_mpc import (
@@ -109,13 +109,6 @@ def test_true_state_is_handed_the_truth(model, safe):
         run(model, safe, estimator=oracle)  # a plant without hidden states
 
 
-@dataclass(frozen=True)
-class Reading:
-    violation_w: float
-    level_w: float
-    alarm: bool
-
-
 class CountingMonitor:
     """Its state is the number of updates; it notes what it is given."""
 
@@ -127,7 +120,7 @@ class CountingMonitor:
 
     def update(self, state, y, u_prev, estimate):
         self.calls.append((state, y.copy(), u_prev.copy(), estimate))
-        return state + 1, Reading(float(state), 2.0 * state, state >= 20)
+        return state + 1, ScriptedReading(state >= 20, violation_w=float(state), level_w=2.0 * state)
 
 
 def test_monitor_sees_each_period_with_the_input_held_before(model, safe):
@@ -252,23 +245,6 @@ def test_a_late_solve_is_the_shifted_plan(model, safe):
 def test_several_inputs_and_outputs():
     a, b = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.0, 0.1], [0.1, 0.0]])
     model = linear_model(a, b, np.eye(2))
-
-    class Linear:
-        def reset(self, x0, seed):
-            return x0
-
-        def step(self, state, u, dt):
-            return a @ state + b @ (u + np.array([0.0, 0.2]))
-
-        def measure(self, state, rng):
-            return state + 1e-4 * rng.normal(size=2)
-
-        def truth(self, state):
-            return state
-
-        def hidden(self, state):
-            return np.zeros(0)
-
     ekf = ExtendedKalmanFilter(
         model,
         sigma_y=[1e-4] * 2,
@@ -281,7 +257,8 @@ def test_several_inputs_and_outputs():
         model, OCP(15, [10.0, 1.0], [1e-4] * 2, [0.0] * 2, [-3.0] * 2, [3.0] * 2)
     )
     zero = lambda t: np.zeros((len(t), 2))  # noqa: E731
-    result = simulate(Linear(), ekf, controller, zero, dt=0.1, duration=8.0, x0=[1.0, 0.0], seed=0)
+    plant = ModelPlant(model, np.array([0.0, 0.2]))
+    result = simulate(plant, ekf, controller, zero, dt=0.1, duration=8.0, x0=[1.0, 0.0], seed=0)
     # Sensor noise of 1e-4 makes d jitter by some 1e-3 to 1e-2 (its random walk is 1e-2 a period).
     np.testing.assert_allclose(result.d[-20:].mean(axis=0), [0.0, 0.2], atol=5e-3)
     assert np.max(np.abs(result.x[-20:, 0])) < 5e-3

@@ -96,9 +96,8 @@ def test_the_rule_is_right_on_all_machines(name, tmp_path):
     (rest,) = rest_speeds(known, Axis(scenario.data.dt).model())
     low, high = MACHINES[name]
     assert low < rest < high
-    if (
-        name in FRICTION_SPEED
-    ):  # the smoothed step has risen to 99 % (tanh 2.65), so what is held at rest can be told
+    # the smoothed step has risen to 99 % (tanh 2.65), so what is held at rest can be told
+    if name in FRICTION_SPEED:
         assert rest > 2.65 * FRICTION_SPEED[name]
 
 

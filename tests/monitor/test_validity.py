@@ -102,9 +102,8 @@ def test_in_the_loop_a_blind_monitor_is_no_quiet_one():
         ("BACKUP", "NORMAL", "no alarm for 0.1 s"),
     ]
     first, last = result.switches[0].t, result.switches[1].t
-    assert first == pytest.approx(
-        0.4 + (5 + 5 + 1) * LOOP_DT
-    )  # longer than its windows, then the next period
+    # longer than its windows, then the next period
+    assert first == pytest.approx(0.4 + (5 + 5 + 1) * LOOP_DT)
     assert 1.0 < last < 1.3
     dark = ~result.valid
     assert dark[:4].all()  # warm-up
