@@ -111,7 +111,7 @@ class Detector:
         return SHORTEST_S * self.time_unit
 
     def check(self, n_q: int, free_runs: bool, dt: float, time_unit: float) -> None:
-        """Refuse a monitor of other forces, without the free runs that it reads, or of another period or unit of time."""
+        """Refuse a monitor of other forces, without free runs, or of another period or unit of time."""
         if len(self.force) != n_q:
             raise InputError(f"detector: learned for {len(self.force)} forces, the model has {n_q}")
         if self.energy and not free_runs:

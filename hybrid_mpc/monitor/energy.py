@@ -144,9 +144,9 @@ class EnergyMonitor:
     moved counts as well, once it is more than a quarter of the input's range. A blocked machine looks the same.
 
     A missing (NaN) measurement gives NaN readings until it has left the window. A level is the mean of the finite ones
-    of the last ``average`` values, NaN (and no alarm) while fewer than half are finite. A monitor without
-    a valid reading for longer than ``window`` and ``average`` together is ``blind``, and that is an alarm. Positions must count
-    on through full turns. Not for several threads at once (it reuses its buffers).
+    of the last ``average`` values, NaN (and no alarm) while fewer than half are finite. A monitor without a
+    valid reading for longer than ``window`` and ``average`` together is ``blind``, and that is an alarm. Positions must
+    count on through full turns. Not for several threads at once (it reuses its buffers).
 
     Args:
         model: Model whose outputs are its positions ``q`` (state ``[q, v]``).
