@@ -43,12 +43,7 @@ GROUP_ROWS = 20_000
 
 @dataclass(frozen=True)
 class NoiseNote:
-    """Process noise of a model's filters.
-
-    Args:
-        source: Where it is from, in words.
-        sigma_x: Standard deviations per period by controller.
-    """
+    """Process noise of a model's filters: where it is from, and standard deviations per period by controller."""
 
     source: str
     sigma_x: Mapping[str, tuple[float, ...]]
@@ -56,13 +51,7 @@ class NoiseNote:
 
 @dataclass(frozen=True)
 class ModelNote:
-    """A model of a study.
-
-    Args:
-        sha256: Hash of its folder.
-        provenance: What it says of itself.
-        noise: What its filters assume.
-    """
+    """A model of a study: hash of its folder, what it says of itself, and what its filters assume."""
 
     sha256: str
     provenance: Mapping[str, Any]
@@ -71,21 +60,7 @@ class ModelNote:
 
 @dataclass(frozen=True)
 class StudyNote:
-    """What a study is made of.
-
-    Args:
-        study: Its settings as plain data.
-        title: The machine, one line.
-        description: The machine, a paragraph.
-        models: By label.
-        runs: How many there are.
-        versions: Versions of the packages.
-        kind: Kind of study. Default: closed loops of all combinations.
-        scenario_sha256: Hash of the scenario's file; None for a registered scenario.
-        engine: What has computed it; empty until it is finished.
-        workers_died: Workers that died on the way.
-        schema_version: Of this note.
-    """
+    """What a study is made of; ``study`` is its settings as plain data, ``engine`` is empty until it is finished."""
 
     study: Mapping[str, Any]
     title: str
@@ -114,11 +89,7 @@ def study_note(folder: Path) -> StudyNote:
 
 
 def note_of(data: Mapping[str, Any], where: str) -> StudyNote:
-    """A note from plain data.
-
-    Raises:
-        InputError: If it is of another version, or a field does not fit.
-    """
+    """A note from plain data; InputError if it is of another version, or a field does not fit."""
     if data.get("schema_version") != SCHEMA_VERSION:
         raise InputError(
             f"{where}: a study of schema version {str(data.get('schema_version'))[:20]}, this version of hybrid-mpc "
@@ -129,13 +100,8 @@ def note_of(data: Mapping[str, Any], where: str) -> StudyNote:
 
 @dataclass(frozen=True)
 class RunRow:
-    """The row of a run.
-
-    Args:
-        id: Name made of all that decides what the run computes.
-        status: ``"done"`` or ``"failed"``.
-        error: Traceback of one that failed.
-        columns: What the run was, and what it found.
+    """The row of a run: what it was and what it found (``columns``), ``"done"`` or ``"failed"``, and then its
+    traceback.
     """
 
     id: str
@@ -153,20 +119,6 @@ class RunLog:
 
     What :meth:`append` has returned from is on the disk. A line that a kill tore apart is cut off when the log is
     opened again: its run counts as not finished. One process at a time may hold the log.
-
-    Args:
-        folder: Folder of the files; made if missing.
-
-    Raises:
-        InputError: If another process holds the log.
-
-    Example:
-        >>> import tempfile
-        >>> folder = Path(tempfile.mkdtemp())
-        >>> with RunLog(folder) as log:
-        ...     log.append([RunRow("a", "done", "", {"cost": cost}) for cost in (0.1, float("inf"))])
-        >>> [row.columns["cost"] for row in rows(folder)]
-        [0.1, inf]
     """
 
     def __init__(self, folder: Path) -> None:
@@ -192,11 +144,7 @@ class RunLog:
         self._held.close()
 
     def append(self, new: Iterable[RunRow]) -> None:
-        """Add rows; on return they are on the disk.
-
-        Raises:
-            InputError: If they cannot be written (a full disk); what was there before is unharmed.
-        """
+        """Add rows; on return they are on the disk. On a full disk what was there before is unharmed."""
         lines = [json.dumps(plain(row.plain()), separators=(",", ":")) + "\n" for row in new]
         if not lines:
             return
@@ -272,16 +220,7 @@ def _repaired(path: Path) -> int:
 
 
 def compact(log: Path, path: Path, provenance: Mapping[str, Any]) -> None:
-    """Write the rows of a log as Parquet: all of it or nothing. Of several rows of a run the last counts.
-
-    Args:
-        log: Folder of the log.
-        path: File to write.
-        provenance: Plain data for the file's metadata.
-
-    Raises:
-        StorageError: If it cannot be written (a full disk); the log is unharmed.
-    """
+    """Write the rows of a log as Parquet: all of it or nothing. Of several rows of a run the last counts."""
     import pyarrow.parquet as pq
 
     last: dict[str, int] = {}
@@ -298,12 +237,7 @@ def compact(log: Path, path: Path, provenance: Mapping[str, Any]) -> None:
 
 
 def intact(path: Path) -> bool:
-    """Whether a Parquet file is there and can be read to its end.
-
-    Example:
-        >>> intact(Path("nowhere.parquet"))
-        False
-    """
+    """Whether a Parquet file is there and can be read to its end."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -319,11 +253,7 @@ def intact(path: Path) -> bool:
 
 
 def provenance_of(path: Path) -> dict[str, Any]:
-    """What a Parquet file of a study says of itself.
-
-    Raises:
-        InputError: If it is no such file.
-    """
+    """What a Parquet file of a study says of itself; InputError if it is no such file."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
