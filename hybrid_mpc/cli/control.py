@@ -76,11 +76,7 @@ def control(
 
 
 def summary(results: dict[str, Any]) -> list[str]:
-    """One line a task and controller.
-
-    Args:
-        results: What results.json holds.
-    """
+    """One line a task and controller, of the content of results.json."""
     first = next(iter(results["loops"][0]["tracking_rmse"]))
     width = max(len(first) + 5, 11)
     head = f"{'RMSE ' + first:>{width}}"

@@ -117,9 +117,6 @@ def summary(results: Results) -> list[str]:
 def tracking(errors: Mapping[str, float]) -> str:
     """The first tracking error with its signal's unit.
 
-    Args:
-        errors: By signal with unit.
-
     Example:
         >>> tracking({"phi [rad]": 0.01234, "phi_dot [rad/s]": 0.5})
         'phi 0.01234 rad'

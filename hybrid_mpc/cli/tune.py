@@ -71,12 +71,7 @@ def tune(
 
 
 def summary(found: SearchResult, names: tuple[str, ...]) -> list[str]:
-    """One line a trial, then the best.
-
-    Args:
-        found: The search's result.
-        names: Searched settings.
-    """
+    """One line a trial, with the searched settings of these names, then the best."""
     lines = ["  ".join(["trial", f"{'state':8}", f"{'E_sim':>8}", "   s", *names])]
     for row in found.trials:
         values = [f"{row.values[name]:>{len(name)}.3g}" for name in names]

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from hybrid_mpc.errors import InputError
@@ -133,9 +132,7 @@ class RunLog:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, t: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -221,6 +218,7 @@ def _repaired(path: Path) -> int:
 
 def compact(log: Path, path: Path, provenance: Mapping[str, Any]) -> None:
     """Write the rows of a log as Parquet: all of it or nothing. Of several rows of a run the last counts."""
+    import pyarrow as pa
     import pyarrow.parquet as pq
 
     last: dict[str, int] = {}
@@ -229,11 +227,17 @@ def compact(log: Path, path: Path, provenance: Mapping[str, Any]) -> None:
         last[row.id] = i
         for key, value in row.plain().items():
             kinds.setdefault(key, set()).add(type(value))
-    schema = _schema(kinds).with_metadata({METADATA: json.dumps(plain(provenance)).encode()})
+    columns = {key: _column(found - {type(None)}) for key, found in kinds.items()}
+    schema = pa.schema([(key, kind) for key, (kind, _) in columns.items()])
+    schema = schema.with_metadata({METADATA: json.dumps(plain(provenance)).encode()})
     final = (row.plain() for i, row in enumerate(rows(log)) if last[row.id] == i)
     with replacing(path) as file, pq.ParquetWriter(file, schema, compression="zstd") as writer:
         while group := list(islice(final, GROUP_ROWS)):
-            writer.write_table(_table(group, schema))
+            for values in group:
+                values |= {
+                    k: make(values[k]) for k, (_, make) in columns.items() if values.get(k) is not None
+                }
+            writer.write_table(pa.Table.from_pylist(group, schema=schema))
 
 
 def intact(path: Path) -> bool:
@@ -269,31 +273,12 @@ def provenance_of(path: Path) -> dict[str, Any]:
         raise InputError(f"{path} is damaged: {error}") from error
 
 
-def _schema(kinds: Mapping[str, set[type]]) -> pa.Schema:
-    import pyarrow as pa
-
-    return pa.schema([(key, _type(found - {type(None)})) for key, found in kinds.items()])
-
-
-def _type(found: set[type]) -> pa.DataType:
+def _column(found: set[type]) -> tuple[pa.DataType, Callable[[Any], Any]]:
+    """Type of a column whose values are of these kinds, and what makes them of it."""
     import pyarrow as pa
 
     if found == {bool}:
-        return pa.bool_()
+        return pa.bool_(), bool
     if found == {int}:
-        return pa.int64()
-    return pa.float64() if found <= {int, float} else pa.string()
-
-
-def _table(group: list[dict[str, Any]], schema: pa.Schema) -> pa.Table:
-    import pyarrow as pa
-
-    columns = []
-    for column in schema:
-        values = [row.get(column.name) for row in group]
-        if column.type == pa.float64():
-            values = [None if v is None else float(v) for v in values]
-        elif column.type == pa.string():
-            values = [None if v is None else str(v) for v in values]
-        columns.append(pa.array(values, type=column.type))
-    return pa.Table.from_arrays(columns, schema=schema)
+        return pa.int64(), int
+    return (pa.float64(), float) if found <= {int, float} else (pa.string(), str)

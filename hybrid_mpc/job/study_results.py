@@ -447,7 +447,12 @@ def _pareto(results: StudyResults) -> tuple[Any, str]:
 
 
 def duration_text(seconds: float) -> str:
-    """A duration as people say it: ``42 s``, ``10 min``, ``2.0 h``, ``4.6 d``."""
+    """A duration as people say it.
+
+    Example:
+        >>> duration_text(42.0), duration_text(600.0), duration_text(7300.0), duration_text(4e5)
+        ('42 s', '10 min', '2.0 h', '4.6 d')
+    """
     for size, unit, digits in ((86400.0, "d", 1), (3600.0, "h", 1), (60.0, "min", 0)):
         if seconds >= 2 * size or (unit != "min" and seconds >= 1.5 * size):
             return f"{seconds / size:.{digits}f} {unit}"

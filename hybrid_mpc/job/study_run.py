@@ -21,7 +21,7 @@ import numpy as np
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import MOST_CONTENT, read_bytes, sha256
-from hybrid_mpc.job.context import Progress, Silent, versions
+from hybrid_mpc.job.context import Progress, versions
 from hybrid_mpc.job.controllers import CONTROLLERS, ORACLES, find_noise
 from hybrid_mpc.job.engine import Engine, Lost, make_engine
 from hybrid_mpc.job.folder import JobNote, check_out, open_folder
@@ -252,7 +252,7 @@ def run_study(
     Example:
         >>> results = run_study(Study("golf_robot", "runs/golf"), "studies/first")  # doctest: +SKIP
     """
-    out, say = Path(out), progress or Silent()
+    out, say = Path(out), progress or Progress()
     check_out(out, NOUN, resume=resume)
     say.start("reading the models, and the filters' noise")
     run, models = load_inputs(study, held_models(out))

@@ -92,15 +92,7 @@ def tuned_noise(
 ) -> Array:
     """Process noise ``(n_x,)`` per period: ``base`` times the scale that makes undisturbed recordings most likely.
 
-    Args:
-        model: The model to estimate with.
-        scenario: The machine: sensor noise, and the control problem's input range.
-        base: The model's one-period errors ``(n_x,)``, see :func:`~hybrid_mpc.estimate.tuning.process_noise`.
-        recordings: Training recordings.
-        observer: Whether the estimator follows an unknown load.
-
-    Example:
-        ``tuned_noise(model, scenario, process_noise(model, train), train, observer=True)``
+    ``base`` are the model's one-period errors ``(n_x,)``; an ``observer`` follows an unknown load.
     """
     places = np.linspace(0, len(recordings) - 1, min(TUNED_RECORDINGS, len(recordings))).round().astype(int)
     parts = [
@@ -163,10 +155,6 @@ def make_estimator(
 
 def first_deviations(model: HybridModel, scenario: LoopAssumptions) -> Array:
     """Standard deviations ``(n_x,)`` of the state at the estimator's start, at rest where the sensors say.
-
-    Args:
-        model: The model.
-        scenario: The machine: its ``sensor_sigma`` and ``first_sigma``.
 
     Raises:
         InputError: If ``sensor_sigma`` or ``first_sigma`` does not fit the model.
@@ -248,13 +236,8 @@ def make_ocp(prior: HybridModel, control: OCP) -> OCP:
 def working_point(model: HybridModel, control: OCP) -> tuple[Array, Array]:
     """Working point of the problem, ``(x, u)``, else in motion at the position zero: speeds ``1 / sqrt(q)``, no input.
 
-    Args:
-        model: The model; its state is ``[q, v]`` where the problem has no working point.
-        control: The control problem. A speed without weight is the one that crosses the position's acceptable deviation
-            ``1 / sqrt(q)`` within the horizon.
-
-    Example:
-        ``x, u = working_point(models["prior"], scenario.control)``
+    A speed without weight is the one that crosses the position's acceptable deviation ``1 / sqrt(q)`` within the
+    horizon.
     """
     if control.working_point is not None:
         return control.working_point
@@ -294,9 +277,6 @@ def sensor_steps(sensor_sigma: Sequence[float]) -> tuple[float, ...]:
 
     A real step may be finer; then a frozen sensor is found a little later.
 
-    Args:
-        sensor_sigma: Standard deviations of the sensors ``(n_y,)``.
-
     Example:
         >>> [round(step, 6) for step in sensor_steps((0.001,))]
         [0.003464]
@@ -318,15 +298,7 @@ def make_resting_guard(model: HybridModel) -> Guard:
 
 
 def make_backup_guard(controller: SafeController, estimator: Estimator) -> Guard:
-    """A guard that hands over to another controller where the model does not describe the machine.
-
-    Args:
-        controller: The backup, e.g. that of the fitted prior; times count in its model's ``time_unit``.
-        estimator: Its estimator.
-
-    Example:
-        ``make_backup_guard(kit.controller("prior"), kit.observer("prior"))``
-    """
+    """A guard that hands over to another controller and its estimator where the model does not describe the machine."""
     unit = controller.controller.model.time_unit
     return Guard(
         Mode.BACKUP, Mode.REST, backup=controller, backup_estimator=estimator, dwell=DWELL_S * unit,
@@ -390,15 +362,8 @@ def make_adaptive_guard(
 def adaptable(model: HybridModel, causes: Mapping[str, Sequence[str]]) -> dict[str, tuple[str, ...]]:
     """Those of the causes that a backup adapts to: gains of inputs only where there is nothing else.
 
-    Args:
-        model: The model that the backup plans with.
-        causes: Parameters that change together, by name.
-
     Raises:
         InputError: If there are no causes, the model does not know its parameters, or its inputs act later.
-
-    Example:
-        ``adaptable(hybrid, {"mass": ("m", "J"), "motor": ("gain of u",)})`` is ``{"mass": ("m", "J")}``.
     """
     groups = {name: tuple(names) for name, names in causes.items()}
     if not groups:

@@ -82,9 +82,8 @@ def test_the_artifact_s_own_detector_needs_no_option(folder, noisy_artifact, tmp
     assert told in done.output
     found = json.loads((tmp_path / "out" / "monitor.json").read_text())
     assert found["detector"]["data_hash"] == detector.data_hash
-    assert (
-        8.0 <= found["recordings"][1]["alarms"][0]["start_s"] < 9.0
-    )  # as with the same detector from a file
+    # as with the same detector from a file
+    assert 8.0 <= found["recordings"][1]["alarms"][0]["start_s"] < 9.0
     without = command(folder, noisy_artifact, tmp_path / "without")
     assert "holds no detector" in without.output
 
