@@ -54,16 +54,9 @@ def tune(
 
     folder = out or Path("runs") / f"tune-{Path(scenario).stem}"
     settings = TuneSettings(
-        scenario,
-        tuple(data or ()),
-        seed,
-        budget,
-        tuple(input_column or ()),
-        tuple(output_column or ()),
-        time_column,
-        kind=kind,
-        space=parsed_space(vary or ()),
-    )
+        scenario, tuple(data or ()), seed, budget, tuple(input_column or ()), tuple(output_column or ()), time_column,
+        kind=kind, space=parsed_space(vary or ()),
+    )  # fmt: skip
     with make_progress() as progress:
         found = run_tuning(settings, folder, trials=trials, timeout=timeout, resume=resume, progress=progress)
     print_summary(summary(found, settings.space.names), folder / "results.json")

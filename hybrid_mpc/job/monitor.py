@@ -55,8 +55,8 @@ class Alarm:
 
 @dataclass(frozen=True)
 class RecordingResult:
-    """What the monitor found in a recording, and why parts were not judged: its window was not full (``warm_up_s``),
-    samples were missing, or model or estimator gave no finite number.
+    """What the monitor found in a recording, and why it had no valid reading of parts: its window was not full
+    (``warm_up_s``), samples were missing, or model or estimator gave no finite number.
     """
 
     recording: str

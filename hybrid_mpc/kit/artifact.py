@@ -11,29 +11,35 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import nn_export
 from hybrid_mpc.control.ocp import OCP
+from hybrid_mpc.control.safeguard import SafeController
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimate.switching import Filter
 from hybrid_mpc.files import read_document, read_object, sha256, write_document
+from hybrid_mpc.kit.assembly import (
+    make_adaptive_guard,
+    make_controller,
+    make_estimator,
+    make_monitor,
+    make_resting_guard,
+    sensor_steps,
+)
+from hybrid_mpc.loop.guard import Guard
 from hybrid_mpc.machine.signals import Parameter, Signal
 from hybrid_mpc.model.delay import with_input_delay
 from hybrid_mpc.model.limits import numbers
 from hybrid_mpc.model.model import STEP_INPUTS, STEP_OUTPUTS, Balance, HybridModel
 from hybrid_mpc.monitor.calibrate import Calibration
 from hybrid_mpc.monitor.detector import Detector
+from hybrid_mpc.monitor.energy import EnergyMonitor
+from hybrid_mpc.monitor.learn import guard_monitor
 from hybrid_mpc.records import known, plain, record
-
-if TYPE_CHECKING:
-    from hybrid_mpc.control.safeguard import SafeController
-    from hybrid_mpc.estimate.switching import Filter
-    from hybrid_mpc.loop.guard import Guard
-    from hybrid_mpc.monitor.energy import EnergyMonitor
-    from hybrid_mpc.scenario import Scenario
+from hybrid_mpc.scenario import Scenario
 
 SCHEMA_VERSION = 3
 FILE, PROGRAMS = "model.json", "programs.json"
@@ -478,8 +484,6 @@ class Kit:
         Raises:
             InputError: If there is no such model or task, no control problem, or no noise for this estimator.
         """
-        from hybrid_mpc.kit.assembly import make_estimator
-
         found, noise = self._model(model), self.noise(f"{model}_observer" if load else model)
         return make_estimator(found, self, noise, self.problem(task), observer=load)
 
@@ -497,8 +501,6 @@ class Kit:
         Raises:
             InputError: If there is no such model, task or solver, or no control problem.
         """
-        from hybrid_mpc.kit.assembly import make_controller
-
         return make_controller(
             self._model(model), self._model("prior"), self.problem(task), solver=solver, iterations=iterations,
             safe_input=self.safe_input,
@@ -520,9 +522,6 @@ class Kit:
         Raises:
             InputError: If there is no such model, task or kind, or no detector where one is asked for.
         """
-        from hybrid_mpc.kit.assembly import make_monitor, sensor_steps
-        from hybrid_mpc.monitor.learn import guard_monitor
-
         watched, learned = self._model(model), self.calibration
         detects = learned is not None and learned.detector is not None and self.control is not None
         kind = known(kind or ("guard" if detects else "energy"), WATCHES, "kind of monitor")
@@ -551,8 +550,6 @@ class Kit:
         Example:
             ``simulate(..., monitor=kit.monitor(), guard=kit.guard())``
         """
-        from hybrid_mpc.kit.assembly import make_adaptive_guard, make_resting_guard
-
         hybrid = self._model("hybrid")
         if not adapt:
             return make_resting_guard(hybrid)

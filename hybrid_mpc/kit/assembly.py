@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +14,7 @@ from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.rti import CondensedController
 from hybrid_mpc.control.safeguard import SafeController
 from hybrid_mpc.control.sqp import SQPController
+from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimator, ExtendedKalmanFilter
 from hybrid_mpc.estimate.parameters import parameter_filter, with_parameter_states
@@ -25,9 +26,6 @@ from hybrid_mpc.monitor.calibrate import Calibration
 from hybrid_mpc.monitor.energy import EnergyMonitor
 from hybrid_mpc.monitor.lengths import LEVEL_S, half_window, samples
 from hybrid_mpc.records import known
-
-if TYPE_CHECKING:
-    from hybrid_mpc.data.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 MODES = ("quiet", "slip", "jump")
@@ -139,13 +137,9 @@ def make_estimator(
 
     def filter_of(scale: float, step: float | None) -> ExtendedKalmanFilter:
         return ExtendedKalmanFilter(
-            model,
-            sigma_y=np.array(scenario.sensor_sigma),
-            sigma_x=scale * sigma_x,
-            sigma_d=None if step is None else step * span,
-            sigma_x0=first,
-            sigma_d0=None if step is None else FIRST_LOAD * span,
-        )
+            model, sigma_y=np.array(scenario.sensor_sigma), sigma_x=scale * sigma_x, sigma_x0=first,
+            sigma_d=None if step is None else step * span, sigma_d0=None if step is None else FIRST_LOAD * span,
+        )  # fmt: skip
 
     if not observer:
         return filter_of(1.0, None)
@@ -264,12 +258,9 @@ def make_monitor(
         ``make_monitor(artifact.models["hybrid"], None)``
     """
     return EnergyMonitor(
-        model,
-        window=2 * half_window(LEVEL_S, model) + 1,
-        average=samples(LEVEL_S, model),
-        calibration=calibration,
+        model, window=2 * half_window(LEVEL_S, model) + 1, average=samples(LEVEL_S, model), calibration=calibration,
         rest_speed=rest_speed,
-    )
+    )  # fmt: skip
 
 
 def sensor_steps(sensor_sigma: Sequence[float]) -> tuple[float, ...]:
