@@ -20,7 +20,7 @@ from parts import arguments, report
 
 from hybrid_mpc import LoopSpec, Study, run_study
 from hybrid_mpc.job import study_run
-from hybrid_mpc.job.context import Silent
+from hybrid_mpc.job.context import Progress
 from hybrid_mpc.job.engine import DaskEngine, LocalEngine
 from hybrid_mpc.job.study_log import RunLog, compact, rows, segments
 from hybrid_mpc.job.study_run import THREADS, TIMING, execute, load_inputs, run_batch
@@ -38,7 +38,7 @@ def resident_mb() -> float:
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
 
 
-class Memory(Silent):
+class Memory(Progress):
     """Notes the parent's memory as runs go by."""
 
     def __init__(self) -> None:
@@ -60,7 +60,7 @@ def many(runs: int) -> Study:
 def timed(engine, runs: int, folder: Path, progress) -> tuple[float, float]:
     """Wall and processor time of this process [s] for runs that do nothing, once the workers have started."""
     with RunLog(folder) as log:
-        execute(many(4).runs(), log, engine, Silent(), 4)
+        execute(many(4).runs(), log, engine, Progress(), 4)
         begin, cpu = perf_counter(), process_time()
         execute(many(runs).runs(), log, engine, progress, runs)
         spent = perf_counter() - begin, process_time() - cpu
@@ -97,7 +97,7 @@ def dask(runs: int, folder: Path) -> dict:
         LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster,
         Client(cluster, set_as_default=False) as client,
     ):
-        wall, scheduler = timed(DaskEngine(partial(run_batch, nothing), client), runs, folder, Silent())
+        wall, scheduler = timed(DaskEngine(partial(run_batch, nothing), client), runs, folder, Progress())
     return {"wall_ms_a_batch": 1e3 * wall / runs, "scheduler_cpu_ms_a_batch": 1e3 * scheduler / runs}
 
 

@@ -46,17 +46,8 @@ LOCK = ".lock"
 def replacing(path: Path) -> Iterator[IO[bytes]]:
     """An open binary file that takes the place of ``path`` when the block ends well; folders are made.
 
-    A kill at any moment, a full disk or a second writer leave the old file or a new one, whole.
-
-    Raises:
-        StorageError: If it cannot be written.
-
-    Example:
-        >>> path = Path(tempfile.mkdtemp()) / "a.txt"
-        >>> with replacing(path) as file:
-        ...     _ = file.write(b"whole")
-        >>> path.read_text()
-        'whole'
+    A kill at any moment, a full disk or a second writer leave the old file or a new one, whole. StorageError if it
+    cannot be written.
     """
     try:
         with nn_export.files.replacing(path) as file:
@@ -66,35 +57,18 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write ``text`` to ``path``, whole or not at all.
-
-    Raises:
-        StorageError: If it cannot be written.
-    """
+    """Write ``text`` to ``path``, whole or not at all."""
     with replacing(path) as file:
         file.write(text.encode("utf-8"))
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write ``value`` as JSON (see :func:`~hybrid_mpc.records.plain`), whole or not at all.
-
-    Raises:
-        StorageError: If it cannot be written.
-
-    Example:
-        >>> path = Path(tempfile.mkdtemp()) / "a.json"
-        >>> write_json(path, {"x": float("inf")}); read_json(path)
-        {'x': 'inf'}
-    """
+    """Write ``value`` as JSON (see :func:`~hybrid_mpc.records.plain`), whole or not at all."""
     write_text(path, json.dumps(plain(value), indent=1, allow_nan=False) + "\n")
 
 
 def read_json(path: Path) -> Any:
-    """Content of a JSON file.
-
-    Raises:
-        InputError: If it is missing, no regular file, larger than 16 MiB, or no JSON.
-    """
+    """Content of a JSON file; InputError if it is missing, no regular file, larger than 16 MiB, or no JSON."""
     content = read_bytes(path, MOST_JSON)
     try:
         return nn_export.files.parse_json(content)
@@ -103,11 +77,7 @@ def read_json(path: Path) -> Any:
 
 
 def read_object(path: Path) -> dict[str, Any]:
-    """The object that a JSON file holds.
-
-    Raises:
-        InputError: If it holds anything else, or as :func:`read_json`.
-    """
+    """The object that a JSON file holds; InputError if it holds anything else, or as :func:`read_json`."""
     found = read_json(path)
     if not isinstance(found, dict):
         raise InputError(f"{path} is damaged: an object (fields and values) is needed")
@@ -125,11 +95,7 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Arrays of a ``.npz`` file; object arrays are refused.
-
-    Raises:
-        InputError: If it is missing, damaged, or unpacks to more than 1 GiB.
-    """
+    """Arrays of a ``.npz`` file; InputError if it is missing, damaged, unpacks to more than 1 GiB, or holds objects."""
     content = read_bytes(path, MOST_ARRAYS)
     try:
         check_npz(content, MOST_ARRAYS)
@@ -144,19 +110,7 @@ def write_document(
 ) -> None:
     """Write a JSON object with the hash of its content, so that damage is noticed when it is read.
 
-    Args:
-        path: The file, ``.json``.
-        value: The object.
-        arrays: Arrays that belong to it, written beside it as ``.npz``, with their hash in the JSON. Default: none.
-
-    Raises:
-        StorageError: If it cannot be written.
-
-    Example:
-        >>> path = Path(tempfile.mkdtemp()) / "a.json"
-        >>> write_document(path, {"x": 1}, {"y": np.zeros(2)})
-        >>> read_document(path), read_document_arrays(path)["y"]
-        ({'x': 1}, array([0., 0.]))
+    ``arrays`` that belong to it are written beside it as ``.npz``, with their hash in the JSON.
     """
     document = plain(value)
     if arrays is not None:
@@ -167,22 +121,14 @@ def write_document(
 
 
 def read_document(path: Path, remedy: str = "") -> dict[str, Any]:
-    """The object of a file that :func:`write_document` wrote; ``remedy`` says what to do where it is damaged.
-
-    Raises:
-        InputError: If it is missing, damaged, or was changed since.
-    """
+    """The object of a file that :func:`write_document` wrote; ``remedy`` says what to do where it is damaged."""
     document = _whole(path, remedy)
     document.pop(ARRAYS_HASH, None)
     return document
 
 
 def read_document_arrays(path: Path, remedy: str = "") -> dict[str, NDArray[Any]]:
-    """The arrays that belong to a JSON file that :func:`write_document` wrote.
-
-    Raises:
-        InputError: If they are missing, damaged, or not those that were written with it.
-    """
+    """The arrays that belong to a JSON file that :func:`write_document` wrote."""
     expected, beside = _whole(path, remedy).get(ARRAYS_HASH), path.with_suffix(".npz")
     try:
         if sha256(beside) != expected:
@@ -209,25 +155,14 @@ def _with(text: str, remedy: str) -> str:
 def check_npz(content: bytes, budget: int, names: Sequence[str] | None = None) -> None:
     """Check what an archive of arrays declares before any array is decompressed.
 
-    Args:
-        content: The ``.npz`` file.
-        budget: Most bytes of numbers in these arrays, each counted as 8 of them at least [byte].
-        names: Arrays that are to be read; others may hold anything. Default: all.
+    ``budget`` is the most bytes of numbers in the arrays that are to be read (``names``; default: all), each number
+    counted as 8 of them at least.
 
     Raises:
         ValueError: If there are too many members, one is not packed as numpy packs, is no array, or holds another
             number of bytes than its shape declares, or they are larger than the budget.
         zipfile.BadZipFile: If it is no archive, or a damaged one.
         KeyError: If there is no array of such a name.
-
-    Example:
-        >>> file = io.BytesIO()
-        >>> np.savez(file, t=np.zeros(1000))
-        >>> check_npz(file.getvalue(), 8000)
-        >>> check_npz(file.getvalue(), 7999)
-        Traceback (most recent call last):
-        ...
-        ValueError: its arrays take 0.008 MB, more than the 0.007999 MB that are read
     """
     if content.count(b"PK\x01\x02") > MOST_MEMBERS:  # the mark of an entry in the list of members
         raise ValueError(f"it has more than {MOST_MEMBERS} members")
@@ -264,11 +199,7 @@ def _declared(archive: zipfile.ZipFile, name: str) -> int:
 
 
 def read_bytes(path: Path, limit: int) -> bytes:
-    """Content of a regular file of at most ``limit`` bytes.
-
-    Raises:
-        InputError: If there is none, or it cannot be read.
-    """
+    """Content of a regular file of at most ``limit`` bytes; InputError if there is none, or it cannot be read."""
     try:
         return nn_export.files.read_bytes(path, limit)
     except FileNotFoundError as error:
@@ -298,11 +229,7 @@ def _exists(path: Path) -> bool:
 
 
 def sha256(path: Path) -> str:
-    """SHA-256 of a regular file's content.
-
-    Raises:
-        InputError: If it is missing or cannot be read.
-    """
+    """SHA-256 of a regular file's content."""
     return hashlib.sha256(read_bytes(path, MOST_CONTENT)).hexdigest()
 
 
@@ -312,11 +239,7 @@ def digest(value: Any) -> str:
 
 
 def is_empty(folder: Path) -> bool:
-    """Whether a folder is not there, or holds nothing but what a killed writer or a lock has left.
-
-    Raises:
-        InputError: If it cannot be looked into.
-    """
+    """Whether a folder is not there, or holds nothing but what a killed writer or a lock has left."""
     try:
         return not folder.exists() or (folder.is_dir() and all(_leftover(path) for path in folder.iterdir()))
     except (OSError, ValueError) as error:
@@ -328,30 +251,14 @@ def _leftover(path: Path) -> bool:
 
 
 def check_folder(folder: Path) -> None:
-    """Refuse a folder for results that holds something, or in which nothing can be written.
-
-    Nothing is left behind: a folder that is not there yet is not made.
-
-    Raises:
-        InputError: If it does, or it cannot.
-
-    Example:
-        >>> check_folder(Path(tempfile.mkdtemp()) / "new")
-        >>> check_folder(Path("/dev/null"))
-        Traceback (most recent call last):
-        hybrid_mpc.errors.InputError: /dev/null exists and is no empty folder; choose another --out
-    """
+    """Refuse a folder for results that holds something, or in which nothing can be written; none is made."""
     if not is_empty(folder):
         raise InputError(f"{folder} exists and is no empty folder; choose another --out")
     check_writable(folder)
 
 
 def check_writable(folder: Path) -> None:
-    """Refuse a folder in which nothing can be written; it need not be there yet.
-
-    Raises:
-        InputError: If that is so.
-    """
+    """Refuse a folder in which nothing can be written; it need not be there yet."""
     try:
         if "\0" in str(folder):
             raise ValueError("its name holds a null character")
@@ -370,17 +277,7 @@ def check_writable(folder: Path) -> None:
 def locked(folder: Path) -> Iterator[None]:
     """Hold a folder, which is made if missing, against other jobs; what killed writers have left in it is removed.
 
-    The system lets go of it when the process ends, however it ends.
-
-    Raises:
-        InputError: If another job holds it, or it cannot be written.
-
-    Example:
-        >>> folder = Path(tempfile.mkdtemp())
-        >>> with locked(folder), locked(folder):
-        ...     pass
-        Traceback (most recent call last):
-        hybrid_mpc.errors.InputError: ... is in use: another process works in this folder; wait for it, or choose ...
+    The system lets go of it when the process ends, however it ends. InputError if another job holds it.
     """
     from filelock import FileLock, Timeout
 

@@ -35,10 +35,7 @@ def plain(value: Any) -> Any:
     """``value`` in JSON's own types.
 
     Dataclasses and mappings become objects, sequences and arrays lists, paths texts, numbers that JSON does not know
-    ``"inf"``, ``"-inf"`` and ``"nan"``, and a CasADi function its program.
-
-    Raises:
-        InputError: If a CasADi function cannot be stated as a program, with what hinders it.
+    ``"inf"``, ``"-inf"`` and ``"nan"``, and a CasADi function its program; InputError if there is none for it.
 
     Example:
         >>> plain({"x": np.array([1.0, np.inf]), "where": Path("a")})
@@ -82,11 +79,7 @@ def record(kind: type[T], data: object, where: str) -> T:
 
     Every field is checked against its annotation: numbers, texts, flags, None, ``Literal``, tuples, sequences, arrays,
     mappings with text keys, CasADi functions, unions and dataclasses of these, ``Any``. A whole number fits a float.
-
-    Args:
-        kind: The dataclass.
-        data: A mapping of its fields; fields with a default may be left out.
-        where: What is read, for the messages: a file's path, or a part of it.
+    Fields with a default may be left out; ``where`` is told in messages.
 
     Raises:
         InputError: Naming all fields that are missing, unknown (with the nearest known one) or do not fit.
@@ -111,16 +104,7 @@ upper, periodic; name is missing; unit: a text is needed, got 3
 
 
 def known(word: object, names: Iterable[str], what: str) -> str:
-    """``word`` if it is one of ``names``; ``what`` says what they name, for the message.
-
-    Raises:
-        InputError: If it is none of them; with the nearest one, and all.
-
-    Example:
-        >>> known("sqq", ("rti", "sqp"), "solver")
-        Traceback (most recent call last):
-        hybrid_mpc.errors.InputError: no solver 'sqq'; did you mean 'sqp'? There are: rti, sqp
-    """
+    """``word`` if it is one of ``names``, else InputError with the nearest one; ``what`` says what they name."""
     names = list(names)
     if isinstance(word, str) and word in names:
         return word
@@ -148,12 +132,7 @@ def _short(value: object) -> str:
 
 
 def shown(text: str) -> str:
-    """A text in quotes for a message, cut where it is long.
-
-    Example:
-        >>> shown("phi"), shown(50 * "9")
-        ("'phi'", "'9999999999999999999999999999999999999999' (50 characters)")
-    """
+    """A text in quotes for a message, cut where it is long."""
     return repr(text) if len(text) <= LONGEST else f"{text[:LONGEST]!r} ({len(text)} characters)"
 
 

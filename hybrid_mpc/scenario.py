@@ -171,13 +171,8 @@ def registered_scenarios() -> dict[str, str]:
 def scenario_of(named: str, where: Path, given: str = "") -> Scenario | None:
     """The scenario that a file names, of registered ones alone: a name from a file never runs anything.
 
-    Args:
-        named: The name in the file; empty for none.
-        where: The file, for messages.
-        given: The user's own registered name or Python file; it is taken first. Default: none.
-
-    Returns:
-        The scenario; None where neither names one.
+    ``given`` is the user's own registered name or Python file, which is taken first; ``where`` names the file in
+    messages. None where neither names one.
 
     Raises:
         InputError: If the file's scenario is not registered, or the user's is another one.
@@ -187,8 +182,7 @@ def scenario_of(named: str, where: Path, given: str = "") -> Scenario | None:
         'golf_robot'
         >>> scenario_of("mine.py", Path("model.json"))
         Traceback (most recent call last):
-        hybrid_mpc.errors.InputError: model.json names the scenario 'mine.py', which is not registered; if it is \
-yours, give its file: --scenario FILE.py
+        hybrid_mpc.errors.InputError: model.json names the scenario 'mine.py', which is not registered; if it is ...
     """
     if given:
         scenario = load_scenario(given)

@@ -87,6 +87,12 @@ def test_every_part_is_made_from_the_folder(run, tmp_path):
     assert kit.controller(task=limited.name).controller.ocp.u_max == limited.control.u_max
 
 
+def test_a_kit_is_printed_short(run):
+    text = repr(hm.load(run))
+    assert "name='hybrid'" in text
+    assert len(text) < 2000  # the signals of two models take 1,000 characters, one program some 10,000
+
+
 def test_the_safe_input_is_the_scenario_s(run):
     kit = hm.load(run)
     other = kit.on(replace(GOLF, safe_input=(0.1,)))

@@ -61,12 +61,7 @@ def analyze(
 
 
 def command(settings: AnalysisSettings, out: Path) -> str:
-    """The command line that repeats this analysis, with full paths.
-
-    Args:
-        settings: What was asked for.
-        out: Where it was written.
-    """
+    """The command line that repeats this analysis, with full paths."""
     words = ["hybrid-mpc", "analyze", str(settings.folder.resolve()), "--out", str(out.resolve())]
     words += ["--scenario", settings.scenario] if settings.scenario else []
     words += [word for path in settings.data for word in ("--data", str(path.resolve()))]

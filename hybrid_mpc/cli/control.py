@@ -57,7 +57,7 @@ def control(
     gif: Annotated[bool, typer.Option("--gif/--no-gif", help="Draw moving pictures.")] = True,
 ) -> None:
     """Close the loop around the simulated machine with a trained model, without training anything."""
-    from hybrid_mpc.cli.progress import make_progress
+    from hybrid_mpc.cli.progress import make_progress, print_summary
     from hybrid_mpc.job.control import run_control
     from hybrid_mpc.job.study import DEFAULT_CONTROLLERS, Study
 
@@ -70,17 +70,11 @@ def control(
     )  # fmt: skip
     with make_progress() as progress:
         results = run_control(study, out, progress, gif=gif, resume=resume)
-    for line in summary(results):
-        print(line)
-    print(f"results: {(out / 'results.json').resolve()}")
+    print_summary(summary(results), out / "results.json")
 
 
 def summary(results: dict[str, Any]) -> list[str]:
-    """One line a task and controller.
-
-    Args:
-        results: What results.json holds.
-    """
+    """One line a task and controller, of the content of results.json."""
     first = next(iter(results["loops"][0]["tracking_rmse"]))
     width = max(len(first) + 5, 11)
     head = f"{'RMSE ' + first:>{width}}"

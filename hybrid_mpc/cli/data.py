@@ -38,17 +38,7 @@ def data(
 
 
 def write_data(scenario: Scenario, out: Path, seed: int, budget: str, data_set: str = "") -> list[Path]:
-    """The recordings of a scenario that makes its own, and a README beside them.
-
-    Args:
-        scenario: The machine. If its ``make_data`` takes a keyword ``data_set``, it has several.
-        out: Folder; made if missing.
-        seed: Same seed, same files.
-        budget: Name of one of the scenario's budgets.
-        data_set: Default: the scenario's default.
-
-    Returns:
-        The files.
+    """The recordings of a scenario that makes its own, and a README beside them; returned are the recordings.
 
     Raises:
         InputError: If the scenario makes no data, has no such budget or data set, or the folder is not empty.

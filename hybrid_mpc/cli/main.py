@@ -19,15 +19,7 @@ except ImportError as missing:  # the online half installs without the command l
     ) from None
 
 from hybrid_mpc import __version__
-from hybrid_mpc.cli import analyze as analyze_command
-from hybrid_mpc.cli import benchmark as benchmark_command
-from hybrid_mpc.cli import control as control_command
-from hybrid_mpc.cli import data as data_command
-from hybrid_mpc.cli import monitor as monitor_command
-from hybrid_mpc.cli import run as run_command
-from hybrid_mpc.cli import scenarios as scenarios_command
-from hybrid_mpc.cli import study as study_command
-from hybrid_mpc.cli import tune as tune_command
+from hybrid_mpc.cli import analyze, benchmark, control, data, monitor, run, scenarios, study, tune
 from hybrid_mpc.errors import InputError, StorageError
 from hybrid_mpc.files import reason
 
@@ -53,15 +45,15 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-app.command("run", epilog=run_command.EXAMPLES)(run_command.run)
-app.command("control", epilog=control_command.EXAMPLES)(control_command.control)
-app.command("analyze", epilog=analyze_command.EXAMPLES)(analyze_command.analyze)
-app.command("benchmark", epilog=benchmark_command.EXAMPLES)(benchmark_command.benchmark)
-app.command("data", epilog=data_command.EXAMPLES)(data_command.data)
-app.command("tune", epilog=tune_command.EXAMPLES)(tune_command.tune)
-app.command("monitor", epilog=monitor_command.EXAMPLES)(monitor_command.monitor)
-app.command("scenarios")(scenarios_command.scenarios)
-app.add_typer(study_command.app, name="study")
+app.command("run", epilog=run.EXAMPLES)(run.run)
+app.command("control", epilog=control.EXAMPLES)(control.control)
+app.command("analyze", epilog=analyze.EXAMPLES)(analyze.analyze)
+app.command("benchmark", epilog=benchmark.EXAMPLES)(benchmark.benchmark)
+app.command("data", epilog=data.EXAMPLES)(data.data)
+app.command("tune", epilog=tune.EXAMPLES)(tune.tune)
+app.command("monitor", epilog=monitor.EXAMPLES)(monitor.monitor)
+app.command("scenarios")(scenarios.scenarios)
+app.add_typer(study.app, name="study")
 for entry in entry_points(group="hybrid_mpc.commands"):  # commands of scenarios, e.g. `reproduce`
     command = entry.load()
     app.command(entry.name, epilog=sys.modules[entry.module].EXAMPLES)(command)

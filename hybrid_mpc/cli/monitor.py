@@ -80,11 +80,7 @@ def monitor(
 
 
 def watching(job: MonitorJob) -> str:
-    """What decides on alarms, in a line.
-
-    Args:
-        job: The job.
-    """
+    """What decides on alarms, in a line."""
     detector, calibration = job.detector, job.monitor.calibration
     if detector is not None:
         return (
@@ -103,11 +99,7 @@ def watching(job: MonitorJob) -> str:
 
 
 def summary(result: MonitorResult) -> list[str]:
-    """One line a recording and alarm.
-
-    Args:
-        result: What was found.
-    """
+    """One line a recording and alarm."""
     lines = []
     for row in result.recordings:
         n = len(row.alarms)

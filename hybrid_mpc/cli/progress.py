@@ -5,21 +5,23 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
+from rich import progress as rich_progress
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from hybrid_mpc.job.context import Progress
 
 LINE_EVERY_S = 5.0
 """Plain output says something at most this often within a stage."""
 
 
-class Bars:
+class Bars(Progress):
     """Rich progress bars, one a part of the stage."""
 
     def __init__(self, console: Console) -> None:
-        self._bars = Progress(
+        self._bars = rich_progress.Progress(
             TextColumn("{task.description:28}"),
             BarColumn(),
             TextColumn("{task.percentage:>3.0f} %"),
@@ -35,9 +37,7 @@ class Bars:
         self._bars.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, t: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._bars.stop()
 
     def start(self, title: str) -> None:
@@ -65,7 +65,7 @@ class Bars:
             self._bars.update(self._stage, completed=1, text=text)
 
 
-class Lines:
+class Lines(Progress):
     """Plain lines for logs and pipes."""
 
     def __init__(self) -> None:
@@ -75,9 +75,7 @@ class Lines:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, t: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         return None
 
     def start(self, title: str) -> None:
@@ -108,13 +106,7 @@ def make_progress() -> Bars | Lines:
 
 
 def print_summary(lines: Iterable[str], result: Path, name: str = "results") -> None:
-    """Print what a command found, and where it wrote it.
-
-    Args:
-        lines: The summary.
-        result: The file.
-        name: What the file holds.
-    """
+    """Print what a command found, and where it wrote it."""
     for line in lines:
         print(line)
     print(f"{name}: {result.resolve()}")

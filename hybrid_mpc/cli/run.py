@@ -63,30 +63,21 @@ def run(
     report. With --resume a stage runs again only where something that it reads has changed. Exit code 1 if a stage
     after the export could not run; the report then says why.
     """
-    from hybrid_mpc.cli.progress import make_progress
+    from hybrid_mpc.cli.progress import make_progress, print_summary
     from hybrid_mpc.job.run import failed_stages
     from hybrid_mpc.job.run import run as run_job
     from hybrid_mpc.job.settings import RunSettings
 
     folder = out or Path("runs") / Path(scenario).stem
     settings = RunSettings(
-        scenario,
-        tuple(data or ()),
-        seed,
-        budget,
-        tuple(input_column or ()),
-        tuple(output_column or ()),
-        time_column,
-        network_settings,
-        device,
-    )
+        scenario, tuple(data or ()), seed, budget, tuple(input_column or ()), tuple(output_column or ()), time_column,
+        network_settings, device,
+    )  # fmt: skip
     with make_progress() as progress:
         results = run_job(
             settings, folder, resume=resume, only=only or (), skip=skip or (), progress=progress,
         )  # fmt: skip
-    for line in summary(results):
-        print(line)
-    print(f"report: {(folder / 'report.html').resolve()}")
+    print_summary(summary(results), folder / "report.html", "report")
     if failed := failed_stages(folder):
         for stage, why in failed.items():
             print(f"stage {stage} could not run: {why}")
@@ -116,9 +107,6 @@ def summary(results: Results) -> list[str]:
 
 def tracking(errors: Mapping[str, float]) -> str:
     """The first tracking error with its signal's unit.
-
-    Args:
-        errors: By signal with unit.
 
     Example:
         >>> tracking({"phi [rad]": 0.01234, "phi_dot [rad/s]": 0.5})

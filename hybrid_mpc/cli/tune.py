@@ -54,16 +54,9 @@ def tune(
 
     folder = out or Path("runs") / f"tune-{Path(scenario).stem}"
     settings = TuneSettings(
-        scenario,
-        tuple(data or ()),
-        seed,
-        budget,
-        tuple(input_column or ()),
-        tuple(output_column or ()),
-        time_column,
-        kind=kind,
-        space=parsed_space(vary or ()),
-    )
+        scenario, tuple(data or ()), seed, budget, tuple(input_column or ()), tuple(output_column or ()), time_column,
+        kind=kind, space=parsed_space(vary or ()),
+    )  # fmt: skip
     with make_progress() as progress:
         found = run_tuning(settings, folder, trials=trials, timeout=timeout, resume=resume, progress=progress)
     print_summary(summary(found, settings.space.names), folder / "results.json")
@@ -71,12 +64,7 @@ def tune(
 
 
 def summary(found: SearchResult, names: tuple[str, ...]) -> list[str]:
-    """One line a trial, then the best.
-
-    Args:
-        found: The search's result.
-        names: Searched settings.
-    """
+    """One line a trial, with the searched settings of these names, then the best."""
     lines = ["  ".join(["trial", f"{'state':8}", f"{'E_sim':>8}", "   s", *names])]
     for row in found.trials:
         values = [f"{row.values[name]:>{len(name)}.3g}" for name in names]

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -36,17 +36,13 @@ from hybrid_mpc.job.benchmark_runs import (
     warm_samples,
 )
 from hybrid_mpc.job.check import check_scenario
-from hybrid_mpc.job.context import Progress, Silent, versions
+from hybrid_mpc.job.context import Progress, versions
 from hybrid_mpc.job.folder import JobNote, write_note
 from hybrid_mpc.job.stages.identify import load_trained, save_trained, train_kinds
 from hybrid_mpc.machine.specification import BenchmarkBudget
+from hybrid_mpc.machine.torch_prior import Prior
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import Scenario, load_scenario
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from hybrid_mpc.machine.torch_prior import Prior
 
 SCHEMA = 1
 MODEL_NOTE = "benchmark_model.json"
@@ -66,16 +62,10 @@ FEWEST_RUNS = 3
 class BenchmarkSettings:
     """What one benchmark computes.
 
-    Args:
-        scenario: Registered name or path of a user's Python file.
-        data: Training files.
-        test: Files to evaluate on. Default: what the training holds back.
-        model: Folder of a model made before; then nothing is trained. Default: none.
-        budget: Name of the machine's budget. Default: quick.
-        seed: Of the networks.
-        workers: Kinds of networks trained at the same time.
-        refit: Length [s] of each test file's start that the prior's parameters are fitted to anew, for a machine that
-            has changed; the rest is evaluated with the old parameters and with the new ones. Default: none.
+    ``data`` and ``test`` are recordings to train and to evaluate on (default: what the training holds back); ``model``
+    is the folder of one made before, in place of training. ``refit`` is the length [s] of each test file's start that
+    the prior's parameters are fitted to anew, for a machine that has changed; the rest is evaluated with old and new
+    ones.
     """
 
     scenario: str
@@ -102,16 +92,9 @@ class _Description:
 
 @dataclass(frozen=True)
 class BenchmarkModel(_Description):
-    """Everything that a free run over another recording needs.
+    """Everything that a free run over another recording needs: prior, recommended model (``hybrid``), networks by kind.
 
-    Args:
-        scenario: Name of the machine.
-        dt: Model period [s].
-        physics: The fitted prior with its delay and smoother.
-        hybrid: The recommended model, e.g. ``"mopgrnn mean"``.
-        validation: Error of every candidate on the validation pieces [unit of the benchmark].
-        long: The same over :attr:`Recordings.long`; may be empty.
-        networks: Trained networks by kind.
+    ``validation`` and ``long`` are the errors of every candidate on validation pieces and on :attr:`Recordings.long`.
     """
 
     networks: Mapping[str, Trained]
@@ -119,13 +102,8 @@ class BenchmarkModel(_Description):
 
 @dataclass(frozen=True)
 class Refit:
-    """A changed machine: errors over what follows a recording's first seconds.
-
-    Args:
-        seconds: Length [s] that the prior was fitted to anew.
-        prior: Its new parameters, a row each.
-        before: Errors with the old parameters, of ``"phy"`` and ``"hybrid"``.
-        after: With the new ones.
+    """A changed machine: errors over what follows the seconds that the prior was fitted to, with its old and new
+    parameters.
     """
 
     seconds: float
@@ -136,13 +114,8 @@ class Refit:
 
 @dataclass(frozen=True)
 class FileResult:
-    """A test file.
-
-    Args:
-        runs: The free runs.
-        errors: By model, and of ``"hybrid"``, the recommended one.
-        scored_s: Length [s] that the errors count.
-        refit: Where one was asked for.
+    """A test file: its free runs, which count ``scored_s`` seconds, and the errors by model; ``"hybrid"`` is the
+    recommended.
     """
 
     runs: Sequence[BenchmarkRun]
@@ -164,15 +137,12 @@ def benchmark(
 ) -> BenchmarkResults:
     """Fit, train and evaluate; or evaluate a model made before. The same command goes on where it was interrupted.
 
-    Args:
-        settings: What to compute.
-        out: Folder for ``results.json`` and, if something is trained, ``model/`` and ``checkpoints/``.
-        progress: Where to report; default: nowhere.
+    ``out`` gets ``results.json`` and, if something is trained, ``model/`` and ``checkpoints/``.
 
     Raises:
         InputError: If a file, the model, the budget or the folder does not fit.
     """
-    progress, scenario = progress or Silent(), load_scenario(settings.scenario)
+    progress, scenario = progress or Progress(), load_scenario(settings.scenario)
     _check(settings, scenario)
     check_scenario(scenario)
     data, tests, warnings = _read(settings, scenario)
@@ -258,14 +228,13 @@ def _make(
     progress.finish("")
     progress.start("training the networks")
     warm = warm_samples(warm_up, physics.delay, dt)
-    networks = _networks(
-        settings,
-        physics,
-        [smoothed(scenario.prior, physics, part, dt) for part in (data.train, data.valid)],
-        lambda kind: training_settings(kind, spec.budgets[settings.budget], seed=settings.seed, warm=warm),
-        out / "checkpoints",
-        progress,
-    )
+    train, valid = (list(smoothed(scenario.prior, physics, part, dt)) for part in (data.train, data.valid))
+    budget = spec.budgets[settings.budget]
+    networks = train_kinds(
+        settings.scenario, physics.fit.values, train, valid,
+        {kind: training_settings(kind, budget, seed=settings.seed, warm=warm) for kind in KINDS},
+        out / "checkpoints", workers=settings.workers, on_progress=progress.update,
+    )  # fmt: skip
     progress.finish("")
     errors = partial(candidate_errors, scenario, physics, networks)
     validation = errors(data.valid, max(warm_up, IN_MOTION))
@@ -310,13 +279,7 @@ def _physics(scenario: Scenario, data: Recordings, out: Path, progress: Progress
 
 
 def training_settings(kind: str, budget: BenchmarkBudget, *, seed: int, warm: int) -> TrainingSettings:
-    """Settings of one kind: free runs are trained on the error of the position, which the benchmark scores.
-
-    Example:
-        >>> budget = BenchmarkBudget(16, 2, teacher_steps=100, free_run_steps=200, horizon=40)
-        >>> training_settings("mopgrnn", budget, seed=0, warm=10).objectives
-        ('position', 'energy')
-    """
+    """Settings of one kind: free runs are trained on the error of the position, which the benchmark scores."""
     return TrainingSettings(
         kind=kind,  # type: ignore[arg-type]
         seed=seed,
@@ -327,22 +290,6 @@ def training_settings(kind: str, budget: BenchmarkBudget, *, seed: int, warm: in
     )
 
 
-def _networks(
-    settings: BenchmarkSettings,
-    physics: Physics,
-    parts: Sequence[Sequence[Trajectory]],
-    settings_of: Callable[[str], TrainingSettings],
-    folder: Path,
-    progress: Progress,
-) -> dict[str, Trained]:
-    """Networks of every kind, trained where ``folder`` does not hold them yet; an interrupted training goes on."""
-    train, valid = (list(part) for part in parts)
-    return train_kinds(
-        settings.scenario, physics.fit.values, train, valid, {kind: settings_of(kind) for kind in KINDS}, folder,
-        workers=settings.workers, on_progress=progress.update,
-    )  # fmt: skip
-
-
 def candidate_errors(
     scenario: Scenario,
     physics: Physics,
@@ -350,15 +297,7 @@ def candidate_errors(
     trajectories: Sequence[Trajectory],
     warm_up: float,
 ) -> dict[str, float]:
-    """Error of every candidate's free runs, in the benchmark's unit.
-
-    Args:
-        scenario: The machine.
-        physics: The fitted prior.
-        networks: Trained networks by kind.
-        trajectories: Recordings with the commanded inputs.
-        warm_up: Length [s] of what is given of each.
-    """
+    """Error of every candidate's free runs, in the benchmark's unit; ``warm_up`` [s] of each recording is given."""
     spec, prior = benchmark_of(scenario), scenario.prior(physics.fit.values)
     runs = run_freely(prior, physics, networks, trajectories, warm_up=warm_up, length=spec.length)
     return {name: run_error(runs, name, spec).rmse for name in runs[0].y_hat}
@@ -369,15 +308,6 @@ def recommended(validation: Mapping[str, float], long: Mapping[str, float]) -> s
 
     Nothing was trained on validation pieces, but they may be shorter than the runs of the test, and then do not show
     drift.
-
-    Args:
-        validation: Errors on the validation pieces.
-        long: Errors on :attr:`Recordings.long`; may be empty.
-
-    Example:
-        >>> short = {"phy": 2.0, "pgrnn": 1.0, "mopgrnn": 1.5, "pgrnn mean": 1.2, "mopgrnn mean": 1.6}
-        >>> recommended(short, {}), recommended(short, {**short, "pgrnn": 3.0, "pgrnn mean": 2.1})
-        ('pgrnn', 'mopgrnn')
     """
 
     def larger(name: str) -> float:
@@ -456,20 +386,10 @@ def _refit(scenario: Scenario, model: BenchmarkModel, whole: Trajectory, seconds
 def refitted(
     make: Callable[..., Prior], physics: Physics, trajectory: Trajectory, *, seconds: float, dt: float
 ) -> tuple[Physics, Trajectory]:
-    """Fit the parameters to the first seconds of a recording of a changed machine, starting from the old ones.
+    """The prior fitted to the first seconds of a recording of a changed machine, and the rest of the recording.
 
     The delay stays. The free runs start from states that the old prior smooths, then from those of the new one: its
     noise is fitted to what it did not know, so a wrong prior costs little there.
-
-    Args:
-        make: Prior class or factory ``(values=None) -> Prior``.
-        physics: The prior as it was fitted.
-        trajectory: Recording of the changed machine, with the commanded inputs.
-        seconds: Length [s] of what is fitted.
-        dt: Model period [s].
-
-    Returns:
-        The prior with its new parameters, and the rest of the recording.
 
     Raises:
         InputError: If the recording is no longer than what is to be fitted, or that is too short.
@@ -520,7 +440,7 @@ def _document(
     test = {
         name: {
             **plain(row.errors),
-            **({} if row.refit is None else {"refit": _refit_document(row.refit)}),
+            **({} if row.refit is None else {"refit": plain(row.refit)}),
             "scored_s": row.scored_s,
         }
         for name, row in results.test.items()
@@ -535,14 +455,6 @@ def _document(
         "model": describe(results.model, scenario),
         "test": test,
         "versions": versions(),
-    }
-
-
-def _refit_document(refit: Refit) -> dict[str, Any]:
-    return {
-        "seconds": refit.seconds,
-        "prior": refit.prior,
-        **plain({k: getattr(refit, k) for k in ("before", "after")}),
     }
 
 
@@ -563,16 +475,7 @@ def describe(model: BenchmarkModel, scenario: Scenario) -> dict[str, Any]:
 
 
 def draw(scenario: Scenario, results: BenchmarkResults, out: Path) -> list[Path]:
-    """Draw the longest free run of every test file into ``out/figures``.
-
-    Args:
-        scenario: The machine.
-        results: What was found.
-        out: The benchmark's folder.
-
-    Returns:
-        The files.
-    """
+    """Draw the longest free run of every test file into ``out/figures``."""
     from hybrid_mpc.plots.fit import benchmark_run
     from hybrid_mpc.plots.style import save
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +22,6 @@ from hybrid_mpc.machine.specification import BenchmarkSpec, Role
 from hybrid_mpc.machine.torch_prior import Prior
 from hybrid_mpc.scenario import Scenario
 
-if TYPE_CHECKING:
-    pass
-
-
 Array = NDArray[np.float64]
 MODELS = ("phy", *KINDS)
 LONGEST = 60.0
@@ -37,15 +32,10 @@ SCORED = 50
 
 @dataclass(frozen=True)
 class Recordings:
-    """The training files of a benchmark.
+    """The training files of a benchmark in pieces: for fit and training, to choose by, and held back for the test.
 
-    Args:
-        train: Pieces for fit and training.
-        valid: Pieces that choose; nothing is fitted to them.
-        held_back: Pieces for the test; may be none.
-        long: Whole recordings that were split in order of time, from the first sample to where validation ends, at
-            most a minute (of the machine's own seconds). They were mostly trained on: they show drift, not accuracy.
-        dataset: The files as they were read.
+    ``long`` are whole recordings that were split in order of time, from the first sample to where validation ends, at
+    most a minute (of the machine's own seconds). They were mostly trained on: they show drift, not accuracy.
     """
 
     train: tuple[Trajectory, ...]
@@ -56,11 +46,7 @@ class Recordings:
 
 
 def benchmark_of(scenario: Scenario) -> BenchmarkSpec:
-    """The scenario's benchmark specification.
-
-    Raises:
-        InputError: If it has none.
-    """
+    """The scenario's benchmark specification; InputError if it has none."""
     if scenario.benchmark is None:
         raise InputError(
             f"scenario {scenario.name} has no benchmark: give it one with Scenario(benchmark=BenchmarkSpec(...))"
@@ -73,7 +59,7 @@ def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
 
     Raises:
         InputError: If a file is bad, has windows where whole files validate, or nothing is left to train or validate
-            on.
+        on.
     """
     prior, spec = scenario.prior(), benchmark_of(scenario)
     uncut = 0 < spec.valid_every <= len(paths)
@@ -121,18 +107,7 @@ def _parts(dataset: Dataset, scenario: Scenario, uncut: bool) -> list[Trajectory
 def until_validated(dataset: Dataset, windows: Container[str]) -> tuple[Trajectory, ...]:
     """Recordings that were split in order of time, from the first sample to a gap or where validation ends.
 
-    Args:
-        dataset: Recordings and their pieces.
-        windows: Stems of files with named windows; what lies between these may be anything.
-
-    Example:
-        >>> t = 0.1 * np.arange(10)
-        >>> z, x = np.zeros((10, 1)), np.zeros((10, 2))
-        >>> whole = Trajectory("run", "", 0.1, t, z, z, x, x)
-        >>> pieces = (whole.part(t < 0.45, "run", "train"), whole.part((t > 0.45) & (t < 0.75), "run#2", "valid"))
-        >>> data = Dataset(pieces, (whole,), (), ("run.csv",), (), "")
-        >>> [(run.role, len(run.t)) for run in until_validated(data, ())], until_validated(data, {"run"})
-        ([('valid', 8)], ())
+    Left out are stems with named ``windows``: what lies between these may be anything.
     """
     stems, found = {Path(file).stem for file in dataset.files}, []
     longest = LONGEST * time_unit(dataset.whole, dataset.whole[0].dt) if dataset.whole else 0.0
@@ -178,11 +153,6 @@ def read_test(
     scenario: Scenario, path: Path, warn: Callable[[str], None] = lambda text: None
 ) -> tuple[Trajectory, ...]:
     """A test file as whole runs, one for each side of a gap; windows of the data specification are ignored.
-
-    Args:
-        scenario: The machine.
-        path: The file.
-        warn: Called with each warning. Default: nobody is told.
 
     Raises:
         InputError: If the file is bad or nothing of it is long enough.
@@ -244,14 +214,8 @@ def pieces(trajectory: Trajectory, seconds: float) -> tuple[Trajectory, ...]:
 
 @dataclass(frozen=True)
 class BenchmarkRun:
-    """A free run of all candidates over one trajectory.
-
-    Args:
-        name: Of the trajectory.
-        t: Times of the scored samples ``(n,)`` [s].
-        u: Commanded inputs there ``(n, n_u)``, as they act.
-        y: Measured outputs ``(n, n_y)``.
-        y_hat: By candidate, ``(n, n_y)``.
+    """A free run of all candidates over one trajectory: the scored samples, commanded inputs as they act, measured
+    outputs, and those of each candidate ``(n, n_y)``.
     """
 
     name: str
@@ -270,21 +234,12 @@ def run_freely(
     warm_up: float,
     length: float | None,
 ) -> list[BenchmarkRun]:
-    """Free runs of the prior, of the best network of each kind, and of the mean over the networks of each kind.
+    """Free runs of the prior (``phy``), of the best network of each kind, and of the mean over those of a kind (``rnn
+    mean``).
 
-    Only what lies within ``warm_up`` is given: it yields the state that all models start from, and the networks'
-    hidden states. Everything after it is scored.
-
-    Args:
-        prior: The fitted prior.
-        physics: Its delay and smoother.
-        networks: Trained networks by kind; each kind's best is that of its own validation.
-        trajectories: Recordings with the commanded inputs.
-        warm_up: Length [s] of what is given.
-        length: Length [s] of a run after it; default: to the end.
-
-    Returns:
-        A run for each trajectory; candidates are ``phy``, ``rnn``, ``rnn mean`` and so on.
+    Only what lies within ``warm_up`` [s] is given: it yields the state that all models start from, and the networks'
+    hidden states. Everything after it is scored, or the first ``length`` [s]. Trajectories have the commanded inputs; a
+    kind's best network is that of its own validation.
     """
     import torch
 
@@ -294,9 +249,7 @@ def run_freely(
     if length is not None:
         n = warm + round(length / dt) + 1
         starts = [t.part(np.arange(len(t.t)) < n, t.name, t.role) for t in starts]
-    after = slice(
-        1, -1
-    )  # states of the samples after the warm-up: neither the start nor what follows the last input
+    after = slice(1, -1)  # after the warm-up: neither the start nor what follows the last input
     found = {"phy": model_states(PriorStep(prior, dt), starts, warm)[:, after]}
     for kind, trained in networks.items():
         states = model_states(trained.stacked_step(prior, dt), starts, warm)[:, :, after]
@@ -322,10 +275,8 @@ def run_freely(
 class RunError:
     """Error of a model's free runs over one file.
 
-    Args:
-        rmse: Root mean square error of the first output over all scored samples [unit]; infinite if a run diverged.
-        relative: Its share of the measured output's standard deviation [-].
-        unit: Unit of the benchmark.
+    ``rmse`` is that of the first output over all scored samples [unit], infinite if a run diverged; ``relative`` its
+    share of the measured output's standard deviation [-].
     """
 
     rmse: float
@@ -334,12 +285,7 @@ class RunError:
 
 
 def run_error(runs: Sequence[BenchmarkRun], name: str, spec: BenchmarkSpec) -> RunError:
-    """Error of one candidate over all runs.
-
-    Args:
-        runs: Free runs over one file.
-        name: The candidate.
-        spec: The benchmark's unit and scale.
+    """Error of one candidate over all runs of a file.
 
     Example:
         >>> y = np.array([[0.0], [1.0], [2.0]])

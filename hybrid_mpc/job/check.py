@@ -15,12 +15,15 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.errors import InputError, refuse
-from hybrid_mpc.kit.artifact import loop_settings
+from hybrid_mpc.kit.artifact import build_model, loop_settings
+from hybrid_mpc.kit.assembly import make_controller, make_estimator
 from hybrid_mpc.loop.faults import check_channels, install
+from hybrid_mpc.loop.loop import Loop
 from hybrid_mpc.loop.plant import Plant
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.scenario import Budget, Scenario, Task
+from nn_export import ExportError
 
 if TYPE_CHECKING:
     import torch
@@ -62,17 +65,10 @@ def check_scenario(scenario: Scenario, budget: Budget | None = None) -> None:
 
     The prior is asked at the origin and at random points within its signals' ranges, as a batch and one by one;
     exported; and the model, controllers, estimators, plant, tasks and their references are built of it and called.
-
-    Args:
-        scenario: The machine.
-        budget: The effort that will be used. Default: every one of the scenario's.
+    Budgets are all of the scenario's where none is given.
 
     Raises:
         InputError: Naming everything that is wrong, a line each.
-
-    Example:
-        >>> from hybrid_mpc.scenario import load_scenario
-        >>> check_scenario(load_scenario("golf_robot"))
     """
     report = _Report()
     prior = _check_prior(report, scenario)
@@ -249,8 +245,6 @@ def _check_export(report: _Report, scenario: Scenario, prior: Prior) -> HybridMo
     """The prior as a deployed model."""
     from hybrid_mpc.identify.export import model_info, trace_model
     from hybrid_mpc.identify.step import PriorStep
-    from hybrid_mpc.kit.artifact import build_model
-    from nn_export import ExportError
 
     with report.part("prior: export to CasADi"):
         try:
@@ -313,9 +307,6 @@ def _check_problem(
     prior: Prior | None,
     model: HybridModel | None,
 ) -> None:
-    from hybrid_mpc.kit.assembly import make_controller, make_estimator
-    from hybrid_mpc.loop.loop import Loop
-
     before = len(report.problems)
     if not isinstance(control, OCP):
         report.add(f"{what}: OCP(...) needed, got {control!r:.60}")

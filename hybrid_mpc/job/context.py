@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -30,8 +29,8 @@ if TYPE_CHECKING:
 R = TypeVar("R")
 
 
-class Progress(Protocol):
-    """Where a run reports to: bars on a terminal, lines elsewhere, nothing in tests."""
+class Progress:
+    """Where a job reports to; this one says nothing."""
 
     def start(self, title: str) -> None:
         """A stage begins."""
@@ -46,37 +45,14 @@ class Progress(Protocol):
         """The stage is done."""
 
 
-class Silent:
-    """A :class:`Progress` that says nothing."""
-
-    def start(self, title: str) -> None:
-        """Ignored."""
-
-    def update(self, key: str, done: int, total: int, text: str) -> None:
-        """Ignored."""
-
-    def warn(self, text: str) -> None:
-        """Ignored."""
-
-    def finish(self, text: str) -> None:
-        """Ignored."""
-
-
 @dataclass(frozen=True)
 class Context:
-    """A run in its folder.
-
-    Args:
-        settings: What the run computes.
-        scenario: The machine.
-        out: The run's folder.
-        progress: Where to report.
-    """
+    """A run in its folder: what it computes, the machine, and where it reports to."""
 
     settings: RunSettings
     scenario: Scenario
     out: Path
-    progress: Progress = field(default_factory=Silent)
+    progress: Progress = field(default_factory=Progress)
     _read: dict[str, Stored[Any]] = field(default_factory=dict, repr=False, compare=False)
 
     @property
@@ -127,7 +103,7 @@ class Context:
 
     @cached_property
     def time_unit(self) -> float:
-        """The machine's second [s], of the training recordings; see :func:`~hybrid_mpc.data.scales.time_unit`."""
+        """The machine's second [s], of the training recordings."""
         return time_unit(self.trajectories("train"), self.spec.dt)
 
     def trajectories(self, role: str) -> list[Trajectory]:
@@ -139,11 +115,19 @@ class Context:
 
         Their inputs are those that act; of a delay's first samples nobody knows what acted, so they are left out.
         """
-        return self._with_states(self._acting(self.trajectories(role)))
+        from hybrid_mpc.identify.delay import shifted
+
+        return self._with_states(shifted(self.trajectories(role), self.prior.delay))
 
     def commanded(self, role: str) -> list[Trajectory]:
         """The same with the inputs as they were commanded: what the deployed models, which hold the delay, take."""
-        return self._with_states([self._late(t) for t in self.trajectories(role)])
+        from hybrid_mpc.identify.delay import lost_samples
+
+        found = []
+        for t in self.trajectories(role):
+            lost = lost_samples(self.prior.delay, t.dt)
+            found.append(t.part(np.arange(len(t.t)) >= lost, t.name, t.role) if lost else t)
+        return self._with_states(found)
 
     @property
     def prior(self) -> PriorResult:
@@ -155,17 +139,6 @@ class Context:
     def _with_states(self, trajectories: list[Trajectory]) -> list[Trajectory]:
         arrays = self.prior.arrays
         return [replace(t, x=arrays[f"{t.name}/x"], xdot=arrays[f"{t.name}/xdot"]) for t in trajectories]
-
-    def _acting(self, trajectories: list[Trajectory]) -> list[Trajectory]:
-        if not self.prior.delay:
-            return trajectories
-        from hybrid_mpc.identify.delay import delayed
-
-        return [delayed(t, self.prior.delay) for t in trajectories]
-
-    def _late(self, t: Trajectory) -> Trajectory:
-        lost = math.ceil(self.prior.delay / t.dt - 1e-6)
-        return t.part(np.arange(len(t.t)) >= lost, t.name, t.role) if lost else t
 
     @property
     def kit(self) -> Kit:
@@ -182,11 +155,7 @@ class Context:
         return self.out / "checkpoints" / f"{stage}.json"
 
     def stored(self, stage: Stage[R]) -> Stored[R] | None:
-        """What the folder holds of a stage; None for nothing.
-
-        Raises:
-            InputError: If its file is damaged; it names what to delete.
-        """
+        """What the folder holds of a stage, or None; InputError, which names what to delete, if its file is damaged."""
         if stage.name not in self._read:
             path = self.path(stage.name)
             if not path.is_file():
@@ -209,11 +178,7 @@ class Context:
         return Absent(f"stage {stage.name} has not run") if stored is None else stored.result
 
     def read(self, stage: Stage[R]) -> R:
-        """Result of a stage.
-
-        Raises:
-            InputError: If there is none, with the reason.
-        """
+        """Result of a stage; InputError with the reason if there is none."""
         found = self.find(stage)
         if isinstance(found, Absent):
             raise InputError(found.reason)

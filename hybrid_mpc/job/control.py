@@ -21,6 +21,8 @@ from hybrid_mpc.job.study_run import StudyModel, load_models
 from hybrid_mpc.job.summary import by_task, summaries
 from hybrid_mpc.job.tasks import tasks_of
 from hybrid_mpc.loop.realtime import percentiles
+from hybrid_mpc.plots import animation, loops
+from hybrid_mpc.plots.style import save
 from hybrid_mpc.records import plain
 from hybrid_mpc.scenario import load_scenario
 
@@ -36,21 +38,11 @@ def run_control(
 ) -> dict[str, Any]:
     """Run a study of one model, solver and set of faults alone in this process; write results and figures.
 
-    Loops run one after the other, so that the durations of their steps count. Each is on the disk as it ends.
-
-    Args:
-        study: The loops.
-        out: Folder to make; it must be new or empty unless ``resume``.
-        progress: Where to report.
-        gif: Whether a moving picture of each task is drawn, if the scenario draws. Default: yes.
-        resume: Run what is missing of the loops that ``out`` holds. Default: no.
-
-    Returns:
-        What ``results.json`` holds.
+    Loops run one after the other, so that the durations of their steps count. Each is on the disk as it ends. Returned
+    is what ``results.json`` holds.
 
     Raises:
-        InputError: If anything does not fit (:func:`~hybrid_mpc.job.study_run.load_models`), the folder holds something
-            else, or nothing can be written in it.
+        InputError: If anything does not fit, the folder holds something else, or nothing can be written in it.
     """
     check_out(out, NOUN, resume=resume)
     progress.start("reading the model, and the filters' noise")
@@ -133,9 +125,6 @@ def _times(rows: Sequence[LoopRow]) -> dict[str, Array]:
 
 def figures(bench: Bench, rows: Sequence[LoopRow], folder: Path, progress: Progress, gif: bool) -> list[Path]:
     """Figures of the first loop of every task and controller, and the durations of steps."""
-    from hybrid_mpc.plots import animation, loops
-    from hybrid_mpc.plots.style import save
-
     (kit,) = bench.kits.values()
     model, scenario, written = kit.models["prior"], bench.scenario, []
     drawn = by_task([row for row in rows if "plans" in row.arrays])

@@ -33,12 +33,9 @@ period it starts from its last plan and from the rival's that is cheaper by its 
 
 @dataclass(frozen=True)
 class NamedController:
-    """A controller with its estimator.
+    """A controller of a ``"prior"``, ``"hybrid"`` or ``"oracle"`` model with its estimator.
 
-    Args:
-        model: ``"prior"``, ``"hybrid"`` or ``"oracle"``.
-        observer: Whether the estimator follows an unknown load at the input.
-        truth: Whether it is handed the plant's true state instead of the measurement.
+    An ``observer`` follows an unknown load at the input; ``truth`` is handed the plant's true state.
     """
 
     model: str
@@ -64,14 +61,7 @@ LEAST_NOISE: Mapping[str, str] = {"hybrid": "prior", "hybrid_observer": "prior_o
 def build(
     name: str, scenario: Scenario, kit: Kit, control: OCP, *, solver: str = "rti"
 ) -> tuple[Estimator, SafeController]:
-    """Estimator and controller by name.
-
-    Args:
-        name: Name in :data:`CONTROLLERS`.
-        scenario: The machine, with its oracle if that is asked for.
-        kit: Prior and hybrid, and the process noise of the controller's filter.
-        control: The task's control problem.
-        solver: Name in :data:`~hybrid_mpc.kit.assembly.SOLVERS`; oracles have their own.
+    """Estimator and controller by name for a task's control problem; oracles have a solver of their own.
 
     Raises:
         InputError: If there is no such controller, the scenario has no oracle, or the kit no noise.
@@ -97,10 +87,7 @@ def build(
 def noise_of(scenario: Scenario, artifact: Kit, recordings: Sequence[Trajectory]) -> dict[str, Array]:
     """Process noise of every controller that estimates, each by maximum likelihood on the same recordings.
 
-    Args:
-        scenario: The machine, with its sensors' noise and input range.
-        artifact: Prior and hybrid.
-        recordings: Training recordings with smoothed states.
+    These are training recordings with smoothed states.
     """
     models = dict(artifact.models)
     if scenario.oracle is not None:
@@ -117,14 +104,7 @@ def noise_of(scenario: Scenario, artifact: Kit, recordings: Sequence[Trajectory]
 
 
 def no_surer_than_prior(scenario: Scenario, noise: Mapping[str, Array]) -> dict[str, Array]:
-    """Process noise by controller; where tasks go beyond the recordings a hybrid has no less than its prior.
-
-    Example:
-        >>> from scenarios.unbalanced_disk import scenario
-        >>> noise = {"prior": np.array([2.0, 5.0]), "hybrid": np.array([1.0, 7.0])}
-        >>> no_surer_than_prior(scenario, noise)["hybrid"].tolist()
-        [2.0, 7.0]
-    """
+    """Process noise by controller; where tasks go beyond the recordings a hybrid has no less than its prior."""
     found = dict(noise)
     if scenario.beyond_recordings:
         for hybrid, prior in LEAST_NOISE.items():

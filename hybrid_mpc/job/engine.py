@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import os
 import re
 import signal
@@ -12,7 +13,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, CancelledError
 from contextvars import ContextVar
-from dataclasses import dataclass
 from functools import partial
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
@@ -42,16 +42,7 @@ R = TypeVar("R")
 
 
 class Lost(Exception):
-    """A batch whose worker died; ``final`` where the engine has tried several times already.
-
-    Args:
-        why: What is known of it.
-        final: Whether there is no use in trying again.
-
-    Example:
-        >>> Lost("the exit codes of the workers are {SIGKILL(-9)}", final=False).final
-        False
-    """
+    """A batch whose worker died; ``final`` where the engine has tried several times already."""
 
     def __init__(self, why: str, final: bool) -> None:
         super().__init__(why)
@@ -75,11 +66,7 @@ class Engine(ABC, Generic[B, R]):
 
     @abstractmethod
     def submit(self, batch: B) -> None:
-        """Begin a batch.
-
-        Raises:
-            RuntimeError: If no worker can be started for it.
-        """
+        """Begin a batch; RuntimeError if no worker can be started for it."""
 
     def next(self, timeout: float) -> tuple[B, R | Lost] | None:
         """A batch that has ended, with its result or how it was lost; None if none ends within ``timeout`` [s].
@@ -107,16 +94,10 @@ class Engine(ABC, Generic[B, R]):
 
 
 class LocalEngine(Engine[B, R]):
-    """Processes of this machine; each computes one batch after the other.
+    """Processes of this machine; each computes one batch after the other. Work, batches and results must pickle.
 
-    Args:
-        work: Makes the result of a batch; it must pickle, and so must batches and results.
-        workers: Processes.
-        threads: Threads that numerical libraries take in each process. Default: what the environment says.
-        begin: Called in each process before its first batch; connections in it are inherited. Default: nothing.
-
-    Raises:
-        InputError: If ``workers`` is less than 1.
+    Numerical libraries take ``threads`` in each process; default: what the environment says. ``begin`` is called in
+    each process before its first batch; connections in it are inherited.
 
     Example:
         >>> engine = LocalEngine(sum, workers=1, threads=1)
@@ -188,20 +169,13 @@ class LocalEngine(Engine[B, R]):
 
 
 class DaskEngine(Engine[B, R]):
-    """Workers of a dask cluster; ``work`` is sent to each of them once, with all that it holds.
+    """Workers of a dask cluster, by its scheduler's address or a ``distributed.Client``; ``work`` is sent to each once.
 
     A worker that dies is the scheduler's affair: it gives the batch to another, and gives it up when several workers
     died of it.
 
-    Args:
-        work: Makes the result of a batch; it must pickle, and so must batches and results.
-        cluster: Address of a scheduler, ``"tcp://host:8786"``, or a ``distributed.Client``.
-
     Raises:
         InputError: If dask is missing, the scheduler cannot be reached, or it has no worker.
-
-    Example:
-        >>> DaskEngine(sum, "tcp://10.0.0.7:8786").submit((1, 2, 3))  # doctest: +SKIP
     """
 
     def __init__(self, work: Callable[[B], R], cluster: Any) -> None:
@@ -227,11 +201,7 @@ class DaskEngine(Engine[B, R]):
         return str(self._client.scheduler.address)
 
     def next(self, timeout: float) -> tuple[B, R | Lost] | None:
-        """See :class:`Engine`.
-
-        Raises:
-            InputError: If the cluster has had no worker for a while.
-        """
+        """See :class:`Engine`; InputError if the cluster has had no worker for a while."""
         now = time.monotonic()
         if now - self._looked >= LOOK_S:
             self._looked, there = now, set(self._client.nthreads())
@@ -248,7 +218,7 @@ class DaskEngine(Engine[B, R]):
                 self._shared = self._client.scatter(self._work, broadcast=True, hash=False, timeout=ALONE_S)
             except TimeoutError as error:
                 raise self._alone() from error
-        self._watch(self._client.submit(_called, self._shared, batch, pure=False), batch)
+        self._watch(self._client.submit(operator.call, self._shared, batch, pure=False), batch)
 
     def _alone(self) -> InputError:
         return InputError(
@@ -289,19 +259,7 @@ def make_engine(
 ) -> Engine[B, R]:
     """The engine of a cluster, or of this machine where there is none.
 
-    Args:
-        work: Makes the result of a batch; it must pickle, and so must batches and results.
-        workers: Processes of this machine.
-        cluster: Address of a dask scheduler or a ``distributed.Client``. Default: none.
-        threads: Threads in each process of this machine. Default: what the environment says. Those of a cluster's
-            workers are set where they are started.
-
-    Raises:
-        InputError: If ``workers`` is less than 1, or the cluster cannot be reached.
-
-    Example:
-        >>> make_engine(sum, workers=2).name
-        'joblib, 2 processes'
+    Threads of a cluster's workers are set where they are started.
     """
     return LocalEngine(work, workers, threads=threads) if cluster is None else DaskEngine(work, cluster)
 
@@ -314,14 +272,9 @@ def run_jobs(
 ) -> dict[str, Any]:
     """Run ``function(*args, report)`` for each job on this machine and return the results by name.
 
-    A job calls ``report(done, total, text)`` as it goes. Jobs start in the order given, ``workers`` at a time, each in
-    a fresh process with the environment's number of threads, so results do not depend on how many run side by side.
-
-    Args:
-        jobs: Functions and their arguments by name; both must pickle, and so must the results.
-        on_progress: ``(name, done, total, text)`` for each report, before the job's result.
-        workers: Jobs side by side.
-        on_result: ``(name, result)`` as each job ends, also beside one that fails. Default: nothing.
+    A job calls ``report(done, total, text)`` as it goes, which ``on_progress`` gets with its name. Jobs start in the
+    order given, ``workers`` at a time, each in a fresh process with the environment's number of threads, so results do
+    not depend on how many run side by side. ``on_result`` is called as each job ends, also beside one that fails.
 
     Raises:
         InputError: If a job raises one: bad input that shows only then. Or if ``workers`` is less than 1.
@@ -343,7 +296,7 @@ def run_jobs(
                 name = queue.pop(0)
                 running[name] = _Job(*jobs[name])
             wait([job.reports for job in running.values()], REPORT_S)
-            failed: dict[str, _Ended] = {}
+            failed: dict[str, Exception] = {}
             for name, job in list(running.items()):
                 ended = job.ended()
                 for report in job.new_reports(rest=ended is not None):
@@ -351,38 +304,19 @@ def run_jobs(
                 if ended is None:
                     continue
                 running.pop(name).close()
-                if ended.succeeded:
-                    results[name] = ended.value
-                    on_result(name, ended.value)
+                value, error = ended
+                if error is None:
+                    results[name] = value
+                    on_result(name, value)
                 else:
-                    failed[name] = ended
+                    failed[name] = error
             if failed:  # raised only now, after the results of others that had ended by then
-                name, first = next(iter(failed.items()))
-                raise first.error(name)
+                name, error = next(iter(failed.items()))
+                raise error if isinstance(error, InputError) else RuntimeError(f"{name} failed:\n{error}")
     finally:
         for job in running.values():
             job.close()
     return results
-
-
-@dataclass(frozen=True)
-class _Ended:
-    """How a job ended: its value, the InputError that it raised, or what else it failed by."""
-
-    value: Any = None
-    refused: tuple[type[InputError], str] | None = None
-    failed: str | None = None
-
-    @property
-    def succeeded(self) -> bool:
-        return self.refused is None and self.failed is None
-
-    def error(self, name: str) -> Exception:
-        """What to raise of a job that has not succeeded."""
-        if self.refused is not None:
-            kind, text = self.refused
-            return kind(text)
-        return RuntimeError(f"{name} failed:\n{self.failed}")
 
 
 class _Job:
@@ -397,16 +331,16 @@ class _Job:
         self._engine = LocalEngine(_run, 1, begin=partial(_report_to, self._theirs))
         self._engine.submit((function, args))
 
-    def ended(self) -> _Ended | None:
-        """How it ended; None while it runs."""
+    def ended(self) -> tuple[Any, Exception | None] | None:
+        """Its value, or what it failed by; None while it runs."""
         try:
             found = self._engine.next(timeout=0.0)
         except Exception:  # arguments or a result that do not pickle
-            return _Ended(failed=traceback.format_exc())
+            return None, RuntimeError(traceback.format_exc())
         if found is None:
             return None
         ended = found[1]
-        return _Ended(failed=f"its process ended ({ended})") if isinstance(ended, Lost) else ended
+        return (None, RuntimeError(f"its process ended ({ended})")) if isinstance(ended, Lost) else ended
 
     def new_reports(self, *, rest: bool) -> Iterator[tuple[int, int, str]]:
         """The next report, if there is one; the ``rest`` of them once the job has ended."""
@@ -435,7 +369,7 @@ def _report_to(reports: Connection) -> None:
     _REPORTS.set(reports)
 
 
-def _run(job: tuple[Callable[..., Any], tuple[Any, ...]]) -> _Ended:
+def _run(job: tuple[Callable[..., Any], tuple[Any, ...]]) -> tuple[Any, Exception | None]:
     """Run a job in its worker."""
     (function, args), reports = job, _REPORTS.get()
 
@@ -443,11 +377,11 @@ def _run(job: tuple[Callable[..., Any], tuple[Any, ...]]) -> _Ended:
         reports.send((done, total, text))
 
     try:
-        return _Ended(function(*args, report))
+        return function(*args, report), None
     except InputError as error:
-        return _Ended(refused=(type(error), str(error)))
+        return None, error
     except BaseException:  # SystemExit too: every failure travels to the parent, which raises it
-        return _Ended(failed=traceback.format_exc())
+        return None, RuntimeError(traceback.format_exc())
     finally:
         reports.close()
 
@@ -473,11 +407,6 @@ def follow(parent: int) -> None:
 def _check(workers: int) -> None:
     if workers < 1:
         raise InputError(f"workers must be 1 or more, got {workers}")
-
-
-def _called(work: Callable[[B], R], batch: B) -> R:
-    """What a worker of a cluster does, which has ``work`` already."""
-    return work(batch)
 
 
 def _connected(address: str) -> Any:

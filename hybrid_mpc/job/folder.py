@@ -25,12 +25,8 @@ DAMAGED = "choose another --out"
 
 @dataclass(frozen=True)
 class JobNote:
-    """What a job says of itself in its folder, in ``<noun>.json``.
-
-    Args:
-        noun: What the folder holds, e.g. ``"run"``.
-        settings: What decides what the job computes, by name.
-        more: What else the note says; it decides nothing. Default: nothing.
+    """What a job says of itself in ``<noun>.json`` of its folder: ``settings`` decide what it computes, ``more``
+    nothing.
     """
 
     noun: str
@@ -39,11 +35,7 @@ class JobNote:
 
 
 def read_note(out: Path, noun: str) -> dict[str, Any]:
-    """The note of a job's folder: ``settings``, and what else it says.
-
-    Raises:
-        InputError: If there is none, or it is damaged.
-    """
+    """The note of a job's folder: ``settings``, and what else it says; InputError if it is missing or damaged."""
     note = read_document(out / f"{noun}.json", DAMAGED)
     if not isinstance(note.get("settings"), dict):
         raise InputError(f"{out / noun}.json is damaged: no settings in it; {DAMAGED}")
@@ -53,19 +45,11 @@ def read_note(out: Path, noun: str) -> dict[str, Any]:
 def check_out(out: Path, noun: str, *, resume: bool | None) -> None:
     """Refuse a folder that a job cannot work in, before anything is computed.
 
-    Args:
-        out: The folder.
-        noun: What the job is, e.g. ``"run"``.
-        resume: Whether a job goes on there; None: either way.
+    With ``resume`` a job of this noun goes on there, without it none may be there; None: either way.
 
     Raises:
         InputError: If the folder holds something else, a job where none is to go on, no job where one is; or if nothing
             can be written there.
-
-    Example:
-        >>> check_out(Path("nowhere"), "run", resume=True)
-        Traceback (most recent call last):
-        hybrid_mpc.errors.InputError: nowhere holds no run to resume; leave --resume out
     """
     _check_place(out, noun, resume)
     check_writable(out)
@@ -83,17 +67,10 @@ def _check_place(out: Path, noun: str, resume: bool | None) -> None:
 
 @contextmanager
 def open_folder(out: Path, note: JobNote, *, resume: bool | None) -> Iterator[None]:
-    """A job's folder while it works: made, held against other processes, the job noted in it.
-
-    Args:
-        out: The folder.
-        note: The job.
-        resume: Whether the same job goes on there; None: either way.
+    """A job's folder while it works: made, held against other processes, the job noted in it; ``resume`` as above.
 
     Raises:
         InputError: As :func:`check_out`; or if it holds a job of other settings, or another process works in it.
-
-    Example: ``with open_folder(Path("runs/mine"), JobNote("run", {"seed": 0}), resume=False): ...``
     """
     check_out(out, note.noun, resume=resume)
     _check_settings(out, note)
@@ -103,11 +80,7 @@ def open_folder(out: Path, note: JobNote, *, resume: bool | None) -> Iterator[No
 
 
 def write_note(out: Path, note: JobNote, *, resume: bool | None) -> None:
-    """Note a job in its folder, which the caller holds; the part of :func:`open_folder` after the lock.
-
-    Raises:
-        InputError: As :func:`open_folder`.
-    """
+    """Note a job in its folder, which the caller holds; the part of :func:`open_folder` after the lock."""
     _check_place(out, note.noun, resume)
     _check_settings(out, note)
     path, own = out / f"{note.noun}.json", {**plain(note.more), "settings": plain(note.settings)}

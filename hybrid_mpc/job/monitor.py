@@ -13,7 +13,7 @@ import numpy as np
 from hybrid_mpc.data.trajectories import Cut, Dataset, Trajectory, load_trajectories
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_object, write_json, write_text
-from hybrid_mpc.job.context import Progress, Silent
+from hybrid_mpc.job.context import Progress
 from hybrid_mpc.job.controllers import find_noise
 from hybrid_mpc.kit.artifact import Kit, artifact_folder, load
 from hybrid_mpc.kit.assembly import make_monitor, sensor_steps
@@ -44,12 +44,8 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Alarm:
-    """An alarm and what explains it.
-
-    Args:
-        start_s: First sample [s], in the recording's own time.
-        end_s: Last sample [s].
-        diagnosis: What explains it; empty where nothing can say.
+    """An alarm from its first to its last sample [s] in the recording's own time, and what explains it, if anything
+    can.
     """
 
     start_s: float
@@ -59,16 +55,8 @@ class Alarm:
 
 @dataclass(frozen=True)
 class RecordingResult:
-    """What the monitor found in a recording, and for how long it had a valid reading.
-
-    Args:
-        recording: Its name.
-        seconds: Its length [s].
-        valid_s: Length [s] with a valid reading.
-        warm_up_s: Length [s] in which the window was not full.
-        missing_s: Length [s] in which samples were missing.
-        not_finite_s: Length [s] in which model or estimator gave no finite number.
-        alarms: The alarms.
+    """What the monitor found in a recording, and why it had no valid reading of parts: its window was not full
+    (``warm_up_s``), samples were missing, or model or estimator gave no finite number.
     """
 
     recording: str
@@ -82,13 +70,7 @@ class RecordingResult:
 
 @dataclass(frozen=True)
 class MonitorResult:
-    """What :func:`watch` found.
-
-    Args:
-        recordings: Each recording.
-        gaps: Gaps in recordings.
-        not_watched: Parts too short to be watched.
-    """
+    """What :func:`watch` found in each recording, the gaps in them, and parts too short to be watched."""
 
     recordings: tuple[RecordingResult, ...]
     gaps: tuple[Cut, ...]
@@ -97,13 +79,8 @@ class MonitorResult:
 
 @dataclass(frozen=True)
 class MonitorJob:
-    """What ``hybrid-mpc monitor`` needs.
-
-    Args:
-        kit: Prior and hybrid, and the process noise of their filters.
-        data: The recordings.
-        resolution: Step of each sensor, or None.
-        detector: Detector, or None for the artifact's thresholds.
+    """What ``hybrid-mpc monitor`` needs: kit, recordings, the step of each sensor, and a detector, or None for the
+    artifact's thresholds.
     """
 
     kit: Kit
@@ -138,13 +115,9 @@ def prepared(
 ) -> MonitorJob:
     """Load and check everything.
 
-    Args:
-        scenario: The machine.
-        model: Artifact folder, or the folder of the run that holds it as ``model``.
-        recordings: CSV, ``.npz`` or ``.mat`` files.
-        resolution: Step of each sensor. Default: with a detector what the filters' assumed noise comes to, as in the
-            main job.
-        calibration: ``calibration.json`` with a detector. Default: the artifact's, if it has one.
+    ``model`` is an artifact's folder or its run's. The ``resolution`` is the step of each sensor; default: with a
+    detector what the filters' assumed noise comes to, as in the main job. ``calibration`` is a ``calibration.json``
+    with a detector; default: the artifact's, if it has one.
 
     Raises:
         InputError: If the scenario defines no control problem, a file is bad, or things do not fit each other.
@@ -180,11 +153,7 @@ def prepared(
 
 
 def read_detector(path: Path) -> Detector:
-    """The detector in a ``calibration.json`` that :func:`learn` wrote.
-
-    Raises:
-        InputError: If it cannot be read or holds none.
-    """
+    """The detector in a ``calibration.json`` that :func:`learn` wrote; InputError if there is none."""
     stored = read_object(path)
     if stored.get("detector") is None:
         raise InputError(f"{path} holds no detector; make it with hybrid-mpc monitor ... --learn 1")
@@ -192,15 +161,8 @@ def read_detector(path: Path) -> Detector:
 
 
 def learn(job: MonitorJob, rate: float, out: Path, progress: Progress | None = None) -> Detector:
-    """Learn a detector from the job's recordings, in which nothing may be wrong; writes ``calibration.json``.
-
-    Args:
-        job: The job.
-        rate: Wanted false alarms an hour.
-        out: Folder.
-        progress: Where to report; default: nowhere.
-    """
-    model, say = job.kit.models["hybrid"], progress or Silent()
+    """Learn a detector for ``rate`` false alarms an hour from nominal recordings; writes ``calibration.json``."""
+    model, say = job.kit.models["hybrid"], progress or Progress()
     say.start("replaying the recordings")
     detector = learn_from(
         model, job.estimator, job.data.whole, false_alarms_per_hour=rate, rest_speed=job.kit.rest_speed,
@@ -212,17 +174,11 @@ def learn(job: MonitorJob, rate: float, out: Path, progress: Progress | None = N
 
 
 def watch(job: MonitorJob, out: Path, progress: Progress | None = None) -> MonitorResult:
-    """Replay the monitor over each recording: ``NAME.csv`` and ``NAME.png``, and last ``monitor.json``.
-
-    Args:
-        job: The job.
-        out: Folder.
-        progress: Where to report; default: nowhere.
-    """
+    """Replay the monitor over each recording: ``NAME.csv`` and ``NAME.png``, and last ``monitor.json``."""
     from hybrid_mpc.plots.monitor import overview
     from hybrid_mpc.plots.style import save
 
-    rows, progress, model = [], progress or Silent(), job.kit.models["hybrid"]
+    rows, progress, model = [], progress or Progress(), job.kit.models["hybrid"]
     calibration = job.monitor.calibration
     limits = {}
     if calibration is not None:
@@ -273,15 +229,9 @@ def explained(
     *,
     prior: HybridModel | None = None,
 ) -> tuple[MonitorTrace, tuple[Alarm, ...]]:
-    """Replay a monitor, and diagnose each alarm.
+    """Replay a monitor with the closed loops' estimator, and diagnose each alarm if it has history and detector.
 
-    Args:
-        monitor: The monitor; only with history and detector its alarms are explained.
-        estimator: The estimator of the closed loops.
-        recording: On the model's grid.
-        causes: What may break, see :class:`~hybrid_mpc.monitor.diagnose.Diagnoser`. Empty: each parameter by itself.
-        on_progress: ``(done, total)`` samples.
-        prior: Model of the prior alone, see there.
+    ``causes`` and ``prior`` are those of :class:`~hybrid_mpc.monitor.diagnose.Diagnoser`.
     """
     can = monitor.layout.history and monitor.detector is not None
     diagnoser = Diagnoser(monitor, causes or None, prior=prior) if can else None

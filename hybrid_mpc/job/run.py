@@ -9,7 +9,7 @@ from typing import Any
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_object
 from hybrid_mpc.job.check import check_scenario
-from hybrid_mpc.job.context import Context, Progress, Silent
+from hybrid_mpc.job.context import Context, Progress
 from hybrid_mpc.job.folder import open_folder
 from hybrid_mpc.job.settings import RunSettings, check_device, run_note
 from hybrid_mpc.job.stage import Absent, Stage, bring_up_to_date, changed
@@ -44,9 +44,8 @@ def run(
     """Run the main job into the folder ``out``; the results stand in its ``results.json``, too.
 
     Every stage leaves its result in ``out/checkpoints``. With ``resume`` a stage runs again only where something that
-    it reads has changed: after an interruption the run goes on, after an edit of a task its loops and the report are
-    made anew, and nothing is trained again. A stage after the export that cannot run costs its own part of the report,
-    which then has the reason.
+    it reads has changed: after an edit of a task its loops and the report are made anew, and nothing is trained again.
+    A stage after the export that cannot run costs its own part of the report, which then has the reason.
 
     Args:
         settings: What to compute.
@@ -65,7 +64,7 @@ def run(
     """
     check_choice(only, skip)
     scenario = load_scenario(settings.scenario)
-    context = Context(settings, scenario, out, progress or Silent())
+    context = Context(settings, scenario, out, progress or Progress())
     check_scenario(scenario, context.budget)
     check_data(context)
     check_device(settings.device)
@@ -80,16 +79,7 @@ def run(
 
 
 def check_choice(only: Sequence[str], skip: Sequence[str]) -> None:
-    """Refuse names that are no stages, and leaving out what all others need.
-
-    Raises:
-        InputError: With the names that there are.
-
-    Example:
-        >>> check_choice((), ("prior",))
-        Traceback (most recent call last):
-        hybrid_mpc.errors.InputError: --skip prior: without it there is no model; what can be left out: noise, ...
-    """
+    """Refuse names that are no stages, and leaving out what all others need."""
     for name in (*only, *skip):
         known(name, NAMES, "stage")
     optional = [stage.name for stage in STAGES if stage.optional]
@@ -115,18 +105,7 @@ def _as_it_is(context: Context, stage: Stage[Any]) -> str:
 
 
 def failed_stages(out: Path) -> dict[str, str]:
-    """Why stages of a run could not run, by stage; empty where all did.
-
-    Args:
-        out: The run's folder.
-
-    Raises:
-        InputError: If a file is damaged.
-
-    Example:
-        >>> failed_stages(Path("nowhere"))
-        {}
-    """
+    """Why stages of a run could not run, by stage; empty where all did."""
     context = Context(RunSettings(""), None, out)  # type: ignore[arg-type]
     found = {stage.name: context.stored(stage) for stage in STAGES}
     absent = {name: stored.result for name, stored in found.items() if stored is not None}

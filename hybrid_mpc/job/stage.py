@@ -38,12 +38,7 @@ LIBRARY = ("hybrid_mpc", "nn_export")
 
 @dataclass(frozen=True)
 class Absent:
-    """Why a stage has no result.
-
-    Args:
-        reason: In words.
-        failed: Whether it could not run; otherwise the scenario has none, or the user left it out.
-    """
+    """Why a stage has no result: it could not run (``failed``), the scenario has none, or the user left it out."""
 
     reason: str
     failed: bool = False
@@ -62,7 +57,7 @@ class Stage(Generic[R]):
         needs: Stages whose results it reads.
         optional: Whether there is a model, and a report on it, without this stage.
         restore: Called with a result that is still right; it puts back what the stage leaves outside its own file, or
-            says why it must be computed again (an empty text: all is well). Default: there is nothing.
+            says why it must be computed again (an empty text: all is well).
     """
 
     name: str
@@ -83,13 +78,7 @@ class Stage(Generic[R]):
 
 @dataclass(frozen=True)
 class Stored(Generic[R]):
-    """What a stage's file holds.
-
-    Args:
-        keys: Digests of what was read.
-        result: What was found.
-        content: Digest of the result.
-    """
+    """What a stage's file holds: digests of what was read, the result, and its digest."""
 
     keys: Mapping[str, str]
     result: R | Absent
@@ -105,11 +94,7 @@ class _File:
 
 
 def write_stage(path: Path, stage: Stage[R], keys: Mapping[str, str], result: R | Absent) -> Stored[R]:
-    """Write a stage's result, its arrays first; the file means that the stage is done.
-
-    Raises:
-        StorageError: If it cannot be written.
-    """
+    """Write a stage's result, its arrays first; the file means that the stage is done."""
     if isinstance(result, Absent):
         content = digest(result)
         write_document(path, plain(_File(keys, result, {}, content)))
@@ -147,14 +132,7 @@ def _has_arrays(stage: Stage[Any]) -> bool:
 
 
 def changed(before: Mapping[str, str], now: Mapping[str, str]) -> str:
-    """What has changed of what a stage reads, in words; empty for nothing.
-
-    Example:
-        >>> changed({"seed": "a", "data": "b"}, {"seed": "a", "data": "c"}), changed({"seed": "a"}, {"seed": "a"})
-        ('data has changed', '')
-        >>> changed({"plant": ""}, {"plant": ""})
-        'nobody knows whether plant has changed'
-    """
+    """What has changed of what a stage reads, in words; empty for nothing."""
     unknown = [name for name, key in now.items() if not key]
     differ = [name for name in now if name not in unknown and now[name] != before.get(name)]
     differ += [name for name in before if name not in now]
@@ -169,15 +147,9 @@ def changed(before: Mapping[str, str], now: Mapping[str, str]) -> str:
 
 
 def bring_up_to_date(context: Context, stage: Stage[Any], skip: bool = False) -> str:
-    """Run a stage, unless the folder holds its result and nothing that it reads has changed.
+    """Run a stage, unless the folder holds its result and nothing that it reads has changed; says what was done.
 
-    Args:
-        context: The run.
-        stage: The stage.
-        skip: Leave it out if it would have to run. Default: no.
-
-    Returns:
-        What was done, in words.
+    With ``skip`` it is left out if it would have to run.
 
     Raises:
         InputError: If a stage that is not optional cannot run.
@@ -227,23 +199,11 @@ def _digest_of_array(array: Any) -> str:
 
 
 def source_of(made: object) -> object:
-    """What a function or class of a scenario is made of: the code of its module and of those that it imports.
+    """What a function or class of a scenario is made of: the code, by module, of its module and of those that it
+    imports.
 
     Comments, docstrings and the statement ``scenario = ...`` do not count: what a scenario says is compared by itself.
-    Packages from elsewhere do not count either.
-
-    Args:
-        made: The function, the class, or a partial of one; None for none.
-
-    Returns:
-        Plain data that changes with the code, or ``UNKNOWN`` where there is no source.
-
-    Example:
-        >>> from hybrid_mpc.scenario import load_scenario
-        >>> sorted(source_of(load_scenario("golf_robot").plant))[:2]
-        ['scenarios.common', 'scenarios.golf_robot.dynamics']
-        >>> source_of(eval("lambda: 0")) is UNKNOWN
-        True
+    Packages from elsewhere do not count either. ``UNKNOWN`` where there is no source; None for None.
     """
     if made is None:
         return None

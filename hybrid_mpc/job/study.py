@@ -50,9 +50,7 @@ class FaultKind:
     Raises:
         InputError: If the target is unknown or a range is empty.
 
-    Example:
-        >>> FaultKind("plant_friction", 1.5, 4.0).signed
-        False
+    Example: ``FaultKind("plant_friction", 1.5, 4.0)``
     """
 
     target: str
@@ -142,28 +140,13 @@ class RandomFaults:
 
 
 def generator(seed: int, draw: int, what: str) -> np.random.Generator:
-    """Random numbers of one thing in one draw, whatever else is drawn.
-
-    Example:
-        >>> float(generator(0, 3, "m").random()) == float(generator(0, 3, "m").random())
-        True
-    """
+    """Random numbers of one thing in one draw, whatever else is drawn."""
     key = hashlib.sha256(f"{seed}/{draw}/{what}".encode()).digest()
     return np.random.default_rng(int.from_bytes(key[:16], "big"))
 
 
 def factors(vary: Sequence[tuple[str, float]], seed: int, draw: int) -> tuple[tuple[str, float], ...]:
-    """Factors of the plant's parameters, uniform in ``1 - span`` to ``1 + span``.
-
-    Args:
-        vary: Parameters with the span of each.
-        seed: Seed of the study's draws.
-        draw: Number of the draw.
-
-    Example:
-        >>> [(name, round(factor, 3)) for name, factor in factors([("m", 0.2)], seed=0, draw=1)]
-        [('m', 1.194)]
-    """
+    """Factors of the plant's parameters in a draw, uniform in ``1 - span`` to ``1 + span``."""
     return tuple(
         (name, float(1.0 + span * generator(seed, draw, name).uniform(-1.0, 1.0))) for name, span in vary
     )
@@ -172,23 +155,14 @@ def factors(vary: Sequence[tuple[str, float]], seed: int, draw: int) -> tuple[tu
 def _span(
     values: Sequence[float], what: str, *, least: float = -math.inf, above: float = -math.inf
 ) -> tuple[float, float]:
-    """Two numbers in order.
-
-    Raises:
-        InputError: If they are not.
-    """
+    """Two numbers in order, or InputError."""
     try:
         low, high = (float(v) for v in values)
     except (TypeError, ValueError) as error:
         raise InputError(f"{what}: two numbers are needed, got {values!r}") from error
     if not (math.isfinite(low) and math.isfinite(high) and low <= high and low >= least and low > above):
-        bounds = (
-            f" of {least:g} or more"
-            if math.isfinite(least)
-            else f" above {above:g}"
-            if math.isfinite(above)
-            else ""
-        )
+        bounds = f" of {least:g} or more" if math.isfinite(least) else ""
+        bounds = f" above {above:g}" if math.isfinite(above) else bounds
         raise InputError(
             f"{what}: [{low:g}, {high:g}] is no range; needed are two finite numbers{bounds}, the smaller one first"
         )
@@ -295,7 +269,7 @@ hybrid, hybrid_observer, oracle, oracle_state
 
     @property
     def axes(self) -> dict[str, int]:
-        """How many of each thing there are; the product is the number of runs."""
+        """How many of each thing there are; their product is the number of runs."""
         lengths = {name: len(getattr(self, name)) for name in AXES}
         tasks = len(selected_tasks(load_scenario(self.scenario), self.tasks))
         return {**lengths, "tasks": tasks, "draws": self.draws}
@@ -306,7 +280,7 @@ hybrid, hybrid_observer, oracle, oracle_state
         return math.prod(self.axes.values())
 
     def runs(self) -> Iterator[LoopSpec]:
-        """The runs, those of a controller next to each other; they are made one by one, so there may be millions."""
+        """The runs, one by one, those of a controller next to each other."""
         tasks = [t.name for t in selected_tasks(load_scenario(self.scenario), self.tasks)]
         drawn = [self._drawn(i) for i in range(self.draws)]
         outer = product(
@@ -439,27 +413,14 @@ MOST_YAML = 2**16
 
 
 def read_study(path: str | Path, **instead: Any) -> Study:
-    r"""The study that a YAML file describes: its keys are the fields of :class:`~hybrid_mpc.job.study.Study`.
+    """The study that a YAML file describes: its keys are the fields of :class:`Study`.
 
-    Folders of models are meant from the folder of the YAML file. The name is that of the file if it gives none. A
-    settings file runs nothing: its scenario is a registered name; a ``.py`` file is given as ``scenario=`` (on the
-    command line ``--scenario FILE.py``).
-
-    Args:
-        path: The file.
-        instead: Fields that replace those of the file, e.g. ``models``.
+    Folders of models are meant from the folder of the YAML file; the name is that of the file if it gives none. A
+    settings file runs nothing: its scenario must be registered; a ``.py`` file is given as ``instead["scenario"]``.
 
     Raises:
         InputError: If the file is missing or no YAML, its scenario is not registered, a key is unknown (with the
             nearest valid one), or the study is not valid.
-
-    Example:
-        >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "mine.yaml"
-        >>> _ = path.write_text("scenario: golf_robot\nmodels: {z32: runs/golf}\nseeds: 2\n")
-        >>> study = read_study(path)
-        >>> study.name, study.seeds, study.folders["z32"] == path.parent / "runs/golf"
-        ('mine', (0, 1), True)
     """
     path = Path(path)
     keys = _mapping(path)
@@ -495,9 +456,8 @@ def _mapping(path: Path) -> dict[str, Any]:
 def _loader() -> Any:
     """A YAML loader of plain data: texts, numbers, true, false, null, lists and mappings with each key once.
 
-    YAML 1.1, which PyYAML reads, makes of ``on`` a flag, of ``2024-01-01`` a date and of ``1:30`` a number; here they
-    are the texts that they look like (YAML 1.2, core schema). Anchors and aliases, with which a small file becomes a
-    huge one, are refused.
+    It reads YAML 1.2's core schema: PyYAML's 1.1 makes of ``on`` a flag and of ``1:30`` a number. Anchors and aliases,
+    with which a small file becomes a huge one, are refused.
     """
     import yaml
 
@@ -540,10 +500,7 @@ _PLAIN = (
 
 
 def built_in_studies() -> dict[str, Path]:
-    """Files of the studies that registered scenarios bring, by name: ``studies/*.yaml`` beside the scenario.
-
-    The first line of each is a comment that says what the study is about.
-    """
+    """Files of the studies that registered scenarios bring, by name; the first line of each says what it is about."""
     found: dict[str, Path] = {}
     for place in registered_scenarios().values():
         module = find_spec(place.partition(":")[0])
@@ -553,18 +510,6 @@ def built_in_studies() -> dict[str, Path]:
 
 
 def built_in_study(name: str, models: str | Path | Mapping[str, str | Path]) -> Study:
-    """The built-in study of that name with these models.
-
-    Args:
-        name: Name in :func:`built_in_studies`.
-        models: Artifact folders by label, or one.
-
-    Raises:
-        InputError: If there is none of that name.
-
-    Example:
-        >>> built_in_study("faults_1000", "runs/golf").size
-        1000
-    """
+    """The built-in study of that name with these models."""
     files = built_in_studies()
     return read_study(files[known(name, files, "built-in study")], models=models)

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from hybrid_mpc.errors import InputError
@@ -43,12 +42,7 @@ GROUP_ROWS = 20_000
 
 @dataclass(frozen=True)
 class NoiseNote:
-    """Process noise of a model's filters.
-
-    Args:
-        source: Where it is from, in words.
-        sigma_x: Standard deviations per period by controller.
-    """
+    """Process noise of a model's filters: where it is from, and standard deviations per period by controller."""
 
     source: str
     sigma_x: Mapping[str, tuple[float, ...]]
@@ -56,13 +50,7 @@ class NoiseNote:
 
 @dataclass(frozen=True)
 class ModelNote:
-    """A model of a study.
-
-    Args:
-        sha256: Hash of its folder.
-        provenance: What it says of itself.
-        noise: What its filters assume.
-    """
+    """A model of a study: hash of its folder, what it says of itself, and what its filters assume."""
 
     sha256: str
     provenance: Mapping[str, Any]
@@ -71,21 +59,7 @@ class ModelNote:
 
 @dataclass(frozen=True)
 class StudyNote:
-    """What a study is made of.
-
-    Args:
-        study: Its settings as plain data.
-        title: The machine, one line.
-        description: The machine, a paragraph.
-        models: By label.
-        runs: How many there are.
-        versions: Versions of the packages.
-        kind: Kind of study. Default: closed loops of all combinations.
-        scenario_sha256: Hash of the scenario's file; None for a registered scenario.
-        engine: What has computed it; empty until it is finished.
-        workers_died: Workers that died on the way.
-        schema_version: Of this note.
-    """
+    """What a study is made of; ``study`` is its settings as plain data, ``engine`` is empty until it is finished."""
 
     study: Mapping[str, Any]
     title: str
@@ -114,11 +88,7 @@ def study_note(folder: Path) -> StudyNote:
 
 
 def note_of(data: Mapping[str, Any], where: str) -> StudyNote:
-    """A note from plain data.
-
-    Raises:
-        InputError: If it is of another version, or a field does not fit.
-    """
+    """A note from plain data; InputError if it is of another version, or a field does not fit."""
     if data.get("schema_version") != SCHEMA_VERSION:
         raise InputError(
             f"{where}: a study of schema version {str(data.get('schema_version'))[:20]}, this version of hybrid-mpc "
@@ -129,13 +99,8 @@ def note_of(data: Mapping[str, Any], where: str) -> StudyNote:
 
 @dataclass(frozen=True)
 class RunRow:
-    """The row of a run.
-
-    Args:
-        id: Name made of all that decides what the run computes.
-        status: ``"done"`` or ``"failed"``.
-        error: Traceback of one that failed.
-        columns: What the run was, and what it found.
+    """The row of a run: what it was and what it found (``columns``), ``"done"`` or ``"failed"``, and then its
+    traceback.
     """
 
     id: str
@@ -153,20 +118,6 @@ class RunLog:
 
     What :meth:`append` has returned from is on the disk. A line that a kill tore apart is cut off when the log is
     opened again: its run counts as not finished. One process at a time may hold the log.
-
-    Args:
-        folder: Folder of the files; made if missing.
-
-    Raises:
-        InputError: If another process holds the log.
-
-    Example:
-        >>> import tempfile
-        >>> folder = Path(tempfile.mkdtemp())
-        >>> with RunLog(folder) as log:
-        ...     log.append([RunRow("a", "done", "", {"cost": cost}) for cost in (0.1, float("inf"))])
-        >>> [row.columns["cost"] for row in rows(folder)]
-        [0.1, inf]
     """
 
     def __init__(self, folder: Path) -> None:
@@ -181,9 +132,7 @@ class RunLog:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, t: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -192,11 +141,7 @@ class RunLog:
         self._held.close()
 
     def append(self, new: Iterable[RunRow]) -> None:
-        """Add rows; on return they are on the disk.
-
-        Raises:
-            InputError: If they cannot be written (a full disk); what was there before is unharmed.
-        """
+        """Add rows; on return they are on the disk. On a full disk what was there before is unharmed."""
         lines = [json.dumps(plain(row.plain()), separators=(",", ":")) + "\n" for row in new]
         if not lines:
             return
@@ -272,16 +217,8 @@ def _repaired(path: Path) -> int:
 
 
 def compact(log: Path, path: Path, provenance: Mapping[str, Any]) -> None:
-    """Write the rows of a log as Parquet: all of it or nothing. Of several rows of a run the last counts.
-
-    Args:
-        log: Folder of the log.
-        path: File to write.
-        provenance: Plain data for the file's metadata.
-
-    Raises:
-        StorageError: If it cannot be written (a full disk); the log is unharmed.
-    """
+    """Write the rows of a log as Parquet: all of it or nothing. Of several rows of a run the last counts."""
+    import pyarrow as pa
     import pyarrow.parquet as pq
 
     last: dict[str, int] = {}
@@ -290,20 +227,21 @@ def compact(log: Path, path: Path, provenance: Mapping[str, Any]) -> None:
         last[row.id] = i
         for key, value in row.plain().items():
             kinds.setdefault(key, set()).add(type(value))
-    schema = _schema(kinds).with_metadata({METADATA: json.dumps(plain(provenance)).encode()})
+    columns = {key: _column(found - {type(None)}) for key, found in kinds.items()}
+    schema = pa.schema([(key, kind) for key, (kind, _) in columns.items()])
+    schema = schema.with_metadata({METADATA: json.dumps(plain(provenance)).encode()})
     final = (row.plain() for i, row in enumerate(rows(log)) if last[row.id] == i)
     with replacing(path) as file, pq.ParquetWriter(file, schema, compression="zstd") as writer:
         while group := list(islice(final, GROUP_ROWS)):
-            writer.write_table(_table(group, schema))
+            for values in group:
+                values |= {
+                    k: make(values[k]) for k, (_, make) in columns.items() if values.get(k) is not None
+                }
+            writer.write_table(pa.Table.from_pylist(group, schema=schema))
 
 
 def intact(path: Path) -> bool:
-    """Whether a Parquet file is there and can be read to its end.
-
-    Example:
-        >>> intact(Path("nowhere.parquet"))
-        False
-    """
+    """Whether a Parquet file is there and can be read to its end."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -319,11 +257,7 @@ def intact(path: Path) -> bool:
 
 
 def provenance_of(path: Path) -> dict[str, Any]:
-    """What a Parquet file of a study says of itself.
-
-    Raises:
-        InputError: If it is no such file.
-    """
+    """What a Parquet file of a study says of itself; InputError if it is no such file."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -339,31 +273,12 @@ def provenance_of(path: Path) -> dict[str, Any]:
         raise InputError(f"{path} is damaged: {error}") from error
 
 
-def _schema(kinds: Mapping[str, set[type]]) -> pa.Schema:
-    import pyarrow as pa
-
-    return pa.schema([(key, _type(found - {type(None)})) for key, found in kinds.items()])
-
-
-def _type(found: set[type]) -> pa.DataType:
+def _column(found: set[type]) -> tuple[pa.DataType, Callable[[Any], Any]]:
+    """Type of a column whose values are of these kinds, and what makes them of it."""
     import pyarrow as pa
 
     if found == {bool}:
-        return pa.bool_()
+        return pa.bool_(), bool
     if found == {int}:
-        return pa.int64()
-    return pa.float64() if found <= {int, float} else pa.string()
-
-
-def _table(group: list[dict[str, Any]], schema: pa.Schema) -> pa.Table:
-    import pyarrow as pa
-
-    columns = []
-    for column in schema:
-        values = [row.get(column.name) for row in group]
-        if column.type == pa.float64():
-            values = [None if v is None else float(v) for v in values]
-        elif column.type == pa.string():
-            values = [None if v is None else str(v) for v in values]
-        columns.append(pa.array(values, type=column.type))
-    return pa.Table.from_arrays(columns, schema=schema)
+        return pa.int64(), int
+    return (pa.float64(), float) if found <= {int, float} else (pa.string(), str)

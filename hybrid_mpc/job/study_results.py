@@ -7,9 +7,10 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.job.study_log import (
@@ -23,12 +24,10 @@ from hybrid_mpc.job.study_log import (
     study_note,
 )
 from hybrid_mpc.job.summary import interval
+from hybrid_mpc.plots import studies
 from hybrid_mpc.plots.style import name_of, save
 from hybrid_mpc.records import known
 from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, write_report
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 FACTORS = ("model", "task", "controller", "solver", "horizon", "monitor", "faults")
 PAIR = ("draw", "seed")
@@ -65,7 +64,6 @@ class StudyResults:
         Raises:
             InputError: If it is no folder of a study, or damaged.
         """
-        import pandas as pd
         import pyarrow.parquet as pq
 
         folder = Path(folder)
@@ -97,9 +95,9 @@ class StudyResults:
     @property
     def figures(self) -> list[str]:
         """Columns that are results and numbers."""
-        known_ones = {*FACTORS, *PAIR, "id", "run", "hidden_units"}
+        others = {*FACTORS, *PAIR, "id", "run", "hidden_units"}
         names = self.table.select_dtypes("number").columns
-        return [c for c in names if c not in known_ones and not c.startswith("factor_")]
+        return [c for c in names if c not in others and not c.startswith("factor_")]
 
     def summary(self, value: str = "cost", by: Sequence[str] | None = None) -> pd.DataFrame:
         """Mean of a figure with its 95 % interval (Student's t).
@@ -118,12 +116,10 @@ class StudyResults:
         Raises:
             InputError: If there is no such column.
         """
-        import pandas as pd
-
         table, by = self._checked(value), self.factors if by is None else list(by)
         found = []
         for key, group in _groups(table, by):
-            units = self._units(group, value, [])
+            units = self._units(group, value)
             middle, half = _interval(units[value])
             left_out = len(group) - int(np.isfinite(group[value]).sum())
             found.append((*key, len(units), middle, middle - half, middle + half, left_out))
@@ -152,8 +148,6 @@ class StudyResults:
         Raises:
             InputError: If there is no such column or level.
         """
-        import pandas as pd
-
         table = self._checked(value)
         known(over, table.columns, "column")
         levels = list(dict.fromkeys(table[over].tolist()))
@@ -163,10 +157,10 @@ class StudyResults:
         by = [c for c in self.factors if c != over] if by is None else list(by)
         found = []
         for key, group in _groups(table, by):
-            first = self._units(group[group[over] == base], value, [])
+            first = self._units(group[group[over] == base], value)
             for level in levels:
                 if level != base:
-                    second = self._units(group[group[over] == level], value, [])
+                    second = self._units(group[group[over] == level], value)
                     found.append((*key, level, *_difference(first, second, value)))
         return pd.DataFrame(found, columns=[*by, over, *DIFFERENCE])
 
@@ -186,8 +180,6 @@ class StudyResults:
         Raises:
             InputError: If the studies have no run in common.
         """
-        import pandas as pd
-
         mine, theirs = self._checked(value), other._checked(value)
         shared = [c for c in (*FACTORS, *PAIR, "drawn_faults") if c in mine and c in theirs]
         shared += sorted(str(c) for c in mine if str(c).startswith("factor_") and c in theirs)
@@ -207,8 +199,8 @@ class StudyResults:
             )
         found = []
         for key, group in _groups(joined, by):
-            first = self._units(group, value, [])
-            second = self._units(group.assign(**{value: group[value + " "]}), value, [])
+            first = self._units(group, value)
+            second = self._units(group.assign(**{value: group[value + " "]}), value)
             found.append((*key, *_difference(first, second, value)))
         result = pd.DataFrame(found, columns=[*by, *DIFFERENCE])
         result.attrs["differs"] = {c: (str(mine[c].iloc[0]), str(theirs[c].iloc[0])) for c in differs}
@@ -218,13 +210,13 @@ class StudyResults:
         known(value, self.figures, "figure")
         return self.table
 
-    def _units(self, group: pd.DataFrame, value: str, by: list[str]) -> pd.DataFrame:
+    def _units(self, group: pd.DataFrame, value: str) -> pd.DataFrame:
         """One row a unit: a draw where there are several, else a draw and seed."""
         finite = group[np.isfinite(group[value])]
         keys = [c for c in PAIR if c in finite]
         if "draw" in self.table and self.table["draw"].nunique() > 1:
             keys = ["draw"]
-        return finite.groupby([*by, *keys], as_index=False, sort=True)[value].mean()
+        return finite.groupby(keys, as_index=False, sort=True)[value].mean()
 
 
 DIFFERENCE = ("n", "base", "difference", "low", "high", "relative", "ratio", "better")
@@ -295,9 +287,10 @@ def write_study_report(results: StudyResults, path: str | Path | None = None) ->
 
 def _report(results: StudyResults, folder: Path) -> Report:
     study, note = results.note.study, results.note
+    costs = _table(results.summary(), "cost: mean, ends of the 95 % interval, runs left out.")
     sections = [
         _what(results),
-        Section("Costs", COST_TEXT, _figure(_distributions, results, folder), [_summary_table(results)]),
+        Section("Costs", COST_TEXT, _figure(_distributions, results, folder), [costs]),
         *_comparison(results, folder),
         Section("Cost against computing time", TIME_TEXT, _figure(_pareto, results, folder)),
         *_task_figures(results),
@@ -362,15 +355,9 @@ def _short(value: Any) -> str:
     return str(value)
 
 
-def _summary_table(results: StudyResults, value: str = "cost") -> Table:
-    found = results.summary(value)
-    return Table(
-        tuple(found.columns), _cells(found), f"{value}: mean, ends of the 95 % interval, runs left out."
-    )
-
-
-def _cells(table: pd.DataFrame) -> list[tuple[Any, ...]]:
-    return [tuple(_cell(v) for v in row) for row in table.itertuples(index=False)]
+def _table(found: pd.DataFrame, caption: str) -> Table:
+    rows = [tuple(_cell(v) for v in row) for row in found.itertuples(index=False)]
+    return Table(tuple(found.columns), rows, caption)
 
 
 def _cell(value: Any) -> Any:
@@ -388,19 +375,17 @@ def _comparison(results: StudyResults, folder: Path) -> list[Section]:
     over = _over(results)
     if over is None:
         return []
-    found = results.paired(over=over)
-    table = Table(tuple(found.columns), _cells(found), f"Cost of each {over} less that of the first.")
+    table = _table(results.paired(over=over), f"Cost of each {over} less that of the first.")
     return [Section("Paired differences", PAIRED_TEXT, _figure(_differences, results, folder), [table])]
 
 
 def _task_figures(results: StudyResults) -> list[Section]:
-    names = [c for c in results.figures if c.startswith("task_")]
     tables = []
-    for name in names:
+    for name in (c for c in results.figures if c.startswith("task_")):
         found = results.summary(name)
         found = found[found["n"] > 0]
         if len(found):
-            tables.append(Table(tuple(found.columns), _cells(found), f"{name.removeprefix('task_')}: mean."))
+            tables.append(_table(found, f"{name.removeprefix('task_')}: mean."))
     return [Section("The tasks' own figures", (), (), tables)] if tables else []
 
 
@@ -425,29 +410,21 @@ def _figure(draw: Any, results: StudyResults, folder: Path) -> Sequence[tuple[Pa
     return [(save(figure, folder / f"{draw.__name__.strip('_')}.png"), caption)]
 
 
-def _levels(results: StudyResults, table: pd.DataFrame, without: str = "task") -> Any:
+def _levels(results: StudyResults) -> Any:
     """Groups of rows by task, and within by all else that differs, with one name each."""
-    others = [c for c in results.factors if c != without]
-    for task, group in table.groupby("task", sort=False):
+    others = [c for c in results.factors if c != "task"]
+    for task, group in results.table.groupby("task", sort=False):
         named = group[others].astype(str).agg(", ".join, axis=1) if others else group["controller"]
         yield str(task), group.groupby(named, sort=False)
 
 
 def _distributions(results: StudyResults) -> tuple[Any, str]:
-    from hybrid_mpc.plots import studies
-
-    values = {
-        task: {str(level): g["cost"].to_numpy() for level, g in rows}
-        for task, rows in _levels(results, results.table)
-    }
-    return studies.distributions(
-        values, "cost [-]"
-    ), "How the cost is distributed over the runs of each task."
+    values = {task: {str(k): g["cost"].to_numpy() for k, g in rows} for task, rows in _levels(results)}
+    caption = "How the cost is distributed over the runs of each task."
+    return studies.distributions(values, "cost [-]"), caption
 
 
 def _differences(results: StudyResults) -> tuple[Any, str]:
-    from hybrid_mpc.plots import studies
-
     over = _over(results)
     found = results.paired(over=over or "controller")
     others = [c for c in results.factors if c not in ("task", over)]
@@ -461,15 +438,12 @@ def _differences(results: StudyResults) -> tuple[Any, str]:
 
 
 def _pareto(results: StudyResults) -> tuple[Any, str]:
-    from hybrid_mpc.plots import studies
-
     points = {
         task: {str(level): (float(g[STEP].mean()), float(g["cost"].mean())) for level, g in rows}
-        for task, rows in _levels(results, results.table)
+        for task, rows in _levels(results)
     }
-    return studies.pareto(
-        points, "cost [-]"
-    ), "Mean cost against the duration of a step; the line joins the front."
+    caption = "Mean cost against the duration of a step; the line joins the front."
+    return studies.pareto(points, "cost [-]"), caption
 
 
 def duration_text(seconds: float) -> str:

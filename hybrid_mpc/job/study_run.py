@@ -21,7 +21,7 @@ import numpy as np
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import MOST_CONTENT, read_bytes, sha256
-from hybrid_mpc.job.context import Progress, Silent, versions
+from hybrid_mpc.job.context import Progress, versions
 from hybrid_mpc.job.controllers import CONTROLLERS, ORACLES, find_noise
 from hybrid_mpc.job.engine import Engine, Lost, make_engine
 from hybrid_mpc.job.folder import JobNote, check_out, open_folder
@@ -70,14 +70,7 @@ PROBE_PERIODS = 20
 
 @dataclass(frozen=True)
 class StudyModel:
-    """A model that fits its study, with the noise of its filters.
-
-    Args:
-        folder: Artifact folder.
-        sha256: Hash of the folder's files.
-        kit: The loaded artifact.
-        noise_source: Where the process noise is from, in words.
-    """
+    """A loaded model that fits its study, the hash of its folder, and where its filters' noise is from, in words."""
 
     folder: Path
     sha256: str
@@ -88,10 +81,8 @@ class StudyModel:
 def load_models(study: Study, held: Mapping[str, NoiseNote] | None = None) -> dict[str, StudyModel]:
     """Load and check everything that a study's loops need, before the first.
 
-    Args:
-        study: The study.
-        held: Process noise by label that is taken as it is. Default: the artifact's; where it holds none, it is
-            estimated on recordings that the scenario makes (budget quick, seed ``study.run_seed``).
+    Process noise by label in ``held`` is taken as it is; else it is the artifact's, or, where that holds none,
+    estimated on recordings that the scenario makes (budget quick, seed ``study.run_seed``).
 
     Raises:
         InputError: If the scenario has nothing to run, a folder holds no artifact or another machine's, or a task,
@@ -138,15 +129,7 @@ def _check_plant(scenario: Scenario, study: Study) -> None:
 
 @dataclass(frozen=True)
 class ModelInput:
-    """A model as workers get it.
-
-    Args:
-        label: Its name in the study.
-        folder: Artifact folder.
-        digest: SHA-256 of the folder's files.
-        noise: Process noise by controller.
-        files: Names and contents of the folder's files, for workers that do not see the folder. Default: none.
-    """
+    """A model as workers get it; its folder's files are in it for workers that do not see the folder."""
 
     label: str
     folder: str
@@ -158,15 +141,7 @@ class ModelInput:
 def load_inputs(
     study: Study, held: Mapping[str, ModelNote] | None = None
 ) -> tuple[LoopRunner, dict[str, ModelNote]]:
-    """What runs a study's loops, and notes of its models by label.
-
-    Args:
-        study: The study.
-        held: Notes of the models of a study that is resumed: their noise is taken. Default: none.
-
-    Raises:
-        InputError: As :func:`load_models`.
-    """
+    """What runs a study's loops, and notes of its models by label; ``held`` are those of a study that is resumed."""
     models, notes = [], {}
     for label, m in load_models(study, {k: note.noise for k, note in (held or {}).items()}).items():
         sigma = {c: tuple(m.kit.noise(c).tolist()) for c in study.controllers if not CONTROLLERS[c].truth}
@@ -177,14 +152,7 @@ def load_inputs(
 
 @dataclass(frozen=True)
 class LoopRunner:
-    """Runs a study's loops; it is sent to each worker once, which then keeps the models loaded.
-
-    Args:
-        scenario: Registered name or path of a user's file.
-        models: The models.
-
-    Example: ``LoopRunner("golf_robot", models)(spec)["cost"]``
-    """
+    """Runs a study's loops; it is sent to each worker once, which then keeps the models loaded."""
 
     scenario: str
     models: tuple[ModelInput, ...]
@@ -256,8 +224,8 @@ def run_study(
     """Run a study into a folder and return its results.
 
     Finished runs are on the disk as they end; after a kill at any moment, Ctrl-C or a full disk ``resume=True`` runs
-    what is missing. Results depend on nothing but the study: not on order, number of workers, or engine; only columns
-    that begin with ``timing_`` differ. A run that raises leaves its traceback, and the others go on.
+    what is missing. Results depend on nothing but the study; only columns that begin with ``timing_`` differ. A run
+    that raises leaves its traceback, and the others go on.
 
     Args:
         study: What to run.
@@ -277,7 +245,7 @@ def run_study(
     Example:
         >>> results = run_study(Study("golf_robot", "runs/golf"), "studies/first")  # doctest: +SKIP
     """
-    out, say = Path(out), progress or Silent()
+    out, say = Path(out), progress or Progress()
     check_out(out, NOUN, resume=resume)
     say.start("reading the models, and the filters' noise")
     run, models = load_inputs(study, held_models(out))
@@ -306,14 +274,7 @@ def run_study(
 def make_note(
     study: Mapping[str, Any], models: Mapping[str, ModelNote], runs: int, kind: str = "loops"
 ) -> StudyNote:
-    """What a study is made of.
-
-    Args:
-        study: Its settings as plain data, with its scenario.
-        models: Its models by label.
-        runs: Number of its runs.
-        kind: Kind of study. Default: closed loops of all combinations.
-    """
+    """What a study of these settings (with its scenario) and models is made of."""
     scenario, path = load_scenario(study["scenario"]), Path(study["scenario"])
     content = sha256(path) if path.suffix == ".py" and path.is_file() else None
     return StudyNote(
@@ -355,12 +316,7 @@ class Config(Protocol):
 
 
 def run_batch(run: Callable[[Any], Mapping[str, Any]], configs: Sequence[Config]) -> list[RunRow]:
-    """Rows of several runs; one that raises leaves its traceback in ``error``.
-
-    Args:
-        run: Makes the columns of one configuration's results.
-        configs: The runs.
-    """
+    """Rows of several runs; one that raises leaves its traceback in ``error``."""
     found = []
     for config in configs:
         begin, cpu = perf_counter(), process_time()
@@ -377,15 +333,7 @@ def run_batch(run: Callable[[Any], Mapping[str, Any]], configs: Sequence[Config]
 
 @dataclass
 class Tally:
-    """What became of the runs so far.
-
-    Args:
-        total: Runs to do.
-        runs: Runs that are done.
-        failed: Those of them that failed.
-        died: Workers that have died, and whose runs were begun again.
-        begin: When it began, on the monotonic clock.
-    """
+    """What became of the runs so far; ``died`` workers have died, and what they were at was begun again."""
 
     total: int
     runs: int = 0
@@ -414,16 +362,10 @@ def execute(
     progress: Progress,
     total: int,
 ) -> Tally:
-    """Run configurations in an engine and log their rows.
+    """Run configurations, taken as they are needed, in an engine and log their rows.
 
-    At any time a few batches are under way; a row is logged before the next batch is asked for.
-
-    Args:
-        configs: The runs; taken as they are needed.
-        log: Where the rows go.
-        engine: Where they are computed.
-        progress: Where to report.
-        total: How many there are, for the report.
+    At any time a few batches are under way; a row is logged before the next batch is asked for. ``total`` is how many
+    there are, for the report.
     """
     tally, left, pace = Tally(total, begin=time.monotonic()), iter(configs), _Pace(engine.workers)
     suspects, running = _Suspects(), 0
@@ -498,14 +440,7 @@ class _Pace:
 
 @dataclass(frozen=True)
 class RunKind:
-    """Runs that take about the same time a period.
-
-    Args:
-        model: Label of the model.
-        controller: Name of the controller.
-        solver: Its solver.
-        horizon: Periods; None for the task's own.
-    """
+    """Runs that take about the same time a period."""
 
     model: str
     controller: str
@@ -515,13 +450,8 @@ class RunKind:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a study would take.
-
-    Args:
-        runs: Number of runs.
-        axes: How many of each thing.
-        seconds: Expected time of all runs on the given workers [s]; without starting processes.
-        kinds: Seconds a run of each kind, averaged over tasks.
+    """What a study would take: seconds of all runs on the given workers, without starting processes, and of a run of
+    each kind, averaged over tasks.
     """
 
     runs: int
@@ -538,8 +468,12 @@ def dry_run(study: Study, *, workers: int = 2, say: Callable[[str], None] = lamb
         workers: Processes that it is to run in.
         say: Called with what is timed.
 
+    Returns:
+        Number of ``runs``, how many of each thing (``axes``), expected ``seconds`` of all, and ``kinds`` of runs with
+        the seconds of one.
+
     Raises:
-        InputError: As :func:`~hybrid_mpc.job.study_run.run_study`.
+        InputError: As :func:`run_study`.
 
     Example: ``dry_run(study, workers=2).seconds``
     """

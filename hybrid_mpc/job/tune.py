@@ -5,22 +5,21 @@ from __future__ import annotations
 import shlex
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import write_json, write_text
-from hybrid_mpc.identify.tune import SearchSpace
+from hybrid_mpc.identify.tune import SearchResult, SearchSpace, check_numbers, tune
 from hybrid_mpc.job.check import check_scenario
-from hybrid_mpc.job.context import Context, Progress, Silent, versions
+from hybrid_mpc.job.context import Context, Progress, versions
 from hybrid_mpc.job.folder import JobNote, open_folder
 from hybrid_mpc.job.settings import RunSettings
 from hybrid_mpc.job.stage import bring_up_to_date
 from hybrid_mpc.job.stages.identify import DATA, MODELS, PRIOR, check_data, training_settings
+from hybrid_mpc.plots import tune as plots
+from hybrid_mpc.plots.style import save
 from hybrid_mpc.report.page import Cell, Table
 from hybrid_mpc.scenario import load_scenario
-
-if TYPE_CHECKING:
-    from hybrid_mpc.identify.tune import SearchResult
 
 SCHEMA_VERSION = 1
 RATES = ("learning_rate", "free_run_learning_rate")
@@ -28,19 +27,8 @@ RATES = ("learning_rate", "free_run_learning_rate")
 
 @dataclass(frozen=True)
 class TuneSettings(RunSettings):
-    """What ``hybrid-mpc tune`` computes: the settings of a run, whose networks are the first trial, and these.
-
-    Args:
-        kind: ``"rnn"``, ``"pgrnn"`` or ``"mopgrnn"``.
-        space: What is searched.
-
-    Raises:
-        InputError: If there is no such kind, or an rnn is to replay a prior that it does not have.
-
-    Example:
-        >>> TuneSettings("golf_robot", kind="gru")
-        Traceback (most recent call last):
-        hybrid_mpc.errors.InputError: kind has no 'gru'; there are: rnn, pgrnn, mopgrnn
+    """What ``hybrid-mpc tune`` computes: the settings of a run, whose networks are the first trial, the kind of
+    network, and what is searched.
     """
 
     kind: str = "mopgrnn"
@@ -66,23 +54,14 @@ def run_tuning(
     """Search the settings of one kind of network, and write settings, tables and figures into ``out``.
 
     Data and prior are the main job's stages with the same seed: a run with the settings found trains what the best
-    trial trained. Only training and validation recordings are read.
-
-    Args:
-        settings: What to compute.
-        out: Folder to make; new or empty unless ``resume``.
-        trials: Trials in all; a resumed search may be given more.
-        timeout: No further trial starts after this time of searching [s]. Default: none.
-        resume: Go on with the search in ``out``.
-        progress: Where to report; default: nowhere.
+    trial trained. Only training and validation recordings are read. A resumed search may be given more ``trials``; none
+    starts after ``timeout`` [s] of searching.
 
     Raises:
         InputError: For any bad input.
     """
-    from hybrid_mpc.identify.tune import check_numbers, tune
-
     check_numbers(trials, settings.seed, timeout)
-    context = Context(settings, load_scenario(settings.scenario), out, progress or Silent())
+    context = Context(settings, load_scenario(settings.scenario), out, progress or Progress())
     check_scenario(context.scenario, context.budget)
     check_data(context)
     with open_folder(out, JobNote("run", settings.identity()), resume=resume):
@@ -132,9 +111,6 @@ def best_settings(found: SearchResult, space: SearchSpace) -> dict[str, Any]:
 
 def _write(context: Context, settings: TuneSettings, found: SearchResult) -> None:
     """Settings, table, figures, and results.json last."""
-    from hybrid_mpc.plots import tune as plots
-    from hybrid_mpc.plots.style import save
-
     out, names, best = context.out, settings.space.names, best_settings(found, settings.space)
     data = context.read(DATA)
     results = {

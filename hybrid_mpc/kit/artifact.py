@@ -11,29 +11,35 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import nn_export
 from hybrid_mpc.control.ocp import OCP
+from hybrid_mpc.control.safeguard import SafeController
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimate.switching import Filter
 from hybrid_mpc.files import read_document, read_object, sha256, write_document
+from hybrid_mpc.kit.assembly import (
+    make_adaptive_guard,
+    make_controller,
+    make_estimator,
+    make_monitor,
+    make_resting_guard,
+    sensor_steps,
+)
+from hybrid_mpc.loop.guard import Guard
 from hybrid_mpc.machine.signals import Parameter, Signal
 from hybrid_mpc.model.delay import with_input_delay
 from hybrid_mpc.model.limits import numbers
 from hybrid_mpc.model.model import STEP_INPUTS, STEP_OUTPUTS, Balance, HybridModel
 from hybrid_mpc.monitor.calibrate import Calibration
 from hybrid_mpc.monitor.detector import Detector
+from hybrid_mpc.monitor.energy import EnergyMonitor
+from hybrid_mpc.monitor.learn import guard_monitor
 from hybrid_mpc.records import known, plain, record
-
-if TYPE_CHECKING:
-    from hybrid_mpc.control.safeguard import SafeController
-    from hybrid_mpc.estimate.switching import Filter
-    from hybrid_mpc.loop.guard import Guard
-    from hybrid_mpc.monitor.energy import EnergyMonitor
-    from hybrid_mpc.scenario import Scenario
+from hybrid_mpc.scenario import Scenario
 
 SCHEMA_VERSION = 3
 FILE, PROGRAMS = "model.json", "programs.json"
@@ -58,13 +64,7 @@ WATCHES = ("own", "energy", "readings", "guard")
 
 @dataclass(frozen=True)
 class BalanceInfo:
-    """Name and units of a balance, see :class:`~hybrid_mpc.model.model.Balance`.
-
-    Args:
-        name: E.g. ``"energy"``.
-        unit: Of the storage, e.g. ``"J"``.
-        rate_unit: Of its rate and of the residual, e.g. ``"W"``.
-    """
+    """Name and units of a :class:`~hybrid_mpc.model.model.Balance`: of the storage, of its rate and of the residual."""
 
     name: str
     unit: str
@@ -186,17 +186,7 @@ def _within(u: tuple[float, ...], problem: OCP) -> bool:
 def loop_settings(
     scenario: Scenario, process_noise: Mapping[str, tuple[float, ...]] | None = None
 ) -> LoopSettings:
-    """What a scenario's loops need beside the models.
-
-    Args:
-        scenario: The machine.
-        process_noise: By estimator. Default: none; it is estimated later.
-
-    Example:
-        >>> from scenarios.golf_robot import scenario
-        >>> sorted(loop_settings(scenario).control)[:2]
-        ['', 'reject_load']
-    """
+    """What a scenario's loops need beside the models; process noise by estimator, unless it is estimated later."""
     problems = {"": scenario.control} | {task.name: task.control for task in scenario.tasks}
     safe = scenario.safe_input
     return LoopSettings(
@@ -213,14 +203,6 @@ def loop_settings(
 @dataclass(frozen=True)
 class Description:
     """What ``model.json`` holds beside its schema version and its hash.
-
-    Args:
-        models: Names of the models, whose programs ``programs.json`` holds.
-        programs_sha256: Hash of ``programs.json``: a pair that does not belong together is refused.
-        model: Period, signals, parameters and balances of the models.
-        calibration: Calibration of the energy monitor, or None.
-        provenance: What the models were made from.
-        loop: Control problems, noise and what else loops need. Default: nothing.
 
     Raises:
         InputError: If there are no models, too many, or two of one name.
@@ -281,11 +263,8 @@ def set_calibration(folder: Path, calibration: Calibration) -> None:
 
 
 def set_process_noise(folder: Path, noise: Mapping[str, ArrayLike]) -> None:
-    """Put the process noise of the estimators into an artifact.
-
-    Args:
-        folder: The artifact.
-        noise: Standard deviations per period ``(n_x,)``, see :class:`LoopSettings`.
+    """Put the process noise of the estimators into an artifact: standard deviations per period ``(n_x,)``, by
+    estimator.
 
     Raises:
         InputError: If the folder holds no artifact.
@@ -300,20 +279,12 @@ def _tuples(noise: Mapping[str, ArrayLike]) -> dict[str, tuple[float, ...]]:
 
 
 def write_description(folder: Path, description: Description) -> None:
-    """Write ``model.json`` with the hash of its content.
-
-    Raises:
-        StorageError: If it cannot be written.
-    """
+    """Write ``model.json`` with the hash of its content."""
     write_document(folder / FILE, {"schema_version": SCHEMA_VERSION, **plain(description)})
 
 
 def read_description(folder: Path) -> Description:
-    """What an artifact says of itself, checked.
-
-    Raises:
-        InputError: If it is missing, damaged, changed by hand, or of another schema.
-    """
+    """What an artifact says of itself; InputError if it is missing, damaged, changed by hand, or of another schema."""
     path = folder / FILE
     if read_object(path).get("schema_version") != SCHEMA_VERSION:
         raise InputError(
@@ -326,15 +297,8 @@ def read_description(folder: Path) -> Description:
 
 
 def artifact_folder(folder: Path) -> Path:
-    """The artifact's folder, given it or the folder of a run that holds it as ``model``.
-
-    Raises:
-        InputError: If neither holds one.
-
-    Example:
-        >>> artifact_folder(Path("nowhere"))
-        Traceback (most recent call last):
-        hybrid_mpc.errors.InputError: nowhere does not exist; needed is an artifact folder, such as model/ of a ...
+    """The artifact's folder, given it or the folder of a run that holds it as ``model``; InputError if neither holds
+    one.
     """
     for place in (folder, folder / "model"):
         if (place / FILE).is_file():
@@ -347,11 +311,6 @@ def artifact_folder(folder: Path) -> Path:
 
 def build_model(name: str, programs: Mapping[str, nn_export.Program], info: ModelInfo) -> HybridModel:
     """The model of ``programs["<name>/step"]`` and its siblings, with the input's delay.
-
-    Args:
-        name: Name of the model.
-        programs: Programs of all models, by ``<model>/<function>``.
-        info: Period, signals, parameters and balances.
 
     Raises:
         KeyError: If a program is missing.
@@ -420,10 +379,10 @@ class Kit:
     """
 
     models: Mapping[str, HybridModel]
-    calibration: Calibration | None
+    calibration: Calibration | None = field(repr=False)
     provenance: Provenance
     input_delay: float = 0.0
-    loop: LoopSettings = field(default_factory=LoopSettings)
+    loop: LoopSettings = field(default_factory=LoopSettings, repr=False)
 
     @property
     def name(self) -> str:
@@ -465,18 +424,12 @@ class Kit:
         return replace(self, loop=replace(self.loop, process_noise=_tuples(noise)))
 
     def on(self, scenario: Scenario) -> Kit:
-        """The kit with the control problems, tasks, sensors and causes that a scenario states now.
-
-        Args:
-            scenario: The machine.
-        """
+        """The kit with the control problems, tasks, sensors and causes that a scenario states now."""
         return replace(self, loop=loop_settings(scenario, self.loop.process_noise))
 
     def problem(self, task: str = "") -> OCP:
-        """The control problem of a task.
-
-        Args:
-            task: Its name; a task without a problem of its own has the common one. Default: the common one.
+        """The control problem of a task; of one without a problem of its own, and where no task is named, the common
+        one.
 
         Raises:
             InputError: If there is no such task, or no control problem.
@@ -511,11 +464,7 @@ class Kit:
         return sigma
 
     def detector(self) -> Detector:
-        """The detector that the guard listens to.
-
-        Raises:
-            InputError: If the folder holds none.
-        """
+        """The detector that the guard listens to; InputError if the folder holds none."""
         found = None if self.calibration is None else self.calibration.detector
         if found is None:
             raise InputError(
@@ -534,12 +483,7 @@ class Kit:
 
         Raises:
             InputError: If there is no such model or task, no control problem, or no noise for this estimator.
-
-        Example:
-            ``hm.load("runs/mine").observer()``
         """
-        from hybrid_mpc.kit.assembly import make_estimator
-
         found, noise = self._model(model), self.noise(f"{model}_observer" if load else model)
         return make_estimator(found, self, noise, self.problem(task), observer=load)
 
@@ -556,12 +500,7 @@ class Kit:
 
         Raises:
             InputError: If there is no such model, task or solver, or no control problem.
-
-        Example:
-            ``hm.load("runs/mine").controller()``
         """
-        from hybrid_mpc.kit.assembly import make_controller
-
         return make_controller(
             self._model(model), self._model("prior"), self.problem(task), solver=solver, iterations=iterations,
             safe_input=self.safe_input,
@@ -582,13 +521,7 @@ class Kit:
 
         Raises:
             InputError: If there is no such model, task or kind, or no detector where one is asked for.
-
-        Example:
-            ``hm.load("runs/mine").monitor()``
         """
-        from hybrid_mpc.kit.assembly import make_monitor, sensor_steps
-        from hybrid_mpc.monitor.learn import guard_monitor
-
         watched, learned = self._model(model), self.calibration
         detects = learned is not None and learned.detector is not None and self.control is not None
         kind = known(kind or ("guard" if detects else "energy"), WATCHES, "kind of monitor")
@@ -617,8 +550,6 @@ class Kit:
         Example:
             ``simulate(..., monitor=kit.monitor(), guard=kit.guard())``
         """
-        from hybrid_mpc.kit.assembly import make_adaptive_guard, make_resting_guard
-
         hybrid = self._model("hybrid")
         if not adapt:
             return make_resting_guard(hybrid)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +14,7 @@ from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.rti import CondensedController
 from hybrid_mpc.control.safeguard import SafeController
 from hybrid_mpc.control.sqp import SQPController
+from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimator, ExtendedKalmanFilter
 from hybrid_mpc.estimate.parameters import parameter_filter, with_parameter_states
@@ -25,9 +26,6 @@ from hybrid_mpc.monitor.calibrate import Calibration
 from hybrid_mpc.monitor.energy import EnergyMonitor
 from hybrid_mpc.monitor.lengths import LEVEL_S, half_window, samples
 from hybrid_mpc.records import known
-
-if TYPE_CHECKING:
-    from hybrid_mpc.data.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 MODES = ("quiet", "slip", "jump")
@@ -92,15 +90,7 @@ def tuned_noise(
 ) -> Array:
     """Process noise ``(n_x,)`` per period: ``base`` times the scale that makes undisturbed recordings most likely.
 
-    Args:
-        model: The model to estimate with.
-        scenario: The machine: sensor noise, and the control problem's input range.
-        base: The model's one-period errors ``(n_x,)``, see :func:`~hybrid_mpc.estimate.tuning.process_noise`.
-        recordings: Training recordings.
-        observer: Whether the estimator follows an unknown load.
-
-    Example:
-        ``tuned_noise(model, scenario, process_noise(model, train), train, observer=True)``
+    ``base`` are the model's one-period errors ``(n_x,)``; an ``observer`` follows an unknown load.
     """
     places = np.linspace(0, len(recordings) - 1, min(TUNED_RECORDINGS, len(recordings))).round().astype(int)
     parts = [
@@ -147,13 +137,9 @@ def make_estimator(
 
     def filter_of(scale: float, step: float | None) -> ExtendedKalmanFilter:
         return ExtendedKalmanFilter(
-            model,
-            sigma_y=np.array(scenario.sensor_sigma),
-            sigma_x=scale * sigma_x,
-            sigma_d=None if step is None else step * span,
-            sigma_x0=first,
-            sigma_d0=None if step is None else FIRST_LOAD * span,
-        )
+            model, sigma_y=np.array(scenario.sensor_sigma), sigma_x=scale * sigma_x, sigma_x0=first,
+            sigma_d=None if step is None else step * span, sigma_d0=None if step is None else FIRST_LOAD * span,
+        )  # fmt: skip
 
     if not observer:
         return filter_of(1.0, None)
@@ -163,10 +149,6 @@ def make_estimator(
 
 def first_deviations(model: HybridModel, scenario: LoopAssumptions) -> Array:
     """Standard deviations ``(n_x,)`` of the state at the estimator's start, at rest where the sensors say.
-
-    Args:
-        model: The model.
-        scenario: The machine: its ``sensor_sigma`` and ``first_sigma``.
 
     Raises:
         InputError: If ``sensor_sigma`` or ``first_sigma`` does not fit the model.
@@ -248,13 +230,8 @@ def make_ocp(prior: HybridModel, control: OCP) -> OCP:
 def working_point(model: HybridModel, control: OCP) -> tuple[Array, Array]:
     """Working point of the problem, ``(x, u)``, else in motion at the position zero: speeds ``1 / sqrt(q)``, no input.
 
-    Args:
-        model: The model; its state is ``[q, v]`` where the problem has no working point.
-        control: The control problem. A speed without weight is the one that crosses the position's acceptable deviation
-            ``1 / sqrt(q)`` within the horizon.
-
-    Example:
-        ``x, u = working_point(models["prior"], scenario.control)``
+    A speed without weight is the one that crosses the position's acceptable deviation ``1 / sqrt(q)`` within the
+    horizon.
     """
     if control.working_point is not None:
         return control.working_point
@@ -281,21 +258,15 @@ def make_monitor(
         ``make_monitor(artifact.models["hybrid"], None)``
     """
     return EnergyMonitor(
-        model,
-        window=2 * half_window(LEVEL_S, model) + 1,
-        average=samples(LEVEL_S, model),
-        calibration=calibration,
+        model, window=2 * half_window(LEVEL_S, model) + 1, average=samples(LEVEL_S, model), calibration=calibration,
         rest_speed=rest_speed,
-    )
+    )  # fmt: skip
 
 
 def sensor_steps(sensor_sigma: Sequence[float]) -> tuple[float, ...]:
     """Largest steps ``(n_y,)`` of the sensors: an error spread evenly over such a step has the deviation given.
 
     A real step may be finer; then a frozen sensor is found a little later.
-
-    Args:
-        sensor_sigma: Standard deviations of the sensors ``(n_y,)``.
 
     Example:
         >>> [round(step, 6) for step in sensor_steps((0.001,))]
@@ -318,15 +289,7 @@ def make_resting_guard(model: HybridModel) -> Guard:
 
 
 def make_backup_guard(controller: SafeController, estimator: Estimator) -> Guard:
-    """A guard that hands over to another controller where the model does not describe the machine.
-
-    Args:
-        controller: The backup, e.g. that of the fitted prior; times count in its model's ``time_unit``.
-        estimator: Its estimator.
-
-    Example:
-        ``make_backup_guard(kit.controller("prior"), kit.observer("prior"))``
-    """
+    """A guard that hands over to another controller and its estimator where the model does not describe the machine."""
     unit = controller.controller.model.time_unit
     return Guard(
         Mode.BACKUP, Mode.REST, backup=controller, backup_estimator=estimator, dwell=DWELL_S * unit,
@@ -390,15 +353,8 @@ def make_adaptive_guard(
 def adaptable(model: HybridModel, causes: Mapping[str, Sequence[str]]) -> dict[str, tuple[str, ...]]:
     """Those of the causes that a backup adapts to: gains of inputs only where there is nothing else.
 
-    Args:
-        model: The model that the backup plans with.
-        causes: Parameters that change together, by name.
-
     Raises:
         InputError: If there are no causes, the model does not know its parameters, or its inputs act later.
-
-    Example:
-        ``adaptable(hybrid, {"mass": ("m", "J"), "motor": ("gain of u",)})`` is ``{"mass": ("m", "J")}``.
     """
     groups = {name: tuple(names) for name, names in causes.items()}
     if not groups:

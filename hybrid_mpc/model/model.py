@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
 import casadi as ca
@@ -97,16 +97,16 @@ class HybridModel:
     states: tuple[Signal, ...]
     inputs: tuple[Signal, ...]
     outputs: tuple[Signal, ...]
-    step: ca.Function
-    xdot: ca.Function
-    output: ca.Function
-    with_jacobian: ca.Function | None = None
-    side_by_side: SideBySide | None = None
+    step: ca.Function = field(repr=False)
+    xdot: ca.Function = field(repr=False)
+    output: ca.Function = field(repr=False)
+    with_jacobian: ca.Function | None = field(default=None, repr=False)
+    side_by_side: SideBySide | None = field(default=None, repr=False)
     disturbances: tuple[Signal, ...] = ()
     nominal_w: tuple[float, ...] = ()
-    parameters: tuple[Parameter, ...] = ()
-    covariance: tuple[tuple[float, ...], ...] = ()
-    balances: tuple[Balance, ...] = ()
+    parameters: tuple[Parameter, ...] = field(default=(), repr=False)
+    covariance: tuple[tuple[float, ...], ...] = field(default=(), repr=False)
+    balances: tuple[Balance, ...] = field(default=(), repr=False)
     delay_states: int = 0
     time_unit: float = 1.0
 

@@ -18,7 +18,7 @@ import numpy as np
 from hybrid_mpc.data.trajectories import Dataset, Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_arrays, read_json, write_json, write_text
-from hybrid_mpc.job.context import Progress, Silent, versions
+from hybrid_mpc.job.context import Progress, versions
 from hybrid_mpc.job.engine import WORKERS, run_jobs
 from hybrid_mpc.job.folder import JobNote, open_folder
 from hybrid_mpc.job.settings import check_device
@@ -59,7 +59,7 @@ def reproduce(
     scenario = load_scenario(settings.scenario)
     experiment = experiment_of(scenario)
     work = Work(
-        settings, scenario, experiment, settings.effort(experiment), out, progress or Silent(), workers
+        settings, scenario, experiment, settings.effort(experiment), out, progress or Progress(), workers
     )
     check_device(settings.device)
     with open_folder(out, JobNote("run", settings.identity()), resume=resume):
@@ -88,7 +88,7 @@ class Work:
     experiment: Experiment
     effort: Effort
     out: Path
-    progress: Progress = field(default_factory=Silent)
+    progress: Progress = field(default_factory=Progress)
     workers: int = WORKERS
 
     @property

@@ -18,10 +18,8 @@ def machine(tmp_path_factory):
 def test_roles_do_not_overlap_and_long_recordings_are_cut(machine):
     scenario = load_scenario(str(machine[0]))
     data = read_training(scenario, [machine[1]])
-    assert [len(p.t) for p in data.train] == [
-        199,
-        199,
-        199,
+    assert [len(p.t) for p in data.train] == 3 * [
+        199
     ]  # 60 s in pieces of 20 s, less the smoothing's distance
     times = [{round(v, 3) for p in part for v in p.t} for part in (data.train, data.valid, data.held_back)]
     assert all(times)
@@ -44,10 +42,8 @@ def test_runs_of_full_length_end_where_validation_does(machine):
     scenario = load_scenario(str(machine[0]))
     data = read_training(scenario, [machine[1]])
     (long,) = data.long
-    assert (long.t[0], long.t[-1]) == (
-        0.0,
-        pytest.approx(60.0),
-    )  # a minute of the 80 s that are not held back
+    # a minute of the 80 s that are not held back
+    assert (long.t[0], long.t[-1]) == (0.0, pytest.approx(60.0))
     (short,) = read_training(scenario, [machine[2]]).long
     assert short.t[-1] == pytest.approx(data_end(machine[2], scenario))
 
@@ -63,9 +59,8 @@ def test_every_so_many_th_file_validates_as_a_whole(machine):
     data = read_training(scenario, [machine[1], machine[2]])  # by name: test.csv, train.csv
     assert {p.name.split(".")[0] for p in data.train} == {"test"}
     assert {p.name.split(".")[0] for p in data.valid} == {"train"}
-    assert (
-        sum(len(p.t) for p in data.valid) == 5 * 199
-    )  # all of it in pieces; the last sample's input has no end
+    # all of it in pieces; the last sample's input has no end
+    assert sum(len(p.t) for p in data.valid) == 5 * 199
     assert (data.held_back, data.long) == ((), ())
     alone = read_training(scenario, [machine[1]])  # too few files: parts in order of time
     assert len(alone.train) == 3

@@ -59,11 +59,8 @@ def test_loops_of_two_controllers(call, run_folder, tmp_path):
     times = results["step_ms"]["prior"]
     assert 0 < times["median"] <= times["p95"] <= times["p99"] <= times["max"]
     assert all(v <= 0.2 for r in results["loops"] for v in r["largest_u"].values())  # a putt's limit
-    assert {p.name for p in (out / "figures").iterdir()} == {
-        "stroke_1.4.png",
-        "stroke_1.4.gif",
-        "step_times.png",
-    }
+    drawn = {p.name for p in (out / "figures").iterdir()}
+    assert drawn == {"stroke_1.4.png", "stroke_1.4.gif", "step_times.png"}
     again = tmp_path / "again"
     assert call("golf_robot", "--model", run_folder / "model", "--out", again, "--no-gif", *words)[0] == 0
     assert not (again / "figures" / "stroke_1.4.gif").exists()
@@ -249,9 +246,8 @@ def test_faults_as_text():
 
 @pytest.mark.full
 def test_noise_is_estimated_where_there_is_no_run(golf_artifact):
-    model = load_models(Study("golf_robot", golf_artifact, tasks=["track_sine"], controllers=["prior"]))[
-        "model"
-    ]
+    study = Study("golf_robot", golf_artifact, tasks=["track_sine"], controllers=["prior"])
+    (model,) = load_models(study).values()
     assert "recordings of the simulated machine" in model.noise_source
     angle, speed = model.kit.noise("prior")
     # The rig accelerates by some rad/s^2 otherwise than the nominal prior: some 1e-2 rad/s within 20 ms.

@@ -12,12 +12,12 @@ from hybrid_mpc import InputError, load_scenario
 from hybrid_mpc.cli.progress import Bars, Lines
 from hybrid_mpc.job import run as job
 from hybrid_mpc.job.benchmark import BenchmarkSettings, _read
-from hybrid_mpc.job.context import Silent
+from hybrid_mpc.job.context import Progress
 
 from .conftest import recording, write
 
 
-class Heard(Silent):
+class Heard(Progress):
     """Keeps the warnings."""
 
     def __init__(self):

@@ -16,13 +16,12 @@ import trivial_runs
 from hybrid_mpc import InputError, StudyResults, run_study
 from hybrid_mpc.errors import StorageError
 from hybrid_mpc.job import engine
-from hybrid_mpc.job.context import Silent
+from hybrid_mpc.job.context import Progress
 from hybrid_mpc.job.engine import THREADS, Lost, make_engine, run_jobs
 from hybrid_mpc.job.study_run import TIMING
 
-ROOT, TESTS = (
-    str(Path(__file__).parents[i]) for i in (2, 1)
-)  # the root first: tests/ has a folder nn_export
+# the root first: tests/ has a folder nn_export
+ROOT, TESTS = (str(Path(__file__).parents[i]) for i in (2, 1))
 
 
 @pytest.fixture(autouse=True)
@@ -291,7 +290,7 @@ def test_unreachable_scheduler(tmp_path, monkeypatch):
         run_study(trivial_runs.study(3), tmp_path / "s", workers=0)
 
 
-class Killer(Silent):
+class Killer(Progress):
     """Kills a process after some runs."""
 
     def __init__(self, process):
@@ -337,13 +336,9 @@ def here_cluster():
 
         def make(n):
             local = LocalCluster(
-                n_workers=n,
-                processes=False,
-                threads_per_worker=1,
-                protocol="tcp",
-                host="127.0.0.1",
+                n_workers=n, processes=False, threads_per_worker=1, protocol="tcp", host="127.0.0.1",
                 dashboard_address=None,
-            )
+            )  # fmt: skip
             stack.enter_context(local)
             return local.scheduler_address, stack.enter_context(Client(local, set_as_default=False))
 
@@ -373,7 +368,7 @@ def test_what_a_cluster_has_forgotten_is_lost(here_cluster):
     client = here_cluster(1)[1]
     far = make_engine(waits, 1, client)
     far.submit((1,))
-    client.cancel([Future(key, client) for key in client.futures if "_called" in key])
+    client.cancel([Future(key, client) for key in client.futures if "call" in key])
     batch, ended = far.next(60.0)
     assert batch == (1,)
     assert isinstance(ended, Lost)

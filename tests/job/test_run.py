@@ -53,9 +53,8 @@ def test_the_fitted_prior_beats_the_nominal_one(finished):
     (signal,) = rmse["phy"]
     assert rmse["phy"][signal] < 0.7 * rmse["phy_nominal"][signal]
     fitted = results(finished)["identification"]["details"]["prior_parameters"]["values"]
-    assert fitted["mgl"] == pytest.approx(
-        1.1, rel=0.05
-    )  # dry friction that the prior lacks biases it a little
+    # dry friction that the prior lacks biases it a little
+    assert fitted["mgl"] == pytest.approx(1.1, rel=0.05)
 
 
 def test_a_machine_without_plant_says_why_it_has_no_closed_loop(finished):

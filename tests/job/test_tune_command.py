@@ -19,7 +19,6 @@ from hybrid_mpc.job.settings import read_network
 from hybrid_mpc.job.stages.identify import training_settings
 from hybrid_mpc.job.tune import TuneSettings, usage
 
-pytestmark = pytest.mark.full  # these share one search of 20 s
 PNG = b"\x89PNG"
 
 
@@ -43,6 +42,7 @@ def trials(results):
     return [{k: v for k, v in row.items() if k != "duration"} for row in results["trials"]]
 
 
+@pytest.mark.full  # these share one search of 20 s
 def test_it_leaves_settings_a_table_and_figures(searched, machine):
     results = json.loads((searched / "results.json").read_text())
     assert (results["schema"], results["kind"], len(results["trials"])) == ("hybrid-mpc tune", "mopgrnn", 2)
@@ -72,6 +72,7 @@ def test_it_leaves_settings_a_table_and_figures(searched, machine):
     assert used == best
 
 
+@pytest.mark.full
 def test_a_search_goes_on_with_more_trials(searched, words, tmp_path, call):
     out = tmp_path / "out"
     shutil.copytree(searched, out)
@@ -84,6 +85,7 @@ def test_a_search_goes_on_with_more_trials(searched, words, tmp_path, call):
     assert len(after["trials"]) == 3
 
 
+@pytest.mark.full
 def test_what_is_refused(searched, words, arguments, tmp_path, call):
     new = ["--out", tmp_path / "new"]
     for given, message in (
@@ -131,11 +133,7 @@ def test_files_of_settings_that_are_none(tmp_path, content, message):
         read_network(path)
 
 
-def test_a_run_without_such_a_file_is_what_it_has_always_been(tmp_path):
-    # what run.json of earlier runs holds: they can be resumed
-    assert set(RunSettings("golf_robot").identity()) == {
-        "scenario", "data", "seed", "budget", "inputs", "outputs", "time",
-    }  # fmt: skip
+def test_a_run_without_such_a_file_takes_the_budget_s_settings(tmp_path):
     scenario = load_scenario("golf_robot")
     plain = training_settings(Context(RunSettings("golf_robot"), scenario, tmp_path), "mopgrnn")
     assert (plain.hidden, plain.horizon, plain.batch, plain.validation_horizon) == (16, 50, 32, None)
@@ -168,7 +166,7 @@ def test_a_run_is_bound_to_the_content_of_its_file(tmp_path):
     path.write_text('{"hidden": 9}')
     for other in (settings, RunSettings("golf_robot")):
         with (
-            pytest.raises(InputError, match="network differ"),
+            pytest.raises(InputError, match="network_file differ"),
             open_folder(tmp_path / "run", JobNote("run", other.identity()), resume=True),
         ):
             pass

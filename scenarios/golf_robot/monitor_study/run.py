@@ -10,7 +10,7 @@ from typing import Any
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_json, write_json
-from hybrid_mpc.job.context import Progress, Silent
+from hybrid_mpc.job.context import Progress
 from hybrid_mpc.job.engine import Engine, make_engine
 from hybrid_mpc.job.folder import check_out, open_folder
 from hybrid_mpc.job.study import Study
@@ -60,7 +60,7 @@ def run_monitor_study(
 
     What is finished is on the disk; after a kill at any moment ``resume=True`` goes on.
     """
-    out, say = Path(out), progress or Silent()
+    out, say = Path(out), progress or Progress()
     check_out(out, NOUN, resume=resume)
     say.start("reading the model, and the filters' noise")
     loops, models = load_inputs(

@@ -18,7 +18,7 @@ from hybrid_mpc import (
     run_study,
     set_process_noise,
 )
-from hybrid_mpc.job.context import Silent
+from hybrid_mpc.job.context import Progress
 from hybrid_mpc.job.loops import run_loops
 from hybrid_mpc.job.study_run import TIMING, load_inputs, load_models
 from hybrid_mpc.kit.artifact import read_description, write_description
@@ -109,7 +109,7 @@ def test_a_cluster_gives_the_same_bits(run_folder, tmp_path):
     away = replace(study, models={"model": moved})
     hidden = []
 
-    class Hide(Silent):
+    class Hide(Progress):
         def start(self, title):
             if title == "running":
                 hidden.append(shutil.move(moved / "model", tmp_path / "hidden"))

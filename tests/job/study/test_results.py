@@ -115,11 +115,8 @@ def test_unknown_figures_and_levels():
 
 def test_report(tmp_path):
     data = table()
-    data.loc[3, ["status", "cost", "error"]] = [
-        "failed",
-        np.nan,
-        "Traceback ...\nZeroDivisionError: <cursed>",
-    ]
+    failure = "failed", np.nan, "Traceback ...\nZeroDivisionError: <cursed>"
+    data.loc[3, ["status", "cost", "error"]] = failure
     path = write_study_report(StudyResults(data, NOTE, tmp_path))
     page = path.read_text()
     assert path == tmp_path / "report.html"
@@ -144,10 +141,8 @@ def test_plots_leave_out_what_is_not_finite():
         {"a": {"x": (1.0, 5.0), "y": (2.0, 6.0), "z": (3.0, 1.0), "w": (4.0, np.nan)}}, "cost"
     )
     steps = [line for line in figure.axes[0].lines if len(line.get_xdata()) > 1]
-    assert [tuple(p) for p in steps[0].get_xydata()] == [
-        (1.0, 5.0),
-        (3.0, 1.0),
-    ]  # y is dearer and slower than x
+    # y is dearer and slower than x
+    assert [tuple(p) for p in steps[0].get_xydata()] == [(1.0, 5.0), (3.0, 1.0)]
     for draw, nothing in (
         (plots.distributions, {"a": {"x": np.array([np.nan])}}),
         (plots.differences, {"a": {"x": (np.nan, 0.0, 0.0)}}),

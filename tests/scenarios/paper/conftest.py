@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from hybrid_mpc.job.context import Silent
+from hybrid_mpc.job.context import Progress
 from scenarios.paper import run as run_module
 from scenarios.paper.run import reproduce
 from scenarios.paper.settings import ReproductionSettings
@@ -72,7 +72,7 @@ def finished(exact, tmp_path_factory) -> Path:
     return out
 
 
-class Interrupting(Silent):
+class Interrupting(Progress):
     """Ctrl-C in the middle of one job."""
 
     def __init__(self, words: str, at: int) -> None:
