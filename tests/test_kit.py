@@ -12,6 +12,7 @@ import pytest
 import hybrid_mpc as hm
 from hybrid_mpc import (
     Calibration,
+    CondensedController,
     Detector,
     ExtendedKalmanFilter,
     Fault,
@@ -27,7 +28,7 @@ from hybrid_mpc import (
     simulate,
 )
 from hybrid_mpc.kit.artifact import loop_settings, read_description, write_description
-from hybrid_mpc.kit.assembly import first_deviations
+from hybrid_mpc.kit.assembly import SOLVERS, first_deviations
 
 README = Path(__file__).parents[1] / "README.md"
 GOLF = load_scenario("golf_robot")
@@ -116,6 +117,15 @@ def test_the_safe_input_is_the_scenario_s(run):
 )
 def test_the_solver_is_the_one_asked_for(run, solver, kind):
     assert type(hm.load(run).controller(solver=solver).controller).__name__ == kind
+
+
+def test_a_solver_more_is_a_line_in_the_table(run, monkeypatch):
+    """A real-time iteration by another name: split into its two parts, its first plan another's."""
+    monkeypatch.setitem(SOLVERS, "mine", CondensedController)
+    kit = hm.load(run)
+    mine, rti = (closed(kit.observer(), kit.controller(solver=name)) for name in ("mine", "rti"))
+    np.testing.assert_array_equal(mine.u, rti.u)
+    assert mine.timing_ms["prepare"][1:].min() > 0
 
 
 def test_the_first_speed_is_as_uncertain_as_two_readings_a_period_apart(run):

@@ -369,6 +369,8 @@ class Controller(Protocol):
 
     problem: Problem
     """Problem and model made ready."""
+    converges: bool = True
+    """False where a solve improves the last plan only a little: the first plan is then another solver's."""
 
     @property
     def model(self) -> HybridModel:
@@ -399,3 +401,17 @@ class Controller(Protocol):
             limits: Bounds of the inputs for this solve. Default: the problem's own.
         """
         ...
+
+
+class SplitController(Controller):
+    """A solver whose work is mostly done before the measurement: the loop prepares while the last input acts."""
+
+    def prepare(self, previous: Solution, weight: Array | None = None) -> Any:
+        """The part of the next :meth:`solve` that needs no measurement; arguments as there."""
+        raise NotImplementedError
+
+    def finish(
+        self, prepared: Any, estimate: Estimate, reference: Array, limits: Limits | None = None
+    ) -> Solution:
+        """The rest of it, given what :meth:`prepare` made."""
+        raise NotImplementedError

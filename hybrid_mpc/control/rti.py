@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.linalg.blas import dgemv
 
 from hybrid_mpc.control.ocp import OCP, Limits
-from hybrid_mpc.control.problem import Controller, Problem, Solution, Status, Target, weights_ok
+from hybrid_mpc.control.problem import Problem, Solution, SplitController, Status, Target, weights_ok
 from hybrid_mpc.control.qp import InputQP
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
@@ -139,7 +139,7 @@ def condense_all(stages: Array, by_inputs: Array, n_x: int, n_u: int) -> Array:
     return total
 
 
-class CondensedController(Controller):
+class CondensedController(SplitController):
     """Nonlinear MPC by Gauss-Newton real-time iterations (RTI).
 
     :meth:`prepare` shifts the previous plan, linearizes the model along it in one call and condenses states and
@@ -174,6 +174,8 @@ class CondensedController(Controller):
         >>> solution.status.name, solution.u[0].round(6)
         ('SOLVED', array([-0.618034]))
     """
+
+    converges = False
 
     def __init__(self, model: HybridModel, ocp: OCP, *, iterations: int = 1, compiled: bool = False) -> None:
         if iterations < 1:

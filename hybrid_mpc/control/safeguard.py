@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import Enum
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.control.ocp import OCP, Limits
-from hybrid_mpc.control.problem import Controller, Solution, Status
-from hybrid_mpc.control.rti import CondensedController, Prepared
+from hybrid_mpc.control.problem import Controller, Solution, SplitController, Status
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
 from hybrid_mpc.model.model import HybridModel
@@ -93,7 +93,7 @@ class SafeController:
         ocp = controller.ocp
         self.controller, self._max_age = controller, max_age
         self.safe_input = checked_safe_input(safe_input, ocp)
-        self._rti = controller if isinstance(controller, CondensedController) else None
+        self._split = controller if isinstance(controller, SplitController) else None
         self._first = controller if first is None else first
         sizes = [(c.model.n_x, c.model.n_h, c.ocp.n_u, c.ocp.horizon) for c in (self._first, controller)]
         if sizes[0] != sizes[1]:
@@ -144,7 +144,7 @@ class SafeController:
 
     def decide(
         self, previous: Decision, estimate: Estimate, reference: Array, weight: Array | None = None,
-        *, limits: Limits | None = None, prepared: Prepared | None = None,
+        *, limits: Limits | None = None, prepared: Any = None,
     ) -> Decision:  # fmt: skip
         """The input to hold from now on; ``previous.u`` is being held.
 
@@ -156,8 +156,8 @@ class SafeController:
             limits: Bounds of the inputs for this period, as :meth:`OCP.bounds` has them. Default: the problem's own.
             prepared: What :meth:`prepare` made of ``previous`` and ``weight``. Default: it is made now.
         """
-        if prepared is not None and self._rti is not None:
-            solution = self._rti.finish(prepared, estimate, reference, limits)
+        if prepared is not None and self._split is not None:
+            solution = self._split.finish(prepared, estimate, reference, limits)
         else:
             solution = self.controller.solve(previous.solution, estimate, reference, weight, limits=limits)
         if solution.status.ok:
@@ -165,12 +165,12 @@ class SafeController:
             return Decision(u, Source.MPC, solution.beginning_with(u), solution.status, 0)
         return self._without(previous, estimate, reference, solution, limits)
 
-    def prepare(self, previous: Decision, weight: Array | None = None) -> Prepared | None:
+    def prepare(self, previous: Decision, weight: Array | None = None) -> Any:
         """The linearization, condensed: the part of the next :meth:`decide` that needs no measurement.
 
         ``weight`` is that of the next period. None for a solver without such a part.
         """
-        return None if self._rti is None else self._rti.prepare(previous.solution, weight)
+        return None if self._split is None else self._split.prepare(previous.solution, weight)
 
     def late(
         self, previous: Decision, estimate: Estimate, reference: Array, *, limits: Limits | None = None

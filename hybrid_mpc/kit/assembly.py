@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from hybrid_mpc.control.best_of import BestOf
 from hybrid_mpc.control.nlp import IpoptController
 from hybrid_mpc.control.ocp import OCP
+from hybrid_mpc.control.problem import Controller
 from hybrid_mpc.control.rti import CondensedController
 from hybrid_mpc.control.safeguard import SafeController
 from hybrid_mpc.control.sqp import SQPController
@@ -48,8 +49,13 @@ PATIENCE_S = 0.8
 """[The machine's seconds.] A push of 0.2 s raised alarms for up to 0.7 s, through the monitor's windows and what the
 observer makes of it; a backup that takes it for a heavier machine costs more than it saves (docs/energy-guard.md)."""
 GAIN = "gain of "
-SOLVERS = ("rti", "sqp", "ipopt")
-"""The condensed real-time iteration; sequential quadratic programs to convergence; the same by IPOPT."""
+SOLVERS: Mapping[str, Callable[..., Controller]] = {
+    "rti": CondensedController,
+    "sqp": SQPController,
+    "ipopt": IpoptController,
+}
+"""By the name that commands and settings take: the condensed real-time iteration; sequential quadratic programs to
+convergence; the same by IPOPT."""
 
 
 class LoopAssumptions(Protocol):
@@ -198,12 +204,10 @@ def make_controller(
         ``make_controller(models["hybrid"], models["prior"], scenario.control)``
     """
     ocp = make_ocp(prior, control)
-    if known(solver, SOLVERS, "solver") == "sqp":
-        return SafeController(SQPController(model, ocp), prior, safe_input=safe_input)
-    if solver == "ipopt":
-        return SafeController(IpoptController(model, ocp), prior, safe_input=safe_input)
-    rti = CondensedController(model, ocp, iterations=iterations)
-    return SafeController(rti, prior, first=first_controller(model, ocp), safe_input=safe_input)
+    options = {"iterations": iterations} if solver == "rti" else {}
+    controller = SOLVERS[known(solver, SOLVERS, "solver")](model, ocp, **options)
+    first = None if controller.converges else first_controller(model, ocp)
+    return SafeController(controller, prior, first=first, safe_input=safe_input)
 
 
 def first_controller(model: HybridModel, ocp: OCP) -> SQPController | BestOf:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.control.ocp import Limits
 from hybrid_mpc.control.problem import Controller, Status
-from hybrid_mpc.control.rti import Prepared
 from hybrid_mpc.control.safeguard import Decision, SafeController, Source
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate, Estimator
@@ -179,7 +178,7 @@ class GuardedController:
 
     def decide(
         self, state: GuardState, previous: Decision, estimate: Estimate, reference: Array,
-        weight: Array | None = None, *, prepared: Prepared | None = None, late: bool = False,
+        weight: Array | None = None, *, prepared: Any = None, late: bool = False,
     ) -> tuple[Decision, GuardState]:  # fmt: skip
         """The input to hold from now on, by the mode's controller; see :meth:`SafeController.decide`.
 
@@ -199,7 +198,7 @@ class GuardedController:
             return replace(decision, status=Status.INITIAL, age=0), state
         return safe.decide(before, known, reference, weight, limits=bounds, prepared=prepared), state
 
-    def prepare(self, state: GuardState, decision: Decision, weight: Array | None) -> Prepared | None:
+    def prepare(self, state: GuardState, decision: Decision, weight: Array | None) -> Any:
         """What of the next solve can be done now; None where there is no such part, or another's plan is taken over."""
         if state.wanted in (Mode.FALLBACK, Mode.REST):
             return None

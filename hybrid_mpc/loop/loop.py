@@ -26,7 +26,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.problem import Controller, Status
-from hybrid_mpc.control.rti import Prepared
 from hybrid_mpc.control.safeguard import Decision, SafeController, Source
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.delay import filtered, sees_truth, whole_periods
@@ -103,7 +102,7 @@ class _Ahead:
     k: int
     decision: Decision
     previews: tuple[Array, Array | None]
-    prepared: Prepared | None
+    prepared: Any
 
 
 class Loop:
@@ -437,7 +436,7 @@ class Loop:
             x_ref = np.atleast_2d(np.asarray(reference, dtype=np.float64))
         return x_ref, factors
 
-    def _prepared(self, previous: Decision, weight: Array | None) -> Prepared | None:
+    def _prepared(self, previous: Decision, weight: Array | None) -> Any:
         """What :meth:`finish` has prepared, if it is for this solve."""
         ahead = self._ahead
         if ahead is None or ahead.decision is not previous:
