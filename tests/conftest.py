@@ -15,7 +15,7 @@ LONG = (
     "notebooks/test_notebooks.py",
     "scenarios/paper/test_reproduce.py",
     "job/test_machine_benchmark.py",
-    "job/test_search_command.py",
+    "job/test_tune_command.py",
     "identify/test_training_options.py",
     "identify/test_training.py",
     "job/test_engine.py",

@@ -47,7 +47,7 @@ def test_a_detector_is_learned_and_finds_a_fault_at_any_period(dt, swing):
     assert trace.alarm[400:].any()
     first = np.flatnonzero(trace.alarm[400:])[0]
     assert first * dt < 2 * swing
-    assert (trace.verdict[armed.window - 1 :] == 0).all()
+    assert (trace.validity[armed.window - 1 :] == 0).all()
     # what explains it is looked for in whole windows; a push is none of the parameters
     assert Diagnoser(armed).diagnose(trace.state).text
 

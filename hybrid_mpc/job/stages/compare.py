@@ -116,7 +116,7 @@ class ControlResult:
     @property
     def drawn(self) -> list[LoopRow]:
         """The loops with their signals."""
-        return with_arrays(self.rows, self.arrays)
+        return with_arrays(self.rows, self.arrays) if self.rows else []
 
 
 def control_stage(context: Context) -> ControlResult | Absent:
