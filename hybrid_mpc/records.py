@@ -79,7 +79,7 @@ def record(kind: type[T], data: object, where: str) -> T:
 
     Every field is checked against its annotation: numbers, texts, flags, None, ``Literal``, tuples, sequences, arrays,
     mappings with text keys, CasADi functions, unions and dataclasses of these, ``Any``. A whole number fits a float.
-    Fields with a default may be left out; ``where`` is told in messages.
+    Fields with a default may be left out; ``where`` stands in messages.
 
     Raises:
         InputError: Naming all fields that are missing, unknown (with the nearest known one) or do not fit.

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hybrid_mpc.cli.options import ScenarioName
 from hybrid_mpc.records import MOST_SEED
+
+if TYPE_CHECKING:
+    from hybrid_mpc.job.control import ControlResults
+    from hybrid_mpc.job.loops import LoopRow
 
 EXAMPLES = (
     "Examples:\n\n"
@@ -73,37 +77,37 @@ def control(
     print_summary(summary(results), out / "results.json")
 
 
-def summary(results: dict[str, Any]) -> list[str]:
-    """One line a task and controller, of the content of results.json."""
-    first = next(iter(results["loops"][0]["tracking_rmse"]))
+def summary(results: ControlResults) -> list[str]:
+    """One line a task and controller."""
+    first = next(iter(results.loops[0].tracking_rmse))
     width = max(len(first) + 5, 11)
     head = f"{'RMSE ' + first:>{width}}"
     lines = [f"{'task':16} {'controller':16} {'cost':>10} {'95 %':>10} {head} {'solved':>8}"]
-    for task, row in results["summary"].items():
+    for task, row in results.summary.items():
         for name, cell in row.items():
-            cost, rmse = cell["cost"], cell["tracking_rmse"][first]["mean"]
+            cost, rmse = cell.cost, cell.tracking_rmse[first].mean
             lines.append(
-                f"{task:16} {name:16} {_number(cost['mean']):>10} {_number(cost['ci95'], '±'):>10} "
-                f"{_number(rmse):>{width}} {100 * cell['sources']['MPC']:>6.1f} %"
+                f"{task:16} {name:16} {_number(cost.mean):>10} {_number(cost.ci95, '±'):>10} "
+                f"{_number(rmse):>{width}} {100 * cell.sources['MPC']:>6.1f} %"
             )
-    lines += [line for row in results["loops"] if results["reaction"] for line in _guarded(row)]
-    for name, times in results["step_ms"].items():
+    lines += [line for row in results.loops if results.reaction for line in _guarded(row)]
+    for name, times in results.step_ms.items():
         lines.append(
             f"a step of {name}: median {times['median']:.2f} ms, 99 % within {times['p99']:.2f} ms, period "
-            f"{results['period_ms']:g} ms"
+            f"{results.period_ms:g} ms"
         )
     return lines
 
 
-def _guarded(row: dict[str, Any]) -> list[str]:
+def _guarded(row: LoopRow) -> list[str]:
     """What the guard of one loop saw and did."""
-    invalid = row["invalid_s"] or 0.0
+    invalid = row.invalid_s or 0.0
     rest = f"; without a valid level: {invalid:.2f} s" if invalid else ""
-    if not row["alarms"]:
-        return [f"guard, {row['task']}, seed {row['seed']}: no alarm{rest}"]
-    when = ", ".join(f"{a['start_s']:.2f} to {a['end_s']:.2f} s" for a in row["alarms"])
-    modes = "".join(f"; {s['after'].lower()} from {s['t_s']:.2f} s on" for s in row["switches"])
-    return [f"guard, {row['task']}, seed {row['seed']}: alarm {when}{modes}{rest}"]
+    if not row.alarms:
+        return [f"guard, {row.task}, seed {row.seed}: no alarm{rest}"]
+    when = ", ".join(f"{a.start_s:.2f} to {a.end_s:.2f} s" for a in row.alarms)
+    modes = "".join(f"; {s.after.lower()} from {s.t_s:.2f} s on" for s in row.switches)
+    return [f"guard, {row.task}, seed {row.seed}: alarm {when}{modes}{rest}"]
 
 
 def _number(value: float | None, sign: str = "") -> str:

@@ -18,8 +18,8 @@ SHIFT = 1e-5
 FLOOR = 1e-3
 """Least curvature along a direction, as a share of Gauss-Newton's."""
 MATTERS = 0.2
-"""Share of Gauss-Newton's curvature, along some direction, below which the hidden state's is left out: what is
-left out slows convergence down to that share a step."""
+"""Curvature of the hidden state below this share of Gauss-Newton's, along every direction, is left out. Convergence is
+then linear, with about this rate."""
 AT_ONCE = 200
 """Periods whose Jacobians are taken in one call: more would not stay in a core's cache."""
 

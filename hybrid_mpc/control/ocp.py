@@ -1,4 +1,4 @@
-"""The control problem as plain data: the only one there is, of a scenario, of a task, of every solver."""
+"""The control problem as plain data, shared by scenarios, tasks and solvers."""
 
 from __future__ import annotations
 
@@ -235,7 +235,7 @@ class OCP:
 
     @property
     def input_range(self) -> Array:
-        """By what an input is much or little ``(n_u,)``: its range, or twice what its weights tolerate."""
+        """Reference size of each input ``(n_u,)``: its range, or twice what its weights tolerate."""
         return 2.0 * self.input_scale
 
     @property

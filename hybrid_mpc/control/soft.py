@@ -23,8 +23,8 @@ class SoftBound:
     """``lower <= expression(x, u) <= upper`` in every period of the horizon, as a penalty on its violation.
 
     A violation ``s`` costs ``linear s + quadratic s^2`` per second. With ``linear`` above the largest multiplier of
-    the hard bound (cost per second and unit by which the bound is moved) the penalty is exact: a bound that can be
-    kept is kept as a hard one. One that cannot is violated as little as is worth its cost. There is always a plan.
+    the hard bound (cost per second and unit by which the bound is moved) the penalty is exact: where the
+    bound can be met it acts as a hard one, else it is violated as little as the cost allows. There is always a plan.
 
     Two bounds are equal if their numbers are and their expressions state the same program.
 

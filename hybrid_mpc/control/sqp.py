@@ -148,7 +148,7 @@ ATTEMPTS = 15
 MORE = 4.0
 """Factor of the damping from one attempt to the next; a good step takes as much away."""
 POOR, GOOD = 0.25, 0.5
-"""Shares of the promise: a step that keeps less asks for damping, one that keeps more for less of it."""
+"""Ratios of actual to predicted decrease: below the first damping is raised, above the second it is lowered."""
 CORRECTIONS = 2
 """Most corrections of a step by what it was found to bend."""
 SLOW = 0.1

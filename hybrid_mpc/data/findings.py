@@ -25,8 +25,8 @@ SHORTEST = 5
 SPANS = (1, 2, 5)
 """Samples over which speeds are taken: steps of the sensor hide a slow motion in one, a fast one is over in five."""
 ABRUPT = 3.0
-"""Times the largest ordinary change of speed that no machine makes to stop or to start. In the recordings of five
-machines whose sensors work it is 1.5 at most (docs/data.md)."""
+"""A stop this many times sharper than any ordinary change of speed is a sensor's fault, not the machine's. In the
+recordings of five machines whose sensors work it is 1.5 at most (docs/data.md)."""
 ORDINARY = 0.99
 """Share of the changes of speed, and of the times between two changes of an output, that are ordinary."""
 STEP = 0.1

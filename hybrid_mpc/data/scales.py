@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 FASTEST, SLOWEST = 0.25, 4.0
-"""Time scales [s] between which a machine's second is a second. The library's lengths in seconds (free runs of a fit,
-windows of the monitor, blocks of false alarms) were tried on machines of 0.5 to 2 s; half and twice that are left to
-either side."""
+"""Machines with a time scale [s] in this range use 1 s as their second. The library's lengths in seconds (free runs of
+a fit, windows of the monitor, blocks of false alarms) were tried on machines of 0.5 to 2 s; half and twice that are
+left to either side."""
 COARSEST = 10
 """Fewest periods in a machine's second: the shortest length, a tenth of a second, is then one of them."""
 SHORTEST = 5

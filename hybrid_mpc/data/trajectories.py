@@ -25,7 +25,7 @@ ROLES: tuple[Role, ...] = ("train", "valid", "test")
 TINY = 1e-6
 """Tolerance [s] of comparisons between time stamps; far below any sampling time, above rounding."""
 UNEVEN = 20.0
-"""Times the median distance of the time stamps that the mean one may be: smoothing works on the median."""
+"""Largest ratio of mean to median sampling interval: smoothing works on the median."""
 WORK = 2e10
 """Most products of smoothing, samples times those in a window: half a minute."""
 

@@ -14,7 +14,7 @@ from hybrid_mpc.estimate.tuning import Recording
 
 Array = NDArray[np.float64]
 LEVEL = 0.95
-"""Share of consistent filters that each of the two tests passes."""
+"""Probability with which a consistent filter passes each of the two tests."""
 
 
 @dataclass(frozen=True)

@@ -100,8 +100,8 @@ def fit_physics(
 ) -> Physics:
     """Fit parameters and delay to longer and longer free runs; the last ones start from states smoothed by the prior.
 
-    The stage with the least error over training and validation runs of the longest length wins: a handful of
-    parameters follows no noise, and where friction drifts a short validation part alone misleads. ``length`` [s] is
+    The stage with the least error over training and validation runs of the longest length wins: few
+    parameters do not overfit, and where friction drifts a short validation part alone misleads. ``length`` [s] is
     that of the longest runs; no delay is searched for where ``largest_delay`` [s] is zero.
     """
     fit = OutputErrorFit(make, dt, largest_delay)

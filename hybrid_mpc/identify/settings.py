@@ -90,4 +90,4 @@ class TrainingSettings:
 
 def _check_choice(name: str, value: Any, choices: tuple[Any, ...]) -> None:
     if value not in choices:
-        raise InputError(f"{name} has no {value!r}; there are: {', '.join(map(str, choices))}")
+        raise InputError(f"{name}: unknown {value!r}; choose one of: {', '.join(map(str, choices))}")

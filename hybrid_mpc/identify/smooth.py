@@ -24,7 +24,7 @@ DECADES = (-2.0, 6.0)
 """Range searched for the ratio of walk to sigma [1/s^2, in the machine's seconds]: from a prior that is right to data
 that jump."""
 IGNORANCE = 1e4
-"""Standard deviation of the start in units of what the noise makes of it, seen over one period."""
+"""Initial standard deviation, as a multiple of the sensor noise's effect over one period."""
 SAMPLE = 12
 """At most so many trajectories decide the noise levels."""
 

@@ -1,4 +1,4 @@
-"""Everything that a scenario defines, built and called once before any work; what is wrong is told all at once."""
+"""Everything that a scenario defines, built and called once before any work; all that is wrong is reported at once."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class _Report:
             yield
         except InputError as error:
             self.add(f"{what}: {error}")
-        except Exception as error:  # the user's own code may raise anything, and this is where it is told
+        except Exception as error:  # the user's own code may raise anything, and this is where it is reported
             self.add(f"{what} raised {type(error).__name__}: {_first_line(error)}{_place(error)}")
 
 
@@ -279,7 +279,7 @@ def _check_control(
 
 
 def _structure(control: Any) -> tuple[Any, ...]:
-    """What tells controllers apart that are built differently; a problem that is none is told on its own."""
+    """What tells controllers apart that are built differently; an object that is no OCP is reported elsewhere."""
     if not isinstance(control, OCP):
         return ()
     bounded = tuple(np.isfinite([control.x_min, control.x_max]).ravel())

@@ -113,7 +113,7 @@ class Context:
     def smoothed(self, role: str) -> list[Trajectory]:
         """Trajectories of one role with the states that the fitted prior's equations smooth them to.
 
-        Their inputs are those that act; of a delay's first samples nobody knows what acted, so they are left out.
+        Their inputs are those that act. Samples before the first delayed input arrives are left out.
         """
         from hybrid_mpc.identify.delay import shifted
 

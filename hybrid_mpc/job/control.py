@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +17,11 @@ from hybrid_mpc.job.folder import JobNote, check_out, open_folder
 from hybrid_mpc.job.loops import Bench, LoopRow, LoopSpec, read_rows, run_loops, write_rows
 from hybrid_mpc.job.study import Study
 from hybrid_mpc.job.study_run import StudyModel, load_models
-from hybrid_mpc.job.summary import by_task, summaries
+from hybrid_mpc.job.summary import Summary, by_task, summaries
 from hybrid_mpc.job.tasks import tasks_of
+from hybrid_mpc.kit.artifact import Provenance
 from hybrid_mpc.loop.realtime import percentiles
+from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.plots import animation, loops
 from hybrid_mpc.plots.style import save
 from hybrid_mpc.records import plain
@@ -33,13 +34,65 @@ DRAWN = ("t", "x", "u", "reference", "plans")
 """Arrays of the first loop of a task and controller, for the figures."""
 
 
+@dataclass(frozen=True)
+class FaultNote:
+    """A fault that all loops had."""
+
+    target: str
+    value: float
+    start_s: float
+    end_s: float
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where the model is from."""
+
+    provenance: Provenance
+
+
+@dataclass(frozen=True)
+class FilterNoise:
+    """Process noise of the filters by controller, and where it is from."""
+
+    source: str
+    sigma_x: Mapping[str, tuple[float, ...]]
+
+
+@dataclass(frozen=True)
+class ControlResults:
+    """What ``results.json`` of ``hybrid-mpc control`` holds (docs/control.md): what was run, every loop, and means.
+
+    ``guard`` is the detector where a guard reacts, ``reaction`` what it does; ``step_ms`` are percentiles of the
+    durations of steps by controller, ``summary`` is by task and controller.
+    """
+
+    schema: str
+    schema_version: int
+    scenario: str
+    solver: str
+    controllers: tuple[str, ...]
+    tasks: tuple[str, ...]
+    seeds: int
+    seed: int
+    faults: tuple[FaultNote, ...]
+    guard: Detector | None
+    reaction: str
+    model: Origin
+    noise: FilterNoise
+    versions: Mapping[str, str]
+    period_ms: float
+    step_ms: Mapping[str, Mapping[str, float]]
+    summary: Mapping[str, Mapping[str, Summary]]
+    loops: tuple[LoopRow, ...]
+
+
 def run_control(
     study: Study, out: Path, progress: Progress, *, gif: bool = True, resume: bool = False
-) -> dict[str, Any]:
+) -> ControlResults:
     """Run a study of one model, solver and set of faults alone in this process; write results and figures.
 
-    Loops run one after the other, so that the durations of their steps count. Each is on the disk as it ends. Returned
-    is what ``results.json`` holds.
+    Loops run one after the other, so that the durations of their steps count. Each is on the disk as it ends.
 
     Raises:
         InputError: If anything does not fit, the folder holds something else, or nothing can be written in it.
@@ -55,7 +108,8 @@ def run_control(
         progress.start("closing the loop")
         rows = _rows(bench, study, model, out / "loops", progress)
         results = collected(study, bench, model, rows)
-        write_json(out / "results.json", results)
+        without_loops = plain(replace(results, loops=()))
+        write_json(out / "results.json", {**without_loops, "loops": [row.plain() for row in results.loops]})
         progress.finish("")
         progress.start("drawing")
         figures(bench, rows, out / "figures", progress, gif)
@@ -86,35 +140,31 @@ def _digest(spec: LoopSpec, model: StudyModel) -> str:
     return digest([spec.id, model.sha256])
 
 
-def collected(study: Study, bench: Bench, model: StudyModel, rows: Sequence[LoopRow]) -> dict[str, Any]:
-    """The content of results.json: what was run, every loop, and means with intervals."""
+def collected(study: Study, bench: Bench, model: StudyModel, rows: Sequence[LoopRow]) -> ControlResults:
+    """The results of loops that have run."""
     kit = bench.kits[next(iter(study.folders))]
     (faults,) = study.fault_sets
-    return {
-        "schema": "hybrid-mpc control",
-        "schema_version": SCHEMA_VERSION,
-        "scenario": bench.scenario.name,
-        "solver": study.solvers[0],
-        "controllers": list(study.controllers),
-        "tasks": list(dict.fromkeys(row.task for row in rows)),
-        "seeds": len(study.loop_seeds),
-        "seed": study.run_seed,
-        "faults": [
-            {"target": f.target, "value": f.value, "start_s": f.start, "end_s": f.end} for f in faults
-        ],
-        "guard": plain(kit.detector()) if study.guard else None,
-        "reaction": study.guard,
-        "model": {"provenance": kit.provenance},
-        "noise": {
-            "source": model.noise_source,
-            "sigma_x": {n: kit.noise(n).tolist() for n in study.controllers if not CONTROLLERS[n].truth},
-        },
-        "versions": versions(),
-        "period_ms": 1e3 * kit.models["prior"].dt,
-        "step_ms": {name: percentiles(values) for name, values in _times(rows).items()},
-        "summary": plain(summaries(rows)),
-        "loops": [row.plain() for row in rows],
-    }
+    filters = [name for name in study.controllers if not CONTROLLERS[name].truth]
+    return ControlResults(
+        schema="hybrid-mpc control",
+        schema_version=SCHEMA_VERSION,
+        scenario=bench.scenario.name,
+        solver=study.solvers[0],
+        controllers=tuple(study.controllers),
+        tasks=tuple(dict.fromkeys(row.task for row in rows)),
+        seeds=len(study.loop_seeds),
+        seed=study.run_seed,
+        faults=tuple(FaultNote(f.target, f.value, f.start, f.end) for f in faults),
+        guard=kit.detector() if study.guard else None,
+        reaction=study.guard,
+        model=Origin(kit.provenance),
+        noise=FilterNoise(model.noise_source, {name: tuple(kit.noise(name).tolist()) for name in filters}),
+        versions=versions(),
+        period_ms=1e3 * kit.models["prior"].dt,
+        step_ms={name: percentiles(values) for name, values in _times(rows).items()},
+        summary=summaries(rows),
+        loops=tuple(rows),
+    )
 
 
 def _times(rows: Sequence[LoopRow]) -> dict[str, Array]:

@@ -1,7 +1,7 @@
 """A stage of a job: what it reads, what it computes, and its typed result on disk.
 
 A stage is computed again only where something that it reads has changed: a setting, a part of the scenario, the result
-of a stage before it. What nothing is known of counts as changed.
+of a stage before it. What cannot be checked counts as changed.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 Array = NDArray[Any]
 R = TypeVar("R")
 UNKNOWN = object()
-"""What a stage reads and nobody can tell whether it has changed."""
+"""Stands for an input whose change cannot be detected: the stage always runs again."""
 LIBRARY = ("hybrid_mpc", "nn_export")
 """Packages whose source counts by their version."""
 
@@ -111,7 +111,7 @@ def read_stage(path: Path, stage: Stage[R], remedy: str) -> Stored[R]:
     """Read a stage's result.
 
     Raises:
-        InputError: If the file is missing or damaged, or holds no such result; ``remedy`` is told.
+        InputError: If the file is missing or damaged, or holds no such result; the message ends with ``remedy``.
     """
     held = record(_File, read_document(path, remedy), str(path))
     if held.absent is not None:

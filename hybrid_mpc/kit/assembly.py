@@ -40,7 +40,7 @@ FIRST_LOAD = 0.001
 """Deviation of the first load, as a share of the input's range. Small: a machine that sticks at rest shows nothing of
 its load, and what an observer makes of it there is wrong when it moves."""
 SCALES = (1.0, 3.0)
-"""Process noise over the model's one-period errors; the most likely one is taken."""
+"""Candidate factors on the model's one-period errors; the likeliest gives the process noise."""
 TUNED_PERIODS, TUNED_RECORDINGS = 500, 3
 """So many periods of so many training recordings decide."""
 DWELL_S, QUIET_S = 0.5, 1.0

@@ -15,8 +15,8 @@ class Signal:
     Args:
         name: Short name, e.g. ``"phi"``.
         unit: SI unit, e.g. ``"rad"``; ``"-"`` for none.
-        lower: Smallest plausible value [unit]; data below it are refused, speeds that are differentiated from them are
-            told. Default: no bound.
+        lower: Smallest plausible value [unit]; data below it are refused, speeds
+            differentiated from them raise a warning. Default: no bound.
         upper: Largest plausible value [unit], likewise. Default: no bound.
         periodic: True for an angle that may turn through: networks see its sine and cosine, and recordings that jump by
             full turns are made to count on.

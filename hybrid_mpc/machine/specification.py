@@ -134,7 +134,7 @@ class BenchmarkSpec:
     Args:
         budgets: Effort by name, ``"quick"`` and ``"full"``.
         unit: Unit of the figures, e.g. ``"mm"`` for an output in metres.
-        scale: Its number in a unit of the output, e.g. 1000. Default: 1.
+        scale: Factor from the output's unit to ``unit``, e.g. 1000 from m to mm. Default: 1.
         largest_delay: Longest delay [s] of the input that is searched for; zero: none. Default: 0.
         length: Length [s] of a run after what is given. Default: the whole recording.
         piece: Length [s] of the pieces that long training recordings are cut into. Default: 25 s.

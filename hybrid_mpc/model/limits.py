@@ -38,7 +38,7 @@ def at_rest(lower: ArrayLike, upper: ArrayLike) -> Array:
 def share_used(values: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> float:
     """Largest share of the way from rest to a limit ``(n,)`` that values ``(m, n)`` use: 1 at the limit, more beyond.
 
-    Beyond a limit that is at rest itself the share is 1 plus that of the whole range; infinite without a range.
+    Where a limit is the rest value itself: 1 plus the violation over the whole range; infinite without a range.
     """
     value, low, high = (np.asarray(v, dtype=float) for v in (values, lower, upper))
     rest, span = at_rest(low, high), high - low

@@ -14,7 +14,7 @@ from hybrid_mpc.monitor.lengths import REST_SPEED, SHORTEST_S, checked_rest
 
 Array = NDArray[np.float64]
 CAP = 1.5
-"""A sum stops at so many thresholds, so that its alarm ends soon after the departure."""
+"""Sums saturate at this multiple of the threshold, so that an alarm ends soon after its cause."""
 TERMS = 4
 """Terms of a scale: constant, squared speed, squared input, and rest (force) or one over the time (energy)."""
 

@@ -34,7 +34,7 @@ from hybrid_mpc.monitor.replay import EstimatorLike, TrajectoryLike, along, repl
 
 Array = NDArray[np.float64]
 DRIFT = 2.0
-"""Departure [deviations] that the detector's sums count as nothing. What that finds how soon: docs/energy-guard.md."""
+"""Dead band of the cumulative sums [deviations]. How soon faults are found with it: docs/energy-guard.md."""
 ROUNDS = 5
 """Fits of a variance, each weighted by the one before."""
 FLOOR = 1e-3

@@ -27,7 +27,7 @@ SETTLING_S = 1.0
 BLOCK_S = 5.0
 """Blocks whose largest levels tell the rate of false alarms: much longer than what one sample does to the next."""
 SHORTEST_S = 0.08
-"""Accumulated times of a free run below this say little."""
+"""A free run counts from this accumulated time on."""
 REST_SPEED = 0.2
 """Rest speed [unit of v] where no recording gave one; it suits angles in rad/s."""
 SHARE = 0.05

@@ -95,7 +95,7 @@ def test_what_is_refused(searched, words, arguments, tmp_path, call):
         ([*words[:-1], "decay=1:2", "--out", searched, "--resume"], "space differ"),
         ([*map(str, words[:4]), "--out", searched, "--resume"], "space differ"),
         (["run", *map(str, words[1:4]), "--out", searched, "--resume"], "kind, space differ"),
-        ([*words, *new, "--kind", "gru"], "kind has no 'gru'"),
+        ([*words, *new, "--kind", "gru"], "kind: unknown 'gru'"),
         ([*words, *new, "--vary", "units=1:2"], "no setting 'units' to vary"),
         ([*words, *new, "--vary", "decay=8:4"], "lower one first"),
         ([*words, *new, "--timeout", "0"], "timeout above 0 s"),

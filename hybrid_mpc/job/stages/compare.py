@@ -186,7 +186,7 @@ def time_on_recording(
 def _seeds(name: str, scenario: Scenario, seeds: int, oracle_seeds: int) -> int:
     if name not in ORACLES:
         return seeds
-    # the oracle that sees the truth differs between seeds by nothing but its rivals' luck
+    # with the true state, seeds differ only in the rivals' plans
     return 0 if scenario.oracle is None else (oracle_seeds if name == "oracle" else min(1, oracle_seeds // 2))
 
 

@@ -36,8 +36,8 @@ from hybrid_mpc.scenario import Budget, Scenario, Task
 CONTROLLER = "hybrid_observer"
 """The controller that the guard is for."""
 BLOCKS = 9
-"""Whole blocks (of five of the machine's seconds) in a loop. Four such loops carry two false alarms an hour, eight
-carry one."""
+"""Whole blocks (of five of the machine's seconds) in a loop. Four such loops suffice for a threshold of two false
+alarms an hour, eight for one."""
 FEWEST, MOST = 4, 16
 """Loops: two for each seed of the budget, within these."""
 FIRST_SEED = 500

@@ -174,7 +174,7 @@ def monitor_stage(context: Context) -> MonitorResult | Absent:
         for key in ("t", "violation_w", "level_w", "residual_level", "alarm"):
             arrays[f"{recording.name}/{key}"] = getattr(trace, key)
         arrays[f"{recording.name}/y"] = recording.y[:, 0]
-        # one that a disturbance raised before the stretch may end in it: what counts is where it starts
+        # an alarm counts where it begins: it may reach in from a disturbed part
         starts = np.diff(trace.alarm.astype(int), prepend=0) == 1
         every, test = (
             _inside(context, recording, roles) for roles in (("train", "valid", "nominal", "test"), ("test",))
