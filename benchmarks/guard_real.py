@@ -105,7 +105,7 @@ def leave_one_out(
     Each is replayed as a whole, as it would have run online: what happens between the windows is in the monitor's
     memory when the next one begins. Nothing is learned from the first of the machine's seconds of a window.
     """
-    stems = [r.name.split("#")[0] for r in recordings]
+    stems = [r.file for r in recordings]
     if len(set(stems)) < 2:
         raise InputError(f"leave_one_out: {len(recordings)} recordings given, at least two files are needed")
     if unknown := sorted(set(stems) - set(windows)):

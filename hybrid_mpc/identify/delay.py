@@ -22,8 +22,7 @@ def delayed(trajectory: Trajectory, delay: float) -> Trajectory:
     [s] is positive.
     """
     whole, rest = _split(delay, trajectory.dt)
-    share = rest / trajectory.dt
-    first = whole + (share > 0)
+    share, first = rest / trajectory.dt, lost_samples(delay, trajectory.dt)
     n = len(trajectory.t)
     if n <= first + 1:
         raise InputError(f"{trajectory.name}: a delay of {delay:g} s leaves nothing of {n} samples")
@@ -39,8 +38,9 @@ def shifted(trajectories: Sequence[Trajectory], delay: float) -> list[Trajectory
 
 
 def lost_samples(delay: float, dt: float) -> int:
-    """Samples at the start of a trajectory whose acting input is not known."""
-    return math.ceil(delay / dt - 1e-6)
+    """Samples at the start of a trajectory whose acting input is not known; none without a delay."""
+    whole, rest = _split(delay, dt) if delay else (0, 0.0)
+    return whole + (rest > 0)
 
 
 def with_states(trajectories: Sequence[Trajectory], smoother: Smoother, delay: float) -> list[Trajectory]:

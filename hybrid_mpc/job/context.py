@@ -20,7 +20,7 @@ from hybrid_mpc.files import digest
 from hybrid_mpc.job.settings import RunSettings
 from hybrid_mpc.job.stage import Absent, Stage, Stored, read_stage, write_stage
 from hybrid_mpc.kit.artifact import Kit, load
-from hybrid_mpc.machine.specification import DataSpec
+from hybrid_mpc.machine.specification import DataSpec, Role
 from hybrid_mpc.scenario import Budget, Scenario
 
 if TYPE_CHECKING:
@@ -106,11 +106,11 @@ class Context:
         """The machine's second [s], of the training recordings."""
         return time_unit(self.trajectories("train"), self.spec.dt)
 
-    def trajectories(self, role: str) -> list[Trajectory]:
+    def trajectories(self, role: Role) -> list[Trajectory]:
         """Trajectories of one role."""
-        return [t for t in self.dataset.trajectories if t.role == role]
+        return list(self.dataset.by_role(role))
 
-    def smoothed(self, role: str) -> list[Trajectory]:
+    def smoothed(self, role: Role) -> list[Trajectory]:
         """Trajectories of one role with the states that the fitted prior's equations smooth them to.
 
         Their inputs are those that act. Samples before the first delayed input arrives are left out.
@@ -119,7 +119,7 @@ class Context:
 
         return self._with_states(shifted(self.trajectories(role), self.prior.delay))
 
-    def commanded(self, role: str) -> list[Trajectory]:
+    def commanded(self, role: Role) -> list[Trajectory]:
         """The same with the inputs as they were commanded: what the deployed models, which hold the delay, take."""
         from hybrid_mpc.identify.delay import lost_samples
 

@@ -164,7 +164,7 @@ def _estimated_noise(
     with tempfile.TemporaryDirectory() as folder:
         files = scenario.make_data(Path(folder), seed, "quick")
         data = load_trajectories(files, scenario.data, outputs=prior.outputs, inputs=prior.inputs)
-    train = [t for t in data.trajectories if t.role == "train"]
+    train = data.by_role("train")
     delay = artifact.input_delay
     smoother = fit_smoother(prior, shifted(train, delay), scenario.data.dt)
     return noise_of(scenario, artifact, with_states(train, smoother, delay))

@@ -230,10 +230,8 @@ def _monitor(context: Context) -> Any:
 def _worth_showing(context: Context) -> list[Any]:
     """Recordings with alarms first, then test recordings, a few in all."""
     alarmed = {alarm.file for alarm in context.read(MONITOR).alarms}
-    tested = {t.name.split("#")[0] for t in context.trajectories("test")}
-    ranked = sorted(
-        context.dataset.whole, key=lambda r: (r.name not in alarmed, r.name.split("#")[0] not in tested)
-    )
+    tested = {t.file for t in context.trajectories("test")}
+    ranked = sorted(context.dataset.whole, key=lambda r: (r.name not in alarmed, r.file not in tested))
     return ranked[:SHOWN_RECORDINGS]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.data.excitation import check_excitation
-from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.data.trajectories import ROLES, Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import digest, read_document, read_document_arrays, sha256, write_document
 from hybrid_mpc.identify.evaluate import FreeRun, Scores, evaluation_trajectories, free_runs, score
@@ -175,13 +175,12 @@ def data_stage(context: Context) -> DataResult:
     dataset, warnings = context.dataset, doubts(context)
     for warning in warnings:
         context.progress.warn(warning)
-    roles = ("train", "valid", "test")
     return DataResult(
         tuple(dataset.files),
         dataset.hash,
         tuple(CutPart(*cut) for cut in dataset.cuts),
-        {role: len(context.trajectories(role)) for role in roles},
-        {role: sum(len(t.t) * t.dt for t in context.trajectories(role)) for role in roles},
+        {role: len(context.trajectories(role)) for role in ROLES},
+        {role: sum(len(t.t) * t.dt for t in context.trajectories(role)) for role in ROLES},
         warnings,
     )
 

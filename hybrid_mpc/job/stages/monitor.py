@@ -238,10 +238,10 @@ def clean_windows(
     context: Context, recording: Trajectory, roles: tuple[str, ...]
 ) -> list[tuple[float, float]]:
     """Stretches of a recording whose role says that nothing disturbs the machine there, ``(start, end)`` [s]."""
-    stem = recording.name.split("#")[0]
+    stem = recording.file
     if stem in context.spec.windows:
         return [(w.start, w.end) for w in context.spec.windows[stem] if w.role in roles]
-    pieces = [t for t in context.dataset.trajectories if t.name.split("#")[0] == stem and t.role in roles]
+    pieces = [t for t in context.dataset.trajectories if t.file == stem and t.role in roles]
     return [(float(t.t[0]), float(t.t[-1])) for t in pieces]
 
 
