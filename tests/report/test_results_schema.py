@@ -1,13 +1,19 @@
 """The schema of results.json names the key that is wrong."""
 
 import copy
+import dataclasses
 import json
 import math
+import re
+import typing
+from pathlib import Path
 
 import pytest
 
 from hybrid_mpc import InputError
-from hybrid_mpc.job.stages.results import read_results
+from hybrid_mpc.job.stages.results import Results, read_results
+
+PAGE = Path(__file__).parents[2] / "docs" / "results-schema.md"
 
 PER_MODEL = {"phy_nominal": 1.0, "phy": 0.2, "rnn": 0.4, "pgrnn": 0.17, "mopgrnn": 0.15}
 RESULTS = {
@@ -154,3 +160,20 @@ def test_another_version_and_unknown_keys_are_refused():
 def test_an_interval_that_ends_before_it_starts_is_refused():
     with pytest.raises(InputError, match="before it starts"):
         read_results(put("monitor.alarms", [{"file": "a.csv", "start_s": 2.0, "end_s": 1.0}]))
+
+
+def keys_of(kind):
+    """Keys of an object and of the objects in it; lists, reasons and details are said in a sentence each."""
+    found = set()
+    for name, hint in typing.get_type_hints(kind).items():
+        if not name.endswith("reason") and name != "details":
+            inner = [t for t in (hint, *typing.get_args(hint)) if dataclasses.is_dataclass(t)]
+            found |= {name}.union(*(keys_of(t) for t in inner if typing.get_origin(hint) is not tuple))
+    return found
+
+
+def test_the_page_names_the_keys_that_the_dataclasses_have():
+    lines = [line for line in PAGE.read_text().splitlines() if line.startswith("|")]
+    page = {key for line in lines for key in re.findall(r"`([a-z_0-9]+)`", line.split("|")[1])} - {"details"}
+    assert page - keys_of(Results) == set()
+    assert keys_of(Results) - page == {"median", "p95", "p99", "max"}  # in the line of controller_step_ms
