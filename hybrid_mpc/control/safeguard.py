@@ -72,6 +72,7 @@ class SafeController:
         >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
         >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
         >>> ocp = OCP(5, [1.0], [1.0], [0.0], [-9.0], [9.0], du_max=[0.5])
+        >>> from hybrid_mpc.control.rti import CondensedController
         >>> safe = SafeController(CondensedController(model, ocp), fallback=model)
         >>> estimate = TrueState(model).start([2.0])
         >>> decision = safe.decide(safe.initial(estimate), estimate, np.full((6, 1), np.nan))
