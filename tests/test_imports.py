@@ -23,7 +23,7 @@ ROOMS = {
     "control": "nn_export errors records model estimate",
     "loop": "errors model estimate control",
     "scenario": "errors machine model control loop",
-    "monitor": "errors data model control",
+    "monitor": "errors data model",
     "analyze": "nn_export errors data model estimate control loop",
     "kit": "nn_export errors records files machine data model estimate control loop scenario monitor",
     "identify": "nn_export errors files machine data model kit",

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.func import functional_call
 
 from hybrid_mpc.data import scales
-from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.data.trajectories import Trajectory, evenly
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.dataset import Windows, cut_windows
 from hybrid_mpc.identify.prior_result import PriorFit
@@ -183,7 +183,7 @@ def cut_segments(trajectories: Sequence[Trajectory], periods: int, most: int = M
             f"{max((len(t.t) for t in trajectories), default=0)} samples. Take shorter segments or longer runs."
         )
     take = max(1, min(len(fitting), most // max(counts)))
-    chosen = [fitting[i] for i in np.linspace(0, len(fitting) - 1, take).round().astype(int)]
+    chosen = [fitting[i] for i in evenly(len(fitting), take)]
     parts, joined = [], []
     for i in chosen:
         n = min(counts[i], most)

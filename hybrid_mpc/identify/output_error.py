@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 from torch import Tensor
 from torch.func import functional_call
 
-from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.data.trajectories import Trajectory, evenly
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.fit import ParameterFit, correlations, covariance_of
 from hybrid_mpc.identify.prior_result import PriorFit
@@ -57,10 +57,7 @@ def cut_runs(trajectories: Sequence[Trajectory], periods: int, lead: int, most: 
             f"no recording is long enough: the longest has {longest} samples, a free run of {periods} periods with "
             f"{lead} samples before it needs {periods + lead + 1}"
         )
-    chosen = [
-        starts[i]
-        for i in np.unique(np.linspace(0, len(starts) - 1, min(most, len(starts))).round().astype(int))
-    ]
+    chosen = [starts[i] for i in evenly(len(starts), most)]
     x = np.stack([t.x[k] for t, k in chosen])
     u = np.stack([t.u[k - lead : k + periods] for t, k in chosen])
     y = np.stack([t.y[k + 1 : k + periods + 1] for t, k in chosen])

@@ -13,7 +13,7 @@ from scipy.optimize import minimize_scalar
 from torch import Tensor
 
 from hybrid_mpc.data import scales
-from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.data.trajectories import Trajectory, evenly
 from hybrid_mpc.identify.step import required_substeps, rk4
 from hybrid_mpc.machine.torch_prior import Prior
 
@@ -147,10 +147,7 @@ def fit_smoother(
         time_unit: The machine's second [s]. Default: that of the trajectories.
     """
     unit = scales.time_unit(trajectories, dt) if time_unit is None else time_unit
-    chosen = sorted(
-        set(np.linspace(0, len(trajectories) - 1, min(SAMPLE, len(trajectories))).round().astype(int))
-    )
-    sample = [trajectories[i] for i in chosen]
+    sample = [trajectories[i] for i in evenly(len(trajectories), SAMPLE)]
     sigma = np.maximum(scales.noise_of(sample), 1e-12)
     count = sum((len(t.t) - 3) * t.y.shape[1] for t in sample)
 

@@ -15,7 +15,7 @@ from hybrid_mpc.control.problem import Controller
 from hybrid_mpc.control.rti import CondensedController
 from hybrid_mpc.control.safeguard import SafeController
 from hybrid_mpc.control.sqp import SQPController
-from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.data.trajectories import Trajectory, evenly
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimator, ExtendedKalmanFilter
 from hybrid_mpc.estimate.parameters import parameter_filter, with_parameter_states
@@ -98,11 +98,8 @@ def tuned_noise(
 
     ``base`` are the model's one-period errors ``(n_x,)``; an ``observer`` follows an unknown load.
     """
-    places = np.linspace(0, len(recordings) - 1, min(TUNED_RECORDINGS, len(recordings))).round().astype(int)
-    parts = [
-        recordings[i].part(np.arange(len(recordings[i].t)) < TUNED_PERIODS, recordings[i].name, "train")
-        for i in dict.fromkeys(places.tolist())
-    ]
+    chosen = [recordings[i] for i in evenly(len(recordings), TUNED_RECORDINGS)]
+    parts = [r.part(slice(TUNED_PERIODS), r.name, "train") for r in chosen]
     return base * most_likely(
         lambda s: make_estimator(model, scenario, s * base, observer=observer), parts, SCALES
     )

@@ -164,10 +164,13 @@ def count_alarms(alarm: Array | NDArray[np.bool_], dt: float) -> tuple[int, floa
 
 def alarm_intervals(alarm: Array | NDArray[np.bool_], dt: float) -> list[tuple[float, float]]:
     """Intervals ``(first, last)`` [s] in which the alarm is on; sample k lies at ``k dt``."""
-    on = np.concatenate([[False], np.asarray(alarm, dtype=bool), [False]]).astype(int)
-    edges = np.diff(on)
-    firsts, lasts = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
-    return [(float(a * dt), float(b * dt)) for a, b in zip(firsts, lasts, strict=True)]
+    return [(float(a * dt), float(b * dt)) for a, b in zip(*stretches(alarm), strict=True)]
+
+
+def stretches(on: ArrayLike) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+    """First and last samples of the stretches in which ``on`` ``(n,)`` is true."""
+    edges = np.diff(np.concatenate([[0], np.asarray(on, dtype=bool), [0]]).astype(int))
+    return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
 
 
 def _ordered(release: float | None, threshold: float | None) -> bool:

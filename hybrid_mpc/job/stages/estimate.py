@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_mpc.data.trajectories import evenly
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.consistency import Consistency, consistency
 from hybrid_mpc.job.context import Context
@@ -99,10 +100,8 @@ def estimation_stage(context: Context) -> EstimationResult | Absent:
 
 def parts_for_tests(recordings: Sequence[Trajectory]) -> list[Trajectory]:
     """The first samples of a few recordings, evenly chosen, that the tests can take the time for."""
-    places = np.linspace(0, len(recordings) - 1, min(RECORDINGS, len(recordings))).round().astype(int)
-    chosen = [recordings[i] for i in dict.fromkeys(places.tolist())]
-    most = PERIODS // max(1, len(chosen))
-    return [r.part(np.arange(len(r.t)) < most, r.name, r.role) for r in chosen]
+    chosen = [recordings[i] for i in evenly(len(recordings), RECORDINGS)]
+    return [r.part(slice(PERIODS // max(1, len(chosen)))) for r in chosen]
 
 
 def figures_of(found: Consistency) -> ObserverTest:

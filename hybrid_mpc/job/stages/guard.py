@@ -24,7 +24,13 @@ from hybrid_mpc.job.stages.monitor import MONITOR, RATES, clean_windows
 from hybrid_mpc.kit.artifact import Kit, read_description, set_calibration
 from hybrid_mpc.loop.faults import Fault, install
 from hybrid_mpc.model.model import HybridModel
-from hybrid_mpc.monitor.calibrate import MAX_EXTRAPOLATION, MIN_BLOCKS, Calibration, alarm_intervals
+from hybrid_mpc.monitor.calibrate import (
+    MAX_EXTRAPOLATION,
+    MIN_BLOCKS,
+    Calibration,
+    alarm_intervals,
+    stretches,
+)
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.learn import DRIFT, guard_monitor, learn_detector
 from hybrid_mpc.monitor.lengths import BLOCK_S, REST_SPEED, SETTLING_S, block_seconds, samples, seconds
@@ -512,11 +518,11 @@ def _recorded(
             monitor, estimator, recording, context.scenario.causes, say, prior=kit.models["prior"]
         )
         found += [ExplainedAlarm(recording.name, **vars(alarm)) for alarm in alarms]
-        edges = np.diff(trace.alarm.astype(int), prepend=0) == 1
+        begins, _ = stretches(trace.alarm)
         for window in clean_windows(context, recording, ("test",)):
             inside = _settled(recording.t, *window, model)
             watched += float(inside.sum() * model.dt)
-            starts += int((edges & inside).sum())
+            starts += int(inside[begins].sum())
         if not arrays or (alarms and not arrays["recorded/alarm"].any()):  # one is shown, best with an alarm
             arrays = trace_arrays("recorded", trace, recording.y)
             shown = recording.name

@@ -22,7 +22,7 @@ from hybrid_mpc.kit.assembly import make_monitor
 from hybrid_mpc.loop.faults import Fault
 from hybrid_mpc.loop.simulate import ClosedLoopResult
 from hybrid_mpc.model.model import HybridModel
-from hybrid_mpc.monitor.calibrate import Calibration, alarm_intervals, calibrate, with_residual
+from hybrid_mpc.monitor.calibrate import Calibration, alarm_intervals, calibrate, stretches, with_residual
 from hybrid_mpc.monitor.lengths import block_seconds, rest_speeds
 from hybrid_mpc.monitor.replay import along, replay, with_alarms
 
@@ -175,15 +175,15 @@ def monitor_stage(context: Context) -> MonitorResult | Absent:
             arrays[f"{recording.name}/{key}"] = getattr(trace, key)
         arrays[f"{recording.name}/y"] = recording.y[:, 0]
         # an alarm counts where it begins: it may reach in from a disturbed part
-        starts = np.diff(trace.alarm.astype(int), prepend=0) == 1
+        starts, _ = stretches(trace.alarm)
         every, test = (
             _inside(context, recording, roles) for roles in (("train", "valid", "nominal", "test"), ("test",))
         )
         clean = CleanAlarms(
             clean.seconds + float(every.sum() * model.dt),
-            clean.alarms + int((starts & every).sum()),
+            clean.alarms + int(every[starts].sum()),
             clean.test_seconds + float(test.sum() * model.dt),
-            clean.test_alarms + int((starts & test).sum()),
+            clean.test_alarms + int(test[starts].sum()),
         )
     load = None
     if context.scenario.plant is not None and context.scenario.tasks:
