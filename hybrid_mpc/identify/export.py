@@ -88,7 +88,7 @@ class _Xdot(_OfStep):
         return super().forward(x, h, u, w, p)[0]
 
 
-class _OfPrior(_WithParameters):
+class OfPrior(_WithParameters):
     """``output`` or ``energy_balance`` of a prior; its last two inputs are ``w`` and ``p``."""
 
     def __init__(self, prior: Prior, method: str) -> None:
@@ -96,6 +96,7 @@ class _OfPrior(_WithParameters):
         self.part = _Method(prior, method)
 
     def forward(self, *args: Tensor) -> Tensor:
+        """The method's result at the signals, ``w`` and ``p``."""
         *signals, _, p = args
         found: Tensor = self.at(self.part, "owner.", p, *signals)
         return found
@@ -110,8 +111,8 @@ def trace_model(step: Step) -> dict[str, nn_export.Program]:
     modules: dict[str, nn.Module] = {
         "step": _OfStep(step, "forward", "integrate"),
         "xdot": _Xdot(step, "xdot", "derivative"),
-        "output": _OfPrior(step.prior, "output"),
-        ENERGY.program: _OfPrior(step.prior, "energy_balance"),
+        "output": OfPrior(step.prior, "output"),
+        ENERGY.program: OfPrior(step.prior, "energy_balance"),
     }
     examples = _examples(step)
     programs = {}

@@ -1,27 +1,28 @@
 """Fit of a prior's parameters to states: equation error, output error over free runs, multiple shooting.
 
-Residuals are errors of free runs over the states' spread, with exact derivatives (forward mode through the integrator).
+Residuals are errors of free runs over the states' spread, with exact derivatives: forward sensitivities of all windows
+in one call (:mod:`~hybrid_mpc.identify.simulation`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from torch import Tensor
-from torch.func import functional_call
 
 from hybrid_mpc.data import scales
 from hybrid_mpc.data.trajectories import Trajectory, evenly
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.dataset import Windows, cut_windows
 from hybrid_mpc.identify.prior_result import PriorFit
-from hybrid_mpc.identify.step import required_substeps, rk4
+from hybrid_mpc.identify.simulation import Simulation, traced
+from hybrid_mpc.identify.step import required_substeps
 from hybrid_mpc.machine.torch_prior import Prior
 
 Array = NDArray[np.float64]
@@ -39,6 +40,12 @@ class ParameterFit:
         self.nominal = np.array([p.value for p in self.free]) / self.unit
         self.lower = np.array([p.lower for p in self.free]) / self.unit
         self.upper = np.array([p.upper for p in self.free]) / self.unit
+
+    @cached_property
+    def simulation(self) -> Simulation:
+        """Free runs of the prior, with derivatives by the free parameters."""
+        names = [p.name for p in self.prior.parameters_spec]
+        return Simulation(traced(self.prior), self.dt, [names.index(p.name) for p in self.free])
 
     def values(self, theta: Array) -> dict[str, float]:
         """Values [SI] of all parameters by name, fixed ones included."""
@@ -62,19 +69,11 @@ class ParameterFit:
 
         Gives ``theta`` and the Jacobian of the residuals over their standard deviation.
         """
-        run = self.residual_function(windows, start)
-        derivative = torch.func.jacfwd(run)
-
-        def residual(theta: Array) -> Array:
-            return run(torch.tensor(theta)).numpy()
-
-        def jacobian(theta: Array) -> Array:
-            return derivative(torch.tensor(theta)).numpy()
-
+        substeps = self.substeps(start)
         result = least_squares(
-            residual,
+            lambda theta: self.residual(theta, windows, substeps),
             self.inside(start),
-            jac=jacobian,
+            jac=lambda theta: self.slope(theta, windows, substeps),
             bounds=(self.lower, self.upper),
             loss="soft_l1",
             max_nfev=evaluations,
@@ -83,15 +82,14 @@ class ParameterFit:
 
     def jacobian(self, theta: Array, windows: Windows) -> Array:
         """Jacobian at ``theta`` of the residuals over their standard deviation, for :meth:`confidence`."""
-        run = self.residual_function(windows, theta)
-        residual = run(torch.tensor(theta))
-        slope = torch.func.jacfwd(run)(torch.tensor(theta)).numpy()
-        return np.asarray(slope / max(float(residual.square().mean().sqrt()), 1e-15))
+        substeps = self.substeps(theta)
+        residual, slope = (f(theta, windows, substeps) for f in (self.residual, self.slope))
+        return np.asarray(slope / max(float(np.sqrt(np.mean(residual**2))), 1e-15))
 
     def error(self, theta: Array, windows: Windows) -> float:
         """Mean absolute error of free runs over the windows [spreads of the data]; infinite if one diverges."""
-        residual = self.residual_function(windows, theta)(torch.tensor(theta))
-        return float(residual.abs().mean()) if bool(torch.isfinite(residual).all()) else float("inf")
+        residual = self.residual(theta, windows, self.substeps(theta))
+        return float(np.abs(residual).mean()) if np.isfinite(residual).all() else float("inf")
 
     def confidence(self, theta: Array, jacobian: Any) -> tuple[dict[str, float], list[str]]:
         """Standard errors [SI] by name and warnings, from a Jacobian as the fits return it."""
@@ -115,31 +113,41 @@ class ParameterFit:
         _, singular, rows = np.linalg.svd(jacobian, full_matrices=False)
         return correlations([p.name for p in self.free], covariance_of(singular, rows))
 
-    def residual_function(self, windows: Windows, near: Array, most: int = 0) -> Callable[[Tensor], Tensor]:
-        """``theta -> `` errors of all states of all free runs over the states' spread, as one vector.
+    def substeps(self, theta: Array) -> int:
+        """Sub-steps a period that the stiffness at ``theta`` asks for."""
+        return required_substeps(self.make(self.values(theta)), self.dt)
 
-        The stiffness at ``near`` decides the sub-steps, unless ``most`` says how many.
-        """
-        spread = spread_of(windows)
-        unit, names = torch.tensor(self.unit), [p.name for p in self.free]
-        inputs = windows.u.transpose(0, 1)
-        substeps = most or required_substeps(self.make(self.values(near)), self.dt)
+    def parameters(self, theta: Array) -> Array:
+        """Values [SI] of all parameters in the order of the specification, for each row of ``theta``."""
+        rows = np.atleast_2d(theta)
+        every = np.tile(list(self.prior.values.values()), (len(rows), 1))
+        every[:, self.simulation.free] = rows * self.unit
+        return every[0] if theta.ndim == 1 else every
 
-        def residual(theta: Tensor) -> Tensor:
-            values = dict(zip(names, theta * unit, strict=True))
-            x, states = windows.x[:, 0], []
-            for u in inputs:
-                x = rk4(lambda z, u=u: functional_call(self.prior, values, (z, u)), x, self.dt, substeps)  # type: ignore[misc]
-                states.append(x)
-            errors = (torch.stack(states, 1) - windows.x[:, 1:]) / spread
-            return errors.clamp(-LARGEST, LARGEST).reshape(-1)
+    def residual(self, theta: Array, windows: Windows, substeps: int) -> Array:
+        """Errors of all states of all free runs over the states' spread, as one vector."""
+        x = self.simulation.states(
+            windows.x[:, 0].numpy(), windows.u.numpy(), self.parameters(theta), substeps
+        )
+        return np.clip(_errors(x, windows), -LARGEST, LARGEST).ravel()
 
-        return residual
+    def slope(self, theta: Array, windows: Windows, substeps: int) -> Array:
+        """Jacobian of :meth:`residual`; zero where that is at its limit."""
+        x, by_p = self.simulation.by_parameters(
+            windows.x[:, 0].numpy(), windows.u.numpy(), self.parameters(theta), substeps
+        )
+        beyond = np.abs(_errors(x, windows)) > LARGEST
+        slope = by_p[:, 1:] / spread_of(windows)[:, None] * self.unit
+        return np.where(beyond[..., None], 0.0, slope).reshape(-1, len(self.unit))
 
 
-def spread_of(windows: Windows) -> Tensor:
+def _errors(x: Array, windows: Windows) -> Array:
+    return np.asarray((x[:, 1:] - windows.x[:, 1:].numpy()) / spread_of(windows))
+
+
+def spread_of(windows: Windows) -> Array:
     """Standard deviation of each state over all windows ``(n_x,)`` [SI]: the unit of all residuals."""
-    return windows.x.reshape(-1, windows.x.shape[-1]).std(0).clamp_min(1e-9)
+    return np.asarray(windows.x.reshape(-1, windows.x.shape[-1]).std(0).clamp_min(1e-9).numpy())
 
 
 def covariance_of(singular: Array, rows: Array) -> Array:
@@ -237,30 +245,34 @@ class _Problem:
         # the start of a segment that follows another is measured as that one's end
         self.first = np.setdiff1d(np.arange(len(segments.joined)), self.joined + 1)
         self.spread = spread_of(segments.windows)
-        self.u = segments.windows.u
-        scaled = segments.windows.x / self.spread
-        self.measured, self.later = scaled[:, 0].numpy(), scaled[:, 1:]
-        self.measurements = self.later.numel()
-        self.substeps = required_substeps(fit.make(fit.values(near)), fit.dt)
-        run = self._run()
-        self._value = torch.func.vmap(run, in_dims=(None, 0, 0))
-        self._slopes = torch.func.vmap(torch.func.jacfwd(run, argnums=(0, 1)), in_dims=(None, 0, 0))
+        self.u = segments.windows.u.numpy()
+        scaled = segments.windows.x.numpy() / self.spread
+        self.measured, self.later = scaled[:, 0], scaled[:, 1:]
+        self.measurements = self.later.size
+        self.substeps = fit.substeps(near)
 
     def residual(self, z: Array, weight: float) -> Array:
         theta, nodes = self._split(z)
-        ahead = self._value(torch.tensor(theta), torch.tensor(nodes), self.u)
-        errors = _limited(ahead - self.later).numpy()
-        gaps = _limited(ahead[:, -1]).numpy()[self.joined] - nodes[self.joined + 1]
+        p, simulation = self.fit.parameters(theta), self.fit.simulation
+        ahead = simulation.states(nodes * self.spread, self.u, p, self.substeps)[:, 1:] / self.spread
+        errors = _limited(ahead - self.later)
+        gaps = _limited(ahead[:, -1])[self.joined] - nodes[self.joined + 1]
         starts = (nodes - self.measured)[self.first]
         return np.concatenate([errors.ravel(), starts.ravel(), weight * gaps.ravel()])
 
     def jacobian(self, z: Array, weight: float) -> Array:
         theta, nodes = self._split(z)
-        by_theta, by_node = (
-            torch.nan_to_num(s, 0.0, 0.0, 0.0).clamp(-1e6, 1e6).numpy()
-            for s in self._slopes(torch.tensor(theta), torch.tensor(nodes), self.u)
+        n_x = nodes.shape[1]
+        _, by_p, by_x = self.fit.simulation.by_all(
+            nodes * self.spread, self.u, self.fit.parameters(theta), self.substeps
         )
-        n, periods, n_x = by_theta.shape[:3]
+        by_theta, by_node = (
+            np.clip(
+                np.nan_to_num(s[:, 1:] / self.spread[:, None], nan=0.0, posinf=0.0, neginf=0.0), -1e6, 1e6
+            )
+            for s in (by_p * self.fit.unit, by_x * self.spread)
+        )
+        n, periods = by_theta.shape[:2]
         p, rows = len(theta), n * periods * n_x
         gaps = rows + len(self.first) * n_x
         out = np.zeros((gaps + len(self.joined) * n_x, p + n * n_x))
@@ -284,24 +296,9 @@ class _Problem:
         p = len(self.fit.free)
         return z[:p], z[p:].reshape(self.measured.shape)
 
-    def _run(self) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
-        fit, spread, substeps = self.fit, self.spread, self.substeps
-        unit, names = torch.tensor(fit.unit), [p.name for p in fit.free]
 
-        def run(theta: Tensor, node: Tensor, inputs: Tensor) -> Tensor:
-            """States ``(periods, n_x)`` [spreads] of one segment."""
-            values = dict(zip(names, theta * unit, strict=True))
-            x, states = node * spread, []
-            for u in inputs:
-                x = rk4(lambda z, u=u: functional_call(fit.prior, values, (z, u)), x, fit.dt, substeps)  # type: ignore[misc]
-                states.append(x / spread)
-            return torch.stack(states)
-
-        return run
-
-
-def _limited(values: Tensor) -> Tensor:
-    return torch.nan_to_num(values, LARGEST, LARGEST, -LARGEST).clamp(-LARGEST, LARGEST)
+def _limited(values: Array) -> Array:
+    return np.clip(np.nan_to_num(values, nan=LARGEST, posinf=LARGEST, neginf=-LARGEST), -LARGEST, LARGEST)
 
 
 STAGES = ((0.5, 20), (2.0, 10), (5.0, 6))

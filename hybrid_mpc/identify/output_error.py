@@ -15,13 +15,12 @@ import torch
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from torch import Tensor
-from torch.func import functional_call
 
 from hybrid_mpc.data.trajectories import Trajectory, evenly
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.fit import ParameterFit, correlations, covariance_of
 from hybrid_mpc.identify.prior_result import PriorFit
-from hybrid_mpc.identify.step import required_substeps, rk4
+from hybrid_mpc.identify.step import required_substeps
 from hybrid_mpc.machine.torch_prior import Prior
 
 Array = NDArray[np.float64]
@@ -92,18 +91,20 @@ class OutputErrorFit:
 
     def errors(self, thetas: Array, runs: Runs) -> Array:
         """Errors of the outputs ``(m, n, periods, n_y)`` [output unit] of ``m`` sets of parameters."""
-        sets = torch.tensor(thetas * self.unit)
-        values = {p.name: sets[:, i].reshape(-1, 1, 1) for i, p in enumerate(self.free)}
+        m, (n, periods) = len(thetas), runs.y.shape[:2]
         substeps = required_substeps(self.make(self.values(thetas[0])), self.dt)
-        inputs = self._acting(sets[:, -1], runs) if self.largest else runs.u[None, :, runs.lead :]
-        x, out = runs.x.expand(len(thetas), *runs.x.shape), []
+        delays = torch.tensor(thetas * self.unit)[:, -1]
+        inputs = self._acting(delays, runs) if self.largest else runs.u[None, :, runs.lead :]
+        u = inputs.expand(m, n, periods, -1)
+        p = self._own.parameters(thetas[:, : len(self.free)])
+        states = self._own.simulation.states(
+            np.tile(runs.x.numpy(), (m, 1)),
+            u.reshape(m * n, periods, -1).numpy(),
+            np.repeat(p, n, axis=0),
+            substeps,
+        )[:, 1:]
         with torch.no_grad():
-            for k in range(runs.y.shape[1]):
-                u = inputs[:, :, k].expand(len(thetas), -1, -1)
-                x = rk4(lambda z, u=u: functional_call(self.prior, values, (z, u)), x, self.dt, substeps)  # type: ignore[misc]
-                out.append(x)
-            states = torch.stack(out, 2)
-            error = self.prior.output(states, inputs.expand(len(thetas), -1, -1, -1)) - runs.y
+            error = self.prior.output(torch.tensor(states).reshape(m, n, periods, -1), u) - runs.y
         return np.nan_to_num(error.numpy(), nan=np.inf, posinf=np.inf, neginf=-np.inf)
 
     def rmse(self, theta: Array, runs: Runs) -> float:

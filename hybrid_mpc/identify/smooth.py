@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
-from torch import Tensor
 
 from hybrid_mpc.data import scales
 from hybrid_mpc.data.trajectories import Trajectory, evenly
-from hybrid_mpc.identify.step import required_substeps, rk4
+from hybrid_mpc.identify.simulation import with_acceleration
+from hybrid_mpc.identify.step import required_substeps
 from hybrid_mpc.machine.torch_prior import Prior
 
 Array = NDArray[np.float64]
@@ -86,21 +86,11 @@ class Smoother:
 
     def _linearize(self, z: Array, u: Array) -> tuple[Array, Array]:
         """Next ``(q, v, d)`` from each ``z`` ``(b, n, 3 n_q)``, and its Jacobian."""
-        n_x, substeps = len(self.prior.states), required_substeps(self.prior, self.dt)
-
-        def step(z: Tensor, u: Tensor) -> Tensor:
-            x, d = z[:n_x], z[n_x:]
-
-            def xdot(x: Tensor) -> Tensor:
-                return self.prior(x, u) + torch.cat([torch.zeros_like(d), d])
-
-            return torch.cat([rk4(xdot, x, self.dt, substeps), d])
-
-        flat = torch.tensor(z).flatten(0, 1), torch.tensor(u).flatten(0, 1)
-        with torch.no_grad():
-            slope = torch.func.vmap(torch.func.jacfwd(step))(*flat).numpy()
-            value = torch.func.vmap(step)(*flat).numpy()
-        return value.reshape(z.shape), slope.reshape(*z.shape, z.shape[-1])
+        n_z, p = z.shape[-1], np.array(list(self.prior.values.values()))
+        every, _, slope = with_acceleration(self.prior, self.dt).by_all(
+            z.reshape(-1, n_z), u.reshape(-1, 1, u.shape[-1]), p, required_substeps(self.prior, self.dt)
+        )
+        return every[:, 1].reshape(z.shape), slope[:, 1].reshape(*z.shape, n_z)
 
     def _sweep(self, offset: Array, slope: Array, y: Array) -> tuple[Array, tuple[float, float]]:
         """Kalman filter and Rauch-Tung-Striebel smoother of ``z_{k+1} = slope_k z_k + offset_k + w``."""
@@ -109,27 +99,31 @@ class Smoother:
         start = np.concatenate([r, r / self.dt**2, np.square(self.walk) + r / self.dt**2])
         z = np.concatenate([y[:, 0], np.zeros((b, 2 * n_q))], axis=-1)
         p = np.broadcast_to(np.diag(IGNORANCE**2 * start), (b, 3 * n_q, 3 * n_q))
-        rows: list[tuple[Array, Array, Array, Array]] = []
-        squares = logs = 0.0
+        means, covariances = np.zeros((2, n, b, 3 * n_q)), np.zeros((2, n, b, 3 * n_q, 3 * n_q))
+        errors, variances = np.zeros((n, b, n_q)), np.zeros((n, b, n_q, n_q))
         for k in range(n):
             if k:
-                z = (slope[:, k - 1] @ z[..., None])[..., 0] + offset[:, k - 1]
-                p = slope[:, k - 1] @ p @ slope[:, k - 1].swapaxes(1, 2) + noise
-            ahead = z, p
+                at = slope[:, k - 1]
+                z = (at @ z[..., None])[..., 0] + offset[:, k - 1]
+                p = at @ p @ at.swapaxes(1, 2) + noise
+            means[0, k], covariances[0, k] = z, p  # ahead of the measurement
             s, e = p[:, :n_q, :n_q] + np.diag(r), y[:, k] - z[:, :n_q]
-            gain = np.linalg.solve(s, p[:, :n_q]).swapaxes(1, 2)
-            if k > 2:  # three samples end the ignorance of position, velocity and correction
-                squares += float(np.sum(e[:, None] @ np.linalg.solve(s, e[..., None])))
-                logs += float(np.linalg.slogdet(s)[1].sum())
+            gain = p[:, :, :n_q] @ np.linalg.inv(s)
             z = z + (gain @ e[..., None])[..., 0]
             p = p - gain @ p[:, :n_q]
             p = 0.5 * (p + p.swapaxes(1, 2))
-            rows.append((z, p, *ahead))
-        smooth = np.stack([row[0] for row in rows], axis=1)
+            means[1, k], covariances[1, k], errors[k], variances[k] = z, p, e, s
+        forward = slope.swapaxes(0, 1) @ covariances[1, :-1]
+        back = np.linalg.solve(covariances[0, 1:], forward).swapaxes(-1, -2)
+        smooth = means[1]
         for k in range(n - 2, -1, -1):
-            back = np.linalg.solve(rows[k + 1][3], slope[:, k] @ rows[k][1]).swapaxes(1, 2)
-            smooth[:, k] += (back @ (smooth[:, k + 1] - rows[k + 1][2])[..., None])[..., 0]
-        return smooth, (squares, logs)
+            smooth[k] += (back[k] @ (smooth[k + 1] - means[0, k + 1])[..., None])[..., 0]
+        e, s = (
+            errors[3:],
+            variances[3:],
+        )  # three samples end the ignorance of position, velocity and correction
+        squares = float(np.sum(e[..., None, :] @ np.linalg.solve(s, e[..., None])))
+        return smooth.swapaxes(0, 1), (squares, float(np.linalg.slogdet(s)[1].sum()))
 
 
 def fit_smoother(

@@ -117,13 +117,9 @@ def errors_of(fit: ParameterFit, thetas: Array, windows: Windows) -> Array:
             groups.setdefault(required_substeps(fit.make(fit.values(theta)), fit.dt), []).append(i)
         except InputError:
             continue
-    with torch.no_grad():
-        for substeps, rows in groups.items():
-            run = fit.residual_function(windows, fit.nominal, substeps)
-            means = torch.func.vmap(lambda theta, run=run: run(theta).abs().mean())(
-                torch.tensor(thetas[rows])
-            )
-            errors[rows] = np.where(np.isfinite(means.numpy()), means.numpy(), np.inf)
+    for substeps, rows in groups.items():
+        means = [np.abs(fit.residual(theta, windows, substeps)).mean() for theta in thetas[rows]]
+        errors[rows] = np.where(np.isfinite(means), means, np.inf)
     return errors
 
 
