@@ -79,7 +79,7 @@ class Simulation:
             slopes = by_x @ z[:, 1:]
             slopes[:, : len(self.free)] += ca.jacobian(x_next, p)[:, self.free]
             after.append(slopes)
-        step = ca.Function("period", [z, u, p], [ca.densify(ca.horzcat(*after))])
+        step = ca.Function("period", [z, u, p], [ca.cse(ca.densify(ca.horzcat(*after)))])
         held = (
             ca.MX.sym("z", self.n_x, 1 + columns),
             ca.MX.sym("u", self.n_u, periods),

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
+import casadi as ca
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -99,20 +101,15 @@ class Smoother:
         start = np.concatenate([r, r / self.dt**2, np.square(self.walk) + r / self.dt**2])
         z = np.concatenate([y[:, 0], np.zeros((b, 2 * n_q))], axis=-1)
         p = np.broadcast_to(np.diag(IGNORANCE**2 * start), (b, 3 * n_q, 3 * n_q))
-        means, covariances = np.zeros((2, n, b, 3 * n_q)), np.zeros((2, n, b, 3 * n_q, 3 * n_q))
-        errors, variances = np.zeros((n, b, n_q)), np.zeros((n, b, n_q, n_q))
-        for k in range(n):
-            if k:
-                at = slope[:, k - 1]
-                z = (at @ z[..., None])[..., 0] + offset[:, k - 1]
-                p = at @ p @ at.swapaxes(1, 2) + noise
-            means[0, k], covariances[0, k] = z, p  # ahead of the measurement
-            s, e = p[:, :n_q, :n_q] + np.diag(r), y[:, k] - z[:, :n_q]
-            gain = p[:, :, :n_q] @ np.linalg.inv(s)
-            z = z + (gain @ e[..., None])[..., 0]
-            p = p - gain @ p[:, :n_q]
-            p = 0.5 * (p + p.swapaxes(1, 2))
-            means[1, k], covariances[1, k], errors[k], variances[k] = z, p, e, s
+        ahead = np.concatenate([z[..., None], p], axis=-1)
+        to_next = np.concatenate([slope, np.zeros((b, 1, 3 * n_q, 3 * n_q))], axis=1)
+        moved = np.concatenate([offset, np.zeros((b, 1, 3 * n_q))], axis=1)
+        given = ahead, y[..., None], to_next, moved[..., None], np.broadcast_to(r[:, None], (b, n_q, 1))
+        found = _filter(n_q, n).map(b)(*(_side_by_side(v) for v in given), np.tile(noise, (1, b)))
+        later, now, seen = (_apart(v.full(), b, n) for v in found)
+        before = np.concatenate([ahead[None], later[:-1]])
+        means, covariances = (np.stack([v[..., part] for v in (before, now)]) for part in (0, slice(1, None)))
+        errors, variances = seen[..., 0], seen[..., 1:]
         forward = slope.swapaxes(0, 1) @ covariances[1, :-1]
         back = np.linalg.solve(covariances[0, 1:], forward).swapaxes(-1, -2)
         smooth = means[1]
@@ -164,3 +161,40 @@ def _by_length(trajectories: Iterable[Trajectory]) -> list[dict[int, Trajectory]
     for i, trajectory in enumerate(trajectories):
         groups.setdefault(len(trajectory.t), {})[i] = trajectory
     return list(groups.values())
+
+
+@lru_cache(maxsize=16)
+def _filter(n_q: int, n: int) -> ca.Function:
+    """Kalman filter over ``n`` samples: what is expected ``[z, P]``, and ``y``, transition, offset, ``r``, noise.
+
+    Gives what is expected of the next sample, the estimates ``[z, P]`` and the innovations ``[e, S]``.
+    """
+    n_z = 3 * n_q
+    ahead, y, at = ca.SX.sym("ahead", n_z, 1 + n_z), ca.SX.sym("y", n_q), ca.SX.sym("at", n_z, n_z)
+    offset, r, noise = ca.SX.sym("offset", n_z), ca.SX.sym("r", n_q), ca.SX.sym("noise", n_z, n_z)
+    z, p = ahead[:, 0], ahead[:, 1:]
+    s, e = p[:n_q, :n_q] + ca.diag(r), y - z[:n_q]
+    gain = p[:, :n_q] @ ca.inv(s)
+    z, p = z + gain @ e, p - gain @ p[:n_q, :]
+    p = 0.5 * (p + p.T)
+    later = ca.horzcat(at @ z + offset, at @ p @ at.T + noise)
+    period = ca.Function(
+        "period",
+        [ahead, y, at, offset, r, noise],
+        [ca.densify(v) for v in (later, ca.horzcat(z, p), ca.horzcat(e, s))],
+    )
+    held = [
+        ca.MX.sym(f"a{i}", period.size1_in(i), period.size2_in(i) * (n if 0 < i < 4 else 1)) for i in range(6)
+    ]
+    over = period.mapaccum(n)(*held[:4], ca.repmat(held[4], 1, n), ca.repmat(held[5], 1, n))
+    return ca.Function("filter", held, list(over))
+
+
+def _side_by_side(blocks: Array) -> Array:
+    """Matrices ``(..., rows, columns)`` in one row."""
+    return np.moveaxis(blocks, -2, 0).reshape(blocks.shape[-2], -1)
+
+
+def _apart(row: Array, b: int, n: int) -> Array:
+    """The matrices ``(n, b, rows, columns)`` of ``b`` trajectories' ``n`` samples in one row."""
+    return np.moveaxis(row.reshape(len(row), b, n, -1), (2, 1), (0, 1))
