@@ -126,3 +126,8 @@ def time_unit(recordings: Sequence[Outputs], dt: float) -> float:
 def periods(seconds: float, dt: float, fewest: int = 1) -> int:
     """Whole periods of a length, at least ``fewest``."""
     return max(fewest, round(seconds / dt))
+
+
+def evenly(n: int, most: int) -> list[int]:
+    """At most ``most`` of the places 0 to n - 1, evenly chosen, in order."""
+    return list(dict.fromkeys(np.linspace(0, n - 1, min(most, n)).round().astype(int).tolist()))

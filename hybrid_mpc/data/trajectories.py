@@ -110,11 +110,6 @@ class Dataset:
         return tuple(piece for piece in self.trajectories if piece.role == role)
 
 
-def evenly(n: int, most: int) -> list[int]:
-    """At most ``most`` of the places 0 to n - 1, evenly chosen, in order."""
-    return list(dict.fromkeys(np.linspace(0, n - 1, min(most, n)).round().astype(int).tolist()))
-
-
 def load_trajectories(
     paths: Sequence[Path | str],
     spec: DataSpec,

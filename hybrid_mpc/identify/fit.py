@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from hybrid_mpc.data import scales
-from hybrid_mpc.data.trajectories import Trajectory, evenly
+from hybrid_mpc.data.scales import evenly
+from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.dataset import Windows, cut_windows
 from hybrid_mpc.identify.prior_result import PriorFit

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from hybrid_mpc.data.trajectories import Trajectory, evenly
+from hybrid_mpc.data.scales import evenly
+from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.fit import ParameterFit, correlations, covariance_of
 from hybrid_mpc.identify.prior_result import PriorFit

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from hybrid_mpc.data import scales
-from hybrid_mpc.data.trajectories import Trajectory, evenly
+from hybrid_mpc.data.scales import evenly
+from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.identify.simulation import with_acceleration
 from hybrid_mpc.identify.step import required_substeps
 from hybrid_mpc.machine.torch_prior import Prior

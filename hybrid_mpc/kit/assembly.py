@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +15,7 @@ from hybrid_mpc.control.problem import Controller
 from hybrid_mpc.control.rti import CondensedController
 from hybrid_mpc.control.safeguard import SafeController
 from hybrid_mpc.control.sqp import SQPController
-from hybrid_mpc.data.trajectories import Trajectory, evenly
+from hybrid_mpc.data.scales import evenly
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimator, ExtendedKalmanFilter
 from hybrid_mpc.estimate.parameters import parameter_filter, with_parameter_states
@@ -27,6 +27,9 @@ from hybrid_mpc.monitor.calibrate import Calibration
 from hybrid_mpc.monitor.energy import EnergyMonitor
 from hybrid_mpc.monitor.lengths import LEVEL_S, half_window, samples
 from hybrid_mpc.records import known
+
+if TYPE_CHECKING:  # reading recordings takes half a second to import, and no controller does
+    from hybrid_mpc.data.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 MODES = ("quiet", "slip", "jump")

@@ -145,7 +145,7 @@ class Detector:
         v2 = u2 = slow = 0.0
         for v, rest in zip(numbers[3 + 2 * n : end], self.rest_speed, strict=True):
             v2 += v * v
-            slow += v * v / rest**2
+            slow += v * v / (rest * rest)
         for u in numbers[end:stop]:
             u2 += u * u
         near = 1.0 / (1.0 + slow)

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from hybrid_mpc.job.stage import read_stage
+from hybrid_mpc.job.stages.monitor import MONITOR
 from hybrid_mpc.job.stages.results import read_results
 from scenarios.torque_pendulum import WINDOWS
 
@@ -33,10 +35,10 @@ def test_golf_robot(tmp_path):
     e_sim = results["identification"]["e_sim_s"]
     assert e_sim["mopgrnn"] < e_sim["phy"] < e_sim["phy_nominal"]
     assert e_sim["mopgrnn"] < e_sim["rnn"]
-    load = json.loads((tmp_path / "run" / "checkpoints" / "monitor.json").read_text())["load"]
-    assert load["delay_s"] is not None
-    assert load["delay_s"] < 0.5  # a fifth of the largest torque, in motion: within two monitor windows
-    assert load["false_alarms"] == 0
+    load = read_stage(tmp_path / "run" / "checkpoints" / "monitor.json", MONITOR, "").result.load
+    assert load.delay_s is not None
+    assert load.delay_s < 0.5  # a fifth of the largest torque, in motion: within two monitor windows
+    assert load.false_alarms == 0
 
 
 @pytest.mark.full

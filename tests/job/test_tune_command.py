@@ -94,7 +94,7 @@ def test_what_is_refused(searched, words, arguments, tmp_path, call):
         ([*words, "--out", searched, "--resume", "--seed", "1"], "seed differ"),
         ([*words[:-1], "decay=1:2", "--out", searched, "--resume"], "space differ"),
         ([*map(str, words[:4]), "--out", searched, "--resume"], "space differ"),
-        (["run", *map(str, words[1:4]), "--out", searched, "--resume"], "kind, space differ"),
+        (["run", *map(str, words[1:4]), "--out", searched, "--resume"], "differ); give the same ones"),
         ([*words, *new, "--kind", "gru"], "kind: unknown 'gru'"),
         ([*words, *new, "--vary", "units=1:2"], "no setting 'units' to vary"),
         ([*words, *new, "--vary", "decay=8:4"], "lower one first"),
