@@ -110,13 +110,13 @@ def test_windows_and_what_is_settled_in_them(real):
 
 def test_bad_input_is_refused(real):
     class Recording:
-        name = "a#2"
+        file = "a"
 
     with pytest.raises(InputError, match="at least two files"):
         real.leave_one_out(None, None, [Recording(), Recording()], WINDOWS, **SETTINGS)
 
     class Other(Recording):
-        name = "b"
+        file = "b"
 
     with pytest.raises(InputError, match=r"no clean windows given for \['b'\]"):
         real.leave_one_out(None, None, [Recording(), Other()], WINDOWS, **SETTINGS)
