@@ -22,8 +22,6 @@ from hybrid_mpc.job.tasks import tasks_of
 from hybrid_mpc.kit.artifact import Provenance
 from hybrid_mpc.loop.realtime import percentiles
 from hybrid_mpc.monitor.detector import Detector
-from hybrid_mpc.plots import animation, loops
-from hybrid_mpc.plots.style import save
 from hybrid_mpc.records import plain
 from hybrid_mpc.scenario import load_scenario
 
@@ -175,6 +173,10 @@ def _times(rows: Sequence[LoopRow]) -> dict[str, Array]:
 
 def figures(bench: Bench, rows: Sequence[LoopRow], folder: Path, progress: Progress, gif: bool) -> list[Path]:
     """Figures of the first loop of every task and controller, and the durations of steps."""
+    # half a second to import: what is refused, is refused before
+    from hybrid_mpc.plots import animation, loops
+    from hybrid_mpc.plots.style import save
+
     (kit,) = bench.kits.values()
     model, scenario, written = kit.models["prior"], bench.scenario, []
     drawn = by_task([row for row in rows if "plans" in row.arrays])

@@ -15,7 +15,7 @@ from itertools import islice
 from pathlib import Path
 from threading import Lock
 from time import perf_counter, process_time
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -41,12 +41,14 @@ from hybrid_mpc.job.study_log import (
     rows,
     study_note,
 )
-from hybrid_mpc.job.study_results import StudyResults, duration_text
 from hybrid_mpc.job.tasks import selected_tasks
 from hybrid_mpc.kit.artifact import FILES, Kit, artifact_folder, load
 from hybrid_mpc.kit.assembly import adaptable
 from hybrid_mpc.records import plain
 from hybrid_mpc.scenario import Scenario, load_scenario
+
+if TYPE_CHECKING:
+    from hybrid_mpc.job.study_results import StudyResults
 
 TIMING = "timing_"
 """Columns that begin so are durations and places: they differ between two runs, no other does."""
@@ -268,6 +270,10 @@ def run_study(
                 compact(out / RUNS, out / RESULTS, plain(made))
     finally:
         engine.close()
+    from hybrid_mpc.job.study_results import (
+        StudyResults,  # plots and pandas: what is refused, is refused before
+    )
+
     return StudyResults.load(out)
 
 
@@ -347,6 +353,8 @@ class Tally:
         rate = self.runs / max(time.monotonic() - self.begin, 1e-9)
         words = [f"{rate:.3g} runs/s"]
         if 0 < self.runs < self.total:
+            from hybrid_mpc.job.study_results import duration_text
+
             words.append(f"{duration_text((self.total - self.runs) / rate)} left")
         if self.failed:
             words.append(f"{self.failed} failed")
