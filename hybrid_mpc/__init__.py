@@ -111,17 +111,12 @@ if TYPE_CHECKING:
     from hybrid_mpc.loop.loop import Loop
     from hybrid_mpc.loop.realtime import Runner, SafeEnd
     from hybrid_mpc.loop.simulate import ClosedLoopResult, simulate
+    from hybrid_mpc.machine.friction import Coulomb, LoadDependent, Stribeck, Viscous, with_friction
+    from hybrid_mpc.machine.mechanical import MechanicalPrior
+    from hybrid_mpc.machine.prior import Balance, OperatingPoint, Prior
     from hybrid_mpc.machine.signals import Parameter, Signal
     from hybrid_mpc.machine.specification import BenchmarkBudget, BenchmarkSpec, DataSpec, Role, Window
-    from hybrid_mpc.machine.torch_prior import (
-        Coulomb,
-        LoadDependent,
-        PendulumLoad,
-        Prior,
-        Stribeck,
-        Viscous,
-        with_friction,
-    )
+    from hybrid_mpc.machine.torch_prior import TorchPrior
     from hybrid_mpc.model.buffered import BufferedFunction
     from hybrid_mpc.model.delay import with_input_delay
     from hybrid_mpc.model.model import HybridModel, longer_period
@@ -143,6 +138,7 @@ except PackageNotFoundError:  # a source tree that was never installed
 __all__ = [
     "__version__",
     "plots",
+    "Balance",
     "Bench",
     "BenchmarkBudget",
     "BenchmarkSpec",
@@ -179,11 +175,12 @@ __all__ = [
     "LoopRow",
     "LoopSettings",
     "LoopSpec",
+    "MechanicalPrior",
     "Mode",
     "ModelInfo",
     "OCP",
+    "OperatingPoint",
     "Parameter",
-    "PendulumLoad",
     "Prior",
     "PriorStep",
     "Provenance",
@@ -207,6 +204,7 @@ __all__ = [
     "StudyResults",
     "SwitchingFilter",
     "Task",
+    "TorchPrior",
     "TrainingSettings",
     "Trajectory",
     "TrueState",
@@ -363,11 +361,12 @@ _ROOMS = {
     "loop.loop": ("Loop",),
     "loop.realtime": ("Runner", "SafeEnd"),
     "loop.simulate": ("ClosedLoopResult", "simulate"),
+    "machine.friction": ("Coulomb", "LoadDependent", "Stribeck", "Viscous", "with_friction"),
+    "machine.mechanical": ("MechanicalPrior",),
+    "machine.prior": ("Balance", "OperatingPoint", "Prior"),
     "machine.signals": ("Parameter", "Signal"),
     "machine.specification": ("BenchmarkBudget", "BenchmarkSpec", "DataSpec", "Role", "Window"),
-    "machine.torch_prior": (
-        "Coulomb", "LoadDependent", "PendulumLoad", "Prior", "Stribeck", "Viscous", "with_friction",
-    ),
+    "machine.torch_prior": ("TorchPrior",),
     "model.buffered": ("BufferedFunction",),
     "model.delay": ("with_input_delay",),
     "model.model": ("HybridModel", "longer_period"),

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from hybrid_mpc.loop.faults import Fault
     from hybrid_mpc.loop.plant import Plant
     from hybrid_mpc.loop.simulate import ClosedLoopResult
-    from hybrid_mpc.machine.torch_prior import Prior
+    from hybrid_mpc.machine.prior import Prior
     from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]

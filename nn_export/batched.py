@@ -79,7 +79,11 @@ class Batched:
         """Nonzeros of the outputs ``(*batch, n)`` at those of the inputs, all with the same leading axes."""
         samples = math.prod(args[0].shape[:-1])
         many = samples >= WALK_FROM or args[0].device.type != "cpu"
-        return self.walk(args) if many and self.steps is not None else self._run(args, samples)
+        return (
+            self.walk(args, args[0].shape[:-1])
+            if many and self.steps is not None
+            else self._run(args, samples)
+        )
 
     @cached_property
     def steps(self) -> list[Step] | None:
@@ -91,14 +95,19 @@ class Batched:
         known = {ca.OP_CONST, ca.OP_INPUT, ca.OP_OUTPUT, *OPERATORS}
         return steps if all(step.code in known for step in steps) else None
 
-    def walk(self, args: list[Tensor]) -> list[Tensor]:
-        """The same, by torch operators."""
+    def check_walkable(self) -> None:
+        """Refuse a function that torch operators do not stand for."""
         if self.steps is None:
             raise ExportError(
                 f"{self.function.name()} has no form in torch operators (a solver, a table, external code, or more "
                 f"than {MAX_WALK} operations): it can be trained with on the CPU, but not be exported or moved"
             )
-        columns, shape = [a.unbind(-1) for a in args], args[0].shape[:-1]
+
+    def walk(self, args: list[Tensor], shape: torch.Size | tuple[int, ...]) -> list[Tensor]:
+        """The same by torch operators; the leading axes of the arguments are broadcast to ``shape``."""
+        self.check_walkable()
+        assert self.steps is not None
+        columns = [a.unbind(-1) for a in args]
         slots: dict[int, Any] = {}
         results: list[list[Any]] = [[None] * self.function.nnz_out(i) for i in range(self.function.n_out())]
         for step in self.steps:
@@ -156,7 +165,7 @@ class Batched:
         self.__dict__.update(state)
 
 
-def _joined(values: list[Any], shape: torch.Size, like: Tensor) -> Tensor:
+def _joined(values: list[Any], shape: torch.Size | tuple[int, ...], like: Tensor) -> Tensor:
     if not values:
         return like.new_zeros((*shape, 0))
     return torch.stack(

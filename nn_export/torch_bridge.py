@@ -12,7 +12,7 @@ from nn_export.batched import Batched
 from nn_export.errors import DtypeError, SignatureError
 
 
-def from_casadi(function: ca.Function) -> CasadiModule:
+def from_casadi(function: ca.Function, *, own_derivatives: bool = True) -> CasadiModule:
     """A CasADi function as a torch module, e.g. a prior to train with.
 
     Gradients are CasADi's own derivative functions, of any order; branches that ``if_else`` does not take
@@ -24,6 +24,9 @@ def from_casadi(function: ca.Function) -> CasadiModule:
         function: Any CasADi function of real numbers. One that can be expanded to scalar operations (at most
             3000) can be exported again by :func:`nn_export.to_casadi` and runs on any device; others
             (solvers, tables, external code) run on the CPU.
+        own_derivatives: False: torch differentiates the operators that it runs, which halves the time of a training
+            through thousands of calls. Then a branch that ``if_else`` does not take must have finite derivatives, and
+            the function must be expandable. Default: CasADi's derivatives.
 
     Returns:
         Module called with one tensor for each input, in the function's order. It has no parameters.
@@ -39,7 +42,7 @@ def from_casadi(function: ca.Function) -> CasadiModule:
         >>> force.tolist(), torch.autograd.grad(force.sum(), stiffness)[0].item()
         ([[-3.0], [-6.0]], -3.0)
     """
-    return CasadiModule(function)
+    return CasadiModule(function, own_derivatives)
 
 
 class CasadiModule(torch.nn.Module):
@@ -54,18 +57,22 @@ class CasadiModule(torch.nn.Module):
 
     Args:
         function: As in :func:`from_casadi`.
+        own_derivatives: As in :func:`from_casadi`.
 
     Raises:
         SignatureError: If the function is none.
+        ExportError: If it has no form in torch operators, and torch is to differentiate them.
     """
 
-    def __init__(self, function: ca.Function) -> None:
+    def __init__(self, function: ca.Function, own_derivatives: bool = True) -> None:
         super().__init__()
         if not isinstance(function, ca.Function):
             raise SignatureError(f"expected a casadi.Function, got {type(function).__name__}")
         if not function.n_in() or not function.n_out():
             raise SignatureError(f"{function}: at least one input and one output are needed")
-        self.batched = Batched(function)
+        self.batched, self.own_derivatives = Batched(function), own_derivatives
+        if not own_derivatives:
+            self.batched.check_walkable()
 
     def forward(self, *inputs: Tensor) -> Tensor | tuple[Tensor, ...]:
         """One tensor for each output, alone if there is one.
@@ -80,14 +87,17 @@ class CasadiModule(torch.nn.Module):
             raise SignatureError(f"{f}: {f.n_in()} tensors are needed, got {len(inputs)}")
         flat = [_nonzeros(f, i, x) for i, x in enumerate(inputs)]
         wide = [x.to(torch.float64) for x in flat]
-        if len({x.shape[:-1] for x in flat}) > 1:
+        walked = (
+            torch.compiler.is_exporting() or not self.own_derivatives
+        )  # an export records plain operators
+        if not walked and len({x.shape[:-1] for x in flat}) > 1:
             wide = [x.expand(*_batch(f, inputs, flat), x.shape[-1]) for x in wide]
         dtype = flat[0].dtype
         for x in flat[1:]:
             dtype = torch.promote_types(dtype, x.dtype)
-        # An export records plain operators.
-        exporting = torch.compiler.is_exporting()
-        results = self.batched.walk(wide) if exporting else _Call.apply(self.batched, *wide)
+        results = (
+            self.batched.walk(wide, _batch(f, inputs, flat)) if walked else _Call.apply(self.batched, *wide)
+        )
         outputs = tuple(_dense(f.sparsity_out(i), y).to(dtype) for i, y in enumerate(results))
         return outputs if len(outputs) > 1 else outputs[0]
 

@@ -5,24 +5,26 @@ import numpy as np
 from hybrid_mpc import write_csv
 
 MACHINE = """
-import torch
 from hybrid_mpc import BenchmarkBudget, BenchmarkSpec
-from hybrid_mpc import Prior
+from hybrid_mpc import MechanicalPrior
 from hybrid_mpc import DataSpec, Scenario
 from hybrid_mpc import Parameter, Signal
 
 
-class Cart(Prior):
+class Cart(MechanicalPrior):
     states = (Signal("s", "m"), Signal("v", "m/s"))
     inputs = (Signal("F", "N"),)
     outputs = (states[0],)
-    parameters_spec = (Parameter("k", 1.0, "N/kg/m", 0.2, 9.0), Parameter("d", 0.5, "1/s", 0.0, 2.0))
+    parameters = (Parameter("k", 1.0, "N/kg/m", 0.2, 9.0), Parameter("d", 0.5, "1/s", 0.0, 2.0))
 
-    def inertia(self, x):
+    def mass_matrix(self, q, p):
         return 1.0
 
-    def acceleration(self, x, u):
-        return u - self.k * x[..., 0:1] - self.d * x[..., 1:2]
+    def potential(self, q, p):
+        return p.k * q.s ** 2 / 2
+
+    def friction(self, q, v, p):
+        return p.d * v.v
 
 
 scenario = Scenario(

@@ -51,7 +51,6 @@ TORCH = (
     "hybrid_mpc/identify/",
     "scenarios/paper/sindy.py",
     "scenarios/paper/step.py",
-    "scenarios/paper/swarm.py",
 )
 # rooms that run beside a machine and so must not even import torch lazily
 ONLINE = ("model", "estimate", "control", "loop", "monitor", "analyze", "kit", "plots", "report")

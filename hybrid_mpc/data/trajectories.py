@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -43,6 +43,7 @@ class Trajectory:
         y: Measured outputs ``(n, n_y)``, interpolated to the grid and not smoothed.
         x: States ``(n, n_x)``, ``[q, v]`` smoothed.
         xdot: Derivatives of the states ``(n, n_x)``, ``[v, v_dot]`` smoothed.
+        w: Measured disturbances ``(n, n_w)``. Default: none.
     """
 
     name: str
@@ -53,6 +54,11 @@ class Trajectory:
     y: Array
     x: Array
     xdot: Array
+    w: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+    def __post_init__(self) -> None:
+        if not self.w.size:
+            object.__setattr__(self, "w", np.zeros((len(self.t), 0)))
 
     @property
     def file(self) -> str:
@@ -69,7 +75,7 @@ class Trajectory:
             name: New name. Default: as before.
             role: New role. Default: as before.
         """
-        arrays = {key: getattr(self, key)[keep] for key in ("t", "u", "y", "x", "xdot")}
+        arrays = {key: getattr(self, key)[keep] for key in ("t", "u", "y", "x", "xdot", "w")}
         own = (self.name if name is None else name), (self.role if role is None else role)
         return replace(self, name=own[0], role=own[1], **arrays)
 

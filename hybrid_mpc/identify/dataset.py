@@ -17,12 +17,13 @@ from hybrid_mpc.errors import InputError
 class Windows:
     """Equal windows cut from trajectories [SI]: a warm-up of ``warm`` samples on measurements, then a scored part.
 
-    States ``x`` are ``(n, warm + horizon + 1, n_x)``; inputs ``u`` and the states' derivatives ``xdot`` at the
-    periods' starts ``(n, warm + horizon, ...)``.
+    States ``x`` are ``(n, warm + horizon + 1, n_x)``; inputs ``u``, disturbances ``w`` and the states' derivatives
+    ``xdot`` at the periods' starts ``(n, warm + horizon, ...)``.
     """
 
     x: Tensor
     u: Tensor
+    w: Tensor
     warm: int
     xdot: Tensor
 
@@ -37,21 +38,24 @@ class Windows:
     def take(self, index: Tensor) -> Windows:
         """The windows of ``index``."""
         index = index.to(self.x.device)
-        return Windows(self.x[index], self.u[index], self.warm, self.xdot[index])
+        return Windows(self.x[index], self.u[index], self.w[index], self.warm, self.xdot[index])
 
     def to(self, device: torch.device) -> Windows:
         """The same windows on a device."""
-        return Windows(self.x.to(device), self.u.to(device), self.warm, self.xdot.to(device))
+        return Windows(
+            self.x.to(device), self.u.to(device), self.w.to(device), self.warm, self.xdot.to(device)
+        )
 
 
 def cut_windows(trajectories: Sequence[Trajectory], warm: int, horizon: int, stride: int) -> Windows:
     """Windows of ``warm + horizon`` periods, every ``stride`` samples, from every trajectory long enough."""
-    x, u, xdot, length = [], [], [], warm + horizon
+    x, u, w, xdot, length = [], [], [], [], warm + horizon
     for trajectory in trajectories:
         _check_finite(trajectory)
         for start in range(0, len(trajectory.t) - length, stride):
             x.append(trajectory.x[start : start + length + 1])
             u.append(trajectory.u[start : start + length])
+            w.append(trajectory.w[start : start + length])
             xdot.append(trajectory.xdot[start : start + length])
     if not x:
         longest = max((len(t.t) for t in trajectories), default=0)
@@ -60,8 +64,8 @@ def cut_windows(trajectories: Sequence[Trajectory], warm: int, horizon: int, str
             f"{warm} warm-up and {horizon} scored periods needs {length + 1}. Record longer runs or lower "
             "warm_up."
         )
-    x_all, u_all, xdot_all = (torch.tensor(np.stack(parts)) for parts in (x, u, xdot))
-    return Windows(x_all, u_all, warm, xdot_all)
+    x_all, u_all, w_all, xdot_all = (torch.tensor(np.stack(parts)) for parts in (x, u, w, xdot))
+    return Windows(x_all, u_all, w_all, warm, xdot_all)
 
 
 def fitting_horizon(trajectories: Sequence[Trajectory], warm: int, most: int) -> int:
@@ -81,7 +85,7 @@ def check_rates(trajectories: Sequence[Trajectory]) -> None:
         _check_finite(trajectory, ("xdot",))
 
 
-def _check_finite(trajectory: Trajectory, names: Sequence[str] = ("x", "u")) -> None:
+def _check_finite(trajectory: Trajectory, names: Sequence[str] = ("x", "u", "w")) -> None:
     for name in names:
         bad = np.flatnonzero(~np.isfinite(getattr(trajectory, name)).all(axis=1))
         if len(bad):

@@ -8,8 +8,9 @@ from dataclasses import replace
 
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.identify.smooth import Smoother
 
+NONE = 0.05
+"""Share of a period below which a delay counts as none."""
 TINY = 1e-9
 """Share of a period below which the part of a delay beyond whole periods counts as none."""
 
@@ -41,14 +42,6 @@ def lost_samples(delay: float, dt: float) -> int:
     """Samples at the start of a trajectory whose acting input is not known; none without a delay."""
     whole, rest = _split(delay, dt) if delay else (0, 0.0)
     return whole + (rest > 0)
-
-
-def with_states(trajectories: Sequence[Trajectory], smoother: Smoother, delay: float) -> list[Trajectory]:
-    """Trajectories with smoothed states but the inputs as they were commanded, without the samples a delay costs."""
-    made = []
-    for t, s in zip(trajectories, smoother.smooth(shifted(trajectories, delay)), strict=True):
-        made.append(replace(t.part(slice(len(t.t) - len(s.t), None)), x=s.x, xdot=s.xdot))
-    return made
 
 
 def _split(delay: float, dt: float) -> tuple[int, float]:

@@ -14,7 +14,7 @@ from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.identify.smooth import Smoother
 from hybrid_mpc.identify.step import Step
 from hybrid_mpc.identify.train import Trained
-from hybrid_mpc.machine.torch_prior import Prior
+from hybrid_mpc.machine.prior import Prior
 
 Array = NDArray[np.float64]
 STARTS = 5
@@ -26,8 +26,8 @@ class FreeRun:
     """A free run over one trajectory after its warm-up, and the measurement; n scored periods.
 
     ``x`` are the measured, smoothed states, ``y`` the measured outputs, not smoothed; ``xdot`` and ``xdot_hat`` are
-    mean rates over each period. ``energy_measured_w`` is ΔE_S, the prior's balance on the measurement,
-    ``energy_model_w`` ΔE_M on the model's own run.
+    mean rates over each period. ``energy_measured_w`` is ΔE_S, the residual of the prior's first balance on the
+    measurement, ``energy_model_w`` ΔE_M on the model's own run; NaN for a prior without balances.
     """
 
     name: str
@@ -130,18 +130,18 @@ def model_states(
     h0 = step.h0 if h0 is None else h0
     longest = max(len(t.t) for t in trajectories)
     h = h0.expand(*h0.shape[:-2], len(trajectories), h0.shape[-1])
-    x_all, u_all = (
+    x_all, u_all, w_all = (
         torch.tensor(np.stack([_padded(getattr(t, key), longest) for t in trajectories]))
-        for key in ("x", "u")
+        for key in ("x", "u", "w")
     )
-    x_all, u_all = (a.expand(*h.shape[:-2], *a.shape) for a in (x_all, u_all))
+    x_all, u_all, w_all = (a.expand(*h.shape[:-2], *a.shape) for a in (x_all, u_all, w_all))
     with torch.no_grad():
         for k in range(warm):
-            _, h = step(x_all[..., k, :], h, u_all[..., k, :])
+            _, h = step(x_all[..., k, :], h, u_all[..., k, :], w_all[..., k, :])
         x = x_all[..., warm, :]
         states = [x]
         for k in range(warm, longest):
-            x, h = step(x, h, u_all[..., k, :])
+            x, h = step(x, h, u_all[..., k, :], w_all[..., k, :])
             states.append(x)
     x_hat: Array = torch.stack(states, -2).numpy()
     return x_hat
@@ -161,13 +161,16 @@ def score(runs: Sequence[FreeRun]) -> Scores:
 def _free_run(prior: Prior, trajectory: Trajectory, x_hat: Array, warm: int) -> FreeRun:
     n, dt = len(trajectory.t) - warm - 1, trajectory.dt
     part = slice(warm, warm + n)
-    u, x = trajectory.u[part], trajectory.x[part]
+    u, w, x = trajectory.u[part], trajectory.w[part], trajectory.x[part]
     xdot, xdot_hat = np.diff(trajectory.x[warm:], axis=0) / dt, np.diff(x_hat[: n + 1], axis=0) / dt
-    x_t, xdot_t, u_t, x_hat_t, xdot_hat_t = (torch.tensor(a) for a in (x, xdot, u, x_hat[:n], xdot_hat))
-    with torch.no_grad():
-        measured = prior.energy_balance(x_t, xdot_t, u_t).numpy()
-        model = prior.energy_balance(x_hat_t, xdot_hat_t, u_t).numpy()
-        y_hat = prior.output(x_hat_t, u_t).numpy()
+    equations, held = prior.equations, (u.T, w.T, prior.p)
+    y_hat = equations.output(x_hat[:n].T, *held).full().T
+    measured, model = (
+        equations.balances[0].residual(*(z.T for z in point), *held).full()[0]
+        if equations.balances
+        else np.full(n, np.nan)
+        for point in ((x, xdot), (x_hat[:n], xdot_hat))
+    )
     return FreeRun(
         trajectory.name, trajectory.t[part], u, x, x_hat[:n], trajectory.y[part], y_hat, xdot, xdot_hat,
         measured, model,

@@ -1,318 +1,391 @@
-"""Fit of a prior's parameters to states: equation error, output error over free runs, multiple shooting.
+"""Fit of a prior to measured outputs: multiple shooting with free first states, exact derivatives, a robust loss.
 
-Residuals are errors of free runs over the states' spread, with exact derivatives: forward sensitivities of all windows
-in one call (:mod:`~hybrid_mpc.identify.simulation`).
+Recordings are cut into windows. The state at the start of each is an unknown that is eliminated from every
+Gauss-Newton step, so that no measured state is taken for exact and states that no sensor sees need no measurement.
+All windows and all directions are one batch of array operations (:mod:`~hybrid_mpc.identify.simulation`).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, TypeAlias
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import Literal, TypeAlias
 
+import casadi as ca
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.stats import qmc
 
 from hybrid_mpc.data import scales
 from hybrid_mpc.data.scales import evenly
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.identify.dataset import Windows, cut_windows
+from hybrid_mpc.identify.delay import NONE, shifted
 from hybrid_mpc.identify.prior_result import PriorFit
-from hybrid_mpc.identify.simulation import Simulation, traced
-from hybrid_mpc.identify.step import required_substeps
-from hybrid_mpc.machine.torch_prior import Prior
+from hybrid_mpc.identify.simulation import Simulation, required_substeps
+from hybrid_mpc.identify.smooth import Smoother, fit_smoother, unseen_states
+from hybrid_mpc.machine.prior import Equations, Prior
 
 Array = NDArray[np.float64]
+LENGTHS = (0.5, 2.0, 5.0)
+"""Lengths of the windows [the machine's seconds, :func:`~hybrid_mpc.data.scales.time_unit`], one after the other: short
+ones have one optimum, long ones are what counts."""
+WINDOWS = 48
+"""Windows of a length at most, evenly chosen."""
+ITERATIONS = 25
+"""Gauss-Newton steps of a length at most."""
+FIRST = 4
+"""Steps at most before outputs and outliers are weighed by what is left of them."""
+STARTS = 6
+"""Starts between the bounds that are tried over the shortest windows, beside the nominal values."""
+START_ITERATIONS = 6
+"""Gauss-Newton steps from each start before the best is taken on."""
+OUTLIERS = 3.0
+"""Residuals beyond this many robust standard deviations count by their size, not by its square."""
 LARGEST = 1e3
 """Residuals beyond this many spreads of the data count as much: a free run that diverges stays finite."""
+CONVERGED = 0.01
+"""A step that takes off less than this share of a window's mean cost ends a fit: it is some hundredth of a standard
+error, if the windows are independent."""
+AT_BOUND = 1e-3
+"""Share of its range within which a parameter counts as at its bound."""
+UNKNOWN = 1e-6
+"""Ratio of singular values below which a combination of parameters is not identified."""
+Progress = Callable[[int, int, str], None]
+Slopes: TypeAlias = Literal["", "x", "all"]
+"""Which derivatives are asked for: none, by the first states, by the parameters too."""
 
 
-class ParameterFit:
-    """A prior's free parameters ``theta``, each over its nominal size, and the residuals that are fitted."""
+@dataclass(frozen=True)
+class OutputWindows:
+    """Windows of recordings: ``y`` ``(n, T + 1, n_y)`` with NaN where nothing was measured, ``u`` ``(n, lead + T + 1,
+    n_u)``, of which the first ``lead`` come before the window, ``w`` ``(n, T + 1, n_w)``, a guess ``x`` ``(n, n_x)`` of
+    the first state, and which samples are censored ``(n, T + 1, n_y)``.
+    """
 
-    def __init__(self, make: Callable[..., Prior], dt: float) -> None:
-        self.make, self.prior, self.dt = make, make(), dt
-        self.free = [p for p in self.prior.parameters_spec if not p.fixed]
-        self.unit = np.array([abs(p.value) if p.value else (p.upper - p.lower) for p in self.free])
-        self.nominal = np.array([p.value for p in self.free]) / self.unit
-        self.lower = np.array([p.lower for p in self.free]) / self.unit
-        self.upper = np.array([p.upper for p in self.free]) / self.unit
+    y: Array
+    u: Array
+    w: Array
+    x: Array
+    censored: Array
+    lead: int
 
-    @cached_property
-    def simulation(self) -> Simulation:
-        """Free runs of the prior, with derivatives by the free parameters."""
-        names = [p.name for p in self.prior.parameters_spec]
-        return Simulation(traced(self.prior), self.dt, [names.index(p.name) for p in self.free])
+    @property
+    def periods(self) -> int:
+        """Periods T of a window."""
+        return self.y.shape[1] - 1
+
+
+def cut_outputs(trajectories: Sequence[Trajectory], periods: int, lead: int, most: int) -> OutputWindows:
+    """At most ``most`` windows of ``periods``, one behind the other, evenly chosen.
+
+    Raises:
+        InputError: If no trajectory is long enough.
+    """
+    starts = [(t, k) for t in trajectories for k in range(lead, len(t.t) - periods, periods)]
+    if not starts:
+        longest = max((len(t.t) for t in trajectories), default=0)
+        raise InputError(
+            f"no recording is long enough: the longest has {longest} samples, a free run of {periods} periods with "
+            f"{lead} samples before it needs {periods + lead + 1}"
+        )
+    chosen = [starts[i] for i in evenly(len(starts), most)]
+
+    def cut(key: str, before: int) -> Array:
+        return np.stack([getattr(t, key)[k - before : k + periods + 1] for t, k in chosen])
+
+    censored = [getattr(t, "censored", np.zeros(t.y.shape)) for t, _ in chosen]
+    return OutputWindows(
+        cut("y", 0), cut("u", lead), cut("w", 0), np.stack([t.x[k] for t, k in chosen]),
+        np.stack([c[k : k + periods + 1] for c, (_, k) in zip(censored, chosen, strict=True)]), lead,
+    )  # fmt: skip
+
+
+class OutputFit:
+    """A prior's free parameters and its input's delay ``theta``, each over its size, and their fit to windows.
+
+    Args:
+        make: Prior class or factory ``(values=None) -> Prior``.
+        dt: Model period [s].
+        largest_delay: Longest delay [s] of the inputs. Default 0: it is not fitted.
+    """
+
+    def __init__(self, make: Callable[..., Prior], dt: float, largest_delay: float = 0.0) -> None:
+        self.make, self.prior, self.dt, self.largest = make, make(), dt, largest_delay
+        self.free = [p for p in self.prior.parameters if not p.fixed]
+        late = [dt] if largest_delay else []
+        own = [abs(p.value) if p.value else (p.upper - p.lower) for p in self.free]
+        self.unit = np.array([*own, *late])
+        self._simulations: dict[tuple[int, ...], Simulation] = {}
+        self.nominal = (
+            np.array([*(p.value for p in self.free), *(0.5 * largest_delay for _ in late)]) / self.unit
+        )
+        self.lower = np.array([*(p.lower for p in self.free), *(0.0 for _ in late)]) / self.unit
+        self.upper = np.array([*(p.upper for p in self.free), *(largest_delay for _ in late)]) / self.unit
+
+    @property
+    def names(self) -> list[str]:
+        """Names of what is fitted."""
+        return [*(p.name for p in self.free), *(["delay"] if self.largest else [])]
+
+    @property
+    def lead(self) -> int:
+        """Samples before a window that its delayed inputs may need."""
+        return math.ceil(self.largest / self.dt) + 1 if self.largest else 0
 
     def values(self, theta: Array) -> dict[str, float]:
-        """Values [SI] of all parameters by name, fixed ones included."""
-        fitted = {p.name: float(v) for p, v in zip(self.free, theta * self.unit, strict=True)}
+        """Values [their units] of all parameters by name, fixed ones included."""
+        fitted = {p.name: float(v) for p, v in zip(self.free, theta * self.unit, strict=False)}
         return {**self.prior.values, **fitted}
 
-    def scaled(self, values: Mapping[str, float]) -> Array:
-        """The free ones of ``values`` [SI] as ``theta``."""
-        return np.array([values[p.name] for p in self.free]) / self.unit
+    def scaled(self, values: Mapping[str, float], delay: float = 0.0) -> Array:
+        """Values [their units] by name, and the delay [s], as ``theta``."""
+        own = [values[p.name] for p in self.free]
+        return np.array([*own, *([delay] if self.largest else [])]) / self.unit
 
-    def inside(self, theta: Array) -> Array:
-        """``theta`` just within its bounds: a start on one would stall a trust-region reflective search."""
-        return np.clip(theta, self.lower + 1e-6, self.upper - 1e-6)
-
-    def equation_error(self, windows: Windows) -> tuple[Array, Any]:
-        """Fit from the nominal values to windows of one period: the state a period later is all there is."""
-        return self.output_error(self.nominal, windows, 40)
-
-    def output_error(self, start: Array, windows: Windows, evaluations: int) -> tuple[Array, Any]:
-        """Fit from ``start`` to free runs over the windows, each from its first measured state.
-
-        Gives ``theta`` and the Jacobian of the residuals over their standard deviation.
-        """
-        substeps = self.substeps(start)
-        result = least_squares(
-            lambda theta: self.residual(theta, windows, substeps),
-            self.inside(start),
-            jac=lambda theta: self.slope(theta, windows, substeps),
-            bounds=(self.lower, self.upper),
-            loss="soft_l1",
-            max_nfev=evaluations,
-        )
-        return result.x, result.jac / np.sqrt(max(2 * result.cost / max(1, result.fun.size), 1e-30))
-
-    def jacobian(self, theta: Array, windows: Windows) -> Array:
-        """Jacobian at ``theta`` of the residuals over their standard deviation, for :meth:`confidence`."""
-        substeps = self.substeps(theta)
-        residual, slope = (f(theta, windows, substeps) for f in (self.residual, self.slope))
-        return np.asarray(slope / max(float(np.sqrt(np.mean(residual**2))), 1e-15))
-
-    def error(self, theta: Array, windows: Windows) -> float:
-        """Mean absolute error of free runs over the windows [spreads of the data]; infinite if one diverges."""
-        residual = self.residual(theta, windows, self.substeps(theta))
-        return float(np.abs(residual).mean()) if np.isfinite(residual).all() else float("inf")
-
-    def confidence(self, theta: Array, jacobian: Any) -> tuple[dict[str, float], list[str]]:
-        """Standard errors [SI] by name and warnings, from a Jacobian as the fits return it."""
-        if jacobian is None:
-            return {}, ["no fit improved on the nominal parameters"]
-        warnings = []
-        _, singular, rows = np.linalg.svd(jacobian, full_matrices=False)
-        if singular[-1] < 1e-6 * singular[0]:
-            names = [p.name for p, w in zip(self.free, np.abs(rows[-1]), strict=True) if w > 0.2]
-            warnings.append(f"the data cannot tell apart: {', '.join(names)}")
-        errors = np.sqrt(np.diag(covariance_of(singular, rows))) * self.unit
-        for p, value, low, high in zip(self.free, theta, self.lower, self.upper, strict=True):
-            if min(value - low, high - value) < 1e-3 * (high - low):
-                warnings.append(f"{p.label} ends at a bound ({value * abs(p.value or 1):.4g})")
-        return {p.name: float(e) for p, e in zip(self.free, errors, strict=True)}, warnings
-
-    def correlations(self, jacobian: Any) -> dict[str, float]:
-        """Correlation of the errors of every two fitted parameters, by ``"a, b"``."""
-        if jacobian is None:
-            return {}
-        _, singular, rows = np.linalg.svd(jacobian, full_matrices=False)
-        return correlations([p.name for p in self.free], covariance_of(singular, rows))
+    def delay(self, theta: Array) -> float:
+        """Delay [s]; none where it is too short to count."""
+        found = float(theta[-1] * self.unit[-1]) if self.largest else 0.0
+        return found if found >= NONE * self.dt else 0.0
 
     def substeps(self, theta: Array) -> int:
         """Sub-steps a period that the stiffness at ``theta`` asks for."""
         return required_substeps(self.make(self.values(theta)), self.dt)
 
-    def parameters(self, theta: Array) -> Array:
-        """Values [SI] of all parameters in the order of the specification, for each row of ``theta``."""
-        rows = np.atleast_2d(theta)
-        every = np.tile(list(self.prior.values.values()), (len(rows), 1))
-        every[:, self.simulation.free] = rows * self.unit
-        return every[0] if theta.ndim == 1 else every
+    def outputs(
+        self, theta: Array, x: Array, windows: OutputWindows, substeps: int, slopes: Slopes
+    ) -> tuple[Array, Array, Array]:
+        """Outputs ``(n, T + 1, n_y)`` of free runs from ``x``, and their derivatives by ``theta`` and ``x``.
 
-    def residual(self, theta: Array, windows: Windows, substeps: int) -> Array:
-        """Errors of all states of all free runs over the states' spread, as one vector."""
-        x = self.simulation.states(
-            windows.x[:, 0].numpy(), windows.u.numpy(), self.parameters(theta), substeps
+        Derivatives by ``theta`` have no columns if only those by ``x`` are asked for; there are none without slopes.
+        """
+        n, periods = len(x), windows.periods
+        p = np.append(self._parameters(theta), 0.0)  # the last is a small change of the delay
+        u, w = self._acting(theta, windows), windows.w
+        free = self._free if slopes == "all" else []
+        simulation = self._simulation(tuple(free))
+        given = x, u[:, :periods], w[:, :periods], p, substeps
+        states, by_p, by_x = simulation.by_all(*given) if slopes else (simulation.states(*given), None, None)
+        held = (v.reshape(n * (periods + 1), -1).T for v in (states, u, w))
+        count = n * (periods + 1)
+        y, c, d = (
+            v.full().reshape(v.shape[0], count, -1).swapaxes(0, 1)
+            for v in _outputs(self.prior.equations, count)(*held, p[:-1])
         )
-        return np.clip(_errors(x, windows), -LARGEST, LARGEST).ravel()
+        y = y.reshape(n, periods + 1, -1)
+        if by_p is None or by_x is None:
+            return y, np.zeros(0), np.zeros(0)
+        c, d = (v.reshape(n, periods + 1, y.shape[-1], -1) for v in (c, d))
+        d = np.concatenate([d, np.zeros((*d.shape[:-1], 1))], axis=-1)[..., free]
+        return y, (c @ by_p + d) * self.unit[: len(free)], c @ by_x
 
-    def slope(self, theta: Array, windows: Windows, substeps: int) -> Array:
-        """Jacobian of :meth:`residual`; zero where that is at its limit."""
-        x, by_p = self.simulation.by_parameters(
-            windows.x[:, 0].numpy(), windows.u.numpy(), self.parameters(theta), substeps
-        )
-        beyond = np.abs(_errors(x, windows)) > LARGEST
-        slope = by_p[:, 1:] / spread_of(windows)[:, None] * self.unit
-        return np.where(beyond[..., None], 0.0, slope).reshape(-1, len(self.unit))
+    @cached_property
+    def _free(self) -> list[int]:
+        """Places in ``p``, with the delay behind the parameters, of what is fitted."""
+        every = [*(p.name for p in self.prior.parameters), "delay"]
+        return [every.index(name) for name in self.names]
 
+    def _simulation(self, free: tuple[int, ...]) -> Simulation:
+        if free not in self._simulations:
+            self._simulations[free] = Simulation(_delayed(self.prior.equations.xdot), self.dt, free)
+        return self._simulations[free]
 
-def _errors(x: Array, windows: Windows) -> Array:
-    return np.asarray((x[:, 1:] - windows.x[:, 1:].numpy()) / spread_of(windows))
+    def _parameters(self, theta: Array) -> Array:
+        return np.array(list(self.values(theta).values()))
 
+    def _acting(self, theta: Array, windows: OutputWindows) -> Array:
+        """Inputs ``(n, T + 1, 2 n_u)`` that act, means over each period, and their derivative by the delay."""
+        n, first = windows.y.shape[1], windows.lead
+        if not self.largest:
+            u = windows.u[:, first : first + n]
+            return np.concatenate([u, np.zeros_like(u)], axis=-1)
+        delay = float(theta[-1] * self.unit[-1]) / self.dt
+        whole = min(math.floor(delay), first - 1)
+        younger, older = (windows.u[:, first - whole - k : first - whole - k + n] for k in (0, 1))
+        share = delay - whole
+        return np.concatenate([(1 - share) * younger + share * older, (older - younger) / self.dt], axis=-1)
 
-def spread_of(windows: Windows) -> Array:
-    """Standard deviation of each state over all windows ``(n_x,)`` [SI]: the unit of all residuals."""
-    return np.asarray(windows.x.reshape(-1, windows.x.shape[-1]).std(0).clamp_min(1e-9).numpy())
+    def fit(
+        self, theta: Array, windows: OutputWindows, sizes: Array, iterations: int, *, fixed: bool = False
+    ) -> Fitted:
+        """Fit ``theta`` and the first states to windows, by Levenberg-Marquardt with the states eliminated.
 
-
-def covariance_of(singular: Array, rows: Array) -> Array:
-    """Covariance of the parameters, from singular values and right vectors of a Jacobian over its noise."""
-    return np.asarray((rows.T / np.maximum(singular, 1e-12 * singular[0]) ** 2) @ rows)
-
-
-def correlations(names: Sequence[str], covariance: Array) -> dict[str, float]:
-    """Correlation of the errors of every two parameters, by ``"a, b"``."""
-    sigma = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    return {
-        f"{names[i]}, {names[j]}": float(covariance[i, j] / (sigma[i] * sigma[j]))
-        for i in range(len(names))
-        for j in range(i + 1, len(names))
-    }
-
-
-MOST_SEGMENTS = 60
-"""Unknown states grow with the segments, and the time of a step with their cube."""
-CONTINUITY = (1.0, 10.0, 100.0)
-"""Weights, one after the other, of the gaps between segments: first they may gape, in the end they are closed to a
-ten-thousandth of a measurement's share."""
-EVALUATIONS = 15
+        ``sizes`` ``(n_x,)`` are the states' natural ones: the first states keep to their guess as if it were known to
+        that. ``fixed`` fits the first states alone.
+        """
+        problem = _Shooting(self, windows, sizes, self.substeps(np.clip(theta, self.lower, self.upper)))
+        return problem.solve(np.clip(theta, self.lower, self.upper), iterations, fixed)
 
 
 @dataclass(frozen=True)
-class Segments:
-    """Adjacent segments of trajectories; ``joined`` ``(n,)`` is true where a segment's end is the next one's start."""
+class Fitted:
+    """What a fit to windows found: ``theta`` with its covariance, and names of what the windows do not identify.
 
-    windows: Windows
-    joined: NDArray[np.bool_]
-
-
-def cut_segments(trajectories: Sequence[Trajectory], periods: int, most: int = MOST_SEGMENTS) -> Segments:
-    """Adjacent segments of ``periods``, of evenly chosen trajectories if there are more than ``most``."""
-    counts = [(len(t.t) - 1) // periods for t in trajectories]
-    fitting = [i for i, count in enumerate(counts) if count]
-    if not fitting:
-        raise InputError(
-            f"multiple shooting: no trajectory holds a segment of {periods} periods; the longest has "
-            f"{max((len(t.t) for t in trajectories), default=0)} samples. Take shorter segments or longer runs."
-        )
-    take = max(1, min(len(fitting), most // max(counts)))
-    chosen = [fitting[i] for i in evenly(len(fitting), take)]
-    parts, joined = [], []
-    for i in chosen:
-        n = min(counts[i], most)
-        parts.append(cut_windows([trajectories[i]], 0, periods, periods).take(torch.arange(n)))
-        joined += [True] * (n - 1) + [False]
-    x, u, xdot = (torch.cat([getattr(p, name) for p in parts]) for name in ("x", "u", "xdot"))
-    whole = Windows(x, u, 0, xdot)
-    return Segments(whole, np.array(joined))
-
-
-def multiple_shooting(fit: ParameterFit, start: Array, segments: Segments) -> tuple[Array, Array]:
-    """Fit parameters and the state at the start of every segment together.
-
-    Residuals, in spreads of the data: the measured states along each segment, those at the start of a trajectory, and
-    the gaps between segments times a weight that grows (``CONTINUITY``). With all gaps closed a trajectory is one free
-    run from an unknown state: no measured state is taken for exact, while free runs from measured ones carry their
-    noise along. Derivatives are exact (forward mode through the integrator).
-
-    Gives ``theta`` and the Jacobian by it with the states projected out, over the residuals' standard deviation: the
-    standard errors made of it know that the states are unknown.
-
-    Source: Bock, *Recent advances in parameter identification techniques for O.D.E.* (1983).
+    ``error`` is the root mean square of the outputs' errors, each over its spread.
     """
-    problem = _Problem(fit, segments, start)
-    z = np.concatenate([fit.inside(start), problem.measured.ravel()])
-    free = np.full(problem.measured.size, np.inf)
-    bounds = np.concatenate([fit.lower, -free]), np.concatenate([fit.upper, free])
-    result: Any = None
-    for weight in CONTINUITY:
-        z = np.concatenate([fit.inside(z[: len(start)]), z[len(start) :]])
-        result = least_squares(
-            lambda z, w=weight: problem.residual(z, w),
-            z,
-            jac=lambda z, w=weight: problem.jacobian(z, w),
-            bounds=bounds,
-            max_nfev=EVALUATIONS,
+
+    theta: Array
+    covariance: Array
+    unidentified: tuple[str, ...]
+    error: float = math.nan
+
+
+class _Shooting:
+    """Windows of outputs as a least-squares problem over ``theta`` and the first states."""
+
+    def __init__(self, fit: OutputFit, windows: OutputWindows, sizes: Array, substeps: int) -> None:
+        self.own, self.windows, self.sizes, self.substeps = fit, windows, sizes, substeps
+        y = windows.y
+        self.seen = np.isfinite(y)
+        self.spread = np.array(
+            [float(np.std(c[np.isfinite(c)])) or 1.0 for c in y.reshape(-1, y.shape[-1]).T]
         )
-        z = result.x
-    n = len(start)
-    own, states = result.jac[:, :n], np.linalg.qr(result.jac[:, n:])[0]
-    degrees = max(1, problem.measurements - n)
-    noise = np.sqrt(max(2 * result.cost / degrees, 1e-30))
-    return z[:n], (own - states @ (states.T @ own)) / noise
+        self.scale, self.outlier = self.spread, math.inf
 
-
-class _Problem:
-    """Residuals of multiple shooting over ``z = [theta, states in spreads]``, and their Jacobian."""
-
-    def __init__(self, fit: ParameterFit, segments: Segments, near: Array) -> None:
-        self.fit, self.joined = fit, np.flatnonzero(segments.joined)
-        # the start of a segment that follows another is measured as that one's end
-        self.first = np.setdiff1d(np.arange(len(segments.joined)), self.joined + 1)
-        self.spread = spread_of(segments.windows)
-        self.u = segments.windows.u.numpy()
-        scaled = segments.windows.x.numpy() / self.spread
-        self.measured, self.later = scaled[:, 0], scaled[:, 1:]
-        self.measurements = self.later.size
-        self.substeps = fit.substeps(near)
-
-    def residual(self, z: Array, weight: float) -> Array:
-        theta, nodes = self._split(z)
-        p, simulation = self.fit.parameters(theta), self.fit.simulation
-        ahead = simulation.states(nodes * self.spread, self.u, p, self.substeps)[:, 1:] / self.spread
-        errors = _limited(ahead - self.later)
-        gaps = _limited(ahead[:, -1])[self.joined] - nodes[self.joined + 1]
-        starts = (nodes - self.measured)[self.first]
-        return np.concatenate([errors.ravel(), starts.ravel(), weight * gaps.ravel()])
-
-    def jacobian(self, z: Array, weight: float) -> Array:
-        theta, nodes = self._split(z)
-        n_x = nodes.shape[1]
-        _, by_p, by_x = self.fit.simulation.by_all(
-            nodes * self.spread, self.u, self.fit.parameters(theta), self.substeps
+    def residual(self, theta: Array, x: Array, slopes: Slopes) -> tuple[Array, Array, Array]:
+        """Errors ``(n, (T + 1) n_y)`` over their scale, zero where nothing was measured; their derivatives."""
+        windows, n = self.windows, len(x)
+        y, by_theta, by_x = self.own.outputs(theta, x, windows, self.substeps, slopes)
+        error = np.nan_to_num(y, nan=np.inf) - np.where(self.seen, windows.y, 0.0)
+        beyond = (windows.censored != 0) & (windows.censored * error > 0)
+        error, counts = error / self.scale, self.seen & ~beyond
+        inside = counts & (np.abs(error) < LARGEST * self.spread / self.scale)
+        limit = LARGEST * self.spread / self.scale
+        error = np.where(counts, np.clip(error, -limit, limit), 0.0).reshape(n, -1)
+        if not slopes:
+            return error, by_theta, by_x
+        by_theta, by_x = (
+            np.where(inside[..., None], v / self.scale[:, None], 0.0).reshape(n, error.shape[1], -1)
+            for v in (by_theta, by_x)
         )
-        by_theta, by_node = (
-            np.clip(
-                np.nan_to_num(s[:, 1:] / self.spread[:, None], nan=0.0, posinf=0.0, neginf=0.0), -1e6, 1e6
-            )
-            for s in (by_p * self.fit.unit, by_x * self.spread)
+        return error, np.nan_to_num(by_theta), np.nan_to_num(by_x * self.sizes)
+
+    def cost(self, error: Array, moved: Array) -> float:
+        """Robust sum of squares, and what the first states moved from their guess, in their sizes."""
+        c2 = self.outlier**2
+        own = np.square(error) if math.isinf(c2) else 2 * c2 * (np.sqrt(1 + np.square(error) / c2) - 1)
+        return float(own.sum() + np.square(moved).sum())
+
+    def rescaled(self, error: Array) -> None:
+        """Scale each output by what is left of it, robustly: outputs of any unit count alike, outliers little."""
+        shape = self.windows.y.shape
+        own = error.reshape(shape) * self.scale
+        left = [np.abs(own[..., j][self.seen[..., j]]) for j in range(shape[-1])]
+        robust = np.array([1.4826 * float(np.median(v)) if len(v) else 0.0 for v in left])
+        whole = np.array([float(np.sqrt(np.mean(v**2))) if len(v) else 0.0 for v in left])
+        robust = np.maximum(robust, 0.1 * whole)  # where most samples are met exactly, the rest is no outlier
+        self.scale = np.maximum(robust, 1e-9 * self.spread)
+        self.outlier = OUTLIERS
+
+    def solve(self, theta: Array, iterations: int, fixed: bool) -> Fitted:
+        x, n_theta = self.windows.x.copy(), 0 if fixed else len(theta)
+        guess, damping = x.copy(), 1e-3
+        slopes: Slopes = "x" if fixed else "all"
+        for stage in range(1 if fixed else 2):  # by the spreads, then by what is left
+            error, by_theta, by_x = self.residual(theta, x, slopes)
+            if stage:
+                self.rescaled(error)
+                error, by_theta, by_x = self.residual(theta, x, slopes)
+            cost = self.cost(error, (x - guess) / self.sizes)
+            for _ in range(iterations if stage or fixed else min(iterations, FIRST)):
+                normal = self._normal(error, by_theta[..., :n_theta], by_x, (x - guess) / self.sizes)
+                better = False
+                for _ in range(6):
+                    step, moved = self._step(normal, damping, theta, n_theta)
+                    if self._promised(normal, step[:n_theta], moved) < CONVERGED * cost / len(x):
+                        break
+                    trial = np.clip(theta + step, self.own.lower, self.own.upper)
+                    x_trial = x + moved * self.sizes
+                    tried, _, _ = self.residual(trial, x_trial, "")
+                    new = self.cost(tried, (x_trial - guess) / self.sizes)
+                    if new < cost:
+                        better = True
+                        damping = max(damping / 5, 1e-9)
+                        break
+                    damping = min(damping * 5, 1e9)
+                if not better:
+                    break
+                gain, theta, x, cost = cost - new, trial, x_trial, new
+                if gain < CONVERGED * cost / len(x):
+                    break
+                error, by_theta, by_x = self.residual(theta, x, slopes)
+        error, by_theta, by_x = self.residual(theta, x, slopes)
+        covariance, unidentified = self._covariance(error, by_theta[..., :n_theta], by_x)
+        count = max(1, int(self.seen.sum()))
+        over = error.reshape(self.windows.y.shape) * self.scale / self.spread
+        return Fitted(theta, covariance, unidentified, float(np.sqrt(np.square(over).sum() / count)))
+
+    def _weighted(self, error: Array, *slopes: Array) -> tuple[Array, ...]:
+        root = (1 + np.square(error / self.outlier)) ** -0.25
+        return root * error, *(root[..., None] * s for s in slopes)
+
+    def _normal(self, error: Array, by_theta: Array, by_x: Array, moved: Array) -> tuple[Array, ...]:
+        """Blocks of the normal equations, window by window."""
+        error, b, a = self._weighted(error, by_theta, by_x)
+        at, bt = a.swapaxes(1, 2), b.swapaxes(1, 2)
+        eye = np.eye(a.shape[-1])
+        return (
+            at @ a + eye, at @ b, bt @ b,
+            (at @ error[..., None])[..., 0] + moved, (bt @ error[..., None])[..., 0],
+        )  # fmt: skip
+
+    @staticmethod
+    def _promised(normal: tuple[Array, ...], step: Array, moved: Array) -> float:
+        """How far a step takes the cost down to first order."""
+        _, _, _, gx, gt = normal
+        return -2.0 * float(gt.sum(0) @ step + np.sum(gx * moved))
+
+    def _step(
+        self, normal: tuple[Array, ...], damping: float, theta: Array, n_theta: int
+    ) -> tuple[Array, Array]:
+        """Step of ``theta``, of which those at a bound that would leave it rest, and of the first states."""
+        xx, xt, tt, gx, gt = normal
+        xx = xx * (1 + damping * np.eye(xx.shape[-1]))
+        solved = np.linalg.solve(xx, np.concatenate([xt, gx[..., None]], axis=-1))
+        by_theta, own = solved[..., :-1], solved[..., -1]
+        reduced = (tt - xt.swapaxes(1, 2) @ by_theta).sum(0)
+        slope = (gt - (xt.swapaxes(1, 2) @ own[..., None])[..., 0]).sum(0)
+        step, free = np.zeros(len(theta)), np.arange(n_theta)
+        reduced = reduced + damping * np.diag(np.maximum(np.diag(tt.sum(0)), 1e-30))
+        for _ in range(n_theta + 1):
+            step[:n_theta] = 0.0
+            if len(free):
+                step[free] = -np.linalg.lstsq(reduced[np.ix_(free, free)], slope[free], rcond=1e-14)[0]
+            low = (theta[free] <= self.own.lower[free]) & (step[free] < 0)
+            high = (theta[free] >= self.own.upper[free]) & (step[free] > 0)
+            if not (low | high).any():
+                break
+            free = free[~(low | high)]
+        return step, -own - (by_theta @ step[:n_theta, None])[..., 0]
+
+    def _covariance(self, error: Array, by_theta: Array, by_x: Array) -> tuple[Array, tuple[str, ...]]:
+        """Covariance of ``theta``, from the scatter of the windows' slopes: errors within one are no white noise.
+
+        Source: Liang and Zeger, *Longitudinal data analysis using generalized linear models* (1986), of clusters.
+        """
+        error, b, a = self._weighted(error, by_theta, by_x)
+        at = a.swapaxes(1, 2)
+        known = np.linalg.solve(
+            at @ a + np.eye(a.shape[-1]), at @ np.concatenate([b, error[..., None]], axis=-1)
         )
-        n, periods = by_theta.shape[:2]
-        p, rows = len(theta), n * periods * n_x
-        gaps = rows + len(self.first) * n_x
-        out = np.zeros((gaps + len(self.joined) * n_x, p + n * n_x))
-        out[:rows, :p] = by_theta.reshape(rows, p)
-        for i in range(n):
-            out[i * periods * n_x : (i + 1) * periods * n_x, self._columns(i)] = by_node[i].reshape(-1, n_x)
-        for k, i in enumerate(self.first.tolist()):
-            out[rows + k * n_x : rows + (k + 1) * n_x, self._columns(i)] = np.eye(n_x)
-        for k, i in enumerate(self.joined.tolist()):
-            at = slice(gaps + k * n_x, gaps + (k + 1) * n_x)
-            out[at, :p] = weight * by_theta[i, -1]
-            out[at, self._columns(i)] = weight * by_node[i, -1]
-            out[at, self._columns(i + 1)] = -weight * np.eye(n_x)
-        return out
-
-    def _columns(self, i: int) -> slice:
-        p, n_x = len(self.fit.free), self.measured.shape[1]
-        return slice(p + i * n_x, p + (i + 1) * n_x)
-
-    def _split(self, z: Array) -> tuple[Array, Array]:
-        p = len(self.fit.free)
-        return z[:p], z[p:].reshape(self.measured.shape)
-
-
-def _limited(values: Array) -> Array:
-    return np.clip(np.nan_to_num(values, nan=LARGEST, posinf=LARGEST, neginf=-LARGEST), -LARGEST, LARGEST)
-
-
-STAGES = ((0.5, 20), (2.0, 10), (5.0, 6))
-"""Lengths [the machine's seconds, :func:`~hybrid_mpc.data.scales.time_unit`] of the free runs that are fitted, from
-short (convex) to long (what counts), each with its most evaluations: the long ones start near their optimum."""
-MAX_WINDOWS = 48
-METHODS = ("equation_error", "output_error", "multiple_shooting")
-"""What :func:`fit_prior` can do."""
-DEFAULT_METHODS = ("equation_error", "output_error")
-SEGMENT = 0.5
-"""Length [the machine's seconds] of a segment of multiple shooting: that of the first free runs."""
-Candidate: TypeAlias = tuple[str, NDArray[np.float64], Any]
-"""Name of a stage, its parameters over their nominal sizes, and the Jacobian that its confidence comes from."""
+        b, error = b - a @ known[..., :-1], error - (a @ known[..., -1:])[..., 0]
+        information = (b.swapaxes(1, 2) @ b).sum(0)
+        if not len(information):
+            return information, ()
+        size = np.sqrt(np.maximum(np.diag(information), 1e-300))
+        values, directions = np.linalg.eigh(information / np.outer(size, size))
+        weak = values < UNKNOWN * values[-1]
+        names = [self.own.names[i] for i in range(len(size)) if (np.abs(directions[i, weak]) > 0.2).any()]
+        inverse = directions / np.maximum(values, 1e-12 * values[-1]) @ directions.T / np.outer(size, size)
+        scores = (b.swapaxes(1, 2) @ error[..., None])[..., 0]
+        n = len(scores)
+        if n >= 2 * scores.shape[1]:  # fewer windows tell nothing of their scatter
+            middle = n / (n - 1) * scores.T @ scores
+        else:
+            middle = information * float(np.mean(np.square(error)))
+        return inverse @ middle @ inverse, tuple(names)
 
 
 def fit_prior(
@@ -321,146 +394,232 @@ def fit_prior(
     valid: Sequence[Trajectory],
     *,
     dt: float,
-    before: PriorFit | None = None,
-    methods: Sequence[str] = DEFAULT_METHODS,
+    length: float | None = None,
+    largest_delay: float = 0.0,
     start: Mapping[str, float] | None = None,
     time_unit: float | None = None,
-    on_progress: Callable[[int, int, str], None] = lambda done, total, text: None,
+    on_progress: Progress = lambda done, total, text: None,
 ) -> PriorFit:
-    """Fit by each of the methods; the best of all on free runs of the validation trajectories wins.
+    """Fit parameters and delay to the measured outputs over longer and longer windows, and find what smooths states.
 
-    ``equation_error``: states one period ahead. ``output_error``: longer and longer free runs from measured
-    states. ``multiple_shooting``: adjacent segments of 0.5 s whose first states are unknowns too. They run in this
-    order; output error and shooting start from the best so far. Residuals are the states' errors over their spread in
-    the data. A prior without free parameters stays as it is.
-
-    The lengths are in the machine's seconds (:func:`~hybrid_mpc.data.scales.time_unit`): seconds on machines that swing
-    in 0.25 to 4 s, and longer or shorter on slower or faster ones.
+    Each length starts from what the one before found, the first from the best of several starts between the bounds. Of
+    the nominal values and all lengths the one wins that explains the windows of the longest length best, over training
+    and validation recordings together: few parameters do not overfit, and where a machine drifts a short validation
+    part alone misleads. A prior without free parameters stays as it is.
 
     Args:
         make: Prior class or factory ``(values=None) -> Prior``.
         train: Training trajectories.
         valid: Validation trajectories (chosen by, not fitted to).
         dt: Model period [s].
-        before: An earlier fit to the same recordings, smoothed otherwise: only the length of free run that
-            was best then is fitted, from its parameters on (or multiple shooting, if that was). Default: all lengths,
-            from the nominal ones.
-        methods: Some of ``METHODS``. Default: equation error and output error.
-        start: Values [SI] by name to try as a start besides the nominal ones, e.g. those of a global search; fixed
-            parameters are left out. Default: none.
+        length: Length [s] of the longest windows: that of the runs that the model will be judged by. Default: 5 of the
+            machine's seconds.
+        largest_delay: Longest delay [s] of the inputs. Default 0: they act at once.
+        start: Values [their units] by name to try as a start besides the nominal ones, e.g. those of a global search;
+            fixed parameters are left out. Default: none.
         time_unit: The machine's second [s]. Default: that of the training trajectories.
         on_progress: ``(done, total, text)`` after every stage.
 
     Raises:
-        InputError: If no trajectory is long enough, the prior diverges with all parameters tried, or there is no such
-            method.
+        InputError: If a state is seen by no output, no trajectory is long enough, or the prior diverges with all
+            parameters tried.
 
     Example:
         >>> from scenarios.pendulum.data import exact_runs
         >>> from scenarios.pendulum.prior import PendulumPrior
         >>> runs = exact_runs("train", 1)
-        >>> fit = fit_prior(PendulumPrior, runs, runs, dt=0.01, methods=("equation_error",))
+        >>> fit = fit_prior(PendulumPrior, runs, runs, dt=0.01)
         >>> round(fit.values["l"], 3)
         0.045
+
+    Source: Bock, *Recent advances in parameter identification techniques for O.D.E.* (1983).
     """
-    _check_methods(methods)
-    fit = ParameterFit(make, dt)
+    fit = OutputFit(make, dt, largest_delay)
     unit = scales.time_unit(train, dt) if time_unit is None else time_unit
-    stages = [(unit * length, most) for length, most in STAGES]
-    stages = [s for s in stages if _fits(train, s[0], dt)] or [(_shortest(train, dt), 20)]
-    lengths = [s for s, _ in stages]
-    longest = scales.periods(_longest(valid or train, lengths), dt)
-    scored = _sample(cut_windows(valid or train, 0, longest, scales.periods(unit * STAGES[0][0], dt)))
-    if not fit.free:
-        row = {"stage": "nominal", "validation_error": fit.error(fit.nominal, scored)}
-        return PriorFit(fit.prior.values, {}, (), (row,))
-    candidates: list[Candidate]
-    if before is None:
-        candidates = [("nominal", fit.nominal, None)]
-        if start is not None:
-            candidates.append(("start", fit.scaled(start), None))
-        if "equation_error" in methods:
-            theta, jacobian = fit.equation_error(_sample(cut_windows(train, 0, 1, 3), 4000))
-            candidates.append(("equation error", theta, jacobian))
-    else:
-        candidates = [("the fit before", fit.scaled(before.values), None)]
-        stages, methods = _again(before, stages, methods)
-    if "output_error" not in methods:
-        stages = []
-    for i, (length, evaluations) in enumerate(stages):
-        on_progress(i, len(stages), f"output error over {length:g} s")
-        windows = _sample(cut_windows(train, 0, scales.periods(length, dt), scales.periods(length / 4, dt)))
-        best = min(candidates, key=lambda c: fit.error(c[1], windows))[1]
-        theta, jacobian = fit.output_error(best, windows, evaluations)
-        candidates.append((f"output error {length:g} s", theta, jacobian))
-    if "multiple_shooting" in methods:
-        on_progress(len(stages), len(stages) + 1, "multiple shooting")
-        candidates.append(_shooting(fit, train, candidates, min(unit * SEGMENT, *lengths)))
-    on_progress(len(stages), len(stages), "done")
-    return _winner(fit, candidates, scored, before)
-
-
-def _winner(
-    fit: ParameterFit, candidates: Sequence[Candidate], scored: Windows, before: PriorFit | None
-) -> PriorFit:
-    """The candidate with the least validation error, with what is known of its confidence."""
-    scores = [fit.error(theta, scored) for _, theta, _ in candidates]
+    check_observable(fit.prior, dt, unit)
+    lengths = _lengths(train, dt, unit, length, fit.lead)
+    total = len(lengths) + 2
+    on_progress(0, total, "smoothing by the nominal prior")
+    smoother = fit_smoother(fit.prior, shifted(train, fit.delay(fit.nominal)), dt, time_unit=unit)
+    sizes = np.array(smoother.sizes.x)
+    guesses = [with_states(part, smoother, fit.delay(fit.nominal)) for part in (train, valid)]
+    found: list[tuple[str, Fitted]] = []
+    theta = fit.nominal
+    if len(theta):
+        on_progress(1, total, "several starts")
+        theta = _best_start(fit, guesses[0], lengths[0], sizes, start)
+        for i, periods in enumerate(lengths):
+            on_progress(2 + i, total, f"free runs of {periods * dt:.3g} s")
+            windows = cut_outputs(guesses[0], periods, fit.lead, WINDOWS)
+            result = fit.fit(theta, windows, sizes, ITERATIONS)
+            theta = result.theta
+            found.append((f"free runs of {periods * dt:.3g} s", result))
+    scored = [
+        cut_outputs(part, lengths[-1], fit.lead, WINDOWS)
+        for part in guesses
+        if _longest(part) > lengths[-1] + fit.lead
+    ]
+    candidates = [("nominal", Fitted(fit.nominal, np.zeros((0, 0)), ())), *found]
+    scores = [_error(fit, c.theta, scored, sizes) for _, c in candidates]
     if not np.isfinite(min(scores)):
         raise InputError("the prior diverges with every set of parameters tried; check its signs and units")
     best = int(np.argmin(scores))
-    _, theta, jacobian = candidates[best]
-    if best == 0 and before is not None:
-        errors, warnings = dict(before.standard_errors), list(before.warnings)
-        correlations = dict(before.correlations)
-    else:
-        errors, warnings = fit.confidence(theta, jacobian)
-        correlations = fit.correlations(jacobian)
-    table = tuple({"stage": c[0], "validation_error": s} for c, s in zip(candidates, scores, strict=True))
-    return PriorFit(fit.values(theta), errors, tuple(warnings), table, correlations)
+    chosen = candidates[best][1]
+    on_progress(total - 1, total, "smoothing by the fitted prior")
+    fitted, delay = make(fit.values(chosen.theta)), fit.delay(chosen.theta)
+    smoother = fit_smoother(fitted, shifted([*train, *valid], delay), dt, time_unit=unit)
+    stages = tuple({"stage": c[0], "validation_error": s} for c, s in zip(candidates, scores, strict=True))
+    on_progress(total, total, "done")
+    return PriorFit(
+        fit.values(chosen.theta), _errors(fit, chosen), _warnings(fit, chosen), stages, _correlations(fit, chosen),
+        delay, smoother.sigma, smoother.walk, smoother.sizes,
+    )  # fmt: skip
 
 
-def _shooting(
-    fit: ParameterFit, train: Sequence[Trajectory], candidates: Sequence[Candidate], length: float
-) -> Candidate:
-    """Multiple shooting over segments of ``length`` [s] from the candidate that is best on them."""
-    segments = cut_segments(train, scales.periods(length, fit.dt))
-    start = min(candidates, key=lambda c: fit.error(c[1], segments.windows))[1]
-    return (f"multiple shooting {length:g} s", *multiple_shooting(fit, start, segments))
+def refit(
+    make: Callable[..., Prior],
+    fit: PriorFit,
+    trajectories: Sequence[Trajectory],
+    *,
+    dt: float,
+    lengths: Sequence[float],
+) -> PriorFit:
+    """Parameters fitted anew to recordings of a machine that has changed, from those of an earlier fit on.
+
+    The delay and what smooths states stay. ``lengths`` [s] are those of the windows, one after the other.
+    """
+    known = smoothed(make, fit, trajectories, dt)
+    own, sizes, stages = OutputFit(make, dt), np.array(fit.smoother(make(fit.values), dt).sizes.x), []
+    found = Fitted(own.scaled(fit.values), np.zeros((0, 0)), ())
+    for length in lengths:
+        windows = cut_outputs(known, scales.periods(length, dt, 2), 0, WINDOWS)
+        found = own.fit(found.theta, windows, sizes, ITERATIONS)
+        stages.append({"stage": f"free runs of {length:g} s", "validation_error": found.error})
+    return replace(
+        fit, values=own.values(found.theta), standard_errors=_errors(own, found), warnings=_warnings(own, found),
+        stages=tuple(stages), correlations=_correlations(own, found),
+    )  # fmt: skip
 
 
-def _again(
-    before: PriorFit, stages: list[tuple[float, int]], methods: Sequence[str]
-) -> tuple[list[tuple[float, int]], Sequence[str]]:
-    """What is fitted again after an earlier fit: the length or the method that won, of the methods asked for."""
-    won = before.best.startswith("multiple shooting")
-    if "multiple_shooting" in methods and (won or "output_error" not in methods):
-        return [], ("multiple_shooting",)
-    stages = [s for s in stages if before.best == f"output error {s[0]:g} s"] or stages[:1]
-    return stages, tuple(m for m in methods if m == "output_error")
+def smoothed(
+    make: Callable[..., Prior], fit: PriorFit, trajectories: Sequence[Trajectory], dt: float
+) -> list[Trajectory]:
+    """Trajectories with the inputs that act and the states that the fitted prior smooths: what networks train on."""
+    return fit.smoother(make(fit.values), dt).smooth(shifted(trajectories, fit.delay))
 
 
-def _check_methods(methods: Sequence[str]) -> None:
-    unknown = [m for m in methods if m not in METHODS]
-    if isinstance(methods, str) or unknown or not methods:
+def check_observable(prior: Prior, dt: float, time_unit: float) -> None:
+    """Refuse a prior with states that no output tells of.
+
+    Raises:
+        InputError: Naming the states.
+    """
+    unseen = unseen_states(prior, dt, time_unit)
+    if unseen:
         raise InputError(
-            f"fit of the prior: methods must be some of {', '.join(METHODS)}, in a tuple; got {methods!r}"
+            f"{type(prior).__name__}: no output tells of {', '.join(unseen)} (outputs: "
+            f"{', '.join(s.name for s in prior.outputs)}): nothing that is measured changes with "
+            f"{'them' if len(unseen) > 1 else 'it'}. Measure it, leave it out of the states, or check output()"
         )
 
 
-def _sample(windows: Windows, most: int = MAX_WINDOWS) -> Windows:
-    """At most ``most`` windows, evenly spread."""
-    return windows.take(torch.linspace(0, len(windows) - 1, min(most, len(windows))).round().long())
+def with_states(trajectories: Sequence[Trajectory], smoother: Smoother, delay: float) -> list[Trajectory]:
+    """Trajectories with smoothed states but the inputs as they were commanded, without the samples a delay costs."""
+    made = []
+    for t, s in zip(trajectories, smoother.smooth(shifted(trajectories, delay)), strict=True):
+        made.append(replace(t.part(slice(len(t.t) - len(s.t), None)), x=s.x, xdot=s.xdot))
+    return made
 
 
-def _fits(trajectories: Sequence[Trajectory], seconds: float, dt: float) -> bool:
-    return any(len(t.t) > round(seconds / dt) for t in trajectories)
+def _longest(trajectories: Sequence[Trajectory]) -> int:
+    return max((len(t.t) for t in trajectories), default=0)
 
 
-def _shortest(trajectories: Sequence[Trajectory], dt: float) -> float:
-    return max((len(t.t) - 1) * dt for t in trajectories) * 0.5
+def _lengths(
+    train: Sequence[Trajectory], dt: float, unit: float, length: float | None, lead: int
+) -> list[int]:
+    """Periods of the windows, the longest last; what the recordings do not hold is cut to half of the longest."""
+    wanted = [unit * own for own in LENGTHS]
+    if length is not None:
+        wanted = [own for own in wanted if own < length] + [length]
+    longest = _longest(train) - lead - 1
+    fitting = [p for p in (scales.periods(own, dt, 2) for own in wanted) if p <= longest]
+    return sorted(dict.fromkeys(fitting)) or [max(2, longest // 2)]
 
 
-def _longest(trajectories: Sequence[Trajectory], lengths: Sequence[float]) -> float:
-    dt = trajectories[0].dt
-    fitting = [s for s in lengths if _fits(trajectories, s, dt)]
-    return max(fitting) if fitting else _shortest(trajectories, dt)
+def _best_start(
+    fit: OutputFit, train: Sequence[Trajectory], periods: int, sizes: Array, start: Mapping[str, float] | None
+) -> Array:
+    """The start from which a few steps over short windows lead furthest down."""
+    windows = cut_outputs(train, periods, fit.lead, WINDOWS // 2)
+    starts = [fit.nominal, *([] if start is None else [fit.scaled(start)])]
+    if len(fit.nominal):
+        between = qmc.Sobol(len(fit.nominal), seed=0).random_base2(3)[:STARTS]
+        starts += list(fit.lower + between * (fit.upper - fit.lower))
+    found = []
+    for one in starts:
+        try:
+            found.append(fit.fit(one, windows, sizes, START_ITERATIONS))
+        except InputError:  # too stiff for the period there
+            continue
+    if not found:
+        return fit.nominal
+    return min(found, key=lambda f: f.error if math.isfinite(f.error) else math.inf).theta
+
+
+def _error(fit: OutputFit, theta: Array, parts: Sequence[OutputWindows], sizes: Array) -> float:
+    """Root mean square of the outputs' errors over their spread, with the first states free, over several parts."""
+    found = [fit.fit(theta, part, sizes, 4, fixed=True).error for part in parts]
+    return float(np.sqrt(np.average(np.square(found), weights=[part.y.size for part in parts])))
+
+
+def _errors(fit: OutputFit, chosen: Fitted) -> dict[str, float]:
+    if not len(chosen.covariance):
+        return {}
+    sizes = np.sqrt(np.maximum(np.diag(chosen.covariance), 0.0)) * fit.unit
+    return {p.name: float(e) for p, e in zip(fit.free, sizes, strict=False)}
+
+
+def _correlations(fit: OutputFit, chosen: Fitted) -> dict[str, float]:
+    """Correlation of the errors of every two fitted parameters, by ``"a, b"``."""
+    c = chosen.covariance
+    sigma = np.sqrt(np.maximum(np.diag(c), 1e-300)) if len(c) else np.zeros(0)
+    n = min(len(c), len(fit.free))
+    return {
+        f"{fit.names[i]}, {fit.names[j]}": float(c[i, j] / (sigma[i] * sigma[j]))
+        for i in range(n)
+        for j in range(i + 1, n)
+    }
+
+
+def _warnings(fit: OutputFit, chosen: Fitted) -> tuple[str, ...]:
+    if not len(chosen.covariance):
+        return ("no fit improved on the nominal parameters",) if fit.free else ()
+    warnings = []
+    if chosen.unidentified:
+        warnings.append(f"the data cannot tell apart: {', '.join(chosen.unidentified)}")
+    for p, value, low, high in zip(fit.free, chosen.theta, fit.lower, fit.upper, strict=False):
+        if min(value - low, high - value) < AT_BOUND * (high - low):
+            warnings.append(f"{p.label} ends at a bound ({value * (abs(p.value) or p.upper - p.lower):.4g})")
+    return tuple(warnings)
+
+
+@lru_cache(maxsize=32)
+def _delayed(xdot: ca.Function) -> ca.Function:
+    """``xdot`` of inputs ``[u, slope by the delay]`` and parameters ``[p, change of the delay]``."""
+    x, u, w, p = (ca.SX.sym(xdot.name_in(i), xdot.size1_in(i)) for i in range(4))
+    slope, change = ca.SX.sym("slope", u.shape[0]), ca.SX.sym("change")
+    rates = xdot(x, u + change * slope, w, p)
+    names = [xdot.name_in(i) for i in range(4)]
+    return ca.Function("xdot", [x, ca.vertcat(u, slope), w, ca.vertcat(p, change)], [rates], names, ["xdot"])
+
+
+@lru_cache(maxsize=64)
+def _outputs(equations: Equations, n: int) -> ca.Function:
+    """Outputs at ``n`` points and their slopes by state and parameters; of inputs as :func:`_delayed` has them."""
+    f = equations.output
+    x, u, w, p = (ca.SX.sym(f.name_in(i), f.size1_in(i)) for i in range(4))
+    slope, y = ca.SX.sym("slope", u.shape[0]), f(x, u, w, p)
+    values = [ca.densify(v) for v in (y, ca.jacobian(y, x), ca.jacobian(y, p))]
+    one = ca.Function("output", [x, ca.vertcat(u, slope), w, p], values)
+    return one.map("outputs", "serial", n, [3], [])

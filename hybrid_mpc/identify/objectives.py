@@ -6,16 +6,18 @@ run (:func:`free_run`).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import TypeAlias, cast
 
 import torch
 from torch import Tensor
 
+from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.dataset import Windows
 from hybrid_mpc.identify.networks import StackedGRU
 from hybrid_mpc.identify.step import RecurrentStep
+from hybrid_mpc.machine.prior import Prior
 
 
 class VectorPerformanceIndex:
@@ -43,8 +45,8 @@ class VectorPerformanceIndex:
 
 @dataclass(frozen=True)
 class Prediction:
-    """A model's prediction along windows and the measurement, at the periods' starts; ``(..., n_x)`` and ``(...,
-    n_u)``.
+    """A model's prediction along windows and the measurement, at the periods' starts; ``(..., n_x)``, ``(..., n_u)``
+    and ``(..., n_w)``.
 
     ``x_hat`` are the measured states under teacher forcing; rates ``xdot`` are as the model's form has them (hybrid:
     means over the period).
@@ -53,21 +55,25 @@ class Prediction:
     x: Tensor
     x_hat: Tensor
     u: Tensor
+    w: Tensor
     xdot: Tensor
     xdot_hat: Tensor
 
 
+Objective: TypeAlias = Callable[[RecurrentStep, Prediction], Tensor]
+
+
 def teacher_forced(step: RecurrentStep, windows: Windows) -> Prediction:
     """One-period predictions from the measured states; only h runs along (the paper's training)."""
-    x, u = windows.x[:, :-1].transpose(0, 1), windows.u.transpose(0, 1)
-    features = step.stacked_features(x, u)
+    x, u, w = (z.transpose(0, 1) for z in (windows.x[:, :-1], windows.u, windows.w))
+    features = step.stacked_features(x, u, w)
     stack = cast(StackedGRU, step.network)
     out, _ = stack.sequence(features, stack.initial(len(windows)))
     correction = (out * step.scale_correction)[windows.warm :]
-    x_k, u_k = x[windows.warm :].unsqueeze(1), u[windows.warm :].unsqueeze(1)
+    x_k, u_k, w_k = (z[windows.warm :].unsqueeze(1) for z in (x, u, w))
     x_next = windows.x[:, windows.warm + 1 :].transpose(0, 1).unsqueeze(1)
     measured = step.measured_rate(x_k, x_next, _scored_xdot(windows))
-    return Prediction(x_k, x_k, u_k, measured, step.rate(x_k, u_k, correction))
+    return Prediction(x_k, x_k, u_k, w_k, measured, step.rate(x_k, u_k, w_k, correction))
 
 
 def warm_up(step: RecurrentStep, windows: Windows) -> Tensor:
@@ -76,8 +82,8 @@ def warm_up(step: RecurrentStep, windows: Windows) -> Tensor:
     h = stack.initial(len(windows))
     if windows.warm == 0:
         return h
-    x, u = windows.x[:, : windows.warm].transpose(0, 1), windows.u[:, : windows.warm].transpose(0, 1)
-    return stack.sequence(step.stacked_features(x, u), h)[1]
+    past = (z[:, : windows.warm].transpose(0, 1) for z in (windows.x, windows.u, windows.w))
+    return stack.sequence(step.stacked_features(*past), h)[1]
 
 
 def free_run(step: RecurrentStep, windows: Windows) -> Prediction:
@@ -85,14 +91,14 @@ def free_run(step: RecurrentStep, windows: Windows) -> Prediction:
     h = warm_up(step, windows)
     x = windows.x[:, windows.warm].unsqueeze(0).expand(h.shape[0], -1, -1)
     states = [x]
-    for u in windows.u[:, windows.warm :].transpose(0, 1).unsqueeze(1).expand(-1, h.shape[0], -1, -1):
-        x, h = step(x, h, u)
+    u, w = (z[:, windows.warm :].transpose(0, 1).unsqueeze(1) for z in (windows.u, windows.w))
+    for u_k, w_k in zip(*(z.expand(-1, h.shape[0], -1, -1) for z in (u, w)), strict=True):
+        x, h = step(x, h, u_k, w_k)
         states.append(x)
     x_hat = torch.stack(states)
     measured = windows.x[:, windows.warm :].transpose(0, 1).unsqueeze(1)
-    u = windows.u[:, windows.warm :].transpose(0, 1).unsqueeze(1)
     rate = step.measured_rate(measured[:-1], measured[1:], _scored_xdot(windows))
-    return Prediction(measured[:-1], x_hat[:-1], u, rate, (x_hat[1:] - x_hat[:-1]) / step.dt)
+    return Prediction(measured[:-1], x_hat[:-1], u, w, rate, (x_hat[1:] - x_hat[:-1]) / step.dt)
 
 
 def error_objective(step: RecurrentStep, prediction: Prediction) -> Tensor:
@@ -100,33 +106,56 @@ def error_objective(step: RecurrentStep, prediction: Prediction) -> Tensor:
     return _per_network((prediction.xdot_hat - prediction.xdot).abs().sum(-1))
 
 
-def energy_objective(step: RecurrentStep, prediction: Prediction) -> Tensor:
-    """Mean violation |ΔE_M - ΔE_S| [W], a value per network, with the prior's parameters for both.
+def balance_objective(name: str) -> Objective:
+    """Mean violation of a balance, |residual of the model - residual of the measurement| [its rate_unit], a value per
+    network, with the prior's parameters for both (paper: |ΔE_M - ΔE_S|).
 
-    At a measured state (:func:`teacher_forced`) it is J|v||a_M - a_S|, a speed-weighted error; along the model's own
-    free run (:func:`free_run`) it also weighs where the model has gone. The velocity is that of the state in both.
+    At a measured state (:func:`teacher_forced`) that of a mechanical machine's energy is M|v||a_M - a_S|, a
+    speed-weighted error; along the model's own free run (:func:`free_run`) it also weighs where the model has gone.
     """
-    model = step.prior.energy_balance(prediction.x_hat, prediction.xdot_hat, prediction.u)
-    measured = step.prior.energy_balance(prediction.x, prediction.xdot, prediction.u)
-    return _per_network((model - measured).abs())
+
+    def violation(step: RecurrentStep, prediction: Prediction) -> Tensor:
+        residual, held = step.equations.residuals[name], (prediction.u, prediction.w, step.p)
+        model = residual(prediction.x_hat, prediction.xdot_hat, *held)
+        measured = residual(prediction.x, prediction.xdot, *held)
+        return _per_network((model - measured).abs().sum(-1))
+
+    return violation
 
 
-def position_objective(step: RecurrentStep, prediction: Prediction) -> Tensor:
-    """Root mean square error of the positions a period later [SI], a value per network.
+def output_objective(step: RecurrentStep, prediction: Prediction) -> Tensor:
+    """Root mean square error of the outputs a period later, each over its spread; a value per network.
 
-    On free runs it is the usual figure of a simulation; the mean absolute error of xdot weighs mostly accelerations.
+    On free runs it is the usual figure of a simulation; the mean absolute error of xdot weighs mostly the fast states.
     """
-    n_q = step.prior.n_q
-    gap = (prediction.x_hat - prediction.x) + step.dt * (prediction.xdot_hat - prediction.xdot)
-    return _per_network(gap[..., :n_q].square().sum(-1)).clamp_min(1e-24).sqrt()
+    held = prediction.u, prediction.w, step.p
+    y = step.equations.output(prediction.x + step.dt * prediction.xdot, *held)
+    y_hat = step.equations.output(prediction.x_hat + step.dt * prediction.xdot_hat, *held)
+    size = y.flatten(0, -2).std(0, correction=0).clamp_min(1e-12)
+    return _per_network(((y_hat - y) / size).square().sum(-1)).clamp_min(1e-24).sqrt()
 
 
-OBJECTIVES: dict[str, Callable[[RecurrentStep, Prediction], Tensor]] = {
-    "error": error_objective,
-    "energy": energy_objective,
-    "position": position_objective,
-}
-"""All objectives by name; one more is an entry here, named in ``TrainingSettings.objectives``."""
+OBJECTIVES: dict[str, Objective] = {"error": error_objective, "output": output_objective}
+"""Objectives of any machine by name; beside them each balance of its prior is one, by its name."""
+BALANCES = "balances"
+"""Stands for all balances of the prior; for none, if it has none."""
+
+
+def objectives_of(prior: Prior, names: Sequence[str]) -> dict[str, Objective]:
+    """Objectives by name, each balance by its own.
+
+    Raises:
+        InputError: If a name is none of an objective or balance of the prior, or there is none left.
+    """
+    balances = [b.name for b in prior.equations.balances]
+    wanted = [one for name in names for one in (balances if name == BALANCES else [name])]
+    unknown = [name for name in wanted if name not in OBJECTIVES and name not in balances]
+    if unknown or not wanted:
+        raise InputError(
+            f"objectives: {', '.join(unknown) or 'there is none'}; choose of: {', '.join([*OBJECTIVES, BALANCES])}, "
+            f"and the balances of {type(prior).__name__}: {', '.join(balances) or 'it has none'}"
+        )
+    return {name: OBJECTIVES.get(name) or balance_objective(name) for name in wanted}
 
 
 def _per_network(values: Tensor) -> Tensor:

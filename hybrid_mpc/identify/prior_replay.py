@@ -20,7 +20,7 @@ from torch import Tensor
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.identify.networks import StackedGRU
 from hybrid_mpc.identify.step import PriorStep, RecurrentStep
-from hybrid_mpc.machine.torch_prior import Prior
+from hybrid_mpc.machine.prior import Prior
 
 Array = NDArray[np.float64]
 RUNS = 2000
@@ -50,54 +50,58 @@ class PriorReplay:
 
     x: Tensor
     u: Tensor
+    w: Tensor
     weight: Tensor
 
     def take(self, index: Tensor) -> PriorReplay:
         """The runs of ``index``."""
         index = index.to(self.x.device)
-        return PriorReplay(self.x[:, index], self.u[:, index], self.weight[:, index])
+        return PriorReplay(self.x[:, index], self.u[:, index], self.w[:, index], self.weight[:, index])
 
     def to(self, device: torch.device) -> PriorReplay:
         """The same runs on a device."""
-        return PriorReplay(self.x.to(device), self.u.to(device), self.weight.to(device))
+        return PriorReplay(*(v.to(device) for v in (self.x, self.u, self.w, self.weight)))
 
 
 def make_prior_replay(prior: Prior, training: Sequence[Trajectory], seed: int) -> PriorReplay:
     """Prior replay around training trajectories."""
     rng = np.random.default_rng([seed, 1])
-    x, u = (np.concatenate([getattr(t, key) for t in training]) for key in ("x", "u"))
+    x, u, w = (np.concatenate([getattr(t, key) for t in training]) for key in ("x", "u", "w"))
     low, high = x.min(0), x.max(0)
     angles = np.array([signal.periodic for signal in prior.states])
     start = rng.uniform(np.where(angles, -np.pi, low), np.where(angles, np.pi, high), (RUNS, x.shape[1]))
     length = FOLLOWED + COUNTED
-    inputs = u[rng.integers(len(u), size=(-(-length // HELD), RUNS))].repeat(HELD, axis=0)[:length]
+    drawn = rng.integers(len(u), size=(-(-length // HELD), RUNS))
+    inputs, disturbances = (z[drawn].repeat(HELD, axis=0)[:length] for z in (u, w))
     far = np.where(angles, np.inf, AWAY * (high - low))
-    states = _prior_runs(prior, training[0].dt, start, inputs, (low - far, high + far))
+    states = _prior_runs(prior, training[0].dt, start, (inputs, disturbances), (low - far, high + far))
     places = _Places(angles, np.sqrt(np.mean(x**2, axis=0)).clip(1e-9))
     distance, _ = cKDTree(places(x)).query(places(states.reshape(-1, x.shape[1])))
     weight = 1.0 - np.exp(-((distance.reshape(states.shape[:2]) / NEAR) ** 2))
     weight *= (angles | ((states >= low) & (states <= high))).all(-1)
-    return PriorReplay(torch.tensor(states), torch.tensor(inputs), torch.tensor(weight))
+    return PriorReplay(*(torch.tensor(v) for v in (states, inputs, disturbances, weight)))
 
 
 def prior_replay_penalty(step: RecurrentStep, prior_replay: PriorReplay) -> Tensor:
     """Mean over all runs of weight times squared correction over its scale, a value per network."""
     stack = cast(StackedGRU, step.network)
-    features = step.stacked_features(prior_replay.x, prior_replay.u)
+    features = step.stacked_features(prior_replay.x, prior_replay.u, prior_replay.w)
     out, _ = stack.sequence(features, stack.initial(prior_replay.x.shape[1]))
     weight = prior_replay.weight[FOLLOWED:, None, :, None]
     return (weight * out[FOLLOWED:].square()).mean(dim=(0, 2, 3))
 
 
-def _prior_runs(prior: Prior, dt: float, start: Array, inputs: Array, bounds: tuple[Array, Array]) -> Array:
+def _prior_runs(
+    prior: Prior, dt: float, start: Array, held: tuple[Array, Array], bounds: tuple[Array, Array]
+) -> Array:
     """States ``(n, RUNS, n_x)`` of the prior alone; a run that would leave the bounds stays where it is."""
     step, none = PriorStep(prior, dt), torch.zeros(len(start), 0, dtype=torch.float64)
     low, high = (torch.tensor(bound) for bound in bounds)
     x, states = torch.tensor(start), []
     with torch.no_grad():
-        for u in torch.tensor(inputs):
+        for u, w in zip(*(torch.tensor(v) for v in held), strict=True):
             states.append(x)
-            x_next, _ = step(x, none, u)
+            x_next, _ = step(x, none, u, w)
             within = ((x_next >= low) & (x_next <= high) & x_next.isfinite()).all(-1, keepdim=True)
             x = torch.where(within, x_next, x)
     return torch.stack(states).numpy()

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.identify.smooth import Sizes, Smoother
+from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.signals import Parameter
 
 if TYPE_CHECKING:
@@ -30,6 +32,10 @@ class PriorFit:
         warnings: Parameters at a bound, or ones that the data do not identify.
         stages: One row per stage: its name and the validation error that chose the winner.
         correlations: Correlation of the errors of every two fitted parameters, by ``"a, b"``. Default: none known.
+        delay: Delay of the inputs [s]. Default: none.
+        sigma: Standard deviation of each output's measurement that the smoother assumes [output units].
+        walk: Standard deviation of the unexplained rates' change per period that it assumes, by corrected state.
+        sizes: Natural sizes of the signals that the smoother assumes.
     """
 
     values: dict[str, float]
@@ -37,6 +43,16 @@ class PriorFit:
     warnings: tuple[str, ...]
     stages: tuple[dict[str, Any], ...]
     correlations: dict[str, float] = field(default_factory=dict)
+    delay: float = 0.0
+    sigma: tuple[float, ...] = ()
+    walk: tuple[float, ...] = ()
+    sizes: Sizes | None = None
+
+    def smoother(self, prior: Prior, dt: float) -> Smoother:
+        """The smoother around the fitted prior."""
+        if self.sizes is None:
+            raise InputError("this fit has no smoother: it was not made by fit_prior")
+        return Smoother(prior, dt, self.sigma, self.walk, self.sizes)
 
     @property
     def best(self) -> str:
@@ -92,7 +108,7 @@ class PriorFit:
         ]
 
     def table(self, parameters: Sequence[Parameter]) -> pd.DataFrame:
-        """:meth:`rows` as a data frame, by parameter; ``fit.table(prior.parameters_spec).to_csv(path)`` writes it."""
+        """:meth:`rows` as a data frame, by parameter; ``fit.table(prior.parameters).to_csv(path)`` writes it."""
         try:
             import pandas as pd
         except ImportError as missing:

@@ -6,52 +6,58 @@ run over all periods and all windows in one call of CasADi, without Python in be
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import cache, lru_cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-import nn_export
-from hybrid_mpc.identify.export import OfPrior
-from hybrid_mpc.machine.torch_prior import Prior
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.machine.prior import Prior
+from hybrid_mpc.machine.signals import Signal
 
 Array = NDArray[np.float64]
+MAX_SUBSTEPS = 20
+"""A prior stiffer than this many Runge-Kutta sub-steps a period can follow needs another dt."""
 
 
 class Simulation:
     """Free runs of an ODE, as functions of its first states, its inputs and its parameters.
 
     Args:
-        xdot: ``(x, u, p) -> xdot`` of scalar operations.
+        xdot: ``(x, u, w, p) -> xdot`` of scalar operations, as :class:`~hybrid_mpc.machine.prior.Equations` has it.
         dt: Period [s].
         free: Places in ``p`` of the parameters by which it is differentiated, in this order.
     """
 
     def __init__(self, xdot: ca.Function, dt: float, free: Sequence[int] = ()) -> None:
         self.dt, self.free, self._xdot = dt, list(free), xdot
-        self.n_x, self.n_u, self.n_p = (xdot.size1_in(i) for i in range(3))
+        self.n_x, self.n_u, self.n_w, self.n_p = (xdot.size1_in(i) for i in range(4))
         self._runs = cache(self._run_function)
 
-    def states(self, x0: Array, u: Array, p: Array, substeps: int) -> Array:
-        """States ``(n, T + 1, n_x)`` of runs from ``x0`` ``(n, n_x)`` under ``u`` ``(n, T, n_u)``.
+    def states(self, x0: Array, u: Array, w: Array, p: Array, substeps: int) -> Array:
+        """States ``(n, T + 1, n_x)`` of runs from ``x0`` ``(n, n_x)`` under ``u`` ``(n, T, n_u)``, ``w`` ``(n, T,
+        n_w)``.
 
         Parameters ``p`` are those of all runs ``(n_p,)``, or of each ``(n, n_p)``.
         """
-        return self._run(x0, u, p, substeps, 0)[0]
+        return self._run(x0, u, w, p, substeps, 0)[0]
 
-    def by_parameters(self, x0: Array, u: Array, p: Array, substeps: int) -> tuple[Array, Array]:
+    def by_parameters(self, x0: Array, u: Array, w: Array, p: Array, substeps: int) -> tuple[Array, Array]:
         """The same states, and their derivatives ``(n, T + 1, n_x, n_p)`` by the free parameters."""
-        return self._run(x0, u, p, substeps, len(self.free))
+        return self._run(x0, u, w, p, substeps, len(self.free))
 
-    def by_all(self, x0: Array, u: Array, p: Array, substeps: int) -> tuple[Array, Array, Array]:
+    def by_all(self, x0: Array, u: Array, w: Array, p: Array, substeps: int) -> tuple[Array, Array, Array]:
         """The same states, and their derivatives by the free parameters and by the first state."""
-        x, s = self._run(x0, u, p, substeps, len(self.free) + self.n_x)
+        x, s = self._run(x0, u, w, p, substeps, len(self.free) + self.n_x)
         return x, s[..., : len(self.free)], s[..., len(self.free) :]
 
-    def _run(self, x0: Array, u: Array, p: Array, substeps: int, columns: int) -> tuple[Array, Array]:
+    def _run(
+        self, x0: Array, u: Array, w: Array, p: Array, substeps: int, columns: int
+    ) -> tuple[Array, Array]:
         n, periods, _ = u.shape
         first = np.zeros((n, 1 + columns, self.n_x))
         first[:, 0] = x0
@@ -59,92 +65,102 @@ class Simulation:
             first[:, 1 + len(self.free) :] = np.eye(self.n_x)
         run = self._runs(substeps, columns, periods, n)
         every_p = np.broadcast_to(p, (n, self.n_p))
-        found = run(first.reshape(-1, self.n_x).T, u.reshape(-1, self.n_u).T, every_p.T)
+        held = u.reshape(-1, self.n_u).T, w.reshape(n * periods, self.n_w).T
+        found = run(first.reshape(-1, self.n_x).T, *held, every_p.T)
         later = np.asarray(found.full().T.reshape(n, periods, 1 + columns, self.n_x))
         every = np.concatenate([first[:, None], later], axis=1)
         return every[:, :, 0], every[:, :, 1:].swapaxes(2, 3)
 
     def _run_function(self, substeps: int, columns: int, periods: int, n: int) -> ca.Function:
-        """All runs in one call: ``(z0, u, p) -> z`` with ``z = [x, columns of derivatives]``."""
-        z, u, p = (
-            ca.SX.sym("z", self.n_x, 1 + columns),
-            ca.SX.sym("u", self.n_u),
-            ca.SX.sym("p", self.n_p),
-        )
+        """All runs in one call: ``(z0, u, w, p) -> z`` with ``z = [x, columns of derivatives]``."""
+        sizes = {"z": (self.n_x, 1 + columns), "u": (self.n_u, 1), "w": (self.n_w, 1), "p": (self.n_p, 1)}
+        z, u, w, p = (ca.SX.sym(name, *size) for name, size in sizes.items())
         x = z[:, 0]
-        x_next = self._stepped(x, u, p, substeps)
+        x_next = stepped(self._xdot, x, u, w, p, self.dt, substeps)
         after = [x_next]
         if columns:
             by_x = ca.jacobian(x_next, x)
             slopes = by_x @ z[:, 1:]
             slopes[:, : len(self.free)] += ca.jacobian(x_next, p)[:, self.free]
             after.append(slopes)
-        step = ca.Function("period", [z, u, p], [ca.cse(ca.densify(ca.horzcat(*after)))])
-        held = (
-            ca.MX.sym("z", self.n_x, 1 + columns),
-            ca.MX.sym("u", self.n_u, periods),
-            ca.MX.sym("p", self.n_p),
-        )
-        over = step.mapaccum(periods)(held[0], held[1], ca.repmat(held[2], 1, periods))
-        return ca.Function("run", list(held), [over]).map(n)
-
-    def _stepped(self, x: ca.SX, u: ca.SX, p: ca.SX, substeps: int) -> ca.SX:
-        s = self.dt / substeps
-        for _ in range(substeps):
-            k1 = self._xdot(x, u, p)
-            k2 = self._xdot(x + 0.5 * s * k1, u, p)
-            k3 = self._xdot(x + 0.5 * s * k2, u, p)
-            k4 = self._xdot(x + s * k3, u, p)
-            x = x + (s / 6.0) * (k1 + 2.0 * (k2 + k3) + k4)
-        return x
+        step = ca.Function("period", [z, u, w, p], [ca.cse(ca.densify(ca.horzcat(*after)))])
+        held = [
+            ca.MX.sym(name, rows, periods if name in ("u", "w") else columns)
+            for name, (rows, columns) in sizes.items()
+        ]
+        over = step.mapaccum(periods)(*held[:3], ca.repmat(held[3], 1, periods))
+        return ca.Function("run", held, [over]).map(n)
 
 
-def traced(prior: Prior) -> ca.Function:
-    """``(x, u, p) -> xdot`` of a prior, ``p`` in the order of its specification, as scalar operations."""
-    return _traced(_Equations(prior))
+def stepped(xdot: ca.Function, x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX, dt: float, substeps: int) -> ca.SX:
+    """The state a period later, by Runge-Kutta of order 4 in equal sub-steps; ``u`` and ``w`` are held."""
+    s = dt / substeps
+    for _ in range(substeps):
+        k1 = xdot(x, u, w, p)
+        k2 = xdot(x + 0.5 * s * k1, u, w, p)
+        k3 = xdot(x + 0.5 * s * k2, u, w, p)
+        k4 = xdot(x + s * k3, u, w, p)
+        x = x + (s / 6.0) * (k1 + 2.0 * (k2 + k3) + k4)
+    return x
 
 
-class _Equations:
-    """A prior without the values of its parameters: equal for two of one class whose own attributes are equal numbers
-    or texts. Any other attribute, buffer or module makes it equal to nothing but itself.
+@lru_cache(maxsize=32)
+def with_unknown_rates(xdot: ca.Function, corrected: tuple[int, ...]) -> ca.Function:
+    """``xdot`` of ``(x, d)``: the rates of the corrected states have an unknown, constant ``d`` added to them."""
+    n_x, n_d = xdot.size1_in(0), len(corrected)
+    z = ca.SX.sym("z", n_x + n_d)
+    u, w, p = (ca.SX.sym(xdot.name_in(i), xdot.size1_in(i)) for i in (1, 2, 3))
+    added = ca.SX(n_x, 1)
+    for k, i in enumerate(corrected):
+        added[i] = z[n_x + k]
+    rate = ca.vertcat(xdot(z[:n_x], u, w, p) + added, ca.SX.zeros(n_d))
+    return ca.Function("xdot", [z, u, w, p], [ca.densify(rate)], ["x", "u", "w", "p"], ["xdot"])
+
+
+def required_substeps(prior: Prior, dt: float) -> int:
+    """Sub-steps a period that keep every eigenvalue of the prior at rest within 1 / sub-step.
+
+    Rest is the operating point, or else the middle of the signals' ranges (:func:`rest_of`).
+    Runge-Kutta of order 4 is stable up to 2.8 and accurate to per cents of the fast mode at 1.
     """
-
-    def __init__(self, prior: Prior) -> None:
-        module = vars(torch.nn.Module())
-        own = {name: value for name, value in vars(prior).items() if name not in module}
-        simple = all(isinstance(value, bool | int | float | str) for value in own.values())
-        alone = not simple or any(True for _ in prior.buffers()) or any(True for _ in prior.children())
-        self.prior = prior
-        self._key = type(prior), prior.parameters_spec, id(prior) if alone else tuple(sorted(own.items()))
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Equations) and self._key == other._key
-
-    def __hash__(self) -> int:
-        return hash(self._key)
+    return substeps_for(
+        prior.equations.xdot, *rest_of(prior), prior.p, dt, f"{type(prior).__name__}: the prior"
+    )
 
 
-@lru_cache(maxsize=16)
-def _traced(equations: _Equations) -> ca.Function:
-    prior = equations.prior
-    n_x, n_u, n_p = len(prior.states), len(prior.inputs), len(prior.parameters_spec)
-    examples = tuple(torch.zeros(n) for n in (n_x, n_u, 0, n_p))
-    program = nn_export.trace(OfPrior(prior, "forward"), examples, input_names=["x", "u", "w", "p"])
-    x, u, p = ca.SX.sym("x", n_x), ca.SX.sym("u", n_u), ca.SX.sym("p", n_p)
-    xdot = nn_export.build(program).expand()(x, u, ca.SX(0, 1), p)
-    return ca.Function("xdot", [x, u, p], [ca.densify(xdot)])
+def rest_of(prior: Prior) -> tuple[Array, Array, Array]:
+    """States, inputs and disturbances at the operating point, or else in the middle of their ranges.
+
+    What has no range is zero, or the limit next to it.
+    """
+    signals = prior.states, prior.inputs, prior.disturbances
+    nearest = [np.array([_middle(s) for s in group], dtype=np.float64) for group in signals]
+    point = prior.operating_point
+    given = (None, None, None) if point is None else (point.x, point.u, point.w)
+    x, u, w = (near if own is None else np.array(own) for own, near in zip(given, nearest, strict=True))
+    return x, u, w if len(w) == len(prior.disturbances) else nearest[2]
 
 
-def with_acceleration(prior: Prior, dt: float) -> Simulation:
-    """Runs of ``(q, v, d)``: the prior with the unknown accelerations ``d``, which are constant."""
-    return _with_acceleration(_Equations(prior), dt)
+def _middle(signal: Signal) -> float:
+    both = 0.5 * (signal.lower + signal.upper)
+    return both if math.isfinite(both) else min(max(0.0, signal.lower), signal.upper)
 
 
-@lru_cache(maxsize=16)
-def _with_acceleration(equations: _Equations, dt: float) -> Simulation:
-    prior, xdot = equations.prior, _traced(equations)
-    n_x, n_q = xdot.size1_in(0), prior.n_q
-    z, u, p = ca.SX.sym("z", n_x + n_q), ca.SX.sym("u", xdot.size1_in(1)), ca.SX.sym("p", xdot.size1_in(2))
-    x, d = z[:n_x], z[n_x:]
-    rate = ca.vertcat(xdot(x, u, p) + ca.vertcat(ca.SX.zeros(n_x - n_q), d), ca.SX.zeros(n_q))
-    return Simulation(ca.Function("xdot", [z, u, p], [ca.densify(rate)]), dt)
+def substeps_for(xdot: ca.Function, x: Any, u: Any, w: Any, p: Any, dt: float, name: str) -> int:
+    """:func:`required_substeps` of any ``xdot(x, u, w, p)`` at a point; an error says that ``name`` is too stiff."""
+    slope = _slope(xdot)(x, u, w, p).full()
+    rate = float(np.abs(np.linalg.eigvals(slope)).max()) if np.isfinite(slope).all() else math.inf
+    substeps = max(1, math.ceil(rate * dt)) if math.isfinite(rate) else MAX_SUBSTEPS + 1
+    if substeps > MAX_SUBSTEPS:
+        raise InputError(
+            f"{name}'s fastest mode at rest is {rate:.3g} 1/s; a period of {dt} s "
+            f"would need {rate * dt:.3g} sub-steps (at most {MAX_SUBSTEPS}). Smooth its friction (lower the slope "
+            f"at zero speed) or take a smaller dt."
+        )
+    return substeps
+
+
+@lru_cache(maxsize=32)
+def _slope(xdot: ca.Function) -> ca.Function:
+    point = [ca.SX.sym(xdot.name_in(i), xdot.size1_in(i)) for i in range(4)]
+    return ca.Function("slope", point, [ca.densify(ca.jacobian(xdot(*point), point[0]))])

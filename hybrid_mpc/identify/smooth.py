@@ -1,50 +1,70 @@
-"""Smoothing of measured positions with the prior's own equations: states that know where the input jumped."""
+"""Smoothing of measured outputs with the prior's own equations: states, measured or not, that know the inputs."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import casadi as ca
 import numpy as np
-import torch
 from numpy.typing import NDArray
+from scipy.linalg import expm
 from scipy.optimize import minimize_scalar
 
 from hybrid_mpc.data import scales
 from hybrid_mpc.data.scales import evenly
 from hybrid_mpc.data.trajectories import Trajectory
-from hybrid_mpc.identify.simulation import with_acceleration
-from hybrid_mpc.identify.step import required_substeps
-from hybrid_mpc.machine.torch_prior import Prior
+from hybrid_mpc.identify.simulation import required_substeps, rest_of, stepped, with_unknown_rates
+from hybrid_mpc.machine.prior import Equations, Prior
 
 Array = NDArray[np.float64]
-SWEEPS = 5
-"""Linearizations along the smoothed trajectory; the last ones change it by far less than the noise."""
-DECADES = (-2.0, 6.0)
-"""Range searched for the ratio of walk to sigma [1/s^2, in the machine's seconds]: from a prior that is right to data
-that jump."""
-IGNORANCE = 1e4
-"""Initial standard deviation, as a multiple of the sensor noise's effect over one period."""
+SWEEPS = 4
+"""Linearizations along the smoothed trajectory, after the first along the filter's estimates."""
+DECADES = (-6.0, 2.0)
+"""Range searched for the walk of the unexplained rates, as a power of ten of their natural size: from a prior that is
+right to one that explains nothing."""
+IGNORANCE = 10.0
+"""Standard deviation of what is not known at first, as a multiple of its natural size."""
 SAMPLE = 12
 """At most so many trajectories decide the noise levels."""
+QUIETEST = 1e-9
+"""Least noise of a sensor, as a share of the spread of its output: recordings of a simulation may have none."""
+UNSEEN = 1e-6
+"""Share of the outputs' spread below which a state's whole range shows in no output."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Natural sizes of a machine's signals, found in its recordings.
+
+    ``y`` ``(n_y,)`` are the spreads of the outputs, ``noise`` ``(n_y,)`` what of them is noise. ``x`` ``(n_x,)`` is how
+    far each state alone moves the outputs by their spread, within the machine's second; ``rate`` ``(n_x,)`` is that
+    over this second. They depend on no unit.
+    """
+
+    y: tuple[float, ...]
+    noise: tuple[float, ...]
+    x: tuple[float, ...]
+    rate: tuple[float, ...]
 
 
 @dataclass(frozen=True)
 class Smoother:
-    """Fixed-interval smoother over ``(q, v, d)``: ``d`` is the acceleration that the prior does not explain.
+    """Fixed-interval smoother over ``(x, d)``: ``d`` is what the prior does not explain of the rates that it corrects.
 
-    ``x_{k+1} = f(x_k, u_k, d_k)`` is the prior integrated over a period with ``d_k`` held, ``d`` walks at
-    random, ``y_k = q_k + noise``. A local polynomial smears the jump of a bang-bang input over its length,
-    and a network would learn the smear; here the input's part of the motion is known.
+    ``x_{k+1} = f(x_k, u_k, w_k, d_k)`` is the prior integrated over a period with ``d_k`` held, ``d`` walks at random,
+    ``y_k = g(x_k, u_k, w_k) + noise``. So states that no sensor sees are estimated, and the input's part of a motion is
+    known where a local polynomial would smear it. Missing samples (NaN) of single outputs are passed over; a censored
+    one counts only where the estimate contradicts it.
 
     Args:
         prior: The fitted prior.
         dt: Period [s].
-        sigma: Standard deviation of the measurement ``(n_q,)`` [output unit].
-        walk: Standard deviation of d's change per period ``(n_q,)`` [output unit / s^2].
+        sigma: Standard deviation of the measurement ``(n_y,)`` [output units].
+        walk: Standard deviation of d's change per period ``(n_d,)`` [units of the corrected rates].
+        sizes: Natural sizes of the signals (:func:`sizes_of`).
 
     Source: Rauch, Tung, Striebel, *Maximum likelihood estimates of linear dynamic systems* (1965); iterated
     linearization: Bell, *The iterated Kalman smoother as a Gauss-Newton method* (1994).
@@ -54,74 +74,137 @@ class Smoother:
     dt: float
     sigma: tuple[float, ...]
     walk: tuple[float, ...]
+    sizes: Sizes
 
     def smooth(self, trajectories: Sequence[Trajectory]) -> list[Trajectory]:
         """Every trajectory with ``x`` and ``xdot`` from all of its own samples and from nothing outside it."""
         smoothed: dict[int, Trajectory] = {}
         for group in _by_length(trajectories):
-            z, _ = self._estimate(group)
+            z = self._estimate(list(group.values()))
             for i, t, zi in zip(group, group.values(), z, strict=True):
                 smoothed[i] = self._with_states(t, zi)
         return [smoothed[i] for i in range(len(trajectories))]
 
-    def innovations(self, trajectories: Sequence[Trajectory]) -> tuple[float, float]:
-        """Squared innovations over their variances, and the logarithms of these variances, both summed."""
-        sums = [self._estimate(group)[1] for group in _by_length(trajectories)]
-        return sum(s[0] for s in sums), sum(s[1] for s in sums)
+    def innovations(self, trajectories: Sequence[Trajectory]) -> tuple[float, float, int]:
+        """Squared innovations over their variances, the logarithms of these variances, and how many there are.
+
+        They are those of a filter that starts in ignorance; the samples that end it do not count.
+        """
+        squares, logs, count = 0.0, 0.0, 0
+        for group in _by_length(trajectories):
+            found = self._filtered(list(group.values()))
+            skip = min(math.ceil(self._n_z / max(1, len(self.sigma))), found.y.shape[1] - 1)
+            e, s, seen = (v[:, skip:] for v in (found.e, found.s, found.seen))
+            squares += float(np.sum(e * np.linalg.solve(s, e[..., None])[..., 0]))
+            logs += float(np.linalg.slogdet(s)[1].sum())
+            count += int(seen.sum())
+        return squares, logs, count
+
+    @property
+    def _n_z(self) -> int:
+        return len(self.prior.states) + len(self.prior.corrected)
+
+    @cached_property
+    def _passes(self) -> tuple[ca.Function, ca.Function]:
+        """One period of the filter: linearized along its own estimates, and along given ones."""
+        return _filters(
+            self.prior.equations, self.prior.corrected, self.dt, required_substeps(self.prior, self.dt)
+        )
 
     def _with_states(self, trajectory: Trajectory, z: Array) -> Trajectory:
         n_x = len(self.prior.states)
         x, d = z[:, :n_x], z[:, n_x:]
-        with torch.no_grad():
-            a = self.prior.acceleration(torch.tensor(x), torch.tensor(trajectory.u)).numpy() + d
-        return replace(trajectory, x=x, xdot=np.hstack([x[:, self.prior.n_q :], a]))
+        held = trajectory.u.T, trajectory.w.T, self.prior.p
+        xdot = self.prior.equations.xdot(x.T, *held).full().T
+        xdot[:, list(self.prior.corrected)] += d
+        return replace(trajectory, x=x, xdot=xdot)
 
-    def _estimate(self, group: dict[int, Trajectory]) -> tuple[Array, tuple[float, float]]:
-        """Smoothed ``(q, v, d)`` ``(b, n, 3 n_q)`` of trajectories of one length, and their innovations."""
-        y, u = (np.stack([getattr(t, key) for t in group.values()]) for key in ("y", "u"))
-        z = np.concatenate([y, np.gradient(y, self.dt, axis=1), np.zeros_like(y)], axis=-1)
-        sums = (0.0, 0.0)
+    def _estimate(self, group: Sequence[Trajectory]) -> Array:
+        """Smoothed ``(x, d)`` ``(b, n, n_z)`` of trajectories of one length."""
+        z = _smoothed(self._filtered(group))
         for _ in range(SWEEPS):
-            predicted, slope = self._linearize(z[:, :-1], u[:, :-1])
-            offset = predicted - (slope @ z[:, :-1, :, None])[..., 0]
-            z, sums = self._sweep(offset, slope, y)
-        return z, sums
+            z = _smoothed(self._filtered(group, z))
+        return z
 
-    def _linearize(self, z: Array, u: Array) -> tuple[Array, Array]:
-        """Next ``(q, v, d)`` from each ``z`` ``(b, n, 3 n_q)``, and its Jacobian."""
-        n_z, p = z.shape[-1], np.array(list(self.prior.values.values()))
-        every, _, slope = with_acceleration(self.prior, self.dt).by_all(
-            z.reshape(-1, n_z), u.reshape(-1, 1, u.shape[-1]), p, required_substeps(self.prior, self.dt)
+    def _filtered(self, group: Sequence[Trajectory], along: Array | None = None) -> _Filtered:
+        """What the filter finds, linearized along its own estimates or along ``(x, d)`` ``(b, n, n_z)``."""
+        y, u, w = (np.stack([getattr(t, key) for t in group]) for key in ("y", "u", "w"))
+        censored = np.stack([_censored(t) for t in group])
+        b, n = y.shape[:2]
+        n_z, n_x = self._n_z, len(self.prior.states)
+        seen = np.isfinite(y)
+        first = np.stack([np.concatenate([self._start(t), np.zeros(n_z - n_x)]) for t in group])
+        rates = [self.sizes.rate[i] for i in self.prior.corrected]
+        spread = IGNORANCE * np.array([*self.sizes.x, *rates])
+        ahead = np.concatenate(
+            [first[..., None], np.broadcast_to(np.diag(spread**2), (b, n_z, n_z))], axis=-1
         )
-        return every[:, 1].reshape(z.shape), slope[:, 1].reshape(*z.shape, n_z)
+        signals = [np.where(seen, y, 0.0), seen.astype(float), censored.astype(float), u, w]
+        noise = np.concatenate([np.zeros(n_x), np.square(self.walk)])
+        constant = [self.prior.p, np.square(self.sigma), noise]
+        own, given = self._passes
+        if along is not None:
+            signals.append(along)
+        run = _run(own if along is None else given, n, b)
+        found = run(
+            np.moveaxis(ahead, 1, 0).reshape(n_z, -1),
+            *(v.reshape(b * n, v.shape[-1]).T for v in signals),
+            *(np.tile(c[:, None], (1, b)) for c in constant),
+        )
+        ahead_, now, slope, e, s = (np.moveaxis(v.full().reshape(v.shape[0], b, n, -1), 0, 2) for v in found)
+        return _Filtered(y, seen, first, spread, ahead_, now, slope, e[..., 0], s)
 
-    def _sweep(self, offset: Array, slope: Array, y: Array) -> tuple[Array, tuple[float, float]]:
-        """Kalman filter and Rauch-Tung-Striebel smoother of ``z_{k+1} = slope_k z_k + offset_k + w``."""
-        (b, n, n_q), r = y.shape, np.square(self.sigma)
-        noise = np.diag(np.concatenate([np.zeros(2 * n_q), np.square(self.walk)]))
-        start = np.concatenate([r, r / self.dt**2, np.square(self.walk) + r / self.dt**2])
-        z = np.concatenate([y[:, 0], np.zeros((b, 2 * n_q))], axis=-1)
-        p = np.broadcast_to(np.diag(IGNORANCE**2 * start), (b, 3 * n_q, 3 * n_q))
-        ahead = np.concatenate([z[..., None], p], axis=-1)
-        to_next = np.concatenate([slope, np.zeros((b, 1, 3 * n_q, 3 * n_q))], axis=1)
-        moved = np.concatenate([offset, np.zeros((b, 1, 3 * n_q))], axis=1)
-        given = ahead, y[..., None], to_next, moved[..., None], np.broadcast_to(r[:, None], (b, n_q, 1))
-        found = _filter(n_q, n).map(b)(*(_side_by_side(v) for v in given), np.tile(noise, (1, b)))
-        later, now, seen = (_apart(v.full(), b, n) for v in found)
-        before = np.concatenate([ahead[None], later[:-1]])
-        means, covariances = (np.stack([v[..., part] for v in (before, now)]) for part in (0, slice(1, None)))
-        errors, variances = seen[..., 0], seen[..., 1:]
-        forward = slope.swapaxes(0, 1) @ covariances[1, :-1]
-        back = np.linalg.solve(covariances[0, 1:], forward).swapaxes(-1, -2)
-        smooth = means[1]
-        for k in range(n - 2, -1, -1):
-            smooth[k] += (back[k] @ (smooth[k + 1] - means[0, k + 1])[..., None])[..., 0]
-        e, s = (
-            errors[3:],
-            variances[3:],
-        )  # three samples end the ignorance of position, velocity and correction
-        squares = float(np.sum(e[..., None, :] @ np.linalg.solve(s, e[..., None])))
-        return smooth.swapaxes(0, 1), (squares, float(np.linalg.slogdet(s)[1].sum()))
+    def _start(self, trajectory: Trajectory) -> Array:
+        """States at the first sample: nearest to rest, in their sizes, of those that explain what is measured."""
+        x, u, w = rest_of(self.prior)
+        u, w = (own[0] if len(own[0]) else near for own, near in ((trajectory.u, u), (trajectory.w, w)))
+        there = np.isfinite(trajectory.y)
+        y = np.array([c[h][0] if h.any() else np.nan for c, h in zip(trajectory.y.T, there.T, strict=True)])
+        output, size, outputs = (
+            _output_slope(self.prior.equations),
+            np.array(self.sizes.x),
+            np.array(self.sizes.y),
+        )
+        for _ in range(5):
+            found, c = (v.full() for v in output(x, u, w, self.prior.p))
+            e = np.where(np.isfinite(y), y - found[:, 0], 0.0) / outputs
+            scaled = c * size / outputs[:, None]
+            x = x + size * (np.linalg.pinv(scaled, rcond=1e-6) @ e)
+        return x
+
+
+@dataclass(frozen=True)
+class _Filtered:
+    """A filter's results for ``b`` trajectories of ``n`` samples; the last axis is ``[z, P]`` of estimates."""
+
+    y: Array
+    seen: NDArray[np.bool_]
+    first: Array
+    spread: Array
+    ahead: Array
+    now: Array
+    slope: Array
+    e: Array
+    s: Array
+
+
+def _smoothed(found: _Filtered) -> Array:
+    """Rauch-Tung-Striebel smoother behind a filter: ``z`` ``(b, n, n_z)``."""
+    b, n, n_z, _ = found.now.shape
+    forward = found.slope[:, :-1] @ found.now[:, :-1, :, 1:]
+    back = np.swapaxes(np.linalg.solve(found.ahead[:, :-1, :, 1:], forward), -1, -2)
+    own, ahead = found.now[..., 0], found.ahead[:, :-1, :, 0]
+    given = own[:, -2::-1] - np.einsum("bnij,bnj->bni", back, ahead)[:, ::-1], back[:, ::-1]
+    if n < 2:
+        return own
+    run = _backward(n_z, n - 1).map(b)
+    later = run(
+        own[:, -1].T,
+        given[0].reshape(-1, n_z).T,
+        np.moveaxis(given[1].reshape(-1, n_z, n_z), 1, 0).reshape(n_z, -1),
+    )
+    earlier = later.full().T.reshape(b, n - 1, n_z)[:, ::-1]
+    return np.concatenate([earlier, own[:, -1:]], axis=1)
 
 
 def fit_smoother(
@@ -129,8 +212,8 @@ def fit_smoother(
 ) -> Smoother:
     """Smoother whose noise and walk make the measurements most likely.
 
-    The ratio of walk to noise is searched, the noise's scale follows in closed form. Several outputs keep
-    the ratio of noises that their third differences show, and share one ratio of walk to noise.
+    The ratio of walk to noise is searched, the noise's scale follows in closed form. Several outputs keep the ratio of
+    noises that their third differences show, several walks that of the natural sizes of the rates.
 
     Args:
         prior: The fitted prior.
@@ -140,20 +223,103 @@ def fit_smoother(
     """
     unit = scales.time_unit(trajectories, dt) if time_unit is None else time_unit
     sample = [trajectories[i] for i in evenly(len(trajectories), SAMPLE)]
-    sigma = np.maximum(scales.noise_of(sample), 1e-12)
-    count = sum((len(t.t) - 3) * t.y.shape[1] for t in sample)
+    sizes = sizes_of(prior, trajectories, dt, unit)
+    rates = np.array(sizes.rate)[list(prior.corrected)] * math.sqrt(dt / unit)
 
     def at(ratio: float, scale: float = 1.0) -> Smoother:
-        levels = scale * sigma, scale * 10.0**ratio * sigma
-        return Smoother(prior, dt, *(tuple(float(v) for v in level) for level in levels))
+        sigma, walk = scale * np.array(sizes.noise), scale * 10.0**ratio * rates
+        return Smoother(prior, dt, tuple(sigma.tolist()), tuple(walk.tolist()), sizes)
 
     def cost(ratio: float) -> float:
-        squares, logs = at(ratio).innovations(sample)
-        return count * math.log(squares / count) + logs
+        squares, logs, count = at(ratio).innovations(sample)
+        value = count * math.log(max(squares, 1e-300) / max(count, 1)) + logs
+        return value if math.isfinite(value) else 1e300
 
-    bounds = [decade - 2.0 * math.log10(unit) for decade in DECADES]
-    best = float(minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 0.05}).x)
-    return at(best, math.sqrt(at(best).innovations(sample)[0] / count))
+    best = float(minimize_scalar(cost, bounds=DECADES, method="bounded", options={"xatol": 0.05}).x)
+    squares, _, count = at(best).innovations(sample)
+    return at(best, math.sqrt(squares / max(count, 1)) or 1.0)
+
+
+def sizes_of(prior: Prior, trajectories: Sequence[Trajectory], dt: float, time_unit: float) -> Sizes:
+    """Natural sizes of a machine's signals, from recordings and the prior linearized at rest."""
+    y = np.concatenate([t.y for t in trajectories])
+    spread = np.array([float(np.std(c[np.isfinite(c)])) if np.isfinite(c).any() else 0.0 for c in y.T])
+    spread = np.where(spread > 0, spread, 1.0)
+    noise = np.maximum(_noise(trajectories), QUIETEST * spread)
+    seen = seen_by(prior, dt, time_unit) / spread[:, None, None]
+    size = np.sqrt(
+        np.mean(np.sum(np.square(seen), axis=0), axis=0)
+    )  # of the outputs, for one unit of each state
+    ranges = np.array([s.upper - s.lower for s in prior.states])
+    x = np.minimum(1.0 / np.maximum(size, 1e-300), np.where(np.isfinite(ranges), ranges, math.inf))
+    unknown = ~np.isfinite(x) | (x > 1e200)
+    x = np.where(unknown, 1.0, x)
+    return Sizes(*(tuple(float(v) for v in values) for values in (spread, noise, x, x / time_unit)))
+
+
+def seen_by(prior: Prior, dt: float, time_unit: float) -> Array:
+    """How each state at a time shows in each output over the machine's second after it ``(n_y, n, n_x)``.
+
+    The prior is linearized at rest (:func:`~hybrid_mpc.identify.simulation.rest_of`) and a little beside it, since a
+    sensor may be blind at one point: ``|v|`` at rest.
+    """
+    x, u, w = rest_of(prior)
+    ranges = np.array([s.upper - s.lower for s in prior.states])
+    beside = x + np.where(np.isfinite(ranges), 0.1 * ranges, 1.0)
+    periods = max(2, round(time_unit / dt))
+    skip = max(1, periods // 50)  # fifty instants tell as much as a thousand
+    slope, output = _flow_slope(prior.equations.xdot), _output_slope(prior.equations)
+    found = []
+    for point in (x, beside):
+        a = slope(point, u, w, prior.p).full()
+        c = output(point, u, w, prior.p)[1].full()
+        if not (np.isfinite(a).all() and np.isfinite(c).all()):
+            continue
+        step, rows, at = expm(a * dt * skip), [], np.eye(len(x))
+        for _ in range(0, periods, skip):
+            at = at @ step
+            rows.append(c @ at)
+        found.append(np.clip(np.nan_to_num(np.stack(rows, axis=1)), -1e100, 1e100))
+    if not found:
+        return np.zeros((len(prior.outputs), 1, len(x)))
+    return np.concatenate(found, axis=1)
+
+
+def unseen_states(prior: Prior, dt: float, time_unit: float) -> list[str]:
+    """Names of the states that no output tells of: alone, or together with others.
+
+    States are scaled by their ranges, outputs by what all states together make of them.
+    """
+    seen = seen_by(prior, dt, time_unit)
+    ranges = np.array([s.upper - s.lower for s in prior.states])
+    scaled = seen * np.where(np.isfinite(ranges), ranges, 1.0)
+    size = np.abs(scaled).max(axis=(1, 2), keepdims=True)
+    rows = (scaled / np.where(size > 0, size, 1.0)).reshape(-1, len(ranges))
+    columns = np.abs(rows).max(axis=0)
+    alone = {s.name for s, c in zip(prior.states, columns, strict=True) if c < UNSEEN}
+    left = [i for i, c in enumerate(columns) if c >= UNSEEN]
+    if left:
+        _, singular, directions = np.linalg.svd(rows[:, left] / columns[left], full_matrices=True)
+        rank = int((singular > UNSEEN * singular[0]).sum())
+        for direction in directions[rank:]:
+            alone |= {prior.states[left[k]].name for k in np.flatnonzero(np.abs(direction) > 0.1)}
+    return [s.name for s in prior.states if s.name in alone]
+
+
+def _noise(trajectories: Sequence[Trajectory]) -> Array:
+    """Standard deviation ``(n_y,)`` of the sensors' noise, from third differences of the samples that are there."""
+    found = []
+    for j in range(trajectories[0].y.shape[1]):
+        columns = [t.y[np.isfinite(t.y[:, j]), j] for t in trajectories]
+        third = np.concatenate([np.diff(c, 3) for c in columns])
+        found.append(float(np.std(third)) / math.sqrt(20.0) if len(third) else 0.0)
+    return np.array(found)
+
+
+def _censored(trajectory: Trajectory) -> NDArray[np.int8]:
+    """Which samples say only at most (-1) or at least (+1)."""
+    own = getattr(trajectory, "censored", None)
+    return np.zeros(trajectory.y.shape, dtype=np.int8) if own is None else own
 
 
 def _by_length(trajectories: Iterable[Trajectory]) -> list[dict[int, Trajectory]]:
@@ -164,38 +330,87 @@ def _by_length(trajectories: Iterable[Trajectory]) -> list[dict[int, Trajectory]
     return list(groups.values())
 
 
-@lru_cache(maxsize=16)
-def _filter(n_q: int, n: int) -> ca.Function:
-    """Kalman filter over ``n`` samples: what is expected ``[z, P]``, and ``y``, transition, offset, ``r``, noise.
+@lru_cache(maxsize=32)
+def _output_slope(equations: Equations) -> ca.Function:
+    """``(x, u, w, p) -> y`` and its derivative by ``x``."""
+    f = equations.output
+    point = [ca.SX.sym(f.name_in(i), f.size1_in(i)) for i in range(4)]
+    y = f(*point)
+    return ca.Function("output", point, [y, ca.densify(ca.jacobian(y, point[0]))])
 
-    Gives what is expected of the next sample, the estimates ``[z, P]`` and the innovations ``[e, S]``.
+
+@lru_cache(maxsize=32)
+def _flow_slope(xdot: ca.Function) -> ca.Function:
+    point = [ca.SX.sym(xdot.name_in(i), xdot.size1_in(i)) for i in range(4)]
+    return ca.Function("slope", point, [ca.densify(ca.jacobian(xdot(*point), point[0]))])
+
+
+@lru_cache(maxsize=32)
+def _filters(
+    equations: Equations, corrected: tuple[int, ...], dt: float, substeps: int
+) -> tuple[ca.Function, ca.Function]:
+    """A period of the filter, along its own estimates and along given ones.
+
+    Takes what is expected ``[z, P]``, a sample ``y``, which outputs were seen, which are censored, ``u, w``, ``z`` to
+    linearize along, ``p``, variances of the noise and of the walk. Gives what is expected of the next sample, the
+    estimate ``[z, P]``, the transition, and the innovation with its covariance.
     """
-    n_z = 3 * n_q
-    ahead, y, at = ca.SX.sym("ahead", n_z, 1 + n_z), ca.SX.sym("y", n_q), ca.SX.sym("at", n_z, n_z)
-    offset, r, noise = ca.SX.sym("offset", n_z), ca.SX.sym("r", n_q), ca.SX.sym("noise", n_z, n_z)
-    z, p = ahead[:, 0], ahead[:, 1:]
-    s, e = p[:n_q, :n_q] + ca.diag(r), y - z[:n_q]
-    gain = p[:, :n_q] @ ca.inv(s)
-    z, p = z + gain @ e, p - gain @ p[:n_q, :]
-    p = 0.5 * (p + p.T)
-    later = ca.horzcat(at @ z + offset, at @ p @ at.T + noise)
-    period = ca.Function(
-        "period",
-        [ahead, y, at, offset, r, noise],
-        [ca.densify(v) for v in (later, ca.horzcat(z, p), ca.horzcat(e, s))],
-    )
+    xdot = with_unknown_rates(equations.xdot, corrected)
+    n_x, n_z, n_y = equations.xdot.size1_in(0), xdot.size1_in(0), equations.output.size1_out(0)
+    sizes = {"u": xdot.size1_in(1), "w": xdot.size1_in(2), "p": xdot.size1_in(3)}
+    ahead, y, seen, censored = (
+        ca.SX.sym("ahead", n_z, 1 + n_z), *(ca.SX.sym(name, n_y) for name in ("y", "seen", "censored"))
+    )  # fmt: skip
+    u, w, p = (ca.SX.sym(name, n) for name, n in sizes.items())
+    along, r, noise = ca.SX.sym("along", n_z), ca.SX.sym("r", n_y), ca.SX.sym("noise", n_z)
+
+    def linear(of: ca.SX, at: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """Output at ``of``, linearized at ``at``, and its slope."""
+        x = ca.SX.sym("x", n_x)
+        value = equations.output(x, u, w, p)
+        slope = ca.horzcat(ca.jacobian(value, x), ca.SX(n_y, n_z - n_x))
+        value, slope = (ca.substitute(v, x, at[:n_x]) for v in (value, slope))
+        return value + slope @ (of - at), slope
+
+    def moved(of: ca.SX, at: ca.SX) -> tuple[ca.SX, ca.SX]:
+        z = ca.SX.sym("z", n_z)
+        value = stepped(xdot, z, u, w, p, dt, substeps)
+        value, slope = (ca.substitute(v, z, at) for v in (value, ca.jacobian(value, z)))
+        return value + slope @ (of - at), slope
+
+    made = []
+    for own in (True, False):
+        z, covariance = ahead[:, 0], ahead[:, 1:]
+        expected, c = linear(z, z if own else along)
+        # a censored sample counts where the estimate lies on the measured side of its limit
+        counts = seen * (1 - ca.logic_and(censored != 0, censored * (expected - y) > 0))
+        e, c = counts * (y - expected), ca.diag(counts) @ c
+        s = c @ covariance @ c.T + ca.diag(counts * r + (1 - counts))
+        gain = ca.solve(s, c @ covariance).T if n_y > 1 else (covariance @ c.T) / s
+        z, covariance = z + gain @ e, covariance - gain @ (c @ covariance)
+        covariance = 0.5 * (covariance + covariance.T)
+        after, slope = moved(z, z if own else along)
+        later = ca.horzcat(after, slope @ covariance @ slope.T + ca.diag(noise))
+        outputs = [ca.densify(v) for v in (later, ca.horzcat(z, covariance), slope, e, s)]
+        given = [ahead, y, seen, censored, u, w, *([] if own else [along]), p, r, noise]
+        made.append(ca.Function("filter" if own else "again", given, [ca.cse(v) for v in outputs]))
+    return made[0], made[1]
+
+
+@lru_cache(maxsize=64)
+def _run(period: ca.Function, n: int, b: int) -> ca.Function:
+    """A filter over ``n`` samples of ``b`` trajectories; the last three inputs are constant."""
+    signals = range(1, period.n_in() - 3)
     held = [
-        ca.MX.sym(f"a{i}", period.size1_in(i), period.size2_in(i) * (n if 0 < i < 4 else 1)) for i in range(6)
+        ca.MX.sym(f"a{i}", period.size1_in(i), period.size2_in(i) * (n if i in signals else 1))
+        for i in range(period.n_in())
     ]
-    over = period.mapaccum(n)(*held[:4], ca.repmat(held[4], 1, n), ca.repmat(held[5], 1, n))
-    return ca.Function("filter", held, list(over))
+    over = period.mapaccum(n)(*held[:-3], *(ca.repmat(v, 1, n) for v in held[-3:]))
+    return ca.Function("run", held, list(over)).map(b)
 
 
-def _side_by_side(blocks: Array) -> Array:
-    """Matrices ``(..., rows, columns)`` in one row."""
-    return np.moveaxis(blocks, -2, 0).reshape(blocks.shape[-2], -1)
-
-
-def _apart(row: Array, b: int, n: int) -> Array:
-    """The matrices ``(n, b, rows, columns)`` of ``b`` trajectories' ``n`` samples in one row."""
-    return np.moveaxis(row.reshape(len(row), b, n, -1), (2, 1), (0, 1))
+@lru_cache(maxsize=64)
+def _backward(n_z: int, n: int) -> ca.Function:
+    """``z_k = offset_k + back_k z_{k+1}`` over ``n`` samples."""
+    z, offset, back = ca.SX.sym("z", n_z), ca.SX.sym("offset", n_z), ca.SX.sym("back", n_z, n_z)
+    return ca.Function("earlier", [z, offset, back], [offset + back @ z]).mapaccum(n)

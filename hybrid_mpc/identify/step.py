@@ -1,12 +1,10 @@
-"""Models as steps ``(x, h, u) -> (x_next, h_next)`` over one period: the prior alone, and prior plus network.
+"""Models as steps ``(x, h, u, w) -> (x_next, h_next)`` over one period: the prior alone, and prior plus network.
 
 One code for training (any batch) and for export (one sample).
 """
 
 from __future__ import annotations
 
-import copy
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -15,17 +13,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.func import functional_call, vmap
 
+import nn_export
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.dataset import Windows
 from hybrid_mpc.identify.networks import StackedGRU
-from hybrid_mpc.machine.torch_prior import Prior
+from hybrid_mpc.identify.simulation import required_substeps
+from hybrid_mpc.machine.prior import Prior
 
-MAX_SUBSTEPS = 20
-"""A prior stiffer than this many Runge-Kutta sub-steps a period can follow needs another dt."""
 SPAN = 10
 """Periods over which the correction is averaged to find its scale."""
+VARIES = 1e-3
+"""Share of a signal's size below which its spread counts as none: what hardly varies is scaled by its size."""
 
 
 def rk4(f: Callable[[Tensor], Tensor], x: Tensor, dt: float, substeps: int) -> Tensor:
@@ -40,37 +39,32 @@ def rk4(f: Callable[[Tensor], Tensor], x: Tensor, dt: float, substeps: int) -> T
     return x
 
 
-def required_substeps(prior: Prior, dt: float) -> int:
-    """Sub-steps a period that keep every eigenvalue of the prior at rest within 1 / sub-step.
+class PriorEquations(nn.Module):
+    """A prior's equations on tensors with any leading axes: ``xdot``, ``output``, and a residual for each balance."""
 
-    Friction is steepest at rest; Runge-Kutta of order 4 is stable up to 2.8 and accurate to per cents
-    of the fast mode at 1.
-    """
-    return substeps_for(prior, len(prior.states), len(prior.inputs), dt, f"{type(prior).__name__}: the prior")
+    def __init__(self, prior: Prior) -> None:
+        super().__init__()
+        equations = prior.equations
 
+        def on_tensors(function: Any) -> nn.Module:
+            return nn_export.from_casadi(function, own_derivatives=False)
 
-def substeps_for(f: Callable[[Tensor, Tensor], Tensor], n_x: int, n_u: int, dt: float, name: str) -> int:
-    """:func:`required_substeps` of any ``xdot = f(x, u)``; ``name`` says in the error what is too stiff."""
-    zeros = torch.zeros(n_x, dtype=torch.float64)
-    u = torch.zeros(n_u, dtype=torch.float64)
-    slope = torch.func.jacrev(lambda x: f(x, u))(zeros)
-    rate = float(torch.linalg.eigvals(slope).abs().max())
-    substeps = max(1, math.ceil(rate * dt))
-    if not math.isfinite(rate) or substeps > MAX_SUBSTEPS:
-        raise InputError(
-            f"{name}'s fastest mode at rest is {rate:.3g} 1/s; a period of {dt} s "
-            f"would need {substeps} sub-steps (at most {MAX_SUBSTEPS}). Smooth its friction (lower the slope "
-            f"at zero speed) or take a smaller dt."
-        )
-    return substeps
+        self.xdot, self.output = on_tensors(equations.xdot), on_tensors(equations.output)
+        self.residuals = nn.ModuleDict({b.name: on_tensors(b.residual) for b in equations.balances})
 
 
 class Step(nn.Module):
-    """What every model is: a step over one period, its derivative, and the prior that names its signals."""
+    """What every model is: a step over one period, its derivative, and the prior that names its signals.
+
+    The prior's parameters ``p`` ``(n_p,)`` are those of ``prior`` where none are given.
+    """
+
+    p: Tensor
 
     def __init__(self, prior: Prior, dt: float) -> None:
         super().__init__()
-        self.prior, self.dt = prior, dt
+        self.prior, self.dt, self.equations = prior, dt, PriorEquations(prior)
+        self.register_buffer("p", torch.tensor(prior.p), persistent=False)
 
     @property
     def n_h(self) -> int:
@@ -82,13 +76,15 @@ class Step(nn.Module):
         """Zero hidden state ``(n_h,)``; of a stack of networks ``(networks, 1, n_h)``."""
         return torch.zeros(self.n_h, dtype=torch.float64)
 
-    def forward(self, x: Tensor, h: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Next state ``(..., n_x)`` and next hidden state ``(..., n_h)``, with ``u`` held over the period."""
-        raise NotImplementedError(f"{type(self).__name__} must define forward(x, h, u)")
+    def forward(
+        self, x: Tensor, h: Tensor, u: Tensor, w: Tensor, p: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Next state ``(..., n_x)`` and next hidden state ``(..., n_h)``, with ``u`` and ``w`` held over the period."""
+        raise NotImplementedError(f"{type(self).__name__} must define forward(x, h, u, w, p)")
 
-    def xdot(self, x: Tensor, h: Tensor, u: Tensor) -> Tensor:
+    def xdot(self, x: Tensor, h: Tensor, u: Tensor, w: Tensor, p: Tensor | None = None) -> Tensor:
         """Derivative of the state ``(..., n_x)`` at the instant."""
-        raise NotImplementedError(f"{type(self).__name__} must define xdot(x, h, u)")
+        raise NotImplementedError(f"{type(self).__name__} must define xdot(x, h, u, w, p)")
 
 
 class PriorStep(Step):
@@ -106,30 +102,46 @@ class PriorStep(Step):
         super().__init__(prior, dt)
         self.substeps = required_substeps(prior, dt)
 
-    def forward(self, x: Tensor, h: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, x: Tensor, h: Tensor, u: Tensor, w: Tensor, p: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Next state and the hidden state as it came."""
-        return rk4(lambda z: self.prior(z, u), x, self.dt, self.substeps), h
+        return rk4(lambda z: self.xdot(z, h, u, w, p), x, self.dt, self.substeps), h
 
-    def xdot(self, x: Tensor, h: Tensor, u: Tensor) -> Tensor:
+    def xdot(self, x: Tensor, h: Tensor, u: Tensor, w: Tensor, p: Tensor | None = None) -> Tensor:
         """Derivative of the state at the instant."""
-        return self.prior(x, u)
+        rates: Tensor = self.equations.xdot(x, u, w, self.p if p is None else p)
+        return rates
 
 
 @dataclass(frozen=True)
 class Scaling:
-    """Magnitudes that make features and outputs of order one; part of the model.
+    """What makes features and outputs of order one; part of the model.
 
     Args:
         x: Scale of each state ``(n_x,)``.
         u: Scale of each input ``(n_u,)``.
-        acceleration: Scale of what the prior gives as a feature: its acceleration ``(n_q,)``.
-        correction: Scale of the network's output ``(n_q,)``.
+        rate: Scale of what the prior gives as a feature: its rates of the corrected states ``(n_c,)``.
+        correction: Scale of the network's output ``(n_c,)``.
+        w: Scale of each disturbance ``(n_w,)``. Default: there is none.
+        centre_x: What is taken off each state first. Default: zero.
+        centre_u: What is taken off each input first. Default: zero.
+        centre_w: What is taken off each disturbance first. Default: zero.
     """
 
     x: tuple[float, ...]
     u: tuple[float, ...]
-    acceleration: tuple[float, ...]
+    rate: tuple[float, ...]
     correction: tuple[float, ...]
+    w: tuple[float, ...] = ()
+    centre_x: tuple[float, ...] = ()
+    centre_u: tuple[float, ...] = ()
+    centre_w: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("x", "u", "w"):
+            centre = getattr(self, f"centre_{name}") or (0.0,) * len(getattr(self, name))
+            object.__setattr__(self, f"centre_{name}", tuple(centre))
 
 
 class RecurrentStep(Step):
@@ -137,8 +149,8 @@ class RecurrentStep(Step):
 
     A subclass says what the network sees and gives (``sizes``, ``scaling_of``, ``features``) and what becomes of it
     (``integrate``, ``derivative``, ``rate``, ``measured_rate``). ``use_prior=False`` makes the plain recurrent network
-    (RNN) of the paper's comparison. ``dynamics`` is the prior's equation with parameters trained along (default:
-    ``prior``); names, output and energy balance stay those of ``prior``.
+    (RNN) of the paper's comparison. ``shift`` is what is added to the prior's parameters: those that were trained along
+    less the fitted ones; names, output and balances stay those of ``prior``.
     """
 
     corrects_prior: ClassVar[bool]
@@ -147,8 +159,13 @@ class RecurrentStep(Step):
     """Whether it is trained on the recorded derivatives, which then have to be known."""
     scale_x: Tensor
     scale_u: Tensor
-    scale_acceleration: Tensor
+    scale_w: Tensor
+    scale_rate: Tensor
     scale_correction: Tensor
+    scale_centre_x: Tensor
+    scale_centre_u: Tensor
+    scale_centre_w: Tensor
+    own_shift: Tensor
 
     def __init__(
         self,
@@ -158,13 +175,16 @@ class RecurrentStep(Step):
         dt: float,
         *,
         use_prior: bool = True,
-        dynamics: Prior | StackedPrior | None = None,
+        shift: Tensor | TrainedParameters | None = None,
     ) -> None:
         super().__init__(prior, dt)
-        self.network, self.use_prior, self.dynamics = network, use_prior, dynamics
+        self.network, self.use_prior = network, use_prior
+        self.trained = shift if isinstance(shift, TrainedParameters) else None
         self.substeps = required_substeps(prior, dt) if use_prior and self.corrects_prior else 1
-        for name in ("x", "u", "acceleration", "correction"):
-            self.register_buffer(f"scale_{name}", torch.tensor(getattr(scaling, name), dtype=torch.float64))
+        own = shift if isinstance(shift, Tensor) else torch.zeros(len(prior.parameters), dtype=torch.float64)
+        self.register_buffer("own_shift", own, persistent=False)
+        for name, values in vars(scaling).items():
+            self.register_buffer(f"scale_{name}", torch.tensor(values, dtype=torch.float64))
 
     @classmethod
     def sizes(cls, prior: Prior, use_prior: bool) -> tuple[int, int]:
@@ -176,21 +196,25 @@ class RecurrentStep(Step):
         """Scaling from training windows."""
         raise NotImplementedError(f"{cls.__name__} must define scaling_of(prior, windows, dt, use_prior=...)")
 
-    def features(self, x: Tensor, u: Tensor) -> Tensor:
+    def features(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         """Network inputs ``s``, scaled."""
-        raise NotImplementedError(f"{type(self).__name__} must define features(x, u)")
+        raise NotImplementedError(f"{type(self).__name__} must define features(x, u, w)")
 
-    def integrate(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
-        """Next state with ``correction`` and ``u`` held over the period."""
-        raise NotImplementedError(f"{type(self).__name__} must define integrate(x, u, correction)")
+    def integrate(
+        self, x: Tensor, u: Tensor, w: Tensor, correction: Tensor, p: Tensor | None = None
+    ) -> Tensor:
+        """Next state with ``correction``, ``u`` and ``w`` held over the period."""
+        raise NotImplementedError(f"{type(self).__name__} must define integrate(x, u, w, correction, p)")
 
-    def derivative(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
+    def derivative(
+        self, x: Tensor, u: Tensor, w: Tensor, correction: Tensor, p: Tensor | None = None
+    ) -> Tensor:
         """Derivative of the state at the instant, ``(..., n_x)``."""
-        raise NotImplementedError(f"{type(self).__name__} must define derivative(x, u, correction)")
+        raise NotImplementedError(f"{type(self).__name__} must define derivative(x, u, w, correction, p)")
 
-    def rate(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
+    def rate(self, x: Tensor, u: Tensor, w: Tensor, correction: Tensor) -> Tensor:
         """Rate of change over the period that the training compares with :meth:`measured_rate`."""
-        raise NotImplementedError(f"{type(self).__name__} must define rate(x, u, correction)")
+        raise NotImplementedError(f"{type(self).__name__} must define rate(x, u, w, correction)")
 
     def measured_rate(self, x: Tensor, x_next: Tensor, xdot: Tensor) -> Tensor:
         """The measured rate, from states and their recorded derivative."""
@@ -207,39 +231,44 @@ class RecurrentStep(Step):
         """Zero hidden state ``(n_h,)``; of a stack of networks ``(networks, 1, n_h)``."""
         return self.network.initial(1) if isinstance(self.network, StackedGRU) else super().h0
 
-    @property
-    def physics(self) -> Prior | StackedPrior:
-        """Whose equation of motion it is: ``dynamics``, or the prior."""
-        return self.prior if self.dynamics is None else self.dynamics
+    def prior_rates(self, x: Tensor, u: Tensor, w: Tensor, p: Tensor | None = None) -> Tensor:
+        """The prior's rates ``(..., n_x)``, with the parameters that were trained along with the network."""
+        shift = self.own_shift if self.trained is None else self.trained.shift()
+        rates: Tensor = self.equations.xdot(x, u, w, (self.p if p is None else p) + shift)
+        return rates
 
-    def stacked_features(self, x: Tensor, u: Tensor) -> Tensor:
-        """Features of a stack ``(T, 1 or networks, n, n_in)`` at ``x`` ``(T, n, n_x)`` and ``u``, the same for all."""
-        if isinstance(self.dynamics, StackedPrior):
-            shape = (-1, self.dynamics.networks, -1, -1)
-            return self.features(x.unsqueeze(1).expand(shape), u.unsqueeze(1).expand(shape))
-        return self.features(x, u).unsqueeze(1)
+    def stacked_features(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
+        """Features of a stack ``(T, 1 or networks, n, n_in)`` at ``x`` ``(T, n, n_x)``, ``u``, ``w``, the same for
+        all.
+        """
+        return self.features(*(z.unsqueeze(1) for z in (x, u, w)))
 
-    def correction(self, x: Tensor, h: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        """What the network gives [SI] (hybrid: acceleration ``(..., n_q)``), and the next hidden state."""
-        out, h_next = self.network(self.features(x, u), h)
+    def correction(self, x: Tensor, h: Tensor, u: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+        """What the network gives (hybrid: rates ``(..., n_c)`` [units of the states per second]), and the next hidden
+        state.
+        """
+        out, h_next = self.network(self.features(x, u, w), h)
         return out * self.scale_correction, h_next
 
-    def forward(self, x: Tensor, h: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Next state ``(..., n_x)`` and next hidden state."""
-        correction, h_next = self.correction(x, h, u)
-        return self.integrate(x, u, correction), h_next
+    def forward(
+        self, x: Tensor, h: Tensor, u: Tensor, w: Tensor, p: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Next state ``(..., n_x)`` and next hidden state. What the network adds does not depend on ``p``."""
+        correction, h_next = self.correction(x, h, u, w)
+        return self.integrate(x, u, w, correction, p), h_next
 
-    def xdot(self, x: Tensor, h: Tensor, u: Tensor) -> Tensor:
-        """Derivative of the state at the instant, with the correction that ``(x, h, u)`` gives."""
-        return self.derivative(x, u, self.correction(x, h, u)[0])
+    def xdot(self, x: Tensor, h: Tensor, u: Tensor, w: Tensor, p: Tensor | None = None) -> Tensor:
+        """Derivative of the state at the instant, with the correction that ``(x, h, u, w)`` gives."""
+        return self.derivative(x, u, w, self.correction(x, h, u, w)[0], p)
 
 
 class HybridStep(RecurrentStep):
-    """Prior plus recurrent correction of its acceleration.
+    """Prior plus recurrent correction of the rates that it names (``Prior.corrects``).
 
-    ``h`` is updated once at ``(x_k, u_k)``; the correction is held over ``dt``; the kinematics are exact; Runge-Kutta
-    of order 4 integrates. Rates are means over the period, so that an input that jumps at a sample counts in the period
-    it acts in. Without the prior (``use_prior=False``) the network gives the whole acceleration.
+    ``h`` is updated once at ``(x_k, u_k, w_k)``; the correction is held over ``dt``; rates that are not corrected are
+    the prior's; Runge-Kutta of order 4 integrates. Rates are means over the period, so that an input that jumps at a
+    sample counts in the period it acts in. Without the prior (``use_prior=False``) the network gives the whole of the
+    rates that it corrects.
 
     Args:
         prior: The ODE prior; it also names the states.
@@ -247,62 +276,100 @@ class HybridStep(RecurrentStep):
         scaling: Magnitudes of features and outputs.
         dt: Model period [s].
         use_prior: False for the plain recurrent network (RNN) of the paper's comparison.
-        dynamics: The prior's equation with parameters that were trained along. Default: ``prior``.
+        shift: What is added to the prior's parameters ``(n_p,)``: those trained along less the fitted ones. Default:
+            nothing.
 
     Raises:
         InputError: If the prior is too stiff for the period.
     """
 
     corrects_prior = True
+    into: Tensor
+    own_rows: Tensor
+
+    def __init__(
+        self,
+        prior: Prior,
+        network: nn.Module,
+        scaling: Scaling,
+        dt: float,
+        *,
+        use_prior: bool = True,
+        shift: Tensor | TrainedParameters | None = None,
+    ) -> None:
+        super().__init__(prior, network, scaling, dt, use_prior=use_prior, shift=shift)
+        rows = torch.tensor(prior.corrected, dtype=torch.int64)
+        into = torch.zeros(len(rows), len(prior.states), dtype=torch.float64)
+        into[torch.arange(len(rows)), rows] = 1.0
+        self.register_buffer("into", into, persistent=False)  # of corrections, into rates
+        self.register_buffer("own_rows", 1.0 - into.sum(0), persistent=False)
+        at = rows.tolist()
+        self.corrected = slice(at[0], at[-1] + 1) if at == list(range(at[0], at[-1] + 1)) else rows
 
     @classmethod
     def sizes(cls, prior: Prior, use_prior: bool) -> tuple[int, int]:
         """Number of features and of outputs of its network."""
-        return n_features(prior, use_prior), prior.n_q
+        return n_features(prior, use_prior), len(prior.corrected)
 
     @classmethod
     def scaling_of(cls, prior: Prior, windows: Windows, dt: float, *, use_prior: bool) -> Scaling:
-        """Root mean squares of signals and of what the network must give.
+        """Means and spreads of the signals, root mean squares of the rates and of what the network must give.
 
-        The latter is averaged over ``SPAN`` periods first: the noise of a twice differentiated position would set the
+        The latter is averaged over ``SPAN`` periods first: the noise of a differentiated measurement would set the
         scale otherwise, and networks on so large a scale learn noise.
         """
-        x, u = windows.x[:, :-1].reshape(-1, windows.x.shape[-1]), windows.u.reshape(-1, windows.u.shape[-1])
-        n_q = prior.n_q
-        measured = (windows.x[:, 1:, n_q:] - windows.x[:, :-1, n_q:]) / dt
-        predicted = prior.acceleration(x, u)
+        x, u, w = (z.flatten(0, 1) for z in (windows.x[:, :-1], windows.u, windows.w))
+        rows = list(prior.corrected)
+        measured = ((windows.x[:, 1:] - windows.x[:, :-1]) / dt)[..., rows]
+        with torch.no_grad():
+            predicted = PriorEquations(prior).xdot(x, u, w, torch.tensor(prior.p))[..., rows]
         residual = measured - predicted.reshape(measured.shape) if use_prior else measured
         uncut = residual[:, : residual.shape[1] // SPAN * SPAN] if residual.shape[1] >= SPAN else residual
-        averaged = uncut.unflatten(1, (-1, min(SPAN, uncut.shape[1]))).mean(2).reshape(-1, n_q)
-        return Scaling(x=rms(x), u=rms(u), acceleration=rms(predicted), correction=rms(averaged))
+        averaged = uncut.unflatten(1, (-1, min(SPAN, uncut.shape[1]))).mean(2).reshape(-1, len(rows))
+        return Scaling(
+            spread(x), spread(u), rms(predicted), rms(averaged), spread(w), mean(x), mean(u), mean(w)
+        )
 
-    def features(self, x: Tensor, u: Tensor) -> Tensor:
-        """Network inputs ``s = [x, u, prior acceleration]``, scaled; an angle that turns as sin and cos."""
-        parts = []
+    def features(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
+        """Network inputs ``s = [x, u, w, prior's rates]``, scaled; an angle that turns as sin and cos."""
+        parts, scaled = [], (x - self.scale_centre_x) / self.scale_x
         for i, signal in enumerate(self.prior.states):
-            component = x[..., i : i + 1]
             if signal.periodic:
+                component = x[..., i : i + 1]
                 parts += [torch.sin(component), torch.cos(component)]
             else:
-                parts.append(component / self.scale_x[i : i + 1])
-        parts.append(u / self.scale_u)
+                parts.append(scaled[..., i : i + 1])
+        parts.append((u - self.scale_centre_u) / self.scale_u)
+        if self.prior.disturbances:
+            parts.append((w - self.scale_centre_w) / self.scale_w)
         if self.use_prior:
-            parts.append(self.physics.acceleration(x, u) / self.scale_acceleration)
+            parts.append(self.prior_rates(x, u, w)[..., self.corrected] / self.scale_rate)
+            if self.trained is not None:  # each network has features of its own
+                parts = [part.expand(*parts[-1].shape[:-1], -1) for part in parts]
         return torch.cat(parts, dim=-1)
 
-    def integrate(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
-        """Next state with ``correction`` and ``u`` held over the period."""
-        return rk4(lambda z: self.derivative(z, u, correction), x, self.dt, self.substeps)
+    def integrate(
+        self, x: Tensor, u: Tensor, w: Tensor, correction: Tensor, p: Tensor | None = None
+    ) -> Tensor:
+        """Next state with ``correction``, ``u`` and ``w`` held over the period."""
+        added = correction @ self.into
 
-    def derivative(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
-        """Derivative of the state at the instant: exact kinematics, prior plus correction."""
-        acceleration = self.physics.acceleration(x, u) + correction if self.use_prior else correction
-        velocity = x[..., self.prior.n_q :]
-        return torch.cat([velocity, acceleration.expand(velocity.shape)], dim=-1)
+        def rates(z: Tensor) -> Tensor:
+            own = self.prior_rates(z, u, w, p)
+            return (own if self.use_prior else own * self.own_rows) + added
 
-    def rate(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
+        return rk4(rates, x, self.dt, self.substeps)
+
+    def derivative(
+        self, x: Tensor, u: Tensor, w: Tensor, correction: Tensor, p: Tensor | None = None
+    ) -> Tensor:
+        """Derivative of the state at the instant: the prior's rates, and the correction on those it corrects."""
+        own = self.prior_rates(x, u, w, p)
+        return (own if self.use_prior else own * self.own_rows) + correction @ self.into
+
+    def rate(self, x: Tensor, u: Tensor, w: Tensor, correction: Tensor) -> Tensor:
         """Mean rate over the period, ``(x_{k+1} - x_k) / dt``."""
-        return (self.integrate(x.expand(*correction.shape[:-1], -1), u, correction) - x) / self.dt
+        return (self.integrate(x.expand(*correction.shape[:-1], -1), u, w, correction) - x) / self.dt
 
     def measured_rate(self, x: Tensor, x_next: Tensor, xdot: Tensor) -> Tensor:
         """Mean rate between two measured states; their derivative is not used."""
@@ -312,7 +379,8 @@ class HybridStep(RecurrentStep):
 def n_features(prior: Prior, use_prior: bool) -> int:
     """Number of features of a :class:`HybridStep`'s network."""
     angles = sum(signal.periodic for signal in prior.states)
-    return len(prior.states) + angles + len(prior.inputs) + (prior.n_q if use_prior else 0)
+    signals = len(prior.states) + angles + len(prior.inputs) + len(prior.disturbances)
+    return signals + (len(prior.corrected) if use_prior else 0)
 
 
 def rms(values: Tensor) -> tuple[float, ...]:
@@ -320,54 +388,61 @@ def rms(values: Tensor) -> tuple[float, ...]:
     return tuple(float(v) for v in values.square().mean(0).sqrt().clamp_min(1e-9))
 
 
+def mean(values: Tensor) -> tuple[float, ...]:
+    """Mean of each column."""
+    return tuple(float(v) for v in values.mean(0))
+
+
+def spread(values: Tensor) -> tuple[float, ...]:
+    """Standard deviation of each column; the size of one that hardly varies, and 1 for one that is zero."""
+    if not values.shape[1]:
+        return ()
+    deviations, sizes = values.std(0, correction=0).tolist(), values.square().mean(0).sqrt().tolist()
+    return tuple(s if s > VARIES * size else size or 1.0 for s, size in zip(deviations, sizes, strict=True))
+
+
 PREFIX = "prior."
 """What the names of trained parameters begin with among a training's weights."""
 
 
-class StackedPrior(nn.Module):
-    """A prior with parameters of its own for each of several networks.
+class TrainedParameters(nn.Module):
+    """A prior's free parameters as each of several networks has its own, trained along.
 
     What is trained is the way from the prior's value in units of the parameter's range, ``(networks, 1)``, zero at
     first: weight decay then pulls towards the prior, as it pulls a network's weights towards no correction.
     :meth:`project` keeps the values within their bounds.
     """
 
+    spans: Tensor
+
     def __init__(self, prior: Prior, networks: int) -> None:
         super().__init__()
-        free = [spec for spec in prior.parameters_spec if not spec.fixed]
+        free = [spec for spec in prior.parameters if not spec.fixed]
         if not free:
             raise InputError(
                 f"{type(prior).__name__} has no free parameter to train along (all have lower == upper); "
                 "leave prior_parameters 'fixed' or give one of them bounds"
             )
-        self.networks, start = networks, prior.values
-        self._prior = (prior,)  # in a tuple: its parameters are no part of what is trained
+        self.networks, start, n_p = networks, prior.values, len(prior.parameters)
         self._spec = {p.name: (start[p.name], p.lower, p.upper) for p in free}
         zeros = torch.zeros(networks, 1, dtype=torch.float64)
         self.ways = nn.ParameterDict({name: nn.Parameter(zeros.clone()) for name in self._spec})
+        into = torch.zeros(len(free), n_p, dtype=torch.float64)
+        for i, spec in enumerate(free):
+            into[i, prior.parameters.index(spec)] = spec.upper - spec.lower
+        self.register_buffer("spans", into, persistent=False)
+
+    def shift(self) -> Tensor:
+        """What is added to the prior's parameters, ``(networks, 1, n_p)``."""
+        ways = torch.cat([self.ways[name] for name in self._spec], dim=1)
+        return (ways @ self.spans).unsqueeze(1)
 
     def values(self) -> dict[str, Tensor]:
-        """Values [SI] of each free parameter, ``(networks,)``."""
+        """Values [their units] of each free parameter, ``(networks,)``."""
         return {
             name: start + (upper - lower) * self.ways[name][:, 0]
             for name, (start, lower, upper) in self._spec.items()
         }
-
-    def forward(self, x: Tensor, u: Tensor) -> Tensor:
-        """Derivative ``(..., networks, batch, n_x)`` at ``x`` and ``u``, whose third axis from the end may be 1."""
-        x, u = (z.expand(*z.shape[:-3], self.networks, *z.shape[-2:]) for z in (x, u))
-
-        def one(values: dict[str, Tensor], x: Tensor, u: Tensor) -> Tensor:
-            derivative: Tensor = functional_call(self._prior[0], values, (x, u))
-            return derivative
-
-        derivative: Tensor = vmap(one, in_dims=(0, -3, -3), out_dims=-3)(self.values(), x, u)
-        return derivative
-
-    def acceleration(self, x: Tensor, u: Tensor) -> Tensor:
-        """Accelerations ``(..., networks, batch, n_q)``."""
-        n_q = self._prior[0].n_q
-        return self.forward(x, u)[..., n_q:]
 
     def project(self) -> None:
         """Put values that have left their bounds back onto them."""
@@ -380,8 +455,8 @@ class StackedPrior(nn.Module):
         """What is trained, by name."""
         return {f"{PREFIX}{name}": way for name, way in self.ways.items()}
 
-    def in_si(self, weights: Mapping[str, Tensor]) -> dict[str, NDArray[np.float64]]:
-        """Values [SI] ``(networks,)`` of weights named as those of :meth:`weights`, none beyond its bound."""
+    def in_units(self, weights: Mapping[str, Tensor]) -> dict[str, NDArray[np.float64]]:
+        """Values ``(networks,)`` [their units] of weights named as those of :meth:`weights`, none beyond its bound."""
         out = {}
         for name, (start, lower, upper) in self._spec.items():
             way = weights[f"{PREFIX}{name}"][:, 0].cpu().numpy()
@@ -389,16 +464,15 @@ class StackedPrior(nn.Module):
         return out
 
 
-def with_values(prior: Prior, values: Mapping[str, float]) -> Prior:
-    """A copy of a prior with other parameter values [SI]."""
-    unknown = set(values) - set(prior.values)
+def shift_to(prior: Prior, values: Mapping[str, float]) -> Tensor:
+    """What is added to a prior's parameters ``(n_p,)`` to have other ``values`` [their units] by name."""
+    own = prior.values
+    unknown = set(values) - set(own)
     if unknown:
         raise InputError(
             f"{type(prior).__name__} has no parameter {', '.join(sorted(unknown))}, which was trained along; "
             "give the prior of the training"
         )
-    copied = copy.deepcopy(prior)
-    with torch.no_grad():
-        for name, value in values.items():
-            getattr(copied, name).fill_(value)
-    return copied
+    return torch.tensor(
+        [values.get(name, fitted) - fitted for name, fitted in own.items()], dtype=torch.float64
+    )

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import json
 import math
@@ -26,11 +25,11 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import MOST_ARRAYS, read_bytes, replacing
 from hybrid_mpc.identify.dataset import Windows, check_rates, cut_windows, fitting_horizon
 from hybrid_mpc.identify.networks import StackedGRU
-from hybrid_mpc.identify.objectives import OBJECTIVES, VectorPerformanceIndex, free_run, teacher_forced
+from hybrid_mpc.identify.objectives import VectorPerformanceIndex, free_run, objectives_of, teacher_forced
 from hybrid_mpc.identify.prior_replay import BATCH, make_prior_replay, prior_replay_penalty
 from hybrid_mpc.identify.settings import TrainingSettings
-from hybrid_mpc.identify.step import PREFIX, HybridStep, RecurrentStep, Scaling, StackedPrior, with_values
-from hybrid_mpc.machine.torch_prior import Prior
+from hybrid_mpc.identify.step import PREFIX, HybridStep, RecurrentStep, Scaling, TrainedParameters, shift_to
+from hybrid_mpc.machine.prior import Prior
 
 Progress = Callable[[int, int, float], None]
 FIXED = 64
@@ -146,9 +145,9 @@ class Trained:
         """
         i = self.best if i is None else i
         values = self.prior_values(i)
-        dynamics = with_values(prior, values) if values else None
+        shift = shift_to(prior, values) if values else None
         own = {name: torch.tensor(w) for name, w in self.weights.items() if not name.startswith(PREFIX)}
-        return self._step(prior, dt, own, lambda stack: stack.member(i), dynamics)
+        return self._step(prior, dt, own, lambda stack: stack.member(i), shift)
 
     def stacked_step(self, prior: Prior, dt: float) -> RecurrentStep:
         """The step of all networks at once, tensors ``(networks, n, ...)``; the prior's parameters must be fixed."""
@@ -166,12 +165,12 @@ class Trained:
         dt: float,
         weights: dict[str, Tensor],
         part: Callable[[StackedGRU], nn.Module],
-        dynamics: Prior | None,
+        shift: Tensor | None,
     ) -> RecurrentStep:
         stack = _stack(prior, self.settings, self.form)
         stack.load_state_dict(weights)
         use_prior = self.settings.use_prior
-        step = self.form(prior, part(stack), self.scaling, dt, use_prior=use_prior, dynamics=dynamics)
+        step = self.form(prior, part(stack), self.scaling, dt, use_prior=use_prior, shift=shift)
         return step.requires_grad_(False)
 
 
@@ -205,22 +204,22 @@ class TrainingRun:
         self.scaling = form.scaling_of(prior, windows, dt, use_prior=s.use_prior)
         self.windows, self.valid = windows.to(self.device), valid.to(self.device)
         self.fixed = self.windows.take(torch.linspace(0, len(windows) - 1, FIXED).round().long().unique())
-        prior = prior if device == "cpu" else copy.deepcopy(prior)  # the prior given stays where it is
-        self.physics = StackedPrior(prior, s.networks) if s.prior_parameters == "trained" else None
+        self.objectives = objectives_of(prior, s.objectives)
+        self.parameters = TrainedParameters(prior, s.networks) if s.prior_parameters == "trained" else None
         replayed = bool(s.prior_replay) and s.use_prior
         self.prior_replay = make_prior_replay(prior, training, s.seed).to(self.device) if replayed else None
         stack = _stack(prior, s, form)
-        step = form(prior, stack, self.scaling, dt, use_prior=s.use_prior, dynamics=self.physics)
+        step = form(prior, stack, self.scaling, dt, use_prior=s.use_prior, shift=self.parameters)
         self.step = step.to(self.device)
         self.weights = dict(stack.named_parameters())
-        if self.physics is not None:
-            self.weights |= self.physics.weights()
+        if self.parameters is not None:
+            self.weights |= self.parameters.weights()
         self.decay = s.decay / sum(len(t.t) for t in training)
         self.optimizer = self._fresh_optimizer()
         self.done, self.free = 0, False
         self.best = torch.full((s.networks,), math.inf, dtype=torch.float64, device=self.device)
         self.best_weights = {name: w.detach().clone() for name, w in self.weights.items()}
-        ones = torch.ones(s.networks, len(s.objectives), dtype=torch.float64, device=self.device)
+        ones = torch.ones(s.networks, len(self.objectives), dtype=torch.float64, device=self.device)
         self.index = VectorPerformanceIndex(ones)
         self.skipped, self.in_row = torch.zeros(2, s.networks, dtype=torch.int64, device=self.device)
         self.stopped = torch.zeros(s.networks, dtype=torch.bool, device=self.device)
@@ -256,7 +255,7 @@ class TrainingRun:
         s = self.settings
         rng = np.random.default_rng([s.seed, self.done])
         batch = self.windows.take(torch.tensor(rng.integers(len(self.windows), size=s.batch)))
-        losses = self._losses(batch, s.objectives if s.kind == "mopgrnn" else s.objectives[:1])
+        losses = self._losses(batch, len(self.objectives) if s.kind == "mopgrnn" else 1)
         value = self.index.value(losses) if s.kind == "mopgrnn" else losses[:, 0] / self.index.bounds[:, 0]
         if self.prior_replay is not None:
             index = torch.tensor(rng.integers(self.prior_replay.x.shape[1], size=BATCH))
@@ -267,8 +266,8 @@ class TrainingRun:
         for group in self.optimizer.param_groups:
             group["lr"] = self._learning_rate()
         self.optimizer.step()
-        if self.physics is not None:
-            self.physics.project()
+        if self.parameters is not None:
+            self.parameters.project()
         self._note(losses, finite)
         self.done += 1
 
@@ -277,7 +276,7 @@ class TrainingRun:
         with torch.no_grad():
             losses = self._losses(self.fixed)
             self.index = self.index.lower(losses)
-            error = OBJECTIVES[self.settings.objectives[0]]
+            error = next(iter(self.objectives.values()))
             valid = error(self.step, free_run(self.step, self.valid))
         valid = torch.where(torch.isfinite(valid), valid, math.inf)
         better = valid < self.best
@@ -318,13 +317,13 @@ class TrainingRun:
 
     def result(self) -> Trained:
         """The best weights and the curve."""
-        rows, objectives = torch.stack(self.rows).cpu().numpy(), self.settings.objectives
+        rows, objectives = torch.stack(self.rows).cpu().numpy(), list(self.objectives)
         losses, bounds = ([f"{kind}_{n}" for n in objectives] for kind in ("loss", "bound"))
         names = ("step", "free_run", *losses, *bounds, "validation")
         curve = {name: rows[:, i] for i, name in enumerate(names)}
         weights = {name: w.cpu().numpy() for name, w in self.best_weights.items()}
-        if self.physics is not None:
-            weights |= self.physics.in_si(self.best_weights)
+        if self.parameters is not None:
+            weights |= self.parameters.in_units(self.best_weights)
         best, skipped = self.best.cpu().numpy(), self.skipped.cpu().numpy()
         failures = tuple(self.failures[i] for i in sorted(self.failures))
         return Trained(self.settings, self.scaling, weights, best, curve, skipped, failures, self.form)
@@ -332,11 +331,11 @@ class TrainingRun:
     def _fresh_optimizer(self) -> torch.optim.Optimizer:
         return torch.optim.AdamW(list(self.weights.values()), weight_decay=self.decay)
 
-    def _losses(self, windows: Windows, names: Sequence[str] | None = None) -> Tensor:
-        """Losses ``(networks, objectives)`` of the present stage's prediction."""
+    def _losses(self, windows: Windows, first: int | None = None) -> Tensor:
+        """Losses ``(networks, objectives)`` of the present stage's prediction, of the first objectives or of all."""
         prediction = (free_run if self.free else teacher_forced)(self.step, windows)
-        every = names or self.settings.objectives
-        return torch.stack([OBJECTIVES[n](self.step, prediction) for n in every], dim=-1)
+        every = list(self.objectives.values())[:first]
+        return torch.stack([objective(self.step, prediction) for objective in every], dim=-1)
 
     def _clip(self) -> Tensor:
         """Clip each network's gradient; one that is not finite becomes zero. Which ones were finite."""
@@ -356,7 +355,7 @@ class TrainingRun:
         self.stopped = self.stopped | (self.in_row >= REPEATS)
         for i in skips.nonzero().flatten().tolist():
             bad = (~torch.isfinite(losses[i].detach())).nonzero().flatten().tolist()
-            objective = self.settings.objectives[bad[0]] if bad else "gradient"
+            objective = list(self.objectives)[bad[0]] if bad else "gradient"
             self.failures[i] = TrainingFailure(i, objective, self.done, bool(self.stopped[i]))
         if self.stopped.any():
             with torch.no_grad():
@@ -399,7 +398,7 @@ def _key(
     plain = [asdict(s), prior.values, form.__name__]
     digest = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())
     for trajectory in (*training, *validation):
-        for array in (trajectory.x, trajectory.u, trajectory.xdot):
+        for array in (trajectory.x, trajectory.u, trajectory.w, trajectory.xdot):
             digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
 

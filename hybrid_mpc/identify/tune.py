@@ -26,7 +26,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import MOST_CONTENT, digest, read_bytes
 from hybrid_mpc.identify.settings import TrainingSettings
 from hybrid_mpc.identify.train import Trained, train
-from hybrid_mpc.machine.torch_prior import Prior
+from hybrid_mpc.machine.prior import Prior
 
 Values = Mapping[str, float]
 Progress = Callable[[int, int, int, float], None]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,9 +18,8 @@ import numpy as np
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import check_writable, digest, locked, read_document, write_document, write_json
-from hybrid_mpc.identify.delay import shifted
-from hybrid_mpc.identify.output_error import OutputErrorFit, cut_runs
-from hybrid_mpc.identify.prior import Physics, fit_physics, smoothed
+from hybrid_mpc.identify.fit import fit_prior, refit, smoothed
+from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.settings import KINDS, TrainingSettings
 from hybrid_mpc.identify.train import Trained
 from hybrid_mpc.job.benchmark_runs import (
@@ -39,8 +38,8 @@ from hybrid_mpc.job.check import check_scenario
 from hybrid_mpc.job.context import Progress, versions
 from hybrid_mpc.job.folder import JobNote, write_note
 from hybrid_mpc.job.stages.identify import load_trained, save_trained, train_kinds
+from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.specification import BenchmarkBudget
-from hybrid_mpc.machine.torch_prior import Prior
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import Scenario, load_scenario
 
@@ -53,7 +52,6 @@ IN_MOTION = 0.1
 20 ms) begins at rest, and two samples tell no speed next to an unknown acceleration."""
 REFIT_LENGTHS = (0.5, 1.0)
 """Free runs [s] of a refit, the short ones first: from parameters that are far off a long one leads nowhere."""
-REFIT_EVALUATIONS = 15
 FEWEST_RUNS = 3
 """Free runs of a refit at least: one alone would be fitted by any parameters."""
 
@@ -84,7 +82,7 @@ class _Description:
 
     scenario: str
     dt: float
-    physics: Physics
+    fit: PriorFit
     hybrid: str
     validation: Mapping[str, float]
     long: Mapping[str, float]
@@ -157,7 +155,7 @@ def benchmark(
         else:
             model = _make(settings, scenario, data, out, progress)
             tests = tests or ({"held back": data.held_back} if data.held_back else {})
-        for warning in model.physics.fit.warnings:
+        for warning in model.fit.warnings:
             progress.warn(f"fit of the prior: {warning}")
         progress.start("free runs over the test files")
         found = {}
@@ -224,23 +222,23 @@ def _make(
     _claim(out, settings, data)
     spec, warm_up, dt = benchmark_of(scenario), scenario.data.warm_up, scenario.data.dt
     progress.start("fitting the prior")
-    physics = _physics(scenario, data, out, progress)
+    fit = _fitted_prior(scenario, data, out, progress)
     progress.finish("")
     progress.start("training the networks")
-    warm = warm_samples(warm_up, physics.delay, dt)
-    train, valid = (list(smoothed(scenario.prior, physics, part, dt)) for part in (data.train, data.valid))
+    warm = warm_samples(warm_up, fit.delay, dt)
+    train, valid = (list(smoothed(scenario.prior, fit, part, dt)) for part in (data.train, data.valid))
     budget = spec.budgets[settings.budget]
     networks = train_kinds(
-        settings.scenario, physics.fit.values, train, valid,
+        settings.scenario, fit.values, train, valid,
         {kind: training_settings(kind, budget, seed=settings.seed, warm=warm) for kind in KINDS},
         out / "checkpoints", workers=settings.workers, on_progress=progress.update,
     )  # fmt: skip
     progress.finish("")
-    errors = partial(candidate_errors, scenario, physics, networks)
+    errors = partial(candidate_errors, scenario, fit, networks)
     validation = errors(data.valid, max(warm_up, IN_MOTION))
     long = errors(data.long, warm_up) if data.long else {}
     hybrid = recommended(validation, long)
-    model = BenchmarkModel(scenario.name, dt, physics, hybrid, validation, long, networks)
+    model = BenchmarkModel(scenario.name, dt, fit, hybrid, validation, long, networks)
     save_model(out / "model", model)
     return model
 
@@ -259,13 +257,13 @@ def _claim(out: Path, settings: BenchmarkSettings, data: Recordings) -> None:
     write_note(out, JobNote("benchmark", own), resume=None)
 
 
-def _physics(scenario: Scenario, data: Recordings, out: Path, progress: Progress) -> Physics:
+def _fitted_prior(scenario: Scenario, data: Recordings, out: Path, progress: Progress) -> PriorFit:
     """The fitted prior; a fit that ``out`` holds is not made again."""
-    note, spec = out / "checkpoints" / "physics.json", benchmark_of(scenario)
+    note, spec = out / "checkpoints" / "prior.json", benchmark_of(scenario)
     if note.is_file():
         held = read_document(note, "delete it, and the same command fits the prior anew")
-        return record(Physics, held, str(note))
-    physics = fit_physics(
+        return record(PriorFit, held, str(note))
+    fit = fit_prior(
         scenario.prior,
         data.train,
         data.valid,
@@ -274,8 +272,8 @@ def _physics(scenario: Scenario, data: Recordings, out: Path, progress: Progress
         largest_delay=spec.largest_delay,
         on_progress=partial(progress.update, "prior"),
     )
-    write_document(note, plain(physics))
-    return physics
+    write_document(note, plain(fit))
+    return fit
 
 
 def training_settings(kind: str, budget: BenchmarkBudget, *, seed: int, warm: int) -> TrainingSettings:
@@ -284,7 +282,7 @@ def training_settings(kind: str, budget: BenchmarkBudget, *, seed: int, warm: in
         kind=kind,  # type: ignore[arg-type]
         seed=seed,
         warm=warm,
-        objectives=("position", "energy"),
+        objectives=("output", "balances"),
         fused=True,
         **asdict(budget),
     )
@@ -292,14 +290,14 @@ def training_settings(kind: str, budget: BenchmarkBudget, *, seed: int, warm: in
 
 def candidate_errors(
     scenario: Scenario,
-    physics: Physics,
+    fit: PriorFit,
     networks: Mapping[str, Trained],
     trajectories: Sequence[Trajectory],
     warm_up: float,
 ) -> dict[str, float]:
     """Error of every candidate's free runs, in the benchmark's unit; ``warm_up`` [s] of each recording is given."""
-    spec, prior = benchmark_of(scenario), scenario.prior(physics.fit.values)
-    runs = run_freely(prior, physics, networks, trajectories, warm_up=warm_up, length=spec.length)
+    spec, prior = benchmark_of(scenario), scenario.prior(fit.values)
+    runs = run_freely(prior, fit, networks, trajectories, warm_up=warm_up, length=spec.length)
     return {name: run_error(runs, name, spec).rmse for name in runs[0].y_hat}
 
 
@@ -356,7 +354,7 @@ def load_model(folder: Path, scenario: str) -> BenchmarkModel:
 def _evaluate(
     scenario: Scenario, model: BenchmarkModel, trajectories: Sequence[Trajectory], refit: float | None
 ) -> FileResult:
-    runs = _runs(scenario, model, model.physics, trajectories)
+    runs = _runs(scenario, model, model.fit, trajectories)
     spec, names = benchmark_of(scenario), {**{m: m for m in MODELS}, "hybrid": model.hybrid}
     return FileResult(
         runs,
@@ -367,29 +365,28 @@ def _evaluate(
 
 
 def _runs(
-    scenario: Scenario, model: BenchmarkModel, physics: Physics, trajectories: Sequence[Trajectory]
+    scenario: Scenario, model: BenchmarkModel, fit: PriorFit, trajectories: Sequence[Trajectory]
 ) -> list[BenchmarkRun]:
-    prior, length = scenario.prior(physics.fit.values), benchmark_of(scenario).length
+    prior, length = scenario.prior(fit.values), benchmark_of(scenario).length
     warm_up = scenario.data.warm_up
-    return run_freely(prior, physics, model.networks, trajectories, warm_up=warm_up, length=length)
+    return run_freely(prior, fit, model.networks, trajectories, warm_up=warm_up, length=length)
 
 
 def _refit(scenario: Scenario, model: BenchmarkModel, whole: Trajectory, seconds: float) -> Refit:
-    physics, rest = refitted(scenario.prior, model.physics, whole, seconds=seconds, dt=model.dt)
+    fit, rest = refitted(scenario.prior, model.fit, whole, seconds=seconds, dt=model.dt)
     spec, errors = benchmark_of(scenario), []
-    for own in (model.physics, physics):
+    for own in (model.fit, fit):
         runs = _runs(scenario, model, own, [rest])
         errors.append({"phy": run_error(runs, "phy", spec), "hybrid": run_error(runs, model.hybrid, spec)})
-    return Refit(seconds, physics.fit.rows(scenario.prior().parameters_spec), *errors)
+    return Refit(seconds, fit.rows(scenario.prior().parameters), *errors)
 
 
 def refitted(
-    make: Callable[..., Prior], physics: Physics, trajectory: Trajectory, *, seconds: float, dt: float
-) -> tuple[Physics, Trajectory]:
+    make: Callable[..., Prior], fit: PriorFit, trajectory: Trajectory, *, seconds: float, dt: float
+) -> tuple[PriorFit, Trajectory]:
     """The prior fitted to the first seconds of a recording of a changed machine, and the rest of the recording.
 
-    The delay stays. The free runs start from states that the old prior smooths, then from those of the new one: its
-    noise is fitted to what it did not know, so a wrong prior costs little there.
+    The delay stays. First states are free, near those that the old prior smooths.
 
     Raises:
         InputError: If the recording is no longer than what is to be fitted, or that is too short.
@@ -403,17 +400,7 @@ def refitted(
     index = np.arange(len(trajectory.t))
     first = trajectory.part(index < n, trajectory.name, trajectory.role)
     rest = trajectory.part(index >= n, trajectory.name, trajectory.role)
-    fit = OutputErrorFit(make, dt)
-    values = physics.fit.values
-    theta, slope = np.array([values[p.name] for p in fit.free]) / fit.unit, np.zeros((0, 0))
-    stages = []
-    for length in REFIT_LENGTHS:
-        known = physics.smoother(make(values), dt).smooth(shifted([first], physics.delay))
-        runs = cut_runs(known, round(length / dt), 0, len(first.t))
-        theta, slope = fit.fit(theta, runs, REFIT_EVALUATIONS, robust=True)
-        values = fit.values(theta)
-        stages.append({"stage": f"free runs of {length:g} s", "validation_error": fit.rmse(theta, runs)})
-    return replace(physics, fit=fit.result(theta, slope, stages)), rest
+    return refit(make, fit, [first], dt=dt, lengths=REFIT_LENGTHS), rest
 
 
 # What is written and printed.
@@ -460,13 +447,13 @@ def _document(
 
 def describe(model: BenchmarkModel, scenario: Scenario) -> dict[str, Any]:
     """A model in plain data: parameters, delay, smoother, errors by candidate and network."""
-    fit, spec = model.physics.fit, benchmark_of(scenario)
+    fit, spec = model.fit, benchmark_of(scenario)
     return {
-        "prior": fit.rows(scenario.prior().parameters_spec),
+        "prior": fit.rows(scenario.prior().parameters),
         "identifiability": list(fit.identifiability),
         "fits": list(fit.stages),
-        "delay_s": model.physics.delay,
-        "smoother": {"sigma": model.physics.sigma, "walk": model.physics.walk},
+        "delay_s": fit.delay,
+        "smoother": {"sigma": fit.sigma, "walk": fit.walk},
         "hybrid": model.hybrid,
         "validation": {"unit": spec.unit, "rmse": dict(model.validation), "long_rmse": dict(model.long)},
         "networks": {kind: trained.validation for kind, trained in model.networks.items()},

@@ -14,12 +14,12 @@ from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.delay import lost_samples, shifted
 from hybrid_mpc.identify.evaluate import evaluation_trajectories, model_states
-from hybrid_mpc.identify.prior import Physics
+from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.settings import KINDS
 from hybrid_mpc.identify.step import PriorStep
 from hybrid_mpc.identify.train import Trained
+from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.specification import BenchmarkSpec, Role
-from hybrid_mpc.machine.torch_prior import Prior
 from hybrid_mpc.scenario import Scenario
 
 Array = NDArray[np.float64]
@@ -227,7 +227,7 @@ class BenchmarkRun:
 
 def run_freely(
     prior: Prior,
-    physics: Physics,
+    fit: PriorFit,
     networks: Mapping[str, Trained],
     trajectories: Sequence[Trajectory],
     *,
@@ -241,11 +241,9 @@ def run_freely(
     hidden states. Everything after it is scored, or the first ``length`` [s]. Trajectories have the commanded inputs; a
     kind's best network is that of its own validation.
     """
-    import torch
-
     dt = trajectories[0].dt
-    warm = warm_samples(warm_up, physics.delay, dt)
-    starts = evaluation_trajectories(shifted(trajectories, physics.delay), physics.smoother(prior, dt), warm)
+    warm = warm_samples(warm_up, fit.delay, dt)
+    starts = evaluation_trajectories(shifted(trajectories, fit.delay), fit.smoother(prior, dt), warm)
     if length is not None:
         n = warm + round(length / dt) + 1
         starts = [t.part(np.arange(len(t.t)) < n, t.name, t.role) for t in starts]
@@ -254,11 +252,13 @@ def run_freely(
     for kind, trained in networks.items():
         states = model_states(trained.stacked_step(prior, dt), starts, warm)[:, :, after]
         found |= {kind: states[trained.best], f"{kind} mean": states.mean(0)}
-    with torch.no_grad():
-        outputs = {
-            name: prior.output(torch.tensor(x), torch.zeros(len(prior.inputs))).numpy()
-            for name, x in found.items()
-        }
+    longest, n_y = max(len(t.t) for t in starts), len(prior.outputs)
+    u, w = (np.stack([_padded(getattr(t, key), longest)[warm + 1 :] for t in starts]) for key in ("u", "w"))
+    held = np.concatenate(u).T, np.concatenate(w).T, prior.p
+    outputs = {
+        name: prior.equations.output(x.reshape(-1, x.shape[-1]).T, *held).full().T.reshape(*x.shape[:2], n_y)
+        for name, x in found.items()
+    }
     return [
         BenchmarkRun(
             t.name,
@@ -309,3 +309,8 @@ def warm_samples(warm_up: float, delay: float, dt: float) -> int:
         (49, 47)
     """
     return max(1, round(warm_up / dt) - lost_samples(delay, dt))
+
+
+def _padded(values: Array, length: int) -> Array:
+    """Rows up to a length, the last one again and again."""
+    return np.concatenate([values, np.repeat(values[-1:], length - len(values), axis=0)])

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,23 +21,17 @@ from hybrid_mpc.kit.assembly import make_controller, make_estimator
 from hybrid_mpc.loop.faults import check_channels, install
 from hybrid_mpc.loop.loop import Loop
 from hybrid_mpc.loop.plant import Plant
+from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.scenario import Budget, Scenario, Task
 from nn_export import ExportError
 
-if TYPE_CHECKING:
-    import torch
-
-    from hybrid_mpc.machine.torch_prior import Prior
-
 Array = NDArray[np.float64]
 POINTS = 16
 """Points at which a prior is asked, beside the origin."""
 BALANCE = 1e-6
-"""Largest energy balance along the prior's own flow, as a share of its terms' size: rounding is 1e9 times less."""
-SAME = 1e-9
-"""Largest relative difference of a prior on a batch and on one sample at a time; rounding is 1e5 times less."""
+"""Largest residual of a balance along the prior's own flow, as a share of its terms: rounding is 1e9 times less."""
 
 
 @dataclass
@@ -85,10 +80,6 @@ def check_scenario(scenario: Scenario, budget: Budget | None = None) -> None:
 
 def _check_prior(report: _Report, scenario: Scenario) -> Prior | None:
     """The prior, if it can be made and gives numbers of the right shape."""
-    import torch
-
-    from hybrid_mpc.machine.torch_prior import Prior
-
     prior: Prior | None = None
     with report.part("prior"):
         prior = scenario.prior()
@@ -104,100 +95,88 @@ def _check_prior(report: _Report, scenario: Scenario) -> Prior | None:
     _check_signals(report, prior)
     if report.problems:
         return None
-    x, u = (
-        torch.from_numpy(_points(signals, seed)) for seed, signals in enumerate((prior.states, prior.inputs))
-    )
-    if xdot := _called(report, "prior: xdot(x, u)", prior, (x, u), len(prior.states), x):
-        with report.part("prior: energy_balance(x, xdot, u)"):
-            _check_balance(report, prior, x, u, xdot[0])
-    _called(report, "prior: output(x, u)", prior.output, (x, u), len(prior.outputs), x)
+    with report.part("prior"):
+        try:
+            prior.equations  # noqa: B018  made here, so that what fails is said here
+        except ExportError as error:
+            raise InputError(str(error)) from error
+        _check_point(prior)
+        _check_equations(prior)
     return None if report.problems else prior
 
 
 def _check_signals(report: _Report, prior: Prior) -> None:
-    for role in ("states", "inputs", "outputs"):
+    for role in ("states", "inputs", "outputs", "disturbances"):
         signals = getattr(prior, role)
-        if not signals or not all(isinstance(s, Signal) for s in signals):
+        if not (signals or role == "disturbances") or not all(isinstance(s, Signal) for s in signals):
             report.add(f"prior: {role} must be a tuple of one Signal or more, got {signals!r}")
         elif len({s.name for s in signals}) < len(signals):
             report.add(f"prior: two of the {role} have the same name: {[s.name for s in signals]}")
-    names = [p.name for p in prior.parameters_spec]
+    names = [p.name for p in prior.parameters]
     if len(set(names)) < len(names):
         report.add(f"prior: two parameters have the same name: {names}")
-    with report.part("prior: parameters"):
-        wrong = [n for n, p in prior.named_parameters() if str(p.dtype) != "torch.float64"]
-        wrong += [
-            n for n, b in prior.named_buffers() if b.is_floating_point() and str(b.dtype) != "torch.float64"
-        ]
-        if wrong:
-            raise InputError(f"{', '.join(wrong)} must be float64; give dtype=torch.float64")
 
 
-def _called(
-    report: _Report,
-    what: str,
-    function: Callable[..., Any],
-    arguments: tuple[torch.Tensor, ...],
-    size: int,
-    x: torch.Tensor,
-) -> list[torch.Tensor]:
-    """What a function of the prior gives on a batch, in a list; empty where it is not what is needed."""
-    import torch
-
-    before = len(report.problems)
-    with report.part(what):
-        found = function(*arguments)
-        if not isinstance(found, torch.Tensor):
-            raise InputError(f"it must return a tensor, got {type(found).__name__}; is a 'return' missing?")
-        needed = (*x.shape[:-1], size)
-        if tuple(found.shape) != needed:
+def _check_point(prior: Prior) -> None:
+    """The operating point: sizes, ranges, and an equilibrium to a thousandth of the rates beside it."""
+    point = prior.operating_point
+    if point is None:
+        return
+    for name, values, signals in (
+        ("x", point.x, prior.states), ("u", point.u, prior.inputs), ("w", point.w, prior.disturbances),
+    ):  # fmt: skip
+        if len(values) != len(signals):
             raise InputError(
-                f"it must return the shape {needed} for a batch of {len(x)} samples, got {tuple(found.shape)}; index "
-                "the last axis (x[..., 0:1]), and keep it"
+                f"operating_point: {name} needs {len(signals)} numbers, got {len(values)}: {values}"
             )
-        if found.dtype != torch.float64:
-            raise InputError(f"it must compute in float64, got {found.dtype}; make constants without a dtype")
-        bad = ~torch.isfinite(found).all(-1)
-        if bool(bad.any()):
-            k = int(torch.nonzero(bad)[0])
-            points = ", ".join(f"{name} = {a[k].tolist()}" for name, a in zip("xu", arguments, strict=False))
+        beyond = [s.label for s, v in zip(signals, values, strict=True) if not s.lower <= v <= s.upper]
+        if beyond:
+            raise InputError(f"operating_point: {name} is outside the range of {', '.join(beyond)}: {values}")
+
+
+def _check_equations(prior: Prior) -> None:
+    """Rates, outputs and their derivatives are finite within the signals' ranges, and balances hold along the flow."""
+    signals = prior.states, prior.inputs, prior.disturbances
+    x, u, w = (_points(group, seed) for seed, group in enumerate(signals))
+    p, equations = prior.p, prior.equations
+    for what, f in (("xdot(x, u, w, p)", equations.xdot), ("output(x, u, w, p)", equations.output)):
+        symbols = [ca.SX.sym(f.name_in(i), f.size1_in(i)) for i in range(4)]
+        value = f(*symbols)
+        slope = ca.Function(
+            "slope", symbols, [ca.vertcat(value, ca.vec(ca.densify(ca.jacobian(value, symbols[0]))))]
+        )
+        found = slope(x.T, u.T, w.T, p).full()
+        bad = ~np.isfinite(found).all(axis=0)
+        if bad.any():
+            k = int(np.argmax(bad))
+            which = "it is" if not np.isfinite(found[: value.shape[0], k]).all() else "its derivative by x is"
+            points = ", ".join(
+                f"{n} = {v[k].tolist()}" for n, v in zip("xuw", (x, u, w), strict=True) if v.size
+            )
             raise InputError(
-                f"it is {found[k].tolist()} at {points}; it must be finite within the signals' ranges"
+                f"{what}: {which} not finite at {points}; it must be within the signals' ranges. Keep a root or a "
+                "division off its end, e.g. sqrt(fmax(level, 1e-6))"
             )
-        single = torch.stack([function(*(a[k] for a in arguments)) for k in range(len(x))])
-        if not torch.allclose(single, found, rtol=SAME, atol=SAME):
-            raise InputError("it gives other values for one sample than for the same sample in a batch")
-    return [found] if len(report.problems) == before else []
-
-
-def _check_balance(
-    report: _Report, prior: Prior, x: torch.Tensor, u: torch.Tensor, xdot: torch.Tensor
-) -> None:
-    """The energy balance: a number a sample, zero along the prior's own flow, growing with the acceleration."""
-    import torch
-
-    along, beyond = prior.energy_balance(x, xdot, u), xdot.clone()
-    n = prior.n_q
-    beyond[..., n : 2 * n] += x[..., n : 2 * n]  # pushed along its own motion
-    pushed = prior.energy_balance(x, beyond, u)
-    for found in (along, pushed):
-        if not isinstance(found, torch.Tensor) or tuple(found.shape) != tuple(x.shape[:-1]):
-            shape = tuple(found.shape) if isinstance(found, torch.Tensor) else type(found).__name__
-            raise InputError(f"it must return one number a sample, shape {tuple(x.shape[:-1])}, got {shape}")
-        if not bool(torch.isfinite(found).all()):
-            raise InputError("it must be finite within the signals' ranges")
-    moving = x[..., n : 2 * n].abs().amax(-1) > 0
-    if not bool((pushed > along)[moving].all()):
-        raise InputError(
-            "it must grow where the machine is pushed along its motion: inertia(x) must be positive, and the energy "
-            "balance power of inertia less power of all forces"
-        )
-    size = float((pushed - along).abs().max())
-    if float(along.abs().max()) > BALANCE * max(size, 1e-300):
-        raise InputError(
-            f"it is up to {float(along.abs().max()):.3g} W along the prior's own flow, where it must be 0; are a force "
-            "or a sign left out?"
-        )
+    rates = equations.xdot(x.T, u.T, w.T, p)
+    for balance in equations.balances:
+        terms = [abs(f(x.T, u.T, w.T, p).full()) for f in (balance.supply, balance.loss)]
+        loss = balance.loss(x.T, u.T, w.T, p).full()
+        residual = balance.residual(x.T, rates, u.T, w.T, p).full()
+        size = max(float(np.max(term)) for term in (*terms, np.abs(residual)))
+        name = f"balance {balance.name} [{balance.rate_unit}]"
+        if not np.isfinite(residual).all():
+            raise InputError(f"{name}: it must be finite within the signals' ranges")
+        if float(np.abs(residual).max()) > BALANCE * size:
+            raise InputError(
+                f"{name}: dS/dt - supply + loss is up to {float(np.abs(residual).max()):.3g} along the prior's own "
+                "flow, where it must be 0; is a term or a sign left out?"
+            )
+        if float(loss.min()) < -BALANCE * size:
+            k = int(np.argmin(loss))
+            raise InputError(
+                f"{name}: the loss is {float(loss.min()):.3g} at x = {x[k].tolist()}; it must not be negative. Put "
+                "what may have either sign into the supply"
+            )
 
 
 def _check_data(report: _Report, scenario: Scenario, prior: Prior | None) -> None:
@@ -243,14 +222,12 @@ def _check_budget(report: _Report, name: str, budget: Budget) -> None:
 
 def _check_export(report: _Report, scenario: Scenario, prior: Prior) -> HybridModel | None:
     """The prior as a deployed model."""
-    from hybrid_mpc.identify.export import model_info, trace_model
-    from hybrid_mpc.identify.step import PriorStep
+    from hybrid_mpc.identify.export import model_info, prior_programs
+    from hybrid_mpc.identify.fit import check_observable
 
-    with report.part("prior: export to CasADi"):
-        try:
-            programs = trace_model(PriorStep(prior, scenario.data.dt))
-        except ExportError as error:
-            raise InputError(str(error)) from error
+    with report.part("prior"):
+        check_observable(prior, scenario.data.dt, max(10 * scenario.data.dt, scenario.data.warm_up))
+        programs = prior_programs(prior, scenario.data.dt)
         return build_model(
             "prior", {f"prior/{name}": p for name, p in programs.items()}, model_info(prior, scenario.data.dt)
         )
@@ -394,14 +371,14 @@ def _check_task(task: Task, scenario: Scenario, prior: Prior, plant: Plant | Non
 
 
 def _points(signals: Sequence[Signal], seed: int) -> Array:
-    """The origin, or what of the range is next to it, and random points within the range."""
+    """The origin, or what of the range is next to it, and random points within the range: rows."""
     rng = np.random.default_rng(seed)
     columns = []
     for signal in signals:
         low = signal.lower if math.isfinite(signal.lower) else min(-1.0, signal.upper - 1.0)
         high = signal.upper if math.isfinite(signal.upper) else max(1.0, signal.lower + 1.0)
         columns.append(np.concatenate([[min(max(0.0, low), high)], rng.uniform(low, high, POINTS)]))
-    return np.column_stack(columns)
+    return np.column_stack(columns) if columns else np.zeros((POINTS + 1, 0))
 
 
 def _first_line(error: BaseException) -> str:

@@ -117,7 +117,7 @@ class Context:
         """
         from hybrid_mpc.identify.delay import shifted
 
-        return self._with_states(shifted(self.trajectories(role), self.prior.delay))
+        return self._with_states(shifted(self.trajectories(role), self.prior.fit.delay))
 
     def commanded(self, role: Role) -> list[Trajectory]:
         """The same with the inputs as they were commanded: what the deployed models, which hold the delay, take."""
@@ -125,7 +125,7 @@ class Context:
 
         found = []
         for t in self.trajectories(role):
-            lost = lost_samples(self.prior.delay, t.dt)
+            lost = lost_samples(self.prior.fit.delay, t.dt)
             found.append(t.part(np.arange(len(t.t)) >= lost, t.name, t.role) if lost else t)
         return self._with_states(found)
 

@@ -152,7 +152,8 @@ def find_noise(
 def _estimated_noise(
     scenario: Scenario, artifact: Kit, lacking: Sequence[str], seed: int
 ) -> Mapping[str, Array]:
-    from hybrid_mpc.identify.delay import shifted, with_states
+    from hybrid_mpc.identify.delay import shifted
+    from hybrid_mpc.identify.fit import with_states
     from hybrid_mpc.identify.smooth import fit_smoother
 
     if scenario.make_data is None or scenario.control is None:

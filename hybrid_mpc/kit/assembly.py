@@ -369,7 +369,7 @@ def adaptable(model: HybridModel, causes: Mapping[str, Sequence[str]]) -> dict[s
     if not model.n_p:
         raise InputError(
             f"a guard that adapts needs a model that knows its parameters; model {model.name} has none: give its prior "
-            "a parameters_spec and train it anew"
+            "a parameters and train it anew"
         )
     if model.delay_states:
         raise InputError(

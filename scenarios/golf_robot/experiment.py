@@ -127,7 +127,6 @@ EXPERIMENT = Experiment(
             test=3,
             every=40,
             decay=300.0,
-            fit=("equation_error",),
         ),
         "full": Effort(16, (3, 6, 9, 12, 15), steps=1500, free_run_steps=200, valid=6, test=15, decay=300.0),
     },

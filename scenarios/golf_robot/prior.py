@@ -1,15 +1,16 @@
-"""The golf robot's prior: the paper's equation of motion (torch)."""
+"""The golf robot's prior: the paper's equation of motion."""
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
+from typing import Any
 
-from hybrid_mpc import Prior
+import casadi as ca
+
+from hybrid_mpc import MechanicalPrior
 from scenarios.golf_robot.nominal import GEAR, INPUTS, OUTPUTS, PARAMETERS, STATES
 
 
-class GolfRobotPrior(Prior):
+class GolfRobotPrior(MechanicalPrior):
     """Club on a belt drive with load-dependent dry friction (Schön, Götte, Timmermann 2022, system 2).
 
     ``phi_ddot = (-m g a sin phi - d phi_dot - M_F + 4 u) / J`` with
@@ -24,36 +25,21 @@ class GolfRobotPrior(Prior):
     states = STATES
     inputs = INPUTS
     outputs = OUTPUTS
-    parameters_spec = PARAMETERS
+    parameters = PARAMETERS
 
-    m: Tensor
-    g: Tensor
-    r: Tensor
-    a: Tensor
-    J: Tensor
-    d: Tensor
-    mu: Tensor
-    gamma: Tensor
+    def mass_matrix(self, q: Any, p: Any) -> Any:
+        """Inertia about the axis J [kg m^2]."""
+        return p.J
 
-    def friction(self, x: Tensor) -> Tensor:
-        """Dry friction torque M_F [N m], shape ``(...)``."""
-        phi, v = x[..., 0], x[..., 1]
-        load = torch.abs(self.m * v * v * self.a + self.m * self.g * torch.cos(phi))
-        return self.r * self.mu * torch.tanh(self.gamma * v) * load
+    def potential(self, q: Any, p: Any) -> Any:
+        """Height of the club [J]."""
+        return -p.m * p.g * p.a * ca.cos(q.phi)
 
-    def inertia(self, x: Tensor) -> Tensor:
-        """Inertia about the axis J [kg m^2], shape ``()``."""
-        return self.J
+    def friction(self, q: Any, v: Any, p: Any) -> Any:
+        """Viscous and dry friction ``d phi_dot + M_F`` [N m]."""
+        load = ca.fabs(p.m * v.phi_dot * v.phi_dot * p.a + p.m * p.g * ca.cos(q.phi))
+        return p.d * v.phi_dot + p.r * p.mu * ca.tanh(p.gamma * v.phi_dot) * load
 
-    def acceleration(self, x: Tensor, u: Tensor) -> Tensor:
-        """Acceleration ``(..., 1)`` [rad/s^2] at ``x`` ``(..., 2)`` and ``u`` ``(..., 1)``."""
-        phi, v = x[..., 0], x[..., 1]
-        gravity = self.m * self.g * self.a * torch.sin(phi)
-        torque = GEAR * u[..., 0] - gravity - self.d * v - self.friction(x)
-        return (torque / self.J).unsqueeze(-1)
-
-    def energy_balance(self, x: Tensor, xdot: Tensor, u: Tensor) -> Tensor:
-        """Energy balance [W], shape ``(...)``: J a v + m g a v sin phi + d v^2 + M_F v - 4 u v."""
-        phi, v = x[..., 0], x[..., 1]
-        gravity = self.m * self.g * self.a * torch.sin(phi)
-        return v * (self.J * xdot[..., 1] + gravity + self.d * v + self.friction(x) - GEAR * u[..., 0])
+    def force(self, q: Any, v: Any, u: Any, w: Any, p: Any) -> Any:
+        """Motor torque at the club [N m]."""
+        return GEAR * u.u

@@ -26,8 +26,6 @@ class Effort:
         every: Steps between evaluations on validation free runs. Default 100.
         batch: Windows a step. Default 32.
         decay: Weight decay of AdamW times the number of training samples; 0 is the paper's Adam. Default 0.
-        fit: Methods that the prior is fitted by, where it is fitted: those of ``fit_prior``, and ``"particle_swarm"``.
-            Default: those of the main job.
     """
 
     networks: int
@@ -40,7 +38,6 @@ class Effort:
     every: int = 100
     batch: int = 32
     decay: float = 0.0
-    fit: tuple[str, ...] = ("equation_error", "output_error")
 
 
 @dataclass(frozen=True)

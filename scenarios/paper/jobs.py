@@ -19,6 +19,7 @@ from scenarios.paper.table import Divergence, Network, Row
 
 if TYPE_CHECKING:
     from hybrid_mpc.identify.evaluate import FreeRun
+    from hybrid_mpc.identify.prior_result import PriorFit
     from hybrid_mpc.identify.settings import TrainingSettings
     from hybrid_mpc.identify.step import RecurrentStep
     from hybrid_mpc.identify.train import Trained
@@ -109,10 +110,9 @@ class EvaluationSet:
 
 @dataclass(frozen=True)
 class Case:
-    """One amount of training data of one data set, as a process gets it, with the prior and the smoother fitted to
-    it.
+    """One amount of training data of one data set, as a process gets it, with the prior fitted to it.
 
-    The smoother is ``sigma`` and ``walk``, None where states are exact. ``form`` of the models is ``"hybrid"`` or
+    The fit is None where states are exact. ``form`` of the models is ``"hybrid"`` or
     ``"paper"``.
     """
 
@@ -121,7 +121,7 @@ class Case:
     training: Sequence[Trajectory]
     validation: Sequence[Trajectory]
     values: dict[str, float]
-    smoother: dict[str, tuple[float, ...]] | None
+    fit: PriorFit | None
     evaluation: EvaluationSet
     folder: Path
     device: str = "cpu"
@@ -145,33 +145,18 @@ def fit_job(
     scenario: str,
     train: Sequence[Trajectory],
     valid: Sequence[Trajectory],
-    methods: tuple[str, ...],
     path: Path,
     report: Progress,
 ) -> None:
-    """Fit the prior to one amount of training data and smooth by it, as the main job does.
-
-    ``"particle_swarm"`` among the methods is the paper's: what it finds is where the others start.
-    """
-    from hybrid_mpc.identify.prior import ROUNDS, fit_and_smooth, smoothed
+    """Fit the prior to one amount of training data and smooth by it, as the main job does."""
+    from hybrid_mpc.identify.fit import fit_prior, smoothed
 
     started, make, dt = time.monotonic(), load_scenario(scenario).prior, train[0].dt
-    start, others = None, tuple(method for method in methods if method != "particle_swarm")
-    if others != methods:
-        from scenarios.paper.swarm import swarm_values
-
-        start = swarm_values(
-            make, train, dt, on_progress=lambda done, total: report(done, total, "particle swarm")
-        )
-    physics = fit_and_smooth(
-        make, train, valid, dt, methods=others, start=start,
-        on_progress=lambda key, done, total, text: report(ROUNDS.index(key), len(ROUNDS), text),
-    )  # fmt: skip
-    parts = [t for part in (train, valid) for t in smoothed(make, physics, part, dt)]
+    fit = fit_prior(make, train, valid, dt=dt, on_progress=report)
+    parts = [t for part in (train, valid) for t in smoothed(make, fit, part, dt)]
     arrays = {f"{t.name}/{key}": getattr(t, key) for t in parts for key in ("x", "xdot")}
     write_arrays(path.with_suffix(".npz"), arrays)
-    note = {**asdict(physics.fit), "smoother": {"sigma": physics.sigma, "walk": physics.walk}}
-    write_json(path.with_suffix(".json"), {**note, "seconds": time.monotonic() - started})
+    write_json(path.with_suffix(".json"), {**asdict(fit), "seconds": time.monotonic() - started})
 
 
 def physics_job(cases: Sequence[tuple[Case, int]], path: Path, report: Progress) -> None:
@@ -235,15 +220,13 @@ def ensemble_job(
 def sindy_job(case: Case, count: int, key: str, report: Progress) -> None:
     """Identify a sparse equation on one amount of data and evaluate it."""
     from hybrid_mpc.identify.evaluate import evaluation_trajectories, free_runs
-    from hybrid_mpc.identify.smooth import Smoother
 
     start, path = time.monotonic(), case.folder / key
     make, evaluation = load_scenario(case.scenario).prior, case.evaluation
     prior, validation = make(case.values), list(case.validation)
     report(0, 1, "searching libraries of terms")
-    if case.smoother is not None:
-        smoother = Smoother(prior, case.dt, tuple(case.smoother["sigma"]), tuple(case.smoother["walk"]))
-        validation = evaluation_trajectories(validation, smoother, evaluation.warm)
+    if case.fit is not None:
+        validation = evaluation_trajectories(validation, case.fit.smoother(prior, case.dt), evaluation.warm)
     fit_sindy = importlib.import_module("scenarios.paper.sindy").fit_sindy
     step = fit_sindy(case.training, prior, case.dt, validation=validation, warm=evaluation.warm)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -252,7 +235,7 @@ def sindy_job(case: Case, count: int, key: str, report: Progress) -> None:
     write_arrays(
         path.with_suffix(".npz"), {f"shown.{k}": v for k, v in shown_run(runs, evaluation.shown).items()}
     )
-    _finish(path, [Row(case.data_set, count, "sindy", (network,))], {"equations": step.equations()}, start)
+    _finish(path, [Row(case.data_set, count, "sindy", (network,))], {"equations": step.text()}, start)
 
 
 def _finish(path: Path, rows: Sequence[Row], details: dict[str, Any], start: float) -> None:

@@ -30,6 +30,7 @@ from scenarios.paper.settings import ReproductionSettings, case_key, experiment_
 from scenarios.paper.table import METRICS, Row, Table, Verdict, verdict_line
 
 if TYPE_CHECKING:
+    from hybrid_mpc.identify.prior_result import PriorFit
     from hybrid_mpc.identify.settings import TrainingSettings
 
 Jobs = dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]
@@ -133,26 +134,28 @@ class Work:
         """The first trajectories of a role, as they were recorded."""
         return [t for t in self.recorded[data_set] if t.role == role][:most]
 
-    def fit(self, data_set: str, count: int) -> dict[str, Any]:
-        """Fitted values and smoother of one amount of data; without a fit the scenario's prior and None."""
+    def fit(self, data_set: str, count: int) -> PriorFit | None:
+        """The prior fitted to one amount of data; None where it is taken as it is."""
         if not self.experiment.measured:
-            return {"values": self.scenario.prior().values, "smoother": None}
-        result: dict[str, Any] = read_json(self.folder / f"{case_key(data_set, count, 'prior')}.json")
-        return result
+            return None
+        path = self.folder / f"{case_key(data_set, count, 'prior')}.json"
+        from hybrid_mpc.identify.prior_result import PriorFit
+
+        note = {key: value for key, value in read_json(path).items() if key != "seconds"}
+        return record(PriorFit, note, str(path))
 
     @cached_property
     def evaluation(self) -> EvaluationSet:
         """What all models are evaluated on: prior and smoother of the most data of the last data set."""
         name, count = self.experiment.reference, self.effort.sequences[-1]
         test, fit = self.trajectories(name, "test", self.effort.test), self.fit(name, count)
-        if self.experiment.measured:
+        values = self.scenario.prior().values if fit is None else fit.values
+        if fit is not None:
             from hybrid_mpc.identify.evaluate import evaluation_trajectories
-            from hybrid_mpc.identify.smooth import Smoother
 
-            prior, levels = self.scenario.prior(fit["values"]), fit["smoother"]
-            smoother = Smoother(prior, self.scenario.data.dt, tuple(levels["sigma"]), tuple(levels["walk"]))
+            smoother = fit.smoother(self.scenario.prior(values), self.scenario.data.dt)
             test = evaluation_trajectories(smoother.smooth(test), smoother, self.warm)
-        return EvaluationSet(test, fit["values"], self.warm, self.experiment.shown)
+        return EvaluationSet(test, values, self.warm, self.experiment.shown)
 
     def case(self, data_set: str, count: int) -> Case:
         """Data and prior of one amount of training data."""
@@ -167,8 +170,8 @@ class Work:
             data_set,
             train,
             valid,
-            fit["values"],
-            fit["smoother"],
+            self.scenario.prior().values if fit is None else fit.values,
+            fit,
             self.evaluation,
             self.folder,
             self.settings.device,
@@ -246,7 +249,7 @@ def fit_stage(work: Work) -> None:
         valid = work.trajectories(data_set, "valid", work.effort.valid)
         jobs[key] = (
             fit_job,
-            (work.settings.scenario, train, valid, work.effort.fit, work.folder / key),
+            (work.settings.scenario, train, valid, work.folder / key),
         )
     work.run(jobs)
     for key in jobs:
@@ -337,7 +340,8 @@ def collected(work: Work, rows: Sequence[Row], table: Table) -> dict[str, Any]:
     for each in experiment.claims:
         verdict = each.check(table)
         claims.append({"name": each.name, "text": each.text, "source": each.source, **asdict(verdict)})
-    priors = {key: {"values": job["values"], "standard_errors": job["standard_errors"], "smoother": job["smoother"]}
+    priors = {key: {"values": job["values"], "standard_errors": job["standard_errors"],
+                    "smoother": {"sigma": job["sigma"], "walk": job["walk"]}}
               for key, job in jobs.items() if key.endswith("_prior")}  # fmt: skip
     return {
         "schema": SCHEMA,

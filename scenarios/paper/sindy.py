@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,8 +19,9 @@ from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.dataset import Windows, check_rates, cut_windows
 from hybrid_mpc.identify.evaluate import free_runs, score
-from hybrid_mpc.identify.step import MAX_SUBSTEPS, Step, rk4, substeps_for
-from hybrid_mpc.machine.torch_prior import Prior
+from hybrid_mpc.identify.simulation import MAX_SUBSTEPS, rest_of
+from hybrid_mpc.identify.step import Step, rk4
+from hybrid_mpc.machine.mechanical import MechanicalPrior
 
 # Libraries of candidate terms, and the model that a sparse regression over them gives, as a step (torch).
 
@@ -99,7 +101,7 @@ class SindyStep(Step):
 
     def __init__(
         self,
-        prior: Prior,
+        prior: MechanicalPrior,
         library: Library,
         coefficients: Tensor,
         dt: float,
@@ -107,7 +109,7 @@ class SindyStep(Step):
         candidates: tuple[SindyCandidate, ...] = (),
     ) -> None:
         super().__init__(prior, dt)
-        self.library, self.candidates = library, candidates
+        self.library, self.candidates, self.n_q = library, candidates, prior.n_q
         self._names = signal_names(prior, library)
         if coefficients.shape[-2:] != (len(library.terms), prior.n_q):
             raise InputError(
@@ -115,15 +117,28 @@ class SindyStep(Step):
                 f"accelerations need {(len(library.terms), prior.n_q)}"
             )
         self.register_buffer("coefficients", coefficients)
-        n_x, n_u = len(prior.states), len(prior.inputs)
-        name = f"SINDy with the library {library.name}: the model"
-        self.substeps = substeps or substeps_for(self._xdot, n_x, n_u, dt, name)
+        self.substeps = substeps or self._required_substeps()
 
-    def forward(self, x: Tensor, h: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    def _required_substeps(self) -> int:
+        """Sub-steps a period that the fastest mode at rest asks for, as of a prior."""
+        x, u, _ = (torch.tensor(v) for v in rest_of(self.prior))
+        slope = torch.func.jacrev(lambda z: self._xdot(z, u))(x)
+        rate = float(torch.linalg.eigvals(slope).abs().max())
+        substeps = max(1, math.ceil(rate * self.dt)) if math.isfinite(rate) else MAX_SUBSTEPS + 1
+        if substeps > MAX_SUBSTEPS:
+            raise InputError(
+                f"SINDy with the library {self.library.name}: the model's fastest mode at rest is {rate:.3g} 1/s, too "
+                f"fast for a period of {self.dt} s"
+            )
+        return substeps
+
+    def forward(
+        self, x: Tensor, h: Tensor, u: Tensor, w: Tensor, p: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Next state ``(..., n_x)`` and the hidden state as it came."""
         return rk4(lambda z: self._xdot(z, u), x, self.dt, self.substeps), h
 
-    def xdot(self, x: Tensor, h: Tensor, u: Tensor) -> Tensor:
+    def xdot(self, x: Tensor, h: Tensor, u: Tensor, w: Tensor, p: Tensor | None = None) -> Tensor:
         """Derivative of the state at the instant."""
         return self._xdot(x, u)
 
@@ -131,9 +146,9 @@ class SindyStep(Step):
         """The terms ``(..., n_terms)`` at ``x`` ``(..., n_x)`` and ``u`` ``(..., n_u)``, which broadcast."""
         return evaluate(self.library, self._names, x, u)
 
-    def equations(self, digits: int = 4) -> tuple[str, ...]:
+    def text(self, digits: int = 4) -> tuple[str, ...]:
         """The identified equations, one an acceleration; terms whose coefficient is zero are left out."""
-        n_q, made = self.prior.n_q, []
+        n_q, made = self.n_q, []
         for i, signal in enumerate(self.prior.states[n_q : 2 * n_q]):
             pairs = zip(self.coefficients[:, i].tolist(), self.library.labels, strict=True)
             parts = [
@@ -147,7 +162,7 @@ class SindyStep(Step):
 
     def _xdot(self, x: Tensor, u: Tensor) -> Tensor:
         acceleration = (self.features(x, u).unsqueeze(-1) * self.coefficients).sum(-2)
-        return torch.cat([x[..., self.prior.n_q :], acceleration], dim=-1)
+        return torch.cat([x[..., self.n_q :], acceleration], dim=-1)
 
 
 @dataclass(frozen=True)
@@ -182,7 +197,7 @@ def evaluate(library: Library, names: dict[str, int], x: Tensor, u: Tensor) -> T
     return torch.stack(columns, dim=-1)
 
 
-def signal_names(prior: Prior, library: Library) -> dict[str, int]:
+def signal_names(prior: MechanicalPrior, library: Library) -> dict[str, int]:
     """Column of each state and input in ``[x, u]``."""
     names = {signal.name: i for i, signal in enumerate((*prior.states, *prior.inputs))}
     unknown = {factor.signal for term in library.terms for factor in term} - set(names)
@@ -192,7 +207,7 @@ def signal_names(prior: Prior, library: Library) -> dict[str, int]:
     return names
 
 
-def machine_libraries(prior: Prior) -> tuple[Library, ...]:
+def machine_libraries(prior: MechanicalPrior) -> tuple[Library, ...]:
     """Libraries for machines that turn or slide: polynomials, trigonometric terms, and friction of several slopes.
 
     With q, v, u of each axis: ``polynomial`` has all monomials of [q, v] up to degree 3 (an angle that turns is left
@@ -239,7 +254,7 @@ ALIKE = 1e-10
 
 def fit_sindy(
     training: Sequence[Trajectory],
-    prior: Prior,
+    prior: MechanicalPrior,
     dt: float,
     *,
     validation: Sequence[Trajectory],
@@ -296,7 +311,7 @@ class _Fit:
 
 
 def _regression(
-    library: Library, prior: Prior, windows: Windows, dt: float, target: Target
+    library: Library, prior: MechanicalPrior, windows: Windows, dt: float, target: Target
 ) -> tuple[Array, Array]:
     """Terms ``(n, n_terms)`` and accelerations ``(n, n_q)`` of all periods of all runs."""
     names, n_q = signal_names(prior, library), prior.n_q
@@ -331,7 +346,7 @@ def _sparse(
 
 
 def _scored(
-    prior: Prior,
+    prior: MechanicalPrior,
     library: Library,
     found: list[tuple[float, Array, float]],
     validation: Sequence[Trajectory],
@@ -375,7 +390,9 @@ def _choice(fits: list[_Fit], validation: Sequence[Trajectory]) -> _Fit:
     return min(equal, key=lambda fit: (fit.candidate.terms, fit.candidate.validation))
 
 
-def _pruned(prior: Prior, fit: _Fit, dt: float, candidates: tuple[SindyCandidate, ...]) -> SindyStep:
+def _pruned(
+    prior: MechanicalPrior, fit: _Fit, dt: float, candidates: tuple[SindyCandidate, ...]
+) -> SindyStep:
     """The step without the terms that no acceleration has."""
     keep = np.flatnonzero((fit.coefficients != 0).any(axis=1))
     keep = keep if len(keep) else np.zeros(1, dtype=int)  # nothing was left: the acceleration is zero
@@ -398,7 +415,9 @@ def _rms(values: Array) -> Array:
     return np.where(size > 0.0, size, 1.0)
 
 
-def _check(training: Sequence[Trajectory], validation: Sequence[Trajectory], prior: Prior, dt: float) -> None:
+def _check(
+    training: Sequence[Trajectory], validation: Sequence[Trajectory], prior: MechanicalPrior, dt: float
+) -> None:
     if not training or not validation:
         raise InputError("SINDy needs training and validation trajectories, at least one of each")
     sizes = {"x": len(prior.states), "u": len(prior.inputs)}

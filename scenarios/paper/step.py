@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from hybrid_mpc.identify.dataset import Windows
-from hybrid_mpc.identify.step import RecurrentStep, Scaling, rms
-from hybrid_mpc.machine.torch_prior import Prior
+from hybrid_mpc.identify.step import PriorEquations, RecurrentStep, Scaling, rms
+from hybrid_mpc.machine.prior import Prior
 
 
 class PaperStep(RecurrentStep):
@@ -34,27 +34,31 @@ class PaperStep(RecurrentStep):
     @classmethod
     def scaling_of(cls, prior: Prior, windows: Windows, dt: float, *, use_prior: bool) -> Scaling:
         """Root mean squares of signals, of the prior's xdot and of xdot."""
-        x, u = windows.x[:, :-1].flatten(0, 1), windows.u.flatten(0, 1)
-        return Scaling(
-            x=rms(x), u=rms(u), acceleration=rms(prior(x, u)), correction=rms(windows.xdot.flatten(0, 1))
-        )
+        x, u, w = (z.flatten(0, 1) for z in (windows.x[:, :-1], windows.u, windows.w))
+        with torch.no_grad():
+            rates = PriorEquations(prior).xdot(x, u, w, torch.tensor(prior.p))
+        return Scaling(rms(x), rms(u), rms(rates), rms(windows.xdot.flatten(0, 1)))
 
-    def features(self, x: Tensor, u: Tensor) -> Tensor:
+    def features(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         """Network inputs ``s = [x, u, prior xdot]``, scaled."""
         parts = [x / self.scale_x, u / self.scale_u]
         if self.use_prior:
-            parts.append(self.physics(x, u) / self.scale_acceleration)
+            parts.append(self.prior_rates(x, u, w) / self.scale_rate)
         return torch.cat(parts, dim=-1)
 
-    def integrate(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
+    def integrate(
+        self, x: Tensor, u: Tensor, w: Tensor, correction: Tensor, p: Tensor | None = None
+    ) -> Tensor:
         """Next state by explicit Euler."""
         return x + self.dt * correction
 
-    def derivative(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
+    def derivative(
+        self, x: Tensor, u: Tensor, w: Tensor, correction: Tensor, p: Tensor | None = None
+    ) -> Tensor:
         """What the network gave."""
         return correction
 
-    def rate(self, x: Tensor, u: Tensor, correction: Tensor) -> Tensor:
+    def rate(self, x: Tensor, u: Tensor, w: Tensor, correction: Tensor) -> Tensor:
         """What the network gave."""
         return correction
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
-from torch import Tensor
 
-from hybrid_mpc import Parameter, Prior, Signal
+from hybrid_mpc import MechanicalPrior, Parameter, Signal, TorchPrior
 from scenarios.pendulum.nominal import INPUTS, OUTPUTS, PARAMETERS, PUBLISHED, STATES
 
 
-class PendulumPrior(Prior):
+class PendulumPrior(TorchPrior, MechanicalPrior):
     """``phi_ddot = (-m g l sin phi - d phi_dot + u) / (m l^2)`` (Schön, Götte, Timmermann 2022, system 1).
 
     ``phi = 0`` hangs down, ``u`` is the torque on the axis [N m]. The known torque sets the scale: ``m l^2``,
@@ -21,28 +20,19 @@ class PendulumPrior(Prior):
     states: ClassVar[tuple[Signal, ...]] = STATES
     inputs: ClassVar[tuple[Signal, ...]] = INPUTS
     outputs: ClassVar[tuple[Signal, ...]] = OUTPUTS
-    parameters_spec: ClassVar[tuple[Parameter, ...]] = PARAMETERS
+    parameters: ClassVar[tuple[Parameter, ...]] = PARAMETERS
 
-    m: Tensor
-    g: Tensor
-    l: Tensor  # noqa: E741  the paper's name
-    d: Tensor
+    def mass_matrix(self, q: Any, p: Any) -> Any:
+        """Inertia about the axis ``m l^2`` [kg m^2]."""
+        return p.m * p.l * p.l
 
-    def inertia(self, x: Tensor) -> Tensor:
-        """Inertia about the axis ``m l^2`` [kg m^2], shape ``()``."""
-        return self.m * self.l * self.l
+    def potential(self, q: Any, p: Any) -> Any:
+        """Height of the weight [J]."""
+        return -p.m * p.g * p.l * torch.cos(q.phi)
 
-    def acceleration(self, x: Tensor, u: Tensor) -> Tensor:
-        """Acceleration ``(..., 1)`` [rad/s^2] at ``x`` ``(..., 2)`` and ``u`` ``(..., 1)``."""
-        phi, v = x[..., 0:1], x[..., 1:2]
-        gravity = self.m * self.g * self.l * torch.sin(phi)
-        return (u - gravity - self.d * v) / self.inertia(x)
-
-    def energy_balance(self, x: Tensor, xdot: Tensor, u: Tensor) -> Tensor:
-        """Energy balance [W], shape ``(...)``: m l^2 a v + m g l v sin phi + d v^2 - u v."""
-        phi, v = x[..., 0], x[..., 1]
-        gravity = self.m * self.g * self.l * torch.sin(phi)
-        return v * (self.inertia(x) * xdot[..., 1] + gravity + self.d * v - u[..., 0])
+    def friction(self, q: Any, v: Any, p: Any) -> Any:
+        """Viscous friction [N m]."""
+        return p.d * v.phi_dot
 
 
 class PublishedPendulumPrior(PendulumPrior):
@@ -51,4 +41,4 @@ class PublishedPendulumPrior(PendulumPrior):
     With l and d free a fit finds the plant itself, since nothing else is wrong: no network could add to that.
     """
 
-    parameters_spec: ClassVar[tuple[Parameter, ...]] = PUBLISHED
+    parameters: ClassVar[tuple[Parameter, ...]] = PUBLISHED

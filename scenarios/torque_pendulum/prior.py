@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
-import torch
-from torch import Tensor
+import casadi as ca
 
-from hybrid_mpc import Parameter, Prior, Signal
+from hybrid_mpc import MechanicalPrior, Parameter, Signal
 
 FRICTION_SPEED = 0.1
 """Speed [rad/s] over which dry friction changes its sign, about the noise of the measured speed."""
 
 
-class TorquePendulumPrior(Prior):
+class TorquePendulumPrior(MechanicalPrior):
     r"""``J phi_ddot = k_u u - mgl sin(phi + phi_0) - d phi_dot - F_c tanh(phi_dot / v_c)``; phi = 0 hangs down.
 
     Motion alone fixes only the ratios of ``J, mgl, d, F_c, k_u``, so ``J`` keeps its data-sheet value and
@@ -28,7 +27,7 @@ class TorquePendulumPrior(Prior):
     )
     inputs: ClassVar[tuple[Signal, ...]] = (Signal("torque", "N m", -5.0, 5.0),)
     outputs: ClassVar[tuple[Signal, ...]] = (states[0],)
-    parameters_spec: ClassVar[tuple[Parameter, ...]] = (
+    parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("J", 0.15, "kg m^2", 0.15, 0.15, "inertia about the axis (fixed: only ratios show)"),
         Parameter("mgl", 2.98, "N m", 2.0, 4.0, "largest gravity torque"),
         Parameter("d", 0.005, "N m s/rad", 0.0, 0.1, "viscous friction"),
@@ -37,27 +36,18 @@ class TorquePendulumPrior(Prior):
         Parameter("k_u", 1.0, "-", 0.5, 1.2, "true over commanded torque"),
     )
 
-    mgl: Tensor
-    d: Tensor
-    J: Tensor
-    F_c: Tensor
-    k_u: Tensor
-    phi_0: Tensor
+    def mass_matrix(self, q: Any, p: Any) -> Any:
+        """Inertia about the axis J [kg m^2]."""
+        return p.J
 
-    def _losses(self, v: Tensor) -> Tensor:
-        return self.d * v + self.F_c * torch.tanh(v / FRICTION_SPEED)
+    def potential(self, q: Any, p: Any) -> Any:
+        """Height of the rod [J]."""
+        return -p.mgl * ca.cos(q.phi + p.phi_0)
 
-    def inertia(self, x: Tensor) -> Tensor:
-        """Inertia about the axis J [kg m^2], shape ``()``."""
-        return self.J
+    def friction(self, q: Any, v: Any, p: Any) -> Any:
+        """Viscous and dry friction [N m]."""
+        return p.d * v.phi_dot + p.F_c * ca.tanh(v.phi_dot / FRICTION_SPEED)
 
-    def acceleration(self, x: Tensor, u: Tensor) -> Tensor:
-        """Angular acceleration ``(..., 1)`` [rad/s^2]."""
-        phi, v = x[..., 0:1], x[..., 1:2]
-        return (self.k_u * u - self.mgl * torch.sin(phi + self.phi_0) - self._losses(v)) / self.J
-
-    def energy_balance(self, x: Tensor, xdot: Tensor, u: Tensor) -> Tensor:
-        """Power [W] that no term of the prior explains, shape ``(...)``."""
-        phi, v, a = x[..., 0], x[..., 1], xdot[..., 1]
-        torque = self.J * a + self.mgl * torch.sin(phi + self.phi_0) + self._losses(v) - self.k_u * u[..., 0]
-        return torque * v
+    def force(self, q: Any, v: Any, u: Any, w: Any, p: Any) -> Any:
+        """Torque of the drive [N m]."""
+        return p.k_u * u.torque

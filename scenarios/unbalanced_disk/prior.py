@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
-import torch
-from torch import Tensor
+import casadi as ca
 
-from hybrid_mpc import Parameter, Prior, Signal
+from hybrid_mpc import MechanicalPrior, Parameter, Signal
 from scenarios.unbalanced_disk.nominal import INPUTS, OUTPUTS, PARAMETERS, STATES
 
 FRICTION_SPEED = 0.05
@@ -15,7 +14,7 @@ FRICTION_SPEED = 0.05
 was given); this is what a few Runge-Kutta steps a period can follow."""
 
 
-class UnbalancedDiskPrior(Prior):
+class UnbalancedDiskPrior(MechanicalPrior):
     r"""``phi_ddot = -w_0^2 sin(phi + phi_0) - gamma phi_dot - F_c tanh(phi_dot / v_c) + K_u u``; phi = 0 hangs down.
 
     ``u`` is the motor's voltage: ``gamma`` holds the back-EMF beside the bearing's friction. Motion tells accelerations
@@ -27,21 +26,20 @@ class UnbalancedDiskPrior(Prior):
     states: ClassVar[tuple[Signal, ...]] = STATES
     inputs: ClassVar[tuple[Signal, ...]] = INPUTS
     outputs: ClassVar[tuple[Signal, ...]] = OUTPUTS
-    parameters_spec: ClassVar[tuple[Parameter, ...]] = PARAMETERS
+    parameters: ClassVar[tuple[Parameter, ...]] = PARAMETERS
 
-    J: Tensor
-    w_0: Tensor
-    gamma: Tensor
-    F_c: Tensor
-    K_u: Tensor
-    phi_0: Tensor
+    def mass_matrix(self, q: Any, p: Any) -> Any:
+        """Inertia about the axis J [kg m^2]."""
+        return p.J
 
-    def inertia(self, x: Tensor) -> Tensor:
-        """Inertia about the axis J [kg m^2], shape ``()``."""
-        return self.J
+    def potential(self, q: Any, p: Any) -> Any:
+        """Height of the disk's weight [J]."""
+        return -p.J * p.w_0 * p.w_0 * ca.cos(q.phi + p.phi_0)
 
-    def acceleration(self, x: Tensor, u: Tensor) -> Tensor:
-        """Angular acceleration ``(..., 1)`` [rad/s^2]."""
-        phi, v = x[..., 0:1], x[..., 1:2]
-        friction = self.gamma * v + self.F_c * torch.tanh(v / FRICTION_SPEED)
-        return self.K_u * u - self.w_0 * self.w_0 * torch.sin(phi + self.phi_0) - friction
+    def friction(self, q: Any, v: Any, p: Any) -> Any:
+        """Viscous friction, the motor's back-EMF and dry friction [N m]."""
+        return p.J * (p.gamma * v.phi_dot + p.F_c * ca.tanh(v.phi_dot / FRICTION_SPEED))
+
+    def force(self, q: Any, v: Any, u: Any, w: Any, p: Any) -> Any:
+        """Torque of the motor's voltage [N m]."""
+        return p.J * p.K_u * u[0]

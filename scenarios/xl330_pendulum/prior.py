@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
-import torch
-from torch import Tensor
+import casadi as ca
 
-from hybrid_mpc import Parameter, Prior, Signal
+from hybrid_mpc import MechanicalPrior, Parameter, Signal
 
 FRICTION_SPEED = 0.1
 """Speed [rad/s] over which dry friction changes its sign."""
 
 
-class Xl330PendulumPrior(Prior):
+class Xl330PendulumPrior(MechanicalPrior):
     """``J phi_ddot = e k_t / R (duty U - k_t phi_dot) - mgl sin(phi + phi_0) - d phi_dot - F_c tanh(phi_dot / v_c)``.
 
     ``e`` is 1 with the motor switched on and 0 without. The weight is known and sets the scale; ``k_t`` and ``R`` show
@@ -33,7 +32,7 @@ class Xl330PendulumPrior(Prior):
         Signal("enabled", "-", 0.0, 1.0),
     )
     outputs: ClassVar[tuple[Signal, ...]] = (states[0],)
-    parameters_spec: ClassVar[tuple[Parameter, ...]] = (
+    parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("mgl", 0.4807, "N m", 0.4807, 0.4807, "largest gravity torque: 0.49 kg at 0.10 m (fixed)"),
         Parameter("J", 0.00671, "kg m^2", 0.004, 0.015, "inertia with the rotor's"),
         Parameter("k_t", 0.387, "N m/A", 0.1, 1.0, "torque constant at the output"),
@@ -43,22 +42,19 @@ class Xl330PendulumPrior(Prior):
         Parameter("phi_0", 0.0, "rad", -0.2, 0.2, "angle of the encoder's zero from hanging down"),
     )
 
-    mgl: Tensor
-    J: Tensor
-    k_t: Tensor
-    R: Tensor
-    d: Tensor
-    F_c: Tensor
-    phi_0: Tensor
+    def mass_matrix(self, q: Any, p: Any) -> Any:
+        """Inertia about the axis J [kg m^2]."""
+        return p.J
 
-    def inertia(self, x: Tensor) -> Tensor:
-        """Inertia about the axis J [kg m^2], shape ``()``."""
-        return self.J
+    def potential(self, q: Any, p: Any) -> Any:
+        """Height of the weight [J]."""
+        return -p.mgl * ca.cos(q.phi + p.phi_0)
 
-    def acceleration(self, x: Tensor, u: Tensor) -> Tensor:
-        """Angular acceleration ``(..., 1)`` [rad/s^2]."""
-        phi, v = x[..., 0:1], x[..., 1:2]
-        voltage = u[..., 0:1] * u[..., 1:2] - self.k_t * v
-        motor = u[..., 2:3] * self.k_t / self.R * voltage
-        friction = self.d * v + self.F_c * torch.tanh(v / FRICTION_SPEED)
-        return (motor - self.mgl * torch.sin(phi + self.phi_0) - friction) / self.J
+    def friction(self, q: Any, v: Any, p: Any) -> Any:
+        """Viscous and dry friction [N m]."""
+        return p.d * v.phi_dot + p.F_c * ca.tanh(v.phi_dot / FRICTION_SPEED)
+
+    def force(self, q: Any, v: Any, u: Any, w: Any, p: Any) -> Any:
+        """Torque of the motor [N m]."""
+        voltage = u.duty * u.supply - p.k_t * v.phi_dot
+        return u.enabled * p.k_t / p.R * voltage

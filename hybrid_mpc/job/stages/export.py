@@ -52,8 +52,8 @@ def export_stage(context: Context) -> ExportResult:
         "hybrid": trained_models(context, DEPLOYED).step(phy, dt),
         "prior": PriorStep(phy, dt),
     }
-    info = model_info(phy, dt, prior.fit.covariance(phy.parameters_spec))
-    deployed = replace(info, input_delay=prior.delay, time_unit=context.time_unit)
+    info = model_info(phy, dt, prior.fit.covariance(phy.parameters))
+    deployed = replace(info, input_delay=prior.fit.delay, time_unit=context.time_unit)
     programs, parities = {}, []
     for i, (name, step) in enumerate(steps.items()):
         context.progress.update("models", i, len(steps), name)

@@ -15,31 +15,27 @@ from hybrid_mpc.data.trajectories import ROLES, Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import digest, read_document, read_document_arrays, sha256, write_document
 from hybrid_mpc.identify.evaluate import FreeRun, Scores, evaluation_trajectories, free_runs, score
-from hybrid_mpc.identify.export import trace_model
-from hybrid_mpc.identify.prior import fit_and_smooth, fit_physics, smoothed
+from hybrid_mpc.identify.export import prior_programs
+from hybrid_mpc.identify.fit import fit_prior, smoothed
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.settings import KINDS, TrainingSettings
-from hybrid_mpc.identify.smooth import Smoother
 from hybrid_mpc.identify.step import PriorStep, Scaling, Step
 from hybrid_mpc.identify.train import Trained, TrainingFailure, train
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.engine import WORKERS, run_jobs
 from hybrid_mpc.job.stage import Stage, source_of
-from hybrid_mpc.machine.torch_prior import Prior
+from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import load_scenario
 from nn_export.program import to_json
 
 Array = NDArray[Any]
 
-DELAY_RUNS = 5.0
-"""Longest free runs [the machine's seconds] that parameters and delay are fitted to: a swing near the top multiplies
-every error."""
 MODELS = ("phy_nominal", "phy", *KINDS)
 """Models that are evaluated."""
 DEPLOYED = "mopgrnn"
 """The kind of network that is exported."""
-ERRORS = {"error": "E_sim", "position": "RMSE", "energy": "energy violation"}
+ERRORS = {"error": "E_sim", "output": "RMSE over the spread"}
 """What the validation of a training is called, by its first objective."""
 
 
@@ -79,21 +75,15 @@ class PriorResult:
     """The fitted prior, and the states that its equations smooth the recordings to.
 
     Args:
-        fit: Parameters with their standard errors.
+        fit: Parameters with their standard errors, the inputs' delay, and what the smoother assumes.
         nominal: Parameters before the fit.
         units: Units of the parameters.
-        sigma: Standard deviation of each sensor that the smoother assumes [output units].
-        walk: Random walk of the unexplained acceleration that it assumes, by degree of freedom.
-        delay: Delay of the input [s]; zero for none.
         arrays: States and their rates, ``"TRAJECTORY/x"`` and ``"TRAJECTORY/xdot"`` ``(n, n_x)``.
     """
 
     fit: PriorFit
     nominal: Mapping[str, float]
     units: Mapping[str, str]
-    sigma: tuple[float, ...]
-    walk: tuple[float, ...]
-    delay: float
     arrays: Mapping[str, Array]
 
 
@@ -200,7 +190,7 @@ def doubts(context: Context) -> tuple[str, ...]:
     """
     found = tuple(str(finding) for finding in context.dataset.findings)
     prior = context.scenario.prior()
-    free = sum(not p.fixed for p in prior.parameters_spec)
+    free = sum(not p.fixed for p in prior.parameters)
     train = context.trajectories("train")
     if not train:  # the prior's fit says so
         return found
@@ -213,10 +203,10 @@ def doubts(context: Context) -> tuple[str, ...]:
 def what_prior_reads(context: Context) -> dict[str, object]:
     """The prior's equations as a traced program, and its parameters."""
     prior = context.scenario.prior()
-    programs = trace_model(PriorStep(prior, context.spec.dt))
+    programs = prior_programs(prior, context.spec.dt)
     return {
         "equations of the prior": {name: to_json(program) for name, program in programs.items()},
-        "parameters of the prior": prior.parameters_spec,
+        "parameters of the prior": prior.parameters,
         "largest delay": context.spec.largest_delay,
     }
 
@@ -225,23 +215,17 @@ def prior_stage(context: Context) -> PriorResult:
     """Fit the prior's parameters, and the input's delay where there may be one, and smooth all recordings by it."""
     make, spec = context.scenario.prior, context.spec
     train, valid, test = (context.trajectories(role) for role in ("train", "valid", "test"))
-    if spec.largest_delay:
-        physics = fit_physics(
-            make, train, valid, dt=spec.dt, length=DELAY_RUNS * context.time_unit, largest_delay=spec.largest_delay,
-            on_progress=lambda done, total, text: context.progress.update("free runs", done, total, text),
-        )  # fmt: skip
-    else:
-        physics = fit_and_smooth(make, train, valid, spec.dt, on_progress=context.progress.update)
-    parts = [smoothed(make, physics, part, spec.dt) for part in (train, valid, test)]
-    for warning in physics.fit.warnings:
+    fit = fit_prior(
+        make, train, valid, dt=spec.dt, largest_delay=spec.largest_delay, time_unit=context.time_unit,
+        on_progress=lambda done, total, text: context.progress.update("free runs", done, total, text),
+    )  # fmt: skip
+    parts = [smoothed(make, fit, part, spec.dt) for part in (train, valid, test)]
+    for warning in fit.warnings:
         context.progress.warn(f"fit of the prior: {warning}")
     return PriorResult(
-        physics.fit,
+        fit,
         make().values,
-        {p.name: p.unit for p in make().parameters_spec},
-        tuple(physics.sigma),
-        tuple(physics.walk),
-        float(physics.delay),
+        {p.name: p.unit for p in make().parameters},
         {f"{t.name}/{key}": getattr(t, key) for part in parts for t in part for key in ("x", "xdot")},
     )
 
@@ -345,7 +329,7 @@ def evaluation_stage(context: Context) -> EvaluationResult:
     """Free runs of every model over the test trajectories; the figures show them whole."""
     prior, spec = context.prior, context.spec
     phy = context.scenario.prior(prior.fit.values)
-    smoother = Smoother(phy, spec.dt, prior.sigma, prior.walk)
+    smoother = prior.fit.smoother(phy, spec.dt)
     whole = context.smoothed("test")
     shown, test = (
         evaluation_trajectories(whole, smoother, context.warm, length) for length in (None, spec.free_run)

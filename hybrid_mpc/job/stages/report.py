@@ -168,7 +168,7 @@ def what_report_reads(context: Context) -> dict[str, object]:
     scenario, prior = context.scenario, context.scenario.prior()
     return {
         "titles": (scenario.title, scenario.description, [task.title for task in scenario.tasks]),
-        "labels": (prior.states, prior.inputs, prior.outputs, prior.parameters_spec),
+        "labels": (prior.states, prior.inputs, prior.outputs, prior.parameters),
         "drawing": source_of(scenario.draw),
         "own figures": source_of(scenario.figures),
         "command": command(context, Path(context.settings.scenario).name),
@@ -356,7 +356,7 @@ def _prior_table(context: Context) -> Table:
     rows = [
         (p.label, p.description, prior.nominal[p.name], prior.fit.values[p.name],
          prior.fit.standard_errors.get(p.name, "fixed"))
-        for p in context.scenario.prior().parameters_spec
+        for p in context.scenario.prior().parameters
     ]  # fmt: skip
     caption = "Parameters of the prior. Standard errors suppose that the prior's structure is right."
     return Table(("parameter", "meaning", "nominal", "fitted", "standard error"), rows, caption)

@@ -397,7 +397,7 @@ def _identification(context: Context) -> Identification:
         ),
         {name: found.scores[name].networks for name in MODELS},
         {stem: {m: finite(found.by_file[m][stem].rmse_rad) for m in MODELS} for stem in found.by_file["phy"]},
-        SmootherNoise(prior.sigma, prior.walk),
+        SmootherNoise(prior.fit.sigma, prior.fit.walk),
         {
             "e_sim_s": _ratio(e_sim["mopgrnn"], e_sim["phy"]),
             "rmse": _ratio(rmse["mopgrnn"], rmse["phy"]),

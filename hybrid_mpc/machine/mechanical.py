@@ -1,0 +1,135 @@
+"""Priors of mechanical machines: an equation of motion by its mass matrix, potential, friction and forces."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import casadi as ca
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.machine.prior import POINT, Balance, Prior, column, components
+
+
+class MechanicalPrior(Prior):
+    """``M(q) q_ddot + C(q, q_dot) q_dot + dV/dq + friction = force``; the states are ``x = [q, v]``, ``q_dot = v``.
+
+    A subclass writes :meth:`mass_matrix` and what else it has of :meth:`potential`, :meth:`friction` and :meth:`force`.
+    Coriolis and centrifugal forces follow from the mass matrix. The kinematics ``q_dot = v`` are exact, so networks
+    correct the accelerations alone (``corrects`` is the speeds). The energy balance is made of the same parts: ``T +
+    V`` is stored, the force's power is supplied, the friction's is lost. Its residual is the paper's ΔE. What
+    :meth:`balances` gives stands beside it.
+
+    Methods take named tuples of scalars, ``q`` the first half of the states and ``v`` the second; in a subclass of
+    :class:`~hybrid_mpc.machine.torch_prior.TorchPrior` too they are written in torch.
+
+    Raises:
+        InputError: If the states are not ``[q, v]`` in pairs.
+
+    Example:
+        >>> class Pendulum(MechanicalPrior):
+        ...     states = (Signal("phi", "rad"), Signal("phi_dot", "rad/s"))
+        ...     inputs = (Signal("torque", "N m"),)
+        ...     outputs = (Signal("phi", "rad"),)
+        ...     parameters = (Parameter("J", 0.1, "kg m^2", 0.01, 1.0), Parameter("mgl", 2.0, "N m", 1.0, 4.0))
+        ...
+        ...     def mass_matrix(self, q, p):
+        ...         return p.J
+        ...
+        ...     def potential(self, q, p):
+        ...         return -p.mgl * ca.cos(q.phi)
+        >>> from hybrid_mpc import Parameter, Signal
+        >>> pendulum = Pendulum()
+        >>> pendulum.equations.xdot([ca.pi / 2, 1.0], 2.5, [], pendulum.p)
+        DM([1, 5])
+    """
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if "states" in vars(cls):
+            if len(cls.states) % 2:
+                raise InputError(
+                    f"{cls.__name__}: states must be [q, v] in pairs, got {len(cls.states)}: "
+                    f"{', '.join(s.name for s in cls.states)}"
+                )
+            if cls.corrects is None:
+                cls.corrects = tuple(s.name for s in cls.states[len(cls.states) // 2 :])
+
+    corrects: ClassVar[tuple[str, ...] | None] = None
+
+    @property
+    def n_q(self) -> int:
+        """Number of degrees of freedom."""
+        return len(self.states) // 2
+
+    def mass_matrix(self, q: Any, p: Any) -> Any:
+        """Inertia [SI]: rows of the symmetric, positive definite matrix ``((m11, m12), (m21, m22))``.
+
+        A tuple of scalars is a diagonal, a scalar that of one degree of freedom.
+        """
+        raise NotImplementedError(f"{type(self).__name__} must define mass_matrix(q, p)")
+
+    def potential(self, q: Any, p: Any) -> Any:
+        """Potential energy V [J]. Default: none."""
+        return 0.0
+
+    def friction(self, q: Any, v: Any, p: Any) -> Any:
+        """Generalised forces against the motion, one a degree of freedom [N or N m]. Default: none.
+
+        Their power is what is lost, so it must not be negative.
+        """
+        return (0.0,) * self.n_q
+
+    def force(self, q: Any, v: Any, u: Any, w: Any, p: Any) -> Any:
+        """Generalised forces that drive the machine, one a degree of freedom [N or N m]. Default: the inputs."""
+        if len(self.inputs) != self.n_q:
+            raise InputError(
+                f"{type(self).__name__}: {len(self.inputs)} inputs drive {self.n_q} degrees of freedom; define "
+                "force(q, v, u, w, p)"
+            )
+        return tuple(u)
+
+    def names_of(self, argument: str) -> tuple[str, ...]:
+        """Names of the components of ``x, u, w, p``, and of ``q`` and ``v``."""
+        if argument in ("q", "v"):
+            names = super().names_of("x")
+            return names[: self.n_q] if argument == "q" else names[self.n_q :]
+        return super().names_of(argument)
+
+    def _parts(self, u: ca.SX, w: ca.SX, p: ca.SX) -> tuple[ca.SX, ...]:
+        """``q, v``, mass matrix, potential energy, friction and force."""
+        n, kind = self.n_q, type(self).__name__
+        q, v = ca.SX.sym("q", n), ca.SX.sym("v", n)
+        mass = self._matrix(self.evaluated("mass_matrix", ("q", q), ("p", p)))
+        potential = column(self.evaluated("potential", ("q", q), ("p", p)), 1, f"{kind}.potential(q, p)")
+        friction = column(
+            self.evaluated("friction", ("q", q), ("v", v), ("p", p)), n, f"{kind}.friction(q, v, p)"
+        )
+        given = ("q", q), ("v", v), ("u", u), ("w", w), ("p", p)
+        force = column(self.evaluated("force", *given), n, f"{kind}.force(q, v, u, w, p)")
+        return q, v, mass, potential, friction, force
+
+    def _matrix(self, value: Any) -> ca.SX:
+        n, entries = self.n_q, [ca.SX(c) for c in components(value)]
+        if len(entries) == n:
+            return ca.diag(ca.vertcat(*entries))
+        if len(entries) != n * n:
+            raise InputError(
+                f"{type(self).__name__}.mass_matrix(q, p) must give {n} rows of {n} values, or {n} values of a "
+                f"diagonal; got {len(entries)} values"
+            )
+        return ca.reshape(ca.vertcat(*entries), n, n).T
+
+    def expressions(self, x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> tuple[Any, Any, tuple[Balance, ...]]:
+        """Rates of the states, outputs and balances, made of the parts of the equation of motion."""
+        given = tuple(zip(POINT, (x, u, w, p), strict=True))
+        q, v, mass, potential, friction, force = self._parts(u, w, p)
+        momentum = mass @ v
+        kinetic = 0.5 * ca.dot(v, momentum)
+        gyroscopic = ca.jacobian(momentum, q) @ v - ca.gradient(kinetic, q)
+        driving = force - friction - ca.gradient(potential, q) - gyroscopic
+        diagonal = mass.sparsity().is_diag()
+        rate = driving / ca.diag(mass) if diagonal else ca.solve(mass, driving)
+        terms = ca.vertcat(v, rate), kinetic + potential, ca.dot(force, v), ca.dot(friction, v)
+        xdot, stored, supplied, lost = (ca.substitute(term, ca.vertcat(q, v), x) for term in terms)
+        energy = Balance("energy", stored, supplied, lost)
+        return xdot, self.evaluated("output", *given), (energy, *self._balances(*given))

@@ -1,0 +1,328 @@
+"""The prior of a machine: an ODE with outputs and balances, written in CasADi. No torch in here.
+
+:class:`Prior` is the base of all. :class:`~hybrid_mpc.machine.torch_prior.TorchPrior` takes the same methods written in
+torch, :class:`~hybrid_mpc.machine.mechanical.MechanicalPrior` the parts of an equation of motion. Whatever it is
+written in, a prior becomes :class:`Equations`: CasADi functions, of which fit, training, estimator and controller are
+made.
+"""
+
+from __future__ import annotations
+
+from collections import namedtuple
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from typing import Any, ClassVar
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.machine.signals import Parameter, Signal
+
+Array = NDArray[np.float64]
+POINT = ("x", "u", "w", "p")
+"""What a prior's equations are functions of: states, inputs, measured disturbances, parameters."""
+
+
+@dataclass(frozen=True)
+class Balance:
+    """What a machine stores of one kind, and what comes and goes: ``dS/dt = supply - loss``.
+
+    Args:
+        name: e.g. ``"energy"``, ``"mass"``, ``"heat"``.
+        storage: What is stored, S(x) [unit].
+        supply: What is put in or taken out per time [rate_unit], of either sign.
+        loss: What is lost per time [rate_unit], not negative. Default: nothing.
+        unit: Unit of the storage. Default: J.
+        rate_unit: Unit of supply and loss. Default: W.
+
+    Example:
+        >>> Balance("mass", storage=2.0, supply=0.1, unit="kg", rate_unit="kg/s").loss
+        0.0
+    """
+
+    name: str
+    storage: Any
+    supply: Any
+    loss: Any = 0.0
+    unit: str = "J"
+    rate_unit: str = "W"
+
+
+@dataclass(frozen=True)
+class OperatingPoint:
+    """An equilibrium around which a machine works.
+
+    Args:
+        x: States ``(n_x,)`` [their units].
+        u: Inputs ``(n_u,)`` that hold them there.
+        w: Measured disturbances ``(n_w,)`` there. Default: none.
+
+    Example:
+        >>> OperatingPoint(x=(0.1, 0.2), u=(3.0,)).w
+        ()
+    """
+
+    x: tuple[float, ...]
+    u: tuple[float, ...]
+    w: tuple[float, ...] = ()
+
+
+class Prior:
+    """Any ODE ``xdot = f(x, u, w; p)`` with outputs ``y = g(x, u, w; p)``, written in CasADi.
+
+    A subclass names its signals and parameters as class attributes and writes :meth:`xdot`; :meth:`output` and
+    :meth:`balances` where it has others than the defaults. Each method takes four named tuples of scalar expressions,
+    in the order of the signals: ``x.level`` or ``level, flow = x``. It gives a tuple of scalars, one a state or output.
+
+    Attributes:
+        states: Signals of ``x``. They need not be measured.
+        inputs: Signals of ``u``: what a controller commands.
+        outputs: Signals of ``y``: what sensors measure.
+        disturbances: Signals of ``w``: measured, but not commanded. Default: none.
+        parameters: The parameters ``p`` with values, bounds and units. Default: none.
+        corrects: Names of the states whose rates a network may correct. Default: all. A rate that is exact, such as
+            that of a position, is not named.
+        operating_point: An equilibrium around which the machine works. Default: none is known.
+
+    Args:
+        values: Parameter values [their units] by name that replace the nominal ones, e.g. fitted ones.
+
+    Raises:
+        InputError: If a name in ``values`` is no parameter, or ``corrects`` names no state.
+
+    Example:
+        >>> class Tank(Prior):
+        ...     states = (Signal("level", "m", 0.0, 1.0),)
+        ...     inputs = (Signal("inflow", "m^3/s"),)
+        ...     outputs = (Signal("level", "m"),)
+        ...     parameters = (Parameter("area", 2.0, "m^2", 1.0, 4.0), Parameter("k", 0.1, "m^2.5/s", 0.0, 1.0))
+        ...
+        ...     def xdot(self, x, u, w, p):
+        ...         return ((u.inflow - p.k * ca.sqrt(ca.fmax(x.level, 1e-6))) / p.area,)
+        ...
+        ...     def balances(self, x, u, w, p):
+        ...         out = p.k * ca.sqrt(ca.fmax(x.level, 1e-6))
+        ...         return (Balance("volume", p.area * x.level, u.inflow, out, "m^3", "m^3/s"),)
+        >>> tank = Tank({"k": 0.2})
+        >>> tank.equations.xdot(0.25, 0.1, [], tank.p)
+        DM(0)
+    """
+
+    states: ClassVar[tuple[Signal, ...]]
+    inputs: ClassVar[tuple[Signal, ...]]
+    outputs: ClassVar[tuple[Signal, ...]]
+    disturbances: ClassVar[tuple[Signal, ...]] = ()
+    parameters: ClassVar[tuple[Parameter, ...]] = ()
+    corrects: ClassVar[tuple[str, ...] | None] = None
+    operating_point: ClassVar[OperatingPoint | None] = None
+
+    def __init__(self, values: Mapping[str, float] | None = None) -> None:
+        given = dict(values or {})
+        self._values = {p.name: float(given.pop(p.name, p.value)) for p in self.parameters}
+        kind = type(self).__name__
+        if given:
+            raise InputError(
+                f"{kind} has no parameter {', '.join(given)}; it has: {', '.join(self._values) or 'none'}"
+            )
+        names = [s.name for s in self.states]
+        unknown = [name for name in self.corrects or () if name not in names]
+        if unknown:
+            raise InputError(
+                f"{kind}: corrects names {', '.join(unknown)}; its states are: {', '.join(names)}"
+            )
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Current parameter values [their units] by name."""
+        return dict(self._values)
+
+    @property
+    def p(self) -> Array:
+        """Current parameter values ``(n_p,)`` in the order of ``parameters``."""
+        return np.array(list(self._values.values()), dtype=np.float64)
+
+    def xdot(self, x: Any, u: Any, w: Any, p: Any) -> Any:
+        """Rates of the states: a tuple of one scalar a state."""
+        raise NotImplementedError(f"{type(self).__name__} must define xdot(x, u, w, p)")
+
+    def output(self, x: Any, u: Any, w: Any, p: Any) -> Any:
+        """Measured outputs: a tuple of one scalar an output. Default: the states of the outputs' names."""
+        at = {state.name: component for state, component in zip(self.states, x, strict=True)}
+        unknown = [output.name for output in self.outputs if output.name not in at]
+        if unknown:
+            raise InputError(
+                f"{type(self).__name__}: no state is called {', '.join(unknown)}, as the output is; its states are: "
+                f"{', '.join(at)}. Define output(x, u, w, p), or give the output the name of the state it measures"
+            )
+        return tuple(at[output.name] for output in self.outputs)
+
+    def balances(self, x: Any, u: Any, w: Any, p: Any) -> tuple[Balance, ...]:
+        """Balances of what the machine stores. Default: none; a MOPGRNN then has no second objective."""
+        return ()
+
+    @property
+    def corrected(self) -> tuple[int, ...]:
+        """Places in ``x`` of the states whose rates a network may correct."""
+        names = {s.name for s in self.states} if self.corrects is None else set(self.corrects)
+        return tuple(i for i, s in enumerate(self.states) if s.name in names)
+
+    @property
+    def equations(self) -> Equations:
+        """The prior as CasADi functions of ``(x, u, w, p)``; made once for equal priors."""
+        return _equations(_Alike(self))
+
+    def expressions(self, x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> tuple[Any, Any, tuple[Balance, ...]]:
+        """Rates of the states, outputs and balances at columns of expressions."""
+        given = tuple(zip(POINT, (x, u, w, p), strict=True))
+        return self.evaluated("xdot", *given), self.evaluated("output", *given), self._balances(*given)
+
+    def _balances(self, *given: tuple[str, ca.SX]) -> tuple[Balance, ...]:
+        found = self.evaluated("balances", *given)
+        if not isinstance(found, tuple | list) or not all(isinstance(b, Balance) for b in found):
+            raise InputError(
+                f"{type(self).__name__}.balances(x, u, w, p) must give a tuple of Balance(...), got {found!r:.80}"
+            )
+        return tuple(found)
+
+    def evaluated(self, method: str, *arguments: tuple[str, ca.SX]) -> Any:
+        """What a method gives at expressions: nested tuples of scalars, and balances.
+
+        Args:
+            method: Its name.
+            arguments: Name and expression ``(n,)`` of each argument; the name says whose components it has
+                (:meth:`names_of`).
+        """
+        return getattr(self, method)(*(named(self.names_of(key), ca.vertsplit(v)) for key, v in arguments))
+
+    def names_of(self, argument: str) -> tuple[str, ...]:
+        """Names of the components of ``x``, ``u``, ``w`` or ``p``."""
+        signals: dict[str, tuple[Signal | Parameter, ...]] = {
+            "x": self.states, "u": self.inputs, "w": self.disturbances, "p": self.parameters,
+        }  # fmt: skip
+        return tuple(s.name for s in signals[argument])
+
+
+@dataclass(frozen=True)
+class BalanceEquations:
+    """A balance as functions of scalar operations.
+
+    ``storage`` ``(x, p)`` [unit]; ``supply`` and ``loss`` ``(x, u, w, p)`` [rate_unit]; ``residual`` ``(x, xdot, u, w,
+    p)`` [rate_unit] is ``dS/dx xdot - supply + loss``. There a rate that networks do not correct is the prior's own.
+    """
+
+    name: str
+    unit: str
+    rate_unit: str
+    storage: ca.Function
+    supply: ca.Function
+    loss: ca.Function
+    residual: ca.Function
+
+
+@dataclass(frozen=True)
+class Equations:
+    """A prior as CasADi functions of scalar operations, of columns ``x, u, w, p``.
+
+    Args:
+        xdot: ``(x, u, w, p) -> xdot (n_x,)``.
+        output: ``(x, u, w, p) -> y (n_y,)``.
+        balances: Its balances.
+    """
+
+    xdot: ca.Function
+    output: ca.Function
+    balances: tuple[BalanceEquations, ...]
+
+
+def components(value: Any) -> list[Any]:
+    """The scalars of what a prior's method gives: of nested tuples, of a column, of a number."""
+    if isinstance(value, tuple | list):
+        return [scalar for part in value for scalar in components(part)]
+    if isinstance(value, ca.SX | ca.DM) and value.numel() > 1:
+        return list(ca.vertsplit(ca.reshape(ca.densify(value).T, -1, 1)))
+    return [value]
+
+
+def column(value: Any, n: int, what: str) -> ca.SX:
+    """What a prior's method gives, as a column of ``n``."""
+    try:
+        found = ca.vertcat(*(ca.SX(v) for v in components(value)))
+    except (NotImplementedError, TypeError) as error:
+        raise InputError(
+            f"{what} gives {type(value).__name__}, which is no tuple of scalars: is a 'return' missing, or is it "
+            "written in torch? Then it must be a TorchPrior"
+        ) from error
+    if found.shape[0] != n:
+        raise InputError(f"{what} must give {n} values, got {found.shape[0]}")
+    return ca.densify(found)
+
+
+@cache
+def _tuple_of(names: tuple[str, ...]) -> Any:
+    return namedtuple("named", names, rename=True)  # what is no identifier has its place alone
+
+
+def named(names: tuple[str, ...], parts: Sequence[Any]) -> Any:
+    """Components with their names: ``x.level`` or ``level, flow = x``."""
+    return _tuple_of(names)(*parts[: len(names)])
+
+
+class _Alike:
+    """A prior without the values of its parameters: equal for two of one class whose own attributes are equal numbers
+    or texts. Any other attribute makes it equal to nothing but itself.
+    """
+
+    def __init__(self, prior: Prior) -> None:
+        own = {name: value for name, value in vars(prior).items() if name != "_values"}
+        simple = all(isinstance(value, bool | int | float | str) for value in own.values())
+        self.prior = prior
+        self._key = type(prior), prior.parameters, tuple(sorted(own.items())) if simple else id(prior)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Alike) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+
+@lru_cache(maxsize=32)
+def _equations(alike: _Alike) -> Equations:
+    prior, kind = alike.prior, type(alike.prior).__name__
+    sizes = (len(prior.names_of(key)) for key in POINT)
+    point = [ca.SX.sym(key, n) for key, n in zip(POINT, sizes, strict=True)]
+    rates, outputs, balances = prior.expressions(*point)
+    xdot = column(rates, len(prior.states), f"{kind}.xdot(x, u, w, p)")
+    y = column(outputs, len(prior.outputs), f"{kind}.output(x, u, w, p)")
+    names = [b.name for b in balances]
+    if len(set(names)) < len(names):
+        raise InputError(f"{kind}.balances(x, u, w, p): two have the same name: {names}")
+    return Equations(
+        ca.Function("xdot", point, [ca.cse(xdot)], [*POINT], ["xdot"]),
+        ca.Function("output", point, [ca.cse(y)], [*POINT], ["y"]),
+        tuple(_balance(prior, b, point, xdot) for b in balances),
+    )
+
+
+def _balance(prior: Prior, balance: Balance, point: list[ca.SX], xdot: ca.SX) -> BalanceEquations:
+    what = f"{type(prior).__name__}: balance {balance.name}"
+    storage, supply, loss = (
+        column(getattr(balance, key), 1, f"{what}: {key}") for key in ("storage", "supply", "loss")
+    )
+    x, u, w, p = point
+    if ca.depends_on(storage, ca.vertcat(u, w)):
+        raise InputError(f"{what}: the storage must be a function of x and p alone, it depends on u or w")
+    rate = ca.SX.sym("xdot", len(prior.states))
+    corrected = set(prior.corrected)
+    taken = ca.vertcat(*(rate[i] if i in corrected else xdot[i] for i in range(rate.numel())))
+    residual = ca.gradient(storage, x).T @ taken - supply + loss
+    held = [x, rate, u, w, p]
+    return BalanceEquations(
+        balance.name, balance.unit, balance.rate_unit,
+        ca.Function("storage", [x, p], [ca.densify(storage)], ["x", "p"], ["storage"]),
+        ca.Function("supply", point, [ca.densify(supply)], [*POINT], ["supply"]),
+        ca.Function("loss", point, [ca.densify(loss)], [*POINT], ["loss"]),
+        ca.Function("residual", held, [ca.cse(ca.densify(residual))], ["x", "xdot", "u", "w", "p"], ["residual"]),
+    )  # fmt: skip
