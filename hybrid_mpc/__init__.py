@@ -75,6 +75,7 @@ if TYPE_CHECKING:
     from hybrid_mpc.identify.evaluate import evaluation_trajectories, free_runs, score
     from hybrid_mpc.identify.export import check_parity, model_info, trace_model
     from hybrid_mpc.identify.fit import fit_prior
+    from hybrid_mpc.identify.linear import LinearModel, fit_arx, fit_subspace
     from hybrid_mpc.identify.networks import GRUNetwork
     from hybrid_mpc.identify.settings import TrainingSettings
     from hybrid_mpc.identify.smooth import fit_smoother
@@ -169,6 +170,7 @@ __all__ = [
     "IpoptController",
     "Kit",
     "Limits",
+    "LinearModel",
     "LoadDependent",
     "LocalPolynomial",
     "Loop",
@@ -228,8 +230,10 @@ __all__ = [
     "excitation_of",
     "feature_box",
     "find_noise",
+    "fit_arx",
     "fit_prior",
     "fit_smoother",
+    "fit_subspace",
     "free_runs",
     "frequency_response",
     "friction_slopes",
@@ -335,6 +339,7 @@ _ROOMS = {
     "identify.evaluate": ("evaluation_trajectories", "free_runs", "score"),
     "identify.export": ("check_parity", "model_info", "trace_model"),
     "identify.fit": ("fit_prior",),
+    "identify.linear": ("LinearModel", "fit_arx", "fit_subspace"),
     "identify.networks": ("GRUNetwork",),
     "identify.settings": ("TrainingSettings",),
     "identify.smooth": ("fit_smoother",),
