@@ -1,0 +1,158 @@
+"""Bands around free runs: how far a model may be off, from what is known of its uncertainty, calibrated once.
+
+The variance of an error is a sum of parts: the sensor's noise, the scatter between networks, what the covariance of the
+fitted parameters makes of the outputs, and a growth with the time since the start. How much each part counts is found
+by maximum likelihood on validation runs; then all widths are scaled so that the share asked for lies inside.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from hybrid_mpc.errors import InputError
+
+Array = NDArray[np.float64]
+SHARE = 0.9
+"""Share of the measurements that a band is to hold."""
+LEAST = 1e-6
+"""Least weight of the noise: a variance is never zero."""
+
+
+@dataclass(frozen=True)
+class RunParts:
+    """A free run's errors and the parts of their variance, for one model.
+
+    Args:
+        error: Errors of the outputs ``(n, n_y)`` [output units]; NaN where nothing was measured.
+        parts: Parts of their variance ``(n, n_y, m)`` [output units^2], each not negative: see :func:`variance_parts`.
+    """
+
+    error: Array
+    parts: Array
+
+
+@dataclass(frozen=True)
+class Bands:
+    """Half widths of a band as a function of the parts of the variance.
+
+    Args:
+        weights: Weight of each part, by output ``(n_y, m)``.
+        scale: Half width over the standard deviation, by output.
+        share: Share of the measurements that it is to hold. Default: 90 %.
+    """
+
+    weights: tuple[tuple[float, ...], ...]
+    scale: tuple[float, ...]
+    share: float = SHARE
+
+    def half_width(self, parts: Array) -> Array:
+        """Half widths ``(n, n_y)`` [output units] of parts ``(n, n_y, m)``."""
+        variance = np.einsum("kjm,jm->kj", parts, np.array(self.weights))
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)) * np.array(self.scale))
+
+
+def variance_parts(t: Array, sigma: Array, spread: Array, networks: Array, parameters: Array) -> Array:
+    """Parts of the variance of a free run's errors ``(n, n_y, 4)`` [output units^2].
+
+    Args:
+        t: Time since the start ``(n,)``, in the run's own length or the machine's seconds; only its shape counts.
+        sigma: Noise of the sensors ``(n_y,)`` [output units].
+        spread: Spread of the outputs ``(n_y,)`` [output units].
+        networks: Variance between the networks ``(n, n_y)`` [output units^2]; zero for the prior.
+        parameters: Variance by the covariance of the fitted parameters ``(n, n_y)`` [output units^2].
+    """
+    n, n_y = networks.shape
+    growth = (np.asarray(t) / max(float(np.max(t)), 1e-300))[:, None] * np.square(spread)
+    noise = np.broadcast_to(np.square(sigma), (n, n_y))
+    return np.stack([noise, networks, parameters, growth], axis=-1)
+
+
+def fit_bands(runs: Sequence[RunParts], share: float = SHARE) -> Bands:
+    """Bands that hold a share of the measurements of validation runs.
+
+    The scale is a quantile of the errors over their standard deviation (split conformal prediction), taken with equal
+    weight of every run. Errors within a run hang together, so what it promises holds on the average over runs alike.
+
+    Raises:
+        InputError: If there is no run, or the share is none.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> parts = np.ones((400, 1, 1))
+        >>> runs = [RunParts(rng.normal(0.0, 2.0, (400, 1)), parts) for _ in range(5)]
+        >>> bands = fit_bands(runs)
+        >>> inside = [np.mean(np.abs(r.error) <= bands.half_width(r.parts)) for r in runs]
+        >>> round(float(np.mean(inside)), 2)  # a little more: the next run is one more of as many
+        0.92
+
+    Source: Lei, G'Sell, Rinaldo, Tibshirani, Wasserman, *Distribution-free predictive inference for regression*, JASA
+    113 (2018), for locally weighted split conformal prediction.
+    """
+    if not runs:
+        raise InputError("bands: there is no validation run to calibrate them on")
+    if not 0 < share < 1:
+        raise InputError(f"bands: share must lie between 0 and 1, got {share}")
+    weights, scale = [], []
+    for j in range(runs[0].error.shape[1]):
+        seen = [np.isfinite(run.error[:, j]) for run in runs]
+        errors = [run.error[s, j] for run, s in zip(runs, seen, strict=True)]
+        parts = [run.parts[s, j] for run, s in zip(runs, seen, strict=True)]
+        own = _weights(np.concatenate(errors), np.concatenate(parts))
+        ratios = np.concatenate(
+            [np.abs(e) / np.sqrt(np.maximum(p @ own, 1e-300)) for e, p in zip(errors, parts, strict=True)]
+        )
+        each = np.concatenate([np.full(len(e), 1.0 / len(e)) for e in errors if len(e)])
+        weights.append(tuple(own.tolist()))
+        scale.append(_quantile(ratios, each, share, len(errors)))
+    return Bands(tuple(weights), tuple(scale), share)
+
+
+def coverage(run: RunParts, bands: Bands) -> float:
+    """Share of the measurements of a run within its band."""
+    inside = np.abs(run.error) <= bands.half_width(run.parts)
+    return float(np.mean(inside[np.isfinite(run.error)]))
+
+
+def interval_score(run: RunParts, bands: Bands) -> float:
+    """Mean interval score of a run's band [output units, summed over the outputs]; the less the better.
+
+    The band's width, and for a measurement outside of it its distance, ``2 / (1 - share)`` times.
+
+    Source: Gneiting and Raftery, *Strictly proper scoring rules, prediction, and estimation*, JASA 102 (2007).
+    """
+    half = bands.half_width(run.parts)
+    beyond = np.maximum(np.abs(run.error) - half, 0.0)
+    return float(np.nanmean(2 * half + 2 / (1 - bands.share) * beyond, axis=0).sum())
+
+
+def _weights(error: Array, parts: Array) -> Array:
+    """Weights of the parts that make the errors most likely, if they were normal."""
+    size = np.maximum(parts.mean(axis=0), 1e-300)
+    known = parts.max(axis=0) > 0
+    scaled, squares = parts / size, np.square(error)
+    level = max(float(np.mean(squares)), 1e-300)
+
+    def cost(logs: Array) -> tuple[float, Array]:
+        own = np.exp(logs) * known
+        variance = np.maximum(scaled @ own, LEAST)
+        ratio = squares / level / variance
+        slope = scaled.T @ ((1.0 - ratio) / variance) * own
+        return float(np.mean(np.log(variance) + ratio)), slope / len(squares)
+
+    start = np.full(parts.shape[1], -math.log(max(int(known.sum()), 1)))
+    found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=[(-20.0, 5.0)] * parts.shape[1])
+    return np.asarray(np.exp(found.x) * known * level / size)
+
+
+def _quantile(ratios: Array, weights: Array, share: float, runs: int) -> float:
+    """Weighted quantile, a little above the share: the next run is one more of as many."""
+    order = np.argsort(ratios)
+    level = min(share + (1 - share) / (runs + 1), 1.0) if runs > 1 else share
+    total = np.cumsum(weights[order]) / float(weights.sum())
+    return float(ratios[order][min(int(np.searchsorted(total, level)), len(order) - 1)])

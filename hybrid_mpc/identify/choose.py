@@ -1,0 +1,154 @@
+"""Do no harm: which of the candidates is recommended, by free runs over validation recordings.
+
+A hybrid is recommended only if it beats the fitted prior there by more than the uncertainty of the comparison.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t as student
+
+from hybrid_mpc.errors import InputError
+
+Array = NDArray[np.float64]
+BLOCKS = 8
+"""Blocks at least that the validation runs are cut into: the scatter between fewer says little."""
+CONFIDENCE = 0.95
+"""Probability, one-sided, with which a recommended hybrid is better than the prior."""
+CONFIDENT = 1.0
+"""Ratio to the prior's error that the upper bound of the hybrid's has to stay below."""
+
+
+@dataclass(frozen=True)
+class CandidateFigures:
+    """A candidate on the validation runs.
+
+    Args:
+        error: Root mean square of the outputs' errors, each over its spread [-]; infinite if a run diverged.
+        ratio: That over the prior's [-].
+        upper: Upper bound of the ratio with a probability of ``CONFIDENCE`` [-].
+    """
+
+    error: float
+    ratio: float
+    upper: float
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which model is recommended and why.
+
+    Args:
+        recommended: Name of the candidate.
+        hybrid: The best of the hybrids, whether it is recommended or not.
+        candidates: Figures by candidate.
+        reason: One sentence for the report.
+        blocks: Blocks of the validation runs that were compared.
+    """
+
+    recommended: str
+    hybrid: str
+    candidates: Mapping[str, CandidateFigures]
+    reason: str
+    blocks: int
+
+
+def recommend(
+    errors: Mapping[str, Sequence[Array]], *, prior: str = "phy", deploy: str = "", samples: int = 1
+) -> Choice:
+    """Choose among the prior and hybrids, by their squared errors over the same validation runs.
+
+    The ratio of a hybrid's error to the prior's is that of their root mean squares over all runs. Its scatter is found
+    by leaving out one block after the other (jackknife); blocks are contiguous parts of the runs.
+
+    Args:
+        errors: For each candidate its squared errors of each run ``(n,)`` [-]: the mean over the outputs of the error
+            over its spread, squared.
+        prior: Name of the prior among them.
+        deploy: Candidate that the user wants whatever the figures say. Default: none.
+        samples: Samples of a block at least, within which errors hang together. Default: 1.
+
+    Raises:
+        InputError: If ``deploy`` is no candidate, or there is no validation run.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> runs = [rng.uniform(0.5, 1.5, 100) for _ in range(4)]
+        >>> choice = recommend({"phy": runs, "pgrnn": [0.25 * run for run in runs]})
+        >>> choice.recommended, round(choice.candidates["pgrnn"].ratio, 3)
+        ('pgrnn', 0.5)
+
+    Source: Efron, *The jackknife, the bootstrap and other resampling plans* (1982).
+    """
+    if deploy and deploy not in errors:
+        raise InputError(f"deploy: no candidate {deploy!r}; choose of: {', '.join(errors)}")
+    if not errors.get(prior):
+        raise InputError("there is no validation run to choose a model by; give longer recordings")
+    cuts = _cuts([len(run) for run in errors[prior]], samples)
+    sums = {name: _sums(runs, cuts) for name, runs in errors.items()}
+    sizes = np.array([b - a for run in cuts for a, b in run])
+    figures = {name: _figures(own, sums[prior], sizes) for name, own in sums.items()}
+    hybrids = [name for name in errors if name != prior]
+    best = min(hybrids, key=lambda name: figures[name].error, default=prior)
+    safe = [name for name in hybrids if figures[name].upper < CONFIDENT]
+    chosen = min(safe, key=lambda name: figures[name].error, default=prior)
+    reason = _reason(figures, best, chosen, prior, len(sizes))
+    if deploy and deploy != chosen:
+        reason = f"{deploy} is deployed as asked for. {reason}"
+    return Choice(deploy or chosen, best if deploy in ("", prior) else deploy, figures, reason, len(sizes))
+
+
+def _reason(figures: Mapping[str, CandidateFigures], best: str, chosen: str, prior: str, blocks: int) -> str:
+    if best == prior:
+        return "There is no hybrid to compare with the fitted prior."
+    own = figures[best]
+    if not math.isfinite(own.error):
+        return f"The fitted prior is recommended: free runs of {best} diverge on validation recordings."
+    said = f"its validation error is {own.ratio:.2f} of the prior's (at most {own.upper:.2f}, {blocks} blocks)"
+    if chosen == prior:
+        return f"The fitted prior is recommended: {best} does not surely beat it; {said}."
+    own = figures[chosen]
+    said = f"its validation error is {own.ratio:.2f} of the prior's (at most {own.upper:.2f}, {blocks} blocks)"
+    return f"{chosen} is recommended: {said}."
+
+
+def _cuts(lengths: Sequence[int], samples: int) -> list[list[tuple[int, int]]]:
+    """Blocks of each run as first and last sample: whole runs, or parts of them where there are few."""
+    parts = math.ceil(BLOCKS / max(1, len(lengths)))
+    cuts = []
+    for n in lengths:
+        count = max(1, min(parts, n // max(1, samples)))
+        edges = np.linspace(0, n, count + 1).round().astype(int).tolist()
+        cuts.append(list(zip(edges[:-1], edges[1:], strict=True)))
+    return cuts
+
+
+def _sums(runs: Sequence[Array], cuts: Sequence[Sequence[tuple[int, int]]]) -> Array:
+    return np.array(
+        [float(np.sum(run[a:b])) for run, own in zip(runs, cuts, strict=True) for a, b in own]
+    )
+
+
+def _figures(own: Array, prior: Array, sizes: Array) -> CandidateFigures:
+    n = len(sizes)
+    error = math.sqrt(float(own.sum()) / float(sizes.sum())) if np.isfinite(own).all() else math.inf
+    if not math.isfinite(error):
+        return CandidateFigures(math.inf, math.inf, math.inf)
+    if own is prior:
+        return CandidateFigures(error, 1.0, 1.0)
+    if not np.isfinite(prior).all():
+        return CandidateFigures(error, 0.0, 0.0)
+    ratio = float(np.sqrt(own.sum() / max(float(prior.sum()), 1e-300)))
+    if n < 2:
+        return CandidateFigures(error, ratio, math.inf)
+    without = 0.5 * np.log(
+        np.maximum(own.sum() - own, 1e-300) / np.maximum(prior.sum() - prior, 1e-300)
+    )
+    scatter = math.sqrt((n - 1) / n * float(np.sum(np.square(without - without.mean()))))
+    bound = math.log(max(ratio, 1e-300)) + float(student.ppf(CONFIDENCE, n - 1)) * scatter
+    return CandidateFigures(error, ratio, math.exp(min(bound, 700.0)))

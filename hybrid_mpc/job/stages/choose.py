@@ -1,0 +1,97 @@
+"""Stage choice: which model is recommended, and the bands around free runs, both by validation recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.identify.bands import Bands, RunParts, fit_bands, variance_parts
+from hybrid_mpc.identify.choose import Choice, recommend
+from hybrid_mpc.identify.evaluate import FreeRun, evaluation_trajectories, free_runs
+from hybrid_mpc.identify.fit import parameter_variance
+from hybrid_mpc.identify.prior_result import PriorFit
+from hybrid_mpc.job.context import Context
+from hybrid_mpc.job.stage import Stage
+from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, members
+from hybrid_mpc.machine.prior import Prior
+
+Array = NDArray[np.float64]
+CANDIDATES = ("phy", "pgrnn", "mopgrnn")
+"""What may be recommended: the fitted prior, and the hybrids."""
+FAR = 1e3
+"""Spreads of an output beyond which a part of an error's variance says no more."""
+
+
+@dataclass(frozen=True)
+class ChoiceResult:
+    """What validation says of the candidates.
+
+    Args:
+        choice: Which one is recommended, and why.
+        bands: Bands around free runs, by candidate.
+    """
+
+    choice: Choice
+    bands: Mapping[str, Bands]
+
+    @property
+    def deployed(self) -> str:
+        """The kind of network that is exported as the hybrid."""
+        return self.choice.hybrid
+
+
+def choice_stage(context: Context) -> ChoiceResult:
+    """Free runs of all candidates over validation recordings, as long as those on unseen data."""
+    prior, spec = context.prior, context.spec
+    phy = context.scenario.prior(prior.fit.values)
+    smoother = prior.fit.smoother(phy, spec.dt)
+    valid = evaluation_trajectories(context.smoothed("valid"), smoother, context.warm, spec.free_run)
+    errors: dict[str, list[Array]] = {}
+    bands: dict[str, Bands] = {}
+    for i, name in enumerate(CANDIDATES):
+        context.progress.update("candidates", i, len(CANDIDATES), name)
+        every = [free_runs(step, phy, valid, context.warm) for step in members(context, name, phy)]
+        errors[name] = [run.squared_errors(smoother.sizes.y) for run in every[0]]
+        bands[name] = fit_bands(run_parts(phy, prior.fit, every, spec.dt))
+    samples = max(1, round(context.time_unit / spec.dt))
+    return ChoiceResult(recommend(errors, deploy=context.settings.deploy, samples=samples), bands)
+
+
+def run_parts(
+    phy: Prior, fit: PriorFit, every: Sequence[Sequence[FreeRun]], dt: float
+) -> list[RunParts]:
+    """Errors of each run of the first network, and the parts of their variance; ``every`` has a row a network."""
+    assert fit.sizes is not None
+    covariance, spread = np.array(fit.covariance(phy.parameters)), np.array(fit.sizes.y)
+    if not covariance.size:
+        covariance = np.zeros((len(phy.parameters), len(phy.parameters)))
+    found = []
+    for runs in zip(*every, strict=True):
+        own = runs[0]
+        outputs = np.stack([run.y_hat for run in runs])
+        limit = np.square(FAR * spread)
+        with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges has a band without end
+            networks = np.nan_to_num(outputs.var(axis=0), nan=np.inf)
+            parameters = parameter_variance(
+                phy, covariance, own.x_hat[None, 0], own.u[None], own.w[None], dt
+            )[0]
+        found.append(
+            RunParts(
+                np.clip(np.nan_to_num(own.y_hat - own.y, nan=np.nan, posinf=np.inf), -FAR * spread, FAR * spread),
+                variance_parts(
+                    own.t - own.t[0], np.array(fit.sigma), spread,
+                    np.minimum(networks, limit), np.minimum(parameters, limit),
+                ),
+            )
+        )  # fmt: skip
+    return found
+
+
+CHOICE = Stage(
+    "choice", "choosing a model", ChoiceResult, choice_stage,
+    lambda context: {"free runs": (context.warm, context.spec.free_run), "deploy": context.settings.deploy},
+    (DATA, PRIOR, TRAINING),
+)  # fmt: skip
