@@ -82,7 +82,8 @@ def _derivatives(y: Array, dt: float, half: int, order: int) -> Array:
         return np.zeros((0, y.shape[1]))
     from scipy.signal import savgol_filter  # slow to import, and monitors import this module
 
-    found = savgol_filter(y, window, 3, deriv=order, delta=dt, axis=0)[half : len(y) - half]
+    # "nearest" reaches into the ends alone, which are left out; polynomials there would take no NaN
+    found = savgol_filter(y, window, 3, deriv=order, delta=dt, axis=0, mode="nearest")[half : len(y) - half]
     return np.asarray(found[np.isfinite(found).all(axis=1)])
 
 
