@@ -91,7 +91,7 @@ def record(kind: type[T], data: object, where: str) -> T:
         >>> record(Signal, {"nam": "q", "unit": 3}, "model.json")
         Traceback (most recent call last):
         hybrid_mpc.errors.InputError: model.json: no field 'nam'; did you mean 'name'? There are: name, unit, lower, \
-upper, periodic; name is missing; unit: a text is needed, got 3
+upper, periodic, saturation; name is missing; unit: a text is needed, got 3
     """
     problems: list[str] = []
     found = _dataclass(kind, data, "", problems)

@@ -135,7 +135,7 @@ FAULTS = (
     ),
     fault(
         "data", "a sensor's noise is estimated too large: the factor of first differences on third ones",
-        "np.std(third, axis=0) / math.sqrt(20.0)", "np.std(third, axis=0) / math.sqrt(2.0)",
+        "float(np.std(third)) / math.sqrt(20.0)", "float(np.std(third)) / math.sqrt(2.0)",
         "scales",
     ),
     fault(

@@ -72,7 +72,7 @@ def readme(scenario: Scenario, files: Sequence[Path], command: str) -> str:
     lines = [
         f"# Recordings: {scenario.title}", "", scenario.description, "", f"Written by `{command}`.", "",
         "| column | unit | meaning |", "| --- | --- | --- |",
-        f"| {spec.time} | s | {stamp} |",
+        *([f"| {spec.time} | s | {stamp} |"] if isinstance(spec.time, str) else []),
         *(f"| {column} | {s.unit} | {_meaning(column in spec.inputs)} {s.name} |" for column, s in signals),
         "",
         f"Sampling: {1e3 * period:.3g} ms, even; arrays of numpy by these names."
@@ -103,8 +103,10 @@ def _role(scenario: Scenario, path: Path) -> str:
     return ", ".join(f"{w.role} {w.start:g} to {w.end:g} s" for w in windows)
 
 
-def _sampling(files: Sequence[Path], column: str) -> tuple[float, float]:
+def _sampling(files: Sequence[Path], column: str | float) -> tuple[float, float]:
     """Median period of the files, and the time stamps' standard deviation around whole periods [s]."""
+    if not isinstance(column, str):
+        return column, 0.0
     times = []
     for path in files:
         if path.suffix == ".npz":  # one number, the sampling time

@@ -322,6 +322,9 @@ def check_excitation(
             )
     for j in range(trajectories[0].y.shape[1]):
         every = np.concatenate([piece.y[:, j] for piece in trajectories])
+        every = every[np.isfinite(every)]
+        if not len(every):
+            continue  # not measured here, perhaps elsewhere: nothing to say
         if float(every.std()) <= NOTHING * _size([every], outputs, j):
             name = outputs[j].name if j < len(outputs) else f"output {j + 1}"
             problems.append(

@@ -12,9 +12,10 @@ import errno
 import hashlib
 import io
 import math
+import re
 import warnings
 from array import array
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -50,6 +51,26 @@ LISTED = 30
 """Most names that a message lists."""
 COMPARED = 1000
 """Most names among which a message looks for one that is nearly right."""
+SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
+"""What may stand between the cells of a CSV file; the one that gives the header most names is taken."""
+TOP = 2**16
+"""Bytes of the header that are looked at for the separator [byte]."""
+BLANK = ("", "nan", "na", "n/a")
+"""Cells that say that there is no value, in small letters."""
+
+
+def name_and_unit(column: str) -> tuple[str, str]:
+    """A column's name and the unit that stands behind it in brackets; ``""`` if there is none.
+
+    Example:
+        >>> name_and_unit("level [mm]"), name_and_unit("time (s)"), name_and_unit("phi")
+        (('level', 'mm'), ('time', 's'), ('phi', ''))
+    """
+    for opening, closing in ("[]", "()"):
+        name, bracket, unit = column.removesuffix(closing).rpartition(opening)
+        if column.endswith(closing) and bracket and name.strip():
+            return name.strip(), unit.strip()
+    return column, ""
 
 
 class MissingColumn(InputError):
@@ -62,7 +83,8 @@ class Columns:
 
     ``values`` ``(m, n)`` has a column for each name asked for, NaN where there is no finite number. ``row`` is what
     the file's own tools call a row, ``"row"`` or ``"index"``, and ``numbers`` are the rows' numbers as they count.
-    ``problems`` of single columns have place and remedy, without the file's name.
+    ``problems`` of single columns have place and remedy, without the file's name; a blank cell is one only in columns
+    that may have none.
     """
 
     values: Array
@@ -77,19 +99,25 @@ class Columns:
 
 @dataclass(frozen=True)
 class Source:
-    """A recording's file, opened: ``read(full names)``, the first one being the time, gives the columns.
+    """A recording's file, opened: ``read(full name of the time, full names, blanks)`` gives the columns, time first.
 
-    ``sha256`` is that of its bytes; ``note`` is what else a user should know who misses a column.
+    ``blanks`` are the names of columns that may have blank cells; a time of None is no column. ``sha256`` is that of
+    the file's bytes; ``note`` is what else a user should know who misses a column.
     """
 
     path: Path
     sha256: str
     header: tuple[str, ...]
-    read: Callable[[Sequence[str]], Columns]
+    read: Callable[[str | None, Sequence[str], Collection[str]], Columns]
     note: str = ""
 
     def find(self, name: str) -> str:
-        """Full name of a column: its own, or ``struct.field`` where just one struct has it; else an error."""
+        """Full name of a column: its own, ``struct.field`` where just one struct has it, or with its unit in brackets.
+
+        Raises:
+            MissingColumn: If there is none.
+            InputError: If there are several.
+        """
         count = self.header.count(name)
         if count == 1:
             return name
@@ -99,7 +127,9 @@ class Source:
             raise InputError(
                 f"{self.path}: column {name!r} appears {count} times in {there}. Rename all but one."
             )
-        fields = [column for column in self.header if column.endswith(f".{name}")]
+        fields = [column for column in self.header if column.endswith(f".{name}")] or [
+            column for column in self.header if name_and_unit(column)[0] == name
+        ]
         if len(fields) == 1:
             return fields[0]
         if fields:
@@ -122,7 +152,8 @@ def opened(path: Path) -> Source:
     ``.npz``    named vectors (``numpy.savez``); objects are refused
     ``.mat``    MATLAB's vectors, ``save`` with ``-v4``, ``-v6`` or ``-v7``, not 7.3; a struct's fields are
                 ``struct.field``
-    any other   CSV: a comma between cells, decimals with a point, the first line the header, UTF-8
+    any other   CSV: a comma, semicolon or tab between cells, decimals with a point (where no comma separates, with a
+                comma, too), the first line the header, UTF-8
     ==========  ========================================================================================
     """
     return {".npz": _npz, ".mat": _mat}.get(path.suffix.lower(), _csv)(path)
@@ -182,15 +213,28 @@ def _csv(path: Path) -> Source:
     text = _Text(path)
     content = _content(path, text.check)
     text.check(b"", last=True)
-    line, header = next(_rows(path, content), (1, []))
+    separator = _separator(content)
+    line, header = next(_rows(path, content, separator), (1, []))
     names = tuple(name.strip() for name in header)
 
-    def read(wanted: Sequence[str]) -> Columns:
-        rows = _rows(path, content)
+    def read(time: str | None, wanted: Sequence[str], blanks: Collection[str]) -> Columns:
+        rows = _rows(path, content, separator)
         next(rows, None)
-        return _parsed(path, rows, line, names, wanted)
+        return _parsed(
+            path, rows, line, names, [*([] if time is None else [time]), *wanted], blanks, separator
+        )
 
     return Source(path, hashlib.sha256(content).hexdigest(), names, read)
+
+
+def _separator(content: bytes) -> str:
+    """What separates the cells of a CSV file, by its header."""
+    found = re.search(rb"[^\s,;][^\r\n]{0,%d}" % TOP, content)
+    line = (found[0] if found else b"").decode("utf-8-sig", errors="replace").splitlines()[:1]
+    return max(
+        SEPARATORS,
+        key=lambda separator: max((len(row) for row in csv.reader(line, delimiter=separator)), default=0),
+    )
 
 
 class _Text:
@@ -222,9 +266,10 @@ class _Text:
         self._row, self._length = self._row + piece.count(b"\n"), rest
 
 
-def _rows(path: Path, content: bytes) -> Iterator[Row]:
+def _rows(path: Path, content: bytes, separator: str) -> Iterator[Row]:
     """Number and cells of each row; blank ones are skipped but counted."""
-    reader = csv.reader(io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline=""))
+    file = io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline="")
+    reader = csv.reader(file, delimiter=separator)
     try:
         for row in reader:
             if any(cell.strip() for cell in row):
@@ -234,14 +279,24 @@ def _rows(path: Path, content: bytes) -> Iterator[Row]:
 
 
 def _parsed(
-    path: Path, rows: Iterator[Row], header: int, names: Sequence[str], wanted: Sequence[str]
+    path: Path,
+    rows: Iterator[Row],
+    header: int,
+    names: Sequence[str],
+    wanted: Sequence[str],
+    blanks: Collection[str],
+    separator: str,
 ) -> Columns:
     """Numbers of the wanted columns; a row of another length than the header is an error of the whole file."""
     places = [names.index(name) for name in wanted]
+    lax = [name in blanks for name in wanted]
     columns, numbers = [array("d") for _ in places], array("q")
     bad = [0] * len(places)  # cells of each column that are no number, and the first of them
     first_bad = [(0, "")] * len(places)
     unequal, first_unequal = 0, (0, 0)
+    marks: dict[
+        str, tuple[int, str]
+    ] = {}  # decimal marks where they may be commas, and the first cell of each
     most = LARGEST // 8 // (len(places) + 1)
     for line, cells in rows:
         if len(cells) != len(names):
@@ -252,9 +307,15 @@ def _parsed(
             raise InputError(f"{path}: has more than {most} rows, more than are read. Split the recording.")
         numbers.append(line)
         for j, place in enumerate(places):
-            value = _number(cells[place])
+            cell = cells[place]
+            if separator != ",":
+                for mark in ",.":
+                    if mark in cell:
+                        marks.setdefault(mark, (line, cell.strip()))
+                cell = cell.replace(",", ".")
+            value = _number(cell)
             columns[j].append(value)
-            if value != value:
+            if value != value and not (lax[j] and cell.strip().lower() in BLANK):
                 first_bad[j] = first_bad[j] if bad[j] else (line, cells[place].strip())
                 bad[j] += 1
     if unequal:
@@ -262,7 +323,7 @@ def _parsed(
         such = f" ({unequal} such rows)" if unequal > 1 else ""
         raise InputError(
             f"{path}: row {line} has {count} cells, the header (row {header}) has {len(names)}{such}. "
-            "Separate cells by commas, write decimals with a point, and complete or delete the row."
+            f"Separate cells by {SEPARATORS[separator]}, write decimals with a point, and complete or delete the row."
         )
     problems = []
     for name, count, (line, cell) in zip(wanted, bad, first_bad, strict=True):
@@ -273,6 +334,12 @@ def _parsed(
                 f"row {line}, column {shown(name)} {what}{such}. Delete the row (longer gaps are cut out) or repair "
                 "the value."
             )
+    if len(marks) > 1:
+        (with_comma, comma), (with_point, point) = marks[","], marks["."]
+        problems.append(
+            f"numbers have commas and points: {shown(comma)} in row {with_comma}, {shown(point)} in row {with_point}. "
+            "Write the file with one decimal mark and nothing between thousands."
+        )
     return Columns(np.column_stack([np.array(column) for column in columns]), "row", numbers, tuple(problems))
 
 
@@ -413,7 +480,8 @@ def _vectors(
     A single number as the time is the sampling time.
     """
 
-    def read(names: Sequence[str]) -> Columns:
+    def read(time: str | None, wanted: Sequence[str], blanks: Collection[str]) -> Columns:
+        names = [*([] if time is None else [time]), *wanted]
         columns: list[Array] = []
         problems: list[str] = []
         left = _budget(content)
@@ -430,7 +498,7 @@ def _vectors(
             except InputError as error:
                 problems += error.problems
         refuse(problems)
-        if columns[0].size == 1 and len(columns) > 1:
+        if time is not None and columns[0].size == 1 and len(columns) > 1:
             columns[0] = _uniform(path, names[0], columns[0].item(), len(columns[1]))
         lengths = dict(zip(names, map(len, columns), strict=True))
         if len(set(lengths.values())) > 1:
@@ -439,7 +507,7 @@ def _vectors(
         values = np.column_stack(columns)
         found = []
         for name, column in zip(names, values.T, strict=True):
-            bad = np.flatnonzero(~np.isfinite(column))
+            bad = np.flatnonzero(np.isinf(column) if name in blanks else ~np.isfinite(column))
             if len(bad):
                 found.append(
                     f"{row} {bad[0] + first}, column {shown(name)} is {column[bad[0]]:g}, not a finite number "

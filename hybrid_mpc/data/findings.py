@@ -74,18 +74,29 @@ def findings_of(
     for recording, (t, x) in zip(recordings, motions, strict=True):
         found += recording.findings
         for j, (name, signal) in enumerate(zip(spec.outputs, outputs, strict=True)):
+            known = np.isfinite(recording.y[:, j])
+            column = _Column(
+                recording.path.name,
+                name,
+                signal,
+                recording.t[known],
+                recording.y[known, j],
+                recording.censored[known, j],
+            )
             still = still_stretches(
-                recording.t,
-                recording.y[:, j],
-                recording.u,
+                column.t,
+                column.y,
+                recording.u[known],
                 max_gap=spec.max_gap,
                 patience=patience[j],
                 spreads=spreads,
             )
-            found += _stuck(recording, name, signal, recording.y[:, j], still)
+            found += _stuck(column, [one for one in still if column.censored[one.first] == 0])
         if len(t):
             for j, speed in enumerate(_speeds_of(states, outputs)):
-                found += _too_fast(recording, spec.outputs[j], speed, t, x[:, len(outputs) + j])
+                v = x[:, len(outputs) + j]
+                known = np.isfinite(v)
+                found += _too_fast(recording, spec.outputs[j], speed, t[known], v[known])
     return tuple(found)
 
 
@@ -99,9 +110,10 @@ def _patience(recordings: Sequence[Recording], j: int, spec: DataSpec) -> float:
     """Time [s] that a driven machine may rest, by the times between two changes of an output in all recordings."""
     waits = []
     for recording in recordings:
-        changes = np.flatnonzero(np.diff(recording.y[:, j])) + 1
+        known = np.isfinite(recording.y[:, j])
+        t, changes = recording.t[known], np.flatnonzero(np.diff(recording.y[known, j])) + 1
         if len(changes):
-            waits.append(np.diff(recording.t[np.r_[0, changes, len(recording.t) - 1]]))
+            waits.append(np.diff(t[np.r_[0, changes, len(t) - 1]]))
     ordinary = float(np.quantile(np.concatenate(waits), ORDINARY)) if waits else 0.0
     return max(PATIENCE * ordinary, LENGTHS * spec.smoothing)
 
@@ -224,45 +236,61 @@ def _driven(u: Array, spreads: Array) -> bool:
     return bool(moving.any() and (np.std(u, axis=0)[moving] >= STIRRED * spreads[moving]).all())
 
 
-def _stuck(
-    recording: Recording, name: str, signal: Signal, y: Array, still: Sequence[Still]
-) -> list[Finding]:
+@dataclass(frozen=True)
+class _Column:
+    """The samples ``(m,)`` of one output that are not missing, and where they come from."""
+
+    file: str
+    name: str
+    signal: Signal
+    t: Array
+    y: Array
+    censored: NDArray[np.int8]
+
+
+def _stuck(column: _Column, still: Sequence[Still]) -> list[Finding]:
     """Clipped at the largest and smallest value, and frozen anywhere else."""
     found: list[Finding] = []
-    largest, smallest = (y.max(), y.min()) if np.ptp(y) > 0 else (np.inf, -np.inf)
+    y = column.y
+    largest, smallest = (y.max(), y.min()) if len(y) and np.ptp(y) > 0 else (np.inf, -np.inf)
     for word, value in (("largest", largest), ("smallest", smallest)):
         there = [s for s in still if y[s.first] == value]
         if there:
-            found.append(_clipped(recording, name, signal, y, there[0], word))
+            found.append(_clipped(column, there[0], word))
     rest = [s for s in still if y[s.first] not in (largest, smallest)]
     if rest:
-        found.append(_frozen(recording, name, signal, y, rest))
+        found.append(_frozen(column, rest))
     return sorted(found, key=lambda finding: finding.start)
 
 
-def _clipped(recording: Recording, name: str, signal: Signal, y: Array, first: Still, word: str) -> Finding:
-    value, start = y[first.first], float(recording.t[first.first])
+def _clipped(column: _Column, first: Still, word: str) -> Finding:
+    t, y, signal = column.t, column.y, column.signal
+    value, start = float(y[first.first]), float(t[first.first])
     count = int((y == value).sum())
+    lower, upper = signal.saturation or (-math.inf, math.inf)
+    ends = f"({lower:g}, {value:g})" if word == "largest" else f"({value:g}, {upper:g})"
     message = (
-        f"column {name!r} stands at its {word} value, {value:.6g} {signal.unit}, for {count} samples, first from "
-        f"{start:.6g} to {recording.t[first.last]:.6g} s, {_why(first, signal)}. The sensor is clipped, or "
-        f"the machine rests against a stop, which a prior does not know of. {LEAVE_OUT} within the sensor's range."
+        f"column {column.name!r} stands at its {word} value, {value:.6g} {signal.unit}, for {count} samples, first "
+        f"from {start:.6g} to {t[first.last]:.6g} s, {_why(first, signal)}. The sensor is clipped, or "
+        f"the machine rests against a stop, which a prior does not know of. If the sensor ends there, declare "
+        f"Signal(..., saturation={ends.replace('inf', 'math.inf')}) for {signal.name}: these samples then count as 'at "
+        f"{'least' if word == 'largest' else 'most'}'. {LEAVE_OUT} within the sensor's range."
     )
-    return Finding("clipped", recording.path.name, name, start, count, message)
+    return Finding("clipped", column.file, column.name, start, count, message)
 
 
-def _frozen(recording: Recording, name: str, signal: Signal, y: Array, still: Sequence[Still]) -> Finding:
-    t = recording.t
+def _frozen(column: _Column, still: Sequence[Still]) -> Finding:
+    t, y, signal = column.t, column.y, column.signal
     longest = max(still, key=lambda s: t[s.last] - t[s.first])
     count = sum(s.last - s.first + 1 for s in still)
     others = len(still) - 1
     more = f" ({others} more such stretch{'es' * (others > 1)}, {count} samples in all)" if others else ""
     message = (
-        f"column {name!r} repeats {y[longest.first]:.6g} {signal.unit} from {t[longest.first]:.6g} to "
+        f"column {column.name!r} repeats {y[longest.first]:.6g} {signal.unit} from {t[longest.first]:.6g} to "
         f"{t[longest.last]:.6g} s, {longest.last - longest.first + 1} samples{more}, {_why(longest, signal)}. "
         f"The sensor is frozen, telegrams are lost, or the machine is blocked. {LEAVE_OUT} again."
     )
-    return Finding("frozen", recording.path.name, name, float(t[still[0].first]), count, message)
+    return Finding("frozen", column.file, column.name, float(t[still[0].first]), count, message)
 
 
 def _why(still: Still, signal: Signal) -> str:

@@ -28,20 +28,40 @@ class Outputs(Protocol):
 
     @property
     def y(self) -> Array:
-        """Measured outputs ``(n, n_y)``; positions."""
+        """Measured outputs ``(n, n_y)``, NaN where a sample is missing."""
+
+
+def thinned(recordings: Sequence[Outputs], i: int) -> tuple[list[Array], int]:
+    """Samples ``(m,)`` of one output of each recording and how many periods they are apart: one, or those of a sensor
+    that is slower than the grid. Those that are still missing are NaN.
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> run = SimpleNamespace(y=np.where(np.arange(9) % 3 == 1, np.arange(9.0), np.nan)[:, None])
+        >>> thinned([run], 0)
+        ([array([1., 4., 7.])], 3)
+    """
+    known = [np.flatnonzero(np.isfinite(r.y[:, i])) for r in recordings]
+    steps = np.concatenate([np.diff(k) for k in known]) if known else np.zeros(0)
+    step = int(np.median(steps)) if len(steps) else 1
+    first = [int(np.argmax(np.bincount(k % step))) if len(k) else 0 for k in known]
+    return [r.y[a::step, i] for r, a in zip(recordings, first, strict=True)], step
 
 
 def noise_of(recordings: Sequence[Outputs]) -> Array:
     """Standard deviation ``(n_y,)`` of the sensors' noise and steps, from third differences [output units].
 
-    White noise of 1 gives third differences of sqrt(20). What the machine itself does in three periods counts as noise
-    too, so the number is at most too large.
+    White noise of 1 gives third differences of sqrt(20). What the machine itself does in three periods (of a slower
+    sensor, in three of its own) counts as noise too, so the number is at most too large. Zero where too little is
+    known.
     """
-    third = np.concatenate([np.diff(r.y, 3, axis=0) for r in recordings])
-    third = third[np.isfinite(third).all(axis=1)]
-    if not len(third):
-        return np.zeros(recordings[0].y.shape[1])
-    return np.asarray(np.std(third, axis=0) / math.sqrt(20.0))
+    return np.array([_noise_of(thinned(recordings, i)[0]) for i in range(recordings[0].y.shape[1])])
+
+
+def _noise_of(pieces: Sequence[Array]) -> float:
+    third = np.concatenate([np.diff(piece, 3) for piece in pieces])
+    third = third[np.isfinite(third)]
+    return float(np.std(third)) / math.sqrt(20.0) if len(third) else 0.0
 
 
 def speeds_of(recording: Outputs, dt: float, half: int) -> Array:
@@ -62,7 +82,8 @@ def _derivatives(y: Array, dt: float, half: int, order: int) -> Array:
         return np.zeros((0, y.shape[1]))
     from scipy.signal import savgol_filter  # slow to import, and monitors import this module
 
-    found = savgol_filter(y, window, 3, deriv=order, delta=dt, axis=0)[half : len(y) - half]
+    # "nearest" reaches into the ends alone, which are left out; polynomials there would take no NaN
+    found = savgol_filter(y, window, 3, deriv=order, delta=dt, axis=0, mode="nearest")[half : len(y) - half]
     return np.asarray(found[np.isfinite(found).all(axis=1)])
 
 
@@ -96,10 +117,11 @@ def time_scale(recordings: Sequence[Outputs], dt: float) -> float:
 
 def _time_scale(recordings: Sequence[Outputs], dt: float, i: int, sigma: float) -> float:
     """Time scale of one output; NaN where its acceleration never stands out of the noise."""
-    half, longest = SHORTEST, max(len(r.y) for r in recordings)
+    pieces, step = thinned(recordings, i)
+    half, longest, dt = SHORTEST, max(map(len, pieces)), step * dt
     while 2 * half + 1 <= longest:
         speed, acceleration = (
-            [_derivatives(r.y[:, i : i + 1], dt, half, order) for r in recordings] for order in (1, 2)
+            [_derivatives(piece[:, None], dt, half, order) for piece in pieces] for order in (1, 2)
         )
         v = np.concatenate([part - part.mean() for part in speed if len(part)] or [np.zeros((0, 1))])
         a = np.concatenate(acceleration)

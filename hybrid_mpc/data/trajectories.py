@@ -15,7 +15,17 @@ from scipy.interpolate import CubicSpline
 
 from hybrid_mpc.data.differentiate import local_polynomial, window_samples
 from hybrid_mpc.data.findings import findings_of
-from hybrid_mpc.data.recording import MIN_SCORED, Finding, Recording, gaps, read_recordings
+from hybrid_mpc.data.recording import (
+    MIN_SCORED,
+    Finding,
+    Flags,
+    Recording,
+    complete,
+    empty,
+    gaps,
+    no_flags,
+    read_recordings,
+)
 from hybrid_mpc.errors import SHOWN, InputError, refuse
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.machine.specification import DataSpec, Role, Window
@@ -23,7 +33,11 @@ from hybrid_mpc.machine.specification import DataSpec, Role, Window
 Array = NDArray[np.float64]
 ROLES: tuple[Role, ...] = ("train", "valid", "test")
 TINY = 1e-6
-"""Tolerance [s] of comparisons between time stamps; far below any sampling time, above rounding."""
+"""Tolerance [periods] where periods are counted: above rounding."""
+NEAR = 5e-5
+"""Tolerance [periods] of comparisons between time stamps, which files round: 1 us at 20 ms."""
+FINEST = 1000
+"""Most samples of the model's grid for one of the recording: beyond it a period is given in a wrong unit."""
 UNEVEN = 20.0
 """Largest ratio of mean to median sampling interval: smoothing works on the median."""
 WORK = 2e10
@@ -40,10 +54,14 @@ class Trajectory:
         dt: Period [s].
         t: Times ``(n,)`` [s] in the recording's own time.
         u: Inputs ``(n, n_u)`` held over ``[t_k, t_k + dt)``: the mean of the recorded zero-order hold.
-        y: Measured outputs ``(n, n_y)``, interpolated to the grid and not smoothed.
-        x: States ``(n, n_x)``, ``[q, v]`` smoothed.
-        xdot: Derivatives of the states ``(n, n_x)``, ``[v, v_dot]`` smoothed.
-        w: Measured disturbances ``(n, n_w)``. Default: none.
+        y: Measured outputs ``(n, n_y)``, interpolated to the grid and not smoothed; NaN where no sample of that output
+            is within reach (:func:`to_grid`).
+        x: States ``(n, n_x)``, ``[q, v]`` smoothed, where the outputs are the positions ``q``; else NaN.
+        xdot: Derivatives of the states ``(n, n_x)``, ``[v, v_dot]`` smoothed, or NaN.
+        w: Disturbances ``(n, n_w)`` over ``[t_k, t_k + dt)``: the mean of the straight lines between their samples.
+            Default: none, ``(n, 0)``.
+        censored: ``(n, n_y)``: 0 where ``y`` is measured, -1 where the sensor was at its lower end and the truth is at
+            most ``y``, +1 where it was at its upper end and the truth is at least ``y``. Default: zeros.
     """
 
     name: str
@@ -54,11 +72,11 @@ class Trajectory:
     y: Array
     x: Array
     xdot: Array
-    w: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    w: Array = field(default_factory=empty)
+    censored: Flags = field(default_factory=no_flags)
 
     def __post_init__(self) -> None:
-        if not self.w.size:
-            object.__setattr__(self, "w", np.zeros((len(self.t), 0)))
+        complete(self)
 
     @property
     def file(self) -> str:
@@ -75,7 +93,7 @@ class Trajectory:
             name: New name. Default: as before.
             role: New role. Default: as before.
         """
-        arrays = {key: getattr(self, key)[keep] for key in ("t", "u", "y", "x", "xdot", "w")}
+        arrays = {key: getattr(self, key)[keep] for key in ("t", "u", "y", "x", "xdot", "w", "censored")}
         own = (self.name if name is None else name), (self.role if role is None else role)
         return replace(self, name=own[0], role=own[1], **arrays)
 
@@ -124,21 +142,26 @@ def load_trajectories(
     inputs: tuple[Signal, ...],
     states: Sequence[Signal] = (),
     needed: Sequence[Role] = ROLES,
+    disturbances: tuple[Signal, ...] = (),
 ) -> Dataset:
-    """Read recordings, cut them at gaps, smooth and differentiate, resample to ``spec.dt``, give roles.
+    """Read recordings, cut them at gaps, shift known delays out, smooth, resample to ``spec.dt``, give roles.
 
-    The outputs are the positions ``q``; velocities and accelerations are their derivatives. Smoothing comes before
-    resampling and the split, never across a gap: a sample's ``x`` and ``xdot`` know half of ``spec.smoothing`` of the
-    time before and after it. Parts by ``fractions`` keep ``spec.smoothing`` apart; ``windows`` should, too.
+    Where the outputs are the positions ``q`` of states ``[q, v]`` (as many, of the same names), velocities and
+    accelerations are their derivatives. Smoothing comes before resampling and the split, never across a gap, and never
+    across samples of that output that are missing or censored for longer than ``spec.max_gap``: there ``x`` and
+    ``xdot`` are NaN. A sample's ``x`` and ``xdot`` know half of ``spec.smoothing`` of the time before and after it.
+    Where the outputs are anything else, ``x`` and ``xdot`` are NaN throughout: states then come from the prior's own
+    equations. Parts by ``fractions`` keep ``spec.smoothing`` apart; ``windows`` should, too.
 
     Args:
         paths: CSV, ``.npz`` or ``.mat`` files with different stems, of any lengths.
-        spec: Columns, ``dt``, ``max_gap``, ``smoothing``, ``warm_up`` [s] and the split.
-        outputs: Signals of the prior's outputs (positions).
+        spec: Columns, ``dt``, ``max_gap``, ``smoothing``, ``warm_up`` [s], delays and the split.
+        outputs: Signals of the prior's outputs.
         inputs: Signals of the prior's inputs.
-        states: Signals of the prior's states ``[q, v, ...]``, for the plausible ranges of the speeds. Default: speeds
-            are not checked.
+        states: Signals of the prior's states, which say whether the outputs are positions, and the plausible ranges of
+            the speeds. Default: they are, and speeds are not checked.
         needed: Roles that must not be empty. Default: all three.
+        disturbances: Signals of the prior's disturbances. Default: none.
 
     Raises:
         InputError: If recordings are bad (see :func:`~hybrid_mpc.data.recording.read_recording`), columns differ
@@ -160,7 +183,10 @@ def load_trajectories(
     if not paths:
         raise InputError("no recordings given; name at least one file with --data")
     _check_windows(spec)
-    recordings, problems = read_recordings(paths, spec, outputs=outputs, inputs=inputs)
+    recordings, problems = read_recordings(
+        paths, spec, outputs=outputs, inputs=inputs, disturbances=disturbances
+    )
+    n_x = None if _are_positions(outputs, states) else len(states)
     trajectories: list[Trajectory] = []
     whole: list[Trajectory] = []
     motions: list[tuple[Array, Array]] = []
@@ -168,14 +194,15 @@ def load_trajectories(
     for recording in recordings:
         own: list[Trajectory] = []
         try:
-            own = list(_segments(recording, spec, cuts))
+            own = list(_segments(recording, spec, n_x, cuts))
             trajectories += _pieces(recording, own, spec, cuts)
         except InputError as error:
             problems.append(f"{recording.path}: {error}")
         whole += own
         t, x = [piece.t for piece in own], [piece.x for piece in own]
         motions.append((np.concatenate(t), np.concatenate(x)) if own else (np.zeros(0), np.zeros((0, 0))))
-    findings = findings_of(recordings, motions, spec, outputs=outputs, states=states)
+    speeds = states if n_x is None else ()
+    findings = findings_of(recordings, motions, spec, outputs=outputs, states=speeds)
     paths_of = {recording.path.name: recording.path for recording in recordings}
     problems += [f"{paths_of[finding.file]}: {finding.message}" for finding in findings if finding.refused]
     refuse(problems)
@@ -193,29 +220,50 @@ def load_trajectories(
     )
 
 
-def _segments(recording: Recording, spec: DataSpec, cuts: list[Cut]) -> Iterator[Trajectory]:
-    """Smoothed and resampled parts between gaps, numbered; too short ones become cuts."""
+def _are_positions(outputs: Sequence[Signal], states: Sequence[Signal]) -> bool:
+    """Whether the outputs are the positions of states ``[q, v]``; without states it is taken for granted."""
+    return not states or (
+        len(states) == 2 * len(outputs)
+        and [s.name for s in states[: len(outputs)]] == [s.name for s in outputs]
+    )
+
+
+def _segments(recording: Recording, spec: DataSpec, n_x: int | None, cuts: list[Cut]) -> Iterator[Trajectory]:
+    """Resampled parts between gaps, numbered; too short ones become cuts.
+
+    They are smoothed if ``n_x`` is None; else their ``n_x`` states are NaN.
+    """
     ends = np.flatnonzero(gaps(recording.t, spec.max_gap))
     for k in ends:
         why = f"gap of {recording.t[k + 1] - recording.t[k]:.4g} s is longer than max_gap {spec.max_gap:g} s"
         cuts.append(Cut(recording.path.name, float(recording.t[k]), float(recording.t[k + 1]), why))
-    samples = window_samples(spec.smoothing, recording.dt)
-    _check_sampling(recording, samples, spec)
-    shortest = max((samples - 1) * recording.dt, (_fewest(spec) - 1) * spec.dt) + spec.dt
+    shortest = _fewest(spec) * spec.dt
+    if n_x is None:
+        samples = window_samples(spec.smoothing, recording.dt)
+        _check_sampling(recording, samples, spec)
+        shortest = max((samples - 1) * recording.dt + spec.dt, shortest)
+    _check_period(recording, spec)
     number = 0
     for rows in np.split(np.arange(len(recording.t)), ends + 1):
-        t = recording.t[rows]
-        if t[-1] - t[0] < shortest - TINY:
-            cuts.append(Cut(recording.path.name, float(t[0]), float(t[-1]), _too_short(shortest, spec)))
+        part = _Part.of(recording, rows, spec)
+        whole, covered = part.span, part.covered()
+        if covered[1] - covered[0] < shortest - NEAR * spec.dt:
+            why = _too_short(shortest, spec)
+            if whole[1] - whole[0] >= shortest - NEAR * spec.dt:
+                why = f"what all columns cover, known delays taken off, is {why}"
+            cuts.append(Cut(recording.path.name, part.origin + whole[0], part.origin + whole[1], why))
             continue
+        for start, end in ((whole[0], covered[0]), (covered[1], whole[1])):
+            if end - start > NEAR * spec.dt:
+                why = "not covered by all columns once known delays are taken off"
+                cuts.append(Cut(recording.path.name, part.origin + start, part.origin + end, why))
         number += 1
-        yield _resample(recording, rows, spec, _numbered(recording.name, number))
+        yield _resampled(part, covered, recording.dt, spec, n_x, _numbered(recording.name, number))
 
 
 def _check_sampling(recording: Recording, samples: int, spec: DataSpec) -> None:
     """Refuse sampling that smoothing would take gigabytes or minutes for."""
-    steps = np.diff(recording.t)
-    mean = float(steps[~gaps(recording.t, spec.max_gap)].mean())
+    mean = _mean_step(recording, spec)
     if mean > UNEVEN * recording.dt:
         raise InputError(
             f"sampling is uneven: the time stamps are {recording.dt:.3g} s apart in the median and {mean:.3g} s in "
@@ -228,23 +276,183 @@ def _check_sampling(recording: Recording, samples: int, spec: DataSpec) -> None:
         )
 
 
-def _resample(recording: Recording, rows: NDArray[np.intp], spec: DataSpec, name: str) -> Trajectory:
-    t, y, u = recording.t[rows], recording.y[rows], recording.u[rows]
-    n = int(np.floor((t[-1] - t[0]) / spec.dt + TINY))
-    grid = t[0] + spec.dt * np.arange(n)
-    fine = t[0] + recording.dt * np.arange(int(np.floor((t[-1] - t[0]) / recording.dt + TINY)) + 1)
-    smooth = local_polynomial(_interpolate(t, y, fine), recording.dt, spec.smoothing)
-    q, v, a = (CubicSpline(fine, z)(grid) for z in (smooth.value, smooth.first, smooth.second))
+def _check_period(recording: Recording, spec: DataSpec) -> None:
+    """Refuse a period so fine that the grid would take gigabytes."""
+    mean = _mean_step(recording, spec)
+    if mean > FINEST * spec.dt:
+        raise InputError(
+            f"the model's period of {spec.dt:g} s is more than {FINEST} times finer than the sampling, {mean:.3g} s in "
+            "the mean. Raise dt in the DataSpec, or check that time is in seconds."
+        )
+
+
+def _mean_step(recording: Recording, spec: DataSpec) -> float:
+    """Mean distance [s] of the time stamps, gaps left out."""
+    steps = np.diff(recording.t)
+    return float(steps[~gaps(recording.t, spec.max_gap)].mean())
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Rows of a recording between two gaps, with times ``t`` ``(m,)`` [s] from ``origin`` on.
+
+    Known delays [s] by input, disturbance and output say how much later a channel acts than it was recorded; those of
+    sensors are negative.
+    """
+
+    origin: float
+    t: Array
+    u: Array
+    w: Array
+    y: Array
+    censored: Flags
+    late_u: tuple[float, ...]
+    late_w: tuple[float, ...]
+    late_y: tuple[float, ...]
+
+    @classmethod
+    def of(cls, recording: Recording, rows: NDArray[np.intp], spec: DataSpec) -> _Part:
+        t, late = recording.t[rows], spec.delays_in(recording.name)
+        return cls(
+            origin=float(t[0]),
+            t=t - t[0],
+            u=recording.u[rows],
+            w=recording.w[rows],
+            y=recording.y[rows],
+            censored=recording.censored[rows],
+            late_u=tuple(late.get(name, 0.0) for name in spec.inputs_in(recording.name)),
+            late_w=tuple(-late.get(name, 0.0) for name in spec.disturbances),
+            late_y=tuple(-late.get(name, 0.0) for name in spec.outputs),
+        )
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """First and last time."""
+        return 0.0, float(self.t[-1])
+
+    def covered(self) -> tuple[float, float]:
+        """First and last time between which every channel has samples; blank outputs count as if they had some."""
+        spans = [(late, self.t[-1] + late) for late in (*self.late_u, *self.late_y)]
+        for late, column in zip(self.late_w, self.w.T, strict=True):
+            known = self.t[np.isfinite(column)]
+            spans.append((known[0] + late, known[-1] + late) if len(known) else (0.0, 0.0))
+        return float(max(start for start, _ in spans)), float(min(end for _, end in spans))
+
+
+def _resampled(
+    part: _Part, covered: tuple[float, float], period: float, spec: DataSpec, n_x: int | None, name: str
+) -> Trajectory:
+    """A part on the model's grid; ``period`` is that of the recording."""
+    n = int(np.floor((covered[1] - covered[0]) / spec.dt + TINY))
+    grid: Array = covered[0] + spec.dt * np.arange(n, dtype=np.float64)
+    u = [
+        hold_mean(part.t + late, column[:, None], grid, spec.dt)
+        for late, column in zip(part.late_u, part.u.T, strict=True)
+    ]
+    w = [
+        line_mean(part.t + late, column, grid, spec.dt)[:, None]
+        for late, column in zip(part.late_w, part.w.T, strict=True)
+    ]
+    outputs = list(zip(part.late_y, part.y.T, part.censored.T, strict=True))
+    measured = [
+        to_grid(part.t + late, column, flags, grid, spec.dt, spec.max_gap) for late, column, flags in outputs
+    ]
+    if n_x is None:
+        motions = [
+            _smoothed(part.t + late, np.where(flags == 0, column, np.nan), grid, period, spec)
+            for late, column, flags in outputs
+        ]
+        q, v, a = (np.column_stack(columns) for columns in zip(*motions, strict=True))
+        x, xdot = np.hstack([q, v]), np.hstack([v, a])
+    else:
+        x, xdot = np.full((n, n_x), np.nan), np.full((n, n_x), np.nan)
     return Trajectory(
         name=name,
         role="",
         dt=spec.dt,
-        t=grid,
-        u=hold_mean(t, u, grid, spec.dt),
-        y=_interpolate(t, y, grid),
-        x=np.hstack([q, v]),
-        xdot=np.hstack([v, a]),
+        t=part.origin + grid,
+        u=np.hstack([np.zeros((n, 0)), *u]),
+        y=np.column_stack([y for y, _ in measured]),
+        x=x,
+        xdot=xdot,
+        w=np.hstack([np.zeros((n, 0)), *w]),
+        censored=np.column_stack([flags for _, flags in measured]),
     )
+
+
+def _smoothed(t: Array, y: Array, grid: Array, period: float, spec: DataSpec) -> tuple[Array, Array, Array]:
+    """Value and two derivatives of one output on the grid, NaN outside the stretches in which its samples are near."""
+    known = np.isfinite(y)
+    t, y = t[known], y[known]
+    value, first, second = (np.full(len(grid), np.nan) for _ in range(3))
+    for rows in np.split(np.arange(len(t)), np.flatnonzero(gaps(t, spec.max_gap)) + 1):
+        if not len(rows):
+            continue
+        start, end = t[rows[0]], t[rows[-1]]
+        fine = start + period * np.arange(int(np.floor((end - start) / period + TINY)) + 1)
+        if len(fine) < window_samples(spec.smoothing, period):
+            continue
+        smooth = local_polynomial(np.interp(fine, t[rows], y[rows]), period, spec.smoothing)
+        inside = (grid >= start - NEAR * spec.dt) & (grid <= end + NEAR * spec.dt)
+        for array, z in ((value, smooth.value), (first, smooth.first), (second, smooth.second)):
+            array[inside] = CubicSpline(fine, z)(grid[inside])
+    return value, first, second
+
+
+def to_grid(
+    t: Array, y: Array, censored: Flags, grid: Array, dt: float, max_gap: float
+) -> tuple[Array, Flags]:
+    """One output's samples on a grid of period ``dt`` [s], without inventing any; what is censored.
+
+    - Between two samples of this output that are at most ``max_gap`` [s] apart the grid has the straight line.
+    - Elsewhere, as between the samples of a slow analyser or in a hole, a sample counts for the one grid point that is
+      nearest to it, with its value as it was measured, at most half a period away. All other points are NaN.
+
+    A straight line to a censored sample is a bound as well, of the same side; it is NaN between the two ends of a
+    sensor.
+
+    Args:
+        t: Times ``(m,)`` [s] of the rows, increasing.
+        y: Samples ``(m,)``; NaN is none.
+        censored: -1, 0 or +1 ``(m,)`` for each.
+        grid: Times ``(n,)`` [s], ``dt`` apart.
+        dt: Period [s].
+        max_gap: Longest distance [s] that a straight line bridges.
+
+    Returns:
+        Values ``(n,)`` and -1, 0 or +1 for each.
+
+    Example:
+        >>> t = 0.1 * np.arange(9)
+        >>> slow = np.where(np.arange(9) % 4 == 0, 10.0 + t, np.nan)
+        >>> to_grid(t, slow, np.zeros(9, dtype=np.int8), t, 0.1, max_gap=0.2)[0].round(3).tolist()
+        [10.0, nan, nan, nan, 10.4, nan, nan, nan, 10.8]
+    """
+    known = np.isfinite(y)
+    t, y, censored = t[known], y[known], censored[known]
+    values, flags = np.full(len(grid), np.nan), np.zeros(len(grid), dtype=np.int8)
+    if not len(t):
+        return values, flags
+    left = np.searchsorted(t, grid, side="right") - 1
+    between = (left >= 0) & (left < len(t) - 1)
+    between[between] &= ~gaps(t, max_gap)[left[between]]
+    left = left[between]
+    values[between] = np.interp(grid[between], t, y)
+    share = (grid[between] - t[left]) / (t[left + 1] - t[left])
+    one = np.where(share < 1 - TINY, censored[left], 0)
+    two = np.where(share > TINY, censored[left + 1], 0)
+    flags[between] = np.where(one == 0, two, one)
+    values[np.flatnonzero(between)[one * two < 0]] = np.nan
+    # TINY: a sample in the middle of two points is counted for the earlier one, whatever the rounding
+    nearest = np.floor((t - grid[0]) / dt + 0.5 - TINY).astype(np.int64)
+    alone = np.flatnonzero((nearest >= 0) & (nearest < len(grid)))
+    alone = alone[~between[nearest[alone]]]
+    alone = alone[
+        np.argsort(-np.abs(t[alone] - grid[nearest[alone]]), kind="stable")
+    ]  # the nearest one stays
+    values[nearest[alone]], flags[nearest[alone]] = y[alone], censored[alone]
+    flags[np.isnan(values)] = 0
+    return values, flags
 
 
 def hold_mean(t: Array, u: Array, grid: Array, dt: float) -> Array:
@@ -254,6 +462,26 @@ def hold_mean(t: Array, u: Array, grid: Array, dt: float) -> Array:
     """
     integral = np.vstack([np.zeros((1, u.shape[1])), np.cumsum(u[:-1] * np.diff(t)[:, None], axis=0)])
     return (_interpolate(t, integral, grid + dt) - _interpolate(t, integral, grid)) / dt
+
+
+def line_mean(t: Array, w: Array, grid: Array, dt: float) -> Array:
+    """Mean over ``[T_k, T_k + dt)`` of the straight lines between samples ``(m,)``; NaN is none. Exact.
+
+    Before the first and after the last sample it is that sample.
+
+    Example:
+        >>> line_mean(np.array([0.0, 1.0, 2.0, 3.0]), np.array([0.0, np.nan, 4.0, 4.0]), np.array([0.0, 1.5]), 1.0)
+        array([1.  , 3.75])
+    """
+    known = np.isfinite(w)
+    t, w = t[known], w[known]
+    area = np.r_[0.0, np.cumsum((w[1:] + w[:-1]) / 2 * np.diff(t))]
+
+    def integral(times: Array) -> Array:
+        k = np.clip(np.searchsorted(t, times, side="right") - 1, 0, len(t) - 1)
+        return np.asarray(area[k] + (times - t[k]) * (w[k] + np.interp(times, t, w)) / 2)
+
+    return (integral(grid + dt) - integral(grid)) / dt
 
 
 def _interpolate(t: Array, z: Array, grid: Array) -> Array:
@@ -268,14 +496,19 @@ def _pieces(
     pieces: list[Trajectory] = []
     for window in sorted(_windows(recording, spec), key=lambda window: window.start):
         for segment in segments:
-            keep = (segment.t >= window.start - TINY) & (segment.t + spec.dt <= window.end + TINY)
+            near = max(NEAR * spec.dt, 4 * float(np.spacing(np.abs(segment.t).max())))
+            keep = (segment.t >= window.start - near) & (segment.t + spec.dt <= window.end + near)
             if not keep.any():
                 continue
             piece = segment.part(keep, _numbered(recording.name, len(pieces) + 1), window.role)
-            if len(piece.t) >= _fewest(spec):
+            if len(piece.t) >= _fewest(spec) and np.isfinite(piece.y).any():
                 pieces.append(piece)
             else:
-                why = f"{window.role}: " + _too_short(_fewest(spec) * spec.dt, spec)
+                why = f"{window.role}: " + (
+                    _too_short(_fewest(spec) * spec.dt, spec)
+                    if len(piece.t) < _fewest(spec)
+                    else "no sample of any output"
+                )
                 cuts.append(Cut(recording.path.name, float(piece.t[0]), float(piece.t[-1]), why))
     return pieces
 

@@ -20,13 +20,18 @@ class Signal:
         upper: Largest plausible value [unit], likewise. Default: no bound.
         periodic: True for an angle that may turn through: networks see its sine and cosine, and recordings that jump by
             full turns are made to count on.
+        saturation: Smallest and largest value [unit] that the sensor can show, ``(-inf, upper)`` or ``(lower, inf)``
+            if it has one end. A sample at or beyond an end is censored: it says only that the truth is at least, or at
+            most, this. Default: the sensor shows every value.
 
     Raises:
-        InputError: If the range is empty.
+        InputError: If the range is empty, the sensor's range is, or it is that of a periodic signal.
 
     Example:
         >>> Signal("phi", "rad").label
         'phi [rad]'
+        >>> Signal("level", "V", 0.0, 12.0, saturation=(0.0, 10.0)).saturation
+        (0.0, 10.0)
     """
 
     name: str
@@ -34,10 +39,25 @@ class Signal:
     lower: float = -math.inf
     upper: float = math.inf
     periodic: bool = False
+    saturation: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if not self.lower < self.upper:
             raise InputError(f"signal {self.label}: its range [{self.lower}, {self.upper}] is empty")
+        if self.saturation is not None:
+            self._check_saturation(tuple(self.saturation))
+
+    def _check_saturation(self, ends: tuple[float, ...]) -> None:
+        """Refuse a sensor's range that is none."""
+        if len(ends) != 2 or not ends[0] < ends[1]:
+            raise InputError(
+                f"signal {self.label}: saturation must be (lower, upper) of the sensor with lower < upper, got {ends}"
+            )
+        if self.periodic:
+            raise InputError(
+                f"signal {self.label}: a periodic signal has no saturation; its sensor begins again at a full turn. "
+                "Leave one of them out."
+            )
 
     @property
     def label(self) -> str:

@@ -34,13 +34,14 @@ class DataSpec:
     """How a machine's recordings are read.
 
     Args:
-        time: Column of the time stamps [s].
+        time: Column of the time stamps [s], or a number: the sampling time [s] of files without such a column.
         inputs: Columns of the inputs, in the order of the prior's inputs (zero-order hold).
-        outputs: Columns of the measured positions, in the order of the prior's outputs.
+        outputs: Columns of the measured outputs, in the order of the prior's outputs. A blank cell is a missing sample.
         dt: Model period [s]; declaring it is the request to resample to it.
         max_gap: Longest distance [s] between two samples; a run is cut where it is exceeded.
-        smoothing: Length [s] of the local polynomial that first smooths and differentiates the positions; the
-            prior is fitted to that, then smooths them once more by its own equations.
+        smoothing: Length [s] of the local polynomial that first smooths and differentiates outputs that are the
+            positions of the states ``[q, v]``; the prior is fitted to that, then smooths them once more by its own
+            equations. Parts by ``fractions`` are this far apart.
         warm_up: Measured past [s] that starts every free run: x(0) is smoothed from it, h warmed up on
             it, and none of it is scored.
         windows: Known windows by file stem. A recording that is not named here is split by ``fractions``.
@@ -52,12 +53,23 @@ class DataSpec:
             the factor as a number (:mod:`hybrid_mpc.data.recording`).
         largest_delay: Longest delay [s] of the inputs that is fitted with the prior's parameters. Default 0: the input
             acts at once.
+        disturbances: Columns of the disturbances, which are measured and not commanded (wind, supply voltage), in the
+            order of the prior's disturbances. Default: none.
+        delays: Known delays [s] by column. An input acts so much later than it is recorded; an output or a disturbance
+            shows what was so much earlier. A negative one is the other way round. Reading shifts the columns against
+            each other. Default: none.
+        delays_of: Known delays of single recordings, by file stem and column, in place of those of ``delays``.
 
     Raises:
-        InputError: If a length is not positive, the delay is negative, or the fractions do not sum to one.
+        InputError: If a length is not positive, a delay is negative or not finite, or the fractions do not sum to one.
+
+    Example:
+        >>> spec = DataSpec(0.1, ("u",), ("y",), 0.1, 0.3, 1.0, 1.0, delays={"y": 0.2}, delays_of={"b": {"u": 0.1}})
+        >>> spec.delays_in("a"), spec.delays_in("b")
+        ({'y': 0.2}, {'y': 0.2, 'u': 0.1})
     """
 
-    time: str
+    time: str | float
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     dt: float
@@ -70,8 +82,30 @@ class DataSpec:
     inputs_of: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     units: Mapping[str, str | float] = field(default_factory=dict)
     largest_delay: float = 0.0
+    disturbances: tuple[str, ...] = ()
+    delays: Mapping[str, float] = field(default_factory=dict)
+    delays_of: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+
+    def inputs_in(self, stem: str) -> tuple[str, ...]:
+        """Input columns of the recording of this file stem."""
+        return tuple(self.inputs_of.get(stem, self.inputs))
+
+    def delays_in(self, stem: str) -> dict[str, float]:
+        """Known delays [s] by column in the recording of this file stem; columns that are not named have none."""
+        return {**self.delays, **self.delays_of.get(stem, {})}
 
     def __post_init__(self) -> None:
+        if not isinstance(self.time, str) and not 0 < self.time < math.inf:
+            raise InputError(
+                "data specification: time must be the name of a column or a positive sampling time [s], got "
+                f"{self.time}"
+            )
+        for delays in (self.delays, *self.delays_of.values()):
+            for column, delay in delays.items():
+                if not math.isfinite(delay):
+                    raise InputError(
+                        f"data specification: the delay of column {column!r} must be a number of seconds, got {delay}"
+                    )
         if not 0 <= self.largest_delay < math.inf:
             raise InputError(
                 f"data specification: largest_delay must be 0 s or more, got {self.largest_delay}"
