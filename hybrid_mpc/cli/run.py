@@ -49,6 +49,12 @@ def run(
         typer.Option("--settings", help="JSON file of network settings, as hybrid-mpc tune leaves it."),
     ] = None,
     device: Device = "cpu",
+    deploy: Annotated[
+        str,
+        typer.Option(
+            help="Model to recommend whatever validation says: phy (the fitted prior), pgrnn or mopgrnn."
+        ),
+    ] = "",
     only: Annotated[
         list[str] | None,
         typer.Option(help="Stage that may run, once for each; the others are taken as they are."),
@@ -59,9 +65,9 @@ def run(
 ) -> None:
     """Fit the prior, train, export, close the loop, monitor, learn the guard, analyze, and write a report.
 
-    The stages are data, prior, training, evaluation, export, noise, control, estimation, monitor, guard, analysis and
-    report. With --resume a stage runs again only where something that it reads has changed. Exit code 1 if a stage
-    after the export could not run; the report then says why.
+    The stages are data, prior, training, choice, evaluation, export, noise, control, estimation, monitor, guard,
+    analysis and report. With --resume a stage runs again only where something that it reads has changed. Exit code 1
+    if a stage after the export could not run; the report then says why.
     """
     from hybrid_mpc.cli.progress import make_progress, print_summary
     from hybrid_mpc.job.run import failed_stages
@@ -71,7 +77,7 @@ def run(
     folder = out or Path("runs") / Path(scenario).stem
     settings = RunSettings(
         scenario, tuple(data or ()), seed, budget, tuple(input_column or ()), tuple(output_column or ()), time_column,
-        network_settings, device,
+        network_settings, device, deploy,
     )  # fmt: skip
     with make_progress() as progress:
         results = run_job(
@@ -94,6 +100,10 @@ def summary(results: Results) -> list[str]:
         if name in found.rmse and not name.endswith("_reason"):
             rmse, balance = found.rmse[name], found.balance_violation[name]
             lines.append(f"  {name:22} {_number(e_sim)} {_number(rmse)} {_number(balance)}")
+    for name, own in found.details.baselines.items():
+        if own.rmse is not None:
+            lines.append(f"  {name:22} {'–':>12} {_number(own.rmse[0])} {'–':>12}")
+    lines.append(found.details.choice.reason)
     for name in ("prior", "hybrid", "oracle"):
         loop = getattr(results.control, name)
         if loop.cost is not None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,11 +110,15 @@ def _reason(figures: Mapping[str, CandidateFigures], best: str, chosen: str, pri
     own = figures[best]
     if not math.isfinite(own.error):
         return f"The fitted prior is recommended: free runs of {best} diverge on validation recordings."
-    said = f"its validation error is {own.ratio:.2f} of the prior's (at most {own.upper:.2f}, {blocks} blocks)"
+    said = (
+        f"its validation error is {own.ratio:.2f} of the prior's (at most {own.upper:.2f}, {blocks} blocks)"
+    )
     if chosen == prior:
         return f"The fitted prior is recommended: {best} does not surely beat it; {said}."
     own = figures[chosen]
-    said = f"its validation error is {own.ratio:.2f} of the prior's (at most {own.upper:.2f}, {blocks} blocks)"
+    said = (
+        f"its validation error is {own.ratio:.2f} of the prior's (at most {own.upper:.2f}, {blocks} blocks)"
+    )
     return f"{chosen} is recommended: {said}."
 
 
@@ -124,14 +129,12 @@ def _cuts(lengths: Sequence[int], samples: int) -> list[list[tuple[int, int]]]:
     for n in lengths:
         count = max(1, min(parts, n // max(1, samples)))
         edges = np.linspace(0, n, count + 1).round().astype(int).tolist()
-        cuts.append(list(zip(edges[:-1], edges[1:], strict=True)))
+        cuts.append(list(pairwise(edges)))
     return cuts
 
 
 def _sums(runs: Sequence[Array], cuts: Sequence[Sequence[tuple[int, int]]]) -> Array:
-    return np.array(
-        [float(np.sum(run[a:b])) for run, own in zip(runs, cuts, strict=True) for a, b in own]
-    )
+    return np.array([float(np.sum(run[a:b])) for run, own in zip(runs, cuts, strict=True) for a, b in own])
 
 
 def _figures(own: Array, prior: Array, sizes: Array) -> CandidateFigures:
@@ -146,9 +149,7 @@ def _figures(own: Array, prior: Array, sizes: Array) -> CandidateFigures:
     ratio = float(np.sqrt(own.sum() / max(float(prior.sum()), 1e-300)))
     if n < 2:
         return CandidateFigures(error, ratio, math.inf)
-    without = 0.5 * np.log(
-        np.maximum(own.sum() - own, 1e-300) / np.maximum(prior.sum() - prior, 1e-300)
-    )
+    without = 0.5 * np.log(np.maximum(own.sum() - own, 1e-300) / np.maximum(prior.sum() - prior, 1e-300))
     scatter = math.sqrt((n - 1) / n * float(np.sum(np.square(without - without.mean()))))
     bound = math.log(max(ratio, 1e-300)) + float(student.ppf(CONFIDENCE, n - 1)) * scatter
     return CandidateFigures(error, ratio, math.exp(min(bound, 700.0)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -41,6 +41,15 @@ class FreeRun:
     xdot_hat: Array
     energy_measured_w: Array
     energy_model_w: Array
+    w: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+    def squared_errors(self, spread: Sequence[float]) -> Array:
+        """Mean over the outputs of the squared error over ``spread`` ``(n_y,)``, where any was measured ``(m,)``."""
+        squares = np.square((self.y_hat - self.y) / np.array(spread))
+        seen = np.isfinite(self.y).any(axis=1)
+        with np.errstate(invalid="ignore"):
+            squares = np.where(np.isfinite(self.y) & ~np.isfinite(squares), np.inf, squares)
+        return np.asarray(np.nanmean(squares[seen], axis=1))
 
 
 @dataclass(frozen=True)
@@ -173,7 +182,7 @@ def _free_run(prior: Prior, trajectory: Trajectory, x_hat: Array, warm: int) -> 
     )
     return FreeRun(
         trajectory.name, trajectory.t[part], u, x, x_hat[:n], trajectory.y[part], y_hat, xdot, xdot_hat,
-        measured, model,
+        measured, model, w,
     )  # fmt: skip
 
 

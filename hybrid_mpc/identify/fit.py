@@ -96,7 +96,7 @@ def cut_outputs(trajectories: Sequence[Trajectory], periods: int, lead: int, mos
     def cut(key: str, before: int) -> Array:
         return np.stack([getattr(t, key)[k - before : k + periods + 1] for t, k in chosen])
 
-    censored = [getattr(t, "censored", np.zeros(t.y.shape)) for t, _ in chosen]
+    censored = [t.censored for t, _ in chosen]
     return OutputWindows(
         cut("y", 0), cut("u", lead), cut("w", 0), np.stack([t.x[k] for t, k in chosen]),
         np.stack([c[k : k + periods + 1] for c, (_, k) in zip(censored, chosen, strict=True)]), lead,
@@ -506,6 +506,31 @@ def smoothed(
 ) -> list[Trajectory]:
     """Trajectories with the inputs that act and the states that the fitted prior smooths: what networks train on."""
     return fit.smoother(make(fit.values), dt).smooth(shifted(trajectories, fit.delay))
+
+
+def parameter_variance(prior: Prior, covariance: Array, x: Array, u: Array, w: Array, dt: float) -> Array:
+    """Variance of the outputs of free runs by that of the parameters ``(b, n, n_y)`` [output units^2].
+
+    Args:
+        prior: The fitted prior.
+        covariance: Covariance of its parameters ``(n_p, n_p)``.
+        x: First states ``(b, n_x)``.
+        u: Inputs ``(b, n, n_u)``.
+        w: Disturbances ``(b, n, n_w)``.
+        dt: Period [s].
+    """
+    b, n = u.shape[:2]
+    simulation = Simulation(prior.equations.xdot, dt, range(len(prior.parameters)))
+    states, by_p = simulation.by_parameters(x, u[:, :-1], w[:, :-1], prior.p, required_substeps(prior, dt))
+    held = (v.reshape(b * n, -1).T for v in (states, np.concatenate([u, np.zeros_like(u)], axis=-1)))
+    flat_w = w.reshape(b * n, w.shape[-1]).T
+    y, c, d = (
+        v.full().reshape(v.shape[0], b * n, -1).swapaxes(0, 1)
+        for v in _outputs(prior.equations, b * n)(*held, flat_w, prior.p)
+    )
+    slope = c @ by_p.reshape(b * n, -1, by_p.shape[-1]) + d
+    variance = np.einsum("kip,pq,kiq->ki", slope, covariance, slope).reshape(b, n, y.shape[1])
+    return np.asarray(np.nan_to_num(np.maximum(variance, 0.0), nan=np.inf))
 
 
 def check_observable(prior: Prior, dt: float, time_unit: float) -> None:

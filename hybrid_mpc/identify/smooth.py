@@ -129,7 +129,7 @@ class Smoother:
     def _filtered(self, group: Sequence[Trajectory], along: Array | None = None) -> _Filtered:
         """What the filter finds, linearized along its own estimates or along ``(x, d)`` ``(b, n, n_z)``."""
         y, u, w = (np.stack([getattr(t, key) for t in group]) for key in ("y", "u", "w"))
-        censored = np.stack([_censored(t) for t in group])
+        censored = np.stack([t.censored for t in group])
         b, n = y.shape[:2]
         n_z, n_x = self._n_z, len(self.prior.states)
         seen = np.isfinite(y)
@@ -314,12 +314,6 @@ def _noise(trajectories: Sequence[Trajectory]) -> Array:
         third = np.concatenate([np.diff(c, 3) for c in columns])
         found.append(float(np.std(third)) / math.sqrt(20.0) if len(third) else 0.0)
     return np.array(found)
-
-
-def _censored(trajectory: Trajectory) -> NDArray[np.int8]:
-    """Which samples say only at most (-1) or at least (+1)."""
-    own = getattr(trajectory, "censored", None)
-    return np.zeros(trajectory.y.shape, dtype=np.int8) if own is None else own
 
 
 def _by_length(trajectories: Iterable[Trajectory]) -> list[dict[int, Trajectory]]:

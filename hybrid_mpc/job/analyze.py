@@ -352,7 +352,12 @@ def _recordings(
     if not files or scenario is None:
         return ()
     found = load_trajectories(
-        files, scenario.data, outputs=model.outputs, inputs=model.inputs, states=model.states
+        files,
+        scenario.data,
+        disturbances=model.disturbances,
+        outputs=model.outputs,
+        inputs=model.inputs,
+        states=model.states,
     )
     return tuple((piece.u[:, 0], piece.y[:, 0], piece.x[0]) for piece in found.whole)
 

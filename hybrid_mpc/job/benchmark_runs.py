@@ -71,7 +71,13 @@ def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
         )
     needed: tuple[Role, ...] = () if spec.cycle or uncut else ("train", "valid")
     dataset = load_trajectories(
-        paths, scenario.data, outputs=prior.outputs, inputs=prior.inputs, states=prior.states, needed=needed
+        paths,
+        scenario.data,
+        disturbances=prior.disturbances,
+        outputs=prior.outputs,
+        inputs=prior.inputs,
+        states=prior.states,
+        needed=needed,
     )
     parts = _parts(dataset, scenario, uncut)
     train, valid, held_back = (
@@ -160,7 +166,13 @@ def read_test(
     prior = scenario.prior()
     spec = replace(scenario.data, windows={})
     dataset = load_trajectories(
-        [path], spec, outputs=prior.outputs, inputs=prior.inputs, states=prior.states, needed=()
+        [path],
+        spec,
+        disturbances=prior.disturbances,
+        outputs=prior.outputs,
+        inputs=prior.inputs,
+        states=prior.states,
+        needed=(),
     )
     if not dataset.whole:
         raise InputError(

@@ -98,7 +98,12 @@ class Context:
         files = self.files
         prior = self.scenario.prior()
         return load_trajectories(
-            files, self.spec, outputs=prior.outputs, inputs=prior.inputs, states=prior.states
+            files,
+            self.spec,
+            disturbances=prior.disturbances,
+            outputs=prior.outputs,
+            inputs=prior.inputs,
+            states=prior.states,
         )
 
     @cached_property

@@ -137,7 +137,13 @@ def prepared(
     # all of a recording is watched: nothing warms up, and no part of it has a role
     spec = replace(scenario.data, windows={}, warm_up=scenario.data.dt, fractions=(1.0, 0.0, 0.0))
     data = load_trajectories(
-        recordings, spec, outputs=hybrid.outputs, inputs=hybrid.inputs, states=hybrid.states, needed=()
+        recordings,
+        spec,
+        disturbances=hybrid.disturbances,
+        outputs=hybrid.outputs,
+        inputs=hybrid.inputs,
+        states=hybrid.states,
+        needed=(),
     )
     if not data.whole:
         cut = "; ".join(f"{c.file} {c.start:g} to {c.end:g} s: {c.why}" for c in data.cuts)

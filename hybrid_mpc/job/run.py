@@ -14,11 +14,13 @@ from hybrid_mpc.job.folder import open_folder
 from hybrid_mpc.job.settings import RunSettings, check_device, run_note
 from hybrid_mpc.job.stage import Absent, Stage, bring_up_to_date, changed
 from hybrid_mpc.job.stages.analyze import ANALYSIS
+from hybrid_mpc.job.stages.choose import CANDIDATES, CHOICE
 from hybrid_mpc.job.stages.compare import CONTROL
 from hybrid_mpc.job.stages.estimate import ESTIMATION
+from hybrid_mpc.job.stages.evaluate import EVALUATION
 from hybrid_mpc.job.stages.export import EXPORT, NOISE
 from hybrid_mpc.job.stages.guard import GUARD
-from hybrid_mpc.job.stages.identify import DATA, EVALUATION, PRIOR, TRAINING, check_data
+from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, check_data
 from hybrid_mpc.job.stages.monitor import MONITOR
 from hybrid_mpc.job.stages.report import REPORT
 from hybrid_mpc.job.stages.results import Results, read_results
@@ -26,7 +28,7 @@ from hybrid_mpc.records import known
 from hybrid_mpc.scenario import load_scenario
 
 STAGES: tuple[Stage[Any], ...] = (
-    DATA, PRIOR, TRAINING, EVALUATION, EXPORT, NOISE, CONTROL, ESTIMATION, MONITOR, GUARD, ANALYSIS, REPORT,
+    DATA, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, NOISE, CONTROL, ESTIMATION, MONITOR, GUARD, ANALYSIS, REPORT,
 )  # fmt: skip
 """Stages in their order."""
 NAMES = tuple(stage.name for stage in STAGES)
@@ -68,6 +70,8 @@ def run(
     check_scenario(scenario, context.budget)
     check_data(context)
     check_device(settings.device)
+    if settings.deploy:
+        known(settings.deploy, CANDIDATES, "model to deploy")
     with open_folder(out, run_note(settings), resume=resume):
         for stage in STAGES:
             context.progress.start(stage.title)

@@ -35,6 +35,8 @@ class RunSettings:
         network_file: JSON object with settings of the networks that replace the budget's, as ``hybrid-mpc tune``
             writes them; default: none.
         device: Where the networks are trained, ``"cpu"`` or e.g. ``"cuda"``. Default: cpu.
+        deploy: Model that is recommended whatever validation says: ``"phy"`` (the fitted prior), ``"pgrnn"`` or
+            ``"mopgrnn"``. Default: what validation recommends.
     """
 
     scenario: str
@@ -46,6 +48,7 @@ class RunSettings:
     time: str = ""
     network_file: Path | None = None
     device: str = "cpu"
+    deploy: str = ""
 
     def network(self) -> dict[str, Any]:
         """Settings of the networks that replace the budget's: what the file holds, checked."""

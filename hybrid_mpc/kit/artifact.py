@@ -204,6 +204,8 @@ def loop_settings(
 class Description:
     """What ``model.json`` holds beside its schema version and its hash.
 
+    ``recommended`` is the model that a loop is made of where none is named; empty: the hybrid.
+
     Raises:
         InputError: If there are no models, too many, or two of one name.
     """
@@ -214,8 +216,13 @@ class Description:
     calibration: Calibration | None
     provenance: Provenance
     loop: LoopSettings = field(default_factory=LoopSettings)
+    recommended: str = ""
 
     def __post_init__(self) -> None:
+        if self.recommended and self.recommended not in self.models:
+            raise InputError(
+                f"recommended: no model {self.recommended!r}; there are: {', '.join(self.models)}"
+            )
         if not 0 < len(set(self.models)) == len(self.models) <= MOST_MODELS:
             raise InputError(f"models: 1 to {MOST_MODELS} different names are needed, got {len(self.models)}")
 
@@ -228,6 +235,7 @@ def save_artifact(
     calibration: Calibration | None = None,
     provenance: Provenance | None = None,
     loop: LoopSettings | None = None,
+    recommended: str = "",
 ) -> None:
     """Write models to ``folder``; ``model.json`` comes last.
 
@@ -239,6 +247,7 @@ def save_artifact(
         calibration: Calibration of the monitor.
         provenance: What the models were made from.
         loop: What loops need beside the models.
+        recommended: Model that a loop is made of where none is named. Default: the hybrid.
 
     Raises:
         InputError: If an expression of a control problem cannot be stated as a program.
@@ -248,7 +257,8 @@ def save_artifact(
     nn_export.save_programs(folder, flat)
     digest, origin = sha256(folder / PROGRAMS), provenance or Provenance()
     write_description(
-        folder, Description(tuple(programs), digest, info, calibration, origin, loop or LoopSettings())
+        folder,
+        Description(tuple(programs), digest, info, calibration, origin, loop or LoopSettings(), recommended),
     )
 
 
@@ -358,7 +368,10 @@ def load(folder: str | Path) -> Kit:
         raise InputError(f"{folder}: {PROGRAMS} lacks {error}, which {FILE} names") from error
     except nn_export.ExportError as error:
         raise InputError(f"{folder}: {error}") from error
-    return Kit(models, found.calibration, found.provenance, found.model.input_delay, found.loop)
+    return Kit(
+        models, found.calibration, found.provenance, found.model.input_delay, found.loop,
+        found.recommended or ("hybrid" if "hybrid" in models else found.models[0]),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -371,6 +384,7 @@ class Kit:
         provenance: What the models were made from.
         input_delay: Delay [s] that the models hold. Default: none.
         loop: Control problems, noise and what else loops need. Default: nothing.
+        recommended: Model that observer, controller and monitor are made of where none is named. Default: the hybrid.
 
     Example: the whole way from a folder to a loop::
 
@@ -383,6 +397,7 @@ class Kit:
     provenance: Provenance
     input_delay: float = 0.0
     loop: LoopSettings = field(default_factory=LoopSettings, repr=False)
+    recommended: str = "hybrid"
 
     @property
     def name(self) -> str:
@@ -473,27 +488,28 @@ class Kit:
             )
         return found
 
-    def observer(self, model: str = "hybrid", *, task: str = "", load: bool = True) -> Filter:
+    def observer(self, model: str = "", *, task: str = "", load: bool = True) -> Filter:
         """The estimator of a model's state, hidden state and, with ``load``, an unknown load at its inputs.
 
         Args:
-            model: Name of the model. Default: the hybrid.
+            model: Name of the model. Default: the recommended one.
             task: Whose control problem says how large a load may be. Default: the common one.
             load: Whether it follows a load: without, a steady one leaves an offset. Default: yes.
 
         Raises:
             InputError: If there is no such model or task, no control problem, or no noise for this estimator.
         """
+        model = model or self.recommended
         found, noise = self._model(model), self.noise(f"{model}_observer" if load else model)
         return make_estimator(found, self, noise, self.problem(task), observer=load)
 
     def controller(
-        self, model: str = "hybrid", *, task: str = "", solver: str = "rti", iterations: int = 1
+        self, model: str = "", *, task: str = "", solver: str = "rti", iterations: int = 1
     ) -> SafeController:
         """The MPC of a model; its safeguards use the prior.
 
         Args:
-            model: Name of the model that plans. Default: the hybrid.
+            model: Name of the model that plans. Default: the recommended one.
             task: Whose control problem it solves. Default: the common one.
             solver: ``"rti"``, ``"sqp"`` or ``"ipopt"``.
             iterations: Linearizations a period of ``rti``. Default: one.
@@ -507,12 +523,12 @@ class Kit:
         )  # fmt: skip
 
     def monitor(
-        self, model: str = "hybrid", *, kind: str = "", task: str = "", diagnose: bool = False
+        self, model: str = "", *, kind: str = "", task: str = "", diagnose: bool = False
     ) -> EnergyMonitor:
         """The energy monitor with what the run has learned.
 
         Args:
-            model: Name of the model that is compared with the machine. Default: the hybrid.
+            model: Name of the model that is compared with the machine. Default: the recommended one.
             kind: ``"guard"``: alarms by the detector, and finds frozen sensors; ``"energy"``: alarms by thresholds, if
                 there are any; ``"own"``: records levels; ``"readings"``: what a detector reads, without one. Default:
                 the detector, else thresholds.
@@ -561,4 +577,4 @@ class Kit:
         return f"the model of scenario {self.name or '(unnamed)'}"
 
     def _model(self, name: str) -> HybridModel:
-        return self.models[known(name, self.models, "model")]
+        return self.models[known(name or self.recommended, self.models, "model")]

@@ -60,6 +60,7 @@ def free_run(
     energy_measured: Array,
     energy_model: Array,
     title: str = "",
+    band: Mapping[str, tuple[Array, Array]] | None = None,
 ) -> Figure:
     """A free run and the measurement, with the energy balances (the paper's Fig. 6).
 
@@ -73,6 +74,7 @@ def free_run(
         energy_measured: Energy balance of the measured system, ``(n,)`` [W].
         energy_model: Energy balance of the MOPGRNN, ``(n,)`` [W].
         title: Title. Default: none.
+        band: Lower and upper end ``(n,)`` of the hybrid's band by the name of a state. Default: none.
 
     Raises:
         InputError: If shapes do not fit.
@@ -91,6 +93,12 @@ def free_run(
     heights = [1.6] * len(states) + [0.9] * len(inputs) + [1.2, 0.9]
     figure, panels = new_column(heights, title=title)
     _states(panels, t, x, predictions, states)
+    for ax, signal in zip(panels, states, strict=False):
+        if band and signal.name in band:
+            low, high = (checked("band", end, len(t)) for end in band[signal.name])
+            limits = ax.get_ylim()
+            ax.fill_between(t, low, high, color=colour(ENERGY), alpha=0.2, linewidth=0, label="90 % band")
+            ax.set_ylim(limits)
     plot_inputs(panels[len(states) : -2], t, checked("u", u, len(t), len(inputs)), inputs)
     panels[-2].plot(t, balances[0], **(line_style("measured") | {"linewidth": 1.0}))
     panels[-2].plot(t, balances[1], **line_style(ENERGY))

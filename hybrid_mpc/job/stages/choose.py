@@ -60,9 +60,7 @@ def choice_stage(context: Context) -> ChoiceResult:
     return ChoiceResult(recommend(errors, deploy=context.settings.deploy, samples=samples), bands)
 
 
-def run_parts(
-    phy: Prior, fit: PriorFit, every: Sequence[Sequence[FreeRun]], dt: float
-) -> list[RunParts]:
+def run_parts(phy: Prior, fit: PriorFit, every: Sequence[Sequence[FreeRun]], dt: float) -> list[RunParts]:
     """Errors of each run of the first network, and the parts of their variance; ``every`` has a row a network."""
     assert fit.sizes is not None
     covariance, spread = np.array(fit.covariance(phy.parameters)), np.array(fit.sizes.y)

@@ -12,7 +12,8 @@ from hybrid_mpc.identify.step import PriorStep, RecurrentStep
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.controllers import noise_of
 from hybrid_mpc.job.stage import Absent, Stage, source_of
-from hybrid_mpc.job.stages.identify import DATA, DEPLOYED, PRIOR, TRAINING, trained_models
+from hybrid_mpc.job.stages.choose import CHOICE
+from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, trained_models
 from hybrid_mpc.kit.artifact import (
     Provenance,
     loop_settings,
@@ -46,10 +47,10 @@ class NoiseResult:
 
 def export_stage(context: Context) -> ExportResult:
     """Write the hybrid and the fitted prior as one artifact; compare both with torch."""
-    dt, settings, prior = context.spec.dt, context.settings, context.prior
+    dt, settings, prior, chosen = context.spec.dt, context.settings, context.prior, context.read(CHOICE)
     phy = context.scenario.prior(prior.fit.values)
     steps: dict[str, RecurrentStep | PriorStep] = {
-        "hybrid": trained_models(context, DEPLOYED).step(phy, dt),
+        "hybrid": trained_models(context, chosen.deployed).step(phy, dt),
         "prior": PriorStep(phy, dt),
     }
     info = model_info(phy, dt, prior.fit.covariance(phy.parameters))
@@ -66,7 +67,10 @@ def export_stage(context: Context) -> ExportResult:
         phy.values,
     )  # fmt: skip
     folder = context.out / "model"
-    save_artifact(folder, programs, deployed, provenance=provenance, loop=loop_settings(context.scenario))
+    save_artifact(
+        folder, programs, deployed, provenance=provenance, loop=loop_settings(context.scenario),
+        recommended="prior" if chosen.choice.recommended == "phy" else "hybrid",
+    )  # fmt: skip
     return ExportResult(
         max(p.max_abs_error for p in parities),
         max(p.jacobian_max_abs_error for p in parities),
@@ -117,7 +121,7 @@ def observed(context: Context) -> dict[str, object]:
 
 EXPORT = Stage(
     "export", "exporting to CasADi", ExportResult, export_stage,
-    lambda context: {"seed": context.settings.seed}, (DATA, PRIOR, TRAINING), restore=artifact_is_there,
+    lambda context: {"seed": context.settings.seed}, (DATA, PRIOR, TRAINING, CHOICE), restore=artifact_is_there,
 )  # fmt: skip
 NOISE = Stage(
     "noise", "tuning the observers", NoiseResult, noise_stage, observed, (DATA, PRIOR, EXPORT), optional=True,

@@ -13,14 +13,17 @@ from hybrid_mpc.identify.settings import KINDS
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.stage import Absent
 from hybrid_mpc.job.stages.analyze import ANALYSIS
+from hybrid_mpc.job.stages.choose import CHOICE
 from hybrid_mpc.job.stages.compare import CONTROL
 from hybrid_mpc.job.stages.estimate import ESTIMATION, OBSERVERS
+from hybrid_mpc.job.stages.evaluate import EVALUATION
 from hybrid_mpc.job.stages.guard import GUARD, read_trace
-from hybrid_mpc.job.stages.identify import EVALUATION, MODELS, trained_models
+from hybrid_mpc.job.stages.identify import MODELS, trained_models
 from hybrid_mpc.job.stages.monitor import MONITOR, clean_windows
 from hybrid_mpc.job.stages.results import REPORTED, finite, step_times
 from hybrid_mpc.job.summary import summaries
 from hybrid_mpc.job.tasks import tasks_of
+from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.monitor.residuals import force_units
 from hybrid_mpc.plots import analysis, animation, data, estimation, fit, loops, monitor
 from hybrid_mpc.plots.style import save
@@ -86,6 +89,7 @@ def _free_runs(context: Context) -> Any:
             shared["t"], shared["x"], {m: own[m]["x_hat"] for m in shown}, shared["u"],
             states=prior.states, inputs=prior.inputs, energy_measured=shared["energy_measured_w"],
             energy_model=own["mopgrnn"]["energy_model_w"], title=f"Free run on {run}",
+            band=_band(prior, arrays, f"{context.read(CHOICE).deployed}/{run}"),
         )  # fmt: skip
         caption = f"Free run over the unseen piece {run}; the warm-up before it is left out."
         yield "free_run", f"free_run_{run.replace('#', '-')}", figure, caption
@@ -100,6 +104,17 @@ def _free_runs(context: Context) -> Any:
     metrics = {**fit.METRICS, "rmse_rad": f"free-run RMSE [{prior.outputs[0].unit}]"}
     caption = "Errors over all unseen pieces; whiskers: standard deviation over the networks of a kind."
     yield "free_run", "errors", fit.errors_bar(values, spread=spread, metrics=metrics), caption
+
+
+def _band(prior: Prior, arrays: Any, run: str) -> dict[str, tuple[Any, Any]]:
+    """The hybrid's band by the name of the state that an output measures: lower and upper end."""
+    y_hat, half = arrays[f"{run}/y_hat"], arrays[f"{run}/band"]
+    names = {s.name for s in prior.states}
+    return {
+        s.name: (y_hat[:, j] - half[:, j], y_hat[:, j] + half[:, j])
+        for j, s in enumerate(prior.outputs)
+        if s.name in names
+    }
 
 
 def _loops(context: Context) -> Any:

@@ -14,7 +14,6 @@ from hybrid_mpc.data.excitation import check_excitation
 from hybrid_mpc.data.trajectories import ROLES, Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import digest, read_document, read_document_arrays, sha256, write_document
-from hybrid_mpc.identify.evaluate import FreeRun, Scores, evaluation_trajectories, free_runs, score
 from hybrid_mpc.identify.export import prior_programs
 from hybrid_mpc.identify.fit import fit_prior, smoothed
 from hybrid_mpc.identify.prior_result import PriorFit
@@ -33,8 +32,6 @@ Array = NDArray[Any]
 
 MODELS = ("phy_nominal", "phy", *KINDS)
 """Models that are evaluated."""
-DEPLOYED = "mopgrnn"
-"""The kind of network that is exported."""
 ERRORS = {"error": "E_sim", "output": "RMSE over the spread"}
 """What the validation of a training is called, by its first objective."""
 
@@ -104,31 +101,6 @@ class TrainingResult:
     skipped_updates: Mapping[str, int]
     failures: Mapping[str, tuple[TrainingFailure, ...]]
     weights: Mapping[str, str]
-
-
-@dataclass(frozen=True)
-class ModelScores:
-    """Errors of a model on unseen data: of the network that validation chose, and of all of its kind."""
-
-    best: Scores
-    networks: tuple[Scores, ...]
-
-
-@dataclass(frozen=True)
-class EvaluationResult:
-    """Free runs of every model over the test recordings.
-
-    Args:
-        scores: Errors by model.
-        by_file: Errors by model and recording.
-        runs: Names of the free runs.
-        arrays: Signals of each run, ``"MODEL/RUN/SIGNAL"``.
-    """
-
-    scores: Mapping[str, ModelScores]
-    by_file: Mapping[str, Mapping[str, Scores]]
-    runs: tuple[str, ...]
-    arrays: Mapping[str, Array]
 
 
 def check_data(context: Context) -> None:
@@ -325,42 +297,7 @@ def trained_models(context: Context, kind: str) -> Trained:
     return load_trained(context.out / "checkpoints" / "training" / context.read(TRAINING).folder, kind)
 
 
-def evaluation_stage(context: Context) -> EvaluationResult:
-    """Free runs of every model over the test trajectories; the figures show them whole."""
-    prior, spec = context.prior, context.spec
-    phy = context.scenario.prior(prior.fit.values)
-    smoother = prior.fit.smoother(phy, spec.dt)
-    whole = context.smoothed("test")
-    shown, test = (
-        evaluation_trajectories(whole, smoother, context.warm, length) for length in (None, spec.free_run)
-    )
-    scores: dict[str, ModelScores] = {}
-    files: dict[str, dict[str, Scores]] = {}
-    arrays: dict[str, Array] = {}
-    for i, name in enumerate(MODELS):
-        context.progress.update("models", i, len(MODELS), name)
-        found = []
-        for k, step in enumerate(_members(context, name, phy)):
-            runs = free_runs(step, phy, test, context.warm)
-            found.append(score(runs))
-            if k == 0:
-                files[name] = {f: score(part) for f, part in _by_file(runs).items()}
-                for run in free_runs(step, phy, shown, context.warm):
-                    for key in ("t", "u", "x", "x_hat", "y", "energy_measured_w", "energy_model_w"):
-                        arrays[f"{name}/{run.name}/{key}"] = getattr(run, key)
-        scores[name] = ModelScores(found[0], tuple(found))
-    return EvaluationResult(scores, files, tuple(t.name for t in whole), arrays)
-
-
-def _by_file(runs: Sequence[FreeRun]) -> dict[str, list[FreeRun]]:
-    """Free runs by the stem of the recording they come from."""
-    files: dict[str, list[FreeRun]] = {}
-    for run in runs:
-        files.setdefault(run.name.split("#")[0], []).append(run)
-    return files
-
-
-def _members(context: Context, name: str, phy: Prior) -> Sequence[Step]:
+def members(context: Context, name: str, phy: Prior) -> Sequence[Step]:
     """Steps of one model, that of the best network by validation first."""
     dt = context.spec.dt
     if name in ("phy_nominal", "phy"):
@@ -459,8 +396,4 @@ PRIOR = Stage("prior", "fitting the prior", PriorResult, prior_stage, what_prior
 TRAINING = Stage(
     "training", "training the networks", TrainingResult, training_stage, what_training_reads, (DATA, PRIOR),
     restore=networks_are_there,
-)  # fmt: skip
-EVALUATION = Stage(
-    "evaluation", "free runs on unseen data", EvaluationResult, evaluation_stage,
-    lambda context: {"free runs": (context.warm, context.spec.free_run)}, (DATA, PRIOR, TRAINING),
 )  # fmt: skip

@@ -13,15 +13,15 @@ from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.controllers import CONTROLLERS
 from hybrid_mpc.job.stage import Stage, source_of
 from hybrid_mpc.job.stages.analyze import ANALYSIS
+from hybrid_mpc.job.stages.choose import CHOICE
 from hybrid_mpc.job.stages.compare import CONTROL
 from hybrid_mpc.job.stages.estimate import ESTIMATION, OBSERVERS
+from hybrid_mpc.job.stages.evaluate import EVALUATION
 from hybrid_mpc.job.stages.export import EXPORT
 from hybrid_mpc.job.stages.figures import OBSERVER_TITLES, Figures, draw_all
 from hybrid_mpc.job.stages.guard import GUARD, FaultedLoop
 from hybrid_mpc.job.stages.identify import (
     DATA,
-    DEPLOYED,
-    EVALUATION,
     MODELS,
     PRIOR,
     TRAINING,
@@ -183,6 +183,7 @@ def command(context: Context, scenario: str = "") -> str:
         words += [w for v in values for w in (option, v)]
     words += ["--time-column", s.time] if s.time else []
     words += ["--settings", s.network_file.name] if s.network_file else []
+    words += ["--deploy", s.deploy] if s.deploy else []
     return shlex.join([*words, "--seed", str(s.seed), "--budget", s.budget])
 
 
@@ -190,7 +191,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
     tables: dict[str, Sequence[Table | None]] = {
         "data": [_data_table(results.data)],
         "models": [_prior_table(context)],
-        "free_run": [_score_table(results)],
+        "free_run": [_score_table(results), _choice_table(results), _band_table(context, results)],
         "export": [_export_table(results.export)],
         "control": [_control_table(results.control)],
         "estimation": [_observer_table(results)],
@@ -228,14 +229,20 @@ def _summary(context: Context, results: Results) -> Iterator[KeyFigure]:
     unit = context.scenario.prior().outputs[0].unit
     rmse = {m: _first(found.rmse[m]) for m in MODELS}
     e_sim = {m: _first(found.e_sim_s[m]) for m in MODELS}
-    ratio = found.details.hybrid_over_phy
+    ratio, hybrid = found.details.hybrid_over_phy, found.details.choice.hybrid
     yield KeyFigure(
-        "Free-run error (RMSE) of the hybrid on unseen data", rmse["mopgrnn"], unit,
+        "Free-run error (RMSE) of the hybrid on unseen data", rmse[hybrid], unit,
         f"fitted prior: {_text(rmse['phy'])} {unit}", _verdict(ratio["rmse"]),
     )  # fmt: skip
     yield KeyFigure(
-        "Simulation error E_sim of the hybrid", e_sim["mopgrnn"], "s",
+        "Simulation error E_sim of the hybrid", e_sim[hybrid], "s",
         f"fitted prior: {_text(e_sim['phy'])}, RNN: {_text(e_sim['rnn'])}", _verdict(ratio["e_sim_s"]),
+    )  # fmt: skip
+    choice = found.details.choice
+    own = choice.candidates[choice.hybrid]
+    yield KeyFigure(
+        f"Recommended: {name_of(choice.recommended)}; validation error of the hybrid over the prior's", own.ratio, "",
+        choice.reason, "plain" if choice.recommended == "phy" else "good",
     )  # fmt: skip
     gap = control.gap_closed
     if gap is not None:
@@ -286,7 +293,9 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
     if without:
         after["estimation"] = (f"Not tested: {'; '.join(dict.fromkeys(without))}.",)
     after["data"] = tuple(f"Warning: {text}" for text in results.data.details.warnings)
-    after["training"] = _prior_replay_text(training_settings(context, DEPLOYED).prior_replay)
+    after["training"] = _prior_replay_text(
+        training_settings(context, context.read(CHOICE).deployed).prior_replay
+    )
     if context.prior.fit.warnings:
         after["models"] = ("Warnings of the fit: " + "; ".join(context.prior.fit.warnings) + ".",)
     monitor = results.monitor
@@ -374,8 +383,38 @@ def _score_table(results: Results) -> Table:
         (name_of(m), *(g[m] for g in groups), *(_percent(g[m], b) for g, b in zip(groups, base, strict=True)))
         for m in MODELS
     ]
+    for name, own in found.details.baselines.items():
+        error = None if own.rmse is None else own.rmse[0]
+        rows.append((f"{name} (linear)", None, error, None, "–", _percent(error, base[1]), "–"))
     columns = ("model", "E_sim [s]", f"RMSE {unit}", "violation [W]", "E_sim", "RMSE", "violation")
     return Table(columns, rows, "Free runs on unseen data; the last columns against the fitted prior.")
+
+
+def _choice_table(results: Results) -> Table:
+    choice = results.identification.details.choice
+    rows = [
+        (name_of(name), c.error, c.ratio, c.upper, "recommended" if name == choice.recommended else "")
+        for name, c in choice.candidates.items()
+    ]
+    columns = ("model", "error [spreads]", "over the prior's", "at most", "")
+    return Table(columns, rows, f"Validation recordings. {choice.reason}")
+
+
+def _band_table(context: Context, results: Results) -> Table:
+    prior, bands = context.scenario.prior(), results.identification.details.bands
+    rows: list[tuple[str | float, ...]] = [
+        (
+            name_of(name), f"{100 * b.share:g} %", f"{100 * b.coverage:.0f} %",
+            *(f"{width:.4g}" for width in b.width), b.score, b.score_of_constant,
+        )
+        for name, b in bands.items()
+    ]  # fmt: skip
+    widths = (f"mean width of {s.label}" for s in prior.outputs)
+    columns = ("model", "is to hold", "holds", *widths, "interval score", "of a constant band")
+    caption = (
+        "Bands around free runs, calibrated on validation recordings, on unseen data; a low score is good."
+    )
+    return Table(columns, rows, caption)
 
 
 def _first(value: Any) -> float | None:
@@ -471,6 +510,6 @@ def _pole_table(analysis: Analysis) -> Table | None:
 
 REPORT = Stage(
     "report", "writing the report", ReportResult, report_stage, what_report_reads,
-    (DATA, PRIOR, TRAINING, EVALUATION, EXPORT, CONTROL, ESTIMATION, MONITOR, GUARD, ANALYSIS),
+    (DATA, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, CONTROL, ESTIMATION, MONITOR, GUARD, ANALYSIS),
     restore=report_is_there,
 )  # fmt: skip

@@ -20,11 +20,13 @@ from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.loops import LoopRow
 from hybrid_mpc.job.stage import Absent
 from hybrid_mpc.job.stages.analyze import ANALYSIS, ModelAnalysis
+from hybrid_mpc.job.stages.choose import CHOICE
 from hybrid_mpc.job.stages.compare import CONTROL
 from hybrid_mpc.job.stages.estimate import ESTIMATION, OBSERVERS, ObservedRecording, ObserverTest
+from hybrid_mpc.job.stages.evaluate import EVALUATION, BandScores, BaselineScores
 from hybrid_mpc.job.stages.export import EXPORT
 from hybrid_mpc.job.stages.guard import GUARD, FaultedLoop, GuardTest, NominalLoop
-from hybrid_mpc.job.stages.identify import DATA, EVALUATION, MODELS
+from hybrid_mpc.job.stages.identify import DATA, MODELS
 from hybrid_mpc.job.stages.monitor import MONITOR, CleanAlarms, RecordedAlarm
 from hybrid_mpc.job.summary import Summary, by_task, summaries
 from hybrid_mpc.monitor.calibrate import Calibration
@@ -100,7 +102,31 @@ class IdentificationDetails:
     by_file: Mapping[str, Mapping[str, float | None]]
     smoother: SmootherNoise
     hybrid_over_phy: Mapping[str, float | None]
+    choice: ModelChoice
+    bands: Mapping[str, BandScores]
+    baselines: Mapping[str, BaselineScores]
     network_settings: Mapping[str, Any] | None = None
+
+
+@dataclass(frozen=True)
+class ModelChoice:
+    """Which model validation recommends, which hybrid is exported, figures of all candidates, and the reason."""
+
+    recommended: str
+    hybrid: str
+    reason: str
+    candidates: Mapping[str, CandidateErrors]
+
+
+@dataclass(frozen=True)
+class CandidateErrors:
+    """Validation error of a candidate [spreads of the outputs], its ratio to the prior's, and that one's upper
+    bound; None where a run diverged or the bound is not known.
+    """
+
+    error: float | None
+    ratio: float | None
+    upper: float | None
 
 
 @dataclass(frozen=True)
@@ -385,7 +411,7 @@ def collect(context: Context) -> Results:
 
 
 def _identification(context: Context) -> Identification:
-    found, prior = context.read(EVALUATION), context.prior
+    found, prior, chosen = context.read(EVALUATION), context.prior, context.read(CHOICE).choice
     output, network = context.scenario.prior().outputs[0].label, context.settings.network()
     best = {name: found.scores[name].best for name in MODELS}
     e_sim = {name: finite(scores.e_sim_s) for name, scores in best.items()}
@@ -399,9 +425,20 @@ def _identification(context: Context) -> Identification:
         {stem: {m: finite(found.by_file[m][stem].rmse_rad) for m in MODELS} for stem in found.by_file["phy"]},
         SmootherNoise(prior.fit.sigma, prior.fit.walk),
         {
-            "e_sim_s": _ratio(e_sim["mopgrnn"], e_sim["phy"]),
-            "rmse": _ratio(rmse["mopgrnn"], rmse["phy"]),
+            "e_sim_s": _ratio(e_sim[chosen.hybrid], e_sim["phy"]),
+            "rmse": _ratio(rmse[chosen.hybrid], rmse["phy"]),
         },
+        ModelChoice(
+            chosen.recommended,
+            chosen.hybrid,
+            chosen.reason,
+            {
+                name: CandidateErrors(finite(c.error), finite(c.ratio), finite(c.upper))
+                for name, c in chosen.candidates.items()
+            },
+        ),
+        found.bands,
+        found.baselines,
         network or None,
     )
     return Identification(

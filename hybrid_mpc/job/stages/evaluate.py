@@ -1,0 +1,168 @@
+"""Stage evaluation: free runs of every model over recordings that none was trained or chosen on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.identify.bands import Bands, RunParts, coverage, interval_score
+from hybrid_mpc.identify.evaluate import FreeRun, Scores, evaluation_trajectories, free_runs, score
+from hybrid_mpc.identify.linear import LinearModel, fit_arx, fit_subspace
+from hybrid_mpc.job.context import Context
+from hybrid_mpc.job.stage import Stage
+from hybrid_mpc.job.stages.choose import CHOICE, run_parts
+from hybrid_mpc.job.stages.identify import DATA, MODELS, PRIOR, TRAINING, members
+
+Array = NDArray[Any]
+BASELINES: Mapping[str, Callable[..., LinearModel]] = {"ARX": fit_arx, "N4SID": fit_subspace}
+"""Linear models of inputs and outputs, which practitioners ask for first."""
+
+
+@dataclass(frozen=True)
+class BandScores:
+    """What the bands around a model's free runs hold of unseen measurements.
+
+    Args:
+        share: Share that they are to hold.
+        coverage: Share that they hold.
+        width: Their mean width, by output [output units].
+        score: Mean interval score [output units]; the less the better.
+        score_of_constant: That of a band of constant width with the same calibration.
+    """
+
+    share: float
+    coverage: float
+    width: tuple[float, ...]
+    score: float
+    score_of_constant: float
+
+
+@dataclass(frozen=True)
+class BaselineScores:
+    """Free-run errors of a linear model: root mean squares by output [output units], its orders, or why there is
+    none.
+    """
+
+    rmse: tuple[float, ...] | None = None
+    chosen: str = ""
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class ModelScores:
+    """Errors of a model on unseen data: of the network that validation chose, and of all of its kind."""
+
+    best: Scores
+    networks: tuple[Scores, ...]
+
+
+@dataclass(frozen=True)
+class EvaluationResult:
+    """Free runs of every model over the test recordings.
+
+    Args:
+        scores: Errors by model.
+        by_file: Errors by model and recording.
+        runs: Names of the free runs.
+        bands: What the bands around the free runs hold, by model.
+        baselines: Errors of linear models of inputs and outputs, by name.
+        arrays: Signals of each run, ``"MODEL/RUN/SIGNAL"``.
+    """
+
+    scores: Mapping[str, ModelScores]
+    by_file: Mapping[str, Mapping[str, Scores]]
+    runs: tuple[str, ...]
+    bands: Mapping[str, BandScores]
+    baselines: Mapping[str, BaselineScores]
+    arrays: Mapping[str, Array]
+
+
+def evaluation_stage(context: Context) -> EvaluationResult:
+    """Free runs of every model over the test trajectories; the figures show them whole."""
+    prior, spec, chosen = context.prior, context.spec, context.read(CHOICE)
+    phy = context.scenario.prior(prior.fit.values)
+    smoother = prior.fit.smoother(phy, spec.dt)
+    whole = context.smoothed("test")
+    shown, test = (
+        evaluation_trajectories(whole, smoother, context.warm, length) for length in (None, spec.free_run)
+    )
+    scores: dict[str, ModelScores] = {}
+    files: dict[str, dict[str, Scores]] = {}
+    arrays: dict[str, Array] = {}
+    bands: dict[str, BandScores] = {}
+    for i, name in enumerate(MODELS):
+        context.progress.update("models", i, len(MODELS), name)
+        found, every, drawn = [], [], []
+        for k, step in enumerate(members(context, name, phy)):
+            runs = free_runs(step, phy, test, context.warm)
+            found.append(score(runs))
+            every.append(runs)
+            if name in chosen.bands:
+                drawn.append(free_runs(step, phy, shown, context.warm))
+            if k == 0:
+                files[name] = {f: score(part) for f, part in _by_file(runs).items()}
+                for run in drawn[0] if drawn else free_runs(step, phy, shown, context.warm):
+                    for key in ("t", "u", "x", "x_hat", "y", "energy_measured_w", "energy_model_w"):
+                        arrays[f"{name}/{run.name}/{key}"] = getattr(run, key)
+        scores[name] = ModelScores(found[0], tuple(found))
+        if name in chosen.bands:
+            own = chosen.bands[name]
+            bands[name] = _band_scores(run_parts(phy, prior.fit, every, spec.dt), own)
+            for run, parts in zip(drawn[0], run_parts(phy, prior.fit, drawn, spec.dt), strict=True):
+                arrays[f"{name}/{run.name}/y_hat"] = run.y_hat
+                arrays[f"{name}/{run.name}/band"] = own.half_width(parts.parts)
+    baselines = {name: _baseline(context, name, test) for name in BASELINES}
+    return EvaluationResult(scores, files, tuple(t.name for t in whole), bands, baselines, arrays)
+
+
+def _band_scores(runs: Sequence[RunParts], bands: Bands) -> BandScores:
+    """What a band holds of unseen runs, and its score beside that of a band of constant width as calibrated."""
+    widths = [2 * bands.half_width(run.parts).mean(axis=0) for run in runs]
+    sizes = [len(run.error) for run in runs]
+
+    def mean(values: Sequence[Any]) -> Any:
+        return np.average(np.array(values), axis=0, weights=sizes)
+
+    flat = bands.of_constant_width()
+    return BandScores(
+        bands.share,
+        float(mean([coverage(run, bands) for run in runs])),
+        tuple(float(w) for w in mean(widths)),
+        float(mean([interval_score(run, bands) for run in runs])),
+        float(mean([interval_score(run, flat) for run in runs])),
+    )
+
+
+def _baseline(context: Context, name: str, test: Sequence[Trajectory]) -> BaselineScores:
+    """Free runs of a linear model over the test trajectories, from the same warm-up as the others."""
+    train, valid = context.trajectories("train"), context.trajectories("valid")
+    warm = context.warm + 1  # the others start from a state that knows this sample
+    try:
+        model = BASELINES[name](train, valid, context.spec.dt, warm=warm)
+    except InputError as error:
+        return BaselineScores(reason=str(error))
+    y_hat = model.free_runs(test, warm)
+    squares = [np.nanmean(np.square(hat - t.y[warm:]), axis=0) for hat, t in zip(y_hat, test, strict=True)]
+    own = {key: getattr(model.chosen, key) for key in ("order", "delay", "horizon")}
+    chosen = ", ".join(f"{key} {value}" for key, value in own.items() if value)
+    return BaselineScores(tuple(np.sqrt(np.mean(squares, axis=0)).tolist()), chosen)
+
+
+def _by_file(runs: Sequence[FreeRun]) -> dict[str, list[FreeRun]]:
+    """Free runs by the stem of the recording they come from."""
+    files: dict[str, list[FreeRun]] = {}
+    for run in runs:
+        files.setdefault(run.name.split("#")[0], []).append(run)
+    return files
+
+
+EVALUATION = Stage(
+    "evaluation", "free runs on unseen data", EvaluationResult, evaluation_stage,
+    lambda context: {"free runs": (context.warm, context.spec.free_run)}, (DATA, PRIOR, TRAINING, CHOICE),
+)  # fmt: skip
