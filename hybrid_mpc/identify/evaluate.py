@@ -173,7 +173,7 @@ def _free_run(prior: Prior, trajectory: Trajectory, x_hat: Array, warm: int) -> 
     u, w, x = trajectory.u[part], trajectory.w[part], trajectory.x[part]
     xdot, xdot_hat = np.diff(trajectory.x[warm:], axis=0) / dt, np.diff(x_hat[: n + 1], axis=0) / dt
     equations, held = prior.equations, (u.T, w.T, prior.p)
-    y_hat = equations.output(x_hat[:n].T, *held).full().T
+    y_hat = measured_as(prior, equations.output(x_hat[:n].T, *held).full().T)
     measured, model = (
         equations.balances[0].residual(*(z.T for z in point), *held).full()[0]
         if equations.balances
@@ -184,6 +184,12 @@ def _free_run(prior: Prior, trajectory: Trajectory, x_hat: Array, warm: int) -> 
         trajectory.name, trajectory.t[part], u, x, x_hat[:n], trajectory.y[part], y_hat, xdot, xdot_hat,
         measured, model, w,
     )  # fmt: skip
+
+
+def measured_as(prior: Prior, y: Array) -> Array:
+    """Outputs ``(..., n_y)`` as the sensors show them: within the ranges that they declare."""
+    ends = [s.saturation or (-np.inf, np.inf) for s in prior.outputs]
+    return np.asarray(np.clip(y, [low for low, _ in ends], [high for _, high in ends]))
 
 
 def _padded(values: Array, length: int) -> Array:

@@ -24,14 +24,19 @@ from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.delay import NONE, shifted
 from hybrid_mpc.identify.prior_result import PriorFit
-from hybrid_mpc.identify.simulation import Simulation, required_substeps
+from hybrid_mpc.identify.simulation import Simulation, flow_slope, required_substeps, rest_of
 from hybrid_mpc.identify.smooth import Smoother, fit_smoother, unseen_states
 from hybrid_mpc.machine.prior import Equations, Prior
+from hybrid_mpc.machine.signals import Signal
 
 Array = NDArray[np.float64]
 LENGTHS = (0.5, 2.0, 5.0)
 """Lengths of the windows [the machine's seconds, :func:`~hybrid_mpc.data.scales.time_unit`], one after the other: short
 ones have one optimum, long ones are what counts."""
+APART = 4.0
+"""Ratio of one length to the next at most."""
+SLOWEST = 3.0
+"""Length of the longest windows, over the largest time constant of the nominal prior."""
 WINDOWS = 48
 """Windows of a length at most, evenly chosen."""
 ITERATIONS = 25
@@ -78,8 +83,16 @@ class OutputWindows:
         return self.y.shape[1] - 1
 
 
-def cut_outputs(trajectories: Sequence[Trajectory], periods: int, lead: int, most: int) -> OutputWindows:
+def cut_outputs(
+    trajectories: Sequence[Trajectory],
+    periods: int,
+    lead: int,
+    most: int,
+    states: Sequence[Signal] = (),
+) -> OutputWindows:
     """At most ``most`` windows of ``periods``, one behind the other, evenly chosen.
+
+    First states are guessed within the ranges of ``states``. Default: as the trajectories have them.
 
     Raises:
         InputError: If no trajectory is long enough.
@@ -97,8 +110,11 @@ def cut_outputs(trajectories: Sequence[Trajectory], periods: int, lead: int, mos
         return np.stack([getattr(t, key)[k - before : k + periods + 1] for t, k in chosen])
 
     censored = [t.censored for t, _ in chosen]
+    guesses = np.stack([t.x[k] for t, k in chosen])
+    if states:
+        guesses = np.clip(guesses, [s.lower for s in states], [s.upper for s in states])
     return OutputWindows(
-        cut("y", 0), cut("u", lead), cut("w", 0), np.stack([t.x[k] for t, k in chosen]),
+        cut("y", 0), cut("u", lead), cut("w", 0), guesses,
         np.stack([c[k : k + periods + 1] for c, (_, k) in zip(censored, chosen, strict=True)]), lead,
     )  # fmt: skip
 
@@ -269,14 +285,16 @@ class _Shooting:
         return float(own.sum() + np.square(moved).sum())
 
     def rescaled(self, error: Array) -> None:
-        """Scale each output by what is left of it, robustly: outputs of any unit count alike, outliers little."""
+        """Scale each output by what is left of it: outputs of any unit count alike, outliers little."""
         shape = self.windows.y.shape
         own = error.reshape(shape) * self.scale
         left = [np.abs(own[..., j][self.seen[..., j]]) for j in range(shape[-1])]
-        robust = np.array([1.4826 * float(np.median(v)) if len(v) else 0.0 for v in left])
+        typical = np.array([1.4826 * float(np.median(v)) if len(v) else 0.0 for v in left])
         whole = np.array([float(np.sqrt(np.mean(v**2))) if len(v) else 0.0 for v in left])
-        robust = np.maximum(robust, 0.1 * whole)  # where most samples are met exactly, the rest is no outlier
-        self.scale = np.maximum(robust, 1e-9 * self.spread)
+        typical = np.maximum(
+            typical, 0.1 * whole
+        )  # where most samples are met exactly, the rest is no outlier
+        self.scale = np.maximum(typical, 1e-9 * self.spread)
         self.outlier = OUTLIERS
 
     def solve(self, theta: Array, iterations: int, fixed: bool) -> Fitted:
@@ -402,8 +420,8 @@ def fit_prior(
 ) -> PriorFit:
     """Fit parameters and delay to the measured outputs over longer and longer windows, and find what smooths states.
 
-    Each length starts from what the one before found, the first from the best of several starts between the bounds. Of
-    the nominal values and all lengths the one wins that explains the windows of the longest length best, over training
+    Each length starts from what explains its windows best of what is known: the nominal values, the best of several
+    starts between the bounds, and what shorter windows found. Of the nominal values and all lengths the one wins that explains the windows of the longest length best, over training
     and validation recordings together: few parameters do not overfit, and where a machine drifts a short validation
     part alone misleads. A prior without free parameters stays as it is.
 
@@ -413,7 +431,7 @@ def fit_prior(
         valid: Validation trajectories (chosen by, not fitted to).
         dt: Model period [s].
         length: Length [s] of the longest windows: that of the runs that the model will be judged by. Default: 5 of the
-            machine's seconds.
+            machine's seconds, or 3 of the nominal prior's largest time constant where that is more.
         largest_delay: Longest delay [s] of the inputs. Default 0: they act at once.
         start: Values [their units] by name to try as a start besides the nominal ones, e.g. those of a global search;
             fixed parameters are left out. Default: none.
@@ -437,6 +455,8 @@ def fit_prior(
     fit = OutputFit(make, dt, largest_delay)
     unit = scales.time_unit(train, dt) if time_unit is None else time_unit
     check_observable(fit.prior, dt, unit)
+    if length is None:
+        length = max(LENGTHS[-1] * unit, SLOWEST * slowest(fit.prior))
     lengths = _lengths(train, dt, unit, length, fit.lead)
     total = len(lengths) + 2
     on_progress(0, total, "smoothing by the nominal prior")
@@ -444,18 +464,23 @@ def fit_prior(
     sizes = np.array(smoother.sizes.x)
     guesses = [with_states(part, smoother, fit.delay(fit.nominal)) for part in (train, valid)]
     found: list[tuple[str, Fitted]] = []
-    theta = fit.nominal
+    theta, states = fit.nominal, fit.prior.states
     if len(theta):
         on_progress(1, total, "several starts")
-        theta = _best_start(fit, guesses[0], lengths[0], sizes, start)
+        theta = _best_start(fit, guesses[0], lengths, sizes, start)
         for i, periods in enumerate(lengths):
             on_progress(2 + i, total, f"free runs of {periods * dt:.3g} s")
-            windows = cut_outputs(guesses[0], periods, fit.lead, WINDOWS)
-            result = fit.fit(theta, windows, sizes, ITERATIONS)
-            theta = result.theta
-            found.append((f"free runs of {periods * dt:.3g} s", result))
+            windows = cut_outputs(guesses[0], periods, fit.lead, WINDOWS, states)
+            known = [
+                fit.nominal,
+                theta,
+                *(f.theta for _, f in found[-1:]),
+            ]  # short windows may have led astray
+            errors = [_error(fit, one, [windows], sizes) for one in known]
+            best, name = known[int(np.argmin(errors))], f"free runs of {periods * dt:.3g} s"
+            found.append((name, fit.fit(best, windows, sizes, ITERATIONS)))
     scored = [
-        cut_outputs(part, lengths[-1], fit.lead, WINDOWS)
+        cut_outputs(part, lengths[-1], fit.lead, WINDOWS, states)
         for part in guesses
         if _longest(part) > lengths[-1] + fit.lead
     ]
@@ -472,7 +497,7 @@ def fit_prior(
     on_progress(total, total, "done")
     return PriorFit(
         fit.values(chosen.theta), _errors(fit, chosen), _warnings(fit, chosen), stages, _correlations(fit, chosen),
-        delay, smoother.sigma, smoother.walk, smoother.sizes,
+        delay, smoother.sigma, smoother.walk, smoother.sizes, smoother.fading,
     )  # fmt: skip
 
 
@@ -556,27 +581,40 @@ def with_states(trajectories: Sequence[Trajectory], smoother: Smoother, delay: f
     return made
 
 
+def slowest(prior: Prior) -> float:
+    """Largest time constant [s] of the prior at rest; that of an integrator or an unstable mode is none."""
+    modes = np.linalg.eigvals(flow_slope(prior.equations.xdot)(*rest_of(prior), prior.p).full())
+    rates = -modes.real[-modes.real > 1e-9 * np.abs(modes).max(initial=0.0)]
+    return float(1.0 / rates.min()) if len(rates) else 0.0
+
+
 def _longest(trajectories: Sequence[Trajectory]) -> int:
     return max((len(t.t) for t in trajectories), default=0)
 
 
-def _lengths(
-    train: Sequence[Trajectory], dt: float, unit: float, length: float | None, lead: int
-) -> list[int]:
+def _lengths(train: Sequence[Trajectory], dt: float, unit: float, length: float, lead: int) -> list[int]:
     """Periods of the windows, the longest last; what the recordings do not hold is cut to half of the longest."""
-    wanted = [unit * own for own in LENGTHS]
-    if length is not None:
-        wanted = [own for own in wanted if own < length] + [length]
-    longest = _longest(train) - lead - 1
+    longest = _longest(train) - 2 * lead - 1  # smoothing under a delay costs as many samples again
+    length = min(length, longest * dt)
+    wanted = [own for own in (unit * own for own in LENGTHS) if own < 0.7 * length]
+    while wanted and length > 1.5 * APART * wanted[-1]:  # from one length to the next errors must stay small
+        wanted.append(wanted[-1] * APART)
+    wanted.append(length)
     fitting = [p for p in (scales.periods(own, dt, 2) for own in wanted) if p <= longest]
     return sorted(dict.fromkeys(fitting)) or [max(2, longest // 2)]
 
 
 def _best_start(
-    fit: OutputFit, train: Sequence[Trajectory], periods: int, sizes: Array, start: Mapping[str, float] | None
+    fit: OutputFit,
+    train: Sequence[Trajectory],
+    lengths: Sequence[int],
+    sizes: Array,
+    start: Mapping[str, float] | None,
 ) -> Array:
-    """The start from which a few steps over short windows lead furthest down."""
-    windows = cut_outputs(train, periods, fit.lead, WINDOWS // 2)
+    """What a few steps over short windows find from several starts: what explains the longest windows best."""
+    windows, long = (
+        cut_outputs(train, lengths[i], fit.lead, WINDOWS // 2, fit.prior.states) for i in (0, -1)
+    )
     starts = [fit.nominal, *([] if start is None else [fit.scaled(start)])]
     if len(fit.nominal):
         between = qmc.Sobol(len(fit.nominal), seed=0).random_base2(3)[:STARTS]
@@ -589,7 +627,8 @@ def _best_start(
             continue
     if not found:
         return fit.nominal
-    return min(found, key=lambda f: f.error if math.isfinite(f.error) else math.inf).theta
+    errors = [_error(fit, f.theta, [long], sizes) for f in found]
+    return found[int(np.argmin([e if math.isfinite(e) else math.inf for e in errors]))].theta
 
 
 def _error(fit: OutputFit, theta: Array, parts: Sequence[OutputWindows], sizes: Array) -> float:

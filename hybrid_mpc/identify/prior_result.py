@@ -36,6 +36,7 @@ class PriorFit:
         sigma: Standard deviation of each output's measurement that the smoother assumes [output units].
         walk: Standard deviation of the unexplained rates' change per period that it assumes, by corrected state.
         sizes: Natural sizes of the signals that the smoother assumes.
+        fading: What is left of an unexplained rate after a period, where nothing tells of it [-].
     """
 
     values: dict[str, float]
@@ -47,12 +48,13 @@ class PriorFit:
     sigma: tuple[float, ...] = ()
     walk: tuple[float, ...] = ()
     sizes: Sizes | None = None
+    fading: float = 1.0
 
     def smoother(self, prior: Prior, dt: float) -> Smoother:
         """The smoother around the fitted prior."""
         if self.sizes is None:
             raise InputError("this fit has no smoother: it was not made by fit_prior")
-        return Smoother(prior, dt, self.sigma, self.walk, self.sizes)
+        return Smoother(prior, dt, self.sigma, self.walk, self.sizes, self.fading)
 
     @property
     def best(self) -> str:

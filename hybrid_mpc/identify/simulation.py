@@ -148,7 +148,7 @@ def _middle(signal: Signal) -> float:
 
 def substeps_for(xdot: ca.Function, x: Any, u: Any, w: Any, p: Any, dt: float, name: str) -> int:
     """:func:`required_substeps` of any ``xdot(x, u, w, p)`` at a point; an error says that ``name`` is too stiff."""
-    slope = _slope(xdot)(x, u, w, p).full()
+    slope = flow_slope(xdot)(x, u, w, p).full()
     rate = float(np.abs(np.linalg.eigvals(slope)).max()) if np.isfinite(slope).all() else math.inf
     substeps = max(1, math.ceil(rate * dt)) if math.isfinite(rate) else MAX_SUBSTEPS + 1
     if substeps > MAX_SUBSTEPS:
@@ -161,6 +161,7 @@ def substeps_for(xdot: ca.Function, x: Any, u: Any, w: Any, p: Any, dt: float, n
 
 
 @lru_cache(maxsize=32)
-def _slope(xdot: ca.Function) -> ca.Function:
+def flow_slope(xdot: ca.Function) -> ca.Function:
+    """``(x, u, w, p)`` to the derivative of ``xdot`` by ``x`` ``(n_x, n_x)``."""
     point = [ca.SX.sym(xdot.name_in(i), xdot.size1_in(i)) for i in range(4)]
     return ca.Function("slope", point, [ca.densify(ca.jacobian(xdot(*point), point[0]))])

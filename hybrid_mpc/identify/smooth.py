@@ -16,7 +16,7 @@ from scipy.optimize import minimize_scalar
 from hybrid_mpc.data import scales
 from hybrid_mpc.data.scales import evenly
 from hybrid_mpc.data.trajectories import Trajectory
-from hybrid_mpc.identify.simulation import required_substeps, rest_of, stepped, with_unknown_rates
+from hybrid_mpc.identify.simulation import flow_slope, required_substeps, rest_of, stepped, with_unknown_rates
 from hybrid_mpc.machine.prior import Equations, Prior
 
 Array = NDArray[np.float64]
@@ -26,9 +26,13 @@ DECADES = (-6.0, 2.0)
 """Range searched for the walk of the unexplained rates, as a power of ten of their natural size: from a prior that is
 right to one that explains nothing."""
 IGNORANCE = 10.0
-"""Standard deviation of what is not known at first, as a multiple of its natural size."""
+"""Standard deviation of a state that is not known at first, as a multiple of its natural size; half its range at
+most."""
 SAMPLE = 12
 """At most so many trajectories decide the noise levels."""
+FADING = 10.0
+"""Machine's seconds in which an unexplained rate fades that nothing tells of: without, what it drives would drift
+away."""
 QUIETEST = 1e-9
 """Least noise of a sensor, as a share of the spread of its output: recordings of a simulation may have none."""
 UNSEEN = 1e-6
@@ -55,7 +59,7 @@ class Smoother:
     """Fixed-interval smoother over ``(x, d)``: ``d`` is what the prior does not explain of the rates that it corrects.
 
     ``x_{k+1} = f(x_k, u_k, w_k, d_k)`` is the prior integrated over a period with ``d_k`` held, ``d`` walks at random,
-    ``y_k = g(x_k, u_k, w_k) + noise``. So states that no sensor sees are estimated, and the input's part of a motion is
+    ``y_k = g(x_k, u_k, w_k) + noise``. Where nothing that is measured tells of ``d``, it fades (``fading``). So states that no sensor sees are estimated, and the input's part of a motion is
     known where a local polynomial would smear it. Missing samples (NaN) of single outputs are passed over; a censored
     one counts only where the estimate contradicts it.
 
@@ -65,6 +69,7 @@ class Smoother:
         sigma: Standard deviation of the measurement ``(n_y,)`` [output units].
         walk: Standard deviation of d's change per period ``(n_d,)`` [units of the corrected rates].
         sizes: Natural sizes of the signals (:func:`sizes_of`).
+        fading: What is left of ``d`` after a period [-].
 
     Source: Rauch, Tung, Striebel, *Maximum likelihood estimates of linear dynamic systems* (1965); iterated
     linearization: Bell, *The iterated Kalman smoother as a Gauss-Newton method* (1994).
@@ -75,6 +80,7 @@ class Smoother:
     sigma: tuple[float, ...]
     walk: tuple[float, ...]
     sizes: Sizes
+    fading: float = 1.0
 
     def smooth(self, trajectories: Sequence[Trajectory]) -> list[Trajectory]:
         """Every trajectory with ``x`` and ``xdot`` from all of its own samples and from nothing outside it."""
@@ -108,7 +114,11 @@ class Smoother:
     def _passes(self) -> tuple[ca.Function, ca.Function]:
         """One period of the filter: linearized along its own estimates, and along given ones."""
         return _filters(
-            self.prior.equations, self.prior.corrected, self.dt, required_substeps(self.prior, self.dt)
+            self.prior.equations,
+            self.prior.corrected,
+            self.dt,
+            required_substeps(self.prior, self.dt),
+            self.fading,
         )
 
     def _with_states(self, trajectory: Trajectory, z: Array) -> Trajectory:
@@ -134,8 +144,11 @@ class Smoother:
         n_z, n_x = self._n_z, len(self.prior.states)
         seen = np.isfinite(y)
         first = np.stack([np.concatenate([self._start(t), np.zeros(n_z - n_x)]) for t in group])
-        rates = [self.sizes.rate[i] for i in self.prior.corrected]
-        spread = IGNORANCE * np.array([*self.sizes.x, *rates])
+        ranges = np.array([0.5 * (s.upper - s.lower) for s in self.prior.states])
+        settled = np.array(self.walk) / math.sqrt(
+            max(1.0 - self.fading**2, 1e-12)
+        )  # of d, when it has long walked
+        spread = np.concatenate([np.minimum(IGNORANCE * np.array(self.sizes.x), ranges), settled])
         ahead = np.concatenate(
             [first[..., None], np.broadcast_to(np.diag(spread**2), (b, n_z, n_z))], axis=-1
         )
@@ -224,11 +237,12 @@ def fit_smoother(
     unit = scales.time_unit(trajectories, dt) if time_unit is None else time_unit
     sample = [trajectories[i] for i in evenly(len(trajectories), SAMPLE)]
     sizes = sizes_of(prior, trajectories, dt, unit)
+    fading = math.exp(-dt / (FADING * unit))
     rates = np.array(sizes.rate)[list(prior.corrected)] * math.sqrt(dt / unit)
 
     def at(ratio: float, scale: float = 1.0) -> Smoother:
         sigma, walk = scale * np.array(sizes.noise), scale * 10.0**ratio * rates
-        return Smoother(prior, dt, tuple(sigma.tolist()), tuple(walk.tolist()), sizes)
+        return Smoother(prior, dt, tuple(sigma.tolist()), tuple(walk.tolist()), sizes, fading)
 
     def cost(ratio: float) -> float:
         squares, logs, count = at(ratio).innovations(sample)
@@ -268,7 +282,7 @@ def seen_by(prior: Prior, dt: float, time_unit: float) -> Array:
     beside = x + np.where(np.isfinite(ranges), 0.1 * ranges, 1.0)
     periods = max(2, round(time_unit / dt))
     skip = max(1, periods // 50)  # fifty instants tell as much as a thousand
-    slope, output = _flow_slope(prior.equations.xdot), _output_slope(prior.equations)
+    slope, output = flow_slope(prior.equations.xdot), _output_slope(prior.equations)
     found = []
     for point in (x, beside):
         a = slope(point, u, w, prior.p).full()
@@ -334,14 +348,8 @@ def _output_slope(equations: Equations) -> ca.Function:
 
 
 @lru_cache(maxsize=32)
-def _flow_slope(xdot: ca.Function) -> ca.Function:
-    point = [ca.SX.sym(xdot.name_in(i), xdot.size1_in(i)) for i in range(4)]
-    return ca.Function("slope", point, [ca.densify(ca.jacobian(xdot(*point), point[0]))])
-
-
-@lru_cache(maxsize=32)
 def _filters(
-    equations: Equations, corrected: tuple[int, ...], dt: float, substeps: int
+    equations: Equations, corrected: tuple[int, ...], dt: float, substeps: int, fading: float
 ) -> tuple[ca.Function, ca.Function]:
     """A period of the filter, along its own estimates and along given ones.
 
@@ -369,6 +377,7 @@ def _filters(
     def moved(of: ca.SX, at: ca.SX) -> tuple[ca.SX, ca.SX]:
         z = ca.SX.sym("z", n_z)
         value = stepped(xdot, z, u, w, p, dt, substeps)
+        value[n_x:] *= fading
         value, slope = (ca.substitute(v, z, at) for v in (value, ca.jacobian(value, z)))
         return value + slope @ (of - at), slope
 

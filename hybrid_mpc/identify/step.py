@@ -127,6 +127,7 @@ class Scaling:
         centre_x: What is taken off each state first. Default: zero.
         centre_u: What is taken off each input first. Default: zero.
         centre_w: What is taken off each disturbance first. Default: zero.
+        xdot: Size of each state's rate ``(n_x,)``: the unit in which errors of rates are added up. Default: 1.
     """
 
     x: tuple[float, ...]
@@ -137,8 +138,10 @@ class Scaling:
     centre_x: tuple[float, ...] = ()
     centre_u: tuple[float, ...] = ()
     centre_w: tuple[float, ...] = ()
+    xdot: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "xdot", tuple(self.xdot or (1.0,) * len(self.x)))
         for name in ("x", "u", "w"):
             centre = getattr(self, f"centre_{name}") or (0.0,) * len(getattr(self, name))
             object.__setattr__(self, f"centre_{name}", tuple(centre))
@@ -165,6 +168,7 @@ class RecurrentStep(Step):
     scale_centre_x: Tensor
     scale_centre_u: Tensor
     scale_centre_w: Tensor
+    scale_xdot: Tensor
     own_shift: Tensor
 
     def __init__(
@@ -327,7 +331,15 @@ class HybridStep(RecurrentStep):
         uncut = residual[:, : residual.shape[1] // SPAN * SPAN] if residual.shape[1] >= SPAN else residual
         averaged = uncut.unflatten(1, (-1, min(SPAN, uncut.shape[1]))).mean(2).reshape(-1, len(rows))
         return Scaling(
-            spread(x), spread(u), rms(predicted), rms(averaged), spread(w), mean(x), mean(u), mean(w)
+            spread(x),
+            spread(u),
+            rms(predicted),
+            rms(averaged),
+            spread(w),
+            mean(x),
+            mean(u),
+            mean(w),
+            spread(((windows.x[:, 1:] - windows.x[:, :-1]) / dt).flatten(0, 1)),
         )
 
     def features(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.delay import lost_samples, shifted
-from hybrid_mpc.identify.evaluate import evaluation_trajectories, model_states
+from hybrid_mpc.identify.evaluate import evaluation_trajectories, measured_as, model_states
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.settings import KINDS
 from hybrid_mpc.identify.step import PriorStep
@@ -268,7 +268,10 @@ def run_freely(
     u, w = (np.stack([_padded(getattr(t, key), longest)[warm + 1 :] for t in starts]) for key in ("u", "w"))
     held = np.concatenate(u).T, np.concatenate(w).T, prior.p
     outputs = {
-        name: prior.equations.output(x.reshape(-1, x.shape[-1]).T, *held).full().T.reshape(*x.shape[:2], n_y)
+        name: measured_as(
+            prior,
+            prior.equations.output(x.reshape(-1, x.shape[-1]).T, *held).full().T.reshape(*x.shape[:2], n_y),
+        )
         for name, x in found.items()
     }
     return [

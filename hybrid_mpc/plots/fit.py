@@ -42,11 +42,6 @@ SHOWN = 20.0
 """Length [s] of a benchmark's run that is drawn sample by sample; the rest is in the errors' course."""
 COURSE = 200
 """Points of the course of the errors over the whole run."""
-_ROWS = (
-    ("loss_error", "bound_error", "error objective [-]"),
-    ("loss_energy", "bound_energy", "energy objective [-]"),
-    ("validation", None, "validation [-]"),
-)
 
 
 def free_run(
@@ -298,16 +293,15 @@ def curves(
     training: Mapping[str, Mapping[str, Any]],
     *,
     free_run_start: Mapping[str, float] | None = None,
-    units: tuple[str, str, str] = ("-", "-", "-"),
+    units: Mapping[str, str] | None = None,
 ) -> Figure:
-    """Training curves, a column a model: two objectives with their never-rising bounds, and the validation.
+    """Training curves, a column a model: each objective with its never-rising bound, and the validation.
 
     Args:
-        training: By model, arrays of equal length: ``step``, ``loss_error`` and, where the model has
-            them, ``loss_energy``, ``bound_error``, ``bound_energy``, ``validation``. NaN where a value
-            was not taken at a step.
+        training: By model, arrays of equal length: ``step``, ``loss_`` and the name of an objective and, where the
+            model has them, ``bound_`` and that name, and ``validation``. NaN where a value was not taken at a step.
         free_run_start: Step at which a model's training turns from teacher forcing to free runs.
-        units: Units of the error objective, the energy objective and the validation metric.
+        units: Units by objective, and that of the ``"validation"``. Default: none has one.
 
     Raises:
         InputError: If there is no model, ``step`` is missing, or lengths differ.
@@ -315,26 +309,33 @@ def curves(
     Example:
         >>> data = {"step": [0, 1, 2], "loss_error": [3.0, 2.0, 1.0]}
         >>> len(curves({"rnn": data}).axes)
-        3
+        2
     """
     if not training:
         raise InputError("plot of the training: there is no model to draw")
-    figure, axes = new_figure(3, len(training), sharex="col", sharey="row", size=(10, 6.6))
+    every = dict.fromkeys(
+        k.removeprefix("loss_") for data in training.values() for k in data if k.startswith("loss_")
+    )
+    rows = [(f"loss_{name}", f"bound_{name}", f"{name} objective", name) for name in every]
+    rows.append(("validation", "", "validation", "validation"))
+    figure, axes = new_figure(
+        len(rows), len(training), sharex="col", sharey="row", size=(10, 2.2 * len(rows))
+    )
     for column, (model, data) in zip(axes.T, training.items(), strict=True):
         if "step" not in data:
             raise InputError(f"plot of the training of {model}: no array 'step'; it has {', '.join(data)}")
         step = np.asarray(data["step"], dtype=float)
-        for ax, (loss, bound, _) in zip(column, _ROWS, strict=True):
+        for ax, (loss, bound, _, _) in zip(column, rows, strict=True):
             _curve(ax, model, step, data.get(loss), loss)
-            if bound is not None and data.get(bound) is not None:
+            if data.get(bound) is not None:
                 values = checked(f"{bound} of {model}", data[bound], len(step))
                 ax.plot(step, values, "k--", linewidth=1.2, drawstyle="steps-post", label="bound $c_j$")
             if free_run_start is not None and model in free_run_start:
                 ax.axvline(free_run_start[model], color=FAINT, linestyle=":", label="free-run stage starts")
         title_axes(column[0], name_of(model))
         column[-1].set_xlabel("optimiser step [-]")
-    for row, (_, _, label), unit in zip(axes, _ROWS, units, strict=True):
-        row[0].set_ylabel(label.replace("[-]", f"[{unit}]"))
+    for row, (_, _, label, name) in zip(axes, rows, strict=True):
+        row[0].set_ylabel(f"{label} [{(units or {}).get(name, '-')}]")
         if any(ax.get_yscale() == "log" for ax in row):
             plain_log(row[0].yaxis, *row[0].get_ylim())
     figure.align_ylabels(list(axes[:, 0]))

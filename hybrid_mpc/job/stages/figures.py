@@ -66,12 +66,14 @@ def _training(context: Context) -> Any:
     starts: dict[str, float] = {}
     for kind in reversed(KINDS):
         trained = trained_models(context, kind)
-        names = ["loss_error", "validation"]
+        objectives = [name.removeprefix("loss_") for name in trained.curve if name.startswith("loss_")]
+        names = ["validation", f"loss_{objectives[0]}"]
         if kind == "mopgrnn":
-            names += ["loss_energy", "bound_error", "bound_energy"]
+            names += [f"loss_{name}" for name in objectives[1:]] + [f"bound_{name}" for name in objectives]
         curves[kind] = {name: trained.curve[name][:, trained.best] for name in ["step", *names]}
         starts[kind] = float(trained.settings.teacher_steps)
-    figure = fit.curves(curves, free_run_start=starts, units=("mixed SI", "W", "mixed SI"))
+    units = {b.name: b.rate_unit for b in context.scenario.prior().equations.balances}
+    figure = fit.curves(curves, free_run_start=starts, units=units)
     caption = (
         "Objectives and bounds of the deployed network of each kind, on a fixed set of training windows."
     )

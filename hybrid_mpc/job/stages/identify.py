@@ -180,6 +180,7 @@ def what_prior_reads(context: Context) -> dict[str, object]:
         "equations of the prior": {name: to_json(program) for name, program in programs.items()},
         "parameters of the prior": prior.parameters,
         "largest delay": context.spec.largest_delay,
+        "longest free run": (context.spec.free_run, context.warm),
     }
 
 
@@ -187,8 +188,11 @@ def prior_stage(context: Context) -> PriorResult:
     """Fit the prior's parameters, and the input's delay where there may be one, and smooth all recordings by it."""
     make, spec = context.scenario.prior, context.spec
     train, valid, test = (context.trajectories(role) for role in ("train", "valid", "test"))
+    longest = spec.free_run or max(
+        ((len(t.t) - context.warm) * spec.dt for t in (*valid, *test)), default=None
+    )
     fit = fit_prior(
-        make, train, valid, dt=spec.dt, largest_delay=spec.largest_delay, time_unit=context.time_unit,
+        make, train, valid, dt=spec.dt, length=longest, largest_delay=spec.largest_delay, time_unit=context.time_unit,
         on_progress=lambda done, total, text: context.progress.update("free runs", done, total, text),
     )  # fmt: skip
     parts = [smoothed(make, fit, part, spec.dt) for part in (train, valid, test)]
@@ -217,6 +221,10 @@ def training_stage(context: Context) -> TrainingResult:
         :12
     ]  # networks of other settings or data lie in a folder of their own
     folder = context.out / "checkpoints" / "training" / name
+    if not context.scenario.prior().equations.balances:
+        context.progress.warn(
+            "the prior has no balance: MOPGRNN has the error as its only objective, as PGRNN"
+        )
     trained = train_kinds(
         context.settings.scenario,
         context.prior.fit.values,
