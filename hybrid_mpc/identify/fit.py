@@ -421,9 +421,10 @@ def fit_prior(
     """Fit parameters and delay to the measured outputs over longer and longer windows, and find what smooths states.
 
     Each length starts from what explains its windows best of what is known: the nominal values, the best of several
-    starts between the bounds, and what shorter windows found. Of the nominal values and all lengths the one wins that explains the windows of the longest length best, over training
-    and validation recordings together: few parameters do not overfit, and where a machine drifts a short validation
-    part alone misleads. A prior without free parameters stays as it is.
+    starts between the bounds, and what shorter windows found. Of the nominal values and all lengths the one wins that
+    explains the windows of the longest length best, over training and validation recordings together: few parameters do
+    not overfit, and where a machine drifts a short validation part alone misleads. A prior without free parameters
+    stays as it is.
 
     Args:
         make: Prior class or factory ``(values=None) -> Prior``.

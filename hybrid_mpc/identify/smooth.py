@@ -59,9 +59,10 @@ class Smoother:
     """Fixed-interval smoother over ``(x, d)``: ``d`` is what the prior does not explain of the rates that it corrects.
 
     ``x_{k+1} = f(x_k, u_k, w_k, d_k)`` is the prior integrated over a period with ``d_k`` held, ``d`` walks at random,
-    ``y_k = g(x_k, u_k, w_k) + noise``. Where nothing that is measured tells of ``d``, it fades (``fading``). So states that no sensor sees are estimated, and the input's part of a motion is
-    known where a local polynomial would smear it. Missing samples (NaN) of single outputs are passed over; a censored
-    one counts only where the estimate contradicts it.
+    ``y_k = g(x_k, u_k, w_k) + noise``. Where nothing that is measured tells of ``d``, it fades (``fading``). So states
+    that no sensor sees are estimated, and the input's part of a motion is known where a local polynomial would smear
+    it. Missing samples (NaN) of single outputs are passed over; a censored one counts only where the estimate
+    contradicts it.
 
     Args:
         prior: The fitted prior.

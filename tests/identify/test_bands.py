@@ -1,0 +1,82 @@
+"""Bands: they hold what they say on runs that they have not seen, and are narrow where the model is sure."""
+
+import numpy as np
+import pytest
+
+from hybrid_mpc import InputError
+from hybrid_mpc.identify.bands import RunParts, coverage, fit_bands, interval_score, variance_parts
+
+N = 400
+
+
+def growing(rng, runs, tails="normal"):
+    """Errors whose standard deviation grows with the time since the start, of two outputs of other units."""
+    t, spread = np.linspace(0, 20, N), np.array([1.0, 300.0])
+    made = []
+    for _ in range(runs):
+        networks = np.square(spread) * np.full((N, 2), 0.01)
+        parts = variance_parts(t, 1e-3 * spread, spread, networks, np.zeros((N, 2)))
+        sigma = np.sqrt(0.02 + 0.3 * t / 20)[:, None] * spread * rng.lognormal(0.0, 0.3)
+        noise = rng.standard_t(3, (N, 2)) if tails == "heavy" else rng.standard_normal((N, 2))
+        made.append(RunParts(sigma * noise, parts))
+    return made
+
+
+@pytest.mark.parametrize("tails", ["normal", "heavy"])
+def test_unseen_runs_are_held_as_promised(tails):
+    """Of 40 calibrations on six runs each the mean coverage of unseen runs is 90 % or somewhat more (six runs are few),
+    whatever the errors' distribution; 97 % would be bands too wide to be of use."""
+    rng = np.random.default_rng(0)
+    held = []
+    for _ in range(40):
+        bands = fit_bands(growing(rng, 6, tails))
+        held += [coverage(run, bands) for run in growing(rng, 4, tails)]
+    assert 0.9 <= np.mean(held) <= 0.97
+
+
+def test_a_band_that_knows_when_it_is_unsure_scores_better_than_a_constant_one():
+    rng = np.random.default_rng(1)
+    bands = fit_bands(growing(rng, 10))
+    unseen = growing(rng, 10)
+    own = np.mean([interval_score(run, bands) for run in unseen])
+    flat = np.mean([interval_score(run, bands.of_constant_width()) for run in unseen])
+    assert own < 0.95 * flat
+    width = bands.half_width(unseen[0].parts)
+    assert (width[-1] > 2 * width[0]).all()  # sqrt(0.32 / 0.02) is 4
+
+
+def test_units_do_not_count():
+    rng = np.random.default_rng(2)
+    runs = growing(rng, 5)
+    scaled = [RunParts(1e-6 * run.error, 1e-12 * run.parts) for run in runs]
+    one, other = fit_bands(runs), fit_bands(scaled)
+    np.testing.assert_allclose(
+        1e6 * other.half_width(scaled[0].parts), one.half_width(runs[0].parts), rtol=1e-3
+    )  # two searches of a flat optimum
+
+
+def test_missing_samples_do_not_count():
+    rng = np.random.default_rng(3)
+    runs = growing(rng, 6)
+    holes = [RunParts(np.where(rng.uniform(size=run.error.shape) < 0.3, np.nan, run.error), run.parts) for run in runs]
+    a, b = (fit_bands(part).half_width(runs[0].parts) for part in (runs, holes))
+    assert np.isfinite(b).all()
+    np.testing.assert_allclose(a, b, rtol=0.25)  # the rest of 2400 errors of six runs
+
+
+def test_the_interval_score_is_that_of_its_definition():
+    bands = fit_bands([RunParts(np.ones((10, 1)), np.ones((10, 1, 1)))] * 2)
+    half = bands.half_width(np.ones((1, 1, 1)))[0, 0]
+    run = RunParts(np.array([[0.0], [half + 0.5]]), np.ones((2, 1, 1)))
+    assert interval_score(run, bands) == pytest.approx(2 * half + 0.5 * (2 / 0.1) * 0.5)
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0, 1.5])
+def test_a_share_that_is_none_is_refused(share):
+    with pytest.raises(InputError, match="between 0 and 1"):
+        fit_bands([RunParts(np.ones((10, 1)), np.ones((10, 1, 1)))], share)
+
+
+def test_without_runs_there_is_no_band():
+    with pytest.raises(InputError, match="no validation run"):
+        fit_bands([])

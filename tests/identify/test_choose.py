@@ -1,0 +1,87 @@
+"""Do no harm: a hybrid is recommended where it surely beats the prior, and nowhere else."""
+
+import numpy as np
+import pytest
+
+from hybrid_mpc import InputError
+from hybrid_mpc.identify.choose import recommend
+
+
+def runs(rng, n=4, size=1.0, length=200):
+    """Squared errors of ``n`` runs."""
+    return [size * np.square(rng.standard_normal(length)) for _ in range(n)]
+
+
+def test_a_hybrid_that_halves_the_error_is_recommended():
+    rng = np.random.default_rng(0)
+    prior = runs(rng)
+    choice = recommend({"phy": prior, "pgrnn": [0.25 * r for r in prior], "mopgrnn": [0.16 * r for r in prior]})
+    assert choice.recommended == choice.hybrid == "mopgrnn"
+    assert choice.candidates["pgrnn"].ratio == pytest.approx(0.5)
+    assert choice.candidates["mopgrnn"].ratio == pytest.approx(0.4)  # roots of the squares' ratios
+    assert choice.candidates["mopgrnn"].upper == pytest.approx(0.4)  # the same share in every block: no scatter
+    assert "0.40 of the prior's" in choice.reason
+
+
+def test_a_hybrid_that_is_better_by_chance_is_not():
+    """With equal errors a hybrid must be recommended in about a twentieth of the cases: 50 of 1000, at most 80 by four
+    standard deviations and the jackknife's own error of some per cent."""
+    rng = np.random.default_rng(1)
+    chosen = [recommend({"phy": runs(rng), "pgrnn": runs(rng)}).recommended for _ in range(1000)]
+    assert 20 <= chosen.count("pgrnn") <= 80
+
+
+def test_one_recording_that_is_much_better_does_not_make_it_sure():
+    rng = np.random.default_rng(2)
+    prior = runs(rng, n=8)
+    hybrid = [1.05 * r for r in prior]
+    hybrid[0] = 0.01 * prior[0]
+    prior[0] = prior[0] * 3.0
+    choice = recommend({"phy": prior, "pgrnn": hybrid})
+    assert choice.candidates["pgrnn"].ratio < 1.0 < choice.candidates["pgrnn"].upper
+    assert choice.recommended == "phy"
+    assert "does not surely beat" in choice.reason
+
+
+def test_a_hybrid_that_diverges_is_never_recommended():
+    rng = np.random.default_rng(3)
+    prior = runs(rng)
+    bad = [0.1 * r for r in prior]
+    bad[1] = np.full(200, np.inf)
+    choice = recommend({"phy": prior, "pgrnn": bad})
+    assert choice.recommended == "phy"
+    assert "diverge" in choice.reason
+    good = recommend({"phy": bad, "pgrnn": prior})  # and a prior that diverges is beaten by what does not
+    assert good.recommended == "pgrnn"
+
+
+def test_the_user_overrules():
+    rng = np.random.default_rng(4)
+    prior = runs(rng)
+    errors = {"phy": prior, "pgrnn": [2.0 * r for r in prior], "mopgrnn": [0.5 * r for r in prior]}
+    choice = recommend(errors, deploy="pgrnn")
+    assert choice.recommended == choice.hybrid == "pgrnn"
+    assert choice.reason.startswith("pgrnn is deployed as asked for. mopgrnn is recommended")
+    kept = recommend(errors, deploy="phy")
+    assert (kept.recommended, kept.hybrid) == ("phy", "mopgrnn")
+    with pytest.raises(InputError, match=r"no candidate 'rnn'; choose of: phy, pgrnn, mopgrnn"):
+        recommend(errors, deploy="rnn")
+
+
+@pytest.mark.parametrize(("n", "length", "samples", "blocks"), [(1, 800, 1, 8), (1, 800, 400, 2), (3, 90, 1, 9), (12, 9, 1, 12)])
+def test_few_runs_are_cut_into_blocks_that_hang_together(n, length, samples, blocks):
+    rng = np.random.default_rng(5)
+    prior = runs(rng, n=n, length=length)
+    assert recommend({"phy": prior, "pgrnn": prior}, samples=samples).blocks == blocks
+
+
+def test_without_runs_nothing_is_chosen():
+    with pytest.raises(InputError, match="no validation run"):
+        recommend({"phy": [], "pgrnn": []})
+
+
+def test_one_block_tells_nothing_of_its_scatter():
+    choice = recommend({"phy": [np.ones(5)], "pgrnn": [0.1 * np.ones(5)]}, samples=5)
+    assert choice.blocks == 1
+    assert choice.candidates["pgrnn"].upper == np.inf
+    assert choice.recommended == "phy"
