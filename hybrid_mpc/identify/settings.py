@@ -34,8 +34,8 @@ class TrainingSettings:
         validation_horizon: Most scored periods of a validation window. Default: five times ``horizon``. Trainings
             with other horizons can be compared by their validation only if this is the same.
         objectives: Names in :data:`~hybrid_mpc.identify.objectives.OBJECTIVES`, of balances of the prior, or
-            ``"balances"`` for all of these; the curve has them all, the first one is that of validation. Default: the
-            error and all balances.
+            ``"balances"`` for all of these; the curve has them all, the first one is that of free runs and validation.
+            Default: the outputs, which models are judged by, and all balances.
         fused: Faster sequences of the GRUs, with other rounding.
         prior_parameters: ``"fixed"`` at their fitted values, or ``"trained"`` along within their bounds, each network
             its own. The energy balance of the objective keeps the fitted values.
@@ -49,7 +49,7 @@ class TrainingSettings:
 
     Example:
         >>> TrainingSettings("mopgrnn", 16, 4, 100, 100, seed=0, warm=10).objectives
-        ('error', 'balances')
+        ('output', 'balances')
     """
 
     kind: Kind
@@ -65,7 +65,7 @@ class TrainingSettings:
     learning_rates: tuple[float, float, float, float] = (1e-2, 1e-3, 5e-3, 1e-4)
     every: int = 25
     validation_horizon: int | None = None
-    objectives: tuple[str, ...] = ("error", "balances")
+    objectives: tuple[str, ...] = ("output", "balances")
     fused: bool = False
     prior_parameters: PriorParameters = "fixed"
     prior_replay: float = 0.0

@@ -25,7 +25,13 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import MOST_ARRAYS, read_bytes, replacing
 from hybrid_mpc.identify.dataset import Windows, check_rates, cut_windows, fitting_horizon
 from hybrid_mpc.identify.networks import StackedGRU
-from hybrid_mpc.identify.objectives import VectorPerformanceIndex, free_run, objectives_of, teacher_forced
+from hybrid_mpc.identify.objectives import (
+    VectorPerformanceIndex,
+    error_objective,
+    free_run,
+    objectives_of,
+    teacher_forced,
+)
 from hybrid_mpc.identify.prior_replay import BATCH, make_prior_replay, prior_replay_penalty
 from hybrid_mpc.identify.settings import TrainingSettings
 from hybrid_mpc.identify.step import PREFIX, HybridStep, RecurrentStep, Scaling, TrainedParameters, shift_to
@@ -53,9 +59,10 @@ def train(
 ) -> Trained:
     """Train a stack of networks on trajectories; each network keeps the weights best on validation free runs.
 
-    First teacher forcing (the paper's training), then free runs with back-propagation through the integrator. All kinds
-    get the same steps, batches and data. A network whose gradient is not finite skips that update; after several in a
-    row it stops with its best weights, and ``Trained.failures`` says why.
+    First teacher forcing (the paper's training), then free runs with back-propagation through the integrator. Where the
+    first objective is that of the outputs, teacher forcing takes that of the rates: a period hardly moves an output.
+    All kinds get the same steps, batches and data. A network whose gradient is not finite skips that update; after
+    several in a row it stops with its best weights, and ``Trained.failures`` says why.
 
     Args:
         prior: The fitted prior.
@@ -335,6 +342,8 @@ class TrainingRun:
         """Losses ``(networks, objectives)`` of the present stage's prediction, of the first objectives or of all."""
         prediction = (free_run if self.free else teacher_forced)(self.step, windows)
         every = list(self.objectives.values())[:first]
+        if not self.free and next(iter(self.objectives)) == "output":
+            every[0] = error_objective  # a single period shows in the rates, hardly in the outputs
         return torch.stack([objective(self.step, prediction) for objective in every], dim=-1)
 
     def _clip(self) -> Tensor:

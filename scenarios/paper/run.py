@@ -194,6 +194,7 @@ class Work:
             batch=e.batch,
             decay=e.decay,
             every=e.every,
+            objectives=("error", "energy"),
             fused=True,
         )
 

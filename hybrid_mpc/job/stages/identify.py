@@ -90,14 +90,14 @@ class TrainingResult:
 
     Args:
         folder: Folder of the weights in ``checkpoints/training``.
-        validation_e_sim_s: Validation error [s] of the best network by kind.
+        validation: Validation error of the best network by kind, of its first objective.
         skipped_updates: Updates that were skipped because a number was not finite, by kind.
         failures: What went wrong in a training, by kind.
         weights: Digest of the weights by kind.
     """
 
     folder: str
-    validation_e_sim_s: Mapping[str, float]
+    validation: Mapping[str, float]
     skipped_updates: Mapping[str, int]
     failures: Mapping[str, tuple[TrainingFailure, ...]]
     weights: Mapping[str, str]
