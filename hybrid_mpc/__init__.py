@@ -5,8 +5,8 @@ the job (``hm.run``), what its result is used with (``hm.load``, ``hm.Loop``, ``
 the parts of a loop, a study or an analysis of one's own. Figures are in ``hm.plots``. A module in which something is
 defined may change; these names stay.
 
-Each name is imported when it is used: torch by who writes a prior or trains, casadi by who states a problem or runs a
-loop.
+Each name is imported when it is used: torch by who trains or writes a prior in it, casadi by who writes a prior, states
+a problem or runs a loop.
 """
 
 import importlib

@@ -112,7 +112,7 @@ class Scenario:
         name: Registered name.
         title: One line for the report.
         description: A paragraph for the report: the machine, its traps, the source of its data.
-        prior: Prior class or factory ``(values=None) -> Prior``; imported lazily, since it needs torch.
+        prior: Prior class or factory ``(values=None) -> Prior``.
         data: How recordings are read.
         make_data: ``(folder, seed, budget name) -> CSV or npz paths`` for a simulated machine; default: none.
         plant: ``() -> Plant``; default: none (then there is no closed loop, only timing).

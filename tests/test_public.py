@@ -87,10 +87,11 @@ def test_nothing_is_loaded_before_it_is_used():
         "print({'casadi', 'torch', 'pandas', 'matplotlib'} & set(sys.modules))\n"
         "hm.OCP, hm.HybridModel, hm.load, hm.Loop, hm.simulate, hm.Runner, hm.EnergyMonitor, hm.linearize\n"
         "print('torch' in sys.modules)\n"
-        "hm.Prior\nprint('torch' in sys.modules)\n"
+        "hm.Prior, hm.MechanicalPrior, hm.fit_prior\nprint('torch' in sys.modules)\n"
+        "hm.TorchPrior\nprint('torch' in sys.modules)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split("\n")[:-1] == ["set()", "set()", "False", "True"]
+    assert done.stdout.split("\n")[:-1] == ["set()", "set()", "False", "False", "True"]
 
 
 def test_the_reference_lists_every_name():

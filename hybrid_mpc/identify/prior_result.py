@@ -27,8 +27,8 @@ class PriorFit:
 
     Args:
         values: Fitted values [SI] by name, fixed ones included.
-        standard_errors: Standard errors [SI] of the fitted ones, from the last fit's Jacobian (they hold
-            for a model without structural error, so read them as lower bounds).
+        standard_errors: Standard errors [SI] of the fitted ones, clustered by window (they hold for a model without
+            structural error, so read them as lower bounds).
         warnings: Parameters at a bound, or ones that the data do not identify.
         stages: One row per stage: its name and the validation error that chose the winner.
         correlations: Correlation of the errors of every two fitted parameters, by ``"a, b"``. Default: none known.

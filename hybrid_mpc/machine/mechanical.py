@@ -26,6 +26,7 @@ class MechanicalPrior(Prior):
         InputError: If the states are not ``[q, v]`` in pairs.
 
     Example:
+        >>> from hybrid_mpc import Parameter, Signal
         >>> class Pendulum(MechanicalPrior):
         ...     states = (Signal("phi", "rad"), Signal("phi_dot", "rad/s"))
         ...     inputs = (Signal("torque", "N m"),)
@@ -37,7 +38,6 @@ class MechanicalPrior(Prior):
         ...
         ...     def potential(self, q, p):
         ...         return -p.mgl * ca.cos(q.phi)
-        >>> from hybrid_mpc import Parameter, Signal
         >>> pendulum = Pendulum()
         >>> pendulum.equations.xdot([ca.pi / 2, 1.0], 2.5, [], pendulum.p)
         DM([1, 5])

@@ -26,6 +26,7 @@ class TorchPrior(Prior):
         nn_export.ExportError: When it is traced, if a method does what cannot be exported.
 
     Example:
+        >>> from hybrid_mpc import Parameter, Signal
         >>> class Tank(TorchPrior):
         ...     states = (Signal("level", "m", 0.0, 1.0),)
         ...     inputs = (Signal("inflow", "m^3/s"),)
@@ -34,7 +35,6 @@ class TorchPrior(Prior):
         ...
         ...     def xdot(self, x, u, w, p):
         ...         return ((u.inflow - p.k * torch.sqrt(x.level.clamp_min(1e-6))) / p.area,)
-        >>> from hybrid_mpc import Parameter, Signal
         >>> tank = Tank()
         >>> tank.equations.xdot(0.25, 0.1, [], tank.p)
         DM(0)
