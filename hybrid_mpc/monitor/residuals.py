@@ -103,7 +103,7 @@ def _energy_of(model: HybridModel) -> Balance:
     known = ", ".join(b.name for b in model.balances) or "none"
     raise InputError(
         f"energy monitor: model {model.name} has no balance {ENERGY!r} (it has: {known}), so its energy cannot be "
-        "watched; give its prior inertia(x), or energy_balance(x, xdot, u), and export it again, or take no monitor"
+        "watched; give its prior one (a MechanicalPrior has it), and export it again, or take no monitor"
     )
 
 
@@ -304,5 +304,5 @@ def check_model(model: HybridModel) -> None:
     if not np.all(np.diag(ca.Function("M", [x, u], [inertia_of(model, x, u)])(0, 0).full()) > 0):
         raise InputError(
             f"energy monitor: the energy balance of model {model.name} does not grow with its acceleration, so it "
-            "says nothing of its motion; its prior needs inertia(x), or energy_balance(x, xdot, u)"
+            "says nothing of its motion; check the mass matrix of its prior, or the storage of its balance"
         )
