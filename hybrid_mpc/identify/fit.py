@@ -16,6 +16,7 @@ from typing import Literal, TypeAlias
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 from scipy.stats import qmc
 
 from hybrid_mpc.data import scales
@@ -56,6 +57,14 @@ CONVERGED = 0.01
 error, if the windows are independent."""
 AT_BOUND = 1e-3
 """Share of its range within which a parameter counts as at its bound."""
+DIFFERENCE = 1e-5
+"""Of the differences for the slopes of predictions, in sizes of the parameters: far above rounding."""
+PREDICTIONS = 12
+"""Evaluations at most of a fit of predictions; it starts near its end."""
+PAST, ANSWERS = 10, 3
+"""Samples of an input's own past, and of prediction errors, that are asked for feedback."""
+CHANCE = 4.0
+"""Standard deviations of a correlation by chance that count as 1: of some dozen, one in a thousand is larger."""
 UNKNOWN = 1e-6
 """Ratio of singular values below which a combination of parameters is not identified."""
 Progress = Callable[[int, int, str], None]
@@ -233,6 +242,83 @@ class OutputFit:
         """
         problem = _Shooting(self, windows, sizes, self.substeps(np.clip(theta, self.lower, self.upper)))
         return problem.solve(np.clip(theta, self.lower, self.upper), iterations, fixed)
+
+
+def fit_by_prediction(
+    fit: OutputFit, theta: Array, trajectories: Sequence[Trajectory], smoother: Smoother
+) -> Fitted:
+    """Fit ``theta`` to the errors of a filter's predictions, one period ahead; the delay stays.
+
+    A machine that is unstable, or that was recorded under feedback with disturbances of its own, biases free runs:
+    inputs then answer to what free runs take for their error. Predictions know the measured past.
+
+    Source: Ljung, *System Identification: Theory for the User*, 1999, section 7.3.
+    """
+    n = len(fit.free)
+    given = shifted(trajectories, fit.delay(theta))
+    fixed = theta[n:]
+
+    def parameters(thetas: Array) -> Array:
+        return np.stack([np.array(list(fit.values(np.append(one, fixed)).values())) for one in thetas])
+
+    def errors(one: Array) -> Array:
+        return np.clip(
+            np.nan_to_num(smoother.prediction_errors(given, parameters(one[None]))[0][0]), -LARGEST, LARGEST
+        )
+
+    def slope(one: Array) -> Array:
+        side = np.where(one + DIFFERENCE > fit.upper[:n], -DIFFERENCE, DIFFERENCE)
+        every, _ = smoother.prediction_errors(given, parameters(np.vstack([one, one + np.diag(side)])))
+        return np.asarray(np.nan_to_num((every[1:] - every[0]) / side[:, None]).T)
+
+    low, high = fit.lower[:n], fit.upper[:n]
+    inside = np.clip(theta[:n], low + 1e-6 * (high - low), high - 1e-6 * (high - low))
+    found = least_squares(errors, inside, jac=slope, bounds=(low, high), loss="soft_l1", max_nfev=PREDICTIONS)
+    information = found.jac.T @ found.jac
+    variance = float(np.mean(np.square(found.fun)))
+    covariance = np.zeros((len(theta), len(theta)))
+    covariance[:n, :n] = variance * np.linalg.pinv(information, rcond=1e-12)
+    return Fitted(np.append(found.x, fixed), covariance, ())
+
+
+def feedback(trajectories: Sequence[Trajectory], errors: Sequence[Array]) -> float:
+    """How far inputs answer to earlier prediction errors: the largest correlation, over what chance makes of it.
+
+    What an input's own past does not tell of it is compared with the prediction errors of the same sample and of those
+    before; it is zero, but for chance, if the recordings were made in open loop. Several times 1 is feedback.
+
+    Args:
+        trajectories: Recordings.
+        errors: Prediction errors ``(n, n_y)`` of each, NaN where nothing was measured.
+    """
+    largest = 0.0
+    for j in range(trajectories[0].u.shape[1]):
+        rows, answers = [], []
+        for t, e in zip(trajectories, errors, strict=True):
+            u = t.u[:, j]
+            if len(u) <= 2 * PAST or not np.ptp(u) > 0:
+                continue
+            past = np.stack([u[PAST - k - 1 : len(u) - k - 1] for k in range(PAST)], axis=1)
+            before = np.stack([np.nan_to_num(e[PAST - k : len(u) - k]) for k in range(ANSWERS)], axis=1)
+            rows.append(np.column_stack([past, np.ones(len(past)), before.reshape(len(past), -1)]))
+            answers.append(u[PAST:])
+        if not rows:
+            continue
+        x, y = np.concatenate(rows), np.concatenate(answers)
+        own = x[:, : PAST + 1]
+        left = _without_jumps(y - own @ np.linalg.lstsq(own, y, rcond=None)[0])
+        for column in x[:, PAST + 1 :].T:
+            rest = _without_jumps(column - own @ np.linalg.lstsq(own, column, rcond=None)[0])
+            size = float(np.linalg.norm(left) * np.linalg.norm(rest))
+            if np.linalg.norm(left) > 1e-9 * np.linalg.norm(y) and size > 0:
+                largest = max(largest, abs(float(left @ rest)) / size * math.sqrt(len(y)))
+    return largest / CHANCE
+
+
+def _without_jumps(values: Array) -> Array:
+    """Values within three robust standard deviations: the jumps of a reference hide the rest of an input."""
+    limit = OUTLIERS * 1.4826 * float(np.median(np.abs(values)))
+    return np.clip(values, -limit, limit)
 
 
 @dataclass(frozen=True)
@@ -426,6 +512,8 @@ def fit_prior(
     not overfit, and where a machine drifts a short validation part alone misleads. A prior without free parameters
     stays as it is.
 
+    Recordings whose inputs answer to the outputs (:func:`feedback`) warn, and the errors of predictions are fitted too.
+
     Args:
         make: Prior class or factory ``(values=None) -> Prior``.
         train: Training trajectories.
@@ -487,6 +575,13 @@ def fit_prior(
     ]
     candidates = [("nominal", Fitted(fit.nominal, np.zeros((0, 0)), ())), *found]
     scores = [_error(fit, c.theta, scored, sizes) for _, c in candidates]
+    _, predicted = smoother.prediction_errors(shifted(train, fit.delay(fit.nominal)), fit.prior.p[None])
+    answered = feedback(shifted(train, fit.delay(fit.nominal)), predicted) if len(fit.free) else 0.0
+    if answered > 1.0 or not np.isfinite(min(scores)):
+        on_progress(total - 1, total, "predictions, as inputs answer to the outputs")
+        name, best_so_far = "predictions", candidates[int(np.argmin(scores))][1].theta
+        candidates.append((name, fit_by_prediction(fit, best_so_far, train, smoother)))
+        scores.append(_error(fit, candidates[-1][1].theta, scored, sizes))
     if not np.isfinite(min(scores)):
         raise InputError("the prior diverges with every set of parameters tried; check its signs and units")
     best = int(np.argmin(scores))
@@ -497,8 +592,8 @@ def fit_prior(
     stages = tuple({"stage": c[0], "validation_error": s} for c, s in zip(candidates, scores, strict=True))
     on_progress(total, total, "done")
     return PriorFit(
-        fit.values(chosen.theta), _errors(fit, chosen), _warnings(fit, chosen), stages, _correlations(fit, chosen),
-        delay, smoother.sigma, smoother.walk, smoother.sizes, smoother.fading,
+        fit.values(chosen.theta), _errors(fit, chosen), _warnings(fit, chosen, answered), stages,
+        _correlations(fit, chosen), delay, smoother.sigma, smoother.walk, smoother.sizes, smoother.fading,
     )  # fmt: skip
 
 
@@ -657,10 +752,15 @@ def _correlations(fit: OutputFit, chosen: Fitted) -> dict[str, float]:
     }
 
 
-def _warnings(fit: OutputFit, chosen: Fitted) -> tuple[str, ...]:
-    if not len(chosen.covariance):
-        return ("no fit improved on the nominal parameters",) if fit.free else ()
+def _warnings(fit: OutputFit, chosen: Fitted, answered: float = 0.0) -> tuple[str, ...]:
     warnings = []
+    if answered > 1.0:
+        warnings.append(
+            "inputs answer to the outputs, as in closed loop: parameters may be biased where the machine is disturbed; "
+            "predictions were fitted too, and validation chose"
+        )
+    if not len(chosen.covariance):
+        return (*warnings, "no fit improved on the nominal parameters") if fit.free else ()
     if chosen.unidentified:
         warnings.append(f"the data cannot tell apart: {', '.join(chosen.unidentified)}")
     for p, value, low, high in zip(fit.free, chosen.theta, fit.lower, fit.upper, strict=False):

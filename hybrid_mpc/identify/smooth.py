@@ -137,8 +137,30 @@ class Smoother:
             z = _smoothed(self._filtered(group, z))
         return z
 
-    def _filtered(self, group: Sequence[Trajectory], along: Array | None = None) -> _Filtered:
-        """What the filter finds, linearized along its own estimates or along ``(x, d)`` ``(b, n, n_z)``."""
+    def prediction_errors(self, trajectories: Sequence[Trajectory], p: Array) -> tuple[Array, list[Array]]:
+        """Prediction errors of the filter for several sets of parameters ``(m, n_p)``.
+
+        Gives them one behind the other, each over the standard deviation that the first set gives it, ``(m, N)``; and
+        those of the first set by trajectory, ``(n, n_y)``, as they are.
+        """
+        every, own = [], []
+        for group in _by_length(trajectories):
+            listed = list(group.values())
+            runs = [t for _ in p for t in listed]
+            found = self._filtered(runs, p=np.repeat(p, len(listed), axis=0))
+            e = found.e.reshape(len(p), len(listed), *found.e.shape[1:])
+            own += list(np.where(found.seen[: len(listed)], e[0], np.nan))
+            root = np.linalg.cholesky(found.s[: len(listed)])
+            every.append(np.linalg.solve(root, e[..., None])[..., 0].reshape(len(p), -1))
+        return np.concatenate(every, axis=1), own
+
+    def _filtered(
+        self, group: Sequence[Trajectory], along: Array | None = None, p: Array | None = None
+    ) -> _Filtered:
+        """What the filter finds, linearized along its own estimates or along ``(x, d)`` ``(b, n, n_z)``.
+
+        Parameters are the prior's, or ``p`` ``(b, n_p)``.
+        """
         y, u, w = (np.stack([getattr(t, key) for t in group]) for key in ("y", "u", "w"))
         censored = np.stack([t.censored for t in group])
         b, n = y.shape[:2]
@@ -155,7 +177,8 @@ class Smoother:
         )
         signals = [np.where(seen, y, 0.0), seen.astype(float), censored.astype(float), u, w]
         noise = np.concatenate([np.zeros(n_x), np.square(self.walk)])
-        constant = [self.prior.p, np.square(self.sigma), noise]
+        constant = [np.square(self.sigma), noise]
+        values = np.broadcast_to(self.prior.p, (b, len(self.prior.parameters))) if p is None else p
         own, given = self._passes
         if along is not None:
             signals.append(along)
@@ -163,6 +186,7 @@ class Smoother:
         found = run(
             np.moveaxis(ahead, 1, 0).reshape(n_z, -1),
             *(v.reshape(b * n, v.shape[-1]).T for v in signals),
+            values.T,
             *(np.tile(c[:, None], (1, b)) for c in constant),
         )
         ahead_, now, slope, e, s = (np.moveaxis(v.full().reshape(v.shape[0], b, n, -1), 0, 2) for v in found)

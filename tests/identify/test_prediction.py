@@ -1,0 +1,93 @@
+"""Recordings under feedback: they are told, and predictions are fitted where free runs are led astray."""
+
+import numpy as np
+import pytest
+
+from hybrid_mpc import Parameter, Prior, Signal, Trajectory
+from hybrid_mpc.identify.fit import OutputFit, feedback, fit_by_prediction
+from hybrid_mpc.identify.smooth import fit_smoother
+
+DT, N = 0.1, 400
+TRUTH = {"a": -0.5, "b": 1.5}
+
+
+class First(Prior):
+    states = (Signal("x", "m"),)
+    inputs = (Signal("u", "V"),)
+    outputs = states
+    parameters = (Parameter("a", -1.0, "1/s", -3.0, 2.0), Parameter("b", 1.0, "m/(V s)", 0.2, 4.0))
+
+    def xdot(self, x, u, w, p):
+        return (p.a * x.x + p.b * u.u,)
+
+
+def record(seed, *, gain, a=TRUTH["a"], disturbed=1.0, noise=0.01):
+    """A run with a random disturbance of the rate, under ``u = r - gain y``; ``gain`` zero is open loop."""
+    rng = np.random.default_rng(seed)
+    r = np.repeat(rng.uniform(-1, 1, N // 10 + 1), 10)[:N]
+    x, d, y, u = 0.0, 0.0, np.empty(N), np.empty(N)
+    for k in range(N):
+        y[k] = x + noise * rng.standard_normal()
+        u[k] = r[k] - gain * y[k]
+        d = 0.98 * d + disturbed * 0.2 * rng.standard_normal()
+        e = np.exp(a * DT)
+        x = e * x + (e - 1) / a * (TRUTH["b"] * u[k] + d)
+    z = np.zeros((N, 1))
+    return Trajectory(f"run{seed}", "train", DT, DT * np.arange(N), u[:, None], y[:, None], z, z)
+
+
+def answered(runs):
+    prior = First(TRUTH)
+    smoother = fit_smoother(prior, runs, DT, time_unit=1.0)
+    return feedback(runs, smoother.prediction_errors(runs, prior.p[None])[1])
+
+
+def test_feedback_is_told_from_open_loop():
+    """Twelve seeds each: a correlation of chance exceeds four standard deviations once in 16,000 times."""
+    assert max(answered([record(seed, gain=0.0) for seed in (s, s + 100)]) for s in range(12)) < 1.0
+    assert min(answered([record(seed, gain=2.0) for seed in (s, s + 100)]) for s in range(12)) > 1.5
+
+
+def test_predictions_find_the_parameters_under_feedback():
+    """Over ten recordings of a disturbed loop the mean estimate is the truth within three of its standard errors."""
+    found = []
+    for s in range(10):
+        runs = [record(10 * s + i, gain=2.0) for i in range(3)]
+        fit = OutputFit(First, DT)
+        smoother = fit_smoother(First(), runs, DT, time_unit=1.0)
+        for _ in range(2):  # the noise belongs to the parameters
+            result = fit_by_prediction(fit, fit.nominal, runs, smoother)
+            smoother = fit_smoother(First(fit.values(result.theta)), runs, DT, time_unit=1.0)
+        found.append([fit.values(result.theta)[name] for name in TRUTH])
+    mean, error = np.mean(found, axis=0), np.std(found, axis=0, ddof=1) / np.sqrt(10)
+    assert (np.abs(mean - list(TRUTH.values())) < 3 * error + 0.02).all(), (mean, error)
+    assert (error < 0.1).all()
+
+
+def test_an_unstable_machine_is_fitted_from_its_loop():
+    """Over eight recordings of a loop around an unstable machine, as above."""
+    found = []
+    for s in range(8):
+        runs = [record(10 * s + i, gain=3.0, a=0.8, disturbed=0.1) for i in range(3)]
+        fit = OutputFit(First, DT)
+        smoother = fit_smoother(First(), runs, DT, time_unit=1.0)
+        for _ in range(2):
+            result = fit_by_prediction(fit, fit.nominal, runs, smoother)
+            smoother = fit_smoother(First(fit.values(result.theta)), runs, DT, time_unit=1.0)
+        found.append([fit.values(result.theta)[name] for name in TRUTH])
+    mean, error = np.mean(found, axis=0), np.std(found, axis=0, ddof=1) / np.sqrt(8)
+    print(mean, error)
+    assert (np.abs(mean - [0.8, TRUTH["b"]]) < 3 * error + 0.02).all(), (mean, error)
+    assert (error < 0.15).all()
+
+
+def test_slopes_are_those_of_the_errors():
+    runs = [record(s, gain=1.0) for s in range(2)]
+    prior = First(TRUTH)
+    smoother = fit_smoother(prior, runs, DT, time_unit=1.0)
+    p = prior.p
+    both, own = smoother.prediction_errors(runs, np.stack([p, p * (1 + 1e-6)]))
+    alone, _ = smoother.prediction_errors(runs, p[None])
+    np.testing.assert_array_equal(both[0], alone[0])
+    assert 0 < np.abs(both[1] - both[0]).max() < 1e-3
+    assert [e.shape for e in own] == [(N, 1), (N, 1)]
