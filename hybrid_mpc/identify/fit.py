@@ -26,7 +26,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.delay import NONE, shifted
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.simulation import Simulation, flow_slope, required_substeps, rest_of
-from hybrid_mpc.identify.smooth import Smoother, fit_smoother, unseen_states
+from hybrid_mpc.identify.smooth import SAMPLE, Smoother, fit_smoother, unseen_states
 from hybrid_mpc.machine.prior import Equations, Prior
 from hybrid_mpc.machine.signals import Signal
 
@@ -63,6 +63,8 @@ PREDICTIONS = 12
 """Evaluations at most of a fit of predictions; it starts near its end."""
 PAST, ANSWERS = 10, 3
 """Samples of an input's own past, and of prediction errors, that are asked for feedback."""
+MEMORY = 200
+"""Lags up to which series are asked how far they hang together."""
 CHANCE = 4.0
 """Standard deviations of a correlation by chance that count as 1: of some dozen, one in a thousand is larger."""
 UNKNOWN = 1e-6
@@ -249,13 +251,16 @@ def fit_by_prediction(
 ) -> Fitted:
     """Fit ``theta`` to the errors of a filter's predictions, one period ahead; the delay stays.
 
+    At most ``SAMPLE`` trajectories, evenly chosen, are taken.
+
     A machine that is unstable, or that was recorded under feedback with disturbances of its own, biases free runs:
     inputs then answer to what free runs take for their error. Predictions know the measured past.
 
     Source: Ljung, *System Identification: Theory for the User*, 1999, section 7.3.
     """
     n = len(fit.free)
-    given = shifted(trajectories, fit.delay(theta))
+    chosen = [trajectories[i] for i in evenly(len(trajectories), SAMPLE)]
+    given = shifted(chosen, fit.delay(theta))
     fixed = theta[n:]
 
     def parameters(thetas: Array) -> Array:
@@ -311,8 +316,22 @@ def feedback(trajectories: Sequence[Trajectory], errors: Sequence[Array]) -> flo
             rest = _without_jumps(column - own @ np.linalg.lstsq(own, column, rcond=None)[0])
             size = float(np.linalg.norm(left) * np.linalg.norm(rest))
             if np.linalg.norm(left) > 1e-9 * np.linalg.norm(y) and size > 0:
-                largest = max(largest, abs(float(left @ rest)) / size * math.sqrt(len(y)))
+                chance = math.sqrt(max(float(_memory(left) @ _memory(rest)), 1.0) / len(y))
+                largest = max(largest, abs(float(left @ rest)) / size / chance)
     return largest / CHANCE
+
+
+def _memory(values: Array) -> Array:
+    """Correlations of a series with itself, at lags of up to ``MEMORY`` to either side.
+
+    The correlation of two independent series has the variance of the sum of the products of theirs, over their length
+    (Bartlett, *On the theoretical specification and sampling properties of autocorrelated time-series*, 1946).
+    """
+    n = len(values)
+    power = np.square(np.abs(np.fft.rfft(values, 2 * n)))
+    own = np.fft.irfft(power)[: min(MEMORY, n - 1) + 1]
+    own = own / max(float(own[0]), 1e-300)
+    return np.concatenate([own, own[1:]])
 
 
 def _without_jumps(values: Array) -> Array:
@@ -575,25 +594,32 @@ def fit_prior(
     ]
     candidates = [("nominal", Fitted(fit.nominal, np.zeros((0, 0)), ())), *found]
     scores = [_error(fit, c.theta, scored, sizes) for _, c in candidates]
-    _, predicted = smoother.prediction_errors(shifted(train, fit.delay(fit.nominal)), fit.prior.p[None])
-    answered = feedback(shifted(train, fit.delay(fit.nominal)), predicted) if len(fit.free) else 0.0
-    if answered > 1.0 or not np.isfinite(min(scores)):
-        on_progress(total - 1, total, "predictions, as inputs answer to the outputs")
-        name, best_so_far = "predictions", candidates[int(np.argmin(scores))][1].theta
-        candidates.append((name, fit_by_prediction(fit, best_so_far, train, smoother)))
-        scores.append(_error(fit, candidates[-1][1].theta, scored, sizes))
-    if not np.isfinite(min(scores)):
-        raise InputError("the prior diverges with every set of parameters tried; check its signs and units")
-    best = int(np.argmin(scores))
-    chosen = candidates[best][1]
     on_progress(total - 1, total, "smoothing by the fitted prior")
-    fitted, delay = make(fit.values(chosen.theta)), fit.delay(chosen.theta)
-    smoother = fit_smoother(fitted, shifted([*train, *valid], delay), dt, time_unit=unit)
+
+    def best() -> tuple[Fitted, Smoother]:
+        if not np.isfinite(min(scores)):
+            raise InputError(
+                "the prior diverges with every set of parameters tried; check its signs and units"
+            )
+        chosen = candidates[int(np.argmin(scores))][1]
+        acting = shifted([*train, *valid], fit.delay(chosen.theta))
+        return chosen, fit_smoother(make(fit.values(chosen.theta)), acting, dt, time_unit=unit)
+
+    chosen, smoother = best()
+    acting = shifted(train, fit.delay(chosen.theta))
+    answered = feedback(acting, smoother.prediction_errors(acting, smoother.prior.p[None])[1])
+    if answered > 1.0 and fit.free:
+        on_progress(total - 1, total, "predictions, as inputs answer to the outputs")
+        candidates.append(("predictions", fit_by_prediction(fit, chosen.theta, train, smoother)))
+        scores.append(_error(fit, candidates[-1][1].theta, scored, sizes))
+        if int(np.argmin(scores)) == len(scores) - 1:
+            chosen, smoother = best()
     stages = tuple({"stage": c[0], "validation_error": s} for c, s in zip(candidates, scores, strict=True))
     on_progress(total, total, "done")
     return PriorFit(
         fit.values(chosen.theta), _errors(fit, chosen), _warnings(fit, chosen, answered), stages,
-        _correlations(fit, chosen), delay, smoother.sigma, smoother.walk, smoother.sizes, smoother.fading,
+        _correlations(fit, chosen), fit.delay(chosen.theta), smoother.sigma, smoother.walk, smoother.sizes,
+        smoother.fading,
     )  # fmt: skip
 
 

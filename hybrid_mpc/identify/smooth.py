@@ -143,16 +143,17 @@ class Smoother:
         Gives them one behind the other, each over the standard deviation that the first set gives it, ``(m, N)``; and
         those of the first set by trajectory, ``(n, n_y)``, as they are.
         """
-        every, own = [], []
+        every: list[Array] = []
+        own: dict[int, Array] = {}
         for group in _by_length(trajectories):
             listed = list(group.values())
             runs = [t for _ in p for t in listed]
             found = self._filtered(runs, p=np.repeat(p, len(listed), axis=0))
             e = found.e.reshape(len(p), len(listed), *found.e.shape[1:])
-            own += list(np.where(found.seen[: len(listed)], e[0], np.nan))
+            own |= dict(zip(group, np.where(found.seen[: len(listed)], e[0], np.nan), strict=True))
             root = np.linalg.cholesky(found.s[: len(listed)])
             every.append(np.linalg.solve(root, e[..., None])[..., 0].reshape(len(p), -1))
-        return np.concatenate(every, axis=1), own
+        return np.concatenate(every, axis=1), [own[i] for i in range(len(trajectories))]
 
     def _filtered(
         self, group: Sequence[Trajectory], along: Array | None = None, p: Array | None = None
