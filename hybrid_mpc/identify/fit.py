@@ -585,8 +585,8 @@ def fit_prior(
                 *(f.theta for _, f in found[-1:]),
             ]  # short windows may have led astray
             errors = [_error(fit, one, [windows], sizes) for one in known]
-            best, name = known[int(np.argmin(errors))], f"free runs of {periods * dt:.3g} s"
-            found.append((name, fit.fit(best, windows, sizes, ITERATIONS)))
+            nearest, name = known[int(np.argmin(errors))], f"free runs of {periods * dt:.3g} s"
+            found.append((name, fit.fit(nearest, windows, sizes, ITERATIONS)))
     scored = [
         cut_outputs(part, lengths[-1], fit.lead, WINDOWS, states)
         for part in guesses

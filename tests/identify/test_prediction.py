@@ -1,7 +1,6 @@
 """Recordings under feedback: they are told, and predictions are fitted where free runs are led astray."""
 
 import numpy as np
-import pytest
 
 from hybrid_mpc import Parameter, Prior, Signal, Trajectory
 from hybrid_mpc.identify.fit import OutputFit, feedback, fit_by_prediction
