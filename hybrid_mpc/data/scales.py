@@ -117,7 +117,8 @@ def time_scale(recordings: Sequence[Outputs], dt: float) -> float:
 
 def _time_scale(recordings: Sequence[Outputs], dt: float, i: int, sigma: float) -> float:
     """Time scale of one output; NaN where its acceleration never stands out of the noise."""
-    pieces, step = thinned(recordings, i)
+    thin, step = thinned(recordings, i)
+    pieces = [_bridged(piece) for piece in thin]
     half, longest, dt = SHORTEST, max(map(len, pieces)), step * dt
     while 2 * half + 1 <= longest:
         speed, acceleration = (
@@ -132,6 +133,14 @@ def _time_scale(recordings: Sequence[Outputs], dt: float, i: int, sigma: float) 
             return 2 * math.pi * math.sqrt(moved / (power - noise[1] ** 2))
         half *= 2
     return math.nan
+
+
+def _bridged(y: Array) -> Array:
+    """Samples ``(m,)`` with straight lines over missing ones; what comes before the first and after the last is cut
+    off.
+    """
+    there = np.flatnonzero(np.isfinite(y))
+    return np.interp(np.arange(there[0], there[-1] + 1), there, y[there]) if len(there) else np.zeros(0)
 
 
 def time_unit(recordings: Sequence[Outputs], dt: float) -> float:

@@ -156,7 +156,7 @@ class Smoother:
             runs = [t for _ in p for t in listed]
             found = self._filtered(runs, p=np.repeat(p, len(listed), axis=0))
             e = found.e.reshape(len(p), len(listed), *found.e.shape[1:])
-            own |= dict(zip(group, np.where(found.seen[: len(listed)], e[0], np.nan), strict=True))
+            own |= dict(zip(group, np.where(found.counted[: len(listed)] > 0, e[0], np.nan), strict=True))
             root = np.linalg.cholesky(found.s[: len(listed)])
             every.append(np.linalg.solve(root, e[..., None])[..., 0].reshape(len(p), -1))
         return np.concatenate(every, axis=1), [own[i] for i in range(len(trajectories))]
@@ -175,9 +175,10 @@ class Smoother:
         seen = np.isfinite(y)
         first = np.stack([np.concatenate([self._start(t), np.zeros(n_z - n_x)]) for t in group])
         ranges = np.array([0.5 * (s.upper - s.lower) for s in self.prior.states])
-        settled = np.array(self.walk) / math.sqrt(
-            max(1.0 - self.fading**2, 1e-12)
-        )  # of d, when it has long walked
+        if self.fading < 1.0:
+            settled = np.array(self.walk) / math.sqrt(1.0 - self.fading**2)  # of d, when it has long walked
+        else:
+            settled = IGNORANCE * np.array([self.sizes.rate[i] for i in self.prior.corrected])
         spread = np.concatenate([np.minimum(IGNORANCE * np.array(self.sizes.x), ranges), settled])
         ahead = np.concatenate(
             [first[..., None], np.broadcast_to(np.diag(spread**2), (b, n_z, n_z))], axis=-1

@@ -150,6 +150,13 @@ def linear_recording(n, dt, seed=0):
     return Trajectory("linear", "train", dt, dt * np.arange(n), u, np.array(y), nothing, nothing, w)
 
 
+def ignorance(smoother):
+    """Standard deviations of the first ``(x, d)``: ten sizes, of a state half its range at most."""
+    ranges = [0.5 * (s.upper - s.lower) for s in smoother.prior.states]
+    rates = IGNORANCE * np.array(smoother.sizes.rate)[list(smoother.prior.corrected)]
+    return np.concatenate([np.minimum(IGNORANCE * np.array(smoother.sizes.x), ranges), rates])
+
+
 def batch_solution(run, sigma, walk, first, spread):
     """Gauss-Markov: all ``z_k`` by least squares of measurements, changes and what is known of the first."""
     n, (a, b, c, e) = len(run.t), discrete(run.dt)
@@ -186,7 +193,7 @@ def test_a_linear_machine_is_smoothed_as_by_least_squares_over_all_samples(missi
     smoother = Smoother(Masses(), dt, sigma, walk, sizes)
     ours = smoother.smooth([run])[0]
     first = np.concatenate([smoother._start(run), np.zeros(2)])
-    spread = IGNORANCE * np.array([2.0, 2.0, 3.0, 3.0, 2.0, 2.0])
+    spread = ignorance(smoother)
     exact = batch_solution(run, sigma, walk, first, spread)
     # rounding, times the ratio of what is known at first to the noise: 3e3 squared
     np.testing.assert_allclose(ours.x, exact[:, :4], rtol=0, atol=1e-8)
@@ -204,7 +211,7 @@ def test_the_likelihood_is_that_of_the_joint_gaussian():
     smoother = Smoother(Masses(), dt, sigma, walk, sizes)
     a, b, c, e = discrete(dt)
     first = np.concatenate([smoother._start(run), np.zeros(2)])
-    held, spread = np.hstack([run.u, run.w]), IGNORANCE * np.array([2.0, 2.0, 3.0, 3.0, 2.0, 2.0])
+    held, spread = np.hstack([run.u, run.w]), ignorance(smoother)
     mean, covariance, means, blocks = first, np.diag(spread**2), [], []
     cross = [covariance]  # of z_k with all before it
     total = np.zeros((2 * n, 2 * n))
