@@ -58,7 +58,10 @@ def test_units_do_not_count():
 def test_missing_samples_do_not_count():
     rng = np.random.default_rng(3)
     runs = growing(rng, 6)
-    holes = [RunParts(np.where(rng.uniform(size=run.error.shape) < 0.3, np.nan, run.error), run.parts) for run in runs]
+    holes = [
+        RunParts(np.where(rng.uniform(size=run.error.shape) < 0.3, np.nan, run.error), run.parts)
+        for run in runs
+    ]
     a, b = (fit_bands(part).half_width(runs[0].parts) for part in (runs, holes))
     assert np.isfinite(b).all()
     np.testing.assert_allclose(a, b, rtol=0.25)  # the rest of 2400 errors of six runs

@@ -15,11 +15,15 @@ def runs(rng, n=4, size=1.0, length=200):
 def test_a_hybrid_that_halves_the_error_is_recommended():
     rng = np.random.default_rng(0)
     prior = runs(rng)
-    choice = recommend({"phy": prior, "pgrnn": [0.25 * r for r in prior], "mopgrnn": [0.16 * r for r in prior]})
+    choice = recommend(
+        {"phy": prior, "pgrnn": [0.25 * r for r in prior], "mopgrnn": [0.16 * r for r in prior]}
+    )
     assert choice.recommended == choice.hybrid == "mopgrnn"
     assert choice.candidates["pgrnn"].ratio == pytest.approx(0.5)
     assert choice.candidates["mopgrnn"].ratio == pytest.approx(0.4)  # roots of the squares' ratios
-    assert choice.candidates["mopgrnn"].upper == pytest.approx(0.4)  # the same share in every block: no scatter
+    assert choice.candidates["mopgrnn"].upper == pytest.approx(
+        0.4
+    )  # the same share in every block: no scatter
     assert "0.40 of the prior's" in choice.reason
 
 
@@ -68,7 +72,9 @@ def test_the_user_overrules():
         recommend(errors, deploy="rnn")
 
 
-@pytest.mark.parametrize(("n", "length", "samples", "blocks"), [(1, 800, 1, 8), (1, 800, 400, 2), (3, 90, 1, 9), (12, 9, 1, 12)])
+@pytest.mark.parametrize(
+    ("n", "length", "samples", "blocks"), [(1, 800, 1, 8), (1, 800, 400, 2), (3, 90, 1, 9), (12, 9, 1, 12)]
+)
 def test_few_runs_are_cut_into_blocks_that_hang_together(n, length, samples, blocks):
     rng = np.random.default_rng(5)
     prior = runs(rng, n=n, length=length)

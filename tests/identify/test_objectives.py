@@ -64,8 +64,9 @@ def test_objectives_of_a_known_error():
     with torch.no_grad():
         p = teacher_forced(step, windows)
         wrong = replace(p, x_hat=p.x, xdot_hat=p.xdot + torch.tensor([0.0, 2.0]))
-        # mean |(0, 2)|_1 = 2 and mean |J v 2|: the energy objective is a speed-weighted error here
-        np.testing.assert_allclose(error_objective(step, wrong), 2.0, rtol=1e-12)
+        # mean of (0, 2) over the rates' spreads, and mean |J v 2|: the energy objective is a speed-weighted error here
+        spread = float(((windows.x[:, 1:, 1] - windows.x[:, :-1, 1]) / DT).std(correction=0))
+        np.testing.assert_allclose(error_objective(step, wrong), 0.5 * 2.0 / spread, rtol=1e-12)
         speed = float(p.x[..., 1].abs().mean())
         energy = balance_objective("energy")(step, wrong)
         np.testing.assert_allclose(energy, 0.15 * 2.0 * speed, rtol=1e-12)

@@ -60,7 +60,9 @@ def test_corrections_fade_there_and_still_explain_the_data(data, prior_replay):
     """Of networks as ``train`` hands them over: the best by validation, which does not know of prior replay."""
 
     def trained(weight):
-        settings = replace(SMALL, teacher_steps=150, free_run_steps=0, prior_replay=weight)
+        settings = replace(
+            SMALL, teacher_steps=150, free_run_steps=0, prior_replay=weight, objectives=("error", "energy")
+        )
         run = TrainingRun(PRIOR, *data, settings)
         best = train(PRIOR, *data, settings)
         run._load({name: torch.tensor(value) for name, value in best.weights.items()})

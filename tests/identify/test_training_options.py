@@ -46,7 +46,7 @@ def test_every_option_trains_resumes_and_makes_a_model(data, usual, options, tmp
     assert torch.isfinite(torch.cat([x_next, h_next])).all()
 
 
-def test_any_number_of_objectives(data, usual, monkeypatch):
+def test_any_number_of_objectives(data, monkeypatch):
     def square(step, p):
         return (p.xdot_hat - p.xdot).square().sum(-1).mean(dim=(0, 2))
 
@@ -55,7 +55,17 @@ def test_any_number_of_objectives(data, usual, monkeypatch):
     for name in ("error", "energy", "square"):
         assert (curve[f"loss_{name}"] > 0).all()
         assert (np.diff(curve[f"bound_{name}"][curve["free_run"][:, 0] == 0], axis=0) <= 0).all()
-    assert not np.array_equal(curve["loss_error"][1:], usual.curve["loss_error"][1:])  # the third one counts
+    two = train(PRIOR, *data, replace(SHORT, objectives=("error", "energy"))).curve
+    assert not np.array_equal(curve["loss_error"][1:], two["loss_error"][1:])  # the third one counts
+
+
+def test_teacher_forcing_takes_the_rates_where_free_runs_take_the_outputs(data):
+    settings = replace(SHORT, kind="pgrnn", free_run_steps=0)
+    rates, outputs = (
+        train(PRIOR, *data, replace(settings, objectives=(name,))) for name in ("error", "output")
+    )
+    np.testing.assert_array_equal(rates.curve["loss_error"], outputs.curve["loss_output"])
+    assert not np.array_equal(rates.curve["validation"], outputs.curve["validation"])  # each by its own
 
 
 @pytest.mark.parametrize(

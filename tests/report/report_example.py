@@ -87,7 +87,7 @@ def training_figure():
     bound = 1.1 * np.minimum.accumulate(out["mopgrnn"]["loss_error"])
     out["mopgrnn"] |= {"loss_energy": energy, "bound_error": bound, "bound_energy": 1.15 * energy}
     starts = dict.fromkeys(out, 300.0)
-    return fit.curves(out, free_run_start=starts, units=("rad/s²", "W", "s"))
+    return fit.curves(out, free_run_start=starts, units={"energy": "W"})
 
 
 def loop_figure():

@@ -44,6 +44,22 @@ RESULTS = {
             "by_file": {},
             "smoother": {"sigma": [0.1], "walk": [1.0]},
             "hybrid_over_phy": {"rmse": 0.75},
+            "choice": {
+                "recommended": "mopgrnn",
+                "hybrid": "mopgrnn",
+                "reason": "mopgrnn is recommended.",
+                "candidates": {"phy": {"error": 0.2, "ratio": 1.0, "upper": 1.0}},
+            },
+            "bands": {
+                "phy": {
+                    "share": 0.9,
+                    "coverage": 0.88,
+                    "width": [0.1],
+                    "score": 0.2,
+                    "score_of_constant": 0.25,
+                }
+            },
+            "baselines": {"ARX": {"rmse": [0.3], "chosen": "order 2"}, "N4SID": {"reason": "too short"}},
         },
     },
     "export": {"parity_max_abs_error": 2e-16, "jacobian_max_abs_error": 1e-15},
