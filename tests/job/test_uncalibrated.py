@@ -121,7 +121,7 @@ def context(machine, samples, out, warm_up):
     made.keep(NOISE, {}, NoiseResult(found))
     train = made.trajectories("train")
     states = {f"{t.name}/{key}": getattr(t, key) for t in train for key in ("x", "xdot")}
-    made.keep(PRIOR, {}, PriorResult(PriorFit({}, {}, (), ()), {}, {}, (), (), 0.0, states))
+    made.keep(PRIOR, {}, PriorResult(PriorFit({}, {}, (), ()), {}, {}, states))
     return made
 
 
