@@ -36,7 +36,7 @@ def random_values(prior: type[Prior] | Prior, rng: np.random.Generator) -> dict[
 
 
 def random_points(prior: Prior, rng: np.random.Generator, n: int = SAMPLES) -> tuple[np.ndarray, ...]:
-    """States ``(n, n_x)``, inputs and disturbances over the signals' ranges, at most 10 [their units] to either side."""
+    """States ``(n, n_x)``, inputs and disturbances over the signals' ranges, at most 10 to either side."""
 
     def draw(signals) -> np.ndarray:
         low, high = (np.clip([getattr(s, key) for s in signals], -10.0, 10.0) for key in ("lower", "upper"))
@@ -89,7 +89,9 @@ def _check_integral(prior: Prior, balance, starts, inputs, disturbances) -> None
             put_in = float(balance.supply(x, u, w, prior.p)) - float(balance.loss(x, u, w, prior.p))
             return [*prior.equations.xdot(x, u, w, prior.p).full()[:, 0], put_in, abs(put_in)]
 
-        end = solve_ivp(motion, (0, seconds), [*x0, 0.0, 0.0], method="DOP853", rtol=1e-10, atol=1e-12).y[:, -1]
+        end = solve_ivp(motion, (0, seconds), [*x0, 0.0, 0.0], method="DOP853", rtol=1e-10, atol=1e-12).y[
+            :, -1
+        ]
         change = float(balance.storage(end[:n_x], prior.p)) - float(balance.storage(x0, prior.p))
         size = max(end[-1], abs(float(balance.storage(x0, prior.p))), 1e-300)
         assert abs(change - end[n_x]) <= 1e-6 * size, f"{change:.6g} stored, {end[n_x]:.6g} put in"

@@ -65,7 +65,8 @@ class _Report:
 def check_scenario(scenario: Scenario, budget: Budget | None = None) -> None:
     """Build and call everything that a scenario defines, before any work is done.
 
-    The prior is asked at the origin and at random points within its signals' ranges; exported; and the model, controllers, estimators, plant, tasks and their references are built of it and called.
+    The prior is asked at the origin and at random points within its signals' ranges, and exported; the model,
+    controllers, estimators, plant, tasks and their references are built of it and called.
     Budgets are all of the scenario's where none is given.
 
     Raises:
@@ -194,8 +195,8 @@ def _check_balance(prior: Prior, balance: BalanceEquations, points: _Points, rat
     size, k = float(np.max(np.abs([supply, loss, residual]))), int(np.argmax(residual))
     if residual[k] > BALANCE * size:
         raise InputError(
-            f"{name}: dS/dt - supply + loss is {residual[k]:.3g} along the prior's own flow at {points.named(k)}, where "
-            "it must be 0; is a term or a sign left out?"
+            f"{name}: dS/dt - supply + loss is {residual[k]:.3g} along the prior's own flow at {points.named(k)}, "
+            "where it must be 0; is a term or a sign left out?"
         )
     k = int(np.argmin(loss))
     if loss[k] < -BALANCE * size:

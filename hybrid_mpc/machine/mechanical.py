@@ -43,18 +43,19 @@ class MechanicalPrior(Prior):
         DM([1, 5])
     """
 
+    corrects: ClassVar[tuple[str, ...] | None] = None
+    _speeds: ClassVar[tuple[str, ...] | None] = None
+
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        if "states" in vars(cls):
-            if len(cls.states) % 2:
-                raise InputError(
-                    f"{cls.__name__}: states must be [q, v] in pairs, got {len(cls.states)}: "
-                    f"{', '.join(s.name for s in cls.states)}"
-                )
-            if cls.corrects is None:
-                cls.corrects = tuple(s.name for s in cls.states[len(cls.states) // 2 :])
-
-    corrects: ClassVar[tuple[str, ...] | None] = None
+        states = getattr(cls, "states", ())  # its own, a base's or a mixin's
+        if len(states) % 2:
+            raise InputError(
+                f"{cls.__name__}: states must be [q, v] in pairs, got {len(states)}: "
+                f"{', '.join(s.name for s in states)}"
+            )
+        if cls.corrects is cls._speeds:  # nobody has chosen others
+            cls.corrects = cls._speeds = tuple(s.name for s in states[len(states) // 2 :]) or None
 
     @property
     def n_q(self) -> int:

@@ -210,8 +210,20 @@ class Prior:
             method: Its name.
             arguments: Name and expression ``(n,)`` of each argument; the name says whose components it has
                 (:meth:`names_of`).
+
+        Raises:
+            InputError: If the method does with them what only torch's tensors can.
         """
-        return getattr(self, method)(*(named(self.names_of(key), ca.vertsplit(v)) for key, v in arguments))
+        given = (named(self.names_of(key), ca.vertsplit(v)) for key, v in arguments)
+        try:
+            return getattr(self, method)(*given)
+        except (TypeError, AttributeError) as error:
+            if "Tensor" not in str(error) and "'SX' object" not in str(error):
+                raise
+            raise InputError(
+                f"{type(self).__name__}.{method} gets CasADi expressions: {error}. Is it written in torch? Then it "
+                "must be a TorchPrior"
+            ) from error
 
     def names_of(self, argument: str) -> tuple[str, ...]:
         """Names of the components of ``x``, ``u``, ``w`` or ``p``."""
@@ -282,8 +294,9 @@ def _tuple_of(names: tuple[str, ...]) -> Any:
     def missing(_: Any, name: str) -> Any:
         raise AttributeError(f"nothing is called {name!r} here; there is: {', '.join(names) or 'nothing'}")
 
-    plain = namedtuple("named", names, rename=True)  # what is no identifier has its place alone
-    return type("named", (plain,), {"__slots__": (), "__getattr__": missing})
+    # what is no identifier has its place alone
+    bases = (namedtuple("named", names, rename=True),)
+    return type("named", bases, {"__slots__": (), "__getattr__": missing})
 
 
 def named(names: tuple[str, ...], parts: Sequence[Any]) -> Any:

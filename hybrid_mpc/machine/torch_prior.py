@@ -46,7 +46,15 @@ class TorchPrior(Prior):
         kind = type(what, (_Traced,), {})  # what cannot be exported is told by this name
         module = kind(self, method, tuple(self.names_of(key) for key, _ in arguments))
         examples = tuple(torch.ones(v.numel(), dtype=torch.float64) for _, v in arguments)
-        shape = module.result(*examples)  # what it gives: tuples of tuples, balances
+        try:
+            shape = module.result(*examples)  # what it gives: tuples of tuples, balances
+        except (NotImplementedError, TypeError) as error:
+            if "Tensor" not in str(error):
+                raise
+            raise InputError(
+                f"{what} gets torch's tensors: {str(error).splitlines()[0]} Is it written in "
+                "CasADi? Then it must be a Prior"
+            ) from error
         scalars = _scalars(shape, what)
         if not any(isinstance(s, Tensor) for s in scalars):
             return shape

@@ -361,6 +361,10 @@ def test_states_that_no_output_sees_are_named(base, members, states):
         check_scenario(changed(base, members))
 
 
+NO_TORCH = ["Changed.xdot", "written in torch? Then it must be a TorchPrior"]
+NO_CASADI = ["Changed.xdot", "written in CasADi? Then it must be a Prior"]
+
+
 def if_else(x, u, p, m):
     return u.inflow if x.level > 0.5 else -u.inflow
 
@@ -381,9 +385,9 @@ def if_else(x, u, p, m):
             ["Changed.xdot", "bessel", "operators.md"],
         ),
         (TorchTank, lambda x, u, p, m: x.level.float(), ["Changed.xdot", "less than float64"]),
-        (TorchTank, lambda x, u, p, m: ca.sqrt(x.level), ["Changed.xdot", "written in CasADi? Then it must be a Prior"]),
-        (Tank, lambda x, u, p, m: torch.sqrt(x.level), ["Changed.xdot", "written in torch? Then it must be a TorchPrior"]),
-        (Tank, lambda x, u, p, m: x.level.clamp_min(1e-6), ["Changed.xdot", "written in torch? Then it must be a TorchPrior"]),
+        (TorchTank, lambda x, u, p, m: ca.sqrt(x.level), NO_CASADI),
+        (Tank, lambda x, u, p, m: torch.sqrt(x.level), NO_TORCH),
+        (Tank, lambda x, u, p, m: x.level.clamp_min(1e-6), NO_TORCH),
     ],
 )
 def test_what_one_way_of_writing_cannot_do_is_told(base, rate, words):
