@@ -131,6 +131,12 @@ def test_a_changed_machine_is_known_again_after_a_few_seconds(machine, made, tmp
         )
 
 
+def test_the_shortest_refit_is_shorter_than_its_longest_run(machine, made, tmp_path):
+    scenario, _, test = machine
+    settings = BenchmarkSettings(str(scenario), test=(test,), model=made[0], refit=1.5)
+    assert benchmark(settings, tmp_path / "judged").test["test.csv"].refit.seconds == 1.5
+
+
 def test_the_delay_takes_samples_from_the_start_only(machine):
     scenario = load_scenario(str(machine[0]))
     (whole,) = read_test(scenario, machine[2])
