@@ -7,7 +7,7 @@ from simulated_pendulum import DT, TRUTH, Pendulum, record
 
 from hybrid_mpc import PriorStep, evaluation_trajectories, free_runs, score
 from hybrid_mpc.identify.evaluate import FreeRun
-from hybrid_mpc.identify.smooth import Smoother
+from hybrid_mpc.identify.smooth import Smoother, sizes_of
 
 
 def hand_made(n, dt, error):
@@ -54,7 +54,8 @@ def test_the_true_model_runs_along_the_measurement():
 
 def test_short_runs_start_every_fifth_of_their_length():
     run, warm = record(3, seconds=2.0), 25
-    smoother = Smoother(Pendulum(TRUTH), DT, (1e-3,), (0.1,))
+    prior = Pendulum(TRUTH)
+    smoother = Smoother(prior, DT, (1e-3,), (0.1,), sizes_of(prior, [run], DT, 1.0))
     pieces = evaluation_trajectories([run], smoother, warm, 0.5)
     # 100 samples; 25 of warm-up, 25 periods of the run; a start every 5 samples
     assert [p.t[0] for p in pieces] == pytest.approx(run.t[0 : 100 - 50 : 5])
@@ -67,7 +68,7 @@ def test_a_free_run_knows_nothing_of_the_measurement_after_its_start():
     later = replace(run, x=run.x.copy(), y=run.y.copy())
     later.x[warm + 1 :], later.y[warm + 1 :] = 9.0, 9.0
     step, h = PriorStep(prior, DT), torch.zeros(0).double()
-    smoother = Smoother(prior, DT, (1e-3,), (0.1,))
+    smoother = Smoother(prior, DT, (1e-3,), (0.1,), sizes_of(prior, [run], DT, 1.0))
     ours, theirs = (
         free_runs(step, prior, evaluation_trajectories([r], smoother, warm), warm, h)[0] for r in (run, later)
     )

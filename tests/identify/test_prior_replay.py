@@ -26,7 +26,8 @@ def test_they_are_the_priors_own_motion_under_recorded_inputs(data, prior_replay
     from hybrid_mpc import PriorStep
 
     step = PriorStep(PRIOR, data[0][0].dt)
-    x, _ = step(prior_replay.x[:-1], torch.zeros(*prior_replay.x.shape[:-1], 0)[:-1], prior_replay.u[:-1])
+    none = torch.zeros(*prior_replay.w.shape[:-1], 0).double()[:-1]
+    x, _ = step(prior_replay.x[:-1], none, prior_replay.u[:-1], prior_replay.w[:-1])
     torch.testing.assert_close(x, prior_replay.x[1:], rtol=0, atol=1e-12)
     recorded = np.unique(np.concatenate([t.u for t in data[0]]))
     assert np.isin(prior_replay.u.numpy(), recorded).all()
@@ -99,8 +100,8 @@ def test_an_rnn_has_nothing_to_fall_back_on(data):
 @pytest.mark.parametrize("strength", [0.1, 1.0, 1e6])
 def test_a_prior_that_runs_away_costs_no_update(data, strength):
     class Bursting(Pendulum):
-        def acceleration(self, x, u):
-            return strength * x[..., 1:2] ** 3 + super().acceleration(x, u)
+        def force(self, q, v, u, w, p):
+            return strength * p.J * v.phi_dot**3 + u.torque
 
     prior_replay = make_prior_replay(Bursting(TRUTH), data[0], seed=0)
     v = np.concatenate([t.x[:, 1] for t in data[0]])

@@ -16,7 +16,7 @@ from hybrid_mpc import (
     trace_model,
     train,
 )
-from hybrid_mpc.identify.step import StackedPrior, with_values
+from hybrid_mpc.identify.step import HybridStep, PriorStep, Scaling, TrainedParameters, shift_to
 from hybrid_mpc.identify.train import TrainingRun
 from hybrid_mpc.kit.artifact import build_model
 from scenarios.pendulum.prior import PublishedPendulumPrior
@@ -43,19 +43,47 @@ def distances(values):
     return [abs(values[n] - TRUTH[n]) / abs(nominal[n] - TRUTH[n]) for n in TRUTH]
 
 
-def test_each_stacked_prior_is_that_prior_with_its_values():
-    stack, x, u = StackedPrior(Pendulum(), 3), torch.rand(4, 1, 5, 2).double(), torch.rand(5, 1).double()
-    for way in stack.ways.values():
+def given(values):
+    """The prior with other parameters."""
+    return Pendulum({**Pendulum().values, **values})
+
+
+def rates(prior, x, u):
+    """``xdot`` of a prior at numpy or torch points ``(..., n)``, by CasADi."""
+    x, u = (np.asarray(v) for v in (x, u))
+    found = prior.equations.xdot(x.reshape(-1, 2).T, u.reshape(-1, 1).T, [], prior.p)
+    return found.full().T.reshape(x.shape)
+
+
+def test_each_network_s_own_prior_is_that_prior_with_its_values():
+    trained, x, u = (
+        TrainedParameters(Pendulum(), 3),
+        torch.rand(4, 1, 5, 2).double(),
+        torch.rand(4, 1, 5, 1).double(),
+    )
+    for way in trained.ways.values():
         torch.nn.init.uniform_(way, -0.1, 0.1, generator=torch.Generator().manual_seed(0))
-    stack.project()
-    xdot = stack(x, u.unsqueeze(0))
+    trained.project()
+    scaling = Scaling((1.0, 1.0), (1.0,), (1.0,), (1.0,))
+    step = HybridStep(Pendulum(), torch.nn.Identity(), scaling, DT, shift=trained)
+    xdot = step.prior_rates(x, u, torch.zeros(4, 1, 5, 0).double())
     assert xdot.shape == (4, 3, 5, 2)
     for i in range(3):
-        alone = with_values(Pendulum(), {name: v[i].item() for name, v in stack.values().items()})
-        torch.testing.assert_close(xdot[:, i], alone(x[:, 0], u), rtol=1e-14, atol=1e-14)  # rounding
+        alone = given({name: v[i].item() for name, v in trained.values().items()})
+        # rounding
+        np.testing.assert_allclose(
+            xdot[:, i].detach(), rates(alone, x[:, 0], u[:, 0]), rtol=1e-13, atol=1e-13
+        )
     xdot[:, 1].sum().backward()
-    for way in stack.ways.values():  # each network's loss reaches its own parameters
+    for way in trained.ways.values():  # each network's loss reaches its own parameters
         assert (way.grad[:, 0] != 0).tolist() == [False, True, False]
+
+
+def test_a_shift_is_the_prior_with_those_values():
+    x, u, w = torch.rand(5, 2).double(), torch.rand(5, 1).double(), torch.zeros(5, 0).double()
+    shift = shift_to(Pendulum(), TRUTH)
+    moved = PriorStep(Pendulum(), DT).xdot(x, w, u, w, torch.tensor(Pendulum().p) + shift)
+    np.testing.assert_allclose(moved, rates(given(TRUTH), x, u), rtol=1e-13, atol=1e-13)
 
 
 def test_wrong_parameters_move_to_the_truth(data, trained):
@@ -71,7 +99,7 @@ def test_wrong_parameters_move_to_the_truth(data, trained):
 
 def test_bounds_hold(data):
     class Narrow(Pendulum):
-        parameters_spec = (
+        parameters = (
             Parameter("J", 0.15, "kg m^2", 0.14, 0.5),
             Parameter("mgl", 1.0, "N m", 1.0, 1.0),
             Parameter("d", 0.01, "N m s/rad", 0.01, 0.5),
@@ -84,10 +112,10 @@ def test_bounds_hold(data):
     assert "prior.mgl" not in narrow.weights  # fixed
     run = TrainingRun(Narrow(), *data, SHORT)
     with torch.no_grad():
-        run.physics.ways["J"].fill_(7.0)
-        run.physics.ways["d"].fill_(-7.0)
-    run.physics.project()
-    values = run.physics.values()
+        run.parameters.ways["J"].fill_(7.0)
+        run.parameters.ways["d"].fill_(-7.0)
+    run.parameters.project()
+    values = run.parameters.values()
     assert values["J"].tolist() == pytest.approx([0.5, 0.5], rel=1e-15)
     assert values["d"].tolist() == pytest.approx([0.01, 0.01], rel=1e-15)
 
@@ -103,11 +131,11 @@ def test_the_step_made_of_it_is_the_one_that_was_trained(data):
     run._load(run.best_weights)
     trained = run.result()
     x, u = torch.rand(2, 3, 2).double(), torch.rand(2, 3, 1).double()
-    h = torch.rand(2, 3, 4).double()
+    h, w = torch.rand(2, 3, 4).double(), torch.zeros(2, 3, 0).double()
     with torch.no_grad():
-        stacked = run.step(x, h, u)
+        stacked = run.step(x, h, u, w)
         for i in range(2):
-            alone = trained.step(Pendulum(), DT, i)(x[i], h[i], u[i])
+            alone = trained.step(Pendulum(), DT, i)(x[i], h[i], u[i], w[i])
             for one, other in zip(stacked, alone, strict=True):
                 torch.testing.assert_close(one[i], other, rtol=1e-13, atol=1e-13)  # rounding of a step
 
@@ -121,23 +149,23 @@ def test_the_exported_model_carries_the_values_and_the_fitted_priors_balance(dat
     assert parity.jacobian_max_abs_error < 1e-12
     model = build_model("m", {f"m/{name}": p for name, p in programs.items()}, info)
     x, u = torch.tensor([0.4, 1.5]).double(), torch.tensor([0.2]).double()
-    for made, zero in ((prior, True), (with_values(prior, trained.prior_values()), False)):
-        rate = made(x, u).numpy()
+    for made, zero in ((prior, True), (given(trained.prior_values()), False)):
+        rate = rates(made, x, u)
         balance = float(model.balances[0].residual(x.numpy(), rate, u.numpy(), model.w, model.p))
         assert (abs(balance) < 1e-12) == zero  # W, rounding of terms of 1 W
     # with other parameters those that were trained are moved as far as the fitted ones
     more = {p.name: 1.1 * p.value for p in model.parameters}
     moved = {n: v + more[n] - prior.values[n] for n, v in trained.prior_values().items()}
     h = torch.rand(step.network.n_h).double()
-    before = [with_values(prior, values)(x, u).numpy() for values in (trained.prior_values(), moved)]
+    before = [rates(given(values), x, u) for values in (trained.prior_values(), moved)]
     after = [model.xdot(x.numpy(), h.numpy(), u.numpy(), model.w, p) for p in (model.p, list(more.values()))]
     np.testing.assert_allclose(
         (after[1] - after[0]).full().ravel(), before[1] - before[0], rtol=1e-9, atol=1e-9
     )
     # without the values the network alone would be another model
     bare = replace(trained, weights={n: w for n, w in trained.weights.items() if "prior." not in n})
-    h = torch.zeros(step.network.n_h).double()
-    assert abs(bare.step(prior, DT).xdot(x, h, u) - step.xdot(x, h, u)).max() > 1.0
+    h, w = torch.zeros(step.network.n_h).double(), torch.zeros(0).double()
+    assert abs(bare.step(prior, DT).xdot(x, h, u, w) - step.xdot(x, h, u, w)).max() > 1.0
     ours, theirs = (score(free_runs(s, prior, data[1], 10, h)).e_sim_s for s in (step, bare.step(prior, DT)))
     assert ours < theirs
 
@@ -148,6 +176,6 @@ def test_what_cannot_be_trained_along_is_refused(data, trained):
     with pytest.raises(InputError, match="fixed, trained"):
         replace(SHORT, prior_parameters="free")
     with pytest.raises(InputError, match="no free parameter"):
-        StackedPrior(PublishedPendulumPrior(), 2)
+        TrainedParameters(PublishedPendulumPrior(), 2)
     with pytest.raises(InputError, match="has no parameter J, mgl"):
         trained.step(PublishedPendulumPrior(), DT)

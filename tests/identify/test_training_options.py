@@ -39,7 +39,9 @@ def test_every_option_trains_resumes_and_makes_a_model(data, usual, options, tmp
         assert not np.array_equal(whole.validation, usual.validation)
     step = whole.step(PRIOR, DT)
     x_next, h_next = step(
-        torch.zeros(2).double(), torch.zeros(step.network.n_h).double(), torch.ones(1).double()
+        *(torch.zeros(n).double() for n in (2, step.network.n_h)),
+        torch.ones(1).double(),
+        torch.zeros(0).double(),
     )
     assert torch.isfinite(torch.cat([x_next, h_next])).all()
 
@@ -60,10 +62,16 @@ def test_any_number_of_objectives(data, usual, monkeypatch):
     ("wrong", "words"),
     [
         ({"kind": "gru"}, "mopgrnn"),
-        ({"objectives": ("error", "power")}, "error, energy"),
         ({"objectives": ()}, "at least one"),
     ],
 )
 def test_settings_that_are_none_are_refused_with_what_there_is(wrong, words):
     with pytest.raises(InputError, match=words):
         replace(SHORT, **wrong)
+
+
+def test_objectives_that_the_prior_lacks_are_refused_before_the_training(data):
+    with pytest.raises(
+        InputError, match="power; choose of: error, output, balances, and .* Pendulum: energy"
+    ):
+        train(PRIOR, *data, replace(SHORT, objectives=("error", "power")), on_progress=None)
