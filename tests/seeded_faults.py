@@ -72,7 +72,7 @@ class Verdict:
 
 
 FOLDERS = {
-    "machine": "tests/identify",
+    "machine": "tests/machine",
     "data": "tests/data",
     "identify": "tests/identify",
     "model": "tests",
@@ -99,23 +99,22 @@ def fault(room: str, what: str, old: str, new: str, words: str = "", folder: str
 FAULTS = (
     fault(
         "machine", "the energy balance is a sum of forces, not of powers",
-        "(v_dot - self.acceleration(x, u)) * v).sum(-1)", "(v_dot - self.acceleration(x, u))).sum(-1)",
-        "friction",
+        "ca.dot(force, v), ca.dot(friction, v)", "ca.sum1(force), ca.sum1(friction)",
     ),
     fault(
         "machine", "friction decelerates by its torque, not by torque over inertia",
-        "return free - torques(self, x) / self.inertia(x)", "return free - torques(self, x)",
+        "rate = driving / ca.diag(mass)", "rate = (driving + friction) / ca.diag(mass) - friction",
         "friction",
     ),
     fault(
         "machine", "a Stribeck curve starts above its static level",
-        "(level + (static - level) * torch.exp(-ratio * ratio))", "(level + static * torch.exp(-ratio * ratio))",
+        "(level + (static - level) * (-ratio * ratio).exp())", "(level + static * (-ratio * ratio).exp())",
         "friction",
     ),
     fault(
         "machine", "the shares of the two inputs that act within one period are swapped",
         "u=(1 - share) * younger + share * older", "u=share * younger + (1 - share) * older",
-        "delay",
+        "delay", "identify",
     ),
     fault(
         "data", "the input of a period is the mean over the period before",
@@ -140,12 +139,12 @@ FAULTS = (
     ),
     fault(
         "identify", "the smoother takes a standard deviation for a variance",
-        "np.zeros(2 * n_q), np.square(self.walk)", "np.zeros(2 * n_q), np.abs(self.walk)",
+        "np.zeros(n_x), np.square(self.walk)", "np.zeros(n_x), np.abs(self.walk)",
         "smoothing",
     ),
     fault(
         "identify", "standard errors of parameters ignore that initial states were fitted too",
-        "(own - states @ (states.T @ own)) / noise", "own / noise",
+        "b, error = b - a @ known[..., :-1], error -", "b, error = b, error -",
         "shooting",
     ),
     fault(

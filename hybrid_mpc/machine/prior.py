@@ -284,8 +284,8 @@ def column(value: Any, n: int, what: str, names: Sequence[str] = ()) -> ca.SX:
             "written in torch? Then it must be a TorchPrior"
         ) from error
     if found.shape[0] != n:
-        each = f" ({', '.join(names)})" if names else ""
-        raise InputError(f"{what} must give {n} value{'s' * (n != 1)}{each}, got {found.shape[0]}")
+        each = f": one for each of {', '.join(names)} is needed" if names else ""
+        raise InputError(f"{what} must give {n} values, got {found.shape[0]}{each}")
     return ca.densify(found)
 
 

@@ -182,19 +182,20 @@ def nothing(x, u, m):
 
 
 PLACE = "test_preflight.py"
+EACH = "one for each of level, warmth is needed"
 AT = ["at x = [0.0, 0.0], u = [0.0]", "within the signals' ranges"]
 IN_BOTH = {
     # what a user gets wrong in the same way in CasADi and in torch
     "too few rates": (flow(lambda x, u, p, m: u.inflow / p.area),
-                      ["Changed.xdot(x, u, w, p) must give 2 values (level, warmth), got 1"]),
-    "too many rates": (flow(*3 * [lambda x, u, p, m: u.inflow]), ["must give 2 values (level, warmth), got 3"]),
-    "no tuple": (members(xdot=lambda self, x, u, w, p: u.inflow), ["must give 2 values (level, warmth), got 1"]),
+                      ["Changed.xdot(x, u, w, p) must give 2 values, got 1: " + EACH]),
+    "too many rates": (flow(*3 * [lambda x, u, p, m: u.inflow]), ["must give 2 values, got 3: " + EACH]),
+    "no tuple": (members(xdot=lambda self, x, u, w, p: u.inflow), ["must give 2 values, got 1: " + EACH]),
     "no return": (members(xdot=lambda self, x, u, w, p: None), ["Changed.xdot", "NoneType", "'return' missing"]),
     "xdot raises": (members(xdot=lambda self, x, u, w, p: raises()), ["prior raised KeyError: 'forgotten'", PLACE]),
     "a typing error": (flow(lambda x, u, p, m: x.levle), ["nothing is called 'levle'", "level, warmth", PLACE]),
     "no such parameter": (level(lambda x, u, p, m: p.volume), ["nothing is called 'volume'", "area, k", PLACE]),
     "output of another shape": (members(output=lambda self, x, u, w, p: (x.level,)),
-                                ["Changed.output(x, u, w, p) must give 2 values (level, warmth), got 1"]),
+                                ["Changed.output(x, u, w, p) must give 2 values, got 1: " + EACH]),
     "output without return": (members(output=lambda self, x, u, w, p: None), ["Changed.output", "'return' missing"]),
     "output raises": (members(output=lambda self, x, u, w, p: raises()), ["prior raised KeyError", PLACE]),
     "an output that is no state": (members(outputs=(Tank.states[0], Signal("hot", "K"))),
@@ -274,9 +275,9 @@ WRONG = {
     "friction that drives": (prior(friction=lambda self, q, v, p: -0.1 * v.phi_dot),
                              ["balance energy [W]: the loss is -", "must not be negative"]),
     "friction of two": (prior(friction=lambda self, q, v, p: (v.phi_dot, v.phi_dot)),
-                        ["Changed.friction(q, v, p) must give 1 value (phi_dot), got 2"]),
+                        ["Changed.friction(q, v, p) must give 1 values, got 2: one for each of phi_dot"]),
     "potential without return": (prior(potential=lambda self, q, p: None), ["Changed.potential(q, p)", "'return'"]),
-    "force of two": (prior(force=lambda self, q, v, u, w, p: (u.tau, u.tau)), ["must give 1 value (phi_dot), got 2"]),
+    "force of two": (prior(force=lambda self, q, v, u, w, p: (u.tau, u.tau)), ["got 2: one for each of phi_dot"]),
     "two inputs and no force": (lambda: prior(inputs=(Signal("a", "N"), Signal("b", "N")))() | data(inputs=("a", "b")),
                                 ["2 inputs drive 1 degrees of freedom; define force(q, v, u, w, p)"]),
     "three states": (prior(states=(*Pendulum.states, Signal("i", "A"))), ["[q, v] in pairs"]),
