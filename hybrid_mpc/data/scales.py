@@ -38,10 +38,8 @@ def noise_of(recordings: Sequence[Outputs]) -> Array:
     too, so the number is at most too large.
     """
     third = np.concatenate([np.diff(r.y, 3, axis=0) for r in recordings])
-    third = third[np.isfinite(third).all(axis=1)]
-    if not len(third):
-        return np.zeros(recordings[0].y.shape[1])
-    return np.asarray(np.std(third, axis=0) / math.sqrt(20.0))
+    there = (column[np.isfinite(column)] for column in third.T)
+    return np.array([np.std(column) / math.sqrt(20.0) if len(column) else 0.0 for column in there])
 
 
 def speeds_of(recording: Outputs, dt: float, half: int) -> Array:
@@ -62,7 +60,8 @@ def _derivatives(y: Array, dt: float, half: int, order: int) -> Array:
         return np.zeros((0, y.shape[1]))
     from scipy.signal import savgol_filter  # slow to import, and monitors import this module
 
-    found = savgol_filter(y, window, 3, deriv=order, delta=dt, axis=0)[half : len(y) - half]
+    # at the ends, which are cut off, nothing is fitted: a sample may be missing there
+    found = savgol_filter(y, window, 3, deriv=order, delta=dt, axis=0, mode="constant")[half : len(y) - half]
     return np.asarray(found[np.isfinite(found).all(axis=1)])
 
 
@@ -97,10 +96,9 @@ def time_scale(recordings: Sequence[Outputs], dt: float) -> float:
 def _time_scale(recordings: Sequence[Outputs], dt: float, i: int, sigma: float) -> float:
     """Time scale of one output; NaN where its acceleration never stands out of the noise."""
     half, longest = SHORTEST, max(len(r.y) for r in recordings)
+    outputs = [_bridged(r.y[:, i]) for r in recordings]
     while 2 * half + 1 <= longest:
-        speed, acceleration = (
-            [_derivatives(r.y[:, i : i + 1], dt, half, order) for r in recordings] for order in (1, 2)
-        )
+        speed, acceleration = ([_derivatives(y, dt, half, order) for y in outputs] for order in (1, 2))
         v = np.concatenate([part - part.mean() for part in speed if len(part)] or [np.zeros((0, 1))])
         a = np.concatenate(acceleration)
         noise = [sigma * speed_gain(dt, half, order) for order in (1, 2)]
@@ -110,6 +108,16 @@ def _time_scale(recordings: Sequence[Outputs], dt: float, i: int, sigma: float) 
             return 2 * math.pi * math.sqrt(moved / (power - noise[1] ** 2))
         half *= 2
     return math.nan
+
+
+def _bridged(y: Array) -> Array:
+    """An output ``(n, 1)`` with straight lines over missing samples; what comes before the first one and after the last
+    is cut off.
+    """
+    there = np.flatnonzero(np.isfinite(y))
+    if not len(there):
+        return np.zeros((0, 1))
+    return np.interp(np.arange(there[0], there[-1] + 1), there, y[there])[:, None]
 
 
 def time_unit(recordings: Sequence[Outputs], dt: float) -> float:

@@ -22,6 +22,8 @@ from hybrid_mpc.machine.prior import Equations, Prior
 Array = NDArray[np.float64]
 SWEEPS = 4
 """Linearizations along the smoothed trajectory, after the first along the filter's estimates."""
+MOST_SWEEPS = 20
+"""Linearizations at most, where the censored samples that count are not yet the same from one to the next."""
 DECADES = (-6.0, 2.0)
 """Range searched for the walk of the unexplained rates, as a power of ten of their natural size: from a prior that is
 right to one that explains nothing."""
@@ -94,10 +96,10 @@ class Smoother:
         for group in _by_length(trajectories):
             found = self._filtered(list(group.values()))
             skip = min(math.ceil(self._n_z / max(1, len(self.sigma))), found.y.shape[1] - 1)
-            e, s, seen = (v[:, skip:] for v in (found.e, found.s, found.seen))
+            e, s, counted = (v[:, skip:] for v in (found.e, found.s, found.counted))
             squares += float(np.sum(e * np.linalg.solve(s, e[..., None])[..., 0]))
             logs += float(np.linalg.slogdet(s)[1].sum())
-            count += int(seen.sum())
+            count += int(counted.sum())
         return squares, logs, count
 
     @property
@@ -121,9 +123,13 @@ class Smoother:
 
     def _estimate(self, group: Sequence[Trajectory]) -> Array:
         """Smoothed ``(x, d)`` ``(b, n, n_z)`` of trajectories of one length."""
-        z = _smoothed(self._filtered(group))
-        for _ in range(SWEEPS):
-            z = _smoothed(self._filtered(group, z))
+        found = self._filtered(group)
+        z = _smoothed(found)
+        for i in range(MOST_SWEEPS):
+            found, before = self._filtered(group, z), found.counted
+            z = _smoothed(found)
+            if i + 1 >= SWEEPS and np.array_equal(before, found.counted):
+                break
         return z
 
     def _filtered(self, group: Sequence[Trajectory], along: Array | None = None) -> _Filtered:
@@ -151,8 +157,10 @@ class Smoother:
             *(v.reshape(b * n, v.shape[-1]).T for v in signals),
             *(np.tile(c[:, None], (1, b)) for c in constant),
         )
-        ahead_, now, slope, e, s = (np.moveaxis(v.full().reshape(v.shape[0], b, n, -1), 0, 2) for v in found)
-        return _Filtered(y, seen, first, spread, ahead_, now, slope, e[..., 0], s)
+        ahead_, now, slope, e, s, counts = (
+            np.moveaxis(v.full().reshape(v.shape[0], b, n, -1), 0, 2) for v in found
+        )
+        return _Filtered(y, counts[..., 0] > 0, first, spread, ahead_, now, slope, e[..., 0], s)
 
     def _start(self, trajectory: Trajectory) -> Array:
         """States at the first sample: nearest to rest, in their sizes, of those that explain what is measured."""
@@ -175,10 +183,13 @@ class Smoother:
 
 @dataclass(frozen=True)
 class _Filtered:
-    """A filter's results for ``b`` trajectories of ``n`` samples; the last axis is ``[z, P]`` of estimates."""
+    """A filter's results for ``b`` trajectories of ``n`` samples; the last axis is ``[z, P]`` of estimates.
+
+    ``counted`` are the samples that are there, without the censored ones that nothing contradicts.
+    """
 
     y: Array
-    seen: NDArray[np.bool_]
+    counted: NDArray[np.bool_]
     first: Array
     spread: Array
     ahead: Array
@@ -353,7 +364,7 @@ def _filters(
 
     Takes what is expected ``[z, P]``, a sample ``y``, which outputs were seen, which are censored, ``u, w``, ``z`` to
     linearize along, ``p``, variances of the noise and of the walk. Gives what is expected of the next sample, the
-    estimate ``[z, P]``, the transition, and the innovation with its covariance.
+    estimate ``[z, P]``, the transition, the innovation with its covariance, and which samples counted.
     """
     xdot = with_unknown_rates(equations.xdot, corrected)
     n_x, n_z, n_y = equations.xdot.size1_in(0), xdot.size1_in(0), equations.output.size1_out(0)
@@ -382,8 +393,10 @@ def _filters(
     for own in (True, False):
         z, covariance = ahead[:, 0], ahead[:, 1:]
         expected, c = linear(z, z if own else along)
-        # a censored sample counts where the estimate lies on the measured side of its limit
-        counts = seen * (1 - ca.logic_and(censored != 0, censored * (expected - y) > 0))
+        # a censored sample counts where the estimate lies on the measured side of its limit: that of all samples, once
+        # there is one, since later samples may draw an earlier state across
+        estimate = expected if own else equations.output(along[:n_x], u, w, p)
+        counts = seen * (1 - ca.logic_and(censored != 0, censored * (estimate - y) > 0))
         e, c = counts * (y - expected), ca.diag(counts) @ c
         s = c @ covariance @ c.T + ca.diag(counts * r + (1 - counts))
         gain = ca.solve(s, c @ covariance).T if n_y > 1 else (covariance @ c.T) / s
@@ -391,7 +404,7 @@ def _filters(
         covariance = 0.5 * (covariance + covariance.T)
         after, slope = moved(z, z if own else along)
         later = ca.horzcat(after, slope @ covariance @ slope.T + ca.diag(noise))
-        outputs = [ca.densify(v) for v in (later, ca.horzcat(z, covariance), slope, e, s)]
+        outputs = [ca.densify(v) for v in (later, ca.horzcat(z, covariance), slope, e, s, counts)]
         given = [ahead, y, seen, censored, u, w, *([] if own else [along]), p, r, noise]
         made.append(ca.Function("filter" if own else "again", given, [ca.cse(v) for v in outputs]))
     return made[0], made[1]

@@ -89,3 +89,31 @@ def test_the_steps_of_a_coarse_sensor_are_no_motion():
     exact = sinusoid(60.0, 0.02, n=12_000, size=6e-2 / (2 * np.pi)).y
     coarse = Outputs(1e-4 * np.round(exact / 1e-4))
     assert time_scale([coarse], 0.02) == pytest.approx(60.0, rel=0.1)
+
+
+@pytest.mark.parametrize("missing", ["half", "the first and the last", "every other", "a stretch"])
+def test_missing_samples_leave_the_scales(missing):
+    run = sinusoid(2.0, 0.02, noise=1e-3)
+    y = np.hstack([run.y, sinusoid(40.0, 0.02, noise=1e-3).y])
+    n = len(y)
+    if missing == "half":
+        y[np.random.default_rng(1).uniform(size=y.shape) < 0.5] = np.nan
+    elif missing == "the first and the last":
+        y[: n // 10] = y[-n // 10 :] = np.nan
+    elif missing == "every other":  # two sensors by turns: no row is whole
+        y[::2, 0] = y[1::2, 1] = np.nan
+    else:
+        y[1000:1400] = np.nan
+    # the noise of what has four samples in a row; what has not shows none
+    noise = noise_of([Outputs(y)])
+    assert noise == pytest.approx(0.0 if missing == "every other" else 1e-3, rel=0.15)
+    # straight lines over the holes bend the motion at their ends: a tenth of the scale, and a machine's second stays
+    assert time_scale([Outputs(y)], 0.02) == pytest.approx(2.0, rel=0.2)
+    assert time_unit([Outputs(y)], 0.02) == 1.0
+
+
+def test_an_output_that_is_never_there_has_no_scale():
+    y = np.hstack([sinusoid(2.0, 0.02).y, np.full((4000, 1), np.nan)])
+    assert time_scale([Outputs(y)], 0.02) == pytest.approx(2.0, rel=0.05)
+    assert np.isnan(time_scale([Outputs(y[:, 1:])], 0.02))
+    assert noise_of([Outputs(y)])[1] == 0.0

@@ -196,9 +196,9 @@ def test_balances_stands_for_all_of_the_prior():
         (
             Tanks,
             ("error", "energy"),
-            "objectives: energy; .* error, output, balances, .* balances of Tanks: volume",
+            r"objectives: energy; .* error, output, balances, .* balances of Tanks: volume",
         ),
-        (Observed, ("balances",), "objectives: there is none; .* Observed: it has none"),
+        (Observed, ("balances",), r"objectives: there is none; .* Observed: it has none"),
         (Observed, ("position", "power"), "position, power"),
     ],
 )

@@ -115,7 +115,7 @@ def test_a_prior_too_stiff_for_its_period_is_refused():
     stiff = Pendulum({"J": 0.02, "d": 0.5})
     assert required_substeps(stiff, 0.1) >= 3  # the rate d / J = 25 1/s asks for ceil(2.5) or more
     for make in (lambda: required_substeps(stiff, 10.0), lambda: PriorStep(stiff, 10.0)):
-        with pytest.raises(InputError, match="Pendulum: the prior.*smaller dt"):
+        with pytest.raises(InputError, match=r"Pendulum: the prior.*smaller dt"):
             make()
 
 

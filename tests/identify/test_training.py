@@ -6,8 +6,8 @@ import torch
 from simulated_pendulum import DT, TRUTH, Pendulum, killed_and_resumed, same_training
 
 from hybrid_mpc import InputError, TrainingSettings, train
-from hybrid_mpc.identify.dataset import cut_windows, fitting_horizon
 from hybrid_mpc.identify import train as training
+from hybrid_mpc.identify.dataset import cut_windows, fitting_horizon
 from hybrid_mpc.identify.objectives import objectives_of
 from hybrid_mpc.identify.settings import KINDS
 from hybrid_mpc.identify.train import REPEATS, TrainingRun, load_checkpoint, save_checkpoint

@@ -72,6 +72,6 @@ def test_settings_that_are_none_are_refused_with_what_there_is(wrong, words):
 
 def test_objectives_that_the_prior_lacks_are_refused_before_the_training(data):
     with pytest.raises(
-        InputError, match="power; choose of: error, output, balances, and .* Pendulum: energy"
+        InputError, match=r"power; choose of: error, output, balances, and .* Pendulum: energy"
     ):
         train(PRIOR, *data, replace(SHORT, objectives=("error", "power")), on_progress=None)
