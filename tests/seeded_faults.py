@@ -134,7 +134,7 @@ FAULTS = (
     ),
     fault(
         "data", "a sensor's noise is estimated too large: the factor of first differences on third ones",
-        "np.std(third, axis=0) / math.sqrt(20.0)", "np.std(third, axis=0) / math.sqrt(2.0)",
+        "np.std(column) / math.sqrt(20.0)", "np.std(column) / math.sqrt(2.0)",
         "scales",
     ),
     fault(
