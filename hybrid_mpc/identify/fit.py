@@ -633,13 +633,15 @@ def refit(
 ) -> PriorFit:
     """Parameters fitted anew to recordings of a machine that has changed, from those of an earlier fit on.
 
-    The delay and what smooths states stay. ``lengths`` [s] are those of the windows, one after the other.
+    The delay and what smooths states stay. ``lengths`` [s] are those of the windows, one after the other; none
+    is longer than the longest recording.
     """
     known = smoothed(make, fit, trajectories, dt)
     own, sizes, stages = OutputFit(make, dt), np.array(fit.smoother(make(fit.values), dt).sizes.x), []
     found = Fitted(own.scaled(fit.values), np.zeros((0, 0)), ())
     for length in lengths:
-        windows = cut_outputs(known, scales.periods(length, dt, 2), 0, WINDOWS)
+        periods = min(scales.periods(length, dt, 2), _longest(known) - 1)
+        windows = cut_outputs(known, periods, 0, WINDOWS)
         found = own.fit(found.theta, windows, sizes, ITERATIONS)
         stages.append({"stage": f"free runs of {length:g} s", "validation_error": found.error})
     return replace(

@@ -50,8 +50,9 @@ CANDIDATES = ("phy", "pgrnn", "mopgrnn", "pgrnn mean", "mopgrnn mean")
 IN_MOTION = 0.1
 """Least length [s] that is given of a validation piece: it begins in motion, while a recording that gives less (EMPS,
 20 ms) begins at rest, and two samples tell no speed next to an unknown acceleration."""
-REFIT_LENGTHS = (0.5, 1.0)
-"""Free runs [s] of a refit, the short ones first: from parameters that are far off a long one leads nowhere."""
+REFIT_LENGTHS = (0.5, 1.0, 3.0)
+"""Free runs [s] of a refit, the short ones first: from parameters that are far off a long one leads nowhere. Short ones
+alone spend what little there is on their first states; 3 s are what a refit is mostly given, whole."""
 FEWEST_RUNS = 3
 """Free runs of a refit at least: one alone would be fitted by any parameters."""
 

@@ -21,7 +21,8 @@ from hybrid_mpc.kit.assembly import make_controller, make_estimator
 from hybrid_mpc.loop.faults import check_channels, install
 from hybrid_mpc.loop.loop import Loop
 from hybrid_mpc.loop.plant import Plant
-from hybrid_mpc.machine.prior import Prior
+from hybrid_mpc.machine.mechanical import MechanicalPrior
+from hybrid_mpc.machine.prior import POINT, BalanceEquations, OperatingPoint, Prior
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.scenario import Budget, Scenario, Task
@@ -32,6 +33,11 @@ POINTS = 16
 """Points at which a prior is asked, beside the origin."""
 BALANCE = 1e-6
 """Largest residual of a balance along the prior's own flow, as a share of its terms: rounding is 1e9 times less."""
+
+
+_FINITE = "; it must be within the signals' ranges. Keep a root, a logarithm or a division off its end"
+IF = "Cannot compute the truth value"
+"""What CasADi says where code decides by an expression."""
 
 
 @dataclass
@@ -52,14 +58,15 @@ class _Report:
         except InputError as error:
             self.add(f"{what}: {error}")
         except Exception as error:  # the user's own code may raise anything, and this is where it is reported
-            self.add(f"{what} raised {type(error).__name__}: {_first_line(error)}{_place(error)}")
+            hint = "; write ca.if_else(condition, one, other) instead of if" if IF in str(error) else ""
+            self.add(f"{what} raised {type(error).__name__}: {_first_line(error)}{_place(error)}{hint}")
 
 
 def check_scenario(scenario: Scenario, budget: Budget | None = None) -> None:
     """Build and call everything that a scenario defines, before any work is done.
 
-    The prior is asked at the origin and at random points within its signals' ranges, as a batch and one by one;
-    exported; and the model, controllers, estimators, plant, tasks and their references are built of it and called.
+    The prior is asked at the origin and at random points within its signals' ranges, and exported; the model,
+    controllers, estimators, plant, tasks and their references are built of it and called.
     Budgets are all of the scenario's where none is given.
 
     Raises:
@@ -101,6 +108,7 @@ def _check_prior(report: _Report, scenario: Scenario) -> Prior | None:
         except ExportError as error:
             raise InputError(str(error)) from error
         _check_point(prior)
+        _check_masses(prior)
         _check_equations(prior)
     return None if report.problems else prior
 
@@ -108,7 +116,7 @@ def _check_prior(report: _Report, scenario: Scenario) -> Prior | None:
 def _check_signals(report: _Report, prior: Prior) -> None:
     for role in ("states", "inputs", "outputs", "disturbances"):
         signals = getattr(prior, role)
-        if not (signals or role == "disturbances") or not all(isinstance(s, Signal) for s in signals):
+        if not (signals or role == "disturbances"):
             report.add(f"prior: {role} must be a tuple of one Signal or more, got {signals!r}")
         elif len({s.name for s in signals}) < len(signals):
             report.add(f"prior: two of the {role} have the same name: {[s.name for s in signals]}")
@@ -118,69 +126,109 @@ def _check_signals(report: _Report, prior: Prior) -> None:
 
 
 def _check_point(prior: Prior) -> None:
-    """The operating point: sizes, ranges, and an equilibrium to a thousandth of the rates beside it."""
+    """The operating point has the right sizes and lies within the ranges."""
     point = prior.operating_point
     if point is None:
         return
+    if not isinstance(point, OperatingPoint):
+        raise InputError(f"operating_point must be OperatingPoint(x=(...), u=(...)), got {point!r:.80}")
     for name, values, signals in (
         ("x", point.x, prior.states), ("u", point.u, prior.inputs), ("w", point.w, prior.disturbances),
     ):  # fmt: skip
         if len(values) != len(signals):
             raise InputError(
-                f"operating_point: {name} needs {len(signals)} numbers, got {len(values)}: {values}"
+                f"operating_point: {name} needs {len(signals)} numbers ("
+                f"{', '.join(s.name for s in signals) or 'there are none'}), got {len(values)}: {values}"
             )
-        beyond = [s.label for s, v in zip(signals, values, strict=True) if not s.lower <= v <= s.upper]
+        beyond = [
+            f"{s.label} from {s.lower:g} to {s.upper:g}"
+            for s, v in zip(signals, values, strict=True)
+            if not (s.lower <= v <= s.upper and math.isfinite(v))
+        ]
         if beyond:
-            raise InputError(f"operating_point: {name} is outside the range of {', '.join(beyond)}: {values}")
+            raise InputError(
+                f"operating_point: {name} = {values} is outside the range of {', '.join(beyond)}; correct it, or the "
+                "bounds of the signal"
+            )
 
 
 def _check_equations(prior: Prior) -> None:
     """Rates, outputs and their derivatives are finite within the signals' ranges, and balances hold along the flow."""
-    signals = prior.states, prior.inputs, prior.disturbances
-    x, u, w = (_points(group, seed) for seed, group in enumerate(signals))
+    points = _Points.of(prior)
+    x, u, w = points.x, points.u, points.w
     p, equations = prior.p, prior.equations
     for what, f in (("xdot(x, u, w, p)", equations.xdot), ("output(x, u, w, p)", equations.output)):
-        symbols = [ca.SX.sym(f.name_in(i), f.size1_in(i)) for i in range(4)]
-        value = f(*symbols)
-        slope = ca.Function(
-            "slope", symbols, [ca.vertcat(value, ca.vec(ca.densify(ca.jacobian(value, symbols[0]))))]
-        )
-        found = slope(x.T, u.T, w.T, p).full()
-        bad = ~np.isfinite(found).all(axis=0)
-        if bad.any():
-            k = int(np.argmax(bad))
-            which = "it is" if not np.isfinite(found[: value.shape[0], k]).all() else "its derivative by x is"
-            points = ", ".join(
-                f"{n} = {v[k].tolist()}" for n, v in zip("xuw", (x, u, w), strict=True) if v.size
-            )
-            raise InputError(
-                f"{what}: {which} not finite at {points}; it must be within the signals' ranges. Keep a root or a "
-                "division off its end, e.g. sqrt(fmax(level, 1e-6))"
-            )
-    rates = equations.xdot(x.T, u.T, w.T, p)
+        symbols = dict(zip(POINT, f.sx_in(), strict=True))
+        value = f(*symbols.values())
+        parts = {"it": value} | {
+            f"its derivative by {key}": ca.vec(ca.densify(ca.jacobian(value, symbols[key]))) for key in "xup"
+        }
+        found = ca.Function("parts", [*symbols.values()], [*parts.values()])(x.T, u.T, w.T, p)
+        for which, values in zip(parts, found, strict=True):
+            bad = ~np.isfinite(values.full()).all(axis=0)
+            if bad.any():
+                where = points.named(int(np.argmax(bad)))
+                raise InputError(
+                    f"{what}: {which} is not finite at {where}{_FINITE}, e.g. sqrt(fmax(level, 1e-6))"
+                )
+    rates = equations.xdot(x.T, u.T, w.T, p).full()
     for balance in equations.balances:
-        terms = [abs(f(x.T, u.T, w.T, p).full()) for f in (balance.supply, balance.loss)]
-        loss = balance.loss(x.T, u.T, w.T, p).full()
-        residual = balance.residual(x.T, rates, u.T, w.T, p).full()
-        size = max(float(np.max(term)) for term in (*terms, np.abs(residual)))
-        name = f"balance {balance.name} [{balance.rate_unit}]"
-        if not np.isfinite(residual).all():
-            raise InputError(f"{name}: it must be finite within the signals' ranges")
-        if float(np.abs(residual).max()) > BALANCE * size:
+        _check_balance(prior, balance, points, rates)
+
+
+def _check_balance(prior: Prior, balance: BalanceEquations, points: _Points, rates: Array) -> None:
+    """A balance tells something of the rates, is finite, holds along the flow, and loses what is not negative."""
+    name = f"balance {balance.name} [{balance.rate_unit}]"
+    symbols = balance.residual.sx_in()
+    if not ca.depends_on(balance.residual(*symbols), symbols[1]):
+        corrected = ", ".join(prior.states[i].name for i in prior.corrected)
+        raise InputError(
+            f"{name}: the storage does not change with {corrected or 'any state'}, whose rates a network may correct, "
+            "so it tells nothing; store what changes with them, or leave the balance out"
+        )
+    x, u, w = points.x.T, points.u.T, points.w.T
+    supply, loss = (f(x, u, w, prior.p).full()[0] for f in (balance.supply, balance.loss))
+    residual = np.abs(balance.residual(x, rates, u, w, prior.p).full()[0])
+    bad = ~np.isfinite([supply, loss, residual]).all(axis=0)
+    if bad.any():
+        raise InputError(f"{name}: it is not finite at {points.named(int(np.argmax(bad)))}{_FINITE}")
+    size, k = float(np.max(np.abs([supply, loss, residual]))), int(np.argmax(residual))
+    if residual[k] > BALANCE * size:
+        raise InputError(
+            f"{name}: dS/dt - supply + loss is {residual[k]:.3g} along the prior's own flow at {points.named(k)}, "
+            "where it must be 0; is a term or a sign left out?"
+        )
+    k = int(np.argmin(loss))
+    if loss[k] < -BALANCE * size:
+        raise InputError(
+            f"{name}: the loss is {loss[k]:.3g} at {points.named(k)}; it must not be negative. Put what may have "
+            "either sign into the supply"
+        )
+
+
+def _check_masses(prior: Prior) -> None:
+    """A mass matrix is symmetric and positive definite within the signals' ranges."""
+    if not isinstance(prior, MechanicalPrior):
+        return
+    points, masses = _Points.of(prior), prior.masses
+    for k, q in enumerate(points.x[:, : prior.n_q]):
+        matrix = masses(q, prior.p).full()
+        right = np.isfinite(matrix).all() and np.allclose(matrix, matrix.T, rtol=BALANCE, atol=0)
+        if not right or np.linalg.eigvalsh(matrix).min() <= 0:
+            found = matrix.tolist() if prior.n_q > 1 else float(matrix[0, 0])
             raise InputError(
-                f"{name}: dS/dt - supply + loss is up to {float(np.abs(residual).max()):.3g} along the prior's own "
-                "flow, where it must be 0; is a term or a sign left out?"
-            )
-        if float(loss.min()) < -BALANCE * size:
-            k = int(np.argmin(loss))
-            raise InputError(
-                f"{name}: the loss is {float(loss.min()):.3g} at x = {x[k].tolist()}; it must not be negative. Put "
-                "what may have either sign into the supply"
+                f"mass_matrix(q, p) is {found} at {points.named(k)}; an inertia must be positive, a mass matrix "
+                "symmetric and positive definite. Check its terms and their signs"
             )
 
 
 def _check_data(report: _Report, scenario: Scenario, prior: Prior | None) -> None:
     spec = scenario.data
+    if prior is not None and prior.disturbances:
+        report.add(
+            f"data: the prior has measured disturbances {', '.join(s.name for s in prior.disturbances)}, and a "
+            "DataSpec cannot say yet which columns hold them; leave them out, or use fit_prior and train"
+        )
     if prior is not None:
         for what, columns, signals in (
             ("inputs", spec.inputs, prior.inputs),
@@ -368,6 +416,24 @@ def _check_task(task: Task, scenario: Scenario, prior: Prior, plant: Plant | Non
             raise InputError("weight: factors must not be negative")
     if plant is not None:
         check_channels(install(plant, task.faults)[1], len(prior.outputs), len(prior.inputs))
+
+
+@dataclass(frozen=True)
+class _Points:
+    """Where a prior is asked: states ``(n, n_x)``, inputs and disturbances."""
+
+    x: Array
+    u: Array
+    w: Array
+
+    @classmethod
+    def of(cls, prior: Prior) -> _Points:
+        signals = prior.states, prior.inputs, prior.disturbances
+        return cls(*(_points(group, seed) for seed, group in enumerate(signals)))
+
+    def named(self, k: int) -> str:
+        """One of them as text."""
+        return ", ".join(f"{name} = {v[k].tolist()}" for name, v in vars(self).items() if v.size)
 
 
 def _points(signals: Sequence[Signal], seed: int) -> Array:

@@ -102,15 +102,24 @@ class MechanicalPrior(Prior):
         q, v = ca.SX.sym("q", n), ca.SX.sym("v", n)
         mass = self._matrix(self.evaluated("mass_matrix", ("q", q), ("p", p)))
         potential = column(self.evaluated("potential", ("q", q), ("p", p)), 1, f"{kind}.potential(q, p)")
-        friction = column(
-            self.evaluated("friction", ("q", q), ("v", v), ("p", p)), n, f"{kind}.friction(q, v, p)"
-        )
+        rubbing = self.evaluated("friction", ("q", q), ("v", v), ("p", p))
+        friction = column(rubbing, n, f"{kind}.friction(q, v, p)", self.names_of("v"))
         given = ("q", q), ("v", v), ("u", u), ("w", w), ("p", p)
-        force = column(self.evaluated("force", *given), n, f"{kind}.force(q, v, u, w, p)")
+        force = column(self.evaluated("force", *given), n, f"{kind}.force(q, v, u, w, p)", self.names_of("v"))
         return q, v, mass, potential, friction, force
 
+    @property
+    def masses(self) -> ca.Function:
+        """The mass matrix as a function ``(q, p) -> M (n_q, n_q)``."""
+        q, p = ca.SX.sym("q", self.n_q), ca.SX.sym("p", len(self.parameters))
+        matrix = self._matrix(self.evaluated("mass_matrix", ("q", q), ("p", p)))
+        return ca.Function("mass_matrix", [q, p], [ca.densify(matrix)], ["q", "p"], ["M"])
+
     def _matrix(self, value: Any) -> ca.SX:
-        n, entries = self.n_q, [ca.SX(c) for c in components(value)]
+        n, found = self.n_q, components(value)
+        if any(one is None for one in found):
+            raise InputError(f"{type(self).__name__}.mass_matrix(q, p) gives None; is a 'return' missing?")
+        entries = [ca.SX(c) for c in found]
         if len(entries) == n:
             return ca.diag(ca.vertcat(*entries))
         if len(entries) != n * n:

@@ -26,6 +26,11 @@ POINT = ("x", "u", "w", "p")
 """What a prior's equations are functions of: states, inputs, measured disturbances, parameters."""
 
 
+_KINDS: dict[str, type] = {
+    "states": Signal, "inputs": Signal, "outputs": Signal, "disturbances": Signal, "parameters": Parameter,
+}  # fmt: skip
+
+
 @dataclass(frozen=True)
 class Balance:
     """What a machine stores of one kind, and what comes and goes: ``dS/dt = supply - loss``.
@@ -91,7 +96,8 @@ class Prior:
         values: Parameter values [their units] by name that replace the nominal ones, e.g. fitted ones.
 
     Raises:
-        InputError: If a name in ``values`` is no parameter, or ``corrects`` names no state.
+        InputError: If a name in ``values`` is no parameter, ``corrects`` names no state, or, when the class is made, a
+            signal or parameter is none.
 
     Example:
         >>> class Tank(Prior):
@@ -118,6 +124,16 @@ class Prior:
     parameters: ClassVar[tuple[Parameter, ...]] = ()
     corrects: ClassVar[tuple[str, ...] | None] = None
     operating_point: ClassVar[OperatingPoint | None] = None
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        for role, kind in _KINDS.items():
+            given = vars(cls).get(role, ())
+            if not isinstance(given, tuple) or not all(isinstance(one, kind) for one in given):
+                one = kind.__name__
+                raise InputError(
+                    f"{cls.__name__}: {role} must be a tuple of {one}, as ({one}(...), {one}(...)), got {given!r:.80}"
+                )
 
     def __init__(self, values: Mapping[str, float] | None = None) -> None:
         given = dict(values or {})
@@ -258,8 +274,8 @@ def components(value: Any) -> list[Any]:
     return [value]
 
 
-def column(value: Any, n: int, what: str) -> ca.SX:
-    """What a prior's method gives, as a column of ``n``."""
+def column(value: Any, n: int, what: str, names: Sequence[str] = ()) -> ca.SX:
+    """What a prior's method gives, as a column of ``n``, one for each of the ``names`` if they are given."""
     try:
         found = ca.vertcat(*(ca.SX(v) for v in components(value)))
     except (NotImplementedError, TypeError) as error:
@@ -268,13 +284,19 @@ def column(value: Any, n: int, what: str) -> ca.SX:
             "written in torch? Then it must be a TorchPrior"
         ) from error
     if found.shape[0] != n:
-        raise InputError(f"{what} must give {n} values, got {found.shape[0]}")
+        each = f": one for each of {', '.join(names)} is needed" if names else ""
+        raise InputError(f"{what} must give {n} values, got {found.shape[0]}{each}")
     return ca.densify(found)
 
 
 @cache
 def _tuple_of(names: tuple[str, ...]) -> Any:
-    return namedtuple("named", names, rename=True)  # what is no identifier has its place alone
+    def missing(_: Any, name: str) -> Any:
+        raise AttributeError(f"nothing is called {name!r} here; there is: {', '.join(names) or 'nothing'}")
+
+    # what is no identifier has its place alone
+    bases = (namedtuple("named", names, rename=True),)
+    return type("named", bases, {"__slots__": (), "__getattr__": missing})
 
 
 def named(names: tuple[str, ...], parts: Sequence[Any]) -> Any:
@@ -306,8 +328,9 @@ def _equations(alike: _Alike) -> Equations:
     sizes = (len(prior.names_of(key)) for key in POINT)
     point = [ca.SX.sym(key, n) for key, n in zip(POINT, sizes, strict=True)]
     rates, outputs, balances = prior.expressions(*point)
-    xdot = column(rates, len(prior.states), f"{kind}.xdot(x, u, w, p)")
-    y = column(outputs, len(prior.outputs), f"{kind}.output(x, u, w, p)")
+    x_names, y_names = ([s.name for s in signals] for signals in (prior.states, prior.outputs))
+    xdot = column(rates, len(x_names), f"{kind}.xdot(x, u, w, p)", x_names)
+    y = column(outputs, len(y_names), f"{kind}.output(x, u, w, p)", y_names)
     names = [b.name for b in balances]
     if len(set(names)) < len(names):
         raise InputError(f"{kind}.balances(x, u, w, p): two have the same name: {names}")

@@ -42,7 +42,9 @@ class TorchPrior(Prior):
 
     def evaluated(self, method: str, *arguments: tuple[str, ca.SX]) -> Any:
         """See :class:`~hybrid_mpc.machine.prior.Prior`."""
-        module = _Traced(self, method, tuple(self.names_of(key) for key, _ in arguments))
+        what = f"{type(self).__name__}.{method}"
+        kind = type(what, (_Traced,), {})  # what cannot be exported is told by this name
+        module = kind(self, method, tuple(self.names_of(key) for key, _ in arguments))
         examples = tuple(torch.ones(v.numel(), dtype=torch.float64) for _, v in arguments)
         try:
             shape = module.result(*examples)  # what it gives: tuples of tuples, balances
@@ -50,14 +52,19 @@ class TorchPrior(Prior):
             if "Tensor" not in str(error):
                 raise
             raise InputError(
-                f"{type(self).__name__}.{method} gets torch's tensors: {str(error).splitlines()[0]} Is it written in "
+                f"{what} gets torch's tensors: {str(error).splitlines()[0]} Is it written in "
                 "CasADi? Then it must be a Prior"
             ) from error
-        scalars = _scalars(shape)
+        scalars = _scalars(shape, what)
         if not any(isinstance(s, Tensor) for s in scalars):
             return shape
         names = [f"{key}{i}" for i, (key, _) in enumerate(arguments)]
-        program = nn_export.trace(module, examples, input_names=names)
+        try:
+            program = nn_export.trace(module, examples, input_names=names)
+        except nn_export.ExportError as error:
+            if str(error).startswith(what):
+                raise
+            raise type(error)(f"{what}: {error}") from error
         values = nn_export.build(program).expand()(*(v for _, v in arguments))
         return _like(shape, iter(ca.vertsplit(values)))
 
@@ -74,7 +81,7 @@ class _Traced(nn.Module):
         return getattr(self._prior, self._method)(*parts)
 
     def forward(self, *vectors: Tensor) -> Tensor:
-        found = [s for s in _scalars(self.result(*vectors)) if isinstance(s, Tensor)]
+        found = [s for s in _scalars(self.result(*vectors), type(self).__name__) if isinstance(s, Tensor)]
         return torch.stack([s.reshape(()).to(torch.float64) for s in found])
 
 
@@ -87,13 +94,13 @@ def _parts_of(value: Any) -> list[Any] | None:
     return list(value) if isinstance(value, tuple | list) else None
 
 
-def _scalars(value: Any) -> list[Any]:
+def _scalars(value: Any, what: str) -> list[Any]:
     parts = _parts_of(value)
     if parts is not None:
-        return [scalar for part in parts for scalar in _scalars(part)]
+        return [scalar for part in parts for scalar in _scalars(part, what)]
     if not isinstance(value, Tensor | float | int):
         raise InputError(
-            f"a method of a TorchPrior must give tensors or numbers in tuples, it gives {type(value).__name__}; is a "
+            f"{what} of a TorchPrior must give tensors or numbers in tuples, it gives {type(value).__name__}; is a "
             "'return' missing, or is it written in CasADi? Then it must be a Prior"
         )
     return [value]

@@ -44,6 +44,8 @@ class PaperStep(RecurrentStep):
         parts = [x / self.scale_x, u / self.scale_u]
         if self.use_prior:
             parts.append(self.prior_rates(x, u, w) / self.scale_rate)
+            if self.trained is not None:  # each network has features of its own
+                parts = [part.expand(*parts[-1].shape[:-1], -1) for part in parts]
         return torch.cat(parts, dim=-1)
 
     def integrate(

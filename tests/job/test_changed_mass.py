@@ -13,7 +13,6 @@ from hybrid_mpc import (
     trace_model,
     write_csv,
 )
-from hybrid_mpc.identify.prior import Physics
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.job.benchmark import refitted
 from hybrid_mpc.job.benchmark_runs import pieces, read_test, run_error, run_freely
@@ -59,25 +58,26 @@ def machines(tmp_path_factory):
     (before,) = read_test(scenario, recording(folder / "before.csv", OLD, seed=0, seconds=160.0))
     (after,) = read_test(scenario, recording(folder / "after.csv", HEAVIER, seed=1, seconds=10.0))
     smoother = fit_smoother(scenario.prior(OLD), pieces(before, 10.0), 0.02)
-    return before, after, Physics(PriorFit(OLD, {}, (), ()), 0.0, smoother.sigma, smoother.walk)
+    known = PriorFit(OLD, {}, (), (), sigma=smoother.sigma, walk=smoother.walk, sizes=smoother.sizes)
+    return before, after, known
 
 
-def rmse(physics, trajectory):
-    prior = scenario.prior(physics.fit.values)
-    runs = run_freely(prior, physics, {}, [trajectory], warm_up=scenario.data.warm_up, length=2.5)
+def rmse(fit, trajectory):
+    prior = scenario.prior(fit.values)
+    runs = run_freely(prior, fit, {}, [trajectory], warm_up=scenario.data.warm_up, length=2.5)
     return run_error(runs, "phy", scenario.benchmark).rmse
 
 
 def test_three_seconds_make_the_prior_know_the_heavier_mass(machines):
-    before, after, physics = machines
-    new, rest = refitted(scenario.prior, physics, after, seconds=3.0, dt=0.02)
+    before, after, old = machines
+    new, rest = refitted(scenario.prior, old, after, seconds=3.0, dt=0.02)
     # the inertia stays at its data-sheet value, so torque and dry friction seem smaller by what it has grown, and
     # gravity hardly changes; in 3 s viscous friction is not told from the torque (it went to zero), hence a tenth
-    assert new.fit.values["k_u"] == pytest.approx(0.83 / 1.27, rel=0.1)
-    assert new.fit.values["F_c"] == pytest.approx(0.15 / 1.27, rel=0.1)
-    assert new.fit.values["mgl"] == pytest.approx(2.98 * 1.28 / 1.27, rel=0.05)
-    assert rmse(physics, before) < 0.01  # the old model on the old machine: a few steps of the encoder
-    assert rmse(physics, rest) > 0.05  # on the new one
+    assert new.values["k_u"] == pytest.approx(0.83 / 1.27, rel=0.1)
+    assert new.values["F_c"] == pytest.approx(0.15 / 1.27, rel=0.1)
+    assert new.values["mgl"] == pytest.approx(2.98 * 1.28 / 1.27, rel=0.05)
+    assert rmse(old, before) < 0.01  # the old model on the old machine: a few steps of the encoder
+    assert rmse(old, rest) > 0.05  # on the new one
     assert rmse(new, rest) < 0.03  # the project's promise
     assert rest.t[0] == pytest.approx(3.0)
 

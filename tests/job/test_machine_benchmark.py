@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from cart import DELAY, TRUE, recording, written
 
-from hybrid_mpc import BenchmarkBudget, BenchmarkSpec, InputError, load_scenario
+from hybrid_mpc import BenchmarkBudget, BenchmarkSpec, InputError, fit_prior, load_scenario
 from hybrid_mpc.files import read_document, write_document
 from hybrid_mpc.identify.dataset import cut_windows
 from hybrid_mpc.identify.delay import shifted
-from hybrid_mpc.identify.prior import fit_physics
 from hybrid_mpc.job.benchmark import BenchmarkSettings, benchmark, load_model, training_settings
 from hybrid_mpc.job.benchmark_runs import BenchmarkRun, read_test, read_training, run_error, run_freely
 from hybrid_mpc.job.stages import identify as training_stage
@@ -47,13 +46,13 @@ def made(machine, tmp_path_factory):
 def test_the_delay_and_the_parameters_are_found(machine):
     scenario = load_scenario(str(machine[0]))
     data = read_training(scenario, [machine[1]])
-    physics = fit_physics(scenario.prior, data.train, data.valid, dt=0.1, length=20.0, largest_delay=0.3)
+    fit = fit_prior(scenario.prior, data.train, data.valid, dt=0.1, length=20.0, largest_delay=0.3)
     # a tenth of a period; the delayed input is a mean over the period, which a swing of 3 s hardly notices
-    assert abs(physics.delay - DELAY) < 0.01
+    assert abs(fit.delay - DELAY) < 0.01
     # the cubic spring counts as a stiffer one: at most 3 * 0.5 * 0.7^2 more, with swings of up to 0.7 m
-    assert TRUE["k"] < physics.fit.values["k"] < TRUE["k"] + 0.75
-    assert abs(physics.fit.values["d"] - TRUE["d"]) < 0.15
-    assert set(physics.fit.standard_errors) == {"k", "d"}
+    assert TRUE["k"] < fit.values["k"] < TRUE["k"] + 0.75
+    assert abs(fit.values["d"] - TRUE["d"]) < 0.15
+    assert set(fit.standard_errors) == {"k", "d"}
 
 
 def test_a_test_file_is_judged_after_what_is_given_and_on_nothing_before(machine, made):
@@ -77,16 +76,14 @@ def test_a_test_file_is_judged_after_what_is_given_and_on_nothing_before(machine
 
 def test_nothing_after_the_warm_up_is_known_to_a_free_run(machine, made, tmp_path):
     scenario, model = load_scenario(str(machine[0])), load_model(made[0], "cart")
-    prior = scenario.prior(model.physics.fit.values)
+    prior = scenario.prior(model.fit.values)
     lines = machine[2].read_text().splitlines()
     # from the 12th sample on, the measured position is something else; time and input are as they were
     changed = [*lines[:12], *(",".join([*line.split(",")[:2], "0.5"]) for line in lines[12:])]
     (tmp_path / "changed.csv").write_text("\n".join(changed) + "\n")
     assert lines[0].split(",") == ["t", "u", "s"]
     found = [
-        run_freely(prior, model.physics, model.networks, read_test(scenario, path), warm_up=1.0, length=None)[
-            0
-        ]
+        run_freely(prior, model.fit, model.networks, read_test(scenario, path), warm_up=1.0, length=None)[0]
         for path in (machine[2], tmp_path / "changed.csv")
     ]
     for name, y_hat in found[0].y_hat.items():
@@ -132,6 +129,12 @@ def test_a_changed_machine_is_known_again_after_a_few_seconds(machine, made, tmp
         benchmark(
             BenchmarkSettings(str(scenario), test=(changed,), model=made[0], refit=50.0), tmp_path / "no"
         )
+
+
+def test_the_shortest_refit_is_shorter_than_its_longest_run(machine, made, tmp_path):
+    scenario, _, test = machine
+    settings = BenchmarkSettings(str(scenario), test=(test,), model=made[0], refit=1.5)
+    assert benchmark(settings, tmp_path / "judged").test["test.csv"].refit.seconds == 1.5
 
 
 def test_the_delay_takes_samples_from_the_start_only(machine):

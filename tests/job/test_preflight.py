@@ -10,32 +10,65 @@ import torch
 
 from hybrid_mpc import (
     OCP,
+    Balance,
     Budget,
     DataSpec,
     Fault,
     InputError,
+    MechanicalPrior,
+    OperatingPoint,
     Parameter,
     Prior,
     Scenario,
     Signal,
     Task,
+    TorchPrior,
     load_scenario,
 )
 from hybrid_mpc.job.check import check_scenario
 from hybrid_mpc.scenario import registered_scenarios
 
 
-class Pendulum(Prior):
+class Pendulum(MechanicalPrior):
     states = (Signal("phi", "rad"), Signal("phi_dot", "rad/s"))
     inputs = (Signal("tau", "N m", -3, 3),)
     outputs = (Signal("phi", "rad", -7, 7),)
-    parameters_spec = (Parameter("J", 0.1, "kg m^2", 0.05, 0.2), Parameter("mgl", 1.0, "N m", 0.3, 3.0))
+    parameters = (Parameter("J", 0.1, "kg m^2", 0.05, 0.2), Parameter("mgl", 1.0, "N m", 0.3, 3.0))
 
-    def acceleration(self, x, u):
-        return (u - self.mgl * torch.sin(x[..., :1])) / self.J
+    def mass_matrix(self, q, p):
+        return p.J
 
-    def inertia(self, x):
-        return self.J
+    def potential(self, q, p):
+        return -p.mgl * ca.cos(q.phi)
+
+
+class Tank(Prior):
+    """A heated tank, in CasADi."""
+
+    states = (Signal("level", "m", 0.0, 1.0), Signal("warmth", "K", 0.0, 90.0))
+    inputs = (Signal("inflow", "m^3/s", 0.0, 1.0),)
+    outputs = states
+    parameters = (Parameter("area", 2.0, "m^2", 1.0, 4.0), Parameter("k", 0.2, "m^2.5/s", 0.0, 1.0))
+
+    def xdot(self, x, u, w, p):
+        return (u.inflow - p.k * ca.sqrt(ca.fmax(x.level, 1e-6))) / p.area, -0.1 * x.warmth
+
+    def balances(self, x, u, w, p):
+        out = p.k * ca.sqrt(ca.fmax(x.level, 1e-6))
+        return (Balance("volume", p.area * x.level, u.inflow, out, "m^3", "m^3/s"),)
+
+
+class TorchTank(TorchPrior):
+    """The same in torch."""
+
+    states, inputs, outputs, parameters = Tank.states, Tank.inputs, Tank.outputs, Tank.parameters
+
+    def xdot(self, x, u, w, p):
+        return (u.inflow - p.k * torch.sqrt(x.level.clamp_min(1e-6))) / p.area, -0.1 * x.warmth
+
+    def balances(self, x, u, w, p):
+        out = p.k * torch.sqrt(x.level.clamp_min(1e-6))
+        return (Balance("volume", p.area * x.level, u.inflow, out, "m^3", "m^3/s"),)
 
 
 class Plant:
@@ -64,9 +97,19 @@ GOOD = Scenario(
 )  # fmt: skip
 
 
+TANK = Scenario(
+    "mine", "Mine", "", prior=Tank, budgets=GOOD.budgets,
+    data=dataclasses.replace(DATA, inputs=("inflow",), outputs=("level", "warmth")),
+)  # fmt: skip
+
+
 def prior(**members):
     """Makes the fields of a scenario with a prior that differs."""
     return lambda: {"prior": type("Changed", (Pendulum,), members)}
+
+
+def data(**fields):
+    return {"data": dataclasses.replace(DATA, **fields)}
 
 
 def control(**fields):
@@ -93,43 +136,151 @@ def raises(*given):
     raise KeyError("forgotten")
 
 
+def flow(*rates):
+    """``xdot`` of these rates of the tank, each a function of ``(x, u, p, m)``; ``m`` is casadi or torch."""
+
+    def members(m):
+        def xdot(self, x, u, w, p):
+            return tuple(rate(x, u, p, m) for rate in rates)
+
+        return {"xdot": xdot, "balances": Prior.balances}
+
+    return members
+
+
+def level(rate):
+    """The tank's flow with another rate of the level."""
+    return flow(rate, lambda x, u, p, m: -0.1 * x.warmth)
+
+
+def balance(*terms, **named):
+    """A balance of the tank's warmth with these terms, each a function of ``(x, u, m)``."""
+
+    def members(m):
+        def balances(self, x, u, w, p):
+            return (Balance("heat", *(term(x, u, m) for term in terms), **named),)
+
+        return {"balances": balances}
+
+    return members
+
+
+def members(**given):
+    return lambda m: given
+
+
+def warmth(x, u, m):
+    return x.warmth
+
+
+def lost(x, u, m):
+    return 0.1 * x.warmth
+
+
+def nothing(x, u, m):
+    return 0.0
+
+
+PLACE = "test_preflight.py"
+EACH = "one for each of level, warmth is needed"
+AT = ["at x = [0.0, 0.0], u = [0.0]", "within the signals' ranges"]
+IN_BOTH = {
+    # what a user gets wrong in the same way in CasADi and in torch
+    "too few rates": (flow(lambda x, u, p, m: u.inflow / p.area),
+                      ["Changed.xdot(x, u, w, p) must give 2 values, got 1: " + EACH]),
+    "too many rates": (flow(*3 * [lambda x, u, p, m: u.inflow]), ["must give 2 values, got 3: " + EACH]),
+    "no tuple": (members(xdot=lambda self, x, u, w, p: u.inflow), ["must give 2 values, got 1: " + EACH]),
+    "no return": (members(xdot=lambda self, x, u, w, p: None), ["Changed.xdot", "NoneType", "'return' missing"]),
+    "xdot raises": (members(xdot=lambda self, x, u, w, p: raises()), ["prior raised KeyError: 'forgotten'", PLACE]),
+    "a typing error": (flow(lambda x, u, p, m: x.levle), ["nothing is called 'levle'", "level, warmth", PLACE]),
+    "no such parameter": (level(lambda x, u, p, m: p.volume), ["nothing is called 'volume'", "area, k", PLACE]),
+    "output of another shape": (members(output=lambda self, x, u, w, p: (x.level,)),
+                                ["Changed.output(x, u, w, p) must give 2 values, got 1: " + EACH]),
+    "output without return": (members(output=lambda self, x, u, w, p: None), ["Changed.output", "'return' missing"]),
+    "output raises": (members(output=lambda self, x, u, w, p: raises()), ["prior raised KeyError", PLACE]),
+    "an output that is no state": (members(outputs=(Tank.states[0], Signal("hot", "K"))),
+                                   ["no state is called hot", "level, warmth", "Define output(x, u, w, p)"]),
+    "NaN": (level(lambda x, u, p, m: m.sqrt(x.level - 0.5)), ["xdot(x, u, w, p): it is not finite", *AT]),
+    "infinite": (level(lambda x, u, p, m: u.inflow / x.level), ["xdot(x, u, w, p): it is not finite", *AT]),
+    "infinite slope": (level(lambda x, u, p, m: u.inflow - m.sqrt(x.level)),
+                       ["xdot(x, u, w, p): its derivative by x is not finite", *AT, "fmax(level, 1e-6)"]),
+    "infinite slope by an input": (level(lambda x, u, p, m: m.sqrt(u.inflow)), ["its derivative by u is", *AT]),
+    "infinite slope by a parameter": (level(lambda x, u, p, m: x.level**p.k * u.inflow**p.k),
+                                      ["its derivative by", "is not finite", *AT]),
+    "NaN of an output": (members(output=lambda self, x, u, w, p: (1 / x.level, x.warmth)),
+                         ["output(x, u, w, p): it is not finite", *AT]),
+    "balance with a wrong sign": (balance(warmth, lost), ["balance heat [W]: dS/dt - supply + loss is", "at x = ",
+                                                          "along the prior's own flow", "sign left out"]),
+    "balance without a term": (balance(warmth, nothing), ["along the prior's own flow", "a term or a sign"]),
+    "negative loss": (balance(warmth, lambda x, u, m: -0.2 * x.warmth, lambda x, u, m: -0.1 * x.warmth),
+                      ["balance heat [W]: the loss is -", "at x = ", "must not be negative", "into the supply"]),
+    "balance of NaN": (balance(lambda x, u, m: m.log(x.warmth), lambda x, u, m: -0.1 + 0 * x.warmth, unit="1"),
+                       ["balance heat [W]: it is not finite", *AT]),
+    "storage of the input": (balance(lambda x, u, m: x.warmth * u.inflow, nothing, lost),
+                             ["balance heat: the storage must be a function of x and p alone"]),
+    "balance of nothing": (balance(nothing, lost, lost), ["balance heat [W]: the storage does not change with level, "
+                                                          "warmth", "leave the balance out"]),
+    "balances that are none": (members(balances=lambda self, x, u, w, p: (x.level,)),
+                               ["Changed.balances(x, u, w, p) must give a tuple of Balance(...)"]),
+    "one balance without its tuple": (members(balances=lambda self, x, u, w, p: Balance("heat", x.warmth, 0.0)),
+                                      ["must give a tuple of Balance(...)"]),
+    "balances of one name": (members(balances=lambda self, x, u, w, p: 2 * (Balance("heat", x.warmth, 0.0),)),
+                             ["two have the same name: ['heat', 'heat']"]),
+    "corrects no state": (members(corrects=("levle",)), ["corrects names levle", "its states are: level, warmth"]),
+    "operating point of one": (members(operating_point=OperatingPoint((0.2,), (0.1,))),
+                               ["operating_point: x needs 2 numbers (level, warmth), got 1: (0.2,)"]),
+    "operating point without input": (members(operating_point=OperatingPoint((0.2, 9.0), ())),
+                                      ["operating_point: u needs 1 numbers (inflow), got 0"]),
+    "operating point with a disturbance": (members(operating_point=OperatingPoint((0.2, 9.0), (0.1,), (1.0,))),
+                                           ["operating_point: w needs 0 numbers (there are none), got 1"]),
+    "operating point out of range": (members(operating_point=OperatingPoint((0.2, 100.0), (0.1,))),
+                                     ["x = (0.2, 100.0) is outside the range of warmth [K] from 0 to 90", "correct"]),
+    "operating point of NaN": (members(operating_point=OperatingPoint((0.2, 9.0), (math.nan,))),
+                               ["outside the range of inflow [m^3/s] from 0 to 1"]),
+    "operating point of numbers": (members(operating_point=(0.2, 9.0)),
+                                   ["operating_point must be OperatingPoint(x=(...), u=(...)), got (0.2, 9.0)"]),
+    "parameters of one name": (members(parameters=(*Tank.parameters, Parameter("k", 1.0, "-", 0.0, 2.0))),
+                               ["two parameters have the same name: ['area', 'k', 'k']"]),
+    "states of one name": (members(states=(Tank.states[0], Tank.states[0])), ["two of the states have the same name"]),
+    "no states": (members(states=()), ["states must be a tuple of one Signal or more, got ()"]),
+    "states that are texts": (members(states=("level", "warmth")), ["Changed: states must be a tuple of Signal"]),
+    "parameters by name": (members(parameters={"k": 1.0}), ["parameters must be a tuple of Parameter", "{'k': 1.0}"]),
+}  # fmt: skip
+"""Members of a class, made by a function of the module that the tank is written in, and words of what is told."""
+BLIND = {"outputs": Tank.outputs[:1]}
+"""A tank whose temperature nobody measures, and which the level does not hang on."""
+TOGETHER = {
+    "outputs": Tank.outputs[:1],
+    "xdot": lambda self, x, u, w, p: (u.inflow - x.up - x.down, x.down, x.up),
+    "states": (Tank.states[0], Signal("up", "m/s", -1.0, 1.0), Signal("down", "m/s", -1.0, 1.0)),
+    "balances": Prior.balances,
+}
+"""Only the sum of two states can be seen."""
 WRONG = {
     # the prior
-    "raises": (prior(acceleration=raises), ["xdot(x, u) raised KeyError", "forgotten", "test_preflight.py"]),
     "raises when made": (field(prior=raises), ["prior raised KeyError"]),
     "is no prior": (field(prior=lambda values=None: 3), ["makes a int"]),
     "ignores its values": (field(prior=lambda values=None: Pendulum({"J": 0.06} if values is None else None)),
                            ["must take its values over"]),
     "takes no values": (field(prior=lambda: Pendulum()), ["prior raised TypeError"]),
-    "returns None": (prior(acceleration=lambda self, x, u: None), ["xdot(x, u) raised"]),
-    "forward returns None": (prior(forward=lambda self, x, u: None), ["must return a tensor, got NoneType", "return"]),
-    "returns numpy": (prior(forward=lambda self, x, u: x.numpy()), ["must return a tensor, got ndarray"]),
-    "returns NaN": (prior(acceleration=lambda self, x, u: u / 0.0 * 0.0), ["xdot(x, u)", "finite"]),
-    "NaN at one side": (prior(acceleration=lambda self, x, u: torch.sqrt(u)), ["finite", "x = ", "u = "]),
-    "returns another shape": (prior(acceleration=lambda self, x, u: (u / self.J).squeeze(-1)), ["xdot(x, u)"]),
-    "returns a state too much": (prior(acceleration=lambda self, x, u: torch.cat([u, u], -1)), ["shape", "(17, 2)"]),
-    "returns one number": (prior(forward=lambda self, x, u: torch.tensor(1.0)), ["must return the shape"]),
-    "mixes the batch": (prior(acceleration=lambda self, x, u: u / self.J - x.mean()), ["in a batch"]),
-    "indexes the batch": (prior(acceleration=lambda self, x, u: u / self.J + x[0, 0]), ["xdot(x, u) raised"]),
-    "float32": (prior(acceleration=lambda self, x, u: (u / self.J).float(),
-                      forward=lambda self, x, u: torch.cat([x[..., 1:], u], -1).float()), ["float64", "float32"]),
-    "float32 buffer": (field(prior=lambda values=None: with_buffer(values)), ["table must be float64"]),
-    "zero inertia": (prior(inertia=lambda self, x: 0.0 * self.J), ["energy_balance", "inertia(x) must be positive"]),
-    "negative inertia": (prior(inertia=lambda self, x: -self.J), ["inertia(x) must be positive"]),
-    "no inertia": (prior(inertia=Prior.inertia), ["must define inertia"]),
-    "balance of another shape": (prior(energy_balance=lambda self, x, xdot, u: xdot), ["one number a sample"]),
-    "balance that is none": (
-        prior(energy_balance=lambda self, x, xdot, u: (self.J * xdot[..., 1] - u[..., 0]) * x[..., 1]),
-        ["along the prior's own flow", "sign"],
-    ),
-    "output of another shape": (prior(output=lambda self, x, u: x), ["output(x, u)", "(17, 1)"]),
-    "output raises": (prior(output=raises), ["output(x, u) raised KeyError"]),
+    "no xdot": (field(prior=type("Empty", (Prior,), {k: getattr(Tank, k) for k in ("states", "inputs", "outputs")})),
+                ["Empty must define xdot(x, u, w, p)"]),
+    "disturbances": (prior(disturbances=(Signal("wind", "m/s"),)), ["measured disturbances wind", "cannot say yet"]),
+    # a mechanical prior
+    "zero inertia": (prior(mass_matrix=lambda self, q, p: 0.0 * p.J), ["mass_matrix(q, p) is 0.0", "be positive"]),
+    "negative inertia": (prior(mass_matrix=lambda self, q, p: -p.J), ["mass_matrix(q, p) is -0.1", "be positive"]),
+    "no inertia": (prior(mass_matrix=MechanicalPrior.mass_matrix), ["must define mass_matrix(q, p)"]),
+    "inertia without return": (prior(mass_matrix=lambda self, q, p: None), ["gives None; is a 'return' missing?"]),
+    "inertia of two": (prior(mass_matrix=lambda self, q, p: ((p.J, 0), (0, p.J))), ["1 rows of 1 values", "got 4"]),
+    "friction that drives": (prior(friction=lambda self, q, v, p: -0.1 * v.phi_dot),
+                             ["balance energy [W]: the loss is -", "must not be negative"]),
+    "friction of two": (prior(friction=lambda self, q, v, p: (v.phi_dot, v.phi_dot)),
+                        ["Changed.friction(q, v, p) must give 1 values, got 2: one for each of phi_dot"]),
+    "potential without return": (prior(potential=lambda self, q, p: None), ["Changed.potential(q, p)", "'return'"]),
+    "force of two": (prior(force=lambda self, q, v, u, w, p: (u.tau, u.tau)), ["got 2: one for each of phi_dot"]),
+    "two inputs and no force": (lambda: prior(inputs=(Signal("a", "N"), Signal("b", "N")))() | data(inputs=("a", "b")),
+                                ["2 inputs drive 1 degrees of freedom; define force(q, v, u, w, p)"]),
     "three states": (prior(states=(*Pendulum.states, Signal("i", "A"))), ["[q, v] in pairs"]),
-    "same names": (prior(states=(Signal("phi", "rad"), Signal("phi", "rad/s"))), ["same name"]),
-    "states that are texts": (prior(states=("phi", "phi_dot")), ["tuple of one Signal or more"]),
-    "an operator that is not exported": (
-        prior(acceleration=lambda self, x, u: torch.special.bessel_j0(x[..., :1]) + u), ["export to CasADi", "bessel"],
-    ),
     # data
     "too few columns": (field(data=dataclasses.replace(DATA, inputs=())), ["0 columns of inputs", "'tau'"]),
     "too many columns": (field(data=dataclasses.replace(DATA, outputs=("phi", "x"))), ["2 columns of outputs"]),
@@ -187,10 +338,64 @@ WRONG = {
 }  # fmt: skip
 
 
-def with_buffer(values):
-    made = Pendulum(values)
-    made.register_buffer("table", torch.zeros(3))
-    return made
+@pytest.mark.parametrize("base", [Tank, TorchTank])
+@pytest.mark.parametrize("name", IN_BOTH)
+def test_every_wrong_prior_is_told_in_both_ways_of_writing(base, name):
+    make, words = IN_BOTH[name]
+    with pytest.raises(InputError) as told:
+        check_scenario(changed(base, make(ca if base is Tank else torch)))
+    for word in words:
+        assert word in str(told.value)
+
+
+def changed(base, members):
+    """The tank's scenario with a prior that differs; a prior that cannot be seen whole has one column less."""
+    own = type("Changed", (base,), members)
+    columns = dataclasses.replace(TANK.data, outputs=TANK.data.outputs[: len(own.outputs)])
+    return dataclasses.replace(TANK, prior=own, data=columns)
+
+
+@pytest.mark.parametrize("base", [Tank, TorchTank])
+@pytest.mark.parametrize(("members", "states"), [(BLIND, "warmth"), (TOGETHER, "up, down")])
+def test_states_that_no_output_sees_are_named(base, members, states):
+    with pytest.raises(InputError, match=rf"no output tells of {states} \(outputs: level\).*Measure it"):
+        check_scenario(changed(base, members))
+
+
+NO_TORCH = ["Changed.xdot", "written in torch? Then it must be a TorchPrior"]
+NO_CASADI = ["Changed.xdot", "written in CasADi? Then it must be a Prior"]
+
+
+def if_else(x, u, p, m):
+    return u.inflow if x.level > 0.5 else -u.inflow
+
+
+@pytest.mark.parametrize(
+    ("base", "rate", "words"),
+    [
+        (Tank, if_else, ["truth value", PLACE, "ca.if_else(condition, one, other)"]),
+        (TorchTank, if_else, ["Changed.xdot decides by the values", PLACE, "torch.where instead of if"]),
+        (
+            TorchTank,
+            lambda x, u, p, m: float(x.level) * u.inflow,
+            ["Changed.xdot", PLACE, "instead of float(x)"],
+        ),
+        (
+            TorchTank,
+            lambda x, u, p, m: torch.special.bessel_j0(x.level),
+            ["Changed.xdot", "bessel", "operators.md"],
+        ),
+        (TorchTank, lambda x, u, p, m: x.level.float(), ["Changed.xdot", "less than float64"]),
+        (TorchTank, lambda x, u, p, m: ca.sqrt(x.level), NO_CASADI),
+        (Tank, lambda x, u, p, m: torch.sqrt(x.level), NO_TORCH),
+        (Tank, lambda x, u, p, m: x.level.clamp_min(1e-6), NO_TORCH),
+    ],
+)
+def test_what_one_way_of_writing_cannot_do_is_told(base, rate, words):
+    with pytest.raises(InputError) as told:
+        check_scenario(changed(base, level(rate)(None)))
+    for word in words:
+        assert word in str(told.value)
 
 
 @pytest.mark.parametrize("changes", [v for v, _ in WRONG.values()], ids=WRONG)
@@ -205,7 +410,7 @@ def test_every_wrong_scenario_is_told(changes):
 
 def test_all_problems_are_told_at_once():
     wrong = {
-        **prior(acceleration=lambda self, x, u: None)(),
+        **prior(mass_matrix=lambda self, q, p: None)(),
         **field(sensor_sigma=(0.0,))(),
         **budget(networks=0)(),
         **task(x0=(0.0,))(),
@@ -214,7 +419,7 @@ def test_all_problems_are_told_at_once():
         check_scenario(dataclasses.replace(GOOD, **wrong))
     message = str(told.value)
     assert "3 problems" in message  # what hangs on the prior (the task's states) cannot be known without one
-    for word in ("xdot", "sensor_sigma", "networks"):
+    for word in ("mass_matrix", "sensor_sigma", "networks"):
         assert word in message
 
 
@@ -233,6 +438,9 @@ def test_a_problem_with_prices_asks_for_them_in_the_reference():
 
 def test_a_good_scenario_passes():
     check_scenario(GOOD)
+    for base in (Tank, TorchTank):
+        point = OperatingPoint((0.25, 0.0), (0.1,))
+        check_scenario(changed(base, {"operating_point": point}))
     check_scenario(dataclasses.replace(GOOD, control=None, tasks=(), plant=None))
 
 

@@ -32,19 +32,19 @@ from hybrid_mpc.job.stages.results import _monitor as monitor_results
 from hybrid_mpc.kit.artifact import read_description, write_description
 
 AXIS = """
-from hybrid_mpc import Prior, Parameter, Signal
+from hybrid_mpc import MechanicalPrior, Parameter, Signal
 
 
-class Axis(Prior):
+class Axis(MechanicalPrior):
     states, inputs = (Signal("q", "m"), Signal("v", "m/s")), (Signal("F", "N", -5, 5),)
     outputs = (Signal("q", "m"),)
-    parameters_spec = (Parameter("m", {mass}, "kg", {mass}, {mass}), Parameter("d", {damping}, "N s/m", 0, 1e9))
+    parameters = (Parameter("m", {mass}, "kg", {mass}, {mass}), Parameter("d", {damping}, "N s/m", 0, 1e9))
 
-    def acceleration(self, x, u):
-        return (u - self.d * x[..., 1:] - {dry} * (x[..., 1:] / {width}).tanh()) / self.m
+    def mass_matrix(self, q, p):
+        return p.m
 
-    def inertia(self, x):
-        return self.m
+    def friction(self, q, v, p):
+        return p.d * v.v + {dry} * (v.v / {width}).tanh()
 """
 
 
@@ -121,7 +121,7 @@ def context(machine, samples, out, warm_up):
     made.keep(NOISE, {}, NoiseResult(found))
     train = made.trajectories("train")
     states = {f"{t.name}/{key}": getattr(t, key) for t in train for key in ("x", "xdot")}
-    made.keep(PRIOR, {}, PriorResult(PriorFit({}, {}, (), ()), {}, {}, (), (), 0.0, states))
+    made.keep(PRIOR, {}, PriorResult(PriorFit({}, {}, (), ()), {}, {}, states))
     return made
 
 

@@ -12,7 +12,7 @@ from hybrid_mpc import (
     Diagnoser,
     EnergyMonitor,
     InputError,
-    Prior,
+    MechanicalPrior,
     PriorStep,
     Signal,
     load,
@@ -111,18 +111,14 @@ def test_the_artifact_brings_what_it_needs(golf_artifact):
         Diagnoser(monitor, {"friction": ("mus",)}, prior=prior)
 
 
-class Bare(Prior):
+class Bare(MechanicalPrior):
     """A prior whose numbers nobody may change."""
 
     states = (Signal("q", "m"), Signal("v", "m/s"))
     inputs = (Signal("F", "N"),)
     outputs = states[:1]
-    parameters_spec = ()
 
-    def acceleration(self, x, u):
-        return u / 2.0
-
-    def inertia(self, x):
+    def mass_matrix(self, q, p):
         return 2.0
 
 

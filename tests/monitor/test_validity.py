@@ -155,7 +155,7 @@ def diverging(folder):
     stack = StackedGRU(1, n_features(prior, True), 8, 1, seed=3)
     with torch.no_grad():
         stack.w_out.mul_(1e307)
-    scaling = Scaling(x=(0.5, 1.5), u=(0.2,), acceleration=(5.0,), correction=(0.5,))
+    scaling = Scaling(x=(0.5, 1.5), u=(0.2,), rate=(5.0,), correction=(0.5,))
     steps = {"hybrid": HybridStep(prior, stack.member(0), scaling, 0.02), "prior": PriorStep(prior, 0.02)}
     programs = {name: trace_model(step.requires_grad_(False)) for name, step in steps.items()}
     loop = LoopSettings(process_noise={"hybrid_observer": (1e-4, 1e-2)})

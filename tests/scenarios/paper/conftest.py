@@ -36,9 +36,7 @@ def runs(data_set, seed, folder):
     return load_trajectories(files, scenario.data, outputs=OUTPUTS, inputs=INPUTS).trajectories
 
 
-effort = Effort(
-    1, (2,), steps=4, free_run_steps=2, valid=1, test=1, hidden=4, every=2, batch=4, fit=("equation_error",)
-)
+effort = Effort(1, (2,), steps=4, free_run_steps=2, valid=1, test=1, hidden=4, every=2, batch=4)
 own = replace(scenario.experiment, runs=runs, measured=True, most=6, efforts={"full": effort})
 scenario = replace(scenario, prior=prior, experiment=own)
 """

@@ -93,7 +93,7 @@ def test_sindy_has_a_row_where_it_is_there(exact, tmp_path, monkeypatch):
     def fit(training, prior, dt, *, validation, warm):
         assert len(training) == 1
         step = PriorStep(prior, dt)
-        step.equations = lambda: ("phi_dot' = u",)
+        step.text = lambda: ("phi_dot' = u",)
         return step
 
     fake = types.ModuleType("sindy")

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from energy_checks import rates
 from simulated_pendulum import DT, TRUTH, Pendulum, dragged, killed_and_resumed, record, same_training
 
 from hybrid_mpc import (
@@ -35,19 +36,20 @@ class Copier(torch.nn.Module):
         return s[..., self.chosen], h
 
 
-SCALES = Scaling(x=(2.0, 3.0), u=(0.5,), acceleration=(4.0, 5.0), correction=(4.0, 5.0))
+SCALES = Scaling(x=(2.0, 3.0), u=(0.5,), rate=(4.0, 5.0), correction=(4.0, 5.0))
 X, U = torch.tensor([0.5, -1.0]).double(), torch.tensor([0.25]).double()
-H = torch.zeros(0).double()
+H = W = torch.zeros(0).double()
 
 
 def test_the_paper_step_is_explicit_euler_of_what_the_network_says():
     prior = Pendulum()
     step = PaperStep(prior, Copier(slice(3, 5)), SCALES, DT)  # the prior's xdot, which is a feature
-    torch.testing.assert_close(step.xdot(X, H, U), prior(X, U), rtol=1e-15, atol=0)
-    torch.testing.assert_close(step(X, H, U)[0], X + DT * prior(X, U), rtol=1e-15, atol=0)
+    own = torch.from_numpy(rates(prior, X.numpy()[None], U.numpy()[None])[0])
+    torch.testing.assert_close(step.xdot(X, H, U, W), own, rtol=1e-15, atol=0)
+    torch.testing.assert_close(step(X, H, U, W)[0], X + DT * own, rtol=1e-15, atol=0)
     free = PaperStep(prior, Copier(slice(1, 3)), SCALES, DT, use_prior=False)  # [v, u]: no exact kinematics
     torch.testing.assert_close(
-        free.xdot(X, H, U), torch.tensor([-4.0 / 3.0, 2.5], dtype=torch.float64), rtol=1e-15, atol=0
+        free.xdot(X, H, U, W), torch.tensor([-4.0 / 3.0, 2.5], dtype=torch.float64), rtol=1e-15, atol=0
     )
 
 
@@ -55,7 +57,7 @@ def test_the_paper_step_is_explicit_euler_of_what_the_network_says():
 def test_features_are_as_many_as_the_form_says(use_prior):
     prior = Pendulum()
     step = PaperStep(prior, Copier(slice(0, 2)), SCALES, DT, use_prior=use_prior)
-    assert (step.features(X, U).numel(), 2) == PaperStep.sizes(prior, use_prior)
+    assert (step.features(X, U, W).numel(), 2) == PaperStep.sizes(prior, use_prior)
 
 
 def test_euler_feeds_energy_into_a_pendulum_and_the_hybrid_step_does_not():
@@ -67,7 +69,7 @@ def test_euler_feeds_energy_into_a_pendulum_and_the_hybrid_step_does_not():
     for step in (paper, exact):
         x = torch.tensor([0.5, 0.0]).double()
         for _ in range(250):
-            x, _ = step(x, H, torch.zeros(1).double())
+            x, _ = step(x, H, torch.zeros(1).double(), W)
         energies.append(float(0.05 * x[1] ** 2 + 1.2 * (1.0 - x[0].cos())))
     start = 1.2 * (1.0 - math.cos(0.5))
     assert energies[1] == pytest.approx(start, rel=1e-4)  # order 4 at 0.07 rad a step
