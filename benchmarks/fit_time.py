@@ -13,9 +13,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from hybrid_mpc import load_scenario
-from hybrid_mpc.data.trajectories import load_trajectories
-from hybrid_mpc.identify.prior import fit_and_smooth, smoothed
+from hybrid_mpc import fit_prior, load_scenario, load_trajectories
+from hybrid_mpc.identify.fit import smoothed
 
 
 def main() -> None:
@@ -31,19 +30,20 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         files = given.files or scenario.make_data(Path(folder), 0, "quick")
         data = load_trajectories(
-            files, scenario.data, outputs=prior.outputs, inputs=prior.inputs, states=prior.states
-        )
+            files, scenario.data, outputs=prior.outputs, inputs=prior.inputs, states=prior.states,
+            disturbances=prior.disturbances,
+        )  # fmt: skip
     train, valid = data.by_role("train"), data.by_role("valid")
     wall, cpu = time.perf_counter(), time.process_time()
-    physics = fit_and_smooth(scenario.prior, train, valid, scenario.data.dt)
+    fit = fit_prior(scenario.prior, train, valid, dt=scenario.data.dt)
     for part in (train, valid, data.by_role("test")):
-        smoothed(scenario.prior, physics, part, scenario.data.dt)
+        smoothed(scenario.prior, fit, part, scenario.data.dt)
     row = {
         "scenario": scenario.name,
         "wall_s": time.perf_counter() - wall,
         "cpu_s": time.process_time() - cpu,
     }
-    print(json.dumps({**row, "values": physics.fit.values}, indent=1))
+    print(json.dumps({**row, "values": fit.values}, indent=1))
 
 
 if __name__ == "__main__":

@@ -47,7 +47,6 @@ def test_solvers_find_the_same_plan(tmp_path):
     [
         ("steps", "--z 4 --n 8"),
         ("training", "--z 4 --steps 10 --batch 4 --rounds 1"),
-        ("prior_fit", "--grid 1 --draws 1"),
         ("monitor_step", "--rounds 1"),
         ("studies", "scale --runs 50"),
         ("studies", "overhead --runs 60"),

@@ -224,15 +224,11 @@ def _check_masses(prior: Prior) -> None:
 
 def _check_data(report: _Report, scenario: Scenario, prior: Prior | None) -> None:
     spec = scenario.data
-    if prior is not None and prior.disturbances:
-        report.add(
-            f"data: the prior has measured disturbances {', '.join(s.name for s in prior.disturbances)}, and a "
-            "DataSpec cannot say yet which columns hold them; leave them out, or use fit_prior and train"
-        )
     if prior is not None:
         for what, columns, signals in (
             ("inputs", spec.inputs, prior.inputs),
             ("outputs", spec.outputs, prior.outputs),
+            ("disturbances", spec.disturbances, prior.disturbances),
         ):
             if len(columns) != len(signals):
                 report.add(
