@@ -26,7 +26,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.delay import NONE, shifted
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.simulation import Simulation, flow_slope, required_substeps, rest_of
-from hybrid_mpc.identify.smooth import SAMPLE, Smoother, fit_smoother, unseen_states
+from hybrid_mpc.identify.smooth import SAMPLE, Smoother, fit_smoother, rough_smoother, unseen_states
 from hybrid_mpc.machine.prior import Equations, Prior
 from hybrid_mpc.machine.signals import Signal
 
@@ -568,7 +568,7 @@ def fit_prior(
     lengths = _lengths(train, dt, unit, length, fit.lead)
     total = len(lengths) + 2
     on_progress(0, total, "smoothing by the nominal prior")
-    smoother = fit_smoother(fit.prior, shifted(train, fit.delay(fit.nominal)), dt, time_unit=unit)
+    smoother = rough_smoother(fit.prior, shifted(train, fit.delay(fit.nominal)), dt, time_unit=unit)
     sizes = np.array(smoother.sizes.x)
     guesses = [with_states(part, smoother, fit.delay(fit.nominal)) for part in (train, valid)]
     found: list[tuple[str, Fitted]] = []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -27,6 +27,8 @@ MOST_SWEEPS = 20
 DECADES = (-6.0, 2.0)
 """Range searched for the walk of the unexplained rates, as a power of ten of their natural size: from a prior that is
 right to one that explains nothing."""
+ROUGH = -0.5
+"""Walk, as a power of ten, of a prior that is not fitted yet."""
 IGNORANCE = 10.0
 """Standard deviation of a state that is not known at first, as a multiple of its natural size; half its range at
 most."""
@@ -274,6 +276,32 @@ def fit_smoother(
     """
     unit = scales.time_unit(trajectories, dt) if time_unit is None else time_unit
     sample = [trajectories[i] for i in evenly(len(trajectories), SAMPLE)]
+    at = _smoothers(prior, trajectories, dt, unit)
+
+    def cost(ratio: float) -> float:
+        squares, logs, count = at(ratio).innovations(sample)
+        value = count * math.log(max(squares, 1e-300) / max(count, 1)) + logs
+        return value if math.isfinite(value) else 1e300
+
+    best = float(minimize_scalar(cost, bounds=DECADES, method="bounded", options={"xatol": 0.1}).x)
+    squares, _, count = at(best).innovations(sample)
+    return at(best, math.sqrt(squares / max(count, 1)) or 1.0)
+
+
+def rough_smoother(
+    prior: Prior, trajectories: Sequence[Trajectory], dt: float, *, time_unit: float
+) -> Smoother:
+    """Smoother of a prior that is not fitted yet: its rates may be wrong by a good part of their size.
+
+    Arguments as for :func:`fit_smoother`; nothing is searched.
+    """
+    return _smoothers(prior, trajectories, dt, time_unit)(ROUGH, 1.0)
+
+
+def _smoothers(
+    prior: Prior, trajectories: Sequence[Trajectory], dt: float, unit: float
+) -> Callable[..., Smoother]:
+    """Smoothers by the walk's ratio, as a power of ten, and the scale of noise and walk."""
     sizes = sizes_of(prior, trajectories, dt, unit)
     fading = math.exp(-dt / (FADING * unit))
     rates = np.array(sizes.rate)[list(prior.corrected)] * math.sqrt(dt / unit)
@@ -282,14 +310,7 @@ def fit_smoother(
         sigma, walk = scale * np.array(sizes.noise), scale * 10.0**ratio * rates
         return Smoother(prior, dt, tuple(sigma.tolist()), tuple(walk.tolist()), sizes, fading)
 
-    def cost(ratio: float) -> float:
-        squares, logs, count = at(ratio).innovations(sample)
-        value = count * math.log(max(squares, 1e-300) / max(count, 1)) + logs
-        return value if math.isfinite(value) else 1e300
-
-    best = float(minimize_scalar(cost, bounds=DECADES, method="bounded", options={"xatol": 0.05}).x)
-    squares, _, count = at(best).innovations(sample)
-    return at(best, math.sqrt(squares / max(count, 1)) or 1.0)
+    return at
 
 
 def sizes_of(prior: Prior, trajectories: Sequence[Trajectory], dt: float, time_unit: float) -> Sizes:

@@ -265,7 +265,8 @@ WRONG = {
     "takes no values": (field(prior=lambda: Pendulum()), ["prior raised TypeError"]),
     "no xdot": (field(prior=type("Empty", (Prior,), {k: getattr(Tank, k) for k in ("states", "inputs", "outputs")})),
                 ["Empty must define xdot(x, u, w, p)"]),
-    "disturbances": (prior(disturbances=(Signal("wind", "m/s"),)), ["data: 0 columns of disturbances [], the prior has 1: ['wind']"]),
+    "disturbances": (prior(disturbances=(Signal("wind", "m/s"),)),
+                     ["data: 0 columns of disturbances [], the prior has 1: ['wind']"]),
     # a mechanical prior
     "zero inertia": (prior(mass_matrix=lambda self, q, p: 0.0 * p.J), ["mass_matrix(q, p) is 0.0", "be positive"]),
     "negative inertia": (prior(mass_matrix=lambda self, q, p: -p.J), ["mass_matrix(q, p) is -0.1", "be positive"]),
