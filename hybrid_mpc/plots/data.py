@@ -105,12 +105,14 @@ def recordings(
 def coverage(trajectories: Sequence[Recording], states: Sequence[Signal]) -> Figure:
     """Phase portrait: where the training data have been, and where the models are tested.
 
+    States are drawn in pairs, the first half against the second; of an odd number each against the next.
+
     Args:
         trajectories: Pieces of recordings.
-        states: Signals of ``x = [q, v]``.
+        states: Signals of ``x``, two at least.
 
     Raises:
-        InputError: If there is no trajectory, or its shapes do not fit the signals.
+        InputError: If there is no trajectory, there is a single state, or its shapes do not fit the signals.
 
     Example:
         >>> import numpy as np
@@ -121,17 +123,20 @@ def coverage(trajectories: Sequence[Recording], states: Sequence[Signal]) -> Fig
     """
     if not trajectories:
         raise InputError("plot of the coverage: there is no recording to draw")
-    n_q = len(states) // 2
-    figure, axes = new_figure(1, n_q, size=(6.8 if n_q == 1 else 5.0 * n_q, 4.6))
-    for q, ax in enumerate(axes[0]):
+    n = len(states)
+    if n < 2:
+        raise InputError("plot of the coverage: a single state has no phase portrait")
+    pairs = [(i, i + n // 2) for i in range(n // 2)] if n % 2 == 0 else [(i, i + 1) for i in range(n - 1)]
+    figure, axes = new_figure(1, len(pairs), size=(6.8 if len(pairs) == 1 else 5.0 * len(pairs), 4.6))
+    for (q, v), ax in zip(pairs, axes[0], strict=True):
         for role in ("train", "test"):
             for piece in (p for p in trajectories if p.role == role):
                 x = checked(f"x of {piece.name}", piece.x, len(piece.t), len(states))
                 width = 2.4 if role == "train" else 1.0
                 position = _wrapped(x[:, q]) if states[q].periodic else x[:, q]
-                ax.plot(position, x[:, n_q + q], color=colour(role), linewidth=width, label=name_of(role))
+                ax.plot(position, x[:, v], color=colour(role), linewidth=width, label=name_of(role))
         ax.set_xlabel(axis_label(states[q]))
-        ax.set_ylabel(axis_label(states[n_q + q]))
+        ax.set_ylabel(axis_label(states[v]))
     shared_legend(figure)
     return figure
 

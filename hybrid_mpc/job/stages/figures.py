@@ -58,7 +58,10 @@ def _data(context: Context) -> Any:
     pieces = [t for t in context.dataset.trajectories if t.role != "nominal"]
     figure = data.recordings(pieces, prior.outputs, prior.inputs)
     yield "data", "recordings", figure, "Recordings with what each part is used for."
-    yield "data", "coverage", data.coverage(pieces, prior.states), "Where training and test data lie."
+    parts = {role: context.smoothed(role) for role in ("train", "test")}  # states that no sensor sees, too
+    smoothed = [t for part in parts.values() for t in part]
+    if len(prior.states) > 1:
+        yield "data", "coverage", data.coverage(smoothed, prior.states), "Where training and test data lie."
 
 
 def _training(context: Context) -> Any:
