@@ -14,7 +14,7 @@ from scipy.linalg import expm
 from scipy.optimize import minimize_scalar
 
 from hybrid_mpc.data import scales
-from hybrid_mpc.data.scales import evenly
+from hybrid_mpc.data.scales import evenly, robust_spread
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.identify.simulation import flow_slope, required_substeps, rest_of, stepped, with_unknown_rates
 from hybrid_mpc.machine.prior import Equations, Prior
@@ -316,7 +316,7 @@ def _smoothers(
 def sizes_of(prior: Prior, trajectories: Sequence[Trajectory], dt: float, time_unit: float) -> Sizes:
     """Natural sizes of a machine's signals, from recordings and the prior linearized at rest."""
     y = np.concatenate([t.y for t in trajectories])
-    spread = np.array([float(np.std(c[np.isfinite(c)])) if np.isfinite(c).any() else 0.0 for c in y.T])
+    spread = np.array([robust_spread(c) for c in y.T])
     spread = np.where(spread > 0, spread, 1.0)
     noise = np.maximum(_noise(trajectories), QUIETEST * spread)
     seen = seen_by(prior, dt, time_unit) / spread[:, None, None]
@@ -385,7 +385,7 @@ def _noise(trajectories: Sequence[Trajectory]) -> Array:
     for j in range(trajectories[0].y.shape[1]):
         columns = [t.y[np.isfinite(t.y[:, j]), j] for t in trajectories]
         third = np.concatenate([np.diff(c, 3) for c in columns])
-        found.append(float(np.std(third)) / math.sqrt(20.0) if len(third) else 0.0)
+        found.append(robust_spread(third) / math.sqrt(20.0))
     return np.array(found)
 
 

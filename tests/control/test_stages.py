@@ -49,7 +49,7 @@ def golf_robot(z):
     prior, dt = scenario.prior(), scenario.data.dt
     step = PriorStep(prior, dt)
     if z:
-        scaling = Scaling(x=(0.5, 1.5), u=(0.2,), acceleration=(5.0,), correction=(0.5,))
+        scaling = Scaling(x=(0.5, 1.5), u=(0.2,), rate=(5.0,), correction=(0.5,))
         step = HybridStep(prior, GRUNetwork(n_features(prior, True), z, prior.n_q), scaling, dt)
     program = trace_model(step.requires_grad_(False))
     return build_model("m", {f"m/{name}": p for name, p in program.items()}, model_info(prior, dt))

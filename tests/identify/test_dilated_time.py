@@ -65,18 +65,21 @@ def test_the_smoother_finds_the_states_at_any_sampling_period(runs, k):
     assert error[1] < 1e-2
 
 
+WINDOWS = ("free runs of 0.5 s", "free runs of 2 s")
+
+
 def test_windows_are_of_half_a_second_and_two_at_20_ms(runs):
-    """25 and 100 periods; the recordings are too short for 5 s."""
+    """25 and 100 periods; the recordings are too short for 5 s, and the longest windows are whole ones."""
     assert time_unit(runs, DT) == 1.0
     fit = fit_prior(Pendulum, runs[:1], runs[1:2], dt=DT)
-    assert [row["stage"] for row in fit.stages] == ["nominal", "free runs of 0.5 s", "free runs of 2 s"]
+    assert [row["stage"] for row in fit.stages] == ["nominal", *WINDOWS, "free runs of 2.98 s"]
     longer = fit_prior(Pendulum, runs[:1], runs[1:2], dt=DT, length=1.5)
     assert [row["stage"] for row in longer.stages] == ["nominal", "free runs of 0.5 s", "free runs of 1.5 s"]
     known = fit_prior(Pendulum, runs[:1], runs[1:2], dt=DT, time_unit=0.8)
     assert [row["stage"] for row in known.stages] == ["nominal", "free runs of 0.4 s", "free runs of 1.6 s"]
 
 
-def test_a_recording_shorter_than_any_window_is_one_of_half_its_length(runs):
+def test_a_recording_shorter_than_any_window_is_one(runs):
     short = [run.part(slice(20)) for run in runs]
     fit = fit_prior(Pendulum, short[:2], short[2:], dt=DT)
-    assert [row["stage"] for row in fit.stages] == ["nominal", "free runs of 0.18 s"]  # 9 of 19 periods
+    assert [row["stage"] for row in fit.stages] == ["nominal", "free runs of 0.38 s"]  # all of its 19 periods

@@ -67,7 +67,7 @@ def test_a_machine_without_plant_says_why_it_has_no_closed_loop(finished):
 def test_bounds_never_rise(finished):
     (path,) = (finished / "checkpoints" / "training").glob("*/mopgrnn.npz")
     curve = np.load(path)
-    for name in ("bound_error", "bound_energy"):
+    for name in ("bound_output", "bound_energy"):
         for stage in (0.0, 1.0):
             bound = curve[f"curve.{name}"][curve["curve.free_run"][:, 0] == stage]
             assert len(bound) >= 2

@@ -150,5 +150,5 @@ def test_bad_input_is_refused():
     with pytest.raises(InputError, match="does not grow with its acceleration"):
         EnergyMonitor(replace(model, balances=(silent,)), window=11, average=1)
     mass = replace(silent, name="mass", unit="kg", rate_unit="kg/s")
-    with pytest.raises(InputError, match=r"no balance 'energy' \(it has: mass\).* give its prior inertia"):
+    with pytest.raises(InputError, match=r"no balance 'energy' \(it has: mass\).* give its prior one"):
         EnergyMonitor(replace(model, balances=(mass,)), window=11, average=1)

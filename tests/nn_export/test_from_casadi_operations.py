@@ -41,6 +41,6 @@ def test_every_operation_as_a_torch_operator(op):
     batched = Batched(function)
     values = torch.tensor(np.random.default_rng(0).uniform(-1, 1, (2, 40, 1)))
     values[1, ::4] = values[0, ::4]  # equal ones too
-    walked, run = batched.walk(list(values)), batched._run(list(values), 40)
+    walked, run = batched.walk(list(values), (40,)), batched._run(list(values), 40)
     for a, b in zip(walked, run, strict=True):
         assert torch.allclose(a, b, rtol=1e-13, atol=0)  # two libraries' elementary functions
