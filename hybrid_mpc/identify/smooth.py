@@ -14,7 +14,7 @@ from scipy.linalg import expm
 from scipy.optimize import minimize_scalar
 
 from hybrid_mpc.data import scales
-from hybrid_mpc.data.scales import evenly
+from hybrid_mpc.data.scales import evenly, robust_spread
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.identify.simulation import required_substeps, rest_of, stepped, with_unknown_rates
 from hybrid_mpc.machine.prior import Equations, Prior
@@ -203,7 +203,11 @@ def _smoothed(found: _Filtered) -> Array:
     """Rauch-Tung-Striebel smoother behind a filter: ``z`` ``(b, n, n_z)``."""
     b, n, n_z, _ = found.now.shape
     forward = found.slope[:, :-1] @ found.now[:, :-1, :, 1:]
-    back = np.swapaxes(np.linalg.solve(found.ahead[:, :-1, :, 1:], forward), -1, -2)
+    # where data are exact some directions are known to rounding: it is added to the correlations
+    covariance = found.ahead[:, :-1, :, 1:]
+    size = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 1e-300))[..., None]
+    correlation = covariance / (size * np.swapaxes(size, -1, -2)) + 1e-14 * np.eye(n_z)
+    back = np.swapaxes(np.linalg.solve(correlation, forward / size) / size, -1, -2)
     own, ahead = found.now[..., 0], found.ahead[:, :-1, :, 0]
     given = own[:, -2::-1] - np.einsum("bnij,bnj->bni", back, ahead)[:, ::-1], back[:, ::-1]
     if n < 2:
@@ -254,7 +258,7 @@ def fit_smoother(
 def sizes_of(prior: Prior, trajectories: Sequence[Trajectory], dt: float, time_unit: float) -> Sizes:
     """Natural sizes of a machine's signals, from recordings and the prior linearized at rest."""
     y = np.concatenate([t.y for t in trajectories])
-    spread = np.array([float(np.std(c[np.isfinite(c)])) if np.isfinite(c).any() else 0.0 for c in y.T])
+    spread = np.array([robust_spread(c) for c in y.T])
     spread = np.where(spread > 0, spread, 1.0)
     noise = np.maximum(_noise(trajectories), QUIETEST * spread)
     seen = seen_by(prior, dt, time_unit) / spread[:, None, None]
@@ -287,9 +291,10 @@ def seen_by(prior: Prior, dt: float, time_unit: float) -> Array:
         if not (np.isfinite(a).all() and np.isfinite(c).all()):
             continue
         step, rows, at = expm(a * dt * skip), [], np.eye(len(x))
-        for _ in range(0, periods, skip):
-            at = at @ step
-            rows.append(c @ at)
+        with np.errstate(over="ignore", invalid="ignore"):  # what runs away is cut off below
+            for _ in range(0, periods, skip):
+                at = at @ step
+                rows.append(c @ at)
         found.append(np.clip(np.nan_to_num(np.stack(rows, axis=1)), -1e100, 1e100))
     if not found:
         return np.zeros((len(prior.outputs), 1, len(x)))
@@ -323,7 +328,7 @@ def _noise(trajectories: Sequence[Trajectory]) -> Array:
     for j in range(trajectories[0].y.shape[1]):
         columns = [t.y[np.isfinite(t.y[:, j]), j] for t in trajectories]
         third = np.concatenate([np.diff(c, 3) for c in columns])
-        found.append(float(np.std(third)) / math.sqrt(20.0) if len(third) else 0.0)
+        found.append(robust_spread(third) / math.sqrt(20.0))
     return np.array(found)
 
 
