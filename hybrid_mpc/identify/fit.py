@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from hybrid_mpc.data import scales
-from hybrid_mpc.data.scales import evenly
+from hybrid_mpc.data.scales import evenly, robust_spread, within
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.delay import NONE, shifted
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.simulation import Simulation, required_substeps
-from hybrid_mpc.identify.smooth import Smoother, fit_smoother, unseen_states
+from hybrid_mpc.identify.smooth import Smoother, fit_smoother, sizes_of, unseen_states
 from hybrid_mpc.machine.prior import Equations, Prior
 
 Array = NDArray[np.float64]
@@ -44,11 +44,17 @@ START_ITERATIONS = 6
 """Gauss-Newton steps from each start before the best is taken on."""
 OUTLIERS = 3.0
 """Residuals beyond this many robust standard deviations count by their size, not by its square."""
+SCALINGS = 4
+"""Times at most that outputs are weighed by what is left of them: outliers hide how little that is."""
+SETTLED = 0.8
+"""Share to which what is left must fall for another time."""
+FAR = 3.0
+"""Errors beyond this many spreads of the data are as bad as this one where candidates are compared."""
 LARGEST = 1e3
 """Residuals beyond this many spreads of the data count as much: a free run that diverges stays finite."""
 CONVERGED = 0.01
-"""A step that takes off less than this share of a window's mean cost ends a fit: it is some hundredth of a standard
-error, if the windows are independent."""
+"""A step that takes off less than this share of a window's mean cost is the last of a fit: what would come after it is
+far less than a standard error."""
 AT_BOUND = 1e-3
 """Share of its range within which a parameter counts as at its bound."""
 UNKNOWN = 1e-6
@@ -178,7 +184,7 @@ class OutputFit:
         if by_p is None or by_x is None:
             return y, np.zeros(0), np.zeros(0)
         c, d = (v.reshape(n, periods + 1, y.shape[-1], -1) for v in (c, d))
-        d = np.concatenate([d, np.zeros((*d.shape[:-1], 1))], axis=-1)[..., free]
+        d = d[..., free]
         return y, (c @ by_p + d) * self.unit[: len(free)], c @ by_x
 
     @cached_property
@@ -223,7 +229,7 @@ class OutputFit:
 class Fitted:
     """What a fit to windows found: ``theta`` with its covariance, and names of what the windows do not identify.
 
-    ``error`` is the root mean square of the outputs' errors, each over its spread.
+    ``error`` is the root mean square of the outputs' errors, each over its spread and at most ``FAR``.
     """
 
     theta: Array
@@ -239,10 +245,8 @@ class _Shooting:
         self.own, self.windows, self.sizes, self.substeps = fit, windows, sizes, substeps
         y = windows.y
         self.seen = np.isfinite(y)
-        self.spread = np.array(
-            [float(np.std(c[np.isfinite(c)])) or 1.0 for c in y.reshape(-1, y.shape[-1]).T]
-        )
-        self.scale, self.outlier = self.spread, math.inf
+        self.spread = np.array([robust_spread(c) or 1.0 for c in y.reshape(-1, y.shape[-1]).T])
+        self.scale = self.spread
 
     def residual(self, theta: Array, x: Array, slopes: Slopes) -> tuple[Array, Array, Array]:
         """Errors ``(n, (T + 1) n_y)`` over their scale, zero where nothing was measured; their derivatives."""
@@ -264,8 +268,8 @@ class _Shooting:
 
     def cost(self, error: Array, moved: Array) -> float:
         """Robust sum of squares, and what the first states moved from their guess, in their sizes."""
-        c2 = self.outlier**2
-        own = np.square(error) if math.isinf(c2) else 2 * c2 * (np.sqrt(1 + np.square(error) / c2) - 1)
+        c2 = OUTLIERS**2
+        own = 2 * c2 * (np.sqrt(1 + np.square(error) / c2) - 1)
         return float(own.sum() + np.square(moved).sum())
 
     def rescaled(self, error: Array) -> None:
@@ -274,51 +278,61 @@ class _Shooting:
         own = error.reshape(shape) * self.scale
         left = [np.abs(own[..., j][self.seen[..., j]]) for j in range(shape[-1])]
         robust = np.array([1.4826 * float(np.median(v)) if len(v) else 0.0 for v in left])
-        whole = np.array([float(np.sqrt(np.mean(v**2))) if len(v) else 0.0 for v in left])
+        whole = np.array([float(np.sqrt(np.mean(within(v) ** 2))) if len(v) else 0.0 for v in left])
         robust = np.maximum(robust, 0.1 * whole)  # where most samples are met exactly, the rest is no outlier
         self.scale = np.maximum(robust, 1e-9 * self.spread)
-        self.outlier = OUTLIERS
 
     def solve(self, theta: Array, iterations: int, fixed: bool) -> Fitted:
-        x, n_theta = self.windows.x.copy(), 0 if fixed else len(theta)
-        guess, damping = x.copy(), 1e-3
-        slopes: Slopes = "x" if fixed else "all"
-        for stage in range(1 if fixed else 2):  # by the spreads, then by what is left
-            error, by_theta, by_x = self.residual(theta, x, slopes)
-            if stage:
-                self.rescaled(error)
-                error, by_theta, by_x = self.residual(theta, x, slopes)
-            cost = self.cost(error, (x - guess) / self.sizes)
-            for _ in range(iterations if stage or fixed else min(iterations, FIRST)):
-                normal = self._normal(error, by_theta[..., :n_theta], by_x, (x - guess) / self.sizes)
-                better = False
-                for _ in range(6):
-                    step, moved = self._step(normal, damping, theta, n_theta)
-                    if self._promised(normal, step[:n_theta], moved) < CONVERGED * cost / len(x):
-                        break
-                    trial = np.clip(theta + step, self.own.lower, self.own.upper)
-                    x_trial = x + moved * self.sizes
-                    tried, _, _ = self.residual(trial, x_trial, "")
-                    new = self.cost(tried, (x_trial - guess) / self.sizes)
-                    if new < cost:
-                        better = True
-                        damping = max(damping / 5, 1e-9)
-                        break
-                    damping = min(damping * 5, 1e9)
-                if not better:
-                    break
-                gain, theta, x, cost = cost - new, trial, x_trial, new
-                if gain < CONVERGED * cost / len(x):
-                    break
-                error, by_theta, by_x = self.residual(theta, x, slopes)
-        error, by_theta, by_x = self.residual(theta, x, slopes)
+        """Fit the first states alone, then ``theta`` with them: by the spreads, then by what is left."""
+        n_theta = 0 if fixed else len(theta)
+        theta, x = self._descend(theta, self.windows.x, 0, iterations if fixed else FIRST)
+        if n_theta:
+            theta, x = self._descend(theta, x, n_theta, min(iterations, FIRST))
+        for k in range(SCALINGS):
+            before = self.scale
+            self.rescaled(self.residual(theta, x, "")[0])
+            if k and (self.scale > SETTLED * before).all():
+                break
+            theta, x = self._descend(theta, x, n_theta, iterations)
+        error, by_theta, by_x = self.residual(theta, x, "all" if n_theta else "x")
         covariance, unidentified = self._covariance(error, by_theta[..., :n_theta], by_x)
         count = max(1, int(self.seen.sum()))
-        over = error.reshape(self.windows.y.shape) * self.scale / self.spread
+        over = np.clip(error.reshape(self.windows.y.shape) * self.scale / self.spread, -FAR, FAR)
         return Fitted(theta, covariance, unidentified, float(np.sqrt(np.square(over).sum() / count)))
 
+    def _descend(self, theta: Array, x: Array, n_theta: int, iterations: int) -> tuple[Array, Array]:
+        """Steps of Levenberg and Marquardt, of the first states and of ``theta`` where ``n_theta`` is not 0."""
+        slopes: Slopes = "all" if n_theta else "x"
+        guess, damping = self.windows.x, 1e-3
+        error, by_theta, by_x = self.residual(theta, x, slopes)
+        cost = self.cost(error, (x - guess) / self.sizes)
+        for _ in range(iterations):
+            normal = self._normal(error, by_theta[..., :n_theta], by_x, (x - guess) / self.sizes)
+            better, last = False, False
+            for _ in range(6):
+                step, moved = self._step(normal, damping, theta, n_theta)
+                last = self._promised(normal, step[:n_theta], moved) < CONVERGED * cost / len(x)
+                trial = np.clip(theta + step, self.own.lower, self.own.upper)
+                x_trial = x + moved * self.sizes
+                tried, _, _ = self.residual(trial, x_trial, "")
+                new = self.cost(tried, (x_trial - guess) / self.sizes)
+                if new < cost:
+                    better = True
+                    damping = max(damping / 5, 1e-9)
+                    break
+                if last:
+                    break
+                damping = min(damping * 5, 1e9)
+            if not better:
+                break
+            gain, theta, x, cost = cost - new, trial, x_trial, new
+            if last or gain < CONVERGED * cost / len(x):
+                break
+            error, by_theta, by_x = self.residual(theta, x, slopes)
+        return theta, x
+
     def _weighted(self, error: Array, *slopes: Array) -> tuple[Array, ...]:
-        root = (1 + np.square(error / self.outlier)) ** -0.25
+        root = (1 + np.square(error / OUTLIERS)) ** -0.25
         return root * error, *(root[..., None] * s for s in slopes)
 
     def _normal(self, error: Array, by_theta: Array, by_x: Array, moved: Array) -> tuple[Array, ...]:
@@ -365,6 +379,7 @@ class _Shooting:
 
         Source: Liang and Zeger, *Longitudinal data analysis using generalized linear models* (1986), of clusters.
         """
+        root = (1 + np.square(error / OUTLIERS)) ** -0.25
         error, b, a = self._weighted(error, by_theta, by_x)
         at = a.swapaxes(1, 2)
         known = np.linalg.solve(
@@ -372,20 +387,26 @@ class _Shooting:
         )
         b, error = b - a @ known[..., :-1], error - (a @ known[..., -1:])[..., 0]
         information = (b.swapaxes(1, 2) @ b).sum(0)
-        if not len(information):
-            return information, ()
-        size = np.sqrt(np.maximum(np.diag(information), 1e-300))
-        values, directions = np.linalg.eigh(information / np.outer(size, size))
-        weak = values < UNKNOWN * values[-1]
-        names = [self.own.names[i] for i in range(len(size)) if (np.abs(directions[i, weak]) > 0.2).any()]
-        inverse = directions / np.maximum(values, 1e-12 * values[-1]) @ directions.T / np.outer(size, size)
-        scores = (b.swapaxes(1, 2) @ error[..., None])[..., 0]
-        n = len(scores)
-        if n >= 2 * scores.shape[1]:  # fewer windows tell nothing of their scatter
-            middle = n / (n - 1) * scores.T @ scores
-        else:
-            middle = information * float(np.mean(np.square(error)))
-        return inverse @ middle @ inverse, tuple(names)
+        told = np.flatnonzero(np.diag(information) > 0)  # of the others the outputs say nothing at all
+        unknown = set(range(len(information))) - set(told.tolist())
+        covariance = np.full(information.shape, math.nan)
+        if len(told):
+            information, b = information[np.ix_(told, told)], b[..., told]
+            size = np.sqrt(np.diag(information))
+            values, directions = np.linalg.eigh(information / np.outer(size, size))
+            weak = np.abs(directions[:, values < UNKNOWN * values[-1]]) > 0.2
+            unknown |= set(told[weak.any(axis=1)].tolist())
+            inverse = (
+                directions / np.maximum(values, 1e-12 * values[-1]) @ directions.T / np.outer(size, size)
+            )
+            scores = (b.swapaxes(1, 2) @ error[..., None])[..., 0]
+            n = len(scores)
+            if n >= 2 * scores.shape[1]:  # fewer windows tell nothing of their scatter
+                middle = n / (n - 1) * scores.T @ scores
+            else:
+                middle = information * float(np.mean(np.square(root * error)))
+            covariance[np.ix_(told, told)] = inverse @ middle @ inverse
+        return covariance, tuple(self.own.names[i] for i in sorted(unknown))
 
 
 def fit_prior(
@@ -437,17 +458,22 @@ def fit_prior(
     fit = OutputFit(make, dt, largest_delay)
     unit = scales.time_unit(train, dt) if time_unit is None else time_unit
     check_observable(fit.prior, dt, unit)
+    if _longest(train) < fit.lead + 3:
+        raise InputError(
+            f"no recording is long enough to fit {type(fit.prior).__name__} to: the longest has {_longest(train)} "
+            f"samples, {fit.lead + 3} are needed at least"
+        )
     lengths = _lengths(train, dt, unit, length, fit.lead)
     total = len(lengths) + 2
     on_progress(0, total, "smoothing by the nominal prior")
-    smoother = fit_smoother(fit.prior, shifted(train, fit.delay(fit.nominal)), dt, time_unit=unit)
-    sizes = np.array(smoother.sizes.x)
-    guesses = [with_states(part, smoother, fit.delay(fit.nominal)) for part in (train, valid)]
+    sizes = np.array(sizes_of(fit.prior, shifted(train, fit.delay(fit.nominal)), dt, unit).x)
+    guesses = _guesses(fit, fit.nominal, (train, valid), unit)
     found: list[tuple[str, Fitted]] = []
     theta = fit.nominal
     if len(theta):
         on_progress(1, total, "several starts")
         theta = _best_start(fit, guesses[0], lengths[0], sizes, start)
+        guesses = _guesses(fit, theta, (train, valid), unit)
         for i, periods in enumerate(lengths):
             on_progress(2 + i, total, f"free runs of {periods * dt:.3g} s")
             windows = cut_outputs(guesses[0], periods, fit.lead, WINDOWS)
@@ -461,7 +487,7 @@ def fit_prior(
     ]
     candidates = [("nominal", Fitted(fit.nominal, np.zeros((0, 0)), ())), *found]
     scores = [_error(fit, c.theta, scored, sizes) for _, c in candidates]
-    if not np.isfinite(min(scores)):
+    if min(scores) > 0.9 * FAR:  # four fifths of all samples are as far off as can be
         raise InputError("the prior diverges with every set of parameters tried; check its signs and units")
     best = int(np.argmin(scores))
     chosen = candidates[best][1]
@@ -547,6 +573,15 @@ def _lengths(
     return sorted(dict.fromkeys(fitting)) or [max(2, longest // 2)]
 
 
+def _guesses(
+    fit: OutputFit, theta: Array, parts: Sequence[Sequence[Trajectory]], unit: float
+) -> list[list[Trajectory]]:
+    """Trajectories with the states that the prior at ``theta`` smooths; the first part decides how."""
+    prior, delay = fit.make(fit.values(theta)), fit.delay(theta)
+    smoother = fit_smoother(prior, shifted(parts[0], delay), fit.dt, time_unit=unit)
+    return [with_states(part, smoother, delay) for part in parts]
+
+
 def _best_start(
     fit: OutputFit, train: Sequence[Trajectory], periods: int, sizes: Array, start: Mapping[str, float] | None
 ) -> Array:
@@ -569,26 +604,27 @@ def _best_start(
 
 def _error(fit: OutputFit, theta: Array, parts: Sequence[OutputWindows], sizes: Array) -> float:
     """Root mean square of the outputs' errors over their spread, with the first states free, over several parts."""
-    found = [fit.fit(theta, part, sizes, 4, fixed=True).error for part in parts]
+    found = [fit.fit(theta, part, sizes, ITERATIONS, fixed=True).error for part in parts]
     return float(np.sqrt(np.average(np.square(found), weights=[part.y.size for part in parts])))
 
 
 def _errors(fit: OutputFit, chosen: Fitted) -> dict[str, float]:
+    """Standard errors of the parameters that the data tell of."""
     if not len(chosen.covariance):
         return {}
     sizes = np.sqrt(np.maximum(np.diag(chosen.covariance), 0.0)) * fit.unit
-    return {p.name: float(e) for p, e in zip(fit.free, sizes, strict=False)}
+    return {p.name: float(e) for p, e in zip(fit.free, sizes, strict=False) if math.isfinite(e)}
 
 
 def _correlations(fit: OutputFit, chosen: Fitted) -> dict[str, float]:
-    """Correlation of the errors of every two fitted parameters, by ``"a, b"``."""
+    """Correlation of the errors of every two parameters that the data tell of, by ``"a, b"``."""
     c = chosen.covariance
     sigma = np.sqrt(np.maximum(np.diag(c), 1e-300)) if len(c) else np.zeros(0)
-    n = min(len(c), len(fit.free))
+    told = [i for i in range(min(len(c), len(fit.free))) if math.isfinite(sigma[i])]
     return {
         f"{fit.names[i]}, {fit.names[j]}": float(c[i, j] / (sigma[i] * sigma[j]))
-        for i in range(n)
-        for j in range(i + 1, n)
+        for k, i in enumerate(told)
+        for j in told[k + 1 :]
     }
 
 
@@ -616,10 +652,13 @@ def _delayed(xdot: ca.Function) -> ca.Function:
 
 @lru_cache(maxsize=64)
 def _outputs(equations: Equations, n: int) -> ca.Function:
-    """Outputs at ``n`` points and their slopes by state and parameters; of inputs as :func:`_delayed` has them."""
+    """Outputs at ``n`` points and their slopes by state, and by parameters and delay; inputs as :func:`_delayed` has
+    them.
+    """
     f = equations.output
     x, u, w, p = (ca.SX.sym(f.name_in(i), f.size1_in(i)) for i in range(4))
     slope, y = ca.SX.sym("slope", u.shape[0]), f(x, u, w, p)
-    values = [ca.densify(v) for v in (y, ca.jacobian(y, x), ca.jacobian(y, p))]
+    by_p = ca.horzcat(ca.jacobian(y, p), ca.jacobian(y, u) @ slope)
+    values = [ca.densify(v) for v in (y, ca.jacobian(y, x), by_p)]
     one = ca.Function("output", [x, ca.vertcat(u, slope), w, p], values)
     return one.map("outputs", "serial", n, [3], [])
