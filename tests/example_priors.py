@@ -17,7 +17,7 @@ class _Tanks:
     outputs = (Signal("lower", "m"),)
     disturbances = (Signal("rain", "m^3/s", 0.0, 0.2),)
     parameters = (
-        Parameter("a_1", 0.8, "m^2", 0.3, 3.0),
+        Parameter("a_1", 1.0, "m^2", 1.0, 1.0),  # an outlet that is not seen tells k_1^2 / a_1 alone
         Parameter("a_2", 1.5, "m^2", 0.3, 3.0),
         Parameter("k_1", 0.15, "m^2.5/s", 0.05, 0.6),
         Parameter("k_2", 0.3, "m^2.5/s", 0.05, 0.6),

@@ -208,8 +208,8 @@ def test_outputs_are_by_default_the_states_of_their_names(prior):
 
 def test_values_replace_the_nominal_ones():
     tanks = Tanks({"k_1": 0.5})
-    assert tanks.values == {"a_1": 0.8, "a_2": 1.5, "k_1": 0.5, "k_2": 0.3}
-    assert tanks.p.tolist() == [0.8, 1.5, 0.5, 0.3]
+    assert tanks.values == {"a_1": 1.0, "a_2": 1.5, "k_1": 0.5, "k_2": 0.3}
+    assert tanks.p.tolist() == [1.0, 1.5, 0.5, 0.3]
     tanks.values["k_1"] = 9.0  # a copy
     assert tanks.p[2] == 0.5
 
