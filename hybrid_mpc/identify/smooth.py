@@ -245,7 +245,11 @@ def _smoothed(found: _Filtered) -> Array:
     """Rauch-Tung-Striebel smoother behind a filter: ``z`` ``(b, n, n_z)``."""
     b, n, n_z, _ = found.now.shape
     forward = found.slope[:, :-1] @ found.now[:, :-1, :, 1:]
-    back = np.swapaxes(np.linalg.solve(found.ahead[:, :-1, :, 1:], forward), -1, -2)
+    # where data are exact some directions are known to rounding: it is added to the correlations
+    covariance = found.ahead[:, :-1, :, 1:]
+    size = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 1e-300))[..., None]
+    correlation = covariance / (size * np.swapaxes(size, -1, -2)) + 1e-14 * np.eye(n_z)
+    back = np.swapaxes(np.linalg.solve(correlation, forward / size) / size, -1, -2)
     own, ahead = found.now[..., 0], found.ahead[:, :-1, :, 0]
     given = own[:, -2::-1] - np.einsum("bnij,bnj->bni", back, ahead)[:, ::-1], back[:, ::-1]
     if n < 2:
@@ -349,9 +353,10 @@ def seen_by(prior: Prior, dt: float, time_unit: float) -> Array:
         if not (np.isfinite(a).all() and np.isfinite(c).all()):
             continue
         step, rows, at = expm(a * dt * skip), [], np.eye(len(x))
-        for _ in range(0, periods, skip):
-            at = at @ step
-            rows.append(c @ at)
+        with np.errstate(over="ignore", invalid="ignore"):  # what runs away is cut off below
+            for _ in range(0, periods, skip):
+                at = at @ step
+                rows.append(c @ at)
         found.append(np.clip(np.nan_to_num(np.stack(rows, axis=1)), -1e100, 1e100))
     if not found:
         return np.zeros((len(prior.outputs), 1, len(x)))
