@@ -752,15 +752,6 @@ def _lengths(train: Sequence[Trajectory], dt: float, unit: float, length: float,
     return sorted(dict.fromkeys(fitting)) or [max(2, longest // 2)]
 
 
-def _guesses(
-    fit: OutputFit, theta: Array, parts: Sequence[Sequence[Trajectory]], unit: float
-) -> list[list[Trajectory]]:
-    """Trajectories with the states that the prior at ``theta`` smooths; the first part decides how."""
-    prior, delay = fit.make(fit.values(theta)), fit.delay(theta)
-    smoother = fit_smoother(prior, shifted(parts[0], delay), fit.dt, time_unit=unit)
-    return [with_states(part, smoother, delay) for part in parts]
-
-
 def _best_start(
     fit: OutputFit,
     train: Sequence[Trajectory],
