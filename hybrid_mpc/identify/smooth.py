@@ -37,8 +37,9 @@ SAMPLE = 12
 FADING = 10.0
 """Machine's seconds in which an unexplained rate fades that nothing tells of: without, what it drives would drift
 away."""
-QUIETEST = 1e-9
-"""Least noise of a sensor, as a share of the spread of its output: recordings of a simulation may have none."""
+QUIETEST = 1e-6
+"""Least noise of a sensor, as a share of the spread of its output: recordings of a simulation may have none, and what is
+not known at first is some 10 spreads, whose square holds no more digits."""
 UNSEEN = 1e-6
 """Share of the outputs' spread below which a state's whole range shows in no output."""
 
@@ -289,7 +290,9 @@ def fit_smoother(
 
     best = float(minimize_scalar(cost, bounds=DECADES, method="bounded", options={"xatol": 0.1}).x)
     squares, _, count = at(best).innovations(sample)
-    return at(best, math.sqrt(squares / max(count, 1)) or 1.0)
+    sizes = at(best).sizes
+    least = QUIETEST * float(np.max(np.array(sizes.y) / np.array(sizes.noise)))
+    return at(best, max(math.sqrt(squares / max(count, 1)), least))
 
 
 def rough_smoother(

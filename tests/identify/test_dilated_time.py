@@ -76,7 +76,12 @@ def test_windows_are_of_half_a_second_and_two_at_20_ms(runs):
     longer = fit_prior(Pendulum, runs[:1], runs[1:2], dt=DT, length=1.5)
     assert [row["stage"] for row in longer.stages] == ["nominal", "free runs of 0.5 s", "free runs of 1.5 s"]
     known = fit_prior(Pendulum, runs[:1], runs[1:2], dt=DT, time_unit=0.8)
-    assert [row["stage"] for row in known.stages] == ["nominal", "free runs of 0.4 s", "free runs of 1.6 s"]
+    assert [row["stage"] for row in known.stages] == [
+        "nominal",
+        "free runs of 0.4 s",
+        "free runs of 1.6 s",
+        "free runs of 2.98 s",
+    ]
 
 
 def test_a_recording_shorter_than_any_window_is_one(runs):
