@@ -701,7 +701,7 @@ def parameter_variance(prior: Prior, covariance: Array, x: Array, u: Array, w: A
         v.full().reshape(v.shape[0], b * n, -1).swapaxes(0, 1)
         for v in _outputs(prior.equations, b * n)(*held, flat_w, prior.p)
     )
-    slope = c @ by_p.reshape(b * n, -1, by_p.shape[-1]) + d
+    slope = c @ by_p.reshape(b * n, -1, by_p.shape[-1]) + d[..., : len(prior.parameters)]
     variance = np.einsum("kip,pq,kiq->ki", slope, covariance, slope).reshape(b, n, y.shape[1])
     return np.asarray(np.nan_to_num(np.maximum(variance, 0.0), nan=np.inf))
 
