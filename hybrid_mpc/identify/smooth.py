@@ -38,8 +38,8 @@ FADING = 10.0
 """Machine's seconds in which an unexplained rate fades that nothing tells of: without, what it drives would drift
 away."""
 QUIETEST = 1e-6
-"""Least noise of a sensor, as a share of the spread of its output: recordings of a simulation may have none, and what is
-not known at first is some 10 spreads, whose square holds no more digits."""
+"""Least noise of a sensor, as a share of the spread of its output: recordings of a simulation may have none, and what
+is not known at first is some 10 spreads, whose square holds no more digits."""
 UNSEEN = 1e-6
 """Share of the outputs' spread below which a state's whole range shows in no output."""
 
