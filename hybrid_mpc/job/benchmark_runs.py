@@ -72,11 +72,8 @@ def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
     needed: tuple[Role, ...] = () if spec.cycle or uncut else ("train", "valid")
     dataset = load_trajectories(
         paths,
+        prior,
         scenario.data,
-        disturbances=prior.disturbances,
-        outputs=prior.outputs,
-        inputs=prior.inputs,
-        states=prior.states,
         needed=needed,
     )
     parts = _parts(dataset, scenario, uncut)
@@ -167,11 +164,8 @@ def read_test(
     spec = replace(scenario.data, windows={})
     dataset = load_trajectories(
         [path],
+        prior,
         spec,
-        disturbances=prior.disturbances,
-        outputs=prior.outputs,
-        inputs=prior.inputs,
-        states=prior.states,
         needed=(),
     )
     if not dataset.whole:

@@ -21,7 +21,6 @@ from scenarios.pendulum.data import (
     simulate,
     stems,
 )
-from scenarios.pendulum.nominal import OUTPUTS
 from scenarios.pendulum.oracle import oracle
 from scenarios.pendulum.plant import DampedPendulum, PendulumParameters
 from scenarios.pendulum.prior import PendulumPrior, PublishedPendulumPrior
@@ -150,7 +149,7 @@ def test_bad_options_are_refused(options, words):
 def test_files_hold_what_was_measured_and_load_with_every_role(tmp_path):
     files = make_data(tmp_path, 3, "quick")
     assert [f.stem for f in files] == stems("quick")
-    data = load_trajectories(files, scenario.data, outputs=OUTPUTS, inputs=scenario.prior().inputs)
+    data = load_trajectories(files, scenario.prior(), scenario.data)
     assert {role: len(data.by_role(role)) for role in ("train", "valid", "test")} == {
         "train": 6, "valid": 3, "test": 4,
     }  # fmt: skip
