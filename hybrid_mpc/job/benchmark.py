@@ -270,7 +270,7 @@ def _fitted_prior(scenario: Scenario, data: Recordings, out: Path, progress: Pro
         data.valid,
         dt=scenario.data.dt,
         length=spec.length or spec.piece,
-        largest_delay=spec.largest_delay,
+        largest_delay=scenario.data.largest_delay,
         on_progress=partial(progress.update, "prior"),
     )
     write_document(note, plain(fit))
