@@ -67,7 +67,9 @@ def run(
     check_choice(only, skip)
     scenario = load_scenario(settings.scenario)
     context = Context(settings, scenario, out, progress or Progress())
-    check_scenario(scenario, context.budget)
+    found = check_scenario(scenario, context.budget, (lambda: context.dataset) if settings.data else None)
+    for warning in found.warnings:
+        context.progress.warn(warning)
     check_data(context)
     check_device(settings.device)
     if settings.deploy:
@@ -97,9 +99,10 @@ def check_choice(only: Sequence[str], skip: Sequence[str]) -> None:
 def _as_it_is(context: Context, stage: Stage[Any]) -> str:
     """Take a stage as the folder holds it."""
     stored = context.stored(stage)
-    if stored is None:
+    if stored is None or stored.unfit:
         if not stage.optional:
-            raise InputError(f"stage {stage.name} has not run in {context.out}; leave --only out")
+            why = f"has not run in {context.out}" if stored is None else f"must run again: {stored.unfit}"
+            raise InputError(f"stage {stage.name} {why}; leave --only out")
         context.leave_out(stage, f"stage {stage.name} was left out")
         return "left out"
     why = changed(stored.keys, stage.keys(context))

@@ -14,8 +14,8 @@ from hybrid_mpc.data.excitation import check_excitation
 from hybrid_mpc.data.trajectories import ROLES, Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import digest, read_document, read_document_arrays, sha256, write_document
-from hybrid_mpc.identify.export import prior_programs
 from hybrid_mpc.identify.fit import fit_prior, smoothed
+from hybrid_mpc.identify.prior_model import prior_programs
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.settings import KINDS, TrainingSettings
 from hybrid_mpc.identify.step import PriorStep, Scaling, Step
