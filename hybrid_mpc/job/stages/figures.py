@@ -292,7 +292,8 @@ def _analysis(context: Context) -> Any:
         "Poles of the one-step maps at rest.",
     )
     prior = context.scenario.prior()
-    titles = {"rest": "at rest, where the slope of dry friction dominates", "moving": "at working speed"}
+    friction = ", where the slope of dry friction dominates" if prior.kinematics else ""
+    titles = {"rest": f"at rest{friction}", "moving": "at working speed"}
     for point in ("rest", "moving"):
         if point not in found.models["prior"].points:
             continue

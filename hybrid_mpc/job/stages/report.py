@@ -46,7 +46,7 @@ from hybrid_mpc.job.stages.results import (
 )
 from hybrid_mpc.job.summary import Summary
 from hybrid_mpc.monitor.residuals import force_units
-from hybrid_mpc.plots.style import name_of
+from hybrid_mpc.plots.style import name_of, number
 from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, Verdict, words, write_report
 
 TITLES: Mapping[str, str] = {
@@ -206,6 +206,14 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         "analysis": [_pole_table(results.analysis)],
     }
     instead, after = _notes(context, results)
+    for key in (
+        "estimation",
+        "timing",
+        "monitor",
+        "guard",
+    ):  # words about pictures that are not there help nobody
+        if key in after and not figures.get(key) and not any(t is not None and t.rows for t in tables[key]):
+            instead[key] = after.pop(key)
     texts = words("run_words.html")
     sections = tuple(
         Section(
@@ -307,6 +315,8 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
     )
     if context.prior.fit.warnings:
         after["models"] = ("Warnings of the fit: " + "; ".join(context.prior.fit.warnings) + ".",)
+    if results.timing.misses is None:
+        after["timing"] = (f"No step was timed: {results.timing.misses_reason.rstrip('.')}.",)
     monitor = results.monitor
     if monitor.details.calibration is None:
         after["monitor"] = (f"No alarms here: {monitor.reason.rstrip('.')}.",)
@@ -534,11 +544,15 @@ def _pole_table(analysis: Analysis) -> Table | None:
     rows = []
     for model, found in analysis.details.models.items():
         for point, a in found.points.items():
-            slow = [f"{w:.2f} ({z:.2f})" for w, z in
+            slow = [f"{number(w)} ({z:.2f})" for w, z in
                     list(zip(a.frequency_rad_s, a.damping, strict=True))[:2] if w is not None]  # fmt: skip
             rows.append((model, point, ", ".join(slow), a.stable, a.stabilisable, a.detectable))
     columns = ("model", "point", "slowest poles: rad/s (damping)", "stable", "stabilisable", "detectable")
-    return Table(columns, rows, "Linearizations at rest and at working speed.")
+    points = {"rest": "at rest", "moving": "at working speed"}
+    there = [
+        points[p] for p in points if any(p in found.points for found in analysis.details.models.values())
+    ]
+    return Table(columns, rows, f"Linearizations {' and '.join(there)}.")
 
 
 REPORT = Stage(
