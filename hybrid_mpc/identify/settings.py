@@ -6,11 +6,25 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.specification import check_prior_replay
 
 Kind = Literal["rnn", "pgrnn", "mopgrnn"]
 PriorParameters = Literal["fixed", "trained"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
+NO_BALANCE = "the prior has no balance, so a MOPGRNN would be the PGRNN once more"
+"""Why there is no MOPGRNN of a prior without balances."""
+
+
+def kinds_of(prior: Prior) -> tuple[Kind, ...]:
+    """Kinds of networks that differ for a prior: one without balances has no second objective, so no MOPGRNN.
+
+    Example:
+        >>> from scenarios.pendulum.prior import PendulumPrior
+        >>> kinds_of(PendulumPrior())
+        ('rnn', 'pgrnn', 'mopgrnn')
+    """
+    return tuple(kind for kind in KINDS if kind != "mopgrnn" or prior.equations.balances)
 
 
 @dataclass(frozen=True)

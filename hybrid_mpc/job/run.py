@@ -20,7 +20,7 @@ from hybrid_mpc.job.stages.estimate import ESTIMATION
 from hybrid_mpc.job.stages.evaluate import EVALUATION
 from hybrid_mpc.job.stages.export import EXPORT, NOISE
 from hybrid_mpc.job.stages.guard import GUARD
-from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, check_data
+from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, check_data, models_of
 from hybrid_mpc.job.stages.monitor import MONITOR
 from hybrid_mpc.job.stages.report import REPORT
 from hybrid_mpc.job.stages.results import Results, read_results
@@ -73,7 +73,8 @@ def run(
     check_data(context)
     check_device(settings.device)
     if settings.deploy:
-        known(settings.deploy, CANDIDATES, "model to deploy")
+        there = models_of(scenario.prior())
+        known(settings.deploy, [name for name in CANDIDATES if name in there], "model to deploy")
     with open_folder(out, run_note(settings), resume=resume):
         for stage in STAGES:
             context.progress.start(stage.title)

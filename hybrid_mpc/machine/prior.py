@@ -194,6 +194,26 @@ class Prior:
         return tuple(i for i, name in enumerate(names) if name in chosen)
 
     @property
+    def kinematics(self) -> tuple[tuple[int, int], ...]:
+        """Places in ``x`` of each state whose rate is another state, and of that one: a position and its speed.
+
+        Example:
+            >>> from scenarios.pendulum.prior import PendulumPrior
+            >>> PendulumPrior().kinematics
+            ((0, 1),)
+        """
+        point = [ca.SX.sym(key, len(self.names_of(key))) for key in POINT]
+        rates = self.equations.xdot(*point)
+        slopes = ca.jacobian(rates, ca.vertcat(*point))
+        found = []
+        for i in range(rates.numel()):
+            row = slopes[i, :]
+            places = row.sparsity().get_col()
+            if len(places) == 1 and places[0] < len(self.states) and ca.is_equal(row.nz[0], ca.SX(1)):
+                found.append((i, places[0]))
+        return tuple(found)
+
+    @property
     def equations(self) -> Equations:
         """The prior as CasADi functions of ``(x, u, w, p)``; made once for equal priors."""
         return _equations(_Alike(self))

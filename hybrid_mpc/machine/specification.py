@@ -167,8 +167,9 @@ class BenchmarkSpec:
 
     Args:
         budgets: Effort by name, ``"quick"`` and ``"full"``.
-        unit: Unit of the figures, e.g. ``"mm"`` for an output in metres.
-        scale: Factor from the output's unit to ``unit``, e.g. 1000 from m to mm. Default: 1.
+        unit: Unit of the first output's figures, e.g. ``"mm"`` for an output in metres. Default: the output's own, as
+            further outputs have it.
+        scale: Factor from the first output's unit to ``unit``, e.g. 1000 from m to mm. Default: 1.
         length: Length [s] of a run after what is given. Default: the whole recording.
         piece: Length [s] of the pieces that long training recordings are cut into. Default: 25 s.
         cycle: Roles of these pieces, again and again in order of time, where a recording's parts are not alike and
@@ -187,7 +188,7 @@ class BenchmarkSpec:
     """
 
     budgets: Mapping[str, BenchmarkBudget] = field(default_factory=dict)
-    unit: str = field(kw_only=True)
+    unit: str = field(default="", kw_only=True)
     scale: float = 1.0
     length: float | None = None
     piece: float = 25.0
