@@ -56,14 +56,14 @@ SETTINGS = {
         "hidden": 16,
         "networks": 2,
         "teacher_steps": 200,
-        "free_run_steps": 200,
+        "free_run_steps": 120,
         "horizon": 60,
     },
     "torque_pendulum": {
         "hidden": 16,
         "networks": 4,
         "teacher_steps": 300,
-        "free_run_steps": 400,
+        "free_run_steps": 150,
         "decay": 6000.0,
     },
 }
