@@ -147,12 +147,8 @@ def model_states(
     with torch.no_grad():
         for k in range(warm):
             _, h = step(x_all[..., k, :], h, u_all[..., k, :], w_all[..., k, :])
-        x = x_all[..., warm, :]
-        states = [x]
-        for k in range(warm, longest):
-            x, h = step(x, h, u_all[..., k, :], w_all[..., k, :])
-            states.append(x)
-    x_hat: Array = torch.stack(states, -2).numpy()
+        held = (a[..., warm:, :].movedim(-2, 0) for a in (u_all, w_all))
+        x_hat: Array = step.free_run(x_all[..., warm, :], h, *held).movedim(0, -2).numpy()
     return x_hat
 
 

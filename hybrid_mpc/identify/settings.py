@@ -36,7 +36,6 @@ class TrainingSettings:
         objectives: Names in :data:`~hybrid_mpc.identify.objectives.OBJECTIVES`, of balances of the prior, or
             ``"balances"`` for all of these; the curve has them all, the first one is that of free runs and validation.
             Default: the outputs, which models are judged by, and all balances.
-        fused: Faster sequences of the GRUs, with other rounding.
         prior_parameters: ``"fixed"`` at their fitted values, or ``"trained"`` along within their bounds, each network
             its own. The energy balance of the objective keeps the fitted values.
         prior_replay: Weight of the mean square of the correction (in its own scale) in states that no recording comes
@@ -66,7 +65,6 @@ class TrainingSettings:
     every: int = 25
     validation_horizon: int | None = None
     objectives: tuple[str, ...] = ("output", "balances")
-    fused: bool = False
     prior_parameters: PriorParameters = "fixed"
     prior_replay: float = 0.0
 

@@ -388,7 +388,7 @@ def _stack(prior: Prior, s: TrainingSettings, form: type[RecurrentStep]) -> Stac
     """The untrained stack of a training."""
     n_in, n_out = form.sizes(prior, s.use_prior)
     zero_head = s.use_prior and form.corrects_prior  # a model that corrects the prior starts as the prior
-    return StackedGRU(s.networks, n_in, s.hidden, n_out, seed=s.seed, zero_head=zero_head, fused=s.fused)
+    return StackedGRU(s.networks, n_in, s.hidden, n_out, seed=s.seed, zero_head=zero_head)
 
 
 def _by(values: Tensor, weight: Tensor) -> Tensor:

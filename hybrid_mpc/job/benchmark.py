@@ -284,7 +284,6 @@ def training_settings(kind: str, budget: BenchmarkBudget, *, seed: int, warm: in
         seed=seed,
         warm=warm,
         objectives=("output", "balances"),
-        fused=True,
         **asdict(budget),
     )
 

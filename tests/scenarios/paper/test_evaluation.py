@@ -52,7 +52,7 @@ def test_the_bound_is_that_of_the_largest_measured_output():
 @pytest.mark.parametrize("form", ["hybrid", "paper"])
 def test_all_networks_at_once_are_the_networks_one_by_one(form):
     prior, warm = PublishedPendulumPrior(), 10
-    settings = TrainingSettings("pgrnn", 4, 3, 5, 0, seed=0, warm=warm, batch=4, every=5, fused=True)
+    settings = TrainingSettings("pgrnn", 4, 3, 5, 0, seed=0, warm=warm, batch=4, every=5)
     data = exact_runs("train", 1), exact_runs("valid", 1)
     trained = train(prior, *data, settings, form=step_class(form))
     test = exact_runs("test", 2)
