@@ -129,7 +129,7 @@ def hybrid_mpc(problem: Problem, watch: Watch, seed: int) -> None:
     watch.look(partial(predict, "phy", {}))
     train, valid = (smoothed(make, fit, part, dt) for part in (p.train, p.valid))
     warm = warm_samples(p.warm * dt, fit.delay, dt)
-    settings = TrainingSettings(kind="pgrnn", seed=seed, warm=warm, fused=True, **p.settings)
+    settings = TrainingSettings(kind="pgrnn", seed=seed, warm=warm, **p.settings)
     run = TrainingRun(prior, train, valid, settings)
     while not run.over:  # as hybrid_mpc.train does
         if run.done in (0, settings.teacher_steps):
