@@ -37,7 +37,8 @@ def given(prior, seed=0):
     rng = np.random.default_rng(seed)
     n_x, n_u, n_w = len(prior.states), len(prior.inputs), len(prior.disturbances)
     x0, u, w = (
-        rng.uniform(0.5, 1.0, shape) for shape in ((RUNS, n_x), (RUNS, PERIODS, n_u), (RUNS, PERIODS, n_w))
+        rng.uniform(0.5, 1.0, shape)
+        for shape in ((RUNS, n_x), (RUNS, PERIODS + 1, n_u), (RUNS, PERIODS + 1, n_w))
     )
     return x0, u, w, prior.p * rng.uniform(0.9, 1.1, len(prior.p))
 
@@ -45,7 +46,7 @@ def given(prior, seed=0):
 def torch_run(prior, x0, u, w, p, extra=0.0):
     """One run ``(PERIODS + 1, n_x)`` by the equations on tensors."""
     rates, states = PriorEquations(prior).xdot, [x0]
-    for u_k, w_k in zip(u, w, strict=True):
+    for u_k, w_k in zip(u[:-1], w[:-1], strict=True):
         f = lambda x, held=(u_k, w_k): rates(x, *held, p) + extra  # noqa: E731
         states.append(rk4(f, states[-1], PERIOD[type(prior)], SUBSTEPS))
     return torch.stack(states)
@@ -57,7 +58,8 @@ def test_values_and_derivatives_are_those_of_torch(kind):
     x0, u, w, p = given(prior)
     free = list(range(len(p)))[::-1]  # in an order of its own
     simulation = Simulation(prior.equations.xdot, PERIOD[kind], free)
-    x, by_p, by_x = simulation.by_all(x0, u, w, p, SUBSTEPS)
+    x, slopes = simulation.by_all(x0, u, w, p, SUBSTEPS)
+    by_p, by_x = slopes[..., : len(free)], slopes[..., len(free) :]
     for i in range(RUNS):
         a, u_i, w_i, q = (torch.tensor(v) for v in (x0[i], u[i], w[i], p))
         # rounding of some hundred operations on numbers of order one
@@ -66,10 +68,10 @@ def test_values_and_derivatives_are_those_of_torch(kind):
         def run(a, q, u_i=u_i, w_i=w_i):
             return torch_run(prior, a, u_i, w_i, q)
 
-        slopes = jacfwd(run, argnums=(0, 1))(a, q)
-        np.testing.assert_allclose(by_x[i], slopes[0], rtol=0, atol=1e-11)
-        np.testing.assert_allclose(by_p[i], slopes[1][..., free], rtol=0, atol=1e-11)
-    np.testing.assert_array_equal(simulation.states(x0, u, w, p, SUBSTEPS), x)
+        want = jacfwd(run, argnums=(0, 1))(a, q)
+        np.testing.assert_allclose(by_x[i], want[0], rtol=0, atol=1e-11)
+        np.testing.assert_allclose(by_p[i], want[1][..., free], rtol=0, atol=1e-11)
+    np.testing.assert_array_equal(simulation.values(x0, u, w, p, SUBSTEPS), x)
     for one, other in zip(simulation.by_parameters(x0, u, w, p, SUBSTEPS), (x, by_p), strict=True):
         np.testing.assert_array_equal(one, other)
 
@@ -79,16 +81,16 @@ def test_derivatives_are_those_of_finite_differences(kind):
     prior = kind()
     x0, u, w, p = given(prior, seed=1)
     simulation = Simulation(prior.equations.xdot, PERIOD[kind], [1, 0])
-    _, by_p, by_x = simulation.by_all(x0, u, w, p, SUBSTEPS)
+    _, slopes = simulation.by_all(x0, u, w, p, SUBSTEPS)
 
     def end(z):
         q = p.copy()
         q[[1, 0]] = z[:2]
-        return simulation.states(z[None, 2:], u[:1], w[:1], q, SUBSTEPS)[0, -1]
+        return simulation.values(z[None, 2:], u[:1], w[:1], q, SUBSTEPS)[0, -1]
 
     numeric = approx_derivative(end, np.concatenate([p[[1, 0]], x0[0]]), method="3-point")
     # three-point differences: rounding^(2/3) of states of the order of one
-    np.testing.assert_allclose(numeric, np.hstack([by_p[0, -1], by_x[0, -1]]), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(numeric, slopes[0, -1], rtol=0, atol=1e-8)
 
 
 def test_a_disturbance_acts_in_its_own_period():
@@ -97,7 +99,7 @@ def test_a_disturbance_acts_in_its_own_period():
     simulation = Simulation(prior.equations.xdot, 0.5)
     dry = w.copy()
     dry[:, 7] = 0.0
-    one, two = (simulation.states(x0, u, v, prior.p, SUBSTEPS) for v in (w, dry))
+    one, two = (simulation.values(x0, u, v, prior.p, SUBSTEPS) for v in (w, dry))
     np.testing.assert_array_equal(one[:, :8], two[:, :8])
     assert (one[:, 8:, 1] > two[:, 8:, 1]).all()
     np.testing.assert_array_equal(one[..., 0], two[..., 0])  # it rains into the lower tank
@@ -107,9 +109,9 @@ def test_parameters_may_be_those_of_each_run():
     prior = Pendulum()
     x0, u, w, p = given(prior)
     simulation, rows = Simulation(prior.equations.xdot, 0.02), p * np.linspace(0.8, 1.2, RUNS)[:, None]
-    together = simulation.states(x0, u, w, rows, SUBSTEPS)
+    together = simulation.values(x0, u, w, rows, SUBSTEPS)
     alone = [
-        simulation.states(*(v[i : i + 1] for v in (x0, u, w)), rows[i], SUBSTEPS)[0] for i in range(RUNS)
+        simulation.values(*(v[i : i + 1] for v in (x0, u, w)), rows[i], SUBSTEPS)[0] for i in range(RUNS)
     ]
     np.testing.assert_array_equal(together, alone)
 
@@ -120,7 +122,7 @@ def test_unknown_rates_act_on_the_states_that_are_corrected_and_stay(kind, rows)
     x0, u, w, p = given(prior)
     d = np.random.default_rng(1).normal(size=(RUNS, len(rows))) * 0.05
     extended = Simulation(with_unknown_rates(prior.equations.xdot, rows), PERIOD[kind])
-    z, n_x = extended.states(np.hstack([x0, d]), u, w, p, SUBSTEPS), x0.shape[1]
+    z, n_x = extended.values(np.hstack([x0, d]), u, w, p, SUBSTEPS), x0.shape[1]
     for i in range(RUNS):
         extra = torch.zeros(n_x).double()
         extra[list(rows)] = torch.tensor(d[i])
