@@ -48,7 +48,8 @@ def trace_model(step: Step) -> dict[str, nn_export.Program]:
     Args:
         step: The model.
     """
-    programs, examples = prior_programs(step.prior, step.dt), _examples(step)
+    substeps = step.substeps if isinstance(step, PriorStep) else 0
+    programs, examples = prior_programs(step.prior, step.dt, substeps), _examples(step)
     if isinstance(step, PriorStep):
         return programs
     for name, method in (("step", "forward"), ("xdot", "xdot")):
@@ -59,14 +60,17 @@ def trace_model(step: Step) -> dict[str, nn_export.Program]:
     return programs
 
 
-def prior_programs(prior: Prior, dt: float) -> dict[str, nn_export.Program]:
-    """Programs of the prior alone: ``step`` and ``xdot`` with no hidden state, ``output``, and its balances."""
+def prior_programs(prior: Prior, dt: float, substeps: int = 0) -> dict[str, nn_export.Program]:
+    """Programs of the prior alone: ``step`` and ``xdot`` with no hidden state, ``output``, and its balances.
+
+    A period is integrated in ``substeps``. Default 0: as many as the prior needs at rest.
+    """
     equations = prior.equations
     names = dict(zip(POINT, (prior.states, prior.inputs, prior.disturbances, prior.parameters), strict=True))
     x, u, w, p = (ca.SX.sym(key, len(signals)) for key, signals in names.items())
     h = ca.SX.sym("h", 0)
     rates = equations.xdot(x, u, w, p)
-    x_next = stepped(equations.xdot, x, u, w, p, dt, required_substeps(prior, dt))
+    x_next = stepped(equations.xdot, x, u, w, p, dt, substeps or required_substeps(prior, dt))
     given, outputs = (
         {"step": [x, h, u, w, p], "xdot": [x, h, u, w, p]},
         {"step": [x_next, h], "xdot": [rates]},

@@ -25,7 +25,7 @@ from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.delay import NONE, shifted
 from hybrid_mpc.identify.prior_result import PriorFit
-from hybrid_mpc.identify.simulation import Simulation, flow_slope, required_substeps, rest_of
+from hybrid_mpc.identify.simulation import Points, Simulation, flow_slope, required_substeps, rest_of, visited
 from hybrid_mpc.identify.smooth import SAMPLE, Smoother, fit_smoother, rough_smoother, unseen_states
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.signals import Signal
@@ -160,6 +160,8 @@ class OutputFit:
         own = [abs(p.value) if p.value else (p.upper - p.lower) for p in self.free]
         self.unit = np.array([*own, *late])
         self._simulations: dict[tuple[int, ...], Simulation] = {}
+        self.points: Points | None = None
+        """Where the recordings go, once their states are known."""
         self.nominal = (
             np.array([*(p.value for p in self.free), *(0.5 * largest_delay for _ in late)]) / self.unit
         )
@@ -192,8 +194,8 @@ class OutputFit:
         return found if found >= NONE * self.dt else 0.0
 
     def substeps(self, theta: Array) -> int:
-        """Sub-steps a period that the stiffness at ``theta`` asks for."""
-        return required_substeps(self.make(self.values(theta)), self.dt)
+        """Sub-steps a period that the stiffness at ``theta`` asks for, at rest and where the recordings go."""
+        return required_substeps(self.make(self.values(theta)), self.dt, self.points)
 
     def outputs(
         self, theta: Array, x: Array, windows: OutputWindows, substeps: int, slopes: Slopes
@@ -655,6 +657,11 @@ def fit_prior(
     smoother = rough_smoother(fit.prior, shifted(train, fit.delay(fit.nominal)), dt, time_unit=unit)
     sizes = np.array(smoother.sizes.x)
     every = with_states([*train, *valid], smoother, fit.delay(fit.nominal))
+    fit.points = visited(every)
+    if fit.substeps(fit.nominal) > smoother.substeps:  # stiff where the recordings go
+        smoother = replace(smoother, substeps=fit.substeps(fit.nominal))
+        every = with_states([*train, *valid], smoother, fit.delay(fit.nominal))
+        fit.points = visited(every)
     guesses = every[: len(train)], every[len(train) :]
     found: list[tuple[str, Fitted]] = []
     theta, states = fit.nominal, fit.prior.states
@@ -685,7 +692,8 @@ def fit_prior(
             )
         chosen = candidates[int(np.argmin(scores))][1]
         acting = shifted([*train, *valid], fit.delay(chosen.theta))
-        return chosen, fit_smoother(make(fit.values(chosen.theta)), acting, dt, time_unit=unit)
+        fitted, substeps = make(fit.values(chosen.theta)), fit.substeps(chosen.theta)
+        return chosen, fit_smoother(fitted, acting, dt, time_unit=unit, substeps=substeps)
 
     chosen, smoother = best()
     acting = shifted(train, fit.delay(chosen.theta))
@@ -701,7 +709,7 @@ def fit_prior(
     return PriorFit(
         fit.values(chosen.theta), _errors(fit, chosen), _warnings(fit, chosen, answered), stages,
         _correlations(fit, chosen), fit.delay(chosen.theta), smoother.sigma, smoother.walk, smoother.sizes,
-        smoother.fading,
+        smoother.fading, smoother.substeps,
     )  # fmt: skip
 
 
@@ -720,6 +728,7 @@ def refit(
     """
     known = smoothed(make, fit, trajectories, dt)
     own, sizes, stages = OutputFit(make, dt), np.array(fit.smoother(make(fit.values), dt).sizes.x), []
+    own.points = visited(known)
     found = Fitted(own.scaled(fit.values), np.zeros((0, 0)), ())
     for length in lengths:
         periods = min(scales.periods(length, dt, 2), _longest(known) - 1)
@@ -730,7 +739,7 @@ def refit(
         stages.append({"stage": f"free runs of {length:g} s", "validation_error": error})
     return replace(
         fit, values=own.values(found.theta), standard_errors=_errors(own, found), warnings=_warnings(own, found),
-        stages=tuple(stages), correlations=_correlations(own, found),
+        stages=tuple(stages), correlations=_correlations(own, found), substeps=own.substeps(found.theta),
     )  # fmt: skip
 
 
@@ -741,7 +750,9 @@ def smoothed(
     return fit.smoother(make(fit.values), dt).smooth(shifted(trajectories, fit.delay))
 
 
-def parameter_variance(prior: Prior, covariance: Array, x: Array, u: Array, w: Array, dt: float) -> Array:
+def parameter_variance(
+    prior: Prior, covariance: Array, x: Array, u: Array, w: Array, dt: float, substeps: int = 0
+) -> Array:
     """Variance of the outputs of free runs by that of the parameters ``(b, n, n_y)`` [output units^2].
 
     Args:
@@ -751,9 +762,10 @@ def parameter_variance(prior: Prior, covariance: Array, x: Array, u: Array, w: A
         u: Inputs ``(b, n, n_u)``.
         w: Disturbances ``(b, n, n_w)``.
         dt: Period [s].
+        substeps: Runge-Kutta sub-steps a period. Default 0: as many as the prior needs at rest.
     """
     simulation = Simulation(prior.equations.xdot, dt, range(len(prior.parameters)), prior.equations.output)
-    _, slope = simulation.by_parameters(x, u, w, prior.p, required_substeps(prior, dt))
+    _, slope = simulation.by_parameters(x, u, w, prior.p, substeps or required_substeps(prior, dt))
     variance = np.einsum("bkip,pq,bkiq->bki", slope, covariance, slope)
     return np.asarray(np.nan_to_num(np.maximum(variance, 0.0), nan=np.inf))
 

@@ -9,12 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cache, lru_cache
-from typing import Any
+from typing import Any, TypeAlias
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_mpc.data.scales import evenly
+from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.signals import Signal
@@ -23,6 +25,10 @@ from nn_export.vectorised import vectorised
 Array = NDArray[np.float64]
 MAX_SUBSTEPS = 20
 """A prior stiffer than this many Runge-Kutta sub-steps a period can follow needs another dt."""
+VISITED = 200
+"""Samples of the recordings that are asked how stiff the prior is there, beside the outermost ones."""
+Points: TypeAlias = tuple[Array, Array, Array]
+"""States ``(n, n_x)``, inputs ``(n, n_u)`` and disturbances ``(n, n_w)``."""
 
 
 class Simulation:
@@ -164,15 +170,39 @@ def with_unknown_rates(xdot: ca.Function, corrected: tuple[int, ...]) -> ca.Func
     return ca.Function("xdot", [z, u, w, p], [ca.densify(rate)], ["x", "u", "w", "p"], ["xdot"])
 
 
-def required_substeps(prior: Prior, dt: float) -> int:
-    """Sub-steps a period that keep every eigenvalue of the prior at rest within 1 / sub-step.
+def required_substeps(prior: Prior, dt: float, points: Points | None = None) -> int:
+    """Sub-steps a period that keep every eigenvalue of the prior within 1 / sub-step: at rest, and at points.
 
-    Rest is the operating point, or else the middle of the signals' ranges (:func:`rest_of`).
-    Runge-Kutta of order 4 is stable up to 2.8 and accurate to per cents of the fast mode at 1.
+    Rest is the operating point, or else the middle of the signals' ranges (:func:`rest_of`). Points are where the
+    machine was (:func:`visited`). Runge-Kutta of order 4 is stable up to 2.8 and accurate to per cents of the fast mode
+    at 1.
+
+    Raises:
+        InputError: If that is more than ``MAX_SUBSTEPS``.
     """
-    return substeps_for(
-        prior.equations.xdot, *rest_of(prior), prior.p, dt, f"{type(prior).__name__}: the prior"
-    )
+    name = f"{type(prior).__name__}: the prior"
+    substeps = substeps_for(prior.equations.xdot, *rest_of(prior), prior.p, dt, name)
+    if points is None or not len(points[0]):
+        return substeps
+    slopes = _slopes_at(prior.equations.xdot, len(points[0]))(*(v.T for v in points), prior.p).full()
+    every = np.moveaxis(slopes.reshape(len(prior.states), -1, len(prior.states)), 1, 0)
+    every = every[np.isfinite(every).all(axis=(1, 2))]
+    rate = float(np.abs(np.linalg.eigvals(every)).max(initial=0.0))
+    return max(substeps, _substeps(rate, dt, name, "where the recordings go"))
+
+
+def visited(trajectories: Sequence[Trajectory]) -> Points:
+    """States, inputs and disturbances where the machine was: some samples, evenly chosen, and the outermost ones.
+
+    They decide how stiff a prior is that is stiff in a part of its range alone.
+    """
+    columns = [np.concatenate([getattr(t, key) for t in trajectories]) for key in ("x", "u", "w")]
+    every = np.hstack(columns)[np.isfinite(np.hstack(columns)).all(axis=1)]
+    if len(every):
+        outermost = {int(i) for found in (every.argmin(axis=0), every.argmax(axis=0)) for i in found}
+        every = every[sorted({*evenly(len(every), VISITED), *outermost})]
+    x, u, w = np.split(every, np.cumsum([v.shape[1] for v in columns])[:-1], axis=1)
+    return x, u, w
 
 
 def rest_of(prior: Prior) -> tuple[Array, Array, Array]:
@@ -197,14 +227,23 @@ def substeps_for(xdot: ca.Function, x: Any, u: Any, w: Any, p: Any, dt: float, n
     """:func:`required_substeps` of any ``xdot(x, u, w, p)`` at a point; an error says that ``name`` is too stiff."""
     slope = flow_slope(xdot)(x, u, w, p).full()
     rate = float(np.abs(np.linalg.eigvals(slope)).max()) if np.isfinite(slope).all() else math.inf
+    return _substeps(rate, dt, name, "at rest")
+
+
+def _substeps(rate: float, dt: float, name: str, where: str) -> int:
     substeps = max(1, math.ceil(rate * dt)) if math.isfinite(rate) else MAX_SUBSTEPS + 1
     if substeps > MAX_SUBSTEPS:
         raise InputError(
-            f"{name}'s fastest mode at rest is {rate:.3g} 1/s; a period of {dt} s "
+            f"{name}'s fastest mode {where} is {rate:.3g} 1/s; a period of {dt} s "
             f"would need {rate * dt:.3g} sub-steps (at most {MAX_SUBSTEPS}). Smooth its friction (lower the slope "
             f"at zero speed) or take a smaller dt."
         )
     return substeps
+
+
+@lru_cache(maxsize=64)
+def _slopes_at(xdot: ca.Function, n: int) -> ca.Function:
+    return flow_slope(xdot).map("slopes", "serial", n, [3], [])
 
 
 @lru_cache(maxsize=32)

@@ -21,6 +21,7 @@ from hybrid_mpc.identify.simulation import (
     required_substeps,
     rest_of,
     stepped,
+    visited,
     with_unknown_rates,
 )
 from hybrid_mpc.machine.prior import Equations, Prior
@@ -88,6 +89,7 @@ class Smoother:
         walk: Standard deviation of d's change per period ``(n_d,)`` [units of the corrected rates].
         sizes: Natural sizes of the signals (:func:`sizes_of`).
         fading: What is left of ``d`` after a period [-].
+        substeps: Runge-Kutta sub-steps a period. Default 0: as many as the prior needs at rest.
 
     Source: Rauch, Tung, Striebel, *Maximum likelihood estimates of linear dynamic systems* (1965); iterated
     linearization: Bell, *The iterated Kalman smoother as a Gauss-Newton method* (1994).
@@ -99,6 +101,7 @@ class Smoother:
     walk: tuple[float, ...]
     sizes: Sizes
     fading: float = 1.0
+    substeps: int = 0
 
     def smooth(self, trajectories: Sequence[Trajectory], *, sweeps: int = SWEEPS) -> list[Trajectory]:
         """Every trajectory with ``x`` and ``xdot`` from all of its own samples and from nothing outside it.
@@ -129,7 +132,7 @@ class Smoother:
             self.prior.equations,
             self.prior.corrected,
             self.dt,
-            required_substeps(self.prior, self.dt),
+            self.substeps or required_substeps(self.prior, self.dt),
             self.fading,
         )
 
@@ -355,7 +358,12 @@ def _innovations(
 
 
 def fit_smoother(
-    prior: Prior, trajectories: Sequence[Trajectory], dt: float, *, time_unit: float | None = None
+    prior: Prior,
+    trajectories: Sequence[Trajectory],
+    dt: float,
+    *,
+    time_unit: float | None = None,
+    substeps: int | None = None,
 ) -> Smoother:
     """Smoother whose noise and walk make the measurements most likely.
 
@@ -367,10 +375,14 @@ def fit_smoother(
         trajectories: Recordings; at most ``SAMPLE`` of them, evenly chosen, are used.
         dt: Period [s].
         time_unit: The machine's second [s]. Default: that of the trajectories.
+        substeps: Runge-Kutta sub-steps a period. Default: as many as the prior needs where the trajectories go, as far
+            as they hold states.
     """
+    if substeps is None:
+        substeps = required_substeps(prior, dt, visited(trajectories))
     unit = scales.time_unit(trajectories, dt) if time_unit is None else time_unit
     sample = [trajectories[i] for i in evenly(len(trajectories), SAMPLE)]
-    at = _smoothers(prior, trajectories, dt, unit)
+    at = _smoothers(prior, trajectories, dt, unit, substeps)
 
     def costs(ratios: Array) -> Array:
         found = _innovations([at(ratio) for ratio in ratios], sample)
@@ -395,11 +407,11 @@ def rough_smoother(
 
     Arguments as for :func:`fit_smoother`; nothing is searched.
     """
-    return _smoothers(prior, trajectories, dt, time_unit)(ROUGH, 1.0)
+    return _smoothers(prior, trajectories, dt, time_unit, required_substeps(prior, dt))(ROUGH, 1.0)
 
 
 def _smoothers(
-    prior: Prior, trajectories: Sequence[Trajectory], dt: float, unit: float
+    prior: Prior, trajectories: Sequence[Trajectory], dt: float, unit: float, substeps: int
 ) -> Callable[..., Smoother]:
     """Smoothers by the walk's ratio, as a power of ten, and the scale of noise and walk."""
     sizes = sizes_of(prior, trajectories, dt, unit)
@@ -408,7 +420,7 @@ def _smoothers(
 
     def at(ratio: float, scale: float = 1.0) -> Smoother:
         sigma, walk = scale * np.array(sizes.noise), scale * 10.0**ratio * rates
-        return Smoother(prior, dt, tuple(sigma.tolist()), tuple(walk.tolist()), sizes, fading)
+        return Smoother(prior, dt, tuple(sigma.tolist()), tuple(walk.tolist()), sizes, fading, substeps)
 
     return at
 

@@ -309,7 +309,8 @@ def members(context: Context, name: str, phy: Prior) -> Sequence[Step]:
     """Steps of one model, that of the best network by validation first."""
     dt = context.spec.dt
     if name in ("phy_nominal", "phy"):
-        return [PriorStep(phy if name == "phy" else context.scenario.prior(), dt)]
+        fitted, nominal = (phy, dt, context.prior.fit.substeps), (context.scenario.prior(), dt)
+        return [PriorStep(*fitted) if name == "phy" else PriorStep(*nominal)]
     trained = trained_models(context, name)
     return [trained.step(phy, dt, int(i)) for i in np.argsort(trained.validation, kind="stable")]
 
