@@ -45,8 +45,9 @@ class TrainingSettings:
         decay: Weight decay of AdamW times the number of training samples: the more data there are, the less it counts.
         learning_rates: Start and end of the cosine schedule, teacher forcing then free runs.
         every: Steps between evaluations (bounds, validation, checkpoint).
-        validation_horizon: Most scored periods of a validation window. Default: five times ``horizon``. Trainings
-            with other horizons can be compared by their validation only if this is the same.
+        validation_horizon: Most scored periods of a validation window. Default: two thirds of a usual validation
+            recording, at most 1000 (:func:`~hybrid_mpc.identify.dataset.validation_horizon`). Trainings can be compared
+            by their validation only if this is the same.
         objectives: Names in :data:`~hybrid_mpc.identify.objectives.OBJECTIVES`, of balances of the prior, or
             ``"balances"`` for all of these; the curve has them all, the first one is that of free runs and validation.
             Default: the outputs, which models are judged by, and all balances.
