@@ -74,7 +74,7 @@ if TYPE_CHECKING:
     from hybrid_mpc.files import write_arrays
     from hybrid_mpc.identify.evaluate import evaluation_trajectories, free_runs, score
     from hybrid_mpc.identify.export import check_parity, trace_model
-    from hybrid_mpc.identify.fit import fit_prior
+    from hybrid_mpc.identify.fit import FirstStates, fit_prior
     from hybrid_mpc.identify.linear import LinearModel, fit_arx, fit_subspace
     from hybrid_mpc.identify.networks import GRUNetwork
     from hybrid_mpc.identify.prior_model import model_info
@@ -163,6 +163,7 @@ __all__ = [
     "ExtendedKalmanFilter",
     "Fault",
     "FaultKind",
+    "FirstStates",
     "GRUNetwork",
     "Guard",
     "HybridModel",
@@ -339,7 +340,7 @@ _ROOMS = {
     "files": ("write_arrays",),
     "identify.evaluate": ("evaluation_trajectories", "free_runs", "score"),
     "identify.export": ("check_parity", "trace_model"),
-    "identify.fit": ("fit_prior",),
+    "identify.fit": ("FirstStates", "fit_prior"),
     "identify.linear": ("LinearModel", "fit_arx", "fit_subspace"),
     "identify.networks": ("GRUNetwork",),
     "identify.prior_model": ("model_info",),
