@@ -33,7 +33,8 @@ def above(level: Any, edge: Any) -> Any:
 class CascadedTanksPrior(Prior):
     """Two tanks above each other, each with an outlet and an edge that it can run over.
 
-    ``upper' = k_p u - k_1 sqrt(upper) - spill_1``, ``lower' = k_1 sqrt(upper) - k_2 sqrt(lower) + s spill_1 - spill_2``.
+    ``upper' = k_p u - k_1 sqrt(upper) - spill_1``, ``lower' = k_1 sqrt(upper) - k_2 sqrt(lower) + s spill_1 -
+    spill_2``.
 
     The sensor shows ``lower + bend lower (lower - 10)``: it is uncalibrated, and 10 V, where it ends, is the level's
     unit. Without ``bend`` free runs over the record's first half are off by 0.42 V, with it by 0.19 V. Nothing tells

@@ -9,8 +9,8 @@ DESCRIPTION = """\
 Two links of 0.2 and 0.3 m, a quasi-direct drive (gear 6) at either joint; q1 = 0 hangs down, q2 counts from the first
 link. Recordings: DFKI Robotics Innovation Center, double_pendulum, design C.1 (BSD-3-Clause; Wiebe et al. 2023): sines
 of torque at 500 Hz, for identification; swing-ups of acrobot and pendubot at 33 Hz; balancing while torques push. The
-input is the commanded torque; angles and speeds are measured, by the drives. The answer of a motor is stored a row late,
-2 ms at 500 Hz, 30 ms at 33 Hz. Near upright every error
+input is the commanded torque; angles and speeds are measured, by the drives. The answer of a motor is stored a row
+late, 2 ms at 500 Hz, 30 ms at 33 Hz. Near upright every error
 grows fast, so runs are 0.5 s."""
 ROW = 0.002
 """Distance of two rows [s] of the recordings for identification."""
