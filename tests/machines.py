@@ -52,7 +52,12 @@ def two_tanks(dt=5.0, **options):
 
 def rest_levels(pump=PUMP, inflow=INFLOW):
     """Levels at which the tanks rest."""
-    return tuple(brentq(lambda level: float(outflow(level)) - flow, 1e-3, 5.0) for flow in (pump, pump + inflow))
+    return level_of(pump), level_of(pump + inflow)
+
+
+def level_of(flow):
+    """Level from which this much flows out."""
+    return brentq(lambda level: float(outflow(level)) - flow, 1e-3, 5.0)
 
 
 def dc_motor(dt=0.005, **options):

@@ -29,14 +29,15 @@ class StageCurvature:
 
     They are differences of the model's exact Jacobians: ``n_x + n_u`` evaluations for the block by states and inputs,
     in which friction curves sharply, and ``n_h`` for the blocks by the hidden state. Those of soft bounds, weighted
-    with their multipliers, are added. The problem's weights and limits give the length of the differences.
+    with their multipliers, are added. The lengths of the differences go by the states' sizes and the inputs' limits.
     """
 
-    def __init__(self, stages: Linearization, ocp: OCP, n_h: int = 0, soft: SoftRows | None = None) -> None:
+    def __init__(
+        self, stages: Linearization, ocp: OCP, sizes: Array, n_h: int = 0, soft: SoftRows | None = None
+    ) -> None:
         self._n_x, self._n_u, self._n_h = ocp.n_x, ocp.n_u, n_h
         self._soft = soft if soft is not None and soft.functions else None
-        tolerated = 1 / np.sqrt(np.where(ocp.q > 0, ocp.q, 1.0))
-        self._shift = SHIFT * np.concatenate([tolerated, ocp.input_scale])
+        self._shift = SHIFT * np.concatenate([sizes, ocp.input_scale])
         self._by_few = stages.slopes(self._shift.size)
         self._group = min(n_h, max(1, AT_ONCE // ocp.horizon))
         self._by_hidden = stages.slopes(self._group, hidden=True) if n_h else None

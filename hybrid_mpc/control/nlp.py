@@ -35,6 +35,7 @@ class Rows(NamedTuple):
 class IpoptController(Controller):
     """Nonlinear MPC by IPOPT on the sparse multiple-shooting problem: the reference, slower than real time.
 
+    Inputs count in :attr:`OCP.input_scale`, states in :attr:`Problem.state_sizes`, soft bounds in half their range.
     Unknowns are the inputs, the states and hidden states of every period, and a slack for every soft bound. Second
     derivatives are exact. Whatever IPOPT reports, the answer counts only if it is finite and keeps model and limits; it
     is SOLVED if IPOPT converged or the KKT residual is small, else STOPPED.
@@ -106,26 +107,28 @@ class IpoptController(Controller):
             return failed
         given = np.concatenate([z[0], u_prev, *(v.ravel() for v in rows), target.e.ravel(), target.p.ravel()])
         slack = problem.soft.excess(problem.soft.values(z[:, : self.ocp.n_x], u, target.e))
-        guess = np.concatenate([u.ravel(), z.ravel(), slack])
+        guess = np.concatenate([u.ravel(), z.ravel(), slack]) / self._scale
         answer = self._solver(x0=guess, p=given, **bounds)
         stats = self._solver.stats()
-        w, lam_g, lam_x = (answer[key].full().ravel() for key in ("x", "lam_g", "lam_x"))
-        if not (np.all(np.isfinite(w)) and np.all(np.isfinite(lam_g)) and np.all(np.isfinite(lam_x))):
+        found, lam_g, lam_x = (answer[key].full().ravel() for key in ("x", "lam_g", "lam_x"))
+        if not all(np.all(np.isfinite(v)) for v in (found, lam_g, lam_x)):
             return failed
-        violated, kkt = self._check(w, given, lam_g, lam_x, bounds)
+        violated, kkt = self._check(found, given, lam_g, lam_x, bounds)
         count = stats["iter_count"]
         if not violated <= FEASIBLE:
             return self._plan(u, z, target, NAN, Status.NLP_FAILED, kkt, start, count)
         status = Status.SOLVED if stats["success"] or kkt <= FEASIBLE else Status.STOPPED
-        u = np.clip(w[: u.size].reshape(u.shape), *self.ocp.bounds(u_prev, limits))
-        z = w[u.size : u.size + z.size].reshape(z.shape)
+        found = found * self._scale
+        u = np.clip(found[: u.size].reshape(u.shape), *self.ocp.bounds(u_prev, limits))
+        z = found[u.size : u.size + z.size].reshape(z.shape)
         cost = problem.cost(z, u, u_prev, target)
         return self._plan(u, z, target, cost, status, kkt, start, count)
 
     def _limited(self, of_inputs: tuple[Array, Array]) -> dict[str, Array]:
         """Bounds of unknowns and rows with those of the inputs put in."""
         lower, upper = self._bounds["lbx"].copy(), self._bounds["ubx"].copy()
-        lower[: of_inputs[0].size], upper[: of_inputs[1].size] = (bound.ravel() for bound in of_inputs)
+        n = of_inputs[0].size
+        lower[:n], upper[:n] = (bound.ravel() / self._scale[:n] for bound in of_inputs)
         return {**self._bounds, "lbx": lower, "ubx": upper}
 
     def _check(
@@ -134,10 +137,9 @@ class IpoptController(Controller):
         """Largest violation as a share of its range, and the KKT residual relative to the objective's slope."""
         slope, objective, g = (m.full().ravel() for m in self._slope(w, given, lam_g))
         kkt = float(np.max(np.abs(slope + lam_x)) / max(1.0, np.max(np.abs(objective))))
-        beyond = np.maximum(bounds["lbg"] - g, g - bounds["ubg"]) / self._g_scale
+        beyond = np.maximum(bounds["lbg"] - g, g - bounds["ubg"])
         n = self.ocp.horizon * self.ocp.n_u
         outside = np.maximum(bounds["lbx"][:n] - w[:n], w[:n] - bounds["ubx"][:n])
-        outside = outside.reshape(self.ocp.horizon, -1) / self._u_scale
         return max(float(np.max(beyond, initial=0.0)), float(np.max(outside))), kkt
 
     def _plan(
@@ -186,29 +188,31 @@ class IpoptController(Controller):
         self._step = stage_step(model).map(n)
         z_next = self._step(z[:, :-1], ca.vertcat(u + added[:n_u, :], added[n_u:, :]))
         du = u - ca.horzcat(u_prev, u[:, :-1])
-        self._u_scale = ocp.input_scale
-        rows = [Rows(z[:, 0] - z0, 0.0, 0.0, 1.0), Rows(z[:, 1:] - z_next, 0.0, 0.0, 1.0)]
+        u_scale, z_scale = ocp.input_scale, np.concatenate([self.problem.state_sizes, np.ones(model.n_h)])
+        rows = [Rows(z[:, 0] - z0, 0.0, 0.0, z_scale), Rows(z[:, 1:] - z_next, 0.0, 0.0, np.tile(z_scale, n))]
         if ocp.du_max is not None:
             limit = np.tile(ocp.du_max, n)
-            rows.append(Rows(du, -limit, limit, np.tile(self._u_scale, n)))
+            rows.append(Rows(du, -limit, limit, np.tile(u_scale, n)))
         inside = [int(k) for k in np.setdiff1d(np.arange(n), ocp.block_starts)]
         if inside:  # move blocks
-            rows.append(Rows(du[:, inside], 0.0, 0.0, np.tile(self._u_scale, len(inside))))
+            rows.append(Rows(du[:, inside], 0.0, 0.0, np.tile(u_scale, len(inside))))
         rows += self._soft_rows(u, z, s, e)
-        free = np.full(n_z * (n + 1), np.inf)
+        free, g_scale = np.full(n_z * (n + 1), np.inf), _filled(rows, 3)
+        self._scale = np.concatenate([np.tile(u_scale, n), np.tile(z_scale, n + 1), soft.scale])
         self._bounds = {
-            "lbx": np.concatenate([np.tile(ocp.u_min, n), -free, np.zeros(len(soft))]),
-            "ubx": np.concatenate([np.tile(ocp.u_max, n), free, np.full(len(soft), np.inf)]),
-            "lbg": _filled(rows, 1), "ubg": _filled(rows, 2),
+            "lbx": np.concatenate([np.tile(ocp.u_min, n), -free, np.zeros(len(soft))]) / self._scale,
+            "ubx": np.concatenate([np.tile(ocp.u_max, n), free, np.full(len(soft), np.inf)]) / self._scale,
+            "lbg": _filled(rows, 1) / g_scale, "ubg": _filled(rows, 2) / g_scale,
         }  # fmt: skip
-        self._g_scale = _filled(rows, 3)
-        return {
-            "x": ca.vertcat(ca.vec(u), ca.vec(z), s),
-            "p": ca.vertcat(z0, u_prev, *(ca.vec(v) for v in (added, x_ref, weight, u_ref, e, p))),
-            "f": self._objective(u - u_ref, du, z[:n_x, :] - x_ref, weight, s)
-            + self._economic(z[:n_x, :-1], u, p),
-            "g": ca.vertcat(*(ca.vec(row.value) for row in rows)),
-        }
+        unknowns = ca.vertcat(ca.vec(u), ca.vec(z), s)
+        given = ca.vertcat(z0, u_prev, *(ca.vec(v) for v in (added, x_ref, weight, u_ref, e, p)))
+        cost = self._objective(u - u_ref, du, z[:n_x, :] - x_ref, weight, s)
+        cost += self._economic(z[:n_x, :-1], u, p)
+        constraints = ca.vertcat(*(ca.vec(row.value) for row in rows)) / g_scale
+        problem = ca.Function("problem", [unknowns, given], [cost, constraints])
+        scaled = ca.MX.sym("scaled", unknowns.numel())
+        f, g = problem.call([self._scale * scaled, given], True, False)
+        return {"x": scaled, "p": given, "f": f, "g": g}
 
     def _objective(self, u: ca.MX, du: ca.MX, error: ca.MX, weight: ca.MX, s: ca.MX) -> ca.MX:
         ocp, soft = self.ocp, self.problem.soft

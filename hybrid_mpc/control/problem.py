@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.control.ocp import OCP, Limits, input_plan
 from hybrid_mpc.control.soft import SoftBound, output_bounds
-from hybrid_mpc.control.targets import Steady, Targets
+from hybrid_mpc.control.targets import Steady, Targets, state_sizes
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
 from hybrid_mpc.model.buffered import BufferedFunction
@@ -63,7 +63,7 @@ class Solution:
         curvature: Second derivatives of the stages by ``(x, u, h)`` ``(N, n, n)``, or by ``(x, u)`` where the
             hidden state's hardly matter, that ``sqp`` starts its next solve with; None from other solvers.
         w: Measured disturbances ``(N, n_w)`` that the prediction assumes.
-        steady: The steady state for the last row of an outputs' reference; None where references are the states'.
+        steady: The steady state for the first row of an outputs' reference; None where references are the states'.
     """
 
     u: Array
@@ -323,7 +323,7 @@ class Target:
         d: Unmeasured disturbances ``(n_d,)``.
         y: Reference of the outputs ``(N + 1, n_y)``, or the nearest that can be reached; no columns where references
             are the states'.
-        steady: Steady state of the last row of such a reference.
+        steady: Steady state of the first row of such a reference.
     """
 
     x: Array
@@ -378,6 +378,8 @@ class Problem:
         self.economic = EconomicCost(ocp, model.dt, model)
         self.run = free_run(model, ocp.horizon)
         self._rows = np.arange(ocp.horizon + 1)
+        self.state_sizes = state_sizes(model, ocp)
+        """By what solvers scale the states ``(n_x,)``."""
         self.u_rest: Array = np.clip(model.u0, ocp.u_min, ocp.u_max)
         """Input ``(n_u,)`` of the operating point, within the limits."""
 
@@ -450,7 +452,6 @@ class Problem:
         for k in knots:
             start = self.targets.at(y_ref[k], d, w[k], start)
             found.append(start)
-        steady = found[-1]
         weighed = self.ocp.q_y > 0
         point = self.model.x0, self.u_rest
         x = np.array([s.x if s.steady else point[0] for s in found])
@@ -463,11 +464,11 @@ class Problem:
         )
         if new.size < KNOTS:
             which = np.searchsorted(knots, self._rows, side="right") - 1
-            return x[which], u[which], y_ref + off[which], steady
+            return x[which], u[which], y_ref + off[which], found[0]
         x, u, off = (
             np.stack([np.interp(self._rows, knots, column) for column in v.T], axis=1) for v in (x, u, off)
         )
-        return x, u, y_ref + off, steady
+        return x, u, y_ref + off, found[0]
 
     def forecast(self, w: ArrayLike | None, estimate: Estimate | None) -> Array:
         """Measured disturbances ``(N, n_w)`` from ``(m, n_w)``, the last ones held; None: those of the estimate."""

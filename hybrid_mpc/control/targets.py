@@ -91,8 +91,7 @@ class Targets:
         self._on_u, self._on_x, self._on_y = model.disturbed
         self._tracked = np.flatnonzero(ocp.q_y > 0)
         self._root = np.sqrt(ocp.q_y[self._tracked])
-        states = np.where(ocp.q > 0, 1.0 / np.sqrt(np.where(ocp.q > 0, ocp.q, 1.0)), _sizes(model))
-        self._scale = np.concatenate([states, np.ones(model.n_h), ocp.input_scale])
+        self._scale = np.concatenate([state_sizes(model, ocp), np.ones(model.n_h), ocp.input_scale])
         ranges = [np.array([(s.lower, s.upper) for s in group]).T for group in (model.states, model.outputs)]
         y_min, y_max = (
             b if b.size else np.full(model.n_y, s) for b, s in ((ocp.y_min, -np.inf), (ocp.y_max, np.inf))
@@ -284,8 +283,11 @@ def bounded_least_squares(h: Array, g: Array, rows: Array, lower: Array, upper: 
     return np.asarray(free + np.linalg.solve(root.T, t))
 
 
-def _sizes(model: HybridModel) -> Array:
-    """A size of each state ``(n_x,)``: half its range, else its operating point's, else 1."""
+def state_sizes(model: HybridModel, ocp: OCP) -> Array:
+    """A size of each state ``(n_x,)``: what its weight tolerates, ``1 / sqrt(q)``; without a weight half its range,
+    else the operating point's value, else 1.
+    """
     half = np.array([0.5 * (s.upper - s.lower) for s in model.states])
     point = np.where(model.x0 != 0, np.abs(model.x0), 1.0)
-    return np.where(np.isfinite(half), half, point)
+    other = np.where(np.isfinite(half), half, point)
+    return np.where(ocp.q > 0, 1.0 / np.sqrt(np.where(ocp.q > 0, ocp.q, 1.0)), other)

@@ -189,7 +189,7 @@ class _Goal(NamedTuple):
 
 
 def _goal(ocp: OCP, model: HybridModel, reference: Array, steady: Steady | None) -> _Goal:
-    """What the first row of a reference asks for; of outputs the steady state is that of the preview's end."""
+    """What a period's row of the reference asks for; of outputs with its steady state."""
     if not ocp.n_y:
         return _Goal(reference[: model.n_x].copy(), model.u0, np.full(model.n_y, np.nan), True)
     y = np.where(ocp.q_y > 0, reference[: model.n_y], 0.0)
@@ -295,7 +295,7 @@ class ClosedLoopResult:
         h: Estimated hidden states ``(n, n_h)``.
         d: Estimated unmeasured disturbances ``(n, n_d)``.
         reference: Reference of the states ``(n, n_x)`` at ``t_k``; where the problem weighs outputs, the steady state
-            of the set-point with which the preview ends.
+            of the set-point.
         source: Name of the :class:`~hybrid_mpc.control.safeguard.Source` of each input.
         status: Name of the :class:`~hybrid_mpc.control.problem.Status` of each solve.
         stage_cost: Stage cost ``(n,)`` per second on the true state and the input that acts on it, with the
@@ -312,7 +312,7 @@ class ClosedLoopResult:
         numbers: The monitor's readings as numbers ``(n, columns)``, from which detectors are learned. Default: none.
         w: Measured disturbances ``(n, n_w)`` that acted from ``t_k`` on. Default: none.
         y_ref: Reference of the outputs ``(n, n_y)`` at ``t_k``; NaN where references are the states'. Default: unknown.
-        reached: ``(n,)``, False where the set-point with which the preview ends cannot be reached. Default: unknown.
+        reached: ``(n,)``, False where the set-point cannot be reached. Default: unknown.
 
     Example:
         >>> one = np.ones((2, 1))
