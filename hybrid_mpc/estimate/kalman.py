@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 START_LIMIT = 25
 """Most periods at rest that the first estimate runs the hidden state through: as many as training warms it up on.
 Longer makes a loop's first step late. Closed loops with a network depend on it (docs/results/README.md)."""
+FITS = 1e-6
+"""Squared error of the first outputs, in the sensors' deviations, below which a state fits them."""
 LOST = 1e12
 """Growth of a variance that leaves few digits of a covariance: nothing is known any more."""
 
@@ -158,7 +160,8 @@ class ExtendedKalmanFilter:
 
         Elements of ``y`` that are not finite tell nothing. Where several states have the output (``l sin q``, a
         speed's size) or the output does not move at the operating point, Newton's method begins one deviation
-        ``sigma_x0`` beside it too, and the nearest state of those that fit is taken.
+        ``sigma_x0`` beside it too, and the nearest state of those that fit is taken. On which side it lies the
+        operating point says alone: the filter does not find out.
         """
         model, u = self.model, self.model.u0
         w = self._known(None, w)
@@ -170,23 +173,43 @@ class ExtendedKalmanFilter:
 
     def _fitting(self, x0: Array, y: Array, u: Array, w: Array) -> Array:
         """The state ``(n_x,)`` nearest to ``x0`` whose output is ``y`` where that is finite."""
-        seen, spread = np.isfinite(y), np.sqrt(self._first[: x0.size])
-        best, least = x0, np.inf
-        for step in (np.zeros(x0.size), *np.diag(spread), *np.diag(-spread)):
-            x, error = x0 + step, np.zeros(y.size)
-            for _ in range(20):  # Newton; one step if the outputs are linear in the state
-                y_hat, c_x, _ = self._measured(x, u, w)
-                error = np.where(seen, y - y_hat, 0.0)
-                if not np.all(np.isfinite(c_x)) or np.max(np.abs(error)) < 1e-12:
-                    break
-                x = x + np.linalg.pinv(np.where(seen[:, None], c_x, 0.0)) @ error
-            unlike = np.sum(error**2 / self._noise_y)
-            score = unlike if np.all(np.isfinite(x)) and np.isfinite(unlike) else np.inf
-            if score < 0.99 * least - 1e-12:
-                best, least = x, score
-            if least < 1e-6:  # fits to a thousandth of the sensors' noise
+        x, unlike, whole = self._newton(x0, y, u, w)
+        if whole and unlike < FITS:
+            return x
+        spread = np.diag(np.sqrt(self._first[: x0.size]))
+        found = [(unlike, x), *(self._newton(x0 + step, y, u, w)[1::-1] for step in (*spread, *-spread))]
+        least = min(score for score, _ in found)
+        fitting = [x for score, x in found if score <= max(least, FITS)] or [x0]
+        return min(fitting, key=lambda x: float(np.sum((x - x0) ** 2)))
+
+    def _newton(self, x: Array, y: Array, u: Array, w: Array) -> tuple[Array, float, bool]:
+        """A state whose output is ``y`` by Newton's method, the squared error in deviations of the sensors, and whether
+        no step had to be shortened. One step if the outputs are linear in the state.
+        """
+        seen, whole = np.isfinite(y), True
+
+        def lacks(at: Array) -> tuple[Array, Array, float]:
+            y_hat, by_x, _ = self._measured(at, u, w)
+            error = np.where(seen, y - y_hat, 0.0)
+            return error, by_x, float(np.sum(error**2 / self._noise_y))
+
+        error, by_x, size = lacks(x)
+        for _ in range(20):
+            if not np.all(np.isfinite(by_x)) or np.max(np.abs(error)) < 1e-12:
                 break
-        return best
+            step = np.linalg.pinv(np.where(seen[:, None], by_x, 0.0)) @ error
+            for halving in range(60):
+                moved = x + step * 0.5**halving
+                after = lacks(moved)
+                if after[2] < size:
+                    break
+                if size < FITS:  # what is left is rounding
+                    return x, size, whole
+                whole = False
+            else:
+                break
+            x, (error, by_x, size) = moved, after
+        return x, size if np.isfinite(size) else np.inf, whole
 
     def _known(self, estimate: Estimate | None, w: ArrayLike | None) -> Array:
         """Measured disturbances ``(n_w,)``: what was measured, else the last ones, else the operating point's."""
