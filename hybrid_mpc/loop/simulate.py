@@ -392,7 +392,7 @@ class ClosedLoopResult:
         columns: dict[str, object] = {"t" if model is None else "t [s]": self.t}
         for name in ("x", "y", "u", "x_hat", "h", "d", "w", "reference", "y_ref"):
             values = getattr(self, name)
-            if not values.size:
+            if not values.size or (name == "y_ref" and not self.tracks_outputs):
                 continue
             labels = _labels(name, values.shape[1], model)
             columns.update({label: values[:, i] for i, label in enumerate(labels)})
