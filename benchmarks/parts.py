@@ -33,7 +33,7 @@ from hybrid_mpc import (
 )
 from scenarios.golf_robot import scenario
 
-SCALING = Scaling(x=(0.5, 1.5), u=(0.2,), acceleration=(5.0,), correction=(0.5,))
+SCALING = Scaling(x=(0.5, 1.5), u=(0.2,), rate=(5.0,), correction=(0.5,))
 GOAL = 0.6  # [rad], from rest at -0.3 rad
 REFERENCE = np.array([[GOAL, 0.0]])
 PERIODS, SKIPPED = 150, 3

@@ -6,7 +6,7 @@ import pytest
 from machines import MachinePlant
 
 import hybrid_mpc as hm
-from hybrid_mpc.identify.export import prior_programs
+from hybrid_mpc.identify.prior_model import prior_programs
 from hybrid_mpc.job.loops import LoopSpec, excess, limits_used, row_of
 from hybrid_mpc.job.tasks import repeated
 from hybrid_mpc.kit.artifact import loop_settings

@@ -32,7 +32,7 @@ def job(out, *words):
 @pytest.mark.full
 def test_golf_robot(tmp_path):
     results = job(tmp_path / "run", "golf_robot")
-    e_sim = results["identification"]["e_sim_s"]
+    e_sim = results["identification"]["e_sim"]
     assert e_sim["mopgrnn"] < e_sim["phy"] < e_sim["phy_nominal"]
     assert e_sim["mopgrnn"] < e_sim["rnn"]
     load = read_stage(tmp_path / "run" / "checkpoints" / "monitor.json", MONITOR, "").result.load

@@ -303,7 +303,6 @@ def wrong(base=Level, **changed):
 REFUSED = {
     "a value that is no parameter's": (lambda: Tanks({"k_3": 1.0}), "Tanks has no parameter k_3; it has: a_1, a_2"),
     "a value where there are none": (lambda: Level({"k": 1.0}), "it has: none"),
-    "corrects names no state": (wrong(corrects=("depth",)), "corrects names depth; its states are: level"),
     "an output of no state": (
         wrong(outputs=(Signal("height", "m"),)), "no state is called height, as the output is.*level.*Define output",
     ),
@@ -367,6 +366,18 @@ def test_what_cannot_be_is_refused_by_name(why):
         make().equations  # noqa: B018
     if why != "a value where there are none" and "value that is no" not in why:
         assert "Wrong" in str(refused.value) or "TorchPrior must give" in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (("depth",), "Wrong: corrects names depth; its states are: level"),
+        ("level", r"a tuple of names, as \('level',\)"),
+    ],
+)
+def test_what_is_corrected_must_be_a_state(names, words):
+    with pytest.raises(InputError, match=words):
+        wrong(corrects=names)().corrected  # noqa: B018
 
 
 @pytest.mark.parametrize("kind", [(MechanicalPrior,), (TorchPrior, MechanicalPrior)])
