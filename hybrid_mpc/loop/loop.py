@@ -439,6 +439,8 @@ class Loop:
         if w is None:
             return None
         rows, n_w = np.atleast_2d(np.asarray(w, dtype=np.float64)), self.model.n_w
+        if rows.size and not n_w:
+            raise InputError(f"w: {rows.size} measured disturbances given, model {self.model.name} has none")
         if rows.ndim != 2 or rows.shape[1] != n_w or not len(rows):
             raise InputError(
                 f"w: measured disturbances of shape {np.shape(w)} given, model {self.model.name} has {n_w}: ({n_w},), "
