@@ -93,7 +93,7 @@ def mpc_gain(
         )
     if ocp.economic is not None or ocp.n_y:
         raise InputError(
-            "MPC gain: the problem has an economic stage cost, or weights on outputs; its gain depends on the whole plan"
+            "MPC gain: the problem has an economic stage cost, or weights on outputs; its gain depends on its plan"
         )
     z0 = np.concatenate([x0, h0])
     plan, z = np.tile(u0, (n, 1)), np.tile(z0, (n + 1, 1))
