@@ -80,7 +80,7 @@ def _tell(console: Console, found: Preflight, spec: DataSpec) -> None:
     console.print(_signals(found, prior, spec))
     if prior.parameters:
         console.print(_parameters(prior))
-    told = "none: a MOPGRNN has no second objective"
+    told = "none: there is no MOPGRNN"
     if not found.problems and prior.equations.balances:
         told = ", ".join(f"{b.name} ({b.unit}, {b.rate_unit})" for b in prior.equations.balances)
     if not found.problems:

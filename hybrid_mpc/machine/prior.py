@@ -176,7 +176,7 @@ class Prior:
         return tuple(at[output.name] for output in self.outputs)
 
     def balances(self, x: Any, u: Any, w: Any, p: Any) -> tuple[Balance, ...]:
-        """Balances of what the machine stores. Default: none; a MOPGRNN then has no second objective."""
+        """Balances of what the machine stores. Default: none; then there is no MOPGRNN."""
         return ()
 
     @property

@@ -46,6 +46,25 @@ def evaluated(prior, seed=0):
     return {name: value.full() for name, value in found.items()}
 
 
+@pytest.mark.parametrize(
+    ("prior", "found"),
+    [(Tanks, ()), (TorchTanks, ()), (Swing, ((0, 1),)), (TorchSwing, ((0, 1),)), (Arm, ((0, 2), (1, 3)))],
+)
+def test_positions_with_their_speeds_are_read_off_the_equations(prior, found):
+    assert prior().kinematics == found
+
+
+def test_a_rate_that_only_is_in_proportion_to_a_state_is_no_speed():
+    class Lag(Prior):
+        states = (Signal("a", "m"), Signal("b", "m"), Signal("c", "m/s"))
+        inputs, outputs = (Signal("u", "m/s"),), (Signal("a", "m"),)
+
+        def xdot(self, x, u, w, p):
+            return 2.0 * x.b, u.u, x.c**2  # a multiple, an input, and a slope that is 1 at one point alone
+
+    assert Lag().kinematics == ()
+
+
 @pytest.mark.parametrize(("one", "other"), PAIRS, ids=lambda p: p.__name__)
 def test_equations_are_the_same_in_casadi_and_in_torch(one, other):
     ours, theirs = evaluated(one()), evaluated(other())

@@ -52,7 +52,7 @@ def export_stage(context: Context) -> ExportResult:
     phy = context.scenario.prior(prior.fit.values)
     steps: dict[str, RecurrentStep | PriorStep] = {
         "hybrid": trained_models(context, chosen.deployed).step(phy, dt),
-        "prior": PriorStep(phy, dt),
+        "prior": PriorStep(phy, dt, prior.fit.substeps),
     }
     info = model_info(phy, dt, prior.fit.covariance(phy.parameters))
     deployed = replace(info, input_delay=prior.fit.delay, time_unit=context.time_unit)
