@@ -45,6 +45,5 @@ scenario = Scenario(
         unit="K",
         length=300.0,
         piece=700.0,
-        largest_delay=LARGEST_DELAY,
     ),
 )
