@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Literal, TypeAlias
 
@@ -22,7 +22,7 @@ from scipy.stats import qmc
 from hybrid_mpc.data import scales
 from hybrid_mpc.data.scales import evenly, robust_spread, within
 from hybrid_mpc.data.trajectories import Trajectory
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.identify.delay import NONE, shifted
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.simulation import Points, Simulation, flow_slope, required_substeps, rest_of, visited
@@ -87,10 +87,87 @@ Slopes: TypeAlias = Literal["", "x", "all"]
 
 
 @dataclass(frozen=True)
+class FirstStates:
+    """What is known of the first states of a fit's free runs.
+
+    Args:
+        kind: ``"free"``: nothing, they are found with the parameters. ``"known"``: ``values`` are those of a
+            trajectory's own first sample, for example of a machine that rests before it is started; the others are
+            free. ``"measured"``: outputs that are states, by their names, are exact wherever a run starts; the others
+            are free.
+            ``"shared"``: all trajectories start from one state, which is free. ``"warm_up"``: a run's first ``seconds``
+            alone tell its first state, and what follows alone counts, as where models are judged.
+        values: Values [their units] of the states that are known, by name.
+        seconds: Length [s] of the warm-up.
+
+    Raises:
+        InputError: If ``values`` or ``seconds`` do not belong to the kind, or are missing.
+
+    Example:
+        >>> FirstStates("known", {"phi_dot": 0.0}).values
+        {'phi_dot': 0.0}
+    """
+
+    kind: Literal["free", "known", "measured", "shared", "warm_up"] = "free"
+    values: Mapping[str, float] = field(default_factory=dict)
+    seconds: float = 0.0
+
+    def __post_init__(self) -> None:
+        problems = []
+        if self.kind not in (kinds := ("free", "known", "measured", "shared", "warm_up")):
+            problems.append(f"first states: kind must be one of {', '.join(kinds)}, got {self.kind!r}")
+        if (self.kind == "known") != bool(self.values):
+            problems.append(
+                f"first states: values by name belong to kind 'known' and to it alone, got {self.values}"
+            )
+        if not all(math.isfinite(value) for value in self.values.values()):
+            problems.append(f"first states: values must be finite, got {self.values}")
+        if (self.kind == "warm_up") != (0 < self.seconds < math.inf):
+            problems.append(
+                f"first states: a positive length [s] belongs to kind 'warm_up' and to it alone, got {self.seconds}"
+            )
+        refuse(problems)
+
+    def samples(self, dt: float) -> int:
+        """Samples of the warm-up, none without."""
+        return scales.periods(self.seconds, dt, 2) if self.kind == "warm_up" else 0
+
+    def check(self, prior: Prior, largest_delay: float) -> None:
+        """Refuse what does not fit to a prior.
+
+        Raises:
+            InputError: With all that does not.
+        """
+        names, outputs = ([s.name for s in signals] for signals in (prior.states, prior.outputs))
+        problems = [
+            f"first states: {name!r} is no state of {type(prior).__name__} ({', '.join(names)})"
+            for name in self.values
+            if name not in names
+        ]
+        if self.kind == "measured" and not set(names) & set(outputs):
+            problems.append(
+                f"first states: no output of {type(prior).__name__} ({', '.join(outputs)}) is a state "
+                f"({', '.join(names)}); leave them free"
+            )
+        if self.kind in ("known", "shared") and largest_delay:
+            problems.append(
+                f"first states: a delay costs the first samples of a trajectory, whose state is {self.kind}; leave "
+                "largest_delay 0, or the first states free"
+            )
+        refuse(problems)
+
+
+FREE = FirstStates()
+
+
+@dataclass(frozen=True)
 class OutputWindows:
     """Windows of recordings: ``y`` ``(n, T + 1, n_y)`` with NaN where nothing was measured, ``u`` ``(n, lead + T + 1,
     n_u)``, of which the first ``lead`` come before the window, ``w`` ``(n, T + 1, n_w)``, a guess ``x`` ``(n, n_x)`` of
     the first state, and which samples are censored ``(n, T + 1, n_y)``.
+
+    Of the first states ``known`` ``(n, n_x)`` are as guessed. Windows of one group ``(n,)`` begin in the same state. Of
+    a window the first ``warm`` samples alone tell its first state, and the others count; 0: all do both.
     """
 
     y: Array
@@ -99,13 +176,17 @@ class OutputWindows:
     x: Array
     censored: Array
     lead: int
+    known: NDArray[np.bool_]
+    group: NDArray[np.int_]
+    warm: int = 0
 
     def times(self, n: int) -> OutputWindows:
         """The same windows, ``n`` times one behind the other."""
-        y, u, w, x, censored = (
-            np.concatenate([v] * n) for v in (self.y, self.u, self.w, self.x, self.censored)
+        y, u, w, x, censored, known = (
+            np.concatenate([v] * n) for v in (self.y, self.u, self.w, self.x, self.censored, self.known)
         )
-        return OutputWindows(y, u, w, x, censored, self.lead)
+        group = np.concatenate([self.group + i * (self.group.max() + 1) for i in range(n)])
+        return OutputWindows(y, u, w, x, censored, self.lead, known, group, self.warm)
 
 
 def cut_outputs(
@@ -114,10 +195,13 @@ def cut_outputs(
     lead: int,
     most: int,
     states: Sequence[Signal] = (),
+    outputs: Sequence[Signal] = (),
+    first: FirstStates = FREE,
 ) -> OutputWindows:
     """At most ``most`` windows of ``periods``, one behind the other, evenly chosen.
 
-    First states are guessed within the ranges of ``states``. Default: as the trajectories have them.
+    First states are guessed within the ranges of ``states``. Default: as the trajectories have them. What is known of
+    them by their names, and by those of the ``outputs``, says ``first``; it needs ``states``.
 
     Raises:
         InputError: If no trajectory is long enough.
@@ -130,6 +214,10 @@ def cut_outputs(
             f"{lead} samples before it needs {periods + lead + 1}"
         )
     chosen = [starts[i] for i in evenly(len(starts), most)]
+    if first.kind in ("known", "shared"):  # what is known is known of a recording's own first sample
+        begins = [one for one in starts if one[1] == 0][:most]
+        others = [one for one in starts if one[1] > 0]
+        chosen = begins + [others[i] for i in evenly(len(others), most - len(begins))]
 
     def cut(key: str, before: int) -> Array:
         return np.stack([getattr(t, key)[k - before : k + periods + 1] for t, k in chosen])
@@ -138,9 +226,24 @@ def cut_outputs(
     guesses = np.stack([t.x[k] for t, k in chosen])
     if states:
         guesses = np.clip(guesses, [s.lower for s in states], [s.upper for s in states])
+    y, n = cut("y", 0), len(chosen)
+    known, group = np.zeros(guesses.shape, dtype=bool), np.arange(n)
+    begin = np.array([k == 0 for _, k in chosen])
+    if first.kind == "shared" and begin.any():
+        group[begin] = int(np.flatnonzero(begin)[0])
+        guesses[begin] = guesses[begin].mean(axis=0)
+        group = np.unique(group, return_inverse=True)[1]
+    for j, state in enumerate(states):
+        if first.kind == "known" and state.name in first.values:
+            known[begin, j], guesses[begin, j] = True, first.values[state.name]
+        for i, output in enumerate(outputs):
+            if first.kind == "measured" and output.name == state.name:
+                there = np.isfinite(y[:, 0, i])
+                known[there, j], guesses[there, j] = True, y[there, 0, i]
     return OutputWindows(
-        cut("y", 0), cut("u", lead), cut("w", 0), guesses,
-        np.stack([c[k : k + periods + 1] for c, (_, k) in zip(censored, chosen, strict=True)]), lead,
+        y, cut("u", lead), cut("w", 0), guesses,
+        np.stack([c[k : k + periods + 1] for c, (_, k) in zip(censored, chosen, strict=True)]), lead, known, group,
+        min(first.samples(trajectories[0].dt), periods - 1),
     )  # fmt: skip
 
 
@@ -391,6 +494,11 @@ class Shooting:
         self.seen = np.isfinite(y)
         own = [robust_spread(c) or 1.0 for c in y.reshape(-1, y.shape[-1]).T]
         self.spread = np.array(own) if spread is None else spread
+        warm = np.repeat(np.arange(y.shape[1]) < windows.warm, y.shape[2]).astype(float)
+        self.tell: Array = warm if windows.warm else 1.0 - warm
+        self.count: Array = 1.0 - warm
+        members = np.bincount(windows.group)
+        self.members, self.alone = members[windows.group].astype(float), bool((members == 1).all())
         self._known: dict[bytes, tuple[float, Array]] = {}
 
     def explained(self, thetas: Sequence[Array]) -> list[float]:
@@ -405,11 +513,15 @@ class Shooting:
                 unknown.setdefault(self.own.substeps(theta), []).append(theta)
             except InputError:
                 self._known[theta.tobytes()] = math.inf, self.windows.x
-        n, share = len(self.windows.x), max(1, int(self.seen.sum()))
+        n = len(self.windows.x)
+        share = max(1.0, float((self.seen.reshape(n, -1) * self.count).sum()))
         for some in unknown.values():  # all at once: windows do not know of each other
             problem = Shooting(self.own, self.windows.times(len(some)), self.sizes, self.spread)
             point = problem._states(problem.start(np.stack(some), problem.windows.x, "x"))
-            over = np.clip(point.error.reshape(problem.windows.y.shape) / self.spread, -FAR, FAR)
+            over = (
+                np.clip(point.error / np.tile(self.spread, problem.windows.y.shape[1]), -FAR, FAR)
+                * self.count
+            )
             for i, theta in enumerate(some):
                 part = slice(i * n, (i + 1) * n)
                 error = float(np.sqrt(np.square(over[part]).sum() / share))
@@ -450,15 +562,35 @@ class Shooting:
         inside = counts & (np.abs(error) < limit)
         error = np.where(counts, np.clip(error, -limit, limit), 0.0).reshape(n, -1)
         by[~inside] = 0.0
-        by[..., -x.shape[1] :] *= self.sizes
+        by[..., -x.shape[1] :] *= np.where(self.windows.known, 0.0, self.sizes)[:, None, None]
         by = np.nan_to_num(by, copy=False).reshape(n, error.shape[1], by.shape[-1])
         return replace(before, theta=theta, x=x, error=error, slopes=by)
 
     def _costs(self, point: _Point) -> Array:
-        """Robust sum of squares of each window, and what its first state moved from its guess, in its sizes."""
-        c2, moved = OUTLIERS**2, (point.x - self.windows.x) / self.sizes
+        """Robust sum of squares of each group of windows that counts for its first state, with what this moved."""
+        c2, moved = OUTLIERS**2, self._moved(point) / np.sqrt(self.members)[:, None]
         own = 2 * c2 * (np.sqrt(1 + np.square(point.error / point.scales) / c2) - 1)
-        return np.asarray(own.sum(axis=1) + np.square(moved).sum(axis=1))
+        return self._grouped((own * self.tell).sum(axis=1) + np.square(moved).sum(axis=1))
+
+    def _cost(self, point: _Point) -> float:
+        """What ``theta`` is fitted by: the same sum, or of a warm-up what comes behind it."""
+        if not self.windows.warm:
+            return float(self._costs(point).sum())
+        c2 = OUTLIERS**2
+        own = 2 * c2 * (np.sqrt(1 + np.square(point.error / point.scales) / c2) - 1)
+        return float((own * self.count).sum())
+
+    def _moved(self, point: _Point) -> Array:
+        """What first states moved from their guess, in their sizes."""
+        return np.asarray((point.x - self.windows.x) / self.sizes)
+
+    def _grouped(self, values: Array) -> Array:
+        """Sums over the windows of each group."""
+        if self.alone:
+            return values
+        total = np.zeros((int(self.windows.group.max()) + 1, *values.shape[1:]))
+        np.add.at(total, self.windows.group, values)
+        return total
 
     def _left(self, error: Array) -> Array:
         """Size of what is left of each output: outputs of any unit count alike, outliers little."""
@@ -471,16 +603,16 @@ class Shooting:
 
     def _states(self, point: _Point) -> _Point:
         """First states at a ``theta``, each window by itself: with a damping of its own, until all have settled."""
-        cost, eye = self._costs(point), np.eye(point.x.shape[1])
+        cost, eye, group = self._costs(point), np.eye(point.x.shape[1]), self.windows.group
         damping, candidates = np.full((len(cost), 1, 1), DAMPING), len(np.atleast_2d(point.theta))
         for _ in range(COMPARED):
             xx, _, _, gx, _ = self._normal(point)
             moved = -np.linalg.solve(xx * (1 + damping * eye), gx[..., None])[..., 0]
-            trial = self._at(point, point.theta, point.x + moved * self.sizes, "x")
+            trial = self._at(point, point.theta, point.x + moved[group] * self.sizes, "x")
             new = self._costs(trial)
             better, promised = new < cost, -2.0 * np.sum(gx * moved, axis=1)
             gain = np.where(better, cost - new, np.where(damping[:, 0, 0] < WORST, promised, 0.0))
-            point = point.where(better, trial)
+            point = point.where(better[group], trial)
             cost = np.minimum(cost, new)
             damping = damping * np.where(better, 0.2, 5.0)[:, None, None]
             gains, costs = (v.reshape(candidates, -1).sum(axis=1) for v in (gain, cost))
@@ -490,15 +622,19 @@ class Shooting:
 
     def _descend(self, point: _Point, iterations: int) -> _Point:
         """Steps of Levenberg and Marquardt, of ``theta`` with the first states."""
-        damping, cost, n = DAMPING, float(self._costs(point).sum()), len(point.x)
+        damping, cost, n = DAMPING, self._cost(point), len(point.x)
         for _ in range(iterations):
-            normal, better = self._normal(point), False
+            better = False
+            normal = self._behind(point) if self.windows.warm else self._normal(point)
             while not better and damping < WORST:
-                step, moved = self._step(normal, damping, point.theta)
-                last = self._promised(normal, step, moved) < CONVERGED * cost / n
+                step, moved, promised = self._step(normal, damping, point.theta)
+                last = promised < CONVERGED * cost / n
                 theta = np.clip(point.theta + step, self.own.lower, self.own.upper)
-                trial = self._at(point, theta, point.x + moved * self.sizes, "all")
-                new = float(self._costs(trial).sum())
+                x = point.x + moved[self.windows.group] * self.sizes
+                if self.windows.warm:  # the warm-up tells the first states of every theta
+                    x = self._states(self._at(point, theta, x, "x")).x
+                trial = self._at(point, theta, x, "all")
+                new = self._cost(trial)
                 better = new < cost
                 damping *= 0.2 if better else 5.0
                 if last:
@@ -518,32 +654,52 @@ class Shooting:
         return np.concatenate([slopes, (root * error)[..., None]], axis=-1)
 
     def _normal(self, point: _Point) -> tuple[Array, ...]:
-        """Blocks of the normal equations, window by window: of ``x``, of both, of ``theta``, and the gradients."""
-        rows, n_x = self._weighted(point), point.x.shape[1]
+        """Blocks of the normal equations: of ``x`` and of both by groups, of ``theta``, and the gradients."""
+        rows, n_x = self._weighted(point) * np.sqrt(self.tell)[:, None], point.x.shape[1]
         every = rows.swapaxes(1, 2) @ rows
         t, x = slice(0, -1 - n_x), slice(-1 - n_x, -1)
-        moved = (point.x - self.windows.x) / self.sizes
+        moved = self._moved(point) / self.members[:, None]
         return (
-            every[:, x, x] + np.eye(n_x), every[:, x, t], every[:, t, t],
-            every[:, x, -1] + moved, every[:, t, -1],
+            self._grouped(every[:, x, x]) + np.eye(n_x), self._grouped(every[:, x, t]), every[:, t, t].sum(axis=0),
+            self._grouped(every[:, x, -1] + moved), every[:, t, -1].sum(axis=0),
         )  # fmt: skip
 
-    @staticmethod
-    def _promised(normal: tuple[Array, ...], step: Array, moved: Array) -> float:
-        """How far a step takes the cost down to first order."""
-        _, _, _, gx, gt = normal
-        return -2.0 * float(gt.sum(0) @ step + np.sum(gx * moved))
+    def _eliminated(self, point: _Point) -> tuple[Array, Array, Array]:
+        """Slopes by ``theta`` and errors of what counts, with first states that follow, by how much these do."""
+        rows, n_x = self._weighted(point), point.x.shape[1]
+        b, a, error = rows[..., : -1 - n_x], rows[..., -1 - n_x : -1], rows[..., -1:]
+        at = (a * self.tell[:, None]).swapaxes(1, 2)
+        xx = self._grouped(at @ a) + np.eye(n_x)
+        follow = np.linalg.solve(xx, self._grouped(at @ np.concatenate([b, error], axis=-1)))
+        left = np.concatenate([b, error], axis=-1) - a @ follow[self.windows.group]
+        left *= self.count[:, None]
+        return left[..., :-1], left[..., -1], np.asarray(follow, dtype=np.float64)
 
-    def _step(self, normal: tuple[Array, ...], damping: float, theta: Array) -> tuple[Array, Array]:
-        """Step of ``theta``, of which those at a bound that would leave it rest, and of the first states."""
+    def _behind(self, point: _Point) -> tuple[Array, ...]:
+        """As :meth:`_normal`, of what comes behind the warm-up; first states follow from the warm-up alone."""
+        b, error, follow = self._eliminated(point)
+        n_x = point.x.shape[1]
+        return (
+            np.broadcast_to(np.eye(n_x), (len(follow), n_x, n_x)), follow[..., :-1],
+            (b.swapaxes(1, 2) @ b).sum(axis=0), follow[..., -1],
+            (b.swapaxes(1, 2) @ error[..., None])[..., 0].sum(axis=0),
+        )  # fmt: skip
+
+    def _step(self, normal: tuple[Array, ...], damping: float, theta: Array) -> tuple[Array, Array, float]:
+        """Step of ``theta``, of which those at a bound that would leave it rest, and of the first states by groups; and
+        how far it takes the cost down to first order.
+        """
         xx, xt, tt, gx, gt = normal
-        xx = xx * (1 + damping * np.eye(xx.shape[-1]))
+        reduced, slope = tt, gt
+        if not self.windows.warm:
+            xx = xx * (1 + damping * np.eye(xx.shape[-1]))
         solved = np.linalg.solve(xx, np.concatenate([xt, gx[..., None]], axis=-1))
         by_theta, own = solved[..., :-1], solved[..., -1]
-        reduced = (tt - xt.swapaxes(1, 2) @ by_theta).sum(0)
-        slope = (gt - (xt.swapaxes(1, 2) @ own[..., None])[..., 0]).sum(0)
+        if not self.windows.warm:
+            reduced = tt - (xt.swapaxes(1, 2) @ by_theta).sum(axis=0)
+            slope = gt - (xt.swapaxes(1, 2) @ own[..., None])[..., 0].sum(axis=0)
         step, free = np.zeros(len(theta)), np.arange(len(theta))
-        reduced = reduced + damping * np.diag(np.maximum(np.diag(tt.sum(0)), 1e-30))
+        reduced = reduced + damping * np.diag(np.maximum(np.diag(tt), 1e-30))
         for _ in range(len(theta) + 1):
             step[:] = 0.0
             if len(free):
@@ -553,22 +709,17 @@ class Shooting:
             if not (low | high).any():
                 break
             free = free[~(low | high)]
-        return step, -own - (by_theta @ step[:, None])[..., 0]
+        moved = -own - (by_theta @ step[:, None])[..., 0]
+        of_states = 0.0 if self.windows.warm else float(np.sum(gx * moved))
+        return step, moved, -2.0 * (float(gt @ step) + of_states)
 
     def _covariance(self, point: _Point) -> tuple[Array, tuple[str, ...]]:
         """Covariance of ``theta``, from the scatter of the windows' slopes: errors within one are no white noise.
 
         Source: Liang and Zeger, *Longitudinal data analysis using generalized linear models* (1986), of clusters.
         """
-        error = point.error / point.scales
-        root = (1 + np.square(error / OUTLIERS)) ** -0.25
-        rows, n_x = self._weighted(point), point.x.shape[1]
-        b, a, error = rows[..., : -1 - n_x], rows[..., -1 - n_x : -1], rows[..., -1]
-        at = a.swapaxes(1, 2)
-        known = np.linalg.solve(
-            at @ a + np.eye(a.shape[-1]), at @ np.concatenate([b, error[..., None]], axis=-1)
-        )
-        b, error = b - a @ known[..., :-1], error - (a @ known[..., -1:])[..., 0]
+        b, error, _ = self._eliminated(point)
+        root = (1 + np.square(point.error / point.scales / OUTLIERS)) ** -0.25
         information = (b.swapaxes(1, 2) @ b).sum(0)
         told = np.flatnonzero(np.diag(information) > 0)  # of the others the outputs say nothing at all
         unknown = set(range(len(information))) - set(told.tolist())
@@ -602,6 +753,7 @@ def fit_prior(
     largest_delay: float = 0.0,
     start: Mapping[str, float] | None = None,
     time_unit: float | None = None,
+    first_states: FirstStates = FREE,
     on_progress: Progress = lambda done, total, text: None,
 ) -> PriorFit:
     """Fit parameters and delay to the measured outputs over longer and longer windows, and find what smooths states.
@@ -625,6 +777,7 @@ def fit_prior(
         start: Values [their units] by name to try as a start besides the nominal ones, e.g. those of a global search;
             fixed parameters are left out. Default: none.
         time_unit: The machine's second [s]. Default: that of the training trajectories.
+        first_states: What is known of the states that free runs start from. Default: nothing, they are free.
         on_progress: ``(done, total, text)`` after every stage.
 
     Raises:
@@ -644,6 +797,7 @@ def fit_prior(
     fit = OutputFit(make, dt, largest_delay)
     unit = scales.time_unit(train, dt) if time_unit is None else time_unit
     check_observable(fit.prior, dt, unit)
+    first_states.check(fit.prior, largest_delay)
     if _longest(train) < fit.lead + 3:
         raise InputError(
             f"no recording is long enough to fit {type(fit.prior).__name__} to: the longest has {_longest(train)} "
@@ -664,11 +818,17 @@ def fit_prior(
         fit.points = visited(every)
     guesses = every[: len(train)], every[len(train) :]
     found: list[tuple[str, Fitted]] = []
-    theta, states = fit.nominal, fit.prior.states
-    problems = [Shooting(fit, cut_outputs(guesses[0], n, fit.lead, WINDOWS, states), sizes) for n in lengths]
+    theta = fit.nominal
+
+    def problem_of(part: Sequence[Trajectory], periods: int, most: int = WINDOWS) -> Shooting:
+        known = fit.prior.states, fit.prior.outputs, first_states
+        return Shooting(fit, cut_outputs(part, periods, fit.lead, most, *known), sizes)
+
+    problems = [problem_of(guesses[0], periods) for periods in lengths]
     if len(theta):
         on_progress(1, total, "several starts")
-        theta = _best_start(fit, guesses[0], lengths, sizes, start)
+        short, long = (problem_of(guesses[0], lengths[i], WINDOWS // 2) for i in (0, -1))
+        theta = _best_start(fit, short, long, start)
         for i, (periods, problem) in enumerate(zip(lengths, problems, strict=True)):
             name = f"free runs of {periods * dt:.3g} s"
             on_progress(2 + i, total, name)
@@ -680,7 +840,7 @@ def fit_prior(
             found.append((name, problem.solve(known[int(np.argmin(problem.explained(known)))])))
     judges = [problems[-1]] if _longest(guesses[0]) > lengths[-1] + fit.lead else []
     if _longest(guesses[1]) > lengths[-1] + fit.lead:
-        judges.append(Shooting(fit, cut_outputs(guesses[1], lengths[-1], fit.lead, WINDOWS, states), sizes))
+        judges.append(problem_of(guesses[1], lengths[-1]))
     candidates = [("nominal", Fitted(fit.nominal, np.zeros((0, 0)), ())), *found]
     scores = _errors_of([c.theta for _, c in candidates], judges)
     on_progress(total - 1, total, "smoothing by the fitted prior")
@@ -816,18 +976,8 @@ def _lengths(train: Sequence[Trajectory], dt: float, unit: float, length: float,
     return sorted(dict.fromkeys(fitting)) or [max(2, longest // 2)]
 
 
-def _best_start(
-    fit: OutputFit,
-    train: Sequence[Trajectory],
-    lengths: Sequence[int],
-    sizes: Array,
-    start: Mapping[str, float] | None,
-) -> Array:
+def _best_start(fit: OutputFit, short: Shooting, long: Shooting, start: Mapping[str, float] | None) -> Array:
     """What a few steps over short windows find from several starts: what explains the longest windows best."""
-    short, long = (
-        Shooting(fit, cut_outputs(train, lengths[i], fit.lead, WINDOWS // 2, fit.prior.states), sizes)
-        for i in (0, -1)
-    )
     starts = [fit.nominal, *([] if start is None else [fit.scaled(start)])]
     if len(fit.nominal):
         between = qmc.Sobol(len(fit.nominal), seed=0).random_base2(3)[:STARTS]

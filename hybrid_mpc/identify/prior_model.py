@@ -61,4 +61,5 @@ def model_info(prior: Prior, dt: float, covariance: Sequence[Sequence[float]] = 
         tuple(replace(spec, value=values[spec.name]) for spec in prior.parameters),
         covariance=tuple(tuple(row) for row in covariance), balances=balances_of(prior),
         disturbances=prior.disturbances, nominal_w=() if point is None else point.w,
+        nominal_x=() if point is None else point.x, nominal_u=() if point is None else point.u,
     )  # fmt: skip

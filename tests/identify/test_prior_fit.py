@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from example_priors import TANKS, Swing, Tanks, TorchSwing, TorchTanks
+from example_priors import TANKS, Arm, Swing, Tanks, TorchArm, TorchSwing, TorchTanks
 from scipy.optimize._numdiff import approx_derivative
 from simulated_pendulum import DT, TRUTH, Pendulum, record
 
 from hybrid_mpc import InputError, Parameter, Prior, Signal, Trajectory, fit_prior
 from hybrid_mpc.identify.fit import OutputFit, Shooting, cut_outputs, refit, smoothed
 from hybrid_mpc.identify.prior_result import PriorFit
-from hybrid_mpc.identify.simulation import Simulation
+from hybrid_mpc.identify.simulation import Simulation, rest_of
 
 NOISE = 2e-3
 
@@ -123,19 +123,46 @@ def test_a_tank_is_found_whose_level_has_no_sensor(kind):
     np.testing.assert_allclose(level[20:-20, 0], again[:-20, 0], atol=0.05)  # a tenth of how far it moves
 
 
+def reaching(noise=NOISE):
+    """The true arm under random torques, both angles measured."""
+    prior, runs = Arm(), []
+    for seed in range(3):
+        rng, n = np.random.default_rng(seed), 150
+        u = np.repeat(rng.uniform(-1.0, 1.0, (n // 10, len(prior.inputs))), 10, axis=0)
+        simulation = Simulation(prior.equations.xdot, DT)
+        start = np.array([[0.3, -0.2, 0.0, 0.0]])
+        x = simulation.values(start, u[None], np.zeros((1, n, 0)), 1.05 * prior.p, 4)[0]
+        run = Trajectory(f"arm{seed}", "train", DT, DT * np.arange(n), u, x[:, :2], x, np.zeros_like(x))
+        runs.append(outputs_of(prior, run, noise, seed))
+    return runs
+
+
 @pytest.mark.parametrize(("one", "other", "runs"), [
     (Swing, TorchSwing, lambda: swings(noise=NOISE)),
     (Tanks, TorchTanks, lambda: [tanks(seed, noise=1e-3) for seed in range(3)]),
+    (Arm, TorchArm, lambda: reaching()),
 ])  # fmt: skip
 def test_the_same_machine_in_casadi_and_in_torch_has_the_same_fit(one, other, runs):
-    data = runs()
-    ours, theirs = (fitted(kind, data, dt=data[0].dt) for kind in (one, other))
-    # rounding, through some dozen steps of Gauss-Newton that all converge to the same point
-    for name, value in ours.values.items():
-        assert theirs.values[name] == pytest.approx(value, rel=1e-9), name
-    for name, value in ours.standard_errors.items():
-        assert theirs.standard_errors[name] == pytest.approx(value, rel=1e-6), name
-    assert theirs.best == ours.best
+    data, found = runs(), []
+    for kind in (one, other):
+        fit = OutputFit(kind, data[0].dt)
+        guessed = [replace(run, x=np.tile(rest_of(kind())[0] + 0.1, (len(run.t), 1))) for run in data]
+        problem = Shooting(fit, cut_outputs(guessed, 25, 0, 8), np.ones(len(fit.prior.states)))
+        point = problem.start(1.02 * fit.nominal, problem.windows.x, "all")
+        best = problem.solve(fit.nominal)
+        found.append((point, best, problem.explained([best.theta])[0]))
+    (ours, best, cost), (theirs, other_best, other_cost) = found
+    # the same operations in another order
+    np.testing.assert_allclose(theirs.error, ours.error, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(theirs.slopes, ours.slopes, rtol=0, atol=1e-10 * np.abs(ours.slopes).max())
+    assert other_cost == pytest.approx(cost, rel=1e-8)
+    told = np.sqrt(np.diag(best.covariance))
+    assert (np.abs(other_best.theta - best.theta) <= 1e-4 * told).all()
+    whole, again = (fitted(kind, data, dt=data[0].dt) for kind in (one, other))
+    for name, error in whole.standard_errors.items():
+        assert abs(again.values[name] - whole.values[name]) <= 1e-4 * error, name
+        assert again.standard_errors[name] == pytest.approx(error, rel=1e-6), name
+    assert again.best == whole.best
 
 
 # recordings as they are

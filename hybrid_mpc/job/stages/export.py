@@ -116,6 +116,7 @@ def observed(context: Context) -> dict[str, object]:
         "sensors": (scenario.sensor_sigma, scenario.first_sigma),
         "limits of the input": None if control is None else (control.u_min, control.u_max),
         "beyond recordings": scenario.beyond_recordings,
+        "disturbance model": scenario.disturbance_model,
         "oracle": source_of(scenario.oracle),
     }
 
