@@ -3,9 +3,9 @@
     python benchmarks/fit_time.py golf_robot
     python benchmarks/fit_time.py torque_pendulum ../shared/data/torque_pendulum/energy_shaping_*.csv
 
-Without files a simulated machine makes its own. Files are cut and given roles as by ``hybrid-mpc benchmark``. Printed is
-a row of JSON: wall-clock and processor time [s], the errors that chose, the fitted values and their standard errors. Run
-it by turns on two commits to compare them.
+Without files a simulated machine makes its own. Files are cut and given roles as by ``hybrid-mpc benchmark``. Printed
+is a row of JSON: wall-clock and processor time [s], the errors that chose, the fitted values and their standard errors.
+Run it by turns on two commits to compare them.
 """
 
 import argparse
