@@ -3,9 +3,9 @@
     python benchmarks/fit_time.py golf_robot
     python benchmarks/fit_time.py torque_pendulum ../shared/data/torque_pendulum/energy_shaping_*.csv
 
-Without files a simulated machine makes its own. Files are cut and given roles as by ``hybrid-mpc benchmark``. Printed is
-a row of JSON: wall-clock and processor time [s], the errors that chose, the fitted values and their standard errors. Run
-it by turns on two commits to compare them.
+Without files a simulated machine makes its own. Files are cut and given roles as by ``hybrid-mpc benchmark``. Printed
+is a row of JSON: wall-clock and processor time [s], the errors that chose, the fitted values and their standard errors.
+Run it by turns on two commits to compare them.
 """
 
 import argparse
@@ -25,13 +25,9 @@ Parts = tuple[Sequence[Trajectory], Sequence[Trajectory], Sequence[Trajectory], 
 
 def simulated(scenario: Scenario) -> Parts:
     """Recordings of a simulated machine for training, validation and test, and options of the fit."""
-    prior = scenario.prior()
     with tempfile.TemporaryDirectory() as folder:
         files = scenario.make_data(Path(folder), 0, "quick")
-        data = load_trajectories(
-            files, scenario.data, outputs=prior.outputs, inputs=prior.inputs, states=prior.states,
-            disturbances=prior.disturbances,
-        )  # fmt: skip
+        data = load_trajectories(files, scenario.prior(), scenario.data)
     options = {"largest_delay": scenario.data.largest_delay}
     return data.by_role("train"), data.by_role("valid"), data.by_role("test"), options
 

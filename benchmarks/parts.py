@@ -10,6 +10,7 @@ import argparse
 import json
 import platform
 import tempfile
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from time import perf_counter
@@ -33,7 +34,7 @@ from hybrid_mpc import (
 )
 from scenarios.golf_robot import scenario
 
-SCALING = Scaling(x=(0.5, 1.5), u=(0.2,), acceleration=(5.0,), correction=(0.5,))
+SCALING = Scaling(x=(0.5, 1.5), u=(0.2,), rate=(5.0,), correction=(0.5,))
 GOAL = 0.6  # [rad], from rest at -0.3 rad
 REFERENCE = np.array([[GOAL, 0.0]])
 PERIODS, SKIPPED = 150, 3
@@ -48,17 +49,20 @@ def arguments(doc: str) -> argparse.ArgumentParser:
     return parser
 
 
-def report(rows: list[dict], out: Path | None) -> None:
-    """Rows with the same keys as a Markdown table, and all with the machine's packages as JSON."""
+def report(rows: list[dict], out: Path | None, packages: Sequence[str] = (), **more: object) -> None:
+    """Rows with the same keys as a Markdown table, and all with the machine's packages as JSON.
+
+    ``packages`` are named beside those that all benchmarks use; ``more`` goes into the JSON alone.
+    """
     columns: tuple = ()
     for row in rows:
         if tuple(row) != columns:
             columns = tuple(row)
             print("\n| " + " | ".join(columns) + " |\n|" + " --- |" * len(columns))
         print("| " + " | ".join(f"{v:.4g}" if isinstance(v, float) else str(v) for v in row.values()) + " |")
-    packages = {name: version(name) for name in ("casadi", "torch", "numpy")}
-    machine = {"machine": platform.machine(), "python": platform.python_version(), **packages}
-    text = json.dumps({**machine, "rows": rows}, indent=1)
+    versions = {name: version(name) for name in ("casadi", "torch", "numpy", *packages)}
+    machine = {"machine": platform.machine(), "python": platform.python_version(), **versions}
+    text = json.dumps({**machine, "rows": rows, **more}, indent=1)
     print("\n" + text) if out is None else out.write_text(text + "\n")
 
 

@@ -57,6 +57,7 @@ TORCH = (
             "networks",
             "objectives",
             "prior_replay",
+            "rollout",
             "step",
             "train",
             "tune",

@@ -46,8 +46,7 @@ class StackedGRU(nn.Module):
 
     Tensors carry the network as first axis, ``(networks, batch, features)``. Small networks are bound by the cost of
     launching operations, so several cost little more than one. Network i of one ``seed`` is the same whatever
-    ``networks`` is; ``zero_head`` starts with zero output; ``fused`` makes :meth:`sequence` faster, with other
-    rounding.
+    ``networks`` is; ``zero_head`` starts with zero output.
     """
 
     def __init__(
@@ -59,10 +58,9 @@ class StackedGRU(nn.Module):
         *,
         seed: int,
         zero_head: bool = False,
-        fused: bool = False,
     ) -> None:
         super().__init__()
-        self.networks, self.n_in, self.n_h, self.n_out, self.fused = networks, n_in, hidden, n_out, fused
+        self.networks, self.n_in, self.n_h, self.n_out = networks, n_in, hidden, n_out
         bound = 1.0 / math.sqrt(hidden)
         generators = [torch.Generator().manual_seed(seed * 1009 + i) for i in range(networks)]
 
@@ -76,6 +74,17 @@ class StackedGRU(nn.Module):
         if zero_head:
             nn.init.zeros_(self.w_out)
             nn.init.zeros_(self.b_out)
+
+    @classmethod
+    def of(cls, network: GRUNetwork) -> StackedGRU:
+        """A stack of one network, with copies of its weights."""
+        cell, head = network.cell, network.head
+        stack = cls(1, cell.input_size, network.n_h, head.out_features, seed=0)
+        weights = cell.weight_ih.T, cell.weight_hh.T, cell.bias_ih, cell.bias_hh, head.weight.T, head.bias
+        with torch.no_grad():
+            for own, weight in zip(stack.parameters(), weights, strict=True):
+                own.copy_(weight.reshape(own.shape))
+        return stack.requires_grad_(network.head.weight.requires_grad)
 
     def initial(self, batch: int) -> Tensor:
         """Zero hidden states ``(networks, batch, z)``."""
@@ -91,15 +100,9 @@ class StackedGRU(nn.Module):
 
         Features ``s`` are ``(T, networks, batch, n_in)``, or ``(T, 1, batch, n_in)`` if all networks have the same.
         """
-        if self.fused:
-            states = fused_states(s, h, self.w_ih, self.w_hh, self.b_ih, self.b_hh)
-            out = torch.baddbmm(self.b_out, states.flatten(1, 2), self.w_out).unflatten(1, states.shape[1:3])
-            return out.transpose(0, 1), states[:, -1]
-        every = []
-        for gate in torch.matmul(s, self.w_ih) + self.b_ih:
-            h = self._cell(gate, h)
-            every.append(h)
-        return torch.matmul(torch.stack(every), self.w_out) + self.b_out, h
+        states = hidden_states(s, h, self.w_ih, self.w_hh, self.b_ih, self.b_hh)
+        out = torch.baddbmm(self.b_out, states.flatten(1, 2), self.w_out).unflatten(1, states.shape[1:3])
+        return out.transpose(0, 1), states[:, -1]
 
     def member(self, i: int) -> GRUNetwork:
         """Network ``i`` alone, with the same weights."""
@@ -120,7 +123,7 @@ class StackedGRU(nn.Module):
         return candidate + z * (h - candidate)
 
 
-def fused_states(s: Tensor, h: Tensor, w_ih: Tensor, w_hh: Tensor, b_ih: Tensor, b_hh: Tensor) -> Tensor:
+def hidden_states(s: Tensor, h: Tensor, w_ih: Tensor, w_hh: Tensor, b_ih: Tensor, b_hh: Tensor) -> Tensor:
     """Hidden states ``(networks, T, batch, z)`` along a sequence; differentiable once by every argument.
 
     The equations of :class:`StackedGRU` with a derivative written by hand. A time step is one matrix product (hidden
@@ -129,14 +132,20 @@ def fused_states(s: Tensor, h: Tensor, w_ih: Tensor, w_hh: Tensor, b_ih: Tensor,
     ``s`` is ``(T, networks or 1, batch, n_in)``, h ``(networks, batch, z)``; the columns of the weights are the gates
     r, z and the candidate.
     """
-    z = w_hh.shape[1]
     rows = torch.cat([s, s.new_ones(*s.shape[:3], 1)], dim=3).transpose(0, 1)
+    states: Tensor = _States.apply(rows, h, *gate_matrices(w_ih, w_hh, b_ih, b_hh))
+    return states
+
+
+def gate_matrices(w_ih: Tensor, w_hh: Tensor, b_ih: Tensor, b_hh: Tensor) -> tuple[Tensor, Tensor]:
+    """A time step as two products: ``[h, s, 1]`` to the gates r, z and what is inside the reset product
+    ``(networks, z + n_in + 1, 3 z)``, and ``[s, 1]`` to what is added to that ``(networks, n_in + 1, z)``.
+    """
+    z = w_hh.shape[1]
     gate = torch.cat([w_ih[..., : 2 * z], (b_ih + b_hh)[..., : 2 * z]], dim=1)
     inside = torch.cat([torch.zeros_like(w_ih[..., 2 * z :]), b_hh[..., 2 * z :]], dim=1)
     recurrent = torch.cat([w_hh, torch.cat([gate, inside], dim=2)], dim=1)
-    direct = torch.cat([w_ih, b_ih], dim=1)[..., 2 * z :].contiguous()
-    states: Tensor = _States.apply(rows, h, recurrent, direct)
-    return states
+    return recurrent, torch.cat([w_ih, b_ih], dim=1)[..., 2 * z :].contiguous()
 
 
 class _States(torch.autograd.Function):
@@ -177,7 +186,7 @@ class _States(torch.autograd.Function):
         d_n, dh, carry = x.new_zeros(3, networks, batch, z)
         for k in range(steps - 1, -1, -1):
             now = x[:, k]
-            _step_back(grad[:, k], carry, dh, now[..., :z], gates[k], candidate[:, k], d, d_n)
+            step_back(grad[:, k], carry, dh, now[..., :z], gates[k], candidate[:, k], d, d_n)
             carry.baddbmm_(d, by_h)
             d_recurrent.baddbmm_(now.mT, d)
             by_direct.baddbmm_(now[..., z:].mT, d_n)
@@ -186,7 +195,7 @@ class _States(torch.autograd.Function):
         return d_rows, carry, d_recurrent, by_direct
 
 
-def _step_back(
+def step_back(
     grad: Tensor, carry: Tensor, dh: Tensor, h: Tensor, g: Tensor, n: Tensor, d: Tensor, d_n: Tensor
 ) -> None:
     """Derivatives by the gates' sums ``d`` and the candidate's ``d_n``, and what h itself hands on, ``carry``."""

@@ -90,12 +90,8 @@ def free_run(step: RecurrentStep, windows: Windows) -> Prediction:
     """The model's own free run over the scored part, h warmed up on the measured past."""
     h = warm_up(step, windows)
     x = windows.x[:, windows.warm].unsqueeze(0).expand(h.shape[0], -1, -1)
-    states = [x]
     u, w = (z[:, windows.warm :].transpose(0, 1).unsqueeze(1) for z in (windows.u, windows.w))
-    for u_k, w_k in zip(*(z.expand(-1, h.shape[0], -1, -1) for z in (u, w)), strict=True):
-        x, h = step(x, h, u_k, w_k)
-        states.append(x)
-    x_hat = torch.stack(states)
+    x_hat = step.free_run(x, h, *(z.expand(-1, h.shape[0], -1, -1) for z in (u, w)))
     measured = windows.x[:, windows.warm :].transpose(0, 1).unsqueeze(1)
     rate = step.measured_rate(measured[:-1], measured[1:], _scored_xdot(windows))
     return Prediction(measured[:-1], x_hat[:-1], u, w, rate, (x_hat[1:] - x_hat[:-1]) / step.dt)

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from functools import cached_property
+from typing import Any, ClassVar, cast
 
+import casadi as ca
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -17,8 +19,9 @@ from torch import Tensor, nn
 import nn_export
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.dataset import Windows
-from hybrid_mpc.identify.networks import StackedGRU
-from hybrid_mpc.identify.simulation import required_substeps
+from hybrid_mpc.identify.networks import GRUNetwork, StackedGRU
+from hybrid_mpc.identify.rollout import Rollout
+from hybrid_mpc.identify.simulation import Simulation, required_substeps, stepped
 from hybrid_mpc.machine.prior import Prior
 
 SPAN = 10
@@ -82,6 +85,14 @@ class Step(nn.Module):
         """Next state ``(..., n_x)`` and next hidden state ``(..., n_h)``, with ``u`` and ``w`` held over the period."""
         raise NotImplementedError(f"{type(self).__name__} must define forward(x, h, u, w, p)")
 
+    def free_run(self, x: Tensor, h: Tensor, u: Tensor, w: Tensor) -> Tensor:
+        """States ``(T + 1, ..., n_x)`` of its own run from ``x`` and ``h`` under ``u``, ``w`` ``(T, ..., n)``."""
+        states = [x]
+        for u_k, w_k in zip(u, w, strict=True):
+            x, h = self(x, h, u_k, w_k)
+            states.append(x)
+        return torch.stack(states)
+
     def xdot(self, x: Tensor, h: Tensor, u: Tensor, w: Tensor, p: Tensor | None = None) -> Tensor:
         """Derivative of the state ``(..., n_x)`` at the instant."""
         raise NotImplementedError(f"{type(self).__name__} must define xdot(x, h, u, w, p)")
@@ -109,6 +120,17 @@ class PriorStep(Step):
     ) -> tuple[Tensor, Tensor]:
         """Next state and the hidden state as it came."""
         return rk4(lambda z: self.xdot(z, h, u, w, p), x, self.dt, self.substeps), h
+
+    def free_run(self, x: Tensor, h: Tensor, u: Tensor, w: Tensor) -> Tensor:
+        """States of its own run, all runs in one call of CasADi; they are not differentiated."""
+        runs, periods = x.shape[:-1].numel(), len(u)
+        u_all, w_all = (
+            torch.cat([z, z[-1:]]).reshape(periods + 1, runs, z.shape[-1]).swapaxes(0, 1).numpy()
+            for z in (u, w)
+        )  # the last period's goes on
+        simulation = Simulation(self.prior.equations.xdot, self.dt)
+        states = simulation.values(x.reshape(runs, -1).numpy(), u_all, w_all, self.p.numpy(), self.substeps)
+        return torch.tensor(states).swapaxes(0, 1).reshape(periods + 1, *x.shape)
 
     def xdot(self, x: Tensor, h: Tensor, u: Tensor, w: Tensor, p: Tensor | None = None) -> Tensor:
         """Derivative of the state at the instant."""
@@ -379,6 +401,52 @@ class HybridStep(RecurrentStep):
             return (own if self.use_prior else own * self.own_rows) + added
 
         return rk4(rates, x, self.dt, self.substeps)
+
+    def free_run(self, x: Tensor, h: Tensor, u: Tensor, w: Tensor) -> Tensor:
+        """States of its own run; on the CPU by :class:`~hybrid_mpc.identify.rollout.Rollout`.
+
+        Those of one network are not differentiated.
+        """
+        if x.device.type != "cpu":
+            return super().free_run(x, h, u, w)
+        if isinstance(self.network, StackedGRU):
+            p = x.new_zeros(len(h), 1, 0) if self.trained is None else self.trained.shift()
+            return self._rollout(self.network, x, h, u, w, p)
+        runs, periods = x.shape[:-1], len(u)
+        x_0, h_0 = (z.reshape(1, runs.numel(), z.shape[-1]) for z in (x, h))
+        u_all, w_all = (z.reshape(periods, 1, runs.numel(), z.shape[-1]) for z in (u, w))
+        stack = StackedGRU.of(cast(GRUNetwork, self.network))
+        with torch.no_grad():
+            states = self._rollout(stack, x_0, h_0, u_all, w_all, x.new_zeros(1, 1, 0))
+        return states.reshape(periods + 1, *x.shape)
+
+    @cached_property
+    def _rollout(self) -> Rollout:
+        """The model's features and period as scalar operations; ``p`` is what is added to the prior's parameters."""
+        prior, xdot = self.prior, self.prior.equations.xdot
+        sizes = {name: xdot.size1_in(i) for i, name in enumerate("xuw")}
+        x, u, w = (ca.SX.sym(name, size) for name, size in sizes.items())
+        c = ca.SX.sym("c", len(prior.corrected))
+        p = ca.SX.sym("p", 0 if self.trained is None else len(prior.parameters))
+        fitted = ca.DM((self.p + self.own_shift).numpy())
+        shifted = fitted if self.trained is None else fitted + p
+        scale, centre = (
+            {k: ca.DM(getattr(self, f"scale_{a}{k}").numpy()) for k in "xuw"} for a in ("", "centre_")
+        )
+        parts, scaled = [], (x - centre["x"]) / scale["x"]
+        for i, signal in enumerate(prior.states):
+            parts += [ca.sin(x[i]), ca.cos(x[i])] if signal.periodic else [scaled[i]]
+        parts += [(u - centre["u"]) / scale["u"], (w - centre["w"]) / scale["w"]]
+        if self.use_prior:
+            parts.append(xdot(x, u, w, shifted)[list(prior.corrected)] / ca.DM(self.scale_rate.numpy()))
+        own = ca.DM.ones(sizes["x"]) if self.use_prior else ca.DM(self.own_rows.numpy())
+        z, held, into = ca.SX.sym("z", sizes["x"]), ca.vertcat(p, c), ca.DM(self.into.numpy().T)
+        rates = ca.Function("xdot", [z, u, w, held], [xdot(z, u, w, shifted) * own + into @ c])
+        x_next = stepped(rates, x, u, w, held, self.dt, self.substeps)
+        features = ca.Function("features", [x, u, w, p], [ca.densify(ca.vertcat(*parts))])
+        return Rollout(
+            features, ca.Function("flow", [x, c, u, w, p], [ca.densify(x_next)]), self.scale_correction
+        )
 
     def derivative(
         self, x: Tensor, u: Tensor, w: Tensor, correction: Tensor, p: Tensor | None = None

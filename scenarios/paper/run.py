@@ -195,7 +195,6 @@ class Work:
             decay=e.decay,
             every=e.every,
             objectives=("error", "energy"),
-            fused=True,
         )
 
     def rows(self) -> list[Row]:

@@ -77,7 +77,7 @@ def test_corrections_fade_there_and_still_explain_the_data(data, prior_replay):
     assert (faded.validation < 0.9 * faded.curve["validation"][0].min()).all()
 
 
-@pytest.mark.parametrize("changed", [{"prior_parameters": "trained"}, {"fused": True}], ids=str)
+@pytest.mark.parametrize("changed", [{"prior_parameters": "trained"}], ids=str)
 def test_it_goes_with_other_options(data, changed):
     one, two = (train(PRIOR, *data, replace(SMALL, prior_replay=w, **changed)) for w in (0.0, 10.0))
     assert np.isfinite(two.validation).all()

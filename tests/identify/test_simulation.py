@@ -12,7 +12,8 @@ from simulated_pendulum import Pendulum
 from torch.func import jacfwd
 
 from hybrid_mpc import InputError, OperatingPoint, Parameter, Prior, Signal, Trajectory, fit_prior
-from hybrid_mpc.identify.export import model_info, trace_model
+from hybrid_mpc.identify.export import trace_model
+from hybrid_mpc.identify.prior_model import model_info
 from hybrid_mpc.identify.simulation import (
     MAX_SUBSTEPS,
     Simulation,

@@ -16,9 +16,7 @@ PRIOR = Pendulum(TRUTH)
 
 OPTIONS = (
     {"objectives": ("error",)},
-    {"fused": True},
     {"prior_parameters": "trained"},
-    {"prior_parameters": "trained", "fused": True},
 )
 
 
@@ -35,8 +33,7 @@ def test_every_option_trains_resumes_and_makes_a_model(data, usual, options, tmp
     assert (whole.validation < whole.curve["validation"][0]).all()
     assert not whole.failures
     same_training(whole, killed_and_resumed(10, file, PRIOR, *data, settings)[0])
-    if options != {"fused": True}:
-        assert not np.array_equal(whole.validation, usual.validation)
+    assert not np.array_equal(whole.validation, usual.validation)
     step = whole.step(PRIOR, DT)
     x_next, h_next = step(
         *(torch.zeros(n).double() for n in (2, step.network.n_h)),
