@@ -35,7 +35,7 @@ def simulated(scenario: Scenario) -> Parts:
 def measured(scenario: Scenario, files: Sequence[Path]) -> Parts:
     """The same of files."""
     data, spec = read_training(scenario, files), scenario.benchmark
-    options = {"length": spec.length or spec.piece, "largest_delay": spec.largest_delay}
+    options = {"length": spec.length or spec.piece, "largest_delay": scenario.data.largest_delay}
     return data.train, data.valid, data.held_back, options
 
 
