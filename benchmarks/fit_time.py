@@ -29,10 +29,7 @@ def main() -> None:
     prior = scenario.prior()
     with tempfile.TemporaryDirectory() as folder:
         files = given.files or scenario.make_data(Path(folder), 0, "quick")
-        data = load_trajectories(
-            files, scenario.data, outputs=prior.outputs, inputs=prior.inputs, states=prior.states,
-            disturbances=prior.disturbances,
-        )  # fmt: skip
+        data = load_trajectories(files, prior, scenario.data)
     train, valid = data.by_role("train"), data.by_role("valid")
     wall, cpu = time.perf_counter(), time.process_time()
     fit = fit_prior(scenario.prior, train, valid, dt=scenario.data.dt)

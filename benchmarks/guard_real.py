@@ -171,9 +171,7 @@ def stretches(rows, chosen) -> list:
 def read(folder: Path, model):
     """All recordings, whole, on the model's grid."""
     files = [folder / f"{name}.csv" for name in CLEAN]
-    return load_trajectories(
-        files, replace(scenario.data, windows={}), outputs=model.outputs, inputs=model.inputs
-    )
+    return load_trajectories(files, model, replace(scenario.data, windows={}))
 
 
 def judge(model, sigma_x, data, rate: float = RATE) -> list[HeldOut]:

@@ -73,10 +73,11 @@ if TYPE_CHECKING:
     from hybrid_mpc.estimate.tuning import process_noise
     from hybrid_mpc.files import write_arrays
     from hybrid_mpc.identify.evaluate import evaluation_trajectories, free_runs, score
-    from hybrid_mpc.identify.export import check_parity, model_info, trace_model
+    from hybrid_mpc.identify.export import check_parity, trace_model
     from hybrid_mpc.identify.fit import fit_prior
     from hybrid_mpc.identify.linear import LinearModel, fit_arx, fit_subspace
     from hybrid_mpc.identify.networks import GRUNetwork
+    from hybrid_mpc.identify.prior_model import model_info
     from hybrid_mpc.identify.settings import TrainingSettings
     from hybrid_mpc.identify.smooth import fit_smoother
     from hybrid_mpc.identify.step import HybridStep, PriorStep, Scaling, n_features
@@ -337,10 +338,11 @@ _ROOMS = {
     "estimate.tuning": ("process_noise",),
     "files": ("write_arrays",),
     "identify.evaluate": ("evaluation_trajectories", "free_runs", "score"),
-    "identify.export": ("check_parity", "model_info", "trace_model"),
+    "identify.export": ("check_parity", "trace_model"),
     "identify.fit": ("fit_prior",),
     "identify.linear": ("LinearModel", "fit_arx", "fit_subspace"),
     "identify.networks": ("GRUNetwork",),
+    "identify.prior_model": ("model_info",),
     "identify.settings": ("TrainingSettings",),
     "identify.smooth": ("fit_smoother",),
     "identify.step": ("HybridStep", "PriorStep", "Scaling", "n_features"),

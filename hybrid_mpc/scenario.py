@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib.util
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.machine.signals import Parameter, Signal
 from hybrid_mpc.machine.specification import BenchmarkSpec, DataSpec, check_prior_replay
 
 if TYPE_CHECKING:
@@ -27,6 +30,19 @@ if TYPE_CHECKING:
     from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
+SWITCHED = (
+    "integer",
+    "binary",
+    "boolean",
+    "discrete",
+    "values",
+    "levels",
+    "options",
+    "choices",
+    "dtype",
+    "kind",
+)
+"""How an input of whole numbers may be declared, which no signal can be."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +114,7 @@ class Budget:
 
 
 DEFAULT_BUDGETS: Mapping[str, Budget] = {
-    "quick": Budget(hidden=16, networks=2, teacher_steps=1000, free_run_steps=100, seeds=2),
+    "quick": Budget(hidden=16, networks=2, teacher_steps=200, free_run_steps=200, seeds=2),
     "full": Budget(hidden=32, networks=4, teacher_steps=2500, free_run_steps=800, seeds=10),
 }
 """Budgets of a scenario that names none: a first look in minutes, and one that is worth reporting."""
@@ -232,7 +248,7 @@ def load_scenario(name_or_path: str) -> Scenario:
         spec.loader.exec_module(module)
     except Exception as error:
         line = _line_in(error, path)
-        raise InputError(f"{path}{line}: {type(error).__name__}: {error}") from error
+        raise InputError(f"{path}{line}: {type(error).__name__}: {error}{_hint(error)}") from error
     if not hasattr(module, "scenario"):
         raise InputError(f"{path} defines no variable 'scenario'; add: scenario = Scenario(name=..., ...)")
     return _checked(module.scenario, str(path))
@@ -245,6 +261,24 @@ def _checked(scenario: object, where: str) -> Scenario:
     if not callable(scenario.prior):
         raise InputError(f"{where}: scenario {scenario.name!r} has no prior; give prior=YourPriorClass")
     return scenario
+
+
+def _hint(error: BaseException) -> str:
+    """What helps where a field was given that its class does not have."""
+    found = re.search(r"(\w+)\.__init__\(\) got an unexpected keyword argument '(\w+)'", str(error))
+    kinds = {
+        kind.__name__: kind for kind in (Signal, Parameter, DataSpec, BenchmarkSpec, Task, Budget, Scenario)
+    }
+    if found is None or found[1] not in kinds:
+        return ""
+    if found[1] == "Signal" and found[2] in SWITCHED:
+        return (
+            ". Inputs of whole numbers, or on and off, are not supported; take one that can have any value between, "
+            "such as a duty"
+        )
+    names = [one.name for one in fields(kinds[found[1]])]
+    near = difflib.get_close_matches(found[2], names, n=1)
+    return f"; did you mean {near[0]!r}?" if near else f"; there are: {', '.join(names)}"
 
 
 def _line_in(error: BaseException, path: Path) -> str:

@@ -29,10 +29,11 @@ class Cart(MechanicalPrior):
 
 scenario = Scenario(
     "cart", "A cart", "", prior=Cart,
-    data=DataSpec("t", ("u",), ("s",), dt=0.1, max_gap=0.25, smoothing=0.7, warm_up=1.0, fractions=(0.6, 0.2, 0.2)),
+    data=DataSpec("t", ("u",), ("s",), dt=0.1, max_gap=0.25, smoothing=0.7, warm_up=1.0, fractions=(0.6, 0.2, 0.2),
+                  largest_delay=0.3),
     benchmark=BenchmarkSpec(
         {"quick": BenchmarkBudget(4, 2, teacher_steps=5, free_run_steps=5, horizon=10, batch=8)},
-        unit="mm", scale=1e3, largest_delay=0.3, piece=20.0,
+        unit="mm", scale=1e3, piece=20.0,
     ),
 )
 """

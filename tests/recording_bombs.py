@@ -13,12 +13,13 @@ import zlib
 from pathlib import Path
 
 import numpy as np
+from machine_signals import machine
 from scipy.io import savemat
 
 from hybrid_mpc import DataSpec, Signal
 
 SPEC = DataSpec("time_s", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.2)
-SIGNALS = {"outputs": (Signal("phi", "rad", -10, 10),), "inputs": (Signal("torque", "N m", -5, 5),)}
+SIGNALS = machine((Signal("phi", "rad", -10, 10),), (Signal("torque", "N m", -5, 5),))
 T = np.arange(60) * 0.01
 GOOD = {"time_s": T, "tau": np.cos(T), "phi": np.sin(T)}
 MEMORY = 500 * 2**20
@@ -250,7 +251,7 @@ def main(folder):
     def read(path):
         begin = time.process_time()
         try:
-            load_trajectories([path], SPEC, **SIGNALS, needed=())
+            load_trajectories([path], SIGNALS, SPEC, needed=())
             outcome = "read"
         except InputError as error:
             outcome = f"refused: {error}"

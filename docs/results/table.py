@@ -8,26 +8,46 @@ from typing import Any
 
 HERE = Path(__file__).parent
 MODELS = ("phy_nominal", "phy", "rnn", "pgrnn", "mopgrnn")
-KEYS = ("e_sim_s", "rmse", "balance_violation")
+WORDS = {
+    "error": "error [spreads]",
+    "e_sim": "E_sim [spreads]",
+    "e_sim_s": "E_sim [s]",
+    "rmse": "RMSE",
+    "balance_violation": "violation",
+}
+"""What errors are called, here and in results of schema 4, whose ``e_sim_s`` is a sum over states."""
 
 
 def identification(results: dict[str, Any]) -> list[str]:
     """Errors of free runs on unseen data, the deployed network of each kind, and its share of ``phy``."""
-    found = results["identification"]
+    columns = {
+        model: errors(results["identification"], model)
+        for model in MODELS
+        if results["identification"]["rmse"][model] is not None
+    }
+    heads = list(columns["phy"])
+    shared = [head for head in heads if not head.startswith("violation")]
     lines = [
-        "| model | E_sim [s] | RMSE [rad] | violation [W] | E_sim / phy | RMSE / phy |",
-        "|" + " --- |" * 6,
+        f"| model | {' | '.join(heads)} | {' | '.join(head.partition(' [')[0] + ' / phy' for head in shared)} |",
+        "|" + " --- |" * (1 + len(heads) + len(shared)),
     ]
-    for model in MODELS:
-        values = [first(found[key][model]) for key in KEYS]
-        shares = [first(found[key][model]) / first(found[key]["phy"]) for key in KEYS[:2]]
-        lines.append(f"| {model} | " + " | ".join(f"{v:.4g}" for v in values + shares) + " |")
+    for model, row in columns.items():
+        values = [*row.values(), *(row[head] / columns["phy"][head] for head in shared)]
+        lines.append(f"| {model} | " + " | ".join(f"{v:.4g}" for v in values) + " |")
     return lines
 
 
-def first(value: Any) -> float:
-    """A number, or the first one of an object by signal."""
-    return float(next(iter(value.values())) if isinstance(value, dict) else value)
+def errors(found: dict[str, Any], model: str) -> dict[str, float]:
+    """Errors of a model by what they are, with unit; the signal's name where there are several."""
+    row = {}
+    for key, word in WORDS.items():
+        value = found.get(key, {}).get(model)
+        by_signal = value if isinstance(value, dict) else {"": value}
+        for label, number in by_signal.items():
+            name = label if len(by_signal) > 1 else label.partition(" ")[2]
+            if number is not None:
+                row[f"{word} {name}".rstrip()] = float(number)
+    return row
 
 
 CONTROLLERS = ("prior", "prior_observer", "hybrid", "hybrid_observer", "oracle", "oracle_state")
@@ -94,15 +114,17 @@ def limits(results: dict[str, Any]) -> list[str]:
 
 
 def files(results: dict[str, Any]) -> list[str]:
-    """RMSE by recording."""
+    """RMSE of the first output by recording."""
     by_file = results["identification"]["details"].get("by_file", {})
     if not 1 <= len(by_file) <= 8:
         return []
-    lines = ["| recording | phy [rad] | mopgrnn [rad] | ratio |", "|" + " --- |" * 4]
+    label = next(iter(results["identification"]["rmse"]["phy"]))
+    hybrid = results["identification"]["details"].get("choice", {}).get("hybrid", "mopgrnn")
+    unit = label.partition(" ")[2]
+    lines = [f"| recording | phy {unit} | {hybrid} {unit} | ratio |", "|" + " --- |" * 4]
     for name, row in by_file.items():
-        lines.append(
-            f"| {name} | {row['phy']:.4f} | {row['mopgrnn']:.4f} | {row['mopgrnn'] / row['phy']:.2f} |"
-        )
+        one, other = (own[label] if isinstance(own, dict) else own for own in (row["phy"], row[hybrid]))
+        lines.append(f"| {name} | {one:.4f} | {other:.4f} | {other / one:.2f} |")
     return lines
 
 

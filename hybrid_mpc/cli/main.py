@@ -19,7 +19,7 @@ except ImportError as missing:  # the online half installs without the command l
     ) from None
 
 from hybrid_mpc import __version__
-from hybrid_mpc.cli import analyze, benchmark, control, data, monitor, run, scenarios, study, tune
+from hybrid_mpc.cli import analyze, benchmark, check, control, data, monitor, new, run, scenarios, study, tune
 from hybrid_mpc.errors import InputError, StorageError
 from hybrid_mpc.files import reason
 
@@ -45,6 +45,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
+app.command("new", epilog=new.EXAMPLES)(new.new)
+app.command("check", epilog=check.EXAMPLES)(check.check)
 app.command("run", epilog=run.EXAMPLES)(run.run)
 app.command("control", epilog=control.EXAMPLES)(control.control)
 app.command("analyze", epilog=analyze.EXAMPLES)(analyze.analyze)

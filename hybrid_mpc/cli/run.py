@@ -12,7 +12,7 @@ from hybrid_mpc.cli.options import Device, InputColumns, OutputColumns, Recordin
 from hybrid_mpc.records import MOST_SEED
 
 if TYPE_CHECKING:
-    from hybrid_mpc.job.stages.results import Guard, Results
+    from hybrid_mpc.job.stages.results import Guard, Identification, Results
 
 INCOMPLETE = 1
 """Exit code of a run whose report lacks a part."""
@@ -93,16 +93,7 @@ def run(
 def summary(results: Results) -> list[str]:
     """The figures of a run that are worth a line on the terminal."""
     found = results.identification
-    known = [errors for errors in found.rmse.values() if isinstance(errors, Mapping)]
-    signal = next(iter(known[0])) if known else "output"
-    lines = [f"free runs on unseen data:    E_sim      RMSE {signal}   energy violation [W]"]
-    for name, e_sim in found.e_sim_s.items():
-        if name in found.rmse and not name.endswith("_reason"):
-            rmse, balance = found.rmse[name], found.balance_violation[name]
-            lines.append(f"  {name:22} {_number(e_sim)} {_number(rmse)} {_number(balance)}")
-    for name, own in found.details.baselines.items():
-        if own.rmse is not None:
-            lines.append(f"  {name:22} {'–':>12} {_number(own.rmse[0])} {'–':>12}")
+    lines = errors_table(found)
     lines.append(found.details.choice.reason)
     for name in ("prior", "hybrid", "oracle"):
         loop = getattr(results.control, name)
@@ -113,6 +104,36 @@ def summary(results: Results) -> list[str]:
     if results.monitor.alarms is None:
         lines.append(f"energy monitor: {results.monitor.reason}")
     return lines + guard_lines(results.guard)
+
+
+def errors_table(found: Identification) -> list[str]:
+    """Errors of free runs on unseen data as lines: a row a model, a column an output and a balance."""
+    outputs, balances = _labels(found.rmse), _labels(found.balance_violation)
+    heads = ["error [-]", "E_sim [-]", *(f"RMSE {s}" for s in outputs), *(f"violation {b}" for b in balances)]
+    rows: dict[str, list[object]] = {"": list(heads)}
+    for name in found.details.scores_of_all_networks:
+        rmse = [_of(found.rmse[name], label) for label in outputs]
+        violation = [_of(found.balance_violation[name], label) for label in balances]
+        rows[name] = [found.error[name], found.e_sim[name], *rmse, *violation]
+    for name, own in found.details.baselines.items():
+        if own.errors is not None:
+            rmse = [_of(own.errors.rmse, label) for label in outputs]
+            rows[name] = [own.errors.error, "–", *rmse, *("–" for _ in balances)]
+    widths = [max(10, len(head)) for head in heads]
+    lines = [
+        f"  {name:12}" + "".join(f"  {_cell(cell):>{w}}" for cell, w in zip(cells, widths, strict=True))
+        for name, cells in rows.items()
+    ]
+    return ["free runs on unseen data:", *lines]
+
+
+def _labels(errors: Mapping[str, object]) -> list[str]:
+    """Signals or balances with unit that errors are of."""
+    return next((list(own) for own in errors.values() if isinstance(own, Mapping)), [])
+
+
+def _of(values: object, label: str) -> object:
+    return values.get(label) if isinstance(values, Mapping) else None
 
 
 def tracking(errors: Mapping[str, float]) -> str:
@@ -141,7 +162,5 @@ def guard_lines(guard: Guard) -> list[str]:
     return lines
 
 
-def _number(value: object) -> str:
-    if isinstance(value, Mapping):
-        value = next(iter(value.values()))
-    return f"{value:12.4g}" if isinstance(value, float) else f"{value!s:>12}"
+def _cell(value: object) -> str:
+    return "diverged" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -19,6 +19,7 @@ from hybrid_mpc.data.files import Columns, MissingColumn, Source, name_and_unit,
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.machine.specification import DataSpec
+from hybrid_mpc.machine.units import alike, factor
 from hybrid_mpc.records import shown
 
 Array = NDArray[np.float64]
@@ -118,6 +119,26 @@ class Recording:
         return float(np.median(np.diff(self.t)))
 
 
+class Signals(Protocol):
+    """Whatever names a machine's signals: a prior, its class, a model."""
+
+    @property
+    def states(self) -> Sequence[Signal]:
+        """Signals of the states."""
+
+    @property
+    def inputs(self) -> Sequence[Signal]:
+        """Signals of what is commanded."""
+
+    @property
+    def outputs(self) -> Sequence[Signal]:
+        """Signals of what is measured."""
+
+    @property
+    def disturbances(self) -> Sequence[Signal]:
+        """Signals of what is measured and not commanded."""
+
+
 class _Samples(Protocol):
     @property
     def t(self) -> Array: ...
@@ -149,11 +170,8 @@ def complete(samples: _Samples) -> None:
 
 def read_recording(
     path: Path | str,
+    prior: Signals,
     spec: DataSpec,
-    *,
-    outputs: Sequence[Signal],
-    inputs: Sequence[Signal],
-    disturbances: Sequence[Signal] = (),
 ) -> Recording:
     """Read one recording (CSV, ``.npz`` or ``.mat``) and check what would mislead an identification.
 
@@ -163,26 +181,21 @@ def read_recording(
     ``.mat``, is the sampling time; time then begins at 0, as it does where ``spec.time`` is a number. Rows are counted
     from 1, as an editor or MATLAB shows them (in CSV the header is row 1), the indices of ``.npz`` from 0.
     """
-    recordings, problems = read_recordings(
-        [path], spec, outputs=outputs, inputs=inputs, disturbances=disturbances
-    )
+    recordings, problems = read_recordings([path], prior, spec)
     refuse(problems)
     return recordings[0]
 
 
 def read_recordings(
     paths: Sequence[Path | str],
+    prior: Signals,
     spec: DataSpec,
-    *,
-    outputs: Sequence[Signal],
-    inputs: Sequence[Signal],
-    disturbances: Sequence[Signal] = (),
 ) -> tuple[list[Recording], list[str]]:
     """Read the recordings of one run: :func:`read_recording` for each, with ``spec.inputs_of`` for those it names.
 
     They may differ in format, length and sampling, and in columns that ``spec`` does not name.
     """
-    refuse(_count_problems(spec, outputs, inputs, disturbances) or _column_problems(spec))
+    refuse(_count_problems(spec, prior) or _column_problems(spec))
     recordings: list[Recording] = []
     problems: list[str] = []
     there: dict[str, list[str]] = {}
@@ -193,7 +206,7 @@ def read_recordings(
             names, lacking = _found(source, spec, there, missing)
             problems += lacking
             if not lacking:
-                recordings.append(_recording(source, spec, names, outputs, inputs, disturbances))
+                recordings.append(_recording(source, spec, names, prior))
         except InputError as error:
             problems += error.problems
     differ = "".join(
@@ -216,10 +229,9 @@ def read_recordings(
     return recordings, problems
 
 
-def _count_problems(
-    spec: DataSpec, outputs: Sequence[Signal], inputs: Sequence[Signal], disturbances: Sequence[Signal]
-) -> list[str]:
+def _count_problems(spec: DataSpec, prior: Signals) -> list[str]:
     """Roles that have more or fewer columns than the prior has signals."""
+    inputs, disturbances, outputs = prior.inputs, prior.disturbances, prior.outputs
     roles: list[tuple[str, str, Sequence[str], Sequence[Signal]]] = [
         ("inputs", "input", spec.inputs, inputs),
         ("disturbances", "disturbance", spec.disturbances, disturbances),
@@ -308,12 +320,10 @@ def _recording(
     source: Source,
     spec: DataSpec,
     found: Sequence[str],
-    outputs: Sequence[Signal],
-    inputs: Sequence[Signal],
-    disturbances: Sequence[Signal],
+    prior: Signals,
 ) -> Recording:
     """A recording whose columns are all there; every check is made, and all that fails is named."""
-    path = source.path
+    path, inputs, disturbances, outputs = source.path, prior.inputs, prior.disturbances, prior.outputs
     names, signals = _asked(source, spec), [*inputs, *disturbances, *outputs]
     if isinstance(spec.time, str):
         signals = [Signal("time", "s"), *signals]
@@ -334,6 +344,7 @@ def _recording(
                 values[:, j] *= _factor(name, spec.units[name], signal)
             else:
                 values[:, j] *= _written_factor(found[j], signal)
+                problems += [problem for problem in [_unit_problem(found[j], signal)] if problem]
     t = values[:, 0]
     if (np.abs(t) <= ABSURD).all():  # the ranges tell of the others, and of what is no number
         problems += _time_problems(t, columns, spec, path.stem)
@@ -457,6 +468,29 @@ def _range_problems(signal: Signal, name: str, column: Array, columns: Columns, 
 # Units
 
 
+def check_unit(spec: DataSpec, column: str, signal: Signal) -> None:
+    """Refuse a column whose unit, in the specification or behind its name, cannot be turned into its signal's.
+
+    Raises:
+        InputError: Naming column, unit and signal.
+    """
+    if column in spec.units:
+        _factor(column, spec.units[column], signal)
+    elif problem := _unit_problem(column, signal):
+        raise InputError(problem)
+
+
+def _unit_problem(column: str, signal: Signal) -> str:
+    """What is wrong with the unit behind a column's name; empty if nothing, or if it may be an index, ``y(1)``."""
+    unit = name_and_unit(column)[1]
+    if unit in ("", "1") or alike(unit, signal.unit):
+        return ""
+    return (
+        f"column {column!r} is in {unit}, which is no unit of {signal.label}. Name the column of that signal, correct "
+        "the unit of one of them, or give the factor: units={...} in the DataSpec."
+    )
+
+
 def _factor(column: str, unit: str | float, signal: Signal) -> float:
     """What a column's numbers are multiplied by to be in the signal's unit."""
     if isinstance(unit, str):
@@ -477,8 +511,10 @@ def _factor(column: str, unit: str | float, signal: Signal) -> float:
 def _written_factor(column: str, signal: Signal) -> float:
     """The same by the unit behind the column's name, where it is known; else the column is in the signal's own."""
     _, unit = name_and_unit(column)
-    known = {_plainly(name): factor for name, factor in UNITS.get(signal.unit, {}).items()}
-    return known.get(_plainly(unit), 1.0) if unit else 1.0
+    if unit in ("", "1"):  # none, or an index
+        return 1.0
+    known = {_plainly(name): size for name, size in UNITS.get(signal.unit, {}).items()}
+    return known.get(_plainly(unit)) or factor(unit, signal.unit) or 1.0
 
 
 def _plainly(unit: str) -> str:

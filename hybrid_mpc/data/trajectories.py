@@ -20,6 +20,7 @@ from hybrid_mpc.data.recording import (
     Finding,
     Flags,
     Recording,
+    Signals,
     complete,
     empty,
     gaps,
@@ -119,6 +120,7 @@ class Dataset:
         sha256: SHA-256 of each file, in the same order.
         hash: One hash of all files' names and contents; it does not depend on their order or folder.
         findings: What is doubtful about the recordings (:mod:`hybrid_mpc.data.findings`). Default: nothing.
+        sampling: Median distance [s] of the time stamps of each file, in the same order. Default: not known.
     """
 
     trajectories: tuple[Trajectory, ...]
@@ -128,6 +130,7 @@ class Dataset:
     sha256: tuple[str, ...]
     hash: str
     findings: tuple[Finding, ...] = ()
+    sampling: tuple[float, ...] = ()
 
     def by_role(self, role: Role) -> tuple[Trajectory, ...]:
         """The trajectories of one role, in order."""
@@ -135,14 +138,7 @@ class Dataset:
 
 
 def load_trajectories(
-    paths: Sequence[Path | str],
-    spec: DataSpec,
-    *,
-    outputs: tuple[Signal, ...],
-    inputs: tuple[Signal, ...],
-    states: Sequence[Signal] = (),
-    needed: Sequence[Role] = ROLES,
-    disturbances: tuple[Signal, ...] = (),
+    paths: Sequence[Path | str], prior: Signals, spec: DataSpec, *, needed: Sequence[Role] = ROLES
 ) -> Dataset:
     """Read recordings, cut them at gaps, shift known delays out, smooth, resample to ``spec.dt``, give roles.
 
@@ -155,13 +151,10 @@ def load_trajectories(
 
     Args:
         paths: CSV, ``.npz`` or ``.mat`` files with different stems, of any lengths.
+        prior: The prior, its class, or a model: its signals say which columns there must be, in which order, whether
+            the outputs are positions, and what is plausible.
         spec: Columns, ``dt``, ``max_gap``, ``smoothing``, ``warm_up`` [s], delays and the split.
-        outputs: Signals of the prior's outputs.
-        inputs: Signals of the prior's inputs.
-        states: Signals of the prior's states, which say whether the outputs are positions, and the plausible ranges of
-            the speeds. Default: they are, and speeds are not checked.
         needed: Roles that must not be empty. Default: all three.
-        disturbances: Signals of the prior's disturbances. Default: none.
 
     Raises:
         InputError: If recordings are bad (see :func:`~hybrid_mpc.data.recording.read_recording`), columns differ
@@ -170,22 +163,23 @@ def load_trajectories(
 
     Example:
         >>> import tempfile
-        >>> from hybrid_mpc import write_csv
+        >>> from hybrid_mpc import Prior, Signal, write_csv
+        >>> class Swing(Prior):
+        ...     states = (Signal("phi", "rad"), Signal("phi_dot", "rad/s"))
+        ...     inputs, outputs = (Signal("tau", "N m"),), states[:1]
         >>> spec = DataSpec("t", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.5)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     t = 0.01 * np.arange(1000)
         ...     file = write_csv(Path(folder) / "run.csv", {"t": t, "tau": 0 * t, "phi": np.sin(t)})
-        ...     data = load_trajectories([file], spec, outputs=(Signal("phi", "rad"),),
-        ...                              inputs=(Signal("tau", "N m"),))
+        ...     data = load_trajectories([file], Swing, spec)
         >>> [(piece.name, piece.role, len(piece.t)) for piece in data.trajectories]
         [('run', 'train', 299), ('run#2', 'valid', 94), ('run#3', 'test', 94)]
     """
     if not paths:
         raise InputError("no recordings given; name at least one file with --data")
     _check_windows(spec)
-    recordings, problems = read_recordings(
-        paths, spec, outputs=outputs, inputs=inputs, disturbances=disturbances
-    )
+    recordings, problems = read_recordings(paths, prior, spec)
+    outputs, states = prior.outputs, prior.states
     n_x = None if _are_positions(outputs, states) else len(states)
     trajectories: list[Trajectory] = []
     whole: list[Trajectory] = []
@@ -217,15 +211,15 @@ def load_trajectories(
             "".join(sorted(f"{t.name} {t.sha256}\n" for t in recordings)).encode()
         ).hexdigest(),
         findings=findings,
+        sampling=tuple(recording.dt for recording in recordings),
     )
 
 
 def _are_positions(outputs: Sequence[Signal], states: Sequence[Signal]) -> bool:
-    """Whether the outputs are the positions of states ``[q, v]``; without states it is taken for granted."""
-    return not states or (
-        len(states) == 2 * len(outputs)
-        and [s.name for s in states[: len(outputs)]] == [s.name for s in outputs]
-    )
+    """Whether the outputs are the positions of states ``[q, v]``."""
+    return len(states) == 2 * len(outputs) and [s.name for s in states[: len(outputs)]] == [
+        s.name for s in outputs
+    ]
 
 
 def _segments(recording: Recording, spec: DataSpec, n_x: int | None, cuts: list[Cut]) -> Iterator[Trajectory]:

@@ -138,8 +138,8 @@ def coverage(run: RunParts, bands: Bands) -> float:
     return float(np.mean(inside[np.isfinite(run.error)]))
 
 
-def interval_score(run: RunParts, bands: Bands) -> float:
-    """Mean interval score of a run's band [output units, summed over the outputs]; the less the better.
+def interval_score(run: RunParts, bands: Bands) -> Array:
+    """Mean interval score of a run's band, by output ``(n_y,)`` [output units]; the less the better.
 
     The band's width, and for a measurement outside of it its distance, ``2 / (1 - share)`` times.
 
@@ -147,7 +147,7 @@ def interval_score(run: RunParts, bands: Bands) -> float:
     """
     half = bands.half_width(run.parts)
     beyond = np.maximum(np.abs(run.error) - half, 0.0)
-    return float(np.nanmean(2 * half + 2 / (1 - bands.share) * beyond, axis=0).sum())
+    return np.asarray(np.nanmean(2 * half + 2 / (1 - bands.share) * beyond, axis=0))
 
 
 def _weights(error: Array, parts: Array) -> Array:

@@ -12,6 +12,9 @@ from torch import Tensor
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 
+LONGEST = 1000
+"""Periods of a validation window at most: drifts show by then, and longer ones would take the training's time."""
+
 
 @dataclass(frozen=True)
 class Windows:
@@ -77,6 +80,17 @@ def fitting_horizon(trajectories: Sequence[Trajectory], warm: int, most: int) ->
     """
     lengths = [2 * (len(t.t) - warm - 1) // 3 for t in trajectories]
     return max(1, min(most, max(min(lengths), min(most // 2, max(lengths)))))
+
+
+def validation_horizon(trajectories: Sequence[Trajectory], warm: int) -> int:
+    """Scored periods of a validation window: a drift shows in long runs alone.
+
+    That is two thirds of what the warm-up leaves of a usual trajectory (half of all samples lie in ones at least as
+    long), at most ``LONGEST``. Shorter trajectories give no window.
+    """
+    lengths = np.sort([len(t.t) for t in trajectories])[::-1]
+    usual = int(lengths[np.searchsorted(np.cumsum(lengths), 0.5 * lengths.sum())])
+    return max(1, min(LONGEST, 2 * (usual - warm - 1) // 3))
 
 
 def check_rates(trajectories: Sequence[Trajectory]) -> None:

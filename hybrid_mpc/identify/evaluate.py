@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,14 +12,18 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.smooth import Smoother
 from hybrid_mpc.identify.step import Step
 from hybrid_mpc.identify.train import Trained
 from hybrid_mpc.machine.prior import Prior
+from hybrid_mpc.machine.signals import Signal
 
 Array = NDArray[np.float64]
 STARTS = 5
 """Starts of short free runs within the length of one."""
+ROUNDING = 1e-9
+"""Share of a signal's largest value below which its standard deviation is rounding: it does not change."""
 
 
 @dataclass(frozen=True)
@@ -26,8 +31,8 @@ class FreeRun:
     """A free run over one trajectory after its warm-up, and the measurement; n scored periods.
 
     ``x`` are the measured, smoothed states, ``y`` the measured outputs, not smoothed; ``xdot`` and ``xdot_hat`` are
-    mean rates over each period. ``energy_measured_w`` is ΔE_S, the residual of the prior's first balance on the
-    measurement, ``energy_model_w`` ΔE_M on the model's own run; NaN for a prior without balances.
+    mean rates over each period. ``balances`` ``(n, n_b)`` are the residuals of the prior's balances on the measurement,
+    ``balances_hat`` on the model's own run, each in the balance's ``rate_unit``: the paper's ΔE_S and ΔE_M.
     """
 
     name: str
@@ -39,8 +44,8 @@ class FreeRun:
     y_hat: Array
     xdot: Array
     xdot_hat: Array
-    energy_measured_w: Array
-    energy_model_w: Array
+    balances: Array
+    balances_hat: Array
     w: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def squared_errors(self, spread: Sequence[float]) -> Array:
@@ -53,18 +58,36 @@ class FreeRun:
 
 
 @dataclass(frozen=True)
-class Scores:
+class OutputErrors:
+    """How far predicted outputs are off, over all samples that were measured; a diverging run makes them infinite.
+
+    Args:
+        error: Root mean square over the outputs of the error over the output's spread [-]: one number to compare
+            models by, whatever the units.
+        rmse: Root mean square error by output, ``"phi [rad]"``.
+        fit_percent: ``100 (1 - RMSE / standard deviation of the measurement)`` by output: 100 is perfect, 0 what the
+            mean alone gives. An output that does not change has none.
+
+    Source of ``fit_percent``: Ljung, *System Identification Toolbox User's Guide* (NRMSE fit).
+    """
+
+    error: float
+    rmse: Mapping[str, float]
+    fit_percent: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Scores(OutputErrors):
     """Figures of one model over several free runs; a diverging run makes them infinite.
 
     Args:
-        e_sim_s: Simulation error in duration form: mean over runs of the time mean of ``|xdot - xdot_hat|_1``.
-        rmse_rad: Root mean square of the first output's error (rad for an angle).
-        energy_violation_w: Time mean of ``|ΔE_M - ΔE_S|`` [W].
+        e_sim: Simulation error in duration form: time mean of ``|xdot - xdot_hat|``, each rate over its standard
+            deviation in the measurement, averaged over the states [-]. A rate that does not change is left out.
+        violation: Time mean of ``|residual of the model - residual of the measurement|`` by balance, ``"energy [W]"``.
     """
 
-    e_sim_s: float
-    rmse_rad: float
-    energy_violation_w: float
+    e_sim: float
+    violation: Mapping[str, float]
 
 
 def evaluation_trajectories(
@@ -101,7 +124,7 @@ def free_runs(
 
     Args:
         step: The model.
-        prior: The prior whose energy balance and output count (the fitted one).
+        prior: The prior whose balances and outputs count (the fitted one).
         trajectories: The trajectories (:func:`evaluation_trajectories`); they may differ in length.
         warm: Samples of the warm-up.
         h0: Hidden state before the warm-up ``(n_h,)``. Default: zero.
@@ -152,15 +175,87 @@ def model_states(
     return x_hat
 
 
-def score(runs: Sequence[FreeRun]) -> Scores:
-    """Figures over free runs (paper: E_sim, energy violation)."""
-    e_sim, square, energy = [], [], []
-    for run in runs:
-        e_sim.append(np.abs(run.xdot_hat - run.xdot).sum(1).mean())
-        square.append(((run.y_hat[:, 0] - run.y[:, 0]) ** 2).mean())
-        energy.append(np.abs(run.energy_model_w - run.energy_measured_w).mean())
-    figures = np.mean(e_sim), np.sqrt(np.mean(square)), np.mean(energy)
-    return Scores(*(float(v) if np.isfinite(v) else float("inf") for v in figures))
+def score(runs: Sequence[FreeRun], prior: Prior, spread: Sequence[float] | None = None) -> Scores:
+    """Figures over all samples of free runs, by the names and units of the prior's signals and balances.
+
+    Args:
+        runs: Free runs (:func:`free_runs`).
+        prior: The prior whose outputs and balances they have.
+        spread: Spread of each output ``(n_y,)`` [output units] that ``error`` is over, e.g. ``fit.sizes.y``. Default:
+            the standard deviations of the measurement in these runs.
+
+    Raises:
+        InputError: If there is no run, or an output was never measured in them.
+
+    Example:
+        >>> from hybrid_mpc import PriorStep
+        >>> from scenarios.pendulum.data import exact_runs
+        >>> from scenarios.pendulum.prior import PendulumPrior
+        >>> prior = PendulumPrior()
+        >>> found = score(free_runs(PriorStep(prior, 0.01), prior, exact_runs("test", 1), warm=10), prior)
+        >>> list(found.rmse), list(found.violation)
+        (['phi [rad]'], ['energy [W]'])
+    """
+    outputs = output_errors([run.y_hat for run in runs], [run.y for run in runs], prior.outputs, spread)
+    xdot, off = np.concatenate([run.xdot for run in runs]), [run.xdot_hat - run.xdot for run in runs]
+    sizes = xdot.std(axis=0)
+    changing = sizes > ROUNDING * np.abs(xdot).max(axis=0)
+    e_sim = np.abs(np.concatenate(off)[:, changing] / sizes[changing]).mean() if changing.any() else 0.0
+    gaps = np.concatenate([run.balances_hat - run.balances for run in runs])
+    violation = {
+        f"{b.name} [{b.rate_unit}]": _finite(np.abs(gap).mean())
+        for b, gap in zip(prior.equations.balances, gaps.T, strict=True)
+    }
+    return Scores(outputs.error, outputs.rmse, outputs.fit_percent, _finite(e_sim), violation)
+
+
+def output_errors(
+    y_hat: Sequence[Array],
+    y: Sequence[Array],
+    outputs: Sequence[Signal],
+    spread: Sequence[float] | None = None,
+) -> OutputErrors:
+    """How far predicted outputs are off the measured ones, over all runs.
+
+    Args:
+        y_hat: Predictions of each run ``(n, n_y)``, and
+        y: the measurement; NaN where a sample is missing.
+        outputs: Signals of ``y``.
+        spread: As :func:`score` has it.
+
+    Raises:
+        InputError: If there is no run, or an output was never measured in them.
+
+    Example:
+        >>> y = np.array([[0.0], [1.0], [2.0]])
+        >>> found = output_errors([y + 0.1], [y], [Signal("level", "m")])
+        >>> found.rmse["level [m]"].__round__(6), found.fit_percent["level [m]"].__round__(2)
+        (0.1, 87.75)
+    """
+    if not y:
+        raise InputError("there is no free run to score; give longer recordings")
+    measured, predicted = np.concatenate(y), np.concatenate(y_hat)
+    rmse, sizes = [], []
+    for signal, truth, guess in zip(outputs, measured.T, predicted.T, strict=True):
+        seen = np.isfinite(truth)
+        if not seen.any():
+            raise InputError(f"output {signal.label} was never measured in the free runs that are scored")
+        with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges is infinitely wrong
+            rmse.append(_finite(np.sqrt(np.mean(np.square(guess[seen] - truth[seen])))))
+        size = float(truth[seen].std())
+        sizes.append(size if size > ROUNDING * float(np.abs(truth[seen]).max()) else 0.0)
+    scale = sizes if spread is None else [float(s) for s in spread]
+    known = [(e, s) for e, s in zip(rmse, scale, strict=True) if s > 0]
+    return OutputErrors(
+        float(np.sqrt(np.mean([(e / s) ** 2 for e, s in known]))) if known else float("inf"),
+        {signal.label: e for signal, e in zip(outputs, rmse, strict=True)},
+        {signal.label: 100 * (1 - e / s) for signal, e, s in zip(outputs, rmse, sizes, strict=True) if s > 0},
+    )
+
+
+def _finite(value: Any) -> float:
+    """The number; infinite where a run has diverged."""
+    return float(value) if np.isfinite(value) else float("inf")
 
 
 def _free_run(prior: Prior, trajectory: Trajectory, x_hat: Array, warm: int) -> FreeRun:
@@ -171,9 +266,9 @@ def _free_run(prior: Prior, trajectory: Trajectory, x_hat: Array, warm: int) -> 
     equations, held = prior.equations, (u.T, w.T, prior.p)
     y_hat = measured_as(prior, equations.output(x_hat[:n].T, *held).full().T)
     measured, model = (
-        equations.balances[0].residual(*(z.T for z in point), *held).full()[0]
-        if equations.balances
-        else np.full(n, np.nan)
+        np.array([b.residual(*(z.T for z in point), *held).full()[0] for b in equations.balances])
+        .reshape(len(equations.balances), n)
+        .T
         for point in ((x, xdot), (x_hat[:n], xdot_hat))
     )
     return FreeRun(

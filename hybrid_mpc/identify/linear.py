@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol, TypeAlias
 
@@ -80,6 +80,12 @@ class Candidate:
     def stable(self) -> bool:
         """No eigenvalue outside the unit circle but for rounding."""
         return self.radius <= STABLE
+
+    @property
+    def text(self) -> str:
+        """What it has of order, delay and horizon, in words: ``"order 2, delay 1"``."""
+        own = {"order": self.order, "delay": self.delay, "horizon": self.horizon}
+        return ", ".join(f"{key} {value}" for key, value in own.items() if value)
 
 
 @dataclass(frozen=True)
@@ -783,3 +789,7 @@ def _best(tried: Iterable[LinearModel | Candidate], valid: Sequence[Measured], w
         else (f"no candidate is stable: this one has an eigenvalue of size {best.chosen.radius:.6g}",)
     )
     return replace(best, candidates=tuple(candidates), warnings=best.warnings + doubts)
+
+
+BASELINES: Mapping[str, Callable[..., LinearModel]] = {"ARX": fit_arx, "N4SID": fit_subspace}
+"""Linear models of inputs and outputs by name, which practitioners ask for first."""

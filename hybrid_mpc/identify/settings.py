@@ -6,11 +6,25 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.specification import check_prior_replay
 
 Kind = Literal["rnn", "pgrnn", "mopgrnn"]
 PriorParameters = Literal["fixed", "trained"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
+NO_BALANCE = "the prior has no balance, so a MOPGRNN would be the PGRNN once more"
+"""Why there is no MOPGRNN of a prior without balances."""
+
+
+def kinds_of(prior: Prior) -> tuple[Kind, ...]:
+    """Kinds of networks that differ for a prior: one without balances has no second objective, so no MOPGRNN.
+
+    Example:
+        >>> from scenarios.pendulum.prior import PendulumPrior
+        >>> kinds_of(PendulumPrior())
+        ('rnn', 'pgrnn', 'mopgrnn')
+    """
+    return tuple(kind for kind in KINDS if kind != "mopgrnn" or prior.equations.balances)
 
 
 @dataclass(frozen=True)
@@ -31,8 +45,9 @@ class TrainingSettings:
         decay: Weight decay of AdamW times the number of training samples: the more data there are, the less it counts.
         learning_rates: Start and end of the cosine schedule, teacher forcing then free runs.
         every: Steps between evaluations (bounds, validation, checkpoint).
-        validation_horizon: Most scored periods of a validation window. Default: five times ``horizon``. Trainings
-            with other horizons can be compared by their validation only if this is the same.
+        validation_horizon: Most scored periods of a validation window. Default: two thirds of a usual validation
+            recording, at most 1000 (:func:`~hybrid_mpc.identify.dataset.validation_horizon`). Trainings can be compared
+            by their validation only if this is the same.
         objectives: Names in :data:`~hybrid_mpc.identify.objectives.OBJECTIVES`, of balances of the prior, or
             ``"balances"`` for all of these; the curve has them all, the first one is that of free runs and validation.
             Default: the outputs, which models are judged by, and all balances.

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import MOST_ARRAYS, read_bytes, replacing
-from hybrid_mpc.identify.dataset import Windows, check_rates, cut_windows, fitting_horizon
+from hybrid_mpc.identify.dataset import Windows, check_rates, cut_windows, fitting_horizon, validation_horizon
 from hybrid_mpc.identify.networks import StackedGRU
 from hybrid_mpc.identify.objectives import (
     VectorPerformanceIndex,
@@ -206,7 +206,11 @@ class TrainingRun:
             )
         horizon = fitting_horizon(training, s.warm, s.horizon)
         windows = cut_windows(training, s.warm, horizon, max(1, horizon // 10))
-        horizon = fitting_horizon(validation, s.warm, s.validation_horizon or 5 * s.horizon)
+        horizon = (
+            fitting_horizon(validation, s.warm, s.validation_horizon)
+            if s.validation_horizon
+            else validation_horizon(validation, s.warm)
+        )
         valid = cut_windows(validation, s.warm, horizon, max(1, horizon // 5))
         self.scaling = form.scaling_of(prior, windows, dt, use_prior=s.use_prior)
         self.windows, self.valid = windows.to(self.device), valid.to(self.device)

@@ -260,8 +260,6 @@ def tune(
         >>> train(prior, train_runs, valid_runs, found.settings)  # doctest: +SKIP
     """
     check_numbers(trials, seed, timeout)
-    if space.horizon is not None:  # trials must be compared on windows of the same length
-        base = replace(base, validation_horizon=base.validation_horizon or 5 * base.horizon)
     study = open_study(storage, _identity(prior, training, validation, base, space, seed))
     warm_up = math.ceil(PATIENCE * (base.teacher_steps + base.free_run_steps))
     study.pruner = optuna.pruners.MedianPruner(FINISHED, warm_up)

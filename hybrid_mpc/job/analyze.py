@@ -351,14 +351,7 @@ def _recordings(
 ) -> tuple[tuple[Array, Array, Array], ...]:
     if not files or scenario is None:
         return ()
-    found = load_trajectories(
-        files,
-        scenario.data,
-        disturbances=model.disturbances,
-        outputs=model.outputs,
-        inputs=model.inputs,
-        states=model.states,
-    )
+    found = load_trajectories(files, model, scenario.data)
     return tuple((piece.u[:, 0], piece.y[:, 0], piece.x[0]) for piece in found.whole)
 
 

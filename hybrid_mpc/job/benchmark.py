@@ -15,23 +15,25 @@ from typing import Any
 
 import numpy as np
 
+from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import check_writable, digest, locked, read_document, write_document, write_json
+from hybrid_mpc.identify.evaluate import OutputErrors
 from hybrid_mpc.identify.fit import fit_prior, refit, smoothed
+from hybrid_mpc.identify.linear import BASELINES, LinearModel
 from hybrid_mpc.identify.prior_result import PriorFit
-from hybrid_mpc.identify.settings import KINDS, TrainingSettings
+from hybrid_mpc.identify.settings import TrainingSettings, kinds_of
 from hybrid_mpc.identify.train import Trained
 from hybrid_mpc.job.benchmark_runs import (
-    MODELS,
     BenchmarkRun,
     Recordings,
-    RunError,
     benchmark_of,
     read_test,
     read_training,
     run_error,
     run_freely,
+    scored_signals,
     warm_samples,
 )
 from hybrid_mpc.job.check import check_scenario
@@ -43,10 +45,12 @@ from hybrid_mpc.machine.specification import BenchmarkBudget
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import Scenario, load_scenario
 
-SCHEMA = 1
+SCHEMA = 2
 MODEL_NOTE = "benchmark_model.json"
 CANDIDATES = ("phy", "pgrnn", "mopgrnn", "pgrnn mean", "mopgrnn mean")
-"""What may be recommended."""
+"""What may be recommended, where it is trained."""
+SHOWN = 20.0
+"""Length of a run that is drawn sample by sample [the machine's seconds]."""
 IN_MOTION = 0.1
 """Least length [s] that is given of a validation piece: it begins in motion, while a recording that gives less (EMPS,
 20 ms) begins at rest, and two samples tell no speed next to an unknown acceleration."""
@@ -85,15 +89,19 @@ class _Description:
     dt: float
     fit: PriorFit
     hybrid: str
-    validation: Mapping[str, float]
-    long: Mapping[str, float]
+    validation: Mapping[str, OutputErrors]
+    long: Mapping[str, OutputErrors]
+    kinds: tuple[str, ...]
+    linear: Mapping[str, LinearModel]
+    no_linear: Mapping[str, str]
 
 
 @dataclass(frozen=True)
 class BenchmarkModel(_Description):
     """Everything that a free run over another recording needs: prior, recommended model (``hybrid``), networks by kind.
 
-    ``validation`` and ``long`` are the errors of every candidate on validation pieces and on :attr:`Recordings.long`.
+    ``validation`` and ``long`` are the errors of every model on validation pieces and on :attr:`Recordings.long`;
+    ``linear`` are the linear baselines by name, ``no_linear`` says why there is none of a name.
     """
 
     networks: Mapping[str, Trained]
@@ -107,8 +115,8 @@ class Refit:
 
     seconds: float
     prior: Sequence[Mapping[str, Any]]
-    before: Mapping[str, RunError]
-    after: Mapping[str, RunError]
+    before: Mapping[str, OutputErrors]
+    after: Mapping[str, OutputErrors]
 
 
 @dataclass(frozen=True)
@@ -118,7 +126,7 @@ class FileResult:
     """
 
     runs: Sequence[BenchmarkRun]
-    errors: Mapping[str, RunError]
+    errors: Mapping[str, OutputErrors]
     scored_s: float
     refit: Refit | None = None
 
@@ -231,17 +239,36 @@ def _make(
     budget = spec.budgets[settings.budget]
     networks = train_kinds(
         settings.scenario, fit.values, train, valid,
-        {kind: training_settings(kind, budget, seed=settings.seed, warm=warm) for kind in KINDS},
+        {kind: training_settings(kind, budget, seed=settings.seed, warm=warm) for kind in kinds_of(scenario.prior())},
         out / "checkpoints", workers=settings.workers, on_progress=progress.update,
     )  # fmt: skip
     progress.finish("")
-    errors = partial(candidate_errors, scenario, fit, networks)
+    progress.start("fitting the linear baselines")
+    linear, no_linear = _baselines(scenario, data)
+    progress.finish("")
+    errors = partial(candidate_errors, scenario, fit, networks, linear)
     validation = errors(data.valid, max(warm_up, IN_MOTION))
     long = errors(data.long, warm_up) if data.long else {}
-    hybrid = recommended(validation, long)
-    model = BenchmarkModel(scenario.name, dt, fit, hybrid, validation, long, networks)
+    hybrid = recommended(*({name: e.error for name, e in part.items()} for part in (validation, long)))
+    model = BenchmarkModel(
+        scenario.name, dt, fit, hybrid, validation, long, tuple(networks), linear, no_linear, networks
+    )
     save_model(out / "model", model)
     return model
+
+
+def _baselines(scenario: Scenario, data: Recordings) -> tuple[dict[str, LinearModel], dict[str, str]]:
+    """Linear models by name, chosen on the same validation pieces, and why there is none of a name."""
+    dt, found, missing = scenario.data.dt, {}, {}
+    warm = (
+        warm_samples(max(scenario.data.warm_up, IN_MOTION), 0.0, dt) + 1
+    )  # others start knowing this sample
+    for name, fitted in BASELINES.items():
+        try:
+            found[name] = fitted(data.train, data.valid, dt, warm=warm)
+        except InputError as error:
+            missing[name] = str(error)
+    return found, missing
 
 
 def _claim(out: Path, settings: BenchmarkSettings, data: Recordings) -> None:
@@ -270,7 +297,7 @@ def _fitted_prior(scenario: Scenario, data: Recordings, out: Path, progress: Pro
         data.valid,
         dt=scenario.data.dt,
         length=spec.length or spec.piece,
-        largest_delay=spec.largest_delay,
+        largest_delay=scenario.data.largest_delay,
         on_progress=partial(progress.update, "prior"),
     )
     write_document(note, plain(fit))
@@ -292,13 +319,14 @@ def candidate_errors(
     scenario: Scenario,
     fit: PriorFit,
     networks: Mapping[str, Trained],
+    linear: Mapping[str, LinearModel],
     trajectories: Sequence[Trajectory],
     warm_up: float,
-) -> dict[str, float]:
-    """Error of every candidate's free runs, in the benchmark's unit; ``warm_up`` [s] of each recording is given."""
+) -> dict[str, OutputErrors]:
+    """Errors of every model's free runs; ``warm_up`` [s] of each recording is given."""
     spec, prior = benchmark_of(scenario), scenario.prior(fit.values)
-    runs = run_freely(prior, fit, networks, trajectories, warm_up=warm_up, length=spec.length)
-    return {name: run_error(runs, name, spec).rmse for name in runs[0].y_hat}
+    runs = run_freely(prior, fit, networks, trajectories, warm_up=warm_up, length=spec.length, linear=linear)
+    return {name: run_error(runs, name, prior.outputs, spec) for name in runs[0].y_hat}
 
 
 def recommended(validation: Mapping[str, float], long: Mapping[str, float]) -> str:
@@ -314,7 +342,7 @@ def recommended(validation: Mapping[str, float], long: Mapping[str, float]) -> s
         ]
         return max(math.inf if math.isnan(v) else v for v in over_prior)  # NaN: both have diverged
 
-    return min(CANDIDATES, key=larger)
+    return min((name for name in CANDIDATES if name in validation), key=larger)
 
 
 def save_model(folder: Path, model: BenchmarkModel) -> None:
@@ -345,7 +373,7 @@ def load_model(folder: Path, scenario: str) -> BenchmarkModel:
     found = record(_Description, document, str(path))
     if found.scenario != scenario:
         raise InputError(f"{folder} holds a model of {found.scenario}, not of {scenario}")
-    return BenchmarkModel(**vars(found), networks={kind: load_trained(folder, kind) for kind in KINDS})
+    return BenchmarkModel(**vars(found), networks={kind: load_trained(folder, kind) for kind in found.kinds})
 
 
 # The evaluation.
@@ -355,10 +383,11 @@ def _evaluate(
     scenario: Scenario, model: BenchmarkModel, trajectories: Sequence[Trajectory], refit: float | None
 ) -> FileResult:
     runs = _runs(scenario, model, model.fit, trajectories)
-    spec, names = benchmark_of(scenario), {**{m: m for m in MODELS}, "hybrid": model.hybrid}
+    spec, outputs = benchmark_of(scenario), scenario.prior().outputs
+    names = {**{m: m for m in ("phy", *model.kinds)}, "hybrid": model.hybrid, **{m: m for m in model.linear}}
     return FileResult(
         runs,
-        {name: run_error(runs, candidate, spec) for name, candidate in names.items()},
+        {name: run_error(runs, candidate, outputs, spec) for name, candidate in names.items()},
         sum(len(run.t) for run in runs) * model.dt,
         None if refit is None else _refit(scenario, model, trajectories[0], refit),
     )
@@ -369,15 +398,18 @@ def _runs(
 ) -> list[BenchmarkRun]:
     prior, length = scenario.prior(fit.values), benchmark_of(scenario).length
     warm_up = scenario.data.warm_up
-    return run_freely(prior, fit, model.networks, trajectories, warm_up=warm_up, length=length)
+    return run_freely(
+        prior, fit, model.networks, trajectories, warm_up=warm_up, length=length, linear=model.linear
+    )
 
 
 def _refit(scenario: Scenario, model: BenchmarkModel, whole: Trajectory, seconds: float) -> Refit:
     fit, rest = refitted(scenario.prior, model.fit, whole, seconds=seconds, dt=model.dt)
-    spec, errors = benchmark_of(scenario), []
+    spec, outputs, errors = benchmark_of(scenario), scenario.prior().outputs, []
     for own in (model.fit, fit):
         runs = _runs(scenario, model, own, [rest])
-        errors.append({"phy": run_error(runs, "phy", spec), "hybrid": run_error(runs, model.hybrid, spec)})
+        names = {"phy": "phy", "hybrid": model.hybrid}
+        errors.append({name: run_error(runs, of, outputs, spec) for name, of in names.items()})
     return Refit(seconds, fit.rows(scenario.prior().parameters), *errors)
 
 
@@ -447,7 +479,7 @@ def _document(
 
 def describe(model: BenchmarkModel, scenario: Scenario) -> dict[str, Any]:
     """A model in plain data: parameters, delay, smoother, errors by candidate and network."""
-    fit, spec = model.fit, benchmark_of(scenario)
+    fit = model.fit
     return {
         "prior": fit.rows(scenario.prior().parameters),
         "identifiability": list(fit.identifiability),
@@ -455,7 +487,10 @@ def describe(model: BenchmarkModel, scenario: Scenario) -> dict[str, Any]:
         "delay_s": fit.delay,
         "smoother": {"sigma": fit.sigma, "walk": fit.walk},
         "hybrid": model.hybrid,
-        "validation": {"unit": spec.unit, "rmse": dict(model.validation), "long_rmse": dict(model.long)},
+        "validation": plain(model.validation),
+        "long": plain(model.long),
+        "baselines": {name: {"chosen": own.chosen.text} for name, own in model.linear.items()}
+        | {name: {"reason": why} for name, why in model.no_linear.items()},
         "networks": {kind: trained.validation for kind, trained in model.networks.items()},
         "faults": {kind: [asdict(f) for f in trained.failures] for kind, trained in model.networks.items()},
     }
@@ -469,13 +504,14 @@ def draw(scenario: Scenario, results: BenchmarkResults, out: Path) -> list[Path]
     hybrid = results.model.hybrid
     kind, _, mean = hybrid.partition(" ")
     chosen = "fitted prior" if kind == "phy" else kind.upper() + (", mean" if mean else "")
-    made, prior, spec = [], scenario.prior(), benchmark_of(scenario)
+    made, prior = [], scenario.prior()
+    units = [(signal.unit, scale) for signal, scale in scored_signals(prior.outputs, benchmark_of(scenario))]
     for file, found in results.test.items():
         run = max(found.runs, key=lambda part: len(part.t))
-        shown = {name: run.y_hat[m][:, 0] for name, m in (("phy", "phy"), ("rnn", "rnn"), ("hybrid", hybrid))}
+        drawn = {name: run.y_hat[m] for name, m in (("phy", "phy"), ("rnn", "rnn"), ("hybrid", hybrid))}
         figure = benchmark_run(
-            run.t, run.y[:, 0], shown, run.u,
-            output=prior.outputs[0], inputs=prior.inputs, unit=spec.unit, scale=spec.scale,
+            run.t, run.y, drawn, run.u, outputs=prior.outputs, inputs=prior.inputs, units=units,
+            shown=SHOWN * time_unit(found.runs, results.model.dt),
             title=f"{scenario.title}: free run over {file}", names={"hybrid": f"hybrid ({chosen})"},
         )  # fmt: skip
         made.append(save(figure, out / "figures" / f"{Path(file).stem}.png"))
@@ -483,10 +519,19 @@ def draw(scenario: Scenario, results: BenchmarkResults, out: Path) -> list[Path]
 
 
 def table(results: BenchmarkResults) -> list[str]:
-    """The results as lines: a row for each test file and model."""
-    lines = [f"{'file':28} {'model':10} {'RMSE':12} share of the motion"]
+    """The results as lines: a row for each test file and model, with each output's error and fit."""
+    lines: list[str] = []
     for file, row in results.test.items():
-        for name, error in row.errors.items():
-            rmse = f"{error.rmse:.4g} {error.unit}"
-            lines.append(f"{file:28} {name:10} {rmse:12} {error.relative:.4g}")
+        for name, found in row.errors.items():
+            by_output = [(f"RMSE {label}", value) for label, value in found.rmse.items()]
+            by_output += [
+                (f"FIT {label.partition(' [')[0]} [%]", found.fit_percent.get(label, math.nan))
+                for label in found.rmse
+            ]
+            if not lines:
+                heads = " ".join(f"{head:>{max(12, len(head))}}" for head, _ in by_output)
+                lines.append(f"{'file':28} {'model':10} {'error [-]':>12} {heads}")
+            cells = " ".join(f"{value:>{max(12, len(head))}.4g}" for head, value in by_output)
+            lines.append(f"{file:28} {name:10} {found.error:>12.4g} {cells}")
+    lines += [f"no {name}: {why}" for name, why in results.model.no_linear.items()]
     return [*lines, f"hybrid: {results.model.hybrid}"]

@@ -13,17 +13,23 @@ from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.delay import lost_samples, shifted
-from hybrid_mpc.identify.evaluate import evaluation_trajectories, measured_as, model_states
+from hybrid_mpc.identify.evaluate import (
+    OutputErrors,
+    evaluation_trajectories,
+    measured_as,
+    model_states,
+    output_errors,
+)
+from hybrid_mpc.identify.linear import LinearModel
 from hybrid_mpc.identify.prior_result import PriorFit
-from hybrid_mpc.identify.settings import KINDS
 from hybrid_mpc.identify.step import PriorStep
 from hybrid_mpc.identify.train import Trained
 from hybrid_mpc.machine.prior import Prior
+from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.machine.specification import BenchmarkSpec, Role
 from hybrid_mpc.scenario import Scenario
 
 Array = NDArray[np.float64]
-MODELS = ("phy", *KINDS)
 LONGEST = 60.0
 """Most of a recording in :attr:`Recordings.long` [the machine's seconds]: drift shows by then."""
 SCORED = 50
@@ -72,11 +78,8 @@ def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
     needed: tuple[Role, ...] = () if spec.cycle or uncut else ("train", "valid")
     dataset = load_trajectories(
         paths,
+        prior,
         scenario.data,
-        disturbances=prior.disturbances,
-        outputs=prior.outputs,
-        inputs=prior.inputs,
-        states=prior.states,
         needed=needed,
     )
     parts = _parts(dataset, scenario, uncut)
@@ -167,11 +170,8 @@ def read_test(
     spec = replace(scenario.data, windows={})
     dataset = load_trajectories(
         [path],
+        prior,
         spec,
-        disturbances=prior.disturbances,
-        outputs=prior.outputs,
-        inputs=prior.inputs,
-        states=prior.states,
         needed=(),
     )
     if not dataset.whole:
@@ -245,9 +245,10 @@ def run_freely(
     *,
     warm_up: float,
     length: float | None,
+    linear: Mapping[str, LinearModel] | None = None,
 ) -> list[BenchmarkRun]:
-    """Free runs of the prior (``phy``), of the best network of each kind, and of the mean over those of a kind (``rnn
-    mean``).
+    """Free runs of the prior (``phy``), of the best network of each kind, of the mean over those of a kind (``rnn
+    mean``), and of linear models by name.
 
     Only what lies within ``warm_up`` [s] is given: it yields the state that all models start from, and the networks'
     hidden states. Everything after it is scored, or the first ``length`` [s]. Trajectories have the commanded inputs; a
@@ -274,46 +275,55 @@ def run_freely(
         )
         for name, x in found.items()
     }
+    first = lost_samples(fit.delay, dt) + warm + 1  # linear models have the inputs as they were commanded
+    whole = [t.part(slice(0, first + len(s.t) - warm - 1)) for t, s in zip(trajectories, starts, strict=True)]
+    straight = {name: model.free_runs(whole, first) for name, model in (linear or {}).items()}
     return [
         BenchmarkRun(
             t.name,
             t.t[warm + 1 :],
             t.u[warm + 1 :],
             t.y[warm + 1 :],
-            {name: y[i, : len(t.t) - warm - 1] for name, y in outputs.items()},
+            {name: y[i, : len(t.t) - warm - 1] for name, y in outputs.items()}
+            | {name: measured_as(prior, y[i]) for name, y in straight.items()},
         )
         for i, t in enumerate(starts)
     ]
 
 
-@dataclass(frozen=True)
-class RunError:
-    """Error of a model's free runs over one file.
+def scored_signals(outputs: Sequence[Signal], spec: BenchmarkSpec) -> list[tuple[Signal, float]]:
+    """Outputs in the units of the figures, and how many of these are one of their own.
 
-    ``rmse`` is that of the first output over all scored samples [unit], infinite if a run diverged; ``relative`` its
-    share of the measured output's standard deviation [-].
+    Example:
+        >>> found = scored_signals((Signal("q", "m"), Signal("v", "m/s")), BenchmarkSpec(unit="mm", scale=1e3))
+        >>> [(signal.label, scale) for signal, scale in found]
+        [('q [mm]', 1000.0), ('v [m/s]', 1.0)]
     """
+    first, *others = outputs
+    return [
+        (Signal(first.name, spec.unit or first.unit), spec.scale),
+        *((Signal(s.name, s.unit), 1.0) for s in others),
+    ]
 
-    rmse: float
-    relative: float
-    unit: str
 
-
-def run_error(runs: Sequence[BenchmarkRun], name: str, spec: BenchmarkSpec) -> RunError:
-    """Error of one candidate over all runs of a file.
+def run_error(
+    runs: Sequence[BenchmarkRun], name: str, outputs: Sequence[Signal], spec: BenchmarkSpec
+) -> OutputErrors:
+    """Errors of one candidate over all runs of a file, in the benchmark's units; ``error`` is over the standard
+    deviations of the outputs in these runs.
 
     Example:
         >>> y = np.array([[0.0], [1.0], [2.0]])
         >>> run = BenchmarkRun("run", np.arange(3.0), y, y, {"phy": y + 0.1})
-        >>> run_error([run], "phy", BenchmarkSpec(unit="mm", scale=1e3)).rmse.__round__(6)
-        100.0
+        >>> found = run_error([run], "phy", [Signal("q", "m")], BenchmarkSpec(unit="mm", scale=1e3))
+        >>> {name: round(value, 6) for name, value in found.rmse.items()}
+        {'q [mm]': 100.0}
     """
-    error = np.concatenate([run.y_hat[name][:, 0] - run.y[:, 0] for run in runs])
-    spread = float(np.std(np.concatenate([run.y[:, 0] for run in runs])))
-    rmse = float(np.sqrt(np.mean(error**2)))
-    if not np.isfinite(rmse):
-        rmse = float("inf")
-    return RunError(spec.scale * rmse, rmse / spread if spread > 0 else float("inf"), spec.unit)
+    signals, scales = zip(*scored_signals(outputs, spec), strict=True)
+    scaled = np.array(scales)
+    return output_errors(
+        [scaled * run.y_hat[name] for run in runs], [scaled * run.y for run in runs], signals
+    )
 
 
 def warm_samples(warm_up: float, delay: float, dt: float) -> int:

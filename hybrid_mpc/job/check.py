@@ -3,251 +3,277 @@
 from __future__ import annotations
 
 import math
-import traceback
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_mpc.analyze.equilibria import Equilibrium, equilibria
 from hybrid_mpc.control.ocp import OCP
+from hybrid_mpc.data.excitation import check_excitation
+from hybrid_mpc.data.recording import check_unit
 from hybrid_mpc.errors import InputError, refuse
+from hybrid_mpc.identify.prior_model import model_info, prior_programs
+from hybrid_mpc.identify.simulation import flow_slope, required_substeps, rest_of
+from hybrid_mpc.job.check_prior import DRIFT, Report, check_prior
 from hybrid_mpc.kit.artifact import build_model, loop_settings
 from hybrid_mpc.kit.assembly import make_controller, make_estimator
 from hybrid_mpc.loop.faults import check_channels, install
 from hybrid_mpc.loop.loop import Loop
 from hybrid_mpc.loop.plant import Plant
-from hybrid_mpc.machine.mechanical import MechanicalPrior
-from hybrid_mpc.machine.prior import POINT, BalanceEquations, OperatingPoint, Prior
+from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.scenario import Budget, Scenario, Task
-from nn_export import ExportError
+
+if TYPE_CHECKING:
+    from hybrid_mpc.data.trajectories import Dataset
 
 Array = NDArray[np.float64]
-POINTS = 16
-"""Points at which a prior is asked, beside the origin."""
-BALANCE = 1e-6
-"""Largest residual of a balance along the prior's own flow, as a share of its terms: rounding is 1e9 times less."""
+STARTS = 32
+"""Starts of the search for equilibria."""
+FEW = 6
+"""Equilibria that are told one by one; more are a continuum as a rule."""
+REACHED = 0.01
+"""Share of its size by which a state may miss a set-point that counts as one that can be held."""
+COARSE = 1.5
+"""Model periods from one sample to the next beyond which the samples are too few."""
+ANSWER = 10
+"""Periods within which the plant is asked for its answer to a step of an input."""
+AGAINST = -0.3
+"""Cosine between the plant's and the prior's answer below which they go different ways."""
 
 
-_FINITE = "; it must be within the signals' ranges. Keep a root, a logarithm or a division off its end"
-IF = "Cannot compute the truth value"
-"""What CasADi says where code decides by an expression."""
+@dataclass(frozen=True)
+class Rest:
+    """A prior where it rests, as far as that is known.
+
+    Args:
+        x: States ``(n_x,)``: the operating point, or else the middle of the signals' ranges.
+        u: Inputs ``(n_u,)`` there.
+        w: Disturbances ``(n_w,)`` there.
+        modes: Eigenvalues ``(n_x,)`` [1/s] of the rates by the states.
+        substeps: Runge-Kutta steps a period.
+        equilibria: Points of rest under ``u`` within the signals' ranges.
+    """
+
+    x: Array
+    u: Array
+    w: Array
+    modes: NDArray[np.complex128]
+    substeps: int
+    equilibria: tuple[Equilibrium, ...]
 
 
-@dataclass
-class _Report:
-    """What was found wrong so far."""
+@dataclass(frozen=True)
+class Preflight:
+    """What a scenario's pre-flight has understood, and what is wrong with it.
 
-    problems: list[str] = field(default_factory=list)
+    Args:
+        scenario: The scenario.
+        prior: Its prior; None if it cannot be made.
+        problems: What must be mended, a line each.
+        warnings: What is doubtful about the scenario.
+        doubts: What is doubtful about the recordings.
+        rest: Where the prior rests; None if its equations cannot be asked there.
+        dataset: The recordings; None if there are none, or they cannot be read.
+    """
 
-    def add(self, text: str) -> None:
-        if text not in self.problems:
-            self.problems.append(text)
-
-    @contextmanager
-    def part(self, what: str) -> Iterator[None]:
-        """A part of the scenario; what it raises is a problem of its own, and the next part is looked at."""
-        try:
-            yield
-        except InputError as error:
-            self.add(f"{what}: {error}")
-        except Exception as error:  # the user's own code may raise anything, and this is where it is reported
-            hint = "; write ca.if_else(condition, one, other) instead of if" if IF in str(error) else ""
-            self.add(f"{what} raised {type(error).__name__}: {_first_line(error)}{_place(error)}{hint}")
+    scenario: Scenario
+    prior: Prior | None
+    problems: tuple[str, ...]
+    warnings: tuple[str, ...]
+    doubts: tuple[str, ...]
+    rest: Rest | None
+    dataset: Dataset | None
 
 
-def check_scenario(scenario: Scenario, budget: Budget | None = None) -> None:
-    """Build and call everything that a scenario defines, before any work is done.
-
-    The prior is asked at the origin and at random points within its signals' ranges, and exported; the model,
-    controllers, estimators, plant, tasks and their references are built of it and called.
-    Budgets are all of the scenario's where none is given.
+def check_scenario(
+    scenario: Scenario, budget: Budget | None = None, recordings: Callable[[], Dataset] | None = None
+) -> Preflight:
+    """Build and call everything that a scenario defines, before any work is done; arguments as of :func:`preflight`.
 
     Raises:
         InputError: Naming everything that is wrong, a line each.
     """
-    report = _Report()
-    prior = _check_prior(report, scenario)
-    _check_data(report, scenario, prior)
+    found = preflight(scenario, budget, recordings)
+    refuse(found.problems)
+    return found
+
+
+def preflight(
+    scenario: Scenario, budget: Budget | None = None, recordings: Callable[[], Dataset] | None = None
+) -> Preflight:
+    """Build and call everything that a scenario defines, and say what was understood and what is wrong.
+
+    The prior is asked at the origin, at random points within its signals' ranges and at their ends, and exported; the
+    model, controllers, estimators, plant, tasks and their references are built of it and called. A part is looked at
+    whatever is wrong with the others, as far as it does not need them.
+
+    Args:
+        scenario: The scenario.
+        budget: The effort that is meant. Default: all of the scenario's.
+        recordings: Reads the recordings. Default: there are none yet.
+    """
+    report = Report()
+    prior, asked = check_prior(report, scenario.prior)
+    if prior is not None:
+        _check_columns(report, scenario, prior)
     for name, one in scenario.budgets.items() if budget is None else [("budget", budget)]:
         _check_budget(report, name, one)
-    model = None
-    if prior is not None and not report.problems:
-        model = _check_export(report, scenario, prior)
-    _check_control(report, scenario, prior, model)
-    _check_plant(report, scenario, prior, model)
-    refuse([f"scenario {scenario.name}: {text}" for text in report.problems])
+    before = len(report.problems)
+    rest = model = None
+    if prior is not None and asked:
+        rest, model = _check_rest(report, scenario, prior)
+    _check_control(report, scenario, prior, model if len(report.problems) == before else None, rest)
+    _check_plant(report, scenario, prior, model, rest)
+    dataset, n_warnings = None, len(report.warnings)
+    if recordings is not None and prior is not None:
+        dataset = _check_recordings(report, prior, recordings, rest, scenario.data.dt)
+    problems, warnings = (
+        tuple(f"scenario {scenario.name}: {text}" for text in texts)
+        for texts in (report.problems, report.warnings)
+    )
+    told, doubts = warnings[:n_warnings], warnings[n_warnings:]
+    return Preflight(scenario, prior, problems, told, doubts, rest, dataset)
 
 
-def _check_prior(report: _Report, scenario: Scenario) -> Prior | None:
-    """The prior, if it can be made and gives numbers of the right shape."""
-    prior: Prior | None = None
+def _sizes(signals: tuple[Signal, ...], at: Array) -> Array:
+    """Size of each signal: its range, or else its value, 1 at least."""
+    ranges = np.array([s.upper - s.lower for s in signals], dtype=np.float64)
+    return np.where(np.isfinite(ranges), ranges, np.maximum(np.abs(at), 1.0))
+
+
+def _check_rest(report: Report, scenario: Scenario, prior: Prior) -> tuple[Rest | None, HybridModel | None]:
+    """Where the prior rests, how fast it is there, what the outputs tell of it; and the prior as a deployed model."""
+    from hybrid_mpc.identify.fit import check_observable
+
+    dt = scenario.data.dt
+    second = max(10 * dt, scenario.data.warm_up)
+    x, u, w = rest_of(prior)
     with report.part("prior"):
-        prior = scenario.prior()
-        if not isinstance(prior, Prior):
-            raise InputError(
-                f"it makes a {type(prior).__name__}; needed is a hybrid_mpc Prior, e.g. prior=MyPrior"
-            )
-        again = scenario.prior(dict(prior.values))
-        if again.values != prior.values:
-            raise InputError(f"prior(values) must take its values over; {prior.values} became {again.values}")
-    if prior is None or report.problems:
-        return None
-    _check_signals(report, prior)
-    if report.problems:
-        return None
+        check_observable(prior, dt, second)
+    _check_equilibrium(report, prior, second)
+    model, substeps = None, 0
     with report.part("prior"):
-        try:
-            prior.equations  # noqa: B018  made here, so that what fails is said here
-        except ExportError as error:
-            raise InputError(str(error)) from error
-        _check_point(prior)
-        _check_masses(prior)
-        _check_equations(prior)
-    return None if report.problems else prior
+        substeps = required_substeps(prior, dt)
+        programs = {f"prior/{name}": p for name, p in prior_programs(prior, dt).items()}
+        model = build_model("prior", programs, model_info(prior, dt))
+    if model is None:
+        return None, None
+    modes = np.linalg.eigvals(flow_slope(prior.equations.xdot)(x, u, w, prior.p).full()).astype(np.complex128)
+    found = _equilibria(prior, model, x, u)
+    if prior.operating_point is None and 1 < len(found) <= FEW:
+        told = "; ".join(f"x = {(p.x.round(6) + 0.0).tolist()} ({p.stability})" for p in found)
+        report.warn(
+            f"prior: several equilibria under u = {u.tolist()}: {told}. Say around which one the machine works: "
+            "operating_point = OperatingPoint(x=(...), u=(...)). Until then the middle of the signals' ranges is taken"
+        )
+    return Rest(x, u, w, modes, substeps, found), model
 
 
-def _check_signals(report: _Report, prior: Prior) -> None:
-    for role in ("states", "inputs", "outputs", "disturbances"):
-        signals = getattr(prior, role)
-        if not (signals or role == "disturbances"):
-            report.add(f"prior: {role} must be a tuple of one Signal or more, got {signals!r}")
-        elif len({s.name for s in signals}) < len(signals):
-            report.add(f"prior: two of the {role} have the same name: {[s.name for s in signals]}")
-    names = [p.name for p in prior.parameters]
-    if len(set(names)) < len(names):
-        report.add(f"prior: two parameters have the same name: {names}")
-
-
-def _check_point(prior: Prior) -> None:
-    """The operating point has the right sizes and lies within the ranges."""
+def _check_equilibrium(report: Report, prior: Prior, second: float) -> None:
+    """An operating point is an equilibrium."""
     point = prior.operating_point
     if point is None:
         return
-    if not isinstance(point, OperatingPoint):
-        raise InputError(f"operating_point must be OperatingPoint(x=(...), u=(...)), got {point!r:.80}")
-    for name, values, signals in (
-        ("x", point.x, prior.states), ("u", point.u, prior.inputs), ("w", point.w, prior.disturbances),
-    ):  # fmt: skip
-        if len(values) != len(signals):
-            raise InputError(
-                f"operating_point: {name} needs {len(signals)} numbers ("
-                f"{', '.join(s.name for s in signals) or 'there are none'}), got {len(values)}: {values}"
-            )
-        beyond = [
-            f"{s.label} from {s.lower:g} to {s.upper:g}"
-            for s, v in zip(signals, values, strict=True)
-            if not (s.lower <= v <= s.upper and math.isfinite(v))
-        ]
-        if beyond:
-            raise InputError(
-                f"operating_point: {name} = {values} is outside the range of {', '.join(beyond)}; correct it, or the "
-                "bounds of the signal"
-            )
-
-
-def _check_equations(prior: Prior) -> None:
-    """Rates, outputs and their derivatives are finite within the signals' ranges, and balances hold along the flow."""
-    points = _Points.of(prior)
-    x, u, w = points.x, points.u, points.w
-    p, equations = prior.p, prior.equations
-    for what, f in (("xdot(x, u, w, p)", equations.xdot), ("output(x, u, w, p)", equations.output)):
-        symbols = dict(zip(POINT, f.sx_in(), strict=True))
-        value = f(*symbols.values())
-        parts = {"it": value} | {
-            f"its derivative by {key}": ca.vec(ca.densify(ca.jacobian(value, symbols[key]))) for key in "xup"
-        }
-        found = ca.Function("parts", [*symbols.values()], [*parts.values()])(x.T, u.T, w.T, p)
-        for which, values in zip(parts, found, strict=True):
-            bad = ~np.isfinite(values.full()).all(axis=0)
-            if bad.any():
-                where = points.named(int(np.argmax(bad)))
-                raise InputError(
-                    f"{what}: {which} is not finite at {where}{_FINITE}, e.g. sqrt(fmax(level, 1e-6))"
-                )
-    rates = equations.xdot(x.T, u.T, w.T, p).full()
-    for balance in equations.balances:
-        _check_balance(prior, balance, points, rates)
-
-
-def _check_balance(prior: Prior, balance: BalanceEquations, points: _Points, rates: Array) -> None:
-    """A balance tells something of the rates, is finite, holds along the flow, and loses what is not negative."""
-    name = f"balance {balance.name} [{balance.rate_unit}]"
-    symbols = balance.residual.sx_in()
-    if not ca.depends_on(balance.residual(*symbols), symbols[1]):
-        corrected = ", ".join(prior.states[i].name for i in prior.corrected)
-        raise InputError(
-            f"{name}: the storage does not change with {corrected or 'any state'}, whose rates a network may correct, "
-            "so it tells nothing; store what changes with them, or leave the balance out"
-        )
-    x, u, w = points.x.T, points.u.T, points.w.T
-    supply, loss = (f(x, u, w, prior.p).full()[0] for f in (balance.supply, balance.loss))
-    residual = np.abs(balance.residual(x, rates, u, w, prior.p).full()[0])
-    bad = ~np.isfinite([supply, loss, residual]).all(axis=0)
-    if bad.any():
-        raise InputError(f"{name}: it is not finite at {points.named(int(np.argmax(bad)))}{_FINITE}")
-    size, k = float(np.max(np.abs([supply, loss, residual]))), int(np.argmax(residual))
-    if residual[k] > BALANCE * size:
-        raise InputError(
-            f"{name}: dS/dt - supply + loss is {residual[k]:.3g} along the prior's own flow at {points.named(k)}, "
-            "where it must be 0; is a term or a sign left out?"
-        )
-    k = int(np.argmin(loss))
-    if loss[k] < -BALANCE * size:
-        raise InputError(
-            f"{name}: the loss is {loss[k]:.3g} at {points.named(k)}; it must not be negative. Put what may have "
-            "either sign into the supply"
+    x, u, w = rest_of(prior)
+    rates = prior.equations.xdot(x, u, w, prior.p).full().ravel()
+    sizes = _sizes(prior.states, x)
+    moving = [
+        f"{s.name} changes by {r:.3g} {s.unit} a second"
+        for s, r, size in zip(prior.states, rates, sizes, strict=True)
+        if abs(r) * second > DRIFT * size
+    ]
+    if moving:
+        report.add(
+            f"prior: operating_point is no equilibrium: at x = {x.tolist()}, u = {u.tolist()} {', '.join(moving)}; "
+            "give the input that holds it there, or the states where this input does"
         )
 
 
-def _check_masses(prior: Prior) -> None:
-    """A mass matrix is symmetric and positive definite within the signals' ranges."""
-    if not isinstance(prior, MechanicalPrior):
-        return
-    points, masses = _Points.of(prior), prior.masses
-    for k, q in enumerate(points.x[:, : prior.n_q]):
-        matrix = masses(q, prior.p).full()
-        right = np.isfinite(matrix).all() and np.allclose(matrix, matrix.T, rtol=BALANCE, atol=0)
-        if not right or np.linalg.eigvalsh(matrix).min() <= 0:
-            found = matrix.tolist() if prior.n_q > 1 else float(matrix[0, 0])
-            raise InputError(
-                f"mass_matrix(q, p) is {found} at {points.named(k)}; an inertia must be positive, a mass matrix "
-                "symmetric and positive definite. Check its terms and their signs"
+def _equilibria(prior: Prior, model: HybridModel, x: Array, u: Array) -> tuple[Equilibrium, ...]:
+    region = []
+    for signal, near in zip(prior.states, x, strict=True):
+        turn = signal.unit == "rad"
+        reach = math.pi if turn else 10.0 * max(1.0, abs(near))
+        low, high = (-math.inf, math.inf) if signal.periodic and turn else (signal.lower, signal.upper)
+        region.append(
+            (low if math.isfinite(low) else near - reach, high if math.isfinite(high) else near + reach)
+        )
+    return equilibria(model, u, region, starts=STARTS).points
+
+
+def _check_recordings(
+    report: Report, prior: Prior, recordings: Callable[[], Dataset], rest: Rest | None, dt: float
+) -> Dataset | None:
+    """The recordings can be read, move what is to be learned, and have been where the machine works."""
+    dataset = None
+    with report.part("recordings"):
+        dataset = recordings()
+    if dataset is None:
+        return None
+    for finding in dataset.findings:
+        report.warn(f"recordings: {finding}")
+    for file, sampling in zip(dataset.files, dataset.sampling, strict=True):
+        if sampling > COARSE * dt:
+            report.warn(
+                f"recordings: {file} is sampled every {sampling:.3g} s, the model's period is {dt:g} s: what lies "
+                "between is made up; raise dt in the DataSpec, or record faster"
             )
+    train = dataset.by_role("train")
+    free = sum(not p.fixed for p in prior.parameters)
+    with report.part("recordings"):
+        for warning in check_excitation(train, inputs=prior.inputs, outputs=prior.outputs, parameters=free):
+            report.warn(f"recordings: {warning}")
+    if rest is not None and prior.operating_point is not None:
+        y = prior.equations.output(rest.x, rest.u, rest.w, prior.p).full().ravel()
+        for signals, values, key in ((prior.inputs, rest.u, "u"), (prior.outputs, y, "y")):
+            every = np.concatenate([getattr(t, key) for t in dataset.whole])
+            for j, (signal, value) in enumerate(zip(signals, values, strict=True)):
+                known = every[np.isfinite(every[:, j]), j]
+                low, high = (known.min(), known.max()) if len(known) else (value, value)
+                beyond = max(low - value, value - high)
+                if beyond > 0.5 * (high - low) and not signal.periodic:
+                    report.warn(
+                        f"recordings: {signal.label} goes from {low:.4g} to {high:.4g}, at the operating point it is "
+                        f"{value:.4g}; record there, or correct the operating point or a unit"
+                    )
+    return dataset
 
 
-def _check_data(report: _Report, scenario: Scenario, prior: Prior | None) -> None:
+def _check_columns(report: Report, scenario: Scenario, prior: Prior) -> None:
+    """As many columns as signals, in units that can be turned into theirs; causes that the prior has."""
     spec = scenario.data
-    if prior is not None:
-        for what, columns, signals in (
-            ("inputs", spec.inputs, prior.inputs),
-            ("outputs", spec.outputs, prior.outputs),
-            ("disturbances", spec.disturbances, prior.disturbances),
-        ):
-            if len(columns) != len(signals):
-                report.add(
-                    f"data: {len(columns)} columns of {what} {list(columns)}, the prior has {len(signals)}: "
-                    f"{[s.name for s in signals]}"
-                )
-        unknown = [
-            name
-            for names in scenario.causes.values()
-            for name in names
-            if name not in prior.values and name not in {f"gain of {s.name}" for s in prior.inputs}
-        ]
-        if unknown:
+    for what, columns, signals in (
+        ("inputs", spec.inputs, prior.inputs),
+        ("outputs", spec.outputs, prior.outputs),
+        ("disturbances", spec.disturbances, prior.disturbances),
+    ):
+        if len(columns) != len(signals):
             report.add(
-                f"causes: the prior has no parameter {', '.join(unknown)}; it has: {', '.join(prior.values)}"
+                f"data: {len(columns)} columns of {what} {list(columns)}, the prior has {len(signals)}: "
+                f"{[s.name for s in signals]}"
             )
+            continue
+        for column, signal in zip(columns, signals, strict=True):
+            with report.part("data"):
+                check_unit(spec, column, signal)
+    unknown = [
+        name
+        for names in scenario.causes.values()
+        for name in names
+        if name not in prior.values and name not in {f"gain of {s.name}" for s in prior.inputs}
+    ]
+    if unknown:
+        report.add(
+            f"causes: the prior has no parameter {', '.join(unknown)}; it has: {', '.join(prior.values)}"
+        )
 
 
-def _check_budget(report: _Report, name: str, budget: Budget) -> None:
+def _check_budget(report: Report, name: str, budget: Budget) -> None:
     least = {
         "hidden": 1,
         "networks": 1,
@@ -264,30 +290,19 @@ def _check_budget(report: _Report, name: str, budget: Budget) -> None:
         report.add(f"budget {name}: decay must be 0 or more, got {budget.decay!r}")
 
 
-def _check_export(report: _Report, scenario: Scenario, prior: Prior) -> HybridModel | None:
-    """The prior as a deployed model."""
-    from hybrid_mpc.identify.export import model_info, prior_programs
-    from hybrid_mpc.identify.fit import check_observable
-
-    with report.part("prior"):
-        check_observable(prior, scenario.data.dt, max(10 * scenario.data.dt, scenario.data.warm_up))
-        programs = prior_programs(prior, scenario.data.dt)
-        return build_model(
-            "prior", {f"prior/{name}": p for name, p in programs.items()}, model_info(prior, scenario.data.dt)
-        )
-    return None
-
-
 def _check_control(
-    report: _Report, scenario: Scenario, prior: Prior | None, model: HybridModel | None
+    report: Report, scenario: Scenario, prior: Prior | None, model: HybridModel | None, rest: Rest | None
 ) -> None:
     control = scenario.control
     if control is None:
         if scenario.tasks:
             report.add("tasks: there is no control problem to run them with; give control=OCP(...)")
         return
+    before = len(report.problems)
     _check_sensors(report, scenario, prior)
-    _check_problem(report, scenario, "control", control, prior, model)
+    if len(report.problems) > before:  # what stands on them says no more
+        model = None
+    _check_problem(report, scenario, "control", control, prior, model, rest)
     built = {_structure(control)}
     with report.part("safe_input"):
         loop_settings(replace(scenario, sensor_sigma=(), first_sigma=None))
@@ -296,7 +311,7 @@ def _check_control(
             new = _structure(task.control) not in built
             built.add(_structure(task.control))
             what = f"control of task {task.name}"
-            _check_problem(report, scenario, what, task.control, prior, model if new else None)
+            _check_problem(report, scenario, what, task.control, prior, model if new else None, rest)
 
 
 def _structure(control: Any) -> tuple[Any, ...]:
@@ -305,10 +320,10 @@ def _structure(control: Any) -> tuple[Any, ...]:
         return ()
     bounded = tuple(np.isfinite([control.x_min, control.x_max]).ravel())
     expressions = control.soft, id(control.economic)
-    return control.horizon, control.blocks, control.du_max is None, bounded, expressions, len(control.starts)
+    return control.horizon, control.blocks, control.du_max is None, bounded, expressions
 
 
-def _check_sensors(report: _Report, scenario: Scenario, prior: Prior | None) -> None:
+def _check_sensors(report: Report, scenario: Scenario, prior: Prior | None) -> None:
     n_y, n_x = (0, 0) if prior is None else (len(prior.outputs), len(prior.states))
     for name, needed in (("sensor_sigma", n_y), ("first_sigma", n_x - n_y)):
         values = getattr(scenario, name)
@@ -321,12 +336,13 @@ def _check_sensors(report: _Report, scenario: Scenario, prior: Prior | None) -> 
 
 
 def _check_problem(
-    report: _Report,
+    report: Report,
     scenario: Scenario,
     what: str,
     control: OCP,
     prior: Prior | None,
     model: HybridModel | None,
+    rest: Rest | None,
 ) -> None:
     before = len(report.problems)
     if not isinstance(control, OCP):
@@ -338,8 +354,11 @@ def _check_problem(
         values = getattr(control, name)
         if len(values) != size:
             report.add(f"{what}: {name} needs {size} numbers, got {len(values)}: {values}")
-    if model is None or len(report.problems) > before:
+    if model is None or rest is None or len(report.problems) > before:
         return
+    control = control.changed(
+        starts=()
+    )  # each is sought from for seconds, and their shapes are known to be right
     with report.part(f"{what}: estimator"):
         estimator = make_estimator(model, scenario, np.ones(model.n_x), control)
     with report.part(f"{what}: controller"):
@@ -348,11 +367,14 @@ def _check_problem(
         return
     with report.part(f"{what}: a period of the loop"):
         loop = Loop(estimator, controller)
-        loop.start(np.zeros(model.n_y))
-        loop.step(np.zeros(model.n_y))
+        y = model.output(rest.x, rest.u, rest.w, model.p).full().ravel()
+        loop.start(y)
+        loop.step(y)
 
 
-def _check_plant(report: _Report, scenario: Scenario, prior: Prior | None, model: HybridModel | None) -> None:
+def _check_plant(
+    report: Report, scenario: Scenario, prior: Prior | None, model: HybridModel | None, rest: Rest | None
+) -> None:
     names = [task.name for task in scenario.tasks]
     if len(set(names)) < len(names):
         report.add(f"tasks: two have the same name: {names}")
@@ -361,10 +383,11 @@ def _check_plant(report: _Report, scenario: Scenario, prior: Prior | None, model
         with report.part("plant"):
             plant = scenario.plant()
             _check_methods(plant, prior, scenario.data.dt)
-    for task in scenario.tasks:
-        if prior is not None:
-            with report.part(f"task {task.name}"):
-                _check_task(task, scenario, prior, plant)
+            if model is not None and rest is not None:
+                _check_answer(report, plant, model, rest)
+    for task in scenario.tasks if prior is not None else ():
+        assert prior is not None
+        _check_task(report, task, scenario, prior, plant, rest)
     if scenario.oracle is not None and model is not None:
         with report.part("oracle"):
             oracle = scenario.oracle(model.dt)
@@ -378,7 +401,11 @@ def _check_plant(report: _Report, scenario: Scenario, prior: Prior | None, model
 
 def _check_methods(plant: Plant, prior: Prior, dt: float) -> None:
     n_x, n_u, n_y = len(prior.states), len(prior.inputs), len(prior.outputs)
-    state = plant.step(plant.reset(np.zeros(n_x), 0), np.zeros(n_u), dt)
+    point = prior.operating_point
+    x, u = (np.zeros(n_x), np.zeros(n_u)) if point is None else (np.array(point.x), np.array(point.u))
+    if (len(x), len(u)) != (n_x, n_u):  # told by the prior
+        return
+    state = plant.step(plant.reset(x, 0), u, dt)
     y, x = plant.measure(state, np.random.default_rng(0)), plant.truth(state)
     for name, found, size in (("measure", y, n_y), ("truth", x, n_x)):
         if np.shape(found) != (size,):
@@ -387,69 +414,117 @@ def _check_methods(plant: Plant, prior: Prior, dt: float) -> None:
             raise InputError(f"{name} gives {found} one period after rest; it must be finite")
 
 
-def _check_task(task: Task, scenario: Scenario, prior: Prior, plant: Plant | None) -> None:
-    n_x, dt = len(prior.states), scenario.data.dt
-    if not (math.isfinite(task.duration) and task.duration >= dt):
-        raise InputError(f"duration must be at least a period of {dt} s and finite, got {task.duration}")
-    if len(task.x0) != n_x or not all(math.isfinite(v) for v in task.x0):
-        raise InputError(f"x0 needs {n_x} finite numbers, got {task.x0}")
-    t = np.arange(0.0, task.duration, dt)
+def _check_answer(report: Report, plant: Plant, model: HybridModel, rest: Rest) -> None:
+    """Plant and prior answer to a step of each input in the same direction."""
+    ranges = np.array([s.upper - s.lower for s in model.inputs])
+    steps = np.where(np.isfinite(ranges), 0.1 * ranges, 1.0)
+    room = np.array([s.upper for s in model.inputs]) - rest.u
+    steps = np.where(room >= steps, steps, -steps)
+    sizes = _sizes(model.states, rest.x)
+
+    def after(u: Array) -> tuple[Array, Array]:
+        state, x = plant.reset(rest.x, 0), rest.x
+        for _ in range(ANSWER):
+            state = plant.step(state, u, model.dt)
+            x = model.step(x, np.zeros(0), u, rest.w, model.p)[0].full().ravel()
+        return np.asarray(plant.truth(state), dtype=np.float64), x
+
+    base = after(rest.u)
+    for j, signal in enumerate(model.inputs):
+        moved = after(rest.u + steps * (np.arange(model.n_u) == j))
+        own, expected = ((one - other) / sizes for one, other in zip(moved, base, strict=True))
+        lengths = float(np.linalg.norm(own)), float(np.linalg.norm(expected))
+        if min(lengths) > 0 and float(own @ expected) < AGAINST * lengths[0] * lengths[1]:
+            told = ", ".join(
+                f"{s.name} by {a * k:.3g} and {b * k:.3g} {s.unit}"
+                for s, a, b, k in zip(model.states, own, expected, sizes, strict=True)
+            )
+            report.warn(
+                f"plant: a step of {signal.label} by {steps[j]:g} moves plant and prior different ways within {ANSWER} "
+                f"periods: {told}; is a sign or a unit wrong in one of them?"
+            )
+
+
+def _check_task(
+    report: Report, task: Task, scenario: Scenario, prior: Prior, plant: Plant | None, rest: Rest | None
+) -> None:
+    n_x, dt, what = len(prior.states), scenario.data.dt, f"task {task.name}"
     control = task.control or scenario.control
     n_p = control.n_p if isinstance(control, OCP) else 0
+    if len(task.x0) != n_x or not all(math.isfinite(v) for v in task.x0):
+        report.add(f"{what}: x0 needs {n_x} finite numbers, got {task.x0}")
+    else:
+        with report.part(what):
+            _check_within("x0", np.array([task.x0]), np.zeros(1), prior)
+    if plant is not None:
+        with report.part(what):
+            check_channels(install(plant, task.faults)[1], len(prior.outputs), len(prior.inputs))
+    if not (math.isfinite(task.duration) and task.duration >= dt):
+        report.add(f"{what}: duration must be at least a period of {dt} s and finite, got {task.duration}")
+        return
+    t = np.arange(0.0, task.duration, dt)
     for name, preview, columns in (("reference", task.reference, n_x + n_p), ("weight", task.weight, n_x)):
         if preview is None:
             continue
-        values = np.asarray(preview(t))
-        if values.shape != (len(t), columns):
+        with report.part(what):
+            values = np.asarray(preview(t))
+            if values.shape != (len(t), columns):
+                raise InputError(
+                    f"{name} must return the shape {(len(t), columns)} for {len(t)} times, got {values.shape}"
+                    + (f"; the last {n_p} for the economic cost's parameters" if columns > n_x else "")
+                )
+            if not np.all(np.isfinite(values)):
+                k = int(np.argmax(~np.isfinite(values).all(axis=1)))
+                raise InputError(f"{name} is {values[k]} at {t[k]:g} s; it must be finite during the task")
+            if name == "weight" and np.any(values < 0):
+                raise InputError("weight: factors must not be negative")
+            if name == "reference":
+                _check_within(name, values[:, :n_x], t, prior)
+                if isinstance(control, OCP) and rest is not None:
+                    _check_set_point(report, task, values[:, :n_x], control, prior, rest)
+
+
+def _check_within(name: str, values: Array, t: Array, prior: Prior) -> None:
+    """States are within their signals' ranges."""
+    for j, signal in enumerate(prior.states):
+        beyond = (values[:, j] < signal.lower) | (values[:, j] > signal.upper)
+        if beyond.any():
+            k = int(np.argmax(beyond))
             raise InputError(
-                f"{name} must return the shape {(len(t), columns)} for {len(t)} times, got {values.shape}"
-                + (f"; the last {n_p} for the economic cost's parameters" if columns > n_x else "")
+                f"{name}: {signal.label} is {values[k, j]:g} at {t[k]:g} s, outside its range from {signal.lower:g} to "
+                f"{signal.upper:g}; correct its unit, or the bounds of the signal"
             )
-        if not np.all(np.isfinite(values)):
-            k = int(np.argmax(~np.isfinite(values).all(axis=1)))
-            raise InputError(f"{name} is {values[k]} at {t[k]:g} s; it must be finite during the task")
-        if name == "weight" and np.any(values < 0):
-            raise InputError("weight: factors must not be negative")
-    if plant is not None:
-        check_channels(install(plant, task.faults)[1], len(prior.outputs), len(prior.inputs))
 
 
-@dataclass(frozen=True)
-class _Points:
-    """Where a prior is asked: states ``(n, n_x)``, inputs and disturbances."""
+def _check_set_point(
+    report: Report, task: Task, reference: Array, control: OCP, prior: Prior, rest: Rest
+) -> None:
+    """Where a reference comes to rest, the inputs' limits let the machine rest, too."""
+    n_x, n_u = len(prior.states), len(prior.inputs)
+    last = reference[-max(2, len(reference) // 10) :]
+    weights = np.sqrt(control.q) if len(control.q) == n_x else np.zeros(n_x)
+    if np.ptp(last, axis=0).any() or not weights.any() or len(control.u_min) != n_u:
+        return
+    from scipy.optimize import least_squares  # takes longer to import than the search takes
 
-    x: Array
-    u: Array
-    w: Array
+    target, sizes = last[-1], _sizes(prior.states, last[-1])
+    tied = weights > 0
+    first = np.concatenate([np.where(tied, target, rest.x), np.clip(rest.u, control.u_min, control.u_max)])
+    low = np.concatenate([np.full(n_x, -np.inf), control.u_min])
+    high = np.concatenate([np.full(n_x, np.inf), control.u_max])
+    span = np.concatenate([sizes, control.input_range])
+    fastest = float(np.abs(rest.modes).max(initial=0.0))
+    second = 1.0 / fastest if fastest > 0 else 1.0
 
-    @classmethod
-    def of(cls, prior: Prior) -> _Points:
-        signals = prior.states, prior.inputs, prior.disturbances
-        return cls(*(_points(group, seed) for seed, group in enumerate(signals)))
+    def misses(z: Array) -> Array:
+        rates = prior.equations.xdot(z[:n_x], z[n_x:], rest.w, prior.p).full().ravel()
+        return np.concatenate([1e3 * second * rates / sizes, ((z[:n_x] - target) / sizes)[tied]])
 
-    def named(self, k: int) -> str:
-        """One of them as text."""
-        return ", ".join(f"{name} = {v[k].tolist()}" for name, v in vars(self).items() if v.size)
-
-
-def _points(signals: Sequence[Signal], seed: int) -> Array:
-    """The origin, or what of the range is next to it, and random points within the range: rows."""
-    rng = np.random.default_rng(seed)
-    columns = []
-    for signal in signals:
-        low = signal.lower if math.isfinite(signal.lower) else min(-1.0, signal.upper - 1.0)
-        high = signal.upper if math.isfinite(signal.upper) else max(1.0, signal.lower + 1.0)
-        columns.append(np.concatenate([[min(max(0.0, low), high)], rng.uniform(low, high, POINTS)]))
-    return np.column_stack(columns) if columns else np.zeros((POINTS + 1, 0))
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).strip() or "no message").splitlines()[0]
-
-
-def _place(error: BaseException) -> str:
-    """The last line of the user's own code that an error came through."""
-    frames = traceback.extract_tb(error.__traceback__)
-    library = Path(__file__).parents[1]
-    own = [f for f in frames if library not in Path(f.filename).parents and "site-packages" not in f.filename]
-    return f" ({own[-1].filename}:{own[-1].lineno})" if own else ""
+    found = least_squares(misses, first, bounds=(low, high), x_scale=span)
+    missed = np.abs(found.x[:n_x] - target) / sizes
+    if (missed[tied] > REACHED).any():
+        report.warn(
+            f"task {task.name}: its reference comes to rest at x = {target.round(6).tolist()}, which no input within "
+            f"its limits holds; the nearest point of rest is x = {(found.x[:n_x].round(4) + 0.0).tolist()} under u = "
+            f"{found.x[n_x:].round(4).tolist()}"
+        )

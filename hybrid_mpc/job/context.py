@@ -95,16 +95,7 @@ class Context:
     @cached_property
     def dataset(self) -> Dataset:
         """All trajectories of the run's recordings."""
-        files = self.files
-        prior = self.scenario.prior()
-        return load_trajectories(
-            files,
-            self.spec,
-            disturbances=prior.disturbances,
-            outputs=prior.outputs,
-            inputs=prior.inputs,
-            states=prior.states,
-        )
+        return load_trajectories(self.files, self.scenario.prior(), self.spec)
 
     @cached_property
     def time_unit(self) -> float:

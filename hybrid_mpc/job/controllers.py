@@ -164,9 +164,7 @@ def _estimated_noise(
     prior = scenario.prior(artifact.provenance.prior_parameters)
     with tempfile.TemporaryDirectory() as folder:
         files = scenario.make_data(Path(folder), seed, "quick")
-        data = load_trajectories(
-            files, scenario.data, disturbances=prior.disturbances, outputs=prior.outputs, inputs=prior.inputs
-        )
+        data = load_trajectories(files, prior, scenario.data)
     train = data.by_role("train")
     delay = artifact.input_delay
     smoother = fit_smoother(prior, shifted(train, delay), scenario.data.dt)

@@ -138,11 +138,8 @@ def prepared(
     spec = replace(scenario.data, windows={}, warm_up=scenario.data.dt, fractions=(1.0, 0.0, 0.0))
     data = load_trajectories(
         recordings,
+        hybrid,
         spec,
-        disturbances=hybrid.disturbances,
-        outputs=hybrid.outputs,
-        inputs=hybrid.inputs,
-        states=hybrid.states,
         needed=(),
     )
     if not data.whole:

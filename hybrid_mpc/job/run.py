@@ -20,7 +20,7 @@ from hybrid_mpc.job.stages.estimate import ESTIMATION
 from hybrid_mpc.job.stages.evaluate import EVALUATION
 from hybrid_mpc.job.stages.export import EXPORT, NOISE
 from hybrid_mpc.job.stages.guard import GUARD
-from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, check_data
+from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, check_data, models_of
 from hybrid_mpc.job.stages.monitor import MONITOR
 from hybrid_mpc.job.stages.report import REPORT
 from hybrid_mpc.job.stages.results import Results, read_results
@@ -67,11 +67,14 @@ def run(
     check_choice(only, skip)
     scenario = load_scenario(settings.scenario)
     context = Context(settings, scenario, out, progress or Progress())
-    check_scenario(scenario, context.budget)
+    found = check_scenario(scenario, context.budget, (lambda: context.dataset) if settings.data else None)
+    for warning in found.warnings:
+        context.progress.warn(warning)
     check_data(context)
     check_device(settings.device)
     if settings.deploy:
-        known(settings.deploy, CANDIDATES, "model to deploy")
+        there = models_of(scenario.prior())
+        known(settings.deploy, [name for name in CANDIDATES if name in there], "model to deploy")
     with open_folder(out, run_note(settings), resume=resume):
         for stage in STAGES:
             context.progress.start(stage.title)
@@ -97,9 +100,10 @@ def check_choice(only: Sequence[str], skip: Sequence[str]) -> None:
 def _as_it_is(context: Context, stage: Stage[Any]) -> str:
     """Take a stage as the folder holds it."""
     stored = context.stored(stage)
-    if stored is None:
+    if stored is None or stored.unfit:
         if not stage.optional:
-            raise InputError(f"stage {stage.name} has not run in {context.out}; leave --only out")
+            why = f"has not run in {context.out}" if stored is None else f"must run again: {stored.unfit}"
+            raise InputError(f"stage {stage.name} {why}; leave --only out")
         context.leave_out(stage, f"stage {stage.name} was left out")
         return "left out"
     why = changed(stored.keys, stage.keys(context))

@@ -78,11 +78,15 @@ class Stage(Generic[R]):
 
 @dataclass(frozen=True)
 class Stored(Generic[R]):
-    """What a stage's file holds: digests of what was read, the result, and its digest."""
+    """What a stage's file holds: digests of what was read, the result, and its digest.
+
+    ``unfit`` says why a whole file holds no result of today's kind: another version wrote it. Empty: it does.
+    """
 
     keys: Mapping[str, str]
     result: R | Absent
     content: str
+    unfit: str = ""
 
 
 @dataclass(frozen=True)
@@ -108,23 +112,32 @@ def write_stage(path: Path, stage: Stage[R], keys: Mapping[str, str], result: R 
 
 
 def read_stage(path: Path, stage: Stage[R], remedy: str) -> Stored[R]:
-    """Read a stage's result.
+    """Read a stage's result; of a file that another version wrote, why it does not fit.
 
     Raises:
-        InputError: If the file is missing or damaged, or holds no such result; the message ends with ``remedy``.
+        InputError: If the file is missing or damaged; the message ends with ``remedy``.
     """
-    held = record(_File, read_document(path, remedy), str(path))
+    document = read_document(path, remedy)
+    try:
+        held = record(_File, document, path.name)
+    except InputError as error:
+        return _unfit(error)
     if held.absent is not None:
         return Stored(held.keys, held.absent, held.content)
     try:
         result = record(
-            stage.result, {**held.result, **({"arrays": {}} if _has_arrays(stage) else {})}, str(path)
+            stage.result, {**held.result, **({"arrays": {}} if _has_arrays(stage) else {})}, path.name
         )
     except InputError as error:
-        raise InputError(f"{error}; {remedy}") from error
+        return _unfit(error)
     if _has_arrays(stage):
         result = replace(result, arrays=read_document_arrays(path, remedy))  # type: ignore[type-var]
     return Stored(held.keys, result, held.content)
+
+
+def _unfit(error: InputError) -> Stored[Any]:
+    why = f"another version wrote its result ({error})"
+    return Stored({}, Absent(why, failed=True), "", why)
 
 
 def _has_arrays(stage: Stage[Any]) -> bool:
@@ -157,7 +170,7 @@ def bring_up_to_date(context: Context, stage: Stage[Any], skip: bool = False) ->
     stored, keys = context.stored(stage), stage.keys(context)
     why = ""
     if stored is not None:
-        why = changed(stored.keys, keys)
+        why = stored.unfit or changed(stored.keys, keys)
         if not why and isinstance(stored.result, Absent):
             why = "it could not run before" if stored.result.failed else ""
         elif not why:

@@ -104,8 +104,6 @@ def usage(settings: RunSettings, out: Path) -> str:
 def best_settings(found: SearchResult, space: SearchSpace) -> dict[str, Any]:
     """The best settings as ``settings.json`` holds them: what was searched and what goes with it."""
     names = {"learning_rates" if name in RATES else name: None for name in space.names}
-    if "horizon" in names:
-        names["validation_horizon"] = None
     return {name: getattr(found.settings, name) for name in names}
 
 

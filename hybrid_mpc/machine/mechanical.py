@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import casadi as ca
@@ -44,6 +45,10 @@ class MechanicalPrior(Prior):
     """
 
     corrects: ClassVar[tuple[str, ...] | None] = None
+    methods: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "mass_matrix": ("q", "p"), "potential": ("q", "p"), "friction": ("q", "v", "p"),
+        "force": ("q", "v", *POINT[1:]), "output": POINT, "balances": POINT,
+    }  # fmt: skip
     _speeds: ClassVar[tuple[str, ...] | None] = None
 
     def __init_subclass__(cls, **options: Any) -> None:

@@ -91,12 +91,13 @@ class Prior:
         corrects: Names of the states whose rates a network may correct. Default: all. A rate that is exact, such as
             that of a position, is not named.
         operating_point: An equilibrium around which the machine works. Default: none is known.
+        methods: What is written of its equations, and the arguments of each.
 
     Args:
         values: Parameter values [their units] by name that replace the nominal ones, e.g. fitted ones.
 
     Raises:
-        InputError: If a name in ``values`` is no parameter, ``corrects`` names no state, or, when the class is made, a
+        InputError: If a name in ``values`` is no parameter, a kind of signals is missing, or, when the class is made, a
             signal or parameter is none.
 
     Example:
@@ -124,6 +125,7 @@ class Prior:
     parameters: ClassVar[tuple[Parameter, ...]] = ()
     corrects: ClassVar[tuple[str, ...] | None] = None
     operating_point: ClassVar[OperatingPoint | None] = None
+    methods: ClassVar[Mapping[str, tuple[str, ...]]] = {"xdot": POINT, "output": POINT, "balances": POINT}
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -136,18 +138,16 @@ class Prior:
                 )
 
     def __init__(self, values: Mapping[str, float] | None = None) -> None:
-        given = dict(values or {})
+        given, kind = dict(values or {}), type(self).__name__
+        missing = [role for role in ("states", "inputs", "outputs") if not hasattr(self, role)]
+        if missing:
+            raise InputError(
+                f"{kind} has no {' and no '.join(missing)}; write {missing[0]} = (Signal(name, unit), ...) in the class"
+            )
         self._values = {p.name: float(given.pop(p.name, p.value)) for p in self.parameters}
-        kind = type(self).__name__
         if given:
             raise InputError(
                 f"{kind} has no parameter {', '.join(given)}; it has: {', '.join(self._values) or 'none'}"
-            )
-        names = [s.name for s in self.states]
-        unknown = [name for name in self.corrects or () if name not in names]
-        if unknown:
-            raise InputError(
-                f"{kind}: corrects names {', '.join(unknown)}; its states are: {', '.join(names)}"
             )
 
     @property
@@ -176,14 +176,42 @@ class Prior:
         return tuple(at[output.name] for output in self.outputs)
 
     def balances(self, x: Any, u: Any, w: Any, p: Any) -> tuple[Balance, ...]:
-        """Balances of what the machine stores. Default: none; a MOPGRNN then has no second objective."""
+        """Balances of what the machine stores. Default: none; then there is no MOPGRNN."""
         return ()
 
     @property
     def corrected(self) -> tuple[int, ...]:
-        """Places in ``x`` of the states whose rates a network may correct."""
-        names = {s.name for s in self.states} if self.corrects is None else set(self.corrects)
-        return tuple(i for i, s in enumerate(self.states) if s.name in names)
+        """Places in ``x`` of the states whose rates a network may correct; InputError if one is no state."""
+        names, kind = [s.name for s in self.states], type(self).__name__
+        if isinstance(self.corrects, str):
+            raise InputError(f"{kind}: corrects must be a tuple of names, as ({self.corrects!r},)")
+        chosen = names if self.corrects is None else self.corrects
+        unknown = [name for name in chosen if name not in names]
+        if unknown:
+            raise InputError(
+                f"{kind}: corrects names {', '.join(unknown)}; its states are: {', '.join(names)}"
+            )
+        return tuple(i for i, name in enumerate(names) if name in chosen)
+
+    @property
+    def kinematics(self) -> tuple[tuple[int, int], ...]:
+        """Places in ``x`` of each state whose rate is another state, and of that one: a position and its speed.
+
+        Example:
+            >>> from scenarios.pendulum.prior import PendulumPrior
+            >>> PendulumPrior().kinematics
+            ((0, 1),)
+        """
+        point = [ca.SX.sym(key, len(self.names_of(key))) for key in POINT]
+        rates = self.equations.xdot(*point)
+        slopes = ca.jacobian(rates, ca.vertcat(*point))
+        found = []
+        for i in range(rates.numel()):
+            row = slopes[i, :]
+            places = row.sparsity().get_col()
+            if len(places) == 1 and places[0] < len(self.states) and ca.is_equal(row.nz[0], ca.SX(1)):
+                found.append((i, places[0]))
+        return tuple(found)
 
     @property
     def equations(self) -> Equations:

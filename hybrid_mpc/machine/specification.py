@@ -167,9 +167,9 @@ class BenchmarkSpec:
 
     Args:
         budgets: Effort by name, ``"quick"`` and ``"full"``.
-        unit: Unit of the figures, e.g. ``"mm"`` for an output in metres.
-        scale: Factor from the output's unit to ``unit``, e.g. 1000 from m to mm. Default: 1.
-        largest_delay: Longest delay [s] of the input that is searched for; zero: none. Default: 0.
+        unit: Unit of the first output's figures, e.g. ``"mm"`` for an output in metres. Default: the output's own, as
+            further outputs have it.
+        scale: Factor from the first output's unit to ``unit``, e.g. 1000 from m to mm. Default: 1.
         length: Length [s] of a run after what is given. Default: the whole recording.
         piece: Length [s] of the pieces that long training recordings are cut into. Default: 25 s.
         cycle: Roles of these pieces, again and again in order of time, where a recording's parts are not alike and
@@ -179,7 +179,7 @@ class BenchmarkSpec:
             windows in the data specification. Fewer files than that are split by it. Default: zero, never.
 
     Raises:
-        InputError: If a length, the scale or the delay is out of its range, a cycle lacks a role that is needed, or
+        InputError: If a length or the scale is out of its range, a cycle lacks a role that is needed, or
             both ``cycle`` and ``valid_every`` are given.
 
     Example:
@@ -188,9 +188,8 @@ class BenchmarkSpec:
     """
 
     budgets: Mapping[str, BenchmarkBudget] = field(default_factory=dict)
-    unit: str = field(kw_only=True)
+    unit: str = field(default="", kw_only=True)
     scale: float = 1.0
-    largest_delay: float = 0.0
     length: float | None = None
     piece: float = 25.0
     cycle: tuple[str, ...] = ()
@@ -210,8 +209,4 @@ class BenchmarkSpec:
             raise InputError(
                 f"benchmark specification: valid_every must be 2 or more (or 0 for never), and there must be no cycle "
                 f"beside it; got {self.valid_every} and cycle {self.cycle}"
-            )
-        if self.largest_delay < 0:
-            raise InputError(
-                f"benchmark specification: largest_delay must not be negative, got {self.largest_delay}"
             )

@@ -15,7 +15,9 @@ from hybrid_mpc.plots.style import (
     axis_label,
     checked,
     colour,
+    finish_column,
     name_of,
+    new_column,
     new_figure,
     plain,
     shared_legend,
@@ -102,42 +104,55 @@ def recordings(
     return figure
 
 
-def coverage(trajectories: Sequence[Recording], states: Sequence[Signal]) -> Figure:
-    """Phase portrait: where the training data have been, and where the models are tested.
-
-    States are drawn in pairs, the first half against the second; of an odd number each against the next.
+def coverage(
+    trajectories: Sequence[Recording], states: Sequence[Signal], pairs: Sequence[tuple[int, int]] = ()
+) -> Figure:
+    """Where the training data have been, and where the models are tested.
 
     Args:
         trajectories: Pieces of recordings.
-        states: Signals of ``x``, two at least.
+        states: Signals of ``x``.
+        pairs: Places in ``x`` of each position and its speed: a phase portrait each. Default: none; then every state
+            is drawn over time.
 
     Raises:
-        InputError: If there is no trajectory, there is a single state, or its shapes do not fit the signals.
+        InputError: If there is no trajectory, or its shapes do not fit the signals.
 
     Example:
         >>> import numpy as np
         >>> from types import SimpleNamespace as Piece
         >>> piece = Piece(name="a", role="train", t=np.zeros(2), x=np.zeros((2, 2)))
-        >>> len(coverage([piece], [Signal("q", "m"), Signal("v", "m/s")]).axes)
-        1
+        >>> states = [Signal("q", "m"), Signal("v", "m/s")]
+        >>> len(coverage([piece], states, [(0, 1)]).axes), len(coverage([piece], states).axes)
+        (1, 2)
     """
     if not trajectories:
         raise InputError("plot of the coverage: there is no recording to draw")
-    n = len(states)
-    if n < 2:
-        raise InputError("plot of the coverage: a single state has no phase portrait")
-    pairs = [(i, i + n // 2) for i in range(n // 2)] if n % 2 == 0 else [(i, i + 1) for i in range(n - 1)]
-    figure, axes = new_figure(1, len(pairs), size=(6.8 if len(pairs) == 1 else 5.0 * len(pairs), 4.6))
-    for (q, v), ax in zip(pairs, axes[0], strict=True):
-        for role in ("train", "test"):
-            for piece in (p for p in trajectories if p.role == role):
-                x = checked(f"x of {piece.name}", piece.x, len(piece.t), len(states))
-                width = 2.4 if role == "train" else 1.0
-                position = _wrapped(x[:, q]) if states[q].periodic else x[:, q]
-                ax.plot(position, x[:, v], color=colour(role), linewidth=width, label=name_of(role))
+    shown = [piece for role in ("train", "test") for piece in trajectories if piece.role == role]
+    if pairs:
+        size = (6.8 if len(pairs) == 1 else 5.0 * len(pairs), 4.6)
+        figure, axes = new_figure(1, len(pairs), size=size)
+        panels = list(axes[0])
+    else:
+        figure, panels = new_column([1.4] * len(states))
+    for piece in shown:
+        x = checked(f"x of {piece.name}", piece.x, len(piece.t), len(states))
+        look = {"color": colour(piece.role), "label": name_of(piece.role)}
+        width = 2.4 if piece.role == "train" else 1.0
+        for (q, v), ax in zip(pairs, panels, strict=False):
+            position = _wrapped(x[:, q]) if states[q].periodic else x[:, q]
+            ax.plot(position, x[:, v], linewidth=width, **look)
+        for values, ax in zip(() if pairs else x.T, panels, strict=False):
+            ax.plot(piece.t, values, linewidth=1.2, **look)
+    for (q, v), ax in zip(pairs, panels, strict=False):
         ax.set_xlabel(axis_label(states[q]))
         ax.set_ylabel(axis_label(states[v]))
-    shared_legend(figure)
+    if pairs:
+        shared_legend(figure)
+        return figure
+    for signal, ax in zip(states, panels, strict=True):
+        ax.set_ylabel(axis_label(signal))
+    finish_column(figure, panels)
     return figure
 
 

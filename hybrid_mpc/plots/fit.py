@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.machine.signals import Signal
@@ -24,52 +27,55 @@ from hybrid_mpc.plots.style import (
     new_column,
     new_figure,
     number,
+    plain,
     plain_log,
     plot_inputs,
     shared_legend,
     title_axes,
 )
 
-METRICS: Mapping[str, str] = {
-    "e_sim_s": "simulation error $E_{sim}$ [s]",
-    "rmse_rad": "free-run RMSE [unit of the output]",
-    "energy_violation_w": "mean violation [W]",
-}
-"""Axis labels by metric; a caller that knows the output puts its unit into that of the RMSE."""
-ENERGY = "mopgrnn"
-"""The model whose energy balance is drawn."""
-SHOWN = 20.0
-"""Length [s] of a benchmark's run that is drawn sample by sample; the rest is in the errors' course."""
+ABREAST = 4
+"""Most panels of the errors side by side."""
 COURSE = 200
 """Points of the course of the errors over the whole run."""
 
 
+@dataclass(frozen=True)
+class BalanceRun:
+    """A balance along a free run: its name, the unit of its rate, and its residuals ``(n,)``, measured and model's."""
+
+    name: str
+    unit: str
+    measured: Array
+    model: Array
+
+
 def free_run(
     t: Array,
-    x: Array,
+    measured: Array,
     predictions: Mapping[str, Array],
     u: Array,
     *,
-    states: Sequence[Signal],
+    signals: Sequence[Signal],
     inputs: Sequence[Signal],
-    energy_measured: Array,
-    energy_model: Array,
+    balances: Sequence[BalanceRun] = (),
+    hybrid: str = "mopgrnn",
     title: str = "",
     band: Mapping[str, tuple[Array, Array]] | None = None,
 ) -> Figure:
-    """A free run and the measurement, with the energy balances (the paper's Fig. 6).
+    """A free run and the measurement, with the balances (the paper's Fig. 6).
 
     Args:
         t: Times ``(n,)`` [s].
-        x: Measured (smoothed) states ``(n, n_x)``.
-        predictions: States ``(n, n_x)`` of each model's free run; NaN during the warm-up.
+        measured: Measured (smoothed) states, and outputs that are none of them ``(n, n_s)``; NaN where not measured.
+        predictions: The same of each model's free run; NaN during the warm-up.
         u: Inputs ``(n, n_u)``, held between samples.
-        states: Signals of ``x``.
+        signals: Signals of ``measured``.
         inputs: Signals of ``u``.
-        energy_measured: Energy balance of the measured system, ``(n,)`` [W].
-        energy_model: Energy balance of the MOPGRNN, ``(n,)`` [W].
+        balances: Balances of the measured system and of the hybrid. Default: none.
+        hybrid: The model whose balances and band are drawn. Default: the MOPGRNN.
         title: Title. Default: none.
-        band: Lower and upper end ``(n,)`` of the hybrid's band by the name of a state. Default: none.
+        band: Lower and upper end ``(n,)`` of the hybrid's band by the name of a signal. Default: none.
 
     Raises:
         InputError: If shapes do not fit.
@@ -77,44 +83,51 @@ def free_run(
     Example:
         >>> t, x, u, power = np.array([0.0, 0.1]), np.zeros((2, 2)), np.zeros((2, 1)), np.zeros(2)
         >>> states, inputs = (Signal("q", "m"), Signal("v", "m/s")), (Signal("F", "N"),)
-        >>> figure = free_run(t, x, {"mopgrnn": x}, u, states=states, inputs=inputs,
-        ...                   energy_measured=power, energy_model=power)
+        >>> energy = BalanceRun("energy", "W", power, power)
+        >>> figure = free_run(t, x, {"mopgrnn": x}, u, signals=states, inputs=inputs, balances=[energy])
         >>> len(figure.axes)
         5
     """
-    t = np.asarray(t, dtype=float)
-    balances = [checked("energy balance", e, len(t)) for e in (energy_measured, energy_model)]
-    gap = np.abs(balances[1] - balances[0])
-    heights = [1.6] * len(states) + [0.9] * len(inputs) + [1.2, 0.9]
-    figure, panels = new_column(heights, title=title)
-    _states(panels, t, x, predictions, states)
-    for ax, signal in zip(panels, states, strict=False):
+    t, n = np.asarray(t, dtype=float), len(signals)
+    figure, panels = new_column([1.6] * n + [0.9] * len(inputs) + [1.2, 0.9] * len(balances), title=title)
+    _signals(panels, t, measured, predictions, signals)
+    ink = colour(hybrid)
+    for ax, signal in zip(panels, signals, strict=False):
         if band and signal.name in band:
             low, high = (checked("band", end, len(t)) for end in band[signal.name])
             limits = ax.get_ylim()
-            ax.fill_between(t, low, high, color=colour(ENERGY), alpha=0.2, linewidth=0, label="90 % band")
+            ax.fill_between(t, low, high, color=ink, alpha=0.2, linewidth=0, label="90 % band")
             ax.set_ylim(limits)
-    plot_inputs(panels[len(states) : -2], t, checked("u", u, len(t), len(inputs)), inputs)
-    panels[-2].plot(t, balances[0], **(line_style("measured") | {"linewidth": 1.0}))
-    panels[-2].plot(t, balances[1], **line_style(ENERGY))
-    panels[-2].set_ylabel("balance\n" r"$\Delta E$ [W]")
-    panels[-1].fill_between(t, gap, color=colour(ENERGY), alpha=0.35, linewidth=0)
-    panels[-1].plot(t, gap, color=colour(ENERGY), linewidth=0.8)
-    panels[-1].set_ylabel("violation\n" r"$\Delta$ [W]")
+    below = panels[n + len(inputs) :]
+    plot_inputs(panels[n : n + len(inputs)], t, checked("u", u, len(t), len(inputs)), inputs)
+    for balance, above, under in zip(balances, below[::2], below[1::2], strict=True):
+        name = plain(balance.name)
+        one, other = (checked(f"balance {name}", e, len(t)) for e in (balance.measured, balance.model))
+        above.plot(t, one, **(line_style("measured") | {"linewidth": 1.0}))
+        above.plot(t, other, **line_style(hybrid))
+        above.set_ylabel(f"{name},\nresidual [{balance.unit}]")
+        gap = np.abs(other - one)
+        under.fill_between(t, gap, color=ink, alpha=0.35, linewidth=0)
+        under.plot(t, gap, color=ink, linewidth=0.8)
+        under.set_ylabel(f"violation\n[{balance.unit}]")
     finish_column(figure, panels, columns=6)
     return figure
 
 
-def _states(
-    panels: Sequence[Axes], t: Array, x: Array, predictions: Mapping[str, Array], states: Sequence[Signal]
+def _signals(
+    panels: Sequence[Axes],
+    t: Array,
+    values: Array,
+    predictions: Mapping[str, Array],
+    signals: Sequence[Signal],
 ) -> None:
-    measured = checked("x", x, len(t), len(states))
-    runs = {m: checked(f"free run of {m}", values, len(t), len(states)) for m, values in predictions.items()}
-    for i, (ax, signal) in enumerate(zip(panels, states, strict=False)):
+    measured = checked("measured", values, len(t), len(signals))
+    runs = {m: checked(f"free run of {m}", run, len(t), len(signals)) for m, run in predictions.items()}
+    for i, (ax, signal) in enumerate(zip(panels, signals, strict=False)):
         ax.plot(t, measured[:, i], **(line_style("measured") | {"linewidth": 2.2, "alpha": 0.85}))
         for model, run in runs.items():
             ax.plot(t, run[:, i], **line_style(model))
-        low, high = measured[:, i].min(), measured[:, i].max()
+        low, high = np.nanmin(measured[:, i]), np.nanmax(measured[:, i])
         room = 0.6 * max(high - low, 1e-9)  # a model that runs away must not flatten the others
         bottom, top = ax.get_ylim()
         ax.set_ylim(max(bottom, low - room), min(top, high + room))
@@ -123,16 +136,16 @@ def _states(
 
 def errors_bar(
     errors: Mapping[str, Mapping[str, float | None]],
+    metrics: Mapping[str, str],
     *,
     spread: Mapping[str, Mapping[str, float]] | None = None,
-    metrics: Mapping[str, str] = METRICS,
 ) -> Figure:
     """Errors of the models, one panel a metric, with the fitted prior as the line to beat.
 
     Args:
         errors: ``{model: {metric: value}}``; a missing value or None leaves a gap.
+        metrics: Axis label with unit by metric name.
         spread: Standard deviation over the trained networks in the same form. Default: none drawn.
-        metrics: Axis label with unit by metric name. Default: the three of ``results.json``.
 
     Returns:
         The figure. A bar far above all others is cut and marked; its number stays.
@@ -141,15 +154,21 @@ def errors_bar(
         InputError: If no model has any of the metrics.
 
     Example:
-        >>> len(errors_bar({"phy": {"e_sim_s": 0.2}, "mopgrnn": {"e_sim_s": 0.1}}).axes)
+        >>> values = {"phy": {"level": 0.2}, "mopgrnn": {"level": 0.1}}
+        >>> len(errors_bar(values, {"level": "RMSE of level [m]"}).axes)
         1
     """
     shown = [m for m in metrics if any(values.get(m) is not None for values in errors.values())]
     if not shown:
         raise InputError(f"plot of the errors: no model has any of {', '.join(metrics)}")
-    figure, axes = new_figure(1, len(shown), size=(max(5.0, 3.4 * len(shown)), 4.2))
+    columns = min(len(shown), ABREAST)
+    rows = math.ceil(len(shown) / columns)
+    figure, axes = new_figure(rows, columns, size=(max(5.0, 3.4 * columns), 0.6 + 3.6 * rows))
     line = f"{name_of('phy')}: the line to beat"
-    for ax, metric in zip(axes[0], shown, strict=True):
+    panels: list[Axes] = axes.ravel().tolist()
+    for ax in panels[len(shown) :]:
+        ax.set_visible(False)
+    for ax, metric in zip(panels, shown, strict=False):
         found = {model: v.get(metric) for model, v in errors.items()}
         values = {model: value for model, value in found.items() if value is not None}
         bars = {model: (spread or {}).get(model, {}).get(metric, 0.0) for model in values}
@@ -230,62 +249,98 @@ def benchmark_run(
     predictions: Mapping[str, Array],
     u: Array,
     *,
-    output: Signal,
+    outputs: Sequence[Signal],
     inputs: Sequence[Signal],
-    unit: str,
-    scale: float,
+    units: Sequence[tuple[str, float]] | None = None,
+    shown: float = math.inf,
     title: str = "",
     names: Mapping[str, str] | None = None,
 ) -> Figure:
-    """A free run over a recording: output, errors, inputs, and the errors' course over the whole run.
+    """A free run over a recording: outputs, errors, inputs, and the errors' course over the whole run.
 
-    ``y`` and each model's run are ``(n,)``; ``scale`` errors of ``unit`` are an SI unit. ``names`` says how models are
-    to be called in the legend, where not as everywhere. The first 20 s of a longer run are drawn; the last row has all
-    of it.
+    Args:
+        t: Times ``(n,)`` [s].
+        y: Measured outputs ``(n, n_y)``; NaN where a sample is missing.
+        predictions: Outputs ``(n, n_y)`` of each model.
+        u: Inputs ``(n, n_u)``, held between samples.
+        outputs: Signals of ``y``.
+        inputs: Signals of ``u``.
+        units: Unit of each output's error, and how many of it are one of the output's. Default: the output's own.
+        shown: Length [s] of the run's start that is drawn sample by sample; the rest is in the errors' course.
+            Default: all of it.
+        title: Title. Default: none.
+        names: How models are called in the legend, where not as everywhere.
+
+    Raises:
+        InputError: If shapes do not fit.
     """
-    t = np.asarray(t, dtype=float)
-    y, u = checked("y", y, len(t)), checked("u", u, len(t), len(inputs))
-    runs = {name: checked(f"free run of {name}", run, len(t)) for name, run in predictions.items()}
-    heights = [1.8, 1.3, *[0.8] * len(inputs), 1.3]
+    t, n_y = np.asarray(t, dtype=float), len(outputs)
+    y, u = checked("y", y, len(t), n_y), checked("u", u, len(t), len(inputs))
+    runs = {name: checked(f"free run of {name}", run, len(t), n_y) for name, run in predictions.items()}
+    heights = [1.8, 1.3] * n_y + [0.8] * len(inputs) + [1.3] * n_y
     figure, axes = new_figure(
         len(heights), 1, heights=heights, title=title, size=(10, 0.8 + 1.3 * sum(heights))
     )
-    column, near = list(axes[:, 0]), t <= t[0] + SHOWN
-    column[0].plot(t[near], y[near], **(line_style("measured") | {"linewidth": 2.2, "alpha": 0.85}))
-    room = 0.3 * max(float(np.ptp(y[near])), 1e-9)
-    for name, run in runs.items():
-        label = (names or {}).get(name, name_of(name))
-        column[0].plot(t[near], run[near], **(line_style(name) | {"label": label}))
-        column[1].plot(t[near], scale * (run - y)[near], color=colour(name), linewidth=1.0, label=label)
-        at, course = _course(t, scale * (run - y))
-        column[-1].plot(at, course, color=colour(name), linewidth=1.4)
-    column[0].set_ylim(y[near].min() - room, y[near].max() + room)  # a model that runs away flattens no other
-    worst = [float(np.abs(scale * (run - y)[near]).max()) for run in runs.values()]
-    best = min((value for value in worst if np.isfinite(value)), default=0.0)
-    if best > 0:
-        column[1].set_ylim(-1.5 * best, 1.5 * best)
-    column[-1].set_yscale("log")
-    column[0].set_ylabel(axis_label(output))
-    column[1].set_ylabel(f"error [{unit}]")
-    column[-1].set_ylabel(f"RMS error [{unit}]")
-    plot_inputs(column[2:-1], t[near], u[near], inputs)
-    for ax, values in zip(column[2:-1], u[near].T, strict=True):
+    column, near = list(axes[:, 0]), t <= t[0] + shown
+    above, between, below = column[: 2 * n_y], column[2 * n_y : -n_y], column[-n_y:]
+    for j, (signal, (unit, scale)) in enumerate(
+        zip(outputs, units or [(s.unit, 1.0) for s in outputs], strict=True)
+    ):
+        name = axis_label(signal).rpartition(" [")[0]
+        of_one = {model: run[:, j] for model, run in runs.items()}
+        _output(above[2 * j : 2 * j + 2], below[j], t, y[:, j], of_one, near, scale, names or {})
+        above[2 * j].set_ylabel(axis_label(signal))
+        above[2 * j + 1].set_ylabel(f"error of\n{name} [{unit}]")
+        below[j].set_ylabel(f"RMS error of\n{name} [{unit}]")
+    plot_inputs(between, t[near], u[near], inputs)
+    for ax, values in zip(between, u[near].T, strict=True):
         size = max(float(np.abs(values).max()), 1e-9)
         if np.ptp(values) < 1e-6 * size:  # a constant input is drawn as one, not its rounding
             ax.set_ylim(float(values.mean()) - size, float(values.mean()) + size)
     for ax in column:
         ax.margins(x=0)
-    column[-2].set_xlabel("time [s]")
+    column[-n_y - 1].set_xlabel("time [s]")
     column[-1].set_xlabel("time [s], the whole run")
     figure.align_ylabels(column)
     shared_legend(figure, columns=6)
     return figure
 
 
+def _output(
+    above: Sequence[Axes],
+    below: Axes,
+    t: Array,
+    y: Array,
+    runs: Mapping[str, Array],
+    near: NDArray[np.bool_],
+    scale: float,
+    names: Mapping[str, str],
+) -> None:
+    """One output of a benchmark's run: itself and its errors at first, and the course of the errors."""
+    signal, error = above
+    signal.plot(t[near], y[near], **(line_style("measured") | {"linewidth": 2.2, "alpha": 0.85}))
+    for name, run in runs.items():
+        label = names.get(name, name_of(name))
+        signal.plot(t[near], run[near], **(line_style(name) | {"label": label}))
+        error.plot(t[near], scale * (run - y)[near], color=colour(name), linewidth=1.0, label=label)
+        at, course = _course(t, scale * (run - y))
+        below.plot(at, course, color=colour(name), linewidth=1.4)
+    low, high = np.nanmin(y[near]), np.nanmax(y[near])
+    room = 0.3 * max(float(high - low), 1e-9)
+    signal.set_ylim(low - room, high + room)  # a model that runs away flattens no other
+    with np.errstate(over="ignore", invalid="ignore"):
+        worst = [float(np.abs(scale * (run - y))[near & np.isfinite(y)].max()) for run in runs.values()]
+    best = min((value for value in worst if np.isfinite(value)), default=0.0)
+    if best > 0:
+        error.set_ylim(-1.5 * best, 1.5 * best)
+    below.set_yscale("log")
+
+
 def _course(t: Array, error: Array) -> tuple[Array, Array]:
     """Root mean square of the error over short parts of the run, at their middles."""
     parts = np.array_split(np.arange(len(t)), min(COURSE, max(1, len(t) // 5)))
-    rms = np.array([np.sqrt(np.mean(error[part] ** 2)) for part in parts])
+    with np.errstate(over="ignore", invalid="ignore"):
+        rms = np.array([np.sqrt(np.nanmean(error[part] ** 2)) for part in parts])
     return np.array([t[part].mean() for part in parts]), np.maximum(rms, 1e-12)
 
 

@@ -60,7 +60,7 @@ def closed_loops(
     inputs: Sequence[Signal],
     limits: tuple[Sequence[float] | Array, Sequence[float] | Array] | None = None,
 ) -> Figure:
-    """The same task under each controller: states with their reference, error of the positions, inputs.
+    """The same task under each controller: states with their reference, tracking errors, inputs.
 
     Args:
         title: The task in one line.
@@ -79,16 +79,15 @@ def closed_loops(
         >>> states, inputs = (Signal("q", "m"), Signal("v", "m/s")), (Signal("F", "N"),)
         >>> figure = closed_loops("Rest", t, x, {"prior": Motion(t, x, u)}, states=states, inputs=inputs)
         >>> len(figure.axes)
-        4
+        5
     """
     if not results:
         raise InputError(f"plot of the closed loops {title!r}: there is no controller to draw")
     t = np.asarray(t, dtype=float)
     target = checked("reference", reference, len(t), len(states))
-    n_x, n_q = len(states), max(1, len(states) // 2)
-    heights = [1.6] * n_x + [1.1] * (n_q + len(inputs))
-    figure, panels = new_column(heights, height=1.15, title=title)
-    errors, below = panels[n_x : n_x + n_q], panels[n_x + n_q :]
+    n_x = len(states)
+    figure, panels = new_column([1.6] * n_x + [1.1] * (n_x + len(inputs)), height=1.15, title=title)
+    errors, below = panels[n_x : 2 * n_x], panels[2 * n_x :]
     for controller, loop in results.items():
         x = checked(f"x of {controller}", loop.x, len(loop.t), n_x)
         u = checked(f"u of {controller}", loop.u, len(loop.t), len(inputs))
@@ -101,7 +100,7 @@ def closed_loops(
     for ax, values, signal in zip(panels, target.T, states, strict=False):
         ax.plot(t, values, **(line_style("reference") | {"zorder": 4}))
         ax.set_ylabel(axis_label(signal))
-    for ax, signal in zip(errors, states, strict=False):
+    for ax, signal in zip(errors, states, strict=True):
         ax.axhline(0.0, color=FAINT, linewidth=0.8)
         ax.set_ylabel(f"error of\n{axis_label(signal)}")
     for i, ax in enumerate(below):
@@ -166,7 +165,7 @@ CONTROLLERS: Mapping[str, tuple[str, str, str, bool]] = MappingProxyType(
         "prior": (name_of("prior"), "prior", "o", True),
         "prior_observer": ("prior with observer", "prior", "s", False),
         "hybrid": (name_of("hybrid"), "hybrid", "o", True),
-        "hybrid_observer": ("MOPGRNN with observer", "hybrid", "s", False),
+        "hybrid_observer": (name_of("hybrid_observer"), "hybrid", "s", False),
         "oracle": ("oracle, measuring", "oracle", "D", True),
         "oracle_state": ("oracle, true state", "oracle", "D", False),
     }

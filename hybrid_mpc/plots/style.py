@@ -38,9 +38,9 @@ _ROLES = {
     "prior_observer": ("#56B4E9", "prior with observer"),
     "rnn": ("#E69F00", "RNN"),
     "pgrnn": ("#009E73", "PGRNN"),
-    "mopgrnn": ("#D55E00", "MOPGRNN (hybrid)"),
-    "hybrid": ("#D55E00", "MOPGRNN (hybrid)"),
-    "hybrid_observer": ("#E69F00", "MOPGRNN with observer"),
+    "mopgrnn": ("#D55E00", "MOPGRNN"),
+    "hybrid": ("#D55E00", "hybrid"),
+    "hybrid_observer": ("#E69F00", "hybrid with observer"),
     "oracle": ("#CC79A7", "oracle"),
     "oracle_state": ("#009E73", "oracle, true state"),
     "train": ("#56B4E9", "training"),
@@ -75,7 +75,7 @@ def name_of(role: str) -> str:
 
     Example:
         >>> name_of("mopgrnn")
-        'MOPGRNN (hybrid)'
+        'MOPGRNN'
     """
     return NAMES.get(role, plain(role))
 

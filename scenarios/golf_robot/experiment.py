@@ -6,7 +6,7 @@ from pathlib import Path
 
 from hybrid_mpc import Dataset, DataSpec, load_trajectories
 from scenarios.golf_robot.data import SIZES, make_data, windows
-from scenarios.golf_robot.nominal import INPUTS, OUTPUTS, STATES
+from scenarios.golf_robot.prior import GolfRobotPrior
 from scenarios.paper.experiment import Effort, Experiment
 from scenarios.paper.table import Claim
 
@@ -28,7 +28,7 @@ DATA = DataSpec(
 def runs(data_set: str, seed: int, folder: Path) -> Dataset:
     """All recordings of a data set; their files go into ``folder``."""
     files = make_data(folder, seed, "full", data_set=data_set)
-    return load_trajectories(files, DATA, outputs=OUTPUTS, inputs=INPUTS, states=STATES)
+    return load_trajectories(files, GolfRobotPrior, DATA)
 
 
 def claims(data_set: str, rnn: float, pgrnn: float, mopgrnn: float) -> tuple[Claim, ...]:

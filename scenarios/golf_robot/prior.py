@@ -6,7 +6,7 @@ from typing import Any
 
 import casadi as ca
 
-from hybrid_mpc import MechanicalPrior
+from hybrid_mpc import MechanicalPrior, OperatingPoint
 from scenarios.golf_robot.nominal import GEAR, INPUTS, OUTPUTS, PARAMETERS, STATES
 
 
@@ -26,6 +26,7 @@ class GolfRobotPrior(MechanicalPrior):
     inputs = INPUTS
     outputs = OUTPUTS
     parameters = PARAMETERS
+    operating_point = OperatingPoint((0.0, 0.0), (0.0,))  # it hangs
 
     def mass_matrix(self, q: Any, p: Any) -> Any:
         """Inertia about the axis J [kg m^2]."""

@@ -143,8 +143,9 @@ def shown_free_run(
 
 def _balances(ax: Axes, t: Any, run: Mapping[str, Any], model: str) -> None:
     """Energy balances of the measured system and of the model, and their distance."""
-    of_system = checked("energy balance", run["energy_measured_w"], len(t))
-    of_model = checked("energy balance", run["energy_model_w"], len(t))
+    of_system, of_model = (
+        checked("energy balance", run[key][:, 0], len(t)) for key in ("balances", "balances_hat")
+    )
     tint, _, _, name = LOOKS.get(model, (colour(model), "-", "", model))
     ax.plot(t, of_system, color="#000000", linewidth=1.0, label=r"$\Delta E_S$, measured")
     ax.plot(t, of_model, color=tint, linewidth=1.0, label=rf"$\Delta E_M$, {name}")

@@ -18,10 +18,11 @@ from torch import Tensor
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.dataset import Windows, check_rates, cut_windows
-from hybrid_mpc.identify.evaluate import free_runs, score
+from hybrid_mpc.identify.evaluate import free_runs
 from hybrid_mpc.identify.simulation import MAX_SUBSTEPS, rest_of
 from hybrid_mpc.identify.step import Step, rk4
 from hybrid_mpc.machine.mechanical import MechanicalPrior
+from scenarios.paper.jobs import figures_of
 
 # Libraries of candidate terms, and the model that a sparse regression over them gives, as a step (torch).
 
@@ -368,7 +369,7 @@ def _scored(
         with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges is scored as infinite
             runs = free_runs(step, prior, list(validation) * len(stable), warm)
             for k, i in enumerate(stable):
-                errors[i] = score(runs[k * len(validation) : (k + 1) * len(validation)]).e_sim_s
+                errors[i] = figures_of(runs[k * len(validation) : (k + 1) * len(validation)])["e_sim_s"]
     return [
         _Fit(
             SindyCandidate(library.name, threshold, int(np.count_nonzero(c)), error, float(errors[i])),

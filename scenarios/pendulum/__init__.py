@@ -42,7 +42,7 @@ scenario = PaperScenario(
     tasks=TASKS,
     experiment=EXPERIMENT,
     budgets={
-        "quick": Budget(hidden=16, networks=2, teacher_steps=1000, free_run_steps=100, seeds=2),
+        "quick": Budget(hidden=16, networks=2, teacher_steps=200, free_run_steps=200, seeds=2),
         "full": Budget(
             hidden=32, networks=4, teacher_steps=2500, free_run_steps=800, seeds=10, oracle_seeds=10
         ),

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import casadi as ca
 
-from hybrid_mpc import MechanicalPrior, Parameter, Signal
+from hybrid_mpc import MechanicalPrior, OperatingPoint, Parameter, Signal
 
 FRICTION_SPEED = 0.1
 """Speed [rad/s] over which dry friction changes its sign, about the noise of the measured speed."""
@@ -35,6 +35,7 @@ class TorquePendulumPrior(MechanicalPrior):
         Parameter("phi_0", 0.0, "rad", -0.1, 0.1, "angle of the encoder's zero from hanging down"),
         Parameter("k_u", 1.0, "-", 0.5, 1.2, "true over commanded torque"),
     )
+    operating_point: ClassVar[OperatingPoint | None] = OperatingPoint((0.0, 0.0), (0.0,))  # it hangs
 
     def mass_matrix(self, q: Any, p: Any) -> Any:
         """Inertia about the axis J [kg m^2]."""

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from machine_signals import machine
 from scipy.io import savemat
 
 from hybrid_mpc import DataSpec, InputError, Signal, Window, load_trajectories, write_csv
@@ -11,7 +12,7 @@ from hybrid_mpc.data.excitation import check_excitation
 from hybrid_mpc.data.files import name_and_unit
 from hybrid_mpc.data.recording import censored_of, read_recording
 from hybrid_mpc.data.scales import noise_of, time_scale
-from hybrid_mpc.data.trajectories import Trajectory, line_mean, to_grid
+from hybrid_mpc.data.trajectories import ROLES, Trajectory, line_mean, to_grid
 
 SPEC = DataSpec("t", ("u",), ("y",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.2)
 U, Y, W = Signal("u", "V"), Signal("y", "m", -100, 100), Signal("wind", "m/s", -50, 50)
@@ -26,9 +27,9 @@ def wrote(tmp_path, name="run.csv", **columns):
     return write_csv(tmp_path / name, {**GOOD, **columns})
 
 
-def read(files, spec=SPEC, **more):
+def read(files, spec=SPEC, needed=ROLES, **more):
     files = files if isinstance(files, list) else [files]
-    return load_trajectories(files, spec, **{**GIVEN, **more})
+    return load_trajectories(files, machine(**{**GIVEN, **more}), spec, needed=needed)
 
 
 def problems(files, spec=SPEC, **more):
@@ -193,7 +194,7 @@ def test_blank_cells_of_all_formats(tmp_path):
         lines = [*text[:301], ",".join([*cells[:2], cell, *cells[3:]]), *text[302:]]
         (tmp_path / name).write_text("\n".join(lines))
     for file in sorted(tmp_path.iterdir()):
-        recording = read_recording(file, SPEC, **GIVEN)
+        recording = read_recording(file, machine(**GIVEN), SPEC)
         assert np.flatnonzero(np.isnan(recording.y[:, 0])).tolist() == [300], file.name
         assert [f.kind for f in recording.findings] == ["missing"]
 
@@ -229,7 +230,7 @@ def test_wrapped_angles_with_holes_count_on(tmp_path):
     angle = 3 * T
     wrapped = blank((angle + np.pi) % (2 * np.pi) - np.pi, np.arange(600) % 5 == 2)
     spec, turns = replace(SPEC, outputs=("y",)), {**GIVEN, "outputs": (Signal("phi", "rad", periodic=True),)}
-    recording = read_recording(wrote(tmp_path, y=wrapped), spec, **turns)
+    recording = read_recording(wrote(tmp_path, y=wrapped), machine(**turns), spec)
     known = np.isfinite(wrapped)
     np.testing.assert_allclose(recording.y[known, 0], angle[known], atol=1e-8)  # ten digits
     assert sorted(f.kind for f in recording.findings) == ["missing", "wrapped"]
@@ -488,7 +489,7 @@ def test_separators_and_decimal_commas(tmp_path, separator, comma):
         lines = [[cell.replace(".", ",") for cell in line] for line in lines]
     other = tmp_path / "other.csv"
     other.write_text("\ufeff" + "\r\n".join(separator.join(line) for line in lines), encoding="utf-8")
-    a, b = (read_recording(file, SPEC, **GIVEN) for file in (plain, other))
+    a, b = (read_recording(file, machine(**GIVEN), SPEC) for file in (plain, other))
     for name in ("t", "u", "y"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
@@ -519,6 +520,23 @@ def test_names_with_units_in_brackets(tmp_path):
     np.testing.assert_allclose(whole.y, plain.y, atol=1e-9)  # its own name comes first
     write_csv(tmp_path / "run.csv", {"t": T, "u": GOOD["u"], "y [m]": GOOD["y"], "y [mm]": T})
     assert "column 'y' may be 'y [m]' or 'y [mm]'" in problems(tmp_path / "run.csv")[0]
+
+
+def test_units_in_brackets_are_those_of_their_signals(tmp_path):
+    signals = {"inputs": (Signal("duty", "-"),), "outputs": (Signal("flow", "m^3/s"),)}
+    write_csv(tmp_path / "run.csv", {"t": T, "u [%]": GOOD["u"], "y [l/min]": GOOD["y"]})
+    (plain,), (whole,) = read(wrote(tmp_path, "plain.csv")).whole, read(tmp_path / "run.csv", **signals).whole
+    np.testing.assert_allclose(whole.u, plain.u / 100, atol=1e-12)
+    np.testing.assert_allclose(whole.y, plain.y / 6e4, atol=1e-12)
+    write_csv(
+        tmp_path / "run.csv", {"t": T, "u [1]": GOOD["u"], "y (1)": GOOD["y"]}
+    )  # MATLAB's first columns
+    np.testing.assert_allclose(read(tmp_path / "run.csv").whole[0].y, plain.y, atol=1e-9)
+    write_csv(tmp_path / "run.csv", {"t": T, "u [V]": GOOD["u"], "y [kg]": GOOD["y"]})
+    (told,) = problems(tmp_path / "run.csv")
+    assert "column 'y [kg]' is in kg, which is no unit of y [m]" in told
+    factor = replace(SPEC, units={"y": 2.0})
+    np.testing.assert_allclose(read(tmp_path / "run.csv", factor).whole[0].y, 2 * plain.y, atol=1e-9)
 
 
 def test_names_and_units():

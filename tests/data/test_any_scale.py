@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from machine_signals import machine
 
 from hybrid_mpc import DataSpec, InputError, Signal, Window, load_trajectories
 from hybrid_mpc.data.excitation import check_excitation, excitation_of
@@ -57,9 +58,7 @@ def read(columns, spec, states, outputs=OUTPUTS, needed=()):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "run.npz"
         np.savez(path, **columns)
-        return load_trajectories(
-            [path], spec, inputs=(U,), outputs=outputs, disturbances=(W,), states=states, needed=needed
-        )
+        return load_trajectories([path], machine(outputs, (U,), states, (W,)), spec, needed=needed)
 
 
 def same_pieces(one, two):

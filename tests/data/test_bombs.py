@@ -60,14 +60,14 @@ def test_two_million_rows_are_read(tmp_path):
     path = tmp_path / "long.csv"
     rows = np.c_[t, np.round(np.cos(3 * t), 4), np.round(np.sin(3 * t), 4)]
     np.savetxt(path, rows, delimiter=",", header="time_s,tau,phi", comments="", fmt=("%.3f", "%.4f", "%.4f"))
-    table = read_recording(path, bombs.SPEC, **bombs.SIGNALS)
+    table = read_recording(path, bombs.SIGNALS, bombs.SPEC)
     assert table.y.shape == (m, 1)
     np.testing.assert_array_equal(table.t, np.round(t, 3))
 
 
 def refused(path, match):
     with pytest.raises(InputError, match=match):
-        read_recording(path, bombs.SPEC, **bombs.SIGNALS)
+        read_recording(path, bombs.SIGNALS, bombs.SPEC)
 
 
 @pytest.mark.parametrize("ending", ["csv", "npz", "mat"])

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from machine_signals import machine
 
 from hybrid_mpc import DataSpec, InputError, Signal, load_scenario, load_trajectories, write_csv
 from hybrid_mpc.data.recording import read_recording
@@ -28,7 +29,7 @@ def quantised(y):
 
 def findings(tmp_path, phi, tau=TAU, signals=SIGNALS, name="run", spec=SPEC, t=T):
     file = write_csv(tmp_path / f"{name}.csv", {"t": t, "tau": tau, "phi": phi})
-    return load_trajectories([file], spec, **signals).findings
+    return load_trajectories([file], machine(**signals), spec).findings
 
 
 SENSORS = {"encoder": quantised, "noisy": lambda y: y + NOISE, "exact": np.copy}
@@ -79,7 +80,7 @@ def test_a_sensor_that_stops_at_rest_is_told_by_the_inputs(tmp_path):
     # a file that stands still from its begin to its end, among others that move
     good = write_csv(tmp_path / "good.csv", {"t": T, "tau": TAU, "phi": quantised(SWING)})
     dead = write_csv(tmp_path / "dead.csv", {"t": T, "tau": TAU, "phi": 0 * T + 0.3})
-    found = load_trajectories([good, dead], SPEC, **SIGNALS).findings
+    found = load_trajectories([good, dead], machine(**SIGNALS), SPEC).findings
     assert [(one.kind, one.file, one.count) for one in found] == [("frozen", "dead.csv", len(T))]
 
 
@@ -103,7 +104,7 @@ def test_wrapped_angles_count_on_where_the_signal_is_periodic(tmp_path):
     assert one.start == pytest.approx(T[1 + np.argmax(np.abs(np.diff(wrapped)) > np.pi)])
     assert f"jumps {jumps} times by about a full turn" in str(one)
     file = tmp_path / "run.csv"
-    read = read_recording(file, SPEC, outputs=TURNS["outputs"], inputs=TURNS["inputs"])
+    read = read_recording(file, machine(**TURNS), SPEC)
     np.testing.assert_allclose(read.y[:, 0], turning, atol=1e-8)  # ten digits in the file
     # the same in degrees, and from 0 to 360
     spec = replace(SPEC, units={"phi": "deg"})
@@ -125,13 +126,13 @@ def test_angles_that_count_on_are_left_as_they_are(tmp_path):
         phi = speed * t + 0.1 * np.sin(t)
         spec = replace(SPEC, smoothing=0.2)
         assert findings(tmp_path, phi, t=t, tau=TAU[::2], signals=fast, spec=spec) == ()
-        read = read_recording(tmp_path / "run.csv", SPEC, outputs=fast["outputs"], inputs=fast["inputs"])
+        read = read_recording(tmp_path / "run.csv", machine(**fast), SPEC)
         np.testing.assert_allclose(read.y[:, 0], phi, rtol=1e-9)
     # an angle that trembles about where it is wrapped, and one that jumps by a turn over a gap in time
     upright = np.pi + 0.01 * np.sin(9 * T)
     (one,) = findings(tmp_path, (upright + np.pi) % (2 * np.pi) - np.pi, signals=TURNS)
     assert one.kind == "wrapped"
-    (whole,) = load_trajectories([tmp_path / "run.csv"], SPEC, **TURNS).whole
+    (whole,) = load_trajectories([tmp_path / "run.csv"], machine(**TURNS), SPEC).whole
     np.testing.assert_allclose(np.ptp(whole.y), 0.02, rtol=1e-2)
     gap = np.r_[T[:900], T[1000:]]
     jumping = np.where(gap < 9.5, SWING[0] + gap, gap - 6.28)
@@ -173,7 +174,7 @@ def test_all_files_are_told_at_once(tmp_path):
         write_csv(tmp_path / "f.csv", {"t": T, "tau": TAU, "phi": 0.9 * np.rad2deg(SWING)}),
     ]
     with pytest.raises(InputError) as caught:
-        load_trajectories(files, SPEC, **SIGNALS)
+        load_trajectories(files, machine(**SIGNALS), SPEC)
     told = caught.value.problems
     words = ("a.csv: column 'phi' jumps", "b.csv: row 502", "c.csv: row 3", "d.csv: there is no such file",
              "f.csv: row")  # fmt: skip
@@ -198,10 +199,9 @@ def test_nothing_is_doubted_about_real_recordings(machine):
     assert files
     scenario = load_scenario(machine)
     prior = scenario.prior()
-    given = {"outputs": prior.outputs, "inputs": prior.inputs, "states": prior.states, "needed": ()}
-    assert load_trajectories(files, scenario.data, **given).findings == ()
+    assert load_trajectories(files, prior, scenario.data, needed=()).findings == ()
     for file in files:  # alone, too
-        assert load_trajectories([file], scenario.data, **given).findings == ()
+        assert load_trajectories([file], prior, scenario.data, needed=()).findings == ()
 
 
 @pytest.mark.full
@@ -210,5 +210,4 @@ def test_nothing_is_doubted_about_simulated_recordings(tmp_path, machine):
     scenario = load_scenario(machine)
     prior = scenario.prior()
     files = scenario.make_data(tmp_path, 0, "quick")
-    given = {"outputs": prior.outputs, "inputs": prior.inputs, "states": prior.states}
-    assert load_trajectories(files, scenario.data, **given).findings == ()
+    assert load_trajectories(files, prior, scenario.data).findings == ()

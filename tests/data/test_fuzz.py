@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from machine_signals import machine
 from recording_bombs import GOOD, SIGNALS, SPEC
 from scipy.io import savemat
 
@@ -18,11 +19,7 @@ STRANGE = (
     0.0, -0.0, 5e-324, -1e-300, 1e-9, 1.0, 6.283, 1e9, -1e99, 1e101, 1e200, 1.7e308, np.inf, -np.inf, np.nan,
 )  # fmt: skip
 PHI = Signal("phi", "rad", periodic=True)
-ANY = {
-    "outputs": (PHI,),
-    "inputs": (Signal("torque", "N m"),),
-    "states": (PHI, Signal("phi_dot", "rad/s", -30, 30)),
-}
+ANY = machine((PHI,), (Signal("torque", "N m"),), (PHI, Signal("phi_dot", "rad/s", -30, 30)))
 
 
 def to_csv(columns):
@@ -58,7 +55,7 @@ def tried(ending, content, spec=SPEC, signals=SIGNALS):
         path = Path(folder) / f"run.{ending}"
         path.write_bytes(content)
         try:
-            data = load_trajectories([path], spec, **signals, needed=())
+            data = load_trajectories([path], signals, spec, needed=())
         except InputError as error:
             assert "run" in str(error)  # noqa: PT017  (both outcomes are right)
             assert len(str(error)) < 5000  # noqa: PT017

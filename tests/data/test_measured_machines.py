@@ -145,19 +145,15 @@ def files_of(machine, pattern=None):
     return found
 
 
-def signals(machine):
-    return {"inputs": machine.inputs, "outputs": machine.outputs, "disturbances": machine.disturbances}
-
-
 def read(machine, files, **more):
-    return load_trajectories(files, machine.spec, **signals(machine), states=machine.states, **more)
+    return load_trajectories(files, machine, machine.spec, **more)
 
 
 @pytest.mark.parametrize("name", MACHINES)
 def test_a_recording_is_read_as_it_is(name):
     machine = MACHINES[name]
     (file,) = files_of(machine)
-    recording = read_recording(file, machine.spec, **signals(machine))
+    recording = read_recording(file, machine, machine.spec)
     raw = pd.read_csv(file)
     assert len(recording.t) == len(raw) == machine.rows
     assert recording.dt == pytest.approx(machine.period, rel=0.02)  # loops of real computers

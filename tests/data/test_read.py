@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from machine_signals import machine
 from recording_bombs import GOOD, SIGNALS, SPEC, T
 from scipy.io import savemat
 from scipy.sparse import csc_array
@@ -45,19 +46,19 @@ def wrote(tmp_path, kind, columns):
 
 def refused(path, match, spec=SPEC, signals=SIGNALS):
     with pytest.raises(InputError, match=match) as caught:
-        read_recording(path, spec, **signals)
+        read_recording(path, signals, spec)
     assert path.name in str(caught.value)
 
 
 def test_the_numbers_are_those_that_were_written(tmp_path, kind):
     path = wrote(tmp_path, kind, MORE)
-    table = read_recording(path, SPEC, **SIGNALS)
+    table = read_recording(path, SIGNALS, SPEC)
     assert table.name == "run"
     for read, written in ((table.t, T), (table.u[:, 0], np.cos(T)), (table.y[:, 0], np.sin(T))):
         np.testing.assert_allclose(read, written, rtol=1e-9 if kind == "csv" else 0)  # CSV has ten digits
     first = path.read_bytes()
     assert wrote(tmp_path, kind, {**MORE, "note": 2 * T}).read_bytes() != first
-    assert read_recording(path, SPEC, **SIGNALS).sha256 != table.sha256
+    assert read_recording(path, SIGNALS, SPEC).sha256 != table.sha256
 
 
 def test_csv_is_written_whole_and_the_same_bytes(tmp_path):
@@ -118,7 +119,7 @@ def test_a_unit_is_proposed_where_it_would_explain_the_column(tmp_path, phi, mat
 
 @pytest.mark.parametrize(("name", "place", "row"), [("phi", 40, 42), ("time_s", 59, 61)])
 def test_an_absurd_value_is_named_where_its_signal_has_no_range(tmp_path, name, place, row):
-    free = {"outputs": (Signal("phi", "rad"),), "inputs": (Signal("torque", "N m"),)}
+    free = machine((Signal("phi", "rad"),), (Signal("torque", "N m"),))
     columns = {**GOOD, name: np.where(np.arange(60) == place, 1e307, GOOD[name])}
     match = rf"row {row}, column '{name}': 1e\+307 is outside the plausible range -1e\+100"
     refused(wrote(tmp_path, "csv", columns), match, signals=free)
@@ -158,7 +159,7 @@ def test_bad_vectors(tmp_path, vectors):
 
 def test_integers_singles_directions_and_a_sampling_time(tmp_path, vectors):
     columns = {"time_s": 0.01, "tau": np.arange(60, dtype=np.uint8)[None] % 3, "phi": np.float32(T)[:, None]}
-    table = read_recording(wrote(tmp_path, vectors, columns), SPEC, **SIGNALS)
+    table = read_recording(wrote(tmp_path, vectors, columns), SIGNALS, SPEC)
     assert table.u.dtype == table.y.dtype == np.float64
     np.testing.assert_array_equal(table.u[:4, 0], [0, 1, 2, 0])
     np.testing.assert_allclose(table.t, T, atol=1e-15)  # the same product
@@ -178,17 +179,17 @@ def test_objects_are_refused_and_never_loaded(tmp_path):
         refused(path, match)
     assert not (tmp_path / "ran").exists()
     np.savez(path, allow_pickle=True, **GOOD, log=trap)
-    assert read_recording(path, SPEC, **SIGNALS).y.shape == (60, 1)  # what nobody names is not touched
+    assert read_recording(path, SIGNALS, SPEC).y.shape == (60, 1)  # what nobody names is not touched
 
 
 def test_fields_of_structs(tmp_path):
     path = tmp_path / "run.mat"
     run = {**GOOD, "deep": {"phi": T}}
     savemat(path, {"run": run})
-    assert read_recording(path, SPEC, **SIGNALS).y.shape == (60, 1)
+    assert read_recording(path, SIGNALS, SPEC).y.shape == (60, 1)
     savemat(path, {"run": run, "old": {"phi": T}})
     refused(path, "column 'phi' may be 'run.phi' or 'old.phi'")
-    table = read_recording(path, replace(SPEC, outputs=("old.phi",)), **SIGNALS)
+    table = read_recording(path, SIGNALS, replace(SPEC, outputs=("old.phi",)))
     np.testing.assert_array_equal(table.y[:, 0], T)
     refused(path, "no column 'deep.*Not read are structs in structs", replace(SPEC, outputs=("deep",)))
     two = np.array([(1.0,), (2.0,)], dtype=[("phi", object)])
@@ -249,7 +250,7 @@ def test_damaged_csv_is_an_input_error_or_finite_increasing_data(place, removed,
         content = path.read_bytes()
         path.write_bytes(content[:place] + inserted + content[place + removed :])
         try:
-            table = read_recording(path, SPEC, **SIGNALS)
+            table = read_recording(path, SIGNALS, SPEC)
         except InputError as error:
             assert "run.csv" in str(error)  # noqa: PT017  (both outcomes are right)
             return
@@ -271,7 +272,7 @@ def test_damaged_vectors_are_an_input_error_or_what_was_written(tmp_path, vector
             damaged[place] = rng.integers(256)
         path.write_bytes(bytes(damaged))
         try:
-            table = read_recording(path, SPEC, **SIGNALS)
+            table = read_recording(path, SIGNALS, SPEC)
         except InputError as error:
             assert path.name in str(error)  # noqa: PT017  (both outcomes are right)
             outcomes.add("refused")

@@ -70,7 +70,7 @@ def test_on_the_real_machines_a_second_is_a_second(name):
     scenario = load_scenario(name)
     prior = scenario.prior()
     files = sorted(p for p in folder.iterdir() if p.suffix in (".csv", ".npz", ".mat"))
-    data = load_trajectories(files, scenario.data, outputs=prior.outputs, inputs=prior.inputs, needed=())
+    data = load_trajectories(files, prior, scenario.data, needed=())
     for part in (data.by_role("train"), data.whole):
         assert time_unit(part, scenario.data.dt) == 1.0
 
@@ -80,7 +80,7 @@ def test_on_the_simulated_machines_a_second_is_a_second(name, tmp_path):
     scenario = load_scenario(name)
     prior = scenario.prior()
     files = scenario.make_data(tmp_path, 0, "quick")
-    data = load_trajectories(files, scenario.data, outputs=prior.outputs, inputs=prior.inputs)
+    data = load_trajectories(files, prior, scenario.data)
     assert time_unit(data.by_role("train"), scenario.data.dt) == 1.0
 
 

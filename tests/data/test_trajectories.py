@@ -3,13 +3,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from machine_signals import machine
 from scipy.io import savemat
 
 from hybrid_mpc import DataSpec, InputError, Signal, Window, load_trajectories, write_csv
 from hybrid_mpc.data.trajectories import hold_mean
 
 SPEC = DataSpec("t", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.2)
-SIGNALS = {"outputs": (Signal("phi", "rad"),), "inputs": (Signal("torque", "N m"),)}
+SIGNALS = machine((Signal("phi", "rad"),), (Signal("torque", "N m"),))
 
 
 def record(path, t, phi=np.sin):
@@ -18,7 +19,7 @@ def record(path, t, phi=np.sin):
 
 def test_states_and_derivatives_of_a_known_motion(tmp_path):
     t = np.arange(0, 5, 0.005) + np.random.default_rng(0).uniform(0, 1e-4, 1000)  # jittered stamps
-    data = load_trajectories([record(tmp_path / "run.csv", t)], SPEC, **SIGNALS)
+    data = load_trajectories([record(tmp_path / "run.csv", t)], SIGNALS, SPEC)
     whole = data.whole[0]
     # linear interpolation of the jitter: h j / 2 = 0.005 * 1e-4 / 2 = 2.5e-7, times filter gains (<= 1e3)
     np.testing.assert_allclose(whole.x, np.c_[np.sin(whole.t), np.cos(whole.t)], atol=2e-5)
@@ -40,9 +41,9 @@ def test_hold_mean_keeps_the_impulse():
 
 def test_gap_cuts_and_nothing_leaks_across_it(tmp_path):
     t = np.r_[np.arange(0, 3, 0.01), np.arange(3.2, 6, 0.01)]
-    before = load_trajectories([record(tmp_path / "a.csv", t)], SPEC, **SIGNALS)
+    before = load_trajectories([record(tmp_path / "a.csv", t)], SIGNALS, SPEC)
     after = load_trajectories(
-        [record(tmp_path / "a.csv", t, lambda t: np.where(t > 3.1, 5.0, np.sin(t)))], SPEC, **SIGNALS
+        [record(tmp_path / "a.csv", t, lambda t: np.where(t > 3.1, 5.0, np.sin(t)))], SIGNALS, SPEC
     )
     assert [(piece.name, piece.role) for piece in before.whole] == [("a", ""), ("a#2", "")]
     np.testing.assert_array_equal(before.whole[0].x, after.whole[0].x)
@@ -54,7 +55,7 @@ def test_gap_cuts_and_nothing_leaks_across_it(tmp_path):
 def test_windows_give_disjoint_roles_and_short_ones_are_reported(tmp_path):
     windows = Window(0, 2, "train"), Window(2.2, 2.4, "train"), Window(3, 4, "valid"), Window(4.2, 6, "test")
     spec = replace(SPEC, windows={"a": windows})
-    data = load_trajectories([record(tmp_path / "a.csv", np.arange(0, 6.01, 0.01))], spec, **SIGNALS)
+    data = load_trajectories([record(tmp_path / "a.csv", np.arange(0, 6.01, 0.01))], SIGNALS, spec)
     times = np.concatenate([piece.t for piece in data.trajectories])
     assert len(np.unique(times)) == len(times)
     assert [cut.start for cut in data.cuts] == pytest.approx([2.2])
@@ -68,14 +69,14 @@ def test_what_cannot_be_split_is_refused(tmp_path):
     file = record(tmp_path / "a.csv", np.arange(0, 6, 0.01))
     only = replace(SPEC, windows={"a": (Window(0, 5, "train"),)})
     with pytest.raises(InputError, match="left for valid and test"):
-        load_trajectories([file], only, **SIGNALS)
+        load_trajectories([file], SIGNALS, only)
     double = replace(SPEC, windows={"a": (Window(0, 5, "train"), Window(4, 6, "test"))})
     with pytest.raises(InputError, match="overlap"):
-        load_trajectories([file], double, **SIGNALS)
+        load_trajectories([file], SIGNALS, double)
     with pytest.raises(InputError, match="same file stem"):
-        load_trajectories([file, file], SPEC, **SIGNALS)
+        load_trajectories([file, file], SIGNALS, SPEC)
     with pytest.raises(InputError, match="no recordings"):
-        load_trajectories([], SPEC, **SIGNALS)
+        load_trajectories([], SIGNALS, SPEC)
 
 
 def test_runs_of_different_length_sampling_and_format(tmp_path):
@@ -85,7 +86,7 @@ def test_runs_of_different_length_sampling_and_format(tmp_path):
     savemat(tmp_path / "matlab.mat", {"run": one})
     np.savez(tmp_path / "short.npz", t=0.005, tau=np.sign(np.cos(7 * fast)), phi=np.sin(fast))
     files = [long, tmp_path / "matlab.mat", tmp_path / "short.npz"]
-    data = load_trajectories(files, SPEC, **SIGNALS)
+    data = load_trajectories(files, SIGNALS, SPEC)
     assert data.files == ("long.csv", "matlab.mat", "short.npz")
     csv, mat, short = data.whole
     assert (len(csv.t), len(mat.t), len(short.t)) == (449, 449, 199)
@@ -94,16 +95,16 @@ def test_runs_of_different_length_sampling_and_format(tmp_path):
         np.testing.assert_allclose(getattr(csv, name), getattr(mat, name), atol=1e-6)
     np.testing.assert_allclose(short.x, np.c_[np.sin(short.t), np.cos(short.t)], atol=2e-5)
     assert [t.role for t in data.trajectories] == 3 * ["train", "valid", "test"]
-    assert data.hash == load_trajectories(files[::-1], SPEC, **SIGNALS).hash
+    assert data.hash == load_trajectories(files[::-1], SIGNALS, SPEC).hash
 
 
 def test_units_of_columns(tmp_path):
     t = np.arange(0, 5, 0.01)
-    plain = load_trajectories([record(tmp_path / "run.csv", t)], SPEC, **SIGNALS).whole[0]
+    plain = load_trajectories([record(tmp_path / "run.csv", t)], SIGNALS, SPEC).whole[0]
     columns = {"t": 1e3 * t, "tau": np.sign(np.cos(7 * t)), "phi": np.rad2deg(np.sin(t))}
     write_csv(tmp_path / "run.csv", columns)
     spec = replace(SPEC, units={"t": "ms", "phi": "deg", "tau": 0.5})
-    got = load_trajectories([tmp_path / "run.csv"], spec, **SIGNALS).whole[0]
+    got = load_trajectories([tmp_path / "run.csv"], SIGNALS, spec).whole[0]
     np.testing.assert_allclose(got.t, plain.t, atol=1e-12)
     np.testing.assert_allclose(got.y, plain.y, atol=1e-9)  # ten digits of CSV
     np.testing.assert_allclose(got.u, 0.5 * plain.u, atol=1e-12)
@@ -112,7 +113,7 @@ def test_units_of_columns(tmp_path):
         ({"tau": 0.0}, "factor 0.0 of column 'tau' to torque .N m. must be finite and not zero"),
     ):
         with pytest.raises(InputError, match=match):
-            load_trajectories([tmp_path / "run.csv"], replace(SPEC, units=units), **SIGNALS)
+            load_trajectories([tmp_path / "run.csv"], SIGNALS, replace(SPEC, units=units))
 
 
 def test_unequal_columns_are_refused_by_file_and_column(tmp_path):
@@ -122,18 +123,18 @@ def test_unequal_columns_are_refused_by_file_and_column(tmp_path):
     np.savez(tmp_path / "sunday.npz", t=t, tau=t, angle=t)
     sunday = tmp_path / "sunday.npz"
     with pytest.raises(InputError) as caught:
-        load_trajectories([monday, other, sunday], SPEC, **SIGNALS)
+        load_trajectories([monday, other, sunday], SIGNALS, SPEC)
     message = str(caught.value)
     assert "tuesday.csv: no column 'tau'" in message
     assert "'tau' is in monday.csv, sunday.npz and not in tuesday.csv" in message
     assert "'phi' is in monday.csv, tuesday.csv and not in sunday.npz" in message
     with pytest.raises(InputError) as caught:  # alone it lacks a column, but differs from none
-        load_trajectories([other], SPEC, **SIGNALS)
+        load_trajectories([other], SIGNALS, SPEC)
     assert "differ" not in str(caught.value)
     named = replace(SPEC, inputs_of={"tuesday": ("torque",)})
-    assert len(load_trajectories([monday, other], named, **SIGNALS).whole) == 2
+    assert len(load_trajectories([monday, other], SIGNALS, named).whole) == 2
     more = write_csv(tmp_path / "more.csv", {"x": t, "t": t, "tau": t, "phi": t})  # nobody reads x
-    assert len(load_trajectories([monday, more], SPEC, **SIGNALS).whole) == 2
+    assert len(load_trajectories([monday, more], SIGNALS, SPEC).whole) == 2
 
 
 def test_the_main_job_reads_mat_files(tmp_path):
@@ -154,8 +155,8 @@ def test_roles_that_are_not_needed_may_be_empty(tmp_path):
     file = record(tmp_path / "run.csv", 0.01 * np.arange(1000))
     spec = replace(SPEC, fractions=(0.75, 0.25, 0.0))
     with pytest.raises(InputError, match="left for test"):
-        load_trajectories([file], spec, **SIGNALS)
-    data = load_trajectories([file], spec, **SIGNALS, needed=("train", "valid"))
+        load_trajectories([file], SIGNALS, spec)
+    data = load_trajectories([file], SIGNALS, spec, needed=("train", "valid"))
     assert [piece.role for piece in data.trajectories] == ["train", "valid"]
 
 
@@ -165,7 +166,7 @@ def test_too_short_a_recording_is_told_how_long_one_must_be(tmp_path):
 
     def read(seconds):
         t = 0.02 * np.arange(round(seconds / 0.02) + 1)
-        return load_trajectories([record(tmp_path / f"run{len(t)}.csv", t)], spec, **SIGNALS)
+        return load_trajectories([record(tmp_path / f"run{len(t)}.csv", t)], SIGNALS, spec)
 
     with pytest.raises(InputError, match=r"split by fractions needs (\S+) s") as short:
         read(2.0)

@@ -74,7 +74,15 @@ def test_the_interval_score_is_that_of_its_definition():
     bands = fit_bands([RunParts(np.ones((10, 1)), np.ones((10, 1, 1)))] * 2)
     half = bands.half_width(np.ones((1, 1, 1)))[0, 0]
     run = RunParts(np.array([[0.0], [half + 0.5]]), np.ones((2, 1, 1)))
-    assert interval_score(run, bands) == pytest.approx(2 * half + 0.5 * (2 / 0.1) * 0.5)
+    assert interval_score(run, bands) == pytest.approx([2 * half + 0.5 * (2 / 0.1) * 0.5])
+
+
+def test_outputs_of_other_units_have_a_score_each():
+    rng = np.random.default_rng(4)
+    runs = growing(rng, 5)
+    both = [RunParts(np.hstack([r.error, 1e3 * r.error]), np.hstack([r.parts, 1e6 * r.parts])) for r in runs]
+    one, other = np.split(interval_score(both[0], fit_bands(both)), 2)
+    np.testing.assert_allclose(other, 1e3 * one, rtol=1e-3)  # two searches of a flat optimum
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0, 1.5])

@@ -5,41 +5,115 @@ import pytest
 import torch
 from simulated_pendulum import DT, TRUTH, Pendulum, record
 
-from hybrid_mpc import PriorStep, evaluation_trajectories, free_runs, score
+from hybrid_mpc import (
+    Balance,
+    InputError,
+    Prior,
+    PriorStep,
+    Signal,
+    Trajectory,
+    evaluation_trajectories,
+    free_runs,
+    score,
+)
 from hybrid_mpc.identify.evaluate import FreeRun
+from hybrid_mpc.identify.settings import kinds_of
 from hybrid_mpc.identify.smooth import Smoother, sizes_of
 
 
-def hand_made(n, dt, error):
-    """A run of n samples: rates off by ``error`` in the second state, output off by 0.5, power by 0.25 W."""
-    zeros, t = np.zeros((n, 2)), dt * np.arange(n)
-    xdot_hat = zeros + np.array([0.0, error])
-    y, power = np.ones((n, 1)), np.zeros(n)
+class Two(Pendulum):
+    """The pendulum with a second output and a second balance, in other units."""
+
+    outputs = (Signal("phi", "rad"), Signal("level", "m"))
+
+    def output(self, x, u, w, p):
+        return x.phi, 2.0 * x.phi
+
+    def balances(self, x, u, w, p):
+        return (Balance("water", x.phi, u[0], unit="kg", rate_unit="kg/s"),)
+
+
+def hand_made(n, error, off=0.5):
+    """A run of n samples: rates [0, +-1] off by ``error``, outputs +-1 and +-10 off by ``off`` and 2, balances by 0.25
+    W and 3 kg/s.
+    """
+    t, sign = 0.02 * np.arange(n), np.where(np.arange(n) % 2, 1.0, -1.0)[:, None]
+    zeros, y = np.zeros((n, 2)), sign * np.array([1.0, 10.0])
+    xdot = sign * np.array([0.0, 1.0])
+    balances = zeros + np.array([1.0, -2.0])
     return FreeRun(
-        "r", t, zeros[:, :1], zeros, zeros, y, y + 0.5, zeros, xdot_hat, power, power - 0.25
+        "r", t, zeros[:, :1], zeros, zeros, y, y + np.array([off, 2.0]), xdot, xdot + np.array([0.0, error]),
+        balances, balances + np.array([-0.25, 3.0]),
     )  # fmt: skip
 
 
 def test_scores_of_a_run_made_by_hand():
-    figures = score([hand_made(100, 0.02, -3.0)])
-    assert figures.e_sim_s == pytest.approx(3.0, rel=1e-12)  # 1/T integral of 3 over T
-    assert figures.rmse_rad == pytest.approx(0.5)
-    assert figures.energy_violation_w == pytest.approx(0.25)
+    figures = score([hand_made(100, -3.0)], Two())
+    assert figures.e_sim == pytest.approx(3.0, rel=1e-12)  # of the rate that changes, over its deviation of 1
+    assert figures.rmse == pytest.approx({"phi [rad]": 0.5, "level [m]": 2.0})
+    assert figures.fit_percent == pytest.approx({"phi [rad]": 50.0, "level [m]": 80.0})
+    assert figures.error == pytest.approx(np.sqrt((0.5**2 + 0.2**2) / 2))
+    assert figures.violation == pytest.approx({"energy [W]": 0.25, "water [kg/s]": 3.0})
 
 
-def test_runs_count_alike_whatever_their_sampling():
-    slow, fast = hand_made(100, 0.02, 1.0), hand_made(200, 0.01, 1.0)
-    assert score([slow]).e_sim_s == pytest.approx(score([fast]).e_sim_s)
-    short, long = hand_made(10, 0.02, 4.0), hand_made(1000, 0.02, 2.0)
-    assert score([short, long]).e_sim_s == pytest.approx(3.0)
+def test_no_unit_counts_in_what_models_are_compared_by():
+    run, scale = hand_made(100, -3.0), np.array([1.0, 1e3])
+    milli = replace(
+        run, y=scale * run.y, y_hat=scale * run.y_hat, xdot=scale * run.xdot, xdot_hat=scale * run.xdot_hat
+    )
+    one, other = score([run], Two()), score([milli], Two())
+    assert (other.error, other.e_sim) == pytest.approx((one.error, one.e_sim))
+    assert other.rmse["level [m]"] == pytest.approx(1e3 * one.rmse["level [m]"])
+
+
+def test_a_given_spread_is_what_the_choice_compares_by():
+    runs, spread = [hand_made(100, 1.0), hand_made(40, 1.0, off=0.1)], (2.0, 4.0)
+    squares = np.concatenate([run.squared_errors(spread) for run in runs])
+    assert score(runs, Two(), spread).error == pytest.approx(np.sqrt(squares.mean()))
+
+
+def test_every_sample_counts_alike():
+    short, long = hand_made(10, 4.0), hand_made(990, 2.0)
+    assert score([short, long], Two()).e_sim == pytest.approx(2.02)
+
+
+def test_a_missing_sample_is_no_error_and_a_constant_output_has_no_fit():
+    run = hand_made(100, 1.0)
+    run.y[3, 0] = np.nan
+    run.y[:, 1] = 7.0
+    figures = score([run], Two())
+    assert figures.rmse["phi [rad]"] == pytest.approx(0.5)
+    assert list(figures.fit_percent) == ["phi [rad]"]
+    run.y[:, 1] = np.nan
+    with pytest.raises(InputError, match=r"level \[m\] was never measured"):
+        score([run], Two())
 
 
 def test_a_diverging_run_makes_its_figures_infinite():
-    run = hand_made(50, 0.02, 1.0)
-    run.y_hat[7] = np.nan
-    figures = score([run])
-    assert figures.rmse_rad == np.inf
-    assert figures.e_sim_s == pytest.approx(1.0)
+    run = hand_made(50, 1.0)
+    run.y_hat[7, 0] = np.nan
+    figures = score([run], Two())
+    assert figures.rmse["phi [rad]"] == figures.error == np.inf
+    assert figures.rmse["level [m]"] == pytest.approx(2.0)
+    assert figures.e_sim == pytest.approx(1.0)
+
+
+def test_a_prior_without_balances_has_no_violation():
+    class Plain(Prior):
+        states = outputs = (Signal("level", "m"),)
+        inputs = (Signal("inflow", "m/s"),)
+
+        def xdot(self, x, u, w, p):
+            return (u.inflow - x.level,)
+
+    t = 0.1 * np.arange(30)
+    flow = np.sin(t)[:, None]
+    run = Trajectory("r", "test", 0.1, t, flow, flow, flow, np.zeros_like(flow))
+    (free,) = free_runs(PriorStep(Plain(), 0.1), Plain(), [run], 5)
+    assert free.balances.shape == free.balances_hat.shape == (24, 0)
+    assert score([free], Plain()).violation == {}
+    assert kinds_of(Plain()) == ("rnn", "pgrnn")
+    assert kinds_of(Pendulum()) == ("rnn", "pgrnn", "mopgrnn")
 
 
 def test_the_true_model_runs_along_the_measurement():
@@ -49,7 +123,7 @@ def test_the_true_model_runs_along_the_measurement():
     assert len(free.t) == len(run.t) - warm - 1
     assert free.t[0] == run.t[warm]
     np.testing.assert_allclose(free.y_hat, free.y, atol=1e-4)
-    assert score([free]).energy_violation_w < 1e-3
+    assert score([free], prior).violation["energy [W]"] < 1e-3
 
 
 def test_short_runs_start_every_fifth_of_their_length():

@@ -7,7 +7,7 @@ from simulated_pendulum import DT, TRUTH, Pendulum, killed_and_resumed, same_tra
 
 from hybrid_mpc import InputError, TrainingSettings, train
 from hybrid_mpc.identify import train as training
-from hybrid_mpc.identify.dataset import cut_windows, fitting_horizon
+from hybrid_mpc.identify.dataset import LONGEST, cut_windows, fitting_horizon, validation_horizon
 from hybrid_mpc.identify.objectives import objectives_of
 from hybrid_mpc.identify.settings import KINDS
 from hybrid_mpc.identify.train import REPEATS, TrainingRun, load_checkpoint, save_checkpoint
@@ -22,6 +22,18 @@ PRIOR = Pendulum(TRUTH)
 def whole(data):
     """What ``SMALL`` comes to when nothing goes wrong."""
     return train(PRIOR, *data, SMALL)
+
+
+def test_validation_runs_are_as_long_as_a_usual_recording_allows(data):
+    long, warm = data[1][0], 10
+    two_thirds = 2 * (len(long.t) - warm - 1) // 3
+    some = [cut(long, warm + 5), cut(long, warm + 9), long]  # most samples lie in the long one
+    assert validation_horizon([long], warm) == validation_horizon(some, warm) == two_thirds < LONGEST
+    for horizon in (5, 20):
+        run = TrainingRun(PRIOR, data[0], some, replace(SMALL, horizon=horizon))
+        assert run.valid.u.shape[1] == warm + two_thirds
+    fixed = TrainingRun(PRIOR, data[0], some[-1:], replace(SMALL, validation_horizon=7))
+    assert fixed.valid.u.shape[1] == warm + 7
 
 
 def test_training_is_deterministic_and_the_seed_matters(data, whole):

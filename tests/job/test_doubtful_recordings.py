@@ -168,7 +168,7 @@ def measured_with_findings(tmp_path):
     path.write_text(f"""
 from dataclasses import replace
 from pathlib import Path
-from hybrid_mpc import DataSpec, Signal
+from hybrid_mpc import DataSpec
 from hybrid_mpc import load_trajectories
 from scenarios.pendulum import scenario
 spec = DataSpec("time_s", ("tau_nm",), ("phi_rad",), dt=0.02, max_gap=0.05, smoothing=0.2, warm_up=0.2)
@@ -176,7 +176,7 @@ spec = DataSpec("time_s", ("tau_nm",), ("phi_rad",), dt=0.02, max_gap=0.05, smoo
 
 def runs(data_set, seed, folder):
     files = [Path({str(tmp_path)!r}) / "mine.csv"]
-    return load_trajectories(files, spec, outputs=(Signal("phi", "rad"),), inputs=(Signal("tau", "N m"),))
+    return load_trajectories(files, scenario.prior(), spec)
 
 
 scenario = replace(scenario, experiment=replace(scenario.experiment, runs=runs))

@@ -32,9 +32,9 @@ def job(out, *words):
 @pytest.mark.full
 def test_golf_robot(tmp_path):
     results = job(tmp_path / "run", "golf_robot")
-    e_sim = results["identification"]["e_sim_s"]
-    assert e_sim["mopgrnn"] < e_sim["phy"] < e_sim["phy_nominal"]
-    assert e_sim["mopgrnn"] < e_sim["rnn"]
+    error = results["identification"]["error"]
+    assert error["mopgrnn"] < error["phy"] < error["phy_nominal"]
+    assert error["mopgrnn"] < error["rnn"]
     load = read_stage(tmp_path / "run" / "checkpoints" / "monitor.json", MONITOR, "").result.load
     assert load.delay_s is not None
     assert load.delay_s < 0.5  # a fifth of the largest torque, in motion: within two monitor windows

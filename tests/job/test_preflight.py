@@ -419,8 +419,8 @@ def test_all_problems_are_told_at_once():
     with pytest.raises(InputError) as told:
         check_scenario(dataclasses.replace(GOOD, **wrong))
     message = str(told.value)
-    assert "3 problems" in message  # what hangs on the prior (the task's states) cannot be known without one
-    for word in ("mass_matrix", "sensor_sigma", "networks"):
+    assert "4 problems" in message
+    for word in ("mass_matrix", "sensor_sigma", "networks", "x0 needs 2"):
         assert word in message
 
 

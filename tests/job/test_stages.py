@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import InputError, RunSettings, load, load_scenario
-from hybrid_mpc.job.context import Context
-from hybrid_mpc.job.run import NAMES, STAGES
+from hybrid_mpc.job.context import Context, Progress
+from hybrid_mpc.job.run import NAMES, STAGES, _as_it_is
 from hybrid_mpc.job.stage import (
     UNKNOWN,
     Absent,
@@ -158,6 +158,45 @@ def test_a_stage_is_computed_once_and_again_where_what_it_reads_has_changed(cont
     for _ in range(2):
         bring_up_to_date(Context(context.settings, context.scenario, context.out), unknown)
     assert calls == [0, 5, 0, 0]
+
+
+@dataclass(frozen=True)
+class OldSum:
+    """What an older version found: no names, and a mean."""
+
+    total: float
+    mean: float
+    arrays: dict
+
+
+def test_a_result_of_another_version_is_computed_again_and_that_is_said(context):
+    old = Stage("sum", "adding up", OldSum, lambda context: OldSum(1.0, 1.0, {}), one(None).reads)
+    bring_up_to_date(context, old)
+    told = []
+    progress = Progress()
+    progress.warn = told.append
+    fresh = Context(context.settings, context.scenario, context.out, progress)
+    with pytest.raises(InputError, match=r"another version wrote its result \(sum.json: .*names is missing"):
+        fresh.read(one(None))
+    assert bring_up_to_date(fresh, one(lambda context: Sum(2.0, ("a",), {}))) == ""
+    assert fresh.read(one(None)).total == 2.0
+    (line,) = told
+    assert line.startswith(
+        "stage sum runs again: another version wrote its result (sum.json: no field 'mean'"
+    )
+    again = Context(context.settings, context.scenario, context.out)
+    assert bring_up_to_date(again, one(None)) == "up to date"
+
+
+def test_only_does_not_take_a_result_of_another_version(context):
+    old = Stage("sum", "adding up", OldSum, lambda context: OldSum(1.0, 1.0, {}), one(None).reads)
+    bring_up_to_date(context, old)
+    fresh = Context(context.settings, context.scenario, context.out)
+    with pytest.raises(
+        InputError, match=r"stage sum must run again: another version wrote .* leave --only out"
+    ):
+        _as_it_is(fresh, one(None))
+    assert _as_it_is(fresh, one(None, optional=True)) == "left out"
 
 
 def test_a_stage_reads_others_by_what_they_found(context):

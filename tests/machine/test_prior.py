@@ -46,6 +46,25 @@ def evaluated(prior, seed=0):
     return {name: value.full() for name, value in found.items()}
 
 
+@pytest.mark.parametrize(
+    ("prior", "found"),
+    [(Tanks, ()), (TorchTanks, ()), (Swing, ((0, 1),)), (TorchSwing, ((0, 1),)), (Arm, ((0, 2), (1, 3)))],
+)
+def test_positions_with_their_speeds_are_read_off_the_equations(prior, found):
+    assert prior().kinematics == found
+
+
+def test_a_rate_that_only_is_in_proportion_to_a_state_is_no_speed():
+    class Lag(Prior):
+        states = (Signal("a", "m"), Signal("b", "m"), Signal("c", "m/s"))
+        inputs, outputs = (Signal("u", "m/s"),), (Signal("a", "m"),)
+
+        def xdot(self, x, u, w, p):
+            return 2.0 * x.b, u.u, x.c**2  # a multiple, an input, and a slope that is 1 at one point alone
+
+    assert Lag().kinematics == ()
+
+
 @pytest.mark.parametrize(("one", "other"), PAIRS, ids=lambda p: p.__name__)
 def test_equations_are_the_same_in_casadi_and_in_torch(one, other):
     ours, theirs = evaluated(one()), evaluated(other())
@@ -303,7 +322,6 @@ def wrong(base=Level, **changed):
 REFUSED = {
     "a value that is no parameter's": (lambda: Tanks({"k_3": 1.0}), "Tanks has no parameter k_3; it has: a_1, a_2"),
     "a value where there are none": (lambda: Level({"k": 1.0}), "it has: none"),
-    "corrects names no state": (wrong(corrects=("depth",)), "corrects names depth; its states are: level"),
     "an output of no state": (
         wrong(outputs=(Signal("height", "m"),)), "no state is called height, as the output is.*level.*Define output",
     ),
@@ -367,6 +385,18 @@ def test_what_cannot_be_is_refused_by_name(why):
         make().equations  # noqa: B018
     if why != "a value where there are none" and "value that is no" not in why:
         assert "Wrong" in str(refused.value) or "TorchPrior must give" in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (("depth",), "Wrong: corrects names depth; its states are: level"),
+        ("level", r"a tuple of names, as \('level',\)"),
+    ],
+)
+def test_what_is_corrected_must_be_a_state(names, words):
+    with pytest.raises(InputError, match=words):
+        wrong(corrects=names)().corrected  # noqa: B018
 
 
 @pytest.mark.parametrize("kind", [(MechanicalPrior,), (TorchPrior, MechanicalPrior)])

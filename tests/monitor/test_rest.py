@@ -91,7 +91,7 @@ def test_the_rule_is_right_on_all_machines(name, tmp_path):
         files = sorted(p for p in folder.iterdir() if p.suffix in (".csv", ".npz", ".mat"))
     else:
         pytest.skip("the real recordings are not on this machine")
-    data = load_trajectories(files, scenario.data, outputs=prior.outputs, inputs=prior.inputs, needed=())
+    data = load_trajectories(files, prior, scenario.data, needed=())
     known = [t for t in data.trajectories if t.role in ("train", "valid", "nominal")]
     (rest,) = rest_speeds(known, Axis(scenario.data.dt).model())
     low, high = MACHINES[name]

@@ -73,19 +73,49 @@ def test_one_colour_per_role():
     assert name_of("my $model") == r"my \$model"
 
 
-def test_free_run_draws_the_violation_of_its_balances():
+def test_free_run_draws_every_balance_with_its_violation_and_unit():
     figure = example.free_run_figure()
-    balances = [line.get_ydata() for line in figure.axes[-2].lines]
-    drawn = figure.axes[-1].lines[0].get_ydata()
-    np.testing.assert_array_equal(drawn, np.abs(balances[1] - balances[0]))
+    assert len(figure.axes) == len(example.STATES) + len(example.INPUTS) + 2 * 2
+    for above, below, unit in ((*figure.axes[-4:-2], "W"), (*figure.axes[-2:], "kg/s")):
+        balances = [line.get_ydata() for line in above.lines]
+        violation = below.lines[0].get_ydata()
+        np.testing.assert_array_equal(violation, np.abs(balances[1] - balances[0]))
+        for ax in (above, below):
+            assert ax.get_ylabel().endswith(f"[{unit}]")
+
+
+def test_states_that_are_no_positions_and_speeds_are_drawn_over_time():
+    signals = tuple(Signal(name, "degC") for name in ("hot", "warm", "cold"))
+    t = np.arange(5.0)
+    piece = example.Piece("a", "train", t, t[:, None], t[:, None], np.column_stack([t, 2 * t, 3 * t]))
+    figure = data.coverage([piece], signals)
+    assert [ax.get_ylabel() for ax in figure.axes] == ["hot [degC]", "warm [degC]", "cold [degC]"]
+    np.testing.assert_array_equal(figure.axes[2].lines[0].get_xydata(), np.column_stack([t, 3 * t]))
+
+
+def test_a_benchmarks_run_has_every_output_in_its_unit():
+    t = np.linspace(0.0, 40.0, 401)
+    y = np.column_stack([np.sin(t), 20 + np.cos(t)])
+    y[7, 1] = np.nan
+    figure = fit.benchmark_run(
+        t, y, {"phy": y + 0.1}, t, outputs=(Signal("q", "m"), Signal("T", "degC")), inputs=(U,),
+        units=[("mm", 1e3), ("K", 1.0)], shown=20.0,
+    )  # fmt: skip
+    assert [ax.get_ylabel().replace("\n", " ") for ax in figure.axes] == [
+        "q [m]", "error of q [mm]", "T [degC]", "error of T [K]", r"$\tau$ [N m]", "RMS error of q [mm]",
+        "RMS error of T [K]",
+    ]  # fmt: skip
+    error = figure.axes[1].lines[0]
+    assert error.get_xdata()[-1] == 20.0
+    np.testing.assert_allclose(error.get_ydata(), 100.0)
+    np.testing.assert_allclose(figure.axes[6].lines[0].get_ydata(), 0.1)  # the missing sample counts nothing
 
 
 def test_a_model_that_runs_away_does_not_flatten_the_others():
     t = np.linspace(0.0, 10.0, 101)
     x = example.swing(t)
     figure = fit.free_run(
-        t, x, {"rnn": 1e6 * x, "mopgrnn": x}, np.zeros((101, 1)), states=example.STATES, inputs=example.INPUTS,
-        energy_measured=np.zeros(101), energy_model=np.zeros(101),
+        t, x, {"rnn": 1e6 * x, "mopgrnn": x}, np.zeros((101, 1)), signals=example.STATES, inputs=example.INPUTS,
     )  # fmt: skip
     low, high = figure.axes[0].get_ylim()
     span = np.ptp(x[:, 0])
@@ -93,14 +123,14 @@ def test_a_model_that_runs_away_does_not_flatten_the_others():
 
 
 def test_a_bar_far_above_the_others_is_cut_and_keeps_its_number():
-    figure = fit.errors_bar({"phy_nominal": {"e_sim_s": 100.0}, "phy": {"e_sim_s": 1.0}})
+    figure = fit.errors_bar({"phy_nominal": {"e_sim": 100.0}, "phy": {"e_sim": 1.0}}, {"e_sim": "E [-]"})
     ax = figure.axes[0]
     assert ax.get_ylim()[1] < 3
     assert [text.get_text() for text in ax.texts] == ["100 ▲", "1.00"]
 
 
 def test_a_missing_error_leaves_a_gap():
-    figure = fit.errors_bar({"rnn": {"e_sim_s": None}, "phy": {"e_sim_s": 1.0}})
+    figure = fit.errors_bar({"rnn": {"e_sim": None}, "phy": {"e_sim": 1.0}}, {"e_sim": "E [-]"})
     assert [text.get_text() for text in figure.axes[0].texts] == ["1.00"]
 
 
@@ -142,7 +172,7 @@ def test_numbers_have_three_digits(value, text):
         lambda: fit.curves({}),
         lambda: fit.curves({"rnn": {"loss_error": [1.0]}}),
         lambda: fit.curves({"rnn": {"step": [0.0, 1.0], "loss_error": [1.0]}}),
-        lambda: fit.errors_bar({"phy": {"other": 1.0}}),
+        lambda: fit.errors_bar({"phy": {"other": 1.0}}, {"e_sim": "E [-]"}),
         lambda: fit.parity({}, {}),
         lambda: loops.closed_loops("x", [0.0], [[0.0, 0.0]], {}, states=example.STATES, inputs=()),
         lambda: loops.solve_times({"hybrid": np.array([])}, 20.0),
@@ -165,7 +195,7 @@ def test_coverage_draws_a_turning_angle_within_half_a_turn_of_zero():
         "a", "train", t, t[:, None], t[:, None], np.column_stack([-12.0 * t, 0 * t - 12.0])
     )
     states = (Signal("phi", "rad", periodic=True), Signal("phi_dot", "rad/s"))
-    (line,) = data.coverage([turning], states).axes[0].get_lines()
+    (line,) = data.coverage([turning], states, [(0, 1)]).axes[0].get_lines()
     drawn = line.get_xdata()
     assert np.nanmax(np.abs(drawn)) <= np.pi
     assert np.isnan(drawn).sum() == 2  # 12 rad pass -pi twice: at 3.1 and at 9.4 rad
@@ -186,7 +216,7 @@ def test_zeros_are_circles_and_those_outside_are_counted():
 def test_a_reduced_model_has_the_colour_of_its_own_and_dashes():
     style = line_style("hybrid, reduced to 2 states")
     assert (style["color"], style["linestyle"]) == (colour("hybrid"), "--")
-    assert style["label"] == "MOPGRNN (hybrid), reduced to 2 states"
+    assert style["label"] == "hybrid, reduced to 2 states"
     assert line_style("run 1, second half")["label"] == "run 1, second half"
 
 

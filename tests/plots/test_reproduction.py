@@ -29,8 +29,8 @@ def run_figure():
         "u": x[:, :1],
         "x": x,
         "x_hat": 1.1 * x,
-        "energy_measured_w": x[:, 0],
-        "energy_model_w": x[:, 1],
+        "balances": x[:, :1],
+        "balances_hat": x[:, 1:],
     }
     states, inputs = [Signal("phi", "rad"), Signal("phi_dot", "rad/s")], [Signal("u", "N m")]
     return shown_free_run({"phy": run, "mopgrnn": run}, states, inputs)

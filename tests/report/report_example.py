@@ -69,9 +69,11 @@ def free_run_figure():
     rng = np.random.default_rng(0)
     measured = 0.03 * np.sin(2.4 * t) ** 2 + 0.004 * rng.standard_normal(len(t))
     model = 0.028 * np.sin(2.4 * t + 0.1) ** 2
-    return fit.free_run(
-        t, x, runs, u, states=STATES, inputs=INPUTS, energy_measured=measured, energy_model=model
-    )
+    balances = [
+        fit.BalanceRun("energy", "W", measured, model),
+        fit.BalanceRun("water", "kg/s", 3 * model, measured),
+    ]
+    return fit.free_run(t, x, runs, u, signals=STATES, inputs=INPUTS, balances=balances)
 
 
 def training_figure():
@@ -149,11 +151,16 @@ def bode_figure():
 
 
 ERRORS = {
-    "phy_nominal": {"e_sim_s": 1.03, "rmse_rad": 0.42, "energy_violation_w": 0.031},
-    "phy": {"e_sim_s": 0.21, "rmse_rad": 0.11, "energy_violation_w": 0.017},
-    "rnn": {"e_sim_s": 0.48, "rmse_rad": 0.15, "energy_violation_w": 0.025},
-    "pgrnn": {"e_sim_s": 0.17, "rmse_rad": 0.09, "energy_violation_w": 0.016},
-    "mopgrnn": {"e_sim_s": 0.15, "rmse_rad": 0.08, "energy_violation_w": 0.012},
+    "phy_nominal": {"rmse": 0.42, "e_sim": 1.03, "violation": 0.031},
+    "phy": {"rmse": 0.11, "e_sim": 0.21, "violation": 0.017},
+    "rnn": {"rmse": 0.15, "e_sim": 0.48, "violation": 0.025},
+    "pgrnn": {"rmse": 0.09, "e_sim": 0.17, "violation": 0.016},
+    "mopgrnn": {"rmse": 0.08, "e_sim": 0.15, "violation": 0.012},
+}
+METRICS = {
+    "rmse": "RMSE of phi [rad]",
+    "e_sim": "simulation error [-]",
+    "violation": "violation of energy [W]",
 }
 SPREAD = {m: {k: 0.12 * v for k, v in ERRORS[m].items()} for m in ("rnn", "pgrnn", "mopgrnn")}
 
@@ -181,10 +188,10 @@ def guard_figure():
 
 FIGURES = {
     "recordings": lambda: data.recordings(pieces(), OUTPUTS, INPUTS),
-    "coverage": lambda: data.coverage(pieces(), STATES),
+    "coverage": lambda: data.coverage(pieces(), STATES, [(0, 1)]),
     "training": training_figure,
     "free_run": free_run_figure,
-    "errors": lambda: fit.errors_bar(ERRORS, spread=SPREAD),
+    "errors": lambda: fit.errors_bar(ERRORS, METRICS, spread=SPREAD),
     "parity": parity_figure,
     "loops": loop_figure,
     "times": times_figure,
@@ -219,7 +226,7 @@ def report(folder: Path) -> Report:
         "Parameters of the prior.",
     )
     results = Table(
-        ("model", "E_sim [s]", "RMSE [rad]", "violation [W]"),
+        ("model", "RMSE of phi [rad]", "E_sim [spreads]", "violation of energy [W]"),
         tuple((name_of(m), *ERRORS[m].values()) for m in MODELS),
         "Errors on test data.",
     )

@@ -17,7 +17,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "results-schema.md"
 
 PER_MODEL = {"phy_nominal": 1.0, "phy": 0.2, "rnn": 0.4, "pgrnn": 0.17, "mopgrnn": 0.15}
 RESULTS = {
-    "schema_version": 4,
+    "schema_version": 5,
     "scenario": "golf_robot",
     "seed": 0,
     "budget": "quick",
@@ -29,8 +29,10 @@ RESULTS = {
         "details": {"seconds": {"train": 30.0}, "why_cut": ["a gap"], "warnings": []},
     },
     "identification": {
-        "e_sim_s": dict(PER_MODEL),
+        "error": dict(PER_MODEL),
         "rmse": {name: {"phi [rad]": value} for name, value in PER_MODEL.items()},
+        "fit_percent": {name: {"phi [rad]": 100 - value} for name, value in PER_MODEL.items()},
+        "e_sim": dict(PER_MODEL),
         "balance_violation": {name: {"energy [W]": value} for name, value in PER_MODEL.items()},
         "details": {
             "prior_parameters": {
@@ -43,7 +45,7 @@ RESULTS = {
             "scores_of_all_networks": {},
             "by_file": {},
             "smoother": {"sigma": [0.1], "walk": [1.0]},
-            "hybrid_over_phy": {"rmse": 0.75},
+            "hybrid_over_phy": {"error": 0.75, "e_sim": 0.8},
             "choice": {
                 "recommended": "mopgrnn",
                 "hybrid": "mopgrnn",
@@ -54,12 +56,22 @@ RESULTS = {
                 "phy": {
                     "share": 0.9,
                     "coverage": 0.88,
-                    "width": [0.1],
-                    "score": 0.2,
-                    "score_of_constant": 0.25,
+                    "width": {"phi [rad]": 0.1},
+                    "score": {"phi [rad]": 0.2},
+                    "score_of_constant": {"phi [rad]": 0.25},
                 }
             },
-            "baselines": {"ARX": {"rmse": [0.3], "chosen": "order 2"}, "N4SID": {"reason": "too short"}},
+            "baselines": {
+                "ARX": {
+                    "errors": {
+                        "error": 0.4,
+                        "rmse": {"phi [rad]": 0.3},
+                        "fit_percent": {"phi [rad]": 60.0},
+                    },
+                    "chosen": "order 2",
+                },
+                "N4SID": {"reason": "too short"},
+            },
         },
     },
     "export": {"parity_max_abs_error": 2e-16, "jacobian_max_abs_error": 1e-15},
@@ -154,8 +166,8 @@ def test_a_wrong_kind_is_named(path):
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, True, -math.inf])
 def test_only_finite_numbers_are_errors_of_a_model(value):
-    with pytest.raises(InputError, match=r"identification\.e_sim_s\.phy"):
-        read_results(put("identification.e_sim_s", PER_MODEL | {"phy": value}))
+    with pytest.raises(InputError, match=r"identification\.e_sim\.phy"):
+        read_results(put("identification.e_sim", PER_MODEL | {"phy": value}))
 
 
 def test_null_needs_a_reason():
@@ -167,8 +179,8 @@ def test_null_needs_a_reason():
 
 
 def test_another_version_and_unknown_keys_are_refused():
-    with pytest.raises(InputError, match="this version reads 4"):
-        read_results(put("schema_version", 3))
+    with pytest.raises(InputError, match="this version reads 5"):
+        read_results(put("schema_version", 4))
     with pytest.raises(InputError, match="no field 'programs'"):
         read_results(put("export.programs", 3))
 

@@ -257,7 +257,7 @@ def test_the_figure_of_the_strokes_shows_units_targets_and_mean_absolute_errors(
         box = ax.patches[0].get_window_extent().transformed(ax.transData.inverted())
         np.testing.assert_allclose([box.y0, box.y1], [-target, target], atol=1e-9)
     assert legend(figure) == [
-        "MOPGRNN (hybrid): 0.3 %, 4 ms, 1 of 3 missed",
+        "hybrid: 0.3 %, 4 ms, 1 of 3 missed",
         "prior, fitted: 40 %, 20 ms",
         "oracle: all 1 missed",
     ]

@@ -32,7 +32,7 @@ def test_it_writes_what_a_run_reads(call, few, tmp_path):
     files = sorted((tmp_path / "d").glob("*.csv"))
     assert [file.stem for file in files if "train" in file.stem] == ["train_01_step", "train_02_chirp"]
     prior = scenario.prior()
-    data = load_trajectories(files, scenario.data, outputs=prior.outputs, inputs=prior.inputs)
+    data = load_trajectories(files, prior, scenario.data)
     assert [len(data.by_role(role)) for role in ("train", "valid", "test")] == [2, 1, 1]
     text = (tmp_path / "d" / "README.md").read_text()
     for words in (

@@ -251,7 +251,7 @@ def test_recordings_of_the_torque_pendulum_load_with_every_role(tmp_path):
         columns = {"time_s": t, "pos_rad": 2 * np.sin(3 * t), "tau_cmd_Nm": np.sign(np.cos(3 * t))}
         files.append(write_csv(tmp_path / f"{stem}.csv", columns))
     prior = TorquePendulumPrior
-    data = load_trajectories(files, torque_pendulum.data, outputs=prior.outputs, inputs=prior.inputs)
+    data = load_trajectories(files, prior, torque_pendulum.data)
     assert {piece.role for piece in data.trajectories} == {"train", "valid", "test", "nominal"}
     names = {role: {p.file for p in data.by_role(role)} for role in ("train", "test")}
     assert names["train"] == {"energy_shaping_0p9Nm", "energy_shaping_1p5Nm"}  # both torques are trained on

@@ -19,7 +19,7 @@ from hybrid_mpc import (
 )
 from scenarios.unbalanced_disk import data, scenario
 from scenarios.unbalanced_disk.dynamics import DiskParameters
-from scenarios.unbalanced_disk.nominal import DT, INPUTS, OUTPUTS
+from scenarios.unbalanced_disk.nominal import DT
 from scenarios.unbalanced_disk.plant import DiskPlant
 from scenarios.unbalanced_disk.prior import UnbalancedDiskPrior
 from scenarios.unbalanced_disk.tasks import PEAK, UP_AT, standing
@@ -99,7 +99,7 @@ def test_recordings_are_files_like_the_real_ones(tmp_path, monkeypatch):
         assert sorted(arrays) == ["dt", "th", "u"]
         steps = arrays["th"] / DiskParameters().count
         np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)  # whole encoder steps
-    read = load_trajectories(files, scenario.data, outputs=OUTPUTS, inputs=INPUTS)
+    read = load_trajectories(files, scenario.prior(), scenario.data)
     assert {t.role for t in read.trajectories} == {"train", "valid", "test"}
     # a file's last sample may fall off the grid by rounding
     assert {data.SAMPLES - len(t.t) for t in read.trajectories} <= {0, 1}

@@ -17,6 +17,7 @@ from hybrid_mpc.files import read_json, write_json
 HERE = Path(__file__).parent
 IMAGES = HERE.parents[1] / "images"
 MODELS = ("phy", "rnn", "pgrnn", "mopgrnn", "hybrid")
+LINEAR = ("ARX", "N4SID")
 DROPPED = ("timing", "versions")
 
 
@@ -41,22 +42,43 @@ def digits(value: float) -> str:
 
 def errors(results: dict[str, Any]) -> list[str]:
     """Free runs: a row a test file, the validation part first."""
-    unit = results["model"]["validation"]["unit"]
-    validation = results["model"]["validation"]
-    known, long = validation["rmse"], validation.get("long_rmse", {})
-    chosen = results["model"]["hybrid"]
-    lines = [
-        f"| free runs [{unit}] | {' | '.join(MODELS)} | hybrid / phy |",
-        "| --- |" + " ---: |" * (len(MODELS) + 1),
-    ]
-    rows = {"validation": {**known, "hybrid": known[chosen]}}
-    if long:
-        rows |= {"whole recordings, mostly trained on": {**long, "hybrid": long[chosen]}}
-    rows |= {name: {m: f[m]["rmse"] for m in MODELS} for name, f in results["test"].items()}
-    for name, row in rows.items():
-        cells = [digits(row[m]) for m in MODELS]
-        lines.append(f"| {name} | {' | '.join(cells)} | {row['hybrid'] / row['phy']:.2f} |")
-    return [*lines, "", f"Recommended: {chosen}."]
+    model, chosen = results["model"], results["model"]["hybrid"]
+    if results["schema"] == 1:  # the first output alone
+        found = model["validation"]
+        unit, known, long = found["unit"], found["rmse"], found.get("long_rmse", {})
+        tests = {
+            name: {m: own["rmse"] for m, own in by.items() if m in MODELS}
+            for name, by in results["test"].items()
+        }
+        outputs = {f"[{unit}]": (known, long, tests)}
+    else:
+        outputs = {
+            label: (
+                {m: own["rmse"][label] for m, own in model["validation"].items()},
+                {m: own["rmse"][label] for m, own in model["long"].items()},
+                {
+                    name: {m: by[m]["rmse"][label] for m in (*MODELS, *LINEAR) if m in by}
+                    for name, by in results["test"].items()
+                },
+            )
+            for label in model["validation"]["phy"]["rmse"]
+        }
+    lines: list[str] = []
+    for label, (known, long, tests) in outputs.items():
+        rows = {"validation": {**known, "hybrid": known[chosen]}}
+        if long:
+            rows |= {"whole recordings, mostly trained on": {**long, "hybrid": long[chosen]}}
+        rows |= tests
+        names = [m for m in (*MODELS, *LINEAR) if all(m in row for row in rows.values())]
+        lines += [
+            f"| free runs {label} | {' | '.join(names)} | hybrid / phy |",
+            "| --- |" + " ---: |" * (len(names) + 1),
+        ]
+        for name, row in rows.items():
+            cells = [digits(row[m]) for m in names]
+            lines.append(f"| {name} | {' | '.join(cells)} | {row['hybrid'] / row['phy']:.2f} |")
+        lines.append("")
+    return [*lines, f"Recommended: {chosen}."]
 
 
 def parameters(results: dict[str, Any]) -> list[str]:

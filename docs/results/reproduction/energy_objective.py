@@ -50,7 +50,7 @@ def samples(work: Work, case: Case, count: int, model: str) -> list[np.ndarray]:
                 [
                     np.abs(run.x[:, -1]),
                     np.abs(run.xdot_hat - run.xdot).sum(1),
-                    np.abs(run.energy_model_w - run.energy_measured_w),
+                    np.abs(run.balances_hat - run.balances)[:, 0],
                 ]
             )
             for run in runs

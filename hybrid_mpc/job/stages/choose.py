@@ -15,12 +15,12 @@ from hybrid_mpc.identify.fit import parameter_variance
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.stage import Stage
-from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, members
+from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, members, models_of
 from hybrid_mpc.machine.prior import Prior
 
 Array = NDArray[np.float64]
 CANDIDATES = ("phy", "pgrnn", "mopgrnn")
-"""What may be recommended: the fitted prior, and the hybrids."""
+"""What may be recommended: the fitted prior, and the hybrids that :func:`models_of` the prior has."""
 FAR = 1e3
 """Spreads of an output beyond which a part of an error's variance says no more."""
 
@@ -51,8 +51,9 @@ def choice_stage(context: Context) -> ChoiceResult:
     valid = evaluation_trajectories(context.smoothed("valid"), smoother, context.warm, spec.free_run)
     errors: dict[str, list[Array]] = {}
     bands: dict[str, Bands] = {}
-    for i, name in enumerate(CANDIDATES):
-        context.progress.update("candidates", i, len(CANDIDATES), name)
+    candidates = [name for name in models_of(phy) if name in CANDIDATES]
+    for i, name in enumerate(candidates):
+        context.progress.update("candidates", i, len(candidates), name)
         every = [free_runs(step, phy, valid, context.warm) for step in members(context, name, phy)]
         errors[name] = [run.squared_errors(smoother.sizes.y) for run in every[0]]
         bands[name] = fit_bands(run_parts(phy, prior.fit, every, spec.dt))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,16 +12,26 @@ from numpy.typing import NDArray
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.bands import Bands, RunParts, coverage, interval_score
-from hybrid_mpc.identify.evaluate import FreeRun, Scores, evaluation_trajectories, free_runs, score
-from hybrid_mpc.identify.linear import LinearModel, fit_arx, fit_subspace
+from hybrid_mpc.identify.evaluate import (
+    FreeRun,
+    OutputErrors,
+    Scores,
+    evaluation_trajectories,
+    free_runs,
+    measured_as,
+    output_errors,
+    score,
+)
+from hybrid_mpc.identify.linear import BASELINES
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.stage import Stage
 from hybrid_mpc.job.stages.choose import CHOICE, run_parts
-from hybrid_mpc.job.stages.identify import DATA, MODELS, PRIOR, TRAINING, members
+from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, members, models_of
+from hybrid_mpc.machine.prior import Prior
 
 Array = NDArray[Any]
-BASELINES: Mapping[str, Callable[..., LinearModel]] = {"ARX": fit_arx, "N4SID": fit_subspace}
-"""Linear models of inputs and outputs, which practitioners ask for first."""
+DRAWN = ("t", "u", "x", "x_hat", "y", "y_hat", "balances", "balances_hat")
+"""Signals of a free run that are kept for the figures."""
 
 
 @dataclass(frozen=True)
@@ -31,25 +41,23 @@ class BandScores:
     Args:
         share: Share that they are to hold.
         coverage: Share that they hold.
-        width: Their mean width, by output [output units].
-        score: Mean interval score [output units]; the less the better.
+        width: Their mean width by output, ``"phi [rad]"``.
+        score: Mean interval score by output; the less the better.
         score_of_constant: That of a band of constant width with the same calibration.
     """
 
     share: float
     coverage: float
-    width: tuple[float, ...]
-    score: float
-    score_of_constant: float
+    width: Mapping[str, float]
+    score: Mapping[str, float]
+    score_of_constant: Mapping[str, float]
 
 
 @dataclass(frozen=True)
 class BaselineScores:
-    """Free-run errors of a linear model: root mean squares by output [output units], its orders, or why there is
-    none.
-    """
+    """Free-run errors of a linear model and its orders, or why there is none."""
 
-    rmse: tuple[float, ...] | None = None
+    errors: OutputErrors | None = None
     chosen: str = ""
     reason: str = ""
 
@@ -96,32 +104,34 @@ def evaluation_stage(context: Context) -> EvaluationResult:
     files: dict[str, dict[str, Scores]] = {}
     arrays: dict[str, Array] = {}
     bands: dict[str, BandScores] = {}
-    for i, name in enumerate(MODELS):
-        context.progress.update("models", i, len(MODELS), name)
+    spread = smoother.sizes.y
+    models = models_of(phy)
+    for i, name in enumerate(models):
+        context.progress.update("models", i, len(models), name)
         found, every, drawn = [], [], []
         for k, step in enumerate(members(context, name, phy)):
             runs = free_runs(step, phy, test, context.warm)
-            found.append(score(runs))
+            found.append(score(runs, phy, spread))
             every.append(runs)
             if name in chosen.bands:
                 drawn.append(free_runs(step, phy, shown, context.warm))
             if k == 0:
-                files[name] = {f: score(part) for f, part in _by_file(runs).items()}
+                files[name] = {f: score(part, phy, spread) for f, part in _by_file(runs).items()}
                 for run in drawn[0] if drawn else free_runs(step, phy, shown, context.warm):
-                    for key in ("t", "u", "x", "x_hat", "y", "energy_measured_w", "energy_model_w"):
+                    for key in DRAWN:
                         arrays[f"{name}/{run.name}/{key}"] = getattr(run, key)
         scores[name] = ModelScores(found[0], tuple(found))
         if name in chosen.bands:
             own = chosen.bands[name]
-            bands[name] = _band_scores(run_parts(phy, prior.fit, every, spec.dt), own)
+            parts_of_runs = run_parts(phy, prior.fit, every, spec.dt)
+            bands[name] = _band_scores(parts_of_runs, own, [s.label for s in phy.outputs])
             for run, parts in zip(drawn[0], run_parts(phy, prior.fit, drawn, spec.dt), strict=True):
-                arrays[f"{name}/{run.name}/y_hat"] = run.y_hat
                 arrays[f"{name}/{run.name}/band"] = own.half_width(parts.parts)
-    baselines = {name: _baseline(context, name, test) for name in BASELINES}
+    baselines = {name: _baseline(context, name, phy, test, spread) for name in BASELINES}
     return EvaluationResult(scores, files, tuple(t.name for t in whole), bands, baselines, arrays)
 
 
-def _band_scores(runs: Sequence[RunParts], bands: Bands) -> BandScores:
+def _band_scores(runs: Sequence[RunParts], bands: Bands, outputs: Sequence[str]) -> BandScores:
     """What a band holds of unseen runs, and its score beside that of a band of constant width as calibrated."""
     widths = [2 * bands.half_width(run.parts).mean(axis=0) for run in runs]
     sizes = [len(run.error) for run in runs]
@@ -129,17 +139,22 @@ def _band_scores(runs: Sequence[RunParts], bands: Bands) -> BandScores:
     def mean(values: Sequence[Any]) -> Any:
         return np.average(np.array(values), axis=0, weights=sizes)
 
+    def by_output(values: Sequence[Any]) -> dict[str, float]:
+        return {name: float(v) for name, v in zip(outputs, mean(values), strict=True)}
+
     flat = bands.of_constant_width()
     return BandScores(
         bands.share,
         float(mean([coverage(run, bands) for run in runs])),
-        tuple(float(w) for w in mean(widths)),
-        float(mean([interval_score(run, bands) for run in runs])),
-        float(mean([interval_score(run, flat) for run in runs])),
+        by_output(widths),
+        by_output([interval_score(run, bands) for run in runs]),
+        by_output([interval_score(run, flat) for run in runs]),
     )
 
 
-def _baseline(context: Context, name: str, test: Sequence[Trajectory]) -> BaselineScores:
+def _baseline(
+    context: Context, name: str, phy: Prior, test: Sequence[Trajectory], spread: Sequence[float]
+) -> BaselineScores:
     """Free runs of a linear model over the test trajectories, from the same warm-up as the others."""
     train, valid = context.trajectories("train"), context.trajectories("valid")
     warm = context.warm + 1  # the others start from a state that knows this sample
@@ -147,11 +162,9 @@ def _baseline(context: Context, name: str, test: Sequence[Trajectory]) -> Baseli
         model = BASELINES[name](train, valid, context.spec.dt, warm=warm)
     except InputError as error:
         return BaselineScores(reason=str(error))
-    y_hat = model.free_runs(test, warm)
-    squares = [np.nanmean(np.square(hat - t.y[warm:]), axis=0) for hat, t in zip(y_hat, test, strict=True)]
-    own = {key: getattr(model.chosen, key) for key in ("order", "delay", "horizon")}
-    chosen = ", ".join(f"{key} {value}" for key, value in own.items() if value)
-    return BaselineScores(tuple(np.sqrt(np.mean(squares, axis=0)).tolist()), chosen)
+    y_hat = [measured_as(phy, own) for own in model.free_runs(test, warm)]
+    errors = output_errors(y_hat, [t.y[warm:] for t in test], phy.outputs, spread)
+    return BaselineScores(errors, model.chosen.text)
 
 
 def _by_file(runs: Sequence[FreeRun]) -> dict[str, list[FreeRun]]:

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import sha256
-from hybrid_mpc.identify.export import check_parity, model_info, trace_model
+from hybrid_mpc.identify.export import check_parity, trace_model
+from hybrid_mpc.identify.prior_model import model_info
 from hybrid_mpc.identify.step import PriorStep, RecurrentStep
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.controllers import noise_of

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from hybrid_mpc.identify.settings import KINDS
+from hybrid_mpc.identify.evaluate import Scores
+from hybrid_mpc.identify.settings import kinds_of
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.stage import Absent
 from hybrid_mpc.job.stages.analyze import ANALYSIS
@@ -18,7 +19,7 @@ from hybrid_mpc.job.stages.compare import CONTROL
 from hybrid_mpc.job.stages.estimate import ESTIMATION, OBSERVERS
 from hybrid_mpc.job.stages.evaluate import EVALUATION
 from hybrid_mpc.job.stages.guard import GUARD, read_trace
-from hybrid_mpc.job.stages.identify import MODELS, trained_models
+from hybrid_mpc.job.stages.identify import trained_models
 from hybrid_mpc.job.stages.monitor import MONITOR, clean_windows
 from hybrid_mpc.job.stages.results import REPORTED, finite, step_times
 from hybrid_mpc.job.summary import summaries
@@ -60,14 +61,16 @@ def _data(context: Context) -> Any:
     yield "data", "recordings", figure, "Recordings with what each part is used for."
     parts = {role: context.smoothed(role) for role in ("train", "test")}  # states that no sensor sees, too
     smoothed = [t for part in parts.values() for t in part]
-    if len(prior.states) > 1:
-        yield "data", "coverage", data.coverage(smoothed, prior.states), "Where training and test data lie."
+    caption = (
+        "Where training and test data lie." if prior.kinematics else "States over time, measured or not."
+    )
+    yield "data", "coverage", data.coverage(smoothed, prior.states, prior.kinematics), caption
 
 
 def _training(context: Context) -> Any:
     curves: dict[str, dict[str, Any]] = {}
     starts: dict[str, float] = {}
-    for kind in reversed(KINDS):
+    for kind in reversed(kinds_of(context.scenario.prior())):
         trained = trained_models(context, kind)
         objectives = [name.removeprefix("loss_") for name in trained.curve if name.startswith("loss_")]
         names = ["validation", f"loss_{objectives[0]}"]
@@ -84,42 +87,63 @@ def _training(context: Context) -> Any:
 
 
 def _free_runs(context: Context) -> Any:
-    found, prior = context.read(EVALUATION), context.scenario.prior()
+    found, prior, deployed = context.read(EVALUATION), context.scenario.prior(), context.read(CHOICE).deployed
     arrays = found.arrays
+    states = {s.name for s in prior.states}
+    others = [j for j, s in enumerate(prior.outputs) if s.name not in states]
+    signals = [*prior.states, *(prior.outputs[j] for j in others)]
+
+    def drawn(run: str, end: str = "") -> Any:
+        return np.hstack([arrays[f"{run}/x{end}"], arrays[f"{run}/y{end}"][:, others]])
+
     for run in found.runs[:SHOWN_RUNS]:
-        own = {m: {k: arrays[f"{m}/{run}/{k}"] for k in ("x_hat", "energy_model_w")} for m in MODELS}
-        shared = {k: arrays[f"mopgrnn/{run}/{k}"] for k in ("t", "x", "u", "energy_measured_w")}
-        shown = ("phy_nominal", "phy", "rnn", "mopgrnn")
+        own = {key: arrays[f"{deployed}/{run}/{key}"] for key in ("t", "u", "balances", "balances_hat")}
+        balances = [
+            fit.BalanceRun(b.name, b.rate_unit, own["balances"][:, i], own["balances_hat"][:, i])
+            for i, b in enumerate(prior.equations.balances)
+        ]
+        shown = ("phy_nominal", "phy", "rnn", deployed)
         figure = fit.free_run(
-            shared["t"], shared["x"], {m: own[m]["x_hat"] for m in shown}, shared["u"],
-            states=prior.states, inputs=prior.inputs, energy_measured=shared["energy_measured_w"],
-            energy_model=own["mopgrnn"]["energy_model_w"], title=f"Free run on {run}",
-            band=_band(prior, arrays, f"{context.read(CHOICE).deployed}/{run}"),
+            own["t"], drawn(f"{deployed}/{run}"), {m: drawn(f"{m}/{run}", "_hat") for m in shown}, own["u"],
+            signals=signals, inputs=prior.inputs, balances=balances, hybrid=deployed,
+            title=f"Free run on {run}", band=_band(prior, arrays, f"{deployed}/{run}"),
         )  # fmt: skip
         caption = f"Free run over the unseen piece {run}; the warm-up before it is left out."
         yield "free_run", f"free_run_{run.replace('#', '-')}", figure, caption
-    keys = ("e_sim_s", "rmse_rad", "energy_violation_w")
-    values = {m: {k: finite(getattr(found.scores[m].best, k)) for k in keys} for m in MODELS}
-    every = {m: {k: [getattr(n, k) for n in found.scores[m].networks] for k in keys} for m in KINDS}
-    spread: dict[str, dict[str, float]] = {
-        m: {k: float(np.std(v)) for k, v in by.items()}
-        for m, by in every.items()
-        if all(np.isfinite(v).all() for v in by.values())
+    metrics = metrics_of(prior)
+    values = {m: _flat(scores.best) for m, scores in found.scores.items()}
+    every = {str(m): [_flat(n) for n in found.scores[m].networks] for m in kinds_of(prior)}
+    spread = {
+        m: {k: float(np.std([n[k] for n in own])) for k in metrics}
+        for m, own in every.items()
+        if all(n[k] is not None for n in own for k in metrics)
     }
-    metrics = {**fit.METRICS, "rmse_rad": f"free-run RMSE [{prior.outputs[0].unit}]"}
     caption = "Errors over all unseen pieces; whiskers: standard deviation over the networks of a kind."
-    yield "free_run", "errors", fit.errors_bar(values, spread=spread, metrics=metrics), caption
+    yield "free_run", "errors", fit.errors_bar(values, metrics, spread=spread), caption
+
+
+def metrics_of(prior: Prior) -> dict[str, str]:
+    """Figures of free runs by the name that they have in :func:`_flat`, with unit: what the bars are of."""
+    rmse = {f"rmse {s.label}": f"RMSE of {s.label}" for s in prior.outputs}
+    balances = [f"{b.name} [{b.rate_unit}]" for b in prior.equations.balances]
+    violation = {f"violation {label}": f"violation of {label}" for label in balances}
+    # one output's error over its spread is its RMSE once more
+    over = {"error": "error over the spread [-]"} if len(prior.outputs) > 1 else {}
+    return {**over, **rmse, "e_sim": "simulation error $E_{sim}$ [-]", **violation}
+
+
+def _flat(scores: Scores) -> dict[str, Any]:
+    """Figures by name; None where a run diverged."""
+    every = {"error": scores.error, "e_sim": scores.e_sim}
+    every |= {f"rmse {label}": value for label, value in scores.rmse.items()}
+    every |= {f"violation {label}": value for label, value in scores.violation.items()}
+    return {name: finite(value) for name, value in every.items()}
 
 
 def _band(prior: Prior, arrays: Any, run: str) -> dict[str, tuple[Any, Any]]:
-    """The hybrid's band by the name of the state that an output measures: lower and upper end."""
+    """The hybrid's band by the name of an output: lower and upper end."""
     y_hat, half = arrays[f"{run}/y_hat"], arrays[f"{run}/band"]
-    names = {s.name for s in prior.states}
-    return {
-        s.name: (y_hat[:, j] - half[:, j], y_hat[:, j] + half[:, j])
-        for j, s in enumerate(prior.outputs)
-        if s.name in names
-    }
+    return {s.name: (y_hat[:, j] - half[:, j], y_hat[:, j] + half[:, j]) for j, s in enumerate(prior.outputs)}
 
 
 def _loops(context: Context) -> Any:
@@ -259,8 +283,8 @@ def _analysis(context: Context) -> Any:
     found = context.find(ANALYSIS)
     if isinstance(found, Absent):
         return
-    arrays, colours = found.arrays, {"prior": "phy", "hybrid": "mopgrnn"}
-    poles = {c: np.array([complex(*z) for z in found.models[n].rest.poles]) for n, c in colours.items()}
+    arrays = found.arrays
+    poles = {n: np.array([complex(*z) for z in found.models[n].rest.poles]) for n in ("prior", "hybrid")}
     yield (
         "analysis",
         "poles",
@@ -268,13 +292,14 @@ def _analysis(context: Context) -> Any:
         "Poles of the one-step maps at rest.",
     )
     prior = context.scenario.prior()
-    titles = {"rest": "at rest, where the slope of dry friction dominates", "moving": "at working speed"}
+    friction = ", where the slope of dry friction dominates" if prior.kinematics else ""
+    titles = {"rest": f"at rest{friction}", "moving": "at working speed"}
     for point in ("rest", "moving"):
         if point not in found.models["prior"].points:
             continue
         responses = {
-            c: (arrays[f"{n}/{point}/omega"], arrays[f"{n}/{point}/magnitude"], arrays[f"{n}/{point}/phase"])
-            for n, c in colours.items()
+            n: (arrays[f"{n}/{point}/omega"], arrays[f"{n}/{point}/magnitude"], arrays[f"{n}/{point}/phase"])
+            for n in poles
         }
         figure = analysis.bode(
             responses, input_signal=prior.inputs[0], output_signal=prior.outputs[0], nyquist=np.pi / context.spec.dt

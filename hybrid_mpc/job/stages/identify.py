@@ -14,10 +14,10 @@ from hybrid_mpc.data.excitation import check_excitation
 from hybrid_mpc.data.trajectories import ROLES, Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import digest, read_document, read_document_arrays, sha256, write_document
-from hybrid_mpc.identify.export import prior_programs
 from hybrid_mpc.identify.fit import fit_prior, smoothed
+from hybrid_mpc.identify.prior_model import prior_programs
 from hybrid_mpc.identify.prior_result import PriorFit
-from hybrid_mpc.identify.settings import KINDS, TrainingSettings
+from hybrid_mpc.identify.settings import KINDS, TrainingSettings, kinds_of
 from hybrid_mpc.identify.step import PriorStep, Scaling, Step
 from hybrid_mpc.identify.train import Trained, TrainingFailure, train
 from hybrid_mpc.job.context import Context
@@ -31,7 +31,7 @@ from nn_export.program import to_json
 Array = NDArray[Any]
 
 MODELS = ("phy_nominal", "phy", *KINDS)
-"""Models that are evaluated."""
+"""Models that may be evaluated; those of a prior: :func:`models_of`."""
 ERRORS = {"error": "E_sim", "output": "RMSE over the spread"}
 """What the validation of a training is called, by its first objective."""
 
@@ -209,10 +209,17 @@ def prior_stage(context: Context) -> PriorResult:
 def what_training_reads(context: Context) -> dict[str, object]:
     """Settings of the networks, the device, and the period of the recordings."""
     return {
-        "settings of the networks": {kind: training_settings(context, kind) for kind in KINDS},
+        "settings of the networks": {
+            kind: training_settings(context, kind) for kind in kinds_of(context.scenario.prior())
+        },
         "device": context.settings.device,
         "period": context.spec.dt,
     }
+
+
+def models_of(prior: Prior) -> tuple[str, ...]:
+    """Models of a prior that are evaluated: without and with fitted parameters, and each kind of network."""
+    return ("phy_nominal", "phy", *kinds_of(prior))
 
 
 def training_stage(context: Context) -> TrainingResult:
@@ -221,16 +228,12 @@ def training_stage(context: Context) -> TrainingResult:
         :12
     ]  # networks of other settings or data lie in a folder of their own
     folder = context.out / "checkpoints" / "training" / name
-    if not context.scenario.prior().equations.balances:
-        context.progress.warn(
-            "the prior has no balance: MOPGRNN has the error as its only objective, as PGRNN"
-        )
     trained = train_kinds(
         context.settings.scenario,
         context.prior.fit.values,
         context.smoothed("train"),
         context.smoothed("valid"),
-        {kind: training_settings(context, kind) for kind in KINDS},
+        {kind: training_settings(context, kind) for kind in kinds_of(context.scenario.prior())},
         folder,
         device=context.settings.device,
         on_progress=context.progress.update,

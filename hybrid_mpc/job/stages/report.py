@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -9,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from hybrid_mpc.files import write_json
+from hybrid_mpc.identify.evaluate import OutputErrors
+from hybrid_mpc.identify.settings import NO_BALANCE
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.controllers import CONTROLLERS
 from hybrid_mpc.job.stage import Stage, source_of
@@ -25,6 +28,7 @@ from hybrid_mpc.job.stages.identify import (
     MODELS,
     PRIOR,
     TRAINING,
+    models_of,
     training_settings,
 )
 from hybrid_mpc.job.stages.monitor import MONITOR, RATES, MonitorResult
@@ -38,10 +42,11 @@ from hybrid_mpc.job.stages.results import (
     Results,
     Timing,
     collect,
+    finite,
 )
 from hybrid_mpc.job.summary import Summary
 from hybrid_mpc.monitor.residuals import force_units
-from hybrid_mpc.plots.style import name_of
+from hybrid_mpc.plots.style import name_of, number
 from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, Verdict, words, write_report
 
 TITLES: Mapping[str, str] = {
@@ -191,7 +196,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
     tables: dict[str, Sequence[Table | None]] = {
         "data": [_data_table(results.data)],
         "models": [_prior_table(context)],
-        "free_run": [_score_table(results), _choice_table(results), _band_table(context, results)],
+        "free_run": [*_score_tables(context, results), _choice_table(results), _band_table(context, results)],
         "export": [_export_table(results.export)],
         "control": [_control_table(results.control)],
         "estimation": [_observer_table(results)],
@@ -201,6 +206,14 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         "analysis": [_pole_table(results.analysis)],
     }
     instead, after = _notes(context, results)
+    for key in (
+        "estimation",
+        "timing",
+        "monitor",
+        "guard",
+    ):  # words about pictures that are not there help nobody
+        if key in after and not figures.get(key) and not any(t is not None and t.rows for t in tables[key]):
+            instead[key] = after.pop(key)
     texts = words("run_words.html")
     sections = tuple(
         Section(
@@ -226,17 +239,19 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
 
 def _summary(context: Context, results: Results) -> Iterator[KeyFigure]:
     found, timing, control = results.identification, results.timing, results.control
-    unit = context.scenario.prior().outputs[0].unit
-    rmse = {m: _first(found.rmse[m]) for m in MODELS}
-    e_sim = {m: _first(found.e_sim_s[m]) for m in MODELS}
     ratio, hybrid = found.details.hybrid_over_phy, found.details.choice.hybrid
+    for output in context.scenario.prior().outputs:
+        rmse, base = (_by(found.rmse[m], output.label) for m in (hybrid, "phy"))
+        fit = _by(found.fit_percent[hybrid], output.label)
+        words = "" if fit is None else f"FIT {fit:.0f} %; "
+        yield KeyFigure(
+            f"Free-run error (RMSE) of {output.name}, hybrid on unseen data", rmse, output.unit,
+            f"{words}fitted prior: {_text(base)} {output.unit}", _verdict(_ratio(rmse, base)),
+        )  # fmt: skip
+    e_sim = {m: _number(found.e_sim[m]) for m in MODELS}
     yield KeyFigure(
-        "Free-run error (RMSE) of the hybrid on unseen data", rmse[hybrid], unit,
-        f"fitted prior: {_text(rmse['phy'])} {unit}", _verdict(ratio["rmse"]),
-    )  # fmt: skip
-    yield KeyFigure(
-        "Simulation error E_sim of the hybrid", e_sim[hybrid], "s",
-        f"fitted prior: {_text(e_sim['phy'])}, RNN: {_text(e_sim['rnn'])}", _verdict(ratio["e_sim_s"]),
+        "Simulation error E_sim of the hybrid, over the rates' spread", e_sim[hybrid], "",
+        f"fitted prior: {_text(e_sim['phy'])}, RNN: {_text(e_sim['rnn'])}", _verdict(ratio["e_sim"]),
     )  # fmt: skip
     choice = found.details.choice
     own = choice.candidates[choice.hybrid]
@@ -293,11 +308,15 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
     if without:
         after["estimation"] = (f"Not tested: {'; '.join(dict.fromkeys(without))}.",)
     after["data"] = tuple(f"Warning: {text}" for text in results.data.details.warnings)
-    after["training"] = _prior_replay_text(
-        training_settings(context, context.read(CHOICE).deployed).prior_replay
+    replay = training_settings(context, context.read(CHOICE).deployed).prior_replay
+    lacking = "mopgrnn" not in models_of(context.scenario.prior())
+    after["training"] = ((f"There is no MOPGRNN: {NO_BALANCE}.",) if lacking else ()) + _prior_replay_text(
+        replay
     )
     if context.prior.fit.warnings:
         after["models"] = ("Warnings of the fit: " + "; ".join(context.prior.fit.warnings) + ".",)
+    if results.timing.misses is None:
+        after["timing"] = (f"No step was timed: {results.timing.misses_reason.rstrip('.')}.",)
     monitor = results.monitor
     if monitor.details.calibration is None:
         after["monitor"] = (f"No alarms here: {monitor.reason.rstrip('.')}.",)
@@ -371,23 +390,40 @@ def _prior_table(context: Context) -> Table:
     return Table(("parameter", "meaning", "nominal", "fitted", "standard error"), rows, caption)
 
 
-def _score_table(results: Results) -> Table:
-    found = results.identification
-    groups = [
-        {m: _first(by[m]) for m in MODELS} for by in (found.e_sim_s, found.rmse, found.balance_violation)
-    ]
-    named = (value for value in found.rmse.values() if isinstance(value, Mapping))
-    unit = next((label for by in named for label in by), "[-]").partition(" ")[2]
-    base = [group["phy"] for group in groups]
-    rows = [
-        (name_of(m), *(g[m] for g in groups), *(_percent(g[m], b) for g, b in zip(groups, base, strict=True)))
-        for m in MODELS
-    ]
+def _score_tables(context: Context, results: Results) -> list[Table]:
+    """Errors of every model: by output; then of its rates and by balance."""
+    found, prior = results.identification, context.scenario.prior()
+    models = models_of(prior)
+    outputs = [s.label for s in prior.outputs]
+    base = _number(found.error["phy"])
+    rows: list[tuple[Any, ...]] = []
+    for m in models:
+        error = _number(found.error[m])
+        rmse, fit = ([_by(by[m], label) for label in outputs] for by in (found.rmse, found.fit_percent))
+        rows.append((name_of(m), error, _percent(error, base), *rmse, *fit))
     for name, own in found.details.baselines.items():
-        error = None if own.rmse is None else own.rmse[0]
-        rows.append((f"{name} (linear)", None, error, None, "–", _percent(error, base[1]), "–"))
-    columns = ("model", "E_sim [s]", f"RMSE {unit}", "violation [W]", "E_sim", "RMSE", "violation")
-    return Table(columns, rows, "Free runs on unseen data; the last columns against the fitted prior.")
+        errors = own.errors or OutputErrors(math.inf, {}, {})
+        error = finite(errors.error)
+        rmse, fit = ([_by(by, label) for label in outputs] for by in (errors.rmse, errors.fit_percent))
+        rows.append((f"{name} (linear)", error, _percent(error, base), *rmse, *fit))
+    columns = ("model", "error [spreads]", "over the prior's", *(f"RMSE of {label}" for label in outputs),
+               *(f"FIT of {s.name} [%]" for s in prior.outputs))  # fmt: skip
+    tables = [Table(columns, rows, "Free runs on unseen data: outputs.")]
+    balances = [f"{b.name} [{b.rate_unit}]" for b in prior.equations.balances]
+    base = _number(found.e_sim["phy"])
+    rows = []
+    for m in models:
+        e_sim = _number(found.e_sim[m])
+        violations = [_by(found.balance_violation[m], label) for label in balances]
+        rows.append((name_of(m), e_sim, _percent(e_sim, base), *violations))
+    columns = (
+        "model",
+        "E_sim [spreads]",
+        "over the prior's",
+        *(f"violation of {label}" for label in balances),
+    )
+    caption = "Free runs on unseen data: rates of the states" + (" and balances." if balances else ".")
+    return [*tables, Table(columns, rows, caption)]
 
 
 def _choice_table(results: Results) -> Table:
@@ -401,25 +437,32 @@ def _choice_table(results: Results) -> Table:
 
 
 def _band_table(context: Context, results: Results) -> Table:
-    prior, bands = context.scenario.prior(), results.identification.details.bands
-    rows: list[tuple[str | float, ...]] = [
-        (
-            name_of(name), f"{100 * b.share:g} %", f"{100 * b.coverage:.0f} %",
-            *(f"{width:.4g}" for width in b.width), b.score, b.score_of_constant,
-        )
-        for name, b in bands.items()
+    rows: list[tuple[Any, ...]] = [
+        (name_of(name), output.label, f"{100 * b.share:g} %", f"{100 * b.coverage:.0f} %",
+         *(by[output.label] for by in (b.width, b.score, b.score_of_constant)))
+        for name, b in results.identification.details.bands.items()
+        for output in context.scenario.prior().outputs
     ]  # fmt: skip
-    widths = (f"mean width of {s.label}" for s in prior.outputs)
-    columns = ("model", "is to hold", "holds", *widths, "interval score", "of a constant band")
+    what = ("mean width", "interval score", "of a constant band")
+    columns = ("model", "output", "is to hold", "all hold", *what)
     caption = (
-        "Bands around free runs, calibrated on validation recordings, on unseen data; a low score is good."
+        "Bands around free runs, calibrated on validation recordings, on unseen data, in the outputs' units; a low "
+        "score is good."
     )
     return Table(columns, rows, caption)
 
 
-def _first(value: Any) -> float | None:
-    """The first number of an object by name, or the number itself."""
-    return next(iter(value.values())) if isinstance(value, Mapping) else value
+def _by(values: Any, label: str) -> float | None:
+    """The number of a signal, where there are any and all are finite."""
+    return values.get(label) if isinstance(values, Mapping) else None
+
+
+def _number(value: Any) -> float | None:
+    return value if isinstance(value, float) else None
+
+
+def _ratio(value: float | None, base: float | None) -> float | None:
+    return None if value is None or not base else value / base
 
 
 def _percent(value: float | None, base: float | None) -> str:
@@ -501,11 +544,15 @@ def _pole_table(analysis: Analysis) -> Table | None:
     rows = []
     for model, found in analysis.details.models.items():
         for point, a in found.points.items():
-            slow = [f"{w:.2f} ({z:.2f})" for w, z in
+            slow = [f"{number(w)} ({z:.2f})" for w, z in
                     list(zip(a.frequency_rad_s, a.damping, strict=True))[:2] if w is not None]  # fmt: skip
             rows.append((model, point, ", ".join(slow), a.stable, a.stabilisable, a.detectable))
     columns = ("model", "point", "slowest poles: rad/s (damping)", "stable", "stabilisable", "detectable")
-    return Table(columns, rows, "Linearizations at rest and at working speed.")
+    points = {"rest": "at rest", "moving": "at working speed"}
+    there = [
+        points[p] for p in points if any(p in found.points for found in analysis.details.models.values())
+    ]
+    return Table(columns, rows, f"Linearizations {' and '.join(there)}.")
 
 
 REPORT = Stage(

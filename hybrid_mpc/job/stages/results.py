@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.evaluate import Scores
+from hybrid_mpc.identify.settings import NO_BALANCE
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.loops import LoopRow
 from hybrid_mpc.job.stage import Absent
@@ -34,9 +35,9 @@ from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.records import plain, record
 
 Array = NDArray[np.float64]
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 ENERGY = "energy [W]"
-"""Name of the only balance that there is so far, with the unit of its rate."""
+"""The balance that the monitor watches, with the unit of its rate."""
 BASELINES = ("prior", "prior_observer")
 REPORTED = {"prior": "prior_observer", "hybrid": "hybrid_observer", "oracle": "oracle"}
 """Controllers behind the three names of ``results.json``: all with the same kind of estimator."""
@@ -93,13 +94,14 @@ class SmootherNoise:
 
 @dataclass(frozen=True)
 class IdentificationDetails:
-    """Behind the errors. ``by_file`` is the RMSE of the first output by recording, None where a run diverged;
-    ``hybrid_over_phy`` the hybrid's error over the fitted prior's; ``network_settings`` what replaced the budget's.
+    """Behind the errors. ``by_file`` is the RMSE by recording, model and output, None where a run diverged;
+    ``hybrid_over_phy`` the hybrid's ``error`` and ``e_sim`` over the fitted prior's; ``network_settings`` what replaced
+    the budget's.
     """
 
     prior_parameters: FittedPrior
     scores_of_all_networks: Mapping[str, tuple[Scores, ...]]
-    by_file: Mapping[str, Mapping[str, float | None]]
+    by_file: Mapping[str, Mapping[str, Mapping[str, float] | None]]
     smoother: SmootherNoise
     hybrid_over_phy: Mapping[str, float | None]
     choice: ModelChoice
@@ -131,10 +133,12 @@ class CandidateErrors:
 
 @dataclass(frozen=True)
 class Identification:
-    """Errors of free runs on unseen data: simulation error, RMSE of the first output, mean absolute violation."""
+    """Errors of free runs on unseen data by model; see :class:`~hybrid_mpc.identify.evaluate.Scores`."""
 
-    e_sim_s: Mapping[str, float | str | None]
+    error: Mapping[str, float | str | None]
     rmse: Errors
+    fit_percent: Errors
+    e_sim: Mapping[str, float | str | None]
     balance_violation: Errors
     details: IdentificationDetails
 
@@ -412,21 +416,23 @@ def collect(context: Context) -> Results:
 
 def _identification(context: Context) -> Identification:
     found, prior, chosen = context.read(EVALUATION), context.prior, context.read(CHOICE).choice
-    output, network = context.scenario.prior().outputs[0].label, context.settings.network()
-    best = {name: found.scores[name].best for name in MODELS}
-    e_sim = {name: finite(scores.e_sim_s) for name, scores in best.items()}
-    rmse = {name: finite(scores.rmse_rad) for name, scores in best.items()}
-    violation = {name: finite(scores.energy_violation_w) for name, scores in best.items()}
+    network = context.settings.network()
+    best = {name: scores.best for name, scores in found.scores.items()}
+    error = {name: finite(scores.error) for name, scores in best.items()}
+    e_sim = {name: finite(scores.e_sim) for name, scores in best.items()}
     details = IdentificationDetails(
         FittedPrior(
             prior.fit.values, prior.fit.standard_errors, prior.nominal, prior.fit.warnings, prior.fit.stages
         ),
-        {name: found.scores[name].networks for name in MODELS},
-        {stem: {m: finite(found.by_file[m][stem].rmse_rad) for m in MODELS} for stem in found.by_file["phy"]},
+        {name: scores.networks for name, scores in found.scores.items()},
+        {
+            stem: {m: _all_finite(by[stem].rmse) for m, by in found.by_file.items()}
+            for stem in found.by_file["phy"]
+        },
         SmootherNoise(prior.fit.sigma, prior.fit.walk),
         {
-            "e_sim_s": _ratio(e_sim[chosen.hybrid], e_sim["phy"]),
-            "rmse": _ratio(rmse[chosen.hybrid], rmse["phy"]),
+            "error": _ratio(error[chosen.hybrid], error["phy"]),
+            "e_sim": _ratio(e_sim[chosen.hybrid], e_sim["phy"]),
         },
         ModelChoice(
             chosen.recommended,
@@ -442,18 +448,25 @@ def _identification(context: Context) -> Identification:
         network or None,
     )
     return Identification(
+        _with_reasons(error),
+        _with_reasons({name: _all_finite(scores.rmse) for name, scores in best.items()}),
+        _with_reasons({name: _all_finite(scores.fit_percent) for name, scores in best.items()}),
         _with_reasons(e_sim),
-        _with_reasons({name: None if value is None else {output: value} for name, value in rmse.items()}),
-        _with_reasons(
-            {name: None if value is None else {ENERGY: value} for name, value in violation.items()}
-        ),
+        _with_reasons({name: _all_finite(scores.violation) for name, scores in best.items()}),
         details,
     )
 
 
 def _with_reasons(values: Mapping[str, Any]) -> dict[str, Any]:
     """Values by model; those that are none with their reason."""
-    return dict(values) | {f"{name}_reason": "a free run diverged" for name, v in values.items() if v is None}
+    every = {name: values.get(name) for name in MODELS}
+    reasons = {name: "a free run diverged" if name in values else NO_BALANCE for name in MODELS}
+    return every | {f"{name}_reason": reasons[name] for name, value in every.items() if value is None}
+
+
+def _all_finite(values: Mapping[str, float]) -> dict[str, float] | None:
+    """Values by signal, or None where one of them is not finite."""
+    return dict(values) if all(math.isfinite(value) for value in values.values()) else None
 
 
 def finite(value: float) -> float | None:

@@ -22,7 +22,6 @@ from hybrid_mpc import load_trajectories
 from scenarios.paper.experiment import Effort
 from scenarios.pendulum import scenario
 from scenarios.pendulum.data import make_data
-from scenarios.pendulum.nominal import INPUTS, OUTPUTS
 
 
 def prior(values=None):
@@ -33,7 +32,7 @@ def prior(values=None):
 
 def runs(data_set, seed, folder):
     files = make_data(folder, seed, "quick")
-    return load_trajectories(files, scenario.data, outputs=OUTPUTS, inputs=INPUTS).trajectories
+    return load_trajectories(files, scenario.prior(), scenario.data).trajectories
 
 
 effort = Effort(1, (2,), steps=4, free_run_steps=2, valid=1, test=1, hidden=4, every=2, batch=4)

@@ -19,7 +19,7 @@ def run(name, n=50):
     t = 0.5 + 0.1 * np.arange(n)
     y, z = np.sin(t)[:, None], np.zeros(n)
     x = np.column_stack([np.sin(t), np.cos(t)])
-    return FreeRun(name, t, z[:, None], x, x, y, y, x, x, z, z)
+    return FreeRun(name, t, z[:, None], x, x, y, y, x, x, z[:, None], z[:, None])
 
 
 def test_a_good_network_has_not_diverged():
@@ -76,11 +76,12 @@ def test_when_a_training_has_converged():
 
 
 @pytest.mark.parametrize("dt", [0.02, 0.01])
-def test_two_figures_that_only_the_paper_needs(dt):
+def test_figures_as_the_paper_has_them(dt):
     n, off = round(2.0 / dt), np.array([0.0, -3.0])
     z = np.zeros((n, 2))
-    made = FreeRun("r", dt * np.arange(n), z[:, :1], z, z, z, z, z, z + off, z[:, 0], z[:, 0])
+    made = FreeRun("r", dt * np.arange(n), z[:, :1], z, z, z, z - 0.5, z, z + off, z[:, :1], z[:, :1] + 0.25)
     figures = figures_of([made])
+    assert (figures["rmse_rad"], figures["energy_violation_w"]) == pytest.approx((0.5, 0.25))
     assert figures["e_sim_s"] == pytest.approx(3.0, rel=1e-12)
     # integral over 2 s / n samples
     assert figures["e_sim_paper_s"] == pytest.approx(3.0 * 2.0 / n, rel=1e-12)

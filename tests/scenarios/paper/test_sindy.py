@@ -14,9 +14,9 @@ from hybrid_mpc import (
     check_parity,
     free_runs,
     model_info,
-    score,
     trace_model,
 )
+from scenarios.paper.jobs import figures_of
 from scenarios.paper.sindy import Factor, Library, SindyStep, fit_sindy, machine_libraries
 from scenarios.pendulum.data import exact_runs
 from scenarios.pendulum.plant import DampedPendulum
@@ -80,7 +80,7 @@ def test_friction_of_an_unknown_slope_is_found_and_beats_what_lacks_it(runs):
     np.testing.assert_allclose(step.coefficients[:, 0] * TRUTH["J"], truth, atol=1e-3)
     test = [record(9, seconds=3.0, extra=friction)]
     ours, prior = (
-        score(free_runs(s, Pendulum(TRUTH), test, WARM, EMPTY)).e_sim_s
+        figures_of(free_runs(s, Pendulum(TRUTH), test, WARM, EMPTY))["e_sim_s"]
         for s in (step, PriorStep(Pendulum(TRUTH), DT))
     )
     assert ours < 0.01 * prior  # 0.0005 and 2.0: the prior has no friction
@@ -97,7 +97,7 @@ def test_validation_alone_chooses_and_the_fewest_terms_win(runs):
     names = {c.library for c in step.candidates}
     assert names == {library.name for library in machine_libraries(Pendulum())}
     # what a candidate is said to score is what its step scores
-    alone = score(free_runs(step, Pendulum(), runs[1], WARM, EMPTY)).e_sim_s
+    alone = figures_of(free_runs(step, Pendulum(), runs[1], WARM, EMPTY))["e_sim_s"]
     # without the terms of coefficient 0: another rounding
     assert alone == pytest.approx(chosen.validation, rel=1e-9)
 

@@ -1,0 +1,208 @@
+"""``hybrid-mpc check``: what is understood of a machine and its recordings, and what is wrong, before any work."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from hybrid_mpc.cli.options import InputColumns, OutputColumns, Recordings, ScenarioName, TimeColumn
+
+if TYPE_CHECKING:
+    from hybrid_mpc.job.check import Preflight, Rest
+    from hybrid_mpc.machine.prior import Prior
+    from hybrid_mpc.machine.signals import Signal
+    from hybrid_mpc.machine.specification import DataSpec
+
+EXAMPLES = (
+    "Examples:\n\n"
+    "  hybrid-mpc check my_machine.py\n\n"
+    "  hybrid-mpc check my_machine.py --data monday.csv --data tuesday.csv"
+)
+WRONG = 2
+"""Exit code where something must be mended."""
+LISTED = 6
+"""Most equilibria that are listed."""
+
+
+def check(
+    scenario: ScenarioName,
+    data: Recordings = None,
+    time_column: TimeColumn = "",
+    input_column: InputColumns = None,
+    output_column: OutputColumns = None,
+) -> None:
+    """Say what is understood of a machine and its recordings, and all that is wrong with them; compute nothing.
+
+    The same is asked first by 'run', 'tune' and 'benchmark'. Exit code 2 if something must be mended.
+    """
+    from hybrid_mpc.job.check import preflight
+    from hybrid_mpc.job.context import Context
+    from hybrid_mpc.job.new import left_to_decide
+    from hybrid_mpc.job.settings import RunSettings
+    from hybrid_mpc.scenario import load_scenario
+
+    machine = load_scenario(scenario)
+    settings = RunSettings(
+        scenario, tuple(data or ()), inputs=tuple(input_column or ()), outputs=tuple(output_column or ()),
+        time=time_column,
+    )  # fmt: skip
+    context = Context(settings, machine, Path())
+    found = preflight(machine, None, (lambda: context.dataset) if data else None)
+    console = Console(highlight=False)
+    _tell(console, found, context.spec)
+    left = left_to_decide(Path(scenario)) if scenario.endswith(".py") else []
+    for texts, style, title in (
+        (left, "cyan", "left to decide"),
+        ((*found.warnings, *found.doubts), "yellow", "doubtful"), (found.problems, "bold red", "to be mended"),
+    ):  # fmt: skip
+        if texts:
+            console.print(f"\n{len(texts)} {title}", style=style)
+        for number, text in enumerate(texts, 1):
+            console.print(f"{number:3}. {text}", markup=False, soft_wrap=True)
+    if found.problems:
+        raise typer.Exit(WRONG)
+    console.print(
+        "\nNothing to be mended." if not data else "\nNothing to be mended; 'hybrid-mpc run' may start."
+    )
+
+
+def _tell(console: Console, found: Preflight, spec: DataSpec) -> None:
+    """What was understood."""
+    scenario, prior = found.scenario, found.prior
+    console.print(scenario.title, style="bold", markup=False)
+    if prior is None:
+        return
+    console.print(_signals(found, prior, spec))
+    if prior.parameters:
+        console.print(_parameters(prior))
+    told = "none: there is no MOPGRNN"
+    if not found.problems and prior.equations.balances:
+        told = ", ".join(f"{b.name} ({b.unit}, {b.rate_unit})" for b in prior.equations.balances)
+    if not found.problems:
+        _line(console, "balances", told)
+    corrects = [prior.states[i].name for i in prior.corrected] if not found.problems else []
+    if corrects:
+        _line(console, "networks may correct the rates of", ", ".join(corrects))
+    if found.rest is not None:
+        for name, text in _rest_lines(prior, found.rest, spec.dt):
+            _line(console, name, text)
+    control = scenario.control
+    if control is not None and hasattr(control, "horizon"):
+        tasks = ", ".join(task.name for task in scenario.tasks) or "none"
+        _line(
+            console,
+            "control",
+            f"{control.horizon} periods, {control.horizon * spec.dt:.4g} s; tasks: {tasks}",
+        )
+    if found.dataset is not None:
+        console.print(_recordings(found))
+
+
+def _line(console: Console, name: str, text: str) -> None:
+    console.print(f"{name}: {text}", markup=False, soft_wrap=True)
+
+
+def _table(title: str, *columns: str) -> Table:
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
+    for column in columns:
+        table.add_column(column, overflow="fold")
+    return table
+
+
+def _signals(found: Preflight, prior: Prior, spec: DataSpec) -> Table:
+    """Signals with their units, ranges and columns, and what the recordings hold of them."""
+    recorded = found.dataset is not None
+    table = _table("signals", "", "name", "unit", "range", "column", *(["recorded"] if recorded else []))
+    for role, signals, columns, key in (
+        ("state", prior.states, (), ""), ("input", prior.inputs, spec.inputs, "u"),
+        ("disturbance", prior.disturbances, spec.disturbances, "w"), ("output", prior.outputs, spec.outputs, "y"),
+    ):  # fmt: skip
+        for j, signal in enumerate(signals):
+            column = columns[j] if j < len(columns) else ""
+            more = [_span(found, key, j)] if recorded else []
+            table.add_row(role, signal.name, signal.unit, _range(signal), column, *more)
+    return table
+
+
+def _range(signal: Signal) -> str:
+    return (
+        f"{signal.lower:g} to {signal.upper:g}" if np.isfinite([signal.lower, signal.upper]).any() else "any"
+    )
+
+
+def _span(found: Preflight, key: str, j: int) -> str:
+    if not key or found.dataset is None:
+        return ""
+    every = np.concatenate([getattr(t, key)[:, j] for t in found.dataset.whole])
+    known = every[np.isfinite(every)]
+    return f"{known.min():.4g} to {known.max():.4g}" if len(known) else "never"
+
+
+def _parameters(prior: Prior) -> Table:
+    table = _table("parameters", "name", "value", "unit", "fitted between", "")
+    for one in prior.parameters:
+        bounds = "fixed" if one.fixed else f"{one.lower:g} and {one.upper:g}"
+        table.add_row(one.name, f"{one.value:g}", one.unit, bounds, one.description)
+    return table
+
+
+def _rest_lines(prior: Prior, rest: Rest, dt: float) -> list[tuple[str, str]]:
+    """Where the prior rests, how fast it is there."""
+    origin = "given" if prior.operating_point is not None else "not given: the middle of the ranges"
+    point = ", ".join(
+        f"{s.name} = {v:.4g} {s.unit}"
+        for signals, values in ((prior.states, rest.x), (prior.inputs, rest.u), (prior.disturbances, rest.w))
+        for s, v in zip(signals, values, strict=True)
+    )
+    listed = "; ".join(
+        f"({', '.join(f'{v + 0.0:.4g}' for v in p.x.round(9))}) {p.stability}"
+        for p in rest.equilibria[:LISTED]
+    )
+    count = len(rest.equilibria)
+    more = f" and {count - LISTED} more found: a continuum?" if count > LISTED else ""
+    return [
+        (f"operating point ({origin})", point),
+        ("equilibria under these inputs", (listed + more) or "none found within the ranges"),
+        (
+            "time constants there",
+            f"{_times(rest.modes)}; {rest.substeps} Runge-Kutta steps a period of {dt:g} s",
+        ),
+    ]
+
+
+def _times(modes: np.ndarray[tuple[int], np.dtype[np.complex128]]) -> str:
+    """The slowest and the fastest time constant, and how many modes integrate or run away."""
+    size = float(np.abs(modes).max(initial=0.0))
+    rates = np.sort(-modes.real[modes.real < -1e-9 * size])
+    told = [f"{1 / rates[0]:.3g} s"] if len(rates) else []
+    told += [f"down to {1 / rates[-1]:.3g} s"] if len(rates) > 1 and rates[-1] > 1.001 * rates[0] else []
+    integrators, unstable = (
+        int((np.abs(modes.real) <= 1e-9 * size).sum()),
+        int((modes.real > 1e-9 * size).sum()),
+    )
+    told += [f"{integrators} undamped or integrating"] if integrators else []
+    told += [f"{unstable} unstable"] if unstable else []
+    return ", ".join(told) if told else "none"
+
+
+def _recordings(found: Preflight) -> Table:
+    assert found.dataset is not None
+    data = found.dataset
+    table = _table("recordings", "file", "length", "sampled every", "training", "validation", "test")
+    seconds = {
+        (t.file, t.role): sum(
+            p.dt * len(p.t) for p in data.trajectories if (p.file, p.role) == (t.file, t.role)
+        )
+        for t in data.trajectories
+    }
+    for name, dt in zip(data.files, data.sampling, strict=True):
+        stem = Path(name).stem
+        length = sum(t.dt * len(t.t) for t in data.whole if t.file == stem)
+        parts = (f"{seconds.get((stem, role), 0.0):.4g} s" for role in ("train", "valid", "test"))
+        table.add_row(name, f"{length:.4g} s", f"{dt:.4g} s", *parts)
+    return table

@@ -1,0 +1,590 @@
+"""What of a prior is wrong: names, units, shapes, jumps, time, balances. Each part is looked at, whatever the others
+are.
+"""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import math
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.machine.mechanical import MechanicalPrior
+from hybrid_mpc.machine.prior import POINT, BalanceEquations, OperatingPoint, Prior, column
+from hybrid_mpc.machine.signals import Parameter, Signal
+from hybrid_mpc.machine.units import differ, is_product, per_second
+from nn_export import ExportError
+
+Array = NDArray[np.float64]
+POINTS = 16
+"""Random points at which a prior is asked, beside the origin and the ends of the signals' ranges."""
+BALANCE = 1e-6
+"""Largest residual of a balance along the prior's own flow, as a share of its terms: rounding is 1e9 times less."""
+SAMPLES = 64
+"""Points of each line along which jumps are looked for."""
+HALVINGS = 40
+"""How often the piece with the largest change is halved: a line is a hundredth of a billionth of its length then."""
+JUMP = 1e-4
+"""What a function changes by on such a piece, as a share of what it changes by along the line, to be called a jump: a
+slope would have to be ten million times steeper than the line's."""
+DRIFT = 0.01
+"""Share of its range that a state may drift by within a warm-up at an operating point that counts as an equilibrium."""
+ROLES = ("states", "inputs", "outputs", "disturbances", "parameters")
+TIMES = ("t", "time", "time_s", "clock", "now", "k")
+ALGEBRAIC = ("z", "alg", "algebraic", "dae", "xdot", "x_dot", "dx", "dxdt")
+NO_TIME = (
+    "; time enters by a measured disturbance alone: a column of the recordings that is known beforehand, a Signal in "
+    "disturbances, w.<name> in the equations"
+)
+NO_DAE = (
+    "; algebraic variables are not supported: put their equation where they are used, or give them a fast rate of "
+    "their own"
+)
+FINITE = "; it must be within the signals' ranges. Keep a root, a logarithm or a division off its end"
+IF = "Cannot compute the truth value"
+"""What CasADi says where code decides by an expression."""
+NUMBER = ("must be real number", "float() argument", "to_int not defined", "loop of ufunc")
+"""What is said where a number is wanted and an expression is given."""
+NO_NUMBERS = (
+    "; write ca.sin(x), ca.sqrt(x) ... instead of math's functions and float(), which know numbers alone"
+)
+
+
+@dataclass
+class Report:
+    """What was found so far: problems, which end a job, and warnings."""
+
+    problems: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+    def add(self, text: str) -> None:
+        """A problem, told once."""
+        if text not in self.problems:
+            self.problems.append(text)
+
+    def warn(self, text: str) -> None:
+        """Something doubtful."""
+        if text not in self.warnings:
+            self.warnings.append(text)
+
+    @contextmanager
+    def part(self, what: str) -> Iterator[None]:
+        """A part of the scenario; what it raises is a problem of its own, and the next part is looked at."""
+        try:
+            yield
+        except InputError as error:
+            for text in error.problems:
+                self.add(f"{what}: {text}")
+        except ExportError as error:  # of several lines, each with an operator
+            self.add(f"{what}: {error}")
+        except Exception as error:  # the user's own code may raise anything, and this is where it is reported
+            self.add(
+                f"{what} raised {type(error).__name__}: {_first_line(error)}{_place(error)}{_hint(error)}"
+            )
+
+    @contextmanager
+    def sound(self, what: str) -> Iterator[list[bool]]:
+        """The same; the list is empty until the part has passed."""
+        before, passed = len(self.problems), list[bool]()
+        with self.part(what):
+            yield passed
+        if len(self.problems) == before:
+            passed.append(True)
+
+
+@dataclass(frozen=True)
+class Points:
+    """Where a prior is asked: states ``(n, n_x)``, inputs, disturbances and parameters ``(n, n_p)``.
+
+    The origin, or what of the ranges is next to it, random points within the ranges, then the ends of the ranges: of
+    one signal alone, and of all together. Parameters are the prior's own, at the random points some within their
+    bounds.
+    """
+
+    x: Array
+    u: Array
+    w: Array
+    p: Array
+
+    @classmethod
+    def of(cls, prior: Prior) -> Points:
+        """The points of a prior."""
+        groups = prior.states, prior.inputs, prior.disturbances
+        drawn = [_drawn(group, seed) for seed, group in enumerate(groups)]
+        signals = [s for group in groups for s in group]
+        inner = np.column_stack(drawn)
+        ends = [inner[0].copy() for _ in range(2 * len(signals))]
+        for j, signal in enumerate(signals):
+            for k, end in enumerate((signal.lower, signal.upper)):
+                if math.isfinite(end):
+                    ends[2 * j + k][j] = end
+        both = [np.array([e if math.isfinite(e) else o for e, o in zip(side, inner[0], strict=True)])
+                for side in ([s.lower for s in signals], [s.upper for s in signals])]  # fmt: skip
+        every = np.vstack([inner, *ends, *both])
+        p = np.broadcast_to(prior.p, (len(every), len(prior.parameters))).copy()
+        rng = np.random.default_rng(3)
+        for j, parameter in enumerate(prior.parameters):
+            if math.isfinite(parameter.upper - parameter.lower):
+                p[1 : POINTS + 1 : 2, j] = rng.uniform(parameter.lower, parameter.upper, POINTS // 2)
+        sizes = np.cumsum([len(group) for group in groups])[:-1]
+        x, u, w = np.split(every, sizes, axis=1)
+        return cls(x, u, w, p)
+
+    @property
+    def columns(self) -> tuple[Array, Array, Array, Array]:
+        """As CasADi takes them: a point a column."""
+        return self.x.T, self.u.T, self.w.T, self.p.T
+
+    @property
+    def nominal(self) -> Points:
+        """Those with the prior's own parameters."""
+        own = (self.p == self.p[0]).all(axis=1)
+        return Points(self.x[own], self.u[own], self.w[own], self.p[own])
+
+    def named(self, k: int) -> str:
+        """One of them as text; parameters where they are not the prior's own."""
+        other = bool((self.p[k] != self.p[0]).any())
+        shown = {key: v for key, v in vars(self).items() if v.size and (key != "p" or other)}
+        return ", ".join(f"{name} = {v[k].tolist()}" for name, v in shown.items())
+
+
+def _drawn(signals: Sequence[Signal], seed: int) -> Array:
+    """The origin, or what of the range is next to it, and random points within the range: rows."""
+    rng = np.random.default_rng(seed)
+    columns = []
+    for signal in signals:
+        low, high = _finite_range(signal)
+        columns.append(np.concatenate([[min(max(0.0, low), high)], rng.uniform(low, high, POINTS)]))
+    return np.column_stack(columns) if columns else np.zeros((POINTS + 1, 0))
+
+
+def _finite_range(signal: Signal) -> tuple[float, float]:
+    low = signal.lower if math.isfinite(signal.lower) else min(-1.0, signal.upper - 1.0)
+    return low, signal.upper if math.isfinite(signal.upper) else max(1.0, signal.lower + 1.0)
+
+
+def check_prior(report: Report, make: Callable[..., Prior]) -> tuple[Prior | None, bool]:
+    """The prior if it can be made, and whether its equations can be asked where it rests."""
+    prior = _made(report, make)
+    if prior is None:
+        return None, False
+    _check_signals(report, prior)
+    if not (prior.states and prior.inputs and prior.outputs):
+        return None, False
+    _check_attributes(report, prior)
+    _check_units(report, prior)
+    with report.sound("prior") as rests:
+        _check_point(prior)
+    with report.part("prior"):
+        prior.corrected  # noqa: B018  tells names that are no states
+    if len(prior.p) == len(prior.parameters) and _written(report, prior):  # two of one name were told above
+        return prior, _check_numbers(report, prior) and bool(rests)
+    return prior, False
+
+
+def _made(report: Report, make: Callable[..., Prior]) -> Prior | None:
+    prior: Prior | None = None
+    with report.part("prior"):
+        found = make()
+        if not isinstance(found, Prior):
+            raise InputError(
+                f"it makes a {type(found).__name__}; needed is a hybrid_mpc Prior, e.g. prior=MyPrior"
+            )
+        prior = found
+    if prior is not None:
+        with report.part("prior"):
+            again = make(dict(prior.values))
+            if again.values != prior.values:
+                raise InputError(
+                    f"prior(values) must take its values over; {prior.values} became {again.values}"
+                )
+    return prior
+
+
+def _check_signals(report: Report, prior: Prior) -> None:
+    for role in ROLES[:-1]:
+        signals = getattr(prior, role)
+        if not (signals or role == "disturbances"):
+            report.add(f"prior: {role} must be a tuple of one Signal or more, got {signals!r}")
+        elif len({s.name for s in signals}) < len(signals):
+            report.add(f"prior: two of the {role} have the same name: {[s.name for s in signals]}")
+    names = [p.name for p in prior.parameters]
+    if len(set(names)) < len(names):
+        report.add(f"prior: two parameters have the same name: {names}")
+
+
+def _check_attributes(report: Report, prior: Prior) -> None:
+    """What a class has that no prior has: algebraic variables, roles that are misspelt, rates that nobody asks for."""
+    kind = type(prior)
+    own = [
+        c for c in kind.__mro__ if issubclass(c, Prior) and not c.__module__.startswith("hybrid_mpc.machine")
+    ]
+    for name, value in {name: value for c in own for name, value in vars(c).items()}.items():
+        if name.startswith("algebraic") or name in ("alg", "dae", "z"):
+            report.add(f"prior: {kind.__name__} has {name!r}{NO_DAE}")
+        held = isinstance(value, tuple) and value and all(isinstance(v, Signal) for v in value)
+        near = difflib.get_close_matches(name, ROLES, n=1, cutoff=0.8)
+        if held and near and name not in ROLES:
+            report.add(
+                f"prior: {kind.__name__} has signals under {name!r}, which nobody reads; did you mean {near[0]!r}?"
+            )
+    if isinstance(prior, MechanicalPrior) and "xdot" not in prior.methods and kind.xdot is not Prior.xdot:
+        report.add(
+            f"prior: {kind.__name__}.xdot is never asked: a MechanicalPrior's rates are made of "
+            f"{', '.join(list(prior.methods)[:4])}. Write these, or make it a Prior"
+        )
+
+
+def _check_units(report: Report, prior: Prior) -> None:
+    """Units that contradict each other; one that is not known contradicts nothing."""
+    if type(prior).output is Prior.output:
+        states = {s.name: s for s in prior.states}
+        for one in prior.outputs:
+            state = states.get(one.name)
+            if state is not None and differ(one.unit, state.unit):
+                report.add(
+                    f"prior: the output {one.label} is the state {state.label} as it is; give both one unit, or write "
+                    "output(x, u, w, p), which converts. Columns in other units: units={...} in the DataSpec"
+                )
+    if not isinstance(prior, MechanicalPrior):
+        return
+    for q, v in zip(prior.states[: prior.n_q], prior.states[prior.n_q :], strict=True):
+        if differ(v.unit, per_second(q.unit)):
+            report.add(
+                f"prior: {v.label} is the rate of {q.label}, so its unit must be {per_second(q.unit)}; are the states "
+                "in the order [q, v]?"
+            )
+    if type(prior).force is MechanicalPrior.force and len(prior.inputs) == prior.n_q:
+        for u, q in zip(prior.inputs, prior.states[: prior.n_q], strict=True):
+            if not is_product(u.unit, q.unit, "J"):
+                report.add(
+                    f"prior: the input {u.label} drives {q.label} as a force, so their product must be an energy [J]; "
+                    "correct a unit, or write force(q, v, u, w, p), which converts"
+                )
+
+
+def _check_point(prior: Prior) -> None:
+    """The operating point has the right sizes and lies within the ranges."""
+    point = prior.operating_point
+    if point is None:
+        return
+    if not isinstance(point, OperatingPoint):
+        raise InputError(f"operating_point must be OperatingPoint(x=(...), u=(...)), got {point!r:.80}")
+    for name, values, signals in (
+        ("x", point.x, prior.states), ("u", point.u, prior.inputs), ("w", point.w, prior.disturbances),
+    ):  # fmt: skip
+        if len(values) != len(signals):
+            raise InputError(
+                f"operating_point: {name} needs {len(signals)} numbers ("
+                f"{', '.join(s.name for s in signals) or 'there are none'}), got {len(values)}: {values}"
+            )
+        beyond = [
+            f"{s.label} from {s.lower:g} to {s.upper:g}"
+            for s, v in zip(signals, values, strict=True)
+            if not (s.lower <= v <= s.upper and math.isfinite(v))
+        ]
+        if beyond:
+            raise InputError(
+                f"operating_point: {name} = {values} is outside the range of {', '.join(beyond)}; correct it, or the "
+                "bounds of the signal"
+            )
+
+
+def _written(report: Report, prior: Prior) -> bool:
+    """Whether all methods take what they are given and give what they must."""
+    before, kind = len(report.problems), type(prior).__name__
+    wrong = [
+        name for name, arguments in prior.methods.items() if _check_arguments(report, prior, name, arguments)
+    ]
+    if not wrong:
+        quiet = Report()
+        with quiet.part("prior"):
+            prior.equations  # noqa: B018
+        if not quiet.problems:
+            return True
+        report_whole = quiet.problems
+    else:
+        report_whole = []
+    for name, arguments in prior.methods.items():
+        if name not in wrong:
+            with report.part("prior"):
+                _ask(prior, name, arguments, f"{kind}.{name}({', '.join(arguments)})")
+    if len(report.problems) == before:
+        for text in report_whole:
+            report.add(text)
+    return False
+
+
+def _check_arguments(report: Report, prior: Prior, name: str, arguments: Sequence[str]) -> bool:
+    """Tell a method that takes something else, time or algebraic variables, say; whether it does."""
+    signature = inspect.signature(getattr(prior, name))
+    others = [key for key in signature.parameters if key not in arguments]
+    fits = True
+    try:
+        signature.bind(*arguments)
+    except TypeError:
+        fits = False
+    time, algebraic = ([key for key in others if key in known] for known in (TIMES, ALGEBRAIC))
+    if fits and not time and not algebraic:
+        return False
+    report.add(
+        f"prior: {type(prior).__name__}.{name} must take ({', '.join(arguments)}), it takes "
+        f"({', '.join(signature.parameters)}){NO_TIME if time else NO_DAE if algebraic else ''}"
+    )
+    return True
+
+
+def _ask(prior: Prior, name: str, arguments: Sequence[str], what: str) -> None:
+    """Ask one method, and check the shape of what it gives."""
+    given = tuple((key, ca.SX.sym(key, len(prior.names_of(key)))) for key in arguments)
+    if name == "balances":
+        prior._balances(*given)
+        return
+    if isinstance(prior, MechanicalPrior) and name == "mass_matrix":
+        prior.masses  # noqa: B018
+        return
+    value = prior.evaluated(name, *given)
+    if isinstance(prior, MechanicalPrior) and name != "output":
+        size, names = (1, ()) if name == "potential" else (prior.n_q, prior.names_of("v"))
+    else:
+        signals = prior.states if name == "xdot" else prior.outputs
+        size, names = len(signals), tuple(s.name for s in signals)
+    try:
+        column(value, size, what, names)
+    except InputError as error:
+        few = name == "xdot" and "must give" in str(error)
+        raise InputError(f"{error}. A state needs a rate{NO_DAE}" if few else str(error)) from error
+
+
+def _check_numbers(report: Report, prior: Prior) -> bool:
+    """All that equations which can be asked give: finite, smooth, of the state alone, in balance; whether finite."""
+    points = Points.of(prior)
+    finite = []
+    with report.part("prior"):
+        _check_again(prior, points)
+    with report.sound("prior") as masses:
+        _check_masses(prior, points.nominal)  # a corner of the parameters' box may be no machine
+    if not masses:
+        return False
+    for what, f in (
+        ("xdot(x, u, w, p)", prior.equations.xdot),
+        ("output(x, u, w, p)", prior.equations.output),
+    ):
+        with report.sound("prior") as passed:
+            _check_finite(what, f, points)
+        finite += passed
+        if passed:
+            with report.part("prior"):
+                _check_smooth(what, f, prior, points)
+    with report.part("prior"):
+        _check_clock(prior)
+    if len(finite) == 2:
+        _check_effects(report, prior, points)
+        rates = prior.equations.xdot(*points.nominal.columns).full()
+        for balance in prior.equations.balances:
+            with report.part("prior"):
+                _check_balance(prior, balance, points.nominal, rates)
+    for balance in prior.equations.balances:
+        if differ(balance.rate_unit, per_second(balance.unit)):
+            report.add(
+                f"prior: balance {balance.name}: what is stored in {balance.unit} comes and goes in "
+                f"{per_second(balance.unit)}, not in {balance.rate_unit}; correct unit or rate_unit"
+            )
+    return len(finite) == 2
+
+
+def _check_again(prior: Prior, points: Points) -> None:
+    """The equations are the same when they are asked again: no clock, no dice."""
+    if type(prior).evaluated is not Prior.evaluated:  # traced once, which takes seconds
+        return
+    symbols = [ca.SX.sym(key, v.shape[1]) for key, v in vars(points).items()]
+    rates, outputs, _ = prior.expressions(*symbols)
+    for what, value, signals, f in (
+        ("xdot", rates, prior.states, prior.equations.xdot),
+        ("output", outputs, prior.outputs, prior.equations.output),
+    ):
+        again = ca.Function(what, symbols, [column(value, len(signals), what)])
+        found, before = (g(*points.columns).full() for g in (again, f))
+        if not np.allclose(found, before, rtol=1e-9, atol=0.0, equal_nan=True):
+            raise InputError(
+                f"{what} gives something else when it is asked again; it must be a function of (x, u, w, p) alone, "
+                f"without a clock or random numbers{NO_TIME}"
+            )
+
+
+def _check_masses(prior: Prior, points: Points) -> None:
+    """A mass matrix is symmetric and positive definite within the signals' ranges."""
+    if not isinstance(prior, MechanicalPrior):
+        return
+    masses = prior.masses
+    for k, q in enumerate(points.x[:, : prior.n_q]):
+        matrix = masses(q, points.p[k]).full()
+        right = np.isfinite(matrix).all() and np.allclose(matrix, matrix.T, rtol=BALANCE, atol=0)
+        if not right or np.linalg.eigvalsh(matrix).min() <= 0:
+            found = matrix.tolist() if prior.n_q > 1 else float(matrix[0, 0])
+            raise InputError(
+                f"mass_matrix(q, p) is {found} at {points.named(k)}; an inertia must be positive, a mass matrix "
+                "symmetric and positive definite. Check its terms and their signs"
+            )
+
+
+def _check_finite(what: str, f: ca.Function, points: Points) -> None:
+    """Values and derivatives are finite within the signals' ranges."""
+    symbols = dict(zip(POINT, f.sx_in(), strict=True))
+    value = f(*symbols.values())
+    parts = {"it": value} | {
+        f"its derivative by {key}": ca.vec(ca.densify(ca.jacobian(value, symbols[key]))) for key in "xup"
+    }
+    found = ca.Function("parts", [*symbols.values()], [*parts.values()])(*points.columns)
+    for which, values in zip(parts, found, strict=True):
+        bad = ~np.isfinite(values.full()).all(axis=0)
+        if which == "it" and bad.all():
+            raise InputError(f"{what}: it is not finite anywhere{NO_NUMBERS}")
+        if bad.any():
+            where = points.named(int(np.argmax(bad)))
+            raise InputError(
+                f"{what}: {which} is not finite at {where}{FINITE}, e.g. sqrt(fmax(level, 1e-6))"
+            )
+
+
+def _check_smooth(what: str, f: ca.Function, prior: Prior, points: Points) -> None:
+    """It does not jump within the ranges: the largest change along lines between points, cornered by halving."""
+    one = np.hstack([points.nominal.x, points.nominal.u, points.nominal.w])
+    ends = one[:-1], one[1:]
+    sizes = [len(prior.states), len(prior.inputs), len(prior.disturbances)]
+
+    def along(share: Array) -> Array:
+        """Values ``(lines, samples, n)`` at shares ``(lines, samples)`` of the way."""
+        at = ends[0][:, None] + share[..., None] * (ends[1] - ends[0])[:, None]
+        x, u, w = np.split(at.reshape(-1, at.shape[2]).T, np.cumsum(sizes)[:-1])
+        found = f(x, u, w, prior.p).full().T
+        return np.asarray(found.reshape(*share.shape, -1))
+
+    share = np.linspace(0.0, 1.0, SAMPLES + 1)
+    values = along(np.broadcast_to(share, (len(ends[0]), SAMPLES + 1)))
+    steps = np.abs(np.diff(values, axis=1))
+    span = np.ptp(values, axis=1)
+    for i in range(values.shape[2]):
+        k = steps[:, :, i].argmax(axis=1)
+        low, high = share[k], share[k + 1]
+        first, last = values[np.arange(len(k)), k, i], values[np.arange(len(k)), k + 1, i]
+        for _ in range(HALVINGS):
+            middle = 0.5 * (low + high)
+            between = along(middle[:, None])[:, 0, i]
+            left = np.abs(between - first) >= np.abs(last - between)
+            low, high = np.where(left, low, middle), np.where(left, middle, high)
+            first, last = np.where(left, first, between), np.where(left, between, last)
+        jump = np.abs(last - first)
+        found = int(
+            np.argmax(np.where(span[:, i] > 0, jump / np.where(span[:, i] > 0, span[:, i], 1.0), 0.0))
+        )
+        if jump[found] > max(JUMP * span[found, i], BALANCE * np.abs(values[:, :, i]).max()):
+            at = ends[0][found] + high[found] * (ends[1][found] - ends[0][found])
+            parts = np.split(at, np.cumsum(sizes)[:-1])
+            where = ", ".join(
+                f"{key} = {v.round(9).tolist()}" for key, v in zip("xuw", parts, strict=True) if v.size
+            )
+            signal = (prior.states if what.startswith("xdot") else prior.outputs)[i]
+            of = "the rate of " if what.startswith("xdot") else ""
+            raise InputError(
+                f"{what}: {of}{signal.name} jumps from {first[found]:.4g} to {last[found]:.4g} at {where}. What "
+                "switches needs a smooth form of a width that you choose, e.g. tanh(v / 0.01) for sign(v); an input "
+                "that takes whole numbers, or is on or off, is not supported"
+            )
+
+
+def _check_clock(prior: Prior) -> None:
+    """No state counts the time."""
+    x, u, w, p = (ca.SX.sym(key, len(prior.names_of(key))) for key in POINT)
+    rates = prior.equations.xdot(x, u, w, p)
+    for state, rate in zip(prior.states, ca.vertsplit(rates), strict=True):
+        if rate.is_constant() and float(rate) != 0.0:
+            raise InputError(
+                f"the rate of {state.label} is {float(rate):g} whatever happens: it counts the time{NO_TIME}"
+            )
+
+
+def _check_effects(report: Report, prior: Prior, points: Points) -> None:
+    """Each input acts, and smoothly; disturbances and parameters that nothing depends on are doubtful."""
+    symbols = [ca.SX.sym(key, len(prior.names_of(key))) for key in POINT]
+    value = ca.vertcat(prior.equations.xdot(*symbols), prior.equations.output(*symbols))
+    groups: tuple[tuple[Signal | Parameter, ...], ...] = prior.inputs, prior.disturbances, prior.parameters
+    for key, symbol, signals in zip("uwp", symbols[1:], groups, strict=True):
+        for one, component in zip(signals, ca.vertsplit(symbol), strict=True):
+            there = bool(ca.depends_on(value, component))
+            if key != "u":
+                if not there:
+                    role = "parameter" if key == "p" else "disturbance"
+                    report.warn(
+                        f"prior: no rate and no output depends on the {role} {one.label}; leave it out"
+                    )
+                continue
+            slope = ca.Function("slope", symbols, [ca.densify(ca.jacobian(value, component))])
+            if there and slope(*points.columns).full().any():
+                continue
+            how = (
+                "acts by switching alone: its derivatives are zero everywhere. Inputs of whole numbers, or on and off, "
+                "are not supported; take one that can have any value between, such as a duty"
+                if there
+                else "changes no rate and no output; use it in the equations, or leave it out"
+            )
+            report.add(f"prior: the input {one.label} {how}")
+
+
+def _check_balance(prior: Prior, balance: BalanceEquations, points: Points, rates: Array) -> None:
+    """A balance tells something of the rates, is finite, holds along the flow, and loses what is not negative."""
+    name = f"balance {balance.name} [{balance.rate_unit}]"
+    symbols = balance.residual.sx_in()
+    if not ca.depends_on(balance.residual(*symbols), symbols[1]):
+        corrected = ", ".join(prior.states[i].name for i in prior.corrected)
+        raise InputError(
+            f"{name}: the storage does not change with {corrected or 'any state'}, whose rates a network may correct, "
+            "so it tells nothing; store what changes with them, or leave the balance out"
+        )
+    x, u, w, p = points.columns
+    supply, loss = (f(x, u, w, p).full()[0] for f in (balance.supply, balance.loss))
+    residual = np.abs(balance.residual(x, rates, u, w, p).full()[0])
+    bad = ~np.isfinite([supply, loss, residual]).all(axis=0)
+    if bad.any():
+        raise InputError(f"{name}: it is not finite at {points.named(int(np.argmax(bad)))}{FINITE}")
+    size, k = float(np.max(np.abs([supply, loss, residual]))), int(np.argmax(residual))
+    if residual[k] > BALANCE * size:
+        raise InputError(
+            f"{name}: dS/dt - supply + loss is {residual[k]:.3g} along the prior's own flow at {points.named(k)}, "
+            "where it must be 0; is a term or a sign left out?"
+        )
+    k = int(np.argmin(loss))
+    if loss[k] < -BALANCE * size:
+        raise InputError(
+            f"{name}: the loss is {loss[k]:.3g} at {points.named(k)}; it must not be negative. Put what may have "
+            "either sign into the supply"
+        )
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).strip() or "no message").splitlines()[0]
+
+
+def _hint(error: BaseException) -> str:
+    """What helps against Python's own words."""
+    text = str(error)
+    if IF in text:
+        return "; write ca.if_else(condition, one, other) instead of if"
+    return NO_NUMBERS if any(word in text for word in NUMBER) else ""
+
+
+def _place(error: BaseException) -> str:
+    """The last line of the user's own code that an error came through."""
+    frames = traceback.extract_tb(error.__traceback__)
+    library = Path(__file__).parents[1]
+    own = [f for f in frames if library not in Path(f.filename).parents and "site-packages" not in f.filename]
+    return f" ({own[-1].filename}:{own[-1].lineno})" if own else ""

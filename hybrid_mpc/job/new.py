@@ -1,0 +1,372 @@
+"""A scenario to begin with, written from a recording; what only its user knows is marked TODO."""
+
+from __future__ import annotations
+
+import keyword
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.data.files import Source, name_and_unit, opened
+from hybrid_mpc.data.recording import UNITS
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import write_text
+
+Array = NDArray[np.float64]
+MARK = "TODO"
+"""What stands before everything that is left to decide."""
+HELD = 0.5
+"""Share of samples equal to the one before from which on a column looks commanded."""
+EVEN = 0.2
+"""Share by which the distances of time stamps may spread."""
+MOST = 2000
+"""Most samples from which a first model is taken."""
+BETTER = 0.8
+"""Error of two states over that of one below which two are taken."""
+FEWEST = 20
+"""Fewest rows of a recording that tell anything."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a recording: full name, name and unit as the header has them, numbers ``(m,)``."""
+
+    full: str
+    name: str
+    unit: str
+    values: Array
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Smallest and largest number."""
+        return float(np.nanmin(self.values)), float(np.nanmax(self.values))
+
+    @property
+    def identifier(self) -> str:
+        """The name as Python can write it after a dot."""
+        text = re.sub(r"\W+", "_", self.name, flags=re.ASCII).strip("_") or "signal"
+        return f"c_{text}" if text[0].isdigit() or keyword.iskeyword(text) else text
+
+
+@dataclass(frozen=True)
+class Draft:
+    """What a recording shows: its time, what looks commanded and what measured, and what is neither.
+
+    ``period`` is the sampling time [s]; ``time`` is None where no column looks like one.
+    """
+
+    time: Column | None
+    period: float
+    inputs: tuple[Column, ...]
+    outputs: tuple[Column, ...]
+    left_out: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Lag:
+    """A first linear model of one output: ``states`` 1 or 2, its time constant [s], damping, gains, offset."""
+
+    states: int
+    seconds: float
+    damping: float
+    gains: tuple[float, ...]
+    offset: float
+
+
+def write_scenario(
+    path: Path, data: Path, inputs: Sequence[str] = (), outputs: Sequence[str] = (), time: str = ""
+) -> Draft:
+    """Write a scenario for a recording; returned is what it was made from.
+
+    Args:
+        path: Python file to make; there must be none.
+        data: The recording (CSV, npz, mat).
+        inputs: Columns of the inputs. Default: those that are held from one sample to the next.
+        outputs: Columns of the outputs. Default: all others that move.
+        time: Column of the time. Default: one that rises evenly.
+
+    Raises:
+        InputError: If the file is there, the recording is bad or too short, or shows no input or no output.
+
+    Example:
+        ``write_scenario(Path("my_machine.py"), Path("monday.csv"))``
+    """
+    if path.suffix != ".py":
+        raise InputError(f"{path}: a scenario is a Python file; give a name that ends with .py")
+    if path.exists():
+        raise InputError(f"{path} is there already; give another name, or remove it")
+    draft = drafted(opened(data), inputs, outputs, time)
+    write_text(path, scenario_text(path, data, draft))
+    return draft
+
+
+def left_to_decide(path: Path) -> list[str]:
+    r"""Lines of a scenario's file that are marked, with their numbers.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "a.py"
+        ...     _ = path.write_text("x = 1\ny = 2  # TODO: is it?\n")
+        ...     left_to_decide(path)
+        ['line 2: is it?']
+    """
+    found = []
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+        _, mark, text = line.partition(f"# {MARK}")
+        if mark:
+            found.append(f"line {number}: {text.lstrip(': ')}")
+    return found
+
+
+def drafted(source: Source, inputs: Sequence[str], outputs: Sequence[str], time: str) -> Draft:
+    """Roles of a recording's columns: as they are given, or as their numbers look."""
+    columns, left_out = _columns(source)
+    by_name = {column.full: column for column in columns}
+
+    def named(names: Sequence[str]) -> tuple[Column, ...]:
+        missing = [name for name in map(source.find, names) if name not in by_name]
+        if missing:
+            raise InputError(f"{source.path}: column {missing[0]!r} holds no numbers that move")
+        return tuple(by_name[source.find(name)] for name in names)
+
+    stamps = named([time])[0] if time else next((c for c in columns if _rises(c.values)), None)
+    taken = {stamps.full} if stamps else set()
+    others = [c for c in columns if c.full not in taken]
+    given = named(inputs), named(outputs)
+    chosen = {c.full for group in given for c in group}
+    free = [c for c in others if c.full not in chosen]
+    held = tuple(c for c in free if _is_held(c.values))
+    u = given[0] or held or tuple(free[: 1 if len(free) > 1 else 0])
+    y = given[1] or tuple(c for c in free if c not in u and not _rises(c.values))
+    if not u or not y:
+        there = ", ".join(source.header)
+        raise InputError(
+            f"{source.path}: no column is left for {'an output' if u else 'an input'}; it has {there}. Say which is "
+            "which: --input-column, --output-column"
+        )
+    scale = 1.0 if stamps is None else _seconds(stamps)
+    period = 1.0 if stamps is None else scale * float(np.median(np.diff(stamps.values)))
+    unused = tuple(c.full for c in others if c not in u and c not in y)
+    return Draft(stamps, period, u, y, (*left_out, *unused))
+
+
+def _columns(source: Source) -> tuple[list[Column], tuple[str, ...]]:
+    """Columns whose numbers move, and the names of the others."""
+    found, left_out = [], []
+    for full in dict.fromkeys(source.header):
+        try:
+            values = source.read(None, [full], [full]).values[:, 0]
+        except InputError:
+            left_out.append(full)
+            continue
+        known = values[np.isfinite(values)]
+        if len(known) < FEWEST or np.ptp(known) == 0:
+            left_out.append(full)
+            continue
+        name, unit = name_and_unit(full.rpartition(".")[2] or full)
+        found.append(Column(full, name, unit, values))
+    if not found:
+        raise InputError(
+            f"{source.path}: no column has {FEWEST} numbers that move; give a recording in which the machine moves"
+        )
+    return found, tuple(left_out)
+
+
+def _rises(values: Array) -> bool:
+    """Whether numbers rise evenly, as time does."""
+    steps = np.diff(values)
+    if not (np.isfinite(values).all() and (steps > 0).all()):
+        return False
+    return bool(np.quantile(np.abs(steps / np.median(steps) - 1), 0.9) < EVEN)
+
+
+def _is_held(values: Array) -> bool:
+    known = values[np.isfinite(values)]
+    return bool((np.diff(known) == 0).mean() >= HELD)
+
+
+def _seconds(stamps: Column) -> float:
+    """Factor from a time column's unit to seconds."""
+    return {"s": 1.0, **UNITS["s"]}.get(stamps.unit, 1.0)
+
+
+def first_model(draft: Draft, output: Column) -> Lag:
+    """A lag of one or two states whose free run is nearest to an output."""
+    every = np.column_stack([output.values, *(c.values for c in draft.inputs)])
+    every = every[np.isfinite(every).all(axis=1)]
+    stride = max(1, len(every) // MOST)
+    y, u = every[::stride, 0], every[::stride, 1:]
+    dt = stride * draft.period
+    best: tuple[float, Lag] | None = None
+    for order in (1, 2):
+        rows = [y[order - 1 - i : len(y) - 1 - i] for i in range(order)]
+        a = np.column_stack([*rows, u[order - 1 : -1], np.ones(len(y) - order)])
+        theta = np.linalg.lstsq(a, y[order:], rcond=None)[0]
+        poles = np.roots(np.concatenate([[1.0], -theta[:order]]))
+        if not (np.isfinite(theta).all() and (np.abs(poles) < 1).all() and (np.abs(poles) > 0.05).all()):
+            continue
+        if order == 1 and not poles[0].real > 0:
+            continue
+        run = y[:order].tolist()
+        for k in range(order, len(y)):
+            run.append(float(theta @ np.concatenate([run[: -order - 1 : -1], u[k - 1], [1.0]])))
+        error = float(np.sqrt(np.mean((np.array(run) - y) ** 2)))
+        rates = np.log(poles.astype(complex)) / dt
+        size = float(np.sqrt(np.abs(np.prod(rates)))) if order == 2 else float(np.abs(rates[0]))
+        damping = float(-rates.real.sum() / (2 * size)) if order == 2 else 1.0
+        still = 1.0 - theta[:order].sum()
+        lag = Lag(order, 1 / size, damping, tuple(theta[order:-1] / still), float(theta[-1] / still))
+        if best is None or error < BETTER * best[0]:
+            best = error, lag
+    if best is not None:
+        return best[1]
+    return Lag(1, 20 * draft.period, 1.0, (0.0,) * len(draft.inputs), float(np.mean(y)))
+
+
+def _rounded(value: float, digits: int = 3) -> str:
+    return f"{float(f'{value:.{digits}g}') + 0.0!r}"
+
+
+def _wide(column: Column) -> tuple[str, str]:
+    """A range twice as wide again as what was recorded, on either side."""
+    low, high = column.span
+    return _rounded(low - (high - low), 2), _rounded(high + (high - low), 2)
+
+
+def _signal(column: Column, name: str) -> tuple[str, str]:
+    """A Signal as it is written, and what stands behind it."""
+    low, high = _wide(column)
+    recorded = f"recorded: {column.span[0]:.4g} to {column.span[1]:.4g}"
+    unit = f"unit by the header; {recorded}" if column.unit else f"{MARK}: its unit; {recorded}"
+    return f'Signal("{name}", "{column.unit or "-"}", {low}, {high})', unit
+
+
+def _names(columns: Sequence[Column], taken: set[str]) -> list[str]:
+    names = []
+    for column in columns:
+        name, k = column.identifier, 2
+        while name in taken:
+            name, k = f"{column.identifier}_{k}", k + 1
+        taken.add(name)
+        names.append(name)
+    return names
+
+
+def scenario_text(path: Path, data: Path, draft: Draft) -> str:
+    """The file: signals, a first prior of lags, and how the recording is read."""
+    y_names = _names(draft.outputs, set())
+    u_names = _names(draft.inputs, set())
+    lags = [first_model(draft, column) for column in draft.outputs]
+    kind = "".join(part.capitalize() for part in re.findall(r"[A-Za-z0-9]+", path.stem)) or "Machine"
+    kind = f"Machine{kind}" if kind[0].isdigit() else kind
+    states, rates, parameters, steady = [], [], [], list[str]()
+    for name, column, lag in zip(y_names, draft.outputs, lags, strict=True):
+        text, note = _signal(column, name)
+        states.append((text, note))
+        unit = column.unit or "-"
+        towards = " + ".join([f"p.rest_{name}", *(f"p.k_{name}_{u} * u.{u}" for u in u_names)])
+        steady.append(f"{name}_steady = {towards}")
+        if lag.states == 1:
+            rates.append((f"({name}_steady - x.{name}) / p.T_{name}", "a lag of first order"))
+        else:
+            rates.append((f"x.{name}_rate", f"exact: the rate of {name}"))
+        lower, upper = _wide(column)
+        parameters.append(
+            (f"T_{name}", lag.seconds, "s", lag.seconds / 20, lag.seconds * 20, "time constant")
+        )
+        if lag.states == 2:
+            parameters.append((f"D_{name}", min(max(lag.damping, 0.01), 5.0), "-", 0.0, 10.0, "damping"))
+        middle = min(max(lag.offset, float(lower)), float(upper))
+        parameters.append((f"rest_{name}", middle, unit, float(lower), float(upper), "value without inputs"))
+        for u, source, gain in zip(u_names, draft.inputs, lag.gains, strict=True):
+            reach = max(10 * abs(gain), 10 * np.ptp(column.span) / np.ptp(source.span))
+            per = f"{unit}/({source.unit})" if source.unit and source.unit != "-" else unit
+            parameters.append((f"k_{name}_{u}", gain, per, -float(reach), float(reach), f"gain from {u}"))
+    for name, column, lag in zip(y_names, draft.outputs, lags, strict=True):
+        if lag.states == 2:
+            unit = f"{column.unit or '-'}/s" if column.unit not in ("", "-") else "1/s"
+            fast = 10 * np.ptp(column.span) / lag.seconds
+            low, high = _rounded(-fast, 2), _rounded(fast, 2)
+            states.append((f'Signal("{name}_rate", "{unit}", {low}, {high})', "not measured"))
+            pull = f"({name}_steady - x.{name}) / p.T_{name}**2"
+            rates.append((f"{pull} - 2 * p.D_{name} / p.T_{name} * x.{name}_rate", "second order"))
+    exact = [name for name, lag in zip(y_names, lags, strict=True) if lag.states == 2]
+    corrected = [n for n, lag in zip(y_names, lags, strict=True) if lag.states == 1] + [
+        f"{n}_rate" for n in exact
+    ]
+    slowest = max(lag.seconds for lag in lags)
+    length = draft.period * len(draft.outputs[0].values)
+    dt = draft.period
+    warm = min(max(10 * dt, slowest), length / 10)
+    time = f'"{draft.time.full}"' if draft.time else _rounded(draft.period)
+    time_note = "rises evenly; in seconds?" if draft.time and not draft.time.unit else ""
+    if draft.time is None:
+        time_note = "the sampling time [s]; no column of the recording looks like time"
+    lines = [
+        f'"""{path.stem}: written from {data.name} by hybrid-mpc new. Lines marked {MARK} are yours to decide."""',
+        "",
+        "from hybrid_mpc import DataSpec, Parameter, Prior, Scenario, Signal",
+        "",
+        "",
+        f"class {kind}(Prior):",
+        '    """A first prior: each output is a lag of the inputs."""',
+        "",
+        f"    # {MARK}: write the machine's own equations in xdot; its states need not be measured",
+        "    states = (",
+        *(f"        {text},  # {note}" for text, note in states),
+        "    )",
+        "    inputs = (",
+        *(
+            f"        {text},  # {note}"
+            for text, note in (_signal(c, n) for c, n in zip(draft.inputs, u_names, strict=True))
+        ),
+        "    )",
+        f"    outputs = states[:{len(y_names)}]",
+        "    parameters = (  # name, value, unit, bounds of the fit",
+        *(
+            f'        Parameter("{n}", {_rounded(v)}, "{unit}", {_rounded(low)}, {_rounded(high)}, "{text}"),'
+            for n, v, unit, low, high, text in parameters
+        ),
+        "    )",
+        f"    corrects = ({', '.join(f'{n!r}' for n in corrected)},)".replace("'", '"'),
+        f"    # {MARK}: operating_point = OperatingPoint(x=(...), u=(...)), if the machine works around one",
+        f"    # {MARK}: balances(self, x, u, w, p), if something is stored: energy, mass, heat",
+        "",
+        "    def xdot(self, x, u, w, p):",
+        *(f"        {text}" for text in steady),
+        "        return (",
+        *(f"            {text},  # {note}" for text, note in rates),
+        "        )",
+        "",
+        "",
+        "scenario = Scenario(",
+        f'    "{path.stem}",',
+        f'    "{path.stem}",  # {MARK}: a title',
+        f'    "",  # {MARK}: a few words for the report',
+        f"    prior={kind},",
+        "    data=DataSpec(",
+        f"        {time}," + (f"  # {MARK}: {time_note}" if time_note else ""),
+        f"        {_tuple(c.full for c in draft.inputs)},  # {MARK}: are these commanded?",
+        f"        {_tuple(c.full for c in draft.outputs)},  # {MARK}: are these measured?",
+        *([f"        # {MARK}: not used: {', '.join(draft.left_out)}"] if draft.left_out else []),
+        f"        dt={_rounded(dt)},  # s, as it was sampled; a tenth of the fastest motion is enough",
+        f"        max_gap={_rounded(5 * draft.period)},",
+        f"        smoothing={_rounded(10 * draft.period)},",
+        f"        warm_up={_rounded(warm)},  # s of the past that start a free run",
+        "    ),",
+        f"    # {MARK}: control=OCP(horizon, q=, r=, r_delta=, u_min=, u_max=), sensor_sigma=, safe_input=, and tasks",
+        ")",
+        "",
+    ]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def _tuple(names: Iterable[str]) -> str:
+    given = list(names)
+    quoted = ", ".join(f'"{name}"' for name in given)
+    return f"({quoted},)" if len(given) == 1 else f"({quoted})"

@@ -1,0 +1,58 @@
+"""``hybrid-mpc check``: what it understands, in units, and what it says is wrong."""
+
+import subprocess
+import sys
+
+WITHOUT_TORCH = """
+import sys
+from hybrid_mpc.cli.main import app
+app(standalone_mode=False)
+assert "torch" not in sys.modules
+"""
+
+
+def checked(call, *words):
+    code, told, _ = call("check", *words)
+    return code, " ".join(told.split())
+
+
+def test_it_says_what_it_understood(call, machine):
+    data = [word for name in ("monday", "tuesday") for word in ("--data", machine / f"{name}.csv")]
+    code, told = checked(call, machine / "my_machine.py", *data)
+    assert code == 0
+    for words in (
+        "input tau N m -3 to 3 tau_nm -0.7 to 0.7",  # two signals of 0.4 and 0.3
+        "state phi_dot rad/s any",
+        "d 0.05 N m s 0 and 0.5",
+        "J 0.1 kg m^2 fixed",
+        "balances: energy (J, W)",
+        "networks may correct the rates of: phi_dot",
+        "operating point (given): phi = 0 rad, phi_dot = 0 rad/s, tau = 0 N m",
+        "(-3.142, 0) unstable; (0, 0) stable; (3.142, 0) unstable",
+        "4 s; 1 Runge-Kutta steps a period of 0.02 s",  # 2 J / d: the envelope of the swing
+        "control: 50 periods, 1 s",
+        "monday.csv 11.98 s 0.01 s",
+        "Nothing to be mended",
+    ):
+        assert words in told
+    assert not list(machine.glob("runs"))
+
+
+def test_machine_and_recordings_are_told_in_one_pass(call, machine, tmp_path):
+    text = (machine / "my_machine.py").read_text()
+    text = text.replace('Signal("phi_dot", "rad/s")', 'Signal("phi_dot", "deg/s")')
+    text = text.replace("sensor_sigma=(1e-3,)", "sensor_sigma=(0.0,)")
+    (tmp_path / "wrong.py").write_text(text)
+    table = (machine / "monday.csv").read_text().replace("tau_nm", "torque")
+    (tmp_path / "monday.csv").write_text(table)
+    code, told = checked(call, tmp_path / "wrong.py", "--data", tmp_path / "monday.csv")
+    assert code == 2
+    assert "3 to be mended" in told
+    for words in ("its unit must be rad/s", "sensor_sigma must be positive", "no column 'tau_nm'"):
+        assert words in told
+
+
+def test_a_machine_in_casadi_is_checked_without_torch(machine):
+    words = ["check", str(machine / "my_machine.py"), "--data", str(machine / "monday.csv")]
+    done = subprocess.run([sys.executable, "-c", WITHOUT_TORCH, *words], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,109 @@
+"""A machine that is no pendulum: heat in two bodies, two outputs of other units, no balance."""
+
+import json
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from hybrid_mpc import write_csv
+from hybrid_mpc.job.stages.results import read_results
+
+MACHINE = """
+from hybrid_mpc import Budget, DataSpec, OperatingPoint, Parameter, Prior, Scenario, Signal
+
+
+class Bodies(Prior):
+    states = (Signal("hot", "degC", 0.0, 200.0), Signal("cold", "degC", 0.0, 200.0))
+    inputs = (Signal("power", "W", 0.0, 50.0),)
+    outputs = (Signal("cold", "degC", 0.0, 200.0), Signal("sensor", "mV", 0.0, 5.0))
+    parameters = (Parameter("gain", 0.05, "K/s/W", 0.02, 0.2), Parameter("loss", 0.04, "1/s", 0.01, 0.1))
+    operating_point = OperatingPoint(x=(70.0, 45.0), u=(25.0,))
+
+    def xdot(self, x, u, w, p):
+        across = 0.05 * (x.hot - x.cold)
+        return p.gain * u.power - across, across - p.loss * (x.cold - 20.0)
+
+    def output(self, x, u, w, p):
+        return x.cold, 0.02 * x.hot
+
+
+scenario = Scenario(
+    "bodies", "Two bodies", "", prior=Bodies,
+    data=DataSpec("t", ("p",), ("c", "s"), dt=2.0, max_gap=5.0, smoothing=10.0, warm_up=10.0),
+    budgets={"quick": Budget(hidden=4, networks=2, teacher_steps=10, free_run_steps=5, seeds=1)},
+)
+"""
+
+
+def recording(path):
+    """900 samples; a little of the heat goes by radiation, which no prior knows."""
+    rng, n = np.random.default_rng(0), 900
+    power, x = np.repeat(rng.uniform(10.0, 40.0, n // 30), 30), np.array([70.0, 45.0])
+    y = np.empty((n, 2))
+    for k in range(n):
+        y[k] = x[1], 0.02 * x[0]
+        for _ in range(10):
+            across = 0.05 * (x[0] - x[1])
+            x = x + 0.2 * np.array(
+                [0.06 * power[k] - across, across - 0.05 * (x[1] - 20.0) - 1e-5 * (x[1] - 20.0) ** 2]
+            )
+    y += rng.normal(0.0, (0.05, 0.001), y.shape)
+    return write_csv(path, {"t": 2.0 * np.arange(n), "p": power, "c": y[:, 0], "s": y[:, 1]})
+
+
+@pytest.fixture(scope="module")
+def bodies(tmp_path_factory):
+    """Folder of a run, and what the terminal was told."""
+    folder = tmp_path_factory.mktemp("bodies")
+    (folder / "bodies.py").write_text(MACHINE)
+    data, out = recording(folder / "run.csv"), folder / "run"
+    skipped = [word for stage in ("control", "estimation", "monitor", "guard") for word in ("--skip", stage)]
+    words = ("run", folder / "bodies.py", "--data", data, *skipped, "--out", out)
+    command = [sys.executable, "-m", "hybrid_mpc.cli", *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return out, done.stdout.partition("free runs on unseen data:")[2]
+
+
+def test_every_output_has_its_figures_and_there_is_no_mopgrnn(bodies):
+    out, told = bodies
+    results = json.loads((out / "results.json").read_text())
+    read_results(results)
+    found = results["identification"]
+    for name in ("phy_nominal", "phy", "rnn", "pgrnn"):
+        assert set(found["rmse"][name]) == set(found["fit_percent"][name]) == {"cold [degC]", "sensor [mV]"}
+        assert found["balance_violation"][name] == {}
+    assert found["fit_percent"]["phy"]["cold [degC]"] > 90
+    for key in ("error", "rmse", "fit_percent", "e_sim", "balance_violation"):
+        assert found[key]["mopgrnn"] is None
+        assert "no balance" in found[key]["mopgrnn_reason"]
+    assert set(found["details"]["choice"]["candidates"]) == {"phy", "pgrnn"}
+    assert set(found["details"]["bands"]["phy"]["width"]) == {"cold [degC]", "sensor [mV]"}
+    for words in ("RMSE cold [degC]", "RMSE sensor [mV]", "ARX", "N4SID"):
+        assert words in told
+    assert "mopgrnn" not in told
+    # what models are compared by is over the outputs' spreads: neither unit rules it
+    shares = [1 - fit / 100 for fit in found["fit_percent"]["phy"].values()]
+    assert found["error"]["phy"] == pytest.approx(
+        np.sqrt(np.mean(np.square(shares))), rel=0.5
+    )  # of training data
+
+
+def test_the_report_has_the_units_of_the_machine_and_says_what_is_missing(bodies):
+    page = (bodies[0] / "report.html").read_text()
+    text = re.sub(r"<[^>]+>", " ", page)
+    for words in ("RMSE of cold [degC]", "RMSE of sensor [mV]", "FIT of sensor [%]", "There is no MOPGRNN"):
+        assert words in text
+    assert not re.search(r"\[(rad|W|N m)\]", text.partition("Names and definitions")[0])
+
+
+def test_a_model_that_is_not_there_cannot_be_deployed(call, bodies, tmp_path):
+    folder = bodies[0].parent
+    words = ("--data", folder / "run.csv", "--deploy", "mopgrnn", "--out", tmp_path / "no")
+    code, _, told = call("run", folder / "bodies.py", *words)
+    assert code == 2
+    assert "model to deploy" in told
+    assert not (tmp_path / "no").exists()
