@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -158,8 +159,9 @@ def operators(xp: ModuleType) -> dict[int, Callable[..., Any]]:
         ca.OP_TWICE: lambda a: a + a, ca.OP_SQ: lambda a: a * a, ca.OP_INV: lambda a: 1.0 / a,
         ca.OP_POW: xp.power, ca.OP_CONSTPOW: xp.power, ca.OP_FABS: xp.abs, ca.OP_ASIN: xp.arcsin,
         ca.OP_ACOS: xp.arccos, ca.OP_ATAN: xp.arctan, ca.OP_ATAN2: xp.arctan2,
-        ca.OP_LT: lambda a, b: 1.0 * (a < b), ca.OP_LE: lambda a, b: 1.0 * (a <= b), ca.OP_NOT: lambda a: 1.0 * (a == 0),
+        ca.OP_LT: lambda a, b: 1.0 * (a < b), ca.OP_LE: lambda a, b: 1.0 * (a <= b),
         ca.OP_EQ: lambda a, b: 1.0 * (a == b), ca.OP_NE: lambda a, b: 1.0 * (a != b),
+        ca.OP_NOT: lambda a: 1.0 * (a == 0),
         ca.OP_AND: lambda a, b: 1.0 * ((a != 0) & (b != 0)), ca.OP_OR: lambda a, b: 1.0 * ((a != 0) | (b != 0)),
         ca.OP_IF_ELSE_ZERO: lambda a, b: xp.where(a != 0, b, 0.0),
     }  # fmt: skip
@@ -664,6 +666,11 @@ NEEDS = {"jax-sysid grey": "jax_sysid", "jax-sysid black": "jax_sysid", "SUBNET"
 def watched(problem: Problem, name: str, seed: int, limit: float, **options: Any) -> Watch:
     """A method's run, from the recordings on."""
     watch = Watch(problem, limit)
-    with contextlib.suppress(Over), contextlib.redirect_stdout(None), contextlib.redirect_stderr(None):
+    with (
+        open(os.devnull, "w") as nowhere,
+        contextlib.redirect_stdout(nowhere),
+        contextlib.redirect_stderr(nowhere),
+        contextlib.suppress(Over),
+    ):
         METHODS[name](problem, watch, seed, **options)
     return watch
